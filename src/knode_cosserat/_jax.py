@@ -1,0 +1,39 @@
+"""How this package uses JAX: double precision, and compiled programs kept on disk between processes."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+from pathlib import Path
+
+import jax
+
+
+def _machine() -> str:
+    """A short name of the CPU model: a program compiled for one may be illegal on another."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        described = "".join(sorted({line for line in lines if line.startswith(("model name", "flags"))}))
+    except OSError:
+        described = f"{platform.machine()} {platform.processor()}"
+    return hashlib.sha256(described.encode()).hexdigest()[:12]
+
+
+def cache_directory() -> Path:
+    """Where compiled programs are kept: $KNODE_COSSERAT_CACHE, or the user's cache directory."""
+    chosen = os.environ.get("KNODE_COSSERAT_CACHE")
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return (Path(chosen) if chosen else home / "knode-cosserat") / _machine()
+
+
+def configure() -> None:
+    """Set JAX up, once, on import. A cache directory that the user chose for JAX is left alone."""
+    jax.config.update("jax_enable_x64", True)
+    if jax.config.jax_compilation_cache_dir is None:
+        jax.config.update("jax_compilation_cache_dir", str(cache_directory()))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+
+
+configure()

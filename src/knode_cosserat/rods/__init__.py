@@ -1,0 +1,1 @@
+"""What a robot is: continuous equations of rods. No grid, no time step, no solver."""

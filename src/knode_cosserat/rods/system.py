@@ -1,0 +1,226 @@
+"""The general class of Cosserat-rod systems (paper eqs. 1-4).
+
+    A y_s + B y_st = f1,     C z + D z_t = f2
+
+An implicit time scheme, y_t = c0 y + ʰy, turns it into an ordinary differential equation along the rod:
+
+    z   = (C + c0 D)⁻¹ (f2 - D ʰz)
+    y_s = (A + c0 B)⁻¹ (f1 - B ʰy_s)
+
+A system says which numbers y and z hold, gives these terms (or y_s and z directly), what holds at the base
+and at the tip, and what is unknown at the base. It knows nothing of nodes in between, time steps or solvers.
+"""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from knode_cosserat.rods.parameters import Parameter, ParameterError, checked, parameters_of
+
+
+class Field(NamedTuple):
+    """A named part of y or z: its size, unit and meaning."""
+
+    name: str
+    size: int
+    unit: str
+    meaning: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """The fields of a packed vector, in order."""
+
+    fields: tuple[Field, ...]
+
+    def __init__(self, *fields: tuple[str, int, str, str]):
+        object.__setattr__(self, "fields", tuple(Field(*field) for field in fields))
+
+    @property
+    def size(self) -> int:
+        """How many numbers a packed vector has."""
+        return sum(field.size for field in self.fields)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The fields' names, in order."""
+        return tuple(field.name for field in self.fields)
+
+    def slice(self, name: str) -> slice:
+        """Where a field stands in a packed vector. `KeyError` if there is no such field."""
+        start = 0
+        for field in self.fields:
+            if field.name == name:
+                return slice(start, start + field.size)
+            start += field.size
+        raise KeyError(f"no field {name!r}; there are {', '.join(self.names)}")
+
+    def get(self, packed: Any, name: str) -> Any:
+        """One field of a packed vector (or of an array of them: the last axis is packed)."""
+        return packed[..., self.slice(name)]
+
+    def split(self, packed: Any) -> tuple[Any, ...]:
+        """All fields of a packed vector, in order."""
+        return tuple(self.get(packed, field.name) for field in self.fields)
+
+    def indices(self, names: tuple[str, ...]) -> np.ndarray:
+        """Positions in the packed vector of the numbers of the named fields."""
+        every = np.arange(self.size)
+        return np.concatenate([every[self.slice(name)] for name in names])
+
+
+class History(NamedTuple):
+    """What an implicit time scheme knows of the past at one point of the rod.
+
+    With it, y_t = c0 y + ʰy, z_t = c0 z + ʰz and y_st = c0 y_s + ʰy_s. At rest c0 and all three are zero.
+    """
+
+    c0: Float[Array, ""]
+    y: Float[Array, " y"]
+    z: Float[Array, " z"]
+    y_s: Float[Array, " y"]
+
+
+class Scales(NamedTuple):
+    """Natural sizes of the numbers in y (y,) and of the tip's residuals (k,): what "small" is measured by."""
+
+    y: Float[Array, " y"]
+    tip: Float[Array, " k"]
+
+
+class System(eqx.Module):
+    """A rod robot of the general class.
+
+    A subclass states the layouts below, `rest`, `base`, `tip`, and either `balance` and `constitutive`
+    (the general form) or `derivatives` (y_s and z directly). Its numeric parameters are leaves of a JAX
+    pytree, so that one compiled program serves every value of them, batches of them, and their derivatives.
+    """
+
+    y_layout: ClassVar[Layout]
+    z_layout: ClassVar[Layout]
+    control_layout: ClassVar[Layout]
+    #: fields of y that are unknown at the base; the tip has as many conditions
+    base_unknowns: ClassVar[tuple[str, ...]]
+    #: whether B is not zero: the history of y_s is then kept
+    mixed: ClassVar[bool] = True
+
+    if TYPE_CHECKING:  # every system has these among its own fields
+        length: Any
+        nodes: int
+
+    # the equations
+
+    def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
+        """C (z, z), D (z, z) and f2 (z,) of C z + D z_t = f2, at arclength s (m) and time t (s)."""
+        raise NotImplementedError(f"{type(self).__name__} gives neither `derivatives` nor `constitutive`")
+
+    def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
+        """A (y, y), B (y, y) and f1 (y,) of A y_s + B y_st = f1, at arclength s (m) and time t (s)."""
+        raise NotImplementedError(f"{type(self).__name__} gives neither `derivatives` nor `balance`")
+
+    def derivatives(
+        self, s: Any, t: Any, y: Float[Array, " y"], control: Any, history: History
+    ) -> tuple[Float[Array, " y"], Float[Array, " z"]]:
+        """y_s and z at one point, semi-discretised in time (paper eq. 4)."""
+        return self.general_derivatives(s, t, y, control, history)
+
+    def general_derivatives(
+        self, s: Any, t: Any, y: Float[Array, " y"], control: Any, history: History
+    ) -> tuple[Float[Array, " y"], Float[Array, " z"]]:
+        """y_s and z from the general form A, B, C, D, f1, f2 (paper eq. 4)."""
+        c0 = history.c0
+        y_t = c0 * y + history.y
+        C, D, f2 = self.constitutive(s, t, y, y_t, control)
+        z = jnp.linalg.solve(C + c0 * D, f2 - D @ history.z)
+        z_t = c0 * z + history.z
+        A, B, f1 = self.balance(s, t, y, y_t, z, z_t, control)
+        y_s = jnp.linalg.solve(A + c0 * B, f1 - B @ history.y_s)
+        return y_s, z
+
+    # the two ends, and rest
+
+    @abc.abstractmethod
+    def rest(self, s: Any) -> tuple[Float[Array, " y"], Float[Array, " z"]]:
+        """y and z at arclength s (m) of the unloaded robot at rest: where a simulation starts by default."""
+
+    def base(self, t: Any, control: Any, unknowns: Float[Array, " k"]) -> Float[Array, " y"]:
+        """y at s = 0: the values at rest, with the unknowns in their places."""
+        fixed, _ = self.rest(jnp.zeros(()))
+        return jnp.asarray(fixed).at[self.y_layout.indices(self.base_unknowns)].set(unknowns)
+
+    def unknowns(self, y: Float[Array, " y"]) -> Float[Array, " k"]:
+        """The unknowns in a given y at s = 0: the inverse of `base`."""
+        return y[..., self.y_layout.indices(self.base_unknowns)]
+
+    @abc.abstractmethod
+    def tip(self, t: Any, control: Any, y: Float[Array, " y"]) -> Float[Array, " k"]:
+        """Residuals of the conditions at s = length: zero when they hold."""
+
+    def scales(self) -> Scales:
+        """Natural sizes of y and of the tip's residuals; ones unless a system knows better."""
+        return Scales(jnp.ones(self.y_layout.size), jnp.ones(self.unknown_count))
+
+    # what every system can be asked
+
+    @property
+    def unknown_count(self) -> int:
+        """How many numbers are unknown at the base."""
+        return len(self.y_layout.indices(self.base_unknowns))
+
+    @property
+    def control_size(self) -> int:
+        """How many numbers a control has."""
+        return self.control_layout.size
+
+    def positions(self, y: Any) -> Any:
+        """Positions (…, 3) in metres of states y (…, y)."""
+        return self._named(y, "p", "position")
+
+    def quaternions(self, y: Any) -> Any:
+        """Orientations (…, 4), scalar first, of states y (…, y)."""
+        return self._named(y, "h", "orientation")
+
+    def _named(self, y: Any, name: str, meaning: str) -> Any:
+        if name not in self.y_layout.names:
+            raise AttributeError(
+                f"{type(self).__name__} has no {meaning}: its y has no field {name!r} "
+                f"(there are {', '.join(self.y_layout.names)})"
+            )
+        return self.y_layout.get(y, name)
+
+    @classmethod
+    def parameters(cls) -> dict[str, Parameter]:
+        """The physical parameters by name, with unit, meaning and allowed range."""
+        return parameters_of(cls)
+
+    def replace(self, **changes: Any) -> Self:
+        """A copy with other parameters, by name; what depends on them follows.
+
+        Raises `ParameterError` for a name that does not exist or a value that is not allowed. Values may be
+        JAX tracers, so that derivatives with respect to a parameter go through here.
+        """
+        known = parameters_of(type(self))
+        settable = [*known, *(f.name for f in dataclasses.fields(self) if f.name not in known)]
+        for name in changes:
+            if name not in settable:
+                raise ParameterError(
+                    f"{type(self).__name__} has no parameter {name!r}; there are {', '.join(settable)}"
+                )
+        return dataclasses.replace(self, **changes)
+
+    def __check_init__(self) -> None:
+        for name, parameter in parameters_of(type(self)).items():
+            checked(name, getattr(self, name), parameter)
+
+
+def is_traced(tree: Any) -> bool:
+    """Whether any leaf is a JAX tracer: inside `jit`, `grad` or `vmap` values cannot be looked at."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))

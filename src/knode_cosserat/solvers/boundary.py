@@ -1,0 +1,229 @@
+"""The boundary-value problem of one time step, solved at all nodes at once.
+
+Unknown are y at every node and the free numbers ξ at the base. Their equations:
+
+    y_0 = base(ξ),     y_{j+1} = Φ_j(y_j)  (one segment of the space scheme),     tip(y_N) = 0
+
+Newton's method linearises all segments side by side, F_j = ∂Φ_j/∂y_j, and one linear recursion along the
+rod gives the correction. Measured against single shooting on the paper's robot this is faster (no serial
+chain of nonlinear evaluations) and converges from further away. Because a linearisation costs several times
+as much as the residual, it is kept for further corrections while those still converge fast. Steps are damped
+by the natural monotonicity test: the correction that the old linearisation proposes at the new point must be
+shorter than the last one (Deuflhard, Newton Methods for Nonlinear Problems, 2004, ch. 3).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from knode_cosserat.rods.system import History, System
+from knode_cosserat.solvers.linear import Linearisation, LinearSolver
+from knode_cosserat.solvers.space import SpaceScheme, middles
+
+
+@dataclasses.dataclass(frozen=True)
+class NewtonOptions:
+    """When a step counts as solved, and how long to try.
+
+    Residuals are measured in the system's natural units (`System.scales`). A step is solved when the largest
+    is below `tolerance`, or below `acceptable` where rounding allows no further progress.
+    """
+
+    tolerance: float = 1e-10
+    acceptable: float = 1e-8
+    max_linearisations: int = 12
+    #: linearise again when the old linearisation is expected to need more corrections than this
+    patience: int = 6
+    least_damping: float = 1e-3
+
+
+class StepProblem(eqx.Module):
+    """One step: the system, its control, and what the time scheme remembers."""
+
+    system: System
+    t: Float[Array, ""]
+    control: Float[Array, " c"]
+    c0: Float[Array, ""]
+    history: Float[Array, "nodes x"]
+    space: SpaceScheme = eqx.field(static=True)
+
+    def point_rates(self, s: Any, y: Float[Array, " y"], history: Float[Array, " x"]) -> Any:
+        """y_s and z at one point, from a packed record of history."""
+        return self.system.derivatives(s, self.t, y, self.control, self._unpack(history))
+
+    def _unpack(self, history: Float[Array, " x"]) -> History:
+        ny, nz = self.system.y_layout.size, self.system.z_layout.size
+        y_s = history[ny + nz :] if self.system.mixed else jnp.zeros(ny)
+        return History(self.c0, history[:ny], history[ny : ny + nz], y_s)
+
+    @property
+    def arclength(self) -> Float[Array, " nodes"]:
+        """s at the nodes (m)."""
+        return jnp.linspace(0.0, 1.0, self.system.nodes) * self.system.length
+
+    def segments(self, each: Callable[..., Any], y: Float[Array, "nodes y"]) -> Any:
+        """Apply `each(advance, y_j)` to all segments side by side; `advance` maps y_j to y_{j+1}."""
+        s = self.arclength
+        ds = self.system.length / (self.system.nodes - 1)
+        start, end = self.history[:-1], self.history[1:]
+        middle = middles(self.history) if self.space.uses_middle else start
+
+        def segment(s_j: Any, y_j: Any, *history: Any) -> Any:
+            def advance(y: Any) -> Any:
+                return self.space.advance(lambda *at: self.point_rates(*at)[0], s_j, ds, y, history)
+
+            return each(advance, y_j)
+
+        # nodes last inside: XLA then vectorises over them
+        lanes = (y[:-1].T, start.T, middle.T, end.T)
+        return jax.vmap(segment, in_axes=(0, -1, -1, -1, -1))(s[:-1], *lanes)
+
+    def record(self, y: Float[Array, "nodes y"]) -> Float[Array, "nodes x"]:
+        """What must be kept of a solved step at every node: y, z and, if B is not zero, y_s."""
+        y_s, z = jax.vmap(self.point_rates)(self.arclength, y, self.history)
+        return jnp.concatenate([y, z, y_s] if self.system.mixed else [y, z], axis=1)
+
+
+class Iterate(NamedTuple):
+    """A point of the iteration; `error` is its largest residual in natural units, infinite for a NaN."""
+
+    y: Float[Array, "nodes y"]
+    unknowns: Float[Array, " k"]
+    error: Float[Array, ""]
+
+
+class Solution(NamedTuple):
+    """What Newton's method ended with: solved if `error` is at most `acceptable`, and not otherwise."""
+
+    y: Float[Array, "nodes y"]
+    unknowns: Float[Array, " k"]
+    error: Float[Array, ""]
+    corrections: Int[Array, ""]
+    linearisations: Int[Array, ""]
+
+
+def _with_base(problem: StepProblem, y: Any, unknowns: Any) -> Any:
+    first = problem.system.base(problem.t, problem.control, unknowns)
+    return jnp.concatenate([first[None], y[1:]])
+
+
+def _error(problem: StepProblem, defects: Any, tip: Any) -> Any:
+    scales = problem.system.scales()
+    error = jnp.maximum(jnp.max(jnp.abs(defects) / scales.y), jnp.max(jnp.abs(tip) / scales.tip))
+    return jnp.where(jnp.isnan(error), jnp.inf, error)
+
+
+def residuals(problem: StepProblem, y: Float[Array, "nodes y"]) -> tuple[Any, Any]:
+    """Defects y_{j+1} - Φ_j(y_j), with their sign turned, and the tip's residuals."""
+    reached = problem.segments(lambda advance, y_j: advance(y_j), y)
+    return reached - y[1:], problem.system.tip(problem.t, problem.control, y[-1])
+
+
+def linearise(problem: StepProblem, y: Float[Array, "nodes y"], unknowns: Any) -> Linearisation:
+    """Residuals and their exact derivatives by forward mode, all segments in one batch."""
+    system, t, control = problem.system, problem.t, problem.control
+
+    def with_value(function: Callable[[Any], Any], at: Any) -> tuple[Any, Any]:
+        def twice(x: Any) -> tuple[Any, Any]:
+            value = function(x)
+            return value, value
+
+        return jax.jacfwd(twice, has_aux=True)(at)
+
+    F, reached = problem.segments(with_value, y)
+    M, tip = with_value(lambda y_tip: system.tip(t, control, y_tip), y[-1])
+    S = jax.jacfwd(lambda xi: system.base(t, control, xi))(unknowns)
+    return Linearisation(F, S, M, reached - y[1:], tip)
+
+
+class _Search(NamedTuple):
+    """State while one linearisation is in use: the point, and the correction proposed there."""
+
+    at: Iterate
+    dy: Float[Array, "nodes y"]
+    dxi: Float[Array, " k"]
+    size: Float[Array, ""]
+    damping: Float[Array, ""]
+    corrections: Int[Array, ""]
+    fresh: Any
+    go: Any
+    dead: Any
+
+
+def newton(
+    problem: StepProblem,
+    y: Float[Array, "nodes y"],
+    unknowns: Float[Array, " k"],
+    linear: LinearSolver,
+    options: NewtonOptions,
+) -> Solution:
+    """Solve one step from a first guess. Never fails: the solution's `error` says what came of it."""
+    y_scale = problem.system.scales().y
+
+    def size_of(dy: Any) -> Any:
+        return jnp.max(jnp.abs(dy) / y_scale)
+
+    def correct(factors: Any, search: _Search) -> _Search:
+        at, damping = search.at, search.damping
+        xi = at.unknowns + damping * search.dxi
+        y = _with_base(problem, at.y + damping * search.dy, xi)
+        defects, tip = residuals(problem, y)
+        trial = Iterate(y, xi, _error(problem, defects, tip))
+        solved = trial.error <= options.tolerance
+        dy, dxi = jax.lax.cond(
+            solved, lambda: (search.dy, search.dxi), lambda: linear.solve(factors, defects, tip)
+        )
+        size = size_of(dy)
+        accept = (size <= (1.0 - damping / 4.0) * search.size) | solved
+        # corrections still to come at this rate, were the linearisation kept
+        rate = jnp.log(jnp.maximum(search.size / size, 1.0 + 1e-6))
+        remaining = jnp.log(trial.error / options.tolerance) / rate
+        keep = accept & (damping == 1.0) & (remaining <= options.patience)
+        shorten = ~accept & search.fresh & (damping > options.least_damping)
+        rounding = ~accept & (at.error <= options.acceptable)
+        return _Search(
+            at=Iterate(*(jnp.where(accept, new, old) for new, old in zip(trial, at, strict=True))),
+            dy=jnp.where(accept, dy, search.dy),
+            dxi=jnp.where(accept, dxi, search.dxi),
+            size=jnp.where(accept, size, search.size),
+            damping=jnp.where(accept, jnp.minimum(1.0, 4.0 * damping), damping / 4.0),
+            corrections=search.corrections + 1,
+            fresh=search.fresh & ~accept,
+            go=~solved & ~rounding & (keep | shorten),
+            dead=rounding | (~accept & search.fresh & ~shorten),
+        )
+
+    def linearised(state: tuple[_Search, Any]) -> tuple[_Search, Any]:
+        search, count = state
+        at = search.at
+        linearisation = linearise(problem, at.y, at.unknowns)
+        factors, dy, dxi = linear.start(linearisation, y_scale)
+        at = at._replace(error=_error(problem, linearisation.defects, linearisation.tip_residual))
+        size = size_of(dy)
+        usable = jnp.isfinite(size)
+        # a damping that this point itself asked for is kept; one left from a stale linearisation is not
+        damping = jnp.where(search.fresh, 1.0, jnp.maximum(search.damping, 0.25))
+        search = _Search(
+            at, dy, dxi, size, damping, search.corrections,
+            fresh=jnp.array(True), go=usable & (at.error > options.tolerance), dead=~usable,
+        )  # fmt: skip
+        return jax.lax.while_loop(lambda s: s.go, lambda s: correct(factors, s), search), count + 1
+
+    def unsolved(state: tuple[_Search, Any]) -> Any:
+        search, count = state
+        return (search.at.error > options.tolerance) & (count < options.max_linearisations) & ~search.dead
+
+    first = _Search(
+        Iterate(_with_base(problem, y, unknowns), unknowns, jnp.array(jnp.inf)),
+        jnp.zeros_like(y), jnp.zeros_like(unknowns), size=jnp.array(0.0), damping=jnp.array(1.0),
+        corrections=jnp.array(0), fresh=jnp.array(True), go=jnp.array(True), dead=jnp.array(False),
+    )  # fmt: skip
+    search, count = jax.lax.while_loop(unsolved, linearised, (first, jnp.array(0)))
+    return Solution(search.at.y, search.at.unknowns, search.at.error, search.corrections, count)

@@ -1,0 +1,168 @@
+"""The linear equations of one Newton correction: a recursion along the rod with conditions at both ends.
+
+    δy_0 = S δξ,     δy_{j+1} = F_j δy_j + r_j,     M δy_N = -tip
+
+Two ways to solve them share one interface. `Condensed` carries the recursion from base to tip and solves for
+δξ there: the fastest, but what grows along the rod (small time steps, soft and long rods) multiplies rounding
+errors. `Decoupled` first carries the tip's conditions down to the base, orthonormalised at every node, and
+projects on them on the way up: growth does no harm, at several times the cost. Measured: docs/solver.md.
+"""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+class Linearisation(NamedTuple):
+    """Residuals at a point and their exact derivatives: of each segment, of the base and of the tip."""
+
+    F: Float[Array, "segments y y"]
+    base: Float[Array, "y k"]
+    tip: Float[Array, "k y"]
+    defects: Float[Array, "segments y"]
+    tip_residual: Float[Array, " k"]
+
+
+@dataclasses.dataclass(frozen=True)
+class LinearSolver(abc.ABC):
+    """Factor once, solve for several residuals."""
+
+    @abc.abstractmethod
+    def start(
+        self, linearisation: Linearisation, y_scale: Float[Array, " y"]
+    ) -> tuple[Any, Float[Array, "nodes y"], Float[Array, " k"]]:
+        """The factors, and with them the first correction (δy, δξ)."""
+
+    @abc.abstractmethod
+    def solve(
+        self, factors: Any, defects: Float[Array, "segments y"], tip: Float[Array, " k"]
+    ) -> tuple[Float[Array, "nodes y"], Float[Array, " k"]]:
+        """The correction (δy, δξ)."""
+
+
+class CondensedFactors(NamedTuple):
+    """F, the response X_j = ∂y_j/∂ξ at every node, the tip's matrix, and the inverse of ∂tip/∂ξ."""
+
+    F: Float[Array, "segments y y"]
+    X: Float[Array, "k nodes y"]
+    tip: Float[Array, "k y"]
+    inverse: Float[Array, "k k"]
+
+
+def _product(F: Any, X: Any) -> Any:
+    """F @ X as a fused multiply and sum: for sizes this small the library's product is twice as slow."""
+    return jnp.sum(F[:, :, None] * X[None], axis=1)
+
+
+def _apply(F: Any, x: Any) -> Any:
+    return jnp.sum(F * x[None], axis=1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Condensed(LinearSolver):
+    """From base to tip in one pass."""
+
+    def start(self, linearisation, y_scale):  # type: ignore[no-untyped-def]
+        """The response of every node to ξ and, in the same pass, to the residuals."""
+        F, S, M, defects, tip = linearisation
+        k = S.shape[1]
+
+        def along(X: Any, step: Any) -> Any:
+            F_j, r_j = step
+            X = _product(F_j, X).at[:, k].add(r_j)
+            return X, X
+
+        first = jnp.concatenate([S, jnp.zeros((S.shape[0], 1))], axis=1)
+        last, X = jax.lax.scan(along, first, (F, defects))
+        X = jnp.transpose(jnp.concatenate([first[None], X]), (2, 0, 1))
+        at_tip = _product(M, last)
+        factors = CondensedFactors(F, X[:k], M, jnp.linalg.inv(at_tip[:, :k]))
+        return factors, *self._combine(factors, X[k], at_tip[:, k] + tip)
+
+    @staticmethod
+    def _combine(factors: CondensedFactors, w: Any, tip: Any) -> tuple[Any, Any]:
+        dxi = -_apply(factors.inverse, tip)
+        return w + jnp.sum(factors.X * dxi[:, None, None], axis=0), dxi
+
+    def solve(self, factors, defects, tip):  # type: ignore[no-untyped-def]
+        """The recursion for the residuals alone, then δξ from the tip."""
+
+        def along(w: Any, step: Any) -> Any:
+            F, r = step
+            w = _apply(F, w) + r
+            return w, w
+
+        last, w = jax.lax.scan(along, jnp.zeros(defects.shape[1]), (factors.F, defects))
+        w = jnp.concatenate([jnp.zeros((1, defects.shape[1])), w])
+        return self._combine(factors, w, _apply(factors.tip, last) + tip)
+
+
+class DecoupledFactors(NamedTuple):
+    """Per node the orthonormal conditions Q and the triangular factors that made them, all in natural units."""
+
+    F: Float[Array, "segments y y"]
+    Q: Float[Array, "nodes k y"]
+    L: Float[Array, "nodes k k"]
+    base: Float[Array, "y k"]
+    inverse: Float[Array, "k k"]
+    y_scale: Float[Array, " y"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Decoupled(LinearSolver):
+    """From tip to base and back, stable whatever grows along the rod."""
+
+    def start(self, linearisation, y_scale):  # type: ignore[no-untyped-def]
+        """Carry the tip's conditions down to the base."""
+        F = linearisation.F * y_scale[None, None, :] / y_scale[None, :, None]
+
+        def normalised(conditions: Any) -> Any:
+            Q, R = jnp.linalg.qr(conditions.T)
+            return Q.T, R.T
+
+        Q_tip, L_tip = normalised(linearisation.tip * y_scale)
+
+        def down(Q: Any, F: Any) -> Any:
+            Q, L = normalised(Q @ F)
+            return Q, (Q, L)
+
+        _, (Q, L) = jax.lax.scan(down, Q_tip, F, reverse=True)
+        Q, L = jnp.concatenate([Q, Q_tip[None]]), jnp.concatenate([L, L_tip[None]])
+        base = linearisation.base / y_scale[:, None]
+        factors = DecoupledFactors(F, Q, L, base, jnp.linalg.inv(Q[0] @ base), y_scale)
+        return factors, *self.solve(factors, linearisation.defects, linearisation.tip_residual)
+
+    def solve(self, factors, defects, tip):  # type: ignore[no-untyped-def]
+        """Conditions Q_j δy_j = c_j from the tip down, then δy from the base up, projected on them."""
+        F, Q, L, base, inverse, y_scale = factors
+        r = defects / y_scale
+
+        def triangular(L: Any, right: Any) -> Any:
+            return jax.scipy.linalg.solve_triangular(L, right, lower=True)
+
+        c_tip = triangular(L[-1], -tip)
+
+        def down(c: Any, node: Any) -> Any:
+            Q_next, L_j, r_j = node
+            c = triangular(L_j, c - Q_next @ r_j)
+            return c, c
+
+        _, c = jax.lax.scan(down, c_tip, (Q[1:], L[:-1], r), reverse=True)
+        dxi = inverse @ c[0]
+
+        def up(dy: Any, node: Any) -> Any:
+            F_j, r_j, Q_next, c_next = node
+            dy = F_j @ dy + r_j
+            dy = dy + (c_next - Q_next @ dy) @ Q_next
+            return dy, dy
+
+        first = base @ dxi
+        c_next = jnp.concatenate([c[1:], c_tip[None]])
+        _, dy = jax.lax.scan(up, first, (F, r, Q[1:], c_next))
+        return jnp.concatenate([first[None], dy]) * y_scale, dxi

@@ -1,0 +1,155 @@
+"""The loop over time, compiled: steps until all are done or one fails."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.boundary import StepProblem, newton
+from knode_cosserat.solvers.linear import Condensed
+from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.time import BDF1
+
+#: how many past states the warm start looks at, and the extrapolations it chooses from: constant, linear,
+#: quadratic in time
+PAST = 3
+EXTRAPOLATIONS = np.array([[1.0, 0.0, 0.0], [2.0, -1.0, 0.0], [3.0, -3.0, 1.0]])
+
+
+class Past(NamedTuple):
+    """What a step needs of the steps before it, newest first."""
+
+    records: Float[Array, "past nodes x"]
+    rate: Float[Array, "nodes x"]
+    unknowns: Float[Array, "past k"]
+    #: the extrapolation that would have been best for the newest step
+    order: Int[Array, ""]
+
+
+class Rows(NamedTuple):
+    """The steps' results, one row a step."""
+
+    records: Float[Array, "steps nodes x"]
+    unknowns: Float[Array, "steps k"]
+    error: Float[Array, " steps"]
+    corrections: Int[Array, " steps"]
+
+
+def rest_record(system: System) -> Any:
+    """The record (nodes, x) of the system at rest; y_s of the record is found from y itself."""
+    s = jnp.linspace(0.0, 1.0, system.nodes) * system.length
+    y, z = jax.vmap(system.rest)(s)
+    return jnp.concatenate([y, z], axis=1)
+
+
+def initial_past(system: System, record: Any) -> Past:
+    """A past of one state only: every state before the first is the first."""
+    ny = system.y_layout.size
+    if system.mixed and record.shape[1] == ny + system.z_layout.size:
+        y = record[:, :ny]
+        ds = system.length / (system.nodes - 1)
+        record = jnp.concatenate([record, jnp.gradient(y, axis=0) / ds], axis=1)
+    unknowns = system.unknowns(record[0, :ny])
+    return Past(
+        jnp.stack([record] * PAST), jnp.zeros_like(record), jnp.stack([unknowns] * PAST), jnp.array(0)
+    )
+
+
+def coefficient_table(settings: Settings, dt: float) -> np.ndarray:
+    """Coefficients (2, 4) of the first step and of every other."""
+    regular = settings.time.coefficients(dt, dt)
+    first = BDF1().coefficients(dt, dt) if settings.start == "consistent" else regular
+    return np.array([first, regular])
+
+
+def history_of(past: Past, coefficients: Any, settings: Settings) -> Any:
+    """ʰ = c1 (newest) + c2 (the one before) + d1 (its rate), for y, z and y_s alike."""
+    _, c1, c2, d1 = coefficients
+    history = c1 * past.records[0] + c2 * past.records[1]
+    return history + d1 * past.rate if settings.time.uses_rate else history
+
+
+def advanced(past: Past, record: Any, unknowns: Any, rate: Any, order: Any) -> Past:
+    """The past of the next step."""
+    return Past(
+        jnp.concatenate([record[None], past.records[:-1]]),
+        rate,
+        jnp.concatenate([unknowns[None], past.unknowns[:-1]]),
+        order,
+    )
+
+
+def step(system: System, settings: Settings, past: Past, coefficients: Any, control: Any, t: Any) -> Any:
+    """One time step: the next past, and the step's row."""
+    ny = system.y_layout.size
+    history = history_of(past, coefficients, settings)
+    problem = StepProblem(system, t, control, coefficients[0], history, settings.space)
+    guesses = jnp.einsum("ep,pny->eny", EXTRAPOLATIONS, past.records[:, :, :ny])
+    weights = jnp.asarray(EXTRAPOLATIONS)[past.order]
+    solution = newton(problem, guesses[past.order], weights @ past.unknowns, Condensed(), settings.newton)
+    record = problem.record(solution.y)
+    misfit = jnp.max(jnp.abs(guesses - solution.y) / system.scales().y, axis=(1, 2))
+    rate = coefficients[0] * record + history if settings.time.uses_rate else past.rate
+    row = Rows(record, solution.unknowns, solution.error, solution.corrections)
+    return advanced(past, record, solution.unknowns, rate, jnp.argmin(misfit)), row
+
+
+def march(
+    system: System, settings: Settings, table: Any, controls: Any, dt: Any, past: Past, start: Any, stop: Any
+) -> tuple[Any, Past, Rows]:
+    """Steps `start` to `stop` (exclusive; step i uses controls[i] and ends at t = (i + 1) dt).
+
+    Ends early at a step that does not converge. Gives how many steps are done, the past of the step that is
+    next, and the rows of all steps that were tried; the rest of the rows are zero.
+    """
+    capacity = controls.shape[0]
+    empty = Rows(
+        jnp.zeros((capacity, *past.records.shape[1:])),
+        jnp.zeros((capacity, past.unknowns.shape[1])),
+        jnp.zeros(capacity),
+        jnp.zeros(capacity, dtype=int),
+    )
+
+    def going(state: Any) -> Any:
+        i, failed, _, _ = state
+        return (i < stop) & ~failed
+
+    def one(state: Any) -> Any:
+        i, _, past, rows = state
+        coefficients = jnp.where(i == 0, table[0], table[1])
+        after, row = step(system, settings, past, coefficients, controls[i], (i + 1) * dt)
+        failed = ~(row.error <= settings.newton.acceptable)
+        past = jax.tree.map(lambda new, old: jnp.where(failed, old, new), after, past)
+        rows = jax.tree.map(lambda all_rows, value: all_rows.at[i].set(value), rows, row)
+        return jnp.where(failed, i, i + 1), failed, past, rows
+
+    done, _, past, rows = jax.lax.while_loop(going, one, (start, jnp.array(False), past, empty))
+    return done, past, rows
+
+
+@functools.partial(jax.jit, static_argnames="settings")
+def march_one(system, settings, table, controls, dt, past, start, stop):  # type: ignore[no-untyped-def]
+    """`march`, compiled."""
+    return march(system, settings, table, controls, dt, past, start, stop)
+
+
+@functools.partial(jax.jit, static_argnames=("settings", "batched", "lockstep"))
+def march_many(system, settings, table, controls, dt, past, start, stop, batched, lockstep):  # type: ignore[no-untyped-def]
+    """`march` for a batch, compiled once: controls (B, T, c), and a batch of systems if `batched`.
+
+    On a CPU the robots run one after the other, each with its own number of Newton corrections; together in
+    lockstep they would all wait for the slowest, which measured half as fast. On a GPU lockstep wins.
+    """
+
+    def one(batch: Any) -> Any:
+        own, control, past = batch
+        return march(own if batched else system, settings, table, control, dt, past, start, stop)
+
+    batch = (system if batched else None, controls, past)
+    return jax.vmap(one)(batch) if lockstep else jax.lax.map(one, batch)

@@ -1,0 +1,203 @@
+"""What is tried when a step does not converge, in order: a stable elimination, load continuation, halving.
+
+This runs outside the compiled loop, step by step in plain Python: it is rare, and its program is compiled only
+when it is first needed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.boundary import Solution, StepProblem, newton
+from knode_cosserat.solvers.linear import Decoupled
+from knode_cosserat.solvers.march import EXTRAPOLATIONS, Past, advanced, history_of
+from knode_cosserat.solvers.result import Result
+from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.time import BDF1, Static
+
+#: a step is halved at most this many times
+HALVINGS = 6
+#: the smallest part of a change of control that continuation goes down to
+LEAST_PART = 1.0 / 512.0
+
+
+class Outcome(NamedTuple):
+    """A recovered step, or the best that was reached (`result` < 0)."""
+
+    result: Result
+    past: Past
+    record: np.ndarray
+    unknowns: np.ndarray
+    error: float
+    corrections: int
+    cause: str
+
+
+@functools.partial(jax.jit, static_argnames="settings")
+def attempt(
+    system: System, settings: Settings, c0: Any, history: Any, control: Any, t: Any, y: Any, unknowns: Any
+) -> tuple[Solution, Any]:
+    """One boundary-value problem with the stable elimination and a long search."""
+    problem = StepProblem(system, t, control, c0, history, settings.space)
+    patient = dataclasses.replace(settings.newton, max_linearisations=40)
+    solution = newton(problem, y, unknowns, Decoupled(), patient)
+    return solution, problem.record(solution.y)
+
+
+class _Step:
+    """One time step as boundary-value problems, for one past and one set of coefficients."""
+
+    def __init__(self, system: System, settings: Settings, past: Past, coefficients: Any, t: float):
+        self.system, self.settings, self.past, self.t = system, settings, past, t
+        self.coefficients = np.asarray(coefficients, dtype=float)
+        self.history = history_of(past, self.coefficients, settings)
+        self.corrections = 0
+
+    def solve(self, control: Any, y: Any, unknowns: Any) -> tuple[Solution, Any]:
+        solution, record = attempt(
+            self.system, self.settings, self.coefficients[0], self.history, control, self.t, y, unknowns
+        )
+        self.corrections += int(solution.corrections)
+        return solution, record
+
+    def guesses(self) -> list[tuple[Any, Any]]:
+        ny = self.system.y_layout.size
+        y = [jnp.einsum("p,pny->ny", w, self.past.records[:, :, :ny]) for w in EXTRAPOLATIONS[:2]]
+        return [(y[i], EXTRAPOLATIONS[i] @ self.past.unknowns) for i in range(2)]
+
+    def solved(self, solution: Solution) -> bool:
+        return bool(solution.error <= self.settings.newton.acceptable)
+
+    def after(self, solution: Solution, record: Any) -> Past:
+        rate = self.coefficients[0] * record + self.history
+        return advanced(self.past, record, solution.unknowns, rate, jnp.array(0))
+
+
+def recover(
+    system: System,
+    settings: Settings,
+    past: Past,
+    coefficients: Any,
+    controls: tuple[Any, Any],
+    t: float,
+    dt: float,
+) -> Outcome:
+    """Solve the step that ends at t. `controls` are the previous step's and this one's."""
+    step = _Step(system, settings, past, coefficients, t)
+    best: tuple[Solution, Any] | None = None
+    for guess in step.guesses():
+        found = step.solve(controls[1], *guess)
+        if step.solved(found[0]):
+            return _outcome(Result.RECOVERED_STABLE_ELIMINATION, step, found)
+        if best is None or found[0].error < best[0].error:
+            best = found
+    continued = _continue_load(step, *controls)
+    if continued is not None:
+        return _outcome(Result.RECOVERED_LOAD_CONTINUATION, step, continued)
+    if isinstance(settings.time, Static):
+        relaxed = _relax(step, controls[1])
+        if relaxed is not None:
+            return _outcome(Result.RECOVERED_RELAXATION, step, relaxed)
+    else:
+        halved = _halve(system, settings, past, controls[1], t, dt)
+        if halved is not None:
+            return _outcome(Result.RECOVERED_STEP_HALVING, *halved)
+    assert best is not None
+    result = Result.NO_CONVERGENCE if np.isfinite(best[0].error) else Result.NOT_FINITE
+    return _outcome(result, step, best)._replace(past=past)
+
+
+def _outcome(result: Result, step: _Step, found: tuple[Solution, Any]) -> Outcome:
+    solution, record = found
+    return Outcome(
+        result,
+        step.after(solution, record),
+        np.asarray(record),
+        np.asarray(solution.unknowns),
+        float(solution.error),
+        step.corrections,
+        likely_cause(result, step),
+    )
+
+
+def _continue_load(step: _Step, before: Any, now: Any) -> tuple[Solution, Any] | None:
+    """From the previous control to this one in parts, each from the solution of the last."""
+    before, now = np.asarray(before, dtype=float), np.asarray(now, dtype=float)
+    if np.array_equal(before, now):
+        return None
+    for guess in step.guesses():
+        found = step.solve(before, *guess)
+        if not step.solved(found[0]):
+            continue
+        reached, part = 0.0, 0.25
+        while reached < 1.0 and part >= LEAST_PART:
+            target = min(1.0, reached + part)
+            following = step.solve(before + target * (now - before), found[0].y, found[0].unknowns)
+            if step.solved(following[0]):
+                found, reached, part = following, target, 2.0 * part
+            else:
+                part /= 4.0
+        if reached == 1.0:
+            return found
+    return None
+
+
+def _halve(
+    system: System, settings: Settings, past: Past, control: Any, t: float, dt: float
+) -> tuple[_Step, tuple[Solution, Any]] | None:
+    """The step in 2, 4, 8 … parts, with coefficients for unequal steps. The control is held."""
+    for halving in range(1, HALVINGS + 1):
+        parts = 2**halving
+        small, now, previous_dt = dt / parts, past, dt
+        step, found = None, None
+        for i in range(parts):
+            scheme = settings.time if settings.start == "paper" or i > 0 else BDF1()
+            coefficients = scheme.coefficients(small, previous_dt)
+            step = _Step(system, settings, now, coefficients, t - dt + (i + 1) * small)
+            guess = step.guesses()[0]
+            found = step.solve(control, *guess)
+            if not step.solved(found[0]):
+                break
+            now, previous_dt = step.after(*found), small
+        else:
+            assert step is not None and found is not None
+            # the next whole step looks back on whole steps, not on the parts
+            step.past = past
+            return step, found
+    return None
+
+
+def _relax(step: _Step, control: Any) -> tuple[Solution, Any] | None:
+    """Implicit Euler with ever longer time steps, then the static solve: comes to rest in a stable shape."""
+    now, dt = step.past, 0.01
+    for _ in range(60):
+        moving = _Step(step.system, step.settings, now, BDF1().coefficients(dt, dt), 0.0)
+        found = moving.solve(control, *moving.guesses()[0])
+        if not moving.solved(found[0]):
+            dt /= 4.0
+            continue
+        now, dt = moving.after(*found), 2.0 * dt
+        if dt > 1e3:
+            break
+    found = step.solve(control, now.records[0][:, : step.system.y_layout.size], now.unknowns[0])
+    return found if step.solved(found[0]) else None
+
+
+def likely_cause(result: Result, step: _Step) -> str:
+    """A hint at what to change, from what can be seen."""
+    if result.solved:
+        return ""
+    nodes = step.system.nodes
+    if result is Result.NOT_FINITE:
+        return f"Likely too few nodes for so soft or loaded a rod ({nodes}): use more, or a smaller time step."
+    return (
+        "Likely cause: the control changes too much in one step, the rod buckles or snaps, "
+        f"or it has too few nodes ({nodes})."
+    )

@@ -1,0 +1,57 @@
+"""What came of each step, and the error that a failed one raises."""
+
+from __future__ import annotations
+
+import enum
+
+
+class Result(enum.IntEnum):
+    """How a step ended. Zero and above: solved to tolerance. Below zero: not solved, the state is invalid."""
+
+    CONVERGED = 0
+    RECOVERED_STABLE_ELIMINATION = 1
+    RECOVERED_LOAD_CONTINUATION = 2
+    RECOVERED_STEP_HALVING = 3
+    RECOVERED_RELAXATION = 4
+    RECOVERED_FINER_SEGMENTS = 5
+    NO_CONVERGENCE = -1
+    NOT_FINITE = -2
+    NOT_REACHED = -3
+
+    @property
+    def solved(self) -> bool:
+        """Whether the state is a solution."""
+        return self >= 0
+
+    @property
+    def message(self) -> str:
+        """The result in words."""
+        return _MESSAGES[self]
+
+
+_MESSAGES = {
+    Result.CONVERGED: "converged",
+    Result.RECOVERED_STABLE_ELIMINATION: "converged with the stable elimination and a longer search",
+    Result.RECOVERED_LOAD_CONTINUATION: "converged by applying the change of control in smaller parts",
+    Result.RECOVERED_STEP_HALVING: "converged by several smaller time steps",
+    Result.RECOVERED_RELAXATION: "converged after a damped motion towards rest",
+    Result.RECOVERED_FINER_SEGMENTS: "converged with every segment divided: undivided they were too long to be stable",
+    Result.NO_CONVERGENCE: "no solution found",
+    Result.NOT_FINITE: "the equations overflow or are undefined there",
+    Result.NOT_REACHED: "not simulated: an earlier step failed",
+}
+
+
+class SimulationError(RuntimeError):
+    """A step could not be solved. `step`, `time` (s), `residual` (natural units), `result` and `cause` say more."""
+
+    def __init__(
+        self, step: int, time: float, residual: float, result: Result, cause: str, robot: int | None = None
+    ):
+        self.step, self.time, self.residual, self.result = step, time, residual, result
+        self.cause, self.robot = cause, robot
+        who = "" if robot is None else f" of robot {robot}"
+        where = "equilibrium" if step == 0 else f"step {step} (t = {time:g} s)"
+        super().__init__(
+            f"{where}{who}: {result.message}; residual {residual:.2g} of its natural scale. {cause}"
+        )

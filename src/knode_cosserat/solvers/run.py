@@ -1,0 +1,222 @@
+"""Running compiled marches: one robot with everything that can be tried, or a batch on all cores."""
+
+from __future__ import annotations
+
+import concurrent.futures
+import dataclasses
+import os
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from scipy.interpolate import make_interp_spline
+from tqdm import tqdm
+
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.march import Past, Rows, coefficient_table, march_many, march_one
+from knode_cosserat.solvers.recovery import Outcome, recover
+from knode_cosserat.solvers.result import Result
+from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.stability import SAFE_DECAY, decay_per_segment, suspicious
+
+#: robots that one thread takes at a time
+CHUNK = 16
+#: how far segments are divided when they are too long to be stable
+MOST_NODES = 400
+
+
+class Steps(NamedTuple):
+    """The steps of one robot (or, with a batch axis in front, of several), and what came of each."""
+
+    records: np.ndarray
+    unknowns: np.ndarray
+    error: np.ndarray
+    corrections: np.ndarray
+    result: np.ndarray
+
+
+class Start(NamedTuple):
+    """Where a run begins: the past, and the control before the first step."""
+
+    past: Past
+    control: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """What is the same for every robot of a run."""
+
+    settings: Settings
+    dt: float
+    steps: int
+    #: whether the past holds real states, so that the first step is a step like any other
+    going_on: bool = False
+
+    @property
+    def table(self) -> np.ndarray:
+        """Coefficients of the first step and of every other."""
+        table = coefficient_table(self.settings, self.dt)
+        return table[[1, 1]] if self.going_on else table
+
+
+def run_one(
+    task: Task, system: System, controls: np.ndarray, start: Start, progress: bool = False
+) -> tuple[Steps, str]:
+    """All steps of one robot, and the likely cause if one of them (`result` < 0) could not be solved."""
+    steps, cause = _with_recovery(task, system, controls, start, progress)
+    if _trustworthy(system, steps):
+        return steps, cause
+    record = start.past.records[0]
+    decay = decay_per_segment(system, task.settings, task.table[1], record, controls[0])
+    if decay < SAFE_DECAY / 4.0:
+        return steps, cause
+    # powers of two: few different node counts, so few programs to compile
+    parts = 2 ** max(1, int(np.ceil(np.log2(decay / SAFE_DECAY))))
+    while parts * (system.nodes - 1) < MOST_NODES:
+        finer = _with_finer_segments(task, system, parts, controls, start, progress)
+        if finer is not None:
+            return finer, ""
+        parts *= 2
+    return steps, (
+        f"{cause} At this time step its waves decay by e^{decay:.2g} within a segment, too much for an explicit "
+        "scheme in space, and dividing the segments did not help: use longer time steps."
+    ).strip()
+
+
+def _trustworthy(system: System, steps: Steps) -> bool:
+    """Solved, and not of a size that suggests an instability in space."""
+    ny = system.y_layout.size
+    return bool(steps.result.min() >= 0) and not suspicious(system, steps.records[..., :ny])
+
+
+def _with_finer_segments(
+    task: Task, system: System, parts: int, controls: np.ndarray, start: Start, progress: bool
+) -> Steps | None:
+    """The same robot with every segment divided, its states given at its own nodes; None if that fails too."""
+    fine = system.replace(nodes=parts * (system.nodes - 1) + 1)
+    coarse_s, fine_s = np.linspace(0.0, 1.0, system.nodes), np.linspace(0.0, 1.0, fine.nodes)
+
+    def refined(values: Any, axis: int) -> Any:
+        return make_interp_spline(coarse_s, np.asarray(values), k=min(3, system.nodes - 1), axis=axis)(fine_s)
+
+    past = start.past._replace(records=refined(start.past.records, 1), rate=refined(start.past.rate, 0))
+    steps, _ = _with_recovery(task, fine, controls, start._replace(past=past), progress)
+    if not _trustworthy(fine, steps):
+        return None
+    records = np.ascontiguousarray(steps.records[:, ::parts])
+    finer = np.full(task.steps, int(Result.RECOVERED_FINER_SEGMENTS))
+    return steps._replace(records=records, result=finer)
+
+
+def _with_recovery(
+    task: Task, system: System, controls: np.ndarray, start: Start, progress: bool
+) -> tuple[Steps, str]:
+    past, total, table = start.past, task.steps, task.table
+    padded = _padded(controls)
+    piece = max(1, total // 100) if progress else total
+    rows: Steps | None = None
+    done = 0
+    with tqdm(total=total, disable=not progress, unit="step", leave=False) as bar:
+        while done < total:
+            stop = min(total, done + piece)
+            reached, past, new = march_one(system, task.settings, table, padded, task.dt, past, done, stop)
+            reached = int(reached)
+            rows = _merged(rows, new, done, reached, total)
+            if reached < stop:
+                outcome = recover(
+                    system, task.settings, past, table[min(reached, 1)],
+                    (controls[reached - 1] if reached else start.control, controls[reached]),
+                    (reached + 1) * task.dt, task.dt,
+                )  # fmt: skip
+                past = outcome.past
+                _set_row(rows, reached, outcome)
+                if not outcome.result.solved:
+                    return rows, outcome.cause
+                reached += 1
+            bar.update(reached - done)
+            done = reached
+    assert rows is not None
+    return rows, ""
+
+
+def run_batch(
+    task: Task, system: System, batched: bool, controls: np.ndarray, start: Start, progress: bool
+) -> tuple[Steps, dict[int, str]]:
+    """All robots, and the likely cause for each that could not be solved.
+
+    They go in chunks, one thread a core. A robot with a step that fails, or that seems unstable, is then run
+    by itself, with everything that `run_one` tries.
+    """
+    size = controls.shape[0]
+    lockstep = jax.default_backend() != "cpu"
+    workers = 1 if lockstep else _cores()
+    chunk = size if lockstep else min(CHUNK, -(-size // workers))
+    padded = _padded(controls)
+
+    def robot(index: Any) -> System:
+        return jax.tree.map(lambda leaf: leaf[index], system) if batched else system
+
+    with tqdm(total=size, disable=not progress, unit="robot", leave=False) as bar:
+
+        def work(first: int) -> Any:
+            # the last chunk is filled up with its last robot: one shape, one program
+            index = np.minimum(np.arange(first, first + chunk), size - 1)
+            past = jax.tree.map(lambda leaf: leaf[index], start.past)
+            done, _, rows = march_many(
+                robot(index), task.settings, task.table, padded[index], task.dt, past, 0, task.steps, batched,
+                lockstep,
+            )  # fmt: skip
+            count = min(chunk, size - first)
+            bar.update(count)
+            return np.asarray(done)[:count], *(np.asarray(leaf)[:count, : task.steps] for leaf in rows)
+
+        with concurrent.futures.ThreadPoolExecutor(workers) as pool:
+            chunks = list(pool.map(work, range(0, size, chunk)))
+    done, *rows = (np.concatenate(parts) for parts in zip(*chunks, strict=True))
+    steps = Steps(*rows, np.zeros(rows[2].shape, dtype=int))
+    causes = {}
+    ny = system.y_layout.size
+    for i in range(size):
+        if done[i] == task.steps and not suspicious(robot(i), steps.records[i, ..., :ny]):
+            continue
+        own = Start(jax.tree.map(lambda leaf, i=i: leaf[i], start.past), start.control[i])
+        alone, cause = run_one(task, robot(i), controls[i], own)
+        for all_robots, one in zip(steps, alone, strict=True):
+            all_robots[i] = one
+        if alone.result.min() < 0:
+            causes[i] = cause
+    return steps, causes
+
+
+def _cores() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _padded(controls: Any) -> np.ndarray:
+    """Controls filled up to a few round lengths, so that a run a little longer needs no new program."""
+    steps = controls.shape[-2]
+    capacity = 1 if steps == 1 else max(16, 2 ** int(np.ceil(np.log2(steps))))
+    width = [(0, 0)] * controls.ndim
+    width[-2] = (0, capacity - steps)
+    return np.pad(controls, width, mode="edge")
+
+
+def _merged(rows: Steps | None, new: Rows, first: int, last: int, total: int) -> Steps:
+    """Add the rows `first` to `last` of a march to those there already."""
+    if rows is None:
+        leaves = [np.asarray(leaf)[:total] for leaf in new]
+        if last == total:
+            return Steps(*leaves, np.zeros(total, dtype=int))
+        rows = Steps(*(np.array(leaf) for leaf in leaves), np.full(total, int(Result.NOT_REACHED)))
+    for old, leaf in zip(rows[:4], new, strict=True):
+        old[first:last] = np.asarray(leaf)[first:last]
+    rows.result[first:last] = Result.CONVERGED
+    return rows
+
+
+def _set_row(rows: Steps, i: int, outcome: Outcome) -> None:
+    rows.records[i], rows.unknowns[i] = outcome.record, outcome.unknowns
+    rows.error[i], rows.corrections[i] = outcome.error, outcome.corrections
+    rows.result[i] = outcome.result

@@ -1,0 +1,112 @@
+"""Derivatives of a simulation, by the implicit function theorem in each step.
+
+A solved step satisfies G(y, ξ; history, control, parameters) = 0 exactly, so its tangent solves the linear
+equations that Newton's method solves anyway, with the tangents of history, control and parameters on the
+right. Nothing of the iteration is differentiated, and reverse mode is the transpose of the same recursion.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.boundary import StepProblem, linearise, residuals
+from knode_cosserat.solvers.linear import Condensed
+from knode_cosserat.solvers.march import Past, Rows, history_of, march_one
+from knode_cosserat.solvers.run import Task
+from knode_cosserat.solvers.settings import Settings
+
+
+@functools.lru_cache(maxsize=64)
+def rollout(task: Task) -> Callable[[System, Any, Past], Rows]:
+    """A differentiable function from (system, controls (T, c), past) to the rows of all steps.
+
+    Kept between calls: JAX recognises by identity what it has traced and transposed before.
+    """
+    settings, table, dt, steps = task.settings, task.table, task.dt, task.steps
+
+    @jax.custom_jvp
+    def run(system: System, controls: Any, past: Past) -> Rows:
+        done, _, rows = march_one(system, settings, table, controls, dt, past, 0, steps)
+        unsolved = jnp.arange(steps) >= done
+        return Rows(
+            jnp.where(unsolved[:, None, None], jnp.nan, rows.records),
+            jnp.where(unsolved[:, None], jnp.nan, rows.unknowns),
+            jnp.where(unsolved, jnp.inf, rows.error),
+            rows.corrections,
+        )
+
+    @run.defjvp
+    def tangent(primals: Any, tangents: Any) -> Any:
+        rows = run(*primals)
+        system, controls, past = primals
+        d_system, d_controls, d_past = tangents
+        d_records, d_unknowns = _tangent_march(
+            settings, table, dt, rows.records, rows.unknowns, system, controls, past, d_system, d_controls,
+            d_past.records[:2], d_past.rate,
+        )  # fmt: skip
+        still = np.zeros(steps, dtype=jax.dtypes.float0)
+        return rows, Rows(d_records, d_unknowns, jnp.zeros_like(rows.error), still)
+
+    return run
+
+
+@functools.partial(jax.jit, static_argnames="settings")
+def _tangent_march(
+    settings: Settings, table: Any, dt: Any, records: Any, unknowns: Any, system: System, controls: Any, past: Past,
+    d_system: Any, d_controls: Any, d_records: Any, d_rate: Any,
+) -> Any:  # fmt: skip
+    """Tangents of all records and unknowns, linear in those of system, controls and past."""
+    ny = system.y_layout.size
+    y_scale = system.scales().y
+
+    def one(carry: Any, now: Any) -> Any:
+        past, d_recent, d_rate = carry
+        i, record, xi, control, d_control = now
+        coefficients = jnp.where(i == 0, table[0], table[1])
+        t = (i + 1) * dt
+        y = record[:, :ny]
+        history = history_of(past, coefficients, settings)
+        d_history = coefficients[1] * d_recent[0] + coefficients[2] * d_recent[1]
+        if settings.time.uses_rate:
+            d_history = d_history + coefficients[3] * d_rate
+
+        def problem_of(system: Any, control: Any, history: Any) -> StepProblem:
+            return StepProblem(system, t, control, coefficients[0], history, settings.space)
+
+        problem = problem_of(system, control, history)
+        linear = Condensed()
+        linearisation = linearise(problem, y, xi)
+        factors, _, _ = linear.start(linearisation, y_scale)
+
+        def at_solution(system: Any, control: Any, history: Any) -> Any:
+            problem = problem_of(system, control, history)
+            return *residuals(problem, y), system.base(t, control, xi)
+
+        given, d_given = (system, control, history), (d_system, d_control, d_history)
+        defects, tip, base = jax.jvp(at_solution, given, d_given)[1]
+        # a base that moves by itself enters through the first segment
+        defects = defects.at[0].add(jnp.sum(linearisation.F[0] * base, axis=1))
+        dy, dxi = linear.solve(factors, defects, tip)
+        dy = dy.at[0].add(base)
+
+        def record_of(system: Any, control: Any, history: Any, y: Any) -> Any:
+            return problem_of(system, control, history).record(y)
+
+        d_record = jax.jvp(record_of, (*given, y), (*d_given, dy))[1]
+        rate = coefficients[0] * record + history if settings.time.uses_rate else past.rate
+        d_rate = coefficients[0] * d_record + d_history if settings.time.uses_rate else d_rate
+        past = past._replace(records=jnp.concatenate([record[None], past.records[:-1]]), rate=rate)
+        return (past, jnp.stack([d_record, d_recent[0]]), d_rate), (d_record, dxi)
+
+    steps = jnp.arange(records.shape[0])
+    _, tangents = jax.lax.scan(
+        one, (past, d_records, d_rate), (steps, records, unknowns, controls, d_controls)
+    )
+    return tangents

@@ -1,0 +1,254 @@
+"""From a system and its controls to a trajectory: one robot, or a batch."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from knode_cosserat.rods.system import System, is_traced
+from knode_cosserat.solvers import sensitivity
+from knode_cosserat.solvers.boundary import NewtonOptions
+from knode_cosserat.solvers.march import Past, initial_past, rest_record
+from knode_cosserat.solvers.result import Result, SimulationError
+from knode_cosserat.solvers.run import Start, Steps, Task, run_batch, run_one
+from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.solvers.time import Static, TimeScheme
+from knode_cosserat.trajectory import Trajectory
+
+
+def simulate(
+    robot: System | Sequence[System],
+    controls: Any,
+    dt: float,
+    *,
+    time: str | TimeScheme = "bdf2",
+    space: str | SpaceScheme = "euler",
+    start: Literal["paper", "consistent"] = "paper",
+    initial: Trajectory | None = None,
+    newton: NewtonOptions = NewtonOptions(),
+    on_failure: Literal["raise", "return"] = "raise",
+    progress: bool = False,
+) -> Trajectory:
+    """Simulate a robot, or a batch of them, under given controls.
+
+    Args:
+        robot: one system, or a sequence of systems that differ in their parameters only.
+        controls: (T, c), or (B, T, c) for a batch; for a tendon robot the tensions in N. Control i is held
+            from row i to row i + 1.
+        dt: time step (s).
+        time: "bdf1", "bdf2", "bdf-alpha", "trapezoidal", or a scheme.
+        space: "euler", "rk4", or a scheme.
+        start: how the first step is made from one state; see `Settings`.
+        initial: start from this trajectory's last row (its last three, if its time step is the same, so that
+            the motion goes on) instead of the robot's state at rest.
+        newton: tolerances and limits of the solve in each step.
+        on_failure: "raise" a `SimulationError`, or "return" the trajectory with the rest marked invalid.
+        progress: show a progress bar.
+
+    Returns:
+        A `Trajectory` of T + 1 rows; row 0 is the initial state. Every row carries its result. Inside `jit`,
+        `grad` or `vmap` nothing can be raised: rows that are not solved are NaN there.
+
+    Raises:
+        SimulationError: a step has no solution, and nothing that was tried helped.
+        ValueError: arguments of a wrong shape or name.
+    """
+    settings = Settings.of(time, space, start, newton)
+    if on_failure not in ("raise", "return"):
+        raise ValueError(f'on_failure is {on_failure!r}; allowed is "raise" or "return"')
+    if is_traced(dt) or not (np.isscalar(dt) and np.isfinite(dt) and dt > 0.0):
+        raise ValueError(f"dt is {dt!r}; allowed is a positive number of seconds")
+    system, batch = _stacked(robot)
+    controls, batch = _checked_controls(system, controls, batch)
+    if initial is not None:
+        _check_initial(system, initial, batch)
+    run = _Run(system, controls, initial, settings, float(dt), batch, isinstance(robot, Sequence))
+    if is_traced((system, controls, initial)):
+        return _traced(*run)
+    if batch:
+        return _batch(run, on_failure, progress)
+    return _single(run, on_failure, progress)
+
+
+class _Run(NamedTuple):
+    """The checked arguments of one call; `many` says that the systems themselves are batched."""
+
+    system: System
+    controls: Any
+    initial: Trajectory | None
+    settings: Settings
+    dt: float
+    batch: int | None
+    many: bool
+
+
+# checking what was given
+
+
+def _stacked(robot: Any) -> tuple[System, int | None]:
+    if isinstance(robot, System):
+        return robot, None
+    robots = list(robot) if isinstance(robot, Sequence) else []
+    if not robots or not all(isinstance(one, System) for one in robots):
+        raise ValueError(f"robot is {type(robot).__name__}; allowed is a robot or a non-empty list of robots")
+    if len({jax.tree.structure(one) for one in robots}) > 1:
+        raise ValueError("the robots of a batch must be of one class, with the same nodes and options given")
+    return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(x) for x in leaves]), *robots), len(robots)
+
+
+def _checked_controls(system: System, controls: Any, batch: int | None) -> tuple[Any, int | None]:
+    names = ", ".join(f"{field.name} ({field.unit})" for field in system.control_layout.fields)
+    size = system.control_size
+    allowed = f"allowed is (steps, {size}) or (batch, steps, {size}): {names}"
+    if not is_traced(controls):
+        try:
+            controls = np.asarray(controls, dtype=float)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"controls are not numbers ({error}); {allowed}") from None
+    shape = np.shape(controls)
+    if len(shape) not in (2, 3) or shape[-1] != size or 0 in shape:
+        raise ValueError(f"controls have shape {shape}; {allowed}")
+    if not is_traced(controls) and not np.all(np.isfinite(controls)):
+        bad = tuple(np.argwhere(~np.isfinite(controls))[0].tolist())
+        raise ValueError(f"controls are {controls[bad]} at index {bad}; they must be finite")
+    if batch is None:
+        return controls, shape[0] if len(shape) == 3 else None
+    if len(shape) == 2:
+        spread = jnp.broadcast_to if is_traced(controls) else np.broadcast_to
+        return spread(controls, (batch, *shape)), batch
+    if shape[0] != batch:
+        raise ValueError(f"there are {batch} robots but {shape[0]} controls; give as many, or one (steps, {size})")
+    return controls, batch
+
+
+def _check_initial(system: System, initial: Trajectory, batch: int | None) -> None:
+    if batch or initial.y.ndim == 4:
+        raise ValueError("initial is for one robot, not for a batch")
+    wanted = (system.nodes, system.y_layout.size)
+    if initial.y.shape[-2:] != wanted:
+        raise ValueError(
+            f"the initial trajectory has {initial.y.shape[-2]} nodes of {initial.y.shape[-1]} numbers, "
+            f"the robot {wanted[0]} of {wanted[1]}"
+        )
+    if not is_traced(initial):
+        initial.require_valid()
+
+
+# where to start
+
+
+def _at_rest(system: System) -> Any:
+    record = rest_record(system)
+    return record, initial_past(system, record)
+
+
+_jit_at_rest = jax.jit(_at_rest)
+_jit_all_at_rest = jax.jit(jax.vmap(_at_rest))
+
+
+def _beginning(run: _Run) -> tuple[Any, Start, float, bool]:
+    """The initial record(s), the start, its time, and whether the motion goes on from before."""
+    system, controls, initial, settings, dt, batch, many = run
+    if initial is not None:
+        return _going_on(system, initial, settings, dt)
+    record, past = (_jit_all_at_rest if many else _jit_at_rest)(system)
+    if batch and not many:
+        record, past = jax.tree.map(lambda x: jnp.broadcast_to(x, (batch, *x.shape)), (record, past))
+    none_yet = np.zeros((*np.shape(controls)[:-2], system.control_size))
+    return record, Start(past, none_yet), 0.0, False
+
+
+def _going_on(system: System, initial: Trajectory, settings: Settings, dt: float) -> tuple[Any, Start, float, bool]:
+    records = jnp.concatenate([initial.y, initial.z], axis=-1)
+    past = initial_past(system, records[-1])
+    time = np.asarray(initial.time)
+    regular = len(time) > 1 and np.isclose(time[-1] - time[-2], dt)
+    going_on = bool(regular and not system.mixed and not isinstance(settings.time, Static))
+    if going_on:
+        rows = [records[max(-k, -records.shape[0])] for k in (1, 2, 3)]
+        unknowns = [system.unknowns(row[0, : system.y_layout.size]) for row in rows]
+        rate = (1.5 * rows[0] - 2.0 * rows[1] + 0.5 * rows[2]) / dt
+        past = Past(jnp.stack(rows), rate, jnp.stack(unknowns), jnp.array(1))
+    return records[-1], Start(past, initial.control[-1]), float(time[-1]), going_on
+
+
+# the three ways to run
+
+
+def _single(run: _Run, on_failure: str, progress: bool) -> Trajectory:
+    system, controls, _, settings, dt, _, _ = run
+    record, start, t0, going_on = _beginning(run)
+    task = Task(settings, dt, len(controls), going_on)
+    steps, cause = run_one(task, system, controls, start, progress)
+    if on_failure == "raise" and steps.result.min() < 0:
+        raise _failure(task, steps, cause, None)
+    return _trajectory(run, record, start.control, t0, steps)
+
+
+def _batch(run: _Run, on_failure: str, progress: bool) -> Trajectory:
+    system, controls, _, settings, dt, _, many = run
+    record, start, t0, _ = _beginning(run)
+    task = Task(settings, dt, controls.shape[1])
+    steps, causes = run_batch(task, system, many, controls, start, progress)
+    if on_failure == "raise" and causes:
+        robot, cause = next(iter(causes.items()))
+        raise _failure(task, Steps(*(leaf[robot] for leaf in steps)), cause, robot)
+    return _trajectory(run, record, start.control, t0, steps)
+
+
+def _failure(task: Task, steps: Steps, cause: str, robot: int | None) -> SimulationError:
+    i = int(np.argmax(steps.result < 0))
+    number = 0 if isinstance(task.settings.time, Static) else i + 1
+    return SimulationError(
+        number, number * task.dt, float(steps.error[i]), Result(int(steps.result[i])), cause, robot
+    )
+
+
+@functools.partial(jax.jit, static_argnums=(3, 4, 5, 6))
+def _traced(system, controls, initial, settings, dt, batch, many):  # type: ignore[no-untyped-def]
+    """As seen by JAX's transformations: nothing is recovered, rows that are not solved become NaN.
+
+    One jitted call, so that a transformation traces it once and not at every call.
+    """
+    run = _Run(system, controls, initial, settings, dt, batch, many)
+    record, start, t0, going_on = _beginning(run)
+    one = sensitivity.rollout(Task(settings, dt, np.shape(controls)[-2], going_on))
+    if batch:
+        rows = jax.vmap(one, in_axes=(0 if many else None, 0, 0))(system, controls, start.past)
+    else:
+        rows = one(system, controls, start.past)
+    result = jnp.where(rows.error <= settings.newton.acceptable, 0, int(Result.NO_CONVERGENCE))
+    return _trajectory(run, record, start.control, t0, Steps(*rows, result))
+
+
+def _trajectory(run: _Run, record: Any, control: Any, t0: float, steps: Steps) -> Trajectory:
+    """Put the initial row before the steps, and NaN where there is no solution."""
+    system, controls, _, settings, dt, batch, _ = run
+    numeric: Any = jnp if is_traced((record, steps)) else np
+    axis = 1 if batch else 0
+    ny, nz = system.y_layout.size, system.z_layout.size
+    invalid = numeric.asarray(steps.result) < 0
+    records = numeric.where(invalid[..., None, None], numeric.nan, steps.records[..., : ny + nz])
+
+    def joined(first: Any, rest: Any) -> Any:
+        return numeric.concatenate([numeric.expand_dims(numeric.asarray(first), axis), rest], axis)
+
+    states = joined(record[..., : ny + nz], records)
+    zero = numeric.zeros(states.shape[:axis])
+    return Trajectory(
+        system=system,
+        settings=settings,
+        time=t0 + np.arange(np.shape(controls)[-2] + 1) * dt,
+        y=states[..., :ny],
+        z=states[..., ny:],
+        control=joined(control, controls),
+        result=joined(zero.astype(int), steps.result),
+        residual=joined(zero, steps.error),
+        iterations=joined(zero.astype(int), steps.corrections),
+    )

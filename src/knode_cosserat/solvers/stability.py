@@ -1,0 +1,51 @@
+"""Whether an explicit scheme in arclength can carry the waves of a rod.
+
+At time step dt a rod's waves grow or decay along it like exp(λs), the faster the smaller dt and the softer
+the rod. Half of them decay. When one decays within a segment an explicit scheme makes it grow: the equations
+are then solved, but what they describe is not the rod, and the motion blows up. The eigenvalues of ∂y_s/∂y
+tell, and how much shorter the segments must be.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import numpy as np
+
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.boundary import StepProblem
+from knode_cosserat.solvers.settings import Settings
+
+#: in natural units: a state beyond this is checked for instability
+SUSPICIOUS = 30.0
+#: |λ| ds of a decaying wave that an explicit scheme carries safely
+SAFE_DECAY = 1.0
+
+
+@jax.jit
+def _jacobians(problem: StepProblem, y: Any) -> Any:
+    def at_node(s: Any, y: Any, history: Any) -> Any:
+        return jax.jacfwd(lambda y: problem.point_rates(s, y, history)[0])(y)
+
+    return jax.vmap(at_node)(problem.arclength, y, problem.history)
+
+
+def decay_per_segment(system: System, settings: Settings, coefficients: Any, record: Any, control: Any) -> float:
+    """The largest |λ| ds among the decaying waves: how many times its own length the steepest decays by.
+
+    Judged at one state (its record, nodes × x), as if the robot rested there.
+    """
+    c0 = np.asarray(coefficients, dtype=float)[0]
+    problem = StepProblem(system, np.zeros(()), np.asarray(control), c0, -c0 * np.asarray(record), settings.space)
+    jacobians = np.asarray(_jacobians(problem, np.asarray(record)[:, : system.y_layout.size]))
+    if not np.all(np.isfinite(jacobians)):
+        return 0.0
+    z = np.linalg.eigvals(jacobians).ravel() * float(system.length) / (system.nodes - 1)
+    return float(np.max(np.abs(z), initial=0.0, where=z.real < -0.3 * np.abs(z)))
+
+
+def suspicious(system: System, y: Any) -> bool:
+    """Whether states (steps, nodes, y) are far beyond natural size."""
+    largest = np.max(np.abs(y), axis=(0, 1))
+    return bool(np.any(largest > SUSPICIOUS * np.asarray(system.scales().y)))

@@ -1,0 +1,116 @@
+"""Implicit time schemes: y_t at the new time as c0 y plus what the past contributes.
+
+    y_t,n = c0 y_n + ʰy,     ʰy = c1 y_{n-1} + c2 y_{n-2} + d1 y_t,{n-1}
+
+Every scheme is its coefficients for a step that may differ from the one before, so that a step can be halved.
+"""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+from typing import NamedTuple
+
+
+class Coefficients(NamedTuple):
+    """c0, c1, c2 in 1/s and d1 (no unit) of one step."""
+
+    c0: float
+    c1: float
+    c2: float
+    d1: float
+
+
+@dataclasses.dataclass(frozen=True)
+class TimeScheme(abc.ABC):
+    """An implicit scheme in time."""
+
+    #: whether y_t of the previous step enters, and so must be kept
+    uses_rate = False
+
+    @property
+    @abc.abstractmethod
+    def order(self) -> int:
+        """Order of convergence in the time step."""
+
+    @abc.abstractmethod
+    def coefficients(self, dt: float, previous_dt: float) -> Coefficients:
+        """Coefficients for a step of dt (s) after one of previous_dt (s)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class BDF1(TimeScheme):
+    """Implicit Euler. Order 1, damps every vibration; it needs one past state only."""
+
+    order = 1
+
+    def coefficients(self, dt: float, previous_dt: float) -> Coefficients:
+        """Coefficients for a step of dt (s); the step before does not matter."""
+        return Coefficients(1.0 / dt, -1.0 / dt, 0.0, 0.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class BDFAlpha(TimeScheme):
+    """The family of Till, Aloi & Rucker (2019): α = 0 is BDF2, α = -1/2 the trapezoidal rule.
+
+    Order 2. The closer α to -1/2, the less numerical damping; at -1/2 there is none, and what is stiff rings.
+    With r = dt/previous_dt, BDF2 for unequal steps plus α times the second difference that stands for
+    y_t,n - y_t,{n-1}.
+    """
+
+    alpha: float = -0.2
+
+    order = 2
+
+    def __post_init__(self) -> None:
+        if not -0.5 <= self.alpha <= 0.0:
+            raise ValueError(f"alpha is {self.alpha!r}; allowed is -0.5 (trapezoidal) to 0 (BDF2)")
+
+    @property
+    def uses_rate(self) -> bool:  # type: ignore[override]
+        """BDF2 itself needs no y_t of the past."""
+        return self.alpha != 0.0
+
+    def coefficients(self, dt: float, previous_dt: float) -> Coefficients:
+        """Coefficients for a step of dt (s) after one of previous_dt (s)."""
+        a, r = self.alpha, dt / previous_dt
+        scale = 1.0 / (dt * (1.0 + a))
+        return Coefficients(
+            c0=scale * ((1.0 + 2.0 * r) + 2.0 * a * r) / (1.0 + r),
+            c1=-scale * ((1.0 + r) + 2.0 * a * r),
+            c2=scale * r * r * (1.0 + 2.0 * a) / (1.0 + r),
+            d1=a / (1.0 + a),
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class BDF2(BDFAlpha):
+    """Backward differentiation of order 2: the paper's scheme. Damps vibrations faster than about 10 dt."""
+
+    alpha: float = 0.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Trapezoidal(BDFAlpha):
+    """The trapezoidal rule. Order 2, no numerical damping: for vibrations that are well resolved in time."""
+
+    alpha: float = -0.5
+
+
+@dataclasses.dataclass(frozen=True)
+class Static(TimeScheme):
+    """Every rate is zero: a step of this scheme is a static equilibrium."""
+
+    order = 0
+
+    def coefficients(self, dt: float, previous_dt: float) -> Coefficients:
+        """Zeros, whatever the step."""
+        return Coefficients(0.0, 0.0, 0.0, 0.0)
+
+
+SCHEMES: dict[str, TimeScheme] = {
+    "bdf1": BDF1(),
+    "bdf2": BDF2(),
+    "bdf-alpha": BDFAlpha(),
+    "trapezoidal": Trapezoidal(),
+}

@@ -1,0 +1,152 @@
+"""What a simulation gives: states over time, with what came of each step."""
+
+from __future__ import annotations
+
+from typing import Any, Self
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.result import Result
+
+
+class Trajectory(eqx.Module):
+    """A system's states at T times and N nodes; every array may have a batch axis in front.
+
+    Row 0 is the initial state; row i is the state after control i, which acted from row i - 1 on. Rows that
+    were not solved are NaN, and `result` says why. A pytree: it can be returned from a jitted function.
+    """
+
+    system: System
+    #: what was chosen of the numerics (`solvers.settings.Settings`), or None for states that were measured
+    settings: Any = eqx.field(static=True)
+    time: Float[Array, " T"]
+    y: Float[Array, "*batch T N y"]
+    z: Float[Array, "*batch T N z"]
+    control: Float[Array, "*batch T c"]
+    result: Int[Array, "*batch T"]
+    #: largest residual in natural units
+    residual: Float[Array, "*batch T"]
+    iterations: Int[Array, "*batch T"]
+
+    # named parts
+
+    @property
+    def state(self) -> Any:
+        """The packed states y (…, T, N, y)."""
+        return self.y
+
+    @property
+    def position(self) -> Any:
+        """Positions (…, T, N, 3) in m, global frame."""
+        return self.system.positions(self.y)
+
+    @property
+    def quaternion(self) -> Any:
+        """Orientations (…, T, N, 4), scalar first."""
+        return self.system.quaternions(self.y)
+
+    @property
+    def tip_position(self) -> Any:
+        """Positions of the last node (…, T, 3) in m."""
+        return self.position[..., -1, :]
+
+    @property
+    def tension(self) -> Any:
+        """Tendon tensions (…, T, tendons) in N; zero in row 0 of a robot that starts at rest."""
+        return self.part("tension")
+
+    @property
+    def arclength(self) -> Any:
+        """s of the nodes (N,) in m, or (B, N) in a batch of robots."""
+        return np.linspace(0.0, 1.0, self.y.shape[-2]) * np.asarray(self.system.length)[..., None]
+
+    @property
+    def dt(self) -> float:
+        """Time step (s)."""
+        return float(self.time[1] - self.time[0])
+
+    def part(self, name: str) -> Any:
+        """A field of y, z or the controls by its name: `n`, `m`, `v`, `u`, `tension` … (…, T, N, size)."""
+        for layout, packed in self._layouts():
+            if name in layout.names:
+                return layout.get(packed, name)
+        known = [name for layout, _ in self._layouts() for name in layout.names]
+        raise KeyError(f"no field {name!r}; there are {', '.join(known)}")
+
+    def _layouts(self) -> tuple[tuple[Any, Any], ...]:
+        system = self.system
+        return (system.y_layout, self.y), (system.z_layout, self.z), (system.control_layout, self.control)
+
+    @property
+    def force(self) -> Any:
+        """Internal force n (…, T, N, 3) in N, global frame."""
+        return self.part("n")
+
+    @property
+    def moment(self) -> Any:
+        """Internal moment m (…, T, N, 3) in N·m, global frame."""
+        return self.part("m")
+
+    @property
+    def velocity(self) -> Any:
+        """Velocity q (…, T, N, 3) in m/s, material frame."""
+        return self.part("q")
+
+    @property
+    def angular_velocity(self) -> Any:
+        """Angular velocity ω (…, T, N, 3) in rad/s, material frame."""
+        return self.part("w")
+
+    @property
+    def strain(self) -> Any:
+        """Strains z (…, T, N, z): for a rod v (no unit), then u (1/m), material frame."""
+        return self.z
+
+    # validity
+
+    @property
+    def valid(self) -> Any:
+        """Which rows are solutions (…, T)."""
+        return self.result >= 0
+
+    @property
+    def all_valid(self) -> bool:
+        """Whether every row is a solution."""
+        return bool(np.all(self.valid))
+
+    def require_valid(self) -> None:
+        """Raise `ValueError`, naming the first row that is not a solution, if there is one."""
+        if not self.all_valid:
+            first = np.argwhere(~np.asarray(self.valid))[0]
+            result = Result(int(np.asarray(self.result)[tuple(first)]))
+            where = f"row {first[-1]}" + (f" of robot {first[0]}" if len(first) == 2 else "")
+            raise ValueError(f"the trajectory is not valid at {where}: {result.message}")
+
+    def __getitem__(self, index: Any) -> Self:
+        """Rows of a trajectory (a slice), or one robot (an integer) or several (a slice) of a batch."""
+        if self.y.ndim == 3 and not isinstance(index, slice):
+            raise TypeError(f"index a trajectory's rows by a slice, not by {index!r}")
+        if self.y.ndim == 4 and not isinstance(index, slice | int | np.integer):
+            raise TypeError(f"index a batch by a slice or a robot's number, not by {index!r}")
+        fields = ("y", "z", "control", "result", "residual", "iterations")
+        picked = [getattr(self, name)[index] for name in fields]
+        time = self.time if self.y.ndim == 4 else self.time[index]
+        system = self.system
+        if np.ndim(system.length):
+            system = _picked(system, index)
+        return type(self)(system, self.settings, time, *picked)
+
+    def save(self, path: Any) -> None:
+        """Write a labelled netCDF file (see `trajectory_file.save`)."""
+        from knode_cosserat import trajectory_file
+
+        trajectory_file.save(self, path)
+
+
+def _picked(system: System, index: Any) -> System:
+    import jax
+
+    return jax.tree.map(lambda leaf: leaf[index], system)
