@@ -1,0 +1,1 @@
+"""How well a prediction matches a reference."""

@@ -1,0 +1,202 @@
+"""Distances between a predicted and a reference trajectory.
+
+Plain NumPy and SciPy on plain arrays: anything with positions and quaternions can be compared, whether it
+was simulated, predicted or recorded. The two figures of the paper's result tables are `tip_dtw` and
+`pose_mse`; the paper is Jiahao et al., "Knowledge-based Neural Ordinary Differential Equations for Cosserat
+Rod-based Soft Robots".
+
+Every row counts, the first one too. The paper keeps T rows of a trajectory under T controls, the initial
+state and those after all but the last control; callers who want its figures slice before they compare.
+"""
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+
+
+class PoseHistory(Protocol):
+    """What the metrics read of a trajectory."""
+
+    @property
+    def position(self) -> ArrayLike:
+        """(T, N, 3) m, global frame."""
+
+    @property
+    def quaternion(self) -> ArrayLike:
+        """(T, N, 4), scalar first, material to global frame; any length but zero."""
+
+
+def dtw_distance(a: ArrayLike, b: ArrayLike) -> float:
+    """Exact dynamic-time-warping distance between two paths, with the L1 ground distance.
+
+    The smallest sum, over all monotone alignments that match both first points and both last points, of
+    |Δx| + |Δy| + |Δz| along the alignment. No window and no normalisation by the alignment's length. Time
+    grows with T · S, memory with T + S.
+
+    Args:
+        a: (T, 3) m.
+        b: (S, 3) m.
+
+    Returns:
+        The distance, m.
+
+    Raises:
+        ValueError: a path is not (T, 3), is empty, or has NaN or inf.
+
+    Source: Sakoe & Chiba, "Dynamic programming algorithm optimization for spoken word recognition", 1978,
+    without slope constraint and with every step weighted one, as in the paper's result tables.
+    """
+    a = _path("first path", a)
+    b = _path("second path", b)
+    _require_finite("first path", a)
+    _require_finite("second path", b)
+
+    # All cells (i, j) with i + j = k depend on the two antidiagonals before only, so each is one vector
+    # operation. Reversed, b lies along the antidiagonal in the direction of a. Columns make the three
+    # coordinates contiguous.
+    rows, columns = len(a), len(b)
+    forward = np.ascontiguousarray(a.T)
+    backward = np.ascontiguousarray(b[::-1].T)
+    # Entry i + 1 is cell i of the antidiagonal; entry 0 and cells outside the table stay infinite.
+    two_before, one_before, current = np.full((3, rows + 1), np.inf)
+    two_before[0] = 0.0
+    for k in range(rows + columns - 1):
+        first, last = max(0, k - columns + 1), min(k, rows - 1) + 1
+        shift = columns - 1 - k
+        difference = forward[:, first:last] - backward[:, first + shift : last + shift]
+        np.abs(difference, out=difference)
+        cheapest = np.minimum(one_before[first:last], one_before[first + 1 : last + 1])
+        np.minimum(cheapest, two_before[first:last], out=cheapest)
+        current.fill(np.inf)
+        current[first + 1 : last + 1] = cheapest + difference[0] + difference[1] + difference[2]
+        two_before, one_before, current = one_before, current, two_before
+    return float(one_before[rows])
+
+
+def tip_dtw(prediction: PoseHistory, reference: PoseHistory) -> float:
+    """`dtw_distance` between the paths of the two tips, the last nodes.
+
+    The trajectories may differ in rows and in nodes.
+
+    Returns:
+        The distance, m; it grows with the number of rows.
+
+    Raises:
+        ValueError: a shape is wrong or a state is invalid.
+
+    Source: "Tip Position DTW" in the paper's simulation and real-world result tables.
+    """
+    predicted, _ = _poses("prediction", prediction)
+    expected, _ = _poses("reference", reference)
+    return dtw_distance(predicted[:, -1], expected[:, -1])
+
+
+def pose_mse(prediction: PoseHistory, reference: PoseHistory) -> float:
+    """Mean squared error of positions and orientations, times 1000, as in the paper's tables.
+
+    The mean runs over rows, nodes and six numbers: x, y, z in metres and three Euler angles in radians,
+    extrinsic in the order z, y, x. It adds m² to rad², and two angles either side of ±π count as almost 2π
+    apart; both are part of the published definition.
+
+    Returns:
+        1000 times the mean, no unit.
+
+    Raises:
+        ValueError: a shape is wrong, rows or nodes differ, or a state is invalid.
+
+    Source: "Pose MSE (× 10³)" in the paper's simulation result table.
+    """
+    predicted, expected = _comparable_poses(prediction, reference)
+    position_error = predicted[0] - expected[0]
+    angle_error = _euler_angles(predicted[1]) - _euler_angles(expected[1])
+    return float(1000 * np.mean(np.concatenate([position_error, angle_error], axis=-1) ** 2))
+
+
+def tip_rmse(prediction: PoseHistory, reference: PoseHistory) -> float:
+    """Root mean square, over rows, of the Euclidean distance between the two tips, the last nodes.
+
+    The trajectories may differ in nodes.
+
+    Returns:
+        The error, m.
+
+    Raises:
+        ValueError: a shape is wrong, rows differ, or a state is invalid.
+    """
+    predicted, expected = _comparable_poses(prediction, reference, same_nodes=False)
+    return float(_rms_distance(predicted[0][:, -1], expected[0][:, -1]))
+
+
+def node_error(prediction: PoseHistory, reference: PoseHistory) -> Array:
+    """Root mean square, over rows, of the Euclidean distance between the positions of each node.
+
+    Returns:
+        (N,) m, base first.
+
+    Raises:
+        ValueError: a shape is wrong, rows or nodes differ, or a state is invalid.
+    """
+    predicted, expected = _comparable_poses(prediction, reference)
+    return _rms_distance(predicted[0], expected[0])
+
+
+def _rms_distance(a: Array, b: Array) -> Array:
+    return np.sqrt(np.mean(np.sum((a - b) ** 2, axis=-1), axis=0))
+
+
+def _euler_angles(quaternion: Array) -> Array:
+    scalar_last = np.roll(quaternion, -1, axis=-1)
+    angles = Rotation.from_quat(scalar_last.reshape(-1, 4)).as_euler("zyx")
+    return angles.reshape(*quaternion.shape[:-1], 3)
+
+
+def _comparable_poses(prediction: PoseHistory, reference: PoseHistory, same_nodes: bool = True):
+    predicted = _poses("prediction", prediction)
+    expected = _poses("reference", reference)
+    for axis, what in enumerate(("rows", "nodes") if same_nodes else ("rows",)):
+        given, wanted = predicted[0].shape[axis], expected[0].shape[axis]
+        if given != wanted:
+            raise ValueError(
+                f"prediction has {given} {what} and reference has {wanted}; both must have the same number"
+            )
+    return predicted, expected
+
+
+def _poses(name: str, history: PoseHistory) -> tuple[Array, Array]:
+    position = np.asarray(history.position, dtype=float)
+    quaternion = np.asarray(history.quaternion, dtype=float)
+    if position.ndim == 4:
+        raise ValueError(
+            f"{name}.position has shape {position.shape}, a batch of {len(position)} trajectories; "
+            "index a single trajectory, (T, N, 3)"
+        )
+    if position.ndim != 3 or position.shape[-1] != 3 or position.size == 0:
+        raise ValueError(
+            f"{name}.position has shape {position.shape}; it must be (T, N, 3) with at least one row and node"
+        )
+    if quaternion.shape != (*position.shape[:2], 4):
+        raise ValueError(
+            f"{name}.quaternion has shape {quaternion.shape}; "
+            f"beside position {position.shape} it must be {(*position.shape[:2], 4)}"
+        )
+    _require_finite(name, position, quaternion, np.where(quaternion.any(axis=-1), 0.0, np.nan))
+    return position, quaternion
+
+
+def _path(name: str, points: ArrayLike) -> Array:
+    points = np.asarray(points, dtype=float)
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
+        raise ValueError(f"{name} has shape {points.shape}; it must be (T, 3) with at least one row")
+    return points
+
+
+def _require_finite(name: str, *arrays: Array) -> None:
+    valid = np.all([np.isfinite(array).reshape(len(array), -1).all(axis=1) for array in arrays], axis=0)
+    if not valid.all():
+        raise ValueError(
+            f"{name} has invalid states from row {int(np.argmin(valid))} on; compare only the valid rows"
+        )
