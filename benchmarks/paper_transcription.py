@@ -125,7 +125,7 @@ class SemiDiscreteRod:
         E = robot.youngs_modulus
         G = E / 2.6 if robot.shear_modulus is None else robot.shear_modulus
         A = np.pi * robot.radius**2
-        I = np.pi * robot.radius**4 / 4  # noqa: E741
+        I = np.pi * robot.radius**4 / 4
         self.nodes = robot.nodes
         self.length = robot.length
         self.ds = robot.length / (robot.nodes - 1)

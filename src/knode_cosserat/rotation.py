@@ -5,11 +5,13 @@ Everything here acts on a single point of the rod; the solvers map it over nodes
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 
-def dot(matrix: Float[Array, "i j"], vector: Float[Array, " j"]) -> Float[Array, " i"]:
+def dot(matrix: Float[Any, "i j"], vector: Float[Any, " j"]) -> Float[Any, " i"]:
     """Product of a small matrix and a vector, written as a sum of scaled columns.
 
     XLA fuses this form with the arithmetic around it. A `matrix @ vector` becomes a kernel of its own:
@@ -21,14 +23,14 @@ def dot(matrix: Float[Array, "i j"], vector: Float[Array, " j"]) -> Float[Array,
     return total
 
 
-def cross(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
+def cross(a: Float[Any, "3"], b: Float[Any, "3"]) -> Float[Any, "3"]:
     """Cross product: the paper's hat operator applied, a × b = â b."""
     return jnp.stack(
         [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]],
     )
 
 
-def rotation_matrix(h: Float[Array, "4"]) -> Float[Array, "3 3"]:
+def rotation_matrix(h: Float[Any, "4"]) -> Float[Any, "3 3"]:
     """Rotation matrix of a quaternion of any length (scalar first), R = I + 2/(h·h) (…).
 
     The division by h·h makes R orthogonal although the integration in s never normalises h.
@@ -44,7 +46,7 @@ def rotation_matrix(h: Float[Array, "4"]) -> Float[Array, "3 3"]:
     )
 
 
-def quaternion_rate(h: Float[Array, "4"], u: Float[Array, "3"]) -> Float[Array, "4"]:
+def quaternion_rate(h: Float[Any, "4"], u: Float[Any, "3"]) -> Float[Any, "4"]:
     """Derivative of h along s for the curvature u in the material frame: h_s = ½ h ∘ (0, u)."""
     w, x, y, z = h[0], h[1], h[2], h[3]
     return 0.5 * jnp.stack(
@@ -57,7 +59,7 @@ def quaternion_rate(h: Float[Array, "4"], u: Float[Array, "3"]) -> Float[Array, 
     )
 
 
-def quaternion_product(a: Float[Array, "4"], b: Float[Array, "4"]) -> Float[Array, "4"]:
+def quaternion_product(a: Float[Any, "4"], b: Float[Any, "4"]) -> Float[Any, "4"]:
     """Hamilton product a ∘ b (rotate by b first, then by a)."""
     return jnp.concatenate(
         [
@@ -67,7 +69,7 @@ def quaternion_product(a: Float[Array, "4"], b: Float[Array, "4"]) -> Float[Arra
     )
 
 
-def inverse(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+def inverse(matrix: Float[Any, "3 3"]) -> Float[Any, "3 3"]:
     """Inverse of a 3×3 matrix by cofactors: for stiffness matrices, symmetric and positive."""
     columns = [matrix[:, i] for i in range(3)]
     cofactors = jnp.stack(

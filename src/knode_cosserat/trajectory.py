@@ -6,7 +6,7 @@ from typing import Any, Self
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.result import Result
@@ -22,14 +22,14 @@ class Trajectory(eqx.Module):
     system: System
     #: what was chosen of the numerics (`solvers.settings.Settings`), or None for states that were measured
     settings: Any = eqx.field(static=True)
-    time: Float[Array, " T"]
-    y: Float[Array, "*batch T N y"]
-    z: Float[Array, "*batch T N z"]
-    control: Float[Array, "*batch T c"]
-    result: Int[Array, "*batch T"]
+    time: Float[Any, " T"]
+    y: Float[Any, "*batch T N y"]
+    z: Float[Any, "*batch T N z"]
+    control: Float[Any, "*batch T c"]
+    result: Int[Any, "*batch T"]
     #: largest residual in natural units
-    residual: Float[Array, "*batch T"]
-    iterations: Int[Array, "*batch T"]
+    residual: Float[Any, "*batch T"]
+    iterations: Int[Any, "*batch T"]
 
     # named parts
 
@@ -65,7 +65,9 @@ class Trajectory(eqx.Module):
 
     @property
     def dt(self) -> float:
-        """Time step (s)."""
+        """Time step (s); NaN for a single row."""
+        if len(self.time) < 2:
+            return float("nan")
         return float(self.time[1] - self.time[0])
 
     def part(self, name: str) -> Any:

@@ -9,7 +9,7 @@ Every row counts, the first one too. The paper keeps T rows of a trajectory unde
 state and those after all but the last control; callers who want its figures slice before they compare.
 """
 
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -154,7 +154,9 @@ def _euler_angles(quaternion: Array) -> Array:
     return angles.reshape(*quaternion.shape[:-1], 3)
 
 
-def _comparable_poses(prediction: PoseHistory, reference: PoseHistory, same_nodes: bool = True):
+def _comparable_poses(
+    prediction: PoseHistory, reference: PoseHistory, same_nodes: bool = True
+) -> tuple[Any, Any]:
     predicted = _poses("prediction", prediction)
     expected = _poses("reference", reference)
     for axis, what in enumerate(("rows", "nodes") if same_nodes else ("rows",)):

@@ -73,7 +73,10 @@ def checked(name: str, value: Any, parameter: Parameter) -> None:
     if isinstance(value, jax.core.Tracer):
         return
     expected = {"scalar": (), "vector": (3,), "matrix": (3, 3)}.get(parameter.shape)
-    array = np.asarray(value)
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError):
+        array = np.array("ragged")
     if array.dtype.kind not in "fiu":
         raise ParameterError(f"{name} is {value!r}; allowed is {parameter.allowed}")
     if (array.ndim != 1 or array.size == 0) if expected is None else array.shape != expected:
@@ -82,9 +85,7 @@ def checked(name: str, value: Any, parameter: Parameter) -> None:
         raise ParameterError(f"{name} is {array.tolist()}; allowed is {parameter.allowed}")
     if parameter.shape == "matrix":
         if not np.allclose(array, array.T, rtol=1e-9, atol=0.0):
-            raise ParameterError(
-                f"{name} is not symmetric: {array.tolist()}; allowed is {parameter.allowed}"
-            )
+            raise ParameterError(f"{name} is not symmetric: {array.tolist()}; allowed is {parameter.allowed}")
         array = np.linalg.eigvalsh(array)
     if np.any(array < parameter.low) or np.any(array > parameter.high):
         shown = np.asarray(value).tolist()
@@ -96,11 +97,12 @@ def _converter(parameter: Parameter) -> Callable[[Any], Any]:
         if value is None or isinstance(value, jax.core.Tracer):
             return _as_matrix(value) if parameter.shape == "matrix" and value is not None else value
         try:
-            array = np.asarray(value, dtype=float)
-        except (TypeError, ValueError):
+            array = np.asarray(value)
+        except (TypeError, ValueError):  # a ragged list
             return value  # `checked` names it: a converter does not know the parameter's name
-        if isinstance(value, str | bool):
+        if array.dtype.kind not in "fiu":
             return value
+        array = array.astype(float)
         return _as_matrix(array) if parameter.shape == "matrix" else array
 
     return convert

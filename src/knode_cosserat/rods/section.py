@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 #: The paper's G = E / (2 (1 + 0.3)), for a robot that gives no shear modulus.
 POISSON_RATIO = 0.3
@@ -28,19 +28,17 @@ class CircularSection(NamedTuple):
         return np.pi * self.radius**4 / 4.0
 
     @property
-    def inertia(self) -> Float[Array, "3 3"]:
+    def inertia(self) -> Float[Any, "3 3"]:
         """J = diag(I, I, 2I): second moments about the material axes (m⁴)."""
         return self.second_moment * np.diag([1.0, 1.0, 2.0])
 
-    def shear_stiffness(self, youngs_modulus: Any, shear_modulus: Any) -> Float[Array, "3 3"]:
+    def shear_stiffness(self, youngs_modulus: Any, shear_modulus: Any) -> Float[Any, "3 3"]:
         """Kse = diag(GA, GA, EA): shear and extension (N)."""
         return self.area * jnp.diag(jnp.stack([shear_modulus, shear_modulus, youngs_modulus]))
 
-    def bending_stiffness(self, youngs_modulus: Any, shear_modulus: Any) -> Float[Array, "3 3"]:
+    def bending_stiffness(self, youngs_modulus: Any, shear_modulus: Any) -> Float[Any, "3 3"]:
         """Kbt = diag(EI, EI, 2GI): bending and twisting (N·m²)."""
-        return self.second_moment * jnp.diag(
-            jnp.stack([youngs_modulus, youngs_modulus, 2.0 * shear_modulus])
-        )
+        return self.second_moment * jnp.diag(jnp.stack([youngs_modulus, youngs_modulus, 2.0 * shear_modulus]))
 
 
 def shear_modulus(youngs_modulus: Any) -> Any:

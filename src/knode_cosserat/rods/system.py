@@ -21,7 +21,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from knode_cosserat.rods.parameters import Parameter, ParameterError, checked, parameters_of
 
@@ -83,17 +83,17 @@ class History(NamedTuple):
     With it, y_t = c0 y + ʰy, z_t = c0 z + ʰz and y_st = c0 y_s + ʰy_s. At rest c0 and all three are zero.
     """
 
-    c0: Float[Array, ""]
-    y: Float[Array, " y"]
-    z: Float[Array, " z"]
-    y_s: Float[Array, " y"]
+    c0: Float[Any, ""]
+    y: Float[Any, " y"]
+    z: Float[Any, " z"]
+    y_s: Float[Any, " y"]
 
 
 class Scales(NamedTuple):
     """Natural sizes of the numbers in y (y,) and of the tip's residuals (k,): what "small" is measured by."""
 
-    y: Float[Array, " y"]
-    tip: Float[Array, " k"]
+    y: Float[Any, " y"]
+    tip: Float[Any, " k"]
 
 
 class System(eqx.Module):
@@ -112,9 +112,10 @@ class System(eqx.Module):
     #: whether B is not zero: the history of y_s is then kept
     mixed: ClassVar[bool] = True
 
-    if TYPE_CHECKING:  # every system has these among its own fields
+    if TYPE_CHECKING:  # every system has a length (m) among its own parameters
         length: Any
-        nodes: int
+    #: how many nodes the rod is divided into, both ends counted
+    nodes: int = eqx.field(static=True, default=10, kw_only=True)
 
     # the equations
 
@@ -127,14 +128,14 @@ class System(eqx.Module):
         raise NotImplementedError(f"{type(self).__name__} gives neither `derivatives` nor `balance`")
 
     def derivatives(
-        self, s: Any, t: Any, y: Float[Array, " y"], control: Any, history: History
-    ) -> tuple[Float[Array, " y"], Float[Array, " z"]]:
+        self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
+    ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
         """y_s and z at one point, semi-discretised in time (paper eq. 4)."""
         return self.general_derivatives(s, t, y, control, history)
 
     def general_derivatives(
-        self, s: Any, t: Any, y: Float[Array, " y"], control: Any, history: History
-    ) -> tuple[Float[Array, " y"], Float[Array, " z"]]:
+        self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
+    ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
         """y_s and z from the general form A, B, C, D, f1, f2 (paper eq. 4)."""
         c0 = history.c0
         y_t = c0 * y + history.y
@@ -148,20 +149,20 @@ class System(eqx.Module):
     # the two ends, and rest
 
     @abc.abstractmethod
-    def rest(self, s: Any) -> tuple[Float[Array, " y"], Float[Array, " z"]]:
+    def rest(self, s: Any) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
         """y and z at arclength s (m) of the unloaded robot at rest: where a simulation starts by default."""
 
-    def base(self, t: Any, control: Any, unknowns: Float[Array, " k"]) -> Float[Array, " y"]:
+    def base(self, t: Any, control: Any, unknowns: Float[Any, " k"]) -> Float[Any, " y"]:
         """y at s = 0: the values at rest, with the unknowns in their places."""
         fixed, _ = self.rest(jnp.zeros(()))
         return jnp.asarray(fixed).at[self.y_layout.indices(self.base_unknowns)].set(unknowns)
 
-    def unknowns(self, y: Float[Array, " y"]) -> Float[Array, " k"]:
+    def unknowns(self, y: Float[Any, " y"]) -> Float[Any, " k"]:
         """The unknowns in a given y at s = 0: the inverse of `base`."""
         return y[..., self.y_layout.indices(self.base_unknowns)]
 
     @abc.abstractmethod
-    def tip(self, t: Any, control: Any, y: Float[Array, " y"]) -> Float[Array, " k"]:
+    def tip(self, t: Any, control: Any, y: Float[Any, " y"]) -> Float[Any, " k"]:
         """Residuals of the conditions at s = length: zero when they hold."""
 
     def scales(self) -> Scales:
@@ -217,6 +218,9 @@ class System(eqx.Module):
         return dataclasses.replace(self, **changes)
 
     def __check_init__(self) -> None:
+        given: Any = self.nodes
+        if not isinstance(given, int) or not 2 <= self.nodes <= 10_000:
+            raise ParameterError(f"nodes is {self.nodes!r}; allowed is a whole number from 2 to 10000")
         for name, parameter in parameters_of(type(self)).items():
             checked(name, getattr(self, name), parameter)
 

@@ -12,13 +12,12 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from knode_cosserat.rods.loads import square_law_drag
-from knode_cosserat.rods.parameters import ParameterError, parameter
+from knode_cosserat.rods.parameters import parameter
 from knode_cosserat.rods.section import CircularSection, shear_modulus
 from knode_cosserat.rods.system import History, Layout, Scales, System
 from knode_cosserat.rods.tendons import transverse_force
@@ -31,7 +30,7 @@ FOUR_TENDONS = tuple(np.pi / 4 + i * np.pi / 2 for i in range(4))
 class TendonRobot(System):
     """A clamped, round, straight rod with tendons, gravity, drag and material damping (paper eqs. 13-15).
 
-    The tendons load the rod as in the paper (`tendons.transverse_force`): a force across the rod and no moment.
+    The tendons load the rod as in the paper (`tendons.transverse_force`): a force across it, no moment.
     """
 
     y_layout: ClassVar[Layout] = Layout(
@@ -84,12 +83,6 @@ class TendonRobot(System):
     bending_stiffness: Any = parameter(
         "N m2", "Kbt; by default diag(EI, EI, 2GI)", shape="matrix", low=1e-15, high=1e9, default=None
     )
-    nodes: int = eqx.field(static=True, default=10)
-    name: str = eqx.field(static=True, default="")
-
-    def __check_init__(self) -> None:
-        if not isinstance(self.nodes, int) or not 2 <= self.nodes <= 10_000:
-            raise ParameterError(f"nodes is {self.nodes!r}; allowed is a whole number from 2 to 10000")
 
     # what follows from the parameters
 
@@ -114,14 +107,14 @@ class TendonRobot(System):
         return shear_modulus(self.youngs_modulus) if self.shear_modulus is None else self.shear_modulus
 
     @property
-    def Kse(self) -> Float[Array, "3 3"]:
+    def Kse(self) -> Float[Any, "3 3"]:
         """Stiffness of shear and extension (N): as given, or from moduli and section."""
         if self.shear_stiffness is not None:
             return self.shear_stiffness
         return self.section.shear_stiffness(self.youngs_modulus, self.G)
 
     @property
-    def Kbt(self) -> Float[Array, "3 3"]:
+    def Kbt(self) -> Float[Any, "3 3"]:
         """Stiffness of bending and twisting (N·m²): as given, or from moduli and section."""
         if self.bending_stiffness is not None:
             return self.bending_stiffness
@@ -140,8 +133,8 @@ class TendonRobot(System):
     # the equations, as the paper gives them
 
     def derivatives(
-        self, s: Any, t: Any, y: Float[Array, " y"], control: Any, history: History
-    ) -> tuple[Float[Array, " y"], Float[Array, " z"]]:
+        self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
+    ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
         """y_s and z directly (paper eqs. 13-15)."""
         c0 = history.c0
         y_t = c0 * y + history.y
@@ -190,14 +183,14 @@ class TendonRobot(System):
 
     # the two ends, and rest
 
-    def rest(self, s: Any) -> tuple[Float[Array, " y"], Float[Array, " z"]]:
+    def rest(self, s: Any) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
         """Straight up along z, unloaded, at rest."""
         p = jnp.stack([jnp.zeros(()), jnp.zeros(()), jnp.asarray(s, dtype=float)])
         h = np.array([1.0, 0.0, 0.0, 0.0])
         y = jnp.concatenate([p, h, np.zeros(12)])
         return y, jnp.concatenate([self.v_star, self.u_star])
 
-    def tip(self, t: Any, control: Any, y: Float[Array, " y"]) -> Float[Array, " k"]:
+    def tip(self, t: Any, control: Any, y: Float[Any, " y"]) -> Float[Any, " k"]:
         """The tip is free: n = m = 0 there."""
         return jnp.concatenate([-self.y_layout.get(y, "n"), -self.y_layout.get(y, "m")])
 

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 
-def transverse_force(
-    tension: Float[Array, " tendons"], angles: Float[Array, " tendons"]
-) -> Float[Array, "3"]:
+def transverse_force(tension: Float[Any, " tendons"], angles: Float[Any, " tendons"]) -> Float[Any, "3"]:
     """The paper's crude model: f = Σ τᵢ dᵢ per metre of rod (N/m), in the global frame.
 
     dᵢ is the unit vector at the tendon's angle (rad) in the global x-y plane. The force does not turn with
     the rod and there is no moment: what the paper writes as τ·φ. Tension in N.
     """
-    return jnp.stack(
-        [jnp.sum(tension * jnp.cos(angles)), jnp.sum(tension * jnp.sin(angles)), jnp.zeros(())]
-    )
+    return jnp.stack([jnp.sum(tension * jnp.cos(angles)), jnp.sum(tension * jnp.sin(angles)), jnp.zeros(())])

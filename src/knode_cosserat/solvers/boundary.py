@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from knode_cosserat.rods.system import History, System
 from knode_cosserat.solvers.linear import Linearisation, LinearSolver
@@ -48,27 +48,27 @@ class StepProblem(eqx.Module):
     """One step: the system, its control, and what the time scheme remembers."""
 
     system: System
-    t: Float[Array, ""]
-    control: Float[Array, " c"]
-    c0: Float[Array, ""]
-    history: Float[Array, "nodes x"]
+    t: Float[Any, ""]
+    control: Float[Any, " c"]
+    c0: Float[Any, ""]
+    history: Float[Any, "nodes x"]
     space: SpaceScheme = eqx.field(static=True)
 
-    def point_rates(self, s: Any, y: Float[Array, " y"], history: Float[Array, " x"]) -> Any:
+    def point_rates(self, s: Any, y: Float[Any, " y"], history: Float[Any, " x"]) -> Any:
         """y_s and z at one point, from a packed record of history."""
         return self.system.derivatives(s, self.t, y, self.control, self._unpack(history))
 
-    def _unpack(self, history: Float[Array, " x"]) -> History:
+    def _unpack(self, history: Float[Any, " x"]) -> History:
         ny, nz = self.system.y_layout.size, self.system.z_layout.size
         y_s = history[ny + nz :] if self.system.mixed else jnp.zeros(ny)
         return History(self.c0, history[:ny], history[ny : ny + nz], y_s)
 
     @property
-    def arclength(self) -> Float[Array, " nodes"]:
+    def arclength(self) -> Float[Any, " nodes"]:
         """s at the nodes (m)."""
         return jnp.linspace(0.0, 1.0, self.system.nodes) * self.system.length
 
-    def segments(self, each: Callable[..., Any], y: Float[Array, "nodes y"]) -> Any:
+    def segments(self, each: Callable[..., Any], y: Float[Any, "nodes y"]) -> Any:
         """Apply `each(advance, y_j)` to all segments side by side; `advance` maps y_j to y_{j+1}."""
         s = self.arclength
         ds = self.system.length / (self.system.nodes - 1)
@@ -85,7 +85,7 @@ class StepProblem(eqx.Module):
         lanes = (y[:-1].T, start.T, middle.T, end.T)
         return jax.vmap(segment, in_axes=(0, -1, -1, -1, -1))(s[:-1], *lanes)
 
-    def record(self, y: Float[Array, "nodes y"]) -> Float[Array, "nodes x"]:
+    def record(self, y: Float[Any, "nodes y"]) -> Float[Any, "nodes x"]:
         """What must be kept of a solved step at every node: y, z and, if B is not zero, y_s."""
         y_s, z = jax.vmap(self.point_rates)(self.arclength, y, self.history)
         return jnp.concatenate([y, z, y_s] if self.system.mixed else [y, z], axis=1)
@@ -94,19 +94,19 @@ class StepProblem(eqx.Module):
 class Iterate(NamedTuple):
     """A point of the iteration; `error` is its largest residual in natural units, infinite for a NaN."""
 
-    y: Float[Array, "nodes y"]
-    unknowns: Float[Array, " k"]
-    error: Float[Array, ""]
+    y: Float[Any, "nodes y"]
+    unknowns: Float[Any, " k"]
+    error: Float[Any, ""]
 
 
 class Solution(NamedTuple):
     """What Newton's method ended with: solved if `error` is at most `acceptable`, and not otherwise."""
 
-    y: Float[Array, "nodes y"]
-    unknowns: Float[Array, " k"]
-    error: Float[Array, ""]
-    corrections: Int[Array, ""]
-    linearisations: Int[Array, ""]
+    y: Float[Any, "nodes y"]
+    unknowns: Float[Any, " k"]
+    error: Float[Any, ""]
+    corrections: Int[Any, ""]
+    linearisations: Int[Any, ""]
 
 
 def _with_base(problem: StepProblem, y: Any, unknowns: Any) -> Any:
@@ -120,13 +120,13 @@ def _error(problem: StepProblem, defects: Any, tip: Any) -> Any:
     return jnp.where(jnp.isnan(error), jnp.inf, error)
 
 
-def residuals(problem: StepProblem, y: Float[Array, "nodes y"]) -> tuple[Any, Any]:
+def residuals(problem: StepProblem, y: Float[Any, "nodes y"]) -> tuple[Any, Any]:
     """Defects y_{j+1} - Φ_j(y_j), with their sign turned, and the tip's residuals."""
     reached = problem.segments(lambda advance, y_j: advance(y_j), y)
     return reached - y[1:], problem.system.tip(problem.t, problem.control, y[-1])
 
 
-def linearise(problem: StepProblem, y: Float[Array, "nodes y"], unknowns: Any) -> Linearisation:
+def linearise(problem: StepProblem, y: Float[Any, "nodes y"], unknowns: Any) -> Linearisation:
     """Residuals and their exact derivatives by forward mode, all segments in one batch."""
     system, t, control = problem.system, problem.t, problem.control
 
@@ -147,11 +147,11 @@ class _Search(NamedTuple):
     """State while one linearisation is in use: the point, and the correction proposed there."""
 
     at: Iterate
-    dy: Float[Array, "nodes y"]
-    dxi: Float[Array, " k"]
-    size: Float[Array, ""]
-    damping: Float[Array, ""]
-    corrections: Int[Array, ""]
+    dy: Float[Any, "nodes y"]
+    dxi: Float[Any, " k"]
+    size: Float[Any, ""]
+    damping: Float[Any, ""]
+    corrections: Int[Any, ""]
     fresh: Any
     go: Any
     dead: Any
@@ -159,8 +159,8 @@ class _Search(NamedTuple):
 
 def newton(
     problem: StepProblem,
-    y: Float[Array, "nodes y"],
-    unknowns: Float[Array, " k"],
+    y: Float[Any, "nodes y"],
+    unknowns: Float[Any, " k"],
     linear: LinearSolver,
     options: NewtonOptions,
 ) -> Solution:

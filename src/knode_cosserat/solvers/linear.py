@@ -16,17 +16,17 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 
 class Linearisation(NamedTuple):
     """Residuals at a point and their exact derivatives: of each segment, of the base and of the tip."""
 
-    F: Float[Array, "segments y y"]
-    base: Float[Array, "y k"]
-    tip: Float[Array, "k y"]
-    defects: Float[Array, "segments y"]
-    tip_residual: Float[Array, " k"]
+    F: Float[Any, "segments y y"]
+    base: Float[Any, "y k"]
+    tip: Float[Any, "k y"]
+    defects: Float[Any, "segments y"]
+    tip_residual: Float[Any, " k"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,24 +35,24 @@ class LinearSolver(abc.ABC):
 
     @abc.abstractmethod
     def start(
-        self, linearisation: Linearisation, y_scale: Float[Array, " y"]
-    ) -> tuple[Any, Float[Array, "nodes y"], Float[Array, " k"]]:
+        self, linearisation: Linearisation, y_scale: Float[Any, " y"]
+    ) -> tuple[Any, Float[Any, "nodes y"], Float[Any, " k"]]:
         """The factors, and with them the first correction (δy, δξ)."""
 
     @abc.abstractmethod
     def solve(
-        self, factors: Any, defects: Float[Array, "segments y"], tip: Float[Array, " k"]
-    ) -> tuple[Float[Array, "nodes y"], Float[Array, " k"]]:
+        self, factors: Any, defects: Float[Any, "segments y"], tip: Float[Any, " k"]
+    ) -> tuple[Float[Any, "nodes y"], Float[Any, " k"]]:
         """The correction (δy, δξ)."""
 
 
 class CondensedFactors(NamedTuple):
     """F, the response X_j = ∂y_j/∂ξ at every node, the tip's matrix, and the inverse of ∂tip/∂ξ."""
 
-    F: Float[Array, "segments y y"]
-    X: Float[Array, "k nodes y"]
-    tip: Float[Array, "k y"]
-    inverse: Float[Array, "k k"]
+    F: Float[Any, "segments y y"]
+    X: Float[Any, "k nodes y"]
+    tip: Float[Any, "k y"]
+    inverse: Float[Any, "k k"]
 
 
 def _product(F: Any, X: Any) -> Any:
@@ -104,14 +104,14 @@ class Condensed(LinearSolver):
 
 
 class DecoupledFactors(NamedTuple):
-    """Per node the orthonormal conditions Q and the triangular factors that made them, all in natural units."""
+    """Per node the orthonormal conditions Q and the triangular factors L; all in natural units."""
 
-    F: Float[Array, "segments y y"]
-    Q: Float[Array, "nodes k y"]
-    L: Float[Array, "nodes k k"]
-    base: Float[Array, "y k"]
-    inverse: Float[Array, "k k"]
-    y_scale: Float[Array, " y"]
+    F: Float[Any, "segments y y"]
+    Q: Float[Any, "nodes k y"]
+    L: Float[Any, "nodes k k"]
+    base: Float[Any, "y k"]
+    inverse: Float[Any, "k k"]
+    y_scale: Float[Any, " y"]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import StepProblem, newton
@@ -25,20 +25,22 @@ EXTRAPOLATIONS = np.array([[1.0, 0.0, 0.0], [2.0, -1.0, 0.0], [3.0, -3.0, 1.0]])
 class Past(NamedTuple):
     """What a step needs of the steps before it, newest first."""
 
-    records: Float[Array, "past nodes x"]
-    rate: Float[Array, "nodes x"]
-    unknowns: Float[Array, "past k"]
+    records: Float[Any, "past nodes x"]
+    rate: Float[Any, "nodes x"]
+    unknowns: Float[Any, "past k"]
     #: the extrapolation that would have been best for the newest step
-    order: Int[Array, ""]
+    order: Int[Any, ""]
 
 
 class Rows(NamedTuple):
     """The steps' results, one row a step."""
 
-    records: Float[Array, "steps nodes x"]
-    unknowns: Float[Array, "steps k"]
-    error: Float[Array, " steps"]
-    corrections: Int[Array, " steps"]
+    records: Float[Any, "steps nodes x"]
+    unknowns: Float[Any, "steps k"]
+    error: Float[Any, " steps"]
+    corrections: Int[Any, " steps"]
+    #: the largest number of y in natural units: a sign of instability when it is far beyond one
+    size: Float[Any, " steps"]
 
 
 def rest_record(system: System) -> Any:
@@ -94,9 +96,11 @@ def step(system: System, settings: Settings, past: Past, coefficients: Any, cont
     weights = jnp.asarray(EXTRAPOLATIONS)[past.order]
     solution = newton(problem, guesses[past.order], weights @ past.unknowns, Condensed(), settings.newton)
     record = problem.record(solution.y)
-    misfit = jnp.max(jnp.abs(guesses - solution.y) / system.scales().y, axis=(1, 2))
+    scale = system.scales().y
+    misfit = jnp.max(jnp.abs(guesses - solution.y) / scale, axis=(1, 2))
     rate = coefficients[0] * record + history if settings.time.uses_rate else past.rate
-    row = Rows(record, solution.unknowns, solution.error, solution.corrections)
+    size = jnp.max(jnp.abs(solution.y) / scale)
+    row = Rows(record, solution.unknowns, solution.error, solution.corrections, size)
     return advanced(past, record, solution.unknowns, rate, jnp.argmin(misfit)), row
 
 
@@ -114,6 +118,7 @@ def march(
         jnp.zeros((capacity, past.unknowns.shape[1])),
         jnp.zeros(capacity),
         jnp.zeros(capacity, dtype=int),
+        jnp.zeros(capacity),
     )
 
     def going(state: Any) -> Any:

@@ -1,7 +1,7 @@
 """What is tried when a step does not converge, in order: a stable elimination, load continuation, halving.
 
-This runs outside the compiled loop, step by step in plain Python: it is rare, and its program is compiled only
-when it is first needed.
+This runs outside the compiled loop, step by step in plain Python: it is rare, and its program is compiled
+only when it is first needed.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ class Outcome(NamedTuple):
     unknowns: np.ndarray
     error: float
     corrections: int
+    size: float
     cause: str
 
 
@@ -123,6 +124,7 @@ def _outcome(result: Result, step: _Step, found: tuple[Solution, Any]) -> Outcom
         np.asarray(solution.unknowns),
         float(solution.error),
         step.corrections,
+        float(np.max(np.abs(solution.y) / np.asarray(step.system.scales().y))),
         likely_cause(result, step),
     )
 
@@ -196,7 +198,9 @@ def likely_cause(result: Result, step: _Step) -> str:
         return ""
     nodes = step.system.nodes
     if result is Result.NOT_FINITE:
-        return f"Likely too few nodes for so soft or loaded a rod ({nodes}): use more, or a smaller time step."
+        return (
+            f"Likely too few nodes for so soft or loaded a rod ({nodes}): use more, or a smaller time step."
+        )
     return (
         "Likely cause: the control changes too much in one step, the rod buckles or snaps, "
         f"or it has too few nodes ({nodes})."

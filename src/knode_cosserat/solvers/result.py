@@ -35,7 +35,7 @@ _MESSAGES = {
     Result.RECOVERED_LOAD_CONTINUATION: "converged by applying the change of control in smaller parts",
     Result.RECOVERED_STEP_HALVING: "converged by several smaller time steps",
     Result.RECOVERED_RELAXATION: "converged after a damped motion towards rest",
-    Result.RECOVERED_FINER_SEGMENTS: "converged with every segment divided: undivided they were too long to be stable",
+    Result.RECOVERED_FINER_SEGMENTS: "converged with every segment divided, being too long to be stable",
     Result.NO_CONVERGENCE: "no solution found",
     Result.NOT_FINITE: "the equations overflow or are undefined there",
     Result.NOT_REACHED: "not simulated: an earlier step failed",
@@ -43,7 +43,10 @@ _MESSAGES = {
 
 
 class SimulationError(RuntimeError):
-    """A step could not be solved. `step`, `time` (s), `residual` (natural units), `result` and `cause` say more."""
+    """A step could not be solved.
+
+    `step`, `time` (s), `residual` (natural units), `result`, `cause` and `robot` (of a batch) say more.
+    """
 
     def __init__(
         self, step: int, time: float, residual: float, result: Result, cause: str, robot: int | None = None

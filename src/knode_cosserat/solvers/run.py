@@ -17,7 +17,7 @@ from knode_cosserat.solvers.march import Past, Rows, coefficient_table, march_ma
 from knode_cosserat.solvers.recovery import Outcome, recover
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.stability import SAFE_DECAY, decay_per_segment, suspicious
+from knode_cosserat.solvers.stability import SAFE_DECAY, SUSPICIOUS, decay_per_segment
 
 #: robots that one thread takes at a time
 CHUNK = 16
@@ -28,18 +28,19 @@ MOST_NODES = 400
 class Steps(NamedTuple):
     """The steps of one robot (or, with a batch axis in front, of several), and what came of each."""
 
-    records: np.ndarray
-    unknowns: np.ndarray
-    error: np.ndarray
-    corrections: np.ndarray
-    result: np.ndarray
+    records: Any
+    unknowns: Any
+    error: Any
+    corrections: Any
+    size: Any
+    result: Any
 
 
 class Start(NamedTuple):
     """Where a run begins: the past, and the control before the first step."""
 
     past: Past
-    control: np.ndarray
+    control: Any
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,7 +65,7 @@ def run_one(
 ) -> tuple[Steps, str]:
     """All steps of one robot, and the likely cause if one of them (`result` < 0) could not be solved."""
     steps, cause = _with_recovery(task, system, controls, start, progress)
-    if _trustworthy(system, steps):
+    if _trustworthy(steps):
         return steps, cause
     record = start.past.records[0]
     decay = decay_per_segment(system, task.settings, task.table[1], record, controls[0])
@@ -78,21 +79,20 @@ def run_one(
             return finer, ""
         parts *= 2
     return steps, (
-        f"{cause} At this time step its waves decay by e^{decay:.2g} within a segment, too much for an explicit "
-        "scheme in space, and dividing the segments did not help: use longer time steps."
+        f"{cause} At this time step its waves decay by e^{decay:.2g} within a segment, too much for an "
+        "explicit scheme in space, and dividing the segments did not help: use longer time steps."
     ).strip()
 
 
-def _trustworthy(system: System, steps: Steps) -> bool:
+def _trustworthy(steps: Steps) -> bool:
     """Solved, and not of a size that suggests an instability in space."""
-    ny = system.y_layout.size
-    return bool(steps.result.min() >= 0) and not suspicious(system, steps.records[..., :ny])
+    return bool(steps.result.min() >= 0 and steps.size.max() <= SUSPICIOUS)
 
 
 def _with_finer_segments(
     task: Task, system: System, parts: int, controls: np.ndarray, start: Start, progress: bool
 ) -> Steps | None:
-    """The same robot with every segment divided, its states given at its own nodes; None if that fails too."""
+    """The same robot with every segment divided, given at its own nodes; None if that fails too."""
     fine = system.replace(nodes=parts * (system.nodes - 1) + 1)
     coarse_s, fine_s = np.linspace(0.0, 1.0, system.nodes), np.linspace(0.0, 1.0, fine.nodes)
 
@@ -101,7 +101,7 @@ def _with_finer_segments(
 
     past = start.past._replace(records=refined(start.past.records, 1), rate=refined(start.past.rate, 0))
     steps, _ = _with_recovery(task, fine, controls, start._replace(past=past), progress)
-    if not _trustworthy(fine, steps):
+    if not _trustworthy(steps):
         return None
     records = np.ascontiguousarray(steps.records[:, ::parts])
     finer = np.full(task.steps, int(Result.RECOVERED_FINER_SEGMENTS))
@@ -173,18 +173,15 @@ def run_batch(
         with concurrent.futures.ThreadPoolExecutor(workers) as pool:
             chunks = list(pool.map(work, range(0, size, chunk)))
     done, *rows = (np.concatenate(parts) for parts in zip(*chunks, strict=True))
-    steps = Steps(*rows, np.zeros(rows[2].shape, dtype=int))
+    steps = Steps._make([*rows, np.zeros((*done.shape, task.steps), dtype=int)])
     causes = {}
-    ny = system.y_layout.size
-    for i in range(size):
-        if done[i] == task.steps and not suspicious(robot(i), steps.records[i, ..., :ny]):
-            continue
+    for i in np.flatnonzero((done < task.steps) | (steps.size.max(axis=1) > SUSPICIOUS)):
         own = Start(jax.tree.map(lambda leaf, i=i: leaf[i], start.past), start.control[i])
         alone, cause = run_one(task, robot(i), controls[i], own)
         for all_robots, one in zip(steps, alone, strict=True):
             all_robots[i] = one
         if alone.result.min() < 0:
-            causes[i] = cause
+            causes[int(i)] = cause
     return steps, causes
 
 
@@ -208,9 +205,9 @@ def _merged(rows: Steps | None, new: Rows, first: int, last: int, total: int) ->
     if rows is None:
         leaves = [np.asarray(leaf)[:total] for leaf in new]
         if last == total:
-            return Steps(*leaves, np.zeros(total, dtype=int))
-        rows = Steps(*(np.array(leaf) for leaf in leaves), np.full(total, int(Result.NOT_REACHED)))
-    for old, leaf in zip(rows[:4], new, strict=True):
+            return Steps._make([*leaves, np.zeros(total, dtype=int)])
+        rows = Steps._make([*map(np.array, leaves), np.full(total, int(Result.NOT_REACHED))])
+    for old, leaf in zip(rows[:-1], new, strict=True):
         old[first:last] = np.asarray(leaf)[first:last]
     rows.result[first:last] = Result.CONVERGED
     return rows
@@ -219,4 +216,5 @@ def _merged(rows: Steps | None, new: Rows, first: int, last: int, total: int) ->
 def _set_row(rows: Steps, i: int, outcome: Outcome) -> None:
     rows.records[i], rows.unknowns[i] = outcome.record, outcome.unknowns
     rows.error[i], rows.corrections[i] = outcome.error, outcome.corrections
+    rows.size[i] = outcome.size
     rows.result[i] = outcome.result

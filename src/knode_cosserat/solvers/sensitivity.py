@@ -40,6 +40,7 @@ def rollout(task: Task) -> Callable[[System, Any, Past], Rows]:
             jnp.where(unsolved[:, None], jnp.nan, rows.unknowns),
             jnp.where(unsolved, jnp.inf, rows.error),
             rows.corrections,
+            rows.size,
         )
 
     @run.defjvp
@@ -52,15 +53,15 @@ def rollout(task: Task) -> Callable[[System, Any, Past], Rows]:
             d_past.records[:2], d_past.rate,
         )  # fmt: skip
         still = np.zeros(steps, dtype=jax.dtypes.float0)
-        return rows, Rows(d_records, d_unknowns, jnp.zeros_like(rows.error), still)
+        return rows, Rows(d_records, d_unknowns, jnp.zeros_like(rows.error), still, jnp.zeros_like(rows.size))
 
     return run
 
 
 @functools.partial(jax.jit, static_argnames="settings")
 def _tangent_march(
-    settings: Settings, table: Any, dt: Any, records: Any, unknowns: Any, system: System, controls: Any, past: Past,
-    d_system: Any, d_controls: Any, d_records: Any, d_rate: Any,
+    settings: Settings, table: Any, dt: Any, records: Any, unknowns: Any, system: System, controls: Any,
+    past: Past, d_system: Any, d_controls: Any, d_records: Any, d_rate: Any,
 ) -> Any:  # fmt: skip
     """Tangents of all records and unknowns, linear in those of system, controls and past."""
     ny = system.y_layout.size

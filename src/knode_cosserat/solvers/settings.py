@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 from knode_cosserat.solvers import space as space_schemes
 from knode_cosserat.solvers import time as time_schemes
@@ -40,7 +40,7 @@ class Settings:
         )
 
 
-def _scheme(what: str, given: object, kind: type, known: dict) -> object:  # type: ignore[type-arg]
+def _scheme(what: str, given: Any, kind: Any, known: Any) -> Any:
     if isinstance(given, kind):
         return given
     if isinstance(given, str) and given in known:

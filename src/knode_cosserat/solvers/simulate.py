@@ -62,13 +62,12 @@ def simulate(
     settings = Settings.of(time, space, start, newton)
     if on_failure not in ("raise", "return"):
         raise ValueError(f'on_failure is {on_failure!r}; allowed is "raise" or "return"')
-    if is_traced(dt) or not (np.isscalar(dt) and np.isfinite(dt) and dt > 0.0):
-        raise ValueError(f"dt is {dt!r}; allowed is a positive number of seconds")
+    dt = _checked_dt(dt)
     system, batch = _stacked(robot)
     controls, batch = _checked_controls(system, controls, batch)
     if initial is not None:
         _check_initial(system, initial, batch)
-    run = _Run(system, controls, initial, settings, float(dt), batch, isinstance(robot, Sequence))
+    run = _Run(system, controls, initial, settings, dt, batch, isinstance(robot, Sequence))
     if is_traced((system, controls, initial)):
         return _traced(*run)
     if batch:
@@ -102,6 +101,12 @@ def _stacked(robot: Any) -> tuple[System, int | None]:
     return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(x) for x in leaves]), *robots), len(robots)
 
 
+def _checked_dt(dt: Any) -> float:
+    if not isinstance(dt, int | float | np.number) or not 0.0 < dt < np.inf:
+        raise ValueError(f"dt is {dt!r}; allowed is a positive number of seconds")
+    return float(dt)
+
+
 def _checked_controls(system: System, controls: Any, batch: int | None) -> tuple[Any, int | None]:
     names = ", ".join(f"{field.name} ({field.unit})" for field in system.control_layout.fields)
     size = system.control_size
@@ -123,7 +128,9 @@ def _checked_controls(system: System, controls: Any, batch: int | None) -> tuple
         spread = jnp.broadcast_to if is_traced(controls) else np.broadcast_to
         return spread(controls, (batch, *shape)), batch
     if shape[0] != batch:
-        raise ValueError(f"there are {batch} robots but {shape[0]} controls; give as many, or one (steps, {size})")
+        raise ValueError(
+            f"there are {batch} robots but {shape[0]} controls; give as many, or one (steps, {size})"
+        )
     return controls, batch
 
 
@@ -164,7 +171,9 @@ def _beginning(run: _Run) -> tuple[Any, Start, float, bool]:
     return record, Start(past, none_yet), 0.0, False
 
 
-def _going_on(system: System, initial: Trajectory, settings: Settings, dt: float) -> tuple[Any, Start, float, bool]:
+def _going_on(
+    system: System, initial: Trajectory, settings: Settings, dt: float
+) -> tuple[Any, Start, float, bool]:
     records = jnp.concatenate([initial.y, initial.z], axis=-1)
     past = initial_past(system, records[-1])
     time = np.asarray(initial.time)
@@ -224,7 +233,7 @@ def _traced(system, controls, initial, settings, dt, batch, many):  # type: igno
     else:
         rows = one(system, controls, start.past)
     result = jnp.where(rows.error <= settings.newton.acceptable, 0, int(Result.NO_CONVERGENCE))
-    return _trajectory(run, record, start.control, t0, Steps(*rows, result))
+    return _trajectory(run, record, start.control, t0, Steps._make([*rows, result]))
 
 
 def _trajectory(run: _Run, record: Any, control: Any, t0: float, steps: Steps) -> Trajectory:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 #: y_s at (s, y, record of history)
 SpatialDerivative = Callable[[Any, Any, Any], Any]
@@ -28,8 +28,8 @@ class SpaceScheme(abc.ABC):
 
     @abc.abstractmethod
     def advance(
-        self, y_s: SpatialDerivative, s: Any, ds: Any, y: Float[Array, " y"], history: tuple[Any, Any, Any]
-    ) -> Float[Array, " y"]:
+        self, y_s: SpatialDerivative, s: Any, ds: Any, y: Float[Any, " y"], history: tuple[Any, Any, Any]
+    ) -> Float[Any, " y"]:
         """y at s + ds from y at s; `history` is the time scheme's, at s, s + ds/2 and s + ds."""
 
 
@@ -64,7 +64,7 @@ class RK4(SpaceScheme):
 SCHEMES: dict[str, SpaceScheme] = {"euler": Euler(), "rk4": RK4()}
 
 
-def middles(values: Float[Array, "nodes x"]) -> Float[Array, "segments x"]:
+def middles(values: Float[Any, "nodes x"]) -> Float[Any, "segments x"]:
     """Values half-way between neighbouring nodes, by cubic interpolation.
 
     Order 4, like RK4: a mean of two neighbours would hold the whole solution to order 2.

@@ -31,21 +31,18 @@ def _jacobians(problem: StepProblem, y: Any) -> Any:
     return jax.vmap(at_node)(problem.arclength, y, problem.history)
 
 
-def decay_per_segment(system: System, settings: Settings, coefficients: Any, record: Any, control: Any) -> float:
+def decay_per_segment(
+    system: System, settings: Settings, coefficients: Any, record: Any, control: Any
+) -> float:
     """The largest |λ| ds among the decaying waves: how many times its own length the steepest decays by.
 
     Judged at one state (its record, nodes × x), as if the robot rested there.
     """
     c0 = np.asarray(coefficients, dtype=float)[0]
-    problem = StepProblem(system, np.zeros(()), np.asarray(control), c0, -c0 * np.asarray(record), settings.space)
-    jacobians = np.asarray(_jacobians(problem, np.asarray(record)[:, : system.y_layout.size]))
+    record = np.asarray(record)
+    problem = StepProblem(system, np.zeros(()), np.asarray(control), c0, -c0 * record, settings.space)
+    jacobians = np.asarray(_jacobians(problem, record[:, : system.y_layout.size]))
     if not np.all(np.isfinite(jacobians)):
         return 0.0
     z = np.linalg.eigvals(jacobians).ravel() * float(system.length) / (system.nodes - 1)
     return float(np.max(np.abs(z), initial=0.0, where=z.real < -0.3 * np.abs(z)))
-
-
-def suspicious(system: System, y: Any) -> bool:
-    """Whether states (steps, nodes, y) are far beyond natural size."""
-    largest = np.max(np.abs(y), axis=(0, 1))
-    return bool(np.any(largest > SUSPICIOUS * np.asarray(system.scales().y)))

@@ -1,0 +1,146 @@
+"""What is measured: `python -m benchmarks.cases NAME` prints one JSON object, in a process of its own.
+
+Times are medians of several calls after compilation. Cases that compare two things call them in turn, so that
+a change of the machine's speed touches both alike.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import resource
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+DT = 0.05
+STEPS = 100
+
+
+def one_core() -> None:
+    """Before JAX starts: this process, and so XLA's thread pool, on one core."""
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+
+
+def seconds(function: Callable[[], Any]) -> float:
+    """Wall time of one call."""
+    begin = time.perf_counter()
+    function()
+    return time.perf_counter() - begin
+
+
+def medians(functions: dict[str, Callable[[], Any]], rounds: int) -> dict[str, float]:
+    """Median seconds of each function, called in turn."""
+    for function in functions.values():
+        function()
+    found: dict[str, list[float]] = {name: [] for name in functions}
+    for _ in range(rounds):
+        for name, function in functions.items():
+            found[name].append(seconds(function))
+    return {name: statistics.median(times) for name, times in found.items()}
+
+
+def steps() -> dict[str, Any]:
+    """100 steps against the transcription, for each kind of control; and with 40 and 100 nodes."""
+    one_core()
+    import knode_cosserat as kc
+    from benchmarks import paper_transcription as paper
+
+    robot, yardstick = kc.load_robot("delrin-tendon-robot"), paper.PaperRobot()
+    controls = {
+        "sine": kc.controls.sine(1.5, STEPS, DT),
+        "step": kc.controls.step(1.5, STEPS, DT),
+        "random": kc.controls.random(STEPS, seed=0),
+    }
+    found: dict[str, Any] = {}
+    for name, tensions in controls.items():
+        both = medians(
+            {
+                "package": lambda tensions=tensions: kc.simulate(robot, tensions, DT),
+                "transcription": lambda tensions=tensions: paper.simulate(
+                    yardstick, tensions, DT, retry=False
+                ),
+            },
+            rounds=5,
+        )
+        found[name] = {**both, "ratio": both["transcription"] / both["package"]}
+    robots = {nodes: robot.replace(nodes=nodes) for nodes in (10, 40, 100)}
+    sizes = {
+        f"{nodes} nodes": functools.partial(kc.simulate, sized, controls["sine"], DT)
+        for nodes, sized in robots.items()
+    }
+    found["nodes"] = medians(sizes, rounds=25)
+    return found
+
+
+def batch() -> dict[str, Any]:
+    """1024 robots, each with tensions of its own."""
+    import numpy as np
+
+    import knode_cosserat as kc
+
+    robot = kc.load_robot("delrin-tendon-robot")
+    generator = np.random.default_rng(0)
+    periods, scale = generator.uniform(0.8, 3.0, 1024), generator.uniform(0.8, 1.2, 1024)
+    tensions = np.stack([a * kc.controls.sine(p, STEPS, DT) for p, a in zip(periods, scale, strict=True)])
+    taken = medians({"batch": lambda: kc.simulate(robot, tensions, DT)}, rounds=3)["batch"]
+    return {"robots": 1024, "steps": STEPS, "seconds": taken, "robot_steps_per_second": 1024 * STEPS / taken}
+
+
+def gradient() -> dict[str, Any]:
+    """The gradient of a rollout with respect to every tension and Young's modulus, against the rollout."""
+    one_core()
+    import jax
+    import jax.numpy as jnp
+
+    import knode_cosserat as kc
+
+    robot, tensions = kc.load_robot("delrin-tendon-robot"), kc.controls.sine(1.5, STEPS, DT)
+
+    def loss(youngs_modulus: Any, tensions: Any) -> Any:
+        tip = kc.simulate(robot.replace(youngs_modulus=youngs_modulus), tensions, DT).tip_position
+        return jnp.sum(tip**2)
+
+    at = (float(robot.youngs_modulus), tensions)
+    value, slope = jax.jit(loss), jax.jit(jax.grad(loss, (0, 1)))
+    first = seconds(lambda: jax.block_until_ready(slope(*at)))
+    times = medians(
+        {
+            "forward": lambda: jax.block_until_ready(value(*at)),
+            "gradient": lambda: jax.block_until_ready(slope(*at)),
+        },
+        rounds=25,
+    )
+    return {**times, "ratio": times["gradient"] / times["forward"], "first_call": first}
+
+
+def first_call() -> dict[str, Any]:
+    """Import and the first simulation, in this process."""
+    begin = time.perf_counter()
+    import knode_cosserat as kc
+
+    imported = time.perf_counter() - begin
+    robot = kc.load_robot("delrin-tendon-robot")
+    tensions = kc.controls.sine(1.5, STEPS, DT)
+    call = seconds(lambda: kc.simulate(robot, tensions, DT))
+    return {"import": imported, "first_call": call}
+
+
+def memory() -> dict[str, Any]:
+    """Peak resident memory of a process that simulates 1,000 steps."""
+    import knode_cosserat as kc
+
+    robot = kc.load_robot("delrin-tendon-robot")
+    kc.simulate(robot, kc.controls.sine(1.5, 1000, DT), DT)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return {"megabytes": peak / (1024 if sys.platform != "darwin" else 1024**2)}
+
+
+CASES = {case.__name__: case for case in (steps, batch, gradient, first_call, memory)}
+
+if __name__ == "__main__":
+    print(json.dumps(CASES[sys.argv[1]]()))

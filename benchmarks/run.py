@@ -1,0 +1,113 @@
+"""`make bench`: run every case, print the table, write it as JSON."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+ROUNDS = 3
+
+
+def case(name: str, cache: str) -> dict[str, Any]:
+    """One case in a process of its own, with the given directory of compiled programs."""
+    ran = subprocess.run(
+        [sys.executable, "-m", "benchmarks.cases", name],
+        env={**os.environ, "KNODE_COSSERAT_CACHE": cache},
+        stdout=subprocess.PIPE,
+        check=True,
+        text=True,
+    )
+    return dict(json.loads(ran.stdout))
+
+
+def command_seconds(cache: str) -> float:
+    """From a command to its result, in a new process."""
+    with tempfile.TemporaryDirectory() as folder:
+        begin = time.perf_counter()
+        subprocess.run(
+            [
+                *(sys.executable, "-m", "knode_cosserat.cli", "simulate", "delrin-tendon-robot"),
+                *("--controls", "sine:1.5", "--steps", "100", "--out", f"{folder}/truth.nc"),
+            ],
+            env={**os.environ, "KNODE_COSSERAT_CACHE": cache},
+            stdout=subprocess.DEVNULL,
+            check=True,
+        )
+        return time.perf_counter() - begin
+
+
+def machine() -> str:
+    """The processor, as its system calls it, and its cores."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        name = next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        name = platform.processor() or platform.machine()
+    return f"{name}, {os.cpu_count()} cores, {platform.system()}, Python {platform.python_version()}"
+
+
+def measure() -> dict[str, Any]:
+    """All figures."""
+    with tempfile.TemporaryDirectory() as cache:
+        cold = []
+        for _ in range(ROUNDS):
+            with tempfile.TemporaryDirectory() as empty:
+                cold.append(case("first_call", empty))
+        command_seconds(cache)
+        second = [command_seconds(cache) for _ in range(ROUNDS)]
+        found = {name: case(name, cache) for name in ("steps", "batch", "gradient", "memory")}
+    found["first_call"] = {key: statistics.median(one[key] for one in cold) for key in cold[0]}
+    found["second_process"] = {"seconds": statistics.median(second)}
+    return {"machine": machine(), **found}
+
+
+def table(found: dict[str, Any]) -> str:
+    """The figures as Markdown, with what is aimed at."""
+    steps, nodes, gradient = found["steps"], found["steps"]["nodes"], found["gradient"]
+    rows = [
+        *(
+            (
+                f"100 steps, 10 nodes, {kind}: against fsolve",
+                f"{steps[kind]['ratio']:.0f}x ({1e3 * steps[kind]['package']:.1f} ms)",
+                ">= 100x",
+            )
+            for kind in ("sine", "step", "random")
+        ),
+        ("40 nodes against 10", f"{nodes['40 nodes'] / nodes['10 nodes']:.1f}x", "<= 4x"),
+        ("100 nodes against 10", f"{nodes['100 nodes'] / nodes['10 nodes']:.1f}x", "<= 8x"),
+        (
+            "1024 robots at once, all cores",
+            f"{found['batch']['robot_steps_per_second']:,.0f} robot-steps/s",
+            ">= 40,000",
+        ),
+        ("first call (nothing compiled yet)", f"{found['first_call']['first_call']:.1f} s", "<= 6 s"),
+        ("second process, command to result", f"{found['second_process']['seconds']:.1f} s", "<= 3 s"),
+        ("gradient of 100 steps against the steps", f"{gradient['ratio']:.1f}x", "<= 5x"),
+        ("peak memory, 1,000 steps", f"{found['memory']['megabytes']:.0f} MB", "<= 700 MB"),
+    ]
+    lines = ["| what | measured | aim |", "| --- | --- | --- |"]
+    return "\n".join([*lines, *(f"| {what} | {value} | {aim} |" for what, value, aim in rows)])
+
+
+def main() -> None:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("benchmarks/results.json"))
+    out: Path = parser.parse_args().out
+    found = measure()
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.write_text(json.dumps(found, indent=2) + "\n")
+    print(f"{found['machine']}\n\n{table(found)}\n\nwritten: {out}")
+
+
+if __name__ == "__main__":
+    main()

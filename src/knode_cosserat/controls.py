@@ -1,0 +1,396 @@
+"""Tendon tensions over time, as arrays (steps, tendons) in N: the studies' signals, and CSV files.
+
+Row i (from 0) is what `simulate` applies from time i dt to (i + 1) dt. The signals that are functions of time
+are evaluated at the end of that step, t = (i + 1) dt, as in the paper's studies. Tendons are numbered from 0
+in arguments, from 1 in files.
+"""
+
+from __future__ import annotations
+
+import csv
+import difflib
+import inspect
+import os
+import re
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+Tensions = Float[np.ndarray, "steps tendons"]
+
+#: factor from a unit that a file may use to newtons
+TENSION_UNITS = {"N": 1.0, "gf": 9.81 / 1000.0}
+
+#: times that differ by less than this part of a step are the same: i dt is rounded, and so are files
+SAME_TIME = 1e-4
+
+
+class ControlsError(ValueError):
+    """Controls that are not possible, or a file of them that cannot be read; the message is one line."""
+
+
+class Controls(NamedTuple):
+    """Tensions (steps, tendons) in N and the time step (s) for which each row is held."""
+
+    tensions: Tensions
+    dt: float
+
+
+# signals
+
+
+def constant(tension: float, steps: int, *, tendons: int = 4) -> Tensions:
+    """One tension (N) in all tendons, all the time.
+
+    Raises:
+        ControlsError: a number that is not possible, as from every function here.
+    """
+    _require_numbers(tension=tension)
+    _require_counts(steps=steps, tendons=tendons)
+    return _pulling(np.full((steps, tendons), float(tension)), "constant")
+
+
+def sine(
+    period: float, steps: int, dt: float, *, base: float = 6.0, amplitude: float = 1.0, tendons: int = 4
+) -> Tensions:
+    """τ_k = base + amplitude sin(2πt/period + 2πk/tendons) in N, k = 0, 1, …; period in s."""
+    _require_positive("period", period)
+    _require_numbers(base=base, amplitude=amplitude)
+    _require_counts(tendons=tendons)
+    phase = 2 * np.pi * np.arange(tendons) / tendons
+    t = _times(steps, dt)
+    return _pulling(base + amplitude * np.sin(2 * np.pi * t[:, None] / period + phase), "sine")
+
+
+def step(
+    height: float, steps: int, dt: float, *, base: float = 5.0, at: float = 1.5,
+    tendons: Sequence[int] = (0, 3), count: int = 4,
+) -> Tensions:  # fmt: skip
+    """`base` (N) in `count` tendons; from t = at (s) on, base + height in the tendons named."""
+    _require_numbers(at=at)
+    t = _times(steps, dt)
+    return _raised("step", height, t >= at - SAME_TIME * dt, base, tendons, count)
+
+
+def ramp(
+    height: float, steps: int, dt: float, *, base: float = 5.0, start: float = 0.0, end: float | None = None,
+    tendons: Sequence[int] = (0, 3), count: int = 4,
+) -> Tensions:  # fmt: skip
+    """`base` (N) in `count` tendons; in those named it rises linearly by `height` (N) between two times (s).
+
+    It stays where it then is; the end is by default that of the last step.
+    """
+    t = _times(steps, dt)
+    end = float(t[-1]) if end is None else end
+    _require_numbers(start=start, end=end)
+    if end <= start:
+        raise ControlsError(f"ramp: end is {end!r} s; allowed is a time after its start, {start!r} s")
+    part = np.clip((t - start) / (end - start), 0.0, 1.0)
+    return _raised("ramp", height, part, base, tendons, count)
+
+
+def random(
+    steps: int, *, low: float = 5.0, high: float = 10.0, seed: int = 0, tendons: int = 4, hold: int = 1
+) -> Tensions:
+    """Uniform between `low` and `high` (N), every tendon by itself; a draw is held for `hold` steps."""
+    _require_counts(steps=steps, tendons=tendons, hold=hold)
+    _require_counts(least=0, seed=seed)
+    _require_numbers(low=low, high=high)
+    if high < low:
+        raise ControlsError(f"random: high is {high!r} N; allowed is a tension from low, {low!r} N, on")
+    draws = np.random.default_rng(seed).uniform(low, high, (-(-steps // hold), tendons))
+    return _pulling(np.repeat(draws, hold, axis=0)[:steps], "random")
+
+
+def _raised(
+    signal: str, height: float, part: np.ndarray, base: float, tendons: Sequence[int], count: int
+) -> Tensions:
+    _require_counts(count=count)
+    _require_numbers(height=height, base=base)
+    if not set(tendons) <= set(range(count)):
+        raise ControlsError(f"{signal}: tendons is {tendons!r}; allowed is numbers from 0 to {count - 1}")
+    tensions = np.full((len(part), count), float(base))
+    tensions[:, [int(k) for k in tendons]] += height * part[:, None]
+    return _pulling(tensions, signal)
+
+
+def _times(steps: int, dt: float) -> np.ndarray:
+    """The ends of the steps (s)."""
+    _require_counts(steps=steps)
+    _require_positive("dt", dt)
+    return np.arange(1, steps + 1) * dt
+
+
+def _pulling(tensions: Tensions, signal: str) -> Tensions:
+    wrong = tensions[~(np.isfinite(tensions) & (tensions >= 0.0))]
+    if wrong.size:
+        raise ControlsError(f"{signal}: a tension is {wrong.min():g} N; allowed is 0 or more (a pull)")
+    return tensions
+
+
+def _require_numbers(**values: Any) -> None:
+    for name, value in values.items():
+        if not _is_number(value):
+            raise ControlsError(f"{name} is {value!r}; allowed is a finite number")
+
+
+def _require_positive(name: str, value: Any) -> None:
+    if not (_is_number(value) and value > 0.0):
+        raise ControlsError(f"{name} is {value!r}; allowed is a number of seconds above 0")
+
+
+def _require_counts(least: int = 1, **values: Any) -> None:
+    for name, value in values.items():
+        if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
+            raise ControlsError(f"{name} is {value!r}; allowed is a whole number from {least} on")
+
+
+def _is_number(value: Any) -> bool:
+    if not isinstance(value, int | float | np.integer | np.floating) or isinstance(value, bool):
+        return False
+    return bool(np.isfinite(value))
+
+
+# files
+
+
+def save(path: str | Path, tensions: Any, dt: float) -> None:
+    """Write tensions (steps, tendons) in N as CSV: the time (s) from which each row is held, then the row."""
+    tensions = np.asarray(tensions, dtype=float)
+    if tensions.ndim != 2 or 0 in tensions.shape:
+        raise ControlsError(f"tensions have shape {tensions.shape}; allowed is (steps, tendons)")
+    _pulling(tensions, str(path))
+    _require_positive("dt", dt)
+    names = [f"tension_{k + 1} [N]" for k in range(tensions.shape[1])]
+    try:
+        with Path(path).open("w", encoding="utf-8", newline="") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(["time [s]", *names])
+            # a Python float prints all its digits, so that reading gives back the same number
+            writer.writerows([i * float(dt), *row] for i, row in enumerate(tensions.tolist()))
+    except OSError as error:
+        raise ControlsError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def load(path: str | Path, dt: float | None = None) -> Controls:
+    """Read a CSV file of tensions.
+
+    Its header names the columns with their units: `time [s]`, and `tension_1 [N]`, `tension_2 [N]`, … or
+    `[gf]` (grams-force). Each row is held from its time until the next row's.
+
+    Args:
+        path: the file.
+        dt: time step (s) to sample at: row i of what is returned is what is held at the file's first time
+            + i dt, up to its last. None: the file's own step, which must then be the same everywhere.
+
+    Raises:
+        ControlsError: the file cannot be read; the message names the line and the column.
+    """
+    if dt is not None:
+        _require_positive("dt", dt)
+    time, tensions = _read(Path(path))
+    if dt is None:
+        return Controls(tensions, _own_step(path, time))
+    count = int(np.floor((time[-1] - time[0]) / dt + SAME_TIME)) + 1
+    at = time[0] + (np.arange(count) + SAME_TIME) * dt
+    return Controls(tensions[np.searchsorted(time, at, side="right") - 1], float(dt))
+
+
+def _own_step(path: str | Path, time: np.ndarray) -> float:
+    if len(time) < 2:
+        raise ControlsError(f"{path}: there is one row of tensions, which tells no time step; give dt")
+    index = np.arange(len(time))
+    first = float(time[1] - time[0])
+    mean = float(time[-1] - time[0]) / (len(time) - 1)
+    if np.all(np.abs(time - time[0] - index * mean) <= 1e-3 * mean):
+        # what `save` wrote comes back to the last bit; rounded times are averaged
+        exact = np.all(np.abs(time - time[0] - index * first) <= 1e-9 * (time[-1] - time[0]))
+        return first if exact else mean
+    steps = np.diff(time)
+    raise ControlsError(
+        f"{path}: the time step varies from {steps.min():g} to {steps.max():g} s; "
+        "allowed is one step throughout, or give dt to sample at it"
+    )
+
+
+class _Column(NamedTuple):
+    title: str
+    tendon: int  # 0 for the time
+    factor: float
+
+
+def _read(path: Path) -> tuple[np.ndarray, Tensions]:
+    """Times (rows,) in s and tensions (rows, tendons) in N."""
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            return _rows(path, csv.reader(file))
+    except FileNotFoundError:
+        raise ControlsError(f"{path}: no such file") from None
+    except OSError as error:
+        raise ControlsError(f"{path}: cannot be read: {error.strerror}") from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ControlsError(f"{path}: not a CSV text file: {error}") from None
+
+
+def _rows(path: Path, reader: Any) -> tuple[np.ndarray, Tensions]:
+    filled = (cells for cells in reader if any(cell.strip() for cell in cells))
+    header = next(filled, None)
+    if header is None:
+        raise ControlsError(f"{path}: the file is empty; allowed is {_HEADER}, then rows of numbers")
+    columns = _columns(path, reader.line_num, header)
+    rows: list[list[float]] = []
+    for cells in filled:
+        where = f"{path}: line {reader.line_num}"
+        if len(cells) != len(columns):
+            raise ControlsError(f"{where} has {len(cells)} cells; allowed is {len(columns)}, like the header")
+        row = [_value(where, column, cell) for column, cell in zip(columns, cells, strict=True)]
+        ordered = [value for _, value in sorted(zip((c.tendon for c in columns), row, strict=True))]
+        if rows and ordered[0] <= rows[-1][0]:
+            raise ControlsError(f"{where}: time is {ordered[0]!r} s; allowed is one after {rows[-1][0]!r} s")
+        rows.append(ordered)
+    if not rows:
+        raise ControlsError(f"{path}: no rows of tensions after the header")
+    table = np.array(rows)
+    return table[:, 0], table[:, 1:]
+
+
+_HEADER = "a header `time [s],tension_1 [N],tension_2 [N],…`"
+
+
+def _columns(path: Path, line: int, header: Iterable[str]) -> list[_Column]:
+    columns = [_column(f"{path}: line {line}", title.strip()) for title in header]
+    tendons = sorted(column.tendon for column in columns)
+    if len(tendons) < 2 or tendons != list(range(len(tendons))):
+        titles = ", ".join(column.title for column in columns)
+        raise ControlsError(
+            f"{path}: line {line}: the columns are {titles}; "
+            "allowed is time, and tension_1, tension_2, … without a gap, once each"
+        )
+    return columns
+
+
+def _column(where: str, title: str) -> _Column:
+    match = re.fullmatch(r"(?:(time)|tension_([1-9]\d{0,5})) *(?:\[ *([^\[\]]*?) *\])?", title)
+    if match is None:
+        raise ControlsError(f"{where}: the column {title!r} is unknown; allowed is {_HEADER}")
+    time, tendon, unit = match.groups()
+    units = {"s": 1.0} if time else TENSION_UNITS
+    allowed = " or ".join(f"[{unit}]" for unit in units)
+    if not unit:
+        raise ControlsError(f"{where}: the column {title!r} has no unit; allowed is {allowed} after its name")
+    if unit not in units:
+        raise ControlsError(f"{where}: the column {title!r} has the unit {unit!r}; allowed is {allowed}")
+    return _Column(title, 0 if time else int(tendon), units[unit])
+
+
+def _value(where: str, column: _Column, cell: str) -> float:
+    allowed = "a finite number" if column.tendon == 0 else "a finite number, 0 or more (a pull)"
+    try:
+        value = float(cell)
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value) or (column.tendon > 0 and value < 0.0):
+        raise ControlsError(f"{where}: {column.title} is {cell.strip()!r}; allowed is {allowed}")
+    return value * column.factor
+
+
+# the command line
+
+
+class _Signal(NamedTuple):
+    make: Callable[..., Tensions]
+    main: str
+    #: what else may be given by name, with how it is read
+    options: dict[str, Callable[[str], Any]]
+    #: what the function calls the number of tendons
+    tendon_count: str = "tendons"
+
+
+def _tendons(text: str) -> tuple[int, ...]:
+    return tuple(int(number) - 1 for number in text.split("+"))
+
+
+_SIGNALS = {
+    "sine": _Signal(sine, "period", {"base": float, "amplitude": float}),
+    "step": _Signal(step, "height", {"base": float, "at": float, "tendons": _tendons}, "count"),
+    "ramp": _Signal(
+        ramp, "height", {"base": float, "start": float, "end": float, "tendons": _tendons}, "count"
+    ),
+    "random": _Signal(random, "seed", {"low": float, "high": float, "hold": int}),
+    "constant": _Signal(constant, "tension", {}),
+}
+
+#: what `parse` takes, for help texts
+SPECIFICATIONS = ", ".join(f"{name}:{it.main.upper()}" for name, it in _SIGNALS.items()) + " or a CSV file"
+
+
+def parse(specification: str, steps: int | None, dt: float, *, tendons: int = 4) -> Tensions:
+    """Tensions from one word, as on the command line.
+
+    `sine:1.5`, `step:1.5`, `ramp:2`, `random:0`, `constant:5`: the signal and its first number (period in s,
+    height in N, height in N, seed, tension in N). What else it takes by name: `sine:1.5,base=8,amplitude=2`,
+    `step:1.5,at=2,tendons=1+4` (tendons numbered from 1). Anything else is a CSV file, sampled at dt.
+
+    Args:
+        specification: as above.
+        steps: how many; None, of a file only: as many as it has.
+        dt: time step (s).
+        tendons: how many the robot has.
+
+    Raises:
+        ControlsError: the specification is not understood, or the file is not right or too short.
+    """
+    name, colon, rest = specification.partition(":")
+    if os.path.exists(specification) and not (colon and name in _SIGNALS):
+        return _from_file(specification, steps, dt, tendons)
+    if name not in _SIGNALS:
+        close = difflib.get_close_matches(name, _SIGNALS, n=1)
+        hint = f"; did you mean {close[0]}:{_SIGNALS[close[0]].main.upper()}?" if close else ""
+        raise ControlsError(
+            f"controls {specification!r}: no such signal or file; allowed is {SPECIFICATIONS}{hint}"
+        )
+    try:
+        if steps is None:
+            raise ControlsError("the number of steps is not given; a signal needs it")
+        return _from_signal(name, rest, steps, dt, tendons)
+    except ControlsError as error:
+        raise ControlsError(f"controls {specification!r}: {error}") from None
+
+
+def _from_file(path: str, steps: int | None, dt: float, tendons: int) -> Tensions:
+    tensions = load(path, dt).tensions
+    if tensions.shape[1] != tendons:
+        raise ControlsError(f"{path}: there are {tensions.shape[1]} tendons; the robot has {tendons}")
+    if steps is None:
+        return tensions
+    _require_counts(steps=steps)
+    if len(tensions) < steps:
+        raise ControlsError(f"{path}: there are {len(tensions)} steps of {dt:g} s; {steps} are asked for")
+    return tensions[:steps]
+
+
+def _from_signal(name: str, text: str, steps: int, dt: float, tendons: int) -> Tensions:
+    signal = _SIGNALS[name]
+    first, *others = text.split(",")
+    arguments = {signal.main: _read_as(int if signal.main == "seed" else float, signal.main, first)}
+    for other in others:
+        key, _, value = (part.strip() for part in other.partition("="))
+        if key not in signal.options or key in arguments:
+            allowed = ", ".join(f"{option}=…" for option in signal.options) or "nothing"
+            raise ControlsError(f"{other!r} is not understood; allowed after the {signal.main} is {allowed}")
+        arguments[key] = _read_as(signal.options[key], key, value)
+    if "dt" in inspect.signature(signal.make).parameters:
+        arguments["dt"] = dt
+    return signal.make(steps=steps, **arguments, **{signal.tendon_count: tendons})
+
+
+def _read_as(kind: Callable[[str], Any], key: str, text: str) -> Any:
+    try:
+        return kind(text)
+    except ValueError:
+        kinds = {float: "a number", int: "a whole number"}
+        allowed = kinds.get(kind, "tendons like 1+4")  # type: ignore[call-overload]
+        raise ControlsError(f"{key} is {text!r}; allowed is {allowed}") from None

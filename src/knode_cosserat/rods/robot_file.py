@@ -1,0 +1,332 @@
+"""Robots as YAML files, and the robots that come with the package.
+
+    format: 1
+    kind: tendon-robot
+    description: what it is, in one line
+    parameters:
+      length: 0.635  # m
+      …
+
+Names, units and allowed values are those that the kind's class states (`System.parameters`). Reading runs no
+code, and numbers are read as YAML 1.2 has it: `2.7e9` is a number and `1:30` is not.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import importlib.resources
+import os
+import re
+import reprlib
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import yaml
+
+from knode_cosserat.rods.parameters import Parameter, ParameterError, checked
+from knode_cosserat.rods.system import System
+from knode_cosserat.rods.tendon_robot import TendonRobot
+
+FORMAT = 1
+
+#: the classes that a file can name as its kind
+KINDS: dict[str, type[System]] = {"tendon-robot": TendonRobot}
+
+
+class RobotFileError(ValueError):
+    """A robot file that is not right: one line that names file, key, value and what is allowed."""
+
+
+def load_robot(name_or_path: str | Path) -> System:
+    """A robot from the catalog, by name, or from a file, by path. The catalog's names come first.
+
+    Raises:
+        RobotFileError: there is no such robot, or its file is not right.
+    """
+    file = _catalog_files().get(str(name_or_path)) or _existing(Path(name_or_path))
+    return parse_robot(_text(file, str(name_or_path)), str(name_or_path))
+
+
+def save_robot(robot: System, path: str | Path, *, description: str = "") -> None:
+    """Write a robot as a file that `load_robot` reads back equal.
+
+    Raises:
+        RobotFileError: it is of a class that no file can name, a batch, or the file cannot be written.
+    """
+    text = format_robot(robot, description)
+    try:
+        Path(path).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise RobotFileError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+def catalog() -> dict[str, str]:
+    """The robots that come with the package: their names, each with a description in one line."""
+    files = sorted(_catalog_files().items())
+    described = {name: _mapping(_text(file, name), name).get("description", "") for name, file in files}
+    return {name: " ".join(description.split()) for name, description in described.items()}
+
+
+def _catalog_files() -> dict[str, Traversable]:
+    folder = importlib.resources.files("knode_cosserat.rods") / "catalog"
+    return {file.name[:-5]: file for file in folder.iterdir() if file.name.endswith(".yaml")}
+
+
+def _existing(path: Path) -> Path:
+    if os.path.exists(path):
+        return path
+    names = sorted(_catalog_files())
+    neighbours = [str(path.with_name(file.name)) for file in path.parent.glob("*.y*ml")]
+    close = difflib.get_close_matches(str(path), [*names, *neighbours], n=1)
+    close = close or difflib.get_close_matches(path.stem, names, n=1)
+    hint = f"; did you mean {close[0]}?" if close else ""
+    raise RobotFileError(f"{path}: no such file or robot; the catalog has {', '.join(names)}{hint}")
+
+
+def _text(file: Traversable, source: str) -> str:
+    try:
+        return file.read_text(encoding="utf-8")
+    except OSError as error:
+        raise RobotFileError(f"{source}: cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise RobotFileError(f"{source}: not YAML: it is not UTF-8 text") from None
+
+
+# text to robot
+
+
+def parse_robot(text: str, source: str) -> System:
+    """A robot from a file's text; `source` is what errors call the file. Raises `RobotFileError`."""
+    file = _mapping(text, source)
+    number = file.get("format", FORMAT)
+    if number != FORMAT or isinstance(number, bool):
+        raise RobotFileError(
+            f"{source}: format is {_shown(number)}; allowed is {FORMAT}, the format that this version reads"
+        )
+    known = ("format", "kind", "description", "parameters")
+    _require_keys(file, source, known=known, required=("format", "kind", "parameters"))
+    for key in ("kind", "description"):
+        if not isinstance(file.get(key, ""), str):
+            raise RobotFileError(f"{source}: {key} is {_shown(file[key])}; allowed is text")
+    kind, values = file["kind"], file["parameters"]
+    if kind not in KINDS:
+        raise RobotFileError(
+            f"{source}: kind is {kind!r}; allowed is {', '.join(KINDS)}{_did_you_mean(kind, KINDS)}"
+        )
+    if not isinstance(values, dict):
+        raise RobotFileError(
+            f"{source}: parameters is {_shown(values)}; allowed is a mapping from names to values"
+        )
+    return _robot(KINDS[kind], values, source)
+
+
+def _robot(cls: type[System], values: dict[Any, Any], source: str) -> System:
+    stated = cls.parameters()
+    # an empty optional value is as good as none
+    values = {
+        key: value
+        for key, value in values.items()
+        if value is not None or key not in stated or not stated[key].optional
+    }
+    fields = {field.name: field for field in dataclasses.fields(cls)}
+    required = [key for key in stated if fields[key].default is dataclasses.MISSING]
+    _require_keys(values, f"{source}: parameters", known=(*stated, "nodes"), required=required)
+    for key, value in values.items():
+        if key in stated:
+            _require_allowed(key, value, stated[key], source)
+        elif not isinstance(value, int):
+            raise RobotFileError(f"{source}: {key} is {_shown(value)}; allowed is a whole number, 2 or more")
+    try:
+        return cls(**values)
+    except ParameterError as error:
+        raise RobotFileError(f"{source}: {error}") from None
+
+
+def _require_keys(mapping: dict[Any, Any], source: str, *, known: Any, required: Any) -> None:
+    for key in mapping:
+        if key not in known:
+            raise RobotFileError(
+                f"{source}: the key {_shown(key)} is unknown; allowed is {', '.join(known)}"
+                f"{_did_you_mean(key, known)}"
+            )
+    missing = [key for key in required if key not in mapping]
+    if missing:
+        raise RobotFileError(
+            f"{source}: the key {missing[0]!r} is missing; required is {', '.join(required)}"
+        )
+
+
+def _did_you_mean(given: Any, known: Any) -> str:
+    close = difflib.get_close_matches(str(given), list(known), n=1)
+    return f"; did you mean {close[0]}?" if close else ""
+
+
+def _shown(value: Any) -> str:
+    """A value in one line of bounded length: a file can hold what would print without end."""
+    short = reprlib.Repr()
+    short.maxstring = short.maxother = 60
+    short.maxlevel = 3
+    shown = short.repr(value)
+    return shown if len(shown) <= 250 else shown[:250] + "…"
+
+
+# values
+
+
+def _require_allowed(key: str, value: Any, parameter: Parameter, source: str) -> None:
+    array = _array(value)
+    if array is not None and parameter.shape == "matrix" and array.shape in ((), (3,)):
+        array = np.diag(np.broadcast_to(array, 3))
+    try:
+        checked(key, np.asarray(None) if array is None else array, parameter)
+    except ParameterError:
+        why = ", not symmetric" if _asymmetric(array, parameter) else ""
+        raise RobotFileError(
+            f"{source}: {key} is {_shown(value)}{why}; allowed is {parameter.allowed}"
+            f"{_unit_hint(value, array, parameter)}"
+        ) from None
+
+
+def _array(value: Any) -> np.ndarray | None:
+    """A number, a list of numbers or a list of lists of them as an array; None of anything else."""
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        try:
+            return np.asarray(float(value))
+        except OverflowError:
+            return np.asarray(np.inf)
+    if not isinstance(value, list) or not value:
+        return None
+    # nothing allowed is deeper than a list of lists: a file may nest without end
+    if any(isinstance(inner, list) for row in value if isinstance(row, list) for inner in row):
+        return None
+    rows = [_array(row) for row in value]
+    if any(row is None for row in rows) or len({row.shape for row in rows if row is not None}) > 1:
+        return None
+    return np.array(rows, dtype=float)
+
+
+def _asymmetric(array: np.ndarray | None, parameter: Parameter) -> bool:
+    if array is None or parameter.shape != "matrix" or array.shape != (3, 3):
+        return False
+    return bool(np.all(np.isfinite(array))) and not np.allclose(array, array.T, rtol=1e-9, atol=0.0)
+
+
+#: by unit: what numbers are typical, and the other units that people write, the likeliest first
+_OTHER_UNITS: dict[str, tuple[float, float, dict[str, float]]] = {
+    "m": (1e-5, 10.0, {"mm": 1e-3, "um": 1e-6}),
+    "Pa": (1e5, 4e11, {"GPa": 1e9, "MPa": 1e6, "kPa": 1e3}),
+    "kg/m3": (100.0, 23e3, {"g/cm3": 1e3, "g/m3": 1e-3}),
+    "m/s2": (-30.0, 30.0, {"mm/s2": 1e-3}),
+    "rad": (-2 * np.pi, 2 * np.pi, {"degrees": np.pi / 180.0}),
+}
+
+
+def _unit_hint(value: Any, array: np.ndarray | None, parameter: Parameter) -> str:
+    """The same number in another unit, if that would have been typical."""
+    if array is None or parameter.unit not in _OTHER_UNITS or parameter.shape == "matrix":
+        return ""
+    low, high, others = _OTHER_UNITS[parameter.unit]
+    low, high = max(low, parameter.low), min(high, parameter.high)
+    for unit, factor in others.items():
+        scaled = array * factor
+        if np.all((low <= scaled) & (scaled <= high)):
+            meant = np.vectorize(lambda number: float(f"{number:.12g}"))(scaled).tolist()
+            return f"; did you mean {_shown(value)} {unit} = {_shown(meant)} {parameter.unit}?"
+    return ""
+
+
+# robot to text
+
+
+def format_robot(robot: System, description: str = "") -> str:
+    """A robot as the text of a file, with the unit beside each value; see `save_robot` for the errors."""
+    kind = next((name for name, cls in KINDS.items() if type(robot) is cls), None)
+    if kind is None:
+        raise RobotFileError(
+            f"a {type(robot).__name__} cannot be written to a robot file; allowed is a robot of a class in "
+            f"robot_file.KINDS: {', '.join(cls.__name__ for cls in KINDS.values())}"
+        )
+    if np.ndim(robot.length):
+        raise RobotFileError("a batch of robots cannot be written to one robot file; write them one by one")
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(robot)):
+        raise RobotFileError("a robot cannot be written to a file inside jit, grad or vmap")
+    head = {"format": FORMAT, "kind": kind, "description": description}
+    lines = [f"{key}: {_flow(value)}" for key, value in head.items() if value != ""]
+    lines.append("parameters:")
+    for name, parameter in robot.parameters().items():
+        value = getattr(robot, name)
+        if value is not None:
+            lines.append(f"  {name}: {_flow(_plain(value))}  # {parameter.unit}, {parameter.meaning}")
+    lines.append(f"  nodes: {robot.nodes}  # base and tip included")
+    return "\n".join(lines) + "\n"
+
+
+def _plain(value: Any) -> Any:
+    """Numbers in the shortest form that reads back equal: a multiple of the identity as one, say."""
+    array = np.asarray(value, dtype=float)
+    if array.shape == (3, 3) and np.array_equal(array, np.diag(np.diag(array))):
+        array = np.diag(array)
+        array = array[0] if np.all(array == array[0]) else array
+    return array.tolist()
+
+
+def _flow(value: Any) -> str:
+    """A value as YAML on one line."""
+    readable = not isinstance(value, str) or value.isprintable()
+    listed = yaml.safe_dump([value], default_flow_style=True, width=float("inf"), allow_unicode=readable)
+    return str(listed).strip()[1:-1]
+
+
+# YAML
+
+
+class _Loader(yaml.SafeLoader):
+    """Safe, with the scalars of YAML 1.2 and no key twice."""
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        seen: set[str] = set()
+        for key, _ in node.value if isinstance(node, yaml.MappingNode) else ():
+            if isinstance(key, yaml.ScalarNode):
+                if key.value in seen:
+                    raise yaml.constructor.ConstructorError(
+                        None, None, f"the key {_shown(key.value)} is there twice", key.start_mark
+                    )
+                seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
+_Loader.yaml_implicit_resolvers = {}
+for _tag, _pattern, _first in (
+    ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
+    ("bool", r"true|True|TRUE|false|False|FALSE", list("tTfF")),
+    ("int", r"[-+]?(0|[1-9][0-9]*)", list("-+0123456789")),
+    (
+        "float",
+        r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
+        list("-+.0123456789"),
+    ),
+):
+    _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"(?:{_pattern})$"), _first)
+
+
+def _mapping(text: str, source: str) -> dict[Any, Any]:
+    """The file's outermost mapping."""
+    try:
+        content = yaml.load(text, _Loader)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        line = f" line {mark.line + 1}:" if mark else ""
+        raise RobotFileError(f"{source}:{line} not YAML: {error.problem}") from None
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise RobotFileError(f"{source}: not YAML: {reason}") from None
+    if not isinstance(content, dict):
+        found = "empty" if content is None else _shown(content)
+        raise RobotFileError(
+            f"{source}: the file is {found}; allowed is a mapping with format, kind and parameters"
+        )
+    return content

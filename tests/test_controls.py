@@ -1,0 +1,314 @@
+import re
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis.extra.numpy import array_shapes, arrays
+
+from knode_cosserat import controls
+from knode_cosserat.controls import Controls, ControlsError
+
+DT = 0.05
+HEADER = "time [s],tension_1 [N],tension_2 [N]\n"
+
+
+def fails(*parts):
+    """A `ControlsError` of one line that has all the parts, in order."""
+    return pytest.raises(ControlsError, match=r"^(?!.*\n).*" + ".*".join(map(re.escape, parts)))
+
+
+def written(tmp_path, text):
+    path = tmp_path / "tensions.csv"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+# signals
+
+
+@pytest.mark.parametrize("period", [0.5, 1.0, 1.5])
+def test_sine_is_the_papers(period):
+    tensions = controls.sine(period, 100, DT)
+    for i in range(1, 101):
+        for k in range(4):
+            expected = 6 + np.sin(2 * np.pi * i * 0.05 / period + k * np.pi / 2)
+            assert tensions[i - 1, k] == pytest.approx(expected, abs=1e-13)
+
+
+@given(st.integers(1, 8), st.floats(0.1, 10), st.floats(1, 50), st.floats(0, 1), st.integers(1, 50))
+def test_sine_of_any_number_of_tendons(tendons, period, base, part, steps):
+    tensions = controls.sine(period, steps, DT, base=base, amplitude=part * base, tendons=tendons)
+    assert tensions.shape == (steps, tendons)
+    assert np.all(np.abs(tensions - base) <= part * base + 1e-12 * base)
+    if tendons > 1:
+        assert tensions.mean(axis=1) == pytest.approx(base)
+
+
+def test_step_is_the_papers():
+    tensions = controls.step(1.5, 100, DT)
+    assert np.all(tensions[:, 1:3] == 5.0)
+    # t = i dt >= 1.5 from i = 30 on, which is row 29
+    assert np.all(tensions[:29] == 5.0)
+    assert np.all(tensions[29:, [0, 3]] == 6.5)
+
+
+@given(st.integers(1, 400), st.sampled_from([0.1, 0.05, 0.02, 0.01, 1 / 30, 1e-3, 0.007]))
+def test_step_does_not_depend_on_rounding(first, dt):
+    raised = controls.step(1.0, 400, dt, at=first * dt)[:, 0] > 5.0
+    assert np.argmax(raised) == first - 1
+    assert raised[first - 1 :].all()
+
+
+def test_step_of_other_tendons():
+    tensions = controls.step(-2.0, 4, 0.5, base=3.0, at=1.0, tendons=[1], count=3)
+    assert tensions.tolist() == [[3, 3, 3], [3, 1, 3], [3, 1, 3], [3, 1, 3]]
+
+
+def test_ramp():
+    tensions = controls.ramp(2.0, 8, 0.5, start=1.0, end=3.0, tendons=(2,))
+    assert tensions[:, 2] == pytest.approx([5, 5, 5.5, 6, 6.5, 7, 7, 7])
+    assert np.all(tensions[:, [0, 1, 3]] == 5.0)
+    assert controls.ramp(2.0, 8, 0.5)[:, 0] == pytest.approx(5 + np.arange(1, 9) / 4)
+
+
+def test_random_is_uniform_and_repeatable():
+    tensions = controls.random(4000, seed=3)
+    assert tensions.shape == (4000, 4)
+    assert tensions.min() >= 5.0
+    assert tensions.max() <= 10.0
+    assert tensions.mean(axis=0) == pytest.approx(7.5, abs=0.1)
+    assert tensions.std(axis=0) == pytest.approx(5 / np.sqrt(12), abs=0.05)
+    assert np.array_equal(tensions, controls.random(4000, seed=3))
+    assert not np.array_equal(tensions, controls.random(4000, seed=4))
+    assert np.array_equal(tensions, 5 + 5 * np.random.default_rng(3).random((4000, 4)))
+
+
+def test_random_holds_its_draws():
+    tensions = controls.random(10, seed=1, hold=4, tendons=2)
+    assert tensions.shape == (10, 2)
+    for rows in (slice(0, 4), slice(4, 8), slice(8, 10)):
+        assert np.all(tensions[rows] == tensions[rows.start])
+    assert len(np.unique(tensions)) == 6
+
+
+def test_constant():
+    assert np.array_equal(controls.constant(5, 3), np.full((3, 4), 5.0))
+    assert controls.constant(0.0, 2, tendons=3).shape == (2, 3)
+
+
+@pytest.mark.parametrize(
+    ("make", "parts"),
+    [
+        (lambda: controls.sine(0.0, 10, DT), ["period is 0.0", "above 0"]),
+        (lambda: controls.sine(-1.5, 10, DT), ["period is -1.5", "above 0"]),
+        (lambda: controls.sine(np.nan, 10, DT), ["period is nan"]),
+        (lambda: controls.sine("1.5", 10, DT), ["period is '1.5'"]),
+        (lambda: controls.sine(1.5, 0, DT), ["steps is 0", "whole number from 1 on"]),
+        (lambda: controls.sine(1.5, 10.0, DT), ["steps is 10.0", "whole number"]),
+        (lambda: controls.sine(1.5, 10, 0.0), ["dt is 0.0", "above 0"]),
+        (lambda: controls.sine(1.5, 10, DT, base=np.inf), ["base is inf", "finite"]),
+        (lambda: controls.sine(1.5, 10, DT, amplitude=7.0), ["sine: a tension is -", "allowed is 0 or more"]),
+        (lambda: controls.sine(1.5, 10, DT, tendons=0), ["tendons is 0"]),
+        (lambda: controls.step(-6.0, 50, DT), ["step: a tension is -1 N"]),
+        (lambda: controls.step("a", 50, DT), ["height is 'a'"]),
+        (lambda: controls.step(1.0, 50, DT, at=np.nan), ["at is nan"]),
+        (lambda: controls.step(1.0, 50, DT, tendons=(1, 4)), ["step: tendons is (1, 4)", "0 to 3"]),
+        (lambda: controls.ramp(1.0, 50, DT, start=2.0, end=2.0), ["ramp: end is 2.0 s", "2.0 s"]),
+        (lambda: controls.ramp(-9.0, 50, DT), ["ramp: a tension is -4 N"]),
+        (lambda: controls.random(5, low=3.0, high=2.0), ["random: high is 2.0 N", "3.0 N"]),
+        (lambda: controls.random(5, low=-3.0, high=-2.0), ["random: a tension is -"]),
+        (lambda: controls.random(5, seed=-1), ["seed is -1", "from 0 on"]),
+        (lambda: controls.random(5, hold=0), ["hold is 0"]),
+        (lambda: controls.constant(-1.0, 5), ["constant: a tension is -1 N"]),
+        (lambda: controls.constant(True, 5), ["tension is True"]),
+    ],
+)
+def test_impossible_signals(make, parts):
+    with fails(*parts):
+        make()
+
+
+# files
+
+
+@settings(max_examples=30)
+@given(
+    arrays(float, array_shapes(min_dims=2, max_dims=2, min_side=2, max_side=8), elements=st.floats(0, 1e6)),
+    st.floats(1e-4, 10),
+)
+def test_files_come_back_to_the_last_bit(tmp_path_factory, tensions, dt):
+    path = tmp_path_factory.mktemp("controls") / "tensions.csv"
+    controls.save(path, tensions, dt)
+    for again in (controls.load(path), controls.load(path, dt)):
+        assert isinstance(again, Controls)
+        assert np.array_equal(again.tensions, tensions)
+        assert again.dt == dt
+
+
+def test_the_files_layout(tmp_path):
+    path = tmp_path / "tensions.csv"
+    controls.save(path, [[5.0, 6.5], [5.25, 7.0]], 0.1)
+    assert path.read_text() == HEADER + "0.0,5.0,6.5\n0.1,5.25,7.0\n"
+
+
+def test_grams_force_and_column_order(tmp_path):
+    path = written(tmp_path, "\ufefftension_2 [gf], time [s] ,tension_1[ N ]\n500,0,1\n\n1000,0.1,2\n")
+    tensions, dt = controls.load(path)
+    assert tensions == pytest.approx(np.array([[1.0, 4.905], [2.0, 9.81]]))
+    assert dt == 0.1
+
+
+def test_sampling_holds_each_row_until_the_next(tmp_path):
+    path = written(tmp_path, HEADER + "100.00,1,2\n100.07,3,4\n100.2,5,6\n")
+    tensions, dt = controls.load(path, 0.05)
+    assert dt == 0.05
+    assert tensions[:, 0].tolist() == [1, 1, 3, 3, 5]
+    assert controls.load(path, 0.3).tensions.tolist() == [[1, 2]]
+
+
+@given(st.integers(2, 60), st.integers(1, 5), st.sampled_from([0.1, 0.05, 1 / 30, 0.007]), st.floats(0, 1e6))
+def test_sampling_does_not_depend_on_rounding(rows, finer, dt, start):
+    path = controls.Path("unused")
+    time = start + np.arange(rows) * dt * finer
+    held = np.arange(rows, dtype=float)[:, None]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(controls, "_read", lambda _: (time, held))
+        sampled = controls.load(path, dt).tensions[:, 0]
+    assert np.array_equal(sampled, np.arange((rows - 1) * finer + 1) // finer)
+
+
+def test_a_file_with_rounded_times_is_uniform(tmp_path):
+    rows = "".join(f"{i / 30:.5f},{i},0\n" for i in range(31))
+    assert controls.load(written(tmp_path, HEADER + rows)).dt == pytest.approx(1 / 30, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("", ["the file is empty", "time [s],tension_1 [N]"]),
+        ("\n \n", ["the file is empty"]),
+        (HEADER, ["no rows"]),
+        ("time [s],tension_1\n0,1\n", ["line 1: the column 'tension_1' has no unit", "[N] or [gf]"]),
+        ("time,tension_1 [N]\n0,1\n", ["line 1: the column 'time' has no unit", "[s]"]),
+        ("time [s],tension_1 []\n0,1\n", ["line 1: the column 'tension_1 []' has no unit"]),
+        ("time [s],tension_1 [lbf]\n0,1\n", ["line 1", "has the unit 'lbf'", "[N] or [gf]"]),
+        ("time [ms],tension_1 [N]\n0,1\n", ["line 1", "has the unit 'ms'", "allowed is [s]"]),
+        ("time [s],force [N]\n0,1\n", ["line 1: the column 'force [N]' is unknown", "tension_1 [N]"]),
+        ("time [s];tension_1 [N]\n0;1\n", ["line 1: the column 'time [s];tension_1 [N]' is unknown"]),
+        ("tension_1 [N],tension_2 [N]\n0,1\n", ["line 1: the columns are tension_1 [N], tension_2 [N]"]),
+        ("time [s],tension_1 [N],tension_1 [N]\n0,1,2\n", ["line 1: the columns are", "once each"]),
+        ("time [s],tension_1 [N],tension_3 [N]\n0,1,2\n", ["line 1: the columns are", "without a gap"]),
+        ("time [s]\n0\n", ["line 1: the columns are time [s]"]),
+        (HEADER + "0,1,2\n0.1,1,a2\n", ["line 3: tension_2 [N] is 'a2'", "finite number"]),
+        (HEADER + "0,1,2\n\n0.1,,2\n", ["line 4: tension_1 [N] is ''"]),
+        (HEADER + "0,1,nan\n0.1,1,2\n", ["line 2: tension_2 [N] is 'nan'"]),
+        (HEADER + "0,1,inf\n0.1,1,2\n", ["line 2: tension_2 [N] is 'inf'"]),
+        (HEADER + "nan,1,2\n0.1,1,2\n", ["line 2: time [s] is 'nan'"]),
+        (HEADER + "0,1,-2\n0.1,1,2\n", ["line 2: tension_2 [N] is '-2'", "0 or more"]),
+        (HEADER + "0,1,2\n0.1,1\n", ["line 3 has 2 cells", "allowed is 3"]),
+        (HEADER + "0,1,2\n0.1,1,2\n0.1,1,2\n", ["line 4: time is 0.1 s", "after 0.1 s"]),
+        (HEADER + "0,1,2\n0.1,1,2\n0.05,1,2\n", ["line 4: time is 0.05 s"]),
+        (HEADER + "0,1,2\n0.1,1,2\n0.3,1,2\n", ["the time step varies from 0.1 to 0.2 s", "give dt"]),
+        (HEADER + "0,1,2\n", ["one row", "give dt"]),
+        ('time [s],"tension_1 [N]\n0,1\n', ["line 2", "is unknown"]),
+    ],
+)
+def test_files_that_are_not_right(tmp_path, text, parts):
+    path = written(tmp_path, text)
+    with fails(str(path), *parts):
+        controls.load(path)
+
+
+def test_files_that_cannot_be_read(tmp_path):
+    with fails("nothing.csv: no such file"):
+        controls.load(tmp_path / "nothing.csv")
+    with fails(str(tmp_path), "cannot be read"):
+        controls.load(tmp_path)
+    path = tmp_path / "binary.csv"
+    path.write_bytes(b"\x89HDF\xff\xfe")
+    with fails("binary.csv: not a CSV text file"):
+        controls.load(path)
+    with fails("dt is 0"):
+        controls.load(path, 0)
+
+
+def test_what_cannot_be_saved(tmp_path):
+    with fails("shape (3,)"):
+        controls.save(tmp_path / "a.csv", [1.0, 2.0, 3.0], DT)
+    with fails("a.csv: a tension is nan"):
+        controls.save(tmp_path / "a.csv", [[1.0, np.nan]], DT)
+    with fails("dt is -1"):
+        controls.save(tmp_path / "a.csv", [[1.0]], -1)
+    with fails("cannot be written"):
+        controls.save(tmp_path / "no" / "a.csv", [[1.0]], DT)
+
+
+# the command line
+
+
+@pytest.mark.parametrize(
+    ("specification", "expected"),
+    [
+        ("sine:1.5", lambda: controls.sine(1.5, 40, DT)),
+        ("sine:1.5,base=8,amplitude=2", lambda: controls.sine(1.5, 40, DT, base=8, amplitude=2)),
+        ("step:1.5", lambda: controls.step(1.5, 40, DT)),
+        ("step:2, at=0.5, tendons=2+3", lambda: controls.step(2, 40, DT, at=0.5, tendons=(1, 2))),
+        ("ramp:2", lambda: controls.ramp(2, 40, DT)),
+        ("ramp:2,start=1,end=1.5", lambda: controls.ramp(2, 40, DT, start=1, end=1.5)),
+        ("random:7", lambda: controls.random(40, seed=7)),
+        ("random:7,low=1,high=2,hold=8", lambda: controls.random(40, seed=7, low=1, high=2, hold=8)),
+        ("constant:5", lambda: controls.constant(5, 40)),
+    ],
+)
+def test_specifications(specification, expected):
+    assert np.array_equal(controls.parse(specification, 40, DT), expected())
+
+
+@pytest.mark.parametrize("specification", ["sine:1", "step:1,tendons=1+3", "random:1", "constant:1"])
+def test_specifications_for_three_tendons(specification):
+    assert controls.parse(specification, 5, DT, tendons=3).shape == (5, 3)
+
+
+def test_a_file_as_specification(tmp_path):
+    path = tmp_path / "tensions.csv"
+    tensions = controls.random(20, seed=1)
+    controls.save(path, tensions, DT)
+    assert np.array_equal(controls.parse(str(path), None, DT), tensions)
+    assert np.array_equal(controls.parse(str(path), 5, DT), tensions[:5])
+    assert np.array_equal(controls.parse(str(path), None, 2 * DT), tensions[::2])
+    with fails("there are 20 steps of 0.05 s; 21 are asked for"):
+        controls.parse(str(path), 21, DT)
+    with fails("there are 4 tendons; the robot has 3"):
+        controls.parse(str(path), 5, DT, tendons=3)
+
+
+@pytest.mark.parametrize(
+    ("specification", "parts"),
+    [
+        ("sin:1.5", ["'sin:1.5'", "no such signal or file", "sine:PERIOD", "did you mean sine:PERIOD?"]),
+        ("nothing.csv", ["'nothing.csv'", "no such signal or file", "CSV file"]),
+        ("", ["''", "no such signal or file"]),
+        ("sine", ["'sine'", "period is ''", "a number"]),
+        ("sine:fast", ["period is 'fast'", "a number"]),
+        ("sine:0", ["'sine:0'", "period is 0.0", "above 0"]),
+        ("sine:1.5,speed=2", ["'speed=2' is not understood", "base=…, amplitude=…"]),
+        ("sine:1.5,base=5,base=6", ["'base=6' is not understood"]),
+        ("constant:5,base=5", ["'base=5' is not understood", "nothing"]),
+        ("random:1.5", ["seed is '1.5'", "a whole number"]),
+        ("random:1,hold=x", ["hold is 'x'", "a whole number"]),
+        ("step:1,tendons=a", ["tendons is 'a'", "tendons like 1+4"]),
+        ("step:1,tendons=5", ["tendons is (4,)", "0 to 3"]),
+        ("constant:-1", ["'constant:-1'", "a tension is -1 N"]),
+        ("constant:nan", ["tension is nan"]),
+        ("x" * 5000, ["no such signal or file"]),
+    ],
+)
+def test_specifications_that_are_not_right(specification, parts):
+    with fails(*parts):
+        controls.parse(specification, 10, DT)
+
+
+def test_a_signal_needs_a_number_of_steps():
+    with fails("'sine:1.5'", "number of steps"):
+        controls.parse("sine:1.5", None, DT)
