@@ -1,0 +1,54 @@
+PYTHON ?= python3
+JOBS ?= 2
+PYTEST_ARGS ?=
+
+BIN := .venv/bin
+# Named after the place too, because an environment is bound to it: a copied checkout has to make its own.
+READY := .venv/.ready-$(shell printf %s '$(CURDIR)' | cksum | cut -d ' ' -f 1)
+
+# Packages of another Python (a sourced ROS set-up, say) would be found before the locked ones.
+unexport PYTHONPATH
+unexport PYTHONHOME
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test test-all lint types format bench lock clean distclean
+
+help: ## show this list
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' Makefile
+
+$(READY): requirements.lock pyproject.toml tools/bootstrap.py
+	@$(PYTHON) tools/bootstrap.py
+	@touch $@
+
+demo: $(READY) ## simulate the demonstration robot and write the results to demo/
+	$(BIN)/python examples/demo.py --out demo/
+
+test: $(READY) ## run the tests, but for the long ones
+	$(BIN)/python -m pytest -n $(JOBS) -m "not campaign" $(PYTEST_ARGS)
+
+test-all: $(READY) ## run all the tests, the long ones too
+	$(BIN)/python -m pytest -n $(JOBS) $(PYTEST_ARGS)
+
+lint: $(READY) ## check style and formatting
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+
+types: $(READY) ## check the types
+	$(BIN)/mypy
+
+format: $(READY) ## format the code, and fix what can be fixed without a decision
+	$(BIN)/ruff check --fix-only
+	$(BIN)/ruff format
+
+bench: $(READY) ## run the benchmarks
+	$(BIN)/python -m benchmarks.run
+
+lock: ## write requirements.lock anew from pyproject.toml (UPGRADE=1: with the newest versions)
+	$(PYTHON) tools/bootstrap.py lock $(if $(UPGRADE),--upgrade)
+
+clean: ## remove outputs and caches
+	rm -rf demo build dist .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	find src tests examples benchmarks tools -name __pycache__ -type d -prune -exec rm -rf {} + 2>/dev/null || true
+
+distclean: clean ## remove the virtual environment too
+	rm -rf .venv
