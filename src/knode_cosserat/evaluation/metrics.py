@@ -13,7 +13,6 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 
@@ -149,6 +148,9 @@ def _rms_distance(a: Array, b: Array) -> Array:
 
 
 def _euler_angles(quaternion: Array) -> Array:
+    # imported here: it takes longer than all the rest of this package
+    from scipy.spatial.transform import Rotation
+
     scalar_last = np.roll(quaternion, -1, axis=-1)
     angles = Rotation.from_quat(scalar_last.reshape(-1, 4)).as_euler("zyx")
     return angles.reshape(*quaternion.shape[:-1], 3)

@@ -14,6 +14,7 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import StepProblem, newton
 from knode_cosserat.solvers.linear import Condensed
 from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.space import Euler
 from knode_cosserat.solvers.time import BDF1
 
 #: how many past states the warm start looks at, and the extrapolations it chooses from: constant, linear,
@@ -44,19 +45,22 @@ class Rows(NamedTuple):
 
 
 def rest_record(system: System) -> Any:
-    """The record (nodes, x) of the system at rest; y_s of the record is found from y itself."""
+    """y and z (nodes, y + z) of the system at rest."""
     s = jnp.linspace(0.0, 1.0, system.nodes) * system.length
     y, z = jax.vmap(system.rest)(s)
     return jnp.concatenate([y, z], axis=1)
 
 
-def initial_past(system: System, record: Any) -> Past:
-    """A past of one state only: every state before the first is the first."""
-    ny = system.y_layout.size
-    if system.mixed and record.shape[1] == ny + system.z_layout.size:
-        y = record[:, :ny]
-        ds = system.length / (system.nodes - 1)
-        record = jnp.concatenate([record, jnp.gradient(y, axis=0) / ds], axis=1)
+def initial_past(system: System, record: Any, control: Any) -> Past:
+    """A past of one state (y and z, nodes × x) only: every state before the first is the first.
+
+    Where B is not zero y_s belongs to a record too: it is found from y as at rest under the control.
+    """
+    ny, nz = system.y_layout.size, system.z_layout.size
+    if system.mixed:
+        nothing = jnp.zeros((system.nodes, ny + nz + ny))
+        still = StepProblem(system, jnp.zeros(()), control, jnp.zeros(()), nothing, Euler())
+        record = jnp.concatenate([record, still.record(record[:, :ny])[:, ny + nz :]], axis=1)
     unknowns = system.unknowns(record[0, :ny])
     return Past(
         jnp.stack([record] * PAST), jnp.zeros_like(record), jnp.stack([unknowns] * PAST), jnp.array(0)

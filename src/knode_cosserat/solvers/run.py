@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from scipy.interpolate import make_interp_spline
 from tqdm import tqdm
 
 from knode_cosserat.rods.system import System
@@ -93,6 +92,9 @@ def _with_finer_segments(
     task: Task, system: System, parts: int, controls: np.ndarray, start: Start, progress: bool
 ) -> Steps | None:
     """The same robot with every segment divided, given at its own nodes; None if that fails too."""
+    # imported here, where it is rarely needed: it would double this package's import time
+    from scipy.interpolate import make_interp_spline
+
     fine = system.replace(nodes=parts * (system.nodes - 1) + 1)
     coarse_s, fine_s = np.linspace(0.0, 1.0, system.nodes), np.linspace(0.0, 1.0, fine.nodes)
 

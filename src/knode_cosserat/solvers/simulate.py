@@ -152,7 +152,7 @@ def _check_initial(system: System, initial: Trajectory, batch: int | None) -> No
 
 def _at_rest(system: System) -> Any:
     record = rest_record(system)
-    return record, initial_past(system, record)
+    return record, initial_past(system, record, jnp.zeros(system.control_size))
 
 
 _jit_at_rest = jax.jit(_at_rest)
@@ -175,7 +175,7 @@ def _going_on(
     system: System, initial: Trajectory, settings: Settings, dt: float
 ) -> tuple[Any, Start, float, bool]:
     records = jnp.concatenate([initial.y, initial.z], axis=-1)
-    past = initial_past(system, records[-1])
+    past = initial_past(system, records[-1], initial.control[-1])
     time = np.asarray(initial.time)
     regular = len(time) > 1 and np.isclose(time[-1] - time[-2], dt)
     going_on = bool(regular and not system.mixed and not isinstance(settings.time, Static))

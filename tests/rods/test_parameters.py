@@ -1,0 +1,50 @@
+"""Parameters by name: what follows from them, and what is refused."""
+
+import numpy as np
+import pytest
+
+import knode_cosserat as kc
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return kc.load_robot("delrin-tendon-robot")
+
+
+def test_dependent_stiffness_follows_unless_given(robot):
+    stiffer = robot.replace(youngs_modulus=10e9)
+    I, A = np.pi * 0.003175**4 / 4, np.pi * 0.003175**2
+    np.testing.assert_allclose(np.diag(stiffer.Kbt), 10e9 * I * np.array([1.0, 1.0, 2.0 / 2.6]))
+    np.testing.assert_allclose(np.diag(stiffer.Kse), 10e9 * A * np.array([1 / 2.6, 1 / 2.6, 1.0]))
+    given = robot.replace(bending_stiffness=[0.3, 0.3, 0.2])
+    np.testing.assert_array_equal(given.replace(youngs_modulus=10e9).Kbt, np.diag([0.3, 0.3, 0.2]))
+    np.testing.assert_allclose(robot.replace(shear_modulus=1e9).Kse[0, 0], 1e9 * A)
+
+
+@pytest.mark.parametrize("given", [0.1, [0.1, 0.1, 0.1], 0.1 * np.eye(3)])
+def test_matrices_in_three_ways(robot, given):
+    np.testing.assert_array_equal(robot.replace(bending_damping=given).bending_damping, 0.1 * np.eye(3))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"youngs_modulo": 1e9}, "no parameter 'youngs_modulo'; there are length, radius"),
+        ({"length": -0.1}, "length is -0.1; allowed is a number 0.001 to 20 m"),
+        ({"length": "long"}, "length is 'long'"),
+        ({"length": [1.0, 2.0]}, r"length has shape \(2,\)"),
+        ({"density": np.nan}, "density is nan"),
+        ({"nodes": 1}, "nodes is 1; allowed is a whole number"),
+        ({"nodes": 10.0}, "nodes is 10.0"),
+        ({"gravity": [0.0, 1.0]}, r"gravity has shape \(2,\)"),
+        ({"bending_stiffness": [[1.0, 0.5, 0], [0, 1, 0], [0, 0, 1]]}, "bending_stiffness is not symmetric"),
+        ({"bending_stiffness": [-1.0, 1.0, 1.0]}, "bending_stiffness is .*; allowed is one number, three"),
+        ({"drag": ["1", "2", "3"]}, "drag is"),
+        ({"drag": [True, True, False]}, "drag is"),
+        ({"drag": [[1.0], [1.0, 2.0]]}, "drag is"),
+    ],
+)
+def test_what_is_refused(robot, change, message):
+    with pytest.raises(kc.ParameterError, match=message) as caught:
+        robot.replace(**change)
+    assert "\n" not in str(caught.value)
