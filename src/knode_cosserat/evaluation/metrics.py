@@ -148,7 +148,7 @@ def _rms_distance(a: Array, b: Array) -> Array:
 
 
 def _euler_angles(quaternion: Array) -> Array:
-    # imported here: it takes longer than all the rest of this package
+    # imported here: it takes a third of a second
     from scipy.spatial.transform import Rotation
 
     scalar_last = np.roll(quaternion, -1, axis=-1)

@@ -62,9 +62,9 @@ def initial_past(system: System, record: Any, control: Any) -> Past:
         still = StepProblem(system, jnp.zeros(()), control, jnp.zeros(()), nothing, Euler())
         record = jnp.concatenate([record, still.record(record[:, :ny])[:, ny + nz :]], axis=1)
     unknowns = system.unknowns(record[0, :ny])
-    return Past(
-        jnp.stack([record] * PAST), jnp.zeros_like(record), jnp.stack([unknowns] * PAST), jnp.array(0)
-    )
+    # an order of a definite type: a weak one would cost a second compilation when a march goes on
+    order = jnp.zeros((), dtype=int)
+    return Past(jnp.stack([record] * PAST), jnp.zeros_like(record), jnp.stack([unknowns] * PAST), order)
 
 
 def coefficient_table(settings: Settings, dt: float) -> np.ndarray:

@@ -78,7 +78,7 @@ class _Step:
 
     def after(self, solution: Solution, record: Any) -> Past:
         rate = self.coefficients[0] * record + self.history
-        return advanced(self.past, record, solution.unknowns, rate, jnp.array(0))
+        return advanced(self.past, record, solution.unknowns, rate, jnp.zeros((), dtype=int))
 
 
 def recover(

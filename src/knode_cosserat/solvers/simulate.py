@@ -183,7 +183,7 @@ def _going_on(
         rows = [records[max(-k, -records.shape[0])] for k in (1, 2, 3)]
         unknowns = [system.unknowns(row[0, : system.y_layout.size]) for row in rows]
         rate = (1.5 * rows[0] - 2.0 * rows[1] + 0.5 * rows[2]) / dt
-        past = Past(jnp.stack(rows), rate, jnp.stack(unknowns), jnp.array(1))
+        past = Past(jnp.stack(rows), rate, jnp.stack(unknowns), jnp.ones((), dtype=int))
     return records[-1], Start(past, initial.control[-1]), float(time[-1]), going_on
 
 
