@@ -33,14 +33,17 @@ def seconds(function: Callable[[], Any]) -> float:
     return time.perf_counter() - begin
 
 
-def medians(functions: dict[str, Callable[[], Any]], rounds: int) -> dict[str, float]:
-    """Median seconds of each function, called in turn."""
-    for function in functions.values():
-        function()
+def medians(functions: dict[str, Callable[[], Any]], rounds: int, repeats: int = 1) -> dict[str, float]:
+    """Median seconds of each function: in turn, in every round as many calls as fit the slowest's one.
+
+    At most `repeats`: a short call after a long one of something else finds cold caches.
+    """
+    once = {name: min(seconds(function) for _ in range(2)) for name, function in functions.items()}
+    calls = {name: max(1, min(repeats, int(max(once.values()) / taken))) for name, taken in once.items()}
     found: dict[str, list[float]] = {name: [] for name in functions}
     for _ in range(rounds):
         for name, function in functions.items():
-            found[name].append(seconds(function))
+            found[name] += [seconds(function) for _ in range(calls[name])]
     return {name: statistics.median(times) for name, times in found.items()}
 
 
@@ -66,6 +69,7 @@ def steps() -> dict[str, Any]:
                 ),
             },
             rounds=5,
+            repeats=20,
         )
         found[name] = {**both, "ratio": both["transcription"] / both["package"]}
     robots = {nodes: robot.replace(nodes=nodes) for nodes in (10, 40, 100)}

@@ -1,8 +1,8 @@
 """Why a time step is solved at all nodes at once: the same equations by single shooting, measured beside it.
 
-`python -m benchmarks.elimination` prints, for each way, the time of a step and how far a load can be applied in
-one go from the straight rod. Single shooting: y is integrated from base to tip, with the derivatives to the six
-base unknowns carried along, and Newton's method works on those six alone.
+`python -m benchmarks.elimination` prints, for each way, the time of a step and how far a load can be applied
+in one go from the straight rod. Single shooting: y is integrated from base to tip, with the derivatives to
+the six base unknowns carried along, and Newton's method works on those six alone.
 """
 
 from __future__ import annotations
@@ -124,7 +124,9 @@ def main() -> None:
     for nodes in (10, 40, 100):
         robot = catalog_robot.replace(nodes=nodes)
         calls = {
-            name: functools.partial(lambda run, robot: jax.block_until_ready(run(robot, controls)), run, robot)
+            name: functools.partial(
+                lambda run, robot: jax.block_until_ready(run(robot, controls)), run, robot
+            )
             for name, run in rollouts.items()
         }
         for name, taken in medians(calls, rounds=15).items():
