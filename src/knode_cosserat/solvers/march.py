@@ -96,9 +96,12 @@ def step(system: System, settings: Settings, past: Past, coefficients: Any, cont
     ny = system.y_layout.size
     history = history_of(past, coefficients, settings)
     problem = StepProblem(system, t, control, coefficients[0], history, settings.space)
-    guesses = jnp.einsum("ep,pny->eny", EXTRAPOLATIONS, past.records[:, :, :ny])
+    # as sums of products, not as matrix products: XLA fuses these with what follows
+    guesses = jnp.sum(EXTRAPOLATIONS[:, :, None, None] * past.records[None, :, :, :ny], axis=1)
     weights = jnp.asarray(EXTRAPOLATIONS)[past.order]
-    solution = newton(problem, guesses[past.order], weights @ past.unknowns, Condensed(), settings.newton)
+    guess = jnp.sum(weights[:, None, None] * past.records[:, :, :ny], axis=0)
+    unknowns = jnp.sum(weights[:, None] * past.unknowns, axis=0)
+    solution = newton(problem, guess, unknowns, Condensed(), settings.newton)
     record = problem.record(solution.y)
     scale = system.scales().y
     misfit = jnp.max(jnp.abs(guesses - solution.y) / scale, axis=(1, 2))

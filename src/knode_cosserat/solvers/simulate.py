@@ -246,9 +246,9 @@ def _trajectory(run: _Run, record: Any, control: Any, t0: float, steps: Steps) -
     records = numeric.where(invalid[..., None, None], numeric.nan, steps.records[..., : ny + nz])
 
     def joined(first: Any, rest: Any) -> Any:
-        return numeric.concatenate([numeric.expand_dims(numeric.asarray(first), axis), rest], axis)
+        return numeric.concatenate([numeric.expand_dims(first, axis), rest], axis)
 
-    states = joined(record[..., : ny + nz], records)
+    states = joined(numeric.asarray(record)[..., : ny + nz], records)
     zero = numeric.zeros(states.shape[:axis])
     return Trajectory(
         system=system,
