@@ -47,7 +47,7 @@ def test_it_swings_and_comes_to_rest(string):
 
 
 def test_its_velocity_is_that_of_its_position(string):
-    """q_s = p_st holds through the history of y_s: q is the rate of p at every node, to the scheme's order."""
+    """q_s = p_st holds through the history of y_s: q is the rate of p at every node, to RK4's order."""
     t = np.arange(1, 41) * 0.05
     hand = HAND + np.stack([0.05 * np.sin(np.pi * t) ** 2, 0.0 * t], axis=1)
     errors = []

@@ -1,8 +1,8 @@
 """Random robots, controls and grids: each is solved, or says why not.
 
 What is drawn: E from 1 MPa to 200 GPa, radius 0.3 to 10 mm, length 0.1 to 2 m, time step 1 to 100 ms, 5 to
-100 nodes; sines, steps and random tensions, scaled so that transverse load·L³/EI ≤ 6 and weight·L²/EI ≤ 5. The
-rest is the paper's robot. Node counts are drawn from a few: each costs a compilation.
+100 nodes; sines, steps and random tensions, scaled so that transverse load·L³/EI ≤ 6 and weight·L²/EI ≤ 5.
+The rest is the paper's robot. Node counts are drawn from a few: each costs a compilation.
 """
 
 import collections
