@@ -31,6 +31,8 @@ class Past(NamedTuple):
     unknowns: Float[Any, "past k"]
     #: the extrapolation that would have been best for the newest step
     order: Int[Any, ""]
+    #: time of row 0 (s): step i ends at t0 + (i + 1) dt
+    t0: Float[Any, ""]
 
 
 class Rows(NamedTuple):
@@ -64,7 +66,32 @@ def initial_past(system: System, record: Any, control: Any) -> Past:
     unknowns = system.unknowns(record[0, :ny])
     # an order of a definite type: a weak one would cost a second compilation when a march goes on
     order = jnp.zeros((), dtype=int)
-    return Past(jnp.stack([record] * PAST), jnp.zeros_like(record), jnp.stack([unknowns] * PAST), order)
+    return Past(
+        jnp.stack([record] * PAST), jnp.zeros_like(record), jnp.stack([unknowns] * PAST), order, jnp.zeros(())
+    )
+
+
+def going_on_past(system: System, settings: Settings, dt: float, records: Any, t0: Any) -> Past:
+    """The past after a trajectory's rows (rows, nodes, x) at the same time step, its last at time t0.
+
+    The rate of a row is its scheme's own, from the first row on, where there was none.
+    """
+    newest = [records[max(-k, -len(records))] for k in (1, 2, 3)]
+    unknowns = [system.unknowns(record[0, : system.y_layout.size]) for record in newest]
+    rate = jnp.zeros_like(newest[0])
+    if settings.time.uses_rate:
+        table = jnp.asarray(coefficient_table(settings, dt))
+        before = jnp.concatenate([records[:1], records[:-1]])
+
+        def one(rate: Any, row: Any) -> Any:
+            i, now, last, last_but_one = row
+            c0, c1, c2, d1 = jnp.where(i == 0, table[0], table[1])
+            return c0 * now + c1 * last + c2 * last_but_one + d1 * rate, None
+
+        rows = (jnp.arange(len(records) - 1), records[1:], before[1:], before[:-1])
+        rate, _ = jax.lax.scan(one, rate, rows)
+    order = jnp.ones((), dtype=int)
+    return Past(jnp.stack(newest), rate, jnp.stack(unknowns), order, jnp.asarray(t0, dtype=float))
 
 
 def coefficient_table(settings: Settings, dt: float) -> np.ndarray:
@@ -83,11 +110,11 @@ def history_of(past: Past, coefficients: Any, settings: Settings) -> Any:
 
 def advanced(past: Past, record: Any, unknowns: Any, rate: Any, order: Any) -> Past:
     """The past of the next step."""
-    return Past(
-        jnp.concatenate([record[None], past.records[:-1]]),
-        rate,
-        jnp.concatenate([unknowns[None], past.unknowns[:-1]]),
-        order,
+    return past._replace(
+        records=jnp.concatenate([record[None], past.records[:-1]]),
+        rate=rate,
+        unknowns=jnp.concatenate([unknowns[None], past.unknowns[:-1]]),
+        order=order,
     )
 
 
@@ -114,7 +141,7 @@ def step(system: System, settings: Settings, past: Past, coefficients: Any, cont
 def march(
     system: System, settings: Settings, table: Any, controls: Any, dt: Any, past: Past, start: Any, stop: Any
 ) -> tuple[Any, Past, Rows]:
-    """Steps `start` to `stop` (exclusive; step i uses controls[i] and ends at t = (i + 1) dt).
+    """Steps `start` to `stop` (exclusive; step i uses controls[i] and ends at t0 + (i + 1) dt).
 
     Ends early at a step that does not converge. Gives how many steps are done, the past of the step that is
     next, and the rows of all steps that were tried; the rest of the rows are zero.
@@ -135,7 +162,7 @@ def march(
     def one(state: Any) -> Any:
         i, _, past, rows = state
         coefficients = jnp.where(i == 0, table[0], table[1])
-        after, row = step(system, settings, past, coefficients, controls[i], (i + 1) * dt)
+        after, row = step(system, settings, past, coefficients, controls[i], past.t0 + (i + 1) * dt)
         failed = ~(row.error <= settings.newton.acceptable)
         past = jax.tree.map(lambda new, old: jnp.where(failed, old, new), after, past)
         rows = jax.tree.map(lambda all_rows, value: all_rows.at[i].set(value), rows, row)

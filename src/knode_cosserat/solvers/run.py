@@ -128,7 +128,7 @@ def _with_recovery(
                 outcome = recover(
                     system, task.settings, past, table[min(reached, 1)],
                     (controls[reached - 1] if reached else start.control, controls[reached]),
-                    (reached + 1) * task.dt, task.dt,
+                    float(past.t0) + (reached + 1) * task.dt, task.dt,
                 )  # fmt: skip
                 past = outcome.past
                 _set_row(rows, reached, outcome)

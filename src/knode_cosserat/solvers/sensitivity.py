@@ -71,7 +71,7 @@ def _tangent_march(
         past, d_recent, d_rate = carry
         i, record, xi, control, d_control = now
         coefficients = jnp.where(i == 0, table[0], table[1])
-        t = (i + 1) * dt
+        t = past.t0 + (i + 1) * dt
         y = record[:, :ny]
         history = history_of(past, coefficients, settings)
         d_history = coefficients[1] * d_recent[0] + coefficients[2] * d_recent[1]

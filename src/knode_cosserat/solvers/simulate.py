@@ -13,7 +13,7 @@ import numpy as np
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.solvers import sensitivity
 from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.march import Past, initial_past, rest_record
+from knode_cosserat.solvers.march import going_on_past, initial_past, rest_record
 from knode_cosserat.solvers.result import Result, SimulationError
 from knode_cosserat.solvers.run import Start, Steps, Task, run_batch, run_one
 from knode_cosserat.solvers.settings import Settings
@@ -159,7 +159,7 @@ _jit_at_rest = jax.jit(_at_rest)
 _jit_all_at_rest = jax.jit(jax.vmap(_at_rest))
 
 
-def _beginning(run: _Run) -> tuple[Any, Start, float, bool]:
+def _beginning(run: _Run) -> tuple[Any, Start, Any, bool]:
     """The initial record(s), the start, its time, and whether the motion goes on from before."""
     system, controls, initial, settings, dt, batch, many = run
     if initial is not None:
@@ -173,18 +173,17 @@ def _beginning(run: _Run) -> tuple[Any, Start, float, bool]:
 
 def _going_on(
     system: System, initial: Trajectory, settings: Settings, dt: float
-) -> tuple[Any, Start, float, bool]:
+) -> tuple[Any, Start, Any, bool]:
     records = jnp.concatenate([initial.y, initial.z], axis=-1)
-    past = initial_past(system, records[-1], initial.control[-1])
-    time = np.asarray(initial.time)
-    regular = len(time) > 1 and np.isclose(time[-1] - time[-2], dt)
+    time = initial.time
+    # of traced times nothing can be said but that a trajectory's rows are as far apart as it is to go on
+    regular = len(time) > 1 and (is_traced(time) or np.isclose(time[-1] - time[-2], dt))
     going_on = bool(regular and not system.mixed and not isinstance(settings.time, Static))
     if going_on:
-        rows = [records[max(-k, -records.shape[0])] for k in (1, 2, 3)]
-        unknowns = [system.unknowns(row[0, : system.y_layout.size]) for row in rows]
-        rate = (1.5 * rows[0] - 2.0 * rows[1] + 0.5 * rows[2]) / dt
-        past = Past(jnp.stack(rows), rate, jnp.stack(unknowns), jnp.ones((), dtype=int))
-    return records[-1], Start(past, initial.control[-1]), float(time[-1]), going_on
+        past = going_on_past(system, settings, dt, records, time[-1])
+    else:
+        past = initial_past(system, records[-1], initial.control[-1])._replace(t0=jnp.asarray(time[-1]))
+    return records[-1], Start(past, initial.control[-1]), time[-1], going_on
 
 
 # the three ways to run
@@ -196,7 +195,7 @@ def _single(run: _Run, on_failure: str, progress: bool) -> Trajectory:
     task = Task(settings, dt, len(controls), going_on)
     steps, cause = run_one(task, system, controls, start, progress)
     if on_failure == "raise" and steps.result.min() < 0:
-        raise _failure(task, steps, cause, None)
+        raise _failure(task, float(t0), steps, cause, None)
     return _trajectory(run, record, start.control, t0, steps)
 
 
@@ -207,15 +206,15 @@ def _batch(run: _Run, on_failure: str, progress: bool) -> Trajectory:
     steps, causes = run_batch(task, system, many, controls, start, progress)
     if on_failure == "raise" and causes:
         robot, cause = next(iter(causes.items()))
-        raise _failure(task, Steps(*(leaf[robot] for leaf in steps)), cause, robot)
+        raise _failure(task, 0.0, Steps(*(leaf[robot] for leaf in steps)), cause, robot)
     return _trajectory(run, record, start.control, t0, steps)
 
 
-def _failure(task: Task, steps: Steps, cause: str, robot: int | None) -> SimulationError:
+def _failure(task: Task, t0: float, steps: Steps, cause: str, robot: int | None) -> SimulationError:
     i = int(np.argmax(steps.result < 0))
     number = 0 if isinstance(task.settings.time, Static) else i + 1
     return SimulationError(
-        number, number * task.dt, float(steps.error[i]), Result(int(steps.result[i])), cause, robot
+        number, t0 + number * task.dt, float(steps.error[i]), Result(int(steps.result[i])), cause, robot
     )
 
 
@@ -236,7 +235,7 @@ def _traced(system, controls, initial, settings, dt, batch, many):  # type: igno
     return _trajectory(run, record, start.control, t0, Steps._make([*rows, result]))
 
 
-def _trajectory(run: _Run, record: Any, control: Any, t0: float, steps: Steps) -> Trajectory:
+def _trajectory(run: _Run, record: Any, control: Any, t0: Any, steps: Steps) -> Trajectory:
     """Put the initial row before the steps, and NaN where there is no solution."""
     system, controls, _, settings, dt, batch, _ = run
     numeric: Any = jnp if is_traced((record, steps)) else np
