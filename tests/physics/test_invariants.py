@@ -141,18 +141,23 @@ def test_damped_motion_ends_in_equilibrium(robot):
 # the same in pieces, and side by side
 
 
+# The rate at a trajectory's first row is not kept, and the trapezoidal rule never forgets it.
+first_rate_unknown = pytest.mark.xfail(reason="a trajectory that began in motion has lost its first rate")
+
+
 @pytest.mark.parametrize(
-    ("time", "start"), [("bdf1", "paper"), ("bdf2", "paper"), ("bdf-alpha", "consistent")]
+    "time", ["bdf1", "bdf2", "bdf-alpha", pytest.param("trapezoidal", marks=first_rate_unknown)]
 )
-def test_motion_goes_on_from_a_trajectory(robot, time, start):
-    options = {"time": time, "start": start}
-    whole = kc.simulate(robot, CONTROLS, DT, **options)
+def test_motion_goes_on_from_a_trajectory(robot, time):
+    whole = kc.simulate(robot, CONTROLS, DT, time=time)
     # longer pieces than needed: the program for this many steps is there already
-    first = kc.simulate(robot, CONTROLS[:80], DT, **options)[:41]
-    rest = kc.simulate(robot, CONTROLS[40:], DT, initial=first, **options)
-    np.testing.assert_allclose(rest.time, whole.time[40:], rtol=1e-12)
-    np.testing.assert_array_equal(rest.control, whole.control[40:])
-    assert_same(rest, whole[40:])
+    first = kc.simulate(robot, CONTROLS[:80], DT, time=time)[:21]
+    second = kc.simulate(robot, CONTROLS[20:100], DT, time=time, initial=first)[:21]
+    third = kc.simulate(robot, CONTROLS[40:], DT, time=time, initial=second)
+    np.testing.assert_allclose(third.time, whole.time[40:], rtol=1e-12)
+    np.testing.assert_array_equal(third.control, whole.control[40:])
+    assert_same(second, whole[20:41])
+    assert_same(third, whole[40:])
 
 
 def test_batch_of_controls_is_each_by_itself(robot):

@@ -138,6 +138,31 @@ def step(system: System, settings: Settings, past: Past, coefficients: Any, cont
     return advanced(past, record, solution.unknowns, rate, jnp.argmin(misfit)), row
 
 
+def _no_rows(shape: tuple[int, ...], past: Past) -> Rows:
+    """Rows of zeros, (steps,) or (robots, steps), for what a past is like."""
+    return Rows(
+        jnp.zeros((*shape, *past.records.shape[-2:])),
+        jnp.zeros((*shape, past.unknowns.shape[-1])),
+        jnp.zeros(shape),
+        jnp.zeros(shape, dtype=int),
+        jnp.zeros(shape),
+    )
+
+
+def _attempt(
+    system: System, settings: Settings, table: Any, past: Past, control: Any, i: Any, dt: Any
+) -> tuple[Any, Past, Rows]:
+    """Step i: whether it failed, the past of the step that is next (this one, if it failed), and its row."""
+    coefficients = jnp.where(i == 0, table[0], table[1])
+    after, row = step(system, settings, past, coefficients, control, past.t0 + (i + 1) * dt)
+    failed = ~(row.error <= settings.newton.acceptable)
+    return failed, _where(failed, past, after), row
+
+
+def _where(condition: Any, one: Any, other: Any) -> Any:
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), one, other)
+
+
 def march(
     system: System, settings: Settings, table: Any, controls: Any, dt: Any, past: Past, start: Any, stop: Any
 ) -> tuple[Any, Past, Rows]:
@@ -146,14 +171,6 @@ def march(
     Ends early at a step that does not converge. Gives how many steps are done, the past of the step that is
     next, and the rows of all steps that were tried; the rest of the rows are zero.
     """
-    capacity = controls.shape[0]
-    empty = Rows(
-        jnp.zeros((capacity, *past.records.shape[1:])),
-        jnp.zeros((capacity, past.unknowns.shape[1])),
-        jnp.zeros(capacity),
-        jnp.zeros(capacity, dtype=int),
-        jnp.zeros(capacity),
-    )
 
     def going(state: Any) -> Any:
         i, failed, _, _ = state
@@ -161,15 +178,49 @@ def march(
 
     def one(state: Any) -> Any:
         i, _, past, rows = state
-        coefficients = jnp.where(i == 0, table[0], table[1])
-        after, row = step(system, settings, past, coefficients, controls[i], past.t0 + (i + 1) * dt)
-        failed = ~(row.error <= settings.newton.acceptable)
-        past = jax.tree.map(lambda new, old: jnp.where(failed, old, new), after, past)
+        failed, past, row = _attempt(system, settings, table, past, controls[i], i, dt)
         rows = jax.tree.map(lambda all_rows, value: all_rows.at[i].set(value), rows, row)
         return jnp.where(failed, i, i + 1), failed, past, rows
 
-    done, _, past, rows = jax.lax.while_loop(going, one, (start, jnp.array(False), past, empty))
+    state = (start, jnp.array(False), past, _no_rows(controls.shape[:1], past))
+    done, _, past, rows = jax.lax.while_loop(going, one, state)
     return done, past, rows
+
+
+def march_in_turn(
+    system: System,
+    settings: Settings,
+    table: Any,
+    controls: Any,
+    dt: Any,
+    pasts: Past,
+    stop: Any,
+    batched: Any,
+) -> tuple[Any, Rows]:
+    """All steps of one robot after the other: how many steps each has done, and all rows.
+
+    One loop over robots and steps, not a loop in a loop: XLA copies all rows at every turn of an inner loop.
+    """
+    size = controls.shape[0]
+
+    def own(tree: Any, robot: Any) -> Any:
+        return jax.tree.map(lambda leaf: leaf[robot], tree)
+
+    def one(state: Any) -> Any:
+        robot, i, past, done, rows = state
+        this = own(system, robot) if batched else system
+        failed, past, row = _attempt(this, settings, table, past, controls[robot, i], i, dt)
+        rows = jax.tree.map(lambda all_rows, value: all_rows.at[robot, i].set(value), rows, row)
+        done = done.at[robot].set(jnp.where(failed, i, i + 1))
+        ended = failed | (i + 1 >= stop)
+        following = jnp.where(ended, robot + 1, robot)
+        past = _where(ended, own(pasts, jnp.minimum(following, size - 1)), past)
+        return following, jnp.where(ended, 0, i + 1), past, done, rows
+
+    zero = jnp.zeros((), dtype=int)
+    state = (zero, zero, own(pasts, 0), jnp.zeros(size, dtype=int), _no_rows(controls.shape[:2], pasts))
+    _, _, _, done, rows = jax.lax.while_loop(lambda state: state[0] < size, one, state)
+    return done, rows
 
 
 @functools.partial(jax.jit, static_argnames="settings")
@@ -179,16 +230,17 @@ def march_one(system, settings, table, controls, dt, past, start, stop):  # type
 
 
 @functools.partial(jax.jit, static_argnames=("settings", "batched", "lockstep"))
-def march_many(system, settings, table, controls, dt, past, start, stop, batched, lockstep):  # type: ignore[no-untyped-def]
-    """`march` for a batch, compiled once: controls (B, T, c), and a batch of systems if `batched`.
+def march_many(system, settings, table, controls, dt, pasts, stop, batched, lockstep):  # type: ignore[no-untyped-def]
+    """A batch, compiled once: controls (B, T, c), and a batch of systems if `batched`.
 
     On a CPU the robots run one after the other, each with its own number of Newton corrections; together in
     lockstep they would all wait for the slowest, which measured half as fast. On a GPU lockstep wins.
     """
+    if not lockstep:
+        return march_in_turn(system, settings, table, controls, dt, pasts, stop, batched)
 
-    def one(batch: Any) -> Any:
-        own, control, past = batch
-        return march(own if batched else system, settings, table, control, dt, past, start, stop)
+    def one(system: System, control: Any, past: Past) -> tuple[Any, Rows]:
+        done, _, rows = march(system, settings, table, control, dt, past, 0, stop)
+        return done, rows
 
-    batch = (system if batched else None, controls, past)
-    return jax.vmap(one)(batch) if lockstep else jax.lax.map(one, batch)
+    return jax.vmap(one, in_axes=(0 if batched else None, 0, 0))(system, controls, pasts)

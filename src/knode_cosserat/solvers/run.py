@@ -164,8 +164,8 @@ def run_batch(
             # the last chunk is filled up with its last robot: one shape, one program
             index = np.minimum(np.arange(first, first + chunk), size - 1)
             past = jax.tree.map(lambda leaf: leaf[index], start.past)
-            done, _, rows = march_many(
-                robot(index), task.settings, task.table, padded[index], task.dt, past, 0, task.steps, batched,
+            done, rows = march_many(
+                robot(index), task.settings, task.table, padded[index], task.dt, past, task.steps, batched,
                 lockstep,
             )  # fmt: skip
             count = min(chunk, size - first)
