@@ -24,10 +24,10 @@ demo: $(READY) ## simulate the demonstration robot and write the results to demo
 	$(BIN)/python examples/demo.py --out demo/
 
 test: $(READY) ## run the tests, but for the long ones
-	$(BIN)/python -m pytest -n $(JOBS) -m "not campaign" $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile -m "not campaign" $(PYTEST_ARGS)
 
 test-all: $(READY) ## run all the tests, the long ones too
-	$(BIN)/python -m pytest -n $(JOBS) $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile $(PYTEST_ARGS)
 
 lint: $(READY) ## check style and formatting
 	$(BIN)/ruff check

@@ -8,7 +8,18 @@ from __future__ import annotations
 from typing import Any
 
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Float
+
+# `lax` directly, because indexing by brackets takes ten times as long to trace, and these are traced often
+
+
+def _parts(vector: Any) -> list[Any]:
+    return [lax.index_in_dim(vector, i, 0, keepdims=False) for i in range(vector.shape[0])]
+
+
+def _columns(matrix: Any) -> list[Any]:
+    return [lax.index_in_dim(matrix, i, 1, keepdims=False) for i in range(matrix.shape[1])]
 
 
 def dot(matrix: Float[Any, "i j"], vector: Float[Any, " j"]) -> Float[Any, " i"]:
@@ -17,17 +28,17 @@ def dot(matrix: Float[Any, "i j"], vector: Float[Any, " j"]) -> Float[Any, " i"]
     XLA fuses this form with the arithmetic around it. A `matrix @ vector` becomes a kernel of its own:
     the linearisation of the rod's equations then takes three times as long.
     """
-    total = matrix[:, 0] * vector[0]
-    for column in range(1, matrix.shape[1]):
-        total = total + matrix[:, column] * vector[column]
+    columns, factors = _columns(matrix), _parts(vector)
+    total = columns[0] * factors[0]
+    for column, factor in zip(columns[1:], factors[1:], strict=True):
+        total = total + column * factor
     return total
 
 
 def cross(a: Float[Any, "3"], b: Float[Any, "3"]) -> Float[Any, "3"]:
     """Cross product: the paper's hat operator applied, a × b = â b."""
-    return jnp.stack(
-        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]],
-    )
+    (ax, ay, az), (bx, by, bz) = _parts(a), _parts(b)
+    return jnp.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
 def rotation_matrix(h: Float[Any, "4"]) -> Float[Any, "3 3"]:
@@ -35,7 +46,7 @@ def rotation_matrix(h: Float[Any, "4"]) -> Float[Any, "3 3"]:
 
     The division by h·h makes R orthogonal although the integration in s never normalises h.
     """
-    w, x, y, z = h[0], h[1], h[2], h[3]
+    w, x, y, z = _parts(h)
     k = 2.0 / (w * w + x * x + y * y + z * z)
     return jnp.stack(
         [
@@ -48,13 +59,13 @@ def rotation_matrix(h: Float[Any, "4"]) -> Float[Any, "3 3"]:
 
 def quaternion_rate(h: Float[Any, "4"], u: Float[Any, "3"]) -> Float[Any, "4"]:
     """Derivative of h along s for the curvature u in the material frame: h_s = ½ h ∘ (0, u)."""
-    w, x, y, z = h[0], h[1], h[2], h[3]
+    (w, x, y, z), (ux, uy, uz) = _parts(h), _parts(u)
     return 0.5 * jnp.stack(
         [
-            -x * u[0] - y * u[1] - z * u[2],
-            w * u[0] + y * u[2] - z * u[1],
-            w * u[1] + z * u[0] - x * u[2],
-            w * u[2] + x * u[1] - y * u[0],
+            -x * ux - y * uy - z * uz,
+            w * ux + y * uz - z * uy,
+            w * uy + z * ux - x * uz,
+            w * uz + x * uy - y * ux,
         ]
     )
 
@@ -71,7 +82,7 @@ def quaternion_product(a: Float[Any, "4"], b: Float[Any, "4"]) -> Float[Any, "4"
 
 def inverse(matrix: Float[Any, "3 3"]) -> Float[Any, "3 3"]:
     """Inverse of a 3×3 matrix by cofactors: for stiffness matrices, symmetric and positive."""
-    columns = [matrix[:, i] for i in range(3)]
+    columns = _columns(matrix)
     cofactors = jnp.stack(
         [cross(columns[1], columns[2]), cross(columns[2], columns[0]), cross(columns[0], columns[1])]
     )

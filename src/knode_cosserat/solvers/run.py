@@ -5,7 +5,7 @@ from __future__ import annotations
 import concurrent.futures
 import dataclasses
 import os
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -20,6 +20,8 @@ from knode_cosserat.solvers.stability import SAFE_DECAY, SUSPICIOUS, decay_per_s
 
 #: robots that one thread takes at a time
 CHUNK = 16
+#: what every run of one robot has room for: short ones, and equilibria, then share a program
+LEAST_CAPACITY = 128
 #: how far segments are divided when they are too long to be stable
 MOST_NODES = 400
 
@@ -49,14 +51,16 @@ class Task:
     settings: Settings
     dt: float
     steps: int
-    #: whether the past holds real states, so that the first step is a step like any other
-    going_on: bool = False
+    #: the first step: as the settings say, like any other (the past holds real states), or by BDF1
+    first: Literal["start", "regular", "consistent"] = "start"
 
     @property
     def table(self) -> np.ndarray:
         """Coefficients of the first step and of every other."""
+        if self.first == "consistent":
+            return coefficient_table(dataclasses.replace(self.settings, start="consistent"), self.dt)
         table = coefficient_table(self.settings, self.dt)
-        return table[[1, 1]] if self.going_on else table
+        return table[[1, 1]] if self.first == "regular" else table
 
 
 def run_one(
@@ -114,7 +118,7 @@ def _with_recovery(
     task: Task, system: System, controls: np.ndarray, start: Start, progress: bool
 ) -> tuple[Steps, str]:
     past, total, table = start.past, task.steps, task.table
-    padded = _padded(controls)
+    padded = _padded(controls, least=LEAST_CAPACITY)
     piece = max(1, total // 100) if progress else total
     rows: Steps | None = None
     done = 0
@@ -193,10 +197,10 @@ def _cores() -> int:
     return os.cpu_count() or 1
 
 
-def _padded(controls: Any) -> np.ndarray:
-    """Controls filled up to a few round lengths, so that a run a little longer needs no new program."""
+def _padded(controls: Any, least: int = 1) -> np.ndarray:
+    """Controls filled up to a power of two, so that a run a little longer needs no new program."""
     steps = controls.shape[-2]
-    capacity = 1 if steps == 1 else max(16, 2 ** int(np.ceil(np.log2(steps))))
+    capacity = max(least, 2 ** int(np.ceil(np.log2(steps))))
     width = [(0, 0)] * controls.ndim
     width[-2] = (0, capacity - steps)
     return np.pad(controls, width, mode="edge")

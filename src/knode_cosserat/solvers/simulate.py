@@ -45,8 +45,9 @@ def simulate(
         time: "bdf1", "bdf2", "bdf-alpha", "trapezoidal", or a scheme.
         space: "euler", "rk4", or a scheme.
         start: how the first step is made from one state; see `Settings`.
-        initial: start from this trajectory's last row (its last three, if its time step is the same, so that
-            the motion goes on) instead of the robot's state at rest.
+        initial: start from this trajectory's last row instead of the robot's state at rest. If its time step
+            is the same the motion goes on exactly, with the history of its last rows; only the trapezoidal
+            rule makes one step by BDF1 after a trajectory that itself began in motion.
         newton: tolerances and limits of the solve in each step.
         on_failure: "raise" a `SimulationError`, or "return" the trajectory with the rest marked invalid.
         progress: show a progress bar.
@@ -159,8 +160,8 @@ _jit_at_rest = jax.jit(_at_rest)
 _jit_all_at_rest = jax.jit(jax.vmap(_at_rest))
 
 
-def _beginning(run: _Run) -> tuple[Any, Start, Any, bool]:
-    """The initial record(s), the start, its time, and whether the motion goes on from before."""
+def _beginning(run: _Run) -> tuple[Any, Start, Any, Any]:
+    """The initial record(s), the start, its time, and how the first step is made."""
     system, controls, initial, settings, dt, batch, many = run
     if initial is not None:
         return _going_on(system, initial, settings, dt)
@@ -168,22 +169,27 @@ def _beginning(run: _Run) -> tuple[Any, Start, Any, bool]:
     if batch and not many:
         record, past = jax.tree.map(lambda x: jnp.broadcast_to(x, (batch, *x.shape)), (record, past))
     none_yet = np.zeros((*np.shape(controls)[:-2], system.control_size))
-    return record, Start(past, none_yet), 0.0, False
+    return record, Start(past, none_yet), 0.0, "start"
 
 
 def _going_on(
     system: System, initial: Trajectory, settings: Settings, dt: float
-) -> tuple[Any, Start, Any, bool]:
+) -> tuple[Any, Start, Any, Any]:
     records = jnp.concatenate([initial.y, initial.z], axis=-1)
     time = initial.time
+    one_state = initial_past(system, records[-1], initial.control[-1])._replace(t0=jnp.asarray(time[-1]))
     # of traced times nothing can be said but that a trajectory's rows are as far apart as it is to go on
     regular = len(time) > 1 and (is_traced(time) or np.isclose(time[-1] - time[-2], dt))
-    going_on = bool(regular and not system.mixed and not isinstance(settings.time, Static))
-    if going_on:
-        past = going_on_past(system, settings, dt, records, time[-1])
-    else:
-        past = initial_past(system, records[-1], initial.control[-1])._replace(t0=jnp.asarray(time[-1]))
-    return records[-1], Start(past, initial.control[-1]), time[-1], going_on
+    # the rate at the first row is not known if that was in motion; long enough after, most schemes forget it
+    unforgotten = abs(settings.time.coefficients(dt, dt).d1) ** (len(time) - 1)
+    rate_known = unforgotten < 1e-9 or (not is_traced(time) and time[0] == 0.0)
+    past, first = one_state, "start"
+    if regular and not system.mixed and not isinstance(settings.time, Static):
+        if rate_known:
+            past, first = going_on_past(system, settings, dt, records, time[-1]), "regular"
+        else:
+            first = "consistent"
+    return records[-1], Start(past, initial.control[-1]), time[-1], first
 
 
 # the three ways to run
@@ -191,8 +197,8 @@ def _going_on(
 
 def _single(run: _Run, on_failure: str, progress: bool) -> Trajectory:
     system, controls, _, settings, dt, _, _ = run
-    record, start, t0, going_on = _beginning(run)
-    task = Task(settings, dt, len(controls), going_on)
+    record, start, t0, first = _beginning(run)
+    task = Task(settings, dt, len(controls), first)
     steps, cause = run_one(task, system, controls, start, progress)
     if on_failure == "raise" and steps.result.min() < 0:
         raise _failure(task, float(t0), steps, cause, None)
@@ -225,8 +231,8 @@ def _traced(system, controls, initial, settings, dt, batch, many):  # type: igno
     One jitted call, so that a transformation traces it once and not at every call.
     """
     run = _Run(system, controls, initial, settings, dt, batch, many)
-    record, start, t0, going_on = _beginning(run)
-    one = sensitivity.rollout(Task(settings, dt, np.shape(controls)[-2], going_on))
+    record, start, t0, first = _beginning(run)
+    one = sensitivity.rollout(Task(settings, dt, np.shape(controls)[-2], first))
     if batch:
         rows = jax.vmap(one, in_axes=(0 if many else None, 0, 0))(system, controls, start.past)
     else:
