@@ -10,7 +10,7 @@ import numpy as np
 
 import knode_cosserat as kc
 from knode_cosserat.evaluation import figures
-from knode_cosserat.evaluation.metrics import dtw_distance
+from knode_cosserat.evaluation.metrics import dtw_distance, rms_distance
 from knode_cosserat.recordings import load_example
 
 #: time step of the paper's studies (s)
@@ -42,7 +42,7 @@ def predict_a_recording(out: Path) -> None:
 
     predicted = np.asarray(prediction.tip_position)
     dtw = dtw_distance(predicted, measured.tip_position)
-    rmse = np.sqrt(np.mean(np.sum((predicted - measured.tip_position) ** 2, axis=-1)))
+    rmse = float(rms_distance(predicted, measured.tip_position))
     print("2. Predicted 10 s of a recording from its measured tensions, by the same physics.")
     print(f"   tip DTW {dtw:.1f} m over {len(predicted)} rows, tip RMSE {100 * rmse:.1f} cm.")
     print(f"   picture: {out / 'recording.png'}")

@@ -70,16 +70,6 @@ def quaternion_rate(h: Float[Any, "4"], u: Float[Any, "3"]) -> Float[Any, "4"]:
     )
 
 
-def quaternion_product(a: Float[Any, "4"], b: Float[Any, "4"]) -> Float[Any, "4"]:
-    """Hamilton product a ∘ b (rotate by b first, then by a)."""
-    return jnp.concatenate(
-        [
-            (a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3])[None],
-            a[0] * b[1:] + b[0] * a[1:] + cross(a[1:], b[1:]),
-        ]
-    )
-
-
 def inverse(matrix: Float[Any, "3 3"]) -> Float[Any, "3 3"]:
     """Inverse of a 3×3 matrix by cofactors: for stiffness matrices, symmetric and positive."""
     columns = _columns(matrix)

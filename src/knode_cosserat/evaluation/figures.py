@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from knode_cosserat.evaluation.metrics import dtw_distance
+from knode_cosserat.evaluation.metrics import dtw_distance, rms_distance
 from knode_cosserat.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -114,7 +114,7 @@ def prediction_against_measurement(prediction: Tips, recording: TipRecording) ->
             "both must have the same number"
         )
     error = np.linalg.norm(predicted - measured, axis=-1)
-    dtw, rmse = dtw_distance(predicted, measured), np.sqrt(np.mean(error**2))
+    dtw, rmse = dtw_distance(predicted, measured), float(rms_distance(predicted, measured))
     robot = "simulated stand-in robot" if recording.simulated else "robot"
     time = recording.time
     with _style():

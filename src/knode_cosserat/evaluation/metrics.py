@@ -127,7 +127,7 @@ def tip_rmse(prediction: PoseHistory, reference: PoseHistory) -> float:
         ValueError: a shape is wrong, rows differ, or a state is invalid.
     """
     predicted, expected = _comparable_poses(prediction, reference, same_nodes=False)
-    return float(_rms_distance(predicted[0][:, -1], expected[0][:, -1]))
+    return float(rms_distance(predicted[0][:, -1], expected[0][:, -1]))
 
 
 def node_error(prediction: PoseHistory, reference: PoseHistory) -> Array:
@@ -140,10 +140,11 @@ def node_error(prediction: PoseHistory, reference: PoseHistory) -> Array:
         ValueError: a shape is wrong, rows or nodes differ, or a state is invalid.
     """
     predicted, expected = _comparable_poses(prediction, reference)
-    return _rms_distance(predicted[0], expected[0])
+    return rms_distance(predicted[0], expected[0])
 
 
-def _rms_distance(a: Array, b: Array) -> Array:
+def rms_distance(a: Array, b: Array) -> Array:
+    """Root mean square over time of the distances between points (T, ..., 3): (...), in their unit."""
     return np.sqrt(np.mean(np.sum((a - b) ** 2, axis=-1), axis=0))
 
 
