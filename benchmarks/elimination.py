@@ -42,7 +42,7 @@ def shooting(problem: StepProblem, y: Any, unknowns: Any) -> tuple[Any, Any, Any
         first = system.base(problem.t, problem.control, xi)
         nodes = (problem.arclength[:-1], problem.history[:-1], problem.history[1:])
         last, rest = jax.lax.scan(segment, first, nodes)
-        tip = system.tip(problem.t, problem.control, last) / system.scales().tip
+        tip = problem.tip_residual(last) / system.scales().tip
         return tip, (tip, jnp.concatenate([first[None], rest]))
 
     def correct(state: Any) -> Any:

@@ -55,7 +55,7 @@ class HangingString(kc.System):
         n = 9.81 * self.density * jnp.stack([a, x])
         return jnp.concatenate([jnp.stack([span, drop]), n, jnp.zeros(2)]), jnp.sqrt(jnp.sum(n**2))[None]
 
-    def tip(self, t, control, y):  # the hand holds it
+    def tip(self, t, control, y, history):  # the hand holds it
         return self.y_layout.get(y, "p") - control
 
     def scales(self):

@@ -71,9 +71,29 @@ def quaternion_rate(h: Float[Any, "4"], u: Float[Any, "3"]) -> Float[Any, "4"]:
 
 
 def inverse(matrix: Float[Any, "3 3"]) -> Float[Any, "3 3"]:
-    """Inverse of a 3×3 matrix by cofactors: for stiffness matrices, symmetric and positive."""
+    """Inverse of a regular 3×3 matrix, by cofactors."""
     columns = _columns(matrix)
     cofactors = jnp.stack(
         [cross(columns[1], columns[2]), cross(columns[2], columns[0]), cross(columns[0], columns[1])]
     )
     return cofactors / jnp.sum(columns[0] * cofactors[0])
+
+
+def small_inverse(matrix: Float[Any, "n n"]) -> Float[Any, "n n"]:
+    """Inverse of a small matrix; of 6×6, in blocks of 3×3, the upper left of which must be regular too.
+
+    Written out because XLA fuses it: the library's factorisation takes several times as long at this size.
+    """
+    if matrix.shape[0] != 6:
+        return jnp.linalg.inv(matrix)
+    A, B, C, D = matrix[:3, :3], matrix[:3, 3:], matrix[3:, :3], matrix[3:, 3:]
+
+    def product(left: Any, right: Any) -> Any:
+        return jnp.stack([dot(left, column) for column in _columns(right)], axis=1)
+
+    inverse_A = inverse(A)
+    across = product(inverse_A, B)
+    rest = inverse(D - product(C, across))
+    down = product(rest, product(C, inverse_A))
+    upper = jnp.concatenate([inverse_A + product(across, down), -product(across, rest)], axis=1)
+    return jnp.concatenate([upper, jnp.concatenate([-down, rest], axis=1)], axis=0)

@@ -32,8 +32,8 @@ class TipLoaded(kc.TendonRobot):
     tip_force: Any = eqx.field(converter=_vector, default=(0.0, 0.0, 0.0))
     tip_moment: Any = eqx.field(converter=_vector, default=(0.0, 0.0, 0.0))
 
-    def tip(self, t, control, y):
-        return super().tip(t, control, y) + jnp.concatenate([self.tip_force, self.tip_moment])
+    def tip(self, t, control, y, history):
+        return super().tip(t, control, y, history) + jnp.concatenate([self.tip_force, self.tip_moment])
 
 
 def rod(*, nodes=21, **changes):
@@ -231,7 +231,7 @@ class Bar(kc.System):
     def rest(self, s):
         return jnp.stack([s, jnp.zeros(()), jnp.zeros(())]), jnp.ones(1)
 
-    def tip(self, t, control, y):
+    def tip(self, t, control, y, history):
         return self.y_layout.get(y, "n")
 
     def amplitude(self, load, dt):

@@ -350,7 +350,7 @@ class Pendulum(kc.System):
     def rest(self, s):
         return np.zeros(1), np.zeros(0)
 
-    def tip(self, t, control, y):
+    def tip(self, t, control, y, history):
         return np.zeros(0)
 
 

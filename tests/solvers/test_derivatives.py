@@ -133,7 +133,7 @@ class Bar(kc.System):
     def rest(self, s):
         return jnp.stack([s, jnp.zeros(()), jnp.zeros(())]), jnp.ones(1)
 
-    def tip(self, t, control, y):
+    def tip(self, t, control, y, history):
         return self.y_layout.get(y, "n")
 
 

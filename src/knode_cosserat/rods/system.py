@@ -7,7 +7,7 @@ An implicit time scheme, y_t = c0 y + ʰy, turns it into an ordinary differentia
     z   = (C + c0 D)⁻¹ (f2 - D ʰz)
     y_s = (A + c0 B)⁻¹ (f1 - B ʰy_s)
 
-A system says which numbers y and z hold, gives these terms (or y_s and z directly), what holds at the base
+A system says which numbers y and z hold, gives these terms (or z and y_s directly), what holds at the base
 and at the tip, and what is unknown at the base. It knows nothing of nodes in between, time steps or solvers.
 """
 
@@ -24,15 +24,23 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.parameters import Parameter, ParameterError, checked, parameters_of
+from knode_cosserat.rotation import dot, rotation_matrix
 
 
 class Field(NamedTuple):
-    """A named part of y or z: its size, unit and meaning."""
+    """A named part of y or z: its size, unit and meaning.
+
+    `frame` names the orientation (a quaternion in y) by whose rotation a vector of the global frame is seen
+    from the material; none for what is not turned. `load` is the unit of the load that the field's rate along
+    s balances, such as N/m of an internal force; none for a field whose rate is geometry.
+    """
 
     name: str
     size: int
     unit: str
     meaning: str
+    frame: str = ""
+    load: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +49,7 @@ class Layout:
 
     fields: tuple[Field, ...]
 
-    def __init__(self, *fields: tuple[str, int, str, str]):
+    def __init__(self, *fields: tuple[Any, ...]):
         object.__setattr__(self, "fields", tuple(Field(*field) for field in fields))
 
     @property
@@ -79,6 +87,9 @@ class Layout:
         every = np.arange(self.size)
         return np.concatenate([every[self.slice(name)] for name in names])
 
+    def __add__(self, other: Layout) -> Layout:
+        return Layout(*self.fields, *other.fields)
+
 
 class History(NamedTuple):
     """What an implicit time scheme knows of the past at one point of the rod.
@@ -92,6 +103,13 @@ class History(NamedTuple):
     y_s: Float[Any, " y"]
 
 
+def unpacked_history(system: System, c0: Any, record: Float[Any, " x"]) -> History:
+    """The history at one point from a packed record of it: y, z and, if B is not zero, y_s."""
+    ny, nz = system.y_layout.size, system.z_layout.size
+    y_s = record[ny + nz :] if system.mixed else jnp.zeros(ny)
+    return History(c0, record[:ny], record[ny : ny + nz], y_s)
+
+
 class Scales(NamedTuple):
     """Natural sizes of the numbers in y (y,) and of the tip's residuals (k,): what "small" is measured by."""
 
@@ -102,9 +120,9 @@ class Scales(NamedTuple):
 class System(eqx.Module):
     """A rod robot of the general class.
 
-    A subclass states the layouts below, `rest`, `base`, `tip`, and either `balance` and `constitutive`
-    (the general form) or `derivatives` (y_s and z directly). Its numeric parameters are leaves of a JAX
-    pytree, so that one compiled program serves every value of them, batches of them, and their derivatives.
+    A subclass states the layouts below, `rest`, `base`, `tip`, and either `constitutive` and `balance`
+    (the general form) or `strains` and `rates` (z and y_s directly). Its numeric parameters are leaves of a
+    JAX pytree, so that one compiled program serves every value of them, batches, and their derivatives.
     """
 
     y_layout: ClassVar[Layout]
@@ -115,6 +133,9 @@ class System(eqx.Module):
     #: whether B is not zero: the history of y_s is then kept
     mixed: ClassVar[bool] = True
 
+    #: observables that are velocities, on which drag and friction depend; none: the system does not say
+    velocities: ClassVar[tuple[str, ...]] = ()
+
     if TYPE_CHECKING:  # every system has a length (m) among its own parameters
         length: Any
     #: how many nodes the rod is divided into, both ends counted
@@ -124,30 +145,34 @@ class System(eqx.Module):
 
     def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
         """C (z, z), D (z, z) and f2 (z,) of C z + D z_t = f2, at arclength s (m) and time t (s)."""
-        raise NotImplementedError(f"{type(self).__name__} gives neither `derivatives` nor `constitutive`")
+        raise NotImplementedError(f"{type(self).__name__} gives neither `strains` nor `constitutive`")
 
     def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
         """A (y, y), B (y, y) and f1 (y,) of A y_s + B y_st = f1, at arclength s (m) and time t (s)."""
-        raise NotImplementedError(f"{type(self).__name__} gives neither `derivatives` nor `balance`")
+        raise NotImplementedError(f"{type(self).__name__} gives neither `rates` nor `balance`")
+
+    def strains(
+        self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
+    ) -> Float[Any, " z"]:
+        """z at one point, semi-discretised in time (paper eq. 4, second line)."""
+        c0 = history.c0
+        C, D, f2 = self.constitutive(s, t, y, c0 * y + history.y, control)
+        return jnp.linalg.solve(C + c0 * D, f2 - D @ history.z)
+
+    def rates(
+        self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
+    ) -> Float[Any, " y"]:
+        """y_s at one point where the strains are z, semi-discretised in time (paper eq. 4, first line)."""
+        c0 = history.c0
+        A, B, f1 = self.balance(s, t, y, c0 * y + history.y, z, c0 * z + history.z, control)
+        return jnp.linalg.solve(A + c0 * B, f1 - B @ history.y_s)
 
     def derivatives(
         self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-        """y_s and z at one point, semi-discretised in time (paper eq. 4)."""
-        return self.general_derivatives(s, t, y, control, history)
-
-    def general_derivatives(
-        self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
-    ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-        """y_s and z from the general form A, B, C, D, f1, f2 (paper eq. 4)."""
-        c0 = history.c0
-        y_t = c0 * y + history.y
-        C, D, f2 = self.constitutive(s, t, y, y_t, control)
-        z = jnp.linalg.solve(C + c0 * D, f2 - D @ history.z)
-        z_t = c0 * z + history.z
-        A, B, f1 = self.balance(s, t, y, y_t, z, z_t, control)
-        y_s = jnp.linalg.solve(A + c0 * B, f1 - B @ history.y_s)
-        return y_s, z
+        """y_s and z at one point: what the solvers integrate."""
+        z = self.strains(s, t, y, control, history)
+        return self.rates(s, t, y, z, control, history), z
 
     # the two ends, and rest
 
@@ -165,12 +190,51 @@ class System(eqx.Module):
         return y[..., self.y_layout.indices(self.base_unknowns)]
 
     @abc.abstractmethod
-    def tip(self, t: Any, control: Any, y: Float[Any, " y"]) -> Float[Any, " k"]:
+    def tip(self, t: Any, control: Any, y: Float[Any, " y"], history: History) -> Float[Any, " k"]:
         """Residuals of the conditions at s = length: zero when they hold."""
+
+    @property
+    def tip_layout(self) -> Layout:
+        """What the tip's residuals are; one nameless field unless a system says more."""
+        return Layout(("tip", self.unknown_count, "", "conditions at the tip"))
 
     def scales(self) -> Scales:
         """Natural sizes of y and of the tip's residuals; ones unless a system knows better."""
         return Scales(jnp.ones(self.y_layout.size), jnp.ones(self.unknown_count))
+
+    # what learning looks at
+
+    def actuation(self, control: Float[Any, " c"]) -> Float[Any, " a"]:
+        """What of the control enters the equations; the control itself unless a system knows better."""
+        return control
+
+    @property
+    def observable_layout(self) -> Layout:
+        """What `observables` gives: by default y, its rate, the strains from rest, and their rate."""
+        state, strain = self.y_layout.fields, self.z_layout.fields
+        return Layout(
+            *state,
+            *((f"{name}_t", size, f"{unit}/s", f"rate of {name}") for name, size, unit, *_ in state),
+            *strain,
+            *((f"{name}_t", size, f"{unit}/s", f"rate of {name}") for name, size, unit, *_ in strain),
+        )
+
+    def observables(
+        self, s: Any, y: Float[Any, " y"], y_t: Any, z: Float[Any, " z"], z_t: Any, control: Any
+    ) -> Float[Any, " o"]:
+        """What a load that the equations miss may depend on, at one point and as seen from the material."""
+        _, z_rest = self.rest(s)
+        return jnp.concatenate([self.turned(y, y), self.turned(y, y_t), z - z_rest, z_t])
+
+    def turned(self, y: Float[Any, " y"], vectors: Float[Any, " y"]) -> Float[Any, " y"]:
+        """Numbers laid out like y with those of the global frame turned into the material's."""
+        parts = []
+        for field in self.y_layout.fields:
+            part = self.y_layout.get(vectors, field.name)
+            if field.frame:
+                part = dot(rotation_matrix(self.y_layout.get(y, field.frame)).T, part)
+            parts.append(part)
+        return jnp.concatenate(parts)
 
     # what every system can be asked
 

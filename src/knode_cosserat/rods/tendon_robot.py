@@ -36,8 +36,8 @@ class TendonRobot(System):
     y_layout: ClassVar[Layout] = Layout(
         ("p", 3, "m", "position, global frame"),
         ("h", 4, "1", "orientation, quaternion, scalar first"),
-        ("n", 3, "N", "internal force, global frame"),
-        ("m", 3, "N m", "internal moment, global frame"),
+        ("n", 3, "N", "internal force, global frame", "h", "N/m"),
+        ("m", 3, "N m", "internal moment, global frame", "h", "N"),
         ("q", 3, "m/s", "velocity, material frame"),
         ("w", 3, "rad/s", "angular velocity, material frame"),
     )
@@ -47,6 +47,7 @@ class TendonRobot(System):
     )
     base_unknowns: ClassVar[tuple[str, ...]] = ("n", "m")
     mixed: ClassVar[bool] = False
+    velocities: ClassVar[tuple[str, ...]] = ("q", "w", "u_t")
 
     length: Any = parameter("m", "length of the rod", low=1e-3, high=20.0)
     radius: Any = parameter("m", "radius of the rod", low=1e-6, high=0.5)
@@ -130,22 +131,57 @@ class TendonRobot(System):
         """u of the unloaded rod (1/m): straight."""
         return np.zeros(3)
 
+    # what learning looks at
+
+    def actuation(self, control: Float[Any, " c"]) -> Float[Any, "3"]:
+        """The resultant of the tendons' forces per length (N/m), global frame: the paper's τ·φ."""
+        return transverse_force(control, self.tendon_angles)
+
+    @property
+    def observable_layout(self) -> Layout:
+        """Motion, bending and actuation, all as seen from the material."""
+        return Layout(
+            ("acceleration", 3, "m/s2", "acceleration of the centreline"),
+            ("spin", 3, "1/s2", "rate of the angular momentum over ρI"),
+            ("q", 3, "m/s", "velocity"),
+            ("w", 3, "rad/s", "angular velocity"),
+            ("u", 3, "1/m", "curvature"),
+            ("u_t", 3, "1/(m s)", "rate of the curvature"),
+            ("actuation", 3, "N/m", "resultant of the tendons' forces"),
+        )
+
+    def observables(self, s: Any, y: Any, y_t: Any, z: Any, z_t: Any, control: Any) -> Float[Any, " o"]:
+        """See `observable_layout`."""
+        _, h, _, _, q, w = self.y_layout.split(y)
+        q_t, w_t = self.y_layout.get(y_t, "q"), self.y_layout.get(y_t, "w")
+        u, u_t = self.z_layout.get(z, "u"), self.z_layout.get(z_t, "u")
+        J = np.diag([1.0, 1.0, 2.0])
+        f = dot(rotation_matrix(h).T, self.actuation(control))
+        return jnp.concatenate(
+            [cross(w, q) + q_t, cross(w, dot(J, w)) + dot(J, w_t), q, w, u - self.u_star, u_t, f]
+        )
+
     # the equations, as the paper gives them
 
-    def derivatives(
+    def strains(
         self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
-    ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-        """y_s and z directly (paper eqs. 13-15)."""
+    ) -> Float[Any, " z"]:
+        """v and u (paper eq. 15)."""
         c0 = history.c0
-        y_t = c0 * y + history.y
         R = rotation_matrix(self.y_layout.get(y, "h"))
         n, m = self.y_layout.get(y, "n"), self.y_layout.get(y, "m")
         hv, hu = self.z_layout.split(history.z)
         Kse, Bse, Kbt, Bbt = self.Kse, self.shear_damping, self.Kbt, self.bending_damping
         v = dot(inverse(Kse + c0 * Bse), dot(R.T, n) + Kse @ self.v_star - dot(Bse, hv))
         u = dot(inverse(Kbt + c0 * Bbt), dot(R.T, m) + Kbt @ self.u_star - dot(Bbt, hu))
-        z = jnp.concatenate([v, u])
-        return self._spatial_rates(y, y_t, z, c0 * z + history.z, R, control), z
+        return jnp.concatenate([v, u])
+
+    def rates(
+        self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
+    ) -> Float[Any, " y"]:
+        """y_s (paper eqs. 13 and 14)."""
+        y_t, z_t = history.c0 * y + history.y, history.c0 * z + history.z
+        return self._spatial_rates(y, y_t, z, z_t, control)
 
     def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
         """C, D, f2: the material's law, K (z - z*) + B z_t = Rᵀ (n, m)."""
@@ -159,19 +195,19 @@ class TendonRobot(System):
 
     def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
         """A = I, B = 0, and f1 the right-hand side of paper eq. 13."""
-        R = rotation_matrix(self.y_layout.get(y, "h"))
         size = self.y_layout.size
-        return jnp.eye(size), jnp.zeros((size, size)), self._spatial_rates(y, y_t, z, z_t, R, control)
+        return jnp.eye(size), jnp.zeros((size, size)), self._spatial_rates(y, y_t, z, z_t, control)
 
-    def _spatial_rates(self, y, y_t, z, z_t, R, control):  # type: ignore[no-untyped-def]
+    def _spatial_rates(self, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
         """The right-hand side of paper eq. 13, once y_t, z and z_t are known."""
         _, h, n, _, q, w = self.y_layout.split(y)
+        R = rotation_matrix(h)
         q_t, w_t = self.y_layout.get(y_t, "q"), self.y_layout.get(y_t, "w")
         v, u = self.z_layout.split(z)
         v_t, u_t = self.z_layout.split(z_t)
         rhoA, rhoJ = self.mass_per_length, self.density * self.section.inertia
         g, C = self.gravity, self.drag
-        f_tendon = transverse_force(control, self.tendon_angles)
+        f_tendon = self.actuation(control)
 
         p_s = dot(R, v)
         h_s = quaternion_rate(h, u)
@@ -190,9 +226,17 @@ class TendonRobot(System):
         y = jnp.concatenate([p, h, np.zeros(12)])
         return y, jnp.concatenate([self.v_star, self.u_star])
 
-    def tip(self, t: Any, control: Any, y: Float[Any, " y"]) -> Float[Any, " k"]:
+    def tip(self, t: Any, control: Any, y: Float[Any, " y"], history: History) -> Float[Any, " k"]:
         """The tip is free: n = m = 0 there."""
         return jnp.concatenate([-self.y_layout.get(y, "n"), -self.y_layout.get(y, "m")])
+
+    @property
+    def tip_layout(self) -> Layout:
+        """Force and moment at the tip, global frame."""
+        return Layout(
+            ("n", 3, "N", "force at the tip, global frame", "h", "N"),
+            ("m", 3, "N m", "moment at the tip, global frame", "h", "N m"),
+        )
 
     def scales(self) -> Scales:
         """Of a beam: length L, force EI/L², moment EI/L, time L² √(ρA/EI)."""

@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float, Int
 
-from knode_cosserat.rods.system import History, System
+from knode_cosserat.rods.system import History, System, unpacked_history
 from knode_cosserat.solvers.linear import Linearisation, LinearSolver
 from knode_cosserat.solvers.space import SpaceScheme, middles
 
@@ -59,9 +59,11 @@ class StepProblem(eqx.Module):
         return self.system.derivatives(s, self.t, y, self.control, self._unpack(history))
 
     def _unpack(self, history: Float[Any, " x"]) -> History:
-        ny, nz = self.system.y_layout.size, self.system.z_layout.size
-        y_s = history[ny + nz :] if self.system.mixed else jnp.zeros(ny)
-        return History(self.c0, history[:ny], history[ny : ny + nz], y_s)
+        return unpacked_history(self.system, self.c0, history)
+
+    def tip_residual(self, y: Float[Any, " y"]) -> Float[Any, " k"]:
+        """What is left of the tip's conditions at this y of the last node."""
+        return self.system.tip(self.t, self.control, y, self._unpack(self.history[-1]))
 
     @property
     def arclength(self) -> Float[Any, " nodes"]:
@@ -123,7 +125,7 @@ def _error(problem: StepProblem, defects: Any, tip: Any) -> Any:
 def residuals(problem: StepProblem, y: Float[Any, "nodes y"]) -> tuple[Any, Any]:
     """Defects y_{j+1} - Φ_j(y_j), with their sign turned, and the tip's residuals."""
     reached = problem.segments(lambda advance, y_j: advance(y_j), y)
-    return reached - y[1:], problem.system.tip(problem.t, problem.control, y[-1])
+    return reached - y[1:], problem.tip_residual(y[-1])
 
 
 def linearise(problem: StepProblem, y: Float[Any, "nodes y"], unknowns: Any) -> Linearisation:
@@ -138,7 +140,7 @@ def linearise(problem: StepProblem, y: Float[Any, "nodes y"], unknowns: Any) -> 
         return jax.jacfwd(twice, has_aux=True)(at)
 
     F, reached = problem.segments(with_value, y)
-    M, tip = with_value(lambda y_tip: system.tip(t, control, y_tip), y[-1])
+    M, tip = with_value(problem.tip_residual, y[-1])
     S = jax.jacfwd(lambda xi: system.base(t, control, xi))(unknowns)
     return Linearisation(F, S, M, reached - y[1:], tip)
 
