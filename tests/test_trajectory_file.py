@@ -167,7 +167,7 @@ class Pendulum(kc.System):
     def rest(self, s):
         return np.zeros(4), np.zeros(0)
 
-    def tip(self, t, control, y):
+    def tip(self, t, control, y, history):
         return np.zeros(0)
 
 
@@ -181,6 +181,72 @@ def test_a_users_system_is_asked_for(tmp_path, batch):
     assert_same(load_trajectory(tmp_path / "a.nc", system=pendulum), trajectory)
     with fails("the variable 'p' is missing"):
         load_trajectory(tmp_path / "a.nc", system=ROBOT)
+
+
+@pytest.fixture
+def codec(monkeypatch):
+    """Pendulums as text, whose length in mm a file can hold; longer ones cannot be written."""
+
+    def encode(pendulum, source):
+        if pendulum.length > 0.9:
+            raise ValueError(f"{source}: too long")
+        return f"{float(pendulum.length) * 1000:.0f} mm".encode()
+
+    def decode(data, source):
+        try:
+            return Pendulum(int(data.removesuffix(b" mm")) / 1000)
+        except ValueError:
+            raise ValueError(f"{source}: not a pendulum: {data!r}") from None
+
+    monkeypatch.setattr(trajectory_file, "_codecs", {})
+    trajectory_file.register_codec(Pendulum, encode, decode)
+
+
+@pytest.mark.parametrize(
+    ("batch", "lengths"),
+    [((), 0.5), ((2,), 0.5), ((3,), [0.5, 0.1, 0.025]), ((1,), [0.25])],
+)
+def test_a_system_with_a_codec_is_in_the_file(tmp_path, codec, batch, lengths):
+    robot = Pendulum(lengths) if isinstance(lengths, float) else stacked(*map(Pendulum, lengths))
+    trajectory = synthetic(batch, robot=robot)
+    trajectory.save(tmp_path / "a.nc")
+    assert_same(load_trajectory(tmp_path / "a.nc"), trajectory)
+    assert_same(load_trajectory(tmp_path / "a.nc", system=robot), trajectory)
+
+
+def test_what_a_codec_cannot_write_is_asked_for(tmp_path, codec):
+    for pendulum in (Pendulum(0.95), stacked(Pendulum(0.5), Pendulum(0.95))):
+        trajectory = synthetic((2,), robot=pendulum)
+        trajectory.save(tmp_path / "a.nc")
+        with fails("does not describe its system, a Pendulum (a Pendulum: too long)", "system=…"):
+            load_trajectory(tmp_path / "a.nc")
+        assert_same(load_trajectory(tmp_path / "a.nc", system=pendulum), trajectory)
+
+
+def test_bytes_of_systems_that_are_not_right(tmp_path, codec, monkeypatch):
+    path = tmp_path / "a.nc"
+    robots = stacked(Pendulum(0.5), Pendulum(0.025))
+    synthetic((2,), robot=robots).save(path)
+    data = xarray.load_dataset(path, decode_cf=False)
+    assert data["system_sizes"].values.tolist() == [6, 5]
+    for sizes in ([6, 6], [11, 0], [-1, 12], [2**62, 2**62], [6.0, 5.0]):
+        changed = data.assign(system_sizes=("batch", np.array(sizes)))
+        changed.to_netcdf(path, engine="h5netcdf")
+        with fails("a.nc: the variable 'system_bytes' does not hold what it should"):
+            load_trajectory(path)
+    data.assign(system_sizes=("batch", [5, 6])).to_netcdf(path, engine="h5netcdf")
+    with fails("a.nc: variable 'system_bytes': not a pendulum: b'500 m'", "or give it", "system=…"):
+        load_trajectory(path)
+    data.drop_vars("system_sizes").to_netcdf(path, engine="h5netcdf")
+    with fails("a.nc: variable 'system_bytes': not a pendulum: b'500 mm25 mm'"):
+        load_trajectory(path)
+    data.assign(system_bytes=("system_byte", np.zeros(11))).to_netcdf(path, engine="h5netcdf")
+    with fails("the variable 'system_bytes' does not hold"):
+        load_trajectory(path)
+    data.to_netcdf(path, engine="h5netcdf")
+    monkeypatch.setattr(trajectory_file, "_codecs", {})
+    with fails("nothing that is imported here reads its system, a Pendulum: give it"):
+        load_trajectory(path)
 
 
 def test_reading_asks_nothing_of_pickle_or_eval():
@@ -373,7 +439,9 @@ def test_what_cannot_be_saved(tmp_path):
     assert os.listdir(tmp_path) == ["folder.nc"]
 
 
-@pytest.mark.parametrize("name", ["time", "result", "a/b", "force", "robot_length", "force_index"])
+@pytest.mark.parametrize(
+    "name", ["time", "result", "a/b", "force", "robot_length", "force_index", "system_bytes", "system_sizes"]
+)
 def test_fields_whose_names_are_taken(tmp_path, monkeypatch, name):
     layout = kc.Layout(("angle", 1, "rad", "angle"), ("force", 3, "N", "force"), (name, 1, "1", "taken"))
     monkeypatch.setattr(Pendulum, "y_layout", layout)

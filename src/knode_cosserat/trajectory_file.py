@@ -2,23 +2,23 @@
 
 Every field of y, z and the controls is a variable under its own name, with unit and meaning, over the
 dimensions (batch,) time, node and component. The robot is an attribute, as the text of a robot file, and so
-are the settings, as JSON. Arrays come back bit for bit. Reading runs no code that a file brings.
+are the settings, as JSON. A system that no robot file describes is there as the bytes of a file of its own,
+if there is a codec for its class. Arrays come back bit for bit. Reading runs no code that a file brings.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import importlib.metadata
 import json
 import os
-import secrets
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
 
+from knode_cosserat._files import package_version, replacing
 from knode_cosserat.rods import robot_file
 from knode_cosserat.rods.parameters import ParameterError
 from knode_cosserat.rods.system import Field, Layout, System
@@ -43,10 +43,33 @@ _ROWS = (
 )
 #: stands before a parameter's name where each robot of a batch has its own
 _PARAMETER = "robot_"
+#: the bytes of a system that has a codec; of a batch, one system's after the other's, with their sizes
+_BYTES, _SIZES = "system_bytes", "system_sizes"
 
 
 class TrajectoryFileError(ValueError):
     """A trajectory's file that cannot be read or written; the message is one line that says why."""
+
+
+class Codec(NamedTuple):
+    """How systems of a class become bytes and come back; the text is what errors call the file.
+
+    Both raise a `ValueError` of one line for what they cannot write or read.
+    """
+
+    cls: type[System]
+    encode: Callable[[Any, str], bytes]
+    decode: Callable[[bytes, str], System]
+
+
+_codecs: dict[str, Codec] = {}
+
+
+def register_codec(
+    cls: type[System], encode: Callable[[Any, str], bytes], decode: Callable[[bytes, str], System]
+) -> None:
+    """Let files of trajectories hold systems of a class that no robot file can name (see `Codec`)."""
+    _codecs[cls.__name__] = Codec(cls, encode, decode)
 
 
 # writing
@@ -55,8 +78,8 @@ class TrajectoryFileError(ValueError):
 def save(trajectory: Trajectory, path: str | Path) -> None:
     """Write a trajectory as a labelled netCDF-4 file that `load_trajectory` reads back equal.
 
-    The file appears complete or not at all. A system of a class that no robot file can name does not stop it:
-    all the states are written, and `load_trajectory` asks for the system.
+    The file appears complete or not at all. A system that no file can describe does not stop it: all the
+    states are written, and `load_trajectory` asks for the system.
 
     Raises:
         TrajectoryFileError: the arrays do not fit together, or the file cannot be written.
@@ -65,16 +88,13 @@ def save(trajectory: Trajectory, path: str | Path) -> None:
     data = _dataset(trajectory, str(path))
     # xarray would declare NaN to mean "missing", but here it means what `result` says
     plain = {name: {"_FillValue": None} for name in data.variables}
-    temporary = path.parent / f".{path.name}.{secrets.token_hex(6)}.tmp"
     try:
-        data.to_netcdf(temporary, engine="h5netcdf", encoding=plain)
-        os.replace(temporary, path)
+        with replacing(path) as temporary:
+            data.to_netcdf(temporary, engine="h5netcdf", encoding=plain)
     except (OSError, RuntimeError) as error:  # HDF5 has either for a full disk
         number = error.errno if isinstance(error, OSError) else None
         reason = os.strerror(number) if number else _first_line(error)
         raise TrajectoryFileError(f"{path}: cannot be written: {reason}") from None
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _dataset(trajectory: Trajectory, source: str) -> xarray.Dataset:
@@ -99,10 +119,9 @@ def _dataset(trajectory: Trajectory, source: str) -> xarray.Dataset:
     for name, unit, meaning in _ROWS:
         variables[name] = (rows, np.asarray(getattr(trajectory, name)), _labels(unit, meaning))
     variables["result"][2].update(_flags(variables["result"][1].dtype))
-    if np.ndim(system.length):
-        variables |= _parameters(system)
+    described, more = _described(system)
     try:
-        return xarray.Dataset(variables, coordinates, _attributes(trajectory, source))
+        return xarray.Dataset(variables | more, coordinates, _attributes(trajectory, source) | described)
     except ValueError as error:
         reason = " ".join(str(error).split())
         raise TrajectoryFileError(
@@ -146,7 +165,8 @@ def _flags(dtype: np.dtype) -> dict[str, Any]:
 def _require_names(system: System, source: str) -> None:
     """A field's name must be free to be a variable's."""
     names = [field.name for layout in _layouts(system) for field in layout.fields]
-    taken = {"time", "node", "batch", "arclength", "axis", "quaternion", *(name for name, *_ in _ROWS)}
+    taken = {"time", "node", "batch", "arclength", "axis", "quaternion", _BYTES, _SIZES}
+    taken |= {name for name, *_ in _ROWS}
     for name in names:
         if name in taken or "/" in name or name.startswith(_PARAMETER) or name.endswith("_index"):
             raise TrajectoryFileError(
@@ -154,6 +174,33 @@ def _require_names(system: System, source: str) -> None:
                 "in a file that name is taken, by another field or otherwise, or impossible"
             )
         taken.add(name)
+
+
+def _described(system: System) -> tuple[dict[str, str], dict[str, Any]]:
+    """Attributes and variables from which the system can be made again, if that is possible."""
+    codec = _codecs.get(type(system).__name__)
+    batch = np.ndim(system.length) > 0
+    if type(system) in robot_file.KINDS.values():
+        described = {"robot": robot_file.format_robot(_robot(system, 0) if batch else system)}
+        return described, _parameters(system) if batch else {}
+    if codec is None or codec.cls is not type(system):
+        return {}, {}
+    robots = [_robot(system, i) for i in range(len(system.length))] if batch else [system]
+    try:
+        parts = [codec.encode(robot, f"a {type(system).__name__}") for robot in robots]
+    except ValueError as error:
+        return {"system_missing": _first_line(error)}, {}
+    labels = {"long_name": "the system, as the bytes of a file"}
+    variables = {_BYTES: ("system_byte", np.frombuffer(b"".join(parts), np.uint8), labels)}
+    if batch:
+        sizes = np.array([len(part) for part in parts])
+        variables[_SIZES] = ("batch", sizes, {"long_name": "how many bytes each system of the batch has"})
+    return {}, variables
+
+
+def _robot(system: System, index: int) -> System:
+    """One robot of a batch."""
+    return jax.tree.map(lambda leaf: leaf[index], system)
 
 
 def _parameters(system: System) -> dict[str, Any]:
@@ -170,31 +217,15 @@ def _parameters(system: System) -> dict[str, Any]:
 
 def _attributes(trajectory: Trajectory, source: str) -> dict[str, Any]:
     system = trajectory.system
-    described = {}
-    if type(system) in robot_file.KINDS.values():
-        described = {"robot": robot_file.format_robot(_first_robot(system))}
     return {
         "title": f"Trajectory of a {type(system).__name__}",
         "comment": "Row 0 is the initial state, row i the state after control i; NaN if not solved.",
         "format": FORMAT,
         "format_version": VERSION,
-        "knode_cosserat_version": _package_version(),
+        "knode_cosserat_version": package_version(),
         "system": type(system).__name__,
-        **described,
         "settings": _settings_text(trajectory.settings, source),
     }
-
-
-def _first_robot(system: System) -> System:
-    """The first of a batch of robots; the one there is, if there is no batch."""
-    return jax.tree.map(lambda leaf: leaf[0], system) if np.ndim(system.length) else system
-
-
-def _package_version() -> str:
-    try:
-        return importlib.metadata.version("knode-cosserat")
-    except importlib.metadata.PackageNotFoundError:
-        return "unknown"  # run from a checkout that is not installed
 
 
 # reading
@@ -205,8 +236,8 @@ def load_trajectory(path: str | Path, *, system: System | None = None) -> Trajec
 
     Args:
         path: the file.
-        system: whose trajectory it is. Only needed for a system that no robot file can describe, such as one
-            of a class of yours.
+        system: whose trajectory it is. Only needed for a system that no file can describe, such as one of a
+            class of yours.
 
     Raises:
         TrajectoryFileError: the file cannot be read, is something else, or does not hold what it should.
@@ -282,10 +313,7 @@ def _system(path: Path, data: xarray.Dataset) -> System:
     """The robot, or the batch of robots, that the file describes."""
     text = data.attrs.get("robot")
     if text is None:
-        raise TrajectoryFileError(
-            f"{path}: the file does not describe its system, a {data.attrs.get('system', 'class unknown')}: "
-            "give it, load_trajectory(path, system=…)"
-        )
+        return _from_bytes(path, data)
     try:
         robot = robot_file.parse_robot(str(text), f"{path}: attribute 'robot'")
         if not any(str(name).startswith(_PARAMETER) for name in data.variables):
@@ -302,6 +330,37 @@ def _system(path: Path, data: xarray.Dataset) -> System:
     except ParameterError as error:
         raise TrajectoryFileError(f"{path}: a robot of the batch is not possible: {error}") from None
     return jax.tree.map(lambda *leaves: np.stack(leaves), *robots)
+
+
+def _from_bytes(path: Path, data: xarray.Dataset) -> System:
+    """The system, or the batch of systems, whose bytes the file holds."""
+    name = str(data.attrs.get("system", "class unknown"))
+    ask = "give it, load_trajectory(path, system=…)"
+    if _BYTES not in data.variables:
+        why = f" ({data.attrs['system_missing']})" if "system_missing" in data.attrs else ""
+        raise TrajectoryFileError(f"{path}: the file does not describe its system, a {name}{why}: {ask}")
+    if name not in _codecs:
+        raise TrajectoryFileError(f"{path}: nothing that is imported here reads its system, a {name}: {ask}")
+    content, sizes = np.asarray(data[_BYTES].values), np.array([data[_BYTES].size])
+    if _SIZES in data.variables:
+        sizes = _values(path, data, _SIZES, (data.sizes.get("batch", 0),))
+    whole = content.dtype == np.uint8 and content.ndim == 1 and sizes.dtype.kind in "iu" and sizes.size > 0
+    if not whole or min(sizes) < 1 or max(sizes) > content.size or sum(sizes.tolist()) != content.size:
+        raise TrajectoryFileError(f"{path}: the variable {_BYTES!r} does not hold what it should")
+    ends = np.cumsum(sizes)
+    try:
+        robots = [
+            _codecs[name].decode(content[end - size : end].tobytes(), f"{path}: variable {_BYTES!r}")
+            for size, end in zip(sizes, ends, strict=True)
+        ]
+    except ValueError as error:
+        raise TrajectoryFileError(f"{_first_line(error)}; or {ask}") from None
+    if _SIZES not in data.variables:
+        return robots[0]
+    try:
+        return jax.tree.map(lambda *leaves: np.stack(leaves), *robots)
+    except ValueError as error:
+        raise TrajectoryFileError(f"{path}: its systems are not a batch: {_first_line(error)}") from None
 
 
 def _first_line(error: Exception) -> str:

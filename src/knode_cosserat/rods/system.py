@@ -32,7 +32,8 @@ class Field(NamedTuple):
 
     `frame` names the orientation (a quaternion in y) by whose rotation a vector of the global frame is seen
     from the material; none for what is not turned. `load` is the unit of the load that the field's rate along
-    s balances, such as N/m of an internal force; none for a field whose rate is geometry.
+    s balances, such as N/m of an internal force, none for a field whose rate is geometry; of a strain, the
+    unit of its stress.
     """
 
     name: str
@@ -222,7 +223,7 @@ class System(eqx.Module):
     def observables(
         self, s: Any, y: Float[Any, " y"], y_t: Any, z: Float[Any, " z"], z_t: Any, control: Any
     ) -> Float[Any, " o"]:
-        """What a load that the equations miss may depend on, at one point and as seen from the material."""
+        """What a load that the equations miss may depend on beside the control, as seen from the material."""
         _, z_rest = self.rest(s)
         return jnp.concatenate([self.turned(y, y), self.turned(y, y_t), z - z_rest, z_t])
 

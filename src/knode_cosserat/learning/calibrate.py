@@ -1,0 +1,233 @@
+"""The physical parameters themselves, found from trajectories, with intervals that say how well."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.learning import search
+from knode_cosserat.learning.misfit import SegmentMisfit, by_group
+from knode_cosserat.learning.noise import MeasurementNoise
+from knode_cosserat.learning.rollouts import RolloutMisfit
+from knode_cosserat.learning.samples import DataError
+from knode_cosserat.learning.search import CalibrationError as CalibrationError
+from knode_cosserat.learning.search import Fit, Misfit
+from knode_cosserat.learning.unknowns import (
+    Unknowns,
+    found,
+    labels,
+    limits,
+    logarithmic,
+    owner_of,
+    searched,
+    units,
+    unknowns_of,
+    values,
+    with_numbers,
+)
+from knode_cosserat.rods.system import System
+from knode_cosserat.trajectory import Trajectory
+
+#: noise may move an estimate by this part of it, on average, and be corrected for
+MOST_SHIFT = 0.3
+
+
+@dataclasses.dataclass(frozen=True)
+class Calibration:
+    """Parameters that were found from trajectories; `print` shows them as a table.
+
+    What is by parameter is a float, or an array for what has several numbers: the components of a vector, the
+    diagonal of a matrix. A matrix that is a multiple of the identity counts as one number.
+    """
+
+    #: the robot with the estimates
+    robot: System
+    #: by parameter: the value before, the estimate, its standard error, and (low, high) of its interval
+    before: Mapping[str, Any]
+    estimates: Mapping[str, Any]
+    standard_errors: Mapping[str, Any]
+    intervals: Mapping[str, Any]
+    #: how probable it is that an interval holds the truth, if what is left is noise
+    level: float
+    #: the numbers in the order of `correlation`, and their units
+    labels: tuple[str, ...]
+    units: tuple[str, ...]
+    #: correlation of the numbers' errors
+    correlation: Float[np.ndarray, "n n"]
+    #: parameters that were left as they were, because the data do not determine them
+    undetermined: tuple[str, ...]
+    #: root mean square of what is left between prediction and data, by field
+    remainder: Mapping[str, float]
+    #: fields in which that is not noise: another parameter is wrong, or the equations miss something
+    unexplained: tuple[str, ...]
+
+    def __str__(self) -> str:
+        def numbers(by_parameter: Mapping[str, Any]) -> list[Any]:
+            return [number for value in by_parameter.values() for number in np.atleast_1d(value)]
+
+        ends = np.concatenate([np.reshape(pair, (-1, 2)) for pair in self.intervals.values()])
+        rows = [("parameter", "unit", "before", "estimate", f"{100 * self.level:g} % interval")]
+        columns = map(numbers, (self.before, self.estimates, self.standard_errors))
+        for label, unit, before, estimate, error, pair in zip(
+            self.labels, self.units, *columns, ends, strict=True
+        ):
+            low, middle, high = (_as_precise_as(value, error) for value in (pair[0], estimate, pair[1]))
+            rows.append((label, unit, f"{before:.6g}", middle, f"{low} to {high}"))
+        widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+        lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
+        lines.insert(1, "  ".join("-" * width for width in widths))
+        if self.undetermined:
+            lines.append(f"left as before, not determined by these data: {', '.join(self.undetermined)}")
+        if self.unexplained:
+            lines.append(
+                f"not explained: what is left in {', '.join(self.unexplained)} is not noise, so that the "
+                "intervals do not hold: another parameter is wrong, or the equations miss something"
+            )
+        return "\n".join(lines)
+
+
+def calibrate(
+    robot: System,
+    trajectories: Sequence[Trajectory],
+    names: Sequence[str] | None = None,
+    *,
+    by: Literal["segments", "rollouts"] = "segments",
+    level: float = 0.95,
+) -> Calibration:
+    """Find physical parameters of a robot from trajectories, by least squares.
+
+    Args:
+        robot: where the search begins; what is not named stays as it is.
+        trajectories: what the real robot did.
+        names: parameters by name (`System.parameters`); by default all that have a value and that the data
+            determine.
+        by: "segments" compares one-segment predictions from the states in the data, all of which must be
+            known. It takes a fraction of a second and finds its way from far off. Noise in the states enters
+            its predictions too; what that does to the estimates is taken away, to leading order in its
+            variance. "rollouts" compares whole simulations with positions and orientations, and needs nothing
+            else of trajectories that begin at rest. Its search begins where segments lead, if they do.
+        level: how probable it is that an interval holds the truth.
+
+    Returns:
+        The estimates, their intervals and the robot that has them. Intervals take what is left for white
+        noise; `unexplained` names the fields where it is not.
+
+    Raises:
+        CalibrationError: the data do not determine a named parameter, or the search does not converge.
+        ParameterError: a name that does not exist, or a parameter that cannot be calibrated.
+        DataError: trajectories that do not fit the robot, or are too short or not finite.
+    """
+    _check(robot, trajectories, by, level)
+    unknowns = unknowns_of(robot, names)
+    if by == "segments":
+        misfit: Misfit = SegmentMisfit(robot, trajectories, unknowns)
+        start = values(robot, unknowns)
+    else:
+        misfit = RolloutMisfit(robot, trajectories, unknowns)
+        start = _by_segments(robot, trajectories, unknowns)
+    fit = search.fit(misfit, searched(unknowns, start), may_leave_out=names is None)
+    return _calibration(misfit, fit, level)
+
+
+def _check(robot: Any, trajectories: Any, by: Any, level: Any) -> None:
+    if not isinstance(robot, System) or np.ndim(robot.length):
+        raise CalibrationError(f"robot is a {type(robot).__name__}; allowed is one robot")
+    if isinstance(trajectories, Trajectory) or not isinstance(trajectories, Sequence):
+        raise DataError(f"trajectories is a {type(trajectories).__name__}; allowed is a list of trajectories")
+    if by not in ("segments", "rollouts"):
+        raise CalibrationError(f'by is {by!r}; allowed is "segments" or "rollouts"')
+    if isinstance(level, bool) or not isinstance(level, int | float) or not 0.0 < level < 1.0:
+        raise CalibrationError(f"level is {level!r}; allowed is a number between 0 and 1")
+    if not owner_of(robot).parameters():
+        raise CalibrationError(f"{type(owner_of(robot)).__name__} has no parameters")
+
+
+def _by_segments(robot: System, trajectories: Sequence[Trajectory], unknowns: Unknowns) -> np.ndarray:
+    """Where segments lead; where the robot is, if that is nowhere or not everything was measured."""
+    try:
+        misfit = SegmentMisfit(robot, trajectories, unknowns)
+        ended = search.fit(misfit, searched(unknowns, values(robot, unknowns)), may_leave_out=True)
+    except (CalibrationError, DataError):
+        return values(robot, unknowns)
+    return found(unknowns, ended.coordinates)
+
+
+def _calibration(misfit: Misfit, ended: Fit, level: float) -> Calibration:
+    """The estimates from where a search ended, with what can be said of their errors."""
+    # imported here: it takes a third of a second
+    from scipy.special import stdtrit
+
+    robot, unknowns, free = misfit.robot, misfit.unknowns, ended.free
+    weights = ended.weights(misfit)
+    differences = misfit(ended.coordinates)
+    count = len(differences.values) - np.count_nonzero(free)
+    coordinates = ended.coordinates.copy()
+    weighted = differences.slopes[:, free] * weights[:, None]
+    lengths = np.linalg.norm(weighted, axis=0)
+    normal = np.linalg.inv((weighted / lengths).T @ (weighted / lengths)) / np.outer(lengths, lengths)
+    if isinstance(misfit, SegmentMisfit):
+        noise = MeasurementNoise(misfit, ended.coordinates, ended.sizes)
+        covariance = noise.covariance(normal @ weighted.T * weights)
+        coordinates[free] -= _believable(misfit, ended, noise.shift(weights, free), covariance)
+    else:
+        covariance = normal * len(weighted) / count
+    limit = limits(robot, unknowns)
+    numbers = np.clip(found(unknowns, coordinates), *limit)
+    errors, quantile = np.sqrt(np.diag(covariance)), stdtrit(count, 0.5 + level / 2.0)
+    which = logarithmic(unknowns)[free]
+    kept = tuple(unknown for unknown in unknowns if unknown.name not in ended.left_out)
+    reach = coordinates[free][:, None] + np.array([-quantile, quantile]) * errors[:, None]
+    ends = np.clip(found(kept, reach.T).T, limit[0][free, None], limit[1][free, None])
+    left = np.sqrt(by_group(np.square(differences.values), misfit.groups))
+    return Calibration(
+        robot=with_numbers(robot, kept, numbers[free]),
+        before=_by_parameter(kept, values(robot, kept)),
+        estimates=_by_parameter(kept, numbers[free]),
+        standard_errors=_by_parameter(kept, np.where(which, numbers[free], 1.0) * errors),
+        intervals=_by_parameter(kept, ends),
+        level=float(level),
+        labels=labels(kept),
+        units=units(robot, kept),
+        correlation=covariance / np.outer(errors, errors),
+        undetermined=ended.left_out,
+        remainder=dict(zip(misfit.fields, left.tolist(), strict=True)),
+        unexplained=search.systematic(misfit, ended),
+    )
+
+
+def _believable(misfit: Misfit, ended: Fit, shift: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """By how much noise moved the estimates on average, if that is little enough to be known."""
+    free = ended.free
+    size = np.where(logarithmic(misfit.unknowns), 1.0, np.abs(found(misfit.unknowns, ended.coordinates)))[
+        free
+    ]
+    errors = np.sqrt(np.diag(covariance))
+    for k in np.flatnonzero((np.abs(shift) > MOST_SHIFT * size) & (np.abs(shift) > 3.0 * errors)):
+        raise CalibrationError(
+            f"noise in the states moves {np.array(labels(misfit.unknowns))[free][k]} by about "
+            f'{100 * abs(shift[k]) / size[k]:.0f} %, too much to be corrected; use by="rollouts"'
+        )
+    return shift
+
+
+def _by_parameter(unknowns: Unknowns, numbers: np.ndarray) -> dict[str, Any]:
+    """Numbers (n,), or pairs of them (n, 2), by parameter."""
+    result, first = {}, 0
+    for unknown in unknowns:
+        own = numbers[first : first + unknown.size]
+        single = own[0] if own.ndim == 2 else float(own[0])
+        result[unknown.name] = single if unknown.kind in ("number", "multiple") else own
+        first += unknown.size
+    return result
+
+
+def _as_precise_as(value: float, error: float) -> str:
+    """A number to two digits of its error, at most twelve."""
+    if not 0.0 < error < np.inf or value == 0.0:
+        return f"{value:.6g}"
+    digits = int(np.floor(np.log10(abs(value)))) - int(np.floor(np.log10(error))) + 2
+    return f"{value:.{min(12, max(2, digits))}g}"

@@ -1,0 +1,175 @@
+"""Where a fit stands, kept in files: interrupted at any moment, it goes on from the last of them.
+
+A checkpoint says which fit it is of: settings, data and knowledge. That of another one is refused, and so is
+one that is truncated or damaged. Files are `container`s: they appear complete or not at all, and reading one
+runs no code.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Self
+
+import jax
+import numpy as np
+
+from knode_cosserat.learning import container
+from knode_cosserat.learning.config import FitConfig
+from knode_cosserat.learning.container import ContainerError, Reader, Title, Writer
+from knode_cosserat.learning.knode import KNODE
+from knode_cosserat.rods.system import System
+from knode_cosserat.trajectory import Trajectory
+
+TITLE = Title("knode-cosserat checkpoint", 1)
+SUFFIX = ".checkpoint"
+
+
+class CheckpointError(ValueError):
+    """A checkpoint that cannot be used or written: one line that says which and why."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Identity:
+    """What makes two fits the same, but for the seed: that stands in a checkpoint's name."""
+
+    config: dict[str, Any]
+    knowledge: str
+    trajectories: tuple[str, ...]
+    held_out: tuple[str, ...]
+
+    @classmethod
+    def of(
+        cls,
+        knowledge: System,
+        trajectories: Sequence[Trajectory],
+        held_out: Sequence[Trajectory],
+        config: FitConfig,
+    ) -> Self:
+        """Of the arguments of `fit`."""
+        settings = {name: value for name, value in config.to_dict().items() if name != "seed"}
+        hashes = (tuple(map(data_hash, several)) for several in (trajectories, held_out))
+        return cls(settings, _knowledge_hash(knowledge), *hashes)
+
+    def difference(self, other: dict[str, Any]) -> str:
+        """In which way a file is of another fit; empty if it is of this one."""
+        changed = _first_change(self.config, other.get("config"))
+        if changed:
+            return f"of other settings: {changed}"
+        for name, words in (
+            ("knowledge", "another knowledge"), ("trajectories", "other trajectories"),
+            ("held_out", "other held-out trajectories"),
+        ):  # fmt: skip
+            own = getattr(self, name)
+            if (list(own) if isinstance(own, tuple) else own) != other.get(name):
+                return f"of {words}"
+        return ""
+
+
+def data_hash(trajectory: Trajectory) -> str:
+    """SHA-256 of a trajectory's times, states, strains and controls: what is learned from."""
+    return _hash([np.asarray(getattr(trajectory, name)) for name in ("time", "y", "z", "control")])
+
+
+def _knowledge_hash(knowledge: System) -> str:
+    residual = knowledge.residual if isinstance(knowledge, KNODE) else None
+    leaves, _ = jax.tree_util.tree_flatten_with_path(knowledge)
+    names = [type(knowledge).__qualname__, type(residual).__qualname__, str(knowledge.nodes)]
+    names += [jax.tree_util.keystr(path) for path, _ in leaves]
+    return _hash([np.array(list("\n".join(names).encode())), *(np.asarray(leaf) for _, leaf in leaves)])
+
+
+def _hash(arrays: Sequence[np.ndarray]) -> str:
+    digest = hashlib.sha256()
+    for array in arrays:
+        digest.update(f"{array.dtype.str} {array.shape}\n".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def _first_change(own: Any, other: Any, where: str = "") -> str:
+    if isinstance(own, dict) and isinstance(other, dict):
+        for key in sorted({*own, *other}):
+            changed = _first_change(own.get(key), other.get(key), f"{where}.{key}" if where else key)
+            if changed:
+                return changed
+        return ""
+    if own == other:
+        return ""
+    return f"{where} is {json.dumps(other)[:60]} there and {json.dumps(own)[:60]} here"
+
+
+class Checkpoints:
+    """The checkpoints of one fit, in a folder: one file for each part that runs by itself.
+
+    Raises:
+        CheckpointError: the folder cannot be made.
+    """
+
+    def __init__(self, folder: str | Path, identity: Identity):
+        self.folder = Path(folder)
+        self.identity = identity
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except (OSError, ValueError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise CheckpointError(f"{folder}: cannot be made a folder: {reason}") from None
+
+    def path(self, name: str) -> Path:
+        """The file of a part."""
+        return self.folder / f"{name}{SUFFIX}"
+
+    def save(self, name: str, snapshot: dict[str, Any]) -> None:
+        """Write where a part stands, in place of what was there. Raises `CheckpointError`."""
+        writer = Writer()
+        try:
+            header = {
+                "identity": json.loads(json.dumps(dataclasses.asdict(self.identity))),
+                "name": name,
+                "snapshot": writer.value(snapshot, "snapshot", {}),
+            }
+            container.write(self.path(name), writer.file(TITLE, header))
+        except ContainerError as error:
+            raise CheckpointError(f"{self.path(name)}: {error}") from None
+
+    def load(self, name: str) -> dict[str, Any] | None:
+        """Where a part stood, or None if it has not been kept yet. Raises `CheckpointError`."""
+        path = self.path(name)
+        for left_over in self.folder.glob(f".{path.name}.*.tmp"):
+            with contextlib.suppress(OSError):
+                left_over.unlink()
+        if not path.exists():
+            return None
+        try:
+            reader = Reader(container.read(path), TITLE)
+            difference = self.identity.difference(reader.entry("identity", dict))
+            if reader.entry("name", str) != name:
+                difference = f"of {reader.header['name'][:60]!r}"
+            snapshot = reader.value(reader.entry("snapshot", dict), "snapshot", {})
+        except ContainerError as error:
+            raise CheckpointError(f"{path}: {error}; delete it to start again") from None
+        if difference:
+            raise CheckpointError(
+                f"{path}: it is {difference}; give this fit another folder, or delete it to start again"
+            )
+        return dict(snapshot)
+
+
+def packed(tree: Any) -> list[np.ndarray]:
+    """The arrays of a pytree, for a snapshot."""
+    return [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
+
+
+def unpacked(arrays: Any, like: Any) -> Any:
+    """A pytree like another one with the arrays of a snapshot. Raises `CheckpointError`."""
+    leaves, structure = jax.tree.flatten(like)
+    described = [(np.shape(leaf), np.asarray(leaf).dtype) for leaf in leaves]
+    if not isinstance(arrays, list) or not all(isinstance(array, np.ndarray) for array in arrays):
+        raise CheckpointError("a checkpoint has something else where arrays should be")
+    if [(array.shape, array.dtype) for array in arrays] != described:
+        raise CheckpointError("a checkpoint has arrays of other shapes than this fit")
+    return jax.tree.unflatten(structure, [jax.numpy.asarray(array) for array in arrays])

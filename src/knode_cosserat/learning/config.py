@@ -1,0 +1,316 @@
+"""What is learned and how: settings as data, checked when they are made, to JSON and back."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import reprlib
+from collections.abc import Callable
+from typing import Any, ClassVar, Literal, Self
+
+import numpy as np
+
+
+class ConfigError(ValueError):
+    """Settings that are not possible: one line that says which, what was given and what is allowed."""
+
+
+# what an option may be
+
+
+@dataclasses.dataclass(frozen=True)
+class _Allowed:
+    """What an option may be: in words, and as a test that gives the value, or None if it is wrong."""
+
+    words: str
+    test: Callable[[Any], Any]
+
+    def __call__(self, name: str, value: Any) -> Any:
+        accepted = self.test(value)
+        if accepted is None:
+            raise ConfigError(f"{name} is {reprlib.repr(value)}; allowed is {self.words}")
+        return accepted
+
+
+def _is_whole(value: Any, low: int, high: float) -> bool:
+    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    return whole and low <= int(value) <= high
+
+
+def _whole(low: int, high: int = 10_000_000) -> _Allowed:
+    return _Allowed(
+        f"a whole number from {low} to {high}", lambda x: int(x) if _is_whole(x, low, high) else None
+    )
+
+
+def _number(low: float, high: float, *, above: bool = False) -> _Allowed:
+    def test(value: Any) -> float | None:
+        if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+            return None
+        return float(value) if (low < value if above else low <= value) and value <= high else None
+
+    return _Allowed(f"a number {'above' if above else 'from'} {low:g} up to {high:g}", test)
+
+
+def _choice(*names: str) -> _Allowed:
+    words = ", ".join(f'"{name}"' for name in names)
+    return _Allowed(words, lambda x: x if isinstance(x, str) and x in names else None)
+
+
+def _flag() -> _Allowed:
+    return _Allowed("true or false", lambda x: x if isinstance(x, bool) else None)
+
+
+def _several(words: str, test: Callable[[Any], bool]) -> _Allowed:
+    def tested(value: Any) -> Any:
+        parts = tuple(value) if isinstance(value, list | tuple) else ()
+        good = parts and len(set(map(str, parts))) == len(parts) and all(test(part) for part in parts)
+        return tuple(part if isinstance(part, str) else int(part) for part in parts) if good else None
+
+    return _Allowed(words, tested)
+
+
+def _option(default: Any, allowed: _Allowed, *, none: str = "") -> Any:
+    """A field with what it may be; `none` says what None means, where that is allowed."""
+    return dataclasses.field(default=default, metadata={"allowed": allowed, "none": none})
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Settings of one kind. Raises `ConfigError` where a value is not allowed."""
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            allowed, none = field.metadata.get("allowed"), field.metadata.get("none")
+            value = getattr(self, field.name)
+            if allowed is None or (none and value is None):
+                continue
+            if none:
+                allowed = dataclasses.replace(allowed, words=f"{allowed.words}, or None: {none}")
+            object.__setattr__(self, field.name, allowed(f"{type(self).__name__}.{field.name}", value))
+
+    def to_dict(self) -> dict[str, Any]:
+        """The settings as JSON can have them."""
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
+
+    @classmethod
+    def from_dict(cls, values: Any) -> Self:
+        """The settings that `to_dict` gave; what is not there is at its default. Raises `ConfigError`."""
+        names = [field.name for field in dataclasses.fields(cls)]
+        return cls(**_checked_keys(cls.__name__, values, names))
+
+
+def _checked_keys(what: str, values: Any, names: list[str]) -> dict[str, Any]:
+    if not isinstance(values, dict):
+        raise ConfigError(f"{what} is {reprlib.repr(values)}; allowed is a mapping of {', '.join(names)}")
+    for key in values:
+        if key not in names:
+            close = difflib.get_close_matches(str(key), names, n=1)
+            hint = f"; did you mean {close[0]}?" if close else ""
+            raise ConfigError(f"{what} has no option {reprlib.repr(key)}; there are {', '.join(names)}{hint}")
+    return dict(values)
+
+
+# what is learned
+
+
+@dataclasses.dataclass(frozen=True)
+class StructuredOptions(Options):
+    """A structured residual, found by sparse regression (`learning.structured`)."""
+
+    kind: ClassVar[str] = "structured"
+
+    #: whether curved functions (powers, saturating) are tried where the linear ones leave something
+    curved: bool = _option(True, _flag())
+    #: whether the seed gives rows random weights (Bayesian bootstrap): seeds then differ as data would
+    resample: bool = _option(False, _flag())
+
+
+@dataclasses.dataclass(frozen=True)
+class NetworkOptions(Options):
+    """A network with one hidden layer, added to y_s and z (`learning.residual.Network`)."""
+
+    kind: ClassVar[str] = "network"
+
+    hidden: int = _option(512, _whole(1, 100_000))
+    #: whether ʰy and ʰz are inputs too
+    history: bool = _option(False, _flag())
+    #: whether the weights are kept from being negative
+    convex: bool = _option(True, _flag())
+    #: whether inputs and outputs are shifted and scaled by what the data are like
+    standardised: bool = _option(False, _flag())
+
+
+# how
+
+
+@dataclasses.dataclass(frozen=True)
+class Training(Options):
+    """Gradient training on one-segment samples: Adam, all samples in every epoch."""
+
+    epochs: int = _option(1000, _whole(1))
+    learning_rate: float = _option(0.01, _number(0.0, 10.0, above=True))
+    #: "plateau": times `factor` after more than `patience` epochs in which the loss fell by less than 1e-4 of
+    #: itself; "cosine": down to zero over all epochs
+    schedule: Literal["plateau", "cosine", "constant"] = _option(
+        "plateau", _choice("plateau", "cosine", "constant")
+    )
+    patience: int = _option(80, _whole(0))
+    factor: float = _option(0.5, _number(0.0, 1.0, above=True))
+    #: "paper", or "standardised": every number by its own spread (also used where the paper's is not defined)
+    loss: Literal["paper", "standardised"] = _option("paper", _choice("paper", "standardised"))
+    #: decoupled (AdamW), of weights and not of biases
+    weight_decay: float = _option(0.0, _number(0.0, 10.0))
+    #: stabilisation: new noise in every epoch, as a part of how much each number varies in the data
+    noise: float = _option(0.0, _number(0.0, 10.0))
+    #: nodes that are predicted
+    nodes: tuple[int, ...] | None = _option(
+        None,
+        _several("different node numbers from 1 on", lambda x: _is_whole(x, 1, 10_000)),
+        none="all nodes",
+    )
+    #: epochs without a better held-out rollout after which to stop; the best weights are kept
+    stop_after: int | None = _option(None, _whole(1), none="never")
+    #: epochs between two held-out rollouts
+    check_every: int = _option(50, _whole(1))
+
+
+@dataclasses.dataclass(frozen=True)
+class RolloutTraining(Options):
+    """Fine-tuning through whole simulations: only what is compared has to be known of the trajectories."""
+
+    updates: int = _option(100, _whole(1))
+    learning_rate: float = _option(1e-3, _number(0.0, 10.0, above=True))
+    schedule: Literal["cosine", "constant"] = _option("constant", _choice("cosine", "constant"))
+    #: fields of y that are compared
+    compared: tuple[str, ...] | None = _option(
+        None,
+        _several("different names of fields of y", lambda x: isinstance(x, str)),
+        none="position p and orientation h",
+    )
+    #: how many rows are simulated
+    horizon: int | None = _option(None, _whole(1), none="all rows")
+    #: the row to start from, with all that is known there
+    first_row: int | None = _option(None, _whole(0), none="the model at rest, at time 0")
+    #: the largest norm of a gradient; a longer one is shortened
+    clip: float = _option(1.0, _number(0.0, 1e12, above=True))
+    #: how often in a row a step may be halved because the robot cannot be simulated after it
+    rejections: int = _option(8, _whole(1, 1000))
+    #: updates without a better held-out rollout after which to stop; the best weights are kept
+    stop_after: int | None = _option(None, _whole(1), none="never")
+    #: updates between two held-out rollouts
+    check_every: int = _option(10, _whole(1))
+
+
+@dataclasses.dataclass(frozen=True)
+class FitConfig:
+    """What `fit` learns, and how. `FitConfig()` is the best preset.
+
+    Attributes:
+        residual: what is learned.
+        segments: gradient training on one-segment samples, or None.
+        rollouts: fine-tuning through whole simulations after that, or None.
+        seed: of the first weights and of the noise; several give as many models.
+
+    Raises:
+        ConfigError: a value is not allowed.
+    """
+
+    residual: StructuredOptions | NetworkOptions = StructuredOptions()
+    segments: Training | None = None
+    rollouts: RolloutTraining | None = None
+    seed: int | tuple[int, ...] = 0
+
+    def __post_init__(self) -> None:
+        for name, kinds in _PARTS.items():
+            value = getattr(self, name)
+            if not isinstance(value, kinds) and not (value is None and name != "residual"):
+                words = " or ".join(kind.__name__ for kind in kinds)
+                raise ConfigError(f"FitConfig.{name} is {reprlib.repr(value)}; allowed is {words}")
+        object.__setattr__(self, "seed", _checked_seed(self.seed))
+        if isinstance(self.residual, NetworkOptions) and self.segments is None and self.rollouts is None:
+            raise ConfigError("FitConfig has a network but neither segments nor rollouts to train it by")
+
+    @classmethod
+    def paper(cls, seed: int | tuple[int, ...] = 0, history: bool = False) -> Self:
+        """The paper's training to the letter; with `history` inputs as in its study of the real robot."""
+        return cls(
+            NetworkOptions(hidden=512, history=history, convex=True, standardised=False),
+            Training(epochs=1000, learning_rate=0.01, schedule="plateau", patience=80, nodes=(3, 5, 7, 9)),
+            seed=seed,
+        )
+
+    @classmethod
+    def network(
+        cls,
+        seed: int | tuple[int, ...] = 0,
+        *,
+        hidden: int = 128,
+        epochs: int = 2000,
+        history: bool = False,
+        noise: float = 0.0,
+        weight_decay: float = 1e-4,
+    ) -> Self:
+        """A network without the paper's constraint, on standardised inputs and outputs, at all nodes."""
+        return cls(
+            NetworkOptions(hidden=hidden, history=history, convex=False, standardised=True),
+            Training(
+                epochs=epochs, learning_rate=3e-3, schedule="cosine", loss="standardised", noise=noise,
+                weight_decay=weight_decay,
+            ),
+            seed=seed,
+        )  # fmt: skip
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """The seeds, also if it is one."""
+        return self.seed if isinstance(self.seed, tuple) else (self.seed,)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The settings as JSON can have them."""
+        return {
+            "residual": {"kind": self.residual.kind, **self.residual.to_dict()},
+            "segments": None if self.segments is None else self.segments.to_dict(),
+            "rollouts": None if self.rollouts is None else self.rollouts.to_dict(),
+            "seed": list(self.seed) if isinstance(self.seed, tuple) else self.seed,
+        }
+
+    @classmethod
+    def from_dict(cls, values: Any) -> Self:
+        """The settings that `to_dict` gave; what is not there is at its default. Raises `ConfigError`."""
+        parts = _checked_keys("FitConfig", values, [field.name for field in dataclasses.fields(cls)])
+        if "residual" in parts:
+            parts["residual"] = _residual(parts["residual"])
+        for name, kind in (("segments", Training), ("rollouts", RolloutTraining)):
+            if parts.get(name) is not None:
+                parts[name] = kind.from_dict(parts[name])
+        return cls(**parts)
+
+
+#: what the parts of a `FitConfig` may be
+_PARTS: dict[str, tuple[type, ...]] = {
+    "residual": (StructuredOptions, NetworkOptions),
+    "segments": (Training,),
+    "rollouts": (RolloutTraining,),
+}
+
+
+def _residual(values: Any) -> Any:
+    kinds = {kind.kind: kind for kind in (StructuredOptions, NetworkOptions)}
+    kind = values.get("kind") if isinstance(values, dict) else None
+    if kind not in kinds:
+        raise ConfigError(
+            f"FitConfig.residual has the kind {reprlib.repr(kind)}; allowed is {', '.join(kinds)}"
+        )
+    return kinds[kind].from_dict({key: value for key, value in values.items() if key != "kind"})
+
+
+def _checked_seed(seed: Any) -> int | tuple[int, ...]:
+    allowed = "a whole number from 0 to 4294967295, or several different ones"
+    several = isinstance(seed, list | tuple)
+    parts = tuple(seed) if several else (seed,)
+    whole = bool(parts) and all(_is_whole(part, 0, 2**32 - 1) for part in parts)
+    if not whole or len(set(parts)) < len(parts):
+        raise ConfigError(f"FitConfig.seed is {reprlib.repr(seed)}; allowed is {allowed}")
+    return tuple(int(part) for part in parts) if several else int(parts[0])

@@ -1,0 +1,231 @@
+"""Whole simulations against trajectories: the loss that fine-tuning goes down, and the held-out error.
+
+Only what is compared has to be known of a trajectory. Derivatives go through every solved step by the
+implicit function theorem (`solvers.sensitivity`), so that any residual can be trained in this way.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.learning.config import RolloutTraining
+from knode_cosserat.learning.knode import KNODE
+from knode_cosserat.learning.samples import DataError, samples
+from knode_cosserat.rods.system import Layout, System
+from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.simulate import simulate
+from knode_cosserat.trajectory import Trajectory
+
+#: what is compared if nothing else is asked for, as far as a system has it
+POSE = ("p", "h")
+
+
+class Past(NamedTuple):
+    """The rows of some trajectories (B) up to the one that simulations start from."""
+
+    time: Float[Any, "B rows"]
+    y: Float[Any, "B rows nodes y"]
+    z: Float[Any, "B rows nodes z"]
+    control: Float[Any, "B rows c"]
+
+
+class Course(NamedTuple):
+    """Trajectories (B) of one length: what is done, and what should come of it."""
+
+    past: Past | None
+    control: Float[Any, "B T c"]
+    #: row 0 is where simulations start
+    y: Float[Any, "B T+1 nodes y"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Courses:
+    """All trajectories, those of one length together, and how they are simulated."""
+
+    parts: tuple[Course, ...]
+    compared: tuple[str, ...]
+    settings: Settings
+    dt: float
+
+
+def courses(
+    knowledge: System, trajectories: Sequence[Trajectory], options: RolloutTraining, what: str = ""
+) -> Courses:
+    """Trajectories as they are simulated and compared; `what` comes before their number in messages.
+
+    Raises:
+        DataError: one does not fit the knowledge or the others, is too short, begins in motion, or is not
+            finite where it matters.
+    """
+    compared = _checked_names(knowledge, options.compared)
+    first = options.first_row
+    try:
+        samples(knowledge, [_relevant(knowledge, one, compared, first) for one in trajectories])
+    except DataError as error:
+        raise DataError(f"{what}{error}") from None
+    by_length: dict[int, list[Course]] = {}
+    for k, trajectory in enumerate(trajectories):
+        name = f"{what}trajectory {k}"
+        if first is None and float(trajectory.time[0]) != 0.0:
+            raise DataError(
+                f"{name} begins at {float(trajectory.time[0]):g} s, in motion; simulations start at rest, at "
+                "time 0, unless RolloutTraining.first_row says where"
+            )
+        start, rows = first or 0, len(trajectory.time)
+        stop = min(rows, start + 1 + (options.horizon or rows))
+        if stop - start < 2:
+            raise DataError(f"{name} has {rows} rows; after row {start} there must be at least one more")
+        part = _course(trajectory, first, start, stop)
+        by_length.setdefault(stop, []).append(part)
+    joined = [jax.tree.map(lambda *leaves: np.stack(leaves), *parts) for parts in by_length.values()]
+    settings = trajectories[0].settings or Settings()
+    return Courses(tuple(joined), compared, settings, trajectories[0].dt)
+
+
+def _course(trajectory: Trajectory, first: int | None, start: int, stop: int) -> Course:
+    arrays = (trajectory.time, trajectory.y, trajectory.z, trajectory.control)
+    time, y, z, control = (np.asarray(array, dtype=float) for array in arrays)
+    before = slice(0, start + 1)
+    past = None if first is None else Past(time[before], y[before], z[before], control[before])
+    return Course(past, control[start + 1 : stop], y[start:stop])
+
+
+def _checked_names(knowledge: System, given: tuple[str, ...] | None) -> tuple[str, ...]:
+    known = knowledge.y_layout.names
+    names = tuple(name for name in POSE if name in known) if given is None else given
+    for name in names:
+        if name not in known:
+            raise DataError(f"RolloutTraining.compared has {name!r}; y has {', '.join(known)}")
+    if not names:
+        raise DataError(f"y has no p or h; RolloutTraining.compared must say which of {', '.join(known)}")
+    return names
+
+
+def _relevant(knowledge: System, trajectory: Any, names: tuple[str, ...], first: int | None) -> Any:
+    """A trajectory with zeros for all that is neither compared nor started from: it may be unknown."""
+    if not isinstance(trajectory, Trajectory) or np.ndim(trajectory.y) != 3:
+        return trajectory
+    y, z = np.array(trajectory.y, dtype=float), np.array(trajectory.z, dtype=float)
+    after = slice(0 if first is None else first + 1, None)
+    if y.shape[-1] == knowledge.y_layout.size:
+        others = [name for name in knowledge.y_layout.names if name not in names]
+        if others:
+            y[after, :, knowledge.y_layout.indices(tuple(others))] = 0.0
+    z[after] = 0.0
+    return dataclasses.replace(trajectory, y=y, z=z)
+
+
+# simulating
+
+
+def rolled(model: System, course: Course, settings: Settings, dt: float) -> Float[Any, "B T+1 nodes y"]:
+    """y of all trajectories as the model has them, one after the other; NaN where a step is not solved."""
+
+    def one(given: Any) -> Any:
+        past, control = given
+        initial = None
+        if past is not None:
+            none, zero = jnp.zeros(past.time.shape[0], dtype=int), jnp.zeros(past.time.shape[0])
+            initial = Trajectory(
+                model, settings, past.time, past.y, past.z, past.control, none, zero, iterations=none
+            )
+        return simulate(
+            model, control, dt, time=settings.time, space=settings.space, start=settings.start,
+            newton=settings.newton, initial=initial,
+        ).y  # fmt: skip
+
+    return jax.lax.map(one, (course.past, course.control))
+
+
+@functools.partial(jax.jit, static_argnames=("settings", "dt"))
+def _tip_errors(model: System, parts: tuple[Course, ...], settings: Settings, dt: float) -> Any:
+    errors = []
+    for course in parts:
+        found = model.positions(rolled(model, course, settings, dt)[:, :, -1])
+        distance = jnp.sum((found - model.positions(course.y[:, :, -1])) ** 2, axis=-1)
+        errors.append(jnp.sqrt(jnp.mean(distance, axis=-1)))
+    return jnp.concatenate(errors)
+
+
+def held_out_courses(knowledge: System, trajectories: Sequence[Trajectory]) -> Courses | None:
+    """Trajectories to be simulated from rest and compared at the tip; None if there are none.
+
+    Raises:
+        DataError: as `courses`; or the system has no positions.
+    """
+    if not trajectories:
+        return None
+    if "p" not in knowledge.y_layout.names:
+        raise DataError(f"held-out rollouts need positions; y has {', '.join(knowledge.y_layout.names)}")
+    return courses(knowledge, trajectories, RolloutTraining(compared=("p",)), what="held-out ")
+
+
+def tip_error(model: System, courses: Courses) -> float:
+    """The root mean square distance (m) of the tips, a mean over trajectories; infinite if not solved."""
+    errors = np.asarray(_tip_errors(model, courses.parts, courses.settings, courses.dt))
+    return float(np.mean(errors)) if np.all(np.isfinite(errors)) else float("inf")
+
+
+# the loss
+
+
+def scales(courses: Courses, layout: Layout) -> tuple[float, ...]:
+    """By what the errors of each compared field are measured: how much it moves, the root mean square."""
+    found = []
+    for name in courses.compared:
+        values = [layout.get(part.y, name) for part in courses.parts]
+        moves = [np.mean(np.var(value, axis=1)) * len(value) for value in values]
+        scale = float(np.sqrt(sum(moves) / sum(map(len, values))))
+        found.append(scale if scale > 1e-12 else 1.0)
+    return tuple(found)
+
+
+class Aim(NamedTuple):
+    """What the loss is measured against, and by what."""
+
+    knowledge: System
+    rest: Any
+    parts: tuple[Course, ...]
+    scales: Any
+
+
+@functools.partial(jax.jit, static_argnames=("compared", "settings", "dt"))
+def loss_and_slope(
+    weights: Any, aim: Aim, compared: tuple[str, ...], settings: Settings, dt: float
+) -> tuple[Float[Any, ""], Any]:
+    """The rollout loss of a residual's weights and its gradient; NaN if a step is not solved.
+
+    A mean over trajectories, rows but the first, nodes and numbers of squared errors, each over the scale of
+    its field; then over fields. A quaternion is compared at length one, and up to its sign.
+    """
+
+    def loss(weights: Any) -> Any:
+        model = KNODE(aim.knowledge, eqx.combine(weights, aim.rest))
+        total, count = jnp.zeros(()), 0
+        for course in aim.parts:
+            found = rolled(model, course, settings, dt)[:, 1:]
+            for i, name in enumerate(compared):
+                pair = (model.y_layout.get(y, name) for y in (found, course.y[:, 1:]))
+                error = _difference(name, *pair) / aim.scales[i]
+                total = total + jnp.mean(error**2) * course.y.shape[0]
+            count += course.y.shape[0]
+        return total / (count * len(compared))
+
+    return jax.value_and_grad(loss)(weights)
+
+
+def _difference(name: str, found: Any, truth: Any) -> Any:
+    if name != "h" or found.shape[-1] != 4:
+        return found - truth
+    found, truth = (h / jnp.sqrt(jnp.sum(h * h, axis=-1, keepdims=True)) for h in (found, truth))
+    same = jnp.sum(found * truth, axis=-1, keepdims=True) >= 0.0
+    return found - jnp.where(same, truth, -truth)

@@ -1,0 +1,159 @@
+"""Several models of the same robot as one: a mean, and a spread that says how far to trust it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, overload
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.learning.knode import KNODE
+from knode_cosserat.learning.model_file import ModelFileError, load_model
+from knode_cosserat.solvers.simulate import simulate
+from knode_cosserat.trajectory import Trajectory
+
+
+class Ensemble(Sequence[KNODE]):
+    """Models that were fitted with several seeds; a sequence of them, and one model that predicts.
+
+    Raises:
+        ValueError: there is none, or one that is not a model.
+    """
+
+    def __init__(self, members: Iterable[KNODE]):
+        self.members = tuple(members)
+        if not self.members or not all(isinstance(member, KNODE) for member in self.members):
+            kinds = ", ".join(sorted({type(member).__name__ for member in self.members})) or "nothing"
+            raise ValueError(f"members are {kinds}; allowed is one KNODE or more")
+
+    def __len__(self) -> int:
+        return len(self.members)
+
+    @overload
+    def __getitem__(self, index: int) -> KNODE: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Ensemble: ...
+
+    def __getitem__(self, index: int | slice) -> KNODE | Ensemble:
+        return Ensemble(self.members[index]) if isinstance(index, slice) else self.members[index]
+
+    def __iter__(self) -> Iterator[KNODE]:
+        return iter(self.members)
+
+    def predict(self, controls: Any, dt: float, **options: Any) -> Prediction:
+        """What every member makes of the controls (T, c).
+
+        Args:
+            controls: as for `simulate`, for one robot.
+            dt: time step (s).
+            options: further arguments of `simulate`.
+
+        Raises:
+            SimulationError: a member has no solution, unless `on_failure="return"`: it is then left out from
+                the row on where it fails.
+        """
+        if len({jax.tree.structure(member) for member in self.members}) == 1 and "initial" not in options:
+            batch = simulate(list(self.members), controls, dt, **options)
+            return Prediction([batch[k] for k in range(len(self))])
+        return Prediction([simulate(member, controls, dt, **options) for member in self.members])
+
+    def save(self, folder: str | Path) -> None:
+        """Write every member to a folder of its own file; `load_ensemble` reads them back."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        for old in folder.glob("member-*.model"):
+            old.unlink()
+        for k, member in enumerate(self.members):
+            member.save(folder / f"member-{k:03d}.model")
+
+
+def load_ensemble(folder: str | Path, **options: Any) -> Ensemble:
+    """The ensemble in a folder; `options` as for `load_model`. Raises `ModelFileError`."""
+    files = sorted(Path(folder).glob("member-*.model"))
+    if not files:
+        raise ModelFileError(f"{folder}: there is no ensemble here (files member-000.model, …)")
+    return Ensemble(load_model(file, **options) for file in files)
+
+
+class Prediction:
+    """What the members predict, their mean and their spread, row by row.
+
+    It has `time`, `position`, `quaternion` and `tip_position` of the mean, and so can be compared and drawn
+    like a trajectory.
+    """
+
+    def __init__(self, members: Sequence[Trajectory]):
+        self.members = list(members)
+
+    @property
+    def time(self) -> Float[np.ndarray, " T"]:
+        """(T,) s."""
+        return np.asarray(self.members[0].time)
+
+    def _positions(self) -> Any:
+        return np.stack([np.asarray(member.position) for member in self.members])
+
+    @property
+    def position(self) -> Float[np.ndarray, "T N 3"]:
+        """Mean of the members' positions (T, N, 3) in m."""
+        return _mean(self._positions())
+
+    @property
+    def quaternion(self) -> Float[np.ndarray, "T N 4"]:
+        """Mean of the members' orientations (T, N, 4), scalar first, of length one."""
+        each = np.stack([np.asarray(member.quaternion) for member in self.members])
+        each = each / np.linalg.norm(each, axis=-1, keepdims=True)
+        each = each * np.where(np.sum(each * each[:1], axis=-1, keepdims=True) < 0.0, -1.0, 1.0)
+        mean = _mean(each)
+        return mean / np.linalg.norm(mean, axis=-1, keepdims=True)
+
+    @property
+    def tip_position(self) -> Float[np.ndarray, "T 3"]:
+        """Mean position of the last node (T, 3) in m."""
+        return self.position[:, -1]
+
+    @property
+    def spread(self) -> Float[np.ndarray, "T N 3"]:
+        """Standard deviation of the members' positions (T, N, 3) in m; NaN with fewer than two members."""
+        each = self._positions()
+        count = np.sum(np.isfinite(each), axis=0)
+        square = np.nansum((each - self.position) ** 2, axis=0)
+        return np.sqrt(np.where(count > 1, square / np.maximum(count - 1, 1), np.nan))
+
+    def interval(self, level: float = 0.9) -> tuple[Float[np.ndarray, "T N 3"], Float[np.ndarray, "T N 3"]]:
+        """Below and above: where one more member would be with this probability (Student's t)."""
+        if not 0.0 < level < 1.0:
+            raise ValueError(f"level is {level!r}; allowed is a number between 0 and 1")
+        from scipy.stats import t
+
+        count = len(self.members)
+        half = t.ppf(0.5 + level / 2.0, max(count - 1, 1)) * np.sqrt(1.0 + 1.0 / count) * self.spread
+        return self.position - half, self.position + half
+
+    def coverage(self, reference: Any, level: float = 0.9) -> float:
+        """Which part of the reference's positions lies within `interval`: of all rows, nodes and axes.
+
+        The spread can be trusted if this is near `level`. Far below it the members agree on something wrong:
+        they differ by the data and by chance, not by what none of them can express.
+
+        Raises:
+            ValueError: rows or nodes differ, or there is one member only.
+        """
+        if len(self.members) < 2:
+            raise ValueError("one member has no spread; at least two are needed")
+        true = np.asarray(reference.position)
+        low, high = self.interval(level)
+        if true.shape != low.shape:
+            raise ValueError(f"the reference's positions are {true.shape} and the prediction's {low.shape}")
+        inside = (low <= true) & (true <= high)
+        # at the base, and in a first row at rest, there is nothing to predict
+        return float(np.mean(inside[1:, 1:]))
+
+
+def _mean(each: Any) -> Any:
+    count = np.sum(np.isfinite(each), axis=0)
+    return np.where(count > 0, np.nansum(each, axis=0) / np.maximum(count, 1), np.nan)

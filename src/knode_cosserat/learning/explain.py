@@ -1,0 +1,107 @@
+"""What a structured residual learned, in words and units: what it adds to length, stress, loads and tip."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from knode_cosserat.learning.expansion import Expansion, Term
+from knode_cosserat.learning.knode import KNODE
+from knode_cosserat.learning.structured import Structured, ambient_layout, loaded, material_layout
+from knode_cosserat.rods.system import Layout
+
+
+class Finding(NamedTuple):
+    """One term: where it is added, a function of what, with which coefficient, in which unit of the two."""
+
+    part: str
+    target: str
+    function: str
+    coefficient: float
+    unit: str
+
+    def __str__(self) -> str:
+        return f"{self.part:<8} {self.target:<5} {self.coefficient:+.5g} {self.function}  [{self.unit}]"
+
+
+def explain(model: KNODE) -> list[Finding]:
+    """What the residual adds to the knowledge, the largest terms first within each part.
+
+    The parts are length, stress, load and tip; with a star what is fixed in the global frame, without what is
+    seen from the material.
+
+    A coefficient stands before the function in SI units, with the plain vector in it, not the scaled one; of
+    a saturating function it is the slope where it begins. Stress is what the law of the strains misses,
+    C z + D z_t + stress = f2; loads are added to the rates of what they balance, or to the tip's conditions.
+
+    Raises:
+        TypeError: the model's residual is not a structured one.
+    """
+    residual, knowledge = model.residual, model.knowledge
+    if not isinstance(residual, Structured):
+        raise TypeError(f"a {type(residual).__name__} has no terms to read; allowed is a structured residual")
+    found = []
+    if float(residual.stretch) != 0.0:
+        found.append(Finding("length", "", "of the knowledge's length", float(residual.stretch), "1"))
+    strain = knowledge.z_layout
+    rates = Layout(
+        *((f"{name}_t", size, f"{unit}/s", meaning) for name, size, unit, meaning, *_ in strain.fields)
+    )
+    found += _terms("stress", strain, residual.stress, strain + rates)
+    parts: list[tuple[str, Layout, Any]] = [
+        ("load", loaded(knowledge), residual.load), ("tip", knowledge.tip_layout, residual.tip_load)
+    ]  # fmt: skip
+    for part, targets, load in parts:
+        if load is not None:
+            found += _terms(part, targets, load.material, material_layout(knowledge))
+            found += _terms(f"{part}*", targets, load.ambient, ambient_layout(knowledge))
+    return found
+
+
+def _terms(part: str, targets: Layout, expansion: Expansion | None, inputs: Layout) -> list[Finding]:
+    if expansion is None:
+        return []
+    rows = [
+        (field, f"{field.name}{_axis(field.size, i)}") for field in targets.fields for i in range(field.size)
+    ]
+    found: list[tuple[float, Finding]] = []
+    weights = np.asarray(expansion.weights)
+    for (field, target), row in zip(rows, weights, strict=True):
+        base = field.load or field.unit
+        if row[0] != 0.0:
+            found.append((abs(float(row[0])), Finding(part, target, "1", float(row[0]), base)))
+        for term, where in expansion.columns():
+            unit = inputs.fields[inputs.names.index(term.name)].unit
+            for axis, k in enumerate(where):
+                if row[k] != 0.0:
+                    power = {"linear": 1, "square": 2, "square_norm": 2, "cube": 3, "cube_norm": 3}.get(
+                        term.form, 1
+                    )
+                    size = float(row[k]) / float(expansion.scales[term.scale]) ** power
+                    shape = _function(term, axis, expansion)
+                    divided = f"{base} / ({unit}){'' if power == 1 else f'^{power}'}"
+                    found.append((abs(float(row[k])), Finding(part, target, shape, size, divided)))
+    return [finding for _, finding in sorted(found, key=lambda pair: -pair[0])]
+
+
+def _axis(size: int, i: int) -> str:
+    return "" if size == 1 else f"_{'xyz'[i]}" if size == 3 else f"_{i + 1}"
+
+
+def _function(term: Term, axis: int, expansion: Expansion) -> str:
+    x = f"{term.name}{_axis(term.size, axis)}"
+    if term.form == "linear":
+        return x
+    if term.form == "square":
+        return f"|{x}| {x}"
+    if term.form == "cube":
+        return f"{x}³"
+    if term.form == "square_norm":
+        return f"|{term.name}| {x}"
+    if term.form == "cube_norm":
+        return f"|{term.name}|² {x}"
+    reach = float(expansion.scales[term.scale] / expansion.slopes[term.slope])
+    if term.form == "saturating":
+        return f"{reach:.4g} tanh({x} / {reach:.4g})"
+    return f"{x} / √(1 + |{term.name}|² / {reach:.4g}²)"

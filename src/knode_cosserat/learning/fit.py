@@ -1,0 +1,198 @@
+"""Fitting: trajectories and an imperfect model in, a KNODE out."""
+
+from __future__ import annotations
+
+import datetime
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from knode_cosserat._files import package_version
+from knode_cosserat.learning.checkpoint import Checkpoints, Identity, data_hash
+from knode_cosserat.learning.config import FitConfig, NetworkOptions
+from knode_cosserat.learning.courses import Courses, courses, held_out_courses
+from knode_cosserat.learning.ensemble import Ensemble
+from knode_cosserat.learning.knode import KNODE, About
+from knode_cosserat.learning.regression import solve
+from knode_cosserat.learning.residual import Residual, network
+from knode_cosserat.learning.runs import FitError, Run, run_all
+from knode_cosserat.learning.samples import Dataset, samples
+from knode_cosserat.learning.stages import RolloutRun, SegmentRun
+from knode_cosserat.learning.training import standardised
+from knode_cosserat.learning.watch import Watch
+from knode_cosserat.rods.system import System, is_traced
+from knode_cosserat.trajectory import Trajectory
+
+#: the best preset
+BEST = FitConfig()
+#: hidden units times samples of all seeds up to which they share one program on a CPU; beyond it one seed
+#: keeps a core busy, and seeds go side by side on all cores
+SHARED = 40_000
+
+
+def fit(
+    knowledge: System,
+    trajectories: Sequence[Trajectory],
+    config: FitConfig = BEST,
+    *,
+    held_out: Sequence[Trajectory] = (),
+    checkpoint: str | Path | None = None,
+    checkpoint_every: int = 100,
+    log_dir: str | Path | None = None,
+    progress: bool = False,
+) -> Any:
+    """Learn from trajectories what an imperfect model misses.
+
+    Args:
+        knowledge: the imperfect model.
+        trajectories: what the robot really does, at the nodes of the knowledge; each counts one.
+        config: what is learned, and how.
+        held_out: trajectories from rest that are not learned from. What the model makes of them is reported,
+            and with `stop_after` in the config it decides when to stop.
+        checkpoint: a folder in which it is kept where the fit stands. The same call goes on from there, and
+            ends as if nothing had happened, bit for bit.
+        checkpoint_every: epochs (or updates) between two checkpoints.
+        log_dir: a folder for metrics as TensorBoard event files, one folder in it for each seed.
+        progress: show a progress bar with the loss and the time left.
+
+    Returns:
+        A `KNODE`, or an `Ensemble` of one for each seed if `config.seed` is several. Its `about.facts` has
+        the config, seed, SHA-256 of each trajectory's data, versions, date, losses, and how long it took.
+
+    Raises:
+        DataError: trajectories that do not fit the knowledge or each other, are too short or not finite.
+        FitError: training cannot begin or go on; the last good checkpoint is kept.
+        CheckpointError: there is a checkpoint of something else, or a damaged one.
+        WatchError: metrics are asked for and tensorboardX is not installed.
+    """
+    began = time.perf_counter()
+    _check(knowledge, config, held_out, checkpoint_every)
+    trajectories, held_out = list(trajectories), list(held_out)
+    first = _first(knowledge, trajectories, config)
+    given = _Given(knowledge, trajectories, config, first.dataset, held_out_courses(knowledge, held_out))
+    kept = None
+    if checkpoint is not None:
+        kept = Checkpoints(checkpoint, Identity.of(knowledge, trajectories, held_out, config))
+    learned = dict(zip(config.seeds, first.residuals, strict=True))
+    histories: dict[int, dict[str, Any]] = {seed: {} for seed in config.seeds}
+    with Watch(progress, log_dir) as watch:
+        for stage in (_segment_runs, _rollout_runs):
+            runs = stage(given, learned)
+            if not runs:
+                continue
+            run_all(runs, kept, checkpoint_every, watch)
+            for run in runs:
+                learned |= dict(zip(run.seeds, run.residuals(), strict=True))
+                for seed in run.seeds:
+                    histories[seed][run.stage] = run.history(seed)
+    facts = _facts(config, trajectories, held_out)
+    seconds = time.perf_counter() - began
+    models = [
+        KNODE(knowledge, learned[seed], About({**facts, "seed": seed, **histories[seed], "seconds": seconds}))
+        for seed in config.seeds
+    ]
+    return Ensemble(models) if isinstance(config.seed, tuple) else models[0]
+
+
+def _check(knowledge: Any, config: Any, held_out: Any, checkpoint_every: Any) -> None:
+    if not isinstance(knowledge, System):
+        raise FitError(f"knowledge is a {type(knowledge).__name__}; allowed is a robot or another System")
+    if is_traced(knowledge) or np.ndim(knowledge.length):
+        raise FitError("knowledge is a batch or inside jit, grad or vmap; allowed is one robot")
+    if not isinstance(config, FitConfig):
+        raise FitError(f"config is a {type(config).__name__}; allowed is a FitConfig")
+    if isinstance(checkpoint_every, bool) or not isinstance(checkpoint_every, int) or checkpoint_every < 1:
+        raise FitError(f"checkpoint_every is {checkpoint_every!r}; allowed is a whole number from 1")
+    for name in ("segments", "rollouts"):
+        stage = getattr(config, name)
+        if stage is not None and stage.stop_after is not None and not held_out:
+            raise FitError(f"{name}.stop_after is {stage.stop_after}, but there are no held_out trajectories")
+
+
+class _First(NamedTuple):
+    """What training begins with: the samples, if they are needed, and a residual for each seed."""
+
+    dataset: Dataset | None
+    residuals: list[Residual]
+
+
+class _Given(NamedTuple):
+    """What the stages of training have in common."""
+
+    knowledge: System
+    trajectories: Sequence[Trajectory]
+    config: FitConfig
+    dataset: Any
+    held_out: Courses | None
+
+
+def _first(knowledge: System, trajectories: Sequence[Trajectory], config: FitConfig) -> _First:
+    options, dataset = config.residual, None
+    if config.segments is not None or (isinstance(options, NetworkOptions) and options.standardised):
+        nodes = None if config.segments is None else config.segments.nodes
+        dataset = samples(knowledge, trajectories, nodes)
+    if isinstance(options, NetworkOptions):
+        networks = [network(knowledge, options, jax.random.key(seed)) for seed in config.seeds]
+        if options.standardised and dataset is not None:
+            networks = [standardised(net, knowledge, dataset.segments) for net in networks]
+        return _First(dataset, list(networks))
+    every = samples(knowledge, trajectories)
+    return _First(dataset, [solve(knowledge, every, options, seed) for seed in config.seeds])
+
+
+def _segment_runs(given: _Given, learned: dict[int, Residual]) -> list[Run]:
+    training = given.config.segments
+    if training is None:
+        return []
+    runs: list[Run] = []
+    for seeds in _groups(given.config, len(given.dataset.segments.t)):
+        residuals = [learned[seed] for seed in seeds]
+        runs.append(SegmentRun(given.knowledge, residuals, given.dataset, training, seeds, given.held_out))
+    return runs
+
+
+def _groups(config: FitConfig, count: int) -> list[tuple[int, ...]]:
+    """Which seeds share one vectorised program: all of them, unless each alone keeps a core busy."""
+    if not isinstance(config.residual, NetworkOptions):
+        return [(seed,) for seed in config.seeds]
+    work = config.residual.hidden * count * len(config.seeds)
+    if jax.default_backend() != "cpu" or work <= SHARED:
+        return [config.seeds]
+    return [(seed,) for seed in config.seeds]
+
+
+def _rollout_runs(given: _Given, learned: dict[int, Residual]) -> list[Run]:
+    options = given.config.rollouts
+    if options is None:
+        return []
+    along = courses(given.knowledge, given.trajectories, options)
+    return [
+        RolloutRun(given.knowledge, residual, along, options, seed, given.held_out)
+        for seed, residual in learned.items()
+    ]
+
+
+def _facts(
+    config: FitConfig, trajectories: Sequence[Trajectory], held_out: Sequence[Trajectory]
+) -> dict[str, Any]:
+    described = [
+        [{"sha256": data_hash(one), "rows": len(one.time), "dt": one.dt} for one in several]
+        for several in (trajectories, held_out)
+    ]
+    return {
+        "config": config.to_dict(),
+        "trajectories": described[0],
+        "held_out": described[1],
+        "versions": {
+            "knode-cosserat": package_version(),
+            "jax": jax.__version__,
+            "numpy": np.__version__,
+            "python": ".".join(map(str, sys.version_info[:3])),
+        },
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+    }

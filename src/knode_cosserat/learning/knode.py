@@ -1,0 +1,148 @@
+"""A system made of a system and a residual: solvers cannot tell the difference."""
+
+from __future__ import annotations
+
+from typing import Any, Self
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.learning.residual import Residual
+from knode_cosserat.rods.system import History, Layout, Scales, System
+
+
+class About:
+    """What is known of a model beside its numbers: how it was fitted, on which data.
+
+    It rides along with a model and is equal to any other, so that models of one structure share compiled
+    programs and can be stacked.
+    """
+
+    def __init__(self, facts: dict[str, Any] | None = None):
+        self.facts = dict(facts or {})
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, About)
+
+    def __hash__(self) -> int:
+        return hash(About)
+
+
+class KNODE(System):
+    """Knowledge and residual together (paper eq. 9), with the layouts and conditions of the knowledge."""
+
+    knowledge: System
+    residual: Residual
+    about: About = eqx.field(static=True)
+
+    def __init__(self, knowledge: System, residual: Residual, about: About | None = None):
+        self.knowledge = knowledge
+        self.residual = residual
+        self.about = about or About()
+        self.nodes = knowledge.nodes
+
+    @property
+    def adapted(self) -> System:
+        """The knowledge as the residual changes it."""
+        return self.residual.adapted(self.knowledge)
+
+    @property
+    def y_layout(self) -> Layout:  # type: ignore[override]
+        """The knowledge's."""
+        return self.knowledge.y_layout
+
+    @property
+    def z_layout(self) -> Layout:  # type: ignore[override]
+        """The knowledge's."""
+        return self.knowledge.z_layout
+
+    @property
+    def control_layout(self) -> Layout:  # type: ignore[override]
+        """The knowledge's."""
+        return self.knowledge.control_layout
+
+    @property
+    def base_unknowns(self) -> tuple[str, ...]:  # type: ignore[override]
+        """The knowledge's."""
+        return self.knowledge.base_unknowns
+
+    @property
+    def mixed(self) -> bool:  # type: ignore[override]
+        """The knowledge's."""
+        return self.knowledge.mixed
+
+    @property
+    def velocities(self) -> tuple[str, ...]:  # type: ignore[override]
+        """The knowledge's."""
+        return self.knowledge.velocities
+
+    @property
+    def length(self) -> Any:  # type: ignore[misc]
+        """Length of the rod (m), as the residual corrects it; one each of a batch."""
+        if np.ndim(self.knowledge.length):
+            return jax.vmap(lambda model: model.adapted.length)(self)
+        return self.adapted.length
+
+    def derivatives(
+        self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
+    ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
+        """y_s and z of knowledge and residual together."""
+        return self.residual.derivatives(self.adapted, s, t, y, control, history)
+
+    def rest(self, s: Any) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
+        """The knowledge's, at its corrected length."""
+        return self.adapted.rest(s)
+
+    def base(self, t: Any, control: Any, unknowns: Float[Any, " k"]) -> Float[Any, " y"]:
+        """The knowledge's."""
+        return self.adapted.base(t, control, unknowns)
+
+    def unknowns(self, y: Float[Any, " y"]) -> Float[Any, " k"]:
+        """The knowledge's."""
+        return self.adapted.unknowns(y)
+
+    def tip(self, t: Any, control: Any, y: Float[Any, " y"], history: History) -> Float[Any, " k"]:
+        """The tip's conditions of knowledge and residual together."""
+        return self.residual.tip(self.adapted, t, control, y, history)
+
+    @property
+    def tip_layout(self) -> Layout:
+        """The knowledge's."""
+        return self.knowledge.tip_layout
+
+    def scales(self) -> Scales:
+        """The knowledge's."""
+        return self.adapted.scales()
+
+    def actuation(self, control: Float[Any, " c"]) -> Float[Any, " a"]:
+        """The knowledge's."""
+        return self.knowledge.actuation(control)
+
+    @property
+    def observable_layout(self) -> Layout:
+        """The knowledge's."""
+        return self.knowledge.observable_layout
+
+    def observables(self, s: Any, y: Any, y_t: Any, z: Any, z_t: Any, control: Any) -> Float[Any, " o"]:
+        """The knowledge's."""
+        return self.adapted.observables(s, y, y_t, z, z_t, control)
+
+    def positions(self, y: Any) -> Any:
+        """The knowledge's."""
+        return self.knowledge.positions(y)
+
+    def quaternions(self, y: Any) -> Any:
+        """The knowledge's."""
+        return self.knowledge.quaternions(y)
+
+    def replace(self, **changes: Any) -> Self:
+        """A copy whose knowledge has other parameters (or nodes), by name."""
+        return type(self)(self.knowledge.replace(**changes), self.residual, self.about)
+
+    def save(self, path: Any) -> None:
+        """Write a model's file (see `model_file.save`)."""
+        from knode_cosserat.learning import model_file
+
+        model_file.save(self, path)

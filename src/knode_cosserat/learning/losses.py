@@ -1,0 +1,136 @@
+"""How far one-segment predictions are from the data.
+
+Everything here has numbers first and samples last, (numbers, S): that is how a network gives them.
+"""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.learning.samples import Samples
+from knode_cosserat.rods.system import Layout, System
+from knode_cosserat.rotation import rotation_matrix
+
+#: the fields of y that the paper's loss speaks of
+PAPER_FIELDS = ("p", "h", "n", "m", "q", "w")
+#: a number that varies by less than this part of what its whole field does is measured by the field
+LEAST_PART = 1e-3
+#: what varies by less, as a part of its size, is taken to be constant
+ROUNDING = 1e-12
+
+
+class Loss(eqx.Module):
+    """Compares predictions with the data that it keeps; every trajectory counts one."""
+
+    @abc.abstractmethod
+    def __call__(self, y: Float[Any, "y S"], z: Float[Any, "z S"]) -> Float[Any, ""]:
+        """The loss of y at the ends of all segments and z at their starts."""
+
+
+class PaperLoss(Loss):
+    """The paper's: the sum of four mean squares, with orientations as Euler angles.
+
+    Positions, Euler angles, strains z, and all of n, m, q and ω together, in SI units; the mean over the
+    numbers of a step and over steps, the sum over trajectories.
+    """
+
+    y: Float[Any, "y S"]
+    z: Float[Any, "z S"]
+    angles: Float[Any, "3 S"]
+    weight: Float[Any, " S"]
+    layout: Layout = eqx.field(static=True)
+
+    def __call__(self, y: Float[Any, "y S"], z: Float[Any, "z S"]) -> Float[Any, ""]:
+        """The loss, no unit that would make sense."""
+        p, h, *rest = (y[self.layout.slice(name)] for name in PAPER_FIELDS)
+        p_true, _, *rest_true = (self.y[self.layout.slice(name)] for name in PAPER_FIELDS)
+        squares = (
+            _mean_square(p - p_true)
+            + _mean_square(jnp.concatenate(rest) - jnp.concatenate(rest_true))
+            + _mean_square(euler_angles(h) - self.angles)
+            + _mean_square(z - self.z)
+        )
+        return jnp.sum(self.weight * squares)
+
+
+class StandardisedLoss(Loss):
+    """The mean square of all numbers' errors, each over its own spread: for any system.
+
+    The spread of y is that of its increments over a segment, the spread of z its own.
+    """
+
+    y: Float[Any, "y S"]
+    z: Float[Any, "z S"]
+    y_spread: Float[Any, " y"]
+    z_spread: Float[Any, " z"]
+    weight: Float[Any, " S"]
+
+    def __call__(self, y: Float[Any, "y S"], z: Float[Any, "z S"]) -> Float[Any, ""]:
+        """The loss, no unit."""
+        errors = [(y - self.y) / self.y_spread[:, None], (z - self.z) / self.z_spread[:, None]]
+        return jnp.sum(self.weight * _mean_square(jnp.concatenate(errors)))
+
+
+def loss_for(name: str, knowledge: System, segments: Samples) -> Loss:
+    """The "paper" loss, where y has the fields that it needs, or the "standardised" one."""
+    y, z = segments.y_next.T, segments.z.T
+    if name == "paper" and set(PAPER_FIELDS) <= set(knowledge.y_layout.names):
+        angles = np.asarray(_angles(y[knowledge.y_layout.slice("h")]))
+        return PaperLoss(y, z, angles, segments.weight, knowledge.y_layout)
+    increments = segments.y_next - segments.y
+    return StandardisedLoss(
+        y, z, spread(increments, sizes(knowledge.y_layout)), spread(segments.z, sizes(knowledge.z_layout)),
+        segments.weight,
+    )  # fmt: skip
+
+
+def euler_angles(h: Float[Any, "4 S"]) -> Float[Any, "3 S"]:
+    """Angles (rad) of quaternions (scalar first, any length) about the fixed z, then y, then x axis.
+
+    The order that SciPy calls "zyx". At ±π/2 of the second one they are not unique, and have no derivative.
+    """
+    R = jax.vmap(rotation_matrix, in_axes=-1, out_axes=-1)(h)
+    return jnp.stack(
+        [
+            jnp.arctan2(-R[0, 1], R[0, 0]),
+            jnp.arcsin(jnp.clip(R[0, 2], -1.0, 1.0)),
+            jnp.arctan2(-R[1, 2], R[2, 2]),
+        ]
+    )
+
+
+_angles = jax.jit(euler_angles)
+
+
+def sizes(layout: Layout) -> list[int]:
+    """How many numbers each field has."""
+    return [field.size for field in layout.fields]
+
+
+def spread(values: Float[Any, "S x"], fields: Sequence[int]) -> Float[np.ndarray, " x"]:
+    """The standard deviation of every number, never zero: what errors, noise and inputs are measured by.
+
+    Args:
+        values: one row a sample.
+        fields: how many numbers each field has, in order. A number that hardly varies, such as a force
+            across the plane of motion, is measured by its field; a field that does not vary at all by one.
+    """
+    found = []
+    for part in np.split(np.asarray(values), np.cumsum(fields)[:-1], axis=1):
+        deviation = np.std(part, axis=0)
+        largest = deviation.max(initial=0.0)
+        varies = largest > ROUNDING * max(1e-3, np.abs(part).max(initial=0.0))
+        found.append(np.maximum(deviation, LEAST_PART * largest) if varies else np.ones_like(deviation))
+    return np.concatenate(found)
+
+
+def _mean_square(errors: Float[Any, "x S"]) -> Float[Any, " S"]:
+    return jnp.mean(errors * errors, axis=0)

@@ -1,0 +1,265 @@
+"""The structured residual from samples, by least squares: material, stretch, loads and tip.
+
+At the true states every part is linear in its weights. What the law of the strains leaves, at the true
+strains, gives the stress; the geometry of the samples gives the stretch; what the balance leaves gives the
+loads. Where a segment is not one Euler step, y_s comes from splines, and the weights found are then polished
+on the segments.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.learning.config import StructuredOptions
+from knode_cosserat.learning.expansion import CURVED, DRAG, LINEAR, Expansion, expansion
+from knode_cosserat.learning.polish import polished
+from knode_cosserat.learning.samples import Dataset, Samples, TipSamples
+from knode_cosserat.learning.selection import folds
+from knode_cosserat.learning.structured import (
+    Load,
+    Structured,
+    ambient_inputs,
+    ambient_layout,
+    geometric,
+    loaded,
+    material_layout,
+    tip_observables,
+)
+from knode_cosserat.learning.sums import Counting, Target, fitted_load, fitted_stress
+from knode_cosserat.rods.system import Layout, System, unpacked_history
+from knode_cosserat.rotation import rotation_matrix
+from knode_cosserat.solvers.space import Euler
+
+#: of the natural size of what is balanced: less than this is the solver's tolerance, not a load
+LEAST = 1e-9
+#: the solver's tolerance, in natural units, with some room
+TOLERANCE = 3e-10
+
+
+def solve(knowledge: System, data: Dataset, options: StructuredOptions, seed: int) -> Structured:
+    """The structured residual that explains the samples; `seed` says how rows count if they are resampled."""
+    segments, tips = (_counting(part, options, seed) for part in (data.segments, data.tips))
+    residual = Structured(np.zeros(()), _stress(knowledge, data.segments, options, segments), None, None)
+    residual = _with_loads(knowledge, data, residual, options, segments)
+    return dataclasses.replace(residual, tip_load=_tip_load(knowledge, data.tips, residual, tips))
+
+
+def _counting(data: Samples | TipSamples, options: StructuredOptions, seed: int) -> Counting:
+    """How much each sample counts, on average one; resampled, rows count at random (Bayesian bootstrap)."""
+    shares = data.weight
+    if options.resample:
+        rows, which = np.unique(data.origin, axis=0, return_inverse=True)
+        shares = shares * np.random.default_rng(seed).exponential(size=len(rows))[which.ravel()]
+    return Counting(shares / np.mean(shares), folds(data.origin))
+
+
+def _floors(layout: Layout, values: Float[Any, "S n"]) -> Float[Any, " n"]:
+    """For each number, the part of its field's natural size below which nothing is meant."""
+    floors = np.zeros(layout.size)
+    for field in layout.fields:
+        where = layout.slice(field.name)
+        floors[where] = LEAST * np.sqrt(np.mean(np.square(values[:, where])))
+    return np.maximum(floors, 1e-300)
+
+
+# the material
+
+
+@jax.jit
+def _left_of_law(knowledge: System, data: Samples) -> tuple[Any, Any, Any]:
+    """What C z + D z_t = f2 leaves at the true strains, its natural size, and what stress may depend on."""
+
+    def one(sample: Samples) -> Any:
+        s = sample.place * knowledge.length
+        history = unpacked_history(knowledge, sample.c0, sample.history[0])
+        z, z_t = sample.z, sample.c0 * sample.z + history.z
+        _, z_rest = knowledge.rest(s)
+        inputs = jnp.concatenate([z - z_rest, z_t])
+        if type(knowledge).constitutive is System.constitutive:
+            own = knowledge.strains(s, sample.t, sample.y, sample.control, history)
+            return own - z, own, inputs
+        y_t = sample.c0 * sample.y + history.y
+        C, D, f2 = knowledge.constitutive(s, sample.t, sample.y, y_t, sample.control)
+        return f2 - C @ z - D @ z_t, f2, inputs
+
+    return jax.vmap(one)(data)
+
+
+def _stress(knowledge: System, data: Samples, options: StructuredOptions, counting: Counting) -> Any:
+    left, size, inputs = (np.asarray(part) for part in _left_of_law(knowledge, data))
+    fields = knowledge.z_layout.fields
+    layout = Layout(*fields, *((f"{name}_t", *rest) for name, *rest in fields))
+    empty = [
+        expansion(layout, inputs, dict.fromkeys(layout.names, forms), left.shape[1])
+        for forms in ((LINEAR, CURVED) if options.curved else (LINEAR,))
+    ]
+    floors = _floors(knowledge.z_layout, size)
+    spots = [knowledge.z_layout.slice(field.name) for field in fields]
+    # curved in the strain itself and its rate only: what the others do is no more than a linear coupling
+    targets = [
+        Target(left[:, spot], None, floors[spot], (field.name, f"{field.name}_t"))
+        for field, spot in zip(fields, spots, strict=True)
+    ]
+    return fitted_stress(empty, inputs, targets, counting)
+
+
+# the loads
+
+
+class _Views(NamedTuple):
+    """What loads may depend on, at every sample, and A + c0 B if B is not zero."""
+
+    material: Float[Any, "S o"]
+    ambient: Float[Any, "S a"]
+    matrix: Any
+
+
+@jax.jit
+def _views(knowledge: System, data: Samples) -> _Views:
+    def one(sample: Samples) -> Any:
+        s = sample.place * knowledge.length
+        history = unpacked_history(knowledge, sample.c0, sample.history[0])
+        y_t, z_t = sample.c0 * sample.y + history.y, sample.c0 * sample.z + history.z
+        observables = knowledge.observables(s, sample.y, y_t, sample.z, z_t, sample.control)
+        matrix = None
+        if knowledge.mixed:
+            A, B, _ = knowledge.balance(s, sample.t, sample.y, y_t, sample.z, z_t, sample.control)
+            matrix = A + sample.c0 * B
+        ambient = ambient_inputs(knowledge, sample.control)
+        return _Views(jnp.concatenate([observables, ambient]), ambient, matrix)
+
+    return jax.vmap(one)(data)
+
+
+@jax.jit
+def _rates(knowledge: System, data: Samples) -> Any:
+    """The knowledge's y_s at the true strains."""
+
+    def one(sample: Samples) -> Any:
+        history = unpacked_history(knowledge, sample.c0, sample.history[0])
+        return knowledge.rates(
+            sample.place * knowledge.length, sample.t, sample.y, sample.z, sample.control, history
+        )
+
+    return jax.vmap(one)(data)
+
+
+def _with_loads(
+    knowledge: System, data: Dataset, residual: Structured, options: StructuredOptions, counting: Counting
+) -> Structured:
+    """The residual with its stretch and its loads."""
+    segments, layout = data.segments, loaded(knowledge)
+    where = knowledge.y_layout.indices(layout.names)
+    views = jax.tree.map(np.asarray, _views(knowledge, segments))
+    moved, doubt = segments.slope / float(knowledge.length), data.doubt / float(knowledge.length)
+    rates = np.asarray(_rates(knowledge, segments))
+    longer = _longer(knowledge, moved, rates, counting.shares)
+    missing = moved / longer - rates
+    if knowledge.mixed:
+        missing = np.einsum("sij,sj->si", views.matrix, missing)
+    ds = float(knowledge.length) / (knowledge.nodes - 1)
+    floors = _floors(knowledge.y_layout, np.abs(rates) + np.abs(moved))
+    floors = np.maximum(floors, TOLERANCE * np.asarray(knowledge.scales().y) / ds)
+    material = _candidates(knowledge, layout, views, options.curved)
+    load = _load(
+        knowledge,
+        layout,
+        missing[:, where],
+        np.maximum(floors, doubt)[where],
+        segments.y,
+        views,
+        counting,
+        material,
+    )
+    residual = dataclasses.replace(residual, stretch=np.array(longer - 1.0), load=load)
+    if isinstance(data.space, Euler):
+        return residual
+    return polished(knowledge, data, residual, ds * floors, counting.shares)
+
+
+def _longer(knowledge: System, moved: Any, rates: Any, shares: Any) -> float:
+    """How much longer the rod is than the knowledge has it, from the rates that are geometry."""
+    ratios, precisions = [], []
+    for name in geometric(knowledge):
+        where = knowledge.y_layout.slice(name)
+        r, d = rates[:, where], moved[:, where]
+        size = np.sum(shares[:, None] * r * r)
+        if size > 0.0:
+            ratio = np.sum(shares[:, None] * r * d) / size
+            left = np.sum(shares[:, None] * (d - ratio * r) ** 2) / d.size
+            ratios.append(ratio)
+            precisions.append(1.0 / (left / size + (LEAST * ratio) ** 2))
+    if not ratios:
+        return 1.0
+    ratio = float(np.average(ratios, weights=precisions))
+    return ratio if abs(ratio - 1.0) > 5.0 / np.sqrt(np.sum(precisions)) else 1.0
+
+
+def _candidates(knowledge: System, layout: Layout, views: _Views, curved: bool) -> list[Expansion]:
+    """What a load may be a sum of: at first, and if that is not enough."""
+    stated = knowledge.velocities or knowledge.observable_layout.names
+    simple: dict[str, Sequence[str]] = dict.fromkeys(knowledge.velocities, DRAG)
+    rich: dict[str, Sequence[str]] = dict.fromkeys(stated, CURVED)
+    return [
+        expansion(material_layout(knowledge), views.material, forms, layout.size)
+        for forms in ([simple, rich] if curved else [simple])
+    ]
+
+
+def _load(
+    knowledge: System, layout: Layout, missing: Any, floors: Any, y: Any, views: _Views, counting: Counting,
+    material: Sequence[Expansion],
+) -> Load | None:  # fmt: skip
+    """The load that explains what is missing (S, l)."""
+    ambient = expansion(ambient_layout(knowledge), views.ambient, {}, layout.size)
+    frames = _frames(knowledge, layout, y)
+    spots = {name: layout.slice(name) for name in layout.names}
+    targets = [Target(missing[:, spot], frames.get(name), floors[spot]) for name, spot in spots.items()]
+    return fitted_load(material, ambient, views.material, views.ambient, targets, counting)
+
+
+@functools.lru_cache(maxsize=1)
+def _turns() -> Callable[[Any], Any]:
+    return jax.jit(jax.vmap(rotation_matrix))
+
+
+def _frames(knowledge: System, layout: Layout, y: Any) -> dict[str, Any]:
+    """The rotation matrices (S, 3, 3) of each field that is turned."""
+    found = {
+        name: np.asarray(_turns()(knowledge.y_layout.get(y, name)))
+        for name in {field.frame for field in layout.fields if field.frame}
+    }
+    return {field.name: found[field.frame] for field in layout.fields if field.frame}
+
+
+# the tip
+
+
+@jax.jit
+def _at_tip(adapted: System, data: TipSamples) -> tuple[Any, _Views]:
+    """What is left of the conditions at the true tip, and what a load there may depend on."""
+
+    def one(sample: TipSamples) -> Any:
+        history = unpacked_history(adapted, sample.c0, sample.history)
+        left = adapted.tip(sample.t, sample.control, sample.y, history)
+        observables = tip_observables(adapted, sample.y, sample.control, history)
+        ambient = ambient_inputs(adapted, sample.control)
+        return left, _Views(jnp.concatenate([observables, ambient]), ambient, None)
+
+    return jax.vmap(one)(data)
+
+
+def _tip_load(knowledge: System, data: TipSamples, residual: Structured, counting: Counting) -> Load | None:
+    left, views = jax.tree.map(np.asarray, _at_tip(residual.adapted(knowledge), data))
+    floors = TOLERANCE * np.asarray(knowledge.scales().tip)
+    layout = knowledge.tip_layout
+    simple = _candidates(knowledge, layout, views, curved=False)
+    return _load(knowledge, layout, -left, floors, data.y, views, counting, simple)

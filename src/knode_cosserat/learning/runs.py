@@ -1,0 +1,204 @@
+"""Running the parts of a fit: side by side on all cores, each with its own checkpoint."""
+
+from __future__ import annotations
+
+import abc
+import collections
+import concurrent.futures
+import os
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from knode_cosserat.learning.checkpoint import CheckpointError, Checkpoints, packed, unpacked
+from knode_cosserat.learning.residual import Residual
+from knode_cosserat.learning.watch import Watch
+
+
+class FitError(ValueError):
+    """A fit that cannot begin or go on: one line that says why, and what is kept."""
+
+
+class Run(abc.ABC):
+    """A part of a fit that runs by itself: some seeds, through so many steps.
+
+    Attributes:
+        name: of its checkpoint.
+        stage: what its steps are, for progress and metrics.
+        seeds: whose weights it trains.
+        steps: how many there are.
+        done: how many of them are done.
+    """
+
+    name: str
+    stage: str
+    seeds: tuple[int, ...]
+    steps: int
+    done: int = 0
+
+    @property
+    @abc.abstractmethod
+    def finished(self) -> bool:
+        """Whether there is nothing left to do."""
+
+    @abc.abstractmethod
+    def compile(self) -> None:
+        """Compile what `advance` runs: threads would each do it."""
+
+    @abc.abstractmethod
+    def advance(self, stop: int, watch: Watch) -> None:
+        """Some steps, to number `stop` at most. Raises `FitError`, and then is as it was before or worse."""
+
+    @abc.abstractmethod
+    def snapshot(self) -> dict[str, Any]:
+        """Where it stands: plain values, arrays, and lists of arrays."""
+
+    @abc.abstractmethod
+    def restore(self, snapshot: dict[str, Any]) -> None:
+        """Go back to a snapshot. Raises `CheckpointError` if it is of something else."""
+
+    @abc.abstractmethod
+    def residuals(self) -> list[Residual]:
+        """What came of it, one for every seed."""
+
+    @abc.abstractmethod
+    def history(self, seed: int) -> dict[str, Any]:
+        """Loss, rate and held-out errors of one seed over the steps."""
+
+
+class Best:
+    """The best weights of each of some seeds by the error of held-out rollouts, and when to stop."""
+
+    def __init__(self, weights: Any, stop_after: int | None):
+        count = jax.tree.leaves(weights)[0].shape[0]
+        self.stop_after = stop_after
+        self.errors = np.full(count, np.inf)
+        self.steps = np.zeros(count, dtype=int)
+        #: after which step each seed stopped; -1 for one that goes on
+        self.stopped = np.full(count, -1)
+        self.weights = jax.tree.map(lambda leaf: np.array(leaf), weights)
+        #: step, and the error of each seed
+        self.seen: list[list[float]] = []
+
+    def offer(self, step: int, errors: Sequence[float], weights: Any) -> None:
+        """The errors and weights (seeds first) after a step."""
+        self.seen.append([float(step), *errors])
+        for k in map(int, np.flatnonzero(self.stopped < 0)):
+            if errors[k] < self.errors[k]:
+                self.errors[k], self.steps[k] = errors[k], step
+                for kept, new in zip(jax.tree.leaves(self.weights), jax.tree.leaves(weights), strict=True):
+                    kept[k] = np.asarray(new)[k]
+            elif self.stop_after is not None and step - self.steps[k] >= self.stop_after:
+                self.stopped[k] = step
+
+    def chosen(self, k: int, last: Any) -> Any:
+        """The weights of a seed: the best if it may stop early, and the last otherwise."""
+        kept = self.stop_after is not None and np.isfinite(self.errors[k])
+        return jax.tree.map(lambda leaf: jax.numpy.asarray(leaf[k]), self.weights if kept else last)
+
+    def history(self, k: int) -> np.ndarray:
+        """Steps and errors (checks, 2) of a seed, as far as it went."""
+        seen = np.array(self.seen).reshape(len(self.seen), 1 + len(self.errors))[:, [0, 1 + k]]
+        return seen if self.stopped[k] < 0 else seen[seen[:, 0] <= self.stopped[k]]
+
+    def snapshot(self) -> dict[str, Any]:
+        """What `restore` takes."""
+        return {
+            "errors": self.errors, "steps": self.steps, "stopped": self.stopped,
+            "weights": packed(self.weights), "seen": np.array(self.seen),
+        }  # fmt: skip
+
+    def restore(self, snapshot: dict[str, Any]) -> None:
+        """Go back to a snapshot. Raises `CheckpointError` if it is of something else."""
+        like = [self.errors, self.steps, self.stopped]
+        given = [snapshot.get(name) for name in ("errors", "steps", "stopped")]
+        self.errors, self.steps, self.stopped = (np.array(leaf) for leaf in unpacked(given, like))
+        self.weights = jax.tree.map(np.array, unpacked(snapshot.get("weights"), self.weights))
+        self.seen = [list(row) for row in np.asarray(snapshot.get("seen")).tolist()]
+
+
+def run_all(runs: Sequence[Run], checkpoints: Checkpoints | None, every: int, watch: Watch) -> None:
+    """All runs to their end, from their checkpoints if there are any, with one every so many steps.
+
+    Raises:
+        FitError: one of them cannot go on; the others have stopped too.
+        CheckpointError: a checkpoint cannot be used, or not be written.
+    """
+    for run in runs if checkpoints else ():
+        _restore(run, checkpoints)
+    stages = {run.stage for run in runs}
+    total = sum(run.steps * len(run.seeds) for run in runs)
+    watch.begin(" and ".join(sorted(stages)), total, sum(run.done * len(run.seeds) for run in runs))
+
+    def work(run: Run) -> None:
+        try:
+            run.advance(run.done - run.done % every + every, watch)
+        except FitError as error:
+            kept = _kept(checkpoints, run)
+            raise FitError(f"{error}; {kept}") from None
+        if checkpoints and (run.finished or run.done % every == 0):
+            checkpoints.save(run.name, run.snapshot())
+
+    _side_by_side([run for run in runs if not run.finished], work)
+
+
+def _restore(run: Run, checkpoints: Any) -> None:
+    snapshot = checkpoints.load(run.name)
+    if snapshot is None:
+        return
+    try:
+        run.restore(snapshot)
+    except (CheckpointError, TypeError, ValueError, AttributeError, KeyError) as error:
+        reason = (
+            str(error) if isinstance(error, CheckpointError) else "it has something else in it than states"
+        )
+        raise CheckpointError(f"{checkpoints.path(run.name)}: {reason}; delete it to start again") from None
+
+
+def _kept(checkpoints: Checkpoints | None, run: Run) -> str:
+    if checkpoints is None:
+        return "nothing was kept: no checkpoint was asked for"
+    path = checkpoints.path(run.name)
+    return f"the last good state is kept in {path}" if path.exists() else "it was too early for a checkpoint"
+
+
+def _side_by_side(runs: Sequence[Run], work: Callable[[Run], None]) -> None:
+    """Every run in turn, a piece at a time, by as many threads as there are cores.
+
+    Not one thread a run: five runs on two cores would take as long as six.
+    """
+    waiting = collections.deque(runs)
+    stop = threading.Event()
+
+    def worker() -> None:
+        while not stop.is_set():
+            try:
+                run = waiting.popleft()
+            except IndexError:
+                return
+            work(run)
+            if not run.finished:
+                waiting.append(run)
+
+    count = min(len(runs), _cores())
+    if count <= 1:
+        worker()
+        return
+    runs[0].compile()
+    with concurrent.futures.ThreadPoolExecutor(count) as pool:
+        workers = [pool.submit(worker) for _ in range(count)]
+        try:
+            done, _ = concurrent.futures.wait(workers, return_when=concurrent.futures.FIRST_EXCEPTION)
+            for future in done:
+                future.result()
+        finally:
+            stop.set()
+
+
+def _cores() -> int:
+    if jax.default_backend() != "cpu":
+        return 1
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

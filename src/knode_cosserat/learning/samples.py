@@ -1,0 +1,256 @@
+"""Trajectories to one-segment samples: the true state of a node, and where the next one truly is.
+
+A sample is one segment of the rod at one time. From the true y at its start, with the true history, a model
+predicts y at its end and z at its start (paper eq. 12); nothing is integrated further than one segment, so
+that errors do not pile up and all samples are predicted side by side.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.rods.system import System, unpacked_history
+from knode_cosserat.solvers.march import coefficient_table
+from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.space import SpaceScheme, middles
+from knode_cosserat.trajectory import Trajectory
+
+
+class DataError(ValueError):
+    """Trajectories that nothing can be learned from; one line says which, where and why."""
+
+
+class Samples(NamedTuple):
+    """Segments (S) of all trajectories, in the order trajectory, row, segment."""
+
+    #: where the segment begins, as a part of the length
+    place: Float[Any, " S"]
+    t: Float[Any, " S"]
+    c0: Float[Any, " S"]
+    y: Float[Any, "S y"]
+    z: Float[Any, "S z"]
+    #: y at the segment's end
+    y_next: Float[Any, "S y"]
+    #: y_s times the length at the segment's start, from the states alone
+    slope: Float[Any, "S y"]
+    control: Float[Any, "S c"]
+    #: packed records of history at the segment's start, middle and end
+    history: tuple[Float[Any, "S x"], Float[Any, "S x"], Float[Any, "S x"]]
+    #: one over how many samples the same trajectory gave
+    weight: Float[Any, " S"]
+    #: which trajectory, and which of its rows
+    origin: Any
+
+
+class TipSamples(NamedTuple):
+    """The last node of every row (S)."""
+
+    t: Float[Any, " S"]
+    c0: Float[Any, " S"]
+    y: Float[Any, "S y"]
+    control: Float[Any, "S c"]
+    history: Float[Any, "S x"]
+    weight: Float[Any, " S"]
+    origin: Any
+
+
+@dataclasses.dataclass(frozen=True)
+class Dataset:
+    """All samples of some trajectories, and the scheme that carries y over a segment."""
+
+    segments: Samples
+    tips: TipSamples
+    space: SpaceScheme
+    #: segments of each row: all of them, or those that were chosen
+    per_row: int
+    #: by how much `Samples.slope` may be wrong (rms)
+    doubt: Float[Any, " y"]
+
+
+def predict(system: System, space: SpaceScheme, sample: Samples) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
+    """y at the end of one segment and z at its start, as the system has them."""
+    s, ds = sample.place * system.length, system.length / (system.nodes - 1)
+
+    def derivatives(s: Any, y: Any, record: Any) -> Any:
+        history = unpacked_history(system, sample.c0, record)
+        return system.derivatives(s, sample.t, y, sample.control, history)
+
+    y_next = space.advance(lambda *at: derivatives(*at)[0], s, ds, sample.y, sample.history)
+    return y_next, derivatives(s, sample.y, sample.history[0])[1]
+
+
+def samples(
+    knowledge: System, trajectories: Sequence[Trajectory], nodes: Sequence[int] | None = None
+) -> Dataset:
+    """One-segment samples of trajectories; `nodes` chooses the nodes that are predicted (1 to N - 1).
+
+    Raises:
+        DataError: a trajectory does not fit the knowledge or the others, is too short or not finite.
+    """
+    _check(knowledge, trajectories)
+    ends = _checked_nodes(knowledge, nodes)
+    parts = [_of_one(knowledge, trajectory, k, ends) for k, trajectory in enumerate(trajectories)]
+    *joined, doubts = zip(*parts, strict=True)
+    segments, tips = (jax.tree.map(lambda *leaves: np.concatenate(leaves), *each) for each in joined)
+    doubt = np.sqrt(np.mean(np.square(doubts), axis=0))
+    return Dataset(segments, tips, _settings(trajectories[0]).space, len(ends), doubt)
+
+
+def _settings(trajectory: Trajectory) -> Settings:
+    return trajectory.settings or Settings()
+
+
+def _of_one(
+    knowledge: System, trajectory: Trajectory, k: int, ends: np.ndarray
+) -> tuple[Samples, TipSamples, np.ndarray]:
+    settings, dt = _settings(trajectory), trajectory.dt
+    y, z, control = (np.asarray(a, dtype=float) for a in (trajectory.y, trajectory.z, trajectory.control))
+    time = np.asarray(trajectory.time, dtype=float)
+    slope, doubt = _slopes(settings, y)
+    record = np.concatenate([y, z, slope / knowledge.length] if knowledge.mixed else [y, z], axis=-1)
+    c0, history = _histories(settings, dt, record)
+    # the rows before the first are its own if it is a start, and not known otherwise
+    first = 1 if time[0] == 0.0 else 2
+    rows = np.arange(first, len(time))
+    history, c0 = history[rows], c0[rows]
+    between = np.stack([np.asarray(middles(each)) for each in history])
+    starts, count = ends - 1, len(rows) * len(ends)
+
+    def flat(values: Any) -> Any:
+        return values.reshape(count, *values.shape[2:])
+
+    def spread(values: Any) -> Any:
+        return np.repeat(values, len(ends), axis=0)
+
+    at = np.ix_(rows, starts)
+    segments = Samples(
+        place=np.tile(starts / (knowledge.nodes - 1.0), len(rows)),
+        t=spread(time[rows]),
+        c0=spread(c0),
+        y=flat(y[at]),
+        z=flat(z[at]),
+        y_next=flat(y[np.ix_(rows, ends)]),
+        slope=flat(slope[at]),
+        control=spread(control[rows]),
+        history=(flat(history[:, starts]), flat(between[:, starts]), flat(history[:, ends])),
+        weight=np.full(count, 1.0 / count),
+        origin=np.stack([np.full(count, k), spread(rows)], axis=1),
+    )
+    tips = TipSamples(
+        t=time[rows], c0=c0, y=y[rows, -1], control=control[rows], history=history[:, -1],
+        weight=np.full(len(rows), 1.0 / len(rows)), origin=np.stack([np.full(len(rows), k), rows], axis=1),
+    )  # fmt: skip
+    return segments, tips, doubt
+
+
+def _histories(settings: Settings, dt: float, record: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """c0 (T,) and ʰ (T, N, x) of every row, by the scheme that made the trajectory; row 0 has none."""
+    table = coefficient_table(settings, dt)
+    rate = np.zeros_like(record[0])
+    c0, history = np.zeros(len(record)), np.zeros_like(record)
+    for i in range(1, len(record)):
+        c0[i], c1, c2, d1 = table[0] if i == 1 else table[1]
+        history[i] = c1 * record[i - 1] + c2 * record[max(i - 2, 0)] + d1 * rate
+        rate = c0[i] * record[i] + history[i]
+    return c0, history
+
+
+def _slopes(settings: Settings, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """y_s times the length (T, N, y), from the states alone, and by how much it may be wrong (y,).
+
+    Exact where a segment is one Euler step; of splines otherwise, judged by those of the next lower order.
+    """
+    last = y.shape[1] - 1
+    if settings.space.order == 1:
+        forward = np.diff(y, axis=1) * last
+        return np.concatenate([forward, forward[:, -1:]], axis=1), np.zeros(y.shape[-1])
+    # imported here: it takes a third of a second
+    from scipy.interpolate import make_interp_spline
+
+    place = np.linspace(0.0, 1.0, last + 1)
+    orders = [max(1, min(order, 2 * ((last - 1) // 2) + 1)) for order in (7, 5)]
+    high, low = (make_interp_spline(place, y, k=order, axis=1).derivative()(place) for order in orders)
+    # that is the lower order's error; the higher one's is a small part of it
+    return high, 0.1 * np.sqrt(np.mean(np.square(high - low), axis=(0, 1)))
+
+
+# checking
+
+
+def _check(knowledge: System, trajectories: Sequence[Trajectory]) -> None:
+    if not trajectories:
+        raise DataError("there are no trajectories; at least one is needed")
+    wanted = (knowledge.nodes, knowledge.y_layout.size)
+    for k, trajectory in enumerate(trajectories):
+        name = f"trajectory {k}"
+        if not isinstance(trajectory, Trajectory):
+            raise DataError(f"{name} is a {type(trajectory).__name__}; allowed is a Trajectory")
+        shape = np.shape(trajectory.y)
+        if len(shape) != 3:
+            raise DataError(f"{name} is a batch of {shape[0]}; give its robots one by one")
+        if shape[0] < 3:
+            raise DataError(f"{name} has {shape[0]} rows; at least 3 are needed")
+        if shape[1:] != wanted:
+            raise DataError(
+                f"{name} has {shape[1]} nodes of {shape[2]} numbers; "
+                f"the knowledge has {wanted[0]} of {wanted[1]}"
+            )
+        controls = np.shape(trajectory.control)[-1]
+        if controls != knowledge.control_size:
+            names = ", ".join(field.name for field in knowledge.control_layout.fields)
+            raise DataError(
+                f"{name} has {controls} controls a row; the knowledge has {knowledge.control_size} ({names})"
+            )
+        _check_finite(name, trajectory)
+        _check_time(name, trajectory)
+    first = trajectories[0]
+    for k, trajectory in enumerate(trajectories):
+        if not np.isclose(trajectory.dt, first.dt, rtol=1e-6):
+            raise DataError(
+                f"trajectory {k} has time steps of {trajectory.dt:g} s and trajectory 0 of {first.dt:g} s; "
+                "all must be the same"
+            )
+        if _settings(trajectory).space != _settings(first).space:
+            raise DataError(
+                f"trajectory {k} was solved by {_settings(trajectory).space} along the rod and "
+                f"trajectory 0 by {_settings(first).space}; all must be the same"
+            )
+
+
+def _check_finite(name: str, trajectory: Trajectory) -> None:
+    for what in ("y", "z", "control"):
+        values = np.asarray(getattr(trajectory, what))
+        if not np.all(np.isfinite(values)):
+            row = int(np.argwhere(~np.isfinite(values))[0][0])
+            raise DataError(
+                f"{name} has {what} that is not finite in row {row}; learn from the rows before it"
+            )
+
+
+def _check_time(name: str, trajectory: Trajectory) -> None:
+    steps = np.diff(np.asarray(trajectory.time))
+    if np.any(steps <= 0) or np.ptp(steps) > 1e-6 * steps.max():
+        raise DataError(
+            f"{name} has time steps from {steps.min():g} to {steps.max():g} s; "
+            "they must be positive and equal"
+        )
+
+
+def _checked_nodes(knowledge: System, nodes: Sequence[int] | None) -> np.ndarray:
+    last = knowledge.nodes - 1
+    if nodes is None:
+        return np.arange(1, last + 1)
+    chosen = list(nodes)
+    if (
+        not chosen
+        or len(set(chosen)) < len(chosen)
+        or not all(1 <= node <= last and node == int(node) for node in chosen)
+    ):
+        raise DataError(f"nodes is {nodes!r}; allowed is different whole numbers from 1 to {last}")
+    return np.array(sorted(chosen))

@@ -1,0 +1,81 @@
+"""Which terms to take where no few of them explain everything: forward selection by held-out error.
+
+What a wrong set of functions leaves is not noise, and evidence would take term after term to chase it;
+such sums fit the data and fail elsewhere. So the terms are added one by one, each the one that lowers the
+error most on data that were held out (whole trajectories, or parts of the only one), until none does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+#: a term stays if it lowers the held-out squared error by this part
+GAIN = 0.05
+MOST_TERMS = 12
+#: into how many parts the rows of a single trajectory are held out
+PARTS = 3
+
+
+class Moments(NamedTuple):
+    """Sums over the samples of one fold: features by features, features by values, values by values."""
+
+    G: Float[Any, "k k"]
+    b: Float[Any, "k n"]
+    c: Float[Any, " n"]
+
+
+def folds(origin: Any) -> Any:
+    """Which fold each sample (trajectory, row) belongs to: its trajectory, or a part of the only one."""
+    trajectories = np.unique(origin[:, 0])
+    if len(trajectories) > 1:
+        return np.searchsorted(trajectories, origin[:, 0])
+    rows = origin[:, 1]
+    return np.minimum(PARTS * (rows - rows.min()) // max(np.ptp(rows) + 1, 1), PARTS - 1)
+
+
+def moments(features: Float[Any, "S k"], values: Float[Any, "S n"], fold: Any) -> list[Moments]:
+    """The moments of every fold."""
+    parts = [(features[fold == k], values[fold == k]) for k in np.unique(fold)]
+    return [Moments(X.T @ X, X.T @ y, np.sum(y * y, axis=0)) for X, y in parts]
+
+
+def held_out_error(parts: Sequence[Moments], columns: Any) -> float:
+    """Sum of squares that the folds' values keep when each is predicted from the others."""
+    total = Moments(*(sum(each) for each in zip(*parts, strict=True)))
+    error = 0.0
+    for part in parts:
+        G, b = total.G - part.G, total.b - part.b
+        w = _solution(G[np.ix_(columns, columns)], b[columns])
+        own = part.G[np.ix_(columns, columns)]
+        error += float(
+            np.sum(part.c - 2.0 * np.sum(w * part.b[columns], axis=0) + np.sum(w * (own @ w), axis=0))
+        )
+    return max(error, 0.0)
+
+
+def selected(parts: Sequence[Moments], groups: Sequence[Any], floor: float) -> tuple[list[int], float]:
+    """The groups of columns to take, and the held-out error with them; `floor` is the least that is meant."""
+    taken: list[int] = []
+    columns = np.zeros(0, dtype=int)
+    error = held_out_error(parts, columns)
+    while len(taken) < MOST_TERMS and error > floor:
+        rest = [k for k in range(len(groups)) if k not in taken]
+        trials = [held_out_error(parts, np.concatenate([columns, groups[k]])) for k in rest]
+        if not rest or min(trials) > (1.0 - GAIN) * error:
+            break
+        best = rest[int(np.argmin(trials))]
+        error = min(trials)
+        taken.append(best)
+        columns = np.concatenate([columns, groups[best]])
+    return taken, error
+
+
+def _solution(G: Any, b: Any) -> Any:
+    """Least squares from moments, in units in which every feature has size one."""
+    size = np.sqrt(np.maximum(np.diag(G), 1e-300))
+    scaled = G / size[:, None] / size[None, :] + 1e-11 * np.eye(len(G))
+    return np.linalg.solve(scaled, b / size[:, None]) / size[:, None]

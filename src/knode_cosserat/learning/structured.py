@@ -1,0 +1,183 @@
+"""The structured residual: it corrects what a mechanician would, where the equations have it.
+
+    length      L (1 + γ)
+    material    C z + D z_t + σ(z - z*, z_t) = f2: the strains are corrected before the kinematics use them
+    loads       + R f(what is seen from the material) + g(control): on what balances loads, nothing else
+    tip         + the same two at the tip: a mass, a weight, a force that the knowledge does not have
+
+The geometry (p_s, h_s, q_s, ω_s of a rod) stays exact, and the laws do not depend on the time step. Each of
+σ, f and g is an `Expansion`. A system says by its layouts what is a load and what is turned (`Field.frame`,
+`Field.load`); in one that does not say, every rate may be corrected.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.learning.expansion import Expansion
+from knode_cosserat.learning.residual import Residual
+from knode_cosserat.rods.system import Field, History, Layout, System
+from knode_cosserat.rotation import dot, rotation_matrix, small_inverse
+
+#: Newton corrections of a material's law that is not linear; the last one carries the derivatives
+CORRECTIONS = 3
+
+
+class Load(eqx.Module):
+    """A load as seen from the material, of observables and control, and a global one, of the control."""
+
+    material: Expansion | None
+    ambient: Expansion | None
+
+    def __call__(
+        self, layout: Layout, frames: Layout, y: Float[Any, " y"], observables: Any, control: Any
+    ) -> Float[Any, " l"]:
+        """The load, laid out by `layout`, in the frames in which the equations have it."""
+        total = jnp.zeros(layout.size)
+        if self.material is not None:
+            total = turned_back(layout, frames, y, self.material(jnp.concatenate([observables, control])))
+        if self.ambient is not None:
+            total = total + self.ambient(control)
+        return total
+
+
+class Structured(Residual):
+    """See the module. Parts that are not needed are None, and cost nothing."""
+
+    stretch: Float[Any, ""]
+    stress: Expansion | None
+    load: Load | None
+    tip_load: Load | None
+
+    def adapted(self, knowledge: System) -> System:
+        """The knowledge with its length corrected."""
+        return knowledge.replace(length=knowledge.length * (1.0 + self.stretch))
+
+    def derivatives(
+        self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
+    ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
+        """y_s and z: the strains corrected first, then the loads added to what they balance."""
+        z = self.strains(knowledge, s, t, y, control, history)
+        y_s = knowledge.rates(s, t, y, z, control, history)
+        if self.load is None:
+            return y_s, z
+        observed = self._observed(self.load, knowledge, s, y, z, control, history)
+        layout = loaded(knowledge)
+        load = self.load(layout, knowledge.y_layout, y, observed, ambient_inputs(knowledge, control))
+        added = jnp.zeros(y.shape[0]).at[knowledge.y_layout.indices(layout.names)].set(load)
+        if knowledge.mixed:
+            z_t, y_t = history.c0 * z + history.z, history.c0 * y + history.y
+            A, B, _ = knowledge.balance(s, t, y, y_t, z, z_t, control)
+            added = jnp.linalg.solve(A + history.c0 * B, added)
+        return y_s + added, z
+
+    def strains(
+        self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
+    ) -> Float[Any, " z"]:
+        """z of the corrected law, M (z - z0) + σ(z - z*, c0 z + ʰz) = 0 with z0 the knowledge's strains."""
+        z0 = knowledge.strains(s, t, y, control, history)
+        if self.stress is None:
+            return z0
+        stress = self.stress
+        _, z_rest = knowledge.rest(s)
+        M = strain_matrix(knowledge, s, t, y, control, history)
+
+        def left(z: Any, z0: Any, hz: Any) -> Any:
+            return dot(M, z - z0) + stress(jnp.concatenate([z - z_rest, history.c0 * z + hz]))
+
+        if not stress.curved:
+            # linear: one correction from z0 is exact, and its matrix is the same along the whole rod
+            n = z_rest.shape[0]
+            inverse = small_inverse(jax.jacfwd(lambda z: left(z, jnp.zeros(n), jnp.zeros(n)))(jnp.zeros(n)))
+            return z0 - dot(inverse, left(z0, z0, history.z))
+        z, fixed = jax.lax.stop_gradient((z0, (z0, history.z)))
+        for _ in range(CORRECTIONS):
+            inverse = small_inverse(jax.jacfwd(left)(z, *fixed))
+            z = z - dot(inverse, left(z, *fixed))
+        # at the solution one more correction changes nothing but has the derivatives of the implicit function
+        return z - dot(inverse, left(z, z0, history.z))
+
+    def tip(
+        self, knowledge: System, t: Any, control: Any, y: Float[Any, " y"], history: History
+    ) -> Float[Any, " k"]:
+        """The knowledge's conditions, and the load that it misses there."""
+        conditions = knowledge.tip(t, control, y, history)
+        if self.tip_load is None:
+            return conditions
+        observed = tip_observables(knowledge, y, control, history)
+        layout, inputs = knowledge.tip_layout, ambient_inputs(knowledge, control)
+        return conditions + self.tip_load(layout, knowledge.y_layout, y, observed, inputs)
+
+    @staticmethod
+    def _observed(
+        load: Load, knowledge: System, s: Any, y: Any, z: Any, control: Any, history: History
+    ) -> Any:
+        if load.material is None:
+            return None
+        y_t, z_t = history.c0 * y + history.y, history.c0 * z + history.z
+        return knowledge.observables(s, y, y_t, z, z_t, control)
+
+
+def tip_observables(knowledge: System, y: Float[Any, " y"], control: Any, history: History) -> Any:
+    """What a load at the tip may depend on: not on the strains there, which it determines itself."""
+    s = knowledge.length
+    _, z = knowledge.rest(s)
+    return knowledge.observables(s, y, history.c0 * y + history.y, z, jnp.zeros_like(z), control)
+
+
+def loaded(knowledge: System) -> Layout:
+    """The fields of y whose rates balance loads; all of them if the system does not say."""
+    stated = tuple(field for field in knowledge.y_layout.fields if field.load)
+    return Layout(*stated) if stated else knowledge.y_layout
+
+
+def geometric(knowledge: System) -> tuple[str, ...]:
+    """The fields of y whose rates are geometry; none if the system does not say."""
+    names = knowledge.y_layout.names
+    return tuple(name for name in names if name not in loaded(knowledge).names)
+
+
+def material_layout(knowledge: System) -> Layout:
+    """What a load as seen from the material may depend on: the observables, and what an ambient one may."""
+    return knowledge.observable_layout + ambient_layout(knowledge)
+
+
+def ambient_layout(knowledge: System) -> Layout:
+    """What an ambient load may depend on: the control, and its actuation if that differs."""
+    if type(knowledge).actuation is System.actuation:
+        return knowledge.control_layout
+    size = jax.eval_shape(knowledge.actuation, np.zeros(knowledge.control_size)).shape[0]
+    actuation = Field("actuation", size, "", "what of the control enters the equations")
+    return knowledge.control_layout + Layout(actuation)
+
+
+def ambient_inputs(knowledge: System, control: Any) -> Any:
+    """The numbers laid out by `ambient_layout`."""
+    if type(knowledge).actuation is System.actuation:
+        return control
+    return jnp.concatenate([control, knowledge.actuation(control)])
+
+
+def strain_matrix(knowledge: System, s: Any, t: Any, y: Any, control: Any, history: History) -> Any:
+    """C + c0 D of the law of the strains; the identity where a system gives its strains directly."""
+    if type(knowledge).constitutive is System.constitutive:
+        return jnp.eye(knowledge.z_layout.size)
+    C, D, _ = knowledge.constitutive(s, t, y, history.c0 * y + history.y, control)
+    return C + history.c0 * D
+
+
+def turned_back(layout: Layout, frames: Layout, y: Any, load: Any) -> Any:
+    """A load as seen from the material, in the frames in which the equations have it."""
+    parts = []
+    for field in layout.fields:
+        part = layout.get(load, field.name)
+        if field.frame:
+            part = dot(rotation_matrix(frames.get(y, field.frame)), part)
+        parts.append(part)
+    return jnp.concatenate(parts)

@@ -1,0 +1,303 @@
+"""Gradient training on one-segment samples: one compiled program for all epochs, and for several seeds.
+
+A network under Euler's scheme adds to what the knowledge alone predicts, and that does not depend on the
+weights: it is found once, and an epoch is then two matrix products and their derivatives. Everything else
+(other schemes, other residuals) is predicted anew in every epoch, just as `samples.predict` has it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax  # type: ignore[import-untyped]
+from jaxtyping import Float, Int, UInt32
+
+from knode_cosserat.learning.config import Training
+from knode_cosserat.learning.knode import KNODE
+from knode_cosserat.learning.losses import Loss, loss_for, sizes, spread
+from knode_cosserat.learning.residual import Network, Residual, elu, input_layout
+from knode_cosserat.learning.samples import Dataset, Samples, predict
+from knode_cosserat.rods.system import System, unpacked_history
+from knode_cosserat.solvers.space import Euler, SpaceScheme
+
+#: the most epochs of one call of the program
+PIECE = 50
+#: by which part of itself the best loss must fall to count as better, as in PyTorch's ReduceLROnPlateau
+LEAST_GAIN = 1e-4
+
+ADAM = optax.scale_by_adam(b1=0.9, b2=0.999, eps=1e-8)
+
+
+# weights
+
+
+def split(residual: Residual) -> tuple[Any, Any]:
+    """The weights of a residual, and the residual without them: `equinox.combine` puts them together."""
+    mask = jax.tree_util.tree_map_with_path(lambda path, leaf: _is_weight(residual, path, leaf), residual)
+    return eqx.partition(residual, mask)
+
+
+def _is_weight(node: Any, path: Any, leaf: Any) -> bool:
+    for key in path:
+        name = getattr(key, "name", None)
+        if name in getattr(type(node), "fixed", ()):
+            return False
+        index = getattr(key, "idx", getattr(key, "key", None))
+        node = node[index] if name is None else getattr(node, name)
+    return bool(np.issubdtype(jnp.result_type(leaf), np.floating))
+
+
+# what a network adds to
+
+
+class Known(NamedTuple):
+    """What the knowledge alone predicts of each sample (S), and what a network sees there, scaled."""
+
+    #: the last row is of ones: the biases' input
+    inputs: Float[Any, "inputs+1 S"]
+    y: Float[Any, "y S"]
+    z: Float[Any, "z S"]
+    ds: Float[Any, ""]
+
+
+def known(net: Network, knowledge: System, samples: Samples) -> Known:
+    """The part of Euler's prediction that does not depend on a network's weights."""
+    ds = knowledge.length / (knowledge.nodes - 1)
+
+    def one(sample: Samples) -> Any:
+        history = unpacked_history(knowledge, sample.c0, sample.history[0])
+        at = sample.place * knowledge.length, sample.t, sample.y, sample.control, history
+        y_s, z = knowledge.derivatives(*at)
+        inputs = net.inputs(knowledge, sample.y, z, sample.control, history)
+        return (inputs - net.input_mean) / net.input_scale, sample.y + ds * y_s, z
+
+    inputs, y, z = jax.vmap(one, out_axes=-1)(samples)
+    return Known(jnp.concatenate([inputs, jnp.ones_like(inputs[:1])]), y, z, jnp.asarray(ds))
+
+
+def corrected(net: Network, known: Known) -> tuple[Float[Any, "y S"], Float[Any, "z S"]]:
+    """Prediction of all samples by knowledge and network, as `samples.predict` has it under Euler.
+
+    Hidden units first and the biases as one more column: of the layouts tried the fastest (0.61 s for 1000
+    epochs of the paper's preset on one core; samples first 0.69 to 1.0 s).
+    """
+    first = jnp.concatenate([net.input_weights, net.input_biases[:, None]], axis=1)
+    second = net.output_weights @ elu(first @ known.inputs) + net.output_biases[:, None]
+    added = net.output_scale[:, None] * second
+    size = known.y.shape[0]
+    return known.y + known.ds * added[:size], known.z + added[size:]
+
+
+def standardised(net: Network, knowledge: System, samples: Samples) -> Network:
+    """The network with its inputs shifted and scaled, and its outputs scaled, by what the data are like.
+
+    An output is scaled by the root mean square of what it would have to add under Euler's scheme.
+    """
+    seen = _known(net, knowledge, samples)
+    inputs = np.asarray(seen.inputs)[:-1].T
+    lacking = [(samples.y_next.T - seen.y) / seen.ds, samples.z.T - seen.z]
+    scale = np.sqrt(np.mean(np.square(np.concatenate(lacking)), axis=1))
+    return dataclasses.replace(
+        net,
+        input_mean=jnp.asarray(inputs.mean(axis=0)),
+        input_scale=jnp.asarray(spread(inputs, sizes(input_layout(knowledge, net.history)))),
+        output_scale=jnp.asarray(scale),
+    )
+
+
+_known = jax.jit(known)
+
+
+# the program
+
+
+class Numbers(NamedTuple):
+    """The settings that are numbers: other values need no new program."""
+
+    learning_rate: Any
+    patience: Any
+    factor: Any
+    weight_decay: Any
+    noise: Any
+    epochs: Any
+
+
+class Recipe(NamedTuple):
+    """The settings that change the program."""
+
+    space: SpaceScheme
+    schedule: str
+    noisy: bool
+
+
+class Data(NamedTuple):
+    """What an epoch needs beside the weights: `known` where that does not change, `samples` elsewhere."""
+
+    knowledge: System
+    rest: Any
+    samples: Samples | None
+    known: Known | None
+    loss: Loss
+    y_spread: Float[Any, " y"]
+    history_spread: Float[Any, " x"]
+
+
+class State(NamedTuple):
+    """Where training stands; all but `epoch` have the seeds (G) as first axis."""
+
+    epoch: Int[Any, ""]
+    weights: Any
+    adam: Any
+    #: of the "plateau" schedule: the rate, the best loss, and how long ago that was
+    rate: Float[Any, " G"]
+    best: Float[Any, " G"]
+    waited: Int[Any, " G"]
+    key: UInt32[Any, "G 2"]
+
+
+def _loss(weights: Any, recipe: Recipe, data: Data, noise: Any, key: Any) -> Any:
+    residual = eqx.combine(weights, data.rest)
+    if data.known is not None:
+        return data.loss(*corrected(residual, data.known))
+    samples: Any = data.samples
+    if recipe.noisy:
+        samples = _noisy(samples, data, noise, key)
+    if _adds(residual, recipe.space):
+        return data.loss(*corrected(residual, known(residual, data.knowledge, samples)))
+    model = KNODE(data.knowledge, residual)
+    return data.loss(*jax.vmap(lambda one: predict(model, recipe.space, one), out_axes=-1)(samples))
+
+
+def _adds(residual: Residual, space: SpaceScheme) -> bool:
+    """Whether a prediction is what the knowledge alone predicts, and something added to that."""
+    return isinstance(residual, Network) and isinstance(space, Euler)
+
+
+def _noisy(samples: Samples, data: Data, noise: Any, key: Any) -> Samples:
+    """Other states and histories at the segments' starts; where they end is still the truth."""
+    for_y, for_history = jax.random.split(key)
+    y = samples.y + noise * data.y_spread * jax.random.normal(for_y, samples.y.shape)
+    # the same along the segment: as if the whole past were a little different
+    shift = noise * data.history_spread * jax.random.normal(for_history, samples.history[0].shape)
+    start, middle, end = (part + shift for part in samples.history)
+    return samples._replace(y=y, history=(start, middle, end))
+
+
+def _rate(recipe: Recipe, numbers: Numbers, epoch: Any, rate: Any) -> Any:
+    if recipe.schedule == "cosine":
+        return numbers.learning_rate * 0.5 * (1.0 + jnp.cos(jnp.pi * epoch / numbers.epochs))
+    return rate
+
+
+def plateau(numbers: Numbers, loss: Any, rate: Any, best: Any, waited: Any) -> tuple[Any, Any, Any]:
+    """Rate, best loss and epochs since then, after an epoch: PyTorch's ReduceLROnPlateau."""
+    better = loss < best * (1.0 - LEAST_GAIN)
+    waited = jnp.where(better, 0, waited + 1)
+    enough = waited > numbers.patience
+    return (
+        jnp.where(enough, rate * numbers.factor, rate),
+        jnp.where(better, loss, best),
+        jnp.where(enough, 0, waited),
+    )
+
+
+def _epoch(recipe: Recipe, numbers: Numbers, data: Data, epoch: Any, of_seed: Any) -> Any:
+    """One update of one seed's weights: what it becomes, the loss before, and the rate."""
+    weights, adam, rate, best, waited, key = of_seed
+    fresh = jax.random.fold_in(key, epoch) if recipe.noisy else None
+    loss, slope = jax.value_and_grad(_loss)(weights, recipe, data, numbers.noise, fresh)
+    now = _rate(recipe, numbers, epoch, rate)
+    direction, adam = ADAM.update(slope, adam)
+
+    def updated(weight: Any, change: Any) -> Any:
+        decay = numbers.weight_decay * weight if weight.ndim >= 2 else 0.0
+        return weight - now * (change + decay)
+
+    weights = jax.tree.map(updated, weights, direction)
+    weights, _ = split(eqx.combine(weights, data.rest).clamped())
+    if recipe.schedule == "plateau":
+        rate, best, waited = plateau(numbers, loss, rate, best, waited)
+    return (weights, adam, rate, best, waited, key), loss, now
+
+
+@functools.partial(jax.jit, static_argnames="recipe")
+def run_epochs(
+    recipe: Recipe, numbers: Numbers, data: Data, state: State, stop: Any
+) -> tuple[State, Float[Any, "PIECE G"], Float[Any, "PIECE G"]]:
+    """Epochs up to `stop`, at most `PIECE` of them: the state then, their losses, and their rates.
+
+    How many is a number, not a shape: one program serves every piece, so that where training is interrupted
+    changes nothing.
+    """
+    first = state.epoch
+
+    def one(carry: Any) -> Any:
+        state, losses, rates = carry
+        epoch, *of_seeds = state
+        update = functools.partial(_epoch, recipe, numbers, data, epoch)
+        of_seeds, loss, rate = _side_by_side(update, tuple(of_seeds))
+        i = epoch - first
+        return State(epoch + 1, *of_seeds), losses.at[i].set(loss), rates.at[i].set(rate)
+
+    nothing = jnp.full((PIECE, state.rate.shape[0]), jnp.nan)
+    last = jnp.minimum(stop, first + PIECE)
+    return jax.lax.while_loop(lambda carry: carry[0].epoch < last, one, (state, nothing, nothing))
+
+
+def _side_by_side(update: Any, of_seeds: Any) -> Any:
+    """`update` of all seeds; a batch of one would cost a third more than the one."""
+    if jax.tree.leaves(of_seeds)[0].shape[0] > 1:
+        return jax.vmap(update)(of_seeds)
+    alone = update(jax.tree.map(lambda leaf: leaf[0], of_seeds))
+    return jax.tree.map(lambda leaf: leaf[None], alone)
+
+
+# before the first epoch
+
+
+def prepared(
+    knowledge: System, residual: Residual, dataset: Dataset, training: Training
+) -> tuple[Recipe, Numbers, Data]:
+    """What the program needs beside its state."""
+    segments = dataset.segments
+    recipe = Recipe(dataset.space, training.schedule, training.noise > 0.0)
+    numbers = Numbers(
+        training.learning_rate, training.patience, training.factor, training.weight_decay, training.noise,
+        float(training.epochs),
+    )  # fmt: skip
+    _, rest = split(residual)
+    given: Any = residual
+    ready = (
+        _known(given, knowledge, segments) if _adds(residual, dataset.space) and not recipe.noisy else None
+    )
+    per_y, per_z = sizes(knowledge.y_layout), sizes(knowledge.z_layout)
+    fields = [*per_y, *per_z, *(per_y if knowledge.mixed else [])]
+    data = Data(
+        knowledge, rest, None if ready else segments, ready,
+        loss_for(training.loss, knowledge, segments),
+        spread(segments.y, per_y), spread(segments.history[0], fields),
+    )  # fmt: skip
+    return recipe, numbers, jax.tree.map(jnp.asarray, data)
+
+
+def started(residuals: Sequence[Residual], training: Training, seeds: Sequence[int]) -> State:
+    """The state before the first epoch, of one residual a seed."""
+    every = [split(residual)[0] for residual in residuals]
+    weights = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(x, dtype=float) for x in leaves]), *every)
+    count = len(residuals)
+    return State(
+        jnp.zeros((), dtype=int),
+        weights,
+        jax.vmap(ADAM.init)(weights),
+        jnp.full(count, training.learning_rate),
+        jnp.full(count, jnp.inf),
+        jnp.zeros(count, dtype=int),
+        jnp.stack([jax.random.key_data(jax.random.fold_in(jax.random.key(seed), 1)) for seed in seeds]),
+    )

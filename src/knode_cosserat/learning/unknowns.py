@@ -1,0 +1,168 @@
+"""Physical parameters as the numbers that a search moves: which, from where, within which bounds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.learning.knode import KNODE
+from knode_cosserat.rods.parameters import Parameter, ParameterError
+from knode_cosserat.rods.system import System
+
+
+class Unknown(NamedTuple):
+    """One parameter to be found: how its value is made of the numbers that are searched.
+
+    "number": a scalar. "multiple": one number times the identity matrix. "diagonal": a matrix's three.
+    "components": those of a vector or a list. What cannot be zero or less is searched by its logarithm.
+    """
+
+    name: str
+    kind: Literal["number", "multiple", "diagonal", "components"]
+    size: int
+    logarithmic: bool
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """A name for each number."""
+        if self.kind in ("number", "multiple"):
+            return (self.name,)
+        return tuple(f"{self.name}[{i}]" for i in range(self.size))
+
+    def value(self, numbers: Any) -> Any:
+        """The parameter's value from its numbers."""
+        if self.kind == "number":
+            return numbers[0]
+        if self.kind == "multiple":
+            return numbers[0] * np.eye(3)
+        return jnp.diag(numbers) if self.kind == "diagonal" else numbers
+
+
+Unknowns = tuple[Unknown, ...]
+
+
+def owner_of(robot: System) -> System:
+    """The system whose parameters they are: of a model, its knowledge."""
+    return owner_of(robot.knowledge) if isinstance(robot, KNODE) else robot
+
+
+def unknowns_of(robot: System, names: Sequence[str] | None) -> Unknowns:
+    """The named parameters of a robot, or all that have a value and can be searched.
+
+    Raises:
+        ParameterError: a name that does not exist or is given twice, a parameter without a value, or a
+            matrix that is not diagonal.
+    """
+    owner = owner_of(robot)
+    known = owner.parameters()
+    if names is None:
+        return tuple(
+            unknown for name, parameter in known.items() for unknown in [_unknown(owner, name, parameter)]
+            if isinstance(unknown, Unknown)
+        )  # fmt: skip
+    given: Any = names
+    if isinstance(given, str) or not isinstance(given, Sequence) or not given:
+        raise ParameterError(f"names is {given!r}; allowed is a list of parameters: {', '.join(known)}")
+    found = []
+    for name in names:
+        if name not in known:
+            raise ParameterError(
+                f"{type(owner).__name__} has no parameter {name!r}; there are {', '.join(known)}"
+            )
+        if list(names).count(name) > 1:
+            raise ParameterError(f"names has {name} twice")
+        unknown = _unknown(owner, name, known[name])
+        if isinstance(unknown, str):
+            raise ParameterError(unknown)
+        found.append(unknown)
+    return tuple(found)
+
+
+def _unknown(owner: System, name: str, parameter: Parameter) -> Unknown | str:
+    """How a parameter is searched, or why it cannot be."""
+    given = getattr(owner, name)
+    if given is None:
+        return f"{name} has no value: it follows from other parameters; give it one first, or calibrate those"
+    value = np.asarray(given)
+    logarithmic = parameter.low > 0.0
+    if parameter.shape == "scalar":
+        return Unknown(name, "number", 1, logarithmic)
+    if parameter.shape != "matrix":
+        return Unknown(name, "components", value.size, logarithmic)
+    diagonal = np.diag(value)
+    if np.any(value != np.diag(diagonal)):
+        return f"{name} is a matrix with more than a diagonal; allowed is one number or three, its diagonal"
+    alike = bool(np.all(diagonal == diagonal[0]))
+    return Unknown(name, "multiple" if alike else "diagonal", 1 if alike else 3, logarithmic)
+
+
+def labels(unknowns: Unknowns) -> tuple[str, ...]:
+    """A name for each number that is searched."""
+    return tuple(label for unknown in unknowns for label in unknown.labels)
+
+
+def values(robot: System, unknowns: Unknowns) -> Float[np.ndarray, " n"]:
+    """The numbers as the robot has them."""
+    owner = owner_of(robot)
+    parts = []
+    for unknown in unknowns:
+        value = np.asarray(getattr(owner, unknown.name), dtype=float)
+        parts.append(np.diag(value) if value.ndim == 2 else np.atleast_1d(value))
+    return np.concatenate([part[: unknown.size] for part, unknown in zip(parts, unknowns, strict=True)])
+
+
+def limits(robot: System, unknowns: Unknowns) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """The lowest and the highest allowed value of each number."""
+    known = owner_of(robot).parameters()
+    low, high = (
+        [getattr(known[u.name], end) for u in unknowns for _ in range(u.size)] for end in ("low", "high")
+    )
+    return np.array(low, dtype=float), np.array(high, dtype=float)
+
+
+def units(robot: System, unknowns: Unknowns) -> tuple[str, ...]:
+    """The unit of each number."""
+    known = owner_of(robot).parameters()
+    return tuple(known[unknown.name].unit for unknown in unknowns for _ in range(unknown.size))
+
+
+def logarithmic(unknowns: Unknowns) -> np.ndarray:
+    """Which numbers are searched by their logarithm."""
+    return np.array([unknown.logarithmic for unknown in unknowns for _ in range(unknown.size)])
+
+
+def searched(unknowns: Unknowns, numbers: np.ndarray) -> np.ndarray:
+    """Coordinates of the search from the numbers."""
+    which = logarithmic(unknowns)
+    return np.where(which, np.log(np.where(which, numbers, 1.0)), numbers)
+
+
+def found(unknowns: Unknowns, coordinates: np.ndarray) -> np.ndarray:
+    """The numbers from the coordinates of the search."""
+    which = logarithmic(unknowns)
+    return np.where(which, np.exp(np.where(which, coordinates, 0.0)), coordinates)
+
+
+def with_coordinates(robot: System, unknowns: Unknowns, coordinates: Any) -> System:
+    """The robot with the parameters that the coordinates stand for; they may be JAX tracers."""
+    changes, first = {}, 0
+    for unknown in unknowns:
+        numbers = coordinates[first : first + unknown.size]
+        changes[unknown.name] = unknown.value(jnp.exp(numbers) if unknown.logarithmic else numbers)
+        first += unknown.size
+    return robot.replace(**changes)
+
+
+def with_numbers(robot: System, unknowns: Unknowns, numbers: np.ndarray) -> System:
+    """The robot with these numbers, each within what is allowed."""
+    within = np.clip(numbers, *limits(robot, unknowns))
+    changes, first = {}, 0
+    for unknown in unknowns:
+        own = within[first : first + unknown.size]
+        changes[unknown.name] = own[0] if unknown.kind in ("number", "multiple") else own
+        first += unknown.size
+    return robot.replace(**changes)
