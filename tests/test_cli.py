@@ -11,9 +11,10 @@ import typer.testing
 
 import knode_cosserat as kc
 from knode_cosserat.cli import app
+from knode_cosserat.evaluation.metrics import dtw_distance
 
 ROBOT = "delrin-tendon-robot"
-COMMANDS = ("simulate", "equilibrium", "info", "evaluate", "plot")
+COMMANDS = ("simulate", "equilibrium", "info", "fit", "evaluate", "plot", "study simulation")
 
 
 def run(*arguments):
@@ -51,7 +52,7 @@ def truth(tmp_path_factory):
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_has_help_with_an_example(command):
-    text = succeeded(command, "--help")
+    text = succeeded(*command.split(), "--help")
     assert text.startswith(f"Usage: knode-cosserat {command}")
     assert f"\n    knode-cosserat {command}" in text
     assert "--json" in text
@@ -59,7 +60,7 @@ def test_every_command_has_help_with_an_example(command):
 
 def test_without_a_command_there_is_help():
     assert succeeded() == succeeded("--help")
-    assert all(command in succeeded("--help") for command in COMMANDS)
+    assert all(command.split()[0] in succeeded("--help") for command in COMMANDS)
 
 
 def test_the_version_is_told():
@@ -224,6 +225,80 @@ def test_info_derives_stiffness_mass_and_frequency():
     assert values["frequency"] == pytest.approx(0.55959 * np.sqrt(E * I / (rho * A * 0.5**4)), rel=1e-4)
 
 
+# fit, and models in the place of robots
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    """Two trajectories to learn from, and one to predict."""
+    folder = tmp_path_factory.mktemp("data")
+    for name, period, steps in (("a", 0.5, 19), ("b", 1.0, 19), ("truth", 1.5, 40)):
+        succeeded(*simulated(folder / f"{name}.nc", controls=f"sine:{period}", steps=steps))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def fitted(data):
+    """A model that had to find out the length, and what the program told of it."""
+    return told("fit", ROBOT, data / "a.nc", data / "b.nc", "--set", "length=0.4", "--out", data / "model")
+
+
+def test_fit_learns_what_is_missing_and_the_model_predicts(data, fitted):
+    assert (fitted["robot"], fitted["preset"], fitted["rows"]) == (ROBOT, "best", 40)
+    (one,) = fitted["models"]
+    assert (one["seed"], fitted["out"]) == (0, str(data / "model"))
+    stretch = next(each for each in one["found"] if each["part"] == "length")
+    assert stretch["coefficient"] == pytest.approx(0.635 / 0.4 - 1, rel=1e-6)
+    (before,) = told("evaluate", ROBOT, data / "truth.nc", "--set", "length=0.4")["references"]
+    (after,) = told("evaluate", data / "model", data / "truth.nc")["references"]
+    assert after["tip_dtw"] < 1e-3 * before["tip_dtw"]
+    assert after["pose_mse"] < 1e-3 * before["pose_mse"]
+
+
+def test_fit_tells_what_it_did(data, tmp_path):
+    text = succeeded(
+        "fit", ROBOT, data / "a.nc", "--set", "length=0.4", "--rows", 12, "--out", tmp_path / "m"
+    )
+    assert f"learned what {ROBOT} misses from 1 trajectories of 12 rows in all: preset best" in text
+    assert "+0.5875 of the knowledge's length" in text
+    assert text.endswith(f"wrote {tmp_path / 'm'}\n")
+
+
+def test_fit_trains_an_ensemble_of_networks_at_once(data, tmp_path):
+    out = tmp_path / "models"
+    facts = told(
+        "fit", ROBOT, data / "a.nc", "--set", "length=0.6", "--preset", "paper", "--seeds", "3,1",
+        "--epochs", 20, "--checkpoint", tmp_path / "kept", "--log", tmp_path / "log", "--out", out,
+    )  # fmt: skip
+    assert [model["seed"] for model in facts["models"]] == [3, 1]
+    one, other = (model["segments"] for model in facts["models"])
+    assert one["steps"] == other["steps"] == 20
+    assert one["loss"] != other["loss"]
+    assert any((tmp_path / "kept").iterdir()) and any((tmp_path / "log").iterdir())
+    members = kc.load_ensemble(out)
+    assert [member.about.facts["segments"]["loss"][-1] for member in members] == [one["loss"], other["loss"]]
+    (row,) = told("evaluate", out, data / "a.nc", "--rows", 5)["references"]
+    reference = kc.load_trajectory(data / "a.nc")
+    mean = members.predict(reference.control[1:], reference.dt)
+    assert row["rows"] == 5
+    assert row["tip_dtw"] == dtw_distance(mean.tip_position[:5], reference.tip_position[:5])
+
+
+def test_a_model_is_taken_where_a_robot_is(data, fitted, tmp_path):
+    model, out = data / "model", tmp_path / "a.nc"
+    succeeded("simulate", model, "--controls", "sine:1.5", "--steps", 40, "--out", out)
+    (row,) = told("evaluate", out, data / "truth.nc")["references"]
+    assert row["tip_rmse"] < 1e-6
+    tips = [told("equilibrium", it, "--tension", "7,5,5,7")["tip_position"] for it in (model, ROBOT)]
+    np.testing.assert_allclose(*tips, atol=1e-5)
+    facts = told("info", model)
+    assert facts["kind"] == "KNODE"
+    assert facts["parameters"]["length"]["value"] == 0.4
+    assert "+0.5875 of the knowledge's length" in succeeded("info", model)
+    assert facts["found"] == fitted["models"][0]["found"]
+    succeeded("plot", out, "--out", tmp_path / "a.png")
+
+
 # evaluate
 
 
@@ -320,6 +395,30 @@ def bad_inputs():
         (("equilibrium", ROBOT, "--tension", "strong"), "strong"),
         (("info", "nobot"), "the catalog has delrin-tendon-robot"),
         (("info", "--set", "length=1"), "name it"),
+        (("fit", ROBOT, "nowhere.nc", "--out", "m"), "nowhere.nc: no such file"),
+        (("fit", ROBOT, "--out", "m"), "TRAJECTORY"),
+        (("fit", ROBOT, "broken.nc", "--out", "m"), "broken.nc: not a netCDF-4 file"),
+        (("fit", ROBOT, "broken.nc"), "--out"),
+        (("fit", ROBOT, "broken.nc", "--out", "nowhere/m"), "no folder nowhere"),
+        (("fit", ROBOT, "broken.nc", "--out", "m", "--preset", "worst"), "worst"),
+        (("fit", ROBOT, "broken.nc", "--out", "m", "--seeds", "a,b"), "whole numbers, such as 0,1,2"),
+        (("fit", ROBOT, "broken.nc", "--out", "m", "--seeds", "1,1"), "several different ones"),
+        (("fit", ROBOT, "broken.nc", "--out", "m", "--seed", "1", "--seeds", "1,2"), "give one of them"),
+        (("fit", ROBOT, "broken.nc", "--out", "m", "--seed", "-1"), "whole number from 0"),
+        (("fit", ROBOT, "broken.nc", "--out", "m", "--epochs", "5"), "the preset best has none"),
+        (("fit", ROBOT, "broken.nc", "--out", "m", "--preset", "paper", "--epochs", "0"), "epochs is 0"),
+        (("fit", "nobot", "broken.nc", "--out", "m"), "nobot"),
+        (("fit", "broken.model", "broken.nc", "--out", "m"), "broken.model"),
+        (("fit", ROBOT, "broken.nc", "--out", "broken.nc", "--seeds", "1,2"), "this is a file"),
+        (("info", "broken.model"), "broken.model"),
+        (("info", "."), "this is a folder"),
+        (("evaluate", ".", "broken.nc"), "no ensemble here"),
+        (("study",), "command"),
+        (("study", "simulation"), "--out"),
+        (("study", "simulation", "--out", "broken.nc"), "this is a file"),
+        (("study", "simulation", "--out", "o", "--seeds", "0"), "--seeds"),
+        (("study", "simulation", "--out", "o", "--methods", "best,worst"), "'worst' is unknown"),
+        (("study", "simulation", "--out", "o", "--workers", "2", "--dask", "a:1"), "give one of them"),
         (("evaluate", "nowhere.nc", "nowhere.nc"), "nowhere.nc: no such file"),
         (("evaluate", "nobot", "nowhere.nc"), "nobot"),
         (("evaluate", ROBOT, "broken.nc"), "broken.nc: not a netCDF-4 file"),
@@ -337,13 +436,15 @@ def test_bad_input_gives_status_2_and_one_line(tmp_path, monkeypatch, arguments,
     monkeypatch.chdir(tmp_path)
     for name in ("broken.csv", "broken.yaml", "broken.nc"):
         Path(name).write_text("this: [is\nnot right")
-    result = run(*arguments, *(["--json"] if as_json else []))
+    Path("broken.model").write_text("knode-cosserat model, format 1, package 0.1.0\nbroken")
+    # a group of commands has no --json
+    result = run(*arguments, *(["--json"] if as_json and arguments != ("study",) else []))
     assert result.exit_code == 2
     assert result.stdout == ""
     assert result.stderr.startswith("error: ")
     assert words in result.stderr
     assert result.stderr.count("\n") == 1 and result.stderr.endswith("\n")
-    assert not {"a.nc", "a.png"} & set(os.listdir())
+    assert not {"a.nc", "a.png", "m", "o"} & set(os.listdir())
 
 
 def test_trajectories_that_cannot_be_compared_give_one_line(tmp_path, truth):
@@ -353,6 +454,12 @@ def test_trajectories_that_cannot_be_compared_give_one_line(tmp_path, truth):
     assert result.stderr == (
         f"error: {truth}: prediction has 10 rows and reference has 17; both must have the same number\n"
     )
+    result = run("fit", ROBOT, truth, tmp_path / "short.nc", "--set", "nodes=8", "--out", tmp_path / "m")
+    assert result.exit_code == 2
+    assert result.stderr.startswith(f"error: {truth} has 10 nodes of 19 numbers; the knowledge has 8")
+    result = run("info", truth)
+    assert result.exit_code == 2
+    assert "this is a trajectory" in result.stderr
     result = run("evaluate", truth, truth, "--set", "length=1")
     assert result.exit_code == 2
     assert "--set changes a robot" in result.stderr
@@ -401,6 +508,14 @@ def test_the_demonstration_runs_and_says_what_it_shows(tmp_path):
     done = python(demo, "--out", "pictures", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     written = {path.name for path in (tmp_path / "pictures").iterdir()}
-    assert written == {"truth.nc", "overview.png", "recording.png"}
+    assert written == {"truth.nc", "overview.png", "recording.png", "model", "learning.png"}
     assert "tip DTW 61." in done.stdout
     assert "simulated stand-in robot" in done.stdout.replace("\n   ", " ")
+    rows = {line[3:33].strip(): line[33:].split() for line in done.stdout.splitlines()}
+    before, published, ours = (
+        [float(word) for word in rows[label]]
+        for label in ("the model, before", "the paper's KNODE, published", "this package's")
+    )
+    assert before == pytest.approx([42.70, 34.57, 23.13, 21.44], rel=5e-3)
+    assert published == pytest.approx([5.07, 10.95, 1.31, 5.94], rel=5e-3)
+    assert all(own < 0.01 * paper for own, paper in zip(ours, published, strict=True))

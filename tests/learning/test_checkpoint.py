@@ -22,11 +22,11 @@ from tests.learning.bar import BAR, WRONG, pulled
 
 ROOT = Path(__file__).parents[2]
 CONFIG = FitConfig(
-    NetworkOptions(hidden=6, convex=False, standardised=True),
+    NetworkOptions(hidden=5, convex=False, standardised=True),
     Training(epochs=130, noise=0.01, schedule="plateau", patience=5),
 )
 LONG = FitConfig(
-    NetworkOptions(hidden=6, convex=False, standardised=True),
+    NetworkOptions(hidden=5, convex=False, standardised=True),
     Training(epochs=4000, noise=0.01, learning_rate=3e-3),
     RolloutTraining(updates=150, horizon=6),
     seed=(2, 5),

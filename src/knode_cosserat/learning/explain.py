@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
+from jaxtyping import Float
 
 from knode_cosserat.learning.expansion import Expansion, Term
 from knode_cosserat.learning.knode import KNODE
+from knode_cosserat.learning.samples import Samples, samples
 from knode_cosserat.learning.structured import Structured, ambient_layout, loaded, material_layout
-from knode_cosserat.rods.system import Layout
+from knode_cosserat.rods.system import Layout, System, unpacked_history
+from knode_cosserat.trajectory import Trajectory
 
 
 class Finding(NamedTuple):
@@ -105,3 +109,37 @@ def _function(term: Term, axis: int, expansion: Expansion) -> str:
     if term.form == "saturating":
         return f"{reach:.4g} tanh({x} / {reach:.4g})"
     return f"{x} / √(1 + |{term.name}|² / {reach:.4g}²)"
+
+
+class Added(NamedTuple):
+    """What a residual adds at the states of a trajectory, at every segment's start."""
+
+    time: Float[np.ndarray, " T"]
+    #: y_s and z of the knowledge alone, and of the model
+    knowledge: tuple[Float[np.ndarray, "T N y"], Float[np.ndarray, "T N z"]]
+    model: tuple[Float[np.ndarray, "T N y"], Float[np.ndarray, "T N z"]]
+
+
+def added(model: KNODE, trajectory: Trajectory) -> Added:
+    """y_s and z at a trajectory's states, without the residual (of any kind) and with it.
+
+    Raises:
+        DataError: the trajectory does not fit the model.
+    """
+    data = samples(model.knowledge, [trajectory]).segments
+    rows = np.unique(data.origin[:, 1])
+    both = [
+        tuple(np.asarray(part).reshape(len(rows), -1, part.shape[-1]) for part in _derivatives(system, data))
+        for system in (model.knowledge, model)
+    ]
+    return Added(np.asarray(trajectory.time)[rows], both[0], both[1])  # type: ignore[arg-type]
+
+
+@jax.jit
+def _derivatives(system: System, data: Samples) -> Any:
+    def one(sample: Samples) -> Any:
+        history = unpacked_history(system, sample.c0, sample.history[0])
+        s = sample.place * system.length
+        return system.derivatives(s, sample.t, sample.y, sample.control, history)
+
+    return jax.vmap(one)(data)

@@ -12,7 +12,7 @@ The geometry (p_s, h_s, q_s, ω_s of a rod) stays exact, and the laws do not dep
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -25,8 +25,11 @@ from knode_cosserat.learning.residual import Residual
 from knode_cosserat.rods.system import Field, History, Layout, System
 from knode_cosserat.rotation import dot, rotation_matrix, small_inverse
 
-#: Newton corrections of a material's law that is not linear; the last one carries the derivatives
-CORRECTIONS = 3
+#: Newton corrections of a material's law that is not linear, at most, and the parts of each that are tried
+MOST_CORRECTIONS = 40
+PARTS = np.array([1.0, 0.5, 0.2, 0.05])
+#: a law is solved when what is left of it is this part of its terms
+SOLVED = 1e-12
 
 
 class Load(eqx.Module):
@@ -45,6 +48,52 @@ class Load(eqx.Module):
         if self.ambient is not None:
             total = total + self.ambient(control)
         return total
+
+
+class _Law(NamedTuple):
+    """M (z - z0) + σ(z - z*, c0 z + ʰz) = 0, for the strains z at one point."""
+
+    stress: Expansion
+    M: Float[Any, "z z"]
+    c0: Any
+    z_rest: Float[Any, " z"]
+    z0: Float[Any, " z"]
+    hz: Float[Any, " z"]
+
+    def left(self, z: Float[Any, " z"]) -> Float[Any, " z"]:
+        """What is left of the law."""
+        return dot(self.M, z - self.z0) + self.stress(
+            jnp.concatenate([z - self.z_rest, self.c0 * z + self.hz])
+        )
+
+
+def solved(law: _Law) -> Float[Any, " z"]:
+    """The strains of a law that is not linear, by Newton's method from z0, damped; NaN where it finds none.
+
+    Each correction is taken in that part, of several, which leaves least: friction makes laws so steep that
+    whole corrections overshoot for ever.
+    """
+    n = law.z0.shape[0]
+    # natural size of what the law sums up, number by number
+    enough = SOLVED * jnp.sum(jnp.abs(law.M) * (jnp.abs(law.z0) + jnp.abs(law.z_rest) + 1e-3), axis=1)
+
+    def size(left: Any) -> Any:
+        return jnp.max(jnp.abs(left) / enough)
+
+    def going(state: Any) -> Any:
+        count, _, left = state
+        return (size(left) > 1.0) & (count < MOST_CORRECTIONS)
+
+    def corrected(state: Any) -> Any:
+        count, z, left = state
+        step = dot(small_inverse(jax.jacfwd(law.left)(z)), left)
+        tried = z - PARTS[:, None] * step
+        leaves = jax.vmap(law.left)(tried)
+        best = jnp.argmin(jnp.where(jnp.isfinite(jax.vmap(size)(leaves)), jax.vmap(size)(leaves), jnp.inf))
+        return count + 1, tried[best], leaves[best]
+
+    _, z, left = jax.lax.while_loop(going, corrected, (0, law.z0, law.left(law.z0)))
+    return jnp.where(size(left) <= 1e4, z, jnp.full(n, jnp.nan))
 
 
 class Structured(Residual):
@@ -84,24 +133,19 @@ class Structured(Residual):
         z0 = knowledge.strains(s, t, y, control, history)
         if self.stress is None:
             return z0
-        stress = self.stress
         _, z_rest = knowledge.rest(s)
         M = strain_matrix(knowledge, s, t, y, control, history)
-
-        def left(z: Any, z0: Any, hz: Any) -> Any:
-            return dot(M, z - z0) + stress(jnp.concatenate([z - z_rest, history.c0 * z + hz]))
-
-        if not stress.curved:
+        law = _Law(self.stress, M, history.c0, z_rest, z0, history.z)
+        if not self.stress.curved:
             # linear: one correction from z0 is exact, and its matrix is the same along the whole rod
-            n = z_rest.shape[0]
-            inverse = small_inverse(jax.jacfwd(lambda z: left(z, jnp.zeros(n), jnp.zeros(n)))(jnp.zeros(n)))
-            return z0 - dot(inverse, left(z0, z0, history.z))
-        z, fixed = jax.lax.stop_gradient((z0, (z0, history.z)))
-        for _ in range(CORRECTIONS):
-            inverse = small_inverse(jax.jacfwd(left)(z, *fixed))
-            z = z - dot(inverse, left(z, *fixed))
-        # at the solution one more correction changes nothing but has the derivatives of the implicit function
-        return z - dot(inverse, left(z, z0, history.z))
+            n = jnp.zeros_like(z_rest)
+            inverse = small_inverse(jax.jacfwd(law._replace(z0=n, hz=n).left)(n))
+            return z0 - dot(inverse, law.left(z0))
+        # the iteration is not differentiated: at the solution one more correction changes nothing, but has
+        # the derivatives of the implicit function
+        z = solved(jax.lax.stop_gradient(law))
+        inverse = jax.lax.stop_gradient(small_inverse(jax.jacfwd(law.left)(z)))
+        return z - dot(inverse, law.left(z))
 
     def tip(
         self, knowledge: System, t: Any, control: Any, y: Float[Any, " y"], history: History

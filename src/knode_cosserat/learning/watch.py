@@ -39,9 +39,7 @@ class Watch:
         """A new stage of so many steps in all, of which some may be done already."""
         if self._bar is not None:
             self._bar.close()
-        self._bar = tqdm(
-            total=total, initial=done, desc=what, unit="step", disable=not self._progress, leave=False
-        )
+        self._bar = tqdm(total=total, initial=done, desc=what, unit="step", disable=not self._progress)
 
     def steps(
         self, what: str, seeds: Sequence[int], first: int, losses: np.ndarray, rates: np.ndarray

@@ -1,14 +1,10 @@
-"""What the commands tell: facts of trajectories and robots, as JSON or in words."""
+"""What the commands tell: facts of trajectories and systems, ready for JSON."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import typer
 
 from knode_cosserat.solvers.result import Result
 
@@ -17,7 +13,8 @@ if TYPE_CHECKING:
     from knode_cosserat.trajectory import Trajectory
 
 
-# finding out
+#: how many terms of a residual are told in words
+MOST_FINDINGS = 24
 
 
 def outcome(trajectory: Trajectory) -> dict[str, Any]:
@@ -54,7 +51,8 @@ def at_rest(rest: Trajectory) -> dict[str, Any]:
 
 
 def parameters(system: System) -> dict[str, dict[str, Any]]:
-    """Every parameter by name, with its value, unit and meaning."""
+    """Every parameter by name, with its value, unit and meaning; of a model, those of its knowledge."""
+    system = _knowledge(system)
     stated = {name: (getattr(system, name), it.unit, it.meaning) for name, it in system.parameters().items()}
     nodes = {"nodes": (system.nodes, "1", "nodes along the rod, base and tip included")}
     return {name: _quantity(*parts) for name, parts in (stated | nodes).items()}
@@ -64,6 +62,7 @@ def derived(system: System) -> dict[str, dict[str, Any]]:
     """What follows from the parameters, in the same form."""
     from knode_cosserat.rods.tendon_robot import TendonRobot
 
+    system = _knowledge(system)
     if not isinstance(system, TendonRobot):
         return {}
     Kse, Kbt, mass = np.asarray(system.Kse), np.asarray(system.Kbt), system.mass_per_length * system.length
@@ -85,39 +84,32 @@ def _quantity(value: Any, unit: str, meaning: str) -> dict[str, Any]:
     return {"value": plain, "unit": unit, "meaning": meaning}
 
 
-# telling it
+def learned(system: System) -> tuple[dict[str, Any], list[str]]:
+    """What a model learned, as facts and in words; nothing of a system that is not a model."""
+    from knode_cosserat.learning.explain import explain
+    from knode_cosserat.learning.knode import KNODE
+    from knode_cosserat.learning.structured import Structured
+
+    if not isinstance(system, KNODE):
+        return {}, []
+    facts: dict[str, Any] = {"residual": type(system.residual).__name__}
+    lines = [f"residual: {facts['residual']}"]
+    for stage in ("segments", "rollouts"):
+        losses = system.about.facts.get(stage, {}).get("loss", ())
+        if len(losses):
+            facts[stage] = {"steps": len(losses), "loss": float(losses[-1])}
+            lines.append(f"{stage}: loss {losses[-1]:.4g} at step {len(losses)}")
+    if isinstance(system.residual, Structured):
+        found = explain(system)
+        facts["found"] = [finding._asdict() for finding in found]
+        lines += [f"  {finding}" for finding in found[:MOST_FINDINGS]] or ["  nothing is missing"]
+        if len(found) > MOST_FINDINGS:
+            lines.append(f"  … and {len(found) - MOST_FINDINGS} more; --json has all of them")
+    return facts, lines
 
 
-def tell(as_json: bool, facts: dict[str, Any], lines: list[str], **written: Path | None) -> None:
-    """Facts as JSON, or the same in words; and the files that were written."""
-    if as_json:
-        files = {name: str(path) if path else None for name, path in written.items()}
-        typer.echo(json.dumps(facts | files, allow_nan=False))
-        return
-    for line in [*lines, *(f"wrote {path}" for path in written.values() if path)]:
-        typer.echo(line)
+def _knowledge(system: System) -> System:
+    """What a model was made of; any other system itself."""
+    from knode_cosserat.learning.knode import KNODE
 
-
-def table(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines with the cells of each column below each other."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    padded = ((cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)
-    return ["  ".join(row).rstrip() for row in padded]
-
-
-def vector(values: list[float]) -> str:
-    """Numbers in words, without those that are rounding errors beside the largest."""
-    size = max(map(abs, values))
-    return "(" + ", ".join(f"{value if abs(value) > 1e-9 * size else 0.0:.6g}" for value in values) + ")"
-
-
-def shown(value: Any) -> str:
-    """A parameter's value in words."""
-    if value is None:
-        return "not given"
-    array = np.asarray(value)
-    if array.ndim == 2 and np.array_equal(array, np.diag(np.diag(array))):
-        return f"diag {shown(np.diag(array).tolist())}"
-    if array.ndim:
-        return "[" + ", ".join(shown(each) for each in value) + "]"
-    return f"{value:.6g}"
+    return _knowledge(system.knowledge) if isinstance(system, KNODE) else system

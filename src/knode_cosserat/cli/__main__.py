@@ -1,0 +1,5 @@
+"""`python -m knode_cosserat.cli`."""
+
+from knode_cosserat.cli import main
+
+main()

@@ -1,0 +1,174 @@
+"""Commands on robots and models: simulate, equilibrium, info."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from knode_cosserat.cli.arguments import (
+    ROBOT,
+    Changes,
+    Json,
+    NetCDF,
+    Nodes,
+    Picture,
+    Progress,
+    Robot,
+    Space,
+    figures,
+    require_writable,
+    system_of,
+    wanted,
+)
+from knode_cosserat.cli.facts import at_rest, derived, learned, outcome, parameters
+from knode_cosserat.cli.program import app, examples
+from knode_cosserat.cli.telling import shown, table, tell, vector
+
+
+@app.command(
+    epilog=examples(
+        "simulate delrin-tendon-robot --controls sine:1.5 --steps 100 --out truth.nc",
+        "simulate delrin-tendon-robot --controls step:1.5,at=2 --steps 200 --dt 0.02 --out step.nc",
+        "simulate my-robot.yaml --controls tensions.csv --set youngs_modulus=10e9 --out stiff.nc",
+        "simulate my-robot.yaml --controls random:0 --steps 100 --out r.nc --figure r.png --json",
+    )
+)
+def simulate(
+    robot: Robot,
+    controls: Annotated[
+        str,
+        typer.Option(
+            metavar="CONTROLS",
+            help="sine:PERIOD, step:HEIGHT, ramp:HEIGHT, random:SEED, constant:TENSION or a CSV file.",
+        ),
+    ],
+    out: Annotated[Path, NetCDF],
+    steps: Annotated[
+        int | None, typer.Option(metavar="N", help="Time steps.", show_default="as many as a file has")
+    ] = None,
+    dt: Annotated[
+        float | None, typer.Option(metavar="S", help="Time step in s.", show_default="0.05, or a file's own")
+    ] = None,
+    time: Annotated[
+        str, typer.Option(metavar="SCHEME", help="Scheme in time: bdf1, bdf2, bdf-alpha or trapezoidal.")
+    ] = "bdf2",
+    space: Space = "euler",
+    changes: Changes = None,
+    nodes: Nodes = None,
+    allow_failure: Annotated[
+        bool, typer.Option("--allow-failure", help="Write what was solved even if a step has no solution.")
+    ] = False,
+    figure: Annotated[Path | None, Picture] = None,
+    progress: Progress = None,
+    as_json: Json = False,
+) -> None:
+    """Simulate a robot under tendon tensions."""
+    require_writable(out, figure)
+    drawing = figures() if figure else None
+    import knode_cosserat as kc
+
+    system = system_of(robot, changes, nodes)
+    if dt is None:
+        dt = kc.controls.load(controls).dt if os.path.isfile(controls) else 0.05
+    tensions = kc.controls.parse(controls, steps, dt, tendons=system.control_size)
+    began = perf_counter()
+    trajectory = kc.simulate(
+        system, tensions, dt, time=time, space=space, progress=wanted(progress),
+        on_failure="return" if allow_failure else "raise",
+    )  # fmt: skip
+    seconds = perf_counter() - began
+    trajectory.save(out)
+    if drawing:
+        drawing.overview(trajectory).savefig(figure)
+    came = outcome(trajectory)
+    facts = {"robot": robot, "steps": len(tensions), "dt": dt, "computing_time": round(seconds, 4), **came}
+    results = ", ".join(f"{count} {result}" for result, count in came["results"].items())
+    lines = [
+        f"simulated {robot}: {len(tensions)} steps of {dt:g} s in {seconds:.2f} s of computing",
+        f"steps: {results}; largest residual {came['largest_residual']:.1e} of its natural scale",
+        f"tip after the last step that was solved: {vector(came['tip_position'])} m",
+    ]
+    if came["first_failure"]:
+        step, at, message = came["first_failure"].values()
+        lines.append(f"NOT SOLVED from step {step} (t = {at:g} s) on: {message}")
+    tell(as_json, facts, lines, out=out, figure=figure)
+
+
+@app.command(epilog=examples("equilibrium delrin-tendon-robot --tension 7,5,5,7"))
+def equilibrium(
+    robot: Robot,
+    tension: Annotated[
+        str, typer.Option(metavar="N,N,…", help="Tension of every tendon in N, such as 7,5,5,7.")
+    ],
+    space: Space = "euler",
+    changes: Changes = None,
+    nodes: Nodes = None,
+    out: Annotated[Path | None, NetCDF] = None,
+    as_json: Json = False,
+) -> None:
+    """Find a robot's shape at rest under constant tensions."""
+    require_writable(out)
+    import knode_cosserat as kc
+
+    system = system_of(robot, changes, nodes)
+    rest = kc.equilibrium(system, _tensions(tension, system.control_size), space=space)
+    if out:
+        rest.save(out)
+    facts = {"robot": robot, **at_rest(rest)}
+    lines = [
+        f"tip: {vector(facts['tip_position'])} m",
+        f"the tip leans {np.degrees(facts['tip_inclination']):.2f} degrees from the z axis",
+        f"internal force at the base: {vector(facts['base_force'])} N",
+        f"internal moment at the base: {vector(facts['base_moment'])} N m",
+    ]
+    tell(as_json, facts, lines, out=out)
+
+
+@app.command(epilog=examples("info", "info delrin-tendon-robot --set length=0.4", "info model"))
+def info(
+    robot: Annotated[
+        str | None, typer.Argument(metavar="[ROBOT]", help=f"{ROBOT} Without: list the catalog.")
+    ] = None,
+    changes: Changes = None,
+    nodes: Nodes = None,
+    as_json: Json = False,
+) -> None:
+    """Show a robot's parameters and what a model learned, or list the catalog."""
+    import knode_cosserat as kc
+
+    robots = kc.catalog()
+    if robot is None:
+        if changes or nodes:
+            raise ValueError("--set and --nodes change a robot: name it")
+        tell(as_json, {"catalog": robots}, table(list(robots.items())))
+        return
+    system = system_of(robot, changes, nodes)
+    parts = {"parameters": parameters(system), "derived": derived(system)}
+    rows = []
+    for title, quantities in parts.items():
+        rows += [[""] * 4, [title, "", "", ""]]
+        rows += [
+            [f"  {name}", shown(it["value"]), it["unit"], it["meaning"]] for name, it in quantities.items()
+        ]
+    heading = f"{robot}: {robots[robot]}" if robot in robots else robot
+    facts, lines = learned(system)
+    tell(
+        as_json,
+        {"robot": robot, "kind": type(system).__name__, **parts, **facts},
+        [heading, *table(rows), *(["", *lines] if lines else [])],
+    )
+
+
+def _tensions(text: str, count: int) -> list[float]:
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != count or not all(0.0 <= value < np.inf for value in values):
+        raise ValueError(f"--tension {text!r}: allowed is {count} numbers, 0 or more (N), such as 7,5,5,7")
+    return values

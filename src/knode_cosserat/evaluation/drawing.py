@@ -1,0 +1,179 @@
+"""What the figures are made of: one style, and the parts that several of them draw. It needs matplotlib."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from knode_cosserat.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+#: Okabe and Ito's colours, which the colour-blind can tell apart, without the yellow that vanishes on paper
+PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+#: the second trajectory and so on, which may lie on the first
+DASHES = ("-", "--", "-.", ":")
+TIME_COLOURS = "viridis"
+STYLE: Any = {
+    "font.size": 10,
+    "axes.titlesize": 11,
+    "axes.axisbelow": True,
+    "axes.grid": True,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "grid.color": "#DDDDDD",
+    "grid.linewidth": 0.6,
+    "legend.frameon": False,
+    "lines.linewidth": 1.6,
+}
+AXES = ("x", "y", "z")
+
+
+class Tips(Protocol):
+    """What has tip positions over time: a trajectory, or a recording."""
+
+    @property
+    def time(self) -> ArrayLike:
+        """(T,) s."""
+
+    @property
+    def tip_position(self) -> ArrayLike:
+        """(T, 3) m."""
+
+
+def draw_rods(figure: Any, axes: Any, trajectory: Trajectory, count: int) -> None:
+    """Rods at `count` times, coloured by time, and the path of the tip."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    position, time = one_of(trajectory).position, np.asarray(trajectory.time)
+    position = np.asarray(position)
+    valid = np.flatnonzero(np.isfinite(position).all(axis=(1, 2)))
+    if len(valid) == 0:
+        raise ValueError("the trajectory has no valid row to draw")
+    shown = valid[np.unique(np.linspace(0, len(valid) - 1, count).round().astype(int))]
+    colours = ScalarMappable(Normalize(time[0], time[-1]), TIME_COLOURS)
+    for row in shown:
+        axes.plot(*position[row].T, color=colours.to_rgba(time[row]), linewidth=2.0, solid_capstyle="round")
+    label = "path of the tip" if len(time) > 1 else None
+    axes.plot(*position[:, -1].T, color="#777777", linewidth=0.9, label=label)
+    axes.plot(*position[shown[0], :1].T, "s", color="#333333", markersize=5, label="base")
+    equal_scales(axes, position[valid])
+    axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
+    axes.legend(loc="upper left")
+    if len(time) > 1:
+        figure.colorbar(colours, ax=axes, label="time [s]", shrink=0.6, pad=0.1)
+
+
+def equal_scales(axes: Any, points: NDArray[np.float64], zoom: float = 0.95) -> None:
+    """A metre is as long in every direction, and a thin box is still deep enough to see."""
+    from matplotlib.ticker import MaxNLocator
+
+    low, high = points.min(axis=(0, 1)), points.max(axis=(0, 1))
+    centre, half = (low + high) / 2, (high - low) / 2
+    half = 1.05 * np.maximum(half, 0.55 * half.max())
+    axes.set(**{f"{name}lim": (c - h, c + h) for name, c, h in zip(AXES, centre, half, strict=True)})
+    axes.set_box_aspect(tuple(half), zoom=zoom)
+    for axis, c, h in zip((axes.xaxis, axes.yaxis, axes.zaxis), centre, half, strict=True):
+        # not near the ends: where two axes meet, their labels would too
+        axis.set_ticks([tick for tick in MaxNLocator(4).tick_values(c - h, c + h) if abs(tick - c) < 0.9 * h])
+    axes.tick_params(axis="z", pad=6.0)
+    for axis, pad in ((axes.xaxis, 6.0), (axes.yaxis, 10.0), (axes.zaxis, 10.0)):
+        axis.labelpad = pad
+
+
+def draw_tips(axes: Any, paths: Mapping[str, tuple[ArrayLike, NDArray[np.float64]]]) -> None:
+    """x, y and z, one below the other, of paths given as times and positions."""
+    for i, (label, (time, tip)) in enumerate(paths.items()):
+        for axis in range(3):
+            axes[axis].plot(time, tip[:, axis], label=label, **line(i, np.size(time)))
+    farthest = max((np.nanmax(np.abs(tip), initial=0.0) for _, tip in paths.values()), default=0.0)
+    for axis, name in enumerate(AXES):
+        axes[axis].set_ylabel(f"tip {name} [m]")
+        require_span(axes[axis], 0.01 * farthest)
+    axes[2].set_xlabel("time [s]")
+
+
+def require_span(axes: Axes, span: float) -> None:
+    """Rounding errors are not to look like a motion."""
+    low, high = axes.get_ylim()
+    if high - low < span:
+        axes.set_ylim((low + high - span) / 2, (low + high + span) / 2)
+
+
+def draw_tensions(axes: Axes, trajectory: Trajectory) -> None:
+    """The tension of every tendon, held from row to row."""
+    values, time = np.asarray(one_of(trajectory).tension), np.asarray(trajectory.time)
+    for k in range(values.shape[1]):
+        # thinner and thinner: where tensions are equal, all of them are still to be seen
+        width = max(0.9, 3.2 - 0.75 * k)
+        style: dict[str, Any] = {
+            "label": f"tendon {k + 1}",
+            "color": PALETTE[k % len(PALETTE)],
+            "linewidth": width,
+        }
+        if len(time) == 1:
+            axes.plot(time, values[:, k], "o", markersize=4.0 * width, **style)
+        else:
+            # row i holds what acted from row i - 1 on
+            axes.stairs(values[1:, k], time, baseline=None, **style)
+    axes.set(xlabel="time [s]", ylabel="tension [N]")
+    axes.margins(y=0.1)
+    legend_above(axes)
+
+
+def line(i: int, rows: int = 2) -> dict[str, Any]:
+    """How the i-th trajectory is drawn: as a line, or as a point if it has one row."""
+    kind = {"linestyle": DASHES[i % len(DASHES)]} if rows > 1 else {"linestyle": "none", "marker": "o"}
+    return {"color": PALETTE[i % len(PALETTE)], **kind}
+
+
+def legend_above(axes: Axes) -> None:
+    """A legend in one line above the axes."""
+    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, columnspacing=1.2, handlelength=1.8)
+
+
+def tips_of(trajectory: Tips) -> NDArray[np.float64]:
+    """Positions of a tip (T, 3)."""
+    if isinstance(trajectory, Trajectory):
+        one_of(trajectory)
+    return np.asarray(trajectory.tip_position, dtype=float)
+
+
+def one_of(trajectory: Trajectory) -> Trajectory:
+    """The trajectory, if it is of one robot."""
+    if np.ndim(trajectory.y) == 4:
+        raise ValueError(
+            f"a batch of {len(trajectory.y)} trajectories cannot be drawn in one figure; index one, batch[0]"
+        )
+    return trajectory
+
+
+# matplotlib
+
+
+def require_matplotlib() -> None:
+    """Raise `ImportError`, saying how to install it, if matplotlib is not there."""
+    try:
+        import matplotlib.figure  # noqa: F401
+    except ImportError:
+        raise ImportError("figures need matplotlib: pip install 'knode-cosserat[viz]'") from None
+
+
+def style() -> Any:
+    """The context in which all figures are made."""
+    require_matplotlib()
+    import matplotlib
+
+    return matplotlib.rc_context(STYLE)
+
+
+def new_figure(width: float, height: float) -> Any:
+    """An empty figure of so many inches."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained", dpi=150)

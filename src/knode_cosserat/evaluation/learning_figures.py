@@ -1,0 +1,49 @@
+"""Figures of what a model learned; they need matplotlib, the extra `viz`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from knode_cosserat.evaluation.drawing import PALETTE, new_figure, style
+from knode_cosserat.learning.explain import added
+from knode_cosserat.learning.knode import KNODE
+from knode_cosserat.rods.system import Field
+from knode_cosserat.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def residual(model: KNODE, trajectory: Trajectory) -> Figure:
+    """What the residual adds to strains and to the rates of what balances loads, at a trajectory's states.
+
+    One row for each field of z, and for each field of y whose rate balances a load (all if the system does
+    not say): the largest over the rod's segments, over time, of the knowledge alone and of what is added.
+
+    Raises:
+        DataError: the trajectory does not fit the model.
+    """
+    found = added(model, trajectory)
+    y_layout, z_layout = model.y_layout, model.z_layout
+    stated = [field for field in y_layout.fields if field.load] or list(y_layout.fields)
+    rows: list[tuple[Field, int, str]] = [
+        *((field, 1, f"{field.name} [{field.unit}]") for field in z_layout.fields),
+        *((field, 0, f"{field.name}_s [{field.load or field.unit + '/m'}]") for field in stated),
+    ]
+    with style():
+        figure = new_figure(7.0, 1.2 + 1.5 * len(rows))
+        axes = figure.subplots(len(rows), 1, sharex=True, squeeze=False)[:, 0]
+        for axis, (field, part, label) in zip(axes, rows, strict=True):
+            layout = (y_layout, z_layout)[part]
+            own, whole = (layout.get(each[part], field.name) for each in (found.knowledge, found.model))
+            for values, colour, name in ((own, "0.6", "knowledge"), (whole - own, PALETTE[0], "added")):
+                size = np.linalg.norm(values, axis=-1).max(axis=1)
+                axis.plot(found.time, size, color=colour, label=name)
+            axis.set_ylabel(label)
+            axis.set_ylim(bottom=0.0)
+        axes[-1].set_xlabel("time [s]")
+        axes[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
+        axes[0].set_title("Largest along the rod", loc="left")
+    return figure

@@ -1,0 +1,160 @@
+"""The figures of a study: its controls, the robots' shapes and tips by each method, and how the loss fell."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from knode_cosserat.evaluation.drawing import (
+    AXES,
+    PALETTE,
+    draw_tensions,
+    equal_scales,
+    new_figure,
+    one_of,
+    require_span,
+    style,
+    tips_of,
+)
+from knode_cosserat.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: how each is drawn, whatever others are there: the reference is wide and pale, so that what lies on it shows
+REFERENCE: dict[str, Any] = {"color": "#AAAAAA", "linewidth": 4.0, "linestyle": "-"}
+METHODS: dict[str, dict[str, Any]] = {
+    "baseline": {"color": PALETTE[1], "linestyle": "-", "linewidth": 1.3},
+    "paper": {"color": PALETTE[0], "linestyle": "-", "linewidth": 1.3},
+    "calibrated": {"color": PALETTE[3], "linestyle": (0, (1, 1.5)), "linewidth": 2.0},
+    "best": {"color": PALETTE[6], "linestyle": (0, (4, 2)), "linewidth": 1.4},
+}
+
+
+def controls(trajectories: Mapping[str, Trajectory]) -> Figure:
+    """The tensions of several trajectories, one below the other, by their titles.
+
+    Raises:
+        ImportError: matplotlib is not installed; from every function here.
+        ValueError: nothing is given to draw, or a batch of robots; from every function here.
+    """
+    _require_some(trajectories)
+    with style():
+        figure = new_figure(7.0, 2.6 * len(trajectories))
+        rows = figure.subplots(len(trajectories), 1, squeeze=False)[:, 0]
+        for axes, (title, trajectory) in zip(rows, trajectories.items(), strict=True):
+            draw_tensions(axes, trajectory)
+            axes.get_legend().remove()
+            axes.set_title(title)
+        _legend_below(figure, rows)
+    return figure
+
+
+def shapes(reference: Trajectory, predictions: Mapping[str, Trajectory], count: int = 6) -> Figure:
+    """The robot at `count` times beside the reference and the paths of the tips, for each prediction."""
+    _require_some(predictions)
+    with style():
+        figure = new_figure(3.3 * len(predictions) + 0.4, 4.8)
+        panels = figure.subplots(1, len(predictions), subplot_kw={"projection": "3d"}, squeeze=False)[0]
+        for axes, (label, prediction) in zip(panels, predictions.items(), strict=True):
+            _draw_shapes(axes, reference, {label: prediction}, count)
+            _show_all(axes, [reference, *predictions.values()], zoom=0.93)
+        _legend_below(figure, panels)
+    return figure
+
+
+def tips(cases: Mapping[str, tuple[Trajectory, Mapping[str, Trajectory]]]) -> Figure:
+    """x, y and z of the tips over time: a column for each case, given as its reference and predictions."""
+    _require_some(cases)
+    with style():
+        figure = new_figure(4.6 * len(cases) + 0.6, 5.4)
+        grid = figure.subplots(3, len(cases), sharex="col", squeeze=False)
+        for column, (title, (reference, predictions)) in zip(grid.T, cases.items(), strict=True):
+            _draw_tips(column, reference, predictions)
+            column[0].set_title(title)
+        figure.align_ylabels()
+        _legend_below(figure, grid.ravel())
+    return figure
+
+
+def comparison(reference: Trajectory, predictions: Mapping[str, Trajectory], count: int = 6) -> Figure:
+    """Shapes and tips of several predictions in one picture, each drawn over the reference."""
+    _require_some(predictions)
+    with style():
+        figure = new_figure(10.0, 5.2)
+        left, right = figure.subfigures(1, 2, width_ratios=(1.0, 1.35))
+        axes = left.add_subplot(projection="3d")
+        _draw_shapes(axes, reference, predictions, count)
+        _show_all(axes, [reference, *predictions.values()], zoom=0.95)
+        column = right.subplots(3, 1, sharex=True)
+        _draw_tips(column, reference, predictions)
+        right.align_ylabels()
+        _legend_below(figure, column)
+    return figure
+
+
+def _draw_shapes(axes: Any, reference: Trajectory, predictions: Mapping[str, Trajectory], count: int) -> None:
+    true = np.asarray(one_of(reference).position)
+    rows = np.unique(np.linspace(0, len(true) - 1, count).round().astype(int))
+    for row in rows:
+        axes.plot(*true[row].T, **REFERENCE, solid_capstyle="round")
+    axes.plot(*true[:, -1].T, **{**REFERENCE, "linewidth": 2.5}, label="reference")
+    for label, prediction in predictions.items():
+        points = np.asarray(one_of(prediction).position)
+        look = {**METHODS.get(label, {"color": PALETTE[0]}), "linestyle": "-"}
+        for row in rows:
+            axes.plot(*points[row].T, **look)
+        axes.plot(*points[:, -1].T, **{**look, "linewidth": 0.9}, label=label)
+    axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
+
+
+def _show_all(axes: Any, trajectories: Sequence[Trajectory], zoom: float) -> None:
+    points = np.concatenate([np.asarray(each.position).reshape(-1, 3) for each in trajectories])
+    equal_scales(axes, points[None, np.isfinite(points).all(axis=1)], zoom)
+
+
+def _draw_tips(column: Any, reference: Trajectory, predictions: Mapping[str, Trajectory]) -> None:
+    true = tips_of(reference)
+    for k, axes in enumerate(column):
+        axes.plot(reference.time, true[:, k], label="reference", **REFERENCE)
+        for label, each in predictions.items():
+            axes.plot(each.time, tips_of(each)[:, k], label=label, **METHODS.get(label, {}))
+        axes.set_ylabel(f"tip {AXES[k]} [m]")
+        require_span(axes, 0.01 * float(np.nanmax(np.abs(true))))
+    column[-1].set_xlabel("time [s]")
+
+
+def losses(runs: Mapping[str, Sequence[ArrayLike]]) -> Figure:
+    """The loss over epochs: for each label the median of its runs (seeds), and a band from least to most."""
+    _require_some(runs)
+    with style():
+        figure = new_figure(7.0, 4.2)
+        axes = figure.subplots()
+        for k, (label, histories) in enumerate(runs.items()):
+            values = np.stack([np.asarray(history, dtype=float) for history in histories])
+            epochs, colour = np.arange(1, values.shape[1] + 1), PALETTE[k % len(PALETTE)]
+            axes.fill_between(
+                epochs, values.min(axis=0), values.max(axis=0), color=colour, alpha=0.25, linewidth=0
+            )
+            axes.plot(epochs, np.median(values, axis=0), color=colour, label=label, linewidth=1.2)
+        axes.set(xlabel="epoch", ylabel="loss", yscale="log")
+        axes.margins(x=0.0)
+        _legend_below(figure, [axes])
+    return figure
+
+
+def _legend_below(figure: Any, axes: Any) -> None:
+    """One legend for all axes, each label once."""
+    handles: dict[str, Any] = {}
+    for each in axes:
+        for handle, label in zip(*each.get_legend_handles_labels(), strict=True):
+            handles.setdefault(label, handle)
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=6, handlelength=2.4)
+
+
+def _require_some(given: Mapping[str, Any]) -> None:
+    if not given:
+        raise ValueError("there is nothing to draw; at least one is needed")

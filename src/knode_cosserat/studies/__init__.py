@@ -1,0 +1,1 @@
+"""The paper's studies: settings as data, and one runner for their jobs."""

@@ -1,0 +1,142 @@
+"""How much data learning needs: the cells of the paper's table from 5 to 30 rows, of one sine and of two.
+
+With a knowledge, by the best preset and by the paper's; without any, by networks of the same size and by
+linear prediction. What has no knowledge does not see the imperfection: it has the same figures for every one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from knode_cosserat import controls
+from knode_cosserat.learning.config import FitConfig
+from knode_cosserat.learning.fit import fit
+from knode_cosserat.learning.runs import FitError
+from knode_cosserat.rods.robot_file import load_robot
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.result import SimulationError
+from knode_cosserat.solvers.simulate import simulate
+from knode_cosserat.studies import simulation
+from knode_cosserat.studies.comparisons import NoKnowledge, compared, linear_predictor
+from knode_cosserat.studies.methods import METHODS, Learned
+from knode_cosserat.studies.runner import Job, Product
+from knode_cosserat.trajectory import Trajectory
+
+#: rows of each sine that are learned from, the state at rest among them
+ROWS = (5, 10, 20, 30)
+#: the first sine alone, and both
+SINES = (1, 2)
+SEEDS = 3
+
+
+def paper_alone(imperfect: System, training: Sequence[Trajectory], seeds: Sequence[int]) -> Learned:
+    """The paper's network and training, on a system that knows nothing."""
+    return _without_knowledge(imperfect, training, FitConfig.paper(seed=tuple(seeds)))
+
+
+def network_alone(imperfect: System, training: Sequence[Trajectory], seeds: Sequence[int]) -> Learned:
+    """A network of that size without the paper's constraint, standardised, on a system that knows nothing."""
+    return _without_knowledge(imperfect, training, FitConfig.network(seed=tuple(seeds), hidden=512))
+
+
+def _without_knowledge(imperfect: System, training: Sequence[Trajectory], config: FitConfig) -> Learned:
+    try:
+        models = fit(NoKnowledge(imperfect), training, config)
+    except FitError as error:
+        return Learned(dict.fromkeys(config.seeds, str(error)))
+    return Learned(dict(zip(config.seeds, models, strict=True)))
+
+
+Method = Callable[[System, Sequence[Trajectory], Sequence[int]], Learned]
+INFORMED: dict[str, Method] = {name: METHODS[name] for name in ("baseline", "paper", "best")}
+ALONE: dict[str, Method] = {"paper, no knowledge": paper_alone, "network, no knowledge": network_alone}
+LINEAR = "linear (DMDc)"
+#: by their names, in the order of the tables
+ALL = (*INFORMED, *ALONE, LINEAR)
+#: what stands for all imperfections, of a method that sees none
+ANY = "any"
+
+
+def jobs(seeds: Sequence[int], rows: Sequence[int] = ROWS, methods: Sequence[str] | None = None) -> list[Job]:
+    """One job for each method, amount of data and, with a knowledge, imperfection.
+
+    Args:
+        seeds: of the fits; the baseline and the linear prediction need none.
+        rows: of each sine.
+        methods: some of `ALL`, and all by default.
+
+    Raises:
+        ValueError: a method is not known.
+    """
+    made = []
+    for method in methods or ALL:
+        if method not in ALL:
+            raise ValueError(f"method {method!r} is unknown; allowed is some of {', '.join(ALL)}")
+        imperfections = simulation.IMPERFECTIONS if method in INFORMED else {ANY: {}}
+        amounts = [(sines, count) for sines in SINES for count in rows] if method != "baseline" else [(0, 0)]
+        made += [
+            _job(method, imperfection, changes, amount, seeds)
+            for imperfection, changes in imperfections.items()
+            for amount in amounts
+        ]
+    return made
+
+
+def _job(method: str, imperfection: str, changes: Any, amount: tuple[int, int], seeds: Sequence[int]) -> Job:
+    sines, rows = amount
+    words = "".join(letter if letter.isalnum() else " " for letter in f"{method} {imperfection}").split()
+    settings = {
+        "robot": simulation.ROBOT, "dt": simulation.DT, "steps": simulation.ROWS,
+        "controls": simulation.CONTROLS, "training": list(simulation.TRAINING[:sines]), "rows": rows,
+        "method": method, "imperfection": imperfection, "changes": changes, "seeds": list(seeds),
+    }  # fmt: skip
+    return Job("-".join([*words, f"{sines}x{rows}"]), predict, settings)
+
+
+# the work
+
+
+def predict(settings: Any) -> Product:
+    """The cells of one method, imperfection and amount of data, under every control."""
+    robot, dt, steps = load_robot(settings["robot"]), settings["dt"], settings["steps"]
+    amount = {"sines": len(settings["training"]), "rows": settings["rows"]}
+    training = [_moved(robot, control, settings["rows"], dt) for control in settings["training"]]
+    truths = {name: _moved(robot, control, steps, dt) for name, control in settings["controls"].items()}
+    cells = []
+    for seed, predictor in _predictors(robot.replace(**settings["changes"]), training, settings).items():
+        for name, truth in truths.items():
+            of = {"imperfection": settings["imperfection"], "control": name, "method": settings["method"]}
+            outcome = compared(predictor(settings["controls"][name]), truth)
+            cells.append({**of, "seed": seed, **amount, **outcome})
+    return Product({"cells": cells}, {})
+
+
+Predictor = Callable[[str], Any]
+
+
+def _predictors(imperfect: System, training: Sequence[Trajectory], settings: Any) -> dict[int, Predictor]:
+    """For each seed, what gives a prediction under a control, or why there is none."""
+    dt, steps, method = settings["dt"], settings["steps"], settings["method"]
+    if method == LINEAR:
+        linear = linear_predictor(imperfect, training)
+        return {0: lambda control: linear(controls.parse(control, steps, dt))}
+    learned = {**INFORMED, **ALONE}[method](imperfect, training, settings["seeds"])
+
+    def predictor(system: System | str) -> Predictor:
+        def predict(control: str) -> Any:
+            if isinstance(system, str):
+                return system
+            try:
+                return _moved(system, control, steps, dt)
+            except SimulationError as error:
+                return str(error)
+
+        return predict
+
+    return {seed: predictor(system) for seed, system in learned.systems.items()}
+
+
+def _moved(system: System, control: str, rows: int, dt: float) -> Trajectory:
+    """The first rows from rest on: the paper keeps as many as there are controls."""
+    return simulate(system, controls.parse(control, rows, dt), dt)[:rows]

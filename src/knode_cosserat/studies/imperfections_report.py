@@ -1,0 +1,180 @@
+"""The study of further imperfections from its jobs to what is written: tables, JSON and a figure."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from knode_cosserat._files import replacing
+from knode_cosserat.evaluation.tables import MEASURES, markdown_table
+from knode_cosserat.studies import runner
+from knode_cosserat.studies.imperfections import CONTROLS, FAR, IMPERFECTIONS, LEFT, NAMED, jobs
+from knode_cosserat.studies.simulation_report import Report
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: a ratio below this is drawn as this: no more than rounding is left
+LEAST = 1e-12
+
+
+def rerun(
+    out: Path,
+    *,
+    seeds: Sequence[int],
+    names: Sequence[str] | None = None,
+    workers: int | None = None,
+    dask: str | None = None,
+    progress: bool = False,
+) -> Report:
+    """Run the study, or what is left of it, and write its tables and figure into the folder.
+
+    Args:
+        out: the folder; an earlier run on it is gone on with.
+        seeds: whole numbers.
+        names: some of `IMPERFECTIONS`; all by default.
+        workers: see `runner.run`.
+        dask: see `runner.run`.
+        progress: show a progress bar.
+
+    Raises:
+        StudyError: see `runner.run`.
+    """
+    made = jobs(names or list(IMPERFECTIONS), seeds)
+    facts = runner.run(made, out, workers=workers, dask=dask, progress=progress)
+    cells = [cell for each in facts.values() for cell in each["cells"]]
+    lines = ",\n".join(json.dumps(cell, allow_nan=False) for cell in cells)
+    texts = {"imperfections.md": as_markdown(cells), "imperfections.json": f"[\n{lines}\n]\n"}
+    for name, text in texts.items():
+        with replacing(out / name) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+    (out / "figures").mkdir(exist_ok=True)
+    picture = out / "figures" / "imperfections.png"
+    figure(cells).savefig(picture)
+    return Report(cells, [out / name for name in texts], [picture])
+
+
+def ratios(cells: Sequence[Mapping[str, Any]], measure: str) -> dict[tuple[str, str], float | None]:
+    """What of the baseline's error the worst seed leaves, by imperfection and control.
+
+    None where a seed could not be simulated. Where the baseline could not, but every seed could, it is zero;
+    where the truth could not, there is nothing.
+    """
+    of: dict[tuple[str, str], dict[bool, list[Any]]] = {}
+    for cell in cells:
+        both = of.setdefault((cell["imperfection"], cell["control"]), {True: [], False: []})
+        both[cell["method"] == "baseline"].append(cell[measure])
+    found: dict[tuple[str, str], float | None] = {}
+    for case, both in of.items():
+        baseline, learned = both[True][0], both[False]
+        if None in learned:
+            if baseline is not None or any(each is not None for each in learned):
+                found[case] = None
+        else:
+            found[case] = 0.0 if baseline is None else max(learned) / baseline
+    return found
+
+
+def missed(cells: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
+    """The imperfections and controls under which the learned model is not as good as it should be.
+
+    Under the study's controls `LEFT` of the baseline's error may be left, in both measures; at twice the
+    tension all of it.
+    """
+    found = {measure: ratios(cells, measure) for measure in MEASURES}
+    wrong = []
+    for case in next(iter(found.values())):
+        allowed = 1.0 if case[1] in FAR else LEFT
+        left = [each[case] for each in found.values()]
+        if any(ratio is None or ratio > allowed for ratio in left):
+            wrong.append(case)
+    return wrong
+
+
+def as_markdown(cells: Sequence[Mapping[str, Any]]) -> str:
+    """One table for each measure, a line for each imperfection, and what is not as good as it should be."""
+    names = list(dict.fromkeys(cell["imperfection"] for cell in cells))
+    controls = list(dict.fromkeys(cell["control"] for cell in cells))
+    wrong = missed(cells)
+    parts = [
+        "What is left of the baseline's error, by the worst seed (in brackets: the baseline's error itself). "
+        f"Allowed is {LEFT:g}, and 1 at twice the tension; what is more than that is in bold."
+    ]
+    for measure, title in MEASURES.items():
+        left = ratios(cells, measure)
+        rows = []
+        for name in names:
+            row = [name if name in NAMED else f"*{name}*"]
+            for control in controls:
+                row.append(_words(left.get((name, control), "?"), _baseline(cells, name, control, measure)))
+                allowed = 1.0 if control in FAR else LEFT
+                ratio = left.get((name, control), 0.0)
+                if ratio is None or ratio > allowed:
+                    row[-1] = f"**{row[-1]}**"
+            rows.append(row)
+        parts += [f"## {title}", markdown_table(["imperfection", *controls], rows)]
+    failures = [
+        "- {imperfection}, {control}, {method}, seed {seed}: {failed}".format(**cell)
+        for cell in cells
+        if "failed" in cell
+    ]
+    if failures:
+        parts += ["What failed:", "\n".join(failures)]
+    count = len(names) - len({name for name, _ in wrong})
+    parts.append(
+        f"{count} of {len(names)} imperfections are learned as well as asked for, under every control."
+    )
+    return "\n\n".join(parts) + "\n"
+
+
+def _baseline(cells: Sequence[Mapping[str, Any]], name: str, control: str, measure: str) -> float | None:
+    for cell in cells:
+        if (cell["imperfection"], cell["control"], cell["method"]) == (name, control, "baseline"):
+            return cell[measure]
+    return None
+
+
+def _words(ratio: float | str | None, baseline: float | None) -> str:
+    left = "failed" if ratio is None else ratio if isinstance(ratio, str) else f"{ratio:.1g}"
+    return left + (" (failed)" if baseline is None else f" ({baseline:.2g})")
+
+
+def figure(cells: Sequence[Mapping[str, Any]]) -> Figure:
+    """What is left of the baseline's error: a line for each imperfection, a point for each control.
+
+    A failure is a cross at the right edge; the dotted line is what is allowed.
+
+    Raises:
+        ImportError: matplotlib is not installed.
+    """
+    from knode_cosserat.evaluation.drawing import PALETTE, new_figure, style
+
+    names = list(dict.fromkeys(cell["imperfection"] for cell in cells))
+    with style():
+        whole = new_figure(9.5, 0.24 * len(names) + 1.8)
+        panels = whole.subplots(1, len(MEASURES), sharey=True)
+        for axes, (measure, title) in zip(panels, MEASURES.items(), strict=True):
+            left = ratios(cells, measure)
+            for k, control in enumerate([*CONTROLS, *FAR]):
+                at = {names.index(name): ratio for (name, of), ratio in left.items() if of == control}
+                known = {line: max(ratio, LEAST) for line, ratio in at.items() if ratio is not None}
+                far = control in FAR
+                axes.plot(
+                    list(known.values()), list(known), "^" if far else "o", label=control, markersize=4.5,
+                    color=PALETTE[k % len(PALETTE)], markerfacecolor="white" if far else None,
+                )  # fmt: skip
+                broken = [line for line in at if line not in known]
+                edge = axes.get_yaxis_transform()
+                axes.plot([0.985] * len(broken), broken, "x", color=PALETTE[k % len(PALETTE)], transform=edge)
+            axes.axvline(LEFT, color="#777777", linestyle=":", linewidth=1.2)
+            axes.set(xscale="log", xlabel="left of the baseline's error", title=title)
+            axes.set_xlim(LEAST / 3.0, 10.0 * max([1.0, *(r for r in left.values() if r is not None)]))
+        panels[0].set_yticks(np.arange(len(names)), names)
+        panels[0].invert_yaxis()
+        handles, labels = panels[0].get_legend_handles_labels()
+        whole.legend(handles, labels, loc="outside lower center", ncols=7, columnspacing=1.2)
+    return whole

@@ -1,0 +1,73 @@
+"""What a study does with an imperfect model and a few trajectories: nothing, calibration, or learning."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from knode_cosserat.learning.calibrate import CalibrationError, calibrate
+from knode_cosserat.learning.config import FitConfig, StructuredOptions
+from knode_cosserat.learning.fit import fit
+from knode_cosserat.learning.runs import FitError
+from knode_cosserat.rods.system import System
+from knode_cosserat.trajectory import Trajectory
+
+Trajectories = Sequence[Trajectory]
+
+
+@dataclasses.dataclass(frozen=True)
+class Learned:
+    """A system for each seed, or why there is none; and what it says of its fit (plain JSON values)."""
+
+    systems: dict[int, System | str]
+    #: the loss of every epoch, where there are epochs
+    loss: dict[str, list[float]] = dataclasses.field(default_factory=dict)
+    found: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+
+def baseline(imperfect: System, training: Trajectories, seeds: Sequence[int]) -> Learned:
+    """The imperfect model as it is."""
+    return Learned({0: imperfect})
+
+
+def calibrated(imperfect: System, training: Trajectories, seeds: Sequence[int]) -> Learned:
+    """The imperfect model with all its parameters that the data determine; no residual."""
+    try:
+        result = calibrate(imperfect, training)
+    except CalibrationError as error:
+        return Learned({0: str(error)})
+    found = {
+        name: {"before": np.asarray(result.before[name]).tolist(), "estimate": np.asarray(value).tolist()}
+        for name, value in result.estimates.items()
+    }
+    return Learned(
+        {0: result.robot}, found={**found, "undetermined": [str(name) for name in result.undetermined]}
+    )
+
+
+def paper(imperfect: System, training: Trajectories, seeds: Sequence[int]) -> Learned:
+    """The paper's network and training."""
+    return _fitted(imperfect, training, FitConfig.paper(seed=tuple(seeds)))
+
+
+def best(imperfect: System, training: Trajectories, seeds: Sequence[int]) -> Learned:
+    """The best preset; seeds are random weights of the data's rows, for it has no chance of its own."""
+    return _fitted(imperfect, training, FitConfig(StructuredOptions(resample=True), seed=tuple(seeds)))
+
+
+def _fitted(imperfect: System, training: Trajectories, config: FitConfig) -> Learned:
+    try:
+        models = fit(imperfect, training, config)
+    except FitError as error:
+        return Learned(dict.fromkeys(config.seeds, str(error)))
+    histories = {str(model.about.facts["seed"]): model.about.facts.get("segments") for model in models}
+    losses = {seed: np.asarray(it["loss"]).tolist() for seed, it in histories.items() if it}
+    return Learned(dict(zip(config.seeds, models, strict=True)), losses)
+
+
+Method = Callable[[System, Trajectories, Sequence[int]], Learned]
+#: by their names, in the order of the table
+METHODS: dict[str, Method] = {method.__name__: method for method in (baseline, paper, calibrated, best)}

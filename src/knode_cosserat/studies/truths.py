@@ -1,0 +1,326 @@
+"""Robots with physics that the package's own robot does not have: what a model of it may be wrong about.
+
+Each is the paper's robot (`TendonRobot`) with one thing more. They play the truth in the study of
+imperfections: a residual on a `TendonRobot` has to learn what is more here from trajectories alone.
+"""
+
+from __future__ import annotations
+
+import abc
+from typing import Any, Literal, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.rods.loads import square_law_drag
+from knode_cosserat.rods.parameters import parameter
+from knode_cosserat.rods.system import History, System
+from knode_cosserat.rods.tendon_robot import TendonRobot
+from knode_cosserat.rotation import cross, dot, inverse, rotation_matrix
+
+#: Newton corrections of a material's law that is not linear: more than it takes; not solved by then is NaN
+CORRECTIONS = 60
+#: parts of a correction that are tried: steep friction overshoots
+PARTS = 0.5 ** np.arange(8)
+#: a law is solved when no more than this part of its terms is left
+TOLERANCE = 1e-12
+
+Robot = TypeVar("Robot", bound=TendonRobot)
+
+
+def extended(kind: type[Robot], robot: TendonRobot, **more: Any) -> Robot:
+    """A robot of the given class with another's parameters, and those that only the class has."""
+    own = {name: getattr(robot, name) for name in robot.parameters() if name in kind.parameters()}
+    return kind(**{**own, "nodes": robot.nodes, **more})
+
+
+# materials
+
+
+class CurvedMaterial(TendonRobot):
+    """A material with a moment beside the linear law: Kbt u + Bbt u_t + μ(u, u_t) = Rᵀm."""
+
+    @abc.abstractmethod
+    def extra_moment(self, u: Float[Any, "3"], u_t: Float[Any, "3"]) -> Float[Any, "3"]:
+        """μ (N·m), material frame."""
+
+    def strains(
+        self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
+    ) -> Float[Any, " z"]:
+        """v of the linear law, and u of this one; NaN if that could not be solved."""
+        z = super().strains(s, t, y, control, history)
+        v, u_linear = self.z_layout.split(z)
+        hu = self.z_layout.get(history.z, "u")
+        given = (self, history.c0, u_linear, hu)
+        # the search itself is not differentiated: one more correction has the implicit function's derivatives
+        u = _solved(jax.lax.stop_gradient(given))
+        return jnp.concatenate([v, u + _correction(given, u)])
+
+    # what is not linear in z has no general form
+    constitutive = System.constitutive
+
+
+def _left(given: Any, u: Any) -> Any:
+    """What the two sides of the law for u differ by (N·m)."""
+    robot, c0, u_linear, hu = given
+    K = robot.Kbt + c0 * robot.bending_damping
+    return dot(K, u - u_linear) + robot.extra_moment(u, c0 * u + hu)
+
+
+def _correction(given: Any, u: Any) -> Any:
+    return -dot(inverse(jax.jacfwd(lambda u: _left(given, u))(u)), _left(given, u))
+
+
+def _solved(given: Any) -> Any:
+    """u by Newton's method, each correction as much as helps most; NaN if that does not solve it."""
+    robot, c0, u_linear, hu = given
+    own = jnp.abs(dot(robot.Kbt, u_linear)) + c0 * jnp.abs(dot(robot.bending_damping, u_linear))
+    size = jnp.max(own + jnp.abs(dot(robot.bending_damping, hu)))
+
+    def missed(u: Any) -> Any:
+        return ~(jnp.max(jnp.abs(_left(given, u))) <= TOLERANCE * size)
+
+    def going(state: Any) -> Any:
+        u, count = state
+        return missed(u) & (count < CORRECTIONS)
+
+    def corrected(state: Any) -> Any:
+        u, count = state
+        tried = u + PARTS[:, None] * _correction(given, u)
+        left = jax.vmap(lambda u: jnp.sum(_left(given, u) ** 2))(tried)
+        return tried[jnp.argmin(left)], count + 1
+
+    u, _ = jax.lax.while_loop(going, corrected, (u_linear, 0))
+    return jnp.where(missed(u), jnp.nan, u)
+
+
+Stiffness = Literal["linear", "square", "exponential", "levelling", "each axis", "one way", "softening"]
+
+
+class Stiffening(CurvedMaterial):
+    """A bending stiffness that depends on the curvature.
+
+    With x = u/u₀, the stiffness Kbt is multiplied by
+
+        linear      1 + |x|            exponential  exp |x|²              each axis  1 + xᵢ²
+        square      1 + |x|²           levelling    1 + xᵢ²/(1 + xᵢ²)     softening  1/(1 + |x|)
+        one way     1.3 about an axis that bends in the positive sense, 1 in the other
+    """
+
+    curvature: Any = parameter("1/m", "u₀, curvature at which the law bends", low=1e-6, high=1e6, default=5.0)
+    law: Stiffness = eqx.field(static=True, default="square")
+
+    def extra_moment(self, u: Float[Any, "3"], u_t: Float[Any, "3"]) -> Float[Any, "3"]:
+        """What is above Kbt u."""
+        x = u / self.curvature
+        square = jnp.sum(x * x)
+        # the square root of zero has no derivative
+        norm = jnp.sqrt(square + 1e-30)
+        factor = {
+            "linear": norm,
+            "square": square,
+            "exponential": jnp.expm1(square),
+            "levelling": x * x / (1.0 + x * x),
+            "each axis": x * x,
+            "one way": 0.3 * (u > 0.0),
+            "softening": -norm / (1.0 + norm),
+        }[self.law]
+        return dot(self.Kbt, factor * u)
+
+
+class Precurved(CurvedMaterial):
+    """A rod that would like to be bent, and is not at the start: a constant moment in the material."""
+
+    rest_curvature: Any = parameter(
+        "1/m", "curvature of the unloaded rod", shape="vector", low=-1e3, high=1e3, default=(0.2, -0.1, 0.0)
+    )
+
+    def extra_moment(self, u: Float[Any, "3"], u_t: Float[Any, "3"]) -> Float[Any, "3"]:
+        """-Kbt u*."""
+        return -dot(self.Kbt, jnp.asarray(self.rest_curvature))
+
+
+class Tapered(TendonRobot):
+    """A rod whose modulus falls linearly towards the tip."""
+
+    tip_softening: Any = parameter(
+        "", "part of the modulus that the tip lacks", low=0.0, high=0.9, default=0.2
+    )
+
+    def _there(self, s: Any) -> TendonRobot:
+        part = 1.0 - self.tip_softening * s / self.length
+        return extended(TendonRobot, self, youngs_modulus=self.youngs_modulus * part)
+
+    def strains(
+        self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
+    ) -> Float[Any, " z"]:
+        """Those of a rod with the modulus at s."""
+        return self._there(s).strains(s, t, y, control, history)
+
+    def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
+        """That of a rod with the modulus at s."""
+        return self._there(s).constitutive(s, t, y, y_t, control)
+
+
+# friction
+
+Rubbing = Literal["each axis", "isotropic", "stribeck"]
+
+
+def rubbing(law: Rubbing, rate: Float[Any, "3"], least: Any) -> Float[Any, "3"]:
+    """The direction and, of about one, the size of what friction opposes to a rate.
+
+    "each axis" is tanh of every number over `least`; "isotropic" points along the rate and levels off where
+    that is beyond `least`; "stribeck" is that, and half as much again while it moves slowly.
+    """
+    if law == "each axis":
+        return jnp.tanh(rate / least)
+    square = jnp.sum(rate * rate) / least**2
+    along = rate / (least * jnp.sqrt(1.0 + square))
+    return along if law == "isotropic" else along * (1.0 + 0.5 * jnp.exp(-square / 9.0))
+
+
+class InternalFriction(CurvedMaterial):
+    """Fibres that rub against each other as the rod bends."""
+
+    friction: Any = parameter("N m", "moment of the friction", low=0.0, high=1e3, default=0.02)
+    least: Any = parameter(
+        "1/(m s)", "rate of curvature from which it is full", low=1e-9, high=1e6, default=1.0
+    )
+    law: Rubbing = eqx.field(static=True, default="each axis")
+
+    def extra_moment(self, u: Float[Any, "3"], u_t: Float[Any, "3"]) -> Float[Any, "3"]:
+        """Against the rate of the curvature."""
+        return self.friction * rubbing(self.law, u_t, self.least)
+
+
+class ExternalFriction(TendonRobot):
+    """A moment per length, as from a sleeve, against the rod's turning."""
+
+    friction: Any = parameter("N", "moment of the friction per length", low=0.0, high=1e3, default=0.05)
+    least: Any = parameter("rad/s", "angular velocity from which it is full", low=1e-9, high=1e6, default=0.5)
+    law: Rubbing = eqx.field(static=True, default="each axis")
+
+    def _spatial_rates(self, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
+        y_s = super()._spatial_rates(y, y_t, z, z_t, control)
+        R = rotation_matrix(self.y_layout.get(y, "h"))
+        moment = self.friction * rubbing(self.law, self.y_layout.get(y, "w"), self.least)
+        return y_s.at[self.y_layout.slice("m")].add(dot(R, moment))
+
+
+# the air and the tendons
+
+
+class Wind(TendonRobot):
+    """Drag in moving air: it depends on the velocity relative to the wind."""
+
+    wind: Any = parameter(
+        "m/s", "velocity of the air, global frame", shape="vector", low=-100.0, high=100.0,
+        default=(3.0, 0.0, 0.0),
+    )  # fmt: skip
+
+    def _spatial_rates(self, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
+        y_s = super()._spatial_rates(y, y_t, z, z_t, control)
+        R, q = rotation_matrix(self.y_layout.get(y, "h")), self.y_layout.get(y, "q")
+        relative = q - dot(R.T, jnp.asarray(self.wind))
+        more = square_law_drag(self.drag, relative) - square_law_drag(self.drag, q)
+        return y_s.at[self.y_layout.slice("n")].add(dot(R, more))
+
+
+class TurningTendons(TendonRobot):
+    """Tendons whose forces turn with the rod, fully (1), not at all (0, as in the paper) or in part."""
+
+    turning: Any = parameter("", "part of the tendons' force that turns", low=0.0, high=1.0, default=1.0)
+
+    def _spatial_rates(self, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
+        y_s = super()._spatial_rates(y, y_t, z, z_t, control)
+        f = self.actuation(control)
+        turned = dot(rotation_matrix(self.y_layout.get(y, "h")), f)
+        return y_s.at[self.y_layout.slice("n")].add(self.turning * (f - turned))
+
+
+class FadingTendons(TendonRobot):
+    """Tendons that lose tension along the rod, as by friction: e^(-loss s)."""
+
+    loss: Any = parameter("1/m", "part of the tension lost per length", low=0.0, high=100.0, default=0.3)
+
+    def rates(
+        self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
+    ) -> Float[Any, " y"]:
+        """Those of the tension that is left at s."""
+        return super().rates(s, t, y, z, jnp.asarray(control) * jnp.exp(-self.loss * s), history)
+
+    def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
+        """That of the tension that is left at s."""
+        return super().balance(s, t, y, y_t, z, z_t, jnp.asarray(control) * jnp.exp(-self.loss * s))
+
+
+# the tip
+
+
+class LoadedTip(TendonRobot):
+    """A robot with a force and a moment at its tip."""
+
+    @abc.abstractmethod
+    def load_at_tip(self, R: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> tuple[Any, Any]:
+        """Force (N) and moment (N·m) on the tip, in the global frame; R turns the material's into it."""
+
+    def tip(self, t: Any, control: Any, y: Float[Any, " y"], history: History) -> Float[Any, " k"]:
+        """n and m at the tip are the load there."""
+        R = rotation_matrix(self.y_layout.get(y, "h"))
+        load = self.load_at_tip(R, y, history.c0 * y + history.y)
+        return super().tip(t, control, y, history) + jnp.concatenate(load)
+
+
+class TipMass(LoadedTip):
+    """A body at the tip: n = M (g - a), and the moment of a body with a size or beside the axis."""
+
+    tip_mass: Any = parameter("kg", "mass at the tip", low=0.0, high=100.0, default=0.01)
+    tip_inertia: Any = parameter(
+        "kg m2", "inertia about its centre", shape="matrix", low=0.0, high=100.0, default=0.0
+    )
+    tip_offset: Any = parameter(
+        "m", "its centre as seen from the tip, material frame", shape="vector", low=-1.0, high=1.0,
+        default=(0.0, 0.0, 0.0),
+    )  # fmt: skip
+
+    def load_at_tip(self, R: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> tuple[Any, Any]:
+        """What moves the body, with the sign turned, and its weight."""
+        part = self.y_layout.get
+        q, w, q_t, w_t = part(y, "q"), part(y, "w"), part(y_t, "q"), part(y_t, "w")
+        offset, J = jnp.asarray(self.tip_offset), jnp.asarray(self.tip_inertia)
+        acceleration = q_t + cross(w, q) + cross(w_t, offset) + cross(w, cross(w, offset))
+        force = self.tip_mass * (dot(R.T, jnp.asarray(self.gravity)) - acceleration)
+        moment = cross(offset, force) - dot(J, w_t) - cross(w, dot(J, w))
+        return dot(R, force), dot(R, moment)
+
+
+class FollowerLoad(LoadedTip):
+    """A force and a moment that turn with the tip, as of a jet or a stiff cable."""
+
+    tip_force: Any = parameter(
+        "N", "force, material frame", shape="vector", low=-1e3, high=1e3, default=(0.0, 0.0, -0.2)
+    )
+    tip_moment: Any = parameter(
+        "N m", "moment, material frame", shape="vector", low=-1e3, high=1e3, default=(0.0, 0.0, 0.0)
+    )
+
+    def load_at_tip(self, R: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> tuple[Any, Any]:
+        """Both, turned."""
+        return dot(R, jnp.asarray(self.tip_force)), dot(R, jnp.asarray(self.tip_moment))
+
+
+class TipFriction(LoadedTip):
+    """A force against the tip's velocity and a moment against its turning."""
+
+    tip_friction: Any = parameter("N", "force of the friction", low=0.0, high=1e3, default=0.05)
+    least: Any = parameter("m/s", "velocity from which it is full", low=1e-9, high=1e6, default=0.1)
+    law: Rubbing = eqx.field(static=True, default="each axis")
+
+    def load_at_tip(self, R: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> tuple[Any, Any]:
+        """The force alone: a point has no moment."""
+        force = -self.tip_friction * rubbing(self.law, self.y_layout.get(y, "q"), self.least)
+        return dot(R, force), np.zeros(3)

@@ -1,0 +1,113 @@
+"""What the sparse regression is made of: evidence, selection, slopes, expansions."""
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import given, settings
+
+from knode_cosserat.learning.evidence import relevant
+from knode_cosserat.learning.expansion import CURVED, LINEAR, expansion
+from knode_cosserat.learning.selection import folds, held_out_error, moments, selected
+from knode_cosserat.learning.slopes import refined
+from knode_cosserat.rods.system import Layout
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.lists(st.integers(0, 29), min_size=1, max_size=4, unique=True),
+    st.floats(-12, -3),
+)
+def test_the_weights_that_made_the_data_are_found(seed, places, exponent):
+    """Four of thirty features at most, with noise of any size down to rounding."""
+    rng = np.random.default_rng(seed)
+    features = rng.normal(size=(400, 30)) * 10.0 ** rng.uniform(-4, 4, 30)
+    truth = np.zeros(30)
+    truth[places] = rng.uniform(0.5, 2.0, len(places)) / features.std(axis=0)[places]
+    noise = 10.0**exponent
+    found = relevant(features, features @ truth + noise * rng.normal(size=400), floor=1e-13)
+    scaled = (found.values - truth) * features.std(axis=0)
+    assert np.all(np.flatnonzero(truth) == np.flatnonzero(np.abs(found.values) * features.std(axis=0) > 0.1))
+    assert np.max(np.abs(scaled)) < 6.0 * noise / np.sqrt(400) + 1e-12
+    assert found.noise < 1.3 * noise + 1e-12
+
+
+def test_pure_noise_is_not_explained():
+    rng = np.random.default_rng(0)
+    found = relevant(rng.normal(size=(300, 40)), rng.normal(size=300), floor=1e-9)
+    assert np.count_nonzero(found.values) <= 1
+
+
+def test_what_is_below_the_floor_is_not_explained():
+    features = np.random.default_rng(0).normal(size=(100, 3))
+    assert not np.any(relevant(features, 1e-10 * features[:, 0], floor=1e-9).values)
+
+
+def test_standard_errors_are_those_of_least_squares():
+    rng = np.random.default_rng(1)
+    features, noise = rng.normal(size=(500, 2)), 0.1
+    spread = [
+        relevant(features, features @ [1.0, -2.0] + noise * rng.normal(size=500), floor=1e-9)
+        for _ in range(50)
+    ]
+    scatter = np.std([each.values for each in spread], axis=0)
+    np.testing.assert_allclose(np.mean([each.errors for each in spread], axis=0), scatter, rtol=0.35)
+
+
+def test_terms_that_do_not_carry_over_are_left_out():
+    """In each fold another feature goes with the noise; only the one that is true in both is taken."""
+    rng = np.random.default_rng(2)
+    truth, chance = rng.normal(size=200), rng.normal(size=200)
+    fold = np.repeat([0, 1], 100)
+    features = np.stack([truth, np.where(fold == 0, chance, -chance)], axis=1)
+    values = (truth + 0.5 * chance)[:, None]
+    taken, error = selected(moments(features, values, fold), [np.array([0]), np.array([1])], floor=0.0)
+    assert taken == [0]
+    assert error == pytest.approx(held_out_error(moments(features, values, fold), np.array([0])))
+
+
+def test_folds_are_trajectories_or_parts_of_the_only_one():
+    two = np.stack([np.repeat([0, 1], 6), np.tile(np.arange(6), 2)], axis=1)
+    assert folds(two).tolist() == [0] * 6 + [1] * 6
+    assert folds(two[:6]).tolist() == [0, 0, 1, 1, 2, 2]
+
+
+def test_slopes_are_found_between_those_of_the_start():
+    x = np.random.default_rng(3).normal(size=200)
+    target = 0.7 * np.tanh(1.37 * x)
+
+    def build(slopes):
+        return np.stack([x, *(np.tanh(k * x) / k for k in slopes)], axis=1)
+
+    start = np.array([1.0, 4.0])
+    owned = np.array([[False, True, False], [False, False, True]])
+    found = refined(build, target, np.array([False, True, False]), start, owned, ["a", "a"])
+    assert found[0] == pytest.approx(1.37, rel=1e-6)
+    assert found[1] == 4.0
+
+
+@pytest.mark.parametrize("forms", [LINEAR, CURVED])
+def test_an_expansion_is_the_sum_of_its_features(forms):
+    rng = np.random.default_rng(4)
+    layout = Layout(("a", 3, "m", ""), ("b", 1, "s", ""))
+    values = rng.normal(size=(20, 4))
+    part = expansion(layout, values, dict.fromkeys(layout.names, forms), 2)
+    weights = rng.normal(size=part.weights.shape)
+    part = type(part)(weights, part.scales, part.slopes, part.terms)
+    assert len(part.labels()) == weights.shape[1]
+    for x in values[:5]:
+        np.testing.assert_allclose(part(x), weights @ np.asarray(part.features(x)), rtol=1e-12)
+
+
+def test_pruning_changes_nothing_but_the_size():
+    rng = np.random.default_rng(5)
+    layout = Layout(("a", 3, "m", ""), ("b", 3, "s", ""))
+    values = rng.normal(size=(20, 6))
+    part = expansion(layout, values, dict.fromkeys(layout.names, CURVED), 3)
+    weights = np.zeros(part.weights.shape)
+    weights[1, 5] = weights[2, 0] = 1.0
+    full = type(part)(weights, part.scales, part.slopes, part.terms)
+    small = full.pruned()
+    assert small.weights.shape[1] < weights.shape[1] and len(small.terms) == 1
+    np.testing.assert_array_equal(full(values[0]), small(values[0]))
+    assert type(part)(0 * weights, part.scales, part.slopes, part.terms).pruned() is None
