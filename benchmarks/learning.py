@@ -1,4 +1,4 @@
-"""What learning costs: `python -m benchmarks.learning NAME` prints one JSON object, as `benchmarks.cases` does.
+"""What learning costs: `python -m benchmarks.learning NAME` prints one JSON object, as `cases` does.
 
 Compilation is apart: everything runs once before it is timed.
 """

@@ -17,10 +17,10 @@ from typing import Any
 ROUNDS = 3
 
 
-def case(name: str, cache: str) -> dict[str, Any]:
+def case(name: str, cache: str, of: str = "cases") -> dict[str, Any]:
     """One case in a process of its own, with the given directory of compiled programs."""
     ran = subprocess.run(
-        [sys.executable, "-m", "benchmarks.cases", name],
+        [sys.executable, "-m", f"benchmarks.{of}", name],
         env={**os.environ, "KNODE_COSSERAT_CACHE": cache},
         stdout=subprocess.PIPE,
         check=True,
@@ -65,6 +65,9 @@ def measure() -> dict[str, Any]:
         command_seconds(cache)
         second = [command_seconds(cache) for _ in range(ROUNDS)]
         found = {name: case(name, cache) for name in ("steps", "batch", "gradient", "memory")}
+        found |= {name: case(name, cache, "learning") for name in ("fits", "learned_steps")}
+    with tempfile.TemporaryDirectory() as empty:
+        found["study"] = case("study", empty, "learning")
     found["first_call"] = {key: statistics.median(one[key] for one in cold) for key in cold[0]}
     found["second_process"] = {"seconds": statistics.median(second)}
     return {"machine": machine(), **found}
@@ -93,9 +96,34 @@ def table(found: dict[str, Any]) -> str:
         ("second process, command to result", f"{found['second_process']['seconds']:.1f} s", "<= 3 s"),
         ("gradient of 100 steps against the steps", f"{gradient['ratio']:.1f}x", "<= 5x"),
         ("peak memory, 1,000 steps", f"{found['memory']['megabytes']:.0f} MB", "<= 700 MB"),
+        *learning_rows(found),
     ]
     lines = ["| what | measured | aim |", "| --- | --- | --- |"]
     return "\n".join([*lines, *(f"| {what} | {value} | {aim} |" for what, value, aim in rows)])
+
+
+def learning_rows(found: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """What learning costs."""
+    paper, best = found["fits"]["paper"], found["fits"]["best"]
+    steps = found["learned_steps"]
+    ratios = [taken / steps["physics"] for name, taken in steps.items() if name not in ("physics", "paper")]
+    return [
+        ("fit, paper preset, 1,000 epochs", f"{paper['one']:.2f} s", "<= 2 s"),
+        ("the same, five seeds against one", f"{paper['ratio']:.1f}x", "<= 2.5x"),
+        ("fit, best preset", f"{1e3 * best['one']:.0f} ms", "<= 5 s"),
+        ("the same, five seeds against one", f"{best['ratio']:.1f}x", "<= 2.5x"),
+        ("a step with the 512-wide network", f"{1e3 * steps['paper']:.2f} ms", "<= 1 ms"),
+        (
+            "a step with the best residual, against the physics alone",
+            f"{min(ratios):.1f}x to {max(ratios):.1f}x",
+            "<= 2x",
+        ),
+        (
+            "the whole simulation study, nothing compiled yet",
+            f"{found['study']['seconds']:.0f} s",
+            "<= 300 s",
+        ),
+    ]
 
 
 def main() -> None:

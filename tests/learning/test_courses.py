@@ -9,7 +9,7 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.learning import courses as module
-from knode_cosserat.learning.config import FitConfig, NetworkOptions, RolloutTraining
+from knode_cosserat.learning.config import FitConfig, NetworkOptions, RolloutTraining, StructuredOptions
 from knode_cosserat.learning.courses import Aim, courses, held_out_courses, loss_and_slope, scales, tip_error
 from knode_cosserat.learning.fit import fit
 from knode_cosserat.learning.knode import KNODE
@@ -143,6 +143,21 @@ def test_it_learns_from_positions_alone(bars):
     # also of the rows after those that it saw, and of a motion that it has not seen
     for truth in (*bars, pulled(1.4)):
         assert simulated_error(model, truth) < 0.7 * simulated_error(WRONG, truth)
+
+
+def test_any_residual_is_fine_tuned(bars):
+    """A structured one that may only use linear functions, and so cannot have the square of the drag."""
+    config = FitConfig(
+        StructuredOptions(curved=False), None, dataclasses.replace(OPTIONS, learning_rate=1e-3)
+    )
+    model = fit(WRONG, bars, config)
+    loss = model.about.facts["rollouts"]["loss"]
+    assert loss[0] > 1e-9 and loss.min() < 0.7 * loss[0]
+    along = courses(WRONG, bars, OPTIONS)
+    weights, rest = split(model.residual)
+    aim = Aim(WRONG, rest, along.parts, np.array(scales(along, WRONG.y_layout)))
+    found, _ = loss_and_slope(weights, aim, along.compared, along.settings, along.dt)
+    np.testing.assert_allclose(found, loss.min(), rtol=1e-9)
 
 
 class Bumpy:

@@ -62,7 +62,8 @@ def test_a_model_and_what_is_known_of_it(bars, unseen):
     assert segments["loss"][-1] < 2e-2 * segments["loss"][0]
     # the held-out error is that of `simulate`, after the last epoch
     assert segments["held_out_error"].shape == (6, 2) and segments["held_out_error"][-1, 0] == 300
-    np.testing.assert_allclose(segments["held_out_error"][-1, 1], tip_rmse(model, unseen), rtol=1e-9)
+    for error in (segments["held_out_error"][-1, 1], facts["held_out_error"]):
+        np.testing.assert_allclose(error, tip_rmse(model, unseen), rtol=1e-9)
 
 
 @pytest.mark.parametrize("shared", [0, 10**9])
@@ -80,7 +81,8 @@ def test_several_seeds(bars, monkeypatch, shared):
 
 
 def test_the_default_is_structured(bars, unseen):
-    model = fit(WRONG, bars)
+    model = fit(WRONG, bars, held_out=[unseen])
+    np.testing.assert_allclose(model.about.facts["held_out_error"], tip_rmse(model, unseen), rtol=1e-6)
     assert model.about.facts["config"]["residual"]["kind"] == "structured"
     assert tip_rmse(model, unseen) < 0.1 * tip_rmse(WRONG, unseen)
 
@@ -242,6 +244,14 @@ def test_metrics_without_tensorboard(bars, tmp_path, monkeypatch):
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(WatchError, match=r"pip install knode-cosserat\[tensorboard\]"):
         fit(WRONG, bars, SMALL, log_dir=tmp_path)
+
+
+def test_metrics_that_cannot_be_written(bars, tmp_path):
+    pytest.importorskip("tensorboardX")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(WatchError, match="file/seed-0: metrics cannot be written") as caught:
+        fit(WRONG, bars, with_training(epochs=10), log_dir=tmp_path / "file")
+    assert "\n" not in str(caught.value)
 
 
 # the paper

@@ -144,10 +144,11 @@ def test_derivatives_of_an_implicit_law(robot):
     y = jnp.asarray(trajectory.y[3, 4])
     history = kc.History(jnp.array(30.0), -30.0 * y, -30.0 * jnp.asarray(trajectory.z[2, 4]), jnp.zeros(19))
 
+    @jax.jit
     def strains(y):
         return model.residual.strains(model.adapted, 0.1, 0.0, y, jnp.zeros(4), history)
 
-    exact = jax.jacfwd(strains)(y)
+    exact = jax.jit(jax.jacfwd(strains))(y)
     step = 1e-5 * np.asarray(robot.scales().y)
     for k in range(3, 13):
         h = np.zeros(19)
@@ -156,6 +157,7 @@ def test_derivatives_of_an_implicit_law(robot):
         np.testing.assert_allclose(exact[:, k], difference, rtol=1e-6, atol=1e-7 * np.abs(exact).max())
 
 
+@pytest.mark.campaign
 def test_a_system_of_ones_own_learns_too():
     """The string, whose layouts say nothing of loads and whose B is not zero: a wrong drag of the air."""
     dt, rest = 0.02, np.array([0.6, 0.0])

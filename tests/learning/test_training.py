@@ -139,13 +139,16 @@ def test_what_no_weight_changes_is_found_once(robot, moved, bars, system):
             return jnp.sum(values * target), values
 
         # the derivative too where it compiles fast
-        return jax.jit(jax.value_and_grad(total, has_aux=True) if system != "robot" else total)(net)
+        if system == "robot":
+            return jax.jit(total)(net)[1], None
+        (_, values), slope = jax.jit(jax.value_and_grad(total, has_aux=True))(net)
+        return values, slope
 
     both = found(fast), found(slow)
     for one, other in zip(*map(jax.tree.leaves, both), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-11 * np.max(np.abs(other)) + 1e-30)
     without = np.concatenate([part.T for part in _alone(imperfect, data)])
-    assert np.max(np.abs(fast(net) - without)) > 1e-6
+    assert np.max(np.abs(both[0][0] - without)) > 1e-6
 
 
 @functools.partial(jax.jit, static_argnums=1)

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from knode_cosserat.learning import search
 from knode_cosserat.learning.misfit import SegmentMisfit, by_group
-from knode_cosserat.learning.noise import MeasurementNoise
+from knode_cosserat.learning.noise import Errors, errors_of
 from knode_cosserat.learning.rollouts import RolloutMisfit
 from knode_cosserat.learning.samples import DataError
 from knode_cosserat.learning.search import CalibrationError as CalibrationError
@@ -129,8 +129,7 @@ def calibrate(
     else:
         misfit = RolloutMisfit(robot, trajectories, unknowns)
         start = _by_segments(robot, trajectories, unknowns)
-    fit = search.fit(misfit, searched(unknowns, start), may_leave_out=names is None)
-    return _calibration(misfit, fit, level)
+    return _calibration(misfit, *_ended(misfit, searched(unknowns, start), names is None), level)
 
 
 def _check(robot: Any, trajectories: Any, by: Any, level: Any) -> None:
@@ -156,62 +155,52 @@ def _by_segments(robot: System, trajectories: Sequence[Trajectory], unknowns: Un
     return found(unknowns, ended.coordinates)
 
 
-def _calibration(misfit: Misfit, ended: Fit, level: float) -> Calibration:
-    """The estimates from where a search ended, with what can be said of their errors."""
+def _ended(misfit: Misfit, start: np.ndarray, may_leave_out: bool) -> tuple[Fit, Errors]:
+    """Where the search ends, and with which errors: little enough for the estimates to mean something."""
+    left_out: tuple[str, ...] = ()
+    while True:
+        ended = search.fit(misfit, start, may_leave_out, left_out)
+        errors = errors_of(misfit, ended)
+        numbers = np.abs(found(misfit.unknowns, ended.coordinates))
+        size = np.where(logarithmic(misfit.unknowns), 1.0, numbers)[ended.free]
+        beyond = np.abs(errors.shift) / np.maximum(MOST_SHIFT * size, 3.0 * errors.standard)
+        worst = np.flatnonzero(ended.free)[np.argmax(beyond)]
+        if np.max(beyond) <= 1.0:
+            return ended, errors
+        if not may_leave_out:
+            raise CalibrationError(
+                f"noise in these states hides {labels(misfit.unknowns)[worst]} from one-segment predictions; "
+                'use by="rollouts", or leave it out of names'
+            )
+        left_out = (*ended.left_out, search.labels_of(misfit.unknowns)[worst])
+
+
+def _calibration(misfit: Misfit, ended: Fit, errors: Errors, level: float) -> Calibration:
     # imported here: it takes a third of a second
     from scipy.special import stdtrit
 
     robot, unknowns, free = misfit.robot, misfit.unknowns, ended.free
-    weights = ended.weights(misfit)
-    differences = misfit(ended.coordinates)
-    count = len(differences.values) - np.count_nonzero(free)
-    coordinates = ended.coordinates.copy()
-    weighted = differences.slopes[:, free] * weights[:, None]
-    lengths = np.linalg.norm(weighted, axis=0)
-    normal = np.linalg.inv((weighted / lengths).T @ (weighted / lengths)) / np.outer(lengths, lengths)
-    if isinstance(misfit, SegmentMisfit):
-        noise = MeasurementNoise(misfit, ended.coordinates, ended.sizes)
-        covariance = noise.covariance(normal @ weighted.T * weights)
-        coordinates[free] -= _believable(misfit, ended, noise.shift(weights, free), covariance)
-    else:
-        covariance = normal * len(weighted) / count
-    limit = limits(robot, unknowns)
-    numbers = np.clip(found(unknowns, coordinates), *limit)
-    errors, quantile = np.sqrt(np.diag(covariance)), stdtrit(count, 0.5 + level / 2.0)
-    which = logarithmic(unknowns)[free]
     kept = tuple(unknown for unknown in unknowns if unknown.name not in ended.left_out)
-    reach = coordinates[free][:, None] + np.array([-quantile, quantile]) * errors[:, None]
-    ends = np.clip(found(kept, reach.T).T, limit[0][free, None], limit[1][free, None])
-    left = np.sqrt(by_group(np.square(differences.values), misfit.groups))
+    low, high = limits(robot, kept)
+    coordinates, left = ended.coordinates[free] - errors.shift, misfit(ended.coordinates).values
+    numbers = np.clip(found(kept, coordinates), low, high)
+    reach = stdtrit(len(left) - len(numbers), 0.5 + level / 2.0) * errors.standard
+    ends = np.column_stack([np.clip(found(kept, coordinates + side * reach), low, high) for side in (-1, 1)])
+    sizes = np.sqrt(by_group(np.square(left), misfit.groups))
     return Calibration(
-        robot=with_numbers(robot, kept, numbers[free]),
+        robot=with_numbers(robot, kept, numbers),
         before=_by_parameter(kept, values(robot, kept)),
-        estimates=_by_parameter(kept, numbers[free]),
-        standard_errors=_by_parameter(kept, np.where(which, numbers[free], 1.0) * errors),
+        estimates=_by_parameter(kept, numbers),
+        standard_errors=_by_parameter(kept, np.where(logarithmic(kept), numbers, 1.0) * errors.standard),
         intervals=_by_parameter(kept, ends),
         level=float(level),
         labels=labels(kept),
         units=units(robot, kept),
-        correlation=covariance / np.outer(errors, errors),
+        correlation=errors.covariance / np.outer(errors.standard, errors.standard),
         undetermined=ended.left_out,
-        remainder=dict(zip(misfit.fields, left.tolist(), strict=True)),
+        remainder=dict(zip(misfit.fields, sizes.tolist(), strict=True)),
         unexplained=search.systematic(misfit, ended),
     )
-
-
-def _believable(misfit: Misfit, ended: Fit, shift: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """By how much noise moved the estimates on average, if that is little enough to be known."""
-    free = ended.free
-    size = np.where(logarithmic(misfit.unknowns), 1.0, np.abs(found(misfit.unknowns, ended.coordinates)))[
-        free
-    ]
-    errors = np.sqrt(np.diag(covariance))
-    for k in np.flatnonzero((np.abs(shift) > MOST_SHIFT * size) & (np.abs(shift) > 3.0 * errors)):
-        raise CalibrationError(
-            f"noise in the states moves {np.array(labels(misfit.unknowns))[free][k]} by about "
-            f'{100 * abs(shift[k]) / size[k]:.0f} %, too much to be corrected; use by="rollouts"'
-        )
-    return shift
 
 
 def _by_parameter(unknowns: Unknowns, numbers: np.ndarray) -> dict[str, Any]:

@@ -250,7 +250,7 @@ class FitConfig:
         epochs: int = 2000,
         history: bool = False,
         noise: float = 0.0,
-        weight_decay: float = 1e-4,
+        weight_decay: float = 0.3,
     ) -> Self:
         """A network without the paper's constraint, on standardised inputs and outputs, at all nodes."""
         return cls(

@@ -15,7 +15,7 @@ import numpy as np
 from knode_cosserat._files import package_version
 from knode_cosserat.learning.checkpoint import Checkpoints, Identity, data_hash
 from knode_cosserat.learning.config import FitConfig, NetworkOptions
-from knode_cosserat.learning.courses import Courses, courses, held_out_courses
+from knode_cosserat.learning.courses import Courses, courses, held_out_courses, tip_error
 from knode_cosserat.learning.ensemble import Ensemble
 from knode_cosserat.learning.knode import KNODE, About
 from knode_cosserat.learning.regression import solve
@@ -30,9 +30,9 @@ from knode_cosserat.trajectory import Trajectory
 
 #: the best preset
 BEST = FitConfig()
-#: hidden units times samples of all seeds up to which they share one program on a CPU; beyond it one seed
-#: keeps a core busy, and seeds go side by side on all cores
-SHARED = 40_000
+#: hidden units times samples of all seeds up to which they share one vectorised program on a CPU; larger ones
+#: go side by side on all cores (measured, five of the paper's networks: 1.9 s on two cores instead of 4 s)
+SHARED = 20_000
 
 
 def fit(
@@ -62,7 +62,10 @@ def fit(
 
     Returns:
         A `KNODE`, or an `Ensemble` of one for each seed if `config.seed` is several. Its `about.facts` has
-        the config, seed, SHA-256 of each trajectory's data, versions, date, losses, and how long it took.
+        "config", "seed", "trajectories" and "held_out" (SHA-256 of the data, rows, time step), "versions",
+        "date" and "seconds"; of each stage of gradient training, "segments" and "rollouts", the "loss" before
+        every step, the "learning_rate", and the "held_out_error" (step, m) at every check; and the
+        "held_out_error" (m) of the model.
 
     Raises:
         DataError: trajectories that do not fit the knowledge or each other, are too short or not finite.
@@ -91,11 +94,13 @@ def fit(
                 for seed in run.seeds:
                     histories[seed][run.stage] = run.history(seed)
     facts = _facts(config, trajectories, held_out)
-    seconds = time.perf_counter() - began
-    models = [
-        KNODE(knowledge, learned[seed], About({**facts, "seed": seed, **histories[seed], "seconds": seconds}))
-        for seed in config.seeds
-    ]
+    models = []
+    for seed, residual in learned.items():
+        own: dict[str, Any] = {**facts, "seed": seed, **histories[seed]}
+        if given.held_out is not None:
+            own["held_out_error"] = tip_error(KNODE(knowledge, residual), given.held_out)
+        own["seconds"] = time.perf_counter() - began
+        models.append(KNODE(knowledge, residual, About(own)))
     return Ensemble(models) if isinstance(config.seed, tuple) else models[0]
 
 

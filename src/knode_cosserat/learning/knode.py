@@ -78,8 +78,8 @@ class KNODE(System):
         """The knowledge's."""
         return self.knowledge.velocities
 
-    @property
-    def length(self) -> Any:  # type: ignore[misc]
+    @property  # type: ignore[misc]
+    def length(self) -> Any:
         """Length of the rod (m), as the residual corrects it; one each of a batch."""
         if np.ndim(self.knowledge.length):
             return jax.vmap(lambda model: model.adapted.length)(self)

@@ -23,6 +23,8 @@ from knode_cosserat.trajectory import Trajectory
 
 #: the solver's tolerance, of natural sizes: what is less than this is not measured
 LEAST = 1e-10
+#: draws of noise; what is found with both signs of each hardly depends on how many there are
+DRAWS = 6
 
 
 def by_group(squares: Any, groups: np.ndarray) -> Float[np.ndarray, " G"]:
@@ -163,18 +165,16 @@ class SegmentMisfit:
         """
         natural = LEAST * np.asarray(self.robot.scales().y)
         noise = np.concatenate([natural, np.zeros(self.robot.z_layout.size)])
-        drawn = self.with_noise(noise, np.random.default_rng(0))
-        change = self(coordinates, drawn).values - self(coordinates).values
+        change = self(coordinates, self.moved(self.draws[0], noise)).values - self(coordinates).values
         return np.sqrt(by_group(np.square(change), self.groups))
 
-    def with_noise(
-        self, sizes: Float[np.ndarray, " x"], rng: np.random.Generator
-    ) -> tuple[Samples, TipSamples]:
-        """The samples of the same trajectories with white noise of these sizes added to y and z."""
-        return self.moved(self.unit_noise(rng), sizes)
-
-    def unit_noise(self, rng: np.random.Generator) -> tuple[Samples, TipSamples]:
+    @functools.cached_property
+    def draws(self) -> list[tuple[Samples, TipSamples]]:
         """What white noise of size one in all of y and z adds to the samples, which are linear in it."""
+        rng = np.random.default_rng(0)
+        return [self._unit_noise(rng) for _ in range(DRAWS)]
+
+    def _unit_noise(self, rng: np.random.Generator) -> tuple[Samples, TipSamples]:
         drawn = [
             dataclasses.replace(
                 each, y=rng.normal(size=np.shape(each.y)), z=rng.normal(size=np.shape(each.z))

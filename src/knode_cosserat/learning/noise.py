@@ -1,99 +1,107 @@
-"""What noise in measured states does to parameters that were found from one-segment predictions.
+"""What noise in the data does to parameters that were found from them.
 
-A state is in a segment's start, in what it is compared with, and, multiplied by 1/dt, in the history of the
-rows after it. So the differences of neighbouring segments and rows are correlated, and noise moves the
-estimates on average, not only by chance. Both follow from how large the noise is in each field of y and z,
-which the differences tell: white noise is assumed, independent from node to node and from row to row.
+In rollouts noise is only in what they are compared with. In one-segment predictions, a state is in a
+segment's start, in what another's end is compared with and, multiplied by 1/dt, in the history of the rows
+after it. So the differences of neighbouring segments and rows are correlated, and noise moves the estimates
+on average, not only by chance. Both follow from how large the noise is in each field of y and z, which the
+differences tell: white noise is assumed, independent from node to node and from row to row.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.learning.misfit import Differences, SegmentMisfit, by_group
 from knode_cosserat.learning.samples import _histories, _settings, _slopes
+from knode_cosserat.learning.search import Fit, Misfit
 from knode_cosserat.solvers.space import middles
 from knode_cosserat.trajectory import Trajectory
 
-#: pairs of draws, with opposite signs, from which the shift of the estimates is taken
-PAIRS = 16
 #: draws from which it is taken how large differences become by noise in each field
 PROBES = 3
 
 
-class MeasurementNoise:
-    """White noise in y and z, as large as the differences at an estimate say.
+class Errors(NamedTuple):
+    """Errors of the coordinates that were searched: their covariance, and what they are on average."""
 
-    `sizes` are standard deviations, by number of y and z.
+    covariance: Float[np.ndarray, "n n"]
+    shift: Float[np.ndarray, " n"]
+
+    @property
+    def standard(self) -> Float[np.ndarray, " n"]:
+        """Standard deviations."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+def errors_of(misfit: Misfit, ended: Fit) -> Errors:
+    """Errors where a search ended, as noise of the size of the differences makes them."""
+    weights = ended.weights(misfit)
+    slopes = misfit(ended.coordinates).slopes[:, ended.free] * weights[:, None]
+    lengths = np.linalg.norm(slopes, axis=0)
+    inverse = np.linalg.inv((slopes / lengths).T @ (slopes / lengths)) / np.outer(lengths, lengths)
+    if not isinstance(misfit, SegmentMisfit):
+        freedom = len(slopes) - len(inverse)
+        return Errors(inverse * len(slopes) / freedom, np.zeros(len(inverse)))
+    sizes = noise_sizes(misfit, ended)
+    covariance = np.zeros_like(inverse)
+    for effects in by_states(misfit, ended.coordinates, inverse @ slopes.T * weights):
+        each = (sizes * effects).reshape(len(inverse), -1)
+        covariance += each @ each.T
+    return Errors(covariance, _shift(misfit, ended, sizes))
+
+
+def noise_sizes(misfit: SegmentMisfit, ended: Fit) -> Float[np.ndarray, " x"]:
+    """Standard deviations of white noise in y and z that explain how large the differences are."""
+    # imported here: it takes a third of a second
+    from scipy.optimize import nnls
+
+    groups, segments = misfit.state_groups, misfit.data.segments
+    typical = np.sqrt(by_group(np.mean(np.square(np.hstack([segments.y, segments.z])), axis=0), groups))
+    # small enough for the differences to be linear in it
+    small = 1e-6 * np.maximum(typical, 1e-6 * typical.max())
+    still = misfit(ended.coordinates).values
+    gains = np.zeros((len(misfit.fields), len(small)))
+    for draw in misfit.draws[:PROBES]:
+        for field, size in enumerate(small):
+            moved = misfit.moved(draw, np.where(groups == field, size, 0.0))
+            change = (misfit(ended.coordinates, moved).values - still) / size
+            gains[:, field] += by_group(np.square(change), misfit.groups) / PROBES
+    seen = ended.sizes > 0.0
+    weights = 1.0 / np.square(ended.sizes[seen])
+    squares, _ = nnls(gains[seen] * weights[:, None], np.ones(len(weights)))
+    return np.sqrt(squares)[groups]
+
+
+def _shift(misfit: SegmentMisfit, ended: Fit, sizes: Float[np.ndarray, " x"]) -> Float[np.ndarray, " n"]:
+    """By how much noise of these sizes moves the estimates on average, to leading order.
+
+    Noise is added once more, with both signs, and each time one step of the search is made. This is linear in
+    the variance, so what a second helping adds on average the first has added too (simulation-extrapolation:
+    Cook & Stefanski, J. Am. Stat. Assoc. 89, 1994).
     """
-
-    def __init__(self, misfit: SegmentMisfit, coordinates: np.ndarray, sizes: Float[np.ndarray, " G"]):
-        """`sizes`: root mean squares of the differences, by field."""
-        # imported here: it takes a third of a second
-        from scipy.optimize import nnls
-
-        self.misfit, self.coordinates = misfit, coordinates
-        rng = np.random.default_rng(0)
-        self._draws = [misfit.unit_noise(rng) for _ in range(PAIRS)]
-        gains = self._gains()
-        seen = sizes > 0.0
-        weight = 1.0 / np.square(sizes[seen])
-        squares, _ = nnls(gains[seen] * weight[:, None], np.square(sizes[seen]) * weight)
-        self.sizes = np.sqrt(squares)[misfit.state_groups]
-
-    def _gains(self) -> Float[np.ndarray, "G F"]:
-        """Mean squares of the differences in each field (G) per variance of each field of y and z (F)."""
-        misfit, groups = self.misfit, self.misfit.state_groups
-        segments = misfit.data.segments
-        typical = np.sqrt(by_group(np.mean(np.square(np.hstack([segments.y, segments.z])), axis=0), groups))
-        # small enough for the differences to be linear in it
-        small = 1e-6 * np.maximum(typical, 1e-6 * typical.max())
-        still = misfit(self.coordinates).values
-        gains = np.zeros((len(misfit.fields), len(small)))
-        for draw in self._draws[:PROBES]:
-            for field, size in enumerate(small):
-                moved = misfit.moved(draw, np.where(groups == field, size, 0.0))
-                change = (misfit(self.coordinates, moved).values - still) / size
-                gains[:, field] += by_group(np.square(change), misfit.groups) / PROBES
-        return gains
-
-    def covariance(self, sensitivity: Float[np.ndarray, "n M"]) -> Float[np.ndarray, "n n"]:
-        """Covariance of estimates that move by `sensitivity` times the change of the differences."""
-        pulled = self.misfit.pulled_back(self.coordinates, sensitivity)
-        total = np.zeros((len(sensitivity), len(sensitivity)))
-        for k, trajectory in enumerate(self.misfit.trajectories):
-            by_state = self.sizes * _by_states(self.misfit, pulled, k, trajectory)
-            each = by_state.reshape(len(sensitivity), -1)
-            total += each @ each.T
-        return total
-
-    def shift(self, weights: Float[np.ndarray, " M"], free: np.ndarray) -> Float[np.ndarray, " n"]:
-        """By how much noise of these sizes moves the estimates on average, to leading order.
-
-        Noise is added once more, with both signs, and each time one step of the search is made. This is
-        linear in the variance, so what a second helping adds on average the first has added too
-        (simulation-extrapolation: Cook & Stefanski, J. Am. Stat. Assoc. 89, 1994).
-        """
-        total = np.zeros(np.count_nonzero(free))
-        for draw in self._draws:
-            for sign in (1.0, -1.0):
-                values, slopes = self.misfit(self.coordinates, self.misfit.moved(draw, sign * self.sizes))
-                total += step(Differences(values, slopes[:, free]), weights)
-        still = self.misfit(self.coordinates)
-        return total / (2 * len(self._draws)) - step(
-            Differences(still.values, still.slopes[:, free]), weights
-        )
+    weights, free = ended.weights(misfit), ended.free
+    moved = [misfit.moved(draw, sign * sizes) for draw in misfit.draws for sign in (1.0, -1.0)]
+    steps = [_step(misfit(ended.coordinates, each), weights, free) for each in moved]
+    return np.mean(steps, axis=0) - _step(misfit(ended.coordinates), weights, free)
 
 
-def step(differences: Differences, weights: Float[np.ndarray, " M"]) -> Float[np.ndarray, " n"]:
+def _step(there: Differences, weights: Float[np.ndarray, " M"], free: np.ndarray) -> Float[np.ndarray, " n"]:
     """One step of Gauss and Newton towards the least weighted squares."""
-    weighted = differences.slopes * weights[:, None]
+    weighted = there.slopes[:, free] * weights[:, None]
     lengths = np.linalg.norm(weighted, axis=0)
-    scaled, *_ = np.linalg.lstsq(weighted / lengths, -differences.values * weights)
+    scaled, *_ = np.linalg.lstsq(weighted / lengths, -there.values * weights)
     return scaled / lengths
+
+
+def by_states(
+    misfit: SegmentMisfit, coordinates: np.ndarray, factors: Float[np.ndarray, "n M"]
+) -> list[Float[np.ndarray, "n T N x"]]:
+    """Derivatives of factors times differences by y and z of each trajectory, all rows and nodes."""
+    pulled = misfit.pulled_back(coordinates, factors)
+    return [_by_states(misfit, pulled, k, each) for k, each in enumerate(misfit.trajectories)]
 
 
 def _by_states(

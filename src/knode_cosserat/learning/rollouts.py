@@ -22,11 +22,10 @@ from knode_cosserat.learning.samples import DataError, samples
 from knode_cosserat.learning.unknowns import Unknowns, found, with_coordinates, with_numbers
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.march import Past, initial_past, rest_record
-from knode_cosserat.solvers.result import SimulationError
-from knode_cosserat.solvers.run import Task
+from knode_cosserat.solvers.run import Task, run_one
 from knode_cosserat.solvers.sensitivity import _tangent_march
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.simulate import _beginning, _Run, simulate
+from knode_cosserat.solvers.simulate import _beginning, _Run
 from knode_cosserat.trajectory import Trajectory
 
 
@@ -55,6 +54,7 @@ class _Rows(NamedTuple):
     """The solved rows of a rollout, what they began from, and what was measured."""
 
     records: Float[Any, "T N x"]
+    unknowns: Float[Any, "T k"]
     past: Past
     #: the last row and control of the rows that it began from, if there are any
     before: Any
@@ -66,7 +66,6 @@ class _Rows(NamedTuple):
 def _differences(robot, coordinates, rows, table, dt, unknowns, settings, oriented):  # type: ignore[no-untyped-def]
     """Differences (M,) of solved rows from what was measured, and their derivatives (M, n)."""
     ny = robot.y_layout.size
-    base = jax.vmap(robot.unknowns)(rows.records[:, 0, :ny])
 
     def start(x: Any) -> Any:
         system = with_coordinates(robot, unknowns, x)
@@ -84,7 +83,7 @@ def _differences(robot, coordinates, rows, table, dt, unknowns, settings, orient
     def along(direction: Any) -> Any:
         (system, past), (d_system, d_past) = jax.jvp(start, (coordinates,), (direction,))
         d_records, _ = _tangent_march(
-            settings, table, dt, rows.records, base, system, rows.control, past, d_system,
+            settings, table, dt, rows.records, rows.unknowns, system, rows.control, past, d_system,
             jnp.zeros_like(rows.control), d_past.records[:2], d_past.rate,
         )  # fmt: skip
         return jax.jvp(left, (rows.records[..., :ny],), (d_records[..., :ny],))[1]
@@ -122,30 +121,29 @@ class RolloutMisfit:
     def __call__(self, coordinates: np.ndarray) -> Differences:
         """Differences of all rollouts; infinite if one of them has no solution."""
         system = with_numbers(self.robot, self.unknowns, found(self.unknowns, coordinates))
-        try:
-            parts = [self._of_one(system, coordinates, rollout) for rollout in self.rollouts]
-        except SimulationError:
-            size = len(self.groups)
-            return Differences(np.full(size, np.inf), np.zeros((size, len(coordinates))))
+        parts = []
+        for rollout in self.rollouts:
+            part = self._of_one(system, coordinates, rollout)
+            if part is None:
+                size = len(self.groups)
+                return Differences(np.full(size, np.inf), np.zeros((size, len(coordinates))))
+            parts.append(part)
         values, slopes = zip(*parts, strict=True)
         return Differences(np.concatenate(values), np.concatenate(slopes))
 
-    def _of_one(self, system: System, coordinates: np.ndarray, rollout: _Rollout) -> tuple[Any, Any]:
+    def _of_one(self, system: System, coordinates: np.ndarray, rollout: _Rollout) -> Differences | None:
         settings, dt, initial, control, y = rollout
-        simulated = simulate(
-            system, control, dt, time=settings.time, space=settings.space, start=settings.start,
-            newton=settings.newton, initial=initial,
-        )  # fmt: skip
-        run = _Run(system, control, initial, settings, dt, None, False)
-        record, begun, _, first = _beginning(run)
+        record, begun, _, first = _beginning(_Run(system, control, initial, settings, dt, None, False))
+        task = Task(settings, dt, len(control), first)
+        steps, _ = run_one(task, system, control, begun)
+        if steps.result.min() < 0:
+            return None
         before = None if initial is None else (record, np.asarray(initial.control)[-1])
-        records = np.concatenate([simulated.y, simulated.z], axis=-1)[1:]
-        rows = _Rows(records, begun.past, before, control, y)
-        table = Task(settings, dt, len(control), first).table
+        rows = _Rows(steps.records, steps.unknowns, begun.past, before, control, y)
         values, slopes = _differences(
-            self.robot, coordinates, rows, table, dt, self.unknowns, settings, self.oriented
+            self.robot, coordinates, rows, task.table, dt, self.unknowns, settings, self.oriented
         )
-        return np.asarray(values), np.asarray(slopes)
+        return Differences(np.asarray(values), np.asarray(slopes))
 
     def blocks(self, values: Float[np.ndarray, " M"]) -> list[tuple[np.ndarray, np.ndarray]]:
         """The field (n,) of the differences of a row, and these by row (R, n), of each trajectory."""

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from knode_cosserat.learning.misfit import SegmentMisfit, by_group
 from knode_cosserat.learning.rollouts import RolloutMisfit
-from knode_cosserat.learning.unknowns import Unknowns, found, labels, limits, logarithmic, searched
+from knode_cosserat.learning.unknowns import Unknowns, found, labels, limits, logarithmic, searched, values
 
 Misfit = SegmentMisfit | RolloutMisfit
 
@@ -21,8 +21,11 @@ MOST_EVALUATIONS = 100
 FLAT = 1e-8
 #: nor is a positive parameter if the standard error of its logarithm is above this
 VAGUE = 1.0
-#: rows apart, beyond the memory of every scheme in time, and the correlation there that noise does not have
-LAG = 3
+#: nor any other if its standard error is this many times what it was before and is now; and of those that
+#: nobody asked for
+HOPELESS, POOR = 10.0, 1.0
+#: rows apart, beyond the memory of BDF2, and a correlation there that noise does not have
+LAGS = range(3, 11)
 ALIKE = 0.3
 #: what takes part in a combination: more than this part of what takes part most
 PART = 0.1
@@ -59,23 +62,26 @@ class Gap(NamedTuple):
     every: bool
 
 
-def fit(misfit: Misfit, start: Float[np.ndarray, " n"], may_leave_out: bool) -> Fit:
+def fit(
+    misfit: Misfit, start: Float[np.ndarray, " n"], may_leave_out: bool, left_out: tuple[str, ...] = ()
+) -> Fit:
     """Search from a start, with weights that follow from the differences that are left.
+
+    What is left out already stays so; `may_leave_out` allows for more.
 
     Raises:
         CalibrationError: no convergence, or something is not determined that may not be left out.
     """
     unknowns = misfit.unknowns
-    left_out: tuple[str, ...] = ()
     while True:
         free = np.array([name not in left_out for name in labels_of(unknowns)])
         if not free.any():
             raise CalibrationError(f"these data determine none of {', '.join(left_out)}")
         # a symmetry that hides something is exact where the search begins, and not quite where noise leads it
-        gap = _gap(misfit, Fit(start, free, (), misfit.first_sizes(), np.zeros(0)), vague=False)
+        gap = _gap(misfit, Fit(start, free, (), misfit.first_sizes(), np.zeros(0)), np.inf)
         if gap is None:
             converged, ended = _search(misfit, start, free)
-            gap = _gap(misfit, ended)
+            gap = _gap(misfit, ended, POOR if may_leave_out else HOPELESS)
             if gap is None and converged:
                 _check_range(misfit, ended)
                 return ended._replace(left_out=left_out)
@@ -117,18 +123,19 @@ def _least_squares(
 
     weights = _inverse(sizes)[misfit.groups]
     low, high = (searched(misfit.unknowns, end)[free] for end in limits(misfit.robot, misfit.unknowns))
+    begin = np.clip(start[free], low, high)
     last: dict[bytes, np.ndarray] = {}
 
     def whole(x: np.ndarray) -> np.ndarray:
         full = start.copy()
-        full[free] = x
+        full[free] = np.clip(begin + x * reach, low, high)
         return full
 
     def reduced(x: np.ndarray) -> np.ndarray:
         """Slopes and values, of thousands of rows, turned into as many rows as columns: the same squares."""
         if x.tobytes() not in last:
-            values, slopes = misfit(whole(x))
-            columns = np.column_stack([slopes[:, free], values]) * weights[:, None]
+            there = misfit(whole(x))
+            columns = np.column_stack([there.slopes[:, free] * reach, there.values]) * weights[:, None]
             last.clear()
             triangle: Any = np.full((len(x) + 1, len(x) + 1), np.inf)
             if np.all(np.isfinite(columns)):
@@ -136,25 +143,31 @@ def _least_squares(
             last[x.tobytes()] = triangle
         return last[x.tobytes()]
 
-    begin = np.clip(start[free], low, high)
-    if not np.all(np.isfinite(reduced(begin))):
-        raise CalibrationError("the robot that the search begins from has no solution under these controls")
-
-    def values(x: np.ndarray) -> np.ndarray:
+    def heights(x: np.ndarray) -> np.ndarray:
         return reduced(x)[:, -1]
 
     def slopes(x: np.ndarray) -> np.ndarray:
         return reduced(x)[:, :-1]
 
+    reach = np.ones(len(begin))
+    first = reduced(np.zeros(len(begin)))
+    if not np.all(np.isfinite(first)):
+        raise CalibrationError("the robot that the search begins from has no solution under these controls")
+    # the first step goes no further than a factor of e, than a number's own size or, if that is zero, than
+    # what it would do by itself: simulations of a robot far from the real one lead astray
+    alone = np.linalg.norm(first[:, -1]) * _inverse(np.linalg.norm(first[:, :-1], axis=0))
+    own = np.where(begin != 0.0, np.abs(begin), np.where(alone > 0.0, alone, 1.0))
+    reach = np.where(logarithmic(misfit.unknowns)[free], 1.0, own)
+    last.clear()
     ended = least_squares(
-        values, begin, slopes, (low, high), x_scale="jac", ftol=1e-15, xtol=1e-12, gtol=1e-15,
-        max_nfev=MOST_EVALUATIONS,
+        heights, np.zeros(len(begin)), slopes, ((low - begin) / reach, (high - begin) / reach),
+        ftol=1e-15, xtol=1e-12, gtol=1e-15, max_nfev=MOST_EVALUATIONS,
     )  # fmt: skip
     return ended.status > 0, whole(ended.x)
 
 
-def _gap(misfit: Misfit, ended: Fit, vague: bool = True) -> Gap | None:
-    """What the data do not determine, if anything; `vague`: nor well enough."""
+def _gap(misfit: Misfit, ended: Fit, worst: float) -> Gap | None:
+    """What the data do not determine, if anything: at all, or with errors up to `worst` times the value."""
     unknowns, free = misfit.unknowns, ended.free
     names = np.array(labels_of(unknowns))[free]
     weighted = misfit(ended.coordinates).slopes[:, free] * ended.weights(misfit)[:, None]
@@ -166,16 +179,25 @@ def _gap(misfit: Misfit, ended: Fit, vague: bool = True) -> Gap | None:
     _, parts, directions = np.linalg.svd(weighted / lengths, full_matrices=False)
     if parts[-1] < FLAT * parts[0]:
         return _together(names, np.abs(directions[-1]))
-    if not vague:
+    if np.isinf(worst):
         return None
     covariance = (directions.T / parts**2) @ directions / np.outer(lengths, lengths)
     errors = np.sqrt(np.diag(covariance))
-    low, high = limits(misfit.robot, unknowns)
-    too_much = np.where(logarithmic(unknowns), VAGUE, (high - low) / 2)[free]
-    if np.all(errors < too_much):
+    too_much = np.where(logarithmic(unknowns), VAGUE, worst * _magnitudes(misfit, ended))[free]
+    if np.all(errors <= too_much):
         return None
-    worst = int(np.argmax(errors / too_much))
-    return _together(names, np.abs(covariance[worst] / errors / errors[worst]) ** 20)
+    k = int(np.argmax(errors / too_much))
+    return _together(names, np.abs(covariance[k] / errors / errors[k]) ** 20)
+
+
+def _magnitudes(misfit: Misfit, ended: Fit) -> Float[np.ndarray, " n"]:
+    """For each number the largest of its parameter, before or now; the allowed range where all are zero."""
+    unknowns = misfit.unknowns
+    names = np.array(labels_of(unknowns))
+    largest = np.maximum(np.abs(values(misfit.robot, unknowns)), np.abs(found(unknowns, ended.coordinates)))
+    low, high = limits(misfit.robot, unknowns)
+    largest = np.array([np.max(largest[names == name]) for name in names])
+    return np.where(largest > 0.0, largest, high - low)
 
 
 def _together(names: np.ndarray, parts: np.ndarray) -> Gap:
@@ -190,10 +212,10 @@ def _check_range(misfit: Misfit, ended: Fit) -> None:
     """Raise if a number ended where its allowed range does; zero is a value like others."""
     unknowns = misfit.unknowns
     low, high = limits(misfit.robot, unknowns)
-    values = found(unknowns, ended.coordinates)
+    numbers = found(unknowns, ended.coordinates)
     for k, label in enumerate(labels(unknowns)):
-        end = high[k] if high[k] - values[k] < values[k] - low[k] else low[k]
-        if ended.free[k] and end != 0.0 and abs(values[k] - end) <= 1e-6 * abs(end):
+        end = high[k] if high[k] - numbers[k] < numbers[k] - low[k] else low[k]
+        if ended.free[k] and end != 0.0 and abs(numbers[k] - end) <= 1e-6 * abs(end):
             raise CalibrationError(
                 f"{label} ran to the end of its allowed range, {end:g}: the data ask for more"
             )
@@ -204,14 +226,16 @@ def _inverse(sizes: np.ndarray) -> np.ndarray:
 
 
 def systematic(misfit: Misfit, ended: Fit) -> tuple[str, ...]:
-    """Fields in which what is left is not noise: it is alike three rows apart, beyond any scheme's memory."""
-    left = misfit(ended.coordinates).values
-    alike, size, count = np.zeros((3, len(misfit.fields)))
-    for fields, rows in misfit.blocks(left):
-        one, other = rows[:-LAG], rows[LAG:]
-        alike += np.bincount(fields, np.sum(one * other, axis=0), len(alike))
-        size += np.bincount(fields, np.sum(one**2 + other**2, axis=0) / 2, len(size))
-        count += np.bincount(fields, minlength=len(count)) * len(one)
-    enough = np.maximum(ALIKE, 4.0 / np.sqrt(np.maximum(count, 1.0)))
-    which = ~ended.exact & (alike > enough * size)
+    """Fields in which what is left is not noise: rows are alike that lie further apart than noise reaches."""
+    blocks = misfit.blocks(misfit(ended.coordinates).values)
+    which = np.zeros(len(misfit.fields), dtype=bool)
+    for lag in LAGS:
+        alike, size, count = np.zeros((3, len(misfit.fields)))
+        for fields, rows in blocks:
+            one, other = rows[:-lag], rows[lag:]
+            alike += np.bincount(fields, np.sum(one * other, axis=0), len(alike))
+            size += np.bincount(fields, np.sum(one**2 + other**2, axis=0) / 2, len(size))
+            count += np.bincount(fields, minlength=len(count)) * len(one)
+        which |= np.abs(alike) > np.maximum(ALIKE, 5.0 / np.sqrt(np.maximum(count, 1.0))) * size
+    which &= ~ended.exact
     return tuple(field for field, one in zip(misfit.fields, which, strict=True) if one)

@@ -54,7 +54,7 @@ def refined(
 
     start = np.log(slopes[free])
     found = least_squares(
-        left, start, bounds=_bounds(start, [kinds[k] for k in free]),
+        left, start, bounds=_bounds(start, [kinds[int(k)] for k in free]),
         xtol=1e-12, ftol=1e-14, gtol=1e-14, max_nfev=60,
     )  # fmt: skip
     return at(found.x)

@@ -21,8 +21,9 @@ from knode_cosserat.learning.training import ADAM, PIECE, prepared, run_epochs, 
 from knode_cosserat.learning.watch import Watch
 from knode_cosserat.rods.system import System
 
-#: a loss so many times what it began with has diverged
+#: a loss so many times what it began with has diverged; one that began with next to nothing may come to one
 DIVERGED = 1e6
+NOTHING = 1e-6
 
 
 def _finite(tree: Any) -> bool:
@@ -82,7 +83,7 @@ class SegmentRun(Run):
     def _require_sane(self, losses: np.ndarray, weights: Any) -> None:
         start = np.concatenate([self._losses, losses])[0]
         going = self._best.stopped < 0
-        bad = ~(losses <= np.where(start > 0.0, DIVERGED * start, np.inf)) & going
+        bad = ~(losses <= DIVERGED * np.maximum(start, NOTHING)) & going
         if bad.any():
             row, k = np.argwhere(bad)[0]
             raise FitError(
@@ -213,7 +214,7 @@ class RolloutRun(Run):
             step = rate * self._scale
             weights, adam = _proposal(self._weights, self._rest, self._adam, self._slope, step, options.clip)
             loss, slope = self._evaluated(weights)
-            if loss <= DIVERGED * self._losses[0] and _finite((weights, slope)):
+            if loss <= DIVERGED * max(self._losses[0], NOTHING) and _finite((weights, slope)):
                 break
             self._scale /= 2.0
         else:

@@ -86,13 +86,28 @@ def corrected(net: Network, known: Known) -> tuple[Float[Any, "y S"], Float[Any,
     """Prediction of all samples by knowledge and network, as `samples.predict` has it under Euler.
 
     Hidden units first and the biases as one more column: of the layouts tried the fastest (0.61 s for 1000
-    epochs of the paper's preset on one core; samples first 0.69 to 1.0 s).
+    epochs of the paper's preset on one core, 0.54 s with `_product`; samples first 0.69 to 1.0 s).
     """
     first = jnp.concatenate([net.input_weights, net.input_biases[:, None]], axis=1)
-    second = net.output_weights @ elu(first @ known.inputs) + net.output_biases[:, None]
+    second = _product(net.output_weights, elu(first @ known.inputs)) + net.output_biases[:, None]
     added = net.output_scale[:, None] * second
     size = known.y.shape[0]
     return known.y + known.ds * added[:size], known.z + added[size:]
+
+
+@jax.custom_vjp
+def _product(weights: Float[Any, "outputs hidden"], units: Float[Any, "hidden S"]) -> Float[Any, "outputs S"]:
+    return weights @ units
+
+
+def _product_slope(given: Any, slope: Any) -> Any:
+    weights, units = given
+    # a copy that XLA may not see through: a product with a transposed matrix takes it twice as long
+    turned = jax.lax.optimization_barrier(weights.T)
+    return slope @ units.T, turned @ slope
+
+
+_product.defvjp(lambda weights, units: (weights @ units, (weights, units)), _product_slope)
 
 
 def standardised(net: Network, knowledge: System, samples: Samples) -> Network:

@@ -61,10 +61,12 @@ class Watch:
         if self._folder is None or self._writer_class is None:
             return
         if seed not in self._writers:
-            # what an interrupted run wrote after its last checkpoint is written again: it counts once
-            self._writers[seed] = self._writer_class(
-                str(self._folder / f"seed-{seed}"), purge_step=first, flush_secs=5
-            )
+            folder = self._folder / f"seed-{seed}"
+            try:
+                # what an interrupted run wrote after its last checkpoint is written again: it counts once
+                self._writers[seed] = self._writer_class(str(folder), purge_step=first, flush_secs=5)
+            except OSError as error:
+                raise WatchError(f"{folder}: metrics cannot be written: {error.strerror}") from None
         for i, value in enumerate(values):
             self._writers[seed].add_scalar(name, float(value), first + i)
 

@@ -104,7 +104,7 @@ def figure(cells: Sequence[Any], measure: str = "tip_dtw") -> Figure:
     imperfections = [name for name in dict.fromkeys(cell["imperfection"] for cell in cells) if name != ANY]
     controls = list(dict.fromkeys(cell["control"] for cell in cells))
     with style():
-        whole = new_figure(2.9 * len(imperfections) + 0.6, 2.9 * len(controls) + 1.0)
+        whole = new_figure(2.9 * len(imperfections) + 0.6, 3.8 * len(controls) + 1.0)
         grid = whole.subplots(len(controls), len(imperfections), sharex=True, sharey=True, squeeze=False)
         for line, control in zip(grid, controls, strict=True):
             for axes, imperfection in zip(line, imperfections, strict=True):

@@ -131,6 +131,8 @@ def settings(name: str, seeds: Sequence[int], **changes: Any) -> dict[str, Any]:
     space, nodes         scheme along the rod, and nodes
     noise                on all that is learned from, as a part of how much each number varies
     """
+    if name not in IMPERFECTIONS:
+        raise ValueError(f"imperfection {name!r} is unknown; allowed is some of {', '.join(IMPERFECTIONS)}")
     usual = {
         "imperfection": name, **IMPERFECTIONS[name], "robot": ROBOT, "seeds": list(seeds), "method": "best",
         "training": list(TRAINING), "rows": TRAINING_ROWS, "training_dt": DT, "dt": DT, "steps": STEPS,

@@ -226,7 +226,8 @@ def _on_dask(jobs: Sequence[Job], address: str) -> Iterator[tuple[Job, _Done]]:
     except ImportError:
         raise ImportError("a Dask cluster needs dask: pip install 'knode-cosserat[dask]'") from None
     try:
-        client = Client(address, timeout=PATIENCE)
+        # not the default for whatever else in this process can use Dask, such as writing files
+        client = Client(address, timeout=PATIENCE, set_as_default=False)
     except (OSError, ValueError) as error:
         raise StudyError(f"no Dask scheduler answers at {address!r}: {error}") from None
     with client:

@@ -1,0 +1,446 @@
+"""Parameters from trajectories: what is found, how well, and what is said when they cannot be."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+
+import knode_cosserat as kc
+from examples.hanging_string import HangingString
+from knode_cosserat.learning import search
+from knode_cosserat.learning.calibrate import CalibrationError, calibrate
+from knode_cosserat.learning.knode import KNODE
+from knode_cosserat.learning.misfit import SegmentMisfit
+from knode_cosserat.learning.noise import by_states, errors_of
+from knode_cosserat.learning.residual import Residual
+from knode_cosserat.learning.samples import DataError
+from knode_cosserat.learning.unknowns import found, searched, unknowns_of, values, with_numbers
+from tests.learning.bar import BAR, WRONG, Bar, pulled
+
+ROBOT = kc.load_robot("delrin-tendon-robot")
+FOUR = ["youngs_modulus", "length", "bending_damping", "drag"]
+DT = 0.05
+
+
+def sines(robot: kc.System) -> list[kc.Trajectory]:
+    """The training data of the paper's study."""
+    return [kc.simulate(robot, kc.controls.sine(period, 30, DT), DT)[:30] for period in (0.5, 1.0)]
+
+
+@pytest.fixture(scope="module")
+def training():
+    return sines(ROBOT)
+
+
+@pytest.fixture(scope="module")
+def swings():
+    return [pulled(1.0), pulled(2.0)]
+
+
+def noisy(trajectories: list[kc.Trajectory], part: float, seed: int) -> list[kc.Trajectory]:
+    """White noise in all of y and z, as large as a part of how much each field varies."""
+    rng = np.random.default_rng(seed)
+    robot = trajectories[0].system
+
+    def sizes(layout: kc.Layout, name: str) -> np.ndarray:
+        every = np.concatenate(
+            [getattr(each, name) - getattr(each, name).mean(axis=0) for each in trajectories]
+        )
+        return np.concatenate(
+            [np.full(field.size, np.std(every[..., layout.slice(field.name)])) for field in layout.fields]
+        )
+
+    in_y, in_z = sizes(robot.y_layout, "y"), sizes(robot.z_layout, "z")
+    return [
+        dataclasses.replace(
+            each, y=each.y + part * in_y * rng.normal(size=each.y.shape),
+            z=each.z + part * in_z * rng.normal(size=each.z.shape),
+        )
+        for each in trajectories
+    ]  # fmt: skip
+
+
+def as_measured(trajectories: list[kc.Trajectory], noise: float, seed: int) -> list[kc.Trajectory]:
+    """Positions (and orientations, as 5 times the noise) alone; nothing else is known."""
+    rng = np.random.default_rng(seed)
+    result = []
+    for each in trajectories:
+        y, layout = np.full_like(each.y, np.nan), each.system.y_layout
+        for name, factor in (("p", 1.0), ("h", 5.0)):
+            if name in layout.names:
+                where = layout.slice(name)
+                y[..., where] = each.y[..., where] + factor * noise * rng.normal(
+                    size=each.y[..., where].shape
+                )
+        result.append(dataclasses.replace(each, y=y, z=np.full_like(each.z, np.nan)))
+    return result
+
+
+# what is found in data without noise
+
+
+@pytest.mark.parametrize(
+    ("truth", "start"),
+    [
+        ({}, {"length": 0.4}),
+        ({}, {"youngs_modulus": 10e9}),
+        ({}, {"length": 0.4, "youngs_modulus": 10e9}),
+        ({"bending_damping": 0.2}, {}),
+        ({"bending_damping": 0.2, "youngs_modulus": 5e9}, {}),
+        ({"drag": 0.0}, {}),
+        ({}, {"drag": 0.0, "bending_damping": 0.0, "youngs_modulus": 1e12, "length": 0.05}),
+    ],
+    ids=str,
+)
+def test_imperfections_are_found(truth, start):
+    true = ROBOT.replace(**truth)
+    result = calibrate(ROBOT.replace(**start), sines(true), FOUR)
+    assert result.estimates["youngs_modulus"] == pytest.approx(float(true.youngs_modulus), rel=1e-8)
+    assert result.estimates["length"] == pytest.approx(float(true.length), rel=1e-8)
+    assert result.estimates["bending_damping"] == pytest.approx(true.bending_damping[0, 0], rel=1e-8)
+    # its force is a millionth of the others'
+    assert result.estimates["drag"] == pytest.approx(true.drag[0, 0], abs=2e-10)
+    for name, (low, high) in result.intervals.items():
+        value = np.max(getattr(true, name))
+        assert low <= value <= high and high - low < 1e-4 * max(value, 1e-4)
+    assert not result.undetermined and not result.unexplained
+    controls = kc.controls.sine(1.5, 100, DT)
+    again = kc.simulate(result.robot, controls, DT)[:100]
+    assert kc.tip_dtw(again, kc.simulate(true, controls, DT)[:100]) < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("truth", "start"),
+    [
+        ({}, {"gravity": (0.0, 0.0, 0.0)}),
+        ({"radius": 0.8 * 0.003175}, {}),
+        ({}, {"length": 0.4, "density": 900.0}),
+    ],
+    ids=str,
+)
+def test_nobody_has_to_say_which_parameter_is_wrong(truth, start):
+    true, begin = ROBOT.replace(**truth), ROBOT.replace(**start)
+    result = calibrate(begin, sines(true))
+    # the sum of opposite tensions is the same all the time, so a turned tendon may as well be gravity
+    assert {"tendon_offset", "tendon_angles"} <= set(result.undetermined)
+    for name in result.undetermined:
+        np.testing.assert_array_equal(getattr(result.robot, name), getattr(begin, name))
+    for name in ("length", "radius", "density", "youngs_modulus"):
+        assert result.estimates[name] == pytest.approx(float(getattr(true, name)), rel=1e-8)
+    np.testing.assert_allclose(result.robot.gravity, true.gravity, atol=1e-7)
+    controls = kc.controls.sine(1.5, 100, DT)
+    again = kc.simulate(result.robot, controls, DT)[:100]
+    assert kc.tip_dtw(again, kc.simulate(true, controls, DT)[:100]) < 1e-6
+
+
+def test_a_robot_at_rest_tells_little():
+    tension = np.array([6.0, 5.0, 5.0, 5.0])
+    still = kc.simulate(ROBOT, np.tile(tension, (29, 1)), DT, initial=kc.equilibrium(ROBOT, tension))
+    result = calibrate(ROBOT.replace(youngs_modulus=4e9), [still, still])
+    assert result.estimates["youngs_modulus"] == pytest.approx(2.757903e9, rel=1e-8)
+    assert {"drag", "bending_damping", "gravity"} <= set(result.undetermined)
+
+
+@pytest.mark.parametrize("by", ["segments", "rollouts"])
+def test_any_system(by, swings):
+    result = calibrate(WRONG.replace(length=1.2, density=2.0, damping=0.0), swings, by=by)
+    for name, value in result.estimates.items():
+        assert value == pytest.approx(float(getattr(BAR, name)), rel=1e-7)
+    assert result.labels == ("length", "density", "stiffness", "damping", "drag")
+
+
+def test_b_not_zero_and_the_length():
+    """Rates along the rod belong to the history then, and follow the length."""
+    string = HangingString(length=1.0, density=0.1, stiffness=1e3, friction=0.05, nodes=21)
+    hand = np.array([0.6, -0.1]) + 0.05 * np.sin(np.pi * np.arange(1, 31) * DT)[:, None] ** 2
+    swing = kc.simulate(string, hand, DT, initial=kc.equilibrium(string, hand[0]))
+    result = calibrate(string.replace(density=0.2, friction=0.0, length=1.1), [swing])
+    for name, value in result.estimates.items():
+        assert value == pytest.approx(float(getattr(string, name)), rel=1e-7)
+
+
+class Stiffer(Residual):
+    """A residual that makes the strain smaller."""
+
+    factor: Any
+
+    def derivatives(self, knowledge, s, t, y, control, history):
+        z = 1.0 + self.factor * (knowledge.strains(s, t, y, control, history) - 1.0)
+        return knowledge.rates(s, t, y, z, control, history), z
+
+
+def test_the_knowledge_of_a_model(swings):
+    model = KNODE(WRONG, Stiffer(np.array(0.5)))
+    result = calibrate(model, [kc.simulate(model.replace(stiffness=20.0), swings[0].control[1:], 0.1)])
+    assert isinstance(result.robot, KNODE)
+    assert result.estimates["stiffness"] == pytest.approx(20.0, rel=1e-7)
+
+
+# noise
+
+
+def test_intervals_hold_the_truth(training):
+    """Noise in all states: intervals of 95 % hold in about as many cases, for every parameter."""
+    inside, errors = [], []
+    for seed in range(40):
+        result = calibrate(ROBOT.replace(youngs_modulus=4e9), noisy(training, 1e-2, seed), FOUR[:3])
+        pairs = [(result.intervals[name], np.max(getattr(ROBOT, name))) for name in FOUR[:3]]
+        inside.append([low <= value <= high for (low, high), value in pairs])
+        errors.append(
+            [result.estimates[name] / value - 1.0 for name, (_, value) in zip(FOUR, pairs, strict=False)]
+        )
+        assert not result.unexplained
+    assert np.all(np.mean(inside, axis=0) >= 0.85)
+    # and they are not idle: a part in a thousand, where the data have noise of a part in a hundred
+    assert np.all(np.std(errors, axis=0) < 1e-3)
+
+
+@pytest.mark.parametrize("by", ["segments", "rollouts"])
+def test_intervals_hold_the_truth_of_a_bar(by, swings):
+    names = ["stiffness", "density", "damping"]
+    inside, widths = {0.95: [], 0.5: []}, []
+    for seed in range(60):
+        data = noisy(swings, 1e-2, seed) if by == "segments" else as_measured(swings, 2e-3, seed)
+        for level, results in inside.items():
+            result = calibrate(BAR.replace(density=1.3), data, names, by=by, level=level)
+            pairs = [(result.intervals[name], float(getattr(BAR, name))) for name in names]
+            results.append([low <= value <= high for (low, high), value in pairs])
+        widths.append([result.standard_errors[name] for name in names])
+    assert np.all(np.mean(inside[0.95], axis=0) >= 0.85)
+    assert np.all(np.abs(np.mean(inside[0.5], axis=0) - 0.5) <= 0.2)
+    assert np.all(np.mean(widths, axis=0) < 0.1)
+
+
+def test_what_noise_does_on_average_is_taken_away(swings):
+    """Noise in the states hides accelerations, so that a bar seems lighter than it is."""
+    unknowns = unknowns_of(BAR, ["stiffness", "density", "damping"])
+    truth = searched(unknowns, values(BAR, unknowns))
+    raw, corrected, errors = [], [], []
+    for seed in range(40):
+        misfit = SegmentMisfit(BAR, noisy(swings, 5e-2, seed), unknowns)
+        ended = search.fit(misfit, truth, may_leave_out=False)
+        found_errors = errors_of(misfit, ended)
+        raw.append(ended.coordinates - truth)
+        corrected.append(raw[-1] - found_errors.shift)
+        errors.append(found_errors.standard)
+    spread = np.mean(errors, axis=0) / np.sqrt(len(errors))
+    density = 1
+    assert np.mean(raw, axis=0)[density] < -8.0 * spread[density]
+    assert np.all(np.abs(np.mean(corrected, axis=0)) < 4.0 * spread)
+
+
+@pytest.mark.parametrize(
+    ("time", "space"), [("bdf2", "euler"), ("bdf2", "rk4"), ("trapezoidal", "euler"), ("string", "euler")]
+)
+def test_how_states_enter_is_known_exactly(time, space):
+    """A small change of all states moves the differences as the covariance takes it to."""
+    if time == "string":
+        robot: kc.System = HangingString(length=1.3, density=0.1, stiffness=1e3, friction=0.05, nodes=5)
+        hand = np.array([0.6, -0.1]) + 0.05 * np.sin(np.pi * np.arange(1, 7) * DT)[:, None] ** 2
+        swing = kc.simulate(robot, hand, DT, initial=kc.equilibrium(robot, hand[0]))
+    else:
+        robot, swing = BAR, pulled(1.0, 8, time=time, space=space)
+    unknowns = unknowns_of(robot, None)
+    misfit = SegmentMisfit(robot, [swing, swing], unknowns)
+    rng, at = np.random.default_rng(0), searched(unknowns, values(robot, unknowns))
+    factors = rng.normal(size=(2, len(misfit.groups)))
+    changes = [(rng.normal(size=swing.y.shape), rng.normal(size=swing.z.shape)) for _ in range(2)]
+    slopes = by_states(misfit, at, factors)
+
+    def changed(size: float) -> Any:
+        data = [dataclasses.replace(swing, y=swing.y + size * y, z=swing.z + size * z) for y, z in changes]
+        return factors @ SegmentMisfit(robot, data, unknowns)(at).values
+
+    step = 1e-6
+    expected = (changed(step) - changed(-step)) / (2 * step)
+    predicted = sum(
+        np.sum(slope * np.concatenate(change, axis=-1), axis=(1, 2, 3))
+        for slope, change in zip(slopes, changes, strict=True)
+    )
+    np.testing.assert_allclose(predicted, expected, rtol=1e-5)
+
+
+def test_rollouts_need_positions_and_orientations_only():
+    """Signs and lengths of quaternions do not matter; what was not measured may be missing."""
+    robot = ROBOT.replace(nodes=6)
+    swing = kc.simulate(robot, kc.controls.sine(1.0, 20, DT), DT)
+    [measured] = as_measured([swing], 0.0, 0)
+    turned = np.array(measured.y)
+    turned[..., 3:7] *= -1.7
+    begin = robot.replace(youngs_modulus=10e9, length=0.4)
+    result = calibrate(begin, [dataclasses.replace(measured, y=turned)], FOUR[:3], by="rollouts")
+    assert result.estimates["youngs_modulus"] == pytest.approx(2.757903e9, rel=1e-8)
+    assert result.estimates["length"] == pytest.approx(0.635, rel=1e-8)
+    assert result.estimates["bending_damping"] == pytest.approx(0.03, rel=1e-8)
+    assert set(result.remainder) == {"position", "orientation"}
+
+
+def test_rollouts_go_on_from_where_data_begin(swings):
+    result = calibrate(WRONG, [swing[6:] for swing in swings], ["stiffness", "drag"], by="rollouts")
+    assert result.estimates["stiffness"] == pytest.approx(20.0, rel=1e-7)
+    assert result.estimates["drag"] == pytest.approx(0.5, rel=1e-7)
+
+
+# what is said
+
+
+def test_the_table(swings):
+    result = calibrate(WRONG, noisy(swings, 1e-2, 0), ["stiffness", "drag"], level=0.9)
+    head, _, stiffness, drag = str(result).splitlines()
+    assert head.split() == ["parameter", "unit", "before", "estimate", "90", "%", "interval"]
+    assert stiffness.split()[:3] == ["stiffness", "N", "30"] and drag.split()[:3] == ["drag", "kg/m2", "0"]
+    low, high = result.intervals["stiffness"]
+    _, _, _, estimate, shown_low, to, shown_high = stiffness.split()
+    assert to == "to"
+    for shown, value in ((estimate, result.estimates["stiffness"]), (shown_low, low), (shown_high, high)):
+        assert float(shown) == pytest.approx(value, abs=0.1 * result.standard_errors["stiffness"])
+    assert float(result.robot.stiffness) == result.estimates["stiffness"]
+    assert result.correlation.shape == (2, 2) and result.correlation[0, 0] == pytest.approx(1.0)
+    assert abs(result.correlation[0, 1]) < 1.0
+
+
+def test_what_the_parameters_cannot_explain_is_said(swings):
+    enough = calibrate(WRONG, noisy(swings, 1e-3, 0), ["stiffness", "drag"])
+    assert enough.unexplained == ()
+    shorter = WRONG.replace(length=0.9)
+    missing = calibrate(shorter, noisy(swings, 1e-3, 0), ["stiffness", "drag"])
+    assert "p" in missing.unexplained
+    assert "not explained: what is left in p" in str(missing)
+
+
+class Ropes(Bar):
+    """A bar of so many ropes; the colour is for the eye."""
+
+    ropes: Any = kc.parameter("1", "how many", low=0.1, high=100.0, default=1.0)
+    colour: Any = kc.parameter("1", "not used", low=0.0, high=1.0, default=0.5)
+
+    def strains(self, s, t, y, control, history):
+        every = self.replace(stiffness=self.stiffness * self.ropes, damping=self.damping * self.ropes)
+        return Bar.strains(every, s, t, y, control, history)
+
+
+ROPES = Ropes(length=1.0, density=1.0, stiffness=30.0, damping=0.4, nodes=6)
+
+
+def test_what_data_cannot_tell_apart_is_named(swings):
+    with pytest.raises(
+        CalibrationError,
+        match=r"^these data determine only a combination of stiffness, damping and ropes; leave one of",
+    ):
+        calibrate(ROPES, swings, ["stiffness", "damping", "density", "ropes"])
+    with pytest.raises(
+        CalibrationError, match=r"^colour has no effect on these data; leave it out of names$"
+    ):
+        calibrate(ROPES, swings, ["stiffness", "colour"])
+    result = calibrate(ROPES, swings)
+    assert set(result.undetermined) == {"colour", "ropes"}
+    assert "not determined by these data: colour, ropes" in str(result)
+    assert result.estimates["stiffness"] == pytest.approx(20.0, rel=1e-7)
+
+
+def test_data_without_motion_do_not_tell_the_drag():
+    still = kc.simulate(BAR, np.ones((20, 1)), 0.1, initial=kc.equilibrium(BAR, np.ones(1)))
+    with pytest.raises(CalibrationError, match=r"^these data do not determine drag; leave it out of names$"):
+        calibrate(BAR, [still], ["stiffness", "drag"])
+
+
+class Soft(Bar):
+    """A bar that may not be as stiff as it is."""
+
+    stiffness: Any = kc.parameter("N", "EA", low=1e-3, high=15.0)
+
+
+def test_the_end_of_the_allowed_range_is_no_estimate(swings):
+    soft = Soft(length=1.0, density=1.0, stiffness=10.0, nodes=6)
+    with pytest.raises(
+        CalibrationError, match=r"^stiffness ran to the end of its allowed range, 15; leave it out"
+    ):
+        calibrate(soft, swings, ["stiffness"])
+
+
+def test_a_search_that_does_not_end_says_so(swings, monkeypatch):
+    monkeypatch.setattr(search, "MOST_EVALUATIONS", 2)
+    with pytest.raises(
+        CalibrationError, match=r"^the search did not converge in 2 evaluations; begin closer"
+    ):
+        calibrate(WRONG, swings, ["stiffness", "drag"])
+
+
+def test_noise_that_hides_a_parameter_is_said(swings):
+    """Accelerations that drown in noise make a mass of nothing: an estimate would be a lie."""
+    still = pulled(200.0)
+    data = noisy([still, still], 1.0, 0)
+    with pytest.raises(
+        CalibrationError, match=r"^(noise in these states hides|these data do not determine) density"
+    ):
+        calibrate(BAR, data, ["stiffness", "density", "damping"])
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (["youngs_modulus"], r"^Bar has no parameter 'youngs_modulus'; there are length, density, stiffness"),
+        ("stiffness", r"^names is 'stiffness'; allowed is a list of parameters: length"),
+        ([], r"^names is \[\]; allowed is a list"),
+        (["drag", "drag"], r"^names has drag twice$"),
+        ([3], r"^Bar has no parameter 3;"),
+    ],
+)
+def test_names_that_are_not_allowed(swings, names, message):
+    with pytest.raises(kc.ParameterError, match=message):
+        calibrate(BAR, swings, names)
+
+
+def test_other_arguments_that_are_not_allowed(swings):
+    with pytest.raises(DataError, match=r"^trajectories is a Trajectory; allowed is a list"):
+        calibrate(BAR, swings[0], ["drag"])
+    with pytest.raises(DataError, match=r"^there are no trajectories"):
+        calibrate(BAR, [], ["drag"])
+    with pytest.raises(CalibrationError, match=r"^robot is a list; allowed is one robot$"):
+        calibrate([BAR], swings, ["drag"])
+    with pytest.raises(CalibrationError, match=r"^by is 'bars'; allowed is"):
+        calibrate(BAR, swings, ["drag"], by="bars")
+    for level in (0.0, 1.0, 95, "much", True):
+        with pytest.raises(CalibrationError, match=r"^level is .* allowed is a number between 0 and 1$"):
+            calibrate(BAR, swings, ["drag"], level=level)
+
+
+@pytest.mark.parametrize("by", ["segments", "rollouts"])
+def test_data_that_are_not_finite(swings, by):
+    y = np.array(swings[0].y)
+    y[4, 2, 0] = np.nan
+    with pytest.raises(DataError, match=r"^trajectory 0 has y that is not finite in row 4"):
+        calibrate(BAR, [dataclasses.replace(swings[0], y=y)], ["drag"], by=by)
+    with pytest.raises(
+        DataError, match=r"^trajectory 0 has 10 nodes of 19 numbers; the knowledge has 6 of 3$"
+    ):
+        calibrate(BAR, [kc.simulate(ROBOT, kc.controls.sine(1.0, 5, DT), DT)], ["drag"], by=by)
+
+
+# parameters as numbers
+
+
+def test_matrices_and_vectors_as_numbers():
+    robot = ROBOT.replace(bending_damping=[0.03, 0.04, 0.05])
+    unknowns = unknowns_of(robot, ["bending_damping", "drag", "gravity", "radius"])
+    assert [unknown.kind for unknown in unknowns] == ["diagonal", "multiple", "components", "number"]
+    numbers = values(robot, unknowns)
+    np.testing.assert_array_equal(numbers, [0.03, 0.04, 0.05, 1e-4, 0.0, 0.0, -9.81, 0.003175])
+    np.testing.assert_allclose(found(unknowns, searched(unknowns, numbers)), numbers, rtol=1e-14)
+    changed = with_numbers(robot, unknowns, np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0]))
+    np.testing.assert_array_equal(changed.bending_damping, np.diag([1.0, 2.0, 3.0]))
+    np.testing.assert_array_equal(changed.drag, 4.0 * np.eye(3))
+    np.testing.assert_array_equal(changed.gravity, [5.0, 6.0, 7.0])
+    assert changed.radius == 0.5  # the most that is allowed
+    full = np.diag([0.03, 0.04, 0.05])
+    full[0, 1] = full[1, 0] = 1e-3
+    with pytest.raises(
+        kc.ParameterError, match=r"^bending_damping is a matrix with more than a diagonal; allowed is"
+    ):
+        unknowns_of(ROBOT.replace(bending_damping=full), ["bending_damping"])
+    with pytest.raises(
+        kc.ParameterError, match=r"^shear_modulus has no value: it follows from other parameters"
+    ):
+        unknowns_of(ROBOT, ["shear_modulus"])
+    assert "shear_modulus" not in [unknown.name for unknown in unknowns_of(ROBOT, None)]
