@@ -15,7 +15,7 @@ by least squares, and each can be read.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -50,6 +50,9 @@ class Term(NamedTuple):
 
 class Expansion(eqx.Module):
     """What some functions of a packed vector (x,) add up to: (outputs,)."""
+
+    #: what gradient training leaves alone
+    fixed: ClassVar[tuple[str, ...]] = ("scales",)
 
     #: (outputs, 1 + features), the constant first
     weights: Float[Any, "outputs features"]

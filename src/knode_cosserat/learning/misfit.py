@@ -17,12 +17,12 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.learning.samples import Dataset, Samples, TipSamples, predict, samples
-from knode_cosserat.learning.unknowns import Unknowns, with_coordinates
+from knode_cosserat.learning.unknowns import Unknowns, found, with_coordinates, with_numbers
 from knode_cosserat.rods.system import System, unpacked_history
 from knode_cosserat.trajectory import Trajectory
 
-#: the solver's tolerance, of natural sizes: what is less than this is not measured
-LEAST = 1e-10
+#: ten times the solver's tolerance, of natural sizes: what is less is its error, and not even white
+LEAST = 1e-9
 #: draws of noise; what is found with both signs of each hardly depends on how many there are
 DRAWS = 6
 
@@ -97,6 +97,9 @@ def _pulled_back(robot, coordinates, data, length, unknowns, space, factors):  #
 class SegmentMisfit:
     """One-segment predictions: y at the segment's end, z at its start, and the tip's conditions."""
 
+    #: whether a search must not go far at once
+    cautious = False
+
     def __init__(self, robot: System, trajectories: Sequence[Trajectory], unknowns: Unknowns):
         self.robot, self.unknowns, self.trajectories = robot, unknowns, list(trajectories)
         self.data: Dataset = samples(robot, trajectories)
@@ -163,7 +166,8 @@ class SegmentMisfit:
 
         z follows from y without an error of its own.
         """
-        natural = LEAST * np.asarray(self.robot.scales().y)
+        system = with_numbers(self.robot, self.unknowns, found(self.unknowns, coordinates))
+        natural = LEAST * np.asarray(system.scales().y)
         noise = np.concatenate([natural, np.zeros(self.robot.z_layout.size)])
         change = self(coordinates, self.moved(self.draws[0], noise)).values - self(coordinates).values
         return np.sqrt(by_group(np.square(change), self.groups))

@@ -47,8 +47,11 @@ def errors_of(misfit: Misfit, ended: Fit) -> Errors:
         return Errors(inverse * len(slopes) / freedom, np.zeros(len(inverse)))
     sizes = noise_sizes(misfit, ended)
     covariance = np.zeros_like(inverse)
-    for effects in by_states(misfit, ended.coordinates, inverse @ slopes.T * weights):
-        each = (sizes * effects).reshape(len(inverse), -1)
+    # of what was left out too, which is zero: one compiled program whatever is left out
+    moves = np.zeros((len(ended.free), len(weights)))
+    moves[ended.free] = inverse @ slopes.T * weights
+    for effects in by_states(misfit, ended.coordinates, moves):
+        each = (sizes * effects[ended.free]).reshape(len(inverse), -1)
         covariance += each @ each.T
     return Errors(covariance, _shift(misfit, ended, sizes))
 

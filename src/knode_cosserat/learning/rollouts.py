@@ -99,6 +99,9 @@ class RolloutMisfit:
     from its own first rows, which then have to be states without noise.
     """
 
+    #: whether a search must not go far at once: simulations of a robot that is far off lead astray
+    cautious = True
+
     def __init__(self, robot: System, trajectories: Sequence[Trajectory], unknowns: Unknowns):
         self.robot, self.unknowns = robot, unknowns
         y = np.zeros(robot.y_layout.size)

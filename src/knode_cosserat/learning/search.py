@@ -81,7 +81,7 @@ def fit(
         gap = _gap(misfit, Fit(start, free, (), misfit.first_sizes(), np.zeros(0)), np.inf)
         if gap is None:
             converged, ended = _search(misfit, start, free)
-            gap = _gap(misfit, ended, POOR if may_leave_out else HOPELESS)
+            gap = _gap(misfit, ended, np.inf if not converged else POOR if may_leave_out else HOPELESS)
             if gap is None and converged:
                 _check_range(misfit, ended)
                 return ended._replace(left_out=left_out)
@@ -124,11 +124,12 @@ def _least_squares(
     weights = _inverse(sizes)[misfit.groups]
     low, high = (searched(misfit.unknowns, end)[free] for end in limits(misfit.robot, misfit.unknowns))
     begin = np.clip(start[free], low, high)
+    origin, reach = np.zeros(len(begin)), np.ones(len(begin))
     last: dict[bytes, np.ndarray] = {}
 
     def whole(x: np.ndarray) -> np.ndarray:
         full = start.copy()
-        full[free] = np.clip(begin + x * reach, low, high)
+        full[free] = np.clip(origin + x * reach, low, high)
         return full
 
     def reduced(x: np.ndarray) -> np.ndarray:
@@ -136,10 +137,10 @@ def _least_squares(
         if x.tobytes() not in last:
             there = misfit(whole(x))
             columns = np.column_stack([there.slopes[:, free] * reach, there.values]) * weights[:, None]
-            last.clear()
             triangle: Any = np.full((len(x) + 1, len(x) + 1), np.inf)
             if np.all(np.isfinite(columns)):
                 triangle = np.linalg.qr(columns, mode="r")
+            last.clear()
             last[x.tobytes()] = triangle
         return last[x.tobytes()]
 
@@ -149,19 +150,20 @@ def _least_squares(
     def slopes(x: np.ndarray) -> np.ndarray:
         return reduced(x)[:, :-1]
 
-    reach = np.ones(len(begin))
-    first = reduced(np.zeros(len(begin)))
+    first = reduced(begin)
     if not np.all(np.isfinite(first)):
         raise CalibrationError("the robot that the search begins from has no solution under these controls")
-    # the first step goes no further than a factor of e, than a number's own size or, if that is zero, than
-    # what it would do by itself: simulations of a robot far from the real one lead astray
-    alone = np.linalg.norm(first[:, -1]) * _inverse(np.linalg.norm(first[:, :-1], axis=0))
-    own = np.where(begin != 0.0, np.abs(begin), np.where(alone > 0.0, alone, 1.0))
-    reach = np.where(logarithmic(misfit.unknowns)[free], 1.0, own)
-    last.clear()
+    if misfit.cautious:
+        # the search's first step is as long as one: a factor of e, a number's own size or, if that is zero,
+        # what the number would do by itself
+        alone = np.linalg.norm(first[:, -1]) * _inverse(np.linalg.norm(first[:, :-1], axis=0))
+        own = np.where(begin != 0.0, np.abs(begin), np.where(alone > 0.0, alone, 1.0))
+        origin, reach = begin, np.where(logarithmic(misfit.unknowns)[free], 1.0, own)
+        last.clear()
     ended = least_squares(
-        heights, np.zeros(len(begin)), slopes, ((low - begin) / reach, (high - begin) / reach),
-        ftol=1e-15, xtol=1e-12, gtol=1e-15, max_nfev=MOST_EVALUATIONS,
+        heights, (begin - origin) / reach, slopes, ((low - origin) / reach, (high - origin) / reach),
+        x_scale=1.0 if misfit.cautious else "jac", ftol=1e-15, xtol=1e-12, gtol=1e-15,
+        max_nfev=MOST_EVALUATIONS,
     )  # fmt: skip
     return ended.status > 0, whole(ended.x)
 
@@ -217,7 +219,7 @@ def _check_range(misfit: Misfit, ended: Fit) -> None:
         end = high[k] if high[k] - numbers[k] < numbers[k] - low[k] else low[k]
         if ended.free[k] and end != 0.0 and abs(numbers[k] - end) <= 1e-6 * abs(end):
             raise CalibrationError(
-                f"{label} ran to the end of its allowed range, {end:g}: the data ask for more"
+                f"{label} ran to the end of its allowed range, {end:g}; leave it out of names"
             )
 
 

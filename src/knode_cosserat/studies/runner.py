@@ -236,5 +236,5 @@ def _on_dask(jobs: Sequence[Job], address: str) -> Iterator[tuple[Job, _Done]]:
         except TimeoutError:
             raise StudyError(f"the Dask cluster at {address!r} has no workers") from None
         futures = {client.submit(_do, job.work, job.settings, pure=False): job for job in jobs}
-        for future in as_completed(futures):
+        for future in as_completed(futures, loop=client.loop):
             yield futures[future], future.result()
