@@ -123,13 +123,14 @@ def calibrate(
     """
     _check(robot, trajectories, by, level)
     unknowns = unknowns_of(robot, names)
+    start = searched(unknowns, values(robot, unknowns))
     if by == "segments":
         misfit: Misfit = SegmentMisfit(robot, trajectories, unknowns)
-        start = values(robot, unknowns)
     else:
-        misfit = RolloutMisfit(robot, trajectories, unknowns)
-        start = _by_segments(robot, trajectories, unknowns)
-    return _calibration(misfit, *_ended(misfit, searched(unknowns, start), names is None), level)
+        near = _by_segments(robot, trajectories, unknowns)
+        misfit = RolloutMisfit(robot, trajectories, unknowns, near is not None)
+        start = start if near is None else near
+    return _calibration(misfit, *_ended(misfit, start, names is None), level)
 
 
 def _check(robot: Any, trajectories: Any, by: Any, level: Any) -> None:
@@ -145,14 +146,13 @@ def _check(robot: Any, trajectories: Any, by: Any, level: Any) -> None:
         raise CalibrationError(f"{type(owner_of(robot)).__name__} has no parameters")
 
 
-def _by_segments(robot: System, trajectories: Sequence[Trajectory], unknowns: Unknowns) -> np.ndarray:
-    """Where segments lead; where the robot is, if that is nowhere or not everything was measured."""
+def _by_segments(robot: System, trajectories: Sequence[Trajectory], unknowns: Unknowns) -> np.ndarray | None:
+    """Where segments lead, if they lead anywhere and all that they need was measured."""
     try:
         misfit = SegmentMisfit(robot, trajectories, unknowns)
-        ended = search.fit(misfit, searched(unknowns, values(robot, unknowns)), may_leave_out=True)
+        return search.fit(misfit, searched(unknowns, values(robot, unknowns)), may_leave_out=True).coordinates
     except (CalibrationError, DataError):
-        return values(robot, unknowns)
-    return found(unknowns, ended.coordinates)
+        return None
 
 
 def _ended(misfit: Misfit, start: np.ndarray, may_leave_out: bool) -> tuple[Fit, Errors]:

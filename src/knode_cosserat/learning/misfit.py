@@ -148,6 +148,10 @@ class SegmentMisfit:
         )
         return jax.tree.map(np.asarray, pulled)
 
+    def beginnings(self) -> list[Float[np.ndarray, " M"]]:
+        """Which differences count in searches that lead to where that of all begins: there are none."""
+        return []
+
     def first_sizes(self) -> Float[np.ndarray, " G"]:
         """Sizes of the differences, by field, before anything is known: how much the data vary there."""
         segments = self.data.segments

@@ -28,6 +28,12 @@ from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.simulate import _beginning, _Run
 from knode_cosserat.trajectory import Trajectory
 
+#: a far start is brought near on the first two rows, then on this many times as many, and so on
+GROWTH = 2
+
+#: how many rows are looked at first
+FIRST_ROWS = (2, 5, 10, 20, 50, 100)
+
 
 class _Rollout(NamedTuple):
     """One trajectory to be simulated again."""
@@ -102,8 +108,11 @@ class RolloutMisfit:
     #: whether a search must not go far at once: simulations of a robot that is far off lead astray
     cautious = True
 
-    def __init__(self, robot: System, trajectories: Sequence[Trajectory], unknowns: Unknowns):
-        self.robot, self.unknowns = robot, unknowns
+    def __init__(
+        self, robot: System, trajectories: Sequence[Trajectory], unknowns: Unknowns, near: bool = False
+    ):
+        """`near`: a search begins where the robot is close to the real one."""
+        self.robot, self.unknowns, self.near = robot, unknowns, near
         y = np.zeros(robot.y_layout.size)
         try:
             sizes = [np.size(robot.positions(y))]
@@ -154,6 +163,19 @@ class RolloutMisfit:
         ends = np.cumsum(counts) * (len(self.groups) // sum(counts))
         parts = zip(np.split(values, ends[:-1]), np.split(self.groups, ends[:-1]), counts, strict=True)
         return [(groups.reshape(count, -1)[0], mine.reshape(count, -1)) for mine, groups, count in parts]
+
+    def beginnings(self) -> list[Float[np.ndarray, " M"]]:
+        """Which differences count in searches that lead to where that of all begins: more rows each time.
+
+        A robot that is far from the real one is soon anywhere, and all rows together lead to a limp robot
+        that hangs in the middle. The first rows tell the way.
+        """
+        if self.near:
+            return []
+        counts = [rollout.y.shape[0] for rollout in self.rollouts]
+        rows = np.concatenate([np.arange(count) for count in counts])
+        rows = np.repeat(rows, len(self.groups) // len(rows))
+        return [(rows < last).astype(float) for last in FIRST_ROWS if last < max(counts)]
 
     def first_sizes(self) -> Float[np.ndarray, " G"]:
         """Sizes of the differences, by field, before anything is known: of positions, the length."""

@@ -17,6 +17,8 @@ Misfit = SegmentMisfit | RolloutMisfit
 PASSES = 5
 #: evaluations of one search
 MOST_EVALUATIONS = 100
+#: steps, in natural sizes, at which a search ends: the last one, and those that only lead to its start
+FINE, ROUGH = 1e-12, 1e-3
 #: a combination of parameters is not determined if it does less than this part of what each does alone
 FLAT = 1e-8
 #: nor is a positive parameter if the standard error of its logarithm is above this
@@ -104,6 +106,8 @@ def _search(misfit: Misfit, start: np.ndarray, free: np.ndarray) -> tuple[bool, 
     """Searches one after the other, each with the sizes of what the last one left as weights."""
     sizes, least = misfit.first_sizes(), np.zeros(len(misfit.fields))
     coordinates, converged, left = start, True, sizes
+    for mask in misfit.beginnings():
+        _, coordinates = _least_squares(misfit, coordinates, free, sizes, mask, ROUGH)
     for _ in range(PASSES):
         converged, coordinates = _least_squares(misfit, coordinates, free, sizes)
         least = misfit.least_sizes(coordinates)
@@ -115,13 +119,18 @@ def _search(misfit: Misfit, start: np.ndarray, free: np.ndarray) -> tuple[bool, 
 
 
 def _least_squares(
-    misfit: Misfit, start: np.ndarray, free: np.ndarray, sizes: np.ndarray
+    misfit: Misfit,
+    start: np.ndarray,
+    free: np.ndarray,
+    sizes: np.ndarray,
+    mask: Any = 1.0,
+    tolerance: float = FINE,
 ) -> tuple[bool, np.ndarray]:
-    """Whether the search converged, and where it ended."""
+    """Whether the search converged, and where it ended; `mask` says which differences count."""
     # imported here: it takes a third of a second
     from scipy.optimize import least_squares
 
-    weights = _inverse(sizes)[misfit.groups]
+    weights = mask * _inverse(sizes)[misfit.groups]
     low, high = (searched(misfit.unknowns, end)[free] for end in limits(misfit.robot, misfit.unknowns))
     begin = np.clip(start[free], low, high)
     origin, reach = np.zeros(len(begin)), np.ones(len(begin))
@@ -162,8 +171,8 @@ def _least_squares(
         last.clear()
     ended = least_squares(
         heights, (begin - origin) / reach, slopes, ((low - origin) / reach, (high - origin) / reach),
-        x_scale=1.0 if misfit.cautious else "jac", ftol=1e-15, xtol=1e-12, gtol=1e-15,
-        max_nfev=MOST_EVALUATIONS,
+        x_scale=1.0 if misfit.cautious else "jac", ftol=1e-3 * tolerance, xtol=tolerance,
+        gtol=1e-15, max_nfev=MOST_EVALUATIONS,
     )  # fmt: skip
     return ended.status > 0, whole(ended.x)
 
