@@ -17,16 +17,14 @@ import dataclasses
 import difflib
 import importlib.resources
 import os
-import re
-import reprlib
 from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-import yaml
 
+from knode_cosserat._yaml import YAMLTextError, did_you_mean, flow, mapping_of, shown
 from knode_cosserat.rods.parameters import Parameter, ParameterError, checked
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.tendon_robot import TendonRobot
@@ -105,21 +103,21 @@ def parse_robot(text: str, source: str) -> System:
     number = file.get("format", FORMAT)
     if number != FORMAT or isinstance(number, bool):
         raise RobotFileError(
-            f"{source}: format is {_shown(number)}; allowed is {FORMAT}, the format that this version reads"
+            f"{source}: format is {shown(number)}; allowed is {FORMAT}, the format that this version reads"
         )
     known = ("format", "kind", "description", "parameters")
     _require_keys(file, source, known=known, required=("format", "kind", "parameters"))
     for key in ("kind", "description"):
         if not isinstance(file.get(key, ""), str):
-            raise RobotFileError(f"{source}: {key} is {_shown(file[key])}; allowed is text")
+            raise RobotFileError(f"{source}: {key} is {shown(file[key])}; allowed is text")
     kind, values = file["kind"], file["parameters"]
     if kind not in KINDS:
         raise RobotFileError(
-            f"{source}: kind is {kind!r}; allowed is {', '.join(KINDS)}{_did_you_mean(kind, KINDS)}"
+            f"{source}: kind is {kind!r}; allowed is {', '.join(KINDS)}{did_you_mean(kind, KINDS)}"
         )
     if not isinstance(values, dict):
         raise RobotFileError(
-            f"{source}: parameters is {_shown(values)}; allowed is a mapping from names to values"
+            f"{source}: parameters is {shown(values)}; allowed is a mapping from names to values"
         )
     return _robot(KINDS[kind], values, source)
 
@@ -139,7 +137,7 @@ def _robot(cls: type[System], values: dict[Any, Any], source: str) -> System:
         if key in stated:
             _require_allowed(key, value, stated[key], source)
         elif not isinstance(value, int):
-            raise RobotFileError(f"{source}: {key} is {_shown(value)}; allowed is a whole number, 2 or more")
+            raise RobotFileError(f"{source}: {key} is {shown(value)}; allowed is a whole number, 2 or more")
     try:
         return cls(**values)
     except ParameterError as error:
@@ -150,28 +148,14 @@ def _require_keys(mapping: dict[Any, Any], source: str, *, known: Any, required:
     for key in mapping:
         if key not in known:
             raise RobotFileError(
-                f"{source}: the key {_shown(key)} is unknown; allowed is {', '.join(known)}"
-                f"{_did_you_mean(key, known)}"
+                f"{source}: the key {shown(key)} is unknown; allowed is {', '.join(known)}"
+                f"{did_you_mean(key, known)}"
             )
     missing = [key for key in required if key not in mapping]
     if missing:
         raise RobotFileError(
             f"{source}: the key {missing[0]!r} is missing; required is {', '.join(required)}"
         )
-
-
-def _did_you_mean(given: Any, known: Any) -> str:
-    close = difflib.get_close_matches(str(given), list(known), n=1)
-    return f"; did you mean {close[0]}?" if close else ""
-
-
-def _shown(value: Any) -> str:
-    """A value in one line of bounded length: a file can hold what would print without end."""
-    short = reprlib.Repr()
-    short.maxstring = short.maxother = 60
-    short.maxlevel = 3
-    shown = short.repr(value)
-    return shown if len(shown) <= 250 else shown[:250] + "…"
 
 
 # values
@@ -186,7 +170,7 @@ def _require_allowed(key: str, value: Any, parameter: Parameter, source: str) ->
     except ParameterError:
         why = ", not symmetric" if _asymmetric(array, parameter) else ""
         raise RobotFileError(
-            f"{source}: {key} is {_shown(value)}{why}; allowed is {parameter.allowed}"
+            f"{source}: {key} is {shown(value)}{why}; allowed is {parameter.allowed}"
             f"{_unit_hint(value, array, parameter)}"
         ) from None
 
@@ -235,7 +219,7 @@ def _unit_hint(value: Any, array: np.ndarray | None, parameter: Parameter) -> st
         scaled = array * factor
         if np.all((low <= scaled) & (scaled <= high)):
             meant = np.vectorize(lambda number: float(f"{number:.12g}"))(scaled).tolist()
-            return f"; did you mean {_shown(value)} {unit} = {_shown(meant)} {parameter.unit}?"
+            return f"; did you mean {shown(value)} {unit} = {shown(meant)} {parameter.unit}?"
     return ""
 
 
@@ -255,12 +239,12 @@ def format_robot(robot: System, description: str = "") -> str:
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(robot)):
         raise RobotFileError("a robot cannot be written to a file inside jit, grad or vmap")
     head = {"format": FORMAT, "kind": kind, "description": description}
-    lines = [f"{key}: {_flow(value)}" for key, value in head.items() if value != ""]
+    lines = [f"{key}: {flow(value)}" for key, value in head.items() if value != ""]
     lines.append("parameters:")
     for name, parameter in robot.parameters().items():
         value = getattr(robot, name)
         if value is not None:
-            lines.append(f"  {name}: {_flow(_plain(value))}  # {parameter.unit}, {parameter.meaning}")
+            lines.append(f"  {name}: {flow(_plain(value))}  # {parameter.unit}, {parameter.meaning}")
     lines.append(f"  nodes: {robot.nodes}  # base and tip included")
     return "\n".join(lines) + "\n"
 
@@ -274,59 +258,12 @@ def _plain(value: Any) -> Any:
     return array.tolist()
 
 
-def _flow(value: Any) -> str:
-    """A value as YAML on one line."""
-    readable = not isinstance(value, str) or value.isprintable()
-    listed = yaml.safe_dump([value], default_flow_style=True, width=float("inf"), allow_unicode=readable)
-    return str(listed).strip()[1:-1]
-
-
 # YAML
-
-
-class _Loader(yaml.SafeLoader):
-    """Safe, with the scalars of YAML 1.2 and no key twice."""
-
-    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-        seen: set[str] = set()
-        for key, _ in node.value if isinstance(node, yaml.MappingNode) else ():
-            if isinstance(key, yaml.ScalarNode):
-                if key.value in seen:
-                    raise yaml.constructor.ConstructorError(
-                        None, None, f"the key {_shown(key.value)} is there twice", key.start_mark
-                    )
-                seen.add(key.value)
-        return super().construct_mapping(node, deep)
-
-
-_Loader.yaml_implicit_resolvers = {}
-for _tag, _pattern, _first in (
-    ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
-    ("bool", r"true|True|TRUE|false|False|FALSE", list("tTfF")),
-    ("int", r"[-+]?(0|[1-9][0-9]*)", list("-+0123456789")),
-    (
-        "float",
-        r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
-        list("-+.0123456789"),
-    ),
-):
-    _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"(?:{_pattern})$"), _first)
 
 
 def _mapping(text: str, source: str) -> dict[Any, Any]:
     """The file's outermost mapping."""
     try:
-        content = yaml.load(text, _Loader)
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark or error.context_mark
-        line = f" line {mark.line + 1}:" if mark else ""
-        raise RobotFileError(f"{source}:{line} not YAML: {error.problem}") from None
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise RobotFileError(f"{source}: not YAML: {reason}") from None
-    if not isinstance(content, dict):
-        found = "empty" if content is None else _shown(content)
-        raise RobotFileError(
-            f"{source}: the file is {found}; allowed is a mapping with format, kind and parameters"
-        )
-    return content
+        return mapping_of(text, "format, kind and parameters")
+    except YAMLTextError as error:
+        raise RobotFileError(f"{source}: {error}") from None

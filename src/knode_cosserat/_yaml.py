@@ -1,0 +1,86 @@
+"""YAML files of settings, read safely: the scalars of YAML 1.2, no key twice, and what is said of a value."""
+
+from __future__ import annotations
+
+import difflib
+import re
+import reprlib
+from typing import Any
+
+import yaml
+
+
+class YAMLTextError(ValueError):
+    """A text that is not YAML, or not a mapping; the message says why and names no file."""
+
+
+def mapping_of(text: str, keys: str) -> dict[Any, Any]:
+    """The outermost mapping of a text; `keys` names some of its keys, for the error.
+
+    Raises:
+        YAMLTextError: the text is not YAML, or holds something else.
+    """
+    try:
+        content = yaml.load(text, _Loader)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        line = f" line {mark.line + 1}:" if mark else ""
+        raise YAMLTextError(f"{line} not YAML: {error.problem}".strip()) from None
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise YAMLTextError(f"not YAML: {reason}") from None
+    if not isinstance(content, dict):
+        found = "empty" if content is None else shown(content)
+        raise YAMLTextError(f"the file is {found}; allowed is a mapping with {keys}")
+    return content
+
+
+def flow(value: Any) -> str:
+    """A value as YAML on one line."""
+    readable = not isinstance(value, str) or value.isprintable()
+    listed = yaml.safe_dump([value], default_flow_style=True, width=float("inf"), allow_unicode=readable)
+    return str(listed).strip()[1:-1]
+
+
+def shown(value: Any) -> str:
+    """A value in one line of bounded length: a file can hold what would print without end."""
+    short = reprlib.Repr()
+    short.maxstring = short.maxother = 60
+    short.maxlevel = 3
+    text = short.repr(value)
+    return text if len(text) <= 250 else text[:250] + "…"
+
+
+def did_you_mean(given: Any, known: Any) -> str:
+    """The end of an error about an unknown name: the known one that is close to it, if one is."""
+    close = difflib.get_close_matches(str(given), list(known), n=1)
+    return f"; did you mean {close[0]}?" if close else ""
+
+
+class _Loader(yaml.SafeLoader):
+    """Safe, with the scalars of YAML 1.2 and no key twice."""
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        seen: set[str] = set()
+        for key, _ in node.value if isinstance(node, yaml.MappingNode) else ():
+            if isinstance(key, yaml.ScalarNode):
+                if key.value in seen:
+                    raise yaml.constructor.ConstructorError(
+                        None, None, f"the key {shown(key.value)} is there twice", key.start_mark
+                    )
+                seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
+_Loader.yaml_implicit_resolvers = {}
+for _tag, _pattern, _first in (
+    ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
+    ("bool", r"true|True|TRUE|false|False|FALSE", list("tTfF")),
+    ("int", r"[-+]?(0|[1-9][0-9]*)", list("-+0123456789")),
+    (
+        "float",
+        r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
+        list("-+.0123456789"),
+    ),
+):
+    _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"(?:{_pattern})$"), _first)
