@@ -1,5 +1,29 @@
 """Recordings of robots: what was measured, on one clock and in the robot's frame."""
 
-from knode_cosserat.recordings.table import RecordingError, TipRecording, load_example, load_table
+from knode_cosserat.recordings.config import (
+    BaseSource,
+    CommandSource,
+    MarkerSource,
+    RecordingConfig,
+    TensionSource,
+)
+from knode_cosserat.recordings.findings import Finding, RecordingError
+from knode_cosserat.recordings.load import load_example, load_recording
+from knode_cosserat.recordings.measurements import Measurements
+from knode_cosserat.recordings.recording import Body, Recording, Tensions
 
-__all__ = ["RecordingError", "TipRecording", "load_example", "load_table"]
+__all__ = [
+    "BaseSource",
+    "Body",
+    "CommandSource",
+    "Finding",
+    "MarkerSource",
+    "Measurements",
+    "Recording",
+    "RecordingConfig",
+    "RecordingError",
+    "TensionSource",
+    "Tensions",
+    "load_example",
+    "load_recording",
+]

@@ -1,124 +1,83 @@
-"""Recordings as tables of tensions and tip positions, and the one that comes with the package.
+"""Recordings as tables, CSV or Parquet: columns with names and units, and what is said of all of them.
 
-A CSV file, UTF-8, with comments before its header:
+A CSV file, UTF-8, with comments before its header; a Parquet file has the same as metadata of its schema:
 
     # source: what the recording is and where it comes from
     # simulated: true
-    time [s],tension_1 [N],tension_2 [N],…,tip_x [m],tip_y [m],tip_z [m]
+    # fraction rib: 0.5
+    # fraction tip: 1
+    # latency: 0.06
+    time [s],tension_1 [N],tension_2 [N],…,command_1 [N],…,rib_x [m],rib_y [m],rib_z [m],rib_qw,…,tip_x [m],…
 
-`simulated: true` says that the robot was itself a simulation, a stand-in for a physical one.
+`simulated` says whether the robot was itself a simulation; without it nothing is claimed. A body alone is at
+the tip, others need their `fraction` of the rod's length. Without a configuration positions are in the robot's
+frame and orientations (quaternions, scalar first) those of the rod. A row has what was measured at its time:
+where other sensors are faster, cells stay empty.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import importlib.resources
 import io
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd  # type: ignore[import-untyped]
 from jaxtyping import Float
 
+from knode_cosserat._yaml import shown
+from knode_cosserat.recordings.config import CommandSource, MarkerSource, RecordingConfig, TensionSource
+from knode_cosserat.recordings.findings import RecordingError
+from knode_cosserat.recordings.messages import Stream
+
 TIME = "time [s]"
-TIP = ("tip_x [m]", "tip_y [m]", "tip_z [m]")
-ALLOWED = f"{TIME}, tension_1 [N], tension_2 [N], …, {', '.join(TIP)}"
-#: where the package's own recording is
-EXAMPLE = "sine_1p0.csv"
+#: what columns of tensions begin with where no configuration says otherwise
+TENSION, COMMAND = "tension", "command"
+ALLOWED = (
+    f"{TIME}, tension_1 [N], tension_2 [N], …, NAME_x [m], NAME_y [m], NAME_z [m] for each body, and, if they "
+    "were measured, NAME_qw, NAME_qx, NAME_qy, NAME_qz, and command_1 [N], …"
+)
+PARQUET_MAGIC = b"PAR1"
+_QUATERNION = ("qw", "qx", "qy", "qz")
+#: larger numbers of seconds cannot be a time
+_LATEST = 9e9
 
 
-class RecordingError(ValueError):
-    """A recording that cannot be read or used; the message is one line that says why."""
+def read_csv(data: bytes, path: str) -> tuple[dict[str, str], pd.DataFrame]:
+    """What a CSV file's comments say, and its columns of numbers. Raises `RecordingError`."""
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise RecordingError(f"{path}: not a recording: no bag, and no CSV text: it is not UTF-8") from None
+    return _comments(text), _numbers(_cells(text, path), path)
 
 
-@dataclasses.dataclass(frozen=True)
-class TipRecording:
-    """Measured tensions and tip positions, row by row at the same times."""
-
-    #: s
-    time: Float[np.ndarray, " T"]
-    #: N, each row held until the next: row i drives the robot from row i to row i + 1
-    tension: Float[np.ndarray, "T tendons"]
-    #: m, in the robot's frame: z up, origin at the clamped end
-    tip_position: Float[np.ndarray, "T 3"]
-    #: whether the robot was itself a simulation
-    simulated: bool
-    #: what the recording is and where it comes from
-    source: str
-
-    @property
-    def dt(self) -> float:
-        """Time from row to row (s). Raises `RecordingError` if it varies."""
-        steps = np.diff(self.time)
-        if len(steps) == 0:
-            raise RecordingError(f"{self.source}: one row has no time step")
-        dt = float(self.time[-1] - self.time[0]) / len(steps)
-        if np.ptp(steps) > 1e-3 * dt:
-            raise RecordingError(
-                f"{self.source}: the time step varies from {steps.min():g} to {steps.max():g} s"
-            )
-        return float(f"{dt:.9g}")  # times in a file are rounded
-
-    def between(self, start: float, end: float) -> TipRecording:
-        """The rows from time `start` (s) on, before time `end`."""
-        first, last = np.searchsorted(self.time, np.array([start, end]) - 1e-9)
-        if first == last:
-            raise RecordingError(
-                f"{self.source}: no rows from {start:g} to {end:g} s; "
-                f"there are rows from {self.time[0]:g} to {self.time[-1]:g} s"
-            )
-        parts = {name: getattr(self, name)[first:last] for name in ("time", "tension", "tip_position")}
-        return dataclasses.replace(self, **parts)
-
-
-def load_example() -> TipRecording:
-    """The recording that comes with the package: tensions on sines of 1 s, 16 s long, 20 rows a second.
-
-    The robot was a stand-in for the paper's, simulated with PyElastica, and not a physical one.
-    """
-    file = importlib.resources.files("knode_cosserat.recordings") / "data" / EXAMPLE
-    return _parsed(file.read_text(encoding="utf-8"), EXAMPLE)
-
-
-def load_table(path: str | Path) -> TipRecording:
-    """Read a recording from a CSV file (see above); what its comments leave out is `path` and not simulated.
+def read_parquet(path: Path) -> tuple[dict[str, str], pd.DataFrame]:
+    """What a Parquet file's metadata say, and its columns of numbers.
 
     Raises:
-        RecordingError: the file cannot be read, or a column, unit or number is not right.
+        RecordingError: the file cannot be read, or a column has no numbers.
+        ImportError: pyarrow is not installed.
     """
     try:
-        text = Path(path).read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise RecordingError(f"{path}: no such file") from None
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise RecordingError(f"{path}: not a CSV text file: it is not UTF-8") from None
-    return _parsed(text, str(path))
+        import pyarrow  # type: ignore[import-not-found, import-untyped, unused-ignore]
+        import pyarrow.parquet  # type: ignore[import-not-found, import-untyped, unused-ignore]
+    except ImportError:
+        raise ImportError("Parquet files need pyarrow: pip install 'knode-cosserat[parquet]'") from None
+    try:
+        table = pyarrow.parquet.read_table(path)
+        said = {key.decode(): value.decode() for key, value in (table.schema.metadata or {}).items()}
+        frame = pd.DataFrame({name: table.column(i).to_numpy() for i, name in enumerate(table.column_names)})
+    except (pyarrow.ArrowException, OSError, ValueError) as error:
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise RecordingError(f"{path}: not a Parquet table: {reason}") from None
+    if len(frame) == 0:
+        raise RecordingError(f"{path}: no rows")
+    return said, _numbers(frame, str(path))
 
 
-def _parsed(text: str, path: str) -> TipRecording:
-    said = _comments(text, path)
-    table = _table(text, path)
-    tensions = _tension_columns(list(table.columns), path)
-    numbers = _numbers(table[[TIME, *tensions, *TIP]], path)
-    time = numbers[:, 0]
-    backwards = np.diff(time) <= 0.0
-    if backwards.any():
-        row = int(np.argmax(backwards)) + 1
-        raise RecordingError(
-            f"{path}: row {row + 1}: time is {time[row]:g} s; allowed is one after {time[row - 1]:g} s"
-        )
-    return TipRecording(
-        time=time,
-        tension=numbers[:, 1:-3],
-        tip_position=numbers[:, -3:],
-        simulated=said.get("simulated") == "true",
-        source=said.get("source", path),
-    )
-
-
-def _comments(text: str, path: str) -> dict[str, str]:
+def _comments(text: str) -> dict[str, str]:
     """What the lines `# key: value` before the header say."""
     said = {}
     for line in text.splitlines():
@@ -127,19 +86,17 @@ def _comments(text: str, path: str) -> dict[str, str]:
         key, colon, value = line.removeprefix("#").partition(":")
         if colon:
             said[key.strip()] = value.strip()
-    if said.get("simulated", "false") not in ("true", "false"):
-        raise RecordingError(f"{path}: simulated is {said['simulated']!r}; allowed is true or false")
     return said
 
 
-def _table(text: str, path: str) -> pd.DataFrame:
+def _cells(text: str, path: str) -> pd.DataFrame:
     """The cells as text, under the header's titles."""
     try:
         cells = pd.read_csv(io.StringIO(text), comment="#", header=None, dtype=str, skipinitialspace=True)
     except pd.errors.EmptyDataError:
         raise RecordingError(f"{path}: the file is empty; allowed is a header {ALLOWED}") from None
-    except pd.errors.ParserError as error:
-        reason = str(error).strip().splitlines()[-1]
+    except (pd.errors.ParserError, ValueError) as error:
+        reason = (str(error).strip().splitlines() or ["it cannot be parsed"])[-1]
         raise RecordingError(f"{path}: not a CSV table: {reason}") from None
     table = cells.iloc[1:].set_axis(cells.iloc[0].fillna("").str.strip(), axis="columns")
     if table.empty:
@@ -147,25 +104,153 @@ def _table(text: str, path: str) -> pd.DataFrame:
     return table
 
 
-def _tension_columns(columns: list[str], path: str) -> list[str]:
-    """The titles of the tensions in the order of the tendons, once all columns are known to be right."""
-    others = [name for name in columns if name not in (TIME, *TIP)]
-    tensions = [f"tension_{k} [N]" for k in range(1, max(1, len(others)) + 1)]
-    for wanted in (TIME, *tensions, *TIP):
-        if columns.count(wanted) != 1:
-            raise RecordingError(
-                f"{path}: the columns are {', '.join(columns)}; allowed is {ALLOWED}, once each"
-            )
-    return tensions
-
-
-def _numbers(table: pd.DataFrame, path: str) -> Float[np.ndarray, "rows columns"]:
-    numbers = table.apply(pd.to_numeric, errors="coerce").to_numpy(dtype=float)
-    if not np.all(np.isfinite(numbers)):
-        row, column = np.argwhere(~np.isfinite(numbers))[0]
+def _numbers(table: pd.DataFrame, path: str) -> pd.DataFrame:
+    """All cells as numbers, NaN where they are empty."""
+    numbers = table.apply(pd.to_numeric, errors="coerce")
+    values = numbers.to_numpy(dtype=float, na_value=np.nan)
+    said = ~table.isna().to_numpy()
+    wrong = said & ~np.isfinite(values)
+    for row, column in np.argwhere(wrong):
         given = table.iat[row, column]
-        shown = "empty" if pd.isna(given) else repr(given)
-        raise RecordingError(
-            f"{path}: row {row + 1}: {table.columns[column]} is {shown}; allowed is a finite number"
+        # how programs write that there is no number
+        if str(given).strip().lower() not in ("nan", "none", "null", "na", "n/a", "-nan", ""):
+            raise RecordingError(
+                f"{path}: row {row + 1}: {table.columns[column]} is {shown(given)}; allowed is a finite number"
+            )
+    return pd.DataFrame(values, columns=list(map(str, table.columns)))
+
+
+# what the columns are
+
+
+def configured(said: Mapping[str, str], columns: list[str], path: str) -> RecordingConfig:
+    """The configuration of a table that comes without one. Raises `RecordingError`."""
+    others = [name for name in columns if name != TIME]
+    tendons = {name: sum(each.startswith(f"{name}_") for each in others) for name in (TENSION, COMMAND)}
+    bodies = [name.removesuffix("_x [m]") for name in others if name.endswith("_x [m]")]
+    known = [f"{name}_{k + 1} [N]" for name, count in tendons.items() for k in range(count)]
+    for body in bodies:
+        known += position_titles(body, "m")
+        oriented = quaternion_titles(body)
+        known += oriented if oriented[0] in columns else []
+    wrong = TIME not in columns or not bodies or not any(tendons.values()) or len(set(columns)) < len(columns)
+    if wrong or sorted(known) != sorted(others):
+        raise RecordingError(f"{path}: the columns are {', '.join(columns)}; allowed is {ALLOWED}, once each")
+    markers = [
+        MarkerSource(body, body, _fraction(body, said, len(bodies), path), rotation=(1.0, 0.0, 0.0, 0.0))
+        for body in bodies
+    ]
+    order = {name: tuple(range(1, count + 1)) for name, count in tendons.items()}
+    try:
+        return RecordingConfig(
+            markers=tuple(sorted(markers, key=lambda marker: marker.fraction)),
+            tension=TensionSource(TENSION, order[TENSION]) if order[TENSION] else None,
+            command=(
+                CommandSource(COMMAND, order[COMMAND], latency=_said_number("latency", said, 0.0, path))
+                if order[COMMAND]
+                else None
+            ),
+            tensions="measured" if order[TENSION] else "commanded",
         )
-    return numbers
+    except RecordingError as error:
+        raise RecordingError(f"{path}: {error}") from None
+
+
+def _fraction(body: str, said: Mapping[str, str], bodies: int, path: str) -> float:
+    key = f"fraction {body}"
+    if key not in said and bodies > 1:
+        raise RecordingError(
+            f"{path}: where on the rod {body} is, is not said; allowed is a line '# {key}: ' with a number from "
+            "0 to 1, or a configuration"
+        )
+    return _said_number(key, said, 1.0, path)
+
+
+def _said_number(key: str, said: Mapping[str, str], otherwise: float, path: str) -> float:
+    try:
+        return float(said.get(key, otherwise))
+    except ValueError:
+        raise RecordingError(f"{path}: {key} is {shown(said[key])}; allowed is a number") from None
+
+
+def said_simulated(said: Mapping[str, str], path: str) -> bool | None:
+    """Whether a table says that the robot was a simulation; None if it does not say. Raises `RecordingError`."""
+    given = said.get("simulated")
+    if given not in (None, "true", "false"):
+        raise RecordingError(f"{path}: simulated is {shown(given)}; allowed is true or false")
+    return None if given is None else given == "true"
+
+
+def position_titles(body: str, unit: str) -> list[str]:
+    """The titles of a body's position."""
+    return [f"{body}_{axis} [{unit}]" for axis in "xyz"]
+
+
+def quaternion_titles(body: str) -> list[str]:
+    """The titles of a body's orientation."""
+    return [f"{body}_{part}" for part in _QUATERNION]
+
+
+def tension_titles(topic: str, unit: str, count: int) -> list[str]:
+    """The titles of tensions, or commands, in the order of a message."""
+    return [f"{topic}_{k + 1} [{unit}]" for k in range(count)]
+
+
+def streams(table: pd.DataFrame, config: RecordingConfig, path: str) -> dict[str, Stream]:
+    """By topic, the rows in which it was measured. Raises `RecordingError` if a column is missing."""
+    columns = list(table.columns)
+    if columns.count(TIME) != 1:
+        raise RecordingError(f"{path}: the columns are {', '.join(columns)}; required is {TIME}, once")
+    time = table[TIME].to_numpy()
+    if np.any(np.abs(time) > _LATEST):
+        row = int(np.argmax(np.abs(time) > _LATEST))
+        raise RecordingError(f"{path}: row {row + 1}: {TIME} is {time[row]:g}; allowed is up to {_LATEST:g}")
+    wanted: dict[str, list[str]] = {}
+    for source in (*config.markers, config.base):
+        if source is not None:
+            titles, turned = (
+                position_titles(source.topic, config.position_unit),
+                quaternion_titles(source.topic),
+            )
+            wanted[source.topic] = titles + (turned if turned[0] in columns else [])
+    for tendons in (config.tension, config.command):
+        if tendons is not None:
+            wanted[tendons.topic] = tension_titles(tendons.topic, tendons.unit, len(tendons.order))
+    optional = _optional(config)
+    found = {}
+    for topic, titles in wanted.items():
+        missing = [title for title in titles if columns.count(title) != 1]
+        if missing and topic in optional and len(missing) == len(titles):
+            continue
+        if missing:
+            raise RecordingError(
+                f"{path}: the column {missing[0]} is {'missing' if missing[0] not in columns else 'there twice'}; "
+                f"the columns are {', '.join(columns)}"
+            )
+        found[topic] = _stream(topic, time, table[titles].to_numpy())
+    return found
+
+
+def _optional(config: RecordingConfig) -> set[str]:
+    """The tensions that nobody needs."""
+    unused = config.command if config.tensions == "measured" else config.tension
+    return {unused.topic} if unused is not None else set()
+
+
+def _stream(topic: str, time: Float[np.ndarray, " n"], values: Float[np.ndarray, "n size"]) -> Stream:
+    there = np.isfinite(time) & np.isfinite(values).any(axis=1)
+    stamps = np.round(time[there] * 1e9).astype(np.int64)
+    # tables may begin before zero, and a stamp below zero would be none
+    return Stream(topic, stamps, stamps, values[there])
+
+
+def frame_of(columns: Mapping[str, Any]) -> pd.DataFrame:
+    """A table of columns that each have their own times: a row for each time at which something was measured.
+
+    Args:
+        columns: by title, times (s) and numbers.
+    """
+    parts = {title: pd.Series(values, index=time) for title, (time, values) in columns.items()}
+    # together, because one by one each would be sorted into all others
+    table = pd.concat(parts, axis=1).sort_index()
+    return table.rename_axis(TIME).reset_index()

@@ -1,0 +1,194 @@
+"""Streams of poses and tensions without what is wrong in them, and what that was."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from knode_cosserat.recordings import cleaning
+from knode_cosserat.recordings.config import (
+    POSITION_UNITS,
+    TENSION_UNITS,
+    RecordingConfig,
+    TensionSource,
+)
+from knode_cosserat.recordings.findings import Finding, RecordingError, Severity
+from knode_cosserat.recordings.recording import Body, Tensions, bridge
+
+#: smaller jumps are left alone: m, rad, N
+SMALLEST_SHIFT, SMALLEST_TURN, SMALLEST_PULL = 5e-3, np.radians(8.0), 0.5
+#: load cells jump for a message or two; more in a row can be a command
+LONGEST_SPIKE = 2
+#: a body needs that many frames
+FEWEST_FRAMES = 2
+
+Seconds = Mapping[str, Float[np.ndarray, " n"]]
+Values = Mapping[str, Float[np.ndarray, "n size"]]
+
+
+def cleaned_poses(
+    config: RecordingConfig, seconds: Seconds, values: Values, path: str
+) -> tuple[list[Body | None], list[Finding]]:
+    """The bodies in the order of the configuration, then the base, or None; in the recording's own frame.
+
+    Raises:
+        RecordingError: a body was not seen in two frames.
+    """
+    bodies: list[Body | None] = []
+    findings: list[Finding] = []
+    for marker in config.markers:
+        body, found = _body(config, marker.name, marker.topic, marker.fraction, seconds, values, path)
+        bodies.append(body)
+        findings += found
+    if config.base is None:
+        return [*bodies, None], findings
+    base, found = _body(config, "base", config.base.topic, float("nan"), seconds, values, path)
+    return [*bodies, base], findings + found
+
+
+def _body(
+    config: RecordingConfig,
+    name: str,
+    topic: str,
+    fraction: float,
+    seconds: Seconds,
+    values: Values,
+    path: str,
+) -> tuple[Body, list[Finding]]:
+    time, pose = seconds[topic], values[topic]
+    findings: list[Finding] = []
+    good = np.isfinite(pose).all(axis=1) & (np.abs(pose) < 1e9).all(axis=1)
+    if pose.shape[1] == 7:
+        # a quaternion of zeros is how some drivers say that they see nothing
+        good[good] &= np.abs(np.linalg.norm(pose[good, 3:], axis=1) - 1.0) < 0.05
+    _drop(findings, topic, time[~good], "pose is", "poses are", "not finite, or no rotation", "warning")
+    time, pose = time[good], pose[good]
+    if len(time) < FEWEST_FRAMES:
+        raise RecordingError(
+            f"{path}: topic {topic}: {len(time)} usable poses of {name}; required is {FEWEST_FRAMES} or more"
+        )
+    if pose.shape[1] == 7:
+        pose[:, 3:] /= np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
+        pose[:, 3:], swaps, unclear = cleaning.swaps_undone(time, pose[:, 3:])
+        for swap in swaps:
+            angles = ", ".join(f"{angle:.0f}" for angle in swap.angles)
+            when = float(time[swap.row])
+            what = f"its axes were swapped at {when:.3f} s (turned by {angles} degrees about x, y, z), and undone"
+            findings.append(Finding("warning", topic, what, (when,)))
+    wrong = _jumping(time, pose, config)
+    if pose.shape[1] == 7:
+        left = [row for row in unclear if not wrong[row - 1 : row + 1].any()]
+        if left:
+            what = f"{_count(len(left), 'turn', 'turns')} too large for a motion that are no swap of axes, left as seen"
+            findings.append(Finding("warning", topic, what, tuple(time[left].tolist())))
+    _drop(findings, topic, time[wrong], "pose jumps", "poses jump", "out of the motion and back", "note")
+    time, pose = time[~wrong], pose[~wrong]
+    quaternion = pose[:, 3:] if pose.shape[1] == 7 else None
+    findings += _pauses(topic, time, config.longest_gap)
+    return Body(name, topic, fraction, time, pose[:, :3], quaternion), findings
+
+
+def _jumping(
+    time: Float[np.ndarray, " n"], pose: Float[np.ndarray, "n size"], config: RecordingConfig
+) -> Bool[np.ndarray, " n"]:
+    # as long as can be bridged, and not so many that they are most of what is looked at
+    usual = float(np.median(np.diff(time))) or 1.0
+    longest = int(np.clip(config.longest_gap / usual, 1, 4))
+    floor = SMALLEST_SHIFT / POSITION_UNITS[config.position_unit]
+    steps = cleaning.position_steps(pose[:, :3])
+    wrong = cleaning.outliers(steps, time, floor=floor, longest=longest)
+    if pose.shape[1] == 7:
+        turns = cleaning.rotation_steps(pose[:, 3:])
+        wrong |= cleaning.outliers(turns, time, floor=SMALLEST_TURN, longest=longest)
+    return wrong
+
+
+def cleaned_tensions(
+    config: RecordingConfig, seconds: Seconds, values: Values, path: str
+) -> tuple[Tensions | None, Tensions | None, list[Finding]]:
+    """Measured and commanded tensions in N, tendon 1 first; None where there are none.
+
+    Raises:
+        RecordingError: messages have another number of tendons, or none is usable and they are needed.
+    """
+    findings: list[Finding] = []
+    both = []
+    for kind, source in (("measured", config.tension), ("commanded", config.command)):
+        if source is None or source.topic not in seconds:
+            both.append(None)
+            continue
+        found = _tensions(source, seconds[source.topic], values[source.topic], findings, path, kind)
+        if found is None and config.tensions == kind:
+            raise RecordingError(f"{path}: topic {source.topic}: no usable {kind} tension")
+        if found is not None and kind == "measured":
+            findings += _pauses(source.topic, found.time, config.longest_gap)
+        both.append(found)
+    return both[0], both[1], findings
+
+
+def _tensions(
+    source: TensionSource, time: np.ndarray, sent: np.ndarray, findings: list[Finding], path: str, kind: str
+) -> Tensions | None:
+    if len(sent) == 0:
+        findings.append(Finding("warning", source.topic, f"there are no {kind} tensions"))
+        return None
+    if sent.shape[1] != len(source.order):
+        raise RecordingError(
+            f"{path}: topic {source.topic}: a message has {sent.shape[1]} tensions; the configuration's order has "
+            f"{len(source.order)} tendons"
+        )
+    newtons = sent[:, np.argsort(source.order)] * TENSION_UNITS[source.unit]
+    good = np.isfinite(newtons).all(axis=1) & (np.abs(newtons) < 1e9).all(axis=1)
+    _drop(findings, source.topic, time[~good], "tension is", "tensions are", "not finite", "warning")
+    time, newtons = time[good], newtons[good]
+    if kind == "measured":
+        spikes = np.zeros(len(time), dtype=bool)
+        for tendon in newtons.T:
+            steps = np.diff(tendon)[:, None]
+            spikes |= cleaning.outliers(steps, time, floor=SMALLEST_PULL, longest=LONGEST_SPIKE)
+        _drop(
+            findings,
+            source.topic,
+            time[spikes],
+            "tension jumps",
+            "tensions jump",
+            "up or down and back",
+            "note",
+        )
+        time, newtons = time[~spikes], newtons[~spikes]
+    return Tensions(source.topic, time, newtons) if len(time) else None
+
+
+def _drop(
+    findings: list[Finding],
+    topic: str,
+    times: np.ndarray,
+    one: str,
+    several: str,
+    why: str,
+    severity: Severity,
+) -> None:
+    if len(times):
+        what = f"{_count(len(times), one, several)} {why}; left out"
+        findings.append(Finding(severity, topic, what, tuple(times[:1000].tolist())))
+
+
+def _pauses(topic: str, time: np.ndarray, longest: float) -> list[Finding]:
+    """What is said of pauses that are too long to be bridged."""
+    steps = np.diff(time)
+    long = steps > bridge(time, longest)
+    if not long.any():
+        return []
+    where = time[:-1][long]
+    listed = ", ".join(
+        f"{a:.2f} to {a + step:.2f} s" for a, step in zip(where[:3], steps[long][:3], strict=True)
+    )
+    more = f" and {int(long.sum()) - 3} more" if long.sum() > 3 else ""
+    what = f"{_count(int(long.sum()), 'pause', 'pauses')} too long to be bridged ({listed}{more}) split the recording"
+    return [Finding("warning", topic, what, tuple(where.tolist()))]
+
+
+def _count(count: int, one: str, several: str) -> str:
+    return f"{count} {one if count == 1 else several}"

@@ -1,0 +1,125 @@
+"""From stamps to seconds on one clock: order, duplicates, jumps, and clocks that disagree."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from knode_cosserat.recordings.findings import Finding
+from knode_cosserat.recordings.messages import Stream
+
+#: clocks that disagree by more are not the same clock, and one that changes by more has jumped (s)
+DISAGREEMENT = 0.5
+JUMP = 0.1
+#: messages that are further from all others than this are not of this recording (s)
+FAR = 600.0
+
+
+def offsets(streams: Sequence[Stream]) -> dict[str, float]:
+    """By topic, how long after its stamp a message was recorded (s, the median); NaN without stamps."""
+    return {stream.topic: _offset(stream) for stream in streams}
+
+
+def _offset(stream: Stream) -> float:
+    known = stream.stamped >= 0
+    if not known.any():
+        return float("nan")
+    return float(np.median((stream.received - stream.stamped)[known])) * 1e-9
+
+
+def chosen(streams: Sequence[Stream], clock: str) -> tuple[dict[str, Int[np.ndarray, " n"]], list[Finding]]:
+    """By topic, when its messages were measured (ns), by the better of the two clocks."""
+    findings: list[Finding] = []
+    late = offsets(streams)
+    known = [delay for delay in late.values() if np.isfinite(delay)]
+    one_clock = not known or max(known) - min(known) <= DISAGREEMENT
+    times = {}
+    for stream in streams:
+        times[stream.topic] = stream.received
+        if clock == "received" or len(stream.received) == 0:
+            continue
+        if np.any(stream.stamped < 0):
+            what = "messages have no stamps of their own; the times of recording are used"
+            findings.append(Finding("note", stream.topic, what))
+        elif not one_clock and abs(late[stream.topic]) > DISAGREEMENT:
+            behind = "behind" if late[stream.topic] > 0 else "before"
+            what = (
+                f"the clock of its stamps is {abs(late[stream.topic]):.3f} s {behind} the recorder's, and others' "
+                "are not; the times of recording are used"
+            )
+            findings.append(Finding("warning", stream.topic, what))
+        else:
+            times[stream.topic], found = _without_jumps(stream)
+            findings += found
+    return times, findings
+
+
+def _without_jumps(stream: Stream) -> tuple[Int[np.ndarray, " n"], list[Finding]]:
+    """The stamps, or the times of recording less the usual delay if the stamps' clock was set meanwhile."""
+    stamps, received = np.diff(stream.stamped) * 1e-9, np.diff(stream.received) * 1e-9
+    usual = np.median(stamps) if len(stamps) else 0.0
+    # of the two, the clock that is further from the usual step is the one that jumped
+    odd = (np.abs(stamps - received) > JUMP) & (np.abs(stamps - usual) > np.abs(received - usual))
+    # there and back: a message out of order, or one damaged stamp
+    odd[1:] &= ~odd[:-1]
+    drift = (stream.stamped - stream.received) * 1e-9
+    stays = [row for row in np.flatnonzero(odd) if _stays(drift, row)]
+    if not stays:
+        return stream.stamped, []
+    sizes = ", ".join(f"{stamps[row] - received[row]:+.3f} s" for row in stays[:3])
+    more = f" and {len(stays) - 3} more" if len(stays) > 3 else ""
+    when = tuple(float(stream.received[row + 1]) for row in stays)
+    delay = np.int64(np.median((stream.received - stream.stamped)[: stays[0] + 1]))
+    what = f"the clock of its stamps jumped ({sizes}{more}); the times of recording are used"
+    return stream.received - delay, [Finding("warning", stream.topic, what, when)]
+
+
+def _stays(drift: Float[np.ndarray, " n"], row: int) -> bool:
+    """Whether the stamps are as far from the times of recording for a while as right after a jump."""
+    before, after = drift[max(0, row - 4) : row + 1], drift[row + 1 : row + 6]
+    return len(after) >= 3 and abs(float(np.median(after) - np.median(before))) > JUMP
+
+
+def ordered(topic: str, time: Int[np.ndarray, " n"]) -> tuple[Int[np.ndarray, " kept"], list[Finding]]:
+    """Which rows to take, in which order, so that times rise; with what was wrong with them."""
+    findings: list[Finding] = []
+    order = np.argsort(time, kind="stable")
+    backwards = int(np.sum(np.diff(time) < 0))
+    if backwards:
+        where = tuple(float(t) for t in time[1:][np.diff(time) < 0][:100])
+        what = f"{_times(backwards)} a stamp is before the one in front of it; the messages were sorted"
+        findings.append(Finding("warning", topic, what, where))
+    rising = time[order]
+    fresh = np.concatenate([np.ones(len(order[:1]), dtype=bool), np.diff(rising) > 0])
+    if not fresh.all():
+        what = (
+            f"{_count(int((~fresh).sum()), 'stamp is', 'stamps are')} there twice; the first of each was kept"
+        )
+        findings.append(Finding("warning", topic, what, tuple(float(t) for t in rising[~fresh][:100])))
+    order = order[fresh]
+    near = _together(time[order])
+    if not near.all():
+        lost = int((~near).sum())
+        what = (
+            f"{_count(lost, 'message is', 'messages are')} more than {FAR:g} s from the others, and left out"
+        )
+        findings.append(Finding("warning", topic, what))
+    return order[near], findings
+
+
+def _together(time: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+    """Which of rising times are in the largest group without a long pause."""
+    if len(time) == 0:
+        return np.ones(0, dtype=bool)
+    group = np.concatenate([[0], np.cumsum(np.diff(time) > FAR * 1e9)])
+    return np.asarray(group == np.argmax(np.bincount(group)))
+
+
+def _times(count: int) -> str:
+    return "once" if count == 1 else f"{count} times"
+
+
+def _count(count: int, one: str, several: str) -> str:
+    return f"{count} {one if count == 1 else several}"

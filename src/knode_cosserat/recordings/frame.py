@@ -1,0 +1,146 @@
+"""The robot's frame, from what is seen at rest: the clamped end, and the axes of bodies."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from knode_cosserat.recordings.config import POSITION_UNITS, RecordingConfig
+from knode_cosserat.recordings.findings import Finding
+from knode_cosserat.recordings.recording import Body
+
+#: the shortest rest that tells how a body's axes are turned (s), and the fewest frames
+SHORTEST_REST, FEWEST_FRAMES = 0.2, 5
+#: a body that stays so near to where it was rests (m), if it shakes no more than by its noise
+STILL = 2e-3
+#: a straight rod that leans by more does not point up (rad)
+LEANING = np.radians(3.0)
+#: lengths of the rod by its bodies that differ by more are not of one rod, or not of this one
+UNEQUAL = 0.05
+
+
+def rest_of(bodies: Sequence[Body]) -> tuple[float, float] | None:
+    """From when to when, in the beginning, no body moves; None if that is too short."""
+    start, end = max(body.time[0] for body in bodies), min(body.time[-1] for body in bodies)
+    for body in bodies:
+        first = body.position[body.time <= start + SHORTEST_REST + 1e-6]
+        where = np.median(first, axis=0)
+        noise = 1.4826 * np.median(np.linalg.norm(first - where, axis=1))
+        away = np.linalg.norm(body.position - where, axis=1) > STILL + 6.0 * min(noise, STILL)
+        moves = body.time[away]
+        if len(moves):
+            end = min(end, float(moves[0]))
+    rows = min(int(np.sum((body.time >= start) & (body.time < end))) for body in bodies)
+    return (float(start), float(end)) if end - start >= SHORTEST_REST and rows >= FEWEST_FRAMES else None
+
+
+def placed(
+    bodies: Sequence[Body], base: Body | None, config: RecordingConfig
+) -> tuple[list[Body], Body | None, tuple[float, float] | None, list[Finding]]:
+    """Bodies in the robot's frame, with orientations of the rod; the rest that told them; and findings.
+
+    The bodies that are given have positions and orientations as they were recorded.
+    """
+    findings: list[Finding] = []
+    turn = Rotation.from_quat(config.rotation, scalar_first=True)
+    scale = POSITION_UNITS[config.position_unit]
+    bodies = [_turned(body, turn, scale) for body in bodies]
+    origin = np.array(config.origin)
+    if base is not None and config.base is not None:
+        base = _turned(base, turn, scale)
+        origin = base.position.mean(axis=0) - [0.0, 0.0, config.base.height]
+        moved = np.linalg.norm(base.position - np.median(base.position, axis=0), axis=1).max()
+        if moved > 10e-3:
+            what = f"the base moves by {1e3 * moved:.0f} mm; its mean position is taken for the clamped end"
+            findings.append(Finding("warning", base.topic, what))
+        base = dataclasses.replace(base, position=base.position - origin)
+    bodies = [dataclasses.replace(body, position=body.position - origin) for body in bodies]
+    given = None if config.rest is None else (config.rest[0], config.rest[1])
+    rest = given or rest_of(bodies)
+    findings += _judged(bodies, rest)
+    placed_bodies = []
+    for body, marker in zip(bodies, config.markers, strict=True):
+        placed_body, found = _of_the_rod(body, marker.rotation, rest)
+        placed_bodies.append(placed_body)
+        findings += found
+    return placed_bodies, base, rest, findings
+
+
+def _turned(body: Body, turn: Rotation, scale: float) -> Body:
+    quaternion = body.quaternion
+    if quaternion is not None:
+        quaternion = (turn * Rotation.from_quat(quaternion, scalar_first=True)).as_quat(scalar_first=True)
+    return dataclasses.replace(body, position=turn.apply(body.position) * scale, quaternion=quaternion)
+
+
+def _of_the_rod(
+    body: Body, rotation: Sequence[float] | None, rest: tuple[float, float] | None
+) -> tuple[Body, list[Finding]]:
+    """The body with the orientation of the rod there in place of its own."""
+    if body.quaternion is None:
+        return body, []
+    own = Rotation.from_quat(body.quaternion, scalar_first=True)
+    if rotation is not None:
+        constant = Rotation.from_quat(rotation, scalar_first=True)
+    else:
+        still = at_rest(body.time, rest)
+        if still.sum() < FEWEST_FRAMES:
+            what = (
+                "how its axes are turned is not known, because it was not seen at rest; its orientations are "
+                "left out (the configuration can state the rest or the marker's rotation)"
+            )
+            return dataclasses.replace(body, quaternion=None), [Finding("problem", body.topic, what)]
+        # at rest the rod points up, and its frame is the robot's
+        constant = own[np.flatnonzero(still)].mean()
+    turned = (own * constant.inv()).as_quat(scalar_first=True)
+    return dataclasses.replace(body, quaternion=turned), []
+
+
+def at_rest(time: Float[np.ndarray, " n"], rest: tuple[float, float] | None) -> np.ndarray:
+    """Which rows are from the rest."""
+    return np.zeros(len(time), dtype=bool) if rest is None else (time >= rest[0] - 1e-6) & (time < rest[1])
+
+
+def rest_positions(
+    bodies: Sequence[Body], rest: tuple[float, float] | None
+) -> Float[np.ndarray, "M 3"] | None:
+    """Where the bodies are at rest (m), or None if one of them is not seen there."""
+    means = [body.position[at_rest(body.time, rest)] for body in bodies]
+    if any(len(positions) == 0 for positions in means):
+        return None
+    return np.array([positions.mean(axis=0) for positions in means])
+
+
+def _judged(bodies: Sequence[Body], rest: tuple[float, float] | None) -> list[Finding]:
+    """Whether this is a rod that points up at rest, with bodies where the configuration has them."""
+    if rest is None:
+        what = f"no rest of {SHORTEST_REST:g} s in the beginning: how bodies are turned is not known from it"
+        return [Finding("warning", "", what)]
+    where = rest_positions(bodies, rest)
+    if where is None:
+        return []
+    findings = []
+    tip = where[-1]
+    leans = np.arctan2(np.linalg.norm(tip[:2]), tip[2]) if np.linalg.norm(tip) > 0 else 0.0
+    if leans > LEANING:
+        what = (
+            f"at rest the last body is {np.degrees(leans):.0f} degrees from straight above the clamped end: "
+            "another rest, another frame or another robot than the configuration says?"
+        )
+        findings.append(Finding("problem", bodies[-1].topic, what))
+    lengths = rod_lengths(bodies, where)
+    if len(lengths) > 1 and np.ptp(lengths) > UNEQUAL * abs(np.median(lengths)):
+        shown = ", ".join(f"{1e3 * length:.0f}" for length in lengths)
+        what = f"the bodies' fractions give the rod's length as {shown} mm: another order or another robot?"
+        findings.append(Finding("problem", "", what))
+    return findings
+
+
+def rod_lengths(bodies: Sequence[Body], where: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, " some"]:
+    """The rod's length (m) by each body that is not at the clamped end, from where they are at rest."""
+    pairs = [(body.fraction, position[2]) for body, position in zip(bodies, where, strict=True)]
+    return np.array([height / fraction for fraction, height in pairs if fraction > 0.05])

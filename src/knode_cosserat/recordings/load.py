@@ -1,0 +1,215 @@
+"""Recordings from files: bags of ROS 1 and 2, CSV and Parquet tables."""
+
+from __future__ import annotations
+
+import importlib.resources
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from knode_cosserat.recordings import clocks, ros1, ros2, table
+from knode_cosserat.recordings.cleaned import cleaned_poses, cleaned_tensions
+from knode_cosserat.recordings.config import RecordingConfig
+from knode_cosserat.recordings.container import Container
+from knode_cosserat.recordings.findings import SEVERITIES, Finding, RecordingError
+from knode_cosserat.recordings.frame import placed
+from knode_cosserat.recordings.messages import Role, Stream, decoded
+from knode_cosserat.recordings.plausible import units_doubted
+from knode_cosserat.recordings.recording import Recording
+
+#: where the package's own recording is
+EXAMPLE = "sine_1p0.csv"
+
+
+def load_recording(path: str | Path, config: RecordingConfig | None = None) -> Recording:
+    """Read a recording: a bag of ROS 1 (.bag, also .bag.active) or ROS 2 (.mcap, .db3, a folder), or a table.
+
+    What the file holds decides, not its name. A bag that was cut, or whose recorder was killed, is read as
+    far as it goes. What was wrong or mended is in the recording's `findings`.
+
+    Args:
+        path: the file or folder.
+        config: what its topics or columns mean; None: those of the paper's robot for bags; for tables what
+            their titles and comments say.
+
+    Raises:
+        RecordingError: the file cannot be read, or a topic or column is missing or not usable; one line.
+        ImportError: a library for this kind of file is not installed.
+    """
+    path = Path(path)
+    begin = _beginning(path)
+    if (
+        path.is_dir()
+        or begin.startswith((ros1.MAGIC, ros2.MCAP_MAGIC, ros2.SQLITE_MAGIC))
+        or _named_bag(path)
+    ):
+        return _from_bag(path, begin, config or RecordingConfig.paper_robot())
+    if begin.startswith(table.PARQUET_MAGIC):
+        said, numbers = table.read_parquet(path)
+    else:
+        said, numbers = table.read_csv(_bytes(path), str(path))
+    return _from_table(path.name, str(path), said, numbers, config)
+
+
+def load_example() -> Recording:
+    """The recording that comes with the package: tensions on sines of 1 s, 16 s long, 20 rows a second.
+
+    The robot was a stand-in for the paper's, simulated with PyElastica, and not a physical one.
+    """
+    file = importlib.resources.files("knode_cosserat.recordings") / "data" / EXAMPLE
+    said, numbers = table.read_csv(file.read_bytes(), EXAMPLE)
+    return _from_table(EXAMPLE, EXAMPLE, said, numbers, None)
+
+
+def _beginning(path: Path) -> bytes:
+    if path.is_dir():
+        return b""
+    try:
+        with path.open("rb") as file:
+            return file.read(16)
+    except FileNotFoundError:
+        raise RecordingError(f"{path}: no such file") from None
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def _bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def _named_bag(path: Path) -> bool:
+    """A bag whose first bytes are damaged is still one."""
+    return path.suffix in (".bag", ".mcap", ".db3") or path.name.endswith(".bag.active")
+
+
+# bags
+
+
+def _from_bag(path: Path, begin: bytes, config: RecordingConfig) -> Recording:
+    wanted = _roles(config)
+    container = _container(path, begin, wanted)
+    unused = config.command if config.tensions == "measured" else config.tension
+    found: dict[str, Stream] = {}
+    findings: list[Finding] = []
+    for name, role in wanted.items():
+        topic = container.topics.get(name)
+        if topic is None and unused is not None and name == unused.topic:
+            findings.append(Finding("note", name, f"there is no such topic, and so no {role}s"))
+            continue
+        if topic is None:
+            there = ", ".join(sorted(container.topics)) or "none"
+            raise RecordingError(f"{path}: topic {name} ({role}) is missing; the bag has {there}")
+        found[name] = decoded(topic, container.ros, role, config.command, str(path))
+    if container.damage:
+        findings.append(_said_damage(container, found.values()))
+    return _assembled(str(path), path.name, config, found, findings)
+
+
+def _roles(config: RecordingConfig) -> dict[str, Role]:
+    roles: dict[str, Role] = {marker.topic: "pose" for marker in config.markers}
+    if config.base is not None:
+        roles[config.base.topic] = "pose"
+    if config.tension is not None:
+        roles[config.tension.topic] = "tension"
+    if config.command is not None:
+        roles[config.command.topic] = "command"
+    return roles
+
+
+def _container(path: Path, begin: bytes, wanted: Iterable[str]) -> Container:
+    names = set(wanted)
+    if path.is_dir():
+        files = ros2.storage_files(path)
+        return ros2.merged([_container(file, _beginning(file), names) for file in files])
+    if begin.startswith(ros2.SQLITE_MAGIC) or path.suffix == ".db3":
+        return ros2.read_sqlite(path, names, str(path))
+    if begin.startswith(ros2.MCAP_MAGIC) or path.suffix == ".mcap":
+        return ros2.read_mcap(_bytes(path), names, str(path))
+    return ros1.read_ros1(_bytes(path), names, str(path))
+
+
+def _said_damage(container: Container, streams: Iterable[Stream]) -> Finding:
+    received = [stream.received for stream in streams if len(stream.received)]
+    reached = (
+        (max(int(np.max(each)) for each in received) - min(int(np.min(each)) for each in received)) * 1e-9
+        if received
+        else 0.0
+    )
+    lost = f", {container.lost} bytes could not be read" if container.lost else ""
+    return Finding("warning", "", f"{container.damage}: recovered up to {reached:.3f} s{lost}")
+
+
+# tables
+
+
+def _from_table(
+    name: str, path: str, said: dict[str, str], numbers: table.pd.DataFrame, config: RecordingConfig | None
+) -> Recording:
+    simulated = table.said_simulated(said, path)
+    config = config or table.configured(said, list(numbers.columns), path)
+    found = table.streams(numbers, config, path)
+    if config.simulated is None:
+        config = config.replace(simulated=simulated)
+    return _assembled(path, said.get("source", name), config, found, [])
+
+
+# both
+
+
+def _assembled(
+    path: str, name: str, config: RecordingConfig, found: dict[str, Stream], findings: list[Finding]
+) -> Recording:
+    for stream in found.values():
+        if stream.broken:
+            what = f"{stream.broken} messages could not be understood, and are left out"
+            findings.append(Finding("warning", stream.topic, what))
+    times, about_clocks = clocks.chosen(list(found.values()), config.clock)
+    rows = {}
+    for topic, stream in found.items():
+        rows[topic], about_order = clocks.ordered(topic, times[topic])
+        about_clocks += about_order
+    zero = _zero(config, times, rows)
+    if zero is None:
+        raise RecordingError(f"{path}: no poses and no tensions in this recording")
+    seconds = {topic: np.round((times[topic][rows[topic]] - zero) * 1e-9, 6) for topic in found}
+    findings += [
+        Finding(each.severity, each.topic, each.message, tuple((t - zero) * 1e-9 for t in each.times))
+        for each in about_clocks
+    ]
+    values = {topic: stream.values[rows[topic]] for topic, stream in found.items()}
+
+    poses, about_poses = cleaned_poses(config, seconds, values, path)
+    *bodies, base = poses
+    tension, command, about_tensions = cleaned_tensions(config, seconds, values, path)
+    assert all(body is not None for body in bodies)
+    in_frame, base, rest, about_frame = placed([body for body in bodies if body is not None], base, config)
+    findings += about_poses + about_tensions + about_frame
+    findings += units_doubted(in_frame, tension, command, rest)
+    if config.simulated:
+        findings.append(Finding("note", "", "the robot was itself a simulation, and not a physical one"))
+    description = f"{name}: {config.description}" if config.description else name
+    return Recording(
+        source=description,
+        config=config,
+        bodies=tuple(in_frame),
+        base=base,
+        tension=tension,
+        command=command,
+        rest=rest,
+        simulated=config.simulated,
+        findings=tuple(sorted(findings, key=lambda each: SEVERITIES.index(each.severity))),
+        delays=clocks.offsets(list(found.values())),
+    )
+
+
+def _zero(
+    config: RecordingConfig, times: dict[str, np.ndarray], rows: dict[str, np.ndarray]
+) -> np.int64 | None:
+    """When the first pose or measured tension was (ns); commands can be long before."""
+    later = {config.command.topic} if config.command is not None and config.tension is not None else set()
+    first = [times[topic][kept[0]] for topic, kept in rows.items() if len(kept) and topic not in later]
+    return np.int64(min(first)) if first else None

@@ -1,0 +1,202 @@
+"""Bags of ROS 1, record by record (bag format 2.0), as far as they go.
+
+The index at a bag's end is not used: a recorder that was killed has not written it. Records are taken one
+after the other, those in chunks without compression too; where none can be read, the next one is searched.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Collection, Iterator
+from typing import NamedTuple
+
+from knode_cosserat.recordings.container import Container, decompressed
+from knode_cosserat.recordings.findings import RecordingError
+
+MAGIC = b"#ROSBAG V"
+VERSION = b"#ROSBAG V2.0\n"
+#: the kinds of records
+MESSAGE, BAG, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07
+KINDS = (MESSAGE, BAG, INDEX, CHUNK, CHUNK_INFO, CONNECTION)
+#: a header field that every record has, up to its value
+_KIND_FIELD = b"\x04\x00\x00\x00op="
+#: no header is longer; a number that says so is an error
+_LONGEST_HEADER = 1 << 16
+_length = struct.Struct("<I").unpack_from
+_stamp = struct.Struct("<II").unpack
+
+
+class _Record(NamedTuple):
+    kind: int
+    fields: dict[bytes, bytes]
+    #: where its data begin, and where they should end
+    begin: int
+    end: int
+
+
+def read_ros1(data: bytes, wanted: Collection[str], source: str) -> Container:
+    """The messages of the wanted topics, and the names and types of all.
+
+    Raises:
+        RecordingError: it is a bag of another version, or nothing in it can be read.
+    """
+    if data.startswith(MAGIC) and not data.startswith(VERSION):
+        version = data[len(MAGIC) :].split(b"\n", 1)[0][:20]
+        raise RecordingError(
+            f"{source}: a bag of version {version.decode('ascii', 'replace')!r}; allowed is 2.0"
+        )
+    bag = _Bag(data, wanted)
+    begin = len(VERSION) if data.startswith(VERSION) else 0
+    bag.scan(memoryview(data), begin)
+    container = bag.gathered()
+    if not container.topics:
+        raise RecordingError(f"{source}: no topic in this bag can be read; it has {len(data)} bytes")
+    return container
+
+
+class _Bag:
+    """What has been read so far: messages by their connection, whose topic may be known only later."""
+
+    def __init__(self, data: bytes, wanted: Collection[str]) -> None:
+        self.size = len(data)
+        self.wanted = wanted
+        self.connections: dict[int, tuple[str, str, str]] = {}
+        self.messages: dict[int, list[tuple[int, memoryview]]] = {}
+        self.lost = 0
+        self.index: int | None = None
+
+    def scan(self, view: memoryview, begin: int) -> None:
+        for record in self._records(view, begin):
+            if record.kind == MESSAGE:
+                self._message(view, record)
+            elif record.kind == CONNECTION:
+                self._connection(view, record)
+            elif record.kind == BAG and len(record.fields.get(b"index_pos", b"")) == 8:
+                self.index = int.from_bytes(record.fields[b"index_pos"], "little")
+            elif record.kind == CHUNK:
+                self._chunk(view, record)
+
+    def _records(self, view: memoryview, position: int) -> Iterator[_Record]:
+        data = view.obj
+        assert isinstance(data, bytes)
+        while position < len(data):
+            record = _record(data, position)
+            if record is None:
+                following = _next_record(data, position + 1)
+                self.lost += following - position
+                position = following
+                continue
+            yield record
+            # what a chunk without compression holds comes next; its length is not trusted
+            inside = record.kind == CHUNK and record.fields.get(b"compression") == b"none"
+            if inside:
+                position = record.begin
+            elif record.end <= len(data):
+                position = record.end
+            else:
+                position = _next_record(data, record.begin)
+
+    def _message(self, view: memoryview, record: _Record) -> None:
+        connection, stamp = record.fields.get(b"conn", b""), record.fields.get(b"time", b"")
+        if len(connection) != 4 or len(stamp) != 8:
+            self.lost += record.end - record.begin
+            return
+        number = int.from_bytes(connection, "little")
+        known = self.connections.get(number)
+        if known is None or known[0] in self.wanted:
+            seconds, nanoseconds = _stamp(stamp)
+            message = seconds * 10**9 + nanoseconds, view[record.begin : record.end]
+            self.messages.setdefault(number, []).append(message)
+
+    def _connection(self, view: memoryview, record: _Record) -> None:
+        number = record.fields.get(b"conn", b"")
+        fields = _fields(bytes(view[record.begin : record.end]), 0, record.end - record.begin)
+        if len(number) != 4 or fields is None or b"type" not in fields:
+            return
+        topic = record.fields.get(b"topic") or fields.get(b"topic", b"")
+        texts = (
+            part.decode("utf-8", "replace") for part in (topic, fields[b"type"], fields.get(b"md5sum", b""))
+        )
+        # the first that can be read: the same one comes again in the index
+        self.connections.setdefault(int.from_bytes(number, "little"), tuple(texts))  # type: ignore[arg-type]
+
+    def _chunk(self, view: memoryview, record: _Record) -> None:
+        compression = record.fields.get(b"compression", b"").decode("ascii", "replace")
+        if compression == "none":
+            return
+        # a recorder that was killed has not yet written how long its last chunk is
+        end = record.end if record.end > record.begin else len(view)
+        packed = view[record.begin : end]
+        size = int.from_bytes(record.fields.get(b"size", b""), "little")
+        records = decompressed(packed, compression, size)
+        if len(records) < size or not records:
+            self.lost += len(packed) if not records else size - len(records)
+        if view.obj is not records:
+            self.scan(memoryview(records), 0)
+
+    def gathered(self) -> Container:
+        container = Container(ros=1, lost=self.lost)
+        for number, (name, kind, digest) in self.connections.items():
+            topic = container.topic(name, kind, digest)
+            if topic is not None and name in self.wanted:
+                for received, raw in self.messages.get(number, ()):
+                    topic.received.append(received)
+                    topic.raw.append(raw)
+        if self.index == 0:
+            container.damage = "the recorder was stopped before it had finished the file"
+        elif self.index is not None and self.index > self.size:
+            container.damage = "the file was cut"
+        elif self.lost or self.index is None:
+            container.damage = "the file is damaged"
+        return container
+
+
+def _record(data: bytes, position: int) -> _Record | None:
+    """The record that begins at a position, or None if there is none."""
+    if position + 4 > len(data):
+        return None
+    (length,) = _length(data, position)
+    begin = position + 4 + length
+    if not 4 < length <= _LONGEST_HEADER or begin + 4 > len(data):
+        return None
+    fields = _fields(data, position + 4, begin)
+    if fields is None:
+        return None
+    kind = fields.get(b"op", b"")
+    if len(kind) != 1 or kind[0] not in KINDS:
+        return None
+    (size,) = _length(data, begin)
+    end = begin + 4 + size
+    # only a chunk is read in part
+    if end > len(data) and kind[0] != CHUNK:
+        return None
+    return _Record(kind[0], fields, begin + 4, end)
+
+
+def _fields(data: bytes, position: int, end: int) -> dict[bytes, bytes] | None:
+    """The named fields from a position on that fill the bytes up to `end`, or None if they do not."""
+    fields: dict[bytes, bytes] = {}
+    while position + 4 <= end:
+        (length,) = _length(data, position)
+        position += 4
+        if length > end - position:
+            return None
+        name, equals, value = data[position : position + length].partition(b"=")
+        if not equals:
+            return None
+        fields[name] = value
+        position += length
+    return fields if position == end else None
+
+
+def _next_record(data: bytes, position: int) -> int:
+    """Where the next record begins, from a position on; the end of the data if there is none."""
+    mark = data.find(_KIND_FIELD, position)
+    while mark >= 0:
+        # fields may stand before the kind: how many is not known, but their lengths have to fit
+        for begin in range(max(position, mark - 80), mark - 3):
+            (length,) = _length(data, begin)
+            if mark - begin <= length <= 4096 and _record(data, begin) is not None:
+                return begin
+        mark = data.find(_KIND_FIELD, mark + 1)
+    return len(data)

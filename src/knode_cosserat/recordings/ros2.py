@@ -1,0 +1,183 @@
+"""Bags of ROS 2: MCAP files, SQLite files (.db3) and the folders that hold them, as far as they go.
+
+Neither the summary at an MCAP file's end nor a folder's metadata.yaml is needed: a recorder that was killed
+has not written them.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+import struct
+import urllib.parse
+from collections.abc import Collection, Iterator
+from pathlib import Path
+
+from knode_cosserat.recordings.container import Container, decompressed
+from knode_cosserat.recordings.findings import RecordingError
+
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+SQLITE_MAGIC = b"SQLite format 3\x00"
+#: the kinds of MCAP's records
+SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 0x03, 0x04, 0x05, 0x06, 0x0F
+_KINDS = range(0x01, 0x10)
+
+
+def storage_files(folder: Path) -> list[Path]:
+    """The files of a bag that is a folder, in the order of recording.
+
+    Raises:
+        RecordingError: it holds none, or compressed ones.
+    """
+    files = [path for path in folder.iterdir() if path.suffix in (".mcap", ".db3")]
+    packed = next((path for path in folder.iterdir() if path.suffix == ".zstd"), None)
+    if packed is not None:
+        raise RecordingError(f"{packed}: a compressed file of a bag; allowed is one unpacked by zstd -d")
+    if not files:
+        raise RecordingError(f"{folder}: this folder holds no bag; allowed is one with .mcap or .db3 files")
+    # the recorder numbers them: _0, _1 … _10
+    return sorted(files, key=lambda path: (len(path.name), path.name))
+
+
+def merged(containers: list[Container]) -> Container:
+    """The files of one bag, one after the other."""
+    whole = containers[0]
+    for each in containers[1:]:
+        whole.lost += each.lost
+        whole.damage = whole.damage or each.damage
+        for topic in each.topics.values():
+            known = whole.topic(topic.name, topic.type, topic.digest)
+            if known is not None:
+                known.received += topic.received
+                known.raw += topic.raw
+    return whole
+
+
+# MCAP
+
+
+def read_mcap(data: bytes, wanted: Collection[str], source: str) -> Container:
+    """The messages of the wanted topics, and the names and types of all. Raises `RecordingError`."""
+    file = _Mcap(wanted)
+    file.scan(memoryview(data), len(MCAP_MAGIC))
+    if not file.finished:
+        file.container.damage = file.container.damage or "the recorder was stopped or the file was cut"
+    if not file.container.topics:
+        raise RecordingError(f"{source}: no topic in this MCAP file can be read; it has {len(data)} bytes")
+    return file.container
+
+
+class _Mcap:
+    """What has been read of an MCAP file so far."""
+
+    def __init__(self, wanted: Collection[str]) -> None:
+        self.container = Container(ros=2)
+        self.wanted = wanted
+        self.types: dict[int, str] = {}
+        self.channels: dict[int, tuple[str, int]] = {}
+        self.finished = False
+
+    def scan(self, view: memoryview, position: int) -> None:
+        for kind, record in self._records(view, position):
+            try:
+                self._take(kind, record)
+            except (struct.error, UnicodeDecodeError):
+                self.container.lost += len(record)
+                self.container.damage = "the file is damaged"
+
+    def _records(self, view: memoryview, position: int) -> Iterator[tuple[int, memoryview]]:
+        while position + 9 <= len(view):
+            kind, size = view[position], int.from_bytes(view[position + 1 : position + 9], "little")
+            begin = position + 9
+            if kind not in _KINDS or (begin + size > len(view) and kind != CHUNK):
+                break
+            yield kind, view[begin : begin + size]
+            position = begin + size
+            # what follows the data repeats them
+            if kind == DATA_END:
+                self.finished = True
+                return
+        self.container.lost += max(0, len(view) - position)
+
+    def _take(self, kind: int, record: memoryview) -> None:
+        if kind == SCHEMA:
+            (number,) = struct.unpack_from("<H", record)
+            self.types[number], _ = _string(record, 2)
+        elif kind == CHANNEL:
+            number, schema = struct.unpack_from("<HH", record)
+            self.channels[number] = _string(record, 4)[0], schema
+            self.container.topic(self.channels[number][0], self.types.get(schema, "unknown"))
+        elif kind == CHUNK:
+            size, _ = struct.unpack_from("<QI", record, 16)
+            compression, begin = _string(record, 28)
+            length = struct.unpack_from("<Q", record, begin)[0]
+            packed = record[begin + 8 : begin + 8 + length]
+            records = decompressed(packed, compression, size) if compression else packed
+            self.container.lost += max(0, min(size, length) - len(records))
+            self.scan(memoryview(records), 0)
+        elif kind == MESSAGE:
+            number, _, received = struct.unpack_from("<HIQ", record)
+            name, schema = self.channels.get(number, ("", 0))
+            topic = (
+                self.container.topic(name, self.types.get(schema, "unknown")) if name in self.wanted else None
+            )
+            if topic is not None:
+                topic.received.append(received)
+                topic.raw.append(record[22:])
+
+
+def _string(record: memoryview, position: int) -> tuple[str, int]:
+    """Text with its length before it, and where it ends."""
+    (length,) = struct.unpack_from("<I", record, position)
+    end = position + 4 + length
+    if end > len(record):
+        raise struct.error("text beyond the record's end")
+    return bytes(record[position + 4 : end]).decode("utf-8"), end
+
+
+# SQLite
+
+
+def read_sqlite(path: Path, wanted: Collection[str], source: str) -> Container:
+    """The messages of the wanted topics, and the names and types of all. Raises `RecordingError`."""
+    container = Container(ros=2)
+    # without a journal beside it the file is only read; with one, SQLite has to look into both
+    journal = path.with_name(path.name + "-wal").exists()
+    address = f"file:{urllib.parse.quote(str(path))}?mode=ro" + ("" if journal else "&immutable=1")
+    try:
+        connection = sqlite3.connect(address, uri=True)
+    except sqlite3.Error as error:
+        raise RecordingError(f"{source}: cannot be read: {error}") from None
+    try:
+        _tables(connection, container, wanted)
+    except (sqlite3.Error, UnicodeDecodeError, OverflowError) as error:
+        container.damage = f"the file was cut or is damaged ({error})"
+    finally:
+        connection.close()
+    if not container.topics:
+        reason = container.damage or "it has no tables of topics and messages"
+        raise RecordingError(f"{source}: no topic in this SQLite file can be read: {reason}")
+    return container
+
+
+def _tables(connection: sqlite3.Connection, container: Container, wanted: Collection[str]) -> None:
+    # not views: reading a file is not to run what somebody wrote into it
+    query = "SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name IN ('topics', 'messages')"
+    if connection.execute(query).fetchone()[0] != 2:
+        return
+    topics = {}
+    for number, name, kind in connection.execute("SELECT id, name, type FROM topics"):
+        if isinstance(name, str) and isinstance(kind, str):
+            topics[number] = container.topic(name, kind)
+    # in the order in which they were written: what is read before the damage is then the beginning
+    for number, received, raw in connection.execute(
+        "SELECT topic_id, timestamp, data FROM messages ORDER BY id"
+    ):
+        topic = topics.get(number)
+        if (
+            topic is not None
+            and topic.name in wanted
+            and isinstance(received, int)
+            and isinstance(raw, bytes)
+        ):
+            topic.received.append(received)
+            topic.raw.append(raw)
