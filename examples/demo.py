@@ -33,7 +33,7 @@ def simulate_the_papers_robot(out: Path) -> None:
 
 def predict_a_recording(out: Path) -> None:
     """The paper's robot under the tensions that were measured on another one, against where its tip went."""
-    measured = load_example().between(1.0, 11.0)
+    measured = load_example().sampled(DT).between(1.0, 11.0)
     robot = kc.load_robot("delrin-tendon-robot")
     # row 0 is the state at rest, so that the last row's tension would lead beyond the last row
     prediction = kc.simulate(robot, measured.tension[:-1], measured.dt)

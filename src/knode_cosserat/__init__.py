@@ -24,6 +24,11 @@ from knode_cosserat.learning.model_file import ModelFileError, load_model
 from knode_cosserat.learning.residual import Residual
 from knode_cosserat.learning.runs import FitError
 from knode_cosserat.learning.samples import DataError
+from knode_cosserat.recordings.config import RecordingConfig
+from knode_cosserat.recordings.findings import RecordingError
+from knode_cosserat.recordings.load import load_recording
+from knode_cosserat.recordings.measurements import Measurements
+from knode_cosserat.recordings.recording import Recording
 from knode_cosserat.rods.parameters import ParameterError, parameter
 from knode_cosserat.rods.robot_file import RobotFileError, catalog, load_robot, save_robot
 from knode_cosserat.rods.system import Field, History, Layout, Scales, System
@@ -56,10 +61,14 @@ __all__ = [
     "FitError",
     "History",
     "Layout",
+    "Measurements",
     "ModelFileError",
     "NetworkOptions",
     "NewtonOptions",
     "ParameterError",
+    "Recording",
+    "RecordingConfig",
+    "RecordingError",
     "Residual",
     "Result",
     "RobotFileError",
@@ -82,6 +91,7 @@ __all__ = [
     "fit",
     "load_ensemble",
     "load_model",
+    "load_recording",
     "load_robot",
     "load_trajectory",
     "node_error",

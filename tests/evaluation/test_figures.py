@@ -8,7 +8,6 @@ import pytest
 import knode_cosserat as kc
 from knode_cosserat.evaluation import figures
 from knode_cosserat.evaluation.metrics import dtw_distance
-from knode_cosserat.recordings import TipRecording
 
 # beyond the package's own warnings: those of matplotlib about what it is asked to draw
 pytestmark = pytest.mark.filterwarnings("error")
@@ -36,8 +35,15 @@ def trajectory():
 def recording(trajectory):
     rng = np.random.default_rng(0)
     tip = np.asarray(trajectory.tip_position) + rng.normal(0.0, 0.05, trajectory.tip_position.shape)
-    return TipRecording(
-        7.0 + np.asarray(trajectory.time), np.asarray(trajectory.tension), tip, True, "a test"
+    return kc.Measurements(
+        time=7.0 + np.asarray(trajectory.time),
+        tension=np.asarray(trajectory.tension),
+        fractions=np.ones(1),
+        position=tip[:, None],
+        quaternion=np.full((len(tip), 1, 4), np.nan),
+        measured=np.ones((len(tip), 1), dtype=bool),
+        simulated=True,
+        source="a test",
     )
 
 

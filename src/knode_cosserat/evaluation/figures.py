@@ -30,7 +30,7 @@ from knode_cosserat.trajectory import Trajectory
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from knode_cosserat.recordings.table import TipRecording
+    from knode_cosserat.recordings.measurements import Measurements
 
 __all__ = [
     "overview",
@@ -87,7 +87,7 @@ def overview(trajectory: Trajectory, count: int = 12) -> Figure:
     return figure
 
 
-def prediction_against_measurement(prediction: Tips, recording: TipRecording) -> Figure:
+def prediction_against_measurement(prediction: Tips, recording: Measurements) -> Figure:
     """Two tip paths row by row: over the recording's time, seen from above, and how far apart they are.
 
     The title gives their DTW distance, and the root mean square of their distance in each row. A recording of

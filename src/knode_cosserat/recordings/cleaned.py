@@ -59,7 +59,7 @@ def _body(
 ) -> tuple[Body, list[Finding]]:
     time, pose = seconds[topic], values[topic]
     findings: list[Finding] = []
-    good = np.isfinite(pose).all(axis=1) & (np.abs(pose) < 1e9).all(axis=1)
+    good = _usable(pose)
     if pose.shape[1] == 7:
         # a quaternion of zeros is how some drivers say that they see nothing
         good[good] &= np.abs(np.linalg.norm(pose[good, 3:], axis=1) - 1.0) < 0.05
@@ -75,13 +75,14 @@ def _body(
         for swap in swaps:
             angles = ", ".join(f"{angle:.0f}" for angle in swap.angles)
             when = float(time[swap.row])
-            what = f"its axes were swapped at {when:.3f} s (turned by {angles} degrees about x, y, z), and undone"
+            what = f"its axes were swapped at {when:.3f} s (by {angles} degrees about x, y, z); undone"
             findings.append(Finding("warning", topic, what, (when,)))
     wrong = _jumping(time, pose, config)
     if pose.shape[1] == 7:
         left = [row for row in unclear if not wrong[row - 1 : row + 1].any()]
         if left:
-            what = f"{_count(len(left), 'turn', 'turns')} too large for a motion that are no swap of axes, left as seen"
+            turns = _count(len(left), "turn", "turns")
+            what = f"{turns} too large for a motion, and no swap of axes; left as seen"
             findings.append(Finding("warning", topic, what, tuple(time[left].tolist())))
     _drop(findings, topic, time[wrong], "pose jumps", "poses jump", "out of the motion and back", "note")
     time, pose = time[~wrong], pose[~wrong]
@@ -114,7 +115,7 @@ def cleaned_tensions(
         RecordingError: messages have another number of tendons, or none is usable and they are needed.
     """
     findings: list[Finding] = []
-    both = []
+    both: list[Tensions | None] = []
     for kind, source in (("measured", config.tension), ("commanded", config.command)):
         if source is None or source.topic not in seconds:
             both.append(None)
@@ -136,11 +137,11 @@ def _tensions(
         return None
     if sent.shape[1] != len(source.order):
         raise RecordingError(
-            f"{path}: topic {source.topic}: a message has {sent.shape[1]} tensions; the configuration's order has "
-            f"{len(source.order)} tendons"
+            f"{path}: topic {source.topic}: a message has {sent.shape[1]} tensions; "
+            f"the configuration's order has {len(source.order)} tendons"
         )
     newtons = sent[:, np.argsort(source.order)] * TENSION_UNITS[source.unit]
-    good = np.isfinite(newtons).all(axis=1) & (np.abs(newtons) < 1e9).all(axis=1)
+    good = _usable(newtons)
     _drop(findings, source.topic, time[~good], "tension is", "tensions are", "not finite", "warning")
     time, newtons = time[good], newtons[good]
     if kind == "measured":
@@ -175,6 +176,11 @@ def _drop(
         findings.append(Finding(severity, topic, what, tuple(times[:1000].tolist())))
 
 
+def _usable(rows: Float[np.ndarray, "n size"]) -> Bool[np.ndarray, " n"]:
+    """Which rows are finite numbers of a size that something can have."""
+    return np.asarray(np.all(np.abs(np.nan_to_num(rows, nan=np.inf)) < 1e9, axis=1))
+
+
 def _pauses(topic: str, time: np.ndarray, longest: float) -> list[Finding]:
     """What is said of pauses that are too long to be bridged."""
     steps = np.diff(time)
@@ -186,7 +192,8 @@ def _pauses(topic: str, time: np.ndarray, longest: float) -> list[Finding]:
         f"{a:.2f} to {a + step:.2f} s" for a, step in zip(where[:3], steps[long][:3], strict=True)
     )
     more = f" and {int(long.sum()) - 3} more" if long.sum() > 3 else ""
-    what = f"{_count(int(long.sum()), 'pause', 'pauses')} too long to be bridged ({listed}{more}) split the recording"
+    pauses = _count(int(long.sum()), "pause", "pauses")
+    what = f"{pauses} too long to be bridged ({listed}{more}): the recording is in parts"
     return [Finding("warning", topic, what, tuple(where.tolist()))]
 
 

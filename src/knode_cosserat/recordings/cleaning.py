@@ -96,7 +96,7 @@ def swaps_undone(
         return quaternion, [], []
     rotation = _rotation(quaternion)
     turn = rotation[:-1].inv() * rotation[1:]
-    angle = turn.magnitude()
+    angle = np.asarray(turn.magnitude())
     large = np.flatnonzero(angle > _LARGEST_TURN)
     rate = np.where(angle > _LARGEST_TURN, 0.0, angle / np.diff(time))
     undo = Rotation.identity()
@@ -107,7 +107,7 @@ def swaps_undone(
     for step in large:
         # what the body can have turned: the fastest of the turns nearby, for as long as nobody looked
         moved = np.max(rate[max(0, step - 10) : step + 11], initial=0.0) * (time[step + 1] - time[step])
-        left = (_CUBE.inv() * turn[step]).magnitude()
+        left = np.asarray((_CUBE.inv() * turn[step]).magnitude())
         nearest = int(np.argmin(left))
         is_identity = _CUBE[nearest].magnitude() < 1e-6
         if is_identity or left[nearest] > max(_MOVED, 1.5 * moved) or moved > _LARGEST_TURN:

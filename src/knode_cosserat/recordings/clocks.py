@@ -46,8 +46,8 @@ def chosen(streams: Sequence[Stream], clock: str) -> tuple[dict[str, Int[np.ndar
         elif not one_clock and abs(late[stream.topic]) > DISAGREEMENT:
             behind = "behind" if late[stream.topic] > 0 else "before"
             what = (
-                f"the clock of its stamps is {abs(late[stream.topic]):.3f} s {behind} the recorder's, and others' "
-                "are not; the times of recording are used"
+                f"the clock of its stamps is {abs(late[stream.topic]):.3f} s {behind} the recorder's, "
+                "and others' are not; the times of recording are used"
             )
             findings.append(Finding("warning", stream.topic, what))
         else:
@@ -65,7 +65,7 @@ def _without_jumps(stream: Stream) -> tuple[Int[np.ndarray, " n"], list[Finding]
     # there and back: a message out of order, or one damaged stamp
     odd[1:] &= ~odd[:-1]
     drift = (stream.stamped - stream.received) * 1e-9
-    stays = [row for row in np.flatnonzero(odd) if _stays(drift, row)]
+    stays = [row for row in np.flatnonzero(odd) if _stays(drift, int(row))]
     if not stays:
         return stream.stamped, []
     sizes = ", ".join(f"{stamps[row] - received[row]:+.3f} s" for row in stays[:3])

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import dataclasses
 import fractions
+import itertools
 import math
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -105,7 +106,7 @@ class CommandSource(TensionSource):
     def __post_init__(self) -> None:
         super().__post_init__()
         _set(self, "latency", _number(self.latency, "latency", 0.0, 10.0, "s"))
-        if self.text is not None and (not isinstance(self.text, str) or self.text.count(PLACE) != 1):
+        if self.text is not None and str(self.text).count(PLACE) != 1:
             raise RecordingError(
                 f"text is {shown(self.text)}; allowed is text with one {PLACE} where the numbers stand"
             )
@@ -123,8 +124,8 @@ class RecordingConfig:
         tensions: which of the two a robot is driven by, where nothing else is asked for.
         position_unit: "m" or "mm".
         origin: the clamped end in motion capture's frame (m), where there is no base.
-        rotation: turns motion capture's frame to the robot's, whose z points up the straight rod; a quaternion,
-            scalar first.
+        rotation: turns motion capture's frame to the robot's, whose z points up the straight rod; a
+            quaternion, scalar first.
         clock: "header": the stamps in messages' headers, when they were measured; "received": when they were
             recorded.
         longest_gap: the longest time without frames that is bridged (s); a stream's own period always is.
@@ -396,7 +397,7 @@ def _markers(value: Any) -> tuple[MarkerSource, ...]:
     if not markers or any(not isinstance(marker, MarkerSource) for marker in markers):
         raise RecordingError(f"markers is {shown(value)}; allowed is a list of one marker or more")
     fractions_given = [marker.fraction for marker in markers]
-    if any(b <= a for a, b in zip(fractions_given, fractions_given[1:], strict=False)):
+    if any(b <= a for a, b in itertools.pairwise(fractions_given)):
         raise RecordingError(
             f"markers have the fractions {shown(fractions_given)}; allowed is each above the last"
         )

@@ -1,21 +1,22 @@
-"""Recordings from files: bags of ROS 1 and 2, CSV and Parquet tables."""
+"""Recordings from files: bags of ROS 1 and 2, CSV and Parquet tables.
+
+What takes long to import (pandas, scipy) is imported where it is used: this module comes with the package.
+"""
 
 from __future__ import annotations
 
 import importlib.resources
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from knode_cosserat.recordings import clocks, ros1, ros2, table
-from knode_cosserat.recordings.cleaned import cleaned_poses, cleaned_tensions
+from knode_cosserat.recordings import ros1, ros2
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.container import Container
-from knode_cosserat.recordings.findings import SEVERITIES, Finding, RecordingError
-from knode_cosserat.recordings.frame import placed
+from knode_cosserat.recordings.findings import Finding, RecordingError
 from knode_cosserat.recordings.messages import Role, Stream, decoded
-from knode_cosserat.recordings.plausible import units_doubted
 from knode_cosserat.recordings.recording import Recording
 
 #: where the package's own recording is
@@ -45,11 +46,13 @@ def load_recording(path: str | Path, config: RecordingConfig | None = None) -> R
         or _named_bag(path)
     ):
         return _from_bag(path, begin, config or RecordingConfig.paper_robot())
+    from knode_cosserat.recordings import table
+
     if begin.startswith(table.PARQUET_MAGIC):
         said, numbers = table.read_parquet(path)
     else:
         said, numbers = table.read_csv(_bytes(path), str(path))
-    return _from_table(path.name, str(path), said, numbers, config)
+    return _from_table(path.name, str(path), (said, numbers), config)
 
 
 def load_example() -> Recording:
@@ -57,9 +60,10 @@ def load_example() -> Recording:
 
     The robot was a stand-in for the paper's, simulated with PyElastica, and not a physical one.
     """
+    from knode_cosserat.recordings import table
+
     file = importlib.resources.files("knode_cosserat.recordings") / "data" / EXAMPLE
-    said, numbers = table.read_csv(file.read_bytes(), EXAMPLE)
-    return _from_table(EXAMPLE, EXAMPLE, said, numbers, None)
+    return _from_table(EXAMPLE, EXAMPLE, table.read_csv(file.read_bytes(), EXAMPLE), None)
 
 
 def _beginning(path: Path) -> bytes:
@@ -90,6 +94,8 @@ def _named_bag(path: Path) -> bool:
 
 
 def _from_bag(path: Path, begin: bytes, config: RecordingConfig) -> Recording:
+    from knode_cosserat.recordings import assembly
+
     wanted = _roles(config)
     container = _container(path, begin, wanted)
     unused = config.command if config.tensions == "measured" else config.tension
@@ -106,7 +112,7 @@ def _from_bag(path: Path, begin: bytes, config: RecordingConfig) -> Recording:
         found[name] = decoded(topic, container.ros, role, config.command, str(path))
     if container.damage:
         findings.append(_said_damage(container, found.values()))
-    return _assembled(str(path), path.name, config, found, findings)
+    return assembly.assembled(str(path), path.name, config, found, findings)
 
 
 def _roles(config: RecordingConfig) -> dict[str, Role]:
@@ -147,69 +153,14 @@ def _said_damage(container: Container, streams: Iterable[Stream]) -> Finding:
 
 
 def _from_table(
-    name: str, path: str, said: dict[str, str], numbers: table.pd.DataFrame, config: RecordingConfig | None
+    name: str, path: str, content: tuple[dict[str, str], Any], config: RecordingConfig | None
 ) -> Recording:
+    from knode_cosserat.recordings import assembly, table
+
+    said, numbers = content
     simulated = table.said_simulated(said, path)
     config = config or table.configured(said, list(numbers.columns), path)
     found = table.streams(numbers, config, path)
     if config.simulated is None:
         config = config.replace(simulated=simulated)
-    return _assembled(path, said.get("source", name), config, found, [])
-
-
-# both
-
-
-def _assembled(
-    path: str, name: str, config: RecordingConfig, found: dict[str, Stream], findings: list[Finding]
-) -> Recording:
-    for stream in found.values():
-        if stream.broken:
-            what = f"{stream.broken} messages could not be understood, and are left out"
-            findings.append(Finding("warning", stream.topic, what))
-    times, about_clocks = clocks.chosen(list(found.values()), config.clock)
-    rows = {}
-    for topic, stream in found.items():
-        rows[topic], about_order = clocks.ordered(topic, times[topic])
-        about_clocks += about_order
-    zero = _zero(config, times, rows)
-    if zero is None:
-        raise RecordingError(f"{path}: no poses and no tensions in this recording")
-    seconds = {topic: np.round((times[topic][rows[topic]] - zero) * 1e-9, 6) for topic in found}
-    findings += [
-        Finding(each.severity, each.topic, each.message, tuple((t - zero) * 1e-9 for t in each.times))
-        for each in about_clocks
-    ]
-    values = {topic: stream.values[rows[topic]] for topic, stream in found.items()}
-
-    poses, about_poses = cleaned_poses(config, seconds, values, path)
-    *bodies, base = poses
-    tension, command, about_tensions = cleaned_tensions(config, seconds, values, path)
-    assert all(body is not None for body in bodies)
-    in_frame, base, rest, about_frame = placed([body for body in bodies if body is not None], base, config)
-    findings += about_poses + about_tensions + about_frame
-    findings += units_doubted(in_frame, tension, command, rest)
-    if config.simulated:
-        findings.append(Finding("note", "", "the robot was itself a simulation, and not a physical one"))
-    description = f"{name}: {config.description}" if config.description else name
-    return Recording(
-        source=description,
-        config=config,
-        bodies=tuple(in_frame),
-        base=base,
-        tension=tension,
-        command=command,
-        rest=rest,
-        simulated=config.simulated,
-        findings=tuple(sorted(findings, key=lambda each: SEVERITIES.index(each.severity))),
-        delays=clocks.offsets(list(found.values())),
-    )
-
-
-def _zero(
-    config: RecordingConfig, times: dict[str, np.ndarray], rows: dict[str, np.ndarray]
-) -> np.int64 | None:
-    """When the first pose or measured tension was (ns); commands can be long before."""
-    later = {config.command.topic} if config.command is not None and config.tension is not None else set()
-    first = [times[topic][kept[0]] for topic, kept in rows.items() if len(kept) and topic not in later]
-    return np.int64(min(first)) if first else None
+    return assembly.assembled(path, said.get("source", name), config, found, [])

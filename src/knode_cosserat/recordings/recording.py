@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Mapping
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation, Slerp
 
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.findings import Finding, RecordingError
@@ -211,12 +210,14 @@ def _runs(time: Float[np.ndarray, " n"], limit: float) -> list[tuple[int, int]]:
     """First and last (exclusive) rows of the pieces without a longer pause."""
     breaks = np.flatnonzero(np.diff(time) > limit) + 1
     ends = [0, *breaks.tolist(), len(time)]
-    return [(first, last) for first, last in zip(ends[:-1], ends[1:], strict=True) if last > first]
+    return [(first, last) for first, last in itertools.pairwise(ends) if last > first]
 
 
 def _curve(
     time: Float[np.ndarray, " n"], position: Float[np.ndarray, "n 3"], at: Float[np.ndarray, " T"]
 ) -> Float[np.ndarray, "T 3"]:
+    from scipy.interpolate import CubicSpline
+
     if len(time) == 1:
         return np.broadcast_to(position[0], (len(at), 3))
     return np.asarray(CubicSpline(time, position, bc_type="natural")(at))
@@ -225,6 +226,8 @@ def _curve(
 def _turned(
     time: Float[np.ndarray, " n"], quaternion: Float[np.ndarray, "n 4"], at: Float[np.ndarray, " T"]
 ) -> Float[np.ndarray, "T 4"]:
+    from scipy.spatial.transform import Rotation, Slerp
+
     if len(time) == 1 or len(at) == 0:
         return np.broadcast_to(quaternion[0], (len(at), 4))
     turned = Slerp(time, Rotation.from_quat(quaternion, scalar_first=True))(at).as_quat(scalar_first=True)

@@ -10,9 +10,9 @@ A CSV file, UTF-8, with comments before its header; a Parquet file has the same 
     time [s],tension_1 [N],tension_2 [N],…,command_1 [N],…,rib_x [m],rib_y [m],rib_z [m],rib_qw,…,tip_x [m],…
 
 `simulated` says whether the robot was itself a simulation; without it nothing is claimed. A body alone is at
-the tip, others need their `fraction` of the rod's length. Without a configuration positions are in the robot's
-frame and orientations (quaternions, scalar first) those of the rod. A row has what was measured at its time:
-where other sensors are faster, cells stay empty.
+the tip, others need their `fraction` of the rod's length. Without a configuration positions are in the
+robot's frame and orientations (quaternions, scalar first) those of the rod. A row has what was measured at its
+time: where other sensors are faster, cells stay empty.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ TIME = "time [s]"
 #: what columns of tensions begin with where no configuration says otherwise
 TENSION, COMMAND = "tension", "command"
 ALLOWED = (
-    f"{TIME}, tension_1 [N], tension_2 [N], …, NAME_x [m], NAME_y [m], NAME_z [m] for each body, and, if they "
-    "were measured, NAME_qw, NAME_qx, NAME_qy, NAME_qz, and command_1 [N], …"
+    f"{TIME}, tension_1 [N], tension_2 [N], …, NAME_x [m], NAME_y [m], NAME_z [m] for each body, and, if "
+    "they were measured, NAME_qw, NAME_qx, NAME_qy, NAME_qz, and command_1 [N], …"
 )
 PARQUET_MAGIC = b"PAR1"
 _QUATERNION = ("qw", "qx", "qy", "qz")
@@ -115,7 +115,8 @@ def _numbers(table: pd.DataFrame, path: str) -> pd.DataFrame:
         # how programs write that there is no number
         if str(given).strip().lower() not in ("nan", "none", "null", "na", "n/a", "-nan", ""):
             raise RecordingError(
-                f"{path}: row {row + 1}: {table.columns[column]} is {shown(given)}; allowed is a finite number"
+                f"{path}: row {row + 1}: {table.columns[column]} is {shown(given)}; "
+                "allowed is a finite number"
             )
     return pd.DataFrame(values, columns=list(map(str, table.columns)))
 
@@ -160,8 +161,8 @@ def _fraction(body: str, said: Mapping[str, str], bodies: int, path: str) -> flo
     key = f"fraction {body}"
     if key not in said and bodies > 1:
         raise RecordingError(
-            f"{path}: where on the rod {body} is, is not said; allowed is a line '# {key}: ' with a number from "
-            "0 to 1, or a configuration"
+            f"{path}: where on the rod {body} is, is not said; allowed is a line '# {key}: ' with a number "
+            "from 0 to 1, or a configuration"
         )
     return _said_number(key, said, 1.0, path)
 
@@ -174,7 +175,7 @@ def _said_number(key: str, said: Mapping[str, str], otherwise: float, path: str)
 
 
 def said_simulated(said: Mapping[str, str], path: str) -> bool | None:
-    """Whether a table says that the robot was a simulation; None if it does not say. Raises `RecordingError`."""
+    """Whether a table says that the robot was a simulation; None if it does not. Raises `RecordingError`."""
     given = said.get("simulated")
     if given not in (None, "true", "false"):
         raise RecordingError(f"{path}: simulated is {shown(given)}; allowed is true or false")
@@ -223,9 +224,9 @@ def streams(table: pd.DataFrame, config: RecordingConfig, path: str) -> dict[str
         if missing and topic in optional and len(missing) == len(titles):
             continue
         if missing:
+            wrong = "missing" if missing[0] not in columns else "there twice"
             raise RecordingError(
-                f"{path}: the column {missing[0]} is {'missing' if missing[0] not in columns else 'there twice'}; "
-                f"the columns are {', '.join(columns)}"
+                f"{path}: the column {missing[0]} is {wrong}; the columns are {', '.join(columns)}"
             )
         found[topic] = _stream(topic, time, table[titles].to_numpy())
     return found
