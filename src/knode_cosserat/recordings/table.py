@@ -11,8 +11,8 @@ A CSV file, UTF-8, with comments before its header; a Parquet file has the same 
 
 `simulated` says whether the robot was itself a simulation; without it nothing is claimed. A body alone is at
 the tip, others need their `fraction` of the rod's length. Without a configuration positions are in the
-robot's frame and orientations (quaternions, scalar first) those of the rod. A row has what was measured at its
-time: where other sensors are faster, cells stay empty.
+robot's frame and orientations (quaternions, scalar first) those of the rod. A row has what was measured at
+its time: where other sensors are faster, cells stay empty.
 """
 
 from __future__ import annotations
@@ -60,11 +60,7 @@ def read_parquet(path: Path) -> tuple[dict[str, str], pd.DataFrame]:
         RecordingError: the file cannot be read, or a column has no numbers.
         ImportError: pyarrow is not installed.
     """
-    try:
-        import pyarrow  # type: ignore[import-not-found, import-untyped, unused-ignore]
-        import pyarrow.parquet  # type: ignore[import-not-found, import-untyped, unused-ignore]
-    except ImportError:
-        raise ImportError("Parquet files need pyarrow: pip install 'knode-cosserat[parquet]'") from None
+    pyarrow = _pyarrow()
     try:
         table = pyarrow.parquet.read_table(path)
         said = {key.decode(): value.decode() for key, value in (table.schema.metadata or {}).items()}
@@ -75,6 +71,22 @@ def read_parquet(path: Path) -> tuple[dict[str, str], pd.DataFrame]:
     if len(frame) == 0:
         raise RecordingError(f"{path}: no rows")
     return said, _numbers(frame, str(path))
+
+
+def write_parquet(path: Path, table: pd.DataFrame, said: Mapping[str, str]) -> None:
+    """Write columns and what is said of them. Raises `ImportError` if pyarrow is not installed."""
+    pyarrow = _pyarrow()
+    written = pyarrow.Table.from_pandas(table, preserve_index=False)
+    pyarrow.parquet.write_table(written.replace_schema_metadata(dict(said)), path)
+
+
+def _pyarrow() -> Any:
+    try:
+        import pyarrow  # type: ignore[import-not-found, import-untyped, unused-ignore]
+        import pyarrow.parquet  # type: ignore[import-not-found, import-untyped, unused-ignore]
+    except ImportError:
+        raise ImportError("Parquet files need pyarrow: pip install 'knode-cosserat[parquet]'") from None
+    return pyarrow
 
 
 def _comments(text: str) -> dict[str, str]:

@@ -1,0 +1,293 @@
+"""Writing recordings, as sensors give them: bags of ROS 1 and 2, and tables, by the same configuration.
+
+What is written with a configuration is read back with it. The name's ending says the format: .bag (ROS 1),
+.mcap or .db3 (ROS 2), .csv, .parquet.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import heapq
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat._files import replacing
+from knode_cosserat.recordings.config import (
+    PLACE,
+    POSITION_UNITS,
+    TENSION_UNITS,
+    CommandSource,
+    RecordingConfig,
+    TensionSource,
+)
+from knode_cosserat.recordings.findings import RecordingError
+from knode_cosserat.recordings.messages import typestore
+
+FORMATS = (".bag", ".mcap", ".db3", ".csv", ".parquet")
+#: what time zero is on the clock of a bag, unless it is said (s since 1970)
+START = 1_720_000_000
+#: the message type for so many numbers; for others, arrays, which have no stamps
+_NUMBERS = {3: "geometry_msgs/msg/Vector3Stamped", 4: "geometry_msgs/msg/QuaternionStamped"}
+_ARRAY = "std_msgs/msg/Float64MultiArray"
+#: what messages are made of
+_PARTS = (
+    "builtin_interfaces/msg/Time",
+    "geometry_msgs/msg/Point",
+    "geometry_msgs/msg/Pose",
+    "geometry_msgs/msg/Quaternion",
+    "geometry_msgs/msg/Vector3",
+    "std_msgs/msg/Header",
+    "std_msgs/msg/MultiArrayLayout",
+)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Poses:
+    """Poses of a body as motion capture gives them, in its own frame and with the body's own axes.
+
+    Attributes:
+        time: s, rising.
+        position: m.
+        quaternion: scalar first; None if only positions are seen.
+    """
+
+    time: Float[np.ndarray, " n"]
+    position: Float[np.ndarray, "n 3"]
+    quaternion: Float[np.ndarray, "n 4"] | None = None
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Pulls:
+    """Tensions (N), tendon 1 first, and when they were measured or commanded (s)."""
+
+    time: Float[np.ndarray, " n"]
+    tension: Float[np.ndarray, "n tendons"]
+
+
+def write_recording(
+    path: str | Path,
+    config: RecordingConfig,
+    poses: Mapping[str, Poses],
+    tension: Pulls | None = None,
+    command: Pulls | None = None,
+    *,
+    start: int = START,
+    delays: Mapping[str, float] | None = None,
+) -> None:
+    """Write a recording that `load_recording(path, config)` reads.
+
+    Args:
+        path: the file; one that is there is replaced.
+        config: topics, order, units; what is on the wire is made by it. Commands in text are whole numbers
+            in grams-force, as the paper's robot sends them.
+        poses: by the markers' names, and the base's under "base".
+        tension: as measured.
+        command: as commanded.
+        start: what time zero is on the bag's clock (s since 1970); tables begin at zero.
+        delays: by topic, how long after its stamp a message is recorded (s); zero where it is not said.
+
+    Raises:
+        RecordingError: the format is not known, something is missing, or the file cannot be written.
+        ImportError: the library for this format is not installed.
+    """
+    path = Path(path)
+    if path.suffix not in FORMATS:
+        raise RecordingError(f"{path}: allowed is a name that ends in {', '.join(FORMATS)}")
+    streams = _on_the_wire(path, config, poses, tension, command)
+    try:
+        if path.suffix == ".bag":
+            _write_ros1(path, streams, start, delays or {})
+        elif path.suffix in (".mcap", ".db3"):
+            _write_ros2(path, streams, start, delays or {})
+        else:
+            _write_table(path, config, streams)
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be written: {error.strerror}") from None
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Stream:
+    """Numbers in the units and the order of the wire."""
+
+    topic: str
+    role: str
+    time: Any
+    values: Any
+    source: Any = None
+
+
+def _on_the_wire(
+    path: Path,
+    config: RecordingConfig,
+    poses: Mapping[str, Poses],
+    tension: Pulls | None,
+    command: Pulls | None,
+) -> list[_Stream]:
+    sources = {marker.name: marker.topic for marker in config.markers}
+    if config.base is not None:
+        sources["base"] = config.base.topic
+    if set(poses) != set(sources):
+        raise RecordingError(f"{path}: poses are given of {sorted(poses)}; required is {sorted(sources)}")
+    scale = POSITION_UNITS[config.position_unit]
+    streams = []
+    for name, topic in sources.items():
+        pose = poses[name]
+        parts = [np.asarray(pose.position) / scale]
+        if pose.quaternion is not None:
+            parts.append(np.asarray(pose.quaternion))
+        streams.append(_Stream(topic, "pose", pose.time, np.concatenate(parts, axis=1)))
+    for role, source, pulls in (("tension", config.tension, tension), ("command", config.command, command)):
+        if pulls is None:
+            continue
+        if source is None or np.shape(pulls.tension)[1:] != (len(source.order),):
+            raise RecordingError(
+                f"{path}: {role} of shape {np.shape(pulls.tension)}; the configuration has "
+                f"{len(source.order) if source else 'no'} tendons there"
+            )
+        streams.append(_Stream(source.topic, role, pulls.time, _sent(source, pulls.tension), source))
+    return streams
+
+
+def _sent(source: TensionSource, newtons: Any) -> Any:
+    sent = np.asarray(newtons)[:, np.array(source.order) - 1] / TENSION_UNITS[source.unit]
+    in_text = isinstance(source, CommandSource) and source.text is not None
+    return np.round(sent) if in_text and source.unit == "gf" else sent
+
+
+# bags
+
+
+def _write_ros1(path: Path, streams: list[_Stream], start: int, delays: Mapping[str, float]) -> None:
+    store = typestore(1)
+    from rosbags.rosbag1 import Writer
+
+    with replacing(path) as temporary, Writer(temporary) as writer:
+        connections = {
+            each.topic: writer.add_connection(each.topic, _type(each, 1), typestore=store) for each in streams
+        }
+        for topic, kind, received, message in _messages(streams, 1, start, delays):
+            writer.write(connections[topic], received, store.serialize_ros1(message, kind))
+
+
+def _write_ros2(path: Path, streams: list[_Stream], start: int, delays: Mapping[str, float]) -> None:
+    store = typestore(2)
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    plugin = StoragePlugin.MCAP if path.suffix == ".mcap" else StoragePlugin.SQLITE3
+    # rosbags writes a folder with a description; the file says all that is in it
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
+        bag = Path(folder) / "bag"
+        with Writer(bag, version=9, storage_plugin=plugin) as writer:
+            connections = {
+                each.topic: writer.add_connection(each.topic, _type(each, 2), typestore=store)
+                for each in streams
+            }
+            for topic, kind, received, message in _messages(streams, 2, start, delays):
+                writer.write(connections[topic], received, store.serialize_cdr(message, kind))
+        (bag / f"bag{path.suffix}").replace(path)
+
+
+def _messages(
+    streams: list[_Stream], ros: int, start: int, delays: Mapping[str, float]
+) -> Iterator[tuple[str, str, int, Any]]:
+    """Topic, type, when it was recorded (ns) and message, in the order of recording."""
+
+    def of(stream: _Stream) -> Iterator[tuple[int, int, str, str, Any]]:
+        kind, make = _type(stream, ros), _maker(stream, ros)
+        delay = round(delays.get(stream.topic, 0.0) * 1e9)
+        for row, (time, values) in enumerate(zip(stream.time, stream.values, strict=True)):
+            stamp = start * 10**9 + round(float(time) * 1e9)
+            yield stamp + delay, row, stream.topic, kind, make(stamp, row, values)
+
+    for received, _, topic, kind, message in heapq.merge(*map(of, streams), key=lambda each: each[:3]):
+        yield topic, kind, received, message
+
+
+def _type(stream: _Stream, ros: int) -> str:
+    size = np.shape(stream.values)[1]
+    if stream.role == "pose":
+        return "geometry_msgs/msg/PoseStamped" if size == 7 else "geometry_msgs/msg/PointStamped"
+    if stream.role == "command" and stream.source.text is not None:
+        return "rosgraph_msgs/msg/Log" if ros == 1 else "rcl_interfaces/msg/Log"
+    return _NUMBERS.get(size, _ARRAY)
+
+
+def _maker(stream: _Stream, ros: int) -> Callable[[int, int, Any], Any]:
+    """What makes a message of a stamp, a row's number and its values."""
+    types, kind = typestore(ros).types, _type(stream, ros)
+    made = {name.rsplit("/", 1)[1]: types[name] for name in _PARTS}
+    frame = "world" if stream.role == "pose" else ""
+
+    def header(stamp: int, row: int) -> Any:
+        time = made["Time"](sec=stamp // 10**9, nanosec=stamp % 10**9)
+        return made["Header"](stamp=time, frame_id=frame, **({"seq": row} if ros == 1 else {}))
+
+    def point(values: Any) -> Any:
+        return made["Point"](*map(float, values))
+
+    def pose(stamp: int, row: int, values: Any) -> Any:
+        if len(values) == 3:
+            return types[kind](header=header(stamp, row), point=point(values))
+        w, x, y, z = map(float, values[3:])
+        turned = made["Quaternion"](x=x, y=y, z=z, w=w)
+        placed = made["Pose"](position=point(values[:3]), orientation=turned)
+        return types[kind](header=header(stamp, row), pose=placed)
+
+    def spoken(stamp: int, row: int, values: Any) -> Any:
+        said = stream.source.text.replace(PLACE, " ".join(f"{value:.10g}" for value in values))
+        head = header(stamp, row)
+        common = {"level": 2, "name": "/motors", "msg": said, "file": "", "function": "", "line": 0}
+        return (
+            types[kind](header=head, topics=[], **common)
+            if ros == 1
+            else types[kind](stamp=head.stamp, **common)
+        )
+
+    def numbers(stamp: int, row: int, values: Any) -> Any:
+        if kind == _ARRAY:
+            layout = made["MultiArrayLayout"](dim=[], data_offset=0)
+            return types[kind](layout=layout, data=np.asarray(values, dtype=float))
+        if len(values) == 3:
+            return types[kind](header=header(stamp, row), vector=made["Vector3"](*map(float, values)))
+        return types[kind](header=header(stamp, row), quaternion=made["Quaternion"](*map(float, values)))
+
+    if stream.role == "pose":
+        return pose
+    return spoken if kind.endswith("/Log") else numbers
+
+
+# tables
+
+
+def _write_table(path: Path, config: RecordingConfig, streams: list[_Stream]) -> None:
+    from knode_cosserat.recordings import table
+
+    columns: dict[str, Any] = {}
+    for stream in streams:
+        if stream.role == "pose":
+            titles = table.position_titles(stream.topic, config.position_unit)
+            titles += table.quaternion_titles(stream.topic) if np.shape(stream.values)[1] == 7 else []
+        else:
+            titles = table.tension_titles(stream.topic, stream.source.unit, len(stream.source.order))
+        columns |= {
+            title: (stream.time, values) for title, values in zip(titles, stream.values.T, strict=True)
+        }
+    said = {f"fraction {marker.topic}": repr(marker.fraction) for marker in config.markers}
+    if config.description:
+        said["source"] = " ".join(config.description.split())
+    if config.simulated is not None:
+        said["simulated"] = "true" if config.simulated else "false"
+    if config.command is not None and config.command.latency:
+        said["latency"] = repr(config.command.latency)
+    frame = table.frame_of(columns)
+    with replacing(path) as temporary:
+        if path.suffix == ".csv":
+            comments = "".join(f"# {key}: {value}\n" for key, value in said.items())
+            temporary.write_text(comments + frame.to_csv(index=False, lineterminator="\n"), encoding="utf-8")
+        else:
+            table.write_parquet(temporary, frame, said)
