@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Mapping
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -14,6 +14,9 @@ from jaxtyping import Bool, Float
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.findings import Finding, RecordingError
 from knode_cosserat.recordings.measurements import Measurements
+
+if TYPE_CHECKING:
+    from knode_cosserat.recordings.health import Health
 
 #: more rows than this are a mistake, and not a recording
 MOST_ROWS = 10_000_000
@@ -136,6 +139,12 @@ class Recording:
             simulated=self.simulated,
             source=self.source,
         )
+
+    def health(self) -> Health:
+        """The report on this recording: rates, gaps, noise, latency, tension errors and findings."""
+        from knode_cosserat.recordings.health import health_of
+
+        return health_of(self)
 
     def _driver(self, kind: str) -> Tensions:
         if kind not in ("measured", "commanded"):

@@ -1,0 +1,172 @@
+"""Figures of recordings; they need matplotlib, the extra `viz`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from knode_cosserat.evaluation.drawing import AXES, PALETTE, legend_above, new_figure, style
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from knode_cosserat.recordings.health import Health
+    from knode_cosserat.recordings.recording import Body, Recording
+
+#: how what happened at a time is marked: what the finding says, its colour and its name
+_MARKS = (
+    ("axes were swapped", PALETTE[1], "axes swapped"),
+    ("clock", PALETTE[3], "clock jumped"),
+    ("left out", PALETTE[4], "left out"),
+)
+
+
+def health(recording: Recording, report: Health) -> Figure:
+    """What sensors saw over time, and how well: tensions, positions, frames that are missing, noise.
+
+    Raises:
+        ImportError: matplotlib is not installed.
+    """
+    with style():
+        figure = new_figure(11.0, 8.2)
+        figure.suptitle(_title(recording, report))
+        left, right = figure.subfigures(1, 2, width_ratios=(2.3, 1.0))
+        axes = left.subplots(5, 1, sharex=True, height_ratios=(1.3, 1.0, 1.0, 1.0, 0.9))
+        _draw_tensions(axes[0], recording)
+        _draw_positions(axes[1:4], recording)
+        _draw_frames(axes[4], recording)
+        axes[4].set_xlabel("time [s]")
+        left.align_ylabels(axes)
+        axes[0].set_xlim(min(0.0, *(body.time[0] for body in recording.bodies)), _end(recording))
+        above, below = right.subplots(2, 1)
+        _draw_noise(above, report)
+        _draw_errors(below, recording, report)
+    return figure
+
+
+def _title(recording: Recording, report: Health) -> str:
+    robot = {True: "a simulated robot", False: "a physical robot", None: "not stated whether simulated"}
+    return f"{recording.source}\n{report.duration:.2f} s, {robot[recording.simulated]}"
+
+
+def _end(recording: Recording) -> float:
+    return float(max(body.time[-1] for body in recording.bodies))
+
+
+def _draw_tensions(axes: Any, recording: Recording) -> None:
+    """Measured tensions as lines, commanded ones as dotted steps."""
+    end = _end(recording)
+    if recording.command is not None:
+        time = np.append(recording.command.time, max(end, recording.command.time[-1]))
+        for k, tension in enumerate(recording.command.tension.T):
+            axes.step(
+                time, np.append(tension, tension[-1]), where="post", linestyle=":", linewidth=1.1,
+                color=PALETTE[k % len(PALETTE)], label="commanded (dotted)" if k == 0 else None,
+            )  # fmt: skip
+    if recording.tension is not None:
+        for k, tension in enumerate(recording.tension.tension.T):
+            axes.plot(
+                recording.tension.time, tension, linewidth=1.0, color=PALETTE[k % len(PALETTE)],
+                label=f"tendon {k + 1}",
+            )  # fmt: skip
+    axes.set_ylabel("tension [N]")
+    axes.legend(
+        loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=recording.tendons + 1, columnspacing=1.2,
+        handlelength=1.8,
+    )  # fmt: skip
+
+
+def _draw_positions(axes: Any, recording: Recording) -> None:
+    """x, y and z of all bodies; lines break where a gap is too long to be bridged."""
+    for k, body in enumerate(recording.bodies):
+        time, position = _with_breaks(body, recording.config.longest_gap)
+        for axis in range(3):
+            axes[axis].plot(
+                time, position[:, axis], linewidth=1.0, color=PALETTE[k % len(PALETTE)], label=body.name
+            )
+    for axis, name in enumerate(AXES):
+        axes[axis].set_ylabel(f"{name} [m]")
+    if recording.rest is not None:
+        for axis in axes:
+            axis.axvspan(*recording.rest, color="#EEEEEE", zorder=0)
+    legend_above(axes[0])
+
+
+def _with_breaks(body: Body, longest: float) -> tuple[np.ndarray, np.ndarray]:
+    from knode_cosserat.recordings.recording import bridge
+
+    breaks = np.flatnonzero(np.diff(body.time) > bridge(body.time, longest)) + 1
+    return np.insert(body.time, breaks, np.nan), np.insert(body.position, breaks, np.nan, axis=0)
+
+
+def _draw_frames(axes: Any, recording: Recording) -> None:
+    """A row for each stream: where frames are missing, and what happened."""
+    from knode_cosserat.recordings.recording import bridge, period
+
+    streams = [(body.name, body.topic, body.time) for body in (*recording.bodies, recording.base) if body]
+    if recording.tension is not None:
+        streams.append(("tensions", recording.tension.topic, recording.tension.time))
+    named: set[str] = set()
+
+    def once(name: str) -> str | None:
+        new = name not in named
+        named.add(name)
+        return name if new else None
+
+    for row, (_, topic, time) in enumerate(streams):
+        steps, limit = np.diff(time), bridge(time, recording.config.longest_gap)
+        for begin, step in zip(time[:-1], steps, strict=True):
+            if step > limit:
+                axes.barh(row, step, left=begin, height=0.8, color=PALETTE[1], alpha=0.5, label=once("gap"))
+        short = (steps > 1.5 * period(time)) & (steps <= limit)
+        where = time[:-1][short] + steps[short] / 2
+        if len(where):
+            axes.plot(
+                where, np.full(len(where), row), "|", color="#555555", markersize=7, label=once("bridged")
+            )
+        for finding in recording.findings:
+            mark = next((mark for mark in _MARKS if mark[0] in finding.message), None)
+            if finding.topic == topic and finding.times and mark is not None:
+                at = np.array(finding.times)
+                axes.plot(at, np.full(len(at), row), "v", color=mark[1], markersize=6, label=once(mark[2]))
+    axes.set_yticks(range(len(streams)), [name for name, _, _ in streams])
+    axes.set(ylim=(len(streams) - 0.4, -0.6), ylabel="frames")
+    if named:
+        legend_above(axes)
+
+
+def _draw_noise(axes: Any, report: Health) -> None:
+    """The noise of positions and, on a second axis, of orientations."""
+    bodies = [stream for stream in report.streams if stream.what not in ("measured tensions", "commands")]
+    at = np.arange(len(bodies))
+    axes.bar(at - 0.2, [1e3 * (each.noise or 0.0) for each in bodies], 0.38, color=PALETTE[0])
+    axes.set_ylabel("noise of position [mm]", color=PALETTE[0])
+    axes.set_xticks(at, [each.what for each in bodies], rotation=30, ha="right")
+    axes.set_title("noise, one standard deviation")
+    if any(each.turn_noise is not None for each in bodies):
+        other = axes.twinx()
+        other.bar(at + 0.2, [1e3 * (each.turn_noise or 0.0) for each in bodies], 0.38, color=PALETTE[1])
+        other.set_ylabel("of orientation [mrad]", color=PALETTE[1])
+        other.grid(False)
+        other.spines["right"].set_visible(True)
+
+
+def _draw_errors(axes: Any, recording: Recording, report: Health) -> None:
+    """Measured less commanded tension by tendon, or the measured ones' spread without commands."""
+    if not report.tension_errors:
+        axes.axis("off")
+        axes.text(0.5, 0.5, "no commands to compare\nmeasured tensions with", ha="center", va="center")
+        return
+    at = np.arange(len(report.tension_errors))
+    colours = [PALETTE[k % len(PALETTE)] for k in at]
+    axes.bar(at, [each.rms for each in report.tension_errors], 0.6, color=colours)
+    axes.plot(at, [each.bias for each in report.tension_errors], "kD", markersize=5, label="bias")
+    axes.axhline(0.0, color="#333333", linewidth=0.8)
+    axes.set_xticks(at, [str(each.tendon) for each in report.tension_errors])
+    axes.set(xlabel="tendon", ylabel="measured less commanded [N]")
+    late = ""
+    if report.latency is not None:
+        late = f"\ncommands {1e3 * report.latency.shift:.0f} ms later; lag {1e3 * report.latency.lag:.0f} ms"
+    axes.set_title(f"tension error, root mean square{late}")
+    axes.legend(loc="best")

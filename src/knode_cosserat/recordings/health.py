@@ -1,0 +1,281 @@
+"""How good a recording is: rates, gaps, noise, how late and how far from commands the tensions are."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import scipy.optimize
+import scipy.signal
+from jaxtyping import Float
+
+from knode_cosserat.recordings.cleaning import rotation_steps
+from knode_cosserat.recordings.findings import Finding
+from knode_cosserat.recordings.frame import at_rest, rest_positions, rod_lengths
+from knode_cosserat.recordings.recording import Body, Recording, Tensions, period
+
+#: commands that change by less say nothing about how late they act (N)
+QUIET = 0.05
+#: latencies are looked for up to this (s), on times this far apart
+LONGEST_LATENCY, _FINE = 0.5, 0.002
+#: fewest rows at rest that tell the noise
+_ENOUGH = 20
+#: a latency that differs by more from the configuration's is said (s)
+_OFF = 0.03
+_NORMAL = 1.4826
+
+
+@dataclasses.dataclass(frozen=True)
+class StreamHealth:
+    """One topic.
+
+    Attributes:
+        topic: its name.
+        what: the body's name, or "measured tensions", or "commands".
+        rows: usable rows.
+        rate: usual rows a second (Hz); None for commands, which come when they come.
+        jitter: standard deviation of the time from row to row, without gaps (s); None as above.
+        missing: share of rows that should be there and are not; None as above.
+        gaps: how often rows are missing; None as above.
+        longest_gap: the longest time from row to row (s).
+        delay: how long after its stamp a message was recorded (s); None without stamps.
+        noise: standard deviation of a coordinate (m), or of a tension (N); None if it cannot be told.
+        turn_noise: standard deviation of orientation about an axis (rad); None if there is none.
+    """
+
+    topic: str
+    what: str
+    rows: int
+    rate: float | None
+    jitter: float | None
+    missing: float | None
+    gaps: int | None
+    longest_gap: float
+    delay: float | None
+    noise: float | None
+    turn_noise: float | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Latency:
+    """How late tensions follow commands.
+
+    Attributes:
+        shift: commands this much later are nearest to the measured tensions (s).
+        delay: until anything happens (s), if what then happens is a first-order lag.
+        lag: that lag's time constant (s).
+    """
+
+    shift: float
+    delay: float
+    lag: float
+
+    @property
+    def total(self) -> float:
+        """How late a change of commands has come through, on average (s)."""
+        return self.delay + self.lag
+
+
+@dataclasses.dataclass(frozen=True)
+class TensionError:
+    """Measured less commanded tension of one tendon (N), commands taken as late as they act."""
+
+    tendon: int
+    bias: float
+    rms: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Health:
+    """A recording's report.
+
+    Attributes:
+        source: what the recording is.
+        simulated: whether the robot was a simulation; None: not stated.
+        duration: how long everything is known (s).
+        rest: from when to when the robot rests (s), or None.
+        rod_length: by each body that is not at the clamped end (m), from the rest; empty without one.
+        streams: by topic.
+        latency: of tensions after commands, or None if that cannot be told.
+        tension_errors: by tendon; empty without both tensions.
+        findings: what was wrong or mended, the gravest first.
+    """
+
+    source: str
+    simulated: bool | None
+    duration: float
+    rest: tuple[float, float] | None
+    rod_length: tuple[float, ...]
+    streams: tuple[StreamHealth, ...]
+    latency: Latency | None
+    tension_errors: tuple[TensionError, ...]
+    findings: tuple[Finding, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The report as JSON can have it."""
+        return dataclasses.asdict(self)
+
+
+def health_of(recording: Recording) -> Health:
+    """The report on a recording."""
+    streams = [_of_body(body, recording) for body in (*recording.bodies, recording.base) if body is not None]
+    for what, tensions in (("measured tensions", recording.tension), ("commands", recording.command)):
+        if tensions is not None:
+            streams.append(_of_tensions(what, tensions, recording))
+    where = rest_positions(recording.bodies, recording.rest)
+    lengths = () if where is None else tuple(rod_lengths(recording.bodies, where).tolist())
+    latency = latency_of(recording)
+    return Health(
+        source=recording.source,
+        simulated=recording.simulated,
+        duration=recording.end,
+        rest=recording.rest,
+        rod_length=lengths,
+        streams=tuple(streams),
+        latency=latency,
+        tension_errors=_tension_errors(recording, latency),
+        findings=(*recording.findings, *_about_latency(recording, latency)),
+    )
+
+
+# streams
+
+
+def _of_body(body: Body, recording: Recording) -> StreamHealth:
+    noise = _noise(body.time, body.position, recording.rest)
+    turned = None
+    if body.quaternion is not None:
+        # summed up from row to row: small turns, whose differences are those of angles
+        turns = np.concatenate([np.zeros((1, 3)), np.cumsum(rotation_steps(body.quaternion), axis=0)])
+        turned = _noise(body.time, turns, recording.rest)
+    return _stream(body.topic, body.name, body.time, recording, noise, turned)
+
+
+def _of_tensions(what: str, tensions: Tensions, recording: Recording) -> StreamHealth:
+    if what == "commands":
+        return _stream(tensions.topic, what, tensions.time, recording, None, None, regular=False)
+    noise = _noise(tensions.time, tensions.tension, recording.rest)
+    return _stream(tensions.topic, what, tensions.time, recording, noise, None)
+
+
+def _stream(
+    topic: str,
+    what: str,
+    time: Float[np.ndarray, " n"],
+    recording: Recording,
+    noise: float | None,
+    turn_noise: float | None,
+    *,
+    regular: bool = True,
+) -> StreamHealth:
+    steps, usual = np.diff(time), period(time)
+    regular = regular and usual > 0.0
+    whole = steps[steps <= 1.5 * usual]
+    expected = int(np.sum(np.round(steps / usual))) + 1 if regular else len(time)
+    delay = recording.delays.get(topic, float("nan"))
+    return StreamHealth(
+        topic=topic,
+        what=what,
+        rows=len(time),
+        rate=round(1.0 / usual, 6) if regular else None,
+        jitter=float(np.std(whole)) if regular else None,
+        missing=max(0.0, 1.0 - len(time) / expected) if regular else None,
+        gaps=int(np.sum(steps > 1.5 * usual)) if regular else None,
+        longest_gap=float(np.max(steps, initial=0.0)),
+        delay=delay if np.isfinite(delay) else None,
+        noise=noise,
+        turn_noise=turn_noise,
+    )
+
+
+def _noise(
+    time: Float[np.ndarray, " n"], values: Float[np.ndarray, "n size"], rest: tuple[float, float] | None
+) -> float | None:
+    """The standard deviation of one number, by what its neighbours do not explain; at rest, if it can be."""
+    still = values[at_rest(time, rest)]
+    known = still if len(still) >= _ENOUGH else values
+    if len(known) < _ENOUGH:
+        return None
+    # third differences leave nothing of a smooth motion; of noise they make √20 as much
+    return float(_NORMAL * np.median(np.abs(np.diff(known, 3, axis=0))) / np.sqrt(20.0))
+
+
+# tensions and commands
+
+
+def latency_of(recording: Recording) -> Latency | None:
+    """How late measured tensions follow commands; None if there are none, or they hardly change."""
+    tension, command = recording.tension, recording.command
+    if tension is None or command is None or len(tension.time) < _ENOUGH:
+        return None
+    if np.max(np.std(command.tension, axis=0)) < QUIET:
+        return None
+    fine = np.arange(tension.time[0], tension.time[-1] + _FINE, _FINE)
+    if len(fine) > 1_000_000:
+        return None
+
+    def missed(delay: float, lag: float) -> float:
+        expected = _followed(command, fine, delay, lag)
+        seen = expected[np.clip(np.searchsorted(fine, tension.time - 1e-9), 0, len(fine) - 1)]
+        left = tension.tension - seen
+        return float(np.sqrt(np.mean((left - left.mean(axis=0)) ** 2)))
+
+    shifts = np.arange(0.0, LONGEST_LATENCY, 5 * _FINE)
+    by_shift = [missed(shift, 0.0) for shift in shifts]
+    shift = float(shifts[int(np.argmin(by_shift))])
+    lags = (0.0, 0.01, 0.02, 0.04, 0.08, 0.16)
+    delays = (0.0, 0.02, 0.04, 0.06, 0.08, 0.1, 0.15, 0.2)
+    first = min(((missed(delay, lag), delay, lag) for delay in delays for lag in lags), key=lambda it: it[0])
+    simplex = np.array(first[1:]) + np.array([[0.0, 0.0], [0.01, 0.0], [0.0, 0.01]])
+    options: Any = {"xatol": 5e-4, "fatol": 1e-6, "maxiter": 80, "initial_simplex": simplex}
+    found = scipy.optimize.minimize(
+        lambda it: missed(abs(float(it[0])), abs(float(it[1]))),
+        np.array(first[1:]),
+        method="Nelder-Mead",
+        options=options,
+    )
+    delay, lag = np.abs(found.x)
+    return Latency(shift, round(float(delay), 4), round(float(lag), 4))
+
+
+def _followed(command: Tensions, time: Float[np.ndarray, " n"], delay: float, lag: float) -> np.ndarray:
+    """Commands held until the next, so much later, through a first-order lag."""
+    last = np.searchsorted(command.time, time - delay + 1e-9, side="right") - 1
+    held = command.tension[np.maximum(last, 0)]
+    if lag < 1e-6:
+        return held
+    stays = np.exp(-_FINE / lag)
+    begin = scipy.signal.lfiltic([1.0 - stays], [1.0, -stays], [1.0])
+    filtered, _ = scipy.signal.lfilter(
+        [1.0 - stays], [1.0, -stays], held, axis=0, zi=begin[:, None] * held[:1]
+    )
+    return np.asarray(filtered)
+
+
+def _tension_errors(recording: Recording, latency: Latency | None) -> tuple[TensionError, ...]:
+    tension, command = recording.tension, recording.command
+    if tension is None or command is None:
+        return ()
+    late = latency.shift if latency else recording.config.command.latency if recording.config.command else 0.0
+    known = tension.time - late >= command.time[0]
+    if not known.any():
+        return ()
+    last = np.searchsorted(command.time, tension.time[known] - late + 1e-9, side="right") - 1
+    error = tension.tension[known] - command.tension[np.maximum(last, 0)]
+    return tuple(
+        TensionError(k + 1, float(each.mean()), float(np.sqrt(np.mean(each**2))))
+        for k, each in enumerate(error.T)
+    )
+
+
+def _about_latency(recording: Recording, latency: Latency | None) -> list[Finding]:
+    if latency is None or recording.config.command is None:
+        return []
+    stated = recording.config.command.latency
+    if abs(latency.total - stated) <= _OFF:
+        return []
+    what = (
+        f"tensions follow commands after {latency.total:.2f} s; the configuration's latency is {stated:g} s"
+    )
+    return [Finding("warning", recording.config.command.topic, what)]
