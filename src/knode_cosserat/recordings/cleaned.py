@@ -73,9 +73,8 @@ def _body(
         pose[:, 3:] /= np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
         pose[:, 3:], swaps, unclear = cleaning.swaps_undone(time, pose[:, 3:])
         for swap in swaps:
-            angles = ", ".join(f"{angle:.0f}" for angle in swap.angles)
             when = float(time[swap.row])
-            what = f"its axes were swapped at {when:.3f} s (by {angles} degrees about x, y, z); undone"
+            what = f"its axes were swapped at {when:.3f} s, by {swap.angle:.0f} degrees about {swap.axis}; undone"
             findings.append(Finding("warning", topic, what, (when,)))
     wrong = _jumping(time, pose, config)
     if pose.shape[1] == 7:

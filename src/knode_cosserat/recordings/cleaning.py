@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 #: a jump is larger than so many standard deviations of the steps around it
 SIGMAS = 12.0
-#: steps around one that say how much the motion itself varies, on each side
-_AROUND = 50
+#: steps around one that say how much the motion itself varies, on each side: just there, and in general
+_AROUND = (10, 50)
 #: the standard deviation of a normal distribution with this median of absolute values
 _NORMAL = 1.4826
 
@@ -40,13 +40,18 @@ def outliers(
     expected = scipy.ndimage.median_filter(steps / dt, size=(9, 1), mode="nearest") * dt
     jump = steps - expected
     size = np.linalg.norm(jump, axis=1)
-    usual = scipy.ndimage.median_filter(size, size=min(2 * _AROUND + 1, len(size)), mode="nearest") * _NORMAL
+    usual = np.max([_running_median(size, around) for around in _AROUND], axis=0) * _NORMAL
     jumps = np.flatnonzero(size > np.maximum(floor, SIGMAS * usual))
     for out, back in itertools.pairwise(jumps):
         returns = np.linalg.norm(jump[out] + jump[back]) < 0.5 * min(size[out], size[back])
         if back - out <= longest and returns and not found[out]:
             found[out + 1 : back + 1] = True
     return found
+
+
+def _running_median(values: Float[np.ndarray, " m"], around: int) -> Float[np.ndarray, " m"]:
+    size = min(2 * around + 1, len(values))
+    return np.asarray(scipy.ndimage.median_filter(values, size=size, mode="nearest"))
 
 
 def position_steps(position: Float[np.ndarray, "n size"]) -> Float[np.ndarray, "m size"]:
@@ -67,8 +72,9 @@ class Swap(NamedTuple):
     """A body's axes became others, from a row on."""
 
     row: int
-    #: the rotation by which they did, in the body's frame (degrees, one axis after the other)
-    angles: tuple[float, ...]
+    #: the turn by which they did (degrees), and about which of the body's axes
+    angle: float
+    axis: tuple[int, ...]
 
 
 #: no motion between two frames turns a body further than this (rad): it would not be told from a swap
@@ -117,7 +123,8 @@ def swaps_undone(
         begin = int(step) + 1
         # turns are seen in the swapped axes: back to the first ones, in the reverse order
         undo = _CUBE[nearest].inv() * undo
-        swaps.append(Swap(begin, tuple(np.round(_CUBE[nearest].as_euler("XYZ", degrees=True)).tolist())))
+        axis = np.sign(np.round(_CUBE[nearest].as_rotvec(), 6)).astype(int).tolist()
+        swaps.append(Swap(begin, float(np.degrees(_CUBE[nearest].magnitude())), tuple(axis)))
     if not swaps:
         return quaternion, [], unclear
     undone.append(rotation[begin:] * undo)

@@ -53,7 +53,7 @@ def placed(
     if base is not None and config.base is not None:
         base = _turned(base, turn, scale)
         origin = base.position.mean(axis=0) - [0.0, 0.0, config.base.height]
-        moved = np.linalg.norm(base.position - np.median(base.position, axis=0), axis=1).max()
+        moved = np.linalg.norm(np.ptp(base.position, axis=0))
         if moved > 10e-3:
             what = f"the base moves by {1e3 * moved:.0f} mm; its mean position is taken for the clamped end"
             findings.append(Finding("warning", base.topic, what))

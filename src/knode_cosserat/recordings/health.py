@@ -229,7 +229,8 @@ def latency_of(recording: Recording) -> Latency | None:
     first = min(((missed(delay, lag), delay, lag) for delay in delays for lag in lags), key=lambda it: it[0])
     simplex = np.array(first[1:]) + np.array([[0.0, 0.0], [0.01, 0.0], [0.0, 0.01]])
     options: Any = {"xatol": 5e-4, "fatol": 1e-6, "maxiter": 80, "initial_simplex": simplex}
-    found = scipy.optimize.minimize(
+    minimize: Any = scipy.optimize.minimize
+    found = minimize(
         lambda it: missed(abs(float(it[0])), abs(float(it[1]))),
         np.array(first[1:]),
         method="Nelder-Mead",

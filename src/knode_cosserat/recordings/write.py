@@ -251,7 +251,7 @@ def _maker(stream: _Stream, ros: int) -> Callable[[int, int, Any], Any]:
     def numbers(stamp: int, row: int, values: Any) -> Any:
         if kind == _ARRAY:
             layout = made["MultiArrayLayout"](dim=[], data_offset=0)
-            return types[kind](layout=layout, data=np.asarray(values, dtype=float))
+            return types[kind](layout=layout, data=np.ascontiguousarray(values, dtype=float))
         if len(values) == 3:
             return types[kind](header=header(stamp, row), vector=made["Vector3"](*map(float, values)))
         return types[kind](header=header(stamp, row), quaternion=made["Quaternion"](*map(float, values)))

@@ -1,0 +1,77 @@
+"""Small recordings whose truth is known, for the tests of reading."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from knode_cosserat.recordings import RecordingConfig
+from knode_cosserat.recordings.write import Poses, Pulls, write_recording
+
+LENGTH = 0.635
+PAPER = RecordingConfig.paper_robot()
+#: the constant rotations of the bodies' axes, and where motion capture has the clamped end
+TURNED = Rotation.from_euler("z", [[0.0], [90.0], [180.0], [-90.0]], degrees=True)
+CLAMP = np.array([0.3, -0.2, 0.8])
+LAG = 0.06
+
+
+def moved(time, fraction):
+    """Where a straight rod that swings about its base from 1 s on has a point, and how it is turned."""
+    swing = 0.5 * np.sin(2 * np.pi * np.clip(time - 1.0, 0.0, None))
+    rotation = Rotation.from_rotvec(swing[:, None] * [0.6, 0.8, 0.0])
+    return rotation.apply([0.0, 0.0, LENGTH * fraction]), rotation
+
+
+def made(seconds=3.0, noise=1e-4, seed=0, config=PAPER):
+    """Streams as the paper's robot would send them: poses by name, tension, command."""
+    rng = np.random.default_rng(seed)
+    time = np.round(np.arange(0.0, seconds, 0.01), 6)
+    poses = {}
+    for k, marker in enumerate(config.markers):
+        position, rotation = moved(time, marker.fraction)
+        shaken = rotation * Rotation.from_rotvec(rng.normal(0.0, 10 * noise, (len(time), 3)))
+        quaternion = (shaken * TURNED[k % 4]).as_quat(scalar_first=True)
+        poses[marker.name] = Poses(
+            time, position + CLAMP + rng.normal(0.0, noise, position.shape), quaternion
+        )
+    if config.base is not None:
+        above = np.array([0.0, 0.0, config.base.height])
+        still = np.tile(CLAMP + above, (len(time), 1))
+        turned = np.tile([1.0, 0.0, 0.0, 0.0], (len(time), 1))
+        poses["base"] = Poses(time, still + rng.normal(0.0, noise, still.shape), turned)
+    sent = np.round(np.arange(0.0, seconds, 0.05), 6)
+    phase = 2 * np.pi * (sent[:, None] - np.arange(config.tendons) / config.tendons)
+    grams = np.round(500.0 + np.where(sent[:, None] < 1.0, 0.0, 200.0 * np.cos(phase)))
+    command = Pulls(sent, grams * 9.81e-3)
+    seen = np.round(np.arange(0.0, seconds, 0.02), 6)
+    return (
+        poses,
+        Pulls(seen, lagged(command, seen) + rng.normal(0.0, 0.01, (len(seen), config.tendons))),
+        command,
+    )
+
+
+def lagged(command, at):
+    """Commands through a first-order lag, at times that are whole milliseconds."""
+    fine = np.arange(0.0, at[-1] + 0.001, 0.001)
+    held = command.tension[np.searchsorted(command.time, fine + 1e-9, side="right") - 1]
+    followed = [held[0]]
+    for each in held[:-1]:
+        followed.append(each + (followed[-1] - each) * np.exp(-0.001 / LAG))
+    return np.array(followed)[np.round(at * 1000).astype(int)]
+
+
+def write(path, streams, config=PAPER, **options):
+    """The streams in a file."""
+    poses, tension, command = streams
+    write_recording(path, config, poses, tension, command, **options)
+    return path
+
+
+def changed(streams, name, rows=None, **parts):
+    """The streams with another body: some of its rows, or other positions or quaternions."""
+    poses, tension, command = streams
+    pose = poses[name]
+    new = {"time": pose.time, "position": pose.position, "quaternion": pose.quaternion} | parts
+    if rows is not None:
+        new = {key: value[rows] for key, value in new.items()}
+    return {**poses, name: Poses(**new)}, tension, command
