@@ -15,12 +15,12 @@ from knode_cosserat.recordings.config import (
     TensionSource,
 )
 from knode_cosserat.recordings.findings import Finding, RecordingError, Severity
-from knode_cosserat.recordings.recording import Body, Tensions, bridge
+from knode_cosserat.recordings.recording import Body, Tensions, bridge, period
 
 #: smaller jumps are left alone: m, rad, N
 SMALLEST_SHIFT, SMALLEST_TURN, SMALLEST_PULL = 5e-3, np.radians(8.0), 0.5
-#: load cells jump for a message or two; more in a row can be a command
-LONGEST_SPIKE = 2
+#: load cells jump for a message or two; what takes longer can be a command (s)
+LONGEST_SPIKE = 0.04
 #: a body needs that many frames
 FEWEST_FRAMES = 2
 
@@ -74,7 +74,8 @@ def _body(
         pose[:, 3:], swaps, unclear = cleaning.swaps_undone(time, pose[:, 3:])
         for swap in swaps:
             when = float(time[swap.row])
-            what = f"its axes were swapped at {when:.3f} s, by {swap.angle:.0f} degrees about {swap.axis}; undone"
+            what = f"its axes were swapped at {when:.3f} s, by {swap.angle:.0f} degrees about {swap.axis}"
+            what += "; undone"
             findings.append(Finding("warning", topic, what, (when,)))
     wrong = _jumping(time, pose, config)
     if pose.shape[1] == 7:
@@ -143,11 +144,12 @@ def _tensions(
     good = _usable(newtons)
     _drop(findings, source.topic, time[~good], "tension is", "tensions are", "not finite", "warning")
     time, newtons = time[good], newtons[good]
-    if kind == "measured":
+    if kind == "measured" and 0.0 < period(time) <= LONGEST_SPIKE:
         spikes = np.zeros(len(time), dtype=bool)
+        longest = min(2, int(LONGEST_SPIKE / period(time)))
         for tendon in newtons.T:
             steps = np.diff(tendon)[:, None]
-            spikes |= cleaning.outliers(steps, time, floor=SMALLEST_PULL, longest=LONGEST_SPIKE)
+            spikes |= cleaning.outliers(steps, time, floor=SMALLEST_PULL, longest=longest)
         _drop(
             findings,
             source.topic,

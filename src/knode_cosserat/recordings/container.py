@@ -40,31 +40,38 @@ class Container:
 
 #: no chunk that is larger than this is taken apart (bytes): its size is more likely an error than true
 LARGEST_CHUNK = 1 << 30
+_PIECE = 1 << 14
 
 
-def decompressed(data: bytes | memoryview, compression: str, size: int) -> bytes:
-    """A chunk's records; as much of them as can be had if the chunk is cut or damaged.
+def decompressed(data: bytes | memoryview, compression: str, size: int) -> tuple[bytes, int]:
+    """A chunk's records, or as many as can be had if it is cut or damaged; and how many bytes they were.
+
+    Args:
+        data: what is packed; more may follow it.
+        compression: how.
+        size: of the records; zero if it is not known.
 
     Raises:
         ImportError: the library for this compression is not installed.
     """
     size = min(size or LARGEST_CHUNK, LARGEST_CHUNK)
     decompressor = _decompressor(compression)
-    if decompressor is None:
-        return b""
     parts: list[bytes] = []
-    have = 0
+    have = used = 0
     # in pieces: what is before the damage then comes out
-    for begin in range(0, len(data), 1 << 14):
+    while decompressor is not None and used < len(data) and have < size:
+        piece = bytes(data[used : used + _PIECE])
         try:
-            parts.append(decompressor.decompress(bytes(data[begin : begin + (1 << 14)]), size - have))
+            parts.append(decompressor.decompress(piece, size - have))
         # each of the three libraries has its own errors
         except Exception:
             break
         have += len(parts[-1])
-        if have >= size or getattr(decompressor, "eof", False):
+        used += len(piece)
+        if decompressor.eof:
+            used -= len(decompressor.unused_data or b"")
             break
-    return b"".join(parts)
+    return b"".join(parts), used
 
 
 def _decompressor(compression: str):  # type: ignore[no-untyped-def]

@@ -7,7 +7,7 @@ after the other, those in chunks without compression too; where none can be read
 from __future__ import annotations
 
 import struct
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from typing import NamedTuple
 
 from knode_cosserat.recordings.container import Container, decompressed
@@ -65,18 +65,7 @@ class _Bag:
         self.lost = 0
         self.index: int | None = None
 
-    def scan(self, view: memoryview, begin: int) -> None:
-        for record in self._records(view, begin):
-            if record.kind == MESSAGE:
-                self._message(view, record)
-            elif record.kind == CONNECTION:
-                self._connection(view, record)
-            elif record.kind == BAG and len(record.fields.get(b"index_pos", b"")) == 8:
-                self.index = int.from_bytes(record.fields[b"index_pos"], "little")
-            elif record.kind == CHUNK:
-                self._chunk(view, record)
-
-    def _records(self, view: memoryview, position: int) -> Iterator[_Record]:
+    def scan(self, view: memoryview, position: int) -> None:
         data = view.obj
         assert isinstance(data, bytes)
         while position < len(data):
@@ -86,15 +75,15 @@ class _Bag:
                 self.lost += following - position
                 position = following
                 continue
-            yield record
-            # what a chunk without compression holds comes next; its length is not trusted
-            inside = record.kind == CHUNK and record.fields.get(b"compression") == b"none"
-            if inside:
-                position = record.begin
-            elif record.end <= len(data):
-                position = record.end
-            else:
-                position = _next_record(data, record.begin)
+            position = record.end
+            if record.kind == MESSAGE:
+                self._message(view, record)
+            elif record.kind == CONNECTION:
+                self._connection(view, record)
+            elif record.kind == BAG and len(record.fields.get(b"index_pos", b"")) == 8:
+                self.index = int.from_bytes(record.fields[b"index_pos"], "little")
+            elif record.kind == CHUNK:
+                position = self._chunk(view, record)
 
     def _message(self, view: memoryview, record: _Record) -> None:
         connection, stamp = record.fields.get(b"conn", b""), record.fields.get(b"time", b"")
@@ -120,19 +109,24 @@ class _Bag:
         # the first that can be read: the same one comes again in the index
         self.connections.setdefault(int.from_bytes(number, "little"), tuple(texts))  # type: ignore[arg-type]
 
-    def _chunk(self, view: memoryview, record: _Record) -> None:
+    def _chunk(self, view: memoryview, record: _Record) -> int:
+        """Take what is in a chunk; where the next record is."""
         compression = record.fields.get(b"compression", b"").decode("ascii", "replace")
         if compression == "none":
-            return
+            # its records come next; its length is not trusted
+            return record.begin
         # a recorder that was killed has not yet written how long its last chunk is
-        end = record.end if record.end > record.begin else len(view)
-        packed = view[record.begin : end]
+        known = record.begin < record.end <= len(view)
+        packed = view[record.begin : record.end if known else len(view)]
         size = int.from_bytes(record.fields.get(b"size", b""), "little")
-        records = decompressed(packed, compression, size)
-        if len(records) < size or not records:
-            self.lost += len(packed) if not records else size - len(records)
-        if view.obj is not records:
+        records, used = decompressed(packed, compression, size)
+        if records:
             self.scan(memoryview(records), 0)
+        if not records or len(records) < size:
+            self.lost += max(size - len(records), 0) or used
+        if known or used == len(packed):
+            return record.begin + len(packed)
+        return _next_record(view.obj, record.begin + used)  # type: ignore[arg-type]
 
     def gathered(self) -> Container:
         container = Container(ros=1, lost=self.lost)

@@ -111,7 +111,7 @@ class _Mcap:
             compression, begin = _string(record, 28)
             length = struct.unpack_from("<Q", record, begin)[0]
             packed = record[begin + 8 : begin + 8 + length]
-            records = decompressed(packed, compression, size) if compression else packed
+            records = decompressed(packed, compression, size)[0] if compression else packed
             self.container.lost += max(0, min(size, length) - len(records))
             self.scan(memoryview(records), 0)
         elif kind == MESSAGE:
@@ -160,6 +160,8 @@ def read_sqlite(path: Path, wanted: Collection[str], source: str) -> Container:
 
 
 def _tables(connection: sqlite3.Connection, container: Container, wanted: Collection[str]) -> None:
+    # without it SQLite does not open a file that is shorter than its first page says
+    connection.execute("PRAGMA writable_schema = ON")
     # not views: reading a file is not to run what somebody wrote into it
     query = "SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name IN ('topics', 'messages')"
     if connection.execute(query).fetchone()[0] != 2:
