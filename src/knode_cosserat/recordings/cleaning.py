@@ -33,7 +33,8 @@ def outliers(
         longest: the most rows that are wrong in a row.
     """
     found = np.zeros(len(time), dtype=bool)
-    if len(steps) < 5:
+    # no jump is larger than two steps
+    if len(steps) < 5 or 2.0 * np.max(np.linalg.norm(steps, axis=1)) < floor:
         return found
     dt = np.diff(time)[:, None]
     # by the rate, because some frames are missing
