@@ -161,12 +161,11 @@ def _draw_errors(axes: Any, recording: Recording, report: Health) -> None:
     at = np.arange(len(report.tension_errors))
     colours = [PALETTE[k % len(PALETTE)] for k in at]
     axes.bar(at, [each.rms for each in report.tension_errors], 0.6, color=colours)
-    axes.plot(at, [each.bias for each in report.tension_errors], "kD", markersize=5, label="bias")
+    axes.plot(at, [each.bias for each in report.tension_errors], "kD", markersize=5)
     axes.axhline(0.0, color="#333333", linewidth=0.8)
     axes.set_xticks(at, [str(each.tendon) for each in report.tension_errors])
     axes.set(xlabel="tendon", ylabel="measured less commanded [N]")
     late = ""
     if report.latency is not None:
         late = f"\ncommands {1e3 * report.latency.shift:.0f} ms later; lag {1e3 * report.latency.lag:.0f} ms"
-    axes.set_title(f"tension error, root mean square{late}")
-    axes.legend(loc="best")
+    axes.set_title(f"tension error: root mean square, and bias as diamonds{late}", fontsize=10)
