@@ -7,9 +7,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.learning.misfit import SegmentMisfit, by_group
-from knode_cosserat.learning.rollouts import RolloutMisfit
-from knode_cosserat.learning.unknowns import Unknowns, found, labels, limits, logarithmic, searched, values
+from knode_cosserat.learning.calibration.misfit import SegmentMisfit, by_group
+from knode_cosserat.learning.calibration.rollouts import RolloutMisfit
+from knode_cosserat.learning.calibration.unknowns import (
+    Unknowns,
+    found,
+    labels,
+    limits,
+    logarithmic,
+    searched,
+    values,
+)
 
 Misfit = SegmentMisfit | RolloutMisfit
 

@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.learning.misfit import LEAST, Differences
+from knode_cosserat.learning.calibration.misfit import LEAST, Differences
+from knode_cosserat.learning.calibration.unknowns import Unknowns, found, with_coordinates, with_numbers
 from knode_cosserat.learning.samples import DataError, samples
-from knode_cosserat.learning.unknowns import Unknowns, found, with_coordinates, with_numbers
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.march import Past, initial_past, rest_record
 from knode_cosserat.solvers.run import Task, run_one

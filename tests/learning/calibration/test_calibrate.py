@@ -8,14 +8,14 @@ import pytest
 
 import knode_cosserat as kc
 from examples.hanging_string import HangingString
-from knode_cosserat.learning import search
-from knode_cosserat.learning.calibrate import CalibrationError, calibrate
+from knode_cosserat.learning.calibration import search
+from knode_cosserat.learning.calibration.calibrate import CalibrationError, calibrate
+from knode_cosserat.learning.calibration.misfit import SegmentMisfit
+from knode_cosserat.learning.calibration.noise import by_states, errors_of
+from knode_cosserat.learning.calibration.unknowns import found, searched, unknowns_of, values, with_numbers
 from knode_cosserat.learning.knode import KNODE
-from knode_cosserat.learning.misfit import SegmentMisfit
-from knode_cosserat.learning.noise import by_states, errors_of
 from knode_cosserat.learning.residual import Residual
 from knode_cosserat.learning.samples import DataError
-from knode_cosserat.learning.unknowns import found, searched, unknowns_of, values, with_numbers
 from tests.learning.bar import BAR, WRONG, Bar, pulled
 
 ROBOT = kc.load_robot("delrin-tendon-robot")

@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.learning.misfit import Differences, SegmentMisfit, by_group
+from knode_cosserat.learning.calibration.misfit import Differences, SegmentMisfit, by_group
+from knode_cosserat.learning.calibration.search import Fit, Misfit
 from knode_cosserat.learning.samples import _histories, _settings, _slopes
-from knode_cosserat.learning.search import Fit, Misfit
 from knode_cosserat.solvers.space import middles
 from knode_cosserat.trajectory import Trajectory
 
