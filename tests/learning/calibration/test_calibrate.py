@@ -87,7 +87,6 @@ def as_measured(trajectories: list[kc.Trajectory], noise: float, seed: int) -> l
 # what is found in data without noise
 
 
-@pytest.mark.campaign
 @pytest.mark.parametrize(
     ("truth", "start"),
     [
@@ -120,7 +119,6 @@ def test_imperfections_are_found(truth, start):
     assert kc.tip_dtw(again, kc.simulate(true, controls, DT)[:100]) < 1e-6
 
 
-@pytest.mark.campaign
 @pytest.mark.parametrize(
     ("truth", "start"),
     [
@@ -145,7 +143,6 @@ def test_nobody_has_to_say_which_parameter_is_wrong(truth, start):
     assert kc.tip_dtw(again, kc.simulate(true, controls, DT)[:100]) < 1e-6
 
 
-@pytest.mark.campaign
 def test_a_robot_at_rest_tells_little():
     tension = np.array([6.0, 5.0, 5.0, 5.0])
     still = kc.simulate(ROBOT, np.tile(tension, (29, 1)), DT, initial=kc.equilibrium(ROBOT, tension))
@@ -281,7 +278,6 @@ def test_how_states_enter_is_known_exactly(time, space, string_swing):
     np.testing.assert_allclose(predicted, expected, rtol=1e-5)
 
 
-@pytest.mark.campaign
 def test_rollouts_need_positions_and_orientations_only(training):
     """Signs and lengths of quaternions do not matter; what was not measured may be missing."""
     [measured] = as_measured(training[1:], 0.0, 0)
