@@ -27,7 +27,7 @@ def curves(axes):
 
 
 def test_it_draws_what_is_added_to_what_the_knowledge_has(states):
-    """(K + c0 B) u is the same for both, so that the knowledge's u is too large by what its K is too small."""
+    """(K + c0 B) u is the same for both: the knowledge's u is too large by what its K is too small."""
     stiffness = float(ROBOT.youngs_modulus) * np.pi * float(ROBOT.radius) ** 4 / 4.0
     model = kc.fit(ROBOT.replace(youngs_modulus=0.25 * float(ROBOT.youngs_modulus)), [states])
     figure = residual(model, states)

@@ -55,8 +55,8 @@ def fit(
         held_out: trajectories from rest that are not learned from. What the model makes of them is reported,
             and with `stop_after` in the config it decides when to stop.
         checkpoint: a folder in which it is kept where the fit stands. The same call goes on from there, and
-            ends as if nothing had happened, bit for bit. What is solved for, not trained, is solved anew: that
-            takes milliseconds.
+            ends as if nothing had happened, bit for bit. What is not trained but solved for, in
+            milliseconds, is solved anew.
         checkpoint_every: epochs (or updates) between two checkpoints.
         log_dir: a folder for metrics as TensorBoard event files, one folder in it for each seed.
         progress: show a progress bar with the loss and the time left.
