@@ -14,7 +14,8 @@ from knode_cosserat.cli import app
 from knode_cosserat.evaluation.metrics import dtw_distance
 
 ROBOT = "delrin-tendon-robot"
-COMMANDS = ("simulate", "equilibrium", "info", "fit", "evaluate", "plot", "inspect", "study simulation")
+COMMANDS = ("simulate", "equilibrium", "info", "fit", "evaluate", "plot", "inspect", "study simulation",
+            "study imperfections", "study data")  # fmt: skip
 
 
 def run(*arguments):
@@ -418,6 +419,8 @@ def bad_inputs():
         (("study", "simulation", "--out", "broken.nc"), "this is a file"),
         (("study", "simulation", "--out", "o", "--seeds", "0"), "--seeds"),
         (("study", "simulation", "--out", "o", "--methods", "best,worst"), "'worst' is unknown"),
+        (("study", "imperfections", "--out", "o", "--only", "damping,rust"), "'rust' is unknown"),
+        (("study", "data", "--out", "o", "--methods", "paper, no knowledge,magic"), "'magic' is unknown"),
         (("study", "simulation", "--out", "o", "--workers", "2", "--dask", "a:1"), "give one of them"),
         (("evaluate", "nowhere.nc", "nowhere.nc"), "nowhere.nc: no such file"),
         (("evaluate", "nobot", "nowhere.nc"), "nobot"),

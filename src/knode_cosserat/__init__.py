@@ -6,8 +6,7 @@ Everything public is here; see `simulate`, `load_robot` and `Trajectory` first.
 from knode_cosserat import _jax as _jax  # isort: split  (first: it sets JAX up)
 from knode_cosserat import controls
 from knode_cosserat.evaluation.metrics import node_error, pose_mse, tip_dtw, tip_rmse
-from knode_cosserat.learning.calibrate import Calibration, CalibrationError, calibrate
-from knode_cosserat.learning.checkpoint import CheckpointError
+from knode_cosserat.learning.calibration.calibrate import Calibration, CalibrationError, calibrate
 from knode_cosserat.learning.config import (
     ConfigError,
     FitConfig,
@@ -18,12 +17,13 @@ from knode_cosserat.learning.config import (
 )
 from knode_cosserat.learning.ensemble import Ensemble, load_ensemble
 from knode_cosserat.learning.explain import explain
+from knode_cosserat.learning.files.model_file import ModelFileError, load_model
 from knode_cosserat.learning.fit import fit
 from knode_cosserat.learning.knode import KNODE
-from knode_cosserat.learning.model_file import ModelFileError, load_model
 from knode_cosserat.learning.residual import Residual
-from knode_cosserat.learning.runs import FitError
 from knode_cosserat.learning.samples import DataError
+from knode_cosserat.learning.training.checkpoint import CheckpointError
+from knode_cosserat.learning.training.runs import FitError
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.load import load_recording

@@ -13,13 +13,13 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.learning import fit as module
-from knode_cosserat.learning.checkpoint import data_hash
 from knode_cosserat.learning.config import FitConfig, NetworkOptions, RolloutTraining, Training
 from knode_cosserat.learning.fit import fit
 from knode_cosserat.learning.knode import KNODE
-from knode_cosserat.learning.runs import FitError
 from knode_cosserat.learning.samples import DataError
-from knode_cosserat.learning.watch import WatchError
+from knode_cosserat.learning.training.checkpoint import data_hash
+from knode_cosserat.learning.training.runs import FitError
+from knode_cosserat.learning.training.watch import WatchError
 from tests.learning.bar import BAR, WRONG, pulled
 
 SMALL = FitConfig.network(hidden=5, epochs=300)

@@ -53,7 +53,7 @@ def system_of(name: str, changes: list[str] | None = None, nodes: int | None = N
     if name not in kc.catalog() and _begins(name, TRAJECTORY_MARK):
         raise ValueError(f"{name}: this is a trajectory; allowed is a robot or a model")
     if name not in kc.catalog() and _begins(name, MODEL_MARK):
-        from knode_cosserat.learning.model_file import load_model
+        from knode_cosserat.learning.files.model_file import load_model
 
         return changed(load_model(name), changes, nodes)
     if name not in kc.catalog() and os.path.isdir(name):
@@ -115,7 +115,7 @@ def is_trajectory(name: str) -> bool:
 def trajectory_of(path: Path) -> Trajectory:
     """The trajectory in a file; also one of a model."""
     import knode_cosserat as kc
-    from knode_cosserat.learning import model_file  # noqa: F401  (so that a trajectory's model is understood)
+    from knode_cosserat.learning.files import model_file  # noqa: F401  (so that a trajectory's model is understood)
 
     return kc.load_trajectory(path)
 

@@ -88,7 +88,7 @@ def learned(system: System) -> tuple[dict[str, Any], list[str]]:
     """What a model learned, as facts and in words; nothing of a system that is not a model."""
     from knode_cosserat.learning.explain import explain
     from knode_cosserat.learning.knode import KNODE
-    from knode_cosserat.learning.structured import Structured
+    from knode_cosserat.learning.structured.residual import Structured
 
     if not isinstance(system, KNODE):
         return {}, []

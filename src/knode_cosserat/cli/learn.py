@@ -13,8 +13,10 @@ import typer
 from knode_cosserat.cli.arguments import (
     Changes,
     Json,
+    Picture,
     Progress,
     Robot,
+    figures,
     require_writable,
     system_of,
     trajectory_of,
@@ -26,6 +28,7 @@ from knode_cosserat.cli.telling import tell
 
 if TYPE_CHECKING:
     from knode_cosserat.learning.config import FitConfig
+    from knode_cosserat.learning.knode import KNODE
     from knode_cosserat.trajectory import Trajectory
 
 
@@ -87,6 +90,7 @@ def fit(
     log: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Write event files for TensorBoard there.")
     ] = None,
+    figure: Annotated[Path | None, Picture] = None,
     progress: Progress = None,
     as_json: Json = False,
 ) -> None:
@@ -96,9 +100,10 @@ def fit(
     """
     numbers = _seeds(seed, seeds)
     several = isinstance(numbers, tuple)
-    if not several:
-        require_writable(out)
-    elif out.exists() and not out.is_dir():
+    require_writable(None if several else out, figure)
+    if figure:
+        figures()
+    if several and out.exists() and not out.is_dir():
         raise ValueError(f"{out}: this is a file; allowed with several seeds is a folder")
     from knode_cosserat.learning.fit import fit as learn
     from knode_cosserat.learning.samples import DataError
@@ -117,6 +122,8 @@ def fit(
         raise ValueError(_named(str(error), trajectories)) from None
     seconds = perf_counter() - began
     found.save(out)
+    if figure:
+        _draw(next(iter(found)) if several else found, given[0], figure)
     count = sum(len(one.time) for one in given)
     lines = [
         f"learned what {robot} misses from {len(given)} trajectories of {count} rows in all: "
@@ -135,7 +142,15 @@ def fit(
         },
         lines,
         out=out,
+        figure=figure,
     )  # fmt: skip
+
+
+def _draw(model: KNODE, states: Trajectory, path: Path) -> None:
+    """What the model adds to its knowledge, at the states of a trajectory."""
+    from knode_cosserat.evaluation.learning_figures import residual
+
+    residual(model, states).savefig(path)
 
 
 def _seeds(seed: int | None, seeds: str | None) -> int | tuple[int, ...]:

@@ -42,7 +42,8 @@ def residual(model: KNODE, trajectory: Trajectory) -> Figure:
                 size = np.linalg.norm(values, axis=-1).max(axis=1)
                 axis.plot(found.time, size, color=colour, label=name)
             axis.set_ylabel(label)
-            axis.set_ylim(bottom=0.0)
+            # a little below zero, for what adds nothing to be seen
+            axis.set_ylim(bottom=-0.04 * axis.get_ylim()[1])
         axes[-1].set_xlabel("time [s]")
         axes[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
         axes[0].set_title("Largest along the rod", loc="left")

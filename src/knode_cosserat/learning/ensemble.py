@@ -10,8 +10,8 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.learning.files.model_file import ModelFileError, load_model
 from knode_cosserat.learning.knode import KNODE
-from knode_cosserat.learning.model_file import ModelFileError, load_model
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.trajectory import Trajectory
 

@@ -8,10 +8,10 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.learning.expansion import Expansion, Term
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.samples import Samples, samples
-from knode_cosserat.learning.structured import Structured, ambient_layout, loaded, material_layout
+from knode_cosserat.learning.structured.expansion import Expansion, Term
+from knode_cosserat.learning.structured.residual import Structured, ambient_layout, loaded, material_layout
 from knode_cosserat.rods.system import Layout, System, unpacked_history
 from knode_cosserat.trajectory import Trajectory
 

@@ -13,18 +13,18 @@ import jax
 import numpy as np
 
 from knode_cosserat._files import package_version
-from knode_cosserat.learning.checkpoint import Checkpoints, Identity, data_hash
 from knode_cosserat.learning.config import FitConfig, NetworkOptions
-from knode_cosserat.learning.courses import Courses, courses, held_out_courses, tip_error
 from knode_cosserat.learning.ensemble import Ensemble
 from knode_cosserat.learning.knode import KNODE, About
-from knode_cosserat.learning.regression import solve
 from knode_cosserat.learning.residual import Residual, network
-from knode_cosserat.learning.runs import FitError, Run, run_all
 from knode_cosserat.learning.samples import Dataset, samples
-from knode_cosserat.learning.stages import RolloutRun, SegmentRun
-from knode_cosserat.learning.training import standardised
-from knode_cosserat.learning.watch import Watch
+from knode_cosserat.learning.structured.regression import solve
+from knode_cosserat.learning.training.checkpoint import Checkpoints, Identity, data_hash
+from knode_cosserat.learning.training.courses import Courses, courses, held_out_courses, tip_error
+from knode_cosserat.learning.training.descent import standardised
+from knode_cosserat.learning.training.runs import FitError, Run, run_all
+from knode_cosserat.learning.training.stages import RolloutRun, SegmentRun
+from knode_cosserat.learning.training.watch import Watch
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.trajectory import Trajectory
 
@@ -55,7 +55,8 @@ def fit(
         held_out: trajectories from rest that are not learned from. What the model makes of them is reported,
             and with `stop_after` in the config it decides when to stop.
         checkpoint: a folder in which it is kept where the fit stands. The same call goes on from there, and
-            ends as if nothing had happened, bit for bit.
+            ends as if nothing had happened, bit for bit. What is not trained but solved for, in
+            milliseconds, is solved anew.
         checkpoint_every: epochs (or updates) between two checkpoints.
         log_dir: a folder for metrics as TensorBoard event files, one folder in it for each seed.
         progress: show a progress bar with the loss and the time left.
@@ -147,7 +148,7 @@ def _first(knowledge: System, trajectories: Sequence[Trajectory], config: FitCon
             networks = [standardised(net, knowledge, dataset.segments) for net in networks]
         return _First(dataset, list(networks))
     every = samples(knowledge, trajectories)
-    return _First(dataset, [solve(knowledge, every, options, seed) for seed in config.seeds])
+    return _First(dataset, list(solve(knowledge, every, options, config.seeds)))
 
 
 def _segment_runs(given: _Given, learned: dict[int, Residual]) -> list[Run]:

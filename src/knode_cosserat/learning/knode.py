@@ -143,6 +143,6 @@ class KNODE(System):
 
     def save(self, path: Any) -> None:
         """Write a model's file (see `model_file.save`)."""
-        from knode_cosserat.learning import model_file
+        from knode_cosserat.learning.files import model_file
 
         model_file.save(self, path)

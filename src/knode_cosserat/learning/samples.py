@@ -99,22 +99,23 @@ def samples(
     *joined, doubts = zip(*parts, strict=True)
     segments, tips = (jax.tree.map(lambda *leaves: np.concatenate(leaves), *each) for each in joined)
     doubt = np.sqrt(np.mean(np.square(doubts), axis=0))
-    return Dataset(segments, tips, _settings(trajectories[0]).space, len(ends), doubt)
+    return Dataset(segments, tips, settings_of(trajectories[0]).space, len(ends), doubt)
 
 
-def _settings(trajectory: Trajectory) -> Settings:
+def settings_of(trajectory: Trajectory) -> Settings:
+    """How a trajectory was solved, or would have been where nothing is said."""
     return trajectory.settings or Settings()
 
 
 def _of_one(
     knowledge: System, trajectory: Trajectory, k: int, ends: np.ndarray
 ) -> tuple[Samples, TipSamples, np.ndarray]:
-    settings, dt = _settings(trajectory), trajectory.dt
+    settings, dt = settings_of(trajectory), trajectory.dt
     y, z, control = (np.asarray(a, dtype=float) for a in (trajectory.y, trajectory.z, trajectory.control))
     time = np.asarray(trajectory.time, dtype=float)
-    slope, doubt = _slopes(settings, y)
+    slope, doubt = slopes_of(settings, y)
     record = np.concatenate([y, z, slope / knowledge.length] if knowledge.mixed else [y, z], axis=-1)
-    c0, history = _histories(settings, dt, record)
+    c0, history = histories(settings, dt, record)
     # the rows before the first are its own if it is a start, and not known otherwise
     first = 1 if time[0] == 0.0 else 2
     rows = np.arange(first, len(time))
@@ -149,7 +150,7 @@ def _of_one(
     return segments, tips, doubt
 
 
-def _histories(settings: Settings, dt: float, record: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def histories(settings: Settings, dt: float, record: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """c0 (T,) and ʰ (T, N, x) of every row, by the scheme that made the trajectory; row 0 has none."""
     table = coefficient_table(settings, dt)
     rate = np.zeros_like(record[0])
@@ -161,7 +162,7 @@ def _histories(settings: Settings, dt: float, record: np.ndarray) -> tuple[np.nd
     return c0, history
 
 
-def _slopes(settings: Settings, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def slopes_of(settings: Settings, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """y_s times the length (T, N, y), from the states alone, and by how much it may be wrong (y,).
 
     Exact where a segment is one Euler step; of splines otherwise, judged by those of the next lower order.
@@ -216,10 +217,10 @@ def _check(knowledge: System, trajectories: Sequence[Trajectory]) -> None:
                 f"trajectory {k} has time steps of {trajectory.dt:g} s and trajectory 0 of {first.dt:g} s; "
                 "all must be the same"
             )
-        if _settings(trajectory).space != _settings(first).space:
+        if settings_of(trajectory).space != settings_of(first).space:
             raise DataError(
-                f"trajectory {k} was solved by {_settings(trajectory).space} along the rod and "
-                f"trajectory 0 by {_settings(first).space}; all must be the same"
+                f"trajectory {k} was solved by {settings_of(trajectory).space} along the rod and "
+                f"trajectory 0 by {settings_of(first).space}; all must be the same"
             )
 
 

@@ -48,7 +48,7 @@ def rollout(task: Task) -> Callable[[System, Any, Past], Rows]:
         rows = run(*primals)
         system, controls, past = primals
         d_system, d_controls, d_past = tangents
-        d_records, d_unknowns = _tangent_march(
+        d_records, d_unknowns = tangent_march(
             settings, table, dt, rows.records, rows.unknowns, system, controls, past, d_system, d_controls,
             d_past.records[:2], d_past.rate,
         )  # fmt: skip
@@ -59,7 +59,7 @@ def rollout(task: Task) -> Callable[[System, Any, Past], Rows]:
 
 
 @functools.partial(jax.jit, static_argnames="settings")
-def _tangent_march(
+def tangent_march(
     settings: Settings, table: Any, dt: Any, records: Any, unknowns: Any, system: System, controls: Any,
     past: Past, d_system: Any, d_controls: Any, d_records: Any, d_rate: Any,
 ) -> Any:  # fmt: skip

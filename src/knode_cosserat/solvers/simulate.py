@@ -68,7 +68,7 @@ def simulate(
     controls, batch = _checked_controls(system, controls, batch)
     if initial is not None:
         _check_initial(system, initial, batch)
-    run = _Run(system, controls, initial, settings, dt, batch, isinstance(robot, Sequence))
+    run = Run(system, controls, initial, settings, dt, batch, isinstance(robot, Sequence))
     if is_traced((system, controls, initial)):
         return _traced(*run)
     if batch:
@@ -76,7 +76,7 @@ def simulate(
     return _single(run, on_failure, progress)
 
 
-class _Run(NamedTuple):
+class Run(NamedTuple):
     """The checked arguments of one call; `many` says that the systems themselves are batched."""
 
     system: System
@@ -160,7 +160,7 @@ _jit_at_rest = jax.jit(_at_rest)
 _jit_all_at_rest = jax.jit(jax.vmap(_at_rest))
 
 
-def _beginning(run: _Run) -> tuple[Any, Start, Any, Any]:
+def beginning(run: Run) -> tuple[Any, Start, Any, Any]:
     """The initial record(s), the start, its time, and how the first step is made."""
     system, controls, initial, settings, dt, batch, many = run
     if initial is not None:
@@ -195,9 +195,9 @@ def _going_on(
 # the three ways to run
 
 
-def _single(run: _Run, on_failure: str, progress: bool) -> Trajectory:
+def _single(run: Run, on_failure: str, progress: bool) -> Trajectory:
     system, controls, _, settings, dt, _, _ = run
-    record, start, t0, first = _beginning(run)
+    record, start, t0, first = beginning(run)
     task = Task(settings, dt, len(controls), first)
     steps, cause = run_one(task, system, controls, start, progress)
     if on_failure == "raise" and steps.result.min() < 0:
@@ -205,9 +205,9 @@ def _single(run: _Run, on_failure: str, progress: bool) -> Trajectory:
     return _trajectory(run, record, start.control, t0, steps)
 
 
-def _batch(run: _Run, on_failure: str, progress: bool) -> Trajectory:
+def _batch(run: Run, on_failure: str, progress: bool) -> Trajectory:
     system, controls, _, settings, dt, _, many = run
-    record, start, t0, _ = _beginning(run)
+    record, start, t0, _ = beginning(run)
     task = Task(settings, dt, controls.shape[1])
     steps, causes = run_batch(task, system, many, controls, start, progress)
     if on_failure == "raise" and causes:
@@ -230,8 +230,8 @@ def _traced(system, controls, initial, settings, dt, batch, many):  # type: igno
 
     One jitted call, so that a transformation traces it once and not at every call.
     """
-    run = _Run(system, controls, initial, settings, dt, batch, many)
-    record, start, t0, first = _beginning(run)
+    run = Run(system, controls, initial, settings, dt, batch, many)
+    record, start, t0, first = beginning(run)
     one = sensitivity.rollout(Task(settings, dt, np.shape(controls)[-2], first))
     if batch:
         rows = jax.vmap(one, in_axes=(0 if many else None, 0, 0))(system, controls, start.past)
@@ -241,7 +241,7 @@ def _traced(system, controls, initial, settings, dt, batch, many):  # type: igno
     return _trajectory(run, record, start.control, t0, Steps._make([*rows, result]))
 
 
-def _trajectory(run: _Run, record: Any, control: Any, t0: Any, steps: Steps) -> Trajectory:
+def _trajectory(run: Run, record: Any, control: Any, t0: Any, steps: Steps) -> Trajectory:
     """Put the initial row before the steps, and NaN where there is no solution."""
     system, controls, _, settings, dt, batch, _ = run
     numeric: Any = jnp if is_traced((record, steps)) else np

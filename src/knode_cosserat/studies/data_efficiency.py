@@ -12,7 +12,7 @@ from typing import Any
 from knode_cosserat import controls
 from knode_cosserat.learning.config import FitConfig
 from knode_cosserat.learning.fit import fit
-from knode_cosserat.learning.runs import FitError
+from knode_cosserat.learning.training.runs import FitError
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.result import SimulationError

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from knode_cosserat._files import replacing
 from knode_cosserat.evaluation.tables import MEASURES, in_words, markdown_table, spreads
 from knode_cosserat.studies import runner
 from knode_cosserat.studies.data_efficiency import ANY, LINEAR, ROWS, jobs
-from knode_cosserat.studies.simulation_report import Report
+from knode_cosserat.studies.report import Report, as_json, write_figures, write_texts
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -52,16 +50,9 @@ def rerun(
     made = jobs(seeds, rows, methods)
     facts = runner.run(made, out, workers=workers, dask=dask, progress=progress)
     cells = [cell for each in facts.values() for cell in each["cells"]]
-    lines = ",\n".join(json.dumps(cell, allow_nan=False) for cell in cells)
-    texts = {"data.md": as_markdown(cells), "data.json": f"[\n{lines}\n]\n"}
-    for name, text in texts.items():
-        with replacing(out / name) as temporary:
-            temporary.write_text(text, encoding="utf-8")
-    (out / "figures").mkdir(exist_ok=True)
-    pictures = [out / "figures" / f"data-{measure.replace('_', '-')}.png" for measure in MEASURES]
-    for path, measure in zip(pictures, MEASURES, strict=True):
-        figure(cells, measure).savefig(path)
-    return Report(cells, [out / name for name in texts], pictures)
+    texts = {"data.md": as_markdown(cells), "data.json": as_json(cells)}
+    drawn = {f"data-{measure.replace('_', '-')}": figure(cells, measure) for measure in MEASURES}
+    return Report(cells, write_texts(out, texts), write_figures(out, drawn))
 
 
 def as_markdown(cells: Sequence[Any]) -> str:

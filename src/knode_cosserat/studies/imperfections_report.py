@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from knode_cosserat._files import replacing
 from knode_cosserat.evaluation.tables import MEASURES, markdown_table
 from knode_cosserat.studies import runner
 from knode_cosserat.studies.imperfections import CONTROLS, FAR, IMPERFECTIONS, LEFT, NAMED, jobs
-from knode_cosserat.studies.simulation_report import Report
+from knode_cosserat.studies.report import Report, as_json, write_figures, write_texts
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -47,15 +45,8 @@ def rerun(
     made = jobs(names or list(IMPERFECTIONS), seeds)
     facts = runner.run(made, out, workers=workers, dask=dask, progress=progress)
     cells = [cell for each in facts.values() for cell in each["cells"]]
-    lines = ",\n".join(json.dumps(cell, allow_nan=False) for cell in cells)
-    texts = {"imperfections.md": as_markdown(cells), "imperfections.json": f"[\n{lines}\n]\n"}
-    for name, text in texts.items():
-        with replacing(out / name) as temporary:
-            temporary.write_text(text, encoding="utf-8")
-    (out / "figures").mkdir(exist_ok=True)
-    picture = out / "figures" / "imperfections.png"
-    figure(cells).savefig(picture)
-    return Report(cells, [out / name for name in texts], [picture])
+    texts = {"imperfections.md": as_markdown(cells), "imperfections.json": as_json(cells)}
+    return Report(cells, write_texts(out, texts), write_figures(out, {"imperfections": figure(cells)}))
 
 
 def ratios(cells: Sequence[Mapping[str, Any]], measure: str) -> dict[tuple[str, str], float | None]:

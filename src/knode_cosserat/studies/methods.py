@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from knode_cosserat.learning.calibrate import CalibrationError, calibrate
+from knode_cosserat.learning.calibration.calibrate import CalibrationError, calibrate
 from knode_cosserat.learning.config import FitConfig, StructuredOptions
 from knode_cosserat.learning.fit import fit
-from knode_cosserat.learning.runs import FitError
+from knode_cosserat.learning.training.runs import FitError
 from knode_cosserat.rods.system import System
 from knode_cosserat.trajectory import Trajectory
 

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple, cast
 from knode_cosserat import controls
 from knode_cosserat.evaluation.metrics import pose_mse, tip_dtw
 from knode_cosserat.evaluation.tables import Cell, Published
+from knode_cosserat.learning.files.model_file import encoded
 from knode_cosserat.learning.knode import KNODE
-from knode_cosserat.learning.model_file import encoded
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.result import SimulationError

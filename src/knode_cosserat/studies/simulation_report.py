@@ -2,27 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-from knode_cosserat._files import replacing
 from knode_cosserat.evaluation import study_figures
 from knode_cosserat.evaluation.tables import Cell, as_csv, as_markdown
 from knode_cosserat.studies import runner, simulation
+from knode_cosserat.studies.report import Report, as_json, write_figures, write_texts
 from knode_cosserat.trajectory import Trajectory
 from knode_cosserat.trajectory_file import load_trajectory
 
 Facts = Mapping[str, Mapping[str, Any]]
-
-
-class Report(NamedTuple):
-    """What a study found, and the files that tell it."""
-
-    cells: list[Cell]
-    tables: list[Path]
-    figures: list[Path]
 
 
 def rerun(
@@ -64,15 +55,14 @@ def cells_of(facts: Facts) -> list[Cell]:
 
 def write_table(cells: Sequence[Cell], out: Path) -> list[Path]:
     """`table1.md`, `table1.csv` and `table1.json`."""
-    texts = {
-        "table1.md": as_markdown(cells, simulation.PUBLISHED, simulation.NOTES),
-        "table1.csv": as_csv(cells, simulation.PUBLISHED),
-        "table1.json": "[\n" + ",\n".join(json.dumps(cell, allow_nan=False) for cell in cells) + "\n]\n",
-    }
-    for name, text in texts.items():
-        with replacing(out / name) as temporary:
-            temporary.write_text(text, encoding="utf-8")
-    return [out / name for name in texts]
+    return write_texts(
+        out,
+        {
+            "table1.md": as_markdown(cells, simulation.PUBLISHED, simulation.NOTES),
+            "table1.csv": as_csv(cells, simulation.PUBLISHED),
+            "table1.json": as_json(cells),
+        },
+    )
 
 
 def draw(facts: Facts, methods: Sequence[str], out: Path) -> list[Path]:
@@ -97,11 +87,7 @@ def draw(facts: Facts, methods: Sequence[str], out: Path) -> list[Path]:
     }
     if losses:
         drawn["loss"] = study_figures.losses(losses)
-    (out / "figures").mkdir(exist_ok=True)
-    written = [out / "figures" / f"{name}.png" for name in drawn]
-    for path, figure in zip(written, drawn.values(), strict=True):
-        figure.savefig(path)
-    return written
+    return write_figures(out, drawn)
 
 
 def _trajectories(facts: Mapping[str, Any], out: Path) -> dict[str, Trajectory]:

@@ -13,9 +13,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from knode_cosserat.learning.checkpoint import CheckpointError, Checkpoints, packed, unpacked
 from knode_cosserat.learning.residual import Residual
-from knode_cosserat.learning.watch import Watch
+from knode_cosserat.learning.training.checkpoint import CheckpointError, Checkpoints, packed, unpacked
+from knode_cosserat.learning.training.watch import Watch
 
 
 class FitError(ValueError):

@@ -5,11 +5,17 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from knode_cosserat.learning.evidence import relevant
-from knode_cosserat.learning.expansion import CURVED, LINEAR, expansion
-from knode_cosserat.learning.selection import folds, held_out_error, moments, selected
-from knode_cosserat.learning.slopes import refined
+from knode_cosserat.learning.structured.evidence import relevant
+from knode_cosserat.learning.structured.expansion import CURVED, LINEAR, expansion
+from knode_cosserat.learning.structured.selection import folds, held_out_error, moments, selected
+from knode_cosserat.learning.structured.slopes import refined
 from knode_cosserat.rods.system import Layout
+
+
+def one(features, target, floor):
+    """The weights of a single target."""
+    [found] = relevant(features, target[:, None], np.array([floor]))
+    return found
 
 
 @settings(max_examples=25, deadline=None)
@@ -25,30 +31,42 @@ def test_the_weights_that_made_the_data_are_found(seed, places, exponent):
     truth = np.zeros(30)
     truth[places] = rng.uniform(0.5, 2.0, len(places)) / features.std(axis=0)[places]
     noise = 10.0**exponent
-    found = relevant(features, features @ truth + noise * rng.normal(size=400), floor=1e-13)
+    found = one(features, features @ truth + noise * rng.normal(size=400), floor=1e-13)
     scaled = (found.values - truth) * features.std(axis=0)
     assert np.all(np.flatnonzero(truth) == np.flatnonzero(np.abs(found.values) * features.std(axis=0) > 0.1))
     assert np.max(np.abs(scaled)) < 6.0 * noise / np.sqrt(400) + 1e-12
     assert found.noise < 1.3 * noise + 1e-12
 
 
+def test_each_of_several_targets_is_explained_on_its_own():
+    rng = np.random.default_rng(3)
+    features = rng.normal(size=(200, 8))
+    targets = np.stack([2.0 * features[:, 1], np.zeros(200), features[:, 4] + 1e-3 * rng.normal(size=200)], 1)
+    floors, weight = np.array([1e-12, 1e-12, 1e-9]), rng.exponential(size=200)
+    together = relevant(features, targets, floors, weight)
+    for k, found in enumerate(together):
+        [alone] = relevant(features, targets[:, [k]], floors[[k]], weight)
+        np.testing.assert_allclose(found.values, alone.values, rtol=1e-6, atol=1e-12)
+        np.testing.assert_allclose(found.noise, alone.noise, rtol=1e-3, atol=1e-13)
+    assert [np.flatnonzero(found.values).tolist() for found in together] == [[1], [], [4]]
+
+
 def test_pure_noise_is_not_explained():
     rng = np.random.default_rng(0)
-    found = relevant(rng.normal(size=(300, 40)), rng.normal(size=300), floor=1e-9)
+    found = one(rng.normal(size=(300, 40)), rng.normal(size=300), floor=1e-9)
     assert np.count_nonzero(found.values) <= 1
 
 
 def test_what_is_below_the_floor_is_not_explained():
     features = np.random.default_rng(0).normal(size=(100, 3))
-    assert not np.any(relevant(features, 1e-10 * features[:, 0], floor=1e-9).values)
+    assert not np.any(one(features, 1e-10 * features[:, 0], floor=1e-9).values)
 
 
 def test_standard_errors_are_those_of_least_squares():
     rng = np.random.default_rng(1)
     features, noise = rng.normal(size=(500, 2)), 0.1
     spread = [
-        relevant(features, features @ [1.0, -2.0] + noise * rng.normal(size=500), floor=1e-9)
-        for _ in range(50)
+        one(features, features @ [1.0, -2.0] + noise * rng.normal(size=500), floor=1e-9) for _ in range(50)
     ]
     scatter = np.std([each.values for each in spread], axis=0)
     np.testing.assert_allclose(np.mean([each.errors for each in spread], axis=0), scatter, rtol=0.35)

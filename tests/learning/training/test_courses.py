@@ -8,17 +8,24 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.learning import courses as module
 from knode_cosserat.learning.config import FitConfig, NetworkOptions, RolloutTraining, StructuredOptions
-from knode_cosserat.learning.courses import Aim, courses, held_out_courses, loss_and_slope, scales, tip_error
 from knode_cosserat.learning.fit import fit
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import network
-from knode_cosserat.learning.runs import FitError
 from knode_cosserat.learning.samples import DataError
-from knode_cosserat.learning.stages import RolloutRun
-from knode_cosserat.learning.training import split
-from knode_cosserat.learning.watch import Watch
+from knode_cosserat.learning.training import courses as module
+from knode_cosserat.learning.training.courses import (
+    Aim,
+    courses,
+    held_out_courses,
+    loss_and_slope,
+    scales,
+    tip_error,
+)
+from knode_cosserat.learning.training.descent import split
+from knode_cosserat.learning.training.runs import FitError
+from knode_cosserat.learning.training.stages import RolloutRun
+from knode_cosserat.learning.training.watch import Watch
 from tests.learning.bar import BAR, WRONG, pulled
 
 OPTIONS = RolloutTraining(horizon=6, updates=60, learning_rate=5e-3)

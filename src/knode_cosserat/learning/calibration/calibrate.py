@@ -9,14 +9,13 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.learning import search
-from knode_cosserat.learning.misfit import SegmentMisfit, by_group
-from knode_cosserat.learning.noise import Errors, errors_of
-from knode_cosserat.learning.rollouts import RolloutMisfit
-from knode_cosserat.learning.samples import DataError
-from knode_cosserat.learning.search import CalibrationError as CalibrationError
-from knode_cosserat.learning.search import Fit, Misfit
-from knode_cosserat.learning.unknowns import (
+from knode_cosserat.learning.calibration import search
+from knode_cosserat.learning.calibration.misfit import SegmentMisfit, by_group
+from knode_cosserat.learning.calibration.noise import Errors, errors_of
+from knode_cosserat.learning.calibration.rollouts import RolloutMisfit
+from knode_cosserat.learning.calibration.search import CalibrationError as CalibrationError
+from knode_cosserat.learning.calibration.search import Fit, Misfit
+from knode_cosserat.learning.calibration.unknowns import (
     Unknowns,
     found,
     labels,
@@ -29,6 +28,7 @@ from knode_cosserat.learning.unknowns import (
     values,
     with_numbers,
 )
+from knode_cosserat.learning.samples import DataError
 from knode_cosserat.rods.system import System
 from knode_cosserat.trajectory import Trajectory
 

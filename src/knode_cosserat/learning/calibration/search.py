@@ -7,14 +7,24 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.learning.misfit import SegmentMisfit, by_group
-from knode_cosserat.learning.rollouts import RolloutMisfit
-from knode_cosserat.learning.unknowns import Unknowns, found, labels, limits, logarithmic, searched, values
+from knode_cosserat.learning.calibration.misfit import SegmentMisfit, by_group
+from knode_cosserat.learning.calibration.rollouts import RolloutMisfit
+from knode_cosserat.learning.calibration.unknowns import (
+    Unknowns,
+    found,
+    labels,
+    limits,
+    logarithmic,
+    searched,
+    values,
+)
 
 Misfit = SegmentMisfit | RolloutMisfit
 
 #: how often the weights of the fields are set anew
 PASSES = 5
+#: ways by which a search from far off is tried, if what the first one leaves is not noise
+MOST_WAYS = 3
 #: evaluations of one search
 MOST_EVALUATIONS = 100
 #: steps, in natural sizes, at which a search ends: the last one, and those that only lead to its start
@@ -103,10 +113,32 @@ def labels_of(unknowns: Unknowns) -> tuple[str, ...]:
 
 
 def _search(misfit: Misfit, start: np.ndarray, free: np.ndarray) -> tuple[bool, Fit]:
+    """The search by the first way whose end leaves nothing but noise, else the best of all ways.
+
+    With noise the first rows of a rollout may point the wrong way, and another number of them the right one.
+    """
+    beginnings = misfit.beginnings()
+    best: tuple[bool, Fit] | None = None
+    for skipped in range(0, len(beginnings) + 1, max(1, len(beginnings) // MOST_WAYS)):
+        converged, ended = _one_way(misfit, start, free, beginnings[skipped:])
+        if best is None or (converged, -_left(ended)) > (best[0], -_left(best[1])):
+            best = converged, ended
+        if converged and not systematic(misfit, ended):
+            break
+    assert best is not None  # the loop has one way at least
+    return best
+
+
+def _left(ended: Fit) -> float:
+    """How much is left, of all fields together: smaller is better."""
+    return float(np.sum(np.log(np.maximum(ended.sizes, 1e-300))))
+
+
+def _one_way(misfit: Misfit, start: np.ndarray, free: np.ndarray, beginnings: Any) -> tuple[bool, Fit]:
     """Searches one after the other, each with the sizes of what the last one left as weights."""
     sizes, least = misfit.first_sizes(), np.zeros(len(misfit.fields))
     coordinates, converged, left = start, True, sizes
-    for mask in misfit.beginnings():
+    for mask in beginnings:
         _, coordinates = _least_squares(misfit, coordinates, free, sizes, mask, ROUGH)
     for _ in range(PASSES):
         converged, coordinates = _least_squares(misfit, coordinates, free, sizes)

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.learning.calibration.unknowns import Unknowns, found, with_coordinates, with_numbers
 from knode_cosserat.learning.samples import Dataset, Samples, TipSamples, predict, samples
-from knode_cosserat.learning.unknowns import Unknowns, found, with_coordinates, with_numbers
 from knode_cosserat.rods.system import System, unpacked_history
 from knode_cosserat.trajectory import Trajectory
 

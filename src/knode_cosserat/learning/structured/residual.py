@@ -20,8 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.learning.expansion import Expansion
 from knode_cosserat.learning.residual import Residual
+from knode_cosserat.learning.structured.expansion import Expansion
 from knode_cosserat.rods.system import Field, History, Layout, System
 from knode_cosserat.rotation import dot, rotation_matrix, small_inverse
 

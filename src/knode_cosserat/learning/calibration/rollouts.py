@@ -17,15 +17,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.learning.misfit import LEAST, Differences
+from knode_cosserat.learning.calibration.misfit import LEAST, Differences
+from knode_cosserat.learning.calibration.unknowns import Unknowns, found, with_coordinates, with_numbers
 from knode_cosserat.learning.samples import DataError, samples
-from knode_cosserat.learning.unknowns import Unknowns, found, with_coordinates, with_numbers
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.march import Past, initial_past, rest_record
 from knode_cosserat.solvers.run import Task, run_one
-from knode_cosserat.solvers.sensitivity import _tangent_march
+from knode_cosserat.solvers.sensitivity import tangent_march
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.simulate import _beginning, _Run
+from knode_cosserat.solvers.simulate import Run, beginning
 from knode_cosserat.trajectory import Trajectory
 
 #: a far start is brought near on the first two rows, then on this many times as many, and so on
@@ -88,7 +88,7 @@ def _differences(robot, coordinates, rows, table, dt, unknowns, settings, orient
 
     def along(direction: Any) -> Any:
         (system, past), (d_system, d_past) = jax.jvp(start, (coordinates,), (direction,))
-        d_records, _ = _tangent_march(
+        d_records, _ = tangent_march(
             settings, table, dt, rows.records, rows.unknowns, system, rows.control, past, d_system,
             jnp.zeros_like(rows.control), d_past.records[:2], d_past.rate,
         )  # fmt: skip
@@ -145,7 +145,7 @@ class RolloutMisfit:
 
     def _of_one(self, system: System, coordinates: np.ndarray, rollout: _Rollout) -> Differences | None:
         settings, dt, initial, control, y = rollout
-        record, begun, _, first = _beginning(_Run(system, control, initial, settings, dt, None, False))
+        record, begun, _, first = beginning(Run(system, control, initial, settings, dt, None, False))
         task = Task(settings, dt, len(control), first)
         steps, _ = run_one(task, system, control, begun)
         if steps.result.min() < 0:

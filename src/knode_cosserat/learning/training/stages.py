@@ -10,15 +10,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from knode_cosserat.learning.checkpoint import packed, unpacked
 from knode_cosserat.learning.config import RolloutTraining, Training
-from knode_cosserat.learning.courses import Aim, Courses, loss_and_slope, scales, tip_error
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import Residual
-from knode_cosserat.learning.runs import Best, FitError, Run
 from knode_cosserat.learning.samples import Dataset
-from knode_cosserat.learning.training import ADAM, PIECE, prepared, run_epochs, split, started
-from knode_cosserat.learning.watch import Watch
+from knode_cosserat.learning.training.checkpoint import packed, unpacked
+from knode_cosserat.learning.training.courses import Aim, Courses, loss_and_slope, scales, tip_error
+from knode_cosserat.learning.training.descent import ADAM, PIECE, prepared, run_epochs, split, started
+from knode_cosserat.learning.training.runs import Best, FitError, Run
+from knode_cosserat.learning.training.watch import Watch
 from knode_cosserat.rods.system import System
 
 #: a loss so many times what it began with has diverged; one that began with next to nothing may come to one

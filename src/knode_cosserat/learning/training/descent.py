@@ -21,9 +21,9 @@ from jaxtyping import Float, Int, UInt32
 
 from knode_cosserat.learning.config import Training
 from knode_cosserat.learning.knode import KNODE
-from knode_cosserat.learning.losses import Loss, loss_for, sizes, spread
 from knode_cosserat.learning.residual import Network, Residual, elu, input_layout
 from knode_cosserat.learning.samples import Dataset, Samples, predict
+from knode_cosserat.learning.training.losses import Loss, loss_for, sizes, spread
 from knode_cosserat.rods.system import System, unpacked_history
 from knode_cosserat.solvers.space import Euler, SpaceScheme
 

@@ -8,6 +8,7 @@ from the material) and what is not (an ambient load) are found together.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -16,11 +17,11 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.learning.evidence import relevant
-from knode_cosserat.learning.expansion import Expansion
-from knode_cosserat.learning.selection import held_out_error, moments, selected
-from knode_cosserat.learning.slopes import refined
-from knode_cosserat.learning.structured import Load
+from knode_cosserat.learning.structured.evidence import relevant
+from knode_cosserat.learning.structured.expansion import Expansion
+from knode_cosserat.learning.structured.residual import Load
+from knode_cosserat.learning.structured.selection import held_out_error, moments, selected
+from knode_cosserat.learning.structured.slopes import refined
 
 #: a remainder below this part of the target is explained well enough by the simple functions
 WELL = 1e-6
@@ -48,30 +49,41 @@ class Counting(NamedTuple):
     fold: Any
 
 
+class Offer:
+    """An expansion whose weights are to be found, and what it depends on, at every sample."""
+
+    def __init__(self, part: Expansion, inputs: Float[Any, "S x"]):
+        self.part, self.inputs = part, inputs
+
+    @functools.cached_property
+    def features(self) -> Float[np.ndarray, "S k"]:
+        """The values of its functions; the same however samples count, so that seeds share them."""
+        return np.asarray(_features_of(self.part, self.inputs))
+
+    def with_slopes(self, slopes: Any) -> Offer:
+        """The same with other slopes."""
+        return Offer(dataclasses.replace(self.part, slopes=slopes), self.inputs)
+
+
 def fitted_load(
-    material: Sequence[Expansion], ambient: Expansion, observables: Any, inputs: Any,
-    targets: Sequence[Target], counting: Counting,
-) -> Load | None:  # fmt: skip
+    material: Sequence[Offer], ambient: Offer, targets: Sequence[Target], counting: Counting
+) -> Load | None:
     """The load that explains the targets: of observables, simple or curved, and of inputs."""
-    own, beside = _best(material, observables, _features(ambient, inputs), targets, counting)
-    outer = dataclasses.replace(ambient, weights=np.concatenate(beside)).pruned()
+    own, beside = _best(material, ambient.features, targets, counting)
+    outer = dataclasses.replace(ambient.part, weights=np.concatenate(beside)).pruned()
     return None if own is None and outer is None else Load(own, outer)
 
 
 def fitted_stress(
-    candidates: Sequence[Expansion], inputs: Any, targets: Sequence[Target], counting: Counting
+    candidates: Sequence[Offer], targets: Sequence[Target], counting: Counting
 ) -> Expansion | None:
     """The stress that explains the targets, with the simple expansion or the curved."""
-    return _best(candidates, inputs, np.ones((len(inputs), 1)), targets, counting)[0]
+    return _best(candidates, np.ones((len(counting.shares), 1)), targets, counting)[0]
 
 
 @eqx.filter_jit
 def _features_of(part: Expansion, inputs: Any) -> Any:
     return jax.vmap(part.features)(inputs)
-
-
-def _features(part: Expansion, inputs: Any) -> Float[np.ndarray, "S k"]:
-    return np.asarray(_features_of(part, inputs))
 
 
 class _Fit(NamedTuple):
@@ -128,11 +140,9 @@ class _Problem:
         """The fit with these columns (all, by default)."""
         among = np.ones(self.columns.shape[1], dtype=bool) if among is None else among
         weights = np.zeros((len(self.floors), len(among)))
-        left = []
-        for row, values, floor in zip(weights, self.values.T, self.floors, strict=True):
-            found = relevant(self.columns[:, among], values, float(floor), self.shares)
-            row[among] = found.values
-            left.append(found.noise)
+        found = relevant(self.columns[:, among], self.values, self.floors, self.shares)
+        weights[:, among] = [each.values for each in found]
+        left = [each.noise for each in found]
         count = self.counts[0]
         if self.target.turn is None:
             material, ambient = weights[:, :count], np.insert(weights[:, count:], 0, 0.0, axis=1)
@@ -179,28 +189,27 @@ class _Problem:
 
 
 def _best(
-    candidates: Sequence[Expansion], inputs: Any, ambient: Any, targets: Sequence[Target], counting: Counting
+    candidates: Sequence[Offer], ambient: Any, targets: Sequence[Target], counting: Counting
 ) -> tuple[Expansion | None, list[Any]]:
     """The expansion of the fields' best fits, and their ambient weights."""
     simple, *richer = candidates
-    features = _features(simple, inputs)
-    problems = [_Problem(target, features, ambient, counting) for target in targets]
+    problems = [_Problem(target, simple.features, ambient, counting) for target in targets]
     fits = [problem.solved() for problem in problems]
     needy = [k for k, fit in enumerate(fits) if problems[k].unexplained(fit) > WELL]
     if not needy:
-        full = dataclasses.replace(simple, weights=np.concatenate([fit.material for fit in fits]))
+        full = dataclasses.replace(simple.part, weights=np.concatenate([fit.material for fit in fits]))
         return full.pruned(), [fit.ambient for fit in fits]
 
     rich = richer[0] if richer else simple
-    where, features = rich.columns_of(simple), _features(rich, inputs)
+    where = rich.part.columns_of(simple.part)
     materials = []
     for fit in fits:
-        wider = np.zeros((fit.material.shape[0], features.shape[1]))
+        wider = np.zeros((fit.material.shape[0], rich.features.shape[1]))
         wider[:, where] = fit.material
         materials.append(wider)
     picks: dict[int, Any] = {}
     for k in needy:
-        problem = _Problem(targets[k], features, ambient, counting)
+        problem = _Problem(targets[k], rich.features, ambient, counting)
         known = problem.spread(np.any(materials[k] != 0.0, axis=0)).astype(bool)
         outer = np.concatenate(
             [fits[k].ambient[:, 1:]] if targets[k].turn is None else [fits[k].ambient], axis=1
@@ -208,26 +217,26 @@ def _best(
         known[len(known) - (outer.shape[1] if targets[k].turn is None else outer.size) :] |= (
             np.any(outer != 0.0, axis=0) if targets[k].turn is None else (outer != 0.0).ravel()
         )
-        among = problem.picked(rich, fits[k]._replace(used=known))
+        among = problem.picked(rich.part, fits[k]._replace(used=known))
         if among is not None:
             picks[k] = among
     if picks:
-        rich = _with_slopes(rich, inputs, ambient, {k: targets[k] for k in picks}, picks, counting)
-        features = _features(rich, inputs)
+        rich = _with_slopes(rich, ambient, {k: targets[k] for k in picks}, picks, counting)
         for k, among in picks.items():
-            fits[k] = _Problem(targets[k], features, ambient, counting).solved(among)
+            fits[k] = _Problem(targets[k], rich.features, ambient, counting).solved(among)
             materials[k] = fits[k].material
-    full = dataclasses.replace(rich, weights=np.concatenate(materials))
+    full = dataclasses.replace(rich.part, weights=np.concatenate(materials))
     return full.pruned(), [fit.ambient for fit in fits]
 
 
 def _with_slopes(
-    rich: Expansion, inputs: Any, ambient: Any, targets: dict[int, Target], picks: dict[int, Any],
-    counting: Counting,
-) -> Expansion:  # fmt: skip
+    rich: Offer, ambient: Any, targets: dict[int, Target], picks: dict[int, Any], counting: Counting
+) -> Offer:
     """The slopes of the saturating functions refined, on the field that they serve worst."""
-    features = _features(rich, inputs)
-    problems = {k: _Problem(target, features, ambient, counting) for k, target in targets.items()}
+    part = rich.part
+    if not part.slopes.size:
+        return rich
+    problems = {k: _Problem(target, rich.features, ambient, counting) for k, target in targets.items()}
     fits = {k: problem.solved(picks[k]) for k, problem in problems.items()}
     k = max(fits, key=lambda k: problems[k].unexplained(fits[k]))
     problem = problems[k]
@@ -235,10 +244,8 @@ def _with_slopes(
     root = np.sqrt(problem.shares)
 
     def build(slopes: Any) -> Any:
-        return problem.arranged(_features(dataclasses.replace(rich, slopes=slopes), inputs)) * root[:, None]
+        return problem.arranged(rich.with_slopes(slopes).features) * root[:, None]
 
-    if not rich.slopes.size:
-        return rich
-    owned = problem.spread(rich.owned())
-    slopes = refined(build, problem.values[:, worst] * root, fits[k].used, rich.slopes, owned, rich.kinds())
-    return dataclasses.replace(rich, slopes=slopes)
+    owned = problem.spread(part.owned())
+    target = problem.values[:, worst] * root
+    return rich.with_slopes(refined(build, target, fits[k].used, part.slopes, owned, part.kinds()))

@@ -18,9 +18,9 @@ from typing import Any, Self
 import jax
 import numpy as np
 
-from knode_cosserat.learning import container
 from knode_cosserat.learning.config import FitConfig
-from knode_cosserat.learning.container import ContainerError, Reader, Title, Writer
+from knode_cosserat.learning.files import container
+from knode_cosserat.learning.files.container import ContainerError, Reader, Title, Writer
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.rods.system import System
 from knode_cosserat.trajectory import Trajectory

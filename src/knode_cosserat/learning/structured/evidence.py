@@ -33,35 +33,62 @@ class Weights(NamedTuple):
 
 def relevant(
     features: Float[Any, "S k"],
-    target: Float[Any, " S"],
-    floor: float,
+    targets: Float[Any, "S n"],
+    floors: Float[Any, " n"],
     weight: Float[Any, " S"] | None = None,
-) -> Weights:
-    """The few weights with which features explain a target.
+) -> list[Weights]:
+    """The few weights with which features explain each target.
 
     Args:
         features: (S, k).
-        target: (S,).
-        floor: what of the target (rms) is known to be noise at least, such as the solver's tolerance.
+        targets: (S, n), each on its own.
+        floors: what of each target (rms) is known to be noise at least, such as the solver's tolerance.
         weight: how much each sample counts, on average one.
     """
-    count, size = features.shape
     if weight is not None:
-        root = np.sqrt(weight)
-        features, target = features * root[:, None], target * root
-    spread = np.sqrt(np.mean(target**2))
-    nothing = Weights(np.zeros(size), np.zeros(size), float(spread), count * np.log(max(spread, floor) ** 2))
+        root = np.sqrt(weight)[:, None]
+        features, targets = features * root, targets * root
+    count, size = features.shape
+    spreads = np.sqrt(np.mean(targets**2, axis=0))
     sizes = np.sqrt(np.mean(features**2, axis=0))
     live = np.flatnonzero(sizes > 1e-13 * max(sizes.max(initial=0.0), 1e-300))
-    if spread <= floor or not len(live):
-        return nothing
-    # in units in which features and target are of size one; the factor stands for all the samples
-    factor: Any = np.linalg.qr(np.column_stack([features[:, live] / sizes[live], target / spread]), mode="r")
-    least = floor / spread
-    X, y = factor[:, :-1], factor[:, -1]
+    if not len(live) or np.all(spreads <= floors):
+        return [_nothing(count, size, *each) for each in zip(spreads, floors, strict=True)]
+    # in units in which features and targets are of size one; the factor stands for all the samples
+    units = np.concatenate([sizes[live], np.where(spreads > 0.0, spreads, 1.0)])
+    factor: Any = np.linalg.qr(np.column_stack([features[:, live], targets]) / units, mode="r")
+    X, along = factor[: len(live), : len(live)], factor[:, len(live) :]
+    # beside the features' directions only the length of a target counts
+    beside = np.linalg.norm(along[len(live) :], axis=0)
+    y = np.vstack([along[: len(live)], beside])
+    X = np.vstack([X, np.zeros((len(y) - len(X), len(live)))])
+    found = []
+    for target, spread, floor in zip(y.T, spreads, floors, strict=True):
+        nothing = _nothing(count, size, spread, floor)
+        part = None if spread <= floor else _of_one(X, target, count, floor / spread)
+        if part is None:
+            found.append(nothing)
+            continue
+        active, w, errors, rest = part
+        values, doubts = np.zeros(size), np.zeros(size)
+        values[live[active]] = w * spread / sizes[live[active]]
+        doubts[live[active]] = errors * spread / sizes[live[active]]
+        noise = spread * np.sqrt(rest / count)
+        criterion = count * np.log(max(noise, floor) ** 2) + len(active) * np.log(count)
+        found.append(Weights(values, doubts, float(noise), float(criterion)))
+    return found
 
-    active = np.arange(len(live))
-    alpha, beta = np.full(len(live), 1e-2), 1e6
+
+def _nothing(count: int, size: int, spread: float, floor: float) -> Weights:
+    return Weights(
+        np.zeros(size), np.zeros(size), float(spread), float(count * np.log(max(spread, floor, 1e-300) ** 2))
+    )
+
+
+def _of_one(X: Any, y: Any, count: int, least: float) -> tuple[Any, Any, Any, float] | None:
+    """The active weights of one target, their values and errors, and the squares left; None if none is."""
+    active = np.arange(X.shape[1])
+    alpha, beta = np.full(X.shape[1], 1e-2), 1e6
     for sweep in range(MOST_SWEEPS):
         w, variance, rest = _posterior(X[:, active], y, alpha[active], beta)
         determined = np.clip(1.0 - alpha[active] * variance, 1e-12, 1.0)
@@ -72,7 +99,7 @@ def relevant(
             break
         active = active[keep]
         if not len(active):
-            return nothing
+            return None
     while True:
         w, variance, rest = _posterior(X[:, active], y, alpha[active], beta)
         certain = np.abs(w) > SIGNIFICANCE * np.sqrt(variance)
@@ -82,16 +109,11 @@ def relevant(
         doubt = np.abs(w) / np.sqrt(variance)
         active = active[doubt >= min(SIGNIFICANCE, np.median(doubt[~certain]) * (1.0 + 1e-9))]
         if not len(active):
-            return nothing
+            return None
         beta = max(count - len(active), 1.0) / max(
             _posterior(X[:, active], y, alpha[active], beta)[2], count * least**2
         )
-    values, errors = np.zeros(size), np.zeros(size)
-    values[live[active]] = w * spread / sizes[live[active]]
-    errors[live[active]] = np.sqrt(variance) * spread / sizes[live[active]]
-    noise = spread * np.sqrt(rest / count)
-    criterion = count * np.log(max(noise, floor) ** 2) + len(active) * np.log(count)
-    return Weights(values, errors, float(noise), float(criterion))
+    return active, w, np.sqrt(variance), rest
 
 
 def _posterior(X: Any, y: Any, alpha: Any, beta: float) -> tuple[Any, Any, float]:

@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.samples import Dataset, Samples, predict
-from knode_cosserat.learning.structured import Structured
+from knode_cosserat.learning.structured.residual import Structured
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.space import SpaceScheme
 

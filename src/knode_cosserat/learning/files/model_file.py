@@ -24,8 +24,8 @@ import jax
 import numpy as np
 
 from knode_cosserat import trajectory_file
-from knode_cosserat.learning import container
-from knode_cosserat.learning.container import (
+from knode_cosserat.learning.files import container
+from knode_cosserat.learning.files.container import (
     Classes,
     ContainerError,
     Reader,
@@ -33,10 +33,10 @@ from knode_cosserat.learning.container import (
     UnknownClassError,
     Writer,
 )
-from knode_cosserat.learning.expansion import Expansion, Term
 from knode_cosserat.learning.knode import KNODE, About
 from knode_cosserat.learning.residual import Network, Residual
-from knode_cosserat.learning.structured import Load, Structured
+from knode_cosserat.learning.structured.expansion import Expansion, Term
+from knode_cosserat.learning.structured.residual import Load, Structured
 from knode_cosserat.rods import robot_file
 from knode_cosserat.rods.system import History, System, is_traced
 from knode_cosserat.solvers import space, time

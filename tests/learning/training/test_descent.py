@@ -12,12 +12,18 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import knode_cosserat as kc
-from knode_cosserat.learning import training as program
 from knode_cosserat.learning.config import NetworkOptions, Training
 from knode_cosserat.learning.knode import KNODE
-from knode_cosserat.learning.losses import PaperLoss, StandardisedLoss, euler_angles, loss_for, spread
 from knode_cosserat.learning.residual import Network, Residual, elu, network
 from knode_cosserat.learning.samples import predict, samples
+from knode_cosserat.learning.training import descent as program
+from knode_cosserat.learning.training.losses import (
+    PaperLoss,
+    StandardisedLoss,
+    euler_angles,
+    loss_for,
+    spread,
+)
 from tests.learning.bar import BAR, WRONG, pulled
 
 DT = 0.05

@@ -14,13 +14,19 @@ import jax
 import numpy as np
 import pytest
 
-from knode_cosserat.learning.checkpoint import CheckpointError, Checkpoints, Identity, data_hash, unpacked
 from knode_cosserat.learning.config import FitConfig, NetworkOptions, RolloutTraining, Training
 from knode_cosserat.learning.fit import fit
-from knode_cosserat.learning.watch import Watch
+from knode_cosserat.learning.training.checkpoint import (
+    CheckpointError,
+    Checkpoints,
+    Identity,
+    data_hash,
+    unpacked,
+)
+from knode_cosserat.learning.training.watch import Watch
 from tests.learning.bar import BAR, WRONG, pulled
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 CONFIG = FitConfig(
     NetworkOptions(hidden=5, convex=False, standardised=True),
     Training(epochs=130, noise=0.01, schedule="plateau", patience=5),
@@ -125,7 +131,7 @@ def long_fit(folder):
 
 def kill_during(stage, folder, delay):
     """Start the fit, kill it a while after the first checkpoint of a stage; whether it was still running."""
-    code = "import sys; from tests.learning.test_checkpoint import long_fit; long_fit(sys.argv[1])"
+    code = "import sys; from tests.learning.training.test_checkpoint import long_fit; long_fit(sys.argv[1])"
     path = os.pathsep.join([str(ROOT / "src"), str(ROOT)])
     process = subprocess.Popen(
         [sys.executable, "-c", code, str(folder)], cwd=ROOT, env={**os.environ, "PYTHONPATH": path}

@@ -22,12 +22,12 @@ from hypothesis import assume, given, settings
 
 import knode_cosserat as kc
 from examples.hanging_string import HangingString
-from knode_cosserat.learning import container, model_file
-from knode_cosserat.learning.expansion import CURVED, expansion
+from knode_cosserat.learning.files import container, model_file
+from knode_cosserat.learning.files.model_file import ModelFileError, load_model
 from knode_cosserat.learning.knode import KNODE, About
-from knode_cosserat.learning.model_file import ModelFileError, load_model
 from knode_cosserat.learning.residual import Network, Residual, input_size
-from knode_cosserat.learning.structured import Load, Structured, ambient_layout, loaded
+from knode_cosserat.learning.structured.expansion import CURVED, expansion
+from knode_cosserat.learning.structured.residual import Load, Structured, ambient_layout, loaded
 from knode_cosserat.trajectory_file import TrajectoryFileError
 
 # few nodes and tensions that no other test has: what is compiled here was not compiled before
@@ -649,7 +649,7 @@ def test_a_prediction_comes_back_with_its_model(prediction):
 def test_a_prediction_is_read_in_another_process(prediction):
     _, path = prediction
     code = (
-        "import sys, knode_cosserat as kc, knode_cosserat.learning.model_file\n"
+        "import sys, knode_cosserat as kc, knode_cosserat.learning.files.model_file\n"
         "found = kc.load_trajectory(sys.argv[1])\n"
         "print(type(found.system).__name__, found.y.shape, found.system.residual.input_weights.sum().hex())"
     )

@@ -19,11 +19,10 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.learning.config import StructuredOptions
-from knode_cosserat.learning.expansion import CURVED, DRAG, LINEAR, Expansion, expansion
-from knode_cosserat.learning.polish import polished
 from knode_cosserat.learning.samples import Dataset, Samples, TipSamples
-from knode_cosserat.learning.selection import folds
-from knode_cosserat.learning.structured import (
+from knode_cosserat.learning.structured.expansion import CURVED, DRAG, LINEAR, Expansion, expansion
+from knode_cosserat.learning.structured.polish import polished
+from knode_cosserat.learning.structured.residual import (
     Load,
     Structured,
     ambient_inputs,
@@ -33,7 +32,8 @@ from knode_cosserat.learning.structured import (
     material_layout,
     tip_observables,
 )
-from knode_cosserat.learning.sums import Counting, Target, fitted_load, fitted_stress
+from knode_cosserat.learning.structured.selection import folds
+from knode_cosserat.learning.structured.sums import Counting, Offer, Target, fitted_load, fitted_stress
 from knode_cosserat.rods.system import Layout, System, unpacked_history
 from knode_cosserat.rotation import rotation_matrix
 from knode_cosserat.solvers.space import Euler
@@ -44,12 +44,71 @@ LEAST = 1e-9
 TOLERANCE = 3e-10
 
 
-def solve(knowledge: System, data: Dataset, options: StructuredOptions, seed: int) -> Structured:
-    """The structured residual that explains the samples; `seed` says how rows count if they are resampled."""
-    segments, tips = (_counting(part, options, seed) for part in (data.segments, data.tips))
-    residual = Structured(np.zeros(()), _stress(knowledge, data.segments, options, segments), None, None)
-    residual = _with_loads(knowledge, data, residual, options, segments)
-    return dataclasses.replace(residual, tip_load=_tip_load(knowledge, data.tips, residual, tips))
+def solve(
+    knowledge: System, data: Dataset, options: StructuredOptions, seeds: Sequence[int]
+) -> list[Structured]:
+    """The structured residuals that explain the samples, one for each seed.
+
+    A seed says how rows count if they are resampled, and nothing else: what they have to explain, and with
+    what, is found once.
+    """
+    seen = _Seen(knowledge, data, options)
+    found: list[Structured] = []
+    for seed in seeds:
+        if found and not options.resample:
+            found.append(found[0])
+            continue
+        segments, tips = (_counting(part, options, seed) for part in (data.segments, data.tips))
+        residual = Structured(np.zeros(()), fitted_stress(*seen.law, segments), None, None)
+        residual = _with_loads(seen, residual, segments)
+        found.append(dataclasses.replace(residual, tip_load=_tip_load(seen, residual, tips)))
+    return found
+
+
+class _Seen:
+    """What has to be explained, and what may explain it: the same however samples count."""
+
+    def __init__(self, knowledge: System, data: Dataset, options: StructuredOptions):
+        self.knowledge, self.data, self.options = knowledge, data, options
+        self.material_layout, self.ambient_layout = material_layout(knowledge), ambient_layout(knowledge)
+        self.scales = knowledge.scales()
+
+    @functools.cached_property
+    def law(self) -> tuple[list[Offer], list[Target]]:
+        """Of the law of the strains."""
+        return _law(self.knowledge, self.data.segments, self.options)
+
+    @functools.cached_property
+    def views(self) -> _Views:
+        """Along the rod."""
+        return jax.tree.map(np.asarray, _views(self.knowledge, self.data.segments))
+
+    @functools.cached_property
+    def rates(self) -> Float[np.ndarray, "S y"]:
+        """The knowledge's y_s at the true strains."""
+        return np.asarray(_rates(self.knowledge, self.data.segments))
+
+    @functools.cached_property
+    def along(self) -> _Sides:
+        """What a load along the rod may be a sum of."""
+        return self.sides(loaded(self.knowledge), self.data.segments.y, self.views, self.options.curved)
+
+    def sides(self, layout: Layout, y: Any, views: _Views, curved: bool) -> _Sides:
+        """What a load of this layout may be a sum of, of the material and ambient, and its frames."""
+        material = _candidates(self.knowledge, self.material_layout, layout, views, curved)
+        ambient = expansion(self.ambient_layout, views.ambient, {}, layout.size)
+        frames = _frames(self.knowledge, layout, y)
+        return _Sides(layout, [Offer(part, views.material) for part in material],
+                      Offer(ambient, views.ambient), frames)  # fmt: skip
+
+
+class _Sides(NamedTuple):
+    """A load's layout, what it may be a sum of, and the rotations (S, 3, 3) of its fields."""
+
+    layout: Layout
+    material: list[Offer]
+    ambient: Offer
+    frames: dict[str, Any]
 
 
 def _counting(data: Samples | TipSamples, options: StructuredOptions, seed: int) -> Counting:
@@ -93,12 +152,12 @@ def _left_of_law(knowledge: System, data: Samples) -> tuple[Any, Any, Any]:
     return jax.vmap(one)(data)
 
 
-def _stress(knowledge: System, data: Samples, options: StructuredOptions, counting: Counting) -> Any:
+def _law(knowledge: System, data: Samples, options: StructuredOptions) -> tuple[list[Offer], list[Target]]:
     left, size, inputs = (np.asarray(part) for part in _left_of_law(knowledge, data))
     fields = knowledge.z_layout.fields
     layout = Layout(*fields, *((f"{name}_t", *rest) for name, *rest in fields))
-    empty = [
-        expansion(layout, inputs, dict.fromkeys(layout.names, forms), left.shape[1])
+    offers = [
+        Offer(expansion(layout, inputs, dict.fromkeys(layout.names, forms), left.shape[1]), inputs)
         for forms in ((LINEAR, CURVED) if options.curved else (LINEAR,))
     ]
     floors = _floors(knowledge.z_layout, size)
@@ -108,7 +167,7 @@ def _stress(knowledge: System, data: Samples, options: StructuredOptions, counti
         Target(left[:, spot], None, floors[spot], (field.name, f"{field.name}_t"))
         for field, spot in zip(fields, spots, strict=True)
     ]
-    return fitted_stress(empty, inputs, targets, counting)
+    return offers, targets
 
 
 # the loads
@@ -152,33 +211,20 @@ def _rates(knowledge: System, data: Samples) -> Any:
     return jax.vmap(one)(data)
 
 
-def _with_loads(
-    knowledge: System, data: Dataset, residual: Structured, options: StructuredOptions, counting: Counting
-) -> Structured:
+def _with_loads(seen: _Seen, residual: Structured, counting: Counting) -> Structured:
     """The residual with its stretch and its loads."""
-    segments, layout = data.segments, loaded(knowledge)
-    where = knowledge.y_layout.indices(layout.names)
-    views = jax.tree.map(np.asarray, _views(knowledge, segments))
-    moved, doubt = segments.slope / float(knowledge.length), data.doubt / float(knowledge.length)
-    rates = np.asarray(_rates(knowledge, segments))
+    knowledge, data, rates = seen.knowledge, seen.data, seen.rates
+    length = float(knowledge.length)
+    moved, doubt = data.segments.slope / length, data.doubt / length
     longer = _longer(knowledge, moved, rates, counting.shares)
     missing = moved / longer - rates
     if knowledge.mixed:
-        missing = np.einsum("sij,sj->si", views.matrix, missing)
-    ds = float(knowledge.length) / (knowledge.nodes - 1)
+        missing = np.einsum("sij,sj->si", seen.views.matrix, missing)
+    ds = length / (knowledge.nodes - 1)
     floors = _floors(knowledge.y_layout, np.abs(rates) + np.abs(moved))
-    floors = np.maximum(floors, TOLERANCE * np.asarray(knowledge.scales().y) / ds)
-    material = _candidates(knowledge, layout, views, options.curved)
-    load = _load(
-        knowledge,
-        layout,
-        missing[:, where],
-        np.maximum(floors, doubt)[where],
-        segments.y,
-        views,
-        counting,
-        material,
-    )
+    floors = np.maximum(floors, TOLERANCE * np.asarray(seen.scales.y) / ds)
+    where = knowledge.y_layout.indices(seen.along.layout.names)
+    load = _load(seen.along, missing[:, where], np.maximum(floors, doubt)[where], counting)
     residual = dataclasses.replace(residual, stretch=np.array(longer - 1.0), load=load)
     if isinstance(data.space, Euler):
         return residual
@@ -203,27 +249,27 @@ def _longer(knowledge: System, moved: Any, rates: Any, shares: Any) -> float:
     return ratio if abs(ratio - 1.0) > 5.0 / np.sqrt(np.sum(precisions)) else 1.0
 
 
-def _candidates(knowledge: System, layout: Layout, views: _Views, curved: bool) -> list[Expansion]:
+def _candidates(
+    knowledge: System, inputs: Layout, layout: Layout, views: _Views, curved: bool
+) -> list[Expansion]:
     """What a load may be a sum of: at first, and if that is not enough."""
     stated = knowledge.velocities or knowledge.observable_layout.names
     simple: dict[str, Sequence[str]] = dict.fromkeys(knowledge.velocities, DRAG)
     rich: dict[str, Sequence[str]] = dict.fromkeys(stated, CURVED)
     return [
-        expansion(material_layout(knowledge), views.material, forms, layout.size)
+        expansion(inputs, views.material, forms, layout.size)
         for forms in ([simple, rich] if curved else [simple])
     ]
 
 
-def _load(
-    knowledge: System, layout: Layout, missing: Any, floors: Any, y: Any, views: _Views, counting: Counting,
-    material: Sequence[Expansion],
-) -> Load | None:  # fmt: skip
+def _load(sides: _Sides, missing: Any, floors: Any, counting: Counting) -> Load | None:
     """The load that explains what is missing (S, l)."""
-    ambient = expansion(ambient_layout(knowledge), views.ambient, {}, layout.size)
-    frames = _frames(knowledge, layout, y)
-    spots = {name: layout.slice(name) for name in layout.names}
-    targets = [Target(missing[:, spot], frames.get(name), floors[spot]) for name, spot in spots.items()]
-    return fitted_load(material, ambient, views.material, views.ambient, targets, counting)
+    targets = [
+        Target(missing[:, spot], sides.frames.get(name), floors[spot])
+        for name in sides.layout.names
+        for spot in [sides.layout.slice(name)]
+    ]
+    return fitted_load(sides.material, sides.ambient, targets, counting)
 
 
 @functools.lru_cache(maxsize=1)
@@ -257,9 +303,8 @@ def _at_tip(adapted: System, data: TipSamples) -> tuple[Any, _Views]:
     return jax.vmap(one)(data)
 
 
-def _tip_load(knowledge: System, data: TipSamples, residual: Structured, counting: Counting) -> Load | None:
-    left, views = jax.tree.map(np.asarray, _at_tip(residual.adapted(knowledge), data))
-    floors = TOLERANCE * np.asarray(knowledge.scales().tip)
-    layout = knowledge.tip_layout
-    simple = _candidates(knowledge, layout, views, curved=False)
-    return _load(knowledge, layout, -left, floors, data.y, views, counting, simple)
+def _tip_load(seen: _Seen, residual: Structured, counting: Counting) -> Load | None:
+    knowledge, tips = seen.knowledge, seen.data.tips
+    left, views = jax.tree.map(np.asarray, _at_tip(residual.adapted(knowledge), tips))
+    sides = seen.sides(knowledge.tip_layout, tips.y, views, curved=False)
+    return _load(sides, -left, TOLERANCE * np.asarray(seen.scales.tip), counting)

@@ -8,14 +8,14 @@ import pytest
 
 import knode_cosserat as kc
 from examples.hanging_string import HangingString
-from knode_cosserat.learning import search
-from knode_cosserat.learning.calibrate import CalibrationError, calibrate
+from knode_cosserat.learning.calibration import search
+from knode_cosserat.learning.calibration.calibrate import CalibrationError, calibrate
+from knode_cosserat.learning.calibration.misfit import SegmentMisfit
+from knode_cosserat.learning.calibration.noise import by_states, errors_of
+from knode_cosserat.learning.calibration.unknowns import found, searched, unknowns_of, values, with_numbers
 from knode_cosserat.learning.knode import KNODE
-from knode_cosserat.learning.misfit import SegmentMisfit
-from knode_cosserat.learning.noise import by_states, errors_of
 from knode_cosserat.learning.residual import Residual
 from knode_cosserat.learning.samples import DataError
-from knode_cosserat.learning.unknowns import found, searched, unknowns_of, values, with_numbers
 from tests.learning.bar import BAR, WRONG, Bar, pulled
 
 ROBOT = kc.load_robot("delrin-tendon-robot")
@@ -87,7 +87,6 @@ def as_measured(trajectories: list[kc.Trajectory], noise: float, seed: int) -> l
 # what is found in data without noise
 
 
-@pytest.mark.campaign
 @pytest.mark.parametrize(
     ("truth", "start"),
     [
@@ -111,14 +110,15 @@ def test_imperfections_are_found(truth, start):
     assert result.estimates["drag"] == pytest.approx(true.drag[0, 0], abs=2e-10)
     for name, (low, high) in result.intervals.items():
         value = np.max(getattr(true, name))
-        assert low <= value <= high and high - low < 1e-3 * max(value, 1e-4)
+        # what the tolerance of the solver may have done to a force so small is much of the drag
+        width = 1e-2 if name == "drag" else 1e-6
+        assert low <= value <= high and high - low < width * max(value, 1e-4)
     assert not result.undetermined and not result.unexplained
     controls = kc.controls.sine(1.5, 100, DT)
     again = kc.simulate(result.robot, controls, DT)[:100]
     assert kc.tip_dtw(again, kc.simulate(true, controls, DT)[:100]) < 1e-6
 
 
-@pytest.mark.campaign
 @pytest.mark.parametrize(
     ("truth", "start"),
     [
@@ -143,7 +143,6 @@ def test_nobody_has_to_say_which_parameter_is_wrong(truth, start):
     assert kc.tip_dtw(again, kc.simulate(true, controls, DT)[:100]) < 1e-6
 
 
-@pytest.mark.campaign
 def test_a_robot_at_rest_tells_little():
     tension = np.array([6.0, 5.0, 5.0, 5.0])
     still = kc.simulate(ROBOT, np.tile(tension, (29, 1)), DT, initial=kc.equilibrium(ROBOT, tension))
@@ -279,7 +278,6 @@ def test_how_states_enter_is_known_exactly(time, space, string_swing):
     np.testing.assert_allclose(predicted, expected, rtol=1e-5)
 
 
-@pytest.mark.campaign
 def test_rollouts_need_positions_and_orientations_only(training):
     """Signs and lengths of quaternions do not matter; what was not measured may be missing."""
     [measured] = as_measured(training[1:], 0.0, 0)

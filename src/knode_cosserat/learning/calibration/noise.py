@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.learning.misfit import Differences, SegmentMisfit, by_group
-from knode_cosserat.learning.samples import _histories, _settings, _slopes
-from knode_cosserat.learning.search import Fit, Misfit
+from knode_cosserat.learning.calibration.misfit import Differences, SegmentMisfit, by_group
+from knode_cosserat.learning.calibration.search import Fit, Misfit
+from knode_cosserat.learning.samples import histories, settings_of, slopes_of
 from knode_cosserat.solvers.space import middles
 from knode_cosserat.trajectory import Trajectory
 
@@ -115,7 +115,7 @@ def _by_states(
     The way of `samples.samples` backwards: it is linear in the states.
     """
     segments, (tip_y, tip_history) = pulled
-    data, settings, robot = misfit.data, _settings(trajectory), misfit.robot
+    data, settings, robot = misfit.data, settings_of(trajectory), misfit.robot
     mine, tips = data.segments.origin[:, 0] == k, data.tips.origin[:, 0] == k
     rows = data.tips.origin[tips, 1]
     (count, nodes), (n, ny) = np.shape(trajectory.y)[:2], (len(tip_y), robot.y_layout.size)
@@ -134,10 +134,10 @@ def _by_states(
     history[:, :, :-1] += per_row(start)
     history[:, :, 1:] += per_row(end)
     history[:, :, -1] += tip_history[:, tips]
-    _, in_time = _histories(settings, trajectory.dt, np.eye(count))
+    _, in_time = histories(settings, trajectory.dt, np.eye(count))
     records = np.einsum("rt,nrjx->ntjx", in_time[rows], history)
     if robot.mixed:
-        along = _slopes(settings, np.eye(nodes)[None])[0][0] / misfit.length
+        along = slopes_of(settings, np.eye(nodes)[None])[0][0] / misfit.length
         records[..., :ny] += np.einsum("jk,ntjx->ntkx", along, records[..., -ny:])
         records = records[..., :-ny]
     return total + records

@@ -1,0 +1,1 @@
+"""The physical parameters themselves, from the same trajectories."""

@@ -1,0 +1,1 @@
+"""Models in files whose loading runs no code."""

@@ -1,0 +1,1 @@
+"""Training by gradients: losses, epochs, many seeds at once, checkpoints."""
