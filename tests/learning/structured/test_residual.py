@@ -15,6 +15,7 @@ from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.samples import samples
 from knode_cosserat.learning.structured.regression import solve
 from knode_cosserat.studies import truths
+from tests.learning.bar import BAR, pulled
 
 DT = 0.05
 UNSEEN = kc.controls.sine(1.5, 60, DT)
@@ -95,7 +96,7 @@ def test_what_is_learned_does_not_depend_on_the_time_step(robot):
     assert left(model, robot, truth, controls, 0.02) < 1e-8
 
 
-@pytest.mark.parametrize("kind", ["Stiffening", "InternalFriction"])
+@pytest.mark.parametrize("kind", ["Stiffening", pytest.param("InternalFriction", marks=pytest.mark.campaign)])
 def test_a_law_that_is_not_linear(robot, kind):
     truth = like(robot, getattr(truths, kind))
     model = learned(robot, recorded(truth))
@@ -131,7 +132,19 @@ def test_noise_does_not_make_terms_up(robot):
     assert left(model, knowledge, robot) < 0.05
 
 
-def test_segments_that_are_not_one_euler_step(robot):
+def test_segments_that_are_not_one_euler_step():
+    """A bar's y_s comes from splines, and what they give first is polished on the segments."""
+    bar = BAR.replace(nodes=12, drag=0.0)
+    wrong = bar.replace(density=1.5, stiffness=30.0)
+    data = [pulled(period, 20, bar, space="rk4") for period in (1.0, 0.7)]
+    model = learned(wrong, data)
+    unseen = 1.5 * np.cos(np.arange(1, 31) * 0.15)[:, None]
+    before, after, true = (kc.simulate(system, unseen, 0.1, space="rk4").y for system in (wrong, model, bar))
+    assert np.max(np.abs(after - true)) < 1e-6 * np.max(np.abs(before - true))
+
+
+@pytest.mark.campaign
+def test_segments_of_the_robot_that_are_not_one_euler_step(robot):
     knowledge = robot.replace(length=0.4, youngs_modulus=10e9)
     model = learned(knowledge, recorded(robot, space="rk4"))
     assert left(model, knowledge, robot, space="rk4") < 1e-7
