@@ -26,13 +26,17 @@ import numpy as np
 
 from knode_cosserat._yaml import YAMLTextError, did_you_mean, flow, mapping_of, shown
 from knode_cosserat.rods.parameters import Parameter, ParameterError, checked
+from knode_cosserat.rods.routed_robot import RoutedTendonRobot
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.tendon_robot import TendonRobot
 
 FORMAT = 1
 
 #: the classes that a file can name as its kind
-KINDS: dict[str, type[System]] = {"tendon-robot": TendonRobot}
+KINDS: dict[str, type[System]] = {
+    "tendon-robot": TendonRobot,
+    "routed-tendon-robot": RoutedTendonRobot,
+}
 
 
 class RobotFileError(ValueError):
