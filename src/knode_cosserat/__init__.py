@@ -7,6 +7,7 @@ from knode_cosserat import _jax as _jax  # isort: split  (first: it sets JAX up)
 from knode_cosserat import controls
 from knode_cosserat.evaluation.metrics import node_error, pose_mse, tip_dtw, tip_rmse
 from knode_cosserat.learning.calibration.calibrate import Calibration, CalibrationError, calibrate
+from knode_cosserat.learning.calibration.identify import identify
 from knode_cosserat.learning.config import (
     ConfigError,
     FitConfig,
@@ -91,6 +92,7 @@ __all__ = [
     "equilibrium",
     "explain",
     "fit",
+    "identify",
     "load_ensemble",
     "load_model",
     "load_recording",

@@ -104,6 +104,8 @@ class Recording:
         start: float | None = None,
         end: float | None = None,
         tensions: Literal["measured", "commanded"] | None = None,
+        *,
+        mean: bool = False,
     ) -> Measurements:
         """The measurements at the times `start`, `start + dt` and so on, up to `end` (s).
 
@@ -117,6 +119,8 @@ class Recording:
             start: the first row; None: where the configuration's `trim` begins, or the recording.
             end: the last row at most; None: where the `trim` or the first stream ends.
             tensions: which ones; None: what the configuration says.
+            mean: tensions are means from each row to the next instead, of measured ones on the lines between
+                messages: what a simulation with a fine time step should be driven by.
 
         Raises:
             RecordingError: there are no such tensions or no such rows.
@@ -127,7 +131,11 @@ class Recording:
         latency = 0.0
         if driver is self.command and self.config.command is not None:
             latency = self.config.command.latency
-        held = _held(driver, time - latency, bridged if driver is self.tension else math.inf)
+        longest = bridged if driver is self.tension else math.inf
+        held = _held(driver, time - latency, longest)
+        if mean:
+            averaged = _averaged(driver, time - latency, dt, straight=driver is self.tension)
+            held = np.where(np.isfinite(held), averaged, np.nan)
         poses = [_interpolated(body, time, bridged) for body in self.bodies]
         return Measurements(
             time=time,
@@ -191,6 +199,31 @@ def _held(driver: Tensions, time: Float[np.ndarray, " T"], longest: float) -> Fl
     age = time - driver.time[np.maximum(last, 0)]
     old = np.abs(age) > bridge(driver.time, longest)
     return np.where(old[:, None], np.nan, driver.tension[np.maximum(last, 0)])
+
+
+def _averaged(
+    driver: Tensions, time: Float[np.ndarray, " T"], dt: float, *, straight: bool
+) -> Float[np.ndarray, "T tendons"]:
+    """Means from each time to `dt` later: on straight lines between messages, or each held until the next."""
+    known, values = driver.time, driver.tension
+    steps = np.diff(known)[:, None]
+    each = 0.5 * (values[1:] + values[:-1]) if straight else values[:-1]
+    integral = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(steps * each, axis=0)])
+
+    def until(at: np.ndarray) -> np.ndarray:
+        inside = np.clip(at, known[0], known[-1])
+        last = np.clip(np.searchsorted(known, inside, side="right") - 1, 0, max(len(known) - 2, 0))
+        since = (inside - known[last])[:, None]
+        rise = np.zeros_like(values[last])
+        if straight and len(known) > 1:
+            rise = (values[last + 1] - values[last]) / steps[last]
+        whole = integral[last] + since * (values[last] + 0.5 * since * rise)
+        # before the first and after the last, those
+        return np.asarray(
+            whole + (at - inside)[:, None] * np.where(at[:, None] < known[0], values[0], values[-1])
+        )
+
+    return np.asarray((until(time + dt) - until(time)) / dt)
 
 
 def _interpolated(

@@ -178,10 +178,10 @@ def run_batch(
 
         firsts = range(0, size, chunk)
         program = _program(system, start.past, padded, task.settings, batched, lockstep, chunk)
-        alone = [] if program in _COMPILED else [work(firsts[0])]
+        first = [] if program in _COMPILED else [work(firsts[0])]
         _COMPILED.add(program)
         with concurrent.futures.ThreadPoolExecutor(workers) as pool:
-            chunks = alone + list(pool.map(work, firsts[len(alone) :]))
+            chunks = first + list(pool.map(work, firsts[len(first) :]))
     done, *rows = (np.concatenate(parts) for parts in zip(*chunks, strict=True))
     steps = Steps._make([*rows, np.zeros((*done.shape, task.steps), dtype=int)])
     causes = {}
@@ -195,8 +195,8 @@ def run_batch(
     return steps, causes
 
 
-#: programs of `run_batch` that there are already. JAX may crash where one thread writes a program to the disk's
-#: cache while another compiles the same, so the first chunk of a new one goes alone.
+#: programs of `run_batch` that there are already. JAX may crash where one thread writes a program to the
+#: disk's cache while another compiles the same, so the first chunk of a new one goes alone.
 _COMPILED: set[Any] = set()
 
 

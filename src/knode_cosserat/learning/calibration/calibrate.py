@@ -29,6 +29,7 @@ from knode_cosserat.learning.calibration.unknowns import (
     with_numbers,
 )
 from knode_cosserat.learning.samples import DataError
+from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.system import System
 from knode_cosserat.trajectory import Trajectory
 
@@ -92,17 +93,19 @@ class Calibration:
 
 def calibrate(
     robot: System,
-    trajectories: Sequence[Trajectory],
+    trajectories: Sequence[Trajectory] | Sequence[Measurements],
     names: Sequence[str] | None = None,
     *,
     by: Literal["segments", "rollouts"] = "segments",
+    undetermined: Literal["stop", "keep"] | None = None,
     level: float = 0.95,
 ) -> Calibration:
     """Find physical parameters of a robot from trajectories, by least squares.
 
     Args:
         robot: where the search begins; what is not named stays as it is.
-        trajectories: what the real robot did.
+        trajectories: what the real robot did; or measurements from rest on (`Recording.sampled`), which only
+            "rollouts" can use.
         names: parameters by name (`System.parameters`); by default all that have a value and that the data
             determine.
         by: "segments" compares one-segment predictions from the states in the data, all of which must be
@@ -110,6 +113,8 @@ def calibrate(
             its predictions too; what that does to the estimates is taken away, to leading order in its
             variance. "rollouts" compares whole simulations with positions and orientations, and needs nothing
             else of trajectories that begin at rest. Its search begins where segments lead, if they do.
+        undetermined: what to do about a parameter that the data do not determine: "stop" with an error, or
+            "keep" it as it was, which `Calibration.undetermined` says. None: stop if it was named.
         level: how probable it is that an interval holds the truth.
 
     Returns:
@@ -122,15 +127,23 @@ def calibrate(
         DataError: trajectories that do not fit the robot, or are too short or not finite.
     """
     _check(robot, trajectories, by, level)
+    if undetermined not in (None, "stop", "keep"):
+        raise CalibrationError(f'undetermined is {undetermined!r}; allowed is "stop", "keep" or None')
+    may_leave_out = names is None if undetermined is None else undetermined == "keep"
     unknowns = unknowns_of(robot, names)
+    misfit, start = _misfit(robot, trajectories, unknowns, by)
+    return _calibration(misfit, *_ended(misfit, start, may_leave_out), level)
+
+
+def _misfit(robot: System, given: Any, unknowns: Unknowns, by: str) -> tuple[Misfit, np.ndarray]:
+    """What is to become small, and where the search begins."""
     start = searched(unknowns, values(robot, unknowns))
     if by == "segments":
-        misfit: Misfit = SegmentMisfit(robot, trajectories, unknowns)
-    else:
-        near = _by_segments(robot, trajectories, unknowns)
-        misfit = RolloutMisfit(robot, trajectories, unknowns, near is not None)
-        start = start if near is None else near
-    return _calibration(misfit, *_ended(misfit, start, names is None), level)
+        return SegmentMisfit(robot, given, unknowns), start
+    if any(isinstance(each, Measurements) for each in given):
+        return RolloutMisfit(robot, given, unknowns, near=True), start
+    near = _by_segments(robot, given, unknowns)
+    return RolloutMisfit(robot, given, unknowns, near is not None), start if near is None else near
 
 
 def _check(robot: Any, trajectories: Any, by: Any, level: Any) -> None:
@@ -140,6 +153,11 @@ def _check(robot: Any, trajectories: Any, by: Any, level: Any) -> None:
         raise DataError(f"trajectories is a {type(trajectories).__name__}; allowed is a list of trajectories")
     if by not in ("segments", "rollouts"):
         raise CalibrationError(f'by is {by!r}; allowed is "segments" or "rollouts"')
+    measured = [isinstance(each, Measurements) for each in trajectories]
+    if any(measured) and by != "rollouts":
+        raise DataError('measurements are no states: calibrate(…, by="rollouts") compares poses only')
+    if any(measured) and not all(measured):
+        raise DataError("trajectories and measurements are mixed; allowed is a list of one kind")
     if isinstance(level, bool) or not isinstance(level, int | float) or not 0.0 < level < 1.0:
         raise CalibrationError(f"level is {level!r}; allowed is a number between 0 and 1")
     if not owner_of(robot).parameters():

@@ -1,7 +1,8 @@
 """How far simulations with given parameters are from what was measured, and the slopes of that.
 
-Only positions and orientations are compared: no velocity, force or strain has to be known. The derivatives
-are those of each solved step, by the implicit function theorem.
+Only positions and orientations are compared, at all nodes of trajectories or where bodies of a recording sit:
+no velocity, force or strain has to be known. The derivatives are those of each solved step, by the implicit
+function theorem.
 """
 
 from __future__ import annotations
@@ -15,11 +16,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from knode_cosserat.learning.calibration.misfit import LEAST, Differences
 from knode_cosserat.learning.calibration.unknowns import Unknowns, found, with_coordinates, with_numbers
 from knode_cosserat.learning.samples import DataError, samples
+from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.march import Past, initial_past, rest_record
 from knode_cosserat.solvers.run import Task, run_one
@@ -36,24 +38,34 @@ FIRST_ROWS = (2, 5, 10, 20, 50, 100)
 
 
 class _Rollout(NamedTuple):
-    """One trajectory to be simulated again."""
+    """One trajectory or recording to be simulated again."""
 
     settings: Settings
     dt: float
     #: the rows that it begins from, or none: it begins from the robot's own state at rest
     initial: Trajectory | None
     control: Float[np.ndarray, "T c"]
-    y: Float[np.ndarray, "T N y"]
+    #: where the places that are compared lie: after which node, and by which part of the way to the next
+    node: Int[np.ndarray, " M"]
+    part: Float[np.ndarray, " M"]
+    #: position and, if that is compared, quaternion of length one; not a number where nothing was seen
+    target: Float[np.ndarray, "T M k"]
 
 
-def _seen(robot: System, oriented: bool, y: Any, like: Any) -> Any:
-    """Positions and, if the robot has any, quaternions of length one, of the same sign as others."""
+def _seen(robot: System, oriented: bool, y: Any, node: Any, part: Any) -> Any:
+    """Positions and, if the robot has any, quaternions of length one, of places on the rod.
+
+    Between nodes as a line, as Euler's method has it.
+    """
+    part = part[:, None]
+    low, high = (y[..., node + k, :] for k in (0, 1))
+    p = (1.0 - part) * robot.positions(low) + part * robot.positions(high)
     if not oriented:
-        return robot.positions(y)
-    h, other = robot.quaternions(y), robot.quaternions(like)
-    size = jnp.sqrt(jnp.sum(h * h, axis=-1, keepdims=True))
-    sign = jnp.where(jnp.sum(h * other, axis=-1, keepdims=True) < 0.0, -1.0, 1.0)
-    return jnp.concatenate([robot.positions(y), sign * h / size], axis=-1)
+        return p
+    one, other = robot.quaternions(low), robot.quaternions(high)
+    same = jnp.sum(one * other, axis=-1, keepdims=True) >= 0.0
+    h = (1.0 - part) * one + part * jnp.where(same, other, -other)
+    return jnp.concatenate([p, h / jnp.sqrt(jnp.sum(h * h, axis=-1, keepdims=True))], axis=-1)
 
 
 class _Rows(NamedTuple):
@@ -65,7 +77,9 @@ class _Rows(NamedTuple):
     #: the last row and control of the rows that it began from, if there are any
     before: Any
     control: Float[Any, "T c"]
-    measured: Float[Any, "T N y"]
+    node: Int[Any, " M"]
+    part: Float[Any, " M"]
+    target: Float[Any, "T M k"]
 
 
 @functools.partial(jax.jit, static_argnames=("unknowns", "settings", "oriented"))
@@ -82,9 +96,14 @@ def _differences(robot, coordinates, rows, table, dt, unknowns, settings, orient
         return system, rows.past
 
     def left(y: Any) -> Any:
-        # the base is left out: it is where the model puts it
-        seen = _seen(robot, oriented, y, rows.measured) - _seen(robot, oriented, rows.measured, rows.measured)
-        return seen[:, 1:].ravel()
+        seen = _seen(robot, oriented, y, rows.node, rows.part)
+        target = jnp.where(jnp.isnan(rows.target), 0.0, rows.target)
+        if oriented:
+            same = jnp.sum(seen[..., 3:] * target[..., 3:], axis=-1, keepdims=True) >= 0.0
+            target = jnp.concatenate(
+                [target[..., :3], jnp.where(same, target[..., 3:], -target[..., 3:])], axis=-1
+            )
+        return jnp.where(jnp.isnan(rows.target), 0.0, seen - target).ravel()
 
     def along(direction: Any) -> Any:
         (system, past), (d_system, d_past) = jax.jvp(start, (coordinates,), (direction,))
@@ -101,15 +120,19 @@ def _differences(robot, coordinates, rows, table, dt, unknowns, settings, orient
 class RolloutMisfit:
     """Whole simulations against the measured positions and orientations, from the same beginning.
 
-    A trajectory that begins at t = 0 under no control begins from the robot's own state at rest; any other
-    from its own first rows, which then have to be states without noise.
+    A trajectory that begins at t = 0 under no control begins from the robot's own state at rest, and so do
+    measurements; any other trajectory from its own first rows, which then have to be states without noise.
     """
 
     #: whether a search must not go far at once: simulations of a robot that is far off lead astray
     cautious = True
 
     def __init__(
-        self, robot: System, trajectories: Sequence[Trajectory], unknowns: Unknowns, near: bool = False
+        self,
+        robot: System,
+        given: Sequence[Trajectory] | Sequence[Measurements],
+        unknowns: Unknowns,
+        near: bool = False,
     ):
         """`near`: a search begins where the robot is close to the real one."""
         self.robot, self.unknowns, self.near = robot, unknowns, near
@@ -121,37 +144,54 @@ class RolloutMisfit:
         with contextlib.suppress(AttributeError):
             sizes.append(np.size(robot.quaternions(y)))
         self.oriented = len(sizes) == 2
-        #: what is compared
-        self.fields = ("position", "orientation")[: len(sizes)]
-        samples(robot, [_without_unused(robot, each) for each in trajectories])  # checks them
-        self.rollouts = [_rollout(each) for each in trajectories]
+        trajectories = [each for each in given if isinstance(each, Trajectory)]
+        if trajectories:
+            samples(robot, [_without_unused(robot, each) for each in trajectories])  # checks them
+        #: whether the data are a real robot's: no model of it is exact, and none is searched as if it were
+        self.rough = not trajectories
+        self.rollouts = [
+            _of_trajectory(robot, self.oriented, each)
+            if isinstance(each, Trajectory)
+            else _of_measurements(robot, self.oriented, each)
+            for each in given
+        ]
+        what = ("position", "orientation")[: len(sizes)]
+        #: what is compared; each recording by itself, for a model may do better on one than on another
+        self.fields, apart = what, 0
+        if self.rough and len(self.rollouts) > 1:
+            names = [each.source.partition(":")[0] for each in given if isinstance(each, Measurements)]
+            self.fields, apart = tuple(f"{each} in {name}" for name in names for each in what), len(what)
         numbers = np.repeat(np.arange(len(sizes)), sizes)
-        count = sum(rollout.y.shape[0] * (rollout.y.shape[1] - 1) for rollout in self.rollouts)
-        #: which of `fields` each difference belongs to
-        self.groups = np.tile(numbers, count)
+        groups = [
+            np.tile(numbers + apart * k, one.target[..., 0].size) for k, one in enumerate(self.rollouts)
+        ]
+        #: which of `fields` each difference belongs to, and which differences there are
+        self._groups, self._sizes = groups, sizes
+        self._known = [np.isfinite(one.target).ravel() for one in self.rollouts]
+        self.groups = np.concatenate([each[known] for each, known in zip(groups, self._known, strict=True)])
 
     def __call__(self, coordinates: np.ndarray) -> Differences:
         """Differences of all rollouts; infinite if one of them has no solution."""
         system = with_numbers(self.robot, self.unknowns, found(self.unknowns, coordinates))
         parts = []
-        for rollout in self.rollouts:
+        for rollout, known in zip(self.rollouts, self._known, strict=True):
             part = self._of_one(system, coordinates, rollout)
             if part is None:
                 size = len(self.groups)
                 return Differences(np.full(size, np.inf), np.zeros((size, len(coordinates))))
-            parts.append(part)
+            parts.append((part.values[known], part.slopes[known]))
         values, slopes = zip(*parts, strict=True)
         return Differences(np.concatenate(values), np.concatenate(slopes))
 
     def _of_one(self, system: System, coordinates: np.ndarray, rollout: _Rollout) -> Differences | None:
-        settings, dt, initial, control, y = rollout
+        settings, dt, initial, control, node, part, target = rollout
         record, begun, _, first = beginning(Run(system, control, initial, settings, dt, None, False))
         task = Task(settings, dt, len(control), first)
         steps, _ = run_one(task, system, control, begun)
         if steps.result.min() < 0:
             return None
         before = None if initial is None else (record, np.asarray(initial.control)[-1])
-        rows = _Rows(steps.records, steps.unknowns, begun.past, before, control, y)
+        rows = _Rows(steps.records, steps.unknowns, begun.past, before, control, node, part, target)
         values, slopes = _differences(
             self.robot, coordinates, rows, task.table, dt, self.unknowns, settings, self.oriented
         )
@@ -159,10 +199,16 @@ class RolloutMisfit:
 
     def blocks(self, values: Float[np.ndarray, " M"]) -> list[tuple[np.ndarray, np.ndarray]]:
         """The field (n,) of the differences of a row, and these by row (R, n), of each trajectory."""
-        counts = [rollout.y.shape[0] for rollout in self.rollouts]
-        ends = np.cumsum(counts) * (len(self.groups) // sum(counts))
-        parts = zip(np.split(values, ends[:-1]), np.split(self.groups, ends[:-1]), counts, strict=True)
-        return [(groups.reshape(count, -1)[0], mine.reshape(count, -1)) for mine, groups, count in parts]
+        ends = np.cumsum([known.sum() for known in self._known])[:-1]
+        found = []
+        for mine, known, groups, one in zip(
+            np.split(values, ends), self._known, self._groups, self.rollouts, strict=True
+        ):
+            whole = np.zeros(len(known))
+            whole[known] = mine
+            rows = len(one.target)
+            found.append((groups.reshape(rows, -1)[0], whole.reshape(rows, -1)))
+        return found
 
     def beginnings(self) -> list[Float[np.ndarray, " M"]]:
         """Which differences count in searches that lead to where that of all begins: more rows each time.
@@ -172,25 +218,61 @@ class RolloutMisfit:
         """
         if self.near:
             return []
-        counts = [rollout.y.shape[0] for rollout in self.rollouts]
-        rows = np.concatenate([np.arange(count) for count in counts])
-        rows = np.repeat(rows, len(self.groups) // len(rows))
-        return [(rows < last).astype(float) for last in FIRST_ROWS if last < max(counts)]
+        rows = np.concatenate(
+            [
+                np.repeat(np.arange(len(one.target)), len(known) // len(one.target))[known]
+                for one, known in zip(self.rollouts, self._known, strict=True)
+            ]
+        )
+        return [(rows < last).astype(float) for last in FIRST_ROWS if last <= rows.max()]
 
     def first_sizes(self) -> Float[np.ndarray, " G"]:
         """Sizes of the differences, by field, before anything is known: of positions, the length."""
-        return np.array([float(np.asarray(self.robot.length)), 1.0])[: len(self.fields)]
+        both = [float(np.asarray(self.robot.length)), 1.0][: len(self._sizes)]
+        return np.array(both * (len(self.fields) // len(both)))
 
     def least_sizes(self, coordinates: np.ndarray) -> Float[np.ndarray, " G"]:
         """The solver's tolerance, by field."""
         return LEAST * self.first_sizes()
 
 
-def _rollout(trajectory: Trajectory) -> _Rollout:
+def _of_trajectory(robot: System, oriented: bool, trajectory: Trajectory) -> _Rollout:
     begins = _first_row(trajectory)
     control, y = (np.asarray(values, dtype=float)[begins:] for values in (trajectory.control, trajectory.y))
     initial = None if _from_rest(trajectory) else trajectory[:begins]
-    return _Rollout(trajectory.settings or Settings(), trajectory.dt, initial, control, y)
+    settings = trajectory.settings or Settings()
+    # the base is left out: it is where the model puts it
+    node, part = np.arange(robot.nodes - 1), np.ones(robot.nodes - 1)
+    target = np.asarray(_seen(robot, oriented, y, node, part))
+    return _Rollout(settings, trajectory.dt, initial, control, node, part, target)
+
+
+def _of_measurements(robot: System, oriented: bool, given: Any) -> _Rollout:
+    """Measurements, with row 0 where the robot rests.
+
+    Raises:
+        DataError: they are not of this robot, too short, or tensions are not known in all rows.
+    """
+    if not isinstance(given, Measurements):
+        raise DataError(f"a {type(given).__name__} is no trajectory and no measurements")
+    if len(given.time) < 2:
+        raise DataError(f"{given.source}: {len(given.time)} rows; at least 2 are needed")
+    if given.tension.shape[1] != robot.control_size:
+        raise DataError(
+            f"{given.source}: {given.tension.shape[1]} tensions in a row; the robot has {robot.control_size}"
+        )
+    if not np.all(np.isfinite(given.tension)):
+        row = int(np.flatnonzero(~np.isfinite(given.tension).all(axis=1))[0])
+        raise DataError(
+            f"{given.source}: no tension is known at {given.time[row]:g} s; use the part before (`parts`)"
+        )
+    place = np.clip(given.fractions, 0.0, 1.0) * (robot.nodes - 1)
+    node = np.clip(np.ceil(place - 1e-9).astype(int) - 1, 0, robot.nodes - 2)
+    target = given.position[1:]
+    if oriented:
+        length = np.linalg.norm(given.quaternion[1:], axis=-1, keepdims=True)
+        target = np.concatenate([target, given.quaternion[1:] / length], axis=-1)
+    return _Rollout(Settings(), given.dt, None, given.tension[:-1], node, place - node, target)
 
 
 def _first_row(trajectory: Trajectory) -> int:

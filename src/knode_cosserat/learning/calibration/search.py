@@ -27,8 +27,17 @@ PASSES = 5
 MOST_WAYS = 3
 #: evaluations of one search
 MOST_EVALUATIONS = 100
-#: steps, in natural sizes, at which a search ends: the last one, and those that only lead to its start
-FINE, ROUGH = 1e-12, 1e-3
+
+
+class End(NamedTuple):
+    """When a search ends: at a step so small, in natural sizes, or a fall of the squares by such a part."""
+
+    step: float
+    fall: float
+
+
+#: the last search, one that only leads to its start, and one for a real robot, of which no model is exact
+FINE, ROUGH, PLAIN = End(1e-12, 1e-15), End(1e-3, 1e-6), End(1e-3, 1e-4)
 #: a combination of parameters is not determined if it does less than this part of what each does alone
 FLAT = 1e-8
 #: nor is a positive parameter if the standard error of its logarithm is above this
@@ -140,8 +149,9 @@ def _one_way(misfit: Misfit, start: np.ndarray, free: np.ndarray, beginnings: An
     coordinates, converged, left = start, True, sizes
     for mask in beginnings:
         _, coordinates = _least_squares(misfit, coordinates, free, sizes, mask, ROUGH)
+    last = PLAIN if isinstance(misfit, RolloutMisfit) and misfit.rough else FINE
     for _ in range(PASSES):
-        converged, coordinates = _least_squares(misfit, coordinates, free, sizes)
+        converged, coordinates = _least_squares(misfit, coordinates, free, sizes, end=last)
         least = misfit.least_sizes(coordinates)
         left = np.sqrt(by_group(np.square(misfit(coordinates).values), misfit.groups))
         before, sizes = sizes, np.maximum(left, least)
@@ -156,14 +166,14 @@ def _least_squares(
     free: np.ndarray,
     sizes: np.ndarray,
     mask: Any = 1.0,
-    tolerance: float = FINE,
+    end: End = FINE,
 ) -> tuple[bool, np.ndarray]:
     """Whether the search converged, and where it ended; `mask` says which differences count."""
     # imported here: it takes a third of a second
     from scipy.optimize import least_squares
 
     weights = mask * _inverse(sizes)[misfit.groups]
-    low, high = (searched(misfit.unknowns, end)[free] for end in limits(misfit.robot, misfit.unknowns))
+    low, high = (searched(misfit.unknowns, bound)[free] for bound in limits(misfit.robot, misfit.unknowns))
     begin = np.clip(start[free], low, high)
     origin, reach = np.zeros(len(begin)), np.ones(len(begin))
     last: dict[bytes, np.ndarray] = {}
@@ -203,7 +213,7 @@ def _least_squares(
         last.clear()
     ended = least_squares(
         heights, (begin - origin) / reach, slopes, ((low - origin) / reach, (high - origin) / reach),
-        x_scale=1.0 if misfit.cautious else "jac", ftol=1e-3 * tolerance, xtol=tolerance,
+        x_scale=1.0 if misfit.cautious else "jac", ftol=end.fall, xtol=end.step,
         gtol=1e-15, max_nfev=MOST_EVALUATIONS,
     )  # fmt: skip
     return ended.status > 0, whole(ended.x)

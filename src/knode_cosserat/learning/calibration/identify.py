@@ -1,0 +1,116 @@
+"""A model of a real robot from its recordings: tendons that bend and rub, and the numbers of that robot."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from knode_cosserat.learning.calibration.calibrate import Calibration, calibrate
+from knode_cosserat.learning.calibration.search import CalibrationError
+from knode_cosserat.recordings.measurements import Measurements
+from knode_cosserat.rods.routed_robot import RoutedTendonRobot
+from knode_cosserat.rods.tendon_rod import TendonRod
+
+#: what is found unless other names are given. Density and gravity stay: with tensions known in newtons, only
+#: the ratios of stiffness, tendon offset and weight can be told from poses
+NAMES = (
+    "youngs_modulus",
+    "tendon_offset",
+    "bending_damping",
+    "sleeve_stiffening",
+    "friction_wobble",
+    "friction_curvature",
+    "friction_reach",
+)
+#: what is found after that, if it explains more
+VIBRATION = ("vibration_tension", "vibration_rate", "vibration_softening")
+#: where the searches begin: some of everything, for what is zero shows no way
+BEGIN: dict[str, Any] = {
+    "sleeve_stiffening": 0.5,
+    "friction_wobble": 0.3,
+    "friction_curvature": 0.1,
+    "friction_reach": 0.1,
+}
+BEGIN_VIBRATION: dict[str, Any] = {"vibration_rate": 0.3, "vibration_softening": 1e-3}
+#: and the sleeve's length, a part of the rod's
+SLEEVE = 0.11
+#: robots begin to vibrate somewhere between the least and the greatest tension of all tendons together, if
+#: these are further apart than this part of the greatest
+SPREAD = 0.2
+#: a rod that is damped more than this part of critical is begun with less: it would hide all motion
+DAMPING = 0.02
+
+
+def identify(
+    knowledge: TendonRod, measurements: Sequence[Measurements], names: Sequence[str] | None = None
+) -> Calibration:
+    """Find the model of a real robot from its recordings.
+
+    The robot is taken for a `RoutedTendonRobot`: the knowledge's rod, with tendons that run beside it and
+    rub. Its numbers are found by least squares through whole simulations, from rest, against the measured
+    poses only: no velocity, force, moment or strain has to be estimated. Each recording counts by what the
+    model leaves of it, so that one that it cannot explain does not spoil the others.
+
+    Args:
+        knowledge: what is known of the robot; its length and density are trusted.
+        measurements: from rest on, at a time step that resolves the robot's motion, with mean tensions:
+            `recording.sampled(0.025, mean=True)`.
+        names: the parameters to find; None: `NAMES`, and `VIBRATION` if it explains more; of these what the
+            recordings determine.
+
+    Returns:
+        The `Calibration`; its `robot` is the model.
+
+    Raises:
+        CalibrationError: the knowledge is no tendon-driven rod, or the search does not converge.
+        DataError: measurements do not fit the robot, are too short, or have rows without tensions.
+    """
+    if not isinstance(knowledge, TendonRod):
+        raise CalibrationError(
+            f"knowledge is a {type(knowledge).__name__}; allowed is a tendon-driven robot (TendonRobot, "
+            "RoutedTendonRobot)"
+        )
+    start = knowledge if isinstance(knowledge, RoutedTendonRobot) else _beginning(knowledge)
+    if names is not None:
+        return calibrate(start, measurements, names, by="rollouts")
+    still = calibrate(start, measurements, NAMES, by="rollouts", undetermined="keep")
+    shaking = _vibrating(still.robot, measurements)
+    if shaking is None:
+        return still
+    try:
+        every = (*NAMES, *VIBRATION)
+        other = calibrate(shaking, measurements, every, by="rollouts", undetermined="keep")
+    except CalibrationError:
+        return still
+    return other if _left(other) < _left(still) else still
+
+
+def _left(calibration: Calibration) -> float:
+    """How much is left of all recordings together, each by its own measure."""
+    return float(np.sum(np.log(list(calibration.remainder.values()))))
+
+
+def _vibrating(robot: RoutedTendonRobot, measurements: Sequence[Measurements]) -> RoutedTendonRobot | None:
+    """The robot with some vibration, if tensions vary enough to tell."""
+    total = np.concatenate([each.tension.sum(axis=1) for each in measurements])
+    least, greatest = float(total.min()), float(total.max())
+    if greatest - least < SPREAD * greatest:
+        return None
+    return robot.replace(**BEGIN_VIBRATION, vibration_tension=0.5 * (least + greatest))
+
+
+def _beginning(knowledge: TendonRod) -> RoutedTendonRobot:
+    mass = float(knowledge.mass_per_length)
+    L, EI = float(knowledge.length), float(knowledge.Kbt[0, 0])
+    # of the first mode: B / EI is twice the damping ratio over the angular frequency
+    frequency = 3.516 * (EI / mass) ** 0.5 / L**2
+    most = 2.0 * DAMPING * EI / frequency
+    return RoutedTendonRobot.like(
+        knowledge,
+        **BEGIN,
+        bending_damping=min(float(knowledge.bending_damping[0, 0]), most) or most,
+        tendon_offset=float(knowledge.tendon_offset) or 5.0 * float(knowledge.radius),
+        sleeve_length=SLEEVE * L,
+    )
