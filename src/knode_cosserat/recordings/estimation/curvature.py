@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from knode_cosserat.recordings.estimation import kinematics
-from knode_cosserat.recordings.estimation.kinematics import Rod, Sensitivity, Shape
+from knode_cosserat.recordings.estimation.kinematics import MODES, Rod, Sensitivity, Shape
 from knode_cosserat.recordings.estimation.smoothing import ORDER, Banded, Splines
 
 #: knots no further apart (s); with frames that are rarer, as far as those
@@ -29,6 +29,11 @@ LEAST_NOISE = (1e-6, 1e-5)
 LARGEST = 30.0
 #: where the search for the smoothness begins: motion up to this frequency (Hz)
 BEGIN = 6.0
+#: a polynomial of higher degree has, in the prior, an amplitude that is smaller by this power, or more: half of it
+DECAY = 2.0
+#: how far the prior's precision follows the jerk: it is at most (1 + 1/QUIET) times as large where nothing moves
+QUIET = 0.05
+WIDTH = 2.0
 _PROBES = 4
 
 
@@ -81,13 +86,14 @@ def fitted(rod: Rod, poses: Poses, stretch: float, noise: tuple[float, float]) -
     ridge = np.full(rod.modes, 1.0 / LARGEST**2)
     curves = np.zeros((splines.count, rod.modes))
     precision: np.ndarray | None = None
+    profile = np.ones(splines.points)
     for correction in range(CORRECTIONS + CHOICES):
         a = np.asarray(design @ curves)
         it = kinematics.shape(rod, a, stretch)
         left = _left(rod, it, poses)
         moves = kinematics.sensitivity(rod, it)
         H, g = _normal(moves, left, poses, noise, a)
-        system = Banded(splines, design, H, g)
+        system = Banded(splines, design, H, g, splines.roots_of(profile))
         if precision is None:
             share = np.einsum("fkk->k", H) / len(H) / usual
             precision = share / (2 * np.pi * BEGIN) ** (2 * ORDER)
@@ -97,6 +103,7 @@ def fitted(rod: Rod, poses: Poses, stretch: float, noise: tuple[float, float]) -
         if correction >= 2:
             # beyond the first corrections the poses are explained, and what is left is noise
             precision, effective = _likelier(system, new, precision, groups)
+            profile = _profile(splines, new, precision)
             after = _after(moves, left, poses, np.asarray(design @ new) - a)
             noise = _noise(after, poses, effective, noise)
             stretch += _stretching(rod, it, after[1])
@@ -155,7 +162,7 @@ def _likelier(
     MacKay's fixed point: τ = γ / ∫ (c''')² dt, where γ counts how many of the jerk's numbers the poses
     determine rather than the prior. The trace in it is estimated by random probes, the same every time.
     """
-    roots = system.splines.roots
+    roots = system.roots
     n, K = curves.shape
     rows = roots.shape[0]  # type: ignore[attr-defined]
     random = np.random.default_rng(0)
@@ -167,14 +174,32 @@ def _likelier(
             probes[:, axis, group * _PROBES : (group + 1) * _PROBES] = roots.T @ signs  # type: ignore[attr-defined]
     flat = probes.reshape(n * K, -1)
     traces = np.einsum("xp,xp->p", flat, system.solve(flat)).reshape(count, _PROBES).mean(axis=1)
-    dimensions = (n - ORDER) * np.bincount(groups)
+    dimensions = n * np.bincount(groups)
     tau = np.array([precision[groups == group][0] for group in range(count)])
     determined = np.clip(dimensions - tau * traces, 1e-3 * dimensions, dimensions)
     jerk = np.bincount(groups, np.sum(np.square(roots @ curves), axis=0))  # type: ignore[operator]
     new = determined / np.maximum(jerk, 1e-300)
     # one choice at a time, and not a leap
     new = np.clip(new, tau / 1e3, tau * 1e3)
-    return new[groups], float(determined.sum() + ORDER * K)
+    first = 0
+    for size in (max(MODES[:2]), MODES[2]):
+        for k in range(first + 1, first + size):
+            degree = k - first
+            new[k] = max(new[k], new[k - 1] * ((degree + 1) / degree) ** DECAY)
+        first += size
+    return new[groups], float(determined.sum())
+
+
+def _profile(
+    splines: Splines, curves: Float[np.ndarray, "n K"], precision: Float[np.ndarray, " K"]
+) -> Float[np.ndarray, " points"]:
+    """How the prior's precision goes over time: lower where the jerk is large, as after a step of a tension."""
+    jerk = splines.roots[: splines.points] @ curves  # type: ignore[index]
+    size = np.sum(jerk**2 * precision, axis=1)
+    from scipy.ndimage import gaussian_filter1d
+
+    size = gaussian_filter1d(size, WIDTH)
+    return (1.0 + QUIET) / (size / size.mean() + QUIET)
 
 
 def _after(

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 #: polynomials for the curvature about x, about y, and for the twist
-MODES = (8, 8, 3)
+MODES = (7, 7, 3)
 #: the longest segment of the grid, as a fraction of the length
 FINEST = 1.0 / 27.0
 _GAUSS = 0.5 / np.sqrt(3.0)

@@ -1,8 +1,12 @@
 """Curves in time: splines of several coefficients at once, fitted to what frames say of them.
 
 A curve is c(t) = Σ_l B_l(t) c_l with B-splines B_l and K numbers in each c_l. Frame i says
-½ aᵀ H_i a - g_iᵀ a of the curve's value a = c(t_i), and the prior ½ Σ_k τ_k ∫ (c_k''')² dt: that of a
-jerk which is white noise of the intensity 1/τ_k. Both together are a banded system.
+½ aᵀ H_i a - g_iᵀ a of the curve's value a = c(t_i), and the prior is, with ''' the third derivative,
+
+    ½ Σ_k τ_k ∫ (c_k''')² + Ω⁶ c_k² dt:
+
+that of a motion whose jerk is white noise of the intensity 1/τ_k above the frequency Ω, and which below it
+is as large as there: what hardly moves is not far from zero either. Both together are a banded system.
 """
 
 from __future__ import annotations
@@ -14,8 +18,8 @@ from jaxtyping import Float
 
 #: degree of the splines: smooth in the accelerations' rate
 DEGREE = 5
-#: which derivative the prior holds small
-ORDER = 3
+#: which derivative the prior holds small, and below which frequency the value itself (Hz)
+ORDER, CORNER = 3, 0.3
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -25,7 +29,8 @@ class Splines:
     Attributes:
         knots: s.
         count: how many splines there are.
-        roots: of the Gram matrix of third derivatives, `rootsᵀ roots`, from first to last.
+        roots: of the prior's matrix at τ = 1, which is `rootsᵀ roots`: first those of the jerk, then those of
+            the value, both at points that follow each other in time.
     """
 
     knots: Float[np.ndarray, " n"]
@@ -35,15 +40,28 @@ class Splines:
     @classmethod
     def of(cls, start: float, end: float, spacing: float) -> Splines:
         """Splines from `start` to `end`, knots as far apart as `spacing` or less (s)."""
+        import scipy.sparse
+
         pieces = max(1, int(np.ceil((end - start) / spacing - 1e-9)))
         step = (end - start) / pieces
         knots = start + step * np.arange(-DEGREE, pieces + DEGREE + 1)
         made = cls(knots, pieces + DEGREE, None)
         nodes, weights = np.polynomial.legendre.leggauss(DEGREE - ORDER + 1)
         at = (start + step * (np.arange(pieces)[:, None] + (nodes + 1) / 2)).ravel()
-        scale = np.sqrt(np.tile(weights * step / 2, pieces))
-        jerk = made.design(at, ORDER)
-        return dataclasses.replace(made, roots=jerk.multiply(scale[:, None]).tocsr())
+        scale = np.sqrt(np.tile(weights * step / 2, pieces))[:, None]
+        corner = (2 * np.pi * CORNER) ** ORDER
+        parts = [made.design(at, ORDER).multiply(scale), made.design(at).multiply(corner * scale)]
+        return dataclasses.replace(made, roots=scipy.sparse.vstack(parts).tocsr())
+
+    def roots_of(self, profile: Float[np.ndarray, " points"]) -> object:
+        """The prior's roots where the jerk is by a profile's factor (1 on average) more precisely zero."""
+        scale = np.concatenate([np.sqrt(profile), np.ones(len(profile))])
+        return self.roots.multiply(scale[:, None]).tocsr()  # type: ignore[attr-defined]
+
+    @property
+    def points(self) -> int:
+        """At how many points in time the prior looks at the jerk."""
+        return self.roots.shape[0] // 2  # type: ignore[attr-defined]
 
     def design(self, time: Float[np.ndarray, " F"], derivative: int = 0):  # type: ignore[no-untyped-def]
         """Values (F, count), sparse, of a derivative of the splines at some times (s)."""
@@ -74,8 +92,9 @@ class Banded:
         design: object,
         H: Float[np.ndarray, "F K K"],
         g: Float[np.ndarray, "F K"],
+        roots: object,
     ) -> None:
-        self.splines, self.modes = splines, g.shape[1]
+        self.splines, self.modes, self.roots = splines, g.shape[1], roots
         n, K = splines.count, self.modes
         self.right = np.asarray(design.T @ g).ravel()  # type: ignore[attr-defined]
         self.data = np.zeros(((DEGREE + 1) * K, n * K))
@@ -85,7 +104,7 @@ class Banded:
             both = columns[:, ahead:].multiply(columns[:, : n - ahead]) if ahead else columns.multiply(columns)
             blocks = np.asarray(both.T.tocsr() @ flat).reshape(n - ahead, K, K)
             _put(self.data, blocks, ahead, K)
-        gram = (splines.roots.T @ splines.roots).tocsc()  # type: ignore[attr-defined]
+        gram = (roots.T @ roots).tocsc()  # type: ignore[attr-defined]
         self.gram = [gram.diagonal(-ahead) for ahead in range(DEGREE + 1)]
         self.factor: np.ndarray | None = None
 
