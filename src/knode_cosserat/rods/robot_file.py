@@ -28,11 +28,12 @@ from knode_cosserat._yaml import YAMLTextError, did_you_mean, flow, mapping_of, 
 from knode_cosserat.rods.parameters import Parameter, ParameterError, checked
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.tendon_robot import TendonRobot
+from knode_cosserat.rods.virtual_robot import VirtualRobot
 
 FORMAT = 1
 
 #: the classes that a file can name as its kind
-KINDS: dict[str, type[System]] = {"tendon-robot": TendonRobot}
+KINDS: dict[str, type[System]] = {"tendon-robot": TendonRobot, "virtual-robot": VirtualRobot}
 
 
 class RobotFileError(ValueError):

@@ -1,7 +1,7 @@
-"""A robot of our own that no model of the package describes: what plays the real one in virtual recordings.
+"""A robot that differs from the paper's model as real ones do: it plays the real one in virtual recordings.
 
-It differs from the paper's knowledge as real robots do. Tendons run at a distance from the axis and bend the
-rod by their moment, rubbing in the holes of its ribs; ribs have masses; a sleeve stiffens the rod at the base.
+Tendons run at a distance from the axis and bend the rod by their moment, rubbing in the holes of its ribs;
+ribs have masses; a sleeve stiffens the rod at the base.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from knode_cosserat.rotation import cross, dot, inverse, rotation_matrix
 
 #: Newton corrections of the material's law with friction, which bends it little
 CORRECTIONS = 12
-#: what of a rib's mass lies within its half width follows from this (m)
+#: standard deviation of how a rib's mass is spread along the rod (m)
 RIB_WIDTH = 0.02
 #: the nine ribs, as fractions of the length
 RIBS = tuple((k + 1) / 9 for k in range(9))
 
 
-class VirtualPlant(TendonRobot):
+class VirtualRobot(TendonRobot):
     """A rod with tendons in ribs: n and m carry rod and tendons together.
 
     With the tendons at r_i, and d₃ the third axis of the material frame,
@@ -36,16 +36,18 @@ class VirtualPlant(TendonRobot):
 
     where ρ_i is the rate at which the tendon is pulled in per metre of rod, so that a tendon that is
     pulled in loses tension towards the tip and one that is let out gains. Near the base Kbt is
-    multiplied; ribs are masses on a part of the length. The balance of n and m is that of a rod without
-    tendons: they act within the section, and at the tip, where they end, all of it is free.
+    multiplied; ribs are masses, each spread over a part of the length. The balance of n and m is that of a
+    rod without tendons, for these act within the section; at the tip, where they end, n and m are zero.
     """
 
-    friction: Any = parameter("1", "μ, part of a tendon's tension lost to the tip", low=0.0, high=0.9, default=0.15)
+    friction: Any = parameter(
+        "", "μ, part of a tendon's tension lost to the tip", low=0.0, high=0.9, default=0.1
+    )
     sliding: Any = parameter(
         "1/s", "ρ₀, rate of sliding per length from which friction is full", low=1e-6, high=10.0, default=0.02
     )
     sleeve_length: Any = parameter("m", "length of the sleeve at the base", low=0.0, high=1.0, default=0.08)
-    sleeve_factor: Any = parameter("1", "what the sleeve multiplies Kbt by", low=1.0, high=100.0, default=4.0)
+    sleeve_factor: Any = parameter("", "what the sleeve multiplies Kbt by", low=1.0, high=100.0, default=4.0)
     rib_mass: Any = parameter("kg", "mass of one of the nine ribs", low=0.0, high=1.0, default=0.0015)
 
     # what is not linear in z has no general form
@@ -81,8 +83,10 @@ class VirtualPlant(TendonRobot):
         d3 = np.array([0.0, 0.0, 1.0])
         K, B, c0 = self.stiffness(s), self.bending_damping, history.c0
         pulled = dot(R.T, n) - jnp.sum(jnp.asarray(control)) * d3
-        v = dot(inverse(self.Kse + c0 * self.shear_damping), pulled + self.Kse @ self.v_star - dot(self.shear_damping, hv))
-        m_local = dot(R.T, m)
+        v = dot(
+            inverse(self.Kse + c0 * self.shear_damping),
+            pulled + self.Kse @ self.v_star - dot(self.shear_damping, hv),
+        )
 
         def left(u: Any, held: Any) -> Any:
             K, B, hu, m, control = held

@@ -73,7 +73,9 @@ def loads_of(robot: System, s: Float[Any, " P"], rows: Rows) -> Float[Any, "T P 
             before = after + ds / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
             return before, jnp.stack([before, middle])
 
-        last = _at_tip(robot, t, control, y[-1], History(jnp.zeros(()), y_t[-1], z_t[-1], jnp.zeros_like(y_t[-1])))
+        last = _at_tip(
+            robot, t, control, y[-1], History(jnp.zeros(()), y_t[-1], z_t[-1], jnp.zeros_like(y_t[-1]))
+        )
         starts = jnp.arange(s.shape[0] - 3, -1, -2)
         _, pairs = jax.lax.scan(segment, last, starts)
         loads = jnp.concatenate([pairs[::-1].reshape(-1, last.shape[0]), last[None]])
@@ -161,7 +163,8 @@ def semi_discretised(
     def step(past: Any, row: Any) -> Any:
         last, before, rate = past
         history = c1 * last + c2 * before + d1 * rate
-        record = solved(*row, history)
+        t, control, y = row
+        record = solved(t, control, y, history)
         return (record, last, c0 * record + history), record
 
     _, z_rest = jax.vmap(robot.rest)(s)

@@ -29,10 +29,11 @@ LEAST_NOISE = (1e-6, 1e-5)
 LARGEST = 30.0
 #: where the search for the smoothness begins: motion up to this frequency (Hz)
 BEGIN = 6.0
-#: a polynomial of higher degree has, in the prior, an amplitude that is smaller by this power, or more: half of it
+#: the prior's precision grows with the polynomials' degree by this power or more
 DECAY = 2.0
-#: how far the prior's precision follows the jerk: it is at most (1 + 1/QUIET) times as large where nothing moves
+#: how far the prior's precision follows the jerk: where nothing moves it is (1 + 1/QUIET) times as large
 QUIET = 0.05
+#: over how many of the points that the prior looks at the jerk is averaged: 3 in the time from knot to knot
 WIDTH = 2.0
 _PROBES = 4
 
@@ -164,40 +165,45 @@ def _likelier(
     """
     roots = system.roots
     n, K = curves.shape
-    rows = roots.shape[0]  # type: ignore[attr-defined]
+    rows = roots.shape[0]
     random = np.random.default_rng(0)
     count = int(groups.max()) + 1
     probes = np.zeros((n, K, count * _PROBES))
     for group in range(count):
         for axis in np.flatnonzero(groups == group):
             signs = random.choice([-1.0, 1.0], (rows, _PROBES))
-            probes[:, axis, group * _PROBES : (group + 1) * _PROBES] = roots.T @ signs  # type: ignore[attr-defined]
+            probes[:, axis, group * _PROBES : (group + 1) * _PROBES] = roots.T @ signs
     flat = probes.reshape(n * K, -1)
     traces = np.einsum("xp,xp->p", flat, system.solve(flat)).reshape(count, _PROBES).mean(axis=1)
     dimensions = n * np.bincount(groups)
     tau = np.array([precision[groups == group][0] for group in range(count)])
     determined = np.clip(dimensions - tau * traces, 1e-3 * dimensions, dimensions)
-    jerk = np.bincount(groups, np.sum(np.square(roots @ curves), axis=0))  # type: ignore[operator]
+    jerk = np.bincount(groups, np.sum(np.square(roots @ curves), axis=0))
     new = determined / np.maximum(jerk, 1e-300)
     # one choice at a time, and not a leap
     new = np.clip(new, tau / 1e3, tau * 1e3)
+    return _decaying(new)[groups], float(determined.sum())
+
+
+def _decaying(precision: Float[np.ndarray, " groups"]) -> Float[np.ndarray, " groups"]:
+    """Precisions that rise with the degree: what the bodies hardly tell would have any, by the evidence."""
     first = 0
     for size in (max(MODES[:2]), MODES[2]):
-        for k in range(first + 1, first + size):
-            degree = k - first
-            new[k] = max(new[k], new[k - 1] * ((degree + 1) / degree) ** DECAY)
+        for degree in range(1, size):
+            least = precision[first + degree - 1] * ((degree + 1) / degree) ** DECAY
+            precision[first + degree] = max(precision[first + degree], least)
         first += size
-    return new[groups], float(determined.sum())
+    return precision
 
 
 def _profile(
     splines: Splines, curves: Float[np.ndarray, "n K"], precision: Float[np.ndarray, " K"]
 ) -> Float[np.ndarray, " points"]:
     """How the prior's precision goes over time: lower where the jerk is large, as after a step of a tension."""
-    jerk = splines.roots[: splines.points] @ curves  # type: ignore[index]
-    size = np.sum(jerk**2 * precision, axis=1)
     from scipy.ndimage import gaussian_filter1d
 
+    jerk = splines.roots[: splines.points] @ curves
+    size = np.sum(jerk**2 * precision, axis=1)
     size = gaussian_filter1d(size, WIDTH)
     return (1.0 + QUIET) / (size / size.mean() + QUIET)
 

@@ -4,7 +4,7 @@ With u(s, t) in the material frame and a constant stretch λ of the centreline,
 
     R_s = R û,    p_s = λ R e₃,
 
-and, in the global frame, with θ a small turn (or its rate), everything that moves is an integral from the base:
+and in the global frame, with θ a small turn, everything that moves is an integral from the base:
 
     δθ(s) = ∫ R δu dσ                        δp(s) = ∫ δθ × p_s dσ
     ω = ∫ R u_t dσ                           p_t  = ∫ ω × p_s dσ
@@ -16,6 +16,7 @@ The curvature about every axis is a sum of Legendre polynomials in s. All arrays
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -71,7 +72,7 @@ class Rod:
         """The grid of a rod of this length (m) with so many nodes and bodies at these fractions."""
         fixed = np.unique(np.round(np.concatenate([np.linspace(0.0, 1.0, nodes), fractions]), 9))
         ends = [np.zeros(1)]
-        for first, last in zip(fixed[:-1], fixed[1:], strict=True):
+        for first, last in itertools.pairwise(fixed):
             pieces = max(1, int(np.ceil((last - first) / FINEST - 1e-6)))
             ends.append(np.linspace(first, last, pieces + 1)[1:])
         joined = np.concatenate(ends)
@@ -156,7 +157,9 @@ def sensitivity(rod: Rod, it: Shape) -> Sensitivity:
         mine = np.flatnonzero(np.any(rod.basis[:, axis] != 0.0, axis=0))
         factors = np.einsum("mp,pk->pmk", weights, rod.basis[:, axis, mine]).reshape(P, -1)
 
-        def integrals(columns: np.ndarray, factors: np.ndarray = factors, count: int = len(mine)) -> np.ndarray:
+        def integrals(
+            columns: np.ndarray, factors: np.ndarray = factors, count: int = len(mine)
+        ) -> np.ndarray:
             flat = np.ascontiguousarray(np.moveaxis(columns, 1, -1)).reshape(F * 3, P)
             return np.moveaxis((flat @ factors).reshape(F, 3, M, count), 1, 2)
 
@@ -222,7 +225,9 @@ def _weights(rod: Rod) -> Float[np.ndarray, "M P"]:
 # rotations
 
 
-def hamilton(left: Float[np.ndarray, "... 4"], right: Float[np.ndarray, "... 4"]) -> Float[np.ndarray, "... 4"]:
+def hamilton(
+    left: Float[np.ndarray, "... 4"], right: Float[np.ndarray, "... 4"]
+) -> Float[np.ndarray, "... 4"]:
     """Product of quaternions, scalar first."""
     a, b, c, d = np.moveaxis(left, -1, 0)
     w, x, y, z = np.moveaxis(right, -1, 0)
@@ -260,5 +265,7 @@ def turn_between(
     return turn[..., 1:] * np.where(size > 1e-12, angle / np.maximum(size, 1e-12), 2.0)
 
 
-def _turned(R: Float[np.ndarray, "F P 3 3"], vectors: Float[np.ndarray, "F P 3"]) -> Float[np.ndarray, "F P 3"]:
+def _turned(
+    R: Float[np.ndarray, "F P 3 3"], vectors: Float[np.ndarray, "F P 3"]
+) -> Float[np.ndarray, "F P 3"]:
     return (R @ vectors[..., None])[..., 0]

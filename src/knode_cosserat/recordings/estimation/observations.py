@@ -29,13 +29,11 @@ class Part:
         rows: measurements at the times to estimate.
         poses: of the bodies that are not at the clamped end, at the full rate.
         fractions: where those bodies sit.
-        simulated_rest: up to when the robot rests (s), or None.
     """
 
     rows: Measurements
     poses: Poses
     fractions: Float[np.ndarray, " M"]
-    rest_end: float | None
 
 
 def parts_of(
@@ -48,7 +46,6 @@ def parts_of(
     """
     if isinstance(recording, Recording):
         rows = recording.sampled(dt, start, end)
-        rest_end = None if recording.rest is None else recording.rest[1]
     elif isinstance(recording, Measurements):
         rows = recording
         if start is not None or end is not None:
@@ -57,7 +54,6 @@ def parts_of(
             raise RecordingError(
                 f"{rows.source}: its rows are {rows.dt:g} s apart and dt is {dt:g} s; allowed is the same"
             )
-        rest_end = None
     else:
         raise RecordingError(
             f"recording is a {type(recording).__name__}; allowed is a Recording or Measurements"
@@ -66,7 +62,8 @@ def parts_of(
     pieces = rows.parts(shortest=(FEWEST_ROWS - 1) * dt)
     if not pieces:
         raise RecordingError(
-            f"{rows.source}: no {FEWEST_ROWS} rows of {dt:g} s one after the other with all positions and tensions"
+            f"{rows.source}: no {FEWEST_ROWS} rows of {dt:g} s one after the other "
+            "with all positions and tensions"
         )
     used = rows.fractions > 0.0
     made = []
@@ -76,7 +73,7 @@ def parts_of(
             if isinstance(recording, Recording)
             else _of_rows(piece, used)
         )
-        made.append(Part(piece, poses, rows.fractions[used], rest_end))
+        made.append(Part(piece, poses, rows.fractions[used]))
     return made
 
 
@@ -84,8 +81,8 @@ def _check(rows: Measurements, robot: System) -> None:
     tendons = rows.tension.shape[1]
     if tendons != robot.control_size:
         raise RecordingError(
-            f"{rows.source}: the recording has {tendons} tendons and the robot {robot.control_size} controls; "
-            "allowed is the same number"
+            f"{rows.source}: the recording has {tendons} tendons and the robot {robot.control_size} "
+            "controls; allowed is the same number"
         )
     away = rows.fractions > 0.0
     if away.sum() < FEWEST_BODIES:
@@ -95,8 +92,8 @@ def _check(rows: Measurements, robot: System) -> None:
         )
     if not np.isfinite(rows.quaternion[:, away]).all(axis=2).any():
         raise RecordingError(
-            f"{rows.source}: no body has orientations; required for states is one or more (see the recording's "
-            "findings, the markers' `rotation` and `rest` in its configuration)"
+            f"{rows.source}: no body has orientations; required for states is one or more (see the "
+            "recording's findings, the markers' `rotation` and `rest` in its configuration)"
         )
 
 

@@ -26,7 +26,9 @@ def states(
     rows = part.rows
     used = rows.fractions > 0.0
     if not np.isfinite(rows.quaternion[:, used]).all():
-        raise RecordingError(f"{rows.source}: a body has no orientation; the paper's method needs that of every body")
+        raise RecordingError(
+            f"{rows.source}: a body has no orientation; the paper's method needs that of every body"
+        )
     y0 = np.asarray(robot.rest(jnp.zeros(()))[0], dtype=float)
     p0, h0 = y0[robot.y_layout.slice("p")], y0[robot.y_layout.slice("h")]
     count = len(rows.time)

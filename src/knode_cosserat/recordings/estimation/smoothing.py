@@ -12,6 +12,7 @@ is as large as there: what hardly moves is not far from zero either. Both togeth
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -35,7 +36,7 @@ class Splines:
 
     knots: Float[np.ndarray, " n"]
     count: int
-    roots: object
+    roots: Any
 
     @classmethod
     def of(cls, start: float, end: float, spacing: float) -> Splines:
@@ -53,33 +54,30 @@ class Splines:
         parts = [made.design(at, ORDER).multiply(scale), made.design(at).multiply(corner * scale)]
         return dataclasses.replace(made, roots=scipy.sparse.vstack(parts).tocsr())
 
-    def roots_of(self, profile: Float[np.ndarray, " points"]) -> object:
+    def roots_of(self, profile: Float[np.ndarray, " points"]) -> Any:
         """The prior's roots where the jerk is by a profile's factor (1 on average) more precisely zero."""
         scale = np.concatenate([np.sqrt(profile), np.ones(len(profile))])
-        return self.roots.multiply(scale[:, None]).tocsr()  # type: ignore[attr-defined]
+        return self.roots.multiply(scale[:, None]).tocsr()
 
     @property
     def points(self) -> int:
         """At how many points in time the prior looks at the jerk."""
-        return self.roots.shape[0] // 2  # type: ignore[attr-defined]
+        return self.roots.shape[0] // 2
 
-    def design(self, time: Float[np.ndarray, " F"], derivative: int = 0):  # type: ignore[no-untyped-def]
+    def design(self, time: Float[np.ndarray, " F"], derivative: int = 0) -> Any:
         """Values (F, count), sparse, of a derivative of the splines at some times (s)."""
         import scipy.sparse
         from scipy.interpolate import BSpline
 
         knots, degree = self.knots, DEGREE - derivative
         inside = np.clip(time, knots[DEGREE], np.nextafter(knots[-DEGREE - 1], -np.inf))
-        values = BSpline.design_matrix(inside, knots[derivative : len(knots) - derivative], degree)
+        values: Any = BSpline.design_matrix(inside, knots[derivative : len(knots) - derivative], degree)
         step = knots[1] - knots[0]
         for order in range(derivative, 0, -1):
             # a derivative is a difference of coefficients
             rows = self.count - order
-            values = values @ scipy.sparse.diags_array(
-                [np.full(rows, -1.0 / step), np.full(rows, 1.0 / step)],
-                offsets=[0, 1],
-                shape=(rows, rows + 1),
-            )
+            difference = scipy.sparse.eye_array(rows, rows + 1, k=1) - scipy.sparse.eye_array(rows, rows + 1)
+            values = values @ (difference / step)
         return values.tocsr()
 
 
@@ -89,22 +87,24 @@ class Banded:
     def __init__(
         self,
         splines: Splines,
-        design: object,
+        design: Any,
         H: Float[np.ndarray, "F K K"],
         g: Float[np.ndarray, "F K"],
-        roots: object,
+        roots: Any,
     ) -> None:
         self.splines, self.modes, self.roots = splines, g.shape[1], roots
         n, K = splines.count, self.modes
-        self.right = np.asarray(design.T @ g).ravel()  # type: ignore[attr-defined]
+        self.right = np.asarray(design.T @ g).ravel()
         self.data = np.zeros(((DEGREE + 1) * K, n * K))
-        columns = design.tocsc()  # type: ignore[attr-defined]
+        columns = design.tocsc()
         flat = H.reshape(len(H), K * K)
         for ahead in range(DEGREE + 1):
-            both = columns[:, ahead:].multiply(columns[:, : n - ahead]) if ahead else columns.multiply(columns)
+            both = (
+                columns[:, ahead:].multiply(columns[:, : n - ahead]) if ahead else columns.multiply(columns)
+            )
             blocks = np.asarray(both.T.tocsr() @ flat).reshape(n - ahead, K, K)
             _put(self.data, blocks, ahead, K)
-        gram = (roots.T @ roots).tocsc()  # type: ignore[attr-defined]
+        gram = (roots.T @ roots).tocsc()
         self.gram = [gram.diagonal(-ahead) for ahead in range(DEGREE + 1)]
         self.factor: np.ndarray | None = None
 
@@ -124,6 +124,7 @@ class Banded:
         """The solution for one right-hand side or several."""
         from scipy.linalg import cho_solve_banded
 
+        assert self.factor is not None
         return np.asarray(cho_solve_banded((self.factor, True), right, check_finite=False))
 
     def curve(self) -> Float[np.ndarray, "n K"]:
