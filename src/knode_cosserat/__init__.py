@@ -33,6 +33,7 @@ from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
 from knode_cosserat.rods.parameters import ParameterError, parameter
 from knode_cosserat.rods.robot_file import RobotFileError, catalog, load_robot, save_robot
+from knode_cosserat.rods.routed_robot import RoutedTendonRobot
 from knode_cosserat.rods.system import Field, History, Layout, Scales, System
 from knode_cosserat.rods.tendon_robot import TendonRobot
 from knode_cosserat.solvers.boundary import NewtonOptions
@@ -75,6 +76,7 @@ __all__ = [
     "Result",
     "RobotFileError",
     "RolloutTraining",
+    "RoutedTendonRobot",
     "Scales",
     "Settings",
     "SimulationError",

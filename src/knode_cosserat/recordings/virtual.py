@@ -86,8 +86,8 @@ def record_virtual(
     """Record a virtual robot: write what its sensors saw, return what it truly did.
 
     Args:
-        path: a bag (.bag, .mcap, .db3) or table (.csv, .parquet), as `RecordingConfig.paper_robot()` reads it.
-        signal: `sine:PERIOD` (s), `step:HEIGHT` (N, of tendons 3 and 4 after 2 s) or `random:SEED`, each about
+        path: a bag (.bag, .mcap, .db3) or table (.csv, .parquet) that the paper's configuration reads.
+        signal: `sine:PERIOD` (s), `step:HEIGHT` (N, tendons 3 and 4 after 2 s) or `random:SEED`, each about
             the paper's rest tension and as large as the paper's; or anything that `controls.parse` takes,
             after 1 s of rest.
         seconds: how long.

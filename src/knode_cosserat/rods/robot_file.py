@@ -26,6 +26,7 @@ import numpy as np
 
 from knode_cosserat._yaml import YAMLTextError, did_you_mean, flow, mapping_of, shown
 from knode_cosserat.rods.parameters import Parameter, ParameterError, checked
+from knode_cosserat.rods.routed_robot import RoutedTendonRobot
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.tendon_robot import TendonRobot
 from knode_cosserat.rods.virtual_robot import VirtualRobot
@@ -33,7 +34,11 @@ from knode_cosserat.rods.virtual_robot import VirtualRobot
 FORMAT = 1
 
 #: the classes that a file can name as its kind
-KINDS: dict[str, type[System]] = {"tendon-robot": TendonRobot, "virtual-robot": VirtualRobot}
+KINDS: dict[str, type[System]] = {
+    "tendon-robot": TendonRobot,
+    "routed-tendon-robot": RoutedTendonRobot,
+    "virtual-robot": VirtualRobot,
+}
 
 
 class RobotFileError(ValueError):

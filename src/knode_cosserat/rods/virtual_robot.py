@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.parameters import parameter
-from knode_cosserat.rods.system import History, System
-from knode_cosserat.rods.tendon_robot import TendonRobot
+from knode_cosserat.rods.system import History
+from knode_cosserat.rods.tendon_rod import TendonRod
 from knode_cosserat.rotation import cross, dot, inverse, rotation_matrix
 
 #: Newton corrections of the material's law with friction, which bends it little
@@ -26,7 +26,7 @@ RIB_WIDTH = 0.02
 RIBS = tuple((k + 1) / 9 for k in range(9))
 
 
-class VirtualRobot(TendonRobot):
+class VirtualRobot(TendonRod):
     """A rod with tendons in ribs: n and m carry rod and tendons together.
 
     With the tendons at r_i, and d₃ the third axis of the material frame,
@@ -50,8 +50,9 @@ class VirtualRobot(TendonRobot):
     sleeve_factor: Any = parameter("", "what the sleeve multiplies Kbt by", low=1.0, high=100.0, default=4.0)
     rib_mass: Any = parameter("kg", "mass of one of the nine ribs", low=0.0, high=1.0, default=0.0015)
 
-    # what is not linear in z has no general form
-    constitutive = System.constitutive
+    def tendon_force(self, control: Float[Any, " c"]) -> Float[Any, "3"]:
+        """None: n carries rod and tendons."""
+        return jnp.zeros(3)
 
     def actuation(self, control: Float[Any, " c"]) -> Float[Any, "3"]:
         """Tension in all, and its moment about the axis (N, N·m, N·m)."""
@@ -114,7 +115,7 @@ class VirtualRobot(TendonRobot):
         lump = jnp.exp(-0.5 * away**2) / (RIB_WIDTH * np.sqrt(2.0 * np.pi))
         mass = self.rib_mass * jnp.sum(lump)
         y_t = history.c0 * y + history.y
-        y_s = super().rates(s, t, y, z, jnp.zeros(self.control_size), history)
+        y_s = super().rates(s, t, y, z, control, history)
         R = rotation_matrix(self.y_layout.get(y, "h"))
         q, w, q_t = self.y_layout.get(y, "q"), self.y_layout.get(y, "w"), self.y_layout.get(y_t, "q")
         more = mass * (dot(R, cross(w, q) + q_t) - self.gravity)

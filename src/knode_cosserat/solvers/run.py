@@ -176,8 +176,12 @@ def run_batch(
             bar.update(count)
             return np.asarray(done)[:count], *(np.asarray(leaf)[:count, : task.steps] for leaf in rows)
 
+        firsts = range(0, size, chunk)
+        program = _program(system, start.past, padded, task.settings, batched, lockstep, chunk)
+        alone = [] if program in _COMPILED else [work(firsts[0])]
+        _COMPILED.add(program)
         with concurrent.futures.ThreadPoolExecutor(workers) as pool:
-            chunks = list(pool.map(work, range(0, size, chunk)))
+            chunks = alone + list(pool.map(work, firsts[len(alone) :]))
     done, *rows = (np.concatenate(parts) for parts in zip(*chunks, strict=True))
     steps = Steps._make([*rows, np.zeros((*done.shape, task.steps), dtype=int)])
     causes = {}
@@ -189,6 +193,17 @@ def run_batch(
         if alone.result.min() < 0:
             causes[int(i)] = cause
     return steps, causes
+
+
+#: programs of `run_batch` that there are already. JAX may crash where one thread writes a program to the disk's
+#: cache while another compiles the same, so the first chunk of a new one goes alone.
+_COMPILED: set[Any] = set()
+
+
+def _program(system: System, past: Any, controls: np.ndarray, *static: Any) -> Any:
+    """What makes JAX compile anew: structures and shapes."""
+    leaves, structure = jax.tree.flatten((system, past))
+    return structure, tuple(np.shape(leaf) for leaf in leaves), controls.shape, static
 
 
 def _cores() -> int:

@@ -199,7 +199,7 @@ def _decaying(precision: Float[np.ndarray, " groups"]) -> Float[np.ndarray, " gr
 def _profile(
     splines: Splines, curves: Float[np.ndarray, "n K"], precision: Float[np.ndarray, " K"]
 ) -> Float[np.ndarray, " points"]:
-    """How the prior's precision goes over time: lower where the jerk is large, as after a step of a tension."""
+    """The prior's precision over time: lower where the jerk is large, as after a step of a tension."""
     from scipy.ndimage import gaussian_filter1d
 
     jerk = splines.roots[: splines.points] @ curves

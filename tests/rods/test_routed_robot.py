@@ -1,0 +1,135 @@
+"""Tendons beside the rod: closed forms, symmetry, friction as a memory, vibration, derivatives."""
+
+import jax
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import knode_cosserat as kc
+from knode_cosserat.solvers.result import Result
+
+KNOWLEDGE = kc.load_robot("delrin-tendon-robot")
+NO_LOADS = {"gravity": [0.0, 0.0, 0.0], "drag": 0.0}
+RUBBING = {
+    "friction_wobble": 0.6, "friction_curvature": 0.1, "friction_reach": 0.1, "bending_damping": 2e-3
+}  # fmt: skip
+
+
+def moved(robot, steps=60, dt=0.025, control="sine:1.0", **options):
+    return kc.simulate(robot, kc.controls.parse(control, steps, dt), dt, **options)
+
+
+@pytest.mark.parametrize("tension", [0.5, 3.0])
+def test_one_tendon_bends_the_rod_to_a_circle(tension):
+    robot = kc.RoutedTendonRobot.like(KNOWLEDGE, **NO_LOADS, nodes=40)
+    bent = kc.equilibrium(robot, np.array([tension, 0.0, 0.0, 0.0]), space=kc.RK4())
+    L, curvature = 0.635, tension * 0.02 / float(robot.Kbt[0, 0])
+    squeezed = 1.0 - tension / float(robot.Kse[2, 2])
+    away = (1.0 - np.cos(curvature * L)) / curvature * squeezed
+    up = np.sin(curvature * L) / curvature * squeezed
+    # towards the tendon, at 45 degrees
+    expected = [away * np.sqrt(0.5), away * np.sqrt(0.5), up]
+    np.testing.assert_allclose(bent.tip_position[-1], expected, atol=1e-8)
+
+
+def test_tendons_pull_the_rod_to_their_side_like_the_crude_model():
+    for k in range(4):
+        pulled = np.zeros(4)
+        pulled[k] = 1.0
+        crude = kc.equilibrium(KNOWLEDGE, pulled).tip_position[-1, :2]
+        real = kc.equilibrium(kc.RoutedTendonRobot.like(KNOWLEDGE), pulled).tip_position[-1, :2]
+        assert np.dot(crude, real) > 0.99 * np.linalg.norm(crude) * np.linalg.norm(real)
+
+
+def test_a_quarter_turn_of_the_tendons_is_a_quarter_turn_of_the_robot():
+    robot = kc.RoutedTendonRobot.like(KNOWLEDGE, **RUBBING, sleeve_stiffening=1.0)
+    control = kc.controls.parse("random:3", 60, 0.025)
+    one, other = kc.simulate(robot, control, 0.025), kc.simulate(robot, np.roll(control, 1, axis=1), 0.025)
+    turned = Rotation.from_euler("z", 90, degrees=True).apply(one.position.reshape(-1, 3))
+    np.testing.assert_allclose(other.position.reshape(-1, 3), turned, atol=1e-8)
+
+
+def test_nothing_is_remembered_without_friction():
+    robot = kc.RoutedTendonRobot.like(KNOWLEDGE)
+    assert not np.any(moved(robot).z[..., 6:] * float(robot.friction_wobble))
+    rubbing = kc.RoutedTendonRobot.like(KNOWLEDGE, **RUBBING)
+    there_and_back = np.concatenate([np.linspace(0, 3, 80), np.linspace(3, 0, 80), np.zeros(80)])
+    control = np.outer(there_and_back, [1.0, 0.0, 0.0, 0.0]) + 3.0
+    for each, least, most in ((robot, 0.0, 2e-4), (rubbing, 2e-3, 1.0)):
+        tip = kc.simulate(each, control, 0.05).tip_position[-1]
+        straight = kc.equilibrium(each, control[-1]).tip_position[-1]
+        assert least <= np.linalg.norm(tip - straight) <= most
+
+
+def test_friction_is_the_same_however_fine_the_time_steps_are():
+    """Quasi-static: Dahl's law has no time in it, only the way that was gone."""
+    robot = kc.RoutedTendonRobot.like(KNOWLEDGE, **{**RUBBING, "bending_damping": 0.03})
+
+    def tip(steps, time):
+        pull = 2.0 * (1.0 - np.cos(2 * np.pi * np.arange(1, steps + 1) / steps)) * (20.0 / 20.0)
+        control = np.outer(pull, [1.0, 0.0, 0.0, 0.0]) + 3.0
+        return kc.simulate(robot, control, 20.0 / steps, time=time).tip_position[-1]
+
+    exact = tip(3200, kc.BDF2())
+    errors = [np.linalg.norm(tip(steps, kc.BDF1()) - exact) for steps in (200, 400, 800)]
+    assert errors[0] > 1.6 * errors[1] > 2.5 * errors[2]
+
+
+def test_friction_stays_between_none_and_all_and_opposes_motion():
+    robot = kc.RoutedTendonRobot.like(KNOWLEDGE, **RUBBING)
+    along = moved(robot, 160, control="random:1")
+    f = np.asarray(along.z)[..., 6:10]
+    assert np.all(np.abs(f) <= 1.0) and np.abs(f).max() > 0.5
+    u = np.asarray(along.z)[..., 3:6]
+    rate = np.diff(u, axis=0) @ np.asarray(robot.bending_directions).T / 0.025
+    sliding = np.abs(rate) > 1.0
+    assert np.mean(np.sign(f[1:][sliding]) == np.sign(rate[sliding])) > 0.8
+
+
+def test_vibration_frees_the_tendons_and_stays_until_tension_falls():
+    robot = kc.RoutedTendonRobot.like(
+        KNOWLEDGE, **RUBBING, vibration_tension=20.0, vibration_rate=1.0, vibration_softening=1e-3
+    )
+    total = np.concatenate([np.full(20, 16.0), np.full(20, 24.0), np.full(20, 18.0)])
+    along = kc.simulate(robot, np.repeat(total[:, None] / 4, 4, axis=1), 0.05)
+    x = np.asarray(along.z)[:, 5, -1]
+    assert x[20] == 0.0 and x[40] == 1.0
+    assert 0.0 <= x[-1] < 1e-9 and 0.2 < x[45] < 0.8
+
+
+def test_derivatives_are_those_of_the_solution():
+    robot = kc.RoutedTendonRobot.like(KNOWLEDGE, **RUBBING, sleeve_stiffening=1.0)
+    control = kc.controls.parse("sine:0.7", 30, 0.05)
+
+    def tip(wobble, reach):
+        changed = robot.replace(friction_wobble=wobble, friction_reach=reach)
+        return kc.simulate(changed, control, 0.05).position[-1, -1]
+
+    slopes = jax.jacfwd(tip, argnums=(0, 1))(0.6, 0.1)
+    for k, (low, high) in enumerate(
+        (((0.6 - 1e-4, 0.1), (0.6 + 1e-4, 0.1)), ((0.6, 0.1 - 2e-5), (0.6, 0.1 + 2e-5)))
+    ):
+        step = max(np.subtract(high, low))
+        expected = (np.asarray(tip(*high)) - np.asarray(tip(*low))) / step
+        np.testing.assert_allclose(slopes[k], expected, rtol=2e-3, atol=1e-6)
+
+
+def test_the_batch_does_what_each_robot_does():
+    robot = kc.RoutedTendonRobot.like(KNOWLEDGE, **RUBBING)
+    controls = np.stack([kc.controls.parse(f"random:{k}", 40, 0.05) for k in range(3)])
+    together = kc.simulate(robot, controls, 0.05)
+    for k, control in enumerate(controls):
+        np.testing.assert_allclose(
+            together.position[k], kc.simulate(robot, control, 0.05).position, atol=1e-9
+        )
+
+
+def test_strong_pulls_and_much_friction_are_solved_or_reported():
+    robot = kc.RoutedTendonRobot.like(
+        KNOWLEDGE, friction_wobble=1.0, friction_reach=0.03, bending_damping=2e-3
+    )
+    for seed in range(4):
+        control = 3.0 * kc.controls.parse(f"random:{seed}", 60, 0.05)
+        along = kc.simulate(robot, control, 0.05, on_failure="return")
+        solved = np.asarray(along.result) >= Result.CONVERGED
+        assert solved.mean() > 0.9 and np.all(np.isfinite(np.asarray(along.y)[solved]))
