@@ -20,7 +20,7 @@ from knode_cosserat.recordings.estimation.smoothing import ORDER, Banded, Spline
 #: knots no further apart (s); with frames that are rarer, as far as those
 SPACING = 0.04
 #: Gauss-Newton's corrections, of which each takes a new choice of smoothness; and choices after the last
-CORRECTIONS, CHOICES = 6, 8
+CORRECTIONS, CHOICES = 5, 3
 #: converged when no coefficient of the curvature changes by more (1/m)
 CLOSE = 1e-6
 #: markers are not better than this (m, rad)
@@ -29,8 +29,8 @@ LEAST_NOISE = (1e-6, 1e-5)
 LARGEST = 30.0
 #: where the search for the smoothness begins: motion up to this frequency (Hz)
 BEGIN = 6.0
-#: the prior's precision grows with the polynomials' degree by this power or more
-DECAY = 2.0
+#: the prior's precision grows with the cosines' order by this power or more; at first, by the other
+DECAY, BEGIN_DECAY = 2.0, 4.0
 #: how far the prior's precision follows the jerk: where nothing moves it is (1 + 1/QUIET) times as large
 QUIET = 0.05
 #: over how many of the points that the prior looks at the jerk is averaged: 3 in the time from knot to knot
@@ -98,7 +98,7 @@ def fitted(rod: Rod, poses: Poses, stretch: float, noise: tuple[float, float]) -
         if precision is None:
             share = np.einsum("fkk->k", H) / len(H) / usual
             precision = share / (2 * np.pi * BEGIN) ** (2 * ORDER)
-            precision = _shared(precision, groups)
+            precision = _decaying(_shared(precision, groups), BEGIN_DECAY)[groups]
         system.factorise(precision, ridge)
         new = system.curve()
         if correction >= 2:
@@ -150,9 +150,8 @@ def _normal(
     return back @ rows, (back @ wanted[..., None])[..., 0]
 
 
-def _shared(values: Float[np.ndarray, " K"], groups: np.ndarray) -> Float[np.ndarray, " K"]:
-    sums = np.bincount(groups, values) / np.bincount(groups)
-    return sums[groups]
+def _shared(values: Float[np.ndarray, " K"], groups: np.ndarray) -> Float[np.ndarray, " groups"]:
+    return np.bincount(groups, values) / np.bincount(groups)
 
 
 def _likelier(
@@ -182,16 +181,16 @@ def _likelier(
     new = determined / np.maximum(jerk, 1e-300)
     # one choice at a time, and not a leap
     new = np.clip(new, tau / 1e3, tau * 1e3)
-    return _decaying(new)[groups], float(determined.sum())
+    return _decaying(new, DECAY)[groups], float(determined.sum())
 
 
-def _decaying(precision: Float[np.ndarray, " groups"]) -> Float[np.ndarray, " groups"]:
-    """Precisions that rise with the degree: what the bodies hardly tell would have any, by the evidence."""
+def _decaying(precision: Float[np.ndarray, " groups"], power: float) -> Float[np.ndarray, " groups"]:
+    """Precisions that rise with the order: what the bodies hardly tell would have any, by the evidence."""
     first = 0
     for size in (max(MODES[:2]), MODES[2]):
-        for degree in range(1, size):
-            least = precision[first + degree - 1] * ((degree + 1) / degree) ** DECAY
-            precision[first + degree] = max(precision[first + degree], least)
+        for k in range(1, size):
+            least = precision[first + k - 1] * ((k + 1) / k) ** power
+            precision[first + k] = max(precision[first + k], least)
         first += size
     return precision
 

@@ -10,7 +10,7 @@ and in the global frame, with θ a small turn, everything that moves is an integ
     ω = ∫ R u_t dσ                           p_t  = ∫ ω × p_s dσ
     ω_t = ∫ R u_tt + ω × R u_t dσ            p_tt = ∫ ω_t × p_s + ω × (ω × p_s) dσ
 
-The curvature about every axis is a sum of Legendre polynomials in s. All arrays have frames in front.
+The curvature about every axis is a sum of cosines, cos(kπ s/L). All arrays have frames in front.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-#: polynomials for the curvature about x, about y, and for the twist
-MODES = (7, 7, 3)
+#: cosines for the curvature about x, about y, and for the twist
+MODES = (9, 9, 3)
 #: the longest segment of the grid, as a fraction of the length
 FINEST = 1.0 / 27.0
 _GAUSS = 0.5 / np.sqrt(3.0)
@@ -97,13 +97,12 @@ class Rod:
 
 
 def mode_groups() -> Int[np.ndarray, " K"]:
-    """Which modes share their smoothness: x and y of one degree, so that a turn about z changes nothing."""
+    """Which modes share their smoothness: x and y of one k, so that a turn about z changes nothing."""
     return np.concatenate([np.arange(MODES[0]), np.arange(MODES[1]), MODES[0] + np.arange(MODES[2])])
 
 
 def _basis(places: Float[np.ndarray, "..."]) -> Float[np.ndarray, "... 3 K"]:
-    degree = max(MODES) - 1
-    values = np.polynomial.legendre.legvander(2.0 * places - 1.0, degree)
+    values = np.cos(np.pi * np.arange(max(MODES)) * places[..., None])
     basis = np.zeros((*places.shape, 3, sum(MODES)))
     start = 0
     for axis, count in enumerate(MODES):

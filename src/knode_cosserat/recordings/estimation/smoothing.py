@@ -20,7 +20,7 @@ from jaxtyping import Float
 #: degree of the splines: smooth in the accelerations' rate
 DEGREE = 5
 #: which derivative the prior holds small, and below which frequency the value itself (Hz)
-ORDER, CORNER = 3, 0.3
+ORDER, CORNER = 3, 0.6
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
