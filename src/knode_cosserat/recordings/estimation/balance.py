@@ -6,7 +6,6 @@ differential equation along the rod, which is integrated from the tip, where the
 
 from __future__ import annotations
 
-import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -23,6 +22,8 @@ from knode_cosserat.solvers.settings import Settings
 KNOWN, LOADS, STRAINS = ("p", "h", "q", "w"), ("n", "m"), ("v", "u")
 #: corrections of the tip's conditions, and of a segment that is implicit; both are linear or nearly so
 _CORRECTIONS = 3
+#: compiled programs are for a multiple of so many rows
+BLOCK = 128
 
 
 def require_rod(robot: System) -> None:
@@ -52,9 +53,13 @@ class Rows(NamedTuple):
     z_t: Float[Any, "T P z"]
 
 
-@jax.jit
-def loads_of(robot: System, s: Float[Any, " P"], rows: Rows) -> Float[Any, "T P y"]:
+def loads_of(robot: System, s: Float[Any, " P"], rows: Rows) -> Float[np.ndarray, "T P y"]:
     """y with n and m, at points that alternate between ends and middles of segments; order 4 in them."""
+    return np.asarray(_loads(robot, s, _padded(rows)))[: len(rows.t)]
+
+
+@jax.jit
+def _loads(robot: System, s: Float[Any, " P"], rows: Rows) -> Float[Any, "T P y"]:
     where = robot.y_layout.indices(LOADS)
 
     def one(t: Any, control: Any, y: Any, y_t: Any, z: Any, z_t: Any) -> Any:
@@ -91,30 +96,35 @@ def _at_tip(robot: System, t: Any, control: Any, y: Any, history: History) -> An
     def left(loads: Any) -> Any:
         return robot.tip(t, control, y.at[where].set(loads), history)
 
-    loads = jnp.zeros(len(where))
-    for _ in range(_CORRECTIONS):
-        loads = loads - jnp.linalg.solve(jax.jacfwd(left)(loads), left(loads))
-    return loads
+    def corrected(_: Any, loads: Any) -> Any:
+        return loads - jnp.linalg.solve(jax.jacfwd(left)(loads), left(loads))
+
+    return jax.lax.fori_loop(0, _CORRECTIONS, corrected, jnp.zeros(len(where)))
 
 
-@functools.partial(jax.jit, static_argnums=(2, 3))
-def strains_of(robot: System, rows: Rows, settings: Settings, dt: float) -> Float[Any, "T N z"]:
+def strains_of(robot: System, rows: Rows, settings: Settings, dt: float) -> Float[np.ndarray, "T N z"]:
     """z by the robot's own law at its nodes, row by row; z_t by the time scheme from the rows before.
 
     `rows.y` is complete here, and `rows.z` not looked at. The first row is taken to be at rest.
     """
+    coefficients = coefficient_table(settings, dt)[1]
+    return np.asarray(_strains(robot, _padded(rows), coefficients))[: len(rows.t)]
+
+
+@jax.jit
+def _strains(robot: System, rows: Rows, coefficients: Float[Any, "4"]) -> Float[Any, "T N z"]:
     s = jnp.linspace(0.0, 1.0, robot.nodes) * robot.length
-    c0, c1, c2, d1 = coefficient_table(settings, dt)[1]
+    c0, c1, c2, d1 = coefficients
 
     def at_nodes(c0: Any, t: Any, control: Any, y: Any, y_t: Any, hz: Any) -> Any:
         def one(s: Any, y: Any, y_t: Any, hz: Any) -> Any:
-            history = History(jnp.asarray(c0), y_t - c0 * y, hz, jnp.zeros_like(y))
+            history = History(c0, y_t - c0 * y, hz, jnp.zeros_like(y))
             return robot.strains(s, t, y, control, history)
 
         return jax.vmap(one)(s, y, y_t, hz)
 
     nothing = jnp.zeros(rows.z.shape[1:])
-    first = at_nodes(0.0, rows.t[0], rows.control[0], rows.y[0], rows.y_t[0], nothing)
+    first = at_nodes(jnp.zeros(()), rows.t[0], rows.control[0], rows.y[0], rows.y_t[0], nothing)
 
     def step(past: Any, row: Any) -> Any:
         last, before, rate = past
@@ -128,31 +138,40 @@ def strains_of(robot: System, rows: Rows, settings: Settings, dt: float) -> Floa
     return jnp.concatenate([first[None], z])
 
 
-@functools.partial(jax.jit, static_argnums=(4, 5))
 def semi_discretised(
     robot: System, t: Any, control: Any, known: Float[Any, "T N y"], settings: Settings, dt: float
-) -> tuple[Float[Any, "T N y"], Float[Any, "T N z"]]:
+) -> tuple[Float[np.ndarray, "T N y"], Float[np.ndarray, "T N z"]]:
     """y and z at the nodes by the equations as a simulation has them, one Euler segment after the other.
 
     Rates are the time scheme's, from the rows before; before the first row is the first (paper, section 3).
     """
+    coefficients = coefficient_table(settings, dt)[1]
+    records = np.asarray(_semi_discretised(robot, *_padded((t, control, known)), coefficients))[: len(t)]
+    ny = robot.y_layout.size
+    return records[..., :ny], records[..., ny:]
+
+
+@jax.jit
+def _semi_discretised(
+    robot: System, t: Any, control: Any, known: Float[Any, "T N y"], coefficients: Float[Any, "4"]
+) -> Float[Any, "T N x"]:
     where = robot.y_layout.indices(LOADS)
     s, ds = jnp.linspace(0.0, 1.0, robot.nodes) * robot.length, robot.length / (robot.nodes - 1)
-    c0, c1, c2, d1 = coefficient_table(settings, dt)[1]
-    ny, nz = robot.y_layout.size, robot.z_layout.size
+    c0, c1, c2, d1 = coefficients
+    ny = robot.y_layout.size
 
     def solved(t: Any, control: Any, y: Any, history: Any) -> Any:
         def of(j: Any) -> History:
-            return History(jnp.asarray(c0), history[j, :ny], history[j, ny:], jnp.zeros(ny))
+            return History(c0, history[j, :ny], history[j, ny:], jnp.zeros(ny))
 
         last = _at_tip(robot, t, control, y[-1], of(-1))
 
         def segment(after: Any, j: Any) -> Any:
-            loads = after
-            for _ in range(_CORRECTIONS):
-                here = y[j].at[where].set(loads)
-                y_s, _ = robot.derivatives(s[j], t, here, control, of(j))
-                loads = after - ds * y_s[where]
+            def corrected(_: Any, loads: Any) -> Any:
+                y_s, _ = robot.derivatives(s[j], t, y[j].at[where].set(loads), control, of(j))
+                return after - ds * y_s[where]
+
+            loads = jax.lax.fori_loop(0, _CORRECTIONS, corrected, after)
             return loads, loads
 
         _, loads = jax.lax.scan(segment, last, jnp.arange(robot.nodes - 2, -1, -1))
@@ -169,12 +188,22 @@ def semi_discretised(
 
     _, z_rest = jax.vmap(robot.rest)(s)
     begin = jnp.concatenate([known[0], z_rest], axis=1)
-    for _ in range(2):
-        # the first row is before itself: n, m and z of it are found from a guess of them
-        begin = solved(t[0], control[0], known[0], (c1 + c2) * begin)
+    # the first row is before itself: n, m and z of it are found from a guess of them
+    begin = jax.lax.fori_loop(
+        0, 2, lambda _, begin: solved(t[0], control[0], known[0], (c1 + c2) * begin), begin
+    )
     _, records = jax.lax.scan(step, (begin, begin, jnp.zeros_like(begin)), (t[1:], control[1:], known[1:]))
-    records = jnp.concatenate([begin[None], records])
-    return records[..., :ny], records[..., ny : ny + nz]
+    return jnp.concatenate([begin[None], records])
+
+
+def _padded(rows: Any) -> Any:
+    """Rows with the last repeated up to a whole number of blocks: one compiled program serves many lengths."""
+    count = -(-len(rows[0]) // BLOCK) * BLOCK
+
+    def longer(values: Any) -> Any:
+        return np.concatenate([values, np.repeat(np.asarray(values)[-1:], count - len(values), axis=0)])
+
+    return jax.tree.map(longer, rows)
 
 
 def packed(robot: System, part: str, **fields: Float[np.ndarray, "... size"]) -> Float[np.ndarray, "... y"]:

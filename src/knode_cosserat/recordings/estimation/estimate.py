@@ -187,9 +187,9 @@ def completed(
         z=z,
         z_t=packed(robot, "z", u=it.u_t),
     )
-    y = np.asarray(balance.loads_of(robot, rod.s, rows))[:, rod.nodes]
+    y = balance.loads_of(robot, rod.s, rows)[:, rod.nodes]
     at_nodes = rows._replace(y=y, y_t=rows.y_t[:, rod.nodes], z=z[:, rod.nodes], z_t=rows.z_t[:, rod.nodes])
     dt = float(np.mean(np.diff(time)))
-    by_law = np.array(balance.strains_of(robot, at_nodes, Settings(), round(dt, 9)))
+    by_law = balance.strains_of(robot, at_nodes, Settings(), round(dt, 9)).copy()
     by_law[..., robot.z_layout.slice("u")] = it.shape.u[:, rod.nodes]
     return y, by_law

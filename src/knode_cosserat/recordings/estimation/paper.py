@@ -44,8 +44,7 @@ def states(
     q = (np.swapaxes(R, -1, -2) @ p_t[..., None])[..., 0]
     w = 2.0 * kinematics.hamilton(h * np.array([1.0, -1.0, -1.0, -1.0]), h_t)[..., 1:]
     known = balance.packed(robot, "y", p=p, h=h, q=q, w=w)
-    y, z = balance.semi_discretised(robot, rows.time, control, known, settings, round(dt, 9))
-    return np.asarray(y), np.asarray(z)
+    return balance.semi_discretised(robot, rows.time, control, known, settings, round(dt, 9))
 
 
 def _along(
