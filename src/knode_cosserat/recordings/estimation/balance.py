@@ -197,7 +197,7 @@ def _semi_discretised(
 
 
 def _padded(rows: Any) -> Any:
-    """Rows with the last repeated up to a whole number of blocks: one compiled program serves many lengths."""
+    """Rows, the last one repeated, in whole blocks: one compiled program serves many lengths."""
     count = -(-len(rows[0]) // BLOCK) * BLOCK
 
     def longer(values: Any) -> Any:
