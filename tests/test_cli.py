@@ -15,7 +15,7 @@ from knode_cosserat.evaluation.metrics import dtw_distance
 
 ROBOT = "delrin-tendon-robot"
 COMMANDS = ("simulate", "equilibrium", "info", "fit", "evaluate", "plot", "inspect", "study simulation",
-            "study imperfections", "study data")  # fmt: skip
+            "study imperfections", "study data", "study estimation", "record-virtual")  # fmt: skip
 
 
 def run(*arguments):

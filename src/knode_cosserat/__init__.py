@@ -6,6 +6,7 @@ Everything public is here; see `simulate`, `load_robot` and `Trajectory` first.
 from knode_cosserat import _jax as _jax  # isort: split  (first: it sets JAX up)
 from knode_cosserat import controls
 from knode_cosserat.evaluation.metrics import node_error, pose_mse, tip_dtw, tip_rmse
+from knode_cosserat.evaluation.state_errors import StateError, state_errors
 from knode_cosserat.learning.calibration.calibrate import Calibration, CalibrationError, calibrate
 from knode_cosserat.learning.calibration.identify import identify
 from knode_cosserat.learning.config import (
@@ -26,6 +27,7 @@ from knode_cosserat.learning.samples import DataError
 from knode_cosserat.learning.training.checkpoint import CheckpointError
 from knode_cosserat.learning.training.runs import FitError
 from knode_cosserat.recordings.config import RecordingConfig
+from knode_cosserat.recordings.estimation.estimate import estimate_parts, estimate_states
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.load import load_recording
 from knode_cosserat.recordings.measurements import Measurements
@@ -79,6 +81,7 @@ __all__ = [
     "Scales",
     "Settings",
     "SimulationError",
+    "StateError",
     "StructuredOptions",
     "System",
     "TendonRobot",
@@ -90,6 +93,8 @@ __all__ = [
     "catalog",
     "controls",
     "equilibrium",
+    "estimate_parts",
+    "estimate_states",
     "explain",
     "fit",
     "identify",
@@ -103,6 +108,7 @@ __all__ = [
     "pose_mse",
     "save_robot",
     "simulate",
+    "state_errors",
     "tip_dtw",
     "tip_rmse",
 ]

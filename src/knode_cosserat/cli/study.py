@@ -136,6 +136,22 @@ def data(
     )  # fmt: skip
 
 
+@studies.command(epilog=examples("study estimation --out results"))
+def estimation(out: Out, as_json: Json = False) -> None:
+    """How well full states are estimated from recordings: the paper's method, and the best.
+
+    Records the virtual robot (simulated: its states are known) and writes the errors of every quantity
+    (estimation.md, .json) and a figure; the bags stay in the folder.
+    """
+    _prepare(out, None, None)
+    from knode_cosserat.studies.estimation import rerun
+
+    _run(
+        lambda **how: rerun(out),
+        {}, out, None, None, None, as_json,
+    )  # fmt: skip
+
+
 # what they share
 
 

@@ -16,7 +16,7 @@ from knode_cosserat.recordings import ros1, ros2
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.container import Container
 from knode_cosserat.recordings.findings import Finding, RecordingError
-from knode_cosserat.recordings.messages import Role, Stream, decoded
+from knode_cosserat.recordings.messages import SIMULATED, Role, Stream, decoded
 from knode_cosserat.recordings.recording import Recording
 
 #: where the package's own recording is
@@ -110,6 +110,9 @@ def _from_bag(path: Path, begin: bytes, config: RecordingConfig) -> Recording:
             there = ", ".join(sorted(container.topics)) or "none"
             raise RecordingError(f"{path}: topic {name} ({role}) is missing; the bag has {there}")
         found[name] = decoded(topic, container.ros, role, config.command, str(path))
+        # text is in messages as it is
+        if config.simulated is None and any(SIMULATED.encode() in bytes(raw) for raw in topic.raw[:100]):
+            config = config.replace(simulated=True)
     if container.damage:
         findings.append(_said_damage(container, found.values()))
     return assembly.assembled(str(path), path.name, config, found, findings)

@@ -62,6 +62,8 @@ NUMBERS: dict[str, Callable[[Any], Any]] = {
     "std_msgs/msg/Float32MultiArray": lambda m: m.data,
     "sensor_msgs/msg/JointState": lambda m: m.effort,
 }
+#: what a line of a log says where the robot of a recording was itself simulated
+SIMULATED = "Simulated: the robot of this recording is a simulation, and not a physical one"
 #: by message type, the text in it
 TEXTS: dict[str, Callable[[Any], str]] = {
     "rosgraph_msgs/msg/Log": lambda m: m.msg,

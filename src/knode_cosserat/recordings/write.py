@@ -26,9 +26,10 @@ from knode_cosserat.recordings.config import (
     TensionSource,
 )
 from knode_cosserat.recordings.findings import RecordingError
-from knode_cosserat.recordings.messages import typestore
+from knode_cosserat.recordings.messages import SIMULATED, typestore
 
-FORMATS = (".bag", ".mcap", ".db3", ".csv", ".parquet")
+BAGS = (".bag", ".mcap", ".db3")
+FORMATS = (*BAGS, ".csv", ".parquet")
 #: what time zero is on the clock of a bag, unless it is said (s since 1970)
 START = 1_720_000_000
 #: the message type for so many numbers; for others, arrays, which have no stamps
@@ -80,6 +81,8 @@ def write_recording(
     delays: Mapping[str, float] | None = None,
 ) -> None:
     """Write a recording that `load_recording(path, config)` reads.
+
+    Where commands are text and the configuration says that the robot is simulated, the log says so too.
 
     Args:
         path: the file; one that is there is replaced.
@@ -149,8 +152,18 @@ def _on_the_wire(
                 f"{path}: {role} of shape {np.shape(pulls.tension)}; the configuration has "
                 f"{len(source.order) if source else 'no'} tendons there"
             )
-        streams.append(_Stream(source.topic, role, pulls.time, _sent(source, pulls.tension), source))
+        stream = _Stream(source.topic, role, pulls.time, _sent(source, pulls.tension), source)
+        streams.append(_saying_so(stream) if config.simulated and path.suffix in BAGS else stream)
     return streams
+
+
+def _saying_so(stream: _Stream) -> _Stream:
+    """The stream; if it is a log, with a row of nothing in front: a line about the recording itself."""
+    if not isinstance(stream.source, CommandSource) or stream.source.text is None or len(stream.time) == 0:
+        return stream
+    nothing = np.full((1, np.shape(stream.values)[1]), np.nan)
+    time, values = np.concatenate([stream.time[:1], stream.time]), np.concatenate([nothing, stream.values])
+    return dataclasses.replace(stream, time=time, values=values)
 
 
 def _sent(source: TensionSource, newtons: Any) -> Any:
@@ -239,7 +252,9 @@ def _maker(stream: _Stream, ros: int) -> Callable[[int, int, Any], Any]:
         return types[kind](header=header(stamp, row), pose=placed)
 
     def spoken(stamp: int, row: int, values: Any) -> Any:
-        said = stream.source.text.replace(PLACE, " ".join(f"{value:.10g}" for value in values))
+        # a row of nothing is what is said of the recording itself
+        numbers = " ".join(f"{value:.10g}" for value in values if np.isfinite(value))
+        said = stream.source.text.replace(PLACE, numbers) if numbers else SIMULATED
         head = header(stamp, row)
         common = {"level": 2, "name": "/motors", "msg": said, "file": "", "function": "", "line": 0}
         return (

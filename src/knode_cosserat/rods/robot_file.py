@@ -29,6 +29,7 @@ from knode_cosserat.rods.parameters import Parameter, ParameterError, checked
 from knode_cosserat.rods.routed_robot import RoutedTendonRobot
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.tendon_robot import TendonRobot
+from knode_cosserat.rods.virtual_robot import VirtualRobot
 
 FORMAT = 1
 
@@ -36,6 +37,7 @@ FORMAT = 1
 KINDS: dict[str, type[System]] = {
     "tendon-robot": TendonRobot,
     "routed-tendon-robot": RoutedTendonRobot,
+    "virtual-robot": VirtualRobot,
 }
 
 

@@ -1,0 +1,65 @@
+"""The command that records a virtual robot."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from time import perf_counter
+from typing import Annotated
+
+import typer
+
+from knode_cosserat.cli.arguments import Json, NetCDF, require_writable
+from knode_cosserat.cli.program import app, examples
+from knode_cosserat.cli.telling import tell
+
+
+@app.command(
+    epilog=examples(
+        "record-virtual sine:1.0 --out x.bag",
+        "record-virtual step:4.4 --out step.bag --seconds 12 --states truth.nc",
+        "record-virtual random:0 --out random.bag --seed 3 --swap 9",
+    )
+)
+def record_virtual(
+    signal: Annotated[
+        str,
+        typer.Argument(
+            metavar="CONTROLS",
+            help="sine:PERIOD, step:HEIGHT or random:SEED about the paper's rest tension, or other controls "
+            "as `simulate` takes them.",
+        ),
+    ],
+    out: Annotated[
+        Path,
+        typer.Option(metavar="FILE", help="Write this bag (.bag, .mcap, .db3) or table (.csv, .parquet)."),
+    ],
+    seconds: Annotated[float, typer.Option(metavar="S", help="How long, in s.")] = 16.0,
+    seed: Annotated[
+        int, typer.Option(metavar="N", min=0, help="Seed of the noise and of how bodies are turned.")
+    ] = 0,
+    swap: Annotated[
+        float | None,
+        typer.Option(metavar="S", help="When a body swaps its axes, in s.", show_default="never"),
+    ] = None,
+    states: Annotated[Path | None, NetCDF] = None,
+    as_json: Json = False,
+) -> None:
+    """Record a virtual robot: a bag as of the paper's robot, without one.
+
+    The robot is simulated, with what models do not know: friction of the tendons, ribs with masses, a sleeve,
+    motors with a lag, and sensors with noise. `--states` keeps what it truly did.
+    """
+    require_writable(out)
+    require_writable(states)
+    from knode_cosserat.recordings.virtual import Sensors
+    from knode_cosserat.recordings.virtual import record_virtual as record
+
+    began = perf_counter()
+    truth = record(out, signal, seconds, seed, Sensors(swap=swap))
+    elapsed = perf_counter() - began
+    if states:
+        truth.save(states)
+    facts = {"signal": signal, "seconds": seconds, "seed": seed, "swap": swap, "simulated": True}
+    lines = [f"{seconds:g} s of {signal}, simulated, in {elapsed:.1f} s"]
+    written = {"out": out} | ({"states": states} if states or as_json else {})
+    tell(as_json, facts | {"computing_time": round(elapsed, 2)}, lines, **written)

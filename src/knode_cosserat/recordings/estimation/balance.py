@@ -1,0 +1,216 @@
+"""Internal force and moment from a robot's own balance, and strains from its own law, where motion is known.
+
+A system gives y_s of all of y. Where p, h, q, ω and their rates are known, those of n and m are a linear
+differential equation along the rod, which is integrated from the tip, where the system says what holds.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.recordings.findings import RecordingError
+from knode_cosserat.rods.system import History, System
+from knode_cosserat.solvers.march import coefficient_table
+from knode_cosserat.solvers.settings import Settings
+
+#: fields that a rod's state has to have here: known from poses, then from the balance; and of the strains
+KNOWN, LOADS, STRAINS = ("p", "h", "q", "w"), ("n", "m"), ("v", "u")
+#: corrections of the tip's conditions, and of a segment that is implicit; both are linear or nearly so
+_CORRECTIONS = 3
+#: compiled programs are for a multiple of so many rows
+BLOCK = 128
+
+
+def require_rod(robot: System) -> None:
+    """Raise `RecordingError` unless the robot's state is that of a rod, free or loaded at its tip."""
+    has = (*robot.y_layout.names, *robot.z_layout.names)
+    missing = [name for name in (*KNOWN, *LOADS, *STRAINS) if name not in has]
+    if missing:
+        raise RecordingError(
+            f"{type(robot).__name__} has no {', '.join(missing)} in its states; estimation is for rods with "
+            f"{', '.join((*KNOWN, *LOADS))} in y and {', '.join(STRAINS)} in z"
+        )
+    if sorted(robot.base_unknowns) != sorted(LOADS):
+        raise RecordingError(
+            f"{type(robot).__name__} has {', '.join(robot.base_unknowns)} unknown at its base; "
+            "estimation is for rods that are clamped there, with n and m unknown"
+        )
+
+
+class Rows(NamedTuple):
+    """What is known at T rows and P points: y without n and m (zero there), its rate, z and its rate."""
+
+    t: Float[Any, " T"]
+    control: Float[Any, "T c"]
+    y: Float[Any, "T P y"]
+    y_t: Float[Any, "T P y"]
+    z: Float[Any, "T P z"]
+    z_t: Float[Any, "T P z"]
+
+
+def loads_of(robot: System, s: Float[Any, " P"], rows: Rows) -> Float[np.ndarray, "T P y"]:
+    """y with n and m, at points that alternate between ends and middles of segments; order 4 in them."""
+    return np.asarray(_loads(robot, s, _padded(rows)))[: len(rows.t)]
+
+
+@jax.jit
+def _loads(robot: System, s: Float[Any, " P"], rows: Rows) -> Float[Any, "T P y"]:
+    where = robot.y_layout.indices(LOADS)
+
+    def one(t: Any, control: Any, y: Any, y_t: Any, z: Any, z_t: Any) -> Any:
+        def slope(j: Any, loads: Any) -> Any:
+            # the rates are given and not made of c0 and the past
+            history = History(jnp.zeros(()), y_t[j], z_t[j], jnp.zeros_like(y_t[j]))
+            return robot.rates(s[j], t, y[j].at[where].set(loads), z[j], control, history)[where]
+
+        def segment(after: Any, j: Any) -> Any:
+            ds = s[j] - s[j + 2]
+            k1 = slope(j + 2, after)
+            k2 = slope(j + 1, after + ds / 2 * k1)
+            k3 = slope(j + 1, after + ds / 2 * k2)
+            k4 = slope(j, after + ds * k3)
+            middle = after + ds / 24 * (5 * k1 + 4 * (k2 + k3) - k4)
+            before = after + ds / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+            return before, jnp.stack([before, middle])
+
+        last = _at_tip(
+            robot, t, control, y[-1], History(jnp.zeros(()), y_t[-1], z_t[-1], jnp.zeros_like(y_t[-1]))
+        )
+        starts = jnp.arange(s.shape[0] - 3, -1, -2)
+        _, pairs = jax.lax.scan(segment, last, starts)
+        loads = jnp.concatenate([pairs[::-1].reshape(-1, last.shape[0]), last[None]])
+        return y.at[:, where].set(loads)
+
+    return jax.vmap(one)(*rows)
+
+
+def _at_tip(robot: System, t: Any, control: Any, y: Any, history: History) -> Any:
+    """n and m with which the tip's conditions hold."""
+    where = robot.y_layout.indices(LOADS)
+
+    def left(loads: Any) -> Any:
+        return robot.tip(t, control, y.at[where].set(loads), history)
+
+    def corrected(_: Any, loads: Any) -> Any:
+        return loads - jnp.linalg.solve(jax.jacfwd(left)(loads), left(loads))
+
+    return jax.lax.fori_loop(0, _CORRECTIONS, corrected, jnp.zeros(len(where)))
+
+
+def strains_of(robot: System, rows: Rows, settings: Settings, dt: float) -> Float[np.ndarray, "T N z"]:
+    """z by the robot's own law at its nodes, row by row; z_t by the time scheme from the rows before.
+
+    `rows.y` is complete here, and `rows.z` not looked at. The first row is taken to be at rest.
+    """
+    coefficients = coefficient_table(settings, dt)[1]
+    return np.asarray(_strains(robot, _padded(rows), coefficients))[: len(rows.t)]
+
+
+@jax.jit
+def _strains(robot: System, rows: Rows, coefficients: Float[Any, "4"]) -> Float[Any, "T N z"]:
+    s = jnp.linspace(0.0, 1.0, robot.nodes) * robot.length
+    c0, c1, c2, d1 = coefficients
+
+    def at_nodes(c0: Any, t: Any, control: Any, y: Any, y_t: Any, hz: Any) -> Any:
+        def one(s: Any, y: Any, y_t: Any, hz: Any) -> Any:
+            history = History(c0, y_t - c0 * y, hz, jnp.zeros_like(y))
+            return robot.strains(s, t, y, control, history)
+
+        return jax.vmap(one)(s, y, y_t, hz)
+
+    nothing = jnp.zeros(rows.z.shape[1:])
+    first = at_nodes(jnp.zeros(()), rows.t[0], rows.control[0], rows.y[0], rows.y_t[0], nothing)
+
+    def step(past: Any, row: Any) -> Any:
+        last, before, rate = past
+        t, control, y, y_t = row
+        hz = c1 * last + c2 * before + d1 * rate
+        z = at_nodes(c0, t, control, y, y_t, hz)
+        return (z, last, c0 * z + hz), z
+
+    rest = (rows.t[1:], rows.control[1:], rows.y[1:], rows.y_t[1:])
+    _, z = jax.lax.scan(step, (first, first, nothing), rest)
+    return jnp.concatenate([first[None], z])
+
+
+def semi_discretised(
+    robot: System, t: Any, control: Any, known: Float[Any, "T N y"], settings: Settings, dt: float
+) -> tuple[Float[np.ndarray, "T N y"], Float[np.ndarray, "T N z"]]:
+    """y and z at the nodes by the equations as a simulation has them, one Euler segment after the other.
+
+    Rates are the time scheme's, from the rows before; before the first row is the first (paper, section 3).
+    """
+    coefficients = coefficient_table(settings, dt)[1]
+    records = np.asarray(_semi_discretised(robot, *_padded((t, control, known)), coefficients))[: len(t)]
+    ny = robot.y_layout.size
+    return records[..., :ny], records[..., ny:]
+
+
+@jax.jit
+def _semi_discretised(
+    robot: System, t: Any, control: Any, known: Float[Any, "T N y"], coefficients: Float[Any, "4"]
+) -> Float[Any, "T N x"]:
+    where = robot.y_layout.indices(LOADS)
+    s, ds = jnp.linspace(0.0, 1.0, robot.nodes) * robot.length, robot.length / (robot.nodes - 1)
+    c0, c1, c2, d1 = coefficients
+    ny = robot.y_layout.size
+
+    def solved(t: Any, control: Any, y: Any, history: Any) -> Any:
+        def of(j: Any) -> History:
+            return History(c0, history[j, :ny], history[j, ny:], jnp.zeros(ny))
+
+        last = _at_tip(robot, t, control, y[-1], of(-1))
+
+        def segment(after: Any, j: Any) -> Any:
+            def corrected(_: Any, loads: Any) -> Any:
+                y_s, _ = robot.derivatives(s[j], t, y[j].at[where].set(loads), control, of(j))
+                return after - ds * y_s[where]
+
+            loads = jax.lax.fori_loop(0, _CORRECTIONS, corrected, after)
+            return loads, loads
+
+        _, loads = jax.lax.scan(segment, last, jnp.arange(robot.nodes - 2, -1, -1))
+        y = y.at[:, where].set(jnp.concatenate([loads[::-1], last[None]]))
+        z = jax.vmap(lambda s, y, j: robot.strains(s, t, y, control, of(j)))(s, y, jnp.arange(robot.nodes))
+        return jnp.concatenate([y, z], axis=1)
+
+    def step(past: Any, row: Any) -> Any:
+        last, before, rate = past
+        history = c1 * last + c2 * before + d1 * rate
+        t, control, y = row
+        record = solved(t, control, y, history)
+        return (record, last, c0 * record + history), record
+
+    _, z_rest = jax.vmap(robot.rest)(s)
+    begin = jnp.concatenate([known[0], z_rest], axis=1)
+    # the first row is before itself: n, m and z of it are found from a guess of them
+    begin = jax.lax.fori_loop(
+        0, 2, lambda _, begin: solved(t[0], control[0], known[0], (c1 + c2) * begin), begin
+    )
+    _, records = jax.lax.scan(step, (begin, begin, jnp.zeros_like(begin)), (t[1:], control[1:], known[1:]))
+    return jnp.concatenate([begin[None], records])
+
+
+def _padded(rows: Any) -> Any:
+    """Rows, the last one repeated, in whole blocks: one compiled program serves many lengths."""
+    count = -(-len(rows[0]) // BLOCK) * BLOCK
+
+    def longer(values: Any) -> Any:
+        return np.concatenate([values, np.repeat(np.asarray(values)[-1:], count - len(values), axis=0)])
+
+    return jax.tree.map(longer, rows)
+
+
+def packed(robot: System, part: str, **fields: Float[np.ndarray, "... size"]) -> Float[np.ndarray, "... y"]:
+    """Fields of y (or z: `part`) in their places, zero elsewhere."""
+    layout = robot.y_layout if part == "y" else robot.z_layout
+    shape = next(iter(fields.values())).shape[:-1]
+    values = np.zeros((*shape, layout.size))
+    for name, field in fields.items():
+        values[..., layout.slice(name)] = field
+    return values

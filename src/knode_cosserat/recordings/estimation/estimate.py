@@ -1,0 +1,195 @@
+"""From a recording to full states on a model's nodes: what learning needs of a real robot."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.recordings.estimation import balance, curvature, kinematics, paper
+from knode_cosserat.recordings.estimation.balance import Rows, packed
+from knode_cosserat.recordings.estimation.observations import Part, parts_of
+from knode_cosserat.recordings.findings import RecordingError
+from knode_cosserat.recordings.measurements import Measurements
+from knode_cosserat.recordings.recording import Recording
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.trajectory import Trajectory
+
+Method = Literal["best", "paper"]
+#: where the search for the noise begins (m, rad)
+NOISE = (3e-4, 3e-3)
+#: lengths of robot and recording that differ by more are not of the same robot
+UNLIKE = 2.0
+
+
+def estimate_states(
+    recording: Recording | Measurements,
+    robot: System,
+    method: Method = "best",
+    dt: float = 0.05,
+    start: float | None = None,
+    end: float | None = None,
+) -> Trajectory:
+    """The full states that a recording shows: y and z on the robot's nodes, ready to be learned from.
+
+    `method="best"` finds the rod's curvature over arclength and time that explains the poses best
+    (`curvature`), at motion capture's own rate; positions, orientations, velocities and accelerations are
+    integrals of it. n and m follow from the robot's balance, integrated from the tip, and v from its
+    law. u is the curvature that was seen, not what the law makes of m: where the robot given is wrong, it
+    shows that. `method="paper"` is the paper's recipe (`paper`).
+
+    Positions, orientations, velocities and u come from the recording alone. n, m and v are those of the
+    robot that is given, and so as right as its masses and loads are.
+
+    Args:
+        recording: as read, or its measurements on a grid; the former is better.
+        robot: whose nodes, balance and law are used; its length is that of its model.
+        method: as above.
+        dt: from row to row (s).
+        start: the first row (s); None: as in `Recording.sampled`.
+        end: the last row at most (s).
+
+    Returns:
+        A `Trajectory` without settings; its time is the recording's. Row i has the control that
+        `simulate` would reach it with: the tension held from row i - 1 on (of row 0, its own).
+
+    Raises:
+        RecordingError: the recording is in parts (then use `estimate_parts`), does not fit the robot, has too
+            few bodies or no orientations; the method or a time is not possible.
+    """
+    found = _parts(recording, robot, method, dt, start, end)
+    if len(found) > 1:
+        times = ", ".join(f"{part.rows.time[0]:g} to {part.rows.time[-1]:g} s" for part in found)
+        raise RecordingError(
+            f"{found[0].rows.source}: the recording is in {len(found)} parts ({times}); choose one by start "
+            "and end, or take all of them by estimate_parts"
+        )
+    return _estimated(found[0], robot, method)
+
+
+def estimate_parts(
+    recording: Recording | Measurements,
+    robot: System,
+    method: Method = "best",
+    dt: float = 0.05,
+    start: float | None = None,
+    end: float | None = None,
+) -> list[Trajectory]:
+    """As `estimate_states`, of every part between pauses that are too long to be bridged.
+
+    Raises:
+        RecordingError: as in `estimate_states`, but for the parts.
+    """
+    return [_estimated(part, robot, method) for part in _parts(recording, robot, method, dt, start, end)]
+
+
+def _parts(
+    recording: Recording | Measurements,
+    robot: System,
+    method: str,
+    dt: float,
+    start: float | None,
+    end: float | None,
+) -> list[Part]:
+    if method not in get_args(Method):
+        raise RecordingError(f'method is {method!r}; allowed is "best" or "paper"')
+    if not isinstance(robot, System):
+        raise RecordingError(f"robot is a {type(robot).__name__}; allowed is a robot or a model")
+    balance.require_rod(robot)
+    parts = parts_of(recording, robot, dt, start, end)
+    for part in parts:
+        ratio = _stretch(part, robot)
+        if not 1.0 / UNLIKE < ratio < UNLIKE:
+            raise RecordingError(
+                f"{part.rows.source}: its rod is {ratio * float(robot.length):.3f} m long and the robot "
+                f"{float(robot.length):.3f} m; allowed is up to {UNLIKE:g} times that, or a half"
+            )
+    return parts
+
+
+def _stretch(part: Part, robot: System) -> float:
+    """How much longer the rod is than its model: by the straightest row, which is at rest if there is one."""
+    places = part.fractions * float(robot.length)
+    reach = np.linalg.norm(part.rows.position[:, part.rows.fractions > 0.0], axis=2)
+    return float(np.nanmax(reach @ places / (places @ places)))
+
+
+def held_controls(part: Part) -> Float[np.ndarray, "T c"]:
+    """For each row the tension that was held up to it; of the first, its own."""
+    tension = part.rows.tension
+    return np.concatenate([tension[:1], tension[:-1]])
+
+
+def _estimated(part: Part, robot: System, method: str) -> Trajectory:
+    control = held_controls(part)
+    if method == "paper":
+        y, z = paper.states(part, robot, control, Settings())
+    else:
+        y, z = _best(part, robot, control)
+    rows = len(part.rows.time)
+    if not (np.isfinite(y).all() and np.isfinite(z).all()):
+        raise RecordingError(f"{part.rows.source}: the robot's equations gave states that are not finite")
+    return Trajectory(
+        system=robot,
+        settings=None,
+        time=part.rows.time,
+        y=y,
+        z=z,
+        control=control,
+        result=np.zeros(rows, dtype=int),
+        residual=np.zeros(rows),
+        iterations=np.zeros(rows, dtype=int),
+    )
+
+
+def rod_of(part: Part, robot: System) -> kinematics.Rod:
+    """The grid for a robot and the bodies of a recording."""
+    y0 = np.asarray(robot.rest(jnp.zeros(()))[0], dtype=float)
+    h = y0[robot.y_layout.slice("h")]
+    return kinematics.Rod.of(
+        float(robot.length),
+        robot.nodes,
+        part.fractions,
+        h / np.linalg.norm(h),
+        y0[robot.y_layout.slice("p")],
+    )
+
+
+def _best(part: Part, robot: System, control: Float[np.ndarray, "T c"]) -> tuple[np.ndarray, np.ndarray]:
+    rod, time = rod_of(part, robot), part.rows.time
+    fit = curvature.fitted(rod, part.poses, _stretch(part, robot), NOISE)
+    it = kinematics.motion(rod, fit.at(time), fit.stretch)
+    return completed(robot, rod, it, time, control)
+
+
+def completed(
+    robot: System,
+    rod: kinematics.Rod,
+    it: kinematics.Motion,
+    time: Float[np.ndarray, " T"],
+    control: Float[np.ndarray, "T c"],
+) -> tuple[Float[np.ndarray, "T N y"], Float[np.ndarray, "T N z"]]:
+    """y and z at the nodes: the motion, with n and m by the robot's balance and v by its law."""
+    spin = np.concatenate([np.zeros_like(it.w[..., :1]), it.w], axis=-1)
+    h_t = 0.5 * kinematics.hamilton(it.shape.h, spin)
+    p_t = (it.shape.R @ it.q[..., None])[..., 0]
+    _, z_rest = robot.rest(jnp.zeros(()))
+    z = np.broadcast_to(np.asarray(z_rest), (*it.q.shape[:2], robot.z_layout.size)).copy()
+    z[..., robot.z_layout.slice("u")] = it.shape.u
+    rows = Rows(
+        t=time,
+        control=control,
+        y=packed(robot, "y", p=it.shape.p, h=it.shape.h, q=it.q, w=it.w),
+        y_t=packed(robot, "y", p=p_t, h=h_t, q=it.q_t, w=it.w_t),
+        z=z,
+        z_t=packed(robot, "z", u=it.u_t),
+    )
+    y = balance.loads_of(robot, rod.s, rows)[:, rod.nodes]
+    at_nodes = rows._replace(y=y, y_t=rows.y_t[:, rod.nodes], z=z[:, rod.nodes], z_t=rows.z_t[:, rod.nodes])
+    dt = float(np.mean(np.diff(time)))
+    by_law = balance.strains_of(robot, at_nodes, Settings(), round(dt, 9)).copy()
+    by_law[..., robot.z_layout.slice("u")] = it.shape.u[:, rod.nodes]
+    return y, by_law

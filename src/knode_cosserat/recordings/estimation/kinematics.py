@@ -1,0 +1,270 @@
+"""Shape and motion of a rod from its curvature: fields along s, integrated from the clamped base.
+
+With u(s, t) in the material frame and a constant stretch λ of the centreline,
+
+    R_s = R û,    p_s = λ R e₃,
+
+and in the global frame, with θ a small turn, everything that moves is an integral from the base:
+
+    δθ(s) = ∫ R δu dσ                        δp(s) = ∫ δθ × p_s dσ
+    ω = ∫ R u_t dσ                           p_t  = ∫ ω × p_s dσ
+    ω_t = ∫ R u_tt + ω × R u_t dσ            p_tt = ∫ ω_t × p_s + ω × (ω × p_s) dσ
+
+The curvature about every axis is a sum of cosines, cos(kπ s/L). All arrays have frames in front.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+#: cosines for the curvature about x, about y, and for the twist
+MODES = (9, 9, 3)
+#: the longest segment of the grid, as a fraction of the length
+FINEST = 1.0 / 27.0
+_GAUSS = 0.5 / np.sqrt(3.0)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Rod:
+    """A grid along a rod, on which its nodes and the bodies on it are points, and the curvature's basis.
+
+    Points alternate between ends and middles of segments, from base to tip.
+
+    Attributes:
+        length: m.
+        s: arclength of the points (m).
+        nodes: which points are the model's nodes.
+        bodies: which points the bodies sit at.
+        basis: of the curvature at the points, modes of all axes one after the other; zero for other axes.
+        gauss: the same at the two Gauss points of every half of a segment.
+        base: orientation at the base, scalar first.
+        origin: position of the base (m).
+    """
+
+    length: float
+    s: Float[np.ndarray, " P"]
+    nodes: Int[np.ndarray, " N"]
+    bodies: Int[np.ndarray, " M"]
+    basis: Float[np.ndarray, "P 3 K"]
+    gauss: Float[np.ndarray, "H 2 3 K"]
+    base: Float[np.ndarray, " 4"]
+    origin: Float[np.ndarray, " 3"]
+
+    @property
+    def modes(self) -> int:
+        """How many numbers describe the curvature at one time."""
+        return self.basis.shape[-1]
+
+    @classmethod
+    def of(
+        cls,
+        length: float,
+        nodes: int,
+        fractions: Float[np.ndarray, " M"],
+        base: Float[np.ndarray, " 4"],
+        origin: Float[np.ndarray, " 3"],
+    ) -> Rod:
+        """The grid of a rod of this length (m) with so many nodes and bodies at these fractions."""
+        fixed = np.unique(np.round(np.concatenate([np.linspace(0.0, 1.0, nodes), fractions]), 9))
+        ends = [np.zeros(1)]
+        for first, last in itertools.pairwise(fixed):
+            pieces = max(1, int(np.ceil((last - first) / FINEST - 1e-6)))
+            ends.append(np.linspace(first, last, pieces + 1)[1:])
+        joined = np.concatenate(ends)
+        points = np.empty(2 * len(joined) - 1)
+        points[::2], points[1::2] = joined, (joined[1:] + joined[:-1]) / 2
+        middle, half = (points[1:] + points[:-1]) / 2, np.diff(points)
+        gauss = np.stack([middle - _GAUSS * half, middle + _GAUSS * half], axis=1)
+
+        def nearest(places: np.ndarray) -> np.ndarray:
+            return 2 * np.argmin(np.abs(joined - np.asarray(places)[:, None]), axis=1)
+
+        return cls(
+            length=length,
+            s=points * length,
+            nodes=nearest(np.linspace(0.0, 1.0, nodes)),
+            bodies=nearest(fractions),
+            basis=_basis(points),
+            gauss=_basis(gauss),
+            base=base,
+            origin=origin,
+        )
+
+
+def mode_groups() -> Int[np.ndarray, " K"]:
+    """Which modes share their smoothness: x and y of one k, so that a turn about z changes nothing."""
+    return np.concatenate([np.arange(MODES[0]), np.arange(MODES[1]), MODES[0] + np.arange(MODES[2])])
+
+
+def _basis(places: Float[np.ndarray, "..."]) -> Float[np.ndarray, "... 3 K"]:
+    values = np.cos(np.pi * np.arange(max(MODES)) * places[..., None])
+    basis = np.zeros((*places.shape, 3, sum(MODES)))
+    start = 0
+    for axis, count in enumerate(MODES):
+        basis[..., axis, start : start + count] = values[..., :count]
+        start += count
+    return basis
+
+
+class Shape(NamedTuple):
+    """A rod at F times: at the points, curvature (1/m), orientation (also as a matrix), position (m)."""
+
+    u: Float[np.ndarray, "F P 3"]
+    h: Float[np.ndarray, "F P 4"]
+    R: Float[np.ndarray, "F P 3 3"]
+    p: Float[np.ndarray, "F P 3"]
+
+
+def shape(rod: Rod, a: Float[np.ndarray, "F K"], stretch: float) -> Shape:
+    """The shape of a rod whose curvature has the coefficients a (1/m); order 4 in the segments."""
+    half = np.diff(rod.s)
+    u1, u2 = (np.einsum("hck,fk->fhc", rod.gauss[:, i], a, optimize=True) for i in (0, 1))
+    # Magnus' expansion to order 4: the turn of a half segment as a rotation vector
+    turn = half[:, None] / 2 * (u1 + u2) + np.sqrt(3.0) / 12 * half[:, None] ** 2 * np.cross(u1, u2)
+    angle = np.linalg.norm(turn, axis=-1, keepdims=True)
+    # sin(x/2)/x, also where x is zero
+    steps = np.concatenate([np.cos(angle / 2), np.sinc(angle / (2 * np.pi)) / 2 * turn], axis=-1)
+    h = np.empty((len(a), len(rod.s), 4))
+    h[:, 0] = rod.base
+    for j in range(len(half)):
+        h[:, j + 1] = hamilton(h[:, j], steps[:, j])
+    R = matrices(h)
+    p = rod.origin + cumulative(rod, stretch * R[..., 2])
+    return Shape(np.einsum("pck,fk->fpc", rod.basis, a, optimize=True), h, R, p)
+
+
+class Sensitivity(NamedTuple):
+    """How poses of the bodies change: turns in the global frame (rad) and shifts (m), per coefficient."""
+
+    turn: Float[np.ndarray, "F M 3 K"]
+    shift: Float[np.ndarray, "F M 3 K"]
+
+
+def sensitivity(rod: Rod, it: Shape) -> Sensitivity:
+    """The derivatives of the bodies' poses by the coefficients; one integral each, no recursion."""
+    weights = _weights(rod)  # (M, P)
+    F, P = it.p.shape[:2]
+    moment = np.cross(it.R, it.p[..., None], axisa=-2, axisb=-2, axisc=-2)  # columns of R, times p
+    M, K = len(rod.bodies), rod.modes
+    turn, shift = np.zeros((F, M, 3, K)), np.zeros((F, M, 3, K))
+    for axis in range(3):
+        mine = np.flatnonzero(np.any(rod.basis[:, axis] != 0.0, axis=0))
+        factors = np.einsum("mp,pk->pmk", weights, rod.basis[:, axis, mine]).reshape(P, -1)
+
+        def integrals(
+            columns: np.ndarray, factors: np.ndarray = factors, count: int = len(mine)
+        ) -> np.ndarray:
+            flat = np.ascontiguousarray(np.moveaxis(columns, 1, -1)).reshape(F * 3, P)
+            return np.moveaxis((flat @ factors).reshape(F, 3, M, count), 1, 2)
+
+        turn[..., mine] = integrals(it.R[..., axis])
+        shift[..., mine] = -integrals(moment[..., axis])
+    shift += np.cross(turn, it.p[:, rod.bodies, :, None], axisa=-2, axisb=-2, axisc=-2)
+    return Sensitivity(turn, shift)
+
+
+class Motion(NamedTuple):
+    """A rod in motion at F times, at the points; q, w and their rates in the material frame, SI units."""
+
+    shape: Shape
+    q: Float[np.ndarray, "F P 3"]
+    w: Float[np.ndarray, "F P 3"]
+    q_t: Float[np.ndarray, "F P 3"]
+    w_t: Float[np.ndarray, "F P 3"]
+    u_t: Float[np.ndarray, "F P 3"]
+
+
+def motion(rod: Rod, a: Float[np.ndarray, "3 F K"], stretch: float) -> Motion:
+    """Shape, velocities and accelerations from the coefficients and their first two rates."""
+    it = shape(rod, a[0], stretch)
+    u_t, u_tt = (np.einsum("pck,fk->fpc", rod.basis, each, optimize=True) for each in a[1:])
+    p_s = stretch * it.R[..., 2]
+    turned = _turned(it.R, u_t)
+    w = cumulative(rod, turned)
+    p_t = cumulative(rod, np.cross(w, p_s))
+    w_t = cumulative(rod, _turned(it.R, u_tt) + np.cross(w, turned))
+    p_tt = cumulative(rod, np.cross(w_t, p_s) + np.cross(w, np.cross(w, p_s)))
+    back = np.swapaxes(it.R, -1, -2)
+    q_local, w_local = _turned(back, p_t), _turned(back, w)
+    # seen from a frame that turns: of ω the two terms cancel
+    q_t = _turned(back, p_tt) - np.cross(w_local, q_local)
+    return Motion(it, q_local, w_local, q_t, _turned(back, w_t), u_t)
+
+
+# integrals
+
+
+def cumulative(rod: Rod, values: Float[np.ndarray, "F P 3"]) -> Float[np.ndarray, "F P 3"]:
+    """Integrals from the base to every point, of parabolas through each segment's three points (Simpson)."""
+    ds = (rod.s[2::2] - rod.s[:-2:2])[:, None]
+    first, middle, last = values[:, :-2:2], values[:, 1::2], values[:, 2::2]
+    total = np.zeros_like(values)
+    total[:, 2::2] = np.cumsum(ds / 6 * (first + 4 * middle + last), axis=1)
+    total[:, 1::2] = total[:, :-2:2] + ds / 24 * (5 * first + 8 * middle - last)
+    return total
+
+
+def _weights(rod: Rod) -> Float[np.ndarray, "M P"]:
+    """Simpson's weights of the integrals from the base to the bodies."""
+    ds = rod.s[2::2] - rod.s[:-2:2]
+    weights = np.zeros((len(rod.bodies), len(rod.s)))
+    for row, end in zip(weights, rod.bodies, strict=True):
+        count = end // 2
+        row[0 : 2 * count : 2] += ds[:count] / 6
+        row[1 : 2 * count : 2] += ds[:count] * 4 / 6
+        row[2 : 2 * count + 1 : 2] += ds[:count] / 6
+    return weights
+
+
+# rotations
+
+
+def hamilton(
+    left: Float[np.ndarray, "... 4"], right: Float[np.ndarray, "... 4"]
+) -> Float[np.ndarray, "... 4"]:
+    """Product of quaternions, scalar first."""
+    a, b, c, d = np.moveaxis(left, -1, 0)
+    w, x, y, z = np.moveaxis(right, -1, 0)
+    return np.stack(
+        [
+            a * w - b * x - c * y - d * z,
+            a * x + b * w + c * z - d * y,
+            a * y - b * z + c * w + d * x,
+            a * z + b * y - c * x + d * w,
+        ],
+        axis=-1,
+    )
+
+
+def matrices(h: Float[np.ndarray, "... 4"]) -> Float[np.ndarray, "... 3 3"]:
+    """Rotation matrices of unit quaternions, scalar first."""
+    w, x, y, z = np.moveaxis(h, -1, 0)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+    )
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def turn_between(
+    to: Float[np.ndarray, "... 4"], start: Float[np.ndarray, "... 4"]
+) -> Float[np.ndarray, "... 3"]:
+    """Rotation vectors (rad), global frame, that turn orientations `start` into `to`."""
+    inverse = start * np.array([1.0, -1.0, -1.0, -1.0])
+    turn = hamilton(to, inverse)
+    turn = np.where(turn[..., :1] < 0.0, -turn, turn)
+    size = np.linalg.norm(turn[..., 1:], axis=-1, keepdims=True)
+    angle = 2.0 * np.arctan2(size, turn[..., :1])
+    return turn[..., 1:] * np.where(size > 1e-12, angle / np.maximum(size, 1e-12), 2.0)
+
+
+def _turned(
+    R: Float[np.ndarray, "F P 3 3"], vectors: Float[np.ndarray, "F P 3"]
+) -> Float[np.ndarray, "F P 3"]:
+    return (R @ vectors[..., None])[..., 0]

@@ -1,0 +1,124 @@
+"""What of a recording the estimation uses: unbroken parts, their poses at full rate, and rows to estimate."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.recordings.estimation.curvature import Poses
+from knode_cosserat.recordings.findings import RecordingError
+from knode_cosserat.recordings.measurements import Measurements
+from knode_cosserat.recordings.recording import Body, Recording
+from knode_cosserat.rods.system import System
+
+#: poses this much before the first row and after the last are looked at too (s)
+AROUND = 0.5
+#: stamps nearer than this are of one frame (s)
+_SAME = 1e-4
+#: fewest bodies away from the clamped end, and fewest rows
+FEWEST_BODIES, FEWEST_ROWS = 2, 4
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Part:
+    """An unbroken part of a recording.
+
+    Attributes:
+        rows: measurements at the times to estimate.
+        poses: of the bodies that are not at the clamped end, at the full rate.
+        fractions: where those bodies sit.
+    """
+
+    rows: Measurements
+    poses: Poses
+    fractions: Float[np.ndarray, " M"]
+
+
+def parts_of(
+    recording: Recording | Measurements, robot: System, dt: float, start: float | None, end: float | None
+) -> list[Part]:
+    """The parts that can be estimated, each with enough rows.
+
+    Raises:
+        RecordingError: the recording does not fit the robot, or does not say enough.
+    """
+    if isinstance(recording, Recording):
+        rows = recording.sampled(dt, start, end)
+    elif isinstance(recording, Measurements):
+        rows = recording
+        if start is not None or end is not None:
+            rows = rows.between(-np.inf if start is None else start, np.inf if end is None else end + 1e-9)
+        if abs(rows.dt - dt) > 1e-6 * dt:
+            raise RecordingError(
+                f"{rows.source}: its rows are {rows.dt:g} s apart and dt is {dt:g} s; allowed is the same"
+            )
+    else:
+        raise RecordingError(
+            f"recording is a {type(recording).__name__}; allowed is a Recording or Measurements"
+        )
+    _check(rows, robot)
+    pieces = rows.parts(shortest=(FEWEST_ROWS - 1) * dt)
+    if not pieces:
+        raise RecordingError(
+            f"{rows.source}: no {FEWEST_ROWS} rows of {dt:g} s one after the other "
+            "with all positions and tensions"
+        )
+    used = rows.fractions > 0.0
+    made = []
+    for piece in pieces:
+        poses = (
+            _frames([body for body, use in zip(recording.bodies, used, strict=True) if use], piece.time)
+            if isinstance(recording, Recording)
+            else _of_rows(piece, used)
+        )
+        made.append(Part(piece, poses, rows.fractions[used]))
+    return made
+
+
+def _check(rows: Measurements, robot: System) -> None:
+    tendons = rows.tension.shape[1]
+    if tendons != robot.control_size:
+        raise RecordingError(
+            f"{rows.source}: the recording has {tendons} tendons and the robot {robot.control_size} "
+            "controls; allowed is the same number"
+        )
+    away = rows.fractions > 0.0
+    if away.sum() < FEWEST_BODIES:
+        raise RecordingError(
+            f"{rows.source}: {int(away.sum())} bodies on the rod away from its clamped end; "
+            f"required is {FEWEST_BODIES} or more"
+        )
+    if not np.isfinite(rows.quaternion[:, away]).all(axis=2).any():
+        raise RecordingError(
+            f"{rows.source}: no body has orientations; required for states is one or more (see the "
+            "recording's findings, the markers' `rotation` and `rest` in its configuration)"
+        )
+
+
+def _of_rows(rows: Measurements, used: np.ndarray) -> Poses:
+    position, quaternion = rows.position[:, used], rows.quaternion[:, used]
+    turned = np.isfinite(quaternion).all(axis=2)
+    filled = np.where(turned[..., None], quaternion, [1.0, 0.0, 0.0, 0.0])
+    # what is bridged was not seen
+    seen = rows.measured[:, used]
+    return Poses(rows.time, position, filled, seen, turned & seen)
+
+
+def _frames(bodies: list[Body], time: Float[np.ndarray, " T"]) -> Poses:
+    """Poses of all bodies, those of one frame together."""
+    first, last = time[0] - AROUND, time[-1] + AROUND
+    inside = [body.time[(body.time >= first) & (body.time <= last)] for body in bodies]
+    stamps = np.unique(np.concatenate(inside))
+    frames = stamps[np.concatenate([[True], np.diff(stamps) > _SAME])]
+    count = (len(frames), len(bodies))
+    position, quaternion = np.zeros((*count, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (*count, 1))
+    placed, turned = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
+    for k, body in enumerate(bodies):
+        mine = np.flatnonzero((body.time >= first) & (body.time <= last))
+        row = np.searchsorted(frames, body.time[mine] + _SAME / 2, side="right") - 1
+        position[row, k], placed[row, k] = body.position[mine], True
+        if body.quaternion is not None:
+            quaternion[row, k], turned[row, k] = body.quaternion[mine], True
+    return Poses(frames, position, quaternion, placed, turned)

@@ -1,0 +1,237 @@
+"""Recordings of a virtual robot, in the paper's format: the whole path from bags to models without a robot.
+
+Commands, in whole grams-force, reach the tendons through motors with a lag. The robot (`VirtualRobot`) is
+simulated with finer steps and more nodes than models have. Motion capture sees bodies with axes of their own,
+loses frames and is noisy; load cells are noisy and count in steps. Every bag says that it is simulated.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat import controls
+from knode_cosserat.recordings.config import TENSION_UNITS, RecordingConfig
+from knode_cosserat.recordings.findings import RecordingError
+from knode_cosserat.recordings.write import FORMATS, Poses, Pulls, write_recording
+from knode_cosserat.rods.virtual_robot import VirtualRobot
+from knode_cosserat.solvers.equilibrium import equilibrium
+from knode_cosserat.solvers.simulate import simulate
+from knode_cosserat.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
+
+#: newtons of a gram-force
+GRAM = TENSION_UNITS["gf"]
+#: the paper's signals: rest, and what is added to it (gf); how long it rests, also before a step (s)
+REST, SWING, HIGHEST, RESTING, BEFORE_STEP = 500.0, 300.0, 700.0, 1.0, 2.0
+#: how far apart commands are (s), and how long a random one is held
+COMMANDED, HELD = 0.05, 0.4
+#: the plant's time step (s) and nodes, and how far apart rows of its states are kept (s)
+PLANT_STEP, PLANT_NODES, KEPT = 0.005, 28, 0.01
+LONGEST = 300.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Sensors:
+    """What measuring does to what is measured.
+
+    Attributes:
+        position_noise: standard deviation of a coordinate (m).
+        turn_noise: of an orientation about an axis (rad).
+        lost: share of frames that motion capture loses.
+        swap: when the third rib's body swaps its axes by a quarter turn (s), or None.
+        tension_noise: standard deviation of a load cell (N).
+        tension_step: what it counts in (N).
+        tension_period: from one tension to the next (s).
+        lag: time constant of the motors (s).
+    """
+
+    position_noise: float = 0.15e-3
+    turn_noise: float = 2e-3
+    lost: float = 0.02
+    swap: float | None = None
+    tension_noise: float = 0.05
+    tension_step: float = GRAM
+    tension_period: float = 0.02
+    lag: float = 0.06
+
+
+def virtual_robot(nodes: int = PLANT_NODES) -> VirtualRobot:
+    """The robot of virtual recordings: as long as the paper's, softer, with ribs and tendons in them."""
+    return VirtualRobot(
+        length=0.635,
+        radius=0.003175,
+        density=1411.6751,
+        youngs_modulus=1.0e9,
+        bending_damping=0.01,
+        drag=3e-3,
+        tendon_offset=0.02,
+        nodes=nodes,
+    )
+
+
+def record_virtual(
+    path: str | Path,
+    signal: str = "sine:1.0",
+    seconds: float = 16.0,
+    seed: int = 0,
+    sensors: Sensors = Sensors(),
+) -> Trajectory:
+    """Record a virtual robot: write what its sensors saw, return what it truly did.
+
+    Args:
+        path: a bag (.bag, .mcap, .db3) or table (.csv, .parquet) that the paper's configuration reads.
+        signal: `sine:PERIOD` (s), `step:HEIGHT` (N, tendons 3 and 4 after 2 s) or `random:SEED`, each about
+            the paper's rest tension and as large as the paper's; or anything that `controls.parse` takes,
+            after 1 s of rest.
+        seconds: how long.
+        seed: of the noise, and of how the bodies' axes are turned.
+        sensors: noise and lag.
+
+    Returns:
+        The plant's `Trajectory`, a row every 10 ms, from its equilibrium at the rest tension on.
+
+    Raises:
+        RecordingError: the path or a number is not possible.
+        ControlsError: the signal is not understood.
+        SimulationError: the tensions are more than the robot can stand.
+    """
+    path = Path(path)
+    if path.suffix not in FORMATS:
+        raise RecordingError(f"{path}: allowed is a name that ends in {', '.join(FORMATS)}")
+    if not 1.5 <= seconds <= LONGEST:
+        raise RecordingError(f"seconds is {seconds:g}; allowed is 1.5 to {LONGEST:g} s")
+    if not 0 <= seed < 2**32:
+        raise RecordingError(f"seed is {seed}; allowed is a whole number from 0 to {2**32 - 1}")
+    sent = commands(signal, seconds)
+    truth = driven(sent, sensors.lag)
+    poses, tension = measured(truth, sent, seed, sensors)
+    config = RecordingConfig.paper_robot().replace(
+        simulated=True, description=f"a virtual robot, simulated: {signal}"
+    )
+    write_recording(path, config, poses, tension, sent)
+    return truth
+
+
+# commands and tensions
+
+
+def commands(signal: str, seconds: float) -> Pulls:
+    """The commands of a signal (see `record_virtual`): whole grams-force in N, every 50 ms."""
+    time = np.round(np.arange(0.0, seconds - 1e-9, COMMANDED), 9)
+    grams = np.full((len(time), 4), REST)
+    name, _, number = signal.partition(":")
+    begin = BEFORE_STEP if name == "step" else RESTING
+    moving = time > begin - 1e-9
+    count = int(moving.sum())
+    plain = _plain_number(number)
+    if count and name == "sine" and plain is not None and plain > 0.0:
+        phase = 2 * np.pi * (time[moving] - begin) / plain
+        turns = np.stack([np.cos(phase), np.sin(phase), -np.cos(phase), -np.sin(phase)], axis=1)
+        grams[moving] += SWING * turns
+    elif count and name == "step" and plain is not None:
+        newtons = controls.step(plain, count, COMMANDED, base=REST * GRAM, at=0.0, tendons=(2, 3))
+        grams[moving] = newtons / GRAM
+    elif count and name == "random" and number.isdecimal():
+        hold = round(HELD / COMMANDED)
+        grams[moving] = controls.random(count, low=REST, high=REST + HIGHEST, seed=int(number), hold=hold)
+    else:
+        newtons = controls.parse(signal, None if Path(signal).exists() else max(count, 1), COMMANDED)
+        used = newtons[:count]
+        grams[len(time) - count : len(time) - count + len(used)] = used / GRAM
+        grams[len(time) - count + len(used) :] = grams[len(time) - count + len(used) - 1]
+    return Pulls(time, np.round(grams) * GRAM)
+
+
+def _plain_number(text: str) -> float | None:
+    try:
+        number = float(text)
+    except ValueError:
+        return None
+    return number if np.isfinite(number) else None
+
+
+def lagged(sent: Pulls, time: Float[np.ndarray, " n"], lag: float) -> Float[np.ndarray, "n 4"]:
+    """Tensions (N) at even times (s): the commands, each held until the next, through a first-order lag.
+
+    Exact where commands come at some of these times.
+    """
+    if lag <= 0.0:
+        return sent.tension[np.searchsorted(sent.time, time + 1e-9, side="right") - 1]
+    stays = np.exp(-(time[1] - time[0]) / lag)
+    # between two times acts the command that came last before them
+    held = sent.tension[np.searchsorted(sent.time, time - 1e-9, side="right").clip(1) - 1]
+    followed = [held[0]]
+    for target in held[1:]:
+        followed.append(target + (followed[-1] - target) * stays)
+    return np.array(followed)
+
+
+def driven(sent: Pulls, lag: float) -> Trajectory:
+    """What the virtual robot does under commands, in rows 10 ms apart."""
+    robot = virtual_robot()
+    time = np.arange(round((sent.time[-1] + COMMANDED) / PLANT_STEP) + 1) * PLANT_STEP
+    tension = lagged(sent, time, lag)
+    still = equilibrium(robot, tension[0], space="rk4")
+    fine = simulate(robot, tension[1:], PLANT_STEP, space="rk4", initial=still)
+    rows = fine[:: round(KEPT / PLANT_STEP)]
+    return dataclasses.replace(rows, settings=None)
+
+
+# sensors
+
+
+def measured(truth: Trajectory, sent: Pulls, seed: int, sensors: Sensors) -> tuple[dict[str, Poses], Pulls]:
+    """What motion capture and load cells give of a robot's states; poses by the names in the paper's bags."""
+    random = np.random.default_rng(seed)
+    time = np.round(np.asarray(truth.time), 9)
+    config = RecordingConfig.paper_robot()
+    assert config.base is not None
+    clamped_end = random.uniform([-0.5, -0.5, 0.8], [0.5, 0.5, 1.2])
+    kept = random.uniform(size=len(time)) >= sensors.lost
+    poses = {}
+    for k, marker in enumerate(config.markers):
+        node = round(marker.fraction * (np.shape(truth.y)[-2] - 1))
+        place, turn = np.asarray(truth.position)[:, node], np.asarray(truth.quaternion)[:, node]
+        swap = sensors.swap if k == 2 else None
+        poses[marker.name] = _seen(time, place + clamped_end, turn, kept, swap, random, sensors)
+    above = clamped_end + np.array([0.0, 0.0, config.base.height])
+    upright = np.tile([1.0, 0.0, 0.0, 0.0], (len(time), 1))
+    poses["base"] = _seen(time, np.tile(above, (len(time), 1)), upright, kept, None, random, sensors)
+    stamps = np.round(np.arange(0.0, time[-1] - 1e-9, sensors.tension_period), 9)
+    fine = np.round(np.arange(0.0, time[-1] + 1e-9, PLANT_STEP), 9)
+    true = lagged(sent, fine, sensors.lag)[np.round(stamps / PLANT_STEP).astype(int)]
+    noisy = true + random.normal(0.0, sensors.tension_noise, true.shape)
+    step = sensors.tension_step
+    return poses, Pulls(stamps, np.round(noisy / step) * step if step > 0.0 else noisy)
+
+
+def _seen(
+    time: Float[np.ndarray, " n"],
+    place: Float[np.ndarray, "n 3"],
+    turn: Float[np.ndarray, "n 4"],
+    kept: np.ndarray,
+    swap: float | None,
+    random: np.random.Generator,
+    sensors: Sensors,
+) -> Poses:
+    """Poses of a body whose axes are turned somehow, in the frames that it was seen in."""
+    from scipy.spatial.transform import Rotation
+
+    axes: Rotation = Rotation.from_quat(random.normal(size=4))
+    # some frames are lost for one body only
+    kept = kept & (random.uniform(size=len(time)) >= sensors.lost / 4)
+    shaken = Rotation.from_rotvec(random.normal(0.0, sensors.turn_noise, (len(time), 3)))
+    seen = shaken * Rotation.from_quat(turn, scalar_first=True) * axes
+    if swap is not None:
+        quarter = Rotation.from_rotvec([0.0, 0.0, np.pi / 2])
+        late = time >= swap
+        seen = Rotation.concatenate([seen[~late], seen[late] * quarter]) if late.any() else seen
+    position = place + random.normal(0.0, sensors.position_noise, place.shape)
+    return Poses(time[kept], position[kept], seen.as_quat(scalar_first=True)[kept])
