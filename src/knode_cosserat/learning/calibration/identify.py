@@ -92,7 +92,7 @@ def _left(calibration: Calibration) -> float:
     return float(np.sum(np.log(list(calibration.remainder.values()))))
 
 
-def _vibrating(robot: RoutedTendonRobot, measurements: Sequence[Measurements]) -> RoutedTendonRobot | None:
+def _vibrating(robot: System, measurements: Sequence[Measurements]) -> System | None:
     """The robot with some vibration, if tensions vary enough to tell."""
     total = np.concatenate([each.tension.sum(axis=1) for each in measurements])
     least, greatest = float(total.min()), float(total.max())
