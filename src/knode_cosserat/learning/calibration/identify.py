@@ -11,6 +11,7 @@ from knode_cosserat.learning.calibration.calibrate import Calibration, calibrate
 from knode_cosserat.learning.calibration.search import CalibrationError
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.routed_robot import RoutedTendonRobot
+from knode_cosserat.rods.system import System
 from knode_cosserat.rods.tendon_rod import TendonRod
 
 #: what is found unless other names are given. Density and gravity stay: with tensions known in newtons, only
