@@ -164,6 +164,9 @@ class Training(Options):
     weight_decay: float = _option(0.0, _number(0.0, 10.0))
     #: stabilisation: new noise in every epoch, as a part of how much each number varies in the data
     noise: float = _option(0.0, _number(0.0, 10.0))
+    #: noise that is added once, before training, to all numbers of y and z in their own units, as the paper
+    #: does with recordings
+    data_noise: float = _option(0.0, _number(0.0, 10.0))
     #: nodes that are predicted
     nodes: tuple[int, ...] | None = _option(
         None,
@@ -234,11 +237,19 @@ class FitConfig:
 
     @classmethod
     def paper(cls, seed: int | tuple[int, ...] = 0, history: bool = False) -> Self:
-        """The paper's training to the letter; with `history` inputs as in its study of the real robot."""
+        """The paper's training to the letter; with `history` inputs if they are asked for."""
         return cls(
             NetworkOptions(hidden=512, history=history, convex=True, standardised=False),
             Training(epochs=1000, learning_rate=0.01, schedule="plateau", patience=80, nodes=(3, 5, 7, 9)),
             seed=seed,
+        )
+
+    @classmethod
+    def paper_recordings(cls, seed: int | tuple[int, ...] = 0) -> Self:
+        """The paper's training on recordings: history inputs, weight decay 0.1, noise of 0.01 in the data."""
+        same = cls.paper(seed, history=True)
+        return dataclasses.replace(
+            same, segments=dataclasses.replace(same.segments, weight_decay=0.1, data_noise=0.01)
         )
 
     @classmethod

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import datetime
 import sys
 import time
@@ -141,7 +142,8 @@ def _first(knowledge: System, trajectories: Sequence[Trajectory], config: FitCon
     options, dataset = config.residual, None
     if config.segments is not None or (isinstance(options, NetworkOptions) and options.standardised):
         nodes = None if config.segments is None else config.segments.nodes
-        dataset = samples(knowledge, trajectories, nodes)
+        noise = 0.0 if config.segments is None else config.segments.data_noise
+        dataset = samples(knowledge, [_noisy(each, noise, k) for k, each in enumerate(trajectories)], nodes)
     if isinstance(options, NetworkOptions):
         networks = [network(knowledge, options, jax.random.key(seed)) for seed in config.seeds]
         if options.standardised and dataset is not None:
@@ -149,6 +151,17 @@ def _first(knowledge: System, trajectories: Sequence[Trajectory], config: FitCon
         return _First(dataset, list(networks))
     every = samples(knowledge, trajectories)
     return _First(dataset, list(solve(knowledge, every, options, config.seeds)))
+
+
+def _noisy(trajectory: Trajectory, size: float, number: int) -> Trajectory:
+    """The same trajectory for all seeds, which then differ in their first weights only."""
+    if size == 0.0 or not isinstance(trajectory, Trajectory):
+        return trajectory
+    rng = np.random.default_rng(number)
+    y, z = (
+        np.asarray(part) + size * rng.normal(size=np.shape(part)) for part in (trajectory.y, trajectory.z)
+    )
+    return dataclasses.replace(trajectory, y=y, z=z)
 
 
 def _segment_runs(given: _Given, learned: dict[int, Residual]) -> list[Run]:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from knode_cosserat.learning.calibration.misfit import LEAST, Differences
 from knode_cosserat.learning.calibration.unknowns import Unknowns, found, with_coordinates, with_numbers
@@ -24,6 +24,7 @@ from knode_cosserat.learning.samples import DataError, samples
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.march import Past, initial_past, rest_record
+from knode_cosserat.solvers.places import Places, places_at, positions_at, quaternions_at
 from knode_cosserat.solvers.run import Task, run_one
 from knode_cosserat.solvers.sensitivity import tangent_march
 from knode_cosserat.solvers.settings import Settings
@@ -45,27 +46,18 @@ class _Rollout(NamedTuple):
     #: the rows that it begins from, or none: it begins from the robot's own state at rest
     initial: Trajectory | None
     control: Float[np.ndarray, "T c"]
-    #: where the places that are compared lie: after which node, and by which part of the way to the next
-    node: Int[np.ndarray, " M"]
-    part: Float[np.ndarray, " M"]
+    #: what is compared
+    places: Places
     #: position and, if that is compared, quaternion of length one; not a number where nothing was seen
     target: Float[np.ndarray, "T M k"]
 
 
-def _seen(robot: System, oriented: bool, y: Any, node: Any, part: Any) -> Any:
-    """Positions and, if the robot has any, quaternions of length one, of places on the rod.
-
-    Between nodes as a line, as Euler's method has it.
-    """
-    part = part[:, None]
-    low, high = (y[..., node + k, :] for k in (0, 1))
-    p = (1.0 - part) * robot.positions(low) + part * robot.positions(high)
-    if not oriented:
-        return p
-    one, other = robot.quaternions(low), robot.quaternions(high)
-    same = jnp.sum(one * other, axis=-1, keepdims=True) >= 0.0
-    h = (1.0 - part) * one + part * jnp.where(same, other, -other)
-    return jnp.concatenate([p, h / jnp.sqrt(jnp.sum(h * h, axis=-1, keepdims=True))], axis=-1)
+def _seen(robot: System, oriented: bool, y: Any, places: Places) -> Any:
+    """Positions and, if the robot has any, quaternions of length one."""
+    seen = [positions_at(robot, y, places)]
+    if oriented:
+        seen.append(quaternions_at(robot, y, places))
+    return jnp.concatenate(seen, axis=-1)
 
 
 class _Rows(NamedTuple):
@@ -77,8 +69,7 @@ class _Rows(NamedTuple):
     #: the last row and control of the rows that it began from, if there are any
     before: Any
     control: Float[Any, "T c"]
-    node: Int[Any, " M"]
-    part: Float[Any, " M"]
+    places: Places
     target: Float[Any, "T M k"]
 
 
@@ -96,7 +87,7 @@ def _differences(robot, coordinates, rows, table, dt, unknowns, settings, orient
         return system, rows.past
 
     def left(y: Any) -> Any:
-        seen = _seen(robot, oriented, y, rows.node, rows.part)
+        seen = _seen(robot, oriented, y, rows.places)
         target = jnp.where(jnp.isnan(rows.target), 0.0, rows.target)
         if oriented:
             same = jnp.sum(seen[..., 3:] * target[..., 3:], axis=-1, keepdims=True) >= 0.0
@@ -184,14 +175,14 @@ class RolloutMisfit:
         return Differences(np.concatenate(values), np.concatenate(slopes))
 
     def _of_one(self, system: System, coordinates: np.ndarray, rollout: _Rollout) -> Differences | None:
-        settings, dt, initial, control, node, part, target = rollout
+        settings, dt, initial, control, places, target = rollout
         record, begun, _, first = beginning(Run(system, control, initial, settings, dt, None, False))
         task = Task(settings, dt, len(control), first)
         steps, _ = run_one(task, system, control, begun)
         if steps.result.min() < 0:
             return None
         before = None if initial is None else (record, np.asarray(initial.control)[-1])
-        rows = _Rows(steps.records, steps.unknowns, begun.past, before, control, node, part, target)
+        rows = _Rows(steps.records, steps.unknowns, begun.past, before, control, places, target)
         values, slopes = _differences(
             self.robot, coordinates, rows, task.table, dt, self.unknowns, settings, self.oriented
         )
@@ -242,9 +233,9 @@ def _of_trajectory(robot: System, oriented: bool, trajectory: Trajectory) -> _Ro
     initial = None if _from_rest(trajectory) else trajectory[:begins]
     settings = trajectory.settings or Settings()
     # the base is left out: it is where the model puts it
-    node, part = np.arange(robot.nodes - 1), np.ones(robot.nodes - 1)
-    target = np.asarray(_seen(robot, oriented, y, node, part))
-    return _Rollout(settings, trajectory.dt, initial, control, node, part, target)
+    places = Places(np.arange(robot.nodes - 1), np.ones(robot.nodes - 1))
+    target = np.asarray(_seen(robot, oriented, y, places))
+    return _Rollout(settings, trajectory.dt, initial, control, places, target)
 
 
 def _of_measurements(robot: System, oriented: bool, given: Any) -> _Rollout:
@@ -266,13 +257,12 @@ def _of_measurements(robot: System, oriented: bool, given: Any) -> _Rollout:
         raise DataError(
             f"{given.source}: no tension is known at {given.time[row]:g} s; use the part before (`parts`)"
         )
-    place = np.clip(given.fractions, 0.0, 1.0) * (robot.nodes - 1)
-    node = np.clip(np.ceil(place - 1e-9).astype(int) - 1, 0, robot.nodes - 2)
+    places = places_at(given.fractions, robot.nodes)
     target = given.position[1:]
     if oriented:
         length = np.linalg.norm(given.quaternion[1:], axis=-1, keepdims=True)
         target = np.concatenate([target, given.quaternion[1:] / length], axis=-1)
-    return _Rollout(Settings(), given.dt, None, given.tension[:-1], node, place - node, target)
+    return _Rollout(Settings(), given.dt, None, given.tension[:-1], places, target)
 
 
 def _first_row(trajectory: Trajectory) -> int:
