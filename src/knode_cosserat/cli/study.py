@@ -152,6 +152,81 @@ def estimation(out: Out, as_json: Json = False) -> None:
     )  # fmt: skip
 
 
+@studies.command(
+    epilog=examples(
+        "study recordings bags/",
+        "study recordings bags/ --train sine_1p0,sine_3p0,rand_0 --out results",
+        "study recordings bags/ --robot my-robot.yaml --config my-recordings.yaml --train first,second",
+    )
+)
+def recordings(
+    bags: Annotated[Path, typer.Argument(metavar="BAGDIR", help="Folder with bags or tables.")],
+    train: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME,…",
+            help="Those to learn from, without endings; all others are predicted.",
+            show_default="sine_1p0, sine_3p0, rand_0",
+        ),
+    ] = None,
+    out: Out = Path("recordings-study"),
+    robot: Annotated[
+        str, typer.Option(metavar="ROBOT", help="What is known of the robot: a name or a file.")
+    ] = "delrin-tendon-robot",
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="YAML",
+            help="What the recordings' topics or columns mean.",
+            show_default="the paper's robot for bags, what it says itself for a table",
+        ),
+    ] = None,
+    start: Annotated[
+        float | None,
+        typer.Option(
+            metavar="S",
+            min=0.0,
+            help="Where predictions begin; the robot still rests there.",
+            show_default="1, and 0 where the name begins with step",
+        ),
+    ] = None,
+    seconds: Annotated[float, typer.Option(metavar="S", min=0.1, help="How long they go on.")] = 10.0,
+    seeds: Seeds = 5,
+    methods: Annotated[str | None, _some("baseline, paper-a, paper-b, best")] = None,
+    simulated: Annotated[
+        bool | None,
+        typer.Option(
+            "--simulated/--physical",
+            help="Whether the robot was a simulation.",
+            show_default="what the recordings say",
+        ),
+    ] = None,
+    workers: Workers = None,
+    dask: Dask = None,
+    progress: Progress = None,
+    as_json: Json = False,
+) -> None:
+    """Learn a robot from some of its recordings, and predict the others: the paper's Table II.
+
+    Reads the bags, estimates states, trains the paper's model without (A) and with (B) the recordings whose
+    names begin with rand, and identifies the best model from measured poses alone. Writes table2.md, .json,
+    figures and models; goes on where an earlier run on the folder stopped.
+    """
+    _prepare(out, workers, dask)
+    from knode_cosserat.studies.recordings import METHODS, Options
+    from knode_cosserat.studies.recordings_report import rerun
+
+    chosen = _chosen("methods", methods, METHODS)
+    names = None if train is None else [name.strip() for each in train for name in each.split(",")]
+    options = Options(robot, None if config is None else str(config), start, seconds, seeds)
+    _run(
+        lambda **how: rerun(
+            out, bags, train=names, methods=chosen, options=options, simulated=simulated, **how
+        ),
+        {"methods": chosen, "seeds": seeds}, out, workers, dask, progress, as_json,
+    )  # fmt: skip
+
+
 # what they share
 
 

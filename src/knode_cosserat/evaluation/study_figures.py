@@ -41,7 +41,7 @@ def controls(trajectories: Mapping[str, Trajectory]) -> Figure:
         ImportError: matplotlib is not installed; from every function here.
         ValueError: nothing is given to draw, or a batch of robots; from every function here.
     """
-    _require_some(trajectories)
+    require_some(trajectories)
     with style():
         figure = new_figure(7.0, 2.6 * len(trajectories))
         rows = figure.subplots(len(trajectories), 1, squeeze=False)[:, 0]
@@ -49,26 +49,26 @@ def controls(trajectories: Mapping[str, Trajectory]) -> Figure:
             draw_tensions(axes, trajectory)
             axes.get_legend().remove()
             axes.set_title(title)
-        _legend_below(figure, rows)
+        legend_below(figure, rows)
     return figure
 
 
 def shapes(reference: Trajectory, predictions: Mapping[str, Trajectory], count: int = 6) -> Figure:
     """The robot at `count` times beside the reference and the paths of the tips, for each prediction."""
-    _require_some(predictions)
+    require_some(predictions)
     with style():
         figure = new_figure(3.3 * len(predictions) + 0.4, 4.8)
         panels = figure.subplots(1, len(predictions), subplot_kw={"projection": "3d"}, squeeze=False)[0]
         for axes, (label, prediction) in zip(panels, predictions.items(), strict=True):
             _draw_shapes(axes, reference, {label: prediction}, count)
             _show_all(axes, [reference, *predictions.values()], zoom=0.93)
-        _legend_below(figure, panels)
+        legend_below(figure, panels)
     return figure
 
 
 def tips(cases: Mapping[str, tuple[Trajectory, Mapping[str, Trajectory]]]) -> Figure:
     """x, y and z of the tips over time: a column for each case, given as its reference and predictions."""
-    _require_some(cases)
+    require_some(cases)
     with style():
         figure = new_figure(4.6 * len(cases) + 0.6, 5.4)
         grid = figure.subplots(3, len(cases), sharex="col", squeeze=False)
@@ -76,13 +76,13 @@ def tips(cases: Mapping[str, tuple[Trajectory, Mapping[str, Trajectory]]]) -> Fi
             _draw_tips(column, reference, predictions)
             column[0].set_title(title)
         figure.align_ylabels()
-        _legend_below(figure, grid.ravel())
+        legend_below(figure, grid.ravel())
     return figure
 
 
 def comparison(reference: Trajectory, predictions: Mapping[str, Trajectory], count: int = 6) -> Figure:
     """Shapes and tips of several predictions in one picture, each drawn over the reference."""
-    _require_some(predictions)
+    require_some(predictions)
     with style():
         figure = new_figure(10.0, 5.2)
         left, right = figure.subfigures(1, 2, width_ratios=(1.0, 1.35))
@@ -92,7 +92,7 @@ def comparison(reference: Trajectory, predictions: Mapping[str, Trajectory], cou
         column = right.subplots(3, 1, sharex=True)
         _draw_tips(column, reference, predictions)
         right.align_ylabels()
-        _legend_below(figure, column)
+        legend_below(figure, column)
     return figure
 
 
@@ -129,7 +129,7 @@ def _draw_tips(column: Any, reference: Trajectory, predictions: Mapping[str, Tra
 
 def losses(runs: Mapping[str, Sequence[ArrayLike]]) -> Figure:
     """The loss over epochs: for each label the median of its runs (seeds), and a band from least to most."""
-    _require_some(runs)
+    require_some(runs)
     with style():
         figure = new_figure(7.0, 4.2)
         axes = figure.subplots()
@@ -142,11 +142,11 @@ def losses(runs: Mapping[str, Sequence[ArrayLike]]) -> Figure:
             axes.plot(epochs, np.median(values, axis=0), color=colour, label=label, linewidth=1.2)
         axes.set(xlabel="epoch", ylabel="loss", yscale="log")
         axes.margins(x=0.0)
-        _legend_below(figure, [axes])
+        legend_below(figure, [axes])
     return figure
 
 
-def _legend_below(figure: Any, axes: Any) -> None:
+def legend_below(figure: Any, axes: Any) -> None:
     """One legend for all axes, each label once."""
     handles: dict[str, Any] = {}
     for each in axes:
@@ -155,6 +155,7 @@ def _legend_below(figure: Any, axes: Any) -> None:
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=6, handlelength=2.4)
 
 
-def _require_some(given: Mapping[str, Any]) -> None:
+def require_some(given: Mapping[str, Any]) -> None:
+    """Raise `ValueError` if nothing is given to draw."""
     if not given:
         raise ValueError("there is nothing to draw; at least one is needed")

@@ -248,9 +248,9 @@ class FitConfig:
     def paper_recordings(cls, seed: int | tuple[int, ...] = 0) -> Self:
         """The paper's training on recordings: history inputs, weight decay 0.1, noise of 0.01 in the data."""
         same = cls.paper(seed, history=True)
-        return dataclasses.replace(
-            same, segments=dataclasses.replace(same.segments, weight_decay=0.1, data_noise=0.01)
-        )
+        assert same.segments is not None
+        training = dataclasses.replace(same.segments, weight_decay=0.1, data_noise=0.01)
+        return dataclasses.replace(same, segments=training)
 
     @classmethod
     def network(

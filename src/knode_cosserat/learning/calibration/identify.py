@@ -45,7 +45,7 @@ DAMPING = 0.02
 
 
 def identify(
-    knowledge: TendonRod, measurements: Sequence[Measurements], names: Sequence[str] | None = None
+    knowledge: System, measurements: Sequence[Measurements], names: Sequence[str] | None = None
 ) -> Calibration:
     """Find the model of a real robot from its recordings.
 

@@ -1,0 +1,168 @@
+"""The figures of the recordings' study: tensions, tips by each method, error over the horizon, repetitions.
+
+What is drawn comes by the recordings' names. Rows that are not known are not numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.evaluation.drawing import PALETTE, equal_scales, new_figure, style
+from knode_cosserat.evaluation.study_figures import METHODS, REFERENCE, legend_below, require_some
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: how each method is drawn
+LINES: dict[str, dict[str, Any]] = {
+    "baseline": METHODS["baseline"],
+    "paper-a": {"color": PALETTE[5], "linestyle": "-", "linewidth": 1.1},
+    "paper-b": METHODS["paper"],
+    "best": METHODS["best"],
+}
+MEASURED = {**REFERENCE, "label": "measured"}
+COLUMNS = 3
+
+
+class Predicted(NamedTuple):
+    """A recording: its tip as measured, and as each method predicts it from its first seed."""
+
+    time: Float[np.ndarray, " T"]
+    measured: Float[np.ndarray, "T 3"]
+    predicted: Mapping[str, Float[np.ndarray, "T 3"]]
+    tension: Float[np.ndarray, "T c"]
+    command: Float[np.ndarray, "T c"] | None
+
+
+def tensions(recordings: Mapping[str, Predicted]) -> Figure:
+    """Commanded tensions and measured ones, tendon by tendon.
+
+    Raises:
+        ImportError: matplotlib is not installed; from every function here.
+        ValueError: there is nothing to draw; from every function here.
+    """
+    with style():
+        figure, panels = _grid(recordings, 2.3)
+        for axes, (name, it) in zip(panels, recordings.items(), strict=False):
+            for k in range(it.tension.shape[1]):
+                colour = PALETTE[k % len(PALETTE)]
+                axes.plot(it.time, it.tension[:, k], color=colour, linewidth=1.1, label=f"tendon {k + 1}")
+                if it.command is not None:
+                    axes.step(
+                        it.time, it.command[:, k], where="post", color=colour, linewidth=0.8, alpha=0.6,
+                        linestyle="--",
+                    )  # fmt: skip
+            axes.set(title=f"{name}: measured (solid), commanded (dashed)", ylabel="tension [N]")
+        return _finished(figure, panels)
+
+
+def tip_x(recordings: Mapping[str, Predicted]) -> Figure:
+    """x of the tips over time."""
+    with style():
+        figure, panels = _grid(recordings, 2.3)
+        for axes, (name, it) in zip(panels, recordings.items(), strict=False):
+            axes.plot(it.time, it.measured[:, 0], **MEASURED)
+            for method, tip in it.predicted.items():
+                axes.plot(it.time, tip[:, 0], label=method, **LINES.get(method, {}))
+            span = float(np.nanmax(np.abs(it.measured[:, 0])))
+            axes.set(title=name, ylabel="tip x [m]", ylim=(-2.5 * span, 2.5 * span))
+        return _finished(figure, panels)
+
+
+def paths(recordings: Mapping[str, Predicted]) -> Figure:
+    """The paths of the tips in space."""
+    require_some(recordings)
+    with style():
+        columns = min(COLUMNS, len(recordings))
+        rows = -(-len(recordings) // columns)
+        figure = new_figure(3.6 * columns, 3.6 * rows + 0.4)
+        grid = figure.subplots(rows, columns, subplot_kw={"projection": "3d"}, squeeze=False).ravel()
+        for axes, (name, it) in zip(grid, recordings.items(), strict=False):
+            axes.plot(*it.measured.T, **MEASURED)
+            for method, tip in it.predicted.items():
+                axes.plot(*tip.T, label=method, **LINES.get(method, {}))
+            axes.set_title(name)
+            points = np.concatenate([it.measured, *it.predicted.values()])
+            equal_scales(axes, points[None, np.isfinite(points).all(axis=1)], 0.85)
+        for axes in grid[len(recordings) :]:
+            axes.set_visible(False)
+        legend_below(figure, grid[: len(recordings)])
+    return figure
+
+
+def horizon(recordings: Mapping[str, Predicted]) -> Figure:
+    """How far the tips are off as time goes on: the root mean square over the recordings, and the worst."""
+    require_some(recordings)
+    with style():
+        figure = new_figure(7.0, 4.2)
+        axes = figure.subplots()
+        methods = list(dict.fromkeys(method for it in recordings.values() for method in it.predicted))
+        for method in methods:
+            several = [it for it in recordings.values() if method in it.predicted]
+            length = min(len(it.time) for it in several)
+            off = np.array(
+                [
+                    np.linalg.norm(it.predicted[method][:length] - it.measured[:length], axis=1)
+                    for it in several
+                ]
+            )
+            time = several[0].time[:length] - several[0].time[0]
+            # of the last second: less ragged
+            means = np.array(
+                [np.sqrt(np.nanmean(off[:, max(0, i - 20) : i + 1] ** 2)) for i in range(length)]
+            )
+            look = LINES.get(method, {})
+            axes.plot(time, 100.0 * means, label=method, **look)
+            axes.fill_between(
+                time, 100.0 * np.nanmin(off, axis=0), 100.0 * np.nanmax(off, axis=0),
+                color=look.get("color"), alpha=0.12, linewidth=0,
+            )  # fmt: skip
+        axes.set(
+            xlabel="time since the prediction began [s]", ylabel="distance of the tips [cm]", yscale="log"
+        )
+        axes.set_title("Lines: root mean square of all recordings over the last second; bands: least to most")
+        axes.title.set_fontsize(9)
+        axes.margins(x=0.0)
+        legend_below(figure, [axes])
+    return figure
+
+
+def consistency(groups: Mapping[str, Sequence[Float[np.ndarray, "T 3"]]], dt: float) -> Figure:
+    """Recordings of one control on each other: how alike the robot does the same thing twice."""
+    with style():
+        figure, panels = _grid(groups, 2.3)
+        for axes, (name, several) in zip(panels, groups.items(), strict=False):
+            length = min(len(tip) for tip in several)
+            tips = np.stack([tip[:length] for tip in several])
+            time = dt * np.arange(length)
+            spread = np.linalg.norm(np.nanstd(tips, axis=0), axis=1)
+            for k, tip in enumerate(tips):
+                axes.plot(time, tip[:, 0], color=PALETTE[0], linewidth=0.8, label="" if k else "each")
+            axes.set(
+                title=f"{name}, {len(tips)} times: {100 * np.sqrt(np.nanmean(spread**2)):.2f} cm apart",
+                ylabel="tip x [m]",
+            )
+        return _finished(figure, panels)
+
+
+def _grid(given: Mapping[str, Any], height: float) -> tuple[Any, Any]:
+    require_some(given)
+    columns = 1 if len(given) < 3 else 2
+    rows = -(-len(given) // columns)
+    figure = new_figure(7.0 * columns, height * rows + 0.6)
+    return figure, figure.subplots(rows, columns, squeeze=False).ravel()
+
+
+def _finished(figure: Any, panels: Any) -> Figure:
+    used = [axes for axes in panels if axes.get_lines()]
+    for axes in panels:
+        axes.set_visible(axes in used)
+        axes.margins(x=0.0)
+    for axes in used[-2:]:
+        axes.set_xlabel("time [s]")
+    legend_below(figure, used)
+    return figure
