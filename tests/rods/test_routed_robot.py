@@ -61,8 +61,9 @@ def test_nothing_is_remembered_without_friction():
         assert least <= np.linalg.norm(tip - straight) <= most
 
 
+@pytest.mark.campaign
 def test_friction_is_the_same_however_fine_the_time_steps_are():
-    """Quasi-static: Dahl's law has no time in it, only the way that was gone."""
+    """Quasi-static: friction has no time in it, only the way that was gone."""
     robot = kc.RoutedTendonRobot.like(KNOWLEDGE, **{**RUBBING, "bending_damping": 0.03})
 
     def tip(steps, time):
@@ -97,6 +98,7 @@ def test_vibration_frees_the_tendons_and_stays_until_tension_falls():
     assert 0.0 <= x[-1] < 1e-9 and 0.2 < x[45] < 0.8
 
 
+@pytest.mark.campaign
 def test_derivatives_are_those_of_the_solution():
     robot = kc.RoutedTendonRobot.like(KNOWLEDGE, **RUBBING, sleeve_stiffening=1.0)
     control = kc.controls.parse("sine:0.7", 30, 0.05)
@@ -114,6 +116,7 @@ def test_derivatives_are_those_of_the_solution():
         np.testing.assert_allclose(slopes[k], expected, rtol=2e-3, atol=1e-6)
 
 
+@pytest.mark.campaign
 def test_the_batch_does_what_each_robot_does():
     robot = kc.RoutedTendonRobot.like(KNOWLEDGE, **RUBBING)
     controls = np.stack([kc.controls.parse(f"random:{k}", 40, 0.05) for k in range(3)])

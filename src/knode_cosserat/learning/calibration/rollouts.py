@@ -7,9 +7,11 @@ function theorem.
 
 from __future__ import annotations
 
+import concurrent.futures
 import contextlib
 import dataclasses
 import functools
+import os
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -36,6 +38,10 @@ GROWTH = 2
 
 #: how many rows are looked at first
 FIRST_ROWS = (2, 5, 10, 20, 50, 100)
+
+
+#: rollouts at a time: each keeps one core busy
+CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class _Rollout(NamedTuple):
@@ -156,22 +162,40 @@ class RolloutMisfit:
         groups = [
             np.tile(numbers + apart * k, one.target[..., 0].size) for k, one in enumerate(self.rollouts)
         ]
+        self._begun = False
+        self._kept: dict[bytes, Differences] = {}
         #: which of `fields` each difference belongs to, and which differences there are
         self._groups, self._sizes = groups, sizes
         self._known = [np.isfinite(one.target).ravel() for one in self.rollouts]
         self.groups = np.concatenate([each[known] for each, known in zip(groups, self._known, strict=True)])
 
     def __call__(self, coordinates: np.ndarray) -> Differences:
-        """Differences of all rollouts; infinite if one of them has no solution."""
+        """Differences of all rollouts; infinite if one of them has no solution. The last ones are kept."""
+        key = np.asarray(coordinates).tobytes()
+        if key not in self._kept:
+            self._kept = {key: self._computed(coordinates)}
+        return self._kept[key]
+
+    def _computed(self, coordinates: np.ndarray) -> Differences:
         system = with_numbers(self.robot, self.unknowns, found(self.unknowns, coordinates))
-        parts = []
-        for rollout, known in zip(self.rollouts, self._known, strict=True):
-            part = self._of_one(system, coordinates, rollout)
-            if part is None:
-                size = len(self.groups)
-                return Differences(np.full(size, np.inf), np.zeros((size, len(coordinates))))
-            parts.append((part.values[known], part.slopes[known]))
-        values, slopes = zip(*parts, strict=True)
+
+        def work(rollout: _Rollout) -> Differences | None:
+            return self._of_one(system, coordinates, rollout)
+
+        if self._begun:
+            with concurrent.futures.ThreadPoolExecutor(CORES) as pool:
+                parts = list(pool.map(work, self.rollouts))
+        else:  # programs are compiled one by one
+            self._begun, parts = True, list(map(work, self.rollouts))
+        solved = [
+            Differences(part.values[known], part.slopes[known])
+            for part, known in zip(parts, self._known, strict=True)
+            if part is not None
+        ]
+        if len(solved) < len(parts):
+            size = len(self.groups)
+            return Differences(np.full(size, np.inf), np.zeros((size, len(coordinates))))
+        values, slopes = zip(*solved, strict=True)
         return Differences(np.concatenate(values), np.concatenate(slopes))
 
     def _of_one(self, system: System, coordinates: np.ndarray, rollout: _Rollout) -> Differences | None:
