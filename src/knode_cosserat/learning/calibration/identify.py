@@ -9,6 +9,7 @@ import numpy as np
 
 from knode_cosserat.learning.calibration.calibrate import Calibration, calibrate
 from knode_cosserat.learning.calibration.search import CalibrationError
+from knode_cosserat.learning.samples import DataError
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.routed_robot import RoutedTendonRobot
 from knode_cosserat.rods.system import System
@@ -27,7 +28,7 @@ NAMES = (
 )
 #: what is found after that, if it explains more
 VIBRATION = ("vibration_tension", "vibration_rate", "vibration_softening")
-#: where the searches begin: some of everything, for what is zero shows no way
+#: where the searches begin: some of everything that is searched, for what is zero shows no way
 BEGIN: dict[str, Any] = {
     "sleeve_stiffening": 0.5,
     "friction_wobble": 0.3,
@@ -73,7 +74,8 @@ def identify(
             f"knowledge is a {type(knowledge).__name__}; allowed is a tendon-driven robot (TendonRobot, "
             "RoutedTendonRobot)"
         )
-    start = knowledge if isinstance(knowledge, RoutedTendonRobot) else _beginning(knowledge)
+    _check(measurements)
+    start = _beginning(knowledge, NAMES if names is None else names)
     if names is not None:
         return calibrate(start, measurements, names, by="rollouts")
     still = calibrate(start, measurements, NAMES, by="rollouts", undetermined="keep")
@@ -86,6 +88,16 @@ def identify(
     except CalibrationError:
         return still
     return other if _left(other) < _left(still) else still
+
+
+def _check(measurements: object) -> None:
+    if not isinstance(measurements, Sequence):
+        raise DataError(f"measurements is a {type(measurements).__name__}; allowed is a list of them")
+    if not measurements:
+        raise DataError("there are no measurements")
+    for each in measurements:
+        if not isinstance(each, Measurements):
+            raise DataError(f"a {type(each).__name__} is no measurements; `Recording.sampled` gives them")
 
 
 def _left(calibration: Calibration) -> float:
@@ -102,7 +114,11 @@ def _vibrating(robot: System, measurements: Sequence[Measurements]) -> System | 
     return robot.replace(**BEGIN_VIBRATION, vibration_tension=0.5 * (least + greatest))
 
 
-def _beginning(knowledge: TendonRod) -> RoutedTendonRobot:
+def _beginning(knowledge: TendonRod, names: Sequence[str]) -> RoutedTendonRobot:
+    """The routed robot that the search begins from; what is not searched is as the knowledge has it."""
+    some = {name: value for name, value in BEGIN.items() if name in names}
+    if isinstance(knowledge, RoutedTendonRobot):
+        return knowledge.replace(**{name: some[name] for name in some if not getattr(knowledge, name)})
     mass = float(knowledge.mass_per_length)
     L, EI = float(knowledge.length), float(knowledge.Kbt[0, 0])
     # of the first mode: B / EI is twice the damping ratio over the angular frequency
@@ -110,7 +126,7 @@ def _beginning(knowledge: TendonRod) -> RoutedTendonRobot:
     most = 2.0 * DAMPING * EI / frequency
     return RoutedTendonRobot.like(
         knowledge,
-        **BEGIN,
+        **some,
         bending_damping=min(float(knowledge.bending_damping[0, 0]), most) or most,
         tendon_offset=float(knowledge.tendon_offset) or 5.0 * float(knowledge.radius),
         sleeve_length=SLEEVE * L,
