@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
+from knode_cosserat.learning.calibration import identify as identification
 from knode_cosserat.learning.calibration.identify import NAMES, VIBRATION, _beginning
 
 DT = 0.05
@@ -204,6 +205,26 @@ def test_what_is_not_searched_is_as_the_knowledge_has_it():
     begun = _beginning(routed, [*names, "sleeve_stiffening"])
     assert float(begun.sleeve_stiffening) == 0.7 and begun.bending_damping[0, 0] == 0.01
     assert float(begun.friction_wobble) == 0.3 and float(begun.friction_curvature) == 0.0
+
+
+@pytest.mark.parametrize("fails", ["search", "value"])
+def test_an_offset_that_runs_off_is_left_as_it_was_measured(seen, found, monkeypatch, fails):
+    """Stiffness and offset of a light rod are known by their ratio only."""
+    asked = []
+
+    def calibrated(start, measurements, names, **_):
+        asked.append(tuple(names))
+        if "tendon_offset" not in names:
+            return dataclasses.replace(found, robot=start)
+        if fails == "search":
+            raise kc.CalibrationError("the search did not converge")
+        return dataclasses.replace(found, robot=start.replace(tendon_offset=0.07))
+
+    monkeypatch.setattr(identification, "calibrate", calibrated)
+    result = kc.identify(KNOWN, [seen])
+    assert asked == [NAMES, tuple(name for name in NAMES if name != "tendon_offset")]
+    assert result.undetermined == ("tendon_offset",) and float(result.robot.tendon_offset) == 0.02
+    assert "left as before, not determined by these data: tendon_offset" in str(result)
 
 
 @pytest.mark.campaign

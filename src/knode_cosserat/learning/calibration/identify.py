@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -43,6 +44,9 @@ SLEEVE = 0.11
 SPREAD = 0.2
 #: a rod that is damped more than this part of critical is begun with less: it would hide all motion
 DAMPING = 0.02
+#: a tendon offset that is found to be so many times what it was measured to be, or as many times less, is not
+#: what the recordings determine
+OFFSET, FARTHEST = "tendon_offset", 3.0
 
 
 def identify(
@@ -60,7 +64,8 @@ def identify(
         measurements: from rest on, at a time step that resolves the robot's motion, with mean tensions:
             `recording.sampled(0.025, mean=True)`.
         names: the parameters to find; None: `NAMES`, and `VIBRATION` if it explains more; of these what the
-            recordings determine.
+            recordings determine. Where stiffness and tendon offset run off together, for a light rod's weight
+            says little, the offset stays as it is known.
 
     Returns:
         The `Calibration`; its `robot` is the model.
@@ -78,16 +83,41 @@ def identify(
     start = _beginning(knowledge, NAMES if names is None else names)
     if names is not None:
         return calibrate(start, measurements, names, by="rollouts")
-    still = calibrate(start, measurements, NAMES, by="rollouts", undetermined="keep")
+    still, names = _still(start, measurements, trusted=bool(knowledge.tendon_offset))
     shaking = _vibrating(still.robot, measurements)
     if shaking is None:
         return still
     try:
-        every = (*NAMES, *VIBRATION)
+        every = (*names, *VIBRATION)
         other = calibrate(shaking, measurements, every, by="rollouts", undetermined="keep")
+        other = dataclasses.replace(other, undetermined=(*_left_out(names), *other.undetermined))
     except CalibrationError:
         return still
     return other if _left(other) < _left(still) else still
+
+
+def _still(
+    start: RoutedTendonRobot, measurements: Sequence[Measurements], trusted: bool
+) -> tuple[Calibration, tuple[str, ...]]:
+    """The robot without vibration, and the names that were searched.
+
+    The weight of a light rod says so little that stiffness and tendon offset can run off together; then the
+    offset is the one that is known (`trusted`: measured, and not a guess of ours).
+    """
+    try:
+        whole = calibrate(start, measurements, NAMES, by="rollouts", undetermined="keep")
+        ratio = float(whole.robot.tendon_offset) / float(start.tendon_offset)
+        if not trusted or 1.0 / FARTHEST <= ratio <= FARTHEST:
+            return whole, NAMES
+    except CalibrationError:
+        pass
+    fewer = tuple(name for name in NAMES if name != OFFSET)
+    part = calibrate(start, measurements, fewer, by="rollouts", undetermined="keep")
+    return dataclasses.replace(part, undetermined=(*_left_out(fewer), *part.undetermined)), fewer
+
+
+def _left_out(names: Sequence[str]) -> tuple[str, ...]:
+    return tuple(name for name in NAMES if name not in names)
 
 
 def _check(measurements: object) -> None:
