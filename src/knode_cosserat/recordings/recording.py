@@ -120,7 +120,8 @@ class Recording:
             end: the last row at most; None: where the `trim` or the first stream ends.
             tensions: which ones; None: what the configuration says.
             mean: tensions are means from each row to the next instead, of measured ones on the lines between
-                messages: what a simulation with a fine time step should be driven by.
+                messages: what a simulation with a fine time step should be driven by. Rows that reach into a
+                pause that is not bridged are NaN.
 
         Raises:
             RecordingError: there are no such tensions or no such rows.
@@ -134,8 +135,11 @@ class Recording:
         longest = bridged if driver is self.tension else math.inf
         held = _held(driver, time - latency, longest)
         if mean:
-            averaged = _averaged(driver, time - latency, dt, straight=driver is self.tension)
-            held = np.where(np.isfinite(held), averaged, np.nan)
+            straight = bridge(driver.time, bridged) if driver is self.tension else 0.0
+            # the last row's goes on for as long as the last message holds
+            until = _held(driver, np.minimum(time - latency + dt, max(driver.time[-1], time[-1])), longest)
+            known = np.isfinite(held) & np.isfinite(until)
+            held = np.where(known, _averaged(driver, time - latency, dt, straight), np.nan)
         poses = [_interpolated(body, time, bridged) for body in self.bodies]
         return Measurements(
             time=time,
@@ -202,21 +206,20 @@ def _held(driver: Tensions, time: Float[np.ndarray, " T"], longest: float) -> Fl
 
 
 def _averaged(
-    driver: Tensions, time: Float[np.ndarray, " T"], dt: float, *, straight: bool
+    driver: Tensions, time: Float[np.ndarray, " T"], dt: float, straight: float
 ) -> Float[np.ndarray, "T tendons"]:
-    """Means from each time to `dt` later: on straight lines between messages, or each held until the next."""
+    """Means from each time to `dt` later: on lines between messages up to `straight` (s) apart, else held."""
     known, values = driver.time, driver.tension
     steps = np.diff(known)[:, None]
-    each = 0.5 * (values[1:] + values[:-1]) if straight else values[:-1]
+    rises = np.where(steps <= straight, np.diff(values, axis=0) / np.maximum(steps, _SAME), 0.0)
+    each = values[:-1] + 0.5 * steps * rises
     integral = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(steps * each, axis=0)])
 
     def until(at: np.ndarray) -> np.ndarray:
         inside = np.clip(at, known[0], known[-1])
         last = np.clip(np.searchsorted(known, inside, side="right") - 1, 0, max(len(known) - 2, 0))
         since = (inside - known[last])[:, None]
-        rise = np.zeros_like(values[last])
-        if straight and len(known) > 1:
-            rise = (values[last + 1] - values[last]) / steps[last]
+        rise = rises[last] if len(known) > 1 else 0.0
         whole = integral[last] + since * (values[last] + 0.5 * since * rise)
         # before the first and after the last, those
         return np.asarray(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from knode_cosserat.learning.calibration.calibrate import Calibration, calibrate
 from knode_cosserat.learning.calibration.search import CalibrationError
+from knode_cosserat.learning.samples import DataError
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.routed_robot import RoutedTendonRobot
 from knode_cosserat.rods.system import System
@@ -27,7 +29,7 @@ NAMES = (
 )
 #: what is found after that, if it explains more
 VIBRATION = ("vibration_tension", "vibration_rate", "vibration_softening")
-#: where the searches begin: some of everything, for what is zero shows no way
+#: where the searches begin: some of everything that is searched, for what is zero shows no way
 BEGIN: dict[str, Any] = {
     "sleeve_stiffening": 0.5,
     "friction_wobble": 0.3,
@@ -42,6 +44,9 @@ SLEEVE = 0.11
 SPREAD = 0.2
 #: a rod that is damped more than this part of critical is begun with less: it would hide all motion
 DAMPING = 0.02
+#: a tendon offset that is found to be so many times what it was measured to be, or as many times less, is not
+#: what the recordings determine
+OFFSET, FARTHEST = "tendon_offset", 3.0
 
 
 def identify(
@@ -59,7 +64,8 @@ def identify(
         measurements: from rest on, at a time step that resolves the robot's motion, with mean tensions:
             `recording.sampled(0.025, mean=True)`.
         names: the parameters to find; None: `NAMES`, and `VIBRATION` if it explains more; of these what the
-            recordings determine.
+            recordings determine. Where stiffness and tendon offset run off together, for a light rod's weight
+            says little, the offset stays as it is known.
 
     Returns:
         The `Calibration`; its `robot` is the model.
@@ -73,19 +79,56 @@ def identify(
             f"knowledge is a {type(knowledge).__name__}; allowed is a tendon-driven robot (TendonRobot, "
             "RoutedTendonRobot)"
         )
-    start = knowledge if isinstance(knowledge, RoutedTendonRobot) else _beginning(knowledge)
+    _check(measurements)
+    start = _beginning(knowledge, NAMES if names is None else names)
     if names is not None:
         return calibrate(start, measurements, names, by="rollouts")
-    still = calibrate(start, measurements, NAMES, by="rollouts", undetermined="keep")
+    still, names = _still(start, measurements, trusted=bool(knowledge.tendon_offset))
     shaking = _vibrating(still.robot, measurements)
     if shaking is None:
         return still
     try:
-        every = (*NAMES, *VIBRATION)
+        every = (*names, *VIBRATION)
         other = calibrate(shaking, measurements, every, by="rollouts", undetermined="keep")
+        other = dataclasses.replace(other, undetermined=(*_left_out(names), *other.undetermined))
     except CalibrationError:
         return still
     return other if _left(other) < _left(still) else still
+
+
+def _still(
+    start: RoutedTendonRobot, measurements: Sequence[Measurements], trusted: bool
+) -> tuple[Calibration, tuple[str, ...]]:
+    """The robot without vibration, and the names that were searched.
+
+    The weight of a light rod says so little that stiffness and tendon offset can run off together; then the
+    offset is the one that is known (`trusted`: measured, and not a guess of ours).
+    """
+    try:
+        whole = calibrate(start, measurements, NAMES, by="rollouts", undetermined="keep")
+        assert isinstance(whole.robot, TendonRod)
+        ratio = float(whole.robot.tendon_offset) / float(start.tendon_offset)
+        if not trusted or 1.0 / FARTHEST <= ratio <= FARTHEST:
+            return whole, NAMES
+    except CalibrationError:
+        pass
+    fewer = tuple(name for name in NAMES if name != OFFSET)
+    part = calibrate(start, measurements, fewer, by="rollouts", undetermined="keep")
+    return dataclasses.replace(part, undetermined=(*_left_out(fewer), *part.undetermined)), fewer
+
+
+def _left_out(names: Sequence[str]) -> tuple[str, ...]:
+    return tuple(name for name in NAMES if name not in names)
+
+
+def _check(measurements: object) -> None:
+    if not isinstance(measurements, Sequence):
+        raise DataError(f"measurements is a {type(measurements).__name__}; allowed is a list of them")
+    if not measurements:
+        raise DataError("there are no measurements")
+    for each in measurements:
+        if not isinstance(each, Measurements):
+            raise DataError(f"a {type(each).__name__} is no measurements; `Recording.sampled` gives them")
 
 
 def _left(calibration: Calibration) -> float:
@@ -102,7 +145,11 @@ def _vibrating(robot: System, measurements: Sequence[Measurements]) -> System | 
     return robot.replace(**BEGIN_VIBRATION, vibration_tension=0.5 * (least + greatest))
 
 
-def _beginning(knowledge: TendonRod) -> RoutedTendonRobot:
+def _beginning(knowledge: TendonRod, names: Sequence[str]) -> RoutedTendonRobot:
+    """The routed robot that the search begins from; what is not searched is as the knowledge has it."""
+    some = {name: value for name, value in BEGIN.items() if name in names}
+    if isinstance(knowledge, RoutedTendonRobot):
+        return knowledge.replace(**{name: some[name] for name in some if not getattr(knowledge, name)})
     mass = float(knowledge.mass_per_length)
     L, EI = float(knowledge.length), float(knowledge.Kbt[0, 0])
     # of the first mode: B / EI is twice the damping ratio over the angular frequency
@@ -110,7 +157,7 @@ def _beginning(knowledge: TendonRod) -> RoutedTendonRobot:
     most = 2.0 * DAMPING * EI / frequency
     return RoutedTendonRobot.like(
         knowledge,
-        **BEGIN,
+        **some,
         bending_damping=min(float(knowledge.bending_damping[0, 0]), most) or most,
         tendon_offset=float(knowledge.tendon_offset) or 5.0 * float(knowledge.radius),
         sleeve_length=SLEEVE * L,

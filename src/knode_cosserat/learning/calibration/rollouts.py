@@ -152,22 +152,43 @@ class RolloutMisfit:
             else _of_measurements(robot, self.oriented, each)
             for each in given
         ]
-        what = ("position", "orientation")[: len(sizes)]
-        #: what is compared; each recording by itself, for a model may do better on one than on another
-        self.fields, apart = what, 0
-        if self.rough and len(self.rollouts) > 1:
-            names = [each.source.partition(":")[0] for each in given if isinstance(each, Measurements)]
-            self.fields, apart = tuple(f"{each} in {name}" for name in names for each in what), len(what)
-        numbers = np.repeat(np.arange(len(sizes)), sizes)
-        groups = [
-            np.tile(numbers + apart * k, one.target[..., 0].size) for k, one in enumerate(self.rollouts)
-        ]
+        if not self.rollouts:
+            raise DataError("there are no trajectories to compare with")
         self._begun = False
         self._kept: dict[bytes, Differences] = {}
-        #: which of `fields` each difference belongs to, and which differences there are
-        self._groups, self._sizes = groups, sizes
         self._known = [np.isfinite(one.target).ravel() for one in self.rollouts]
-        self.groups = np.concatenate([each[known] for each, known in zip(groups, self._known, strict=True)])
+        #: what is compared; each recording by itself, for a model may do better on one than on another
+        self.fields, self._natural, self._groups = self._fields_of(given, sizes)
+        #: which of `fields` each difference belongs to
+        self.groups = np.concatenate(
+            [each[known] for each, known in zip(self._groups, self._known, strict=True)]
+        )
+
+    def _fields_of(self, given: Sequence[Any], sizes: list[int]) -> tuple[tuple[str, ...], Any, Any]:
+        """The fields in which something was seen, their natural sizes, and the field of each difference.
+
+        The differences are by rollout, also of what was not seen; that which is never seen is in field -1.
+        """
+        apart = self.rough and len(self.rollouts) > 1
+        what = ("position", "orientation")[: len(sizes)]
+        names = [f" in {name}" for name in _names(given)] if apart else [""]
+        labels = [f"{each}{name}" for name in names for each in what]
+        natural = [float(np.asarray(self.robot.length)), 1.0][: len(what)] * len(names)
+        kinds = np.repeat(np.arange(len(sizes)), sizes)
+        groups = [
+            np.tile(kinds + apart * len(what) * k, one.target[..., 0].size)
+            for k, one in enumerate(self.rollouts)
+        ]
+        seen = np.unique(
+            np.concatenate([each[known] for each, known in zip(groups, self._known, strict=True)])
+        )
+        number = np.full(len(labels), -1)
+        number[seen] = np.arange(len(seen))
+        return (
+            tuple(labels[k] for k in seen),
+            np.array([natural[k] for k in seen]),
+            [number[each] for each in groups],
+        )
 
     def __call__(self, coordinates: np.ndarray) -> Differences:
         """Differences of all rollouts; infinite if one of them has no solution. The last ones are kept."""
@@ -222,7 +243,8 @@ class RolloutMisfit:
             whole = np.zeros(len(known))
             whole[known] = mine
             rows = len(one.target)
-            found.append((groups.reshape(rows, -1)[0], whole.reshape(rows, -1)))
+            fields = groups.reshape(rows, -1)[0]
+            found.append((fields[fields >= 0], whole.reshape(rows, -1)[:, fields >= 0]))
         return found
 
     def beginnings(self) -> list[Float[np.ndarray, " M"]]:
@@ -243,8 +265,7 @@ class RolloutMisfit:
 
     def first_sizes(self) -> Float[np.ndarray, " G"]:
         """Sizes of the differences, by field, before anything is known: of positions, the length."""
-        both = [float(np.asarray(self.robot.length)), 1.0][: len(self._sizes)]
-        return np.array(both * (len(self.fields) // len(both)))
+        return self._natural
 
     def least_sizes(self, coordinates: np.ndarray) -> Float[np.ndarray, " G"]:
         """The solver's tolerance, by field."""
@@ -276,6 +297,8 @@ def _of_measurements(robot: System, oriented: bool, given: Any) -> _Rollout:
         raise DataError(
             f"{given.source}: {given.tension.shape[1]} tensions in a row; the robot has {robot.control_size}"
         )
+    if not np.any(np.isfinite(given.position[1:])):
+        raise DataError(f"{given.source}: no pose was seen after the first row")
     if not np.all(np.isfinite(given.tension)):
         row = int(np.flatnonzero(~np.isfinite(given.tension).all(axis=1))[0])
         raise DataError(
@@ -287,6 +310,14 @@ def _of_measurements(robot: System, oriented: bool, given: Any) -> _Rollout:
         length = np.linalg.norm(given.quaternion[1:], axis=-1, keepdims=True)
         target = np.concatenate([target, given.quaternion[1:] / length], axis=-1)
     return _Rollout(Settings(), given.dt, None, given.tension[:-1], places, target)
+
+
+def _names(given: Sequence[Measurements]) -> list[str]:
+    """A name for each recording: how its source begins, or all of it; numbered where they are still alike."""
+    names = [each.source.partition(":")[0] for each in given]
+    if len(set(names)) < len(names):
+        names = [each.source for each in given]
+    return [f"{name} ({k + 1})" if names.count(name) > 1 else name for k, name in enumerate(names)]
 
 
 def _first_row(trajectory: Trajectory) -> int:

@@ -1,0 +1,80 @@
+"""A robot of your own in an afternoon: three tendons, one body at the tip, four CSV recordings of 8 s.
+
+python examples/your_own_robot.py --out afternoon/
+
+No robot is at hand, so that a simulated one is recorded: `VirtualRobot`, which has what a model does not know
+(friction of another kind, masses of the ribs, a lag). Delete `record`, and put your own files there.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+import knode_cosserat as kc
+from knode_cosserat.evaluation import figures
+from knode_cosserat.evaluation.metrics import rms_distance
+from knode_cosserat.recordings.virtual import lagged
+from knode_cosserat.recordings.write import Poses, Pulls, write_recording
+from knode_cosserat.rods.virtual_robot import VirtualRobot
+
+HERE = Path(__file__).parent
+SIGNALS = {"sine-1": "sine:1", "sine-2": "sine:2", "random-0": "random:0", "unseen": "random:7"}
+DT, FINE, RESTING = 0.025, 0.005, 1.0
+#: what is not known: all that `identify` looks for but the tendons' offset, which was measured
+NAMES = ["youngs_modulus", "bending_damping", "sleeve_stiffening"]
+NAMES += ["friction_wobble", "friction_curvature", "friction_reach"]
+
+
+def record(path: Path, signal: str, seconds: float) -> None:
+    """What sensors would see of the robot that is not at hand: rest, then the signal."""
+    real = VirtualRobot(
+        length=0.4, radius=0.0025, density=1500, youngs_modulus=1.3e9, bending_damping=4e-3, drag=2e-3,
+        tendon_offset=0.018, tendon_angles=np.arange(3) * 2 * np.pi / 3, rib_mass=4e-4, nodes=19,
+    )  # fmt: skip
+    count = round((seconds - RESTING) / 0.05)
+    if signal.startswith("sine"):
+        pulls = kc.controls.sine(float(signal[5:]), count, 0.05, base=5.0, amplitude=3.0, tendons=3)
+    else:
+        pulls = kc.controls.random(count, low=3.0, high=8.0, seed=int(signal[7:]), tendons=3, hold=8)
+    sent = np.concatenate([np.full((round(RESTING / 0.05), 3), 5.0), pulls])
+    command = Pulls(0.05 * np.arange(len(sent)), sent)
+    time = FINE * np.arange(round(seconds / FINE) + 1)
+    tension = lagged(command, time, 0.06)
+    still = kc.equilibrium(real, tension[0], space="rk4")
+    moved = kc.simulate(real, tension[1:], FINE, space="rk4", initial=still)[::2]
+    rng = np.random.default_rng(list(signal.encode()))
+    config = kc.RecordingConfig.load(HERE / "your_own_recording.yaml")
+    seen = np.asarray(moved.tip_position) + config.origin + rng.normal(0.0, 2e-4, (len(moved.time), 3))
+    turned = np.asarray(moved.quaternion)[:, -1] + rng.normal(0.0, 1e-3, (len(moved.time), 4))
+    seen, turned = seen.round(5), turned.round(4)
+    measured = (tension[::4] + rng.normal(0.0, 0.03, tension[::4].shape)).round(2)
+    about = config.replace(simulated=True, description=f"{path.stem}: a virtual robot")
+    write_recording(path, about, {"tip": Poses(time[::2], seen, turned)}, Pulls(time[::4], measured))
+
+
+def main(out: Path, seconds: float = 8.0) -> tuple[float, float]:
+    """Record, identify, and predict what was not seen; the tip's errors (m) before and after."""
+    out.mkdir(parents=True, exist_ok=True)
+    knowledge = kc.load_robot(HERE / "your_own_robot.yaml")
+    config = kc.RecordingConfig.load(HERE / "your_own_recording.yaml")
+    for name, signal in SIGNALS.items():
+        record(out / f"{name}.csv", signal, seconds)
+    recordings = {name: kc.load_recording(out / f"{name}.csv", config) for name in SIGNALS}
+    unseen = recordings.pop("unseen").sampled(DT, mean=True)
+    found = kc.identify(knowledge, [each.sampled(DT, mean=True) for each in recordings.values()], NAMES)
+    print(found, *(f"left of the {name}: {size:.2g}" for name, size in found.remainder.items()), sep="\n")
+    kc.save_robot(found.robot, out / "found.yaml")
+    errors = []
+    for label, robot in (("before", knowledge), ("after", found.robot)):
+        prediction = kc.simulate(robot, unseen.tension[:-1], DT)
+        figures.prediction_against_measurement(prediction, unseen).savefig(out / f"{label}.png", dpi=80)
+        errors.append(float(rms_distance(np.asarray(prediction.tip_position), unseen.tip_position)))
+    print(f"tip RMSE on an unseen recording: {100 * errors[0]:.1f} cm before, {100 * errors[1]:.2f} cm after")
+    return errors[0], errors[1]
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("afternoon"))
+    main(parser.parse_args().out)

@@ -1,0 +1,136 @@
+"""Mean tensions from row to row: what a simulation with a fine time step is driven by."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from knode_cosserat.recordings import (
+    Body,
+    CommandSource,
+    MarkerSource,
+    Recording,
+    RecordingConfig,
+    RecordingError,
+    Tensions,
+    TensionSource,
+)
+
+LATENCY = 0.06
+CONFIG = RecordingConfig(
+    markers=(MarkerSource("tip", "tip", 1.0),),
+    tension=TensionSource("tension", (1, 2)),
+    command=CommandSource("command", (1, 2), latency=LATENCY),
+)
+#: messages at times of their own, as sensors send them
+TIMES = np.round(0.02 * np.arange(201) + np.random.default_rng(0).uniform(0.0, 0.015, 201), 6)
+
+
+def recorded(time, tension, command=None, until=4.0):
+    """A recording whose tensions are known; its body stands still."""
+    frames = np.round(np.arange(0.0, until + 1e-9, 0.01), 6)
+    body = Body("tip", "tip", 1.0, frames, np.tile([0.0, 0.0, 0.5], (len(frames), 1)), None)
+    return Recording(
+        source="it", config=CONFIG, bodies=(body,), base=None, tension=Tensions("tension", time, tension),
+        command=command, rest=None, simulated=True, findings=(), delays={},
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def uneven():
+    values = np.random.default_rng(1).uniform(2.0, 9.0, (len(TIMES), 2))
+    return recorded(TIMES, values)
+
+
+def lines(recording, time):
+    """Tensions on straight lines between messages; before the first and after the last, those."""
+    known = recording.tension
+    return np.stack([np.interp(time, known.time, known.tension[:, k]) for k in range(2)], axis=1)
+
+
+def test_a_mean_is_that_of_the_lines_between_messages(uneven):
+    given = uneven.sampled(0.05, start=0.2, mean=True)
+    fine = np.linspace(0.0, 0.05, 20001)
+    for row in (0, 1, 17, 40, len(given.time) - 3):
+        values = lines(uneven, given.time[row] + fine)
+        np.testing.assert_allclose(given.tension[row], np.trapezoid(values, fine, axis=0) / 0.05, rtol=1e-5)
+    held = uneven.sampled(0.05, start=0.2)
+    assert np.abs(held.tension - given.tension).max() > 0.5
+    # only the tensions are others
+    np.testing.assert_array_equal(held.position, given.position)
+    np.testing.assert_array_equal(held.time, given.time)
+
+
+@pytest.mark.parametrize("dt", [0.005, 0.025, 0.05, 0.2])
+def test_means_of_means_are_means(uneven, dt):
+    """Whatever the time step, all rows together are the integral: no tension is lost or counted twice."""
+    given = uneven.sampled(dt, start=0.2, end=3.0, mean=True)
+    breaks = np.unique(np.concatenate([[0.2, 3.0], TIMES[(TIMES > 0.2) & (TIMES < 3.0)]]))
+    integral = np.trapezoid(lines(uneven, breaks), breaks, axis=0)
+    np.testing.assert_allclose(given.tension[:-1].sum(axis=0) * dt, integral, rtol=1e-12)
+    # the last row's goes on from there: it drives whatever comes after the rows
+    coarse = uneven.sampled(2 * dt, start=0.2, end=3.0, mean=True)
+    pairs = given.tension[: 2 * (len(coarse.time) - 1)].reshape(-1, 2, 2).mean(axis=1)
+    np.testing.assert_allclose(coarse.tension[:-1], pairs, rtol=1e-12)
+
+
+def test_a_constant_stays_and_a_line_is_taken_in_its_middle():
+    time = np.round(np.arange(0.0, 4.0, 0.02), 6)
+    constant = recorded(time, np.tile([5.0, 2.0], (len(time), 1))).sampled(0.05, mean=True)
+    np.testing.assert_allclose(constant.tension, np.tile([5.0, 2.0], (len(constant.time), 1)), rtol=1e-12)
+    rising = recorded(time, np.stack([time, 9.0 - 2 * time], axis=1)).sampled(0.05, end=3.9, mean=True)
+    middle = rising.time + 0.025
+    np.testing.assert_allclose(rising.tension, np.stack([middle, 9.0 - 2 * middle], axis=1), rtol=1e-12)
+
+
+def test_before_the_first_message_and_after_the_last_its_tension_holds():
+    time, values = np.array([0.03, 0.1, 0.13]), np.array([[1.0, 1.0], [3.0, 1.0], [7.0, 1.0]])
+    given = recorded(time, values, until=0.13).sampled(0.1, start=0.0, mean=True)
+    # 0.03 s at 1 N, then 0.07 s on the way to 3 N; 0.03 s on the way to 7 N, then 0.07 s there
+    np.testing.assert_allclose(given.time, [0.0, 0.1])
+    np.testing.assert_allclose(given.tension[:, 0], [0.3 * 1 + 0.7 * 2, 0.3 * 5 + 0.7 * 7], rtol=1e-12)
+    alone = recorded(np.array([0.05]), np.array([[4.0, 5.0]]), until=0.05).sampled(0.05, mean=True)
+    np.testing.assert_allclose(alone.tension, [[4.0, 5.0], [4.0, 5.0]])
+
+
+def test_commands_are_steps_and_come_late():
+    """Each is held until the next, from its latency on."""
+    sent = Tensions("command", np.array([0.0, 1.0, 1.42]), np.array([[2.0, 2.0], [6.0, 2.0], [3.0, 2.0]]))
+    recording = recorded(np.array([0.0, 4.0]), np.zeros((2, 2)), sent)
+    given = recording.sampled(0.1, tensions="commanded", mean=True)
+    rows = {round(float(t), 9): k for k, t in enumerate(given.time)}
+    assert given.tension[rows[0.9], 0] == pytest.approx(2.0)
+    # 0.06 s of the old one, 0.04 s of the new one
+    assert given.tension[rows[1.0], 0] == pytest.approx(0.6 * 2.0 + 0.4 * 6.0)
+    assert given.tension[rows[1.1], 0] == pytest.approx(6.0)
+    assert given.tension[rows[1.4], 0] == pytest.approx(0.8 * 6.0 + 0.2 * 3.0)
+    # the last one holds
+    np.testing.assert_allclose(given.tension[rows[1.5] :, 0], 3.0)
+    held = recording.sampled(0.1, tensions="commanded")
+    assert held.tension[rows[1.0], 0] == 2.0 and held.tension[rows[1.4], 0] == 6.0
+
+
+def test_a_pause_stays_unknown(uneven):
+    """Nothing is averaged over what was not measured."""
+    known = uneven.tension
+    kept = (known.time < 1.0) | (known.time > 2.0)
+    paused = dataclasses.replace(uneven, tension=Tensions("tension", known.time[kept], known.tension[kept]))
+    given = paused.sampled(0.05, start=0.2, mean=True)
+    times = paused.tension.time
+    last, following = times[times < 1.0][-1], times[times > 2.0][0]
+    unknown = ~np.isfinite(given.tension).all(axis=1)
+    end = given.time + 0.05
+    # a tension is believed for as long as a pause is bridged
+    np.testing.assert_array_equal(unknown, (end > last + 0.1) & (given.time < following))
+    plain = uneven.sampled(0.05, start=0.2, mean=True)
+    whole = (end < last) | (given.time > following)
+    np.testing.assert_allclose(given.tension[whole], plain.tension[whole])
+    # until then it is held, and no line leads to what was measured a second later
+    held = ~unknown & (given.time > last) & (given.time < following)
+    assert held.any()
+    np.testing.assert_allclose(given.tension[held], np.tile(lines(paused, np.array([last])), (held.sum(), 1)))
+
+
+def test_without_such_tensions_it_says_so(uneven):
+    with pytest.raises(RecordingError, match=r"^it: there are no commanded tensions$"):
+        uneven.sampled(0.05, tensions="commanded", mean=True)
