@@ -192,7 +192,14 @@ def recordings(
     ] = None,
     seconds: Annotated[float, typer.Option(metavar="S", min=0.1, help="How long they go on.")] = 10.0,
     seeds: Seeds = 5,
-    methods: Annotated[str | None, _some("baseline, paper-a, paper-b, best")] = None,
+    methods: Annotated[
+        str,
+        typer.Option(
+            metavar="A,B,…",
+            help="Some of those, and of what the parts of best are worth: calibrated (the model given, its "
+            "numbers found), no-memory, no-vibration.",
+        ),
+    ] = "baseline,paper-a,paper-b,best",
     simulated: Annotated[
         bool | None,
         typer.Option(

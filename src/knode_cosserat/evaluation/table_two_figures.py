@@ -23,6 +23,9 @@ LINES: dict[str, dict[str, Any]] = {
     "paper-a": {"color": PALETTE[5], "linestyle": "-", "linewidth": 1.1},
     "paper-b": METHODS["paper"],
     "best": METHODS["best"],
+    "calibrated": METHODS["calibrated"],
+    "no-memory": {"color": PALETTE[2], "linestyle": "-", "linewidth": 1.1},
+    "no-vibration": {"color": PALETTE[4], "linestyle": "--", "linewidth": 1.1},
 }
 MEASURED = {**REFERENCE, "label": "measured"}
 COLUMNS = 3
@@ -64,12 +67,13 @@ def tip_x(recordings: Mapping[str, Predicted]) -> Figure:
     """x of the tips over time."""
     with style():
         figure, panels = _grid(recordings, 2.3)
+        # one scale: what hardly moves should look it; and a prediction that is far out goes off it
+        reach = 2.5 * max(float(np.nanmax(np.abs(it.measured[:, 0]))) for it in recordings.values())
         for axes, (name, it) in zip(panels, recordings.items(), strict=False):
             axes.plot(it.time, it.measured[:, 0], **MEASURED)
             for method, tip in it.predicted.items():
                 axes.plot(it.time, tip[:, 0], label=method, **LINES.get(method, {}))
-            span = float(np.nanmax(np.abs(it.measured[:, 0])))
-            axes.set(title=name, ylabel="tip x [m]", ylim=(-2.5 * span, 2.5 * span))
+            axes.set(title=name, ylabel="tip x [m]", ylim=(-reach, reach))
         return _finished(figure, panels)
 
 
@@ -86,6 +90,8 @@ def paths(recordings: Mapping[str, Predicted]) -> Figure:
             for method, tip in it.predicted.items():
                 axes.plot(*tip.T, label=method, **LINES.get(method, {}))
             axes.set_title(name)
+            axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
+            axes.locator_params(nbins=4)
             points = np.concatenate([it.measured, *it.predicted.values()])
             equal_scales(axes, points[None, np.isfinite(points).all(axis=1)], 0.85)
         for axes in grid[len(recordings) :]:

@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.evaluation.metrics import dtw_distance, pose_mse
-from knode_cosserat.learning.calibration.calibrate import CalibrationError
-from knode_cosserat.learning.calibration.identify import identify
+from knode_cosserat.learning.calibration.calibrate import Calibration, CalibrationError, calibrate
+from knode_cosserat.learning.calibration.identify import NAMES, identify
 from knode_cosserat.learning.config import FitConfig
 from knode_cosserat.learning.files.model_file import encoded
 from knode_cosserat.learning.fit import fit
@@ -244,19 +244,51 @@ def _paper(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence
 
 
 def _best(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence[int]) -> Learned:
+    return _identified(knowledge, train, read, None)
+
+
+def _no_vibration(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence[int]) -> Learned:
+    return _identified(knowledge, train, read, NAMES)
+
+
+def _no_memory(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence[int]) -> Learned:
+    return _identified(
+        knowledge, train, read, tuple(name for name in NAMES if not name.startswith("friction"))
+    )
+
+
+def _identified(
+    knowledge: System, train: Sequence[str], read: _Read, names: tuple[str, ...] | None
+) -> Learned:
+    return _found(lambda rows: identify(knowledge, rows, names), train, read)
+
+
+def _calibrated(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence[int]) -> Learned:
+    names = ("youngs_modulus", "density", "bending_damping", "drag", "gravity")
+    return _found(
+        lambda rows: calibrate(knowledge, rows, names, by="rollouts", undetermined="keep"), train, read
+    )
+
+
+def _found(search: Callable[[list[Measurements]], Calibration], train: Sequence[str], read: _Read) -> Learned:
     """No chance in it: one seed."""
     try:
-        calibration = identify(knowledge, [read.rows(name, FINER) for name in train])
+        calibration = search([read.rows(name, FINER) for name in train])
     except CalibrationError as error:
-        return Learned({0: str(error)})
+        return Learned({0: str(error)}, FINER)
     return Learned({0: calibration.robot}, FINER, told=str(calibration))
 
 
+#: those of the paper's Table II, and what of the best each part of it buys
+TABLE = ("baseline", "paper-a", "paper-b", "best")
 METHODS: dict[str, Callable[[System, Sequence[str], _Read, Sequence[int]], Learned]] = {
     "baseline": _baseline,
     "paper-a": _paper_a,
     "paper-b": _paper,
     "best": _best,
+    "calibrated": _calibrated,
+    "no-memory": _no_memory,
+    "no-vibration": _no_vibration,
 }
 
 
