@@ -1,0 +1,165 @@
+"""The study of recordings: which are learned from, what is written, and that the best model predicts."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
+
+import knode_cosserat as kc
+from knode_cosserat.cli import app
+from knode_cosserat.recordings import RecordingConfig
+from knode_cosserat.recordings.write import Poses, Pulls, write_recording
+from knode_cosserat.studies import recordings as study
+from knode_cosserat.studies.recordings_report import repetitions
+from knode_cosserat.studies.runner import StudyError
+
+PAPER = RecordingConfig.paper_robot()
+DT = 0.01
+TRUE = kc.RoutedTendonRobot.like(
+    kc.load_robot("delrin-tendon-robot"),
+    bending_damping=5e-3,
+    friction_wobble=0.5,
+    friction_reach=0.15,
+    sleeve_stiffening=0.5,
+    sleeve_length=0.07,
+)
+SECONDS = 4.0
+
+
+def recorded(path, tension, seed):
+    """A bag of the true robot: 1 s of rest, then the tensions at 100 Hz."""
+    rng = np.random.default_rng(seed)
+    rest = np.full((100, 4), 5.0)
+    control = np.concatenate([rest, tension, tension[-30:]])
+    moved = kc.simulate(TRUE, control, DT)
+    time = np.asarray(moved.time)
+    nodes = dict(zip((marker.name for marker in PAPER.markers), (3, 5, 7, 9), strict=True))
+    poses = {}
+    for name, node in nodes.items():
+        turned = Rotation.from_quat(np.asarray(moved.quaternion)[:, node], scalar_first=True)
+        poses[name] = Poses(
+            time,
+            np.asarray(moved.position)[:, node] + rng.normal(0.0, 2e-4, (len(time), 3)),
+            (turned * Rotation.from_rotvec(rng.normal(0.0, 2e-3, (len(time), 3)))).as_quat(scalar_first=True),
+        )
+    still = np.tile([0.0, 0.0, PAPER.base.height], (len(time), 1))
+    poses["base"] = Poses(time, still, np.tile([1.0, 0.0, 0.0, 0.0], (len(time), 1)))
+    pulled = Pulls(time[::2][: len(control[::2])], control[::2])
+    write_recording(path, PAPER, poses, pulled, pulled)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Five short bags; one control is recorded twice."""
+    there = tmp_path_factory.mktemp("bags")
+    rows = int(SECONDS / DT)
+
+    def sine(period):
+        return kc.controls.sine(period, rows, DT, base=5.0, amplitude=3.0)
+
+    given = {
+        "sine_1p0": sine(1.0),
+        "rand_0": kc.controls.random(rows, low=4.0, high=7.0, seed=1, hold=40),
+        "sine_2p0": sine(2.0),
+        "sine_2p0_again": sine(2.0),
+        "other": kc.controls.random(rows, low=4.0, high=7.0, seed=2, hold=40),
+    }
+    for k, (name, tension) in enumerate(given.items()):
+        recorded(there / f"{name}.bag", tension, k)
+    return there
+
+
+def run(*arguments):
+    return CliRunner().invoke(app, ["study", "recordings", *map(str, arguments)])
+
+
+def test_the_knowledge_alone(folder, tmp_path):
+    """A second run takes what is there; what is written is the same."""
+    given = (folder, "--out", tmp_path, "--train", "sine_1p0,rand_0", "--methods", "baseline", "--seconds", 3)
+    first = run(*given)
+    assert first.exit_code == 0, first.output
+    cells = json.loads((tmp_path / "table2.json").read_text())
+    assert [cell["recording"] for cell in cells] == ["other", "sine_2p0", "sine_2p0_again"]
+    assert all(
+        set(cell) == {"recording", "method", "seed", "tip_dtw", "pose_mse", "tip_rmse"} for cell in cells
+    )
+    # the figures are those of the plain way, by hand
+    seen = kc.load_recording(folder / "sine_2p0.bag").sampled(0.05, 1.0, 4.0)
+    moved = kc.simulate(kc.load_robot("delrin-tendon-robot"), seen.tension[:-1], 0.05)
+    off = np.asarray(moved.tip_position)[:60] - seen.tip_position[:60]
+    assert cells[1]["tip_rmse"] == pytest.approx(np.sqrt(np.mean(np.sum(off**2, axis=1))), rel=1e-9)
+    table = (tmp_path / "table2.md").read_text()
+    assert "the recordings do not say" in table and "| sine_2p0 " in table
+    assert {path.stem for path in (tmp_path / "figures").iterdir()} == {
+        "tensions", "paths", "tip-x", "horizon", "consistency"
+    }  # fmt: skip
+    kept = (tmp_path / "jobs" / "baseline.json").stat().st_mtime_ns
+    again = run(*given, "--simulated")
+    assert again.exit_code == 0 and (tmp_path / "jobs" / "baseline.json").stat().st_mtime_ns == kept
+    assert "of a simulated robot, not of a physical one" in (tmp_path / "table2.md").read_text()
+
+
+def test_the_same_control_twice_is_seen(folder):
+    rows = {}
+    for name in ("sine_2p0", "sine_2p0_again", "sine_1p0"):
+        it = kc.load_recording(folder / f"{name}.bag").sampled(0.05, 1.0, 4.0)
+        rows[name] = type("It", (), {"tension": it.tension, "command": None, "measured": it.tip_position})
+    found = repetitions(rows)
+    assert list(found) == ["sine_2p0"] and len(found["sine_2p0"]) == 2
+
+
+@pytest.mark.campaign
+def test_the_whole_table(folder, tmp_path):
+    """The best model is the robot's kind: what it has not seen it predicts; the paper's learns."""
+    done = run(
+        folder, "--out", tmp_path, "--train", "sine_1p0", "--train", "rand_0", "--seconds", 3, "--seeds", 2,
+        "--physical",
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    cells = json.loads((tmp_path / "table2.json").read_text())
+    by = {(cell["recording"], cell["method"], cell["seed"]): cell for cell in cells}
+    assert len(by) == 3 * (1 + 2 + 2 + 1)
+    for name in ("other", "sine_2p0"):
+        base, best = by[name, "baseline", 0], by[name, "best", 0]
+        for measure in ("tip_dtw", "pose_mse", "tip_rmse"):
+            assert best[measure] < 0.1 * base[measure]
+    assert kc.load_robot(tmp_path / "models" / "best.yaml").friction_wobble > 0.0
+    assert isinstance(kc.load_model(tmp_path / "models" / "paper-a-1"), kc.KNODE)
+    assert (tmp_path / "figures" / "loss.png").exists()
+    assert "recordings are of a physical robot" in (tmp_path / "table2.md").read_text()
+
+
+def test_which_are_learned_from():
+    names = ["a", "rand_0", "sine_1p0", "sine_3p0", "step"]
+    assert study.chosen(names, None) == (["sine_1p0", "sine_3p0", "rand_0"], ["a", "step"])
+    assert study.chosen(names, ["a"])[1] == ["rand_0", "sine_1p0", "sine_3p0", "step"]
+
+
+@pytest.mark.parametrize(
+    ("files", "train", "parts"),
+    [
+        ([], None, ("no recordings there", ".bag")),
+        (["a.bag", "a.csv"], None, ("a.bag and a.csv", "same name")),
+        (["a.bag"], None, ("'sine_1p0'", "--train")),
+        (["a.bag", "b.bag"], ["c"], ("'c'", "a, b")),
+        (["a.bag"], ["a"], ("others predicted",)),
+    ],
+)
+def test_folders_that_will_not_do(tmp_path, files, train, parts):
+    for name in files:
+        (tmp_path / name).touch()
+    with pytest.raises(StudyError) as error:
+        study.chosen(list(study.found(tmp_path)), train)
+    message = str(error.value)
+    assert "\n" not in message and all(part in message for part in parts)
+
+
+def test_no_folder_and_a_recording_that_is_none(tmp_path):
+    gone = run(tmp_path / "gone", "--out", tmp_path / "out")
+    assert gone.exit_code != 0 and "no such folder" in gone.output
+    for name in ("sine_1p0", "sine_3p0", "rand_0", "broken"):
+        (tmp_path / f"{name}.bag").write_bytes(b"nonsense")
+    broken = run(tmp_path, "--out", tmp_path / "out", "--methods", "baseline")
+    assert broken.exit_code != 0 and ".bag" in broken.output and "Traceback" not in broken.output
