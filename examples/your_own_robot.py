@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 import knode_cosserat as kc
-from knode_cosserat.evaluation import figures
+from knode_cosserat.evaluation import figures, recording_figures
 from knode_cosserat.evaluation.metrics import rms_distance
 from knode_cosserat.recordings.virtual import lagged
 from knode_cosserat.recordings.write import Poses, Pulls, write_recording
@@ -38,19 +38,17 @@ def record(path: Path, signal: str, seconds: float) -> None:
     else:
         pulls = kc.controls.random(count, low=3.0, high=8.0, seed=int(signal[7:]), tendons=3, hold=8)
     sent = np.concatenate([np.full((round(RESTING / 0.05), 3), 5.0), pulls])
-    command = Pulls(0.05 * np.arange(len(sent)), sent)
     time = FINE * np.arange(round(seconds / FINE) + 1)
-    tension = lagged(command, time, 0.06)
+    tension = lagged(Pulls(0.05 * np.arange(len(sent)), sent), time, 0.06)
     still = kc.equilibrium(real, tension[0], space="rk4")
     moved = kc.simulate(real, tension[1:], FINE, space="rk4", initial=still)[::2]
     rng = np.random.default_rng(list(signal.encode()))
     config = kc.RecordingConfig.load(HERE / "your_own_recording.yaml")
+    config = config.replace(simulated=True, description=f"{path.stem}: a virtual robot")
     seen = np.asarray(moved.tip_position) + config.origin + rng.normal(0.0, 2e-4, (len(moved.time), 3))
     turned = np.asarray(moved.quaternion)[:, -1] + rng.normal(0.0, 1e-3, (len(moved.time), 4))
-    seen, turned = seen.round(5), turned.round(4)
-    measured = (tension[::4] + rng.normal(0.0, 0.03, tension[::4].shape)).round(2)
-    about = config.replace(simulated=True, description=f"{path.stem}: a virtual robot")
-    write_recording(path, about, {"tip": Poses(time[::2], seen, turned)}, Pulls(time[::4], measured))
+    pulled = Pulls(time[::4], (tension[::4] + rng.normal(0.0, 0.03, tension[::4].shape)).round(2))
+    write_recording(path, config, {"tip": Poses(time[::2], seen.round(5), turned.round(4))}, pulled)
 
 
 def main(out: Path, seconds: float = 8.0) -> tuple[float, float]:
@@ -62,6 +60,8 @@ def main(out: Path, seconds: float = 8.0) -> tuple[float, float]:
         record(out / f"{name}.csv", signal, seconds)
     recordings = {name: kc.load_recording(out / f"{name}.csv", config) for name in SIGNALS}
     unseen = recordings.pop("unseen").sampled(DT, mean=True)
+    first = recordings["sine-1"]
+    recording_figures.health(first, first.health()).savefig(out / "health.png", dpi=80)
     found = kc.identify(knowledge, [each.sampled(DT, mean=True) for each in recordings.values()], NAMES)
     print(found, *(f"left of the {name}: {size:.2g}" for name, size in found.remainder.items()), sep="\n")
     kc.save_robot(found.robot, out / "found.yaml")
