@@ -20,8 +20,17 @@ def moved(robot, steps=60, dt=0.025, control="sine:1.0", **options):
 
 
 @pytest.mark.parametrize("tension", [0.5, 3.0])
-def test_one_tendon_bends_the_rod_to_a_circle(tension):
-    robot = kc.RoutedTendonRobot.like(KNOWLEDGE, **NO_LOADS, nodes=40)
+def test_one_tendon_bends_the_rod_evenly(tension):
+    robot = kc.RoutedTendonRobot.like(KNOWLEDGE, **NO_LOADS)
+    bent = kc.equilibrium(robot, np.array([tension, 0.0, 0.0, 0.0]))
+    curvature = tension * 0.02 / float(robot.Kbt[0, 0])
+    towards_the_tendon = curvature * np.sqrt(0.5) * np.array([-1.0, 1.0, 0.0])
+    np.testing.assert_allclose(np.asarray(bent.z)[-1, :, 3:6] - towards_the_tendon, 0.0, atol=1e-9)
+
+
+@pytest.mark.campaign
+def test_one_tendon_bends_the_rod_to_a_circle():
+    tension, robot = 3.0, kc.RoutedTendonRobot.like(KNOWLEDGE, **NO_LOADS, nodes=40)
     bent = kc.equilibrium(robot, np.array([tension, 0.0, 0.0, 0.0]), space=kc.RK4())
     L, curvature = 0.635, tension * 0.02 / float(robot.Kbt[0, 0])
     squeezed = 1.0 - tension / float(robot.Kse[2, 2])
@@ -127,6 +136,7 @@ def test_the_batch_does_what_each_robot_does():
         )
 
 
+@pytest.mark.campaign
 def test_strong_pulls_and_much_friction_are_solved_or_reported():
     robot = kc.RoutedTendonRobot.like(
         KNOWLEDGE, friction_wobble=1.0, friction_reach=0.03, bending_damping=2e-3

@@ -37,7 +37,9 @@ BEGIN: dict[str, Any] = {
     "friction_reach": 0.1,
 }
 BEGIN_VIBRATION: dict[str, Any] = {"vibration_rate": 0.3, "vibration_softening": 1e-3}
-#: and the sleeve's length, a part of the rod's
+#: vibration has to explain this part of what is left, on average, or it is not there
+WORTH = 0.02
+#: the sleeve's length, a part of the rod's
 SLEEVE = 0.11
 #: robots begin to vibrate somewhere between the least and the greatest tension of all tendons together, if
 #: these are further apart than this part of the greatest
@@ -93,7 +95,7 @@ def identify(
         other = dataclasses.replace(other, undetermined=(*_left_out(names), *other.undetermined))
     except CalibrationError:
         return still
-    return other if _left(other) < _left(still) else still
+    return other if _left(other) < _left(still) - WORTH else still
 
 
 def _still(
@@ -132,8 +134,8 @@ def _check(measurements: object) -> None:
 
 
 def _left(calibration: Calibration) -> float:
-    """How much is left of all recordings together, each by its own measure."""
-    return float(np.sum(np.log(list(calibration.remainder.values()))))
+    """How much is left of the recordings, each by its own measure: the mean logarithm."""
+    return float(np.mean(np.log(list(calibration.remainder.values()))))
 
 
 def _vibrating(robot: System, measurements: Sequence[Measurements]) -> System | None:
