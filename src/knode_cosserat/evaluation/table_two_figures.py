@@ -95,7 +95,7 @@ def paths(recordings: Mapping[str, Predicted]) -> Figure:
             points = np.concatenate([it.measured, *it.predicted.values()])
             equal_scales(axes, points[None, np.isfinite(points).all(axis=1)], 0.85)
         for axes in grid[len(recordings) :]:
-            axes.set_visible(False)
+            axes.remove()
         legend_below(figure, grid[: len(recordings)])
     return figure
 
@@ -166,8 +166,9 @@ def _grid(given: Mapping[str, Any], height: float) -> tuple[Any, Any]:
 def _finished(figure: Any, panels: Any) -> Figure:
     used = [axes for axes in panels if axes.get_lines()]
     for axes in panels:
-        axes.set_visible(axes in used)
         axes.margins(x=0.0)
+        if axes not in used:
+            axes.remove()
     for axes in used[-2:]:
         axes.set_xlabel("time [s]")
     legend_below(figure, used)

@@ -23,6 +23,8 @@ Misfit = SegmentMisfit | RolloutMisfit
 
 #: how often the weights of the fields are set anew
 PASSES = 5
+#: and the part by which they may still change
+SETTLED = 0.02
 #: ways by which a search from far off is tried, if what the first one leaves is not noise
 MOST_WAYS = 3
 #: evaluations of one search
@@ -37,7 +39,7 @@ class End(NamedTuple):
 
 
 #: the last search, one that only leads to its start, and one for a real robot, of which no model is exact
-FINE, ROUGH, PLAIN = End(1e-12, 1e-15), End(1e-3, 1e-6), End(1e-3, 1e-4)
+FINE, ROUGH, PLAIN = End(1e-12, 1e-15), End(1e-3, 1e-6), End(1e-3, 1e-3)
 #: a combination of parameters is not determined if it does less than this part of what each does alone
 FLAT = 1e-8
 #: nor is a positive parameter if the standard error of its logarithm is above this
@@ -149,13 +151,14 @@ def _one_way(misfit: Misfit, start: np.ndarray, free: np.ndarray, beginnings: An
     coordinates, converged, left = start, True, sizes
     for mask in beginnings:
         _, coordinates = _least_squares(misfit, coordinates, free, sizes, mask, ROUGH)
-    last = PLAIN if isinstance(misfit, RolloutMisfit) and misfit.rough else FINE
+    rough = isinstance(misfit, RolloutMisfit) and misfit.rough
+    last, settled = (PLAIN, 5.0 * SETTLED) if rough else (FINE, SETTLED)
     for _ in range(PASSES):
         converged, coordinates = _least_squares(misfit, coordinates, free, sizes, end=last)
         least = misfit.least_sizes(coordinates)
         left = np.sqrt(by_group(np.square(misfit(coordinates).values), misfit.groups))
         before, sizes = sizes, np.maximum(left, least)
-        if not converged or np.all(np.abs(sizes - before) <= 0.02 * before):
+        if not converged or np.all(np.abs(sizes - before) <= settled * before):
             break
     return converged, Fit(coordinates, free, (), sizes, left <= least)
 
