@@ -147,7 +147,8 @@ def consistency(groups: Mapping[str, Sequence[Float[np.ndarray, "T 3"]]], dt: fl
             time = dt * np.arange(length)
             spread = np.linalg.norm(np.nanstd(tips, axis=0), axis=1)
             for k, tip in enumerate(tips):
-                axes.plot(time, tip[:, 0], color=PALETTE[0], linewidth=0.8, label="" if k else "each recording")
+                label = "" if k else "each recording"
+                axes.plot(time, tip[:, 0], color=PALETTE[0], linewidth=0.8, label=label)
             axes.set(
                 title=f"{name}, {len(tips)} times: {100 * np.sqrt(np.nanmean(spread**2)):.2f} cm apart",
                 ylabel="tip x [m]",
