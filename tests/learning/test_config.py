@@ -1,5 +1,6 @@
 """Settings of a fit: what is allowed, and to JSON and back."""
 
+import dataclasses
 import json
 
 import pytest
@@ -42,6 +43,15 @@ def test_presets():
     assert FitConfig.paper(seed=(1, 2)).seeds == (1, 2)
     assert FitConfig() == FitConfig(StructuredOptions())
     assert len(set(CONFIGS)) == len(CONFIGS)
+
+
+def test_the_papers_training_on_recordings():
+    """As its section on the real robot has it; all else is as in simulation."""
+    same, own = FitConfig.paper(2, history=True), FitConfig.paper_recordings(2)
+    assert (own.segments.weight_decay, own.segments.data_noise) == (0.1, 0.01)
+    assert own.residual == same.residual and own.residual.history and own.seed == 2
+    changed = dataclasses.replace(own.segments, weight_decay=0.0, data_noise=0.0)
+    assert dataclasses.replace(own, segments=changed) == same
 
 
 def test_values_take_one_form():

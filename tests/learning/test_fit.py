@@ -66,6 +66,16 @@ def test_a_model_and_what_is_known_of_it(bars, unseen):
         np.testing.assert_allclose(error, tip_rmse(model, unseen), rtol=1e-9)
 
 
+def test_noise_in_the_data_is_in_every_number_and_the_same_each_time(bars):
+    shaken, again = (module._noisy(bars[0], 0.01, 0) for _ in range(2))
+    for name in ("y", "z"):
+        change = np.asarray(getattr(shaken, name)) - np.asarray(getattr(bars[0], name))
+        assert np.all(change != 0.0) and 0.007 < change.std() < 0.013
+        np.testing.assert_array_equal(getattr(shaken, name), getattr(again, name))
+    assert np.any(module._noisy(bars[0], 0.01, 1).y != shaken.y)
+    assert module._noisy(bars[0], 0.0, 0) is bars[0]
+
+
 @pytest.mark.parametrize("shared", [0, 10**9])
 def test_several_seeds(bars, monkeypatch, shared):
     """On their own threads, or in one vectorised program, they are what they are alone."""
