@@ -47,6 +47,7 @@ def prediction(ensemble):
     return ensemble.predict(kc.controls.sine(1.5, 40, DT), DT)
 
 
+@pytest.mark.campaign
 def test_the_members_differ_by_as_much_as_they_may_be_wrong(prediction, truth):
     error = np.sqrt(np.mean((prediction.tip_position - truth.tip_position)[1:] ** 2))
     spread = np.sqrt(np.mean(prediction.spread[1:, -1] ** 2))

@@ -162,6 +162,7 @@ def test_on_the_virtual_robot_the_best_is_three_times_better(virtual):
         assert 3.0 * best[name].rms < paper[name].rms, name
 
 
+@pytest.mark.campaign
 def test_measurements_on_a_grid_will_do(virtual):
     path, truth = virtual
     states = kc.estimate_states(kc.load_recording(path).sampled(0.05), virtual_robot(10))
@@ -169,6 +170,7 @@ def test_measurements_on_a_grid_will_do(virtual):
     assert errors["p"].rms < 0.4e-3 and errors["q"].rms < 0.05 * errors["q"].size
 
 
+@pytest.mark.campaign
 def test_what_is_estimated_can_be_learned_from(virtual):
     path, _ = virtual
     states = kc.estimate_states(kc.load_recording(path), ROBOT, end=2.0)

@@ -127,6 +127,7 @@ def test_step_halving_is_the_same_motion_in_smaller_steps(robot):
     assert HALVINGS >= 3
 
 
+@pytest.mark.campaign
 def test_a_run_that_blows_up_in_space_is_repeated_with_finer_segments():
     """Forward Euler on five long segments at a short time step: solved to rounding, and nonsense."""
     soft = kc.TendonRobot(
@@ -160,6 +161,7 @@ def test_jit_equals_plain(robot, sine, truth):
 # batches
 
 
+@pytest.mark.campaign
 def test_lockstep_as_on_a_gpu_equals_one_after_the_other(robot, sine):
     record, past = _at_rest(robot)
     del record

@@ -113,6 +113,7 @@ def test_killed_in_the_middle_it_goes_on_to_the_same_table(tmp_path, baseline):
     assert len(now) == 5 and {name: now[name] for name in kept} == kept
 
 
+@pytest.mark.campaign
 def test_a_cluster_gives_the_same_table(tmp_path, baseline):
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(

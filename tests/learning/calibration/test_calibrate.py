@@ -213,6 +213,7 @@ def test_intervals_hold_the_truth_of_the_robot(by, training):
 
 
 @pytest.mark.parametrize("by", ["segments", "rollouts"])
+@pytest.mark.campaign
 def test_intervals_hold_the_truth(by, swings):
     """Of 40 times that noise was drawn, intervals of 95 % hold the truth in about as many, not in all."""
     names = ["stiffness", "density", "damping"]

@@ -85,6 +85,7 @@ def test_a_material_with_friction_balances_its_moment(law):
     np.testing.assert_allclose(linear + 0.02 * friction, moment, atol=1e-10)
 
 
+@pytest.mark.campaign
 def test_a_stiffening_rod_has_the_moment_of_its_law_and_its_slope():
     robot = truths.extended(truths.Stiffening, ROBOT, law="exponential", curvature=2.0)
     y = np.zeros(19)
