@@ -39,7 +39,7 @@ def shooting(problem: StepProblem, y: Any, unknowns: Any) -> tuple[Any, Any, Any
             )
             return after, after
 
-        first = system.base(problem.t, problem.control, xi)
+        first = problem.base(xi)
         nodes = (problem.arclength[:-1], problem.history[:-1], problem.history[1:])
         last, rest = jax.lax.scan(segment, first, nodes)
         tip = problem.tip_residual(last) / system.scales().tip

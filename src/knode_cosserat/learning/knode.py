@@ -95,9 +95,9 @@ class KNODE(System):
         """The knowledge's, at its corrected length."""
         return self.adapted.rest(s)
 
-    def base(self, t: Any, control: Any, unknowns: Float[Any, " k"]) -> Float[Any, " y"]:
+    def base(self, t: Any, control: Any, unknowns: Float[Any, " k"], history: History) -> Float[Any, " y"]:
         """The knowledge's."""
-        return self.adapted.base(t, control, unknowns)
+        return self.adapted.base(t, control, unknowns, history)
 
     def unknowns(self, y: Float[Any, " y"]) -> Float[Any, " k"]:
         """The knowledge's."""

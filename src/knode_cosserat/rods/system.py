@@ -181,8 +181,11 @@ class System(eqx.Module):
     def rest(self, s: Any) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
         """y and z at arclength s (m) of the unloaded robot at rest: where a simulation starts by default."""
 
-    def base(self, t: Any, control: Any, unknowns: Float[Any, " k"]) -> Float[Any, " y"]:
-        """y at s = 0: the values at rest, with the unknowns in their places."""
+    def base(self, t: Any, control: Any, unknowns: Float[Any, " k"], history: History) -> Float[Any, " y"]:
+        """y at s = 0: the values at rest, with the unknowns in their places.
+
+        `history` is that of the first node: a base that moves has its velocity from it.
+        """
         fixed, _ = self.rest(jnp.zeros(()))
         return jnp.asarray(fixed).at[self.y_layout.indices(self.base_unknowns)].set(unknowns)
 

@@ -61,6 +61,10 @@ class StepProblem(eqx.Module):
     def _unpack(self, history: Float[Any, " x"]) -> History:
         return unpacked_history(self.system, self.c0, history)
 
+    def base(self, unknowns: Float[Any, " k"]) -> Float[Any, " y"]:
+        """y at the first node, for these unknowns."""
+        return self.system.base(self.t, self.control, unknowns, self._unpack(self.history[0]))
+
     def tip_residual(self, y: Float[Any, " y"]) -> Float[Any, " k"]:
         """What is left of the tip's conditions at this y of the last node."""
         return self.system.tip(self.t, self.control, y, self._unpack(self.history[-1]))
@@ -112,8 +116,7 @@ class Solution(NamedTuple):
 
 
 def _with_base(problem: StepProblem, y: Any, unknowns: Any) -> Any:
-    first = problem.system.base(problem.t, problem.control, unknowns)
-    return jnp.concatenate([first[None], y[1:]])
+    return jnp.concatenate([problem.base(unknowns)[None], y[1:]])
 
 
 def _error(problem: StepProblem, defects: Any, tip: Any) -> Any:
@@ -130,7 +133,6 @@ def residuals(problem: StepProblem, y: Float[Any, "nodes y"]) -> tuple[Any, Any]
 
 def linearise(problem: StepProblem, y: Float[Any, "nodes y"], unknowns: Any) -> Linearisation:
     """Residuals and their exact derivatives by forward mode, all segments in one batch."""
-    system, t, control = problem.system, problem.t, problem.control
 
     def with_value(function: Callable[[Any], Any], at: Any) -> tuple[Any, Any]:
         def twice(x: Any) -> tuple[Any, Any]:
@@ -141,7 +143,7 @@ def linearise(problem: StepProblem, y: Float[Any, "nodes y"], unknowns: Any) -> 
 
     F, reached = problem.segments(with_value, y)
     M, tip = with_value(problem.tip_residual, y[-1])
-    S = jax.jacfwd(lambda xi: system.base(t, control, xi))(unknowns)
+    S = jax.jacfwd(problem.base)(unknowns)
     return Linearisation(F, S, M, reached - y[1:], tip)
 
 

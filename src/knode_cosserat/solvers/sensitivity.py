@@ -88,7 +88,7 @@ def tangent_march(
 
         def at_solution(system: Any, control: Any, history: Any) -> Any:
             problem = problem_of(system, control, history)
-            return *residuals(problem, y), system.base(t, control, xi)
+            return *residuals(problem, y), problem.base(xi)
 
         given, d_given = (system, control, history), (d_system, d_control, d_history)
         defects, tip, base = jax.jvp(at_solution, given, d_given)[1]

@@ -68,9 +68,9 @@ class NoKnowledge(System):
         """The model's: where a simulation begins is no physics."""
         return self.model.rest(s)
 
-    def base(self, t: Any, control: Any, unknowns: Float[Any, " k"]) -> Float[Any, " y"]:
+    def base(self, t: Any, control: Any, unknowns: Float[Any, " k"], history: History) -> Float[Any, " y"]:
         """The model's."""
-        return self.model.base(t, control, unknowns)
+        return self.model.base(t, control, unknowns, history)
 
     def unknowns(self, y: Float[Any, " y"]) -> Float[Any, " k"]:
         """The model's."""
