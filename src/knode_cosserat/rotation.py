@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Float
 
@@ -68,6 +69,35 @@ def quaternion_rate(h: Float[Any, "4"], u: Float[Any, "3"]) -> Float[Any, "4"]:
             w * uz + x * uy - y * ux,
         ]
     )
+
+
+def quaternion_product(a: Float[Any, "4"], b: Float[Any, "4"]) -> Float[Any, "4"]:
+    """The rotation b, then a: a ∘ b."""
+    (aw, ax, ay, az), (bw, bx, by, bz) = _parts(a), _parts(b)
+    return jnp.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ]
+    )
+
+
+def conjugate(h: Float[Any, "4"]) -> Float[Any, "4"]:
+    """The rotation back, of a quaternion of length one."""
+    return h * np.array([1.0, -1.0, -1.0, -1.0])
+
+
+def quaternion_of(vector: Float[Any, "3"]) -> Float[Any, "4"]:
+    """The rotation about a vector by its length (rad)."""
+    square = jnp.sum(vector * vector)
+    small = square < 1e-8
+    # the root of zero has no derivative
+    angle = jnp.sqrt(jnp.where(small, 1.0, square))
+    over = jnp.where(small, 0.5 - square / 48.0, jnp.sin(angle / 2.0) / angle)
+    real = jnp.where(small, 1.0 - square / 8.0, jnp.cos(angle / 2.0))
+    return jnp.concatenate([real[None], over * vector])
 
 
 def inverse(matrix: Float[Any, "3 3"]) -> Float[Any, "3 3"]:

@@ -74,6 +74,21 @@ class KNODE(System):
         return self.knowledge.mixed
 
     @property
+    def cuts(self) -> tuple[float, ...]:  # type: ignore[override]
+        """The knowledge's."""
+        return self.knowledge.cuts
+
+    @property
+    def jumps(self) -> bool:  # type: ignore[override]
+        """The knowledge's."""
+        return self.knowledge.jumps
+
+    @property
+    def starts_at_rest(self) -> bool:  # type: ignore[override]
+        """The knowledge's."""
+        return self.knowledge.starts_at_rest
+
+    @property
     def velocities(self) -> tuple[str, ...]:  # type: ignore[override]
         """The knowledge's."""
         return self.knowledge.velocities
@@ -90,6 +105,12 @@ class KNODE(System):
     ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
         """y_s and z of knowledge and residual together."""
         return self.residual.derivatives(self.adapted, s, t, y, control, history)
+
+    def crossed(
+        self, acting: Float[Any, " cuts"], t: Any, y: Float[Any, " y"], control: Any, history: History
+    ) -> Float[Any, " y"]:
+        """The knowledge's."""
+        return self.adapted.crossed(acting, t, y, control, history)
 
     def rest(self, s: Any) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
         """The knowledge's, at its corrected length."""

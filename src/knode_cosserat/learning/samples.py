@@ -12,10 +12,12 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.system import System, unpacked_history
+from knode_cosserat.solvers.crossing import Crossing, carried, crossing_of, within
 from knode_cosserat.solvers.march import coefficient_table
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme, middles
@@ -81,7 +83,21 @@ def predict(system: System, space: SpaceScheme, sample: Samples) -> tuple[Float[
         history = unpacked_history(system, sample.c0, record)
         return system.derivatives(s, sample.t, y, sample.control, history)
 
-    y_next = space.advance(lambda *at: derivatives(*at)[0], s, ds, sample.y, sample.history)
+    def rates(*at: Any) -> Any:
+        return derivatives(*at)[0]
+
+    def jump(acting: Any, y: Any, record: Any) -> Any:
+        history = unpacked_history(system, sample.c0, record)
+        return system.crossed(acting, sample.t, y, sample.control, history) if system.jumps else y
+
+    crossings = crossing_of(system)
+    if crossings is None:
+        y_next = space.advance(rates, s, ds, sample.y, sample.history)
+    else:
+        segment = jnp.round(sample.place * (system.nodes - 1)).astype(int)
+        crossing = Crossing(*(jnp.asarray(each)[segment] for each in crossings))
+        y_next = carried(space, rates, jump, crossing, (s, ds), sample.y, sample.history, first=1)
+        s = within(s, s, s + ds)
     return y_next, derivatives(s, sample.y, sample.history[0])[1]
 
 

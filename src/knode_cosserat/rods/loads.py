@@ -1,15 +1,157 @@
-"""Distributed loads of a rod, per metre of arclength."""
+"""Loads of a rod: what pulls at it along its length, and what sits or pulls at one place of it.
+
+A load at a place makes n and m jump there: n(s⁺) = n(s⁻) - F, m(s⁺) = m(s⁻) - M. At the tip it is part of the
+tip's conditions instead.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+import abc
+from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from knode_cosserat.rotation import dot
+from knode_cosserat.rods.parameters import choice, parameter, place
+from knode_cosserat.rods.parts import Part
+from knode_cosserat.rods.system import Field
+from knode_cosserat.rotation import cross, dot, rotation_matrix
 
 
 def square_law_drag(C: Float[Any, "3 3"], q: Float[Any, "3"]) -> Float[Any, "3"]:
     """Drag C q ⊙ |q| against the velocity q, both in the material frame (N/m); C in kg/m²."""
     return dot(C, q * jnp.abs(q))
+
+
+class Motion(NamedTuple):
+    """How a point of the rod is placed and moves: p, R in the global frame, the rest in the material's."""
+
+    p: Float[Any, "3"]
+    R: Float[Any, "3 3"]
+    q: Float[Any, "3"]
+    w: Float[Any, "3"]
+    q_t: Float[Any, "3"]
+    w_t: Float[Any, "3"]
+
+    @classmethod
+    def of(cls, layout: Any, y: Any, y_t: Any) -> Motion:
+        """From a packed y and its rate."""
+        p, h, q, w = (layout.get(y, name) for name in ("p", "h", "q", "w"))
+        return cls(p, rotation_matrix(h), q, w, layout.get(y_t, "q"), layout.get(y_t, "w"))
+
+
+class Wrench(NamedTuple):
+    """A force (N, or N/m) and a moment (N·m, or N) about the axis, global frame."""
+
+    force: Float[Any, "3"]
+    moment: Float[Any, "3"]
+
+    def __add__(self, other: Any) -> Wrench:
+        return Wrench(self.force + other.force, self.moment + other.moment)
+
+
+class Load(Part):
+    """Anything that loads a rod beside gravity and drag, which every rod has."""
+
+
+class PointLoad(Load):
+    """A load at one place, `at`, as a part of the rod's length."""
+
+    at: float = place("where it acts", default=1.0)
+
+    @abc.abstractmethod
+    def wrench(self, motion: Motion, gravity: Any, control: Any) -> Wrench:
+        """What it does to the rod (N, N·m)."""
+
+
+class SpreadLoad(Load):
+    """A load per length, between two places."""
+
+    begin: float = place("where it begins", default=0.0)
+    end: float = place("where it ends", default=1.0)
+
+    @abc.abstractmethod
+    def wrench(self, motion: Motion, control: Any) -> Wrench:
+        """What it does to the rod, per length (N/m, N)."""
+
+
+_FOLLOWS = "whether it turns with the rod"
+_CONTROLLED = "whether a control multiplies it"
+
+
+class PointWrench(PointLoad):
+    """A force and a moment at a place: dead, in the global frame, or following, in the material's."""
+
+    kind: ClassVar[str] = "point-wrench"
+
+    force: Any = parameter("N", "force", shape="vector", low=-1e9, high=1e9, default=(0.0, 0.0, 0.0))
+    moment: Any = parameter("N m", "moment", shape="vector", low=-1e9, high=1e9, default=(0.0, 0.0, 0.0))
+    follows: bool = choice(_FOLLOWS, (False, True), False)
+    controlled: bool = choice(_CONTROLLED, (False, True), False)
+
+    @property
+    def control_fields(self) -> tuple[Field, ...]:
+        """The multiple of it that acts, if it is controlled."""
+        return (Field("scale", 1, "1", "multiple of the load that acts"),) if self.controlled else ()
+
+    def wrench(self, motion: Motion, gravity: Any, control: Any) -> Wrench:
+        """As given, turned with the rod if it follows."""
+        return _given(self, motion, control)
+
+
+class DistributedWrench(SpreadLoad):
+    """A force and a moment per length: dead, in the global frame, or following, in the material's."""
+
+    kind: ClassVar[str] = "distributed-wrench"
+
+    force: Any = parameter(
+        "N/m", "force per length", shape="vector", low=-1e9, high=1e9, default=(0.0, 0.0, 0.0)
+    )
+    moment: Any = parameter(
+        "N", "moment per length", shape="vector", low=-1e9, high=1e9, default=(0.0, 0.0, 0.0)
+    )
+    follows: bool = choice(_FOLLOWS, (False, True), False)
+    controlled: bool = choice(_CONTROLLED, (False, True), False)
+
+    @property
+    def control_fields(self) -> tuple[Field, ...]:
+        """The multiple of it that acts, if it is controlled."""
+        return (Field("scale", 1, "1", "multiple of the load that acts"),) if self.controlled else ()
+
+    def wrench(self, motion: Motion, control: Any) -> Wrench:
+        """As given, turned with the rod if it follows."""
+        return _given(self, motion, control)
+
+
+def _given(load: Any, motion: Motion, control: Any) -> Wrench:
+    factor = control[0] if load.controlled else 1.0
+    force, moment = factor * jnp.asarray(load.force), factor * jnp.asarray(load.moment)
+    return Wrench(dot(motion.R, force), dot(motion.R, moment)) if load.follows else Wrench(force, moment)
+
+
+class AttachedMass(PointLoad):
+    """A rigid body on the rod: a rib, a gripper, a payload. At the tip it is the robot's rigid end.
+
+    Its moments of inertia are about its own centre of mass and the axes of the material's frame.
+    """
+
+    kind: ClassVar[str] = "attached-mass"
+
+    mass: Any = parameter("kg", "mass", low=0.0, high=1e4, default=0.0)
+    inertia: Any = parameter(
+        "kg m2", "moments of inertia about its centre", shape="vector", low=0.0, high=1e6,
+        default=(0.0, 0.0, 0.0),
+    )  # fmt: skip
+    offset: Any = parameter(
+        "m", "its centre of mass from the rod's axis, material frame", shape="vector", low=-10.0, high=10.0,
+        default=(0.0, 0.0, 0.0),
+    )  # fmt: skip
+
+    def wrench(self, motion: Motion, gravity: Any, control: Any) -> Wrench:
+        """Weight less what its motion takes: F = M (g - a), M = r × F - (I ω_t + ω × I ω)."""
+        _, R, q, w, q_t, w_t = motion
+        r, I = jnp.asarray(self.offset), jnp.asarray(self.inertia)
+        acceleration = q_t + cross(w, q) + cross(w_t, r) + cross(w, cross(w, r))
+        force = self.mass * (dot(R.T, jnp.asarray(gravity)) - acceleration)
+        moment = cross(r, force) - (I * w_t + cross(w, I * w))
+        return Wrench(dot(R, force), dot(R, moment))

@@ -1,6 +1,7 @@
 """Physical parameters: units, meaning and allowed range, stated once beside each parameter.
 
-The same statement serves `System.replace`, robot files and `knode-cosserat info`.
+The same statement serves `System.replace`, robot files and `knode-cosserat info`. Beside numbers a robot may
+state choices (words), and parts: tendons' routings, loads, ends, obstacles, each with parameters of its own.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ class ParameterError(ValueError):
     """A parameter's name or value is not allowed; the message says what was given and what is."""
 
 
-Shape = Literal["scalar", "vector", "matrix", "list"]
+Shape = Literal["scalar", "vector", "quaternion", "matrix", "list"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,6 +40,7 @@ class Parameter:
         kind = {
             "scalar": "a number",
             "vector": "three numbers, each",
+            "quaternion": "four numbers, not all zero, scalar first, each",
             "matrix": "one number, three (a diagonal) or a symmetric 3x3 matrix, with eigenvalues",
             "list": "a list of numbers, each",
         }[self.shape]
@@ -60,10 +62,92 @@ def parameter(
     return eqx.field(converter=_converter(stated), metadata={"parameter": stated}, **extra)
 
 
+def place(meaning: str, *, low: float = 0.0, default: Any = dataclasses.MISSING) -> Any:
+    """A field that holds a place on the rod, as a part of its length. It is part of a program, not data."""
+    stated = Parameter("", f"{meaning}, as a part of the length", "scalar", low, 1.0, optional=False)
+    extra = {} if default is dataclasses.MISSING else {"default": default}
+    return eqx.field(static=True, converter=_plain_number, metadata={"parameter": stated}, **extra)
+
+
+@dataclasses.dataclass(frozen=True)
+class Choice:
+    """What is known of a field that holds one of some words, or several of them."""
+
+    meaning: str
+    allowed: tuple[Any, ...]
+    many: bool
+
+    @property
+    def words(self) -> str:
+        """The allowed values, in words."""
+        listed = ", ".join(str(value).lower() for value in self.allowed)
+        return f"a list of different ones of {listed}" if self.many else listed
+
+
+def choice(meaning: str, allowed: tuple[Any, ...], default: Any) -> Any:
+    """A dataclass field with one of the allowed words, or several where the default is a tuple."""
+    stated = Choice(meaning, allowed, isinstance(default, tuple))
+    convert = (lambda given: tuple(given) if isinstance(given, list) else given) if stated.many else None
+    extra: dict[str, Any] = {} if convert is None else {"converter": convert}
+    return eqx.field(static=True, default=default, metadata={"choice": stated}, **extra)
+
+
+@dataclasses.dataclass(frozen=True)
+class Slot:
+    """What is known of a field that holds a part, or (`many`) a tuple of parts, of a family of classes."""
+
+    meaning: str
+    family: type
+    many: bool
+    optional: bool
+
+
+def part(meaning: str, family: type, *, many: bool = False, default: Any) -> Any:
+    """A dataclass field that holds a part, or parts (see `parts.Part`); a default of None: optional."""
+    stated = Slot(meaning, family, many, optional=default is None)
+    convert = (lambda given: tuple(given) if isinstance(given, list) else given) if many else None
+    extra: dict[str, Any] = {} if convert is None else {"converter": convert}
+    return eqx.field(default=default, metadata={"part": stated}, **extra)
+
+
+def choices_of(cls: type) -> dict[str, Choice]:
+    """The choices of a class, by name."""
+    return _stated(cls, "choice")
+
+
+def slots_of(cls: type) -> dict[str, Slot]:
+    """The slots for parts of a class, by name."""
+    return _stated(cls, "part")
+
+
+def check_fields(owner: Any) -> None:
+    """Raise `ParameterError` unless all parameters, choices and parts of an object are allowed."""
+    for name, parameter in parameters_of(type(owner)).items():
+        checked(name, getattr(owner, name), parameter)
+    for name, stated in choices_of(type(owner)).items():
+        given = getattr(owner, name)
+        several = given if stated.many and isinstance(given, tuple) else (given,)
+        if any(each not in stated.allowed for each in several) or len(set(several)) < len(several):
+            raise ParameterError(f"{name} is {given!r}; allowed is {stated.words}")
+    for name, slot in slots_of(type(owner)).items():
+        given = getattr(owner, name)
+        several = given if slot.many and isinstance(given, tuple) else (given,)
+        if given is None and slot.optional:
+            continue
+        for each in several:
+            if not isinstance(each, slot.family):
+                found = type(each).__name__
+                raise ParameterError(f"{name} holds a {found}; allowed is a {slot.family.__name__.lower()}")
+
+
 def parameters_of(cls: type) -> dict[str, Parameter]:
     """The parameters of a class, by name."""
-    stated = {field.name: field.metadata.get("parameter") for field in dataclasses.fields(cls)}
-    return {name: parameter for name, parameter in stated.items() if parameter is not None}
+    return _stated(cls, "parameter")
+
+
+def _stated(cls: type, what: str) -> dict[str, Any]:
+    stated = {field.name: field.metadata.get(what) for field in dataclasses.fields(cls)}
+    return {name: each for name, each in stated.items() if each is not None}
 
 
 def checked(name: str, value: Any, parameter: Parameter) -> None:
@@ -72,7 +156,7 @@ def checked(name: str, value: Any, parameter: Parameter) -> None:
         return
     if isinstance(value, jax.core.Tracer):
         return
-    expected = {"scalar": (), "vector": (3,), "matrix": (3, 3)}.get(parameter.shape)
+    expected = {"scalar": (), "vector": (3,), "quaternion": (4,), "matrix": (3, 3)}.get(parameter.shape)
     try:
         array = np.asarray(value)
     except (TypeError, ValueError):
@@ -82,6 +166,8 @@ def checked(name: str, value: Any, parameter: Parameter) -> None:
     if (array.ndim != 1 or array.size == 0) if expected is None else array.shape != expected:
         raise ParameterError(f"{name} has shape {array.shape}; allowed is {parameter.allowed}")
     if not np.all(np.isfinite(array)):
+        raise ParameterError(f"{name} is {array.tolist()}; allowed is {parameter.allowed}")
+    if parameter.shape == "quaternion" and not np.any(array):
         raise ParameterError(f"{name} is {array.tolist()}; allowed is {parameter.allowed}")
     if parameter.shape == "matrix":
         if not np.allclose(array, array.T, rtol=1e-9, atol=0.0):
@@ -106,6 +192,13 @@ def _converter(parameter: Parameter) -> Callable[[Any], Any]:
         return _as_matrix(array) if parameter.shape == "matrix" else array
 
     return convert
+
+
+def _plain_number(value: Any) -> Any:
+    """A number as Python's own, so that it can be compared and hashed; anything else is for `checked`."""
+    return (
+        float(value) if isinstance(value, int | float | np.number) and not isinstance(value, bool) else value
+    )
 
 
 def _as_matrix(value: Any) -> Any:

@@ -21,22 +21,35 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
 
 from knode_cosserat._yaml import YAMLTextError, did_you_mean, flow, mapping_of, shown
-from knode_cosserat.rods.parameters import Parameter, ParameterError, checked
+from knode_cosserat.rods.parameters import (
+    Parameter,
+    ParameterError,
+    Slot,
+    checked,
+    choices_of,
+    parameters_of,
+    slots_of,
+)
+from knode_cosserat.rods.parts import kinds_of
 from knode_cosserat.rods.routed_robot import RoutedTendonRobot
+from knode_cosserat.rods.slender_rod import SlenderRod
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.tendon_robot import TendonRobot
 from knode_cosserat.rods.virtual_robot import VirtualRobot
 
-FORMAT = 1
+#: what files say is their format. The first had numbers only; a robot that needs no more is still written so
+FORMATS = (1, 2)
 
 #: the classes that a file can name as its kind
 KINDS: dict[str, type[System]] = {
     "tendon-robot": TendonRobot,
     "routed-tendon-robot": RoutedTendonRobot,
+    "slender-rod": SlenderRod,
     "virtual-robot": VirtualRobot,
 }
 
@@ -106,10 +119,11 @@ def _text(file: Traversable, source: str) -> str:
 def parse_robot(text: str, source: str) -> System:
     """A robot from a file's text; `source` is what errors call the file. Raises `RobotFileError`."""
     file = _mapping(text, source)
-    number = file.get("format", FORMAT)
-    if number != FORMAT or isinstance(number, bool):
+    number = file.get("format", FORMATS[0])
+    if isinstance(number, bool) or number not in FORMATS:
         raise RobotFileError(
-            f"{source}: format is {shown(number)}; allowed is {FORMAT}, the format that this version reads"
+            f"{source}: format is {shown(number)}; allowed is {' or '.join(map(str, FORMATS))}, "
+            "the formats that this version reads"
         )
     known = ("format", "kind", "description", "parameters")
     _require_keys(file, source, known=known, required=("format", "kind", "parameters"))
@@ -129,25 +143,62 @@ def parse_robot(text: str, source: str) -> System:
 
 
 def _robot(cls: type[System], values: dict[Any, Any], source: str) -> System:
-    stated = cls.parameters()
+    made = _made(cls, values, source, "parameters", more=("nodes",))
+    assert isinstance(made, System)
+    return made
+
+
+def _made(cls: type, values: dict[Any, Any], source: str, where: str, more: tuple[str, ...] = ()) -> Any:
+    """An object of a class that states its parameters, choices and parts, from a mapping of them."""
+    numbers, words, parts = parameters_of(cls), choices_of(cls), slots_of(cls)
     # an empty optional value is as good as none
-    values = {
-        key: value
-        for key, value in values.items()
-        if value is not None or key not in stated or not stated[key].optional
-    }
+    optional = {name for name, each in (numbers | parts).items() if each.optional}
+    values = {key: value for key, value in values.items() if value is not None or key not in optional}
     fields = {field.name: field for field in dataclasses.fields(cls)}
-    required = [key for key in stated if fields[key].default is dataclasses.MISSING]
-    _require_keys(values, f"{source}: parameters", known=(*stated, "nodes"), required=required)
+    required = [key for key in numbers if fields[key].default is dataclasses.MISSING]
+    _require_keys(values, f"{source}: {where}", known=(*numbers, *words, *parts, *more), required=required)
+    given: dict[str, Any] = {}
+    inner = "" if where == "parameters" else f"{where}."
     for key, value in values.items():
-        if key in stated:
-            _require_allowed(key, value, stated[key], source)
-        elif not isinstance(value, int):
+        if key in numbers:
+            _require_allowed(inner + key, value, numbers[key], source)
+        elif key in parts:
+            value = _parts(value, parts[key], source, inner + key)
+        elif key not in words and (not isinstance(value, int) or isinstance(value, bool)):
             raise RobotFileError(f"{source}: {key} is {shown(value)}; allowed is a whole number, 2 or more")
+        elif key in words and not isinstance(value, str | bool | list):
+            raise RobotFileError(f"{source}: {inner}{key} is {shown(value)}; allowed is {words[key].words}")
+        given[key] = value
     try:
-        return cls(**values)
+        return cls(**given)
     except ParameterError as error:
-        raise RobotFileError(f"{source}: {error}") from None
+        raise RobotFileError(f"{source}: {inner and where + ': '}{error}") from None
+    except TypeError:  # a word that is a list within a list cannot be compared
+        raise RobotFileError(f"{source}: {where}: a choice is neither a word nor a list of words") from None
+
+
+def _parts(value: Any, slot: Slot, source: str, where: str) -> Any:
+    """A part from a mapping with its kind, or parts from a list of such."""
+    known = kinds_of(slot.family)
+    names = ", ".join(known)
+    if slot.many:
+        if not isinstance(value, list):
+            raise RobotFileError(
+                f"{source}: {where} is {shown(value)}; "
+                f"allowed is a list of mappings, each with a kind: {names}"
+            )
+        one = dataclasses.replace(slot, many=False)
+        return tuple(_parts(each, one, source, f"{where}.{k}") for k, each in enumerate(value))
+    if not isinstance(value, dict) or "kind" not in value:
+        raise RobotFileError(
+            f"{source}: {where} is {shown(value)}; allowed is a mapping with a kind: {names}"
+        )
+    kind = value["kind"]
+    if not isinstance(kind, str) or kind not in known:
+        raise RobotFileError(
+            f"{source}: {where}.kind is {shown(kind)}; allowed is {names}{did_you_mean(kind, known)}"
+        )
+    return _made(known[kind], {key: each for key, each in value.items() if key != "kind"}, source, where)
 
 
 def _require_keys(mapping: dict[Any, Any], source: str, *, known: Any, required: Any) -> None:
@@ -244,7 +295,8 @@ def format_robot(robot: System, description: str = "") -> str:
         raise RobotFileError("a batch of robots cannot be written to one robot file; write them one by one")
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(robot)):
         raise RobotFileError("a robot cannot be written to a file inside jit, grad or vmap")
-    head = {"format": FORMAT, "kind": kind, "description": description}
+    more = _more_lines(robot)
+    head = {"format": FORMATS[1 if more else 0], "kind": kind, "description": description}
     lines = [f"{key}: {flow(value)}" for key, value in head.items() if value != ""]
     lines.append("parameters:")
     for name, parameter in robot.parameters().items():
@@ -252,7 +304,51 @@ def format_robot(robot: System, description: str = "") -> str:
         if value is not None:
             lines.append(f"  {name}: {flow(_plain(value))}  # {parameter.unit}, {parameter.meaning}")
     lines.append(f"  nodes: {robot.nodes}  # base and tip included")
-    return "\n".join(lines) + "\n"
+    return "\n".join(lines + more) + "\n"
+
+
+def _more_lines(robot: System) -> list[str]:
+    """The choices and parts of a robot that are not as they are by default."""
+    lines = []
+    defaults = {field.name: field.default for field in dataclasses.fields(robot)}
+    for name, choice in choices_of(type(robot)).items():
+        value = getattr(robot, name)
+        if value != defaults[name]:
+            lines.append(f"  {name}: {_word(value)}  # {choice.meaning}")
+    for name, slot in slots_of(type(robot)).items():
+        value = getattr(robot, name)
+        if value is None or eqx.tree_equal(value, defaults[name]) is True:
+            continue
+        if not slot.many:
+            lines.append(f"  {name}: {_part_text(value)}  # {slot.meaning}")
+            continue
+        lines.append(f"  {name}:  # {slot.meaning}")
+        lines += [f"    - {_part_text(each)}" for each in value]
+    return lines
+
+
+def _part_text(each: Any) -> str:
+    """A part on one line."""
+    if not each.kind:
+        raise RobotFileError(
+            f"a {type(each).__name__} cannot be written to a robot file: it is made of code, not of numbers"
+        )
+    entries = [f"kind: {each.kind}"]
+    defaults: dict[str, Any] = {field.name: field.default for field in dataclasses.fields(each)}
+    for name in parameters_of(type(each)):
+        value = getattr(each, name)
+        if value is not None and not np.array_equal(value, defaults[name]):
+            entries.append(f"{name}: {flow(_plain(value))}")
+    entries += [
+        f"{name}: {_word(getattr(each, name))}"
+        for name in choices_of(type(each))
+        if getattr(each, name) != defaults[name]
+    ]
+    return "{" + ", ".join(entries) + "}"
+
+
+def _word(value: Any) -> str:
+    return flow(list(value) if isinstance(value, tuple) else value)
 
 
 def _plain(value: Any) -> Any:

@@ -117,10 +117,6 @@ class RoutedTendonRobot(TendonRod):
         """Σ Tᵢ d₃ × rᵢ: how the tendons would bend the rod without friction (N·m), material frame."""
         return self.tendon_offset * dot(self.bending_directions.T, control)
 
-    def tendon_force(self, control: Float[Any, " c"]) -> Float[Any, "3"]:
-        """None: n carries rod and tendons."""
-        return jnp.zeros(3)
-
     def rest(self, s: Any) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
         """Straight up along z, unloaded, at rest, and no friction."""
         y, z = super().rest(s)
@@ -158,7 +154,7 @@ class RoutedTendonRobot(TendonRod):
     def _moment(self, s: Any, u: Float[Any, "3"], control: Any, x: Any, history: History) -> Any:
         """Rᵀm by the material's law where the curvature is u."""
         u_t = history.c0 * u + self.z_layout.get(history.z, "u")
-        bent = u - self.u_star
+        bent = u
         turn = s * (jnp.sqrt(jnp.sum(u[:2] ** 2) + STRAIGHT**2) - STRAIGHT)
         path = self.friction_wobble * s + self.friction_curvature * turn
         tension = control * jnp.exp(-(1.0 - x) * path * self._friction(u_t, history))
@@ -191,7 +187,7 @@ class RoutedTendonRobot(TendonRod):
 
         B, hu = self.bending_damping, self.z_layout.get(history.z, "u")
         smooth = inverse(self.bending_stiffness_at(s) + history.c0 * B)
-        start = dot(smooth, m + self.actuation(control) + dot(self.Kbt, self.u_star) - dot(B, hu))
+        start = dot(smooth, m + self.actuation(control) - dot(B, hu))
         begun = (0, jax.lax.stop_gradient(start), jnp.inf)
         _, u, _ = jax.lax.while_loop(goes_on, corrected, begun)
         slope = jax.lax.stop_gradient(inverse(jax.jacfwd(left)(u)))

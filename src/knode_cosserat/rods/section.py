@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+import abc
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+
+from knode_cosserat.rods.parameters import choice, parameter, place
+from knode_cosserat.rods.parts import Part
+from knode_cosserat.rods.system import Field
 
 #: The paper's G = E / (2 (1 + 0.3)), for a robot that gives no shear modulus.
 POISSON_RATIO = 0.3
@@ -44,3 +51,119 @@ class CircularSection(NamedTuple):
 def shear_modulus(youngs_modulus: Any) -> Any:
     """Shear modulus G = E / (2 (1 + ν)) of an isotropic material (Pa)."""
     return youngs_modulus / (2.0 * (1.0 + POISSON_RATIO))
+
+
+class Differences(NamedTuple):
+    """How a place of the rod differs: factors of radius and stiffness, and curvature (1/m) added at rest."""
+
+    radius: Any = 1.0
+    stiffness: Any = 1.0
+    curvature: Any = 0.0
+
+
+class SectionChange(Part):
+    """Where, and how, a rod's cross-section is not what its parameters say."""
+
+    begin: float = place("where it begins", default=0.0)
+    end: float = place("where it ends", default=1.0)
+
+    @abc.abstractmethod
+    def differences(self, part: Any, control: Any) -> Differences:
+        """How the rod differs at a part of the way, 0 to 1, from `begin` to `end`."""
+
+
+class Stretch(SectionChange):
+    """A stretch of rod whose radius, stiffness or curvature at rest differs, along it and by control.
+
+    With ξ from 0 to 1 along the stretch, the radius is multiplied by a + b ξ + c ξ² … with the coefficients
+    given, and so is the stiffness. A control c, if there is one, multiplies the stiffness by another 1 +
+    gain·c and adds gain·c to the curvature.
+    """
+
+    kind: ClassVar[str] = "stretch"
+
+    radius: Any = parameter(
+        "", "factor of the radius, coefficients in ξ", shape="list", low=-1e3, high=1e3, default=(1.0,)
+    )
+    stiffness: Any = parameter(
+        "", "factor of the stiffness, coefficients in ξ", shape="list", low=-1e6, high=1e6, default=(1.0,)
+    )
+    curvature: Any = parameter(
+        "1/m",
+        "curvature at rest, material frame",
+        shape="vector",
+        low=-1e4,
+        high=1e4,
+        default=(0.0, 0.0, 0.0),
+    )
+    curvature_slope: Any = parameter(
+        "1/m", "how much more of it there is where the stretch ends", shape="vector", low=-1e4, high=1e4,
+        default=(0.0, 0.0, 0.0),
+    )  # fmt: skip
+    controlled: bool = choice("whether a control acts on it", (False, True), False)
+    stiffness_gain: Any = parameter(
+        "", "what a control of 1 adds to the factor of the stiffness", low=-1e6, high=1e6, default=0.0
+    )
+    curvature_gain: Any = parameter(
+        "1/m", "what a control of 1 adds to the curvature at rest", shape="vector", low=-1e4, high=1e4,
+        default=(0.0, 0.0, 0.0),
+    )  # fmt: skip
+
+    @property
+    def control_fields(self) -> tuple[Field, ...]:
+        """One number, if it is controlled."""
+        return (Field("input", 1, "1", "what acts on the section"),) if self.controlled else ()
+
+    def differences(self, part: Any, control: Any) -> Differences:
+        """See the class."""
+        input = control[0] if self.controlled else 0.0
+        stiffness = _polynomial(self.stiffness, part) * (1.0 + self.stiffness_gain * input)
+        curvature = (
+            jnp.asarray(self.curvature)
+            + jnp.asarray(self.curvature_slope) * part
+            + jnp.asarray(self.curvature_gain) * input
+        )
+        return Differences(_polynomial(self.radius, part), stiffness, curvature)
+
+
+class FunctionSection(SectionChange):
+    """A section that is any function of the part of the way along it, for use from Python.
+
+    `function` maps the part of the way, 0 to 1, and the robot's control of it to `Differences`; with
+    `inputs` it has as many numbers of the control. It must be traceable by JAX, and no file can hold it.
+    """
+
+    function: Callable[[Any, Any], Differences] = eqx.field(
+        static=True, default=lambda part, control: Differences()
+    )
+    inputs: int = eqx.field(static=True, default=0)
+
+    @property
+    def control_fields(self) -> tuple[Field, ...]:
+        """As many numbers as were asked for."""
+        return (Field("input", self.inputs, "1", "what acts on the section"),) if self.inputs else ()
+
+    def differences(self, part: Any, control: Any) -> Differences:
+        """What the function says."""
+        return self.function(part, control)
+
+
+def _polynomial(coefficients: Any, at: Any) -> Any:
+    value = 0.0
+    for k in reversed(range(np.shape(coefficients)[0])):
+        value = value * at + coefficients[k]
+    return value
+
+
+def differences_at(changes: tuple[SectionChange, ...], part: Any, controls: list[Any]) -> Differences:
+    """How the rod differs at a part of its length: factors multiplied, curvatures added."""
+    found = Differences(1.0, 1.0, jnp.zeros(3))
+    for change, control in zip(changes, controls, strict=True):
+        own = change.differences((part - change.begin) / (change.end - change.begin), control)
+        within = (part >= change.begin) & (part <= change.end)
+        found = Differences(
+            found.radius * jnp.where(within, own.radius, 1.0),
+            found.stiffness * jnp.where(within, own.stiffness, 1.0),
+            found.curvature + jnp.where(within, own.curvature, 0.0),
+        )
+    return found

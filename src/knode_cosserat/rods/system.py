@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.rods.parameters import Parameter, ParameterError, checked, parameters_of
+from knode_cosserat.rods.parameters import Parameter, ParameterError, check_fields, parameters_of
 from knode_cosserat.rotation import dot, rotation_matrix
 
 
@@ -137,6 +137,14 @@ class System(eqx.Module):
     #: observables that are velocities, on which drag and friction depend; none: the system does not say
     velocities: ClassVar[tuple[str, ...]] = ()
 
+    #: places, as parts of the length between 0 and 1, where the right-hand side or y jumps
+    cuts: ClassVar[tuple[float, ...]] = ()
+    #: whether y jumps at some of them
+    jumps: ClassVar[bool] = False
+    #: whether the state of `rest` meets the conditions at both ends, so that a simulation can start there;
+    #: one of a robot that is held at its tip starts at the equilibrium under its first control
+    starts_at_rest: ClassVar[bool] = True
+
     if TYPE_CHECKING:  # every system has a length (m) among its own parameters
         length: Any
     #: how many nodes the rod is divided into, both ends counted
@@ -174,6 +182,12 @@ class System(eqx.Module):
         """y_s and z at one point: what the solvers integrate."""
         z = self.strains(s, t, y, control, history)
         return self.rates(s, t, y, z, control, history), z
+
+    def crossed(
+        self, acting: Float[Any, " cuts"], t: Any, y: Float[Any, " y"], control: Any, history: History
+    ) -> Float[Any, " y"]:
+        """y on the far side of the cuts that are acting (one each; zero: not here), from that on the near side."""
+        raise NotImplementedError(f"{type(self).__name__} has `jumps`, but gives no `crossed`")
 
     # the two ends, and rest
 
@@ -276,9 +290,16 @@ class System(eqx.Module):
     def replace(self, **changes: Any) -> Self:
         """A copy with other parameters, by name; what depends on them follows.
 
+        Those of parts have names with dots, and numbers where there are several: `base_end.position`,
+        `loads.0.mass`; they are given as `replace(**{"loads.0.mass": 0.1})`.
+
         Raises `ParameterError` for a name that does not exist or a value that is not allowed. Values may be
         JAX tracers, so that derivatives with respect to a parameter go through here.
         """
+        for name in [name for name in changes if "." in name]:
+            first, _, rest = name.partition(".")
+            owner = changes.get(first, getattr(self, first, None))
+            changes[first] = with_value(owner, rest, changes.pop(name), name)
         known = parameters_of(type(self))
         settable = [*known, *(f.name for f in dataclasses.fields(self) if f.name not in known)]
         for name in changes:
@@ -292,8 +313,23 @@ class System(eqx.Module):
         given: Any = self.nodes
         if not isinstance(given, int) or not 2 <= self.nodes <= 10_000:
             raise ParameterError(f"nodes is {self.nodes!r}; allowed is a whole number from 2 to 10000")
-        for name, parameter in parameters_of(type(self)).items():
-            checked(name, getattr(self, name), parameter)
+        check_fields(self)
+
+
+def with_value(owner: Any, path: str, value: Any, name: str) -> Any:
+    """A part, or a tuple of parts, with another value at a path such as `0.mass`."""
+    first, _, rest = path.partition(".")
+    several = isinstance(owner, tuple)
+    known = [str(k) for k in range(len(owner))] if several else getattr(owner, "__dataclass_fields__", {})
+    if first not in known:
+        raise ParameterError(
+            f"there is no parameter {name!r}: no {first!r} among {', '.join(known) or 'nothing'}"
+        )
+    inner = owner[int(first)] if several else getattr(owner, first)
+    changed = with_value(inner, rest, value, name) if rest else value
+    if several:
+        return tuple(changed if k == int(first) else each for k, each in enumerate(owner))
+    return dataclasses.replace(owner, **{first: changed})
 
 
 def is_traced(tree: Any) -> bool:

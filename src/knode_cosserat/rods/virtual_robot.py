@@ -50,10 +50,6 @@ class VirtualRobot(TendonRod):
     sleeve_factor: Any = parameter("", "what the sleeve multiplies Kbt by", low=1.0, high=100.0, default=4.0)
     rib_mass: Any = parameter("kg", "mass of one of the nine ribs", low=0.0, high=1.0, default=0.0015)
 
-    def tendon_force(self, control: Float[Any, " c"]) -> Float[Any, "3"]:
-        """None: n carries rod and tendons."""
-        return jnp.zeros(3)
-
     def actuation(self, control: Float[Any, " c"]) -> Float[Any, "3"]:
         """Tension in all, and its moment about the axis (N, N·m, N·m)."""
         moment = self.tendon_offset * jnp.stack(
@@ -92,7 +88,7 @@ class VirtualRobot(TendonRod):
         def left(u: Any, held: Any) -> Any:
             K, B, hu, m, control = held
             u_t = c0 * u + hu
-            return dot(K, u - self.u_star) + dot(B, u_t) + self.tendon_moment(s, u_t, control) - m
+            return dot(K, u) + dot(B, u_t) + self.tendon_moment(s, u_t, control) - m
 
         def corrected(u: Any, held: Any) -> Any:
             return u - dot(inverse(jax.jacfwd(left)(u, held)), left(u, held))

@@ -24,6 +24,7 @@ import jax.numpy as jnp
 from jaxtyping import Float, Int
 
 from knode_cosserat.rods.system import History, System, unpacked_history
+from knode_cosserat.solvers.crossing import Crossing, carried, crossing_of, within
 from knode_cosserat.solvers.linear import Linearisation, LinearSolver
 from knode_cosserat.solvers.space import SpaceScheme, middles
 
@@ -53,6 +54,8 @@ class StepProblem(eqx.Module):
     c0: Float[Any, ""]
     history: Float[Any, "nodes x"]
     space: SpaceScheme = eqx.field(static=True)
+    #: what the tip's conditions are to leave: zero, but on the way to a solution
+    tip_offset: Any = None
 
     def point_rates(self, s: Any, y: Float[Any, " y"], history: Float[Any, " x"]) -> Any:
         """y_s and z at one point, from a packed record of history."""
@@ -67,7 +70,14 @@ class StepProblem(eqx.Module):
 
     def tip_residual(self, y: Float[Any, " y"]) -> Float[Any, " k"]:
         """What is left of the tip's conditions at this y of the last node."""
-        return self.system.tip(self.t, self.control, y, self._unpack(self.history[-1]))
+        left = self.system.tip(self.t, self.control, y, self._unpack(self.history[-1]))
+        return left if self.tip_offset is None else left - self.tip_offset
+
+    def crossed(self, acting: Any, y: Float[Any, " y"], history: Float[Any, " x"]) -> Float[Any, " y"]:
+        """y on the far side of the cuts that are acting."""
+        if not self.system.jumps:
+            return y
+        return self.system.crossed(acting, self.t, y, self.control, self._unpack(history))
 
     @property
     def arclength(self) -> Float[Any, " nodes"]:
@@ -81,19 +91,36 @@ class StepProblem(eqx.Module):
         start, end = self.history[:-1], self.history[1:]
         middle = middles(self.history) if self.space.uses_middle else start
 
-        def segment(s_j: Any, y_j: Any, *history: Any) -> Any:
+        def rates(*at: Any) -> Any:
+            return self.point_rates(*at)[0]
+
+        def segment(s_j: Any, y_j: Any, *history: Any, crossing: Crossing | None = None) -> Any:
             def advance(y: Any) -> Any:
-                return self.space.advance(lambda *at: self.point_rates(*at)[0], s_j, ds, y, history)
+                if crossing is None:
+                    return self.space.advance(rates, s_j, ds, y, history)
+                return carried(self.space, rates, self.crossed, crossing, (s_j, ds), y, history)
 
             return each(advance, y_j)
 
         # nodes last inside: XLA then vectorises over them
         lanes = (y[:-1].T, start.T, middle.T, end.T)
-        return jax.vmap(segment, in_axes=(0, -1, -1, -1, -1))(s[:-1], *lanes)
+        crossings = crossing_of(self.system)
+        if crossings is None:
+            return jax.vmap(segment, in_axes=(0, -1, -1, -1, -1))(s[:-1], *lanes)
+        return jax.vmap(
+            lambda crossing, *lane: segment(*lane, crossing=crossing), in_axes=(0, 0, -1, -1, -1, -1)
+        )(Crossing(*map(jnp.asarray, crossings)), s[:-1], *lanes)
 
     def record(self, y: Float[Any, "nodes y"]) -> Float[Any, "nodes x"]:
         """What must be kept of a solved step at every node: y, z and, if B is not zero, y_s."""
-        y_s, z = jax.vmap(self.point_rates)(self.arclength, y, self.history)
+        s, crossings = self.arclength, crossing_of(self.system)
+        here = y
+        if crossings is not None:
+            # on the far side of what is at a node, and at the tip on the near side
+            s = jnp.concatenate([within(s[:-1], s[:-1], s[1:]), within(s[-1:], s[-2:-1], s[-1:])])
+            across = jax.vmap(self.crossed)(jnp.asarray(crossings.acting[:, 0]), y[:-1], self.history[:-1])
+            here = jnp.concatenate([across, y[-1:]])
+        y_s, z = jax.vmap(self.point_rates)(s, here, self.history)
         return jnp.concatenate([y, z, y_s] if self.system.mixed else [y, z], axis=1)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -26,6 +27,8 @@ from knode_cosserat.solvers.time import BDF1, Static
 HALVINGS = 6
 #: the smallest part of a change of control that continuation goes down to
 LEAST_PART = 1.0 / 512.0
+#: what part of the way a tip is brought in one step while a robot comes to rest
+DRAWN = 0.05
 
 
 class Outcome(NamedTuple):
@@ -43,10 +46,15 @@ class Outcome(NamedTuple):
 
 @functools.partial(jax.jit, static_argnames="settings")
 def attempt(
-    system: System, settings: Settings, c0: Any, history: Any, control: Any, t: Any, y: Any, unknowns: Any
-) -> tuple[Solution, Any]:
-    """One boundary-value problem with the stable elimination and a long search."""
+    system: System, settings: Settings, c0: Any, history: Any, control: Any, t: Any, y: Any, unknowns: Any,
+    part: Any, from_y: Any,
+) -> tuple[Solution, Any]:  # fmt: skip
+    """One boundary-value problem with the stable elimination and a long search.
+
+    The tip's conditions hold in `part`: of what they leave at `from_y` the rest is still left.
+    """
     problem = StepProblem(system, t, control, c0, history, settings.space)
+    problem = dataclasses.replace(problem, tip_offset=(1.0 - part) * problem.tip_residual(from_y[-1]))
     patient = dataclasses.replace(settings.newton, max_linearisations=40)
     solution = newton(problem, y, unknowns, Decoupled(), patient)
     return solution, problem.record(solution.y)
@@ -61,10 +69,13 @@ class _Step:
         self.history = history_of(past, self.coefficients, settings)
         self.corrections = 0
 
-    def solve(self, control: Any, y: Any, unknowns: Any) -> tuple[Solution, Any]:
+    def solve(
+        self, control: Any, y: Any, unknowns: Any, part: float = 1.0, from_y: Any = None
+    ) -> tuple[Solution, Any]:
         solution, record = attempt(
-            self.system, self.settings, self.coefficients[0], self.history, control, self.t, y, unknowns
-        )
+            self.system, self.settings, self.coefficients[0], self.history, control, self.t, y, unknowns,
+            part, y if from_y is None else from_y,
+        )  # fmt: skip
         self.corrections += int(solution.corrections)
         return solution, record
 
@@ -138,17 +149,27 @@ def _continue_load(step: _Step, before: Any, now: Any) -> tuple[Solution, Any] |
         found = step.solve(before, *guess)
         if not step.solved(found[0]):
             continue
-        reached, part = 0.0, 0.25
-        while reached < 1.0 and part >= LEAST_PART:
-            target = min(1.0, reached + part)
-            following = step.solve(before + target * (now - before), found[0].y, found[0].unknowns)
-            if step.solved(following[0]):
-                found, reached, part = following, target, 2.0 * part
-            else:
-                part /= 4.0
-        if reached == 1.0:
-            return found
+        whole = _in_parts(
+            step, found, lambda part, at: step.solve(before + part * (now - before), at.y, at.unknowns)
+        )
+        if whole is not None:
+            return whole
     return None
+
+
+def _in_parts(
+    step: _Step, found: tuple[Solution, Any], solve: Callable[[float, Solution], tuple[Solution, Any]]
+) -> tuple[Solution, Any] | None:
+    """From a solution at part 0 to that at 1, each from the last, in steps as long as go well."""
+    reached, part = 0.0, 0.25
+    while reached < 1.0 and part >= LEAST_PART:
+        target = min(1.0, reached + part)
+        following = solve(target, found[0])
+        if step.solved(following[0]):
+            found, reached, part = following, target, 2.0 * part
+        else:
+            part /= 4.0
+    return found if reached == 1.0 else None
 
 
 def _halve(
@@ -177,15 +198,22 @@ def _halve(
 
 
 def _relax(step: _Step, control: Any) -> tuple[Solution, Any] | None:
-    """Implicit Euler with ever longer time steps, then the static solve: comes to rest in a stable shape."""
-    now, dt = step.past, 0.01
-    for _ in range(60):
+    """Implicit Euler with ever longer time steps, then the static solve: comes to rest in a stable shape.
+
+    A tip that is held elsewhere than where it is, or loaded, is brought there in the first steps.
+    """
+    now, dt, part = step.past, 0.01, 0.0
+    at_first = step.guesses()[0][0]
+    for _ in range(80):
         moving = _Step(step.system, step.settings, now, BDF1().coefficients(dt, dt), 0.0)
-        found = moving.solve(control, *moving.guesses()[0])
+        target = min(1.0, part + DRAWN)
+        found = moving.solve(control, *moving.guesses()[0], target, at_first)
         if not moving.solved(found[0]):
             dt /= 4.0
             continue
-        now, dt = moving.after(*found), 2.0 * dt
+        # short steps until the tip is where it belongs
+        now, dt = moving.after(*found), 2.0 * dt if part == 1.0 else dt
+        part = target
         if dt > 1e3:
             break
     found = step.solve(control, now.records[0][:, : step.system.y_layout.size], now.unknowns[0])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
@@ -38,7 +39,8 @@ def simulate(
     """Simulate a robot, or a batch of them, under given controls.
 
     Args:
-        robot: one system, or a sequence of systems that differ in their parameters only.
+        robot: one system, or a sequence of systems that differ in their parameters only. It starts at rest, or,
+            if it is held at its tip (`System.starts_at_rest`), at its equilibrium under the first control.
         controls: (T, c), or (B, T, c) for a batch; for a tendon robot the tensions in N. Control i is held
             from row i to row i + 1.
         dt: time step (s).
@@ -118,7 +120,7 @@ def _checked_controls(system: System, controls: Any, batch: int | None) -> tuple
         except (TypeError, ValueError) as error:
             raise ValueError(f"controls are not numbers ({error}); {allowed}") from None
     shape = np.shape(controls)
-    if len(shape) not in (2, 3) or shape[-1] != size or 0 in shape:
+    if len(shape) not in (2, 3) or shape[-1] != size or 0 in shape[:-1]:
         raise ValueError(f"controls have shape {shape}; {allowed}")
     if not is_traced(controls) and not np.all(np.isfinite(controls)):
         bad = tuple(np.argwhere(~np.isfinite(controls))[0].tolist())
@@ -165,11 +167,29 @@ def beginning(run: Run) -> tuple[Any, Start, Any, Any]:
     system, controls, initial, settings, dt, batch, many = run
     if initial is not None:
         return _going_on(system, initial, settings, dt)
+    if not system.starts_at_rest and not isinstance(settings.time, Static):
+        return _at_equilibrium(run)
     record, past = (_jit_all_at_rest if many else _jit_at_rest)(system)
     if batch and not many:
         record, past = jax.tree.map(lambda x: jnp.broadcast_to(x, (batch, *x.shape)), (record, past))
     none_yet = np.zeros((*np.shape(controls)[:-2], system.control_size))
     return record, Start(past, none_yet), 0.0, "start"
+
+
+def _at_equilibrium(run: Run) -> tuple[Any, Start, Any, str]:
+    """Where a robot starts whose straight shape does not meet the conditions at its ends."""
+    settings = dataclasses.replace(run.settings, time=Static())
+    still = run._replace(controls=run.controls[..., :1, :], settings=settings, dt=1.0)
+    if is_traced((run.system, run.controls)):
+        found = _traced(*still)
+    else:
+        found = _batch(still, "raise", False) if run.batch else _single(still, "raise", False)
+    row = jnp.concatenate([found.y, found.z], axis=-1)[..., 1, :, :]
+    control = run.controls[..., 0, :]
+    if not run.batch:
+        return row, Start(initial_past(run.system, row, control), control), 0.0, "start"
+    pasts = jax.vmap(initial_past, in_axes=(0 if run.many else None, 0, 0))(run.system, row, control)
+    return row, Start(pasts, control), 0.0, "start"
 
 
 def _going_on(

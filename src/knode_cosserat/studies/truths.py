@@ -204,8 +204,9 @@ class ExternalFriction(TendonRobot):
     least: Any = parameter("rad/s", "angular velocity from which it is full", low=1e-9, high=1e6, default=0.5)
     law: Rubbing = eqx.field(static=True, default="each axis")
 
-    def _spatial_rates(self, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
-        y_s = super()._spatial_rates(y, y_t, z, z_t, control)
+    def spatial_rates(self, s, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
+        """With what this robot has beside."""
+        y_s = super().spatial_rates(s, y, y_t, z, z_t, control)
         R = rotation_matrix(self.y_layout.get(y, "h"))
         moment = self.friction * rubbing(self.law, self.y_layout.get(y, "w"), self.least)
         return y_s.at[self.y_layout.slice("m")].add(dot(R, moment))
@@ -222,8 +223,9 @@ class Wind(TendonRobot):
         default=(3.0, 0.0, 0.0),
     )  # fmt: skip
 
-    def _spatial_rates(self, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
-        y_s = super()._spatial_rates(y, y_t, z, z_t, control)
+    def spatial_rates(self, s, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
+        """With what this robot has beside."""
+        y_s = super().spatial_rates(s, y, y_t, z, z_t, control)
         R, q = rotation_matrix(self.y_layout.get(y, "h")), self.y_layout.get(y, "q")
         relative = q - dot(R.T, jnp.asarray(self.wind))
         more = square_law_drag(self.drag, relative) - square_law_drag(self.drag, q)
@@ -235,8 +237,9 @@ class TurningTendons(TendonRobot):
 
     turning: Any = parameter("", "part of the tendons' force that turns", low=0.0, high=1.0, default=1.0)
 
-    def _spatial_rates(self, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
-        y_s = super()._spatial_rates(y, y_t, z, z_t, control)
+    def spatial_rates(self, s, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
+        """With what this robot has beside."""
+        y_s = super().spatial_rates(s, y, y_t, z, z_t, control)
         f = self.actuation(control)
         turned = dot(rotation_matrix(self.y_layout.get(y, "h")), f)
         return y_s.at[self.y_layout.slice("n")].add(self.turning * (f - turned))

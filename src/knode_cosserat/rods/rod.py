@@ -1,0 +1,432 @@
+"""A Cosserat rod with everything that may load it, hold it and touch it: what all robots of one rod share.
+
+`slender_rod` is a rod by itself; `tendon_robot` and `routed_robot` add what tendons do. Symbols follow the
+paper's table of notations:
+
+    p  position (m)            h  orientation, quaternion, scalar first     R  its rotation matrix
+    n  internal force (N)      m  internal moment (N·m), both in the global frame
+    q  velocity (m/s)          w  angular velocity ω (1/s), both in the material frame
+    v  rate of p along s       u  curvature (1/m), both in the material frame
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.rods.ends import Clamped, End, Free, Pose, velocities
+from knode_cosserat.rods.loads import Load, Motion, PointLoad, SpreadLoad, Wrench, square_law_drag
+from knode_cosserat.rods.parameters import parameter, part
+from knode_cosserat.rods.parts import placed, shares
+from knode_cosserat.rods.section import CircularSection, SectionChange, differences_at, shear_modulus
+from knode_cosserat.rods.surroundings import Obstacle
+from knode_cosserat.rods.system import History, Layout, Scales, System
+from knode_cosserat.rotation import cross, dot, inverse, quaternion_rate, rotation_matrix
+
+#: d₃: along the rod
+ALONG = np.array([0.0, 0.0, 1.0])
+#: steps in which the shape at rest of a rod that is curved at rest is integrated
+REST_STEPS = 100
+
+
+class Material(NamedTuple):
+    """The rod's section and material at one place: the law K (z - z*) + B z_t and the inertia."""
+
+    Kse: Float[Any, "3 3"]
+    Bse: Float[Any, "3 3"]
+    Kbt: Float[Any, "3 3"]
+    Bbt: Float[Any, "3 3"]
+    u_star: Float[Any, "3"]
+    #: ρA (kg/m)
+    rhoA: Any
+    #: ρJ (kg·m)
+    rhoJ: Float[Any, "3 3"]
+    radius: Any
+
+
+class Rod(System):
+    """A round rod with gravity, drag, material damping, loads, ends and surroundings (paper eqs. 13-15).
+
+    A subclass says what its actuators do: `strains`, and if they load it from outside `actuator_force`.
+    """
+
+    y_layout: ClassVar[Layout] = Layout(
+        ("p", 3, "m", "position, global frame"),
+        ("h", 4, "1", "orientation, quaternion, scalar first"),
+        ("n", 3, "N", "internal force, global frame", "h", "N/m"),
+        ("m", 3, "N m", "internal moment, global frame", "h", "N"),
+        ("q", 3, "m/s", "velocity, material frame"),
+        ("w", 3, "rad/s", "angular velocity, material frame"),
+    )
+    z_layout: ClassVar[Layout] = Layout(
+        ("v", 3, "1", "rate of position along the rod, material frame", "", "N"),
+        ("u", 3, "1/m", "curvature, material frame", "", "N m"),
+    )
+    mixed: ClassVar[bool] = False
+    velocities: ClassVar[tuple[str, ...]] = ("q", "w", "u_t")
+
+    length: Any = parameter("m", "length of the rod", low=1e-3, high=20.0)
+    radius: Any = parameter("m", "radius of the rod", low=1e-6, high=0.5)
+    density: Any = parameter("kg/m3", "density of the rod", low=1.0, high=30e3)
+    youngs_modulus: Any = parameter("Pa", "Young's modulus", low=1e3, high=2e12)
+    shear_modulus: Any = parameter(
+        "Pa", "shear modulus; by default E / 2.6", low=1e2, high=1e12, default=None
+    )
+    shear_damping: Any = parameter(
+        "N s", "Bse, damping of shear and extension", shape="matrix", low=0.0, high=1e6, default=0.0
+    )
+    bending_damping: Any = parameter(
+        "N m2 s", "Bbt, damping of bending and twisting", shape="matrix", low=0.0, high=1e4, default=0.0
+    )
+    drag: Any = parameter("kg/m2", "C, square-law drag", shape="matrix", low=0.0, high=1e3, default=0.0)
+    linear_drag: Any = parameter(
+        "kg/(m s)", "drag in proportion to velocity", shape="matrix", low=0.0, high=1e4, default=None
+    )
+    gravity: Any = parameter(
+        "m/s2",
+        "gravitational acceleration, global frame",
+        shape="vector",
+        low=-100.0,
+        high=100.0,
+        default=(0.0, 0.0, -9.81),
+    )
+    shear_stiffness: Any = parameter(
+        "N", "Kse; by default diag(GA, GA, EA)", shape="matrix", low=1e-9, high=1e15, default=None
+    )
+    bending_stiffness: Any = parameter(
+        "N m2", "Kbt; by default diag(EI, EI, 2GI)", shape="matrix", low=1e-15, high=1e9, default=None
+    )
+    sections: tuple[SectionChange, ...] = part(
+        "where the section differs", SectionChange, many=True, default=()
+    )
+    loads: tuple[Load, ...] = part("what loads it beside gravity and drag", Load, many=True, default=())
+    surroundings: tuple[Obstacle, ...] = part("what it may touch", Obstacle, many=True, default=())
+    base_end: End = part("what holds it at s = 0", End, default=Clamped())
+    tip_end: End = part("what holds it at s = length", End, default=Free())
+
+    # what follows from the parameters
+
+    @property
+    def base_unknowns(self) -> tuple[str, ...]:  # type: ignore[override]
+        """What the end at the base leaves unknown."""
+        return self.base_end.unknowns
+
+    @property
+    def actuator_layout(self) -> Layout:
+        """The controls of the actuators: none, unless a robot has some."""
+        return Layout()
+
+    @property
+    def control_layout(self) -> Layout:  # type: ignore[override]
+        """The actuators' controls, then those of ends, sections and loads."""
+        driven = [field for prefix, each in self._driven for field in placed(each.control_fields, prefix)]
+        return Layout(*self.actuator_layout.fields, *driven)
+
+    @property
+    def _driven(self) -> list[tuple[str, Any]]:
+        """Everything that may have controls of its own, with how its controls are called."""
+        ends = [("base", self.base_end), ("tip", self.tip_end)]
+        sections = [(f"section{k}", each) for k, each in enumerate(self.sections)]
+        return [*ends, *sections, *((f"load{k}", each) for k, each in enumerate(self.loads))]
+
+    def _controls(self, control: Any) -> list[Any]:
+        """The controls of the base, the tip, each section and each load."""
+        spots = shares(tuple(each for _, each in self._driven), self.actuator_layout.size)
+        return [control[spot] for spot in spots]
+
+    @property
+    def starts_at_rest(self) -> bool:  # type: ignore[override]
+        """Not where its tip is held, which the straight rod need not meet, nor where it is curved by control."""
+        return not self.tip_end.held
+
+    @property
+    def section(self) -> CircularSection:
+        """The rod's cross-section, where nothing is said of another."""
+        return CircularSection(self.radius)
+
+    @property
+    def mass_per_length(self) -> Any:
+        """ρA (kg/m)."""
+        return self.density * self.section.area
+
+    @property
+    def G(self) -> Any:
+        """Shear modulus (Pa): as given, or from Young's."""
+        return shear_modulus(self.youngs_modulus) if self.shear_modulus is None else self.shear_modulus
+
+    @property
+    def Kse(self) -> Float[Any, "3 3"]:
+        """Stiffness of shear and extension (N): as given, or from moduli and section."""
+        if self.shear_stiffness is not None:
+            return self.shear_stiffness
+        return self.section.shear_stiffness(self.youngs_modulus, self.G)
+
+    @property
+    def Kbt(self) -> Float[Any, "3 3"]:
+        """Stiffness of bending and twisting (N·m²): as given, or from moduli and section."""
+        if self.bending_stiffness is not None:
+            return self.bending_stiffness
+        return self.section.bending_stiffness(self.youngs_modulus, self.G)
+
+    @property
+    def v_star(self) -> np.ndarray:
+        """v of the unloaded rod: along z, unstretched."""
+        return ALONG
+
+    def material(self, s: Any, control: Any) -> Material:
+        """Section and material at arclength s (m)."""
+        plain = Material(
+            self.Kse, self.shear_damping, self.Kbt, self.bending_damping, np.zeros(3),
+            self.mass_per_length, self.density * self.section.inertia, self.radius,
+        )  # fmt: skip
+        if not self.sections:
+            return plain
+        found = differences_at(
+            self.sections, s / self.length, self._controls(control)[2 : 2 + len(self.sections)]
+        )
+        area = found.radius * found.radius
+        return Material(
+            plain.Kse * (area * found.stiffness), plain.Bse * area,
+            plain.Kbt * (area * area * found.stiffness), plain.Bbt * (area * area), found.curvature,
+            plain.rhoA * area, plain.rhoJ * (area * area), plain.radius * found.radius,
+        )  # fmt: skip
+
+    # what learning looks at
+
+    @property
+    def observable_layout(self) -> Layout:
+        """Motion and bending, as seen from the material."""
+        return Layout(
+            ("acceleration", 3, "m/s2", "acceleration of the centreline"),
+            ("spin", 3, "1/s2", "rate of the angular momentum over ρI"),
+            ("q", 3, "m/s", "velocity"),
+            ("w", 3, "rad/s", "angular velocity"),
+            ("u", 3, "1/m", "curvature"),
+            ("u_t", 3, "1/(m s)", "rate of the curvature"),
+        )
+
+    def observables(self, s: Any, y: Any, y_t: Any, z: Any, z_t: Any, control: Any) -> Float[Any, " o"]:
+        """See `observable_layout`."""
+        q, w = self.y_layout.get(y, "q"), self.y_layout.get(y, "w")
+        q_t, w_t = self.y_layout.get(y_t, "q"), self.y_layout.get(y_t, "w")
+        u, u_t = self.z_layout.get(z, "u"), self.z_layout.get(z_t, "u")
+        J = np.diag([1.0, 1.0, 2.0])
+        acceleration, spin = cross(w, q) + q_t, cross(w, dot(J, w)) + dot(J, w_t)
+        bent = u - self.material(s, control).u_star
+        return jnp.concatenate([acceleration, spin, q, w, bent, u_t])
+
+    # the equations, as the paper gives them
+
+    def stresses(self, y: Float[Any, " y"]) -> tuple[Float[Any, "3"], Float[Any, "3"]]:
+        """Rᵀn (N) and Rᵀm (N·m)."""
+        R = rotation_matrix(self.y_layout.get(y, "h"))
+        return dot(R.T, self.y_layout.get(y, "n")), dot(R.T, self.y_layout.get(y, "m"))
+
+    def linear_strains(self, s: Any, y: Float[Any, " y"], control: Any, history: History) -> Float[Any, " 6"]:
+        """v and u of the rod's own linear law (paper eq. 15)."""
+        c0, material = history.c0, self.material(s, control)
+        n, m = self.stresses(y)
+        hv, hu = self.z_layout.get(history.z, "v"), self.z_layout.get(history.z, "u")
+        Kse, Bse, Kbt, Bbt = material[:4]
+        bent = m if not self.sections else m + dot(Kbt, material.u_star)
+        v = dot(inverse(Kse + c0 * Bse), n + Kse @ self.v_star - dot(Bse, hv))
+        u = dot(inverse(Kbt + c0 * Bbt), bent - dot(Bbt, hu))
+        return jnp.concatenate([v, u])
+
+    def linear_law(self, s: Any, y: Float[Any, " y"], control: Any) -> tuple[Any, Any, Any]:
+        """C, D, f2 of the same law: K (z - z*) + B z_t = Rᵀ (n, m)."""
+        material = self.material(s, control)
+        n, m = self.stresses(y)
+        zero = jnp.zeros((3, 3))
+        C = jnp.block([[material.Kse, zero], [zero, material.Kbt]])
+        D = jnp.block([[material.Bse, zero], [zero, material.Bbt]])
+        return C, D, jnp.concatenate([n + material.Kse @ self.v_star, m + material.Kbt @ material.u_star])
+
+    def actuator_force(self, control: Float[Any, " c"]) -> Float[Any, "3"] | None:
+        """What actuators add to the load per length (N/m), global frame; none, unless a robot says so."""
+        return None
+
+    def rates(
+        self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
+    ) -> Float[Any, " y"]:
+        """y_s (paper eqs. 13 and 14)."""
+        y_t, z_t = history.c0 * y + history.y, history.c0 * z + history.z
+        return self.spatial_rates(s, y, y_t, z, z_t, control)
+
+    def spatial_rates(self, s, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
+        """The right-hand side of paper eq. 13, once y_t, z and z_t are known; further fields of y stay as they are."""
+        h, n = self.y_layout.get(y, "h"), self.y_layout.get(y, "n")
+        motion = Motion.of(self.y_layout, y, y_t)
+        _, R, q, w, q_t, w_t = motion
+        v, u = self.z_layout.get(z, "v"), self.z_layout.get(z, "u")
+        v_t, u_t = self.z_layout.get(z_t, "v"), self.z_layout.get(z_t, "u")
+        *_, rhoA, rhoJ, radius = self.material(s, control)
+        dragged = square_law_drag(self.drag, q)
+        if self.linear_drag is not None:
+            dragged = dragged + dot(self.linear_drag, q)
+
+        p_s = dot(R, v)
+        h_s = quaternion_rate(h, u)
+        n_s = dot(R, rhoA * (cross(w, q) + q_t) + dragged) - rhoA * self.gravity
+        m_s = dot(R, cross(w, dot(rhoJ, w)) + dot(rhoJ, w_t)) - cross(p_s, n)
+        q_s = v_t - cross(u, q) + cross(w, v)
+        w_s = u_t - cross(u, w)
+        pushed = self.actuator_force(control)
+        if pushed is not None:
+            n_s = n_s - pushed
+        for load in self._distributed(s, motion, radius, control):
+            n_s, m_s = n_s - load.force, m_s - load.moment
+        return jnp.concatenate([p_s, h_s, n_s, m_s, q_s, w_s])
+
+    def _distributed(self, s: Any, motion: Motion, radius: Any, control: Any) -> list[Wrench]:
+        """What loads and surroundings do, per length."""
+        found = [obstacle.wrench(motion, radius) for obstacle in self.surroundings]
+        for load, own in zip(self.loads, self._controls(control)[2 + len(self.sections) :], strict=True):
+            if not isinstance(load, SpreadLoad):
+                continue
+            wrench = load.wrench(motion, own)
+            if (load.begin, load.end) != (0.0, 1.0):
+                acts = (s >= load.begin * self.length) & (s <= load.end * self.length)
+                wrench = Wrench(*(jnp.where(acts, each, 0.0) for each in wrench))
+            found.append(wrench)
+        return found
+
+    # places where something begins, ends or pulls
+
+    @property
+    def cuts(self) -> tuple[float, ...]:  # type: ignore[override]
+        """Where loads and sections begin or end, and where loads act at one place."""
+        stretches: list[Any] = [
+            *self.sections,
+            *(load for load in self.loads if isinstance(load, SpreadLoad)),
+        ]
+        found = {end for each in stretches for end in (each.begin, each.end)}
+        found |= {load.at for load in self.loads if isinstance(load, PointLoad)}
+        return tuple(sorted(cut for cut in found if 0.0 < cut < 1.0))
+
+    @property
+    def jumps(self) -> bool:  # type: ignore[override]
+        """Whether a load acts at one place."""
+        return any(isinstance(load, PointLoad) and 0.0 < load.at < 1.0 for load in self.loads)
+
+    def crossed(
+        self, acting: Float[Any, " cuts"], t: Any, y: Float[Any, " y"], control: Any, history: History
+    ) -> Float[Any, " y"]:
+        """y on the far side of the cuts that are acting (ones; zeros elsewhere): n and m less what pulls there."""
+        places = {cut: k for k, cut in enumerate(self.cuts)}
+        weights = {k: acting[places[load.at]] for k, load in self._points() if load.at in places}
+        wrench = self._point_wrench(weights, y, control, history)
+        change = jnp.concatenate([np.zeros(7), wrench.force, wrench.moment])
+        return y - jnp.concatenate([change, np.zeros(self.y_layout.size - 13)])
+
+    def _points(self) -> list[tuple[int, PointLoad]]:
+        return [(k, load) for k, load in enumerate(self.loads) if isinstance(load, PointLoad)]
+
+    def _point_wrench(self, weights: Any, y: Any, control: Any, history: History) -> Wrench:
+        """The sum of the loads at places, each times its weight."""
+        controls = self._controls(control)[2 + len(self.sections) :]
+        motion = Motion.of(self.y_layout, y, history.c0 * y + history.y)
+        total = Wrench(jnp.zeros(3), jnp.zeros(3))
+        for k, weight in weights.items():
+            load: Any = self.loads[k]
+            own = load.wrench(motion, self.gravity, controls[k])
+            total = total + Wrench(weight * own.force, weight * own.moment)
+        return total
+
+    # the two ends, and rest
+
+    def rest(self, s: Any) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
+        """Unloaded, at rest, from the base on: straight, or as it is curved there."""
+        base = self.base_end.pose(Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])), self._no_control(0))
+        s = jnp.asarray(s, dtype=float)
+        p, h, u = self._rest_shape(base, s)
+        y = jnp.concatenate([p, h, np.zeros(self.y_layout.size - 7)])
+        return y, jnp.concatenate([self.v_star, u])
+
+    def _no_control(self, k: int) -> np.ndarray:
+        """The control of the k-th driven part while nothing is controlled."""
+        return np.zeros(sum(field.size for field in self._driven[k][1].control_fields))
+
+    def _rest_shape(self, base: Pose, s: Any) -> tuple[Any, Any, Any]:
+        if not self.sections:
+            along = dot(rotation_matrix(base.h), jnp.stack([jnp.zeros(()), jnp.zeros(()), s]))
+            return base.p + along, base.h, np.zeros(3)
+        still = np.zeros(self.control_layout.size)
+
+        def curvature(at: Any) -> Any:
+            return self.material(at, still).u_star
+
+        def on(k: Any, pose: tuple[Any, Any]) -> tuple[Any, Any]:
+            p, h = pose
+            ds = s / REST_STEPS
+            # the middle of each step is exact enough for a start, and an equilibrium is found from there
+            half = h + 0.5 * ds * quaternion_rate(h, curvature(k * ds))
+            h = h + ds * quaternion_rate(half, curvature((k + 0.5) * ds))
+            return p + ds * dot(rotation_matrix(half), ALONG), h / jnp.sqrt(jnp.sum(h * h))
+
+        p, h = jax.lax.fori_loop(0, REST_STEPS, on, (base.p, base.h))
+        return p, h, curvature(s)
+
+    def base(self, t: Any, control: Any, unknowns: Float[Any, " k"], history: History) -> Float[Any, " y"]:
+        """y at s = 0: held as its end has it, and moving as that moves."""
+        y, _ = self.rest(jnp.zeros(()))
+        if type(self.base_end) is Clamped:
+            return y.at[self.y_layout.indices(self.base_unknowns)].set(unknowns)
+        own = self._controls(control)[0]
+        held = self.base_end.pose(Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])), own)
+        y = jnp.concatenate([held.p, held.h, y[7:]])
+        y = y.at[self.y_layout.indices(self.base_unknowns)].set(unknowns)
+        y_t = history.c0 * y + history.y
+        q, w = velocities(self._pose(y), self._pose(y_t))
+        return jnp.concatenate([y[:13], q, w, y[19:]])
+
+    def _pose(self, y: Any) -> Pose:
+        return Pose(self.y_layout.get(y, "p"), self.y_layout.get(y, "h"))
+
+    def tip(self, t: Any, control: Any, y: Float[Any, " y"], history: History) -> Float[Any, " k"]:
+        """What is left of the conditions of the end there, of loads at the tip, and of the quaternion's length."""
+        n, m = self.y_layout.get(y, "n"), self.y_layout.get(y, "m")
+        at_tip = {k: 1.0 for k, load in self._points() if load.at == 1.0}
+        if at_tip:
+            loaded = self._point_wrench(at_tip, y, control, history)
+            n, m = n - loaded.force, m - loaded.moment
+        if type(self.tip_end) is Free:
+            left = jnp.concatenate([-n, -m])
+        else:
+            rest = self._pose(self.rest(self.length)[0])
+            held = self.tip_end.pose(rest, self._controls(control)[1])
+            left = self.tip_end.left(held, self._pose(y), n, m)
+        if "h" not in self.base_unknowns:
+            return left
+        h = self.y_layout.get(y, "h")
+        return jnp.concatenate([left, jnp.sum(h * h)[None] - 1.0])
+
+    @property
+    def tip_layout(self) -> Layout:
+        """Of the end at the tip: force and moment, or where it is held."""
+        fields = self.tip_end.conditions
+        if "h" in self.base_unknowns:
+            fields = (*fields, ("norm", 1, "1", "square of the length of the quaternion, less one"))
+        return Layout(*fields)
+
+    def scales(self) -> Scales:
+        """Of a beam: length L, force EI/L², moment EI/L, time L² √(ρA/EI)."""
+        L, EI = self.length, self.Kbt[0, 0]
+        T = L * L * jnp.sqrt(self.mass_per_length / EI)
+        sizes = {
+            "p": L, "h": 1.0, "n": EI / (L * L), "m": EI / L, "q": L / T, "w": 1.0 / T,
+            "turn": 1.0, "norm": 1.0,
+        }  # fmt: skip
+
+        def of(layout: Layout) -> Any:
+            return jnp.concatenate([jnp.full(f.size, self.scale_of(f.name, sizes)) for f in layout.fields])
+
+        return Scales(of(self.y_layout), of(self.tip_layout))
+
+    def scale_of(self, name: str, sizes: dict[str, Any]) -> Any:
+        """The natural size of a field of y or of the tip's conditions; those of a beam are given."""
+        return sizes[name]

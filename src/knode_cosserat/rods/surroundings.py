@@ -1,0 +1,128 @@
+"""What a rod may touch: planes, spheres and cylinders, fixed in the global frame.
+
+The contact is smooth. With the gap g from the rod's surface to the obstacle's and the smoothing δ, an
+obstacle pushes with the force per length
+
+    f = k δ log(1 + exp(-g/δ)),
+
+which is a spring of stiffness k where the rod is pressed in by more than δ, and fades within δ before it is
+touched. Friction is Coulomb's with its jump smoothed over slow sliding: -μ f v/√(|v|² + ε²), v the velocity
+of the rod's surface along the obstacle's. It therefore creeps where it should stick, at a speed below ε; an
+equilibrium, with all velocities zero, has no friction.
+"""
+
+from __future__ import annotations
+
+import abc
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Float
+
+from knode_cosserat.rods.loads import Motion, Wrench
+from knode_cosserat.rods.parameters import choice, parameter
+from knode_cosserat.rods.parts import Part
+from knode_cosserat.rotation import cross, dot
+
+
+class Obstacle(Part):
+    """Something that a rod touches and does not pass through."""
+
+    stiffness: Any = parameter(
+        "N/m2", "k, contact force per length and depth", low=0.0, high=1e12, default=1e4
+    )
+    smoothing: Any = parameter("m", "δ, depth over which contact sets in", low=1e-9, high=1.0, default=1e-4)
+    damping: Any = parameter(
+        "s/m", "d, part by which the contact force grows with the speed of approach", low=0.0, high=1e4,
+        default=0.0,
+    )  # fmt: skip
+    friction: Any = parameter("", "μ, coefficient of friction", low=0.0, high=10.0, default=0.0)
+    slip: Any = parameter(
+        "m/s", "ε, speed of sliding at which friction is full", low=1e-9, high=1e3, default=1e-3
+    )
+
+    @abc.abstractmethod
+    def distance(self, p: Float[Any, "3"]) -> tuple[Any, Float[Any, "3"]]:
+        """Distance (m) from the obstacle's surface, negative within, and the unit vector away from it."""
+
+    def wrench(self, motion: Motion, radius: Any) -> Wrench:
+        """What it does to a rod of this radius (m) at a point, per length (N/m, N), global frame."""
+        distance, normal = self.distance(motion.p)
+        arm = -radius * normal
+        velocity = dot(motion.R, motion.q) + cross(dot(motion.R, motion.w), arm)
+        approach = -jnp.sum(velocity * normal)
+        pressed = self.stiffness * self.smoothing * jax.nn.softplus((radius - distance) / self.smoothing)
+        pressed = pressed * jnp.maximum(1.0 + self.damping * approach, 0.0)
+        sliding = velocity + approach * normal
+        held = self.friction * pressed / jnp.sqrt(jnp.sum(sliding**2) + self.slip**2)
+        force = pressed * normal - held * sliding
+        return Wrench(force, cross(arm, force))
+
+
+def _length(vector: Any) -> Any:
+    """Length, never zero, so that it has a slope at the centre of a sphere too."""
+    return jnp.sqrt(jnp.sum(vector * vector) + 1e-24)
+
+
+_INSIDE = "whether the rod is inside of it"
+
+
+class Plane(Obstacle):
+    """A plane; the rod is on the side to which its normal points."""
+
+    kind: ClassVar[str] = "plane"
+
+    point: Any = parameter("m", "a point of it", shape="vector", low=-1e3, high=1e3, default=(0.0, 0.0, 0.0))
+    normal: Any = parameter(
+        "1", "its normal, of any length", shape="vector", low=-1e3, high=1e3, default=(0.0, 0.0, 1.0)
+    )
+
+    def distance(self, p: Float[Any, "3"]) -> tuple[Any, Float[Any, "3"]]:
+        """See `Obstacle.distance`."""
+        normal = jnp.asarray(self.normal) / _length(jnp.asarray(self.normal))
+        return jnp.sum((p - self.point) * normal), normal
+
+
+class Sphere(Obstacle):
+    """A ball, or with `inside` a hollow one."""
+
+    kind: ClassVar[str] = "sphere"
+
+    center: Any = parameter("m", "its centre", shape="vector", low=-1e3, high=1e3, default=(0.0, 0.0, 0.0))
+    radius: Any = parameter("m", "its radius", low=1e-6, high=1e3, default=0.1)
+    inside: bool = choice(_INSIDE, (False, True), False)
+
+    def distance(self, p: Float[Any, "3"]) -> tuple[Any, Float[Any, "3"]]:
+        """See `Obstacle.distance`."""
+        away = p - self.center
+        return _round(away, self.radius, self.inside)
+
+
+class Cylinder(Obstacle):
+    """An endless round bar, or with `inside` a pipe."""
+
+    kind: ClassVar[str] = "cylinder"
+
+    point: Any = parameter(
+        "m", "a point of its axis", shape="vector", low=-1e3, high=1e3, default=(0.0, 0.0, 0.0)
+    )
+    axis: Any = parameter(
+        "1", "direction of its axis, of any length", shape="vector", low=-1e3, high=1e3,
+        default=(0.0, 1.0, 0.0),
+    )  # fmt: skip
+    radius: Any = parameter("m", "its radius", low=1e-6, high=1e3, default=0.1)
+    inside: bool = choice(_INSIDE, (False, True), False)
+
+    def distance(self, p: Float[Any, "3"]) -> tuple[Any, Float[Any, "3"]]:
+        """See `Obstacle.distance`."""
+        axis = jnp.asarray(self.axis) / _length(jnp.asarray(self.axis))
+        away = p - self.point
+        return _round(away - jnp.sum(away * axis) * axis, self.radius, self.inside)
+
+
+def _round(away: Any, radius: Any, inside: bool) -> tuple[Any, Any]:
+    length = _length(away)
+    if inside:
+        return radius - length, -away / length
+    return length - radius, away / length

@@ -1,0 +1,104 @@
+"""Carrying y over one segment of a rod on which something may begin, end or pull in between.
+
+A scheme in arclength keeps its order only where the right-hand side is smooth. A segment is therefore
+parted where the system has a cut, and y jumps there if the system says so. A cut on a node parts nothing: y
+at a node is that on its near side, z that on its far side. What is known of the past at a cut is
+interpolated, to order 3.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.space import SpaceScheme
+
+#: cuts closer to a node than this part of the length are on it
+ON_NODE = 1e-9
+#: by this part of a segment points are moved into it, so that what is smooth within is seen up to its ends
+INWARD = 1e-9
+
+
+class Crossing(NamedTuple):
+    """How one segment is parted: where (parts of the segment), and which cuts act before each part."""
+
+    bounds: Float[Any, " parts+1"]
+    acting: Float[Any, "parts cuts"]
+
+
+@functools.lru_cache(maxsize=256)
+def crossings(cuts: tuple[float, ...], nodes: int) -> Crossing:
+    """The crossings of all segments, stacked: as many parts each as the segment with most cuts needs."""
+    along = np.asarray(cuts) * (nodes - 1)
+    nearest = np.round(along)
+    along = np.where(np.abs(along - nearest) < ON_NODE * (nodes - 1), nearest, along)
+    segment = np.minimum(np.floor(along).astype(int), nodes - 2)
+    inner = [sorted({a - j for a in along[segment == j] if a > j}) for j in range(nodes - 1)]
+    parts = 1 + max(map(len, inner))
+    bounds = np.ones((nodes - 1, parts + 1))
+    acting = np.zeros((nodes - 1, parts, len(cuts)))
+    for j, places in enumerate(inner):
+        bounds[j, 0] = 0.0
+        bounds[j, 1 : 1 + len(places)] = places
+        for cut in np.flatnonzero(segment == j):
+            within = along[cut] - j
+            acting[j, 0 if within == 0.0 else 1 + places.index(within), cut] = 1.0
+    return Crossing(bounds, acting)
+
+
+def crossing_of(system: System) -> Crossing | None:
+    """The crossings of a system's segments; None where there is nothing to cross."""
+    return crossings(system.cuts, system.nodes) if system.cuts else None
+
+
+def within(s: Any, low: Any, high: Any) -> Any:
+    """s, moved a little into the part from low to high if it is at its end."""
+    margin = INWARD * (high - low)
+    return jnp.clip(s, low + margin, high - margin)
+
+
+#: y at the far side of cuts: (acting, y, record of history)
+Jump = Callable[[Any, Any, Any], Any]
+
+
+def carried(
+    space: SpaceScheme, rates: Callable[[Any, Any, Any], Any], jump: Jump, crossing: Crossing, where: tuple[Any, Any],
+    y: Float[Any, " y"], history: tuple[Any, Any, Any], first: int = 0,
+) -> Float[Any, " y"]:  # fmt: skip
+    """y at a segment's end from y at its start; `where` is its start and its length (m).
+
+    `first` of 1 leaves out the jump at the start: y is then that on the far side.
+    """
+    s, ds = where
+    parts = crossing.acting.shape[0]
+    for k in range(parts):
+        begin, end = crossing.bounds[k], crossing.bounds[k + 1]
+        past = history if parts == 1 else _part_of(space, history, begin, end)
+        if k >= first:
+            y = jump(crossing.acting[k], y, past[0])
+        low, high = s + begin * ds, s + end * ds
+
+        def inside(at: Any, y: Any, record: Any, low: Any = low, high: Any = high) -> Any:
+            return rates(within(at, low, high), y, record)
+
+        y = space.advance(inside, low, high - low, y, past)
+    return y
+
+
+def _part_of(space: SpaceScheme, history: tuple[Any, Any, Any], begin: Any, end: Any) -> tuple[Any, Any, Any]:
+    """What is known of the past at the begin, middle and end of a part, from that of the whole segment."""
+    start, middle, last = history
+
+    def at(part: Any) -> Any:
+        if not space.uses_middle:
+            return start + part * (last - start)
+        weights = (2 * part - 1) * (part - 1), 4 * part * (1 - part), part * (2 * part - 1)
+        return weights[0] * start + weights[1] * middle + weights[2] * last
+
+    return at(begin), at((begin + end) / 2), at(end)
