@@ -32,9 +32,13 @@ from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.load import load_recording
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
+from knode_cosserat.rods import ends, loads, surroundings
 from knode_cosserat.rods.parameters import ParameterError, parameter
 from knode_cosserat.rods.robot_file import RobotFileError, catalog, load_robot, save_robot
+from knode_cosserat.rods.rod import Rod
 from knode_cosserat.rods.routed_robot import RoutedTendonRobot
+from knode_cosserat.rods.section import Differences, FunctionSection, Stretch
+from knode_cosserat.rods.slender_rod import SlenderRod
 from knode_cosserat.rods.system import Field, History, Layout, Scales, System
 from knode_cosserat.rods.tendon_robot import TendonRobot
 from knode_cosserat.solvers.boundary import NewtonOptions
@@ -58,11 +62,13 @@ __all__ = [
     "CheckpointError",
     "ConfigError",
     "DataError",
+    "Differences",
     "Ensemble",
     "Euler",
     "Field",
     "FitConfig",
     "FitError",
+    "FunctionSection",
     "History",
     "Layout",
     "Measurements",
@@ -76,12 +82,15 @@ __all__ = [
     "Residual",
     "Result",
     "RobotFileError",
+    "Rod",
     "RolloutTraining",
     "RoutedTendonRobot",
     "Scales",
     "Settings",
     "SimulationError",
+    "SlenderRod",
     "StateError",
+    "Stretch",
     "StructuredOptions",
     "System",
     "TendonRobot",
@@ -92,6 +101,7 @@ __all__ = [
     "calibrate",
     "catalog",
     "controls",
+    "ends",
     "equilibrium",
     "estimate_parts",
     "estimate_states",
@@ -103,12 +113,14 @@ __all__ = [
     "load_recording",
     "load_robot",
     "load_trajectory",
+    "loads",
     "node_error",
     "parameter",
     "pose_mse",
     "save_robot",
     "simulate",
     "state_errors",
+    "surroundings",
     "tip_dtw",
     "tip_rmse",
 ]

@@ -140,7 +140,7 @@ class Rod(System):
 
     @property
     def starts_at_rest(self) -> bool:  # type: ignore[override]
-        """Not where its tip is held, which the straight rod need not meet, nor where it is curved by control."""
+        """Not where its tip is held, which the straight rod need not meet."""
         return not self.tip_end.held
 
     @property
@@ -258,7 +258,7 @@ class Rod(System):
         return self.spatial_rates(s, y, y_t, z, z_t, control)
 
     def spatial_rates(self, s, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
-        """The right-hand side of paper eq. 13, once y_t, z and z_t are known; further fields of y stay as they are."""
+        """The right-hand side of paper eq. 13, once y_t, z and z_t are known."""
         h, n = self.y_layout.get(y, "h"), self.y_layout.get(y, "n")
         motion = Motion.of(self.y_layout, y, y_t)
         _, R, q, w, q_t, w_t = motion
@@ -316,7 +316,7 @@ class Rod(System):
     def crossed(
         self, acting: Float[Any, " cuts"], t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> Float[Any, " y"]:
-        """y on the far side of the cuts that are acting (ones; zeros elsewhere): n and m less what pulls there."""
+        """y on the far side of the cuts that are acting: n and m less what pulls there."""
         places = {cut: k for k, cut in enumerate(self.cuts)}
         weights = {k: acting[places[load.at]] for k, load in self._points() if load.at in places}
         wrench = self._point_wrench(weights, y, control, history)
@@ -388,7 +388,7 @@ class Rod(System):
         return Pose(self.y_layout.get(y, "p"), self.y_layout.get(y, "h"))
 
     def tip(self, t: Any, control: Any, y: Float[Any, " y"], history: History) -> Float[Any, " k"]:
-        """What is left of the conditions of the end there, of loads at the tip, and of the quaternion's length."""
+        """What is left of the end's conditions, with the loads there, and of the quaternion's length."""
         n, m = self.y_layout.get(y, "n"), self.y_layout.get(y, "m")
         at_tip = {k: 1.0 for k, load in self._points() if load.at == 1.0}
         if at_tip:

@@ -186,7 +186,7 @@ class System(eqx.Module):
     def crossed(
         self, acting: Float[Any, " cuts"], t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> Float[Any, " y"]:
-        """y on the far side of the cuts that are acting (one each; zero: not here), from that on the near side."""
+        """y on the far side of the cuts that act (ones; zeros elsewhere), from that on the near side."""
         raise NotImplementedError(f"{type(self).__name__} has `jumps`, but gives no `crossed`")
 
     # the two ends, and rest

@@ -20,7 +20,7 @@ class TendonRobot(TendonRod):
     """
 
     def actuation(self, control: Float[Any, " c"]) -> Float[Any, " a"]:
-        """The resultant of the tendons' forces per length (N/m), global frame: the paper's τ·φ; other controls."""
+        """The resultant of the tendons' forces per length (N/m), global frame: the paper's τ·φ."""
         force = self.actuator_force(control)
         count = self.actuator_layout.size
         return force if count == self.control_size else jnp.concatenate([force, control[count:]])

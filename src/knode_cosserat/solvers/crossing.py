@@ -68,8 +68,8 @@ Jump = Callable[[Any, Any, Any], Any]
 
 
 def carried(
-    space: SpaceScheme, rates: Callable[[Any, Any, Any], Any], jump: Jump, crossing: Crossing, where: tuple[Any, Any],
-    y: Float[Any, " y"], history: tuple[Any, Any, Any], first: int = 0,
+    space: SpaceScheme, rates: Callable[[Any, Any, Any], Any], jump: Jump, crossing: Crossing,
+    where: tuple[Any, Any], y: Float[Any, " y"], history: tuple[Any, Any, Any], first: int = 0,
 ) -> Float[Any, " y"]:  # fmt: skip
     """y at a segment's end from y at its start; `where` is its start and its length (m).
 
