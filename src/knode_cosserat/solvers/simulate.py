@@ -40,7 +40,7 @@ def simulate(
 
     Args:
         robot: one system, or a sequence of systems that differ in their parameters only. It starts at rest,
-            or, if it is held at its tip (`System.starts_at_rest`), at its equilibrium under the first control.
+            or, if it is held at its tip (see `System`), at its equilibrium under the first control.
         controls: (T, c), or (B, T, c) for a batch; for a tendon robot the tensions in N. Control i is held
             from row i to row i + 1.
         dt: time step (s).
