@@ -1,0 +1,215 @@
+"""The material's law of a rod together with its tendons: v and u where n and m carry both.
+
+At one point of the rod, in the material frame, with tendon i at rᵢ(s) = (x, y, 0) under the tension Tᵢ,
+
+    K_v v + Σ Tᵢ tᵢ = a,     K_u u + Σ Tᵢ rᵢ × tᵢ = b,     tᵢ = ṗᵢ/|ṗᵢ|,     ṗᵢ = v + u × rᵢ + rᵢ′
+
+K_v = Kse + c0 Bse and K_u = Kbt + c0 Bbt; a and b come from n, m and history (Rucker & Webster 2011, in the
+form that keeps the paper's y and z). For K positive definite and Tᵢ ≥ 0 there is exactly one solution: the
+least of the strictly convex energy ½ vᵀK_v v + ½ uᵀK_u u + Σ Tᵢ |ṗᵢ| - aᵀv - bᵀu. Its second derivative is
+
+    J = diag(K_v, K_u) + Σ Tᵢ/|ṗᵢ| (WᵢᵀWᵢ - gᵢgᵢᵀ),     Wᵢ = [I, -r̂ᵢ],     gᵢ = Wᵢᵀtᵢ = (tᵢ, rᵢ × tᵢ)
+
+A few corrections with one J settle it for robots that bend; where they do not, Newton's method goes on, damped.
+How far tendons turn is the measure of all of it: by how much, as a part, a correction changes ṗᵢ.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Float
+
+from knode_cosserat.rotation import dot, inverse, small_inverse
+
+#: corrections with the first J, before Newton's method
+CHORDS = 2
+#: corrections of Newton's method at most
+CORRECTIONS = 50
+#: what may be missing of a tendon's tangent
+MISSING = 1e-13
+
+
+def path_rates(
+    v: Float[Any, "3"], u: Float[Any, "3"], r: Float[Any, "c 3"], r_s: Float[Any, "c 3"]
+) -> Float[Any, "c 3"]:
+    """ṗᵢ = v + u × rᵢ + rᵢ′, along the tendons per metre of rod, material frame."""
+    return jnp.stack(_rates(jnp.concatenate([v, u]), r, r_s), axis=1)
+
+
+def stretches(
+    v: Float[Any, "3"], u: Float[Any, "3"], r: Float[Any, "c 3"], r_s: Float[Any, "c 3"]
+) -> Float[Any, " c"]:
+    """|ṗᵢ|: metres of tendon per metre of rod; its integral is the length of the tendon in the rod."""
+    x, y, z = _rates(jnp.concatenate([v, u]), r, r_s)
+    return jnp.sqrt(x * x + y * y + z * z)
+
+
+def tangents(
+    v: Float[Any, "3"], u: Float[Any, "3"], r: Float[Any, "c 3"], r_s: Float[Any, "c 3"]
+) -> Float[Any, "c 3"]:
+    """tᵢ, unit tangents of the tendons, material frame."""
+    direction, _ = _units(jnp.concatenate([v, u]), r, r_s)
+    return jnp.stack(direction, axis=1)
+
+
+def tendon_wrench(
+    v: Float[Any, "3"], u: Float[Any, "3"], r: Float[Any, "c 3"], r_s: Float[Any, "c 3"], tension: Any
+) -> tuple[Float[Any, "3"], Float[Any, "3"]]:
+    """Σ Tᵢ tᵢ (N) and Σ Tᵢ rᵢ × tᵢ (N·m), material frame: what tendons take of Rᵀn and Rᵀm."""
+    loads = _loads(_units(jnp.concatenate([v, u]), r, r_s)[0], tension, r)
+    return loads[:3], loads[3:]
+
+
+def tendon_strains(
+    K_v: Float[Any, "3 3"],
+    K_u: Float[Any, "3 3"],
+    a: Float[Any, "3"],
+    b: Float[Any, "3"],
+    r: Float[Any, "c 3"],
+    r_s: Float[Any, "c 3"],
+    tension: Float[Any, " c"],
+) -> tuple[Float[Any, "3"], Float[Any, "3"]]:
+    """v and u (1/m) that fulfil the law: see the module's head.
+
+    Args:
+        K_v, K_u: symmetric and positive definite (N, N·m²).
+        a, b: what is to be balanced (N, N·m).
+        r, r_s: where the tendons run (m), and its derivative along the rod; the third numbers are not used.
+        tension: T (N), not negative; 0 of a tendon that has ended.
+
+    Returns:
+        v and u, solved to rounding; NaN where Newton's method did not find them. Derivatives of any order
+        and mode are those of the solution.
+    """
+    ab = jnp.concatenate([a, b])
+    x = _solution(K_v, K_u, ab, r, r_s, tension)
+    return x[:3], x[3:]
+
+
+# x is v and u together
+
+
+def _columns(vectors: Float[Any, "c 3"]) -> tuple[Any, Any]:
+    return tuple(jax.lax.index_in_dim(vectors, k, 1, keepdims=False) for k in range(2))  # type: ignore[return-value]
+
+
+def _turned(x: Float[Any, "6"], r: Float[Any, "c 3"]) -> tuple[Any, Any, Any]:
+    """Wᵢ x = v + u × rᵢ, in parts (c,)."""
+    vx, vy, vz, ux, uy, uz = (jax.lax.index_in_dim(x, k, 0, keepdims=False) for k in range(6))
+    rx, ry = _columns(r)
+    return vx - uz * ry, vy + uz * rx, vz + ux * ry - uy * rx
+
+
+def _rates(x: Float[Any, "6"], r: Float[Any, "c 3"], r_s: Float[Any, "c 3"]) -> tuple[Any, Any, Any]:
+    (px, py, pz), (dx, dy) = _turned(x, r), _columns(r_s)
+    return px + dx, py + dy, pz
+
+
+def _units(x: Float[Any, "6"], r: Float[Any, "c 3"], r_s: Float[Any, "c 3"]) -> tuple[Any, Any]:
+    """Tangents, in parts (c,), and 1/|ṗᵢ|."""
+    px, py, pz = _rates(x, r, r_s)
+    shorter = 1.0 / jnp.sqrt(px * px + py * py + pz * pz)
+    return (px * shorter, py * shorter, pz * shorter), shorter
+
+
+def _levers(t: tuple[Any, Any, Any], r: Float[Any, "c 3"]) -> tuple[Any, ...]:
+    """gᵢ = (tᵢ, rᵢ × tᵢ), in parts (c,)."""
+    (tx, ty, tz), (rx, ry) = t, _columns(r)
+    return tx, ty, tz, ry * tz, -rx * tz, rx * ty - ry * tx
+
+
+def _loads(t: tuple[Any, Any, Any], tension: Any, r: Float[Any, "c 3"]) -> Float[Any, "6"]:
+    return jnp.stack([jnp.sum(tension * part, axis=0) for part in _levers(t, r)])
+
+
+def _balance(x: Any, K_v: Any, K_u: Any, ab: Any, r: Any, r_s: Any, tension: Any) -> Float[Any, "6"]:
+    """What is left of the law at x."""
+    elastic = jnp.concatenate([dot(K_v, x[:3]), dot(K_u, x[3:])])
+    return elastic + _loads(_units(x, r, r_s)[0], tension, r) - ab
+
+
+def _flexibility(x: Any, K_v: Any, K_u: Any, r: Any, r_s: Any, tension: Any) -> Float[Any, "6 6"]:
+    """J⁻¹ at x."""
+    t, shorter = _units(x, r, r_s)
+    g, (rx, ry) = jnp.stack(_levers(t, r)), _columns(r)
+    o, one = jnp.zeros_like(rx), jnp.ones_like(rx)
+    # rows of Wᵢ: apart from x, and so constants where r is
+    W = [jnp.stack(row) for row in ((one, o, o, o, o, -ry), (o, one, o, o, o, rx), (o, o, one, ry, -rx, o))]
+    spread = sum(row[:, None] * row[None, :] for row in W)
+    stiffer = jnp.sum(tension * shorter * (spread - g[:, None] * g[None, :]), axis=2)
+    nothing = np.zeros((3, 3))
+    upper, lower = jnp.concatenate([K_v, nothing], axis=1), jnp.concatenate([nothing, K_u], axis=1)
+    return small_inverse(jnp.concatenate([upper, lower]) + stiffer)
+
+
+def _turn(dx: Float[Any, "6"], shorter: Any, r: Any) -> Any:
+    """The largest |Wᵢ dx|/|ṗᵢ|: by how much dx turns or stretches a tendon."""
+    x, y, z = _turned(dx, r)
+    return jnp.sqrt(jnp.max((x * x + y * y + z * z) * shorter * shorter, axis=0))
+
+
+def _solved(K_v: Any, K_u: Any, ab: Any, r: Any, r_s: Any, tension: Any) -> Float[Any, "6"]:
+    """The law's solution, from where it is if tendons run along the unbent rod."""
+
+    def correction(x: Any, flexibility: Any) -> tuple[Any, Any]:
+        dx = dot(flexibility, _balance(x, K_v, K_u, ab, r, r_s, tension))
+        return dx, _turn(dx, _units(x, r, r_s)[1], r)
+
+    def flexibility_at(x: Any) -> Any:
+        return _flexibility(x, K_v, K_u, r, r_s, tension)
+
+    dx, dy = _columns(r_s)
+    shorter = 1.0 / jnp.sqrt(1.0 + dx * dx + dy * dy)
+    free = ab - _loads((dx * shorter, dy * shorter, shorter), tension, r)
+    start = jnp.concatenate([dot(inverse(K_v), free[:3]), dot(inverse(K_u), free[3:])])
+
+    flexibility = flexibility_at(start)
+    dx, first = correction(start, flexibility)
+    x, turned = start - dx, first
+    for _ in range(CHORDS - 1):
+        dx, turned = correction(x, flexibility)
+        x = x - dx
+    # the next would be what tangents bend over the whole way (t″ ≤ 3) times this one
+    missing = 3.0 * first * turned
+
+    def goes_on(reached: Any) -> Any:
+        count, _, missing = reached
+        return (count < CORRECTIONS) & ~(missing <= MISSING)
+
+    def corrected(reached: Any) -> Any:
+        count, x, _ = reached
+        dx, turned = correction(x, flexibility_at(x))
+        # the damping that keeps a convex function with |f‴| ≤ 3 f″ going down (Sun & Tran-Dinh 2019)
+        damping = jnp.log1p(3.0 * turned) / jnp.maximum(3.0 * turned, 1e-300)
+        return count + 1, x - damping * dx, 3.0 * turned**2
+
+    x = jnp.where(turned <= first, x, start)
+    _, x, missing = jax.lax.while_loop(goes_on, corrected, (0, x, missing))
+    return jnp.where(missing <= MISSING, x, jnp.nan)
+
+
+_solution = jax.custom_jvp(_solved)
+
+
+def _slope(primals: Any, tangents: Any) -> tuple[Any, Any]:
+    """J dx = -d(law) at the solution, for those arguments that have slopes (most often a and b only)."""
+    x = _solution(*primals)
+    moves = [not isinstance(tangent, SymbolicZero) for tangent in tangents]
+
+    def left(*moving: Any) -> Any:
+        given = iter(moving)
+        return _balance(x, *(next(given) if m else p for m, p in zip(moves, primals, strict=True)))
+
+    moving = [p for m, p in zip(moves, primals, strict=True) if m]
+    along = [t for m, t in zip(moves, tangents, strict=True) if m]
+    K_v, K_u, _, r, r_s, tension = primals
+    _, change = jax.jvp(left, moving, along)
+    return x, -dot(_flexibility(x, K_v, K_u, r, r_s, tension), change)
+
+
+_solution.defjvp(_slope, symbolic_zeros=True)
