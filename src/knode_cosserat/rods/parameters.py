@@ -62,11 +62,15 @@ def parameter(
     return eqx.field(converter=_converter(stated), metadata={"parameter": stated}, **extra)
 
 
-def place(meaning: str, *, low: float = 0.0, default: Any = dataclasses.MISSING) -> Any:
+def place(
+    meaning: str, *, low: float = 0.0, default: Any = dataclasses.MISSING, kw_only: bool = False
+) -> Any:
     """A field that holds a place on the rod, as a part of its length. It is part of a program, not data."""
     stated = Parameter("", f"{meaning}, as a part of the length", "scalar", low, 1.0, optional=False)
-    extra = {} if default is dataclasses.MISSING else {"default": default}
-    return eqx.field(static=True, converter=_plain_number, metadata={"parameter": stated}, **extra)
+    extra: dict[str, Any] = {} if default is dataclasses.MISSING else {"default": default}
+    return eqx.field(
+        static=True, kw_only=kw_only, converter=_plain_number, metadata={"parameter": stated}, **extra
+    )
 
 
 @dataclasses.dataclass(frozen=True)

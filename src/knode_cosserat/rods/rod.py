@@ -71,7 +71,7 @@ class Rod(System):
 
     length: Any = parameter("m", "length of the rod", low=1e-3, high=20.0)
     radius: Any = parameter("m", "radius of the rod", low=1e-6, high=0.5)
-    density: Any = parameter("kg/m3", "density of the rod", low=1.0, high=30e3)
+    density: Any = parameter("kg/m3", "density of the rod, ribs spread over it included", low=1.0, high=100e3)
     youngs_modulus: Any = parameter("Pa", "Young's modulus", low=1e3, high=2e12)
     shear_modulus: Any = parameter(
         "Pa", "shear modulus; by default E / 2.6", low=1e2, high=1e12, default=None

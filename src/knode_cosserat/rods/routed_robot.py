@@ -1,22 +1,28 @@
-"""A robot whose tendons run through holes in its ribs: they bend it, and rub. Symbols as in `tendon_rod`.
+"""A robot whose tendons run through holes in its ribs: they bend it, and rub. Symbols as in `rod`.
 
-n and m carry rod and tendons together, so that their balance has no tendon in it and the tip, where the
-tendons are anchored, is free. What the tendons take of them stands in the material's law (Till 2019, after
-Rucker & Webster 2011), here for tendons that run beside the rod at rᵢ, with the tangent d₃:
+n and m carry rod and tendons together, so that their balance has no tendon in it, and where a tendon is
+anchored nothing of theirs jumps. What the tendons take of them stands in the material's law (Till 2019,
+after Rucker & Webster 2011; `tendon_law`), with tendon i at rᵢ(s) and ṗᵢ = v + u × rᵢ + rᵢ′:
 
-    Rᵀn = Kse (v - v*) + Bse v_t + Σ τᵢ d₃          Rᵀm = Kbt (u - u*) + Bbt u_t + Σ τᵢ rᵢ × d₃
+    Rᵀn = Kse (v - v*) + Bse v_t + Σ τᵢ ṗᵢ/|ṗᵢ|        Rᵀm = Kbt (u - u*) + Bbt u_t + Σ τᵢ rᵢ × ṗᵢ/|ṗᵢ|
 
-Friction. A tendon that slides loses tension on its way, as in a sheath: τᵢ(s) = Tᵢ exp(-fᵢ (k s + μ α)), with
-the wobble coefficient k, the curvature friction coefficient μ and the angle α by which the rod has turned,
-here taken as s |u|. fᵢ, from -1 to 1, is how much of the friction holds the tendon and which way. It is a
-memory, the part of z that remembers where the robot has come from: it grows as the rod bends in the tendon's
-direction eᵢ, up to where the tendon slides (an elastic, perfectly plastic element: Prandtl 1928)
+Drive. Tendons are pulled with a tension, or by a reel. A reel that has taken in dᵢ leaves a tendon the
+length ℓᵢ* - dᵢ + C Tᵢ, with its length ℓᵢ* in the robot unloaded and the compliance C; the way through the
+robot is ℓᵢ = ∫|ṗᵢ| ds. Either the tendon is taut and they are equal, or it is slack and Tᵢ = 0:
+
+    0 ≤ Tᵢ  ⊥  ℓᵢ* - dᵢ + C Tᵢ - ℓᵢ ≥ 0
+
+Friction. A tendon that slides loses tension on its way, as a rope on a capstan: τᵢ = Tᵢ exp(-λᵢ) with λᵢ_s
+= fᵢ (k + μ |u|), the wobble coefficient k and the curvature friction coefficient μ. fᵢ, from -1 to 1, is
+how much of the friction holds the tendon and which way. It is a memory, the part of z that remembers where
+the robot has come from: it grows as the rod bends in the tendon's direction eᵢ, up to where the tendon
+slides (an elastic, perfectly plastic element: Prandtl 1928)
 
     fᵢ_t = eᵢ·u_t / κ₀    while |fᵢ| < 1
 
 so that a robot that is held stays where it is, whatever noise its tensions have. (Dahl's smooth law lets it
-creep: with it a step of 10 s was predicted with three times the error.) An equilibrium, with all rates zero,
-is the one without friction.
+creep: with it a step of 10 s was predicted with three times the error.) An equilibrium, with all rates
+zero, is the one without friction.
 
 Vibration. Above some tension of all tendons together robots begin to shake, and what shakes does not stick:
 x, from 0 to 1, is the part of the friction that is gone. It is a memory too, x_t = k_v (Σ Tᵢ - T_v), and
@@ -33,39 +39,55 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.rods.parameters import parameter
+from knode_cosserat.rods.parameters import choice, parameter, part
+from knode_cosserat.rods.rod import Material, Rod
+from knode_cosserat.rods.routing import Routing, Straight, ends, routes
 from knode_cosserat.rods.system import History, Layout
+from knode_cosserat.rods.tendon_law import stretches, tendon_strains
 from knode_cosserat.rods.tendon_rod import TendonRod
-from knode_cosserat.rotation import dot, inverse, rotation_matrix
+from knode_cosserat.rotation import dot
 
-#: corrections of u at a node at most, each of which tries these parts of Newton's step
-CORRECTIONS = 20
-#: a correction of this part of u is the last: the step after it squares what is left
-SETTLED = 1e-7
-PARTS = np.array([1.0, 0.5, 0.2])
-#: turns (1/m) below this hardly count in α, so that it has a slope everywhere
+#: turns (1/m) below this hardly count in friction, so that it has a slope everywhere
 STRAIGHT = 1e-2
+#: of the rod's length: how far slack and taut are blended, so that Newton's method has a slope between them
+BLEND = 1e-7
+#: points of Gauss's rule for the length of a tendon in the unloaded robot
+GAUSS = 24
 
 
 class RoutedTendonRobot(TendonRod):
-    """A clamped, round, straight rod with tendons beside it that bend it, with friction where they run.
+    """A round rod with tendons that run beside it, anywhere, and bend it, with friction where they run.
 
     Without friction and vibration (the defaults) it has no memory beyond that of its damping. The module's
-    head has the equations.
+    head has the equations. Tendons are at `tendon_offset` and `tendon_angles`, or where `routing` has them.
     """
 
+    routing: tuple[Routing, ...] | None = part(
+        "where the tendons run; by default straight, at their offset and angles", Routing, many=True,
+        default=None,
+    )  # fmt: skip
+    drive: str = choice(
+        "what is given of the tendons: their tension, or what reels take in", ("tension", "reel"), "tension"
+    )
+    tendon_compliance: Any = parameter(
+        "m/N",
+        "C, how much a tendon gives by its tension, if a reel drives it",
+        low=0.0,
+        high=1.0,
+        default=0.0,
+    )
     sleeve_stiffening: Any = parameter(
         "", "how much stiffer against bending the rod is at its base, as a part", low=0.0, high=1e4,
-        default=0.0,
+        default=None,
     )  # fmt: skip
     sleeve_length: Any = parameter(
         "m", "where that ends: exp(-(s / length)^4) of it are left at s", low=1e-4, high=20.0, default=0.05
     )
     friction_wobble: Any = parameter(
-        "1/m", "k, friction of the tendons by the way they run", low=0.0, high=100.0, default=0.0
+        "1/m", "k, friction of the tendons by the way they run", low=0.0, high=100.0, default=None
     )
     friction_curvature: Any = parameter(
-        "1/rad", "μ, friction of the tendons by the angle they turn", low=0.0, high=10.0, default=0.0
+        "1/rad", "μ, friction of the tendons by the angle they turn", low=0.0, high=10.0, default=None
     )
     friction_reach: Any = parameter(
         "1/m", "κ₀, change of curvature that builds friction up", low=1e-4, high=100.0, default=0.1
@@ -75,7 +97,7 @@ class RoutedTendonRobot(TendonRod):
         default=1e6,
     )  # fmt: skip
     vibration_rate: Any = parameter(
-        "1/(N s)", "k_v, how fast it grows; none at 0", low=0.0, high=1e3, default=0.0
+        "1/(N s)", "k_v, how fast it grows; none at 0", low=0.0, high=1e3, default=None
     )
     vibration_softening: Any = parameter(
         "m2", "c, loss of bending stiffness by vibration, by tension", low=0.0, high=1.0, default=0.0
@@ -91,104 +113,231 @@ class RoutedTendonRobot(TendonRod):
         same = {field.name: getattr(robot, field.name) for field in dataclasses.fields(TendonRod)}
         return cls(**same).replace(**changes)
 
+    # what its tendons have: which states there are
+
+    @property
+    def rubs(self) -> bool:
+        """Whether there is friction, or could be: a coefficient of it is given."""
+        return self.friction_wobble is not None or self.friction_curvature is not None
+
+    @property
+    def vibrates(self) -> bool:
+        """Whether vibration is a state: its rate is given."""
+        return self.vibration_rate is not None
+
+    @property
+    def routings(self) -> tuple[Routing, ...]:
+        """Where the tendons run."""
+        if self.routing is not None:
+            return self.routing
+        angles = jnp.asarray(self.tendon_angles)
+        x, y = self.tendon_offset * jnp.cos(angles), self.tendon_offset * jnp.sin(angles)
+        return tuple(Straight(x[k], y[k]) for k in range(angles.shape[0]))
+
+    @property
+    def tendon_count(self) -> int:
+        """How many tendons there are."""
+        return len(self.routing) if self.routing is not None else int(np.shape(self.tendon_angles)[-1])
+
+    @property
+    def actuator_layout(self) -> Layout:
+        """One tension per tendon, or what its reel has taken in."""
+        if self.drive == "reel":
+            return Layout(("reel", self.tendon_count, "m", "length of tendon that the reel has taken in"))
+        return Layout(("tension", self.tendon_count, "N", "tendon tension"))
+
+    @property
+    def y_layout(self) -> Layout:  # type: ignore[override]
+        """The rod's, the loss of tension by friction, and of reels the tension and the tendons' ways."""
+        count, more = self.tendon_count, []
+        if self.rubs:
+            more.append(("loss", count, "1", "logarithm of tension lost by friction"))
+        if self.drive == "reel":
+            more.append(("tension", count, "N", "tendon tension at the base"))
+            more.append(("path", count, "m", "way of the tendons through the robot"))
+        return Rod.y_layout + Layout(*more)
+
     @property
     def z_layout(self) -> Layout:  # type: ignore[override]
         """Strains, friction of each tendon, and vibration."""
-        return Layout(
-            *TendonRod.z_layout.fields,
-            (
-                "f",
-                self.control_size,
-                "1",
-                "part of the friction that holds each tendon, and which way",
-            ),
-            ("x", 1, "1", "part of the friction that vibration has taken away"),
-        )
+        more = []
+        if self.rubs:
+            more.append(
+                ("f", self.tendon_count, "1", "part of the friction that holds a tendon, and which way")
+            )
+        if self.vibrates:
+            more.append(("x", 1, "1", "part of the friction that vibration has taken away"))
+        return Rod.z_layout + Layout(*more)
+
+    @property
+    def base_unknowns(self) -> tuple[str, ...]:  # type: ignore[override]
+        """Those of the rod, and the tension that comes of a reel's position."""
+        return (*self.base_end.unknowns, "tension") if self.drive == "reel" else self.base_end.unknowns
+
+    @property
+    def cuts(self) -> tuple[float, ...]:  # type: ignore[override]
+        """Those of the rod, and where tendons are anchored."""
+        return tuple(sorted({*super().cuts, *(end for end in self._ends if end < 1.0)}))
+
+    @property
+    def _ends(self) -> tuple[float, ...]:
+        return (1.0,) if self.routing is None else tuple(float(end) for end in ends(self.routing))
 
     # what the tendons do
 
-    @property
-    def bending_directions(self) -> Float[Any, "c 3"]:
-        """eᵢ: the direction of u in which each tendon bends the rod, material frame."""
-        angles = jnp.asarray(self.tendon_angles)
-        return jnp.stack([-jnp.sin(angles), jnp.cos(angles), jnp.zeros_like(angles)], axis=-1)
+    def base_tension(self, y: Float[Any, " y"], control: Float[Any, " c"]) -> Float[Any, " c"]:
+        """T (N) at the base."""
+        return self.y_layout.get(y, "tension") if self.drive == "reel" else control[: self.tendon_count]
 
-    def actuation(self, control: Float[Any, " c"]) -> Float[Any, "3"]:
-        """Σ Tᵢ d₃ × rᵢ: how the tendons would bend the rod without friction (N·m), material frame."""
-        return self.tendon_offset * dot(self.bending_directions.T, control)
+    def tension_at(self, s: Any, y: Float[Any, " y"], control: Float[Any, " c"]) -> Float[Any, " c"]:
+        """τ (N) at s: less by friction, and none of a tendon that has ended."""
+        T = self.base_tension(y, control)
+        if self.rubs:
+            T = T * jnp.exp(-self.y_layout.get(y, "loss"))
+        if min(self._ends) < 1.0:
+            T = jnp.where(s < np.array(self._ends) * self.length, T, 0.0)
+        return T
+
+    def routes_at(self, s: Any) -> tuple[Float[Any, "c 3"], Float[Any, "c 3"]]:
+        """r and r′ of the tendons at s."""
+        if self.routing is not None:
+            return routes(self.routing, s / self.length, self.length)
+        angles = jnp.asarray(self.tendon_angles)
+        around = jnp.stack([jnp.cos(angles), jnp.sin(angles), jnp.zeros_like(angles)], axis=-1)
+        return self.tendon_offset * around, np.zeros(around.shape)
+
+    def bending_directions(self, s: Any) -> Float[Any, "c 3"]:
+        """eᵢ: the direction of u in which each tendon bends the rod at s, material frame."""
+        if self.routing is None:
+            angles = jnp.asarray(self.tendon_angles)
+            return jnp.stack([-jnp.sin(angles), jnp.cos(angles), jnp.zeros_like(angles)], axis=-1)
+        r, _ = self.routes_at(s)
+        across = jnp.stack([-r[:, 1], r[:, 0], jnp.zeros_like(r[:, 0])], axis=-1)
+        return across / jnp.sqrt(jnp.sum(across * across, axis=1, keepdims=True) + 1e-24)
+
+    def actuation(self, control: Float[Any, " c"]) -> Float[Any, " a"]:
+        """Σ Tᵢ d₃ × rᵢ of straight tendons (N·m), material frame; of all others the control."""
+        if self.routing is not None or self.drive == "reel" or self.control_size > self.tendon_count:
+            return control
+        return self.tendon_offset * dot(self.bending_directions(0.0).T, control)
+
+    def material(self, s: Any, control: Any) -> Material:
+        """The rod's, stiffer against bending within the sleeve."""
+        found = super().material(s, control)
+        if self.sleeve_stiffening is None:
+            return found
+        stiffer = 1.0 + self.sleeve_stiffening * jnp.exp(-((s / self.sleeve_length) ** 4))
+        return found._replace(Kbt=found.Kbt * stiffer)
 
     def rest(self, s: Any) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-        """Straight up along z, unloaded, at rest, and no friction."""
+        """That of the rod; no tension, and no friction."""
         y, z = super().rest(s)
-        return y, jnp.concatenate([z, np.zeros(self.control_size + 1)])
+        if self.drive == "reel":
+            y = y.at[self.y_layout.slice("path")].set(self._ways(s))
+        return y, jnp.concatenate([z, np.zeros(self.z_layout.size - 6)])
 
-    def bending_stiffness_at(self, s: Any) -> Float[Any, "3 3"]:
-        """Kbt (N·m²) at arclength s (m), the sleeve included."""
-        return self.Kbt * (1.0 + self.sleeve_stiffening * jnp.exp(-((s / self.sleeve_length) ** 4)))
+    def _ways(self, s: Any) -> Float[Any, " c"]:
+        """Lengths of the tendons through the unloaded robot from the base to s, by Gauss's rule."""
+        nodes, weights = np.polynomial.legendre.leggauss(GAUSS)
+        ways = []
+        for k, routing in enumerate(self.routings):
+            last = jnp.minimum(s, routing.end * self.length)
+            at = 0.5 * (nodes + 1.0) * jnp.asarray(last)[..., None]
+
+            def stretched(place: Any, k: int = k) -> Any:
+                r, r_s = routes((self.routings[k],), place / self.length, self.length)
+                u = self.material(place, np.zeros(self.control_size)).u_star
+                return stretches(jnp.asarray(self.v_star), jnp.asarray(u), jnp.asarray(r), jnp.asarray(r_s))[
+                    0
+                ]
+
+            ways.append(0.5 * last * jnp.sum(weights * jax.vmap(stretched)(at)))
+        return jnp.stack(ways)
+
+    # the equations
 
     def strains(
         self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> Float[Any, " z"]:
-        """v, u, f and x: the material's law solved for them."""
-        c0 = history.c0
-        hv, hu, _, hx = self.z_layout.split(history.z)
-        R = rotation_matrix(self.y_layout.get(y, "h"))
-        n, m = dot(R.T, self.y_layout.get(y, "n")), dot(R.T, self.y_layout.get(y, "m"))
-        growth = self.vibration_rate * (jnp.sum(control) - self.vibration_tension)
-        # at rest (c0 = 0) it has grown as far as it will
-        x = jnp.where(c0 > 0.0, (growth - hx) / jnp.where(c0 > 0.0, c0, 1.0), jnp.sign(growth))
-        x = jnp.clip(x, 0.0, 1.0)
-        u = self._curvature(s, m, control, x, history)
-        pulled = n - jnp.sum(control) * self.v_star
-        Kse, Bse = self.Kse, self.shear_damping
-        v = dot(inverse(Kse + c0 * Bse), pulled + dot(Kse, self.v_star) - dot(Bse, hv))
-        f = self._friction(c0 * u + hu, history)
-        return jnp.concatenate([v, u, f, x])
+        """v and u by the material's law, f and x by their own."""
+        c0, material = history.c0, self.material(s, control)
+        n, m = self.stresses(y)
+        hv, hu = self.z_layout.get(history.z, "v"), self.z_layout.get(history.z, "u")
+        Kse, Bse, Kbt, Bbt = material[:4]
+        more = []
+        if self.vibrates:
+            x = self._vibration(y, control, history)
+            more.append(x)
+            total = jnp.sum(self.base_tension(y, control))
+            Kbt = Kbt - self.vibration_softening * x[0] * total * np.diag([1.0, 1.0, 0.0])
+        a = n + dot(Kse, self.v_star) - dot(Bse, hv)
+        b = m - dot(Bbt, hu) if not self.sections else m + dot(Kbt, material.u_star) - dot(Bbt, hu)
+        tension = self.tension_at(s, y, control)
+        v, u = tendon_strains(Kse + c0 * Bse, Kbt + c0 * Bbt, a, b, *self.routes_at(s), tension)
+        if self.rubs:
+            more.insert(0, self._friction(s, c0 * u + hu, history))
+        return jnp.concatenate([v, u, *more])
 
-    def _friction(self, u_t: Float[Any, "3"], history: History) -> Float[Any, " c"]:
-        rate = dot(self.bending_directions, u_t) / self.friction_reach
+    def _vibration(self, y: Any, control: Any, history: History) -> Float[Any, " 1"]:
+        total = jnp.sum(self.base_tension(y, control))
+        growth = self.vibration_rate * (total - self.vibration_tension)
+        # at rest (c0 = 0) it has grown as far as it will
+        moving = history.c0 > 0.0
+        grown = (growth - self.z_layout.get(history.z, "x")) / jnp.where(moving, history.c0, 1.0)
+        return jnp.clip(jnp.where(moving, grown, jnp.sign(growth)), 0.0, 1.0)
+
+    def _friction(self, s: Any, u_t: Float[Any, "3"], history: History) -> Float[Any, " c"]:
+        rate = dot(self.bending_directions(s), u_t) / self.friction_reach
         moving = history.c0 > 0.0
         held = (rate - self.z_layout.get(history.z, "f")) / jnp.where(moving, history.c0, 1.0)
         return jnp.where(moving, jnp.clip(held, -1.0, 1.0), 0.0)
 
-    def _moment(self, s: Any, u: Float[Any, "3"], control: Any, x: Any, history: History) -> Any:
-        """Rᵀm by the material's law where the curvature is u."""
-        u_t = history.c0 * u + self.z_layout.get(history.z, "u")
-        bent = u
-        turn = s * (jnp.sqrt(jnp.sum(u[:2] ** 2) + STRAIGHT**2) - STRAIGHT)
-        path = self.friction_wobble * s + self.friction_curvature * turn
-        tension = control * jnp.exp(-(1.0 - x) * path * self._friction(u_t, history))
-        soft = self.vibration_softening * x * jnp.sum(control) * bent * np.array([1.0, 1.0, 0.0])
-        elastic = dot(self.bending_stiffness_at(s), bent) + dot(self.bending_damping, u_t)
-        return elastic - soft - self.actuation(tension)
+    def spatial_rates(self, s, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
+        """Those of the rod, of the tension, and of the tendons' way."""
+        rates = [super().spatial_rates(s, y, y_t, z, z_t, control)]
+        v, u = self.z_layout.get(z, "v"), self.z_layout.get(z, "u")
+        if self.rubs:
+            turn = jnp.sqrt(jnp.sum(u[:2] ** 2) + STRAIGHT**2) - STRAIGHT
+            path = _or_zero(self.friction_wobble) + _or_zero(self.friction_curvature) * turn
+            held = self.z_layout.get(z, "f")
+            if self.vibrates:
+                held = held * (1.0 - self.z_layout.get(z, "x"))
+            rates.append(path * held)
+        if self.drive == "reel":
+            way = stretches(v, u, *map(jnp.asarray, self.routes_at(s)))
+            if min(self._ends) < 1.0:
+                way = jnp.where(s < np.array(self._ends) * self.length, way, 0.0)
+            rates += [jnp.zeros(self.tendon_count), way]
+        return jnp.concatenate(rates)
 
-    def _curvature(
-        self, s: Any, m: Float[Any, "3"], control: Any, x: Any, history: History
-    ) -> Float[Any, "3"]:
-        """u where the material's law gives the moment m: Newton's method, then one step that has slopes.
+    def tip(self, t: Any, control: Any, y: Float[Any, " y"], history: History) -> Float[Any, " k"]:
+        """That of the rod; of reels, that tension or slack is zero (Fischer & Burmeister, blended)."""
+        left = super().tip(t, control, y, history)
+        if self.drive != "reel":
+            return left
+        T, way = self.y_layout.get(y, "tension"), self.y_layout.get(y, "path")
+        given = self._ways(self.length) - control[: self.tendon_count] + self.tendon_compliance * T
+        slack, pulled = given - way, self._give * T
+        blend = BLEND * self.length
+        return jnp.concatenate([left, slack + pulled - jnp.sqrt(slack**2 + pulled**2 + 2.0 * blend**2)])
 
-        That step makes derivatives those of the solution, whatever way Newton's method went.
-        """
-        fixed = jax.lax.stop_gradient((self, s, m, control, x, history))
+    @property
+    def _give(self) -> Any:
+        """Metres per newton by which tension and slack are compared: the tendon's own, and the rod's."""
+        return self.tendon_compliance + 1e-3 * self.length**3 / self.Kbt[0, 0]
 
-        def left(u: Any) -> Any:
-            robot, s, m, control, x, history = fixed
-            return robot._moment(s, u, control, x, history) - m
+    @property
+    def tip_layout(self) -> Layout:
+        """That of the rod, and of reels."""
+        if self.drive != "reel":
+            return super().tip_layout
+        return super().tip_layout + Layout(("slack", self.tendon_count, "m", "slack or tension"))
 
-        def goes_on(reached: Any) -> Any:
-            count, u, moved = reached
-            return (count < CORRECTIONS) & (moved > SETTLED * (1.0 + jnp.max(jnp.abs(u))))
+    def scale_of(self, name: str, sizes: dict[str, Any]) -> Any:
+        """Tension of a rod's own force, ways of its length."""
+        more = {"loss": 1.0, "tension": sizes["n"], "path": sizes["p"], "slack": sizes["p"]}
+        return more[name] if name in more else super().scale_of(name, sizes)
 
-        def corrected(reached: Any) -> Any:
-            count, u, _ = reached
-            tried = u - PARTS[:, None] * dot(inverse(jax.jacfwd(left)(u)), left(u))
-            best = tried[jnp.argmin(jnp.sum(jax.vmap(left)(tried) ** 2, axis=1))]
-            return count + 1, best, jnp.max(jnp.abs(best - u))
 
-        B, hu = self.bending_damping, self.z_layout.get(history.z, "u")
-        smooth = inverse(self.bending_stiffness_at(s) + history.c0 * B)
-        start = dot(smooth, m + self.actuation(control) - dot(B, hu))
-        begun = (0, jax.lax.stop_gradient(start), jnp.inf)
-        _, u, _ = jax.lax.while_loop(goes_on, corrected, begun)
-        slope = jax.lax.stop_gradient(inverse(jax.jacfwd(left)(u)))
-        return u - dot(slope, self._moment(s, u, control, x, history) - m)
+def _or_zero(value: Any) -> Any:
+    return 0.0 if value is None else value

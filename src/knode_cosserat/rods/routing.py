@@ -16,16 +16,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.rods.parameters import ParameterError, checked, parameter, parameters_of
+from knode_cosserat.rods.parameters import ParameterError, parameter, place
+from knode_cosserat.rods.parts import Part
 
 
-class Routing(eqx.Module):
+class Routing(Part):
     """The way of one tendon. `end` is the part of the length at which it is anchored."""
 
-    #: what robot files call it
-    kind: ClassVar[str]
-
-    end: float = eqx.field(static=True, default=1.0, kw_only=True)
+    end: float = place("where the tendon is anchored", low=1e-3, default=1.0, kw_only=True)
 
     @abc.abstractmethod
     def at(self, sigma: Any) -> tuple[Any, Any]:
@@ -36,20 +34,6 @@ class Routing(eqx.Module):
         sigma = jnp.asarray(sigma, dtype=float)
         x_s, y_s = jax.jvp(self.at, (sigma,), (jnp.ones_like(sigma),))[1]
         return x_s, y_s
-
-    def __check_init__(self) -> None:
-        name, end = type(self).__name__, self.end
-        number = isinstance(end, int | float | np.number) and not isinstance(end, bool)
-        if not number or not 0.0 < end <= 1.0:
-            raise ParameterError(
-                f"{name}: end is {end!r}; allowed is a number above 0, up to 1: the part of the length where "
-                "the tendon is anchored"
-            )
-        for field, stated in parameters_of(type(self)).items():
-            try:
-                checked(field, getattr(self, field), stated)
-            except ParameterError as error:
-                raise ParameterError(f"{name}: {error}") from None
 
 
 class Straight(Routing):
@@ -132,9 +116,7 @@ class Polynomial(Routing):
 class FunctionRouting(Routing):
     """Any function of σ that gives x and y (m), written with `jax.numpy`. Robot files cannot hold it."""
 
-    kind: ClassVar[str] = "function"
-
-    function: Callable[[Any], tuple[Any, Any]] = eqx.field(static=True)
+    function: Callable[[Any], tuple[Any, Any]] = eqx.field(static=True)  # type: ignore[misc]
 
     def at(self, sigma: Any) -> tuple[Any, Any]:
         """What the function says."""
@@ -142,28 +124,20 @@ class FunctionRouting(Routing):
         return x, y
 
     def __check_init__(self) -> None:
+        super().__check_init__()
+        allowed = "allowed is a JAX-traceable function of σ that gives two numbers, x and y"
         if not callable(self.function):
-            raise ParameterError(
-                f"FunctionRouting: function is {self.function!r}; allowed is a function of σ that gives x and y"
-            )
+            raise ParameterError(f"FunctionRouting: function is {self.function!r}; {allowed}")
         try:
             given = jax.eval_shape(self.function, jnp.zeros(()))
-            shapes = [np.shape(part) for part in given]
         except Exception as error:
+            first = (str(error).splitlines() or [""])[0]
             raise ParameterError(
-                f"FunctionRouting: function cannot be traced by JAX: {type(error).__name__}: "
-                f"{str(error).splitlines()[0] if str(error) else ''}"
+                f"FunctionRouting: function raises {type(error).__name__}: {first}; {allowed}"
             ) from None
+        shapes = [np.shape(part) for part in given] if isinstance(given, tuple | list) else given
         if shapes != [(), ()]:
-            raise ParameterError(
-                f"FunctionRouting: function gives shapes {shapes}; allowed is two numbers, x and y"
-            )
-
-
-#: the routings that a robot file can name as a kind
-KINDS: dict[str, type[Routing]] = {
-    routing.kind: routing for routing in (Straight, Tapered, Helical, Polynomial)
-}
+            raise ParameterError(f"FunctionRouting: function gives shapes {shapes}; {allowed}")
 
 
 def routes(
