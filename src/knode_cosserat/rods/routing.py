@@ -2,6 +2,9 @@
 
 A routing says where its tendon crosses the section at σ = s/L: (x, y) in metres in the material frame, whose
 third axis is along the rod. σ runs from 0 to 1 over the whole rod, also for a tendon that ends before.
+
+Where n and m carry rod and tendons they are continuous where a tendon ends: it suffices that its tension is 0
+from there on. (n and m of the rod alone jump, by that tendon's pull and by the kinks that the others get.)
 """
 
 from __future__ import annotations
@@ -39,7 +42,8 @@ class Routing(eqx.Module):
 
     def __check_init__(self) -> None:
         name, end = type(self).__name__, self.end
-        number = isinstance(end, int | float | np.number) and not isinstance(end, bool)
+        given: Any = end
+        number = isinstance(given, int | float | np.number) and not isinstance(given, bool)
         if not number or not 0.0 < end <= 1.0:
             raise ParameterError(
                 f"{name}: end is {end!r}; allowed is a number above 0, up to 1: the part of the length where "
@@ -142,22 +146,19 @@ class FunctionRouting(Routing):
         return x, y
 
     def __check_init__(self) -> None:
+        allowed = "allowed is a JAX-traceable function of σ that gives two numbers, x and y"
         if not callable(self.function):
-            raise ParameterError(
-                f"FunctionRouting: function is {self.function!r}; allowed is a function of σ that gives x and y"
-            )
+            raise ParameterError(f"FunctionRouting: function is {self.function!r}; {allowed}")
         try:
             given = jax.eval_shape(self.function, jnp.zeros(()))
-            shapes = [np.shape(part) for part in given]
         except Exception as error:
+            first = (str(error).splitlines() or [""])[0]
             raise ParameterError(
-                f"FunctionRouting: function cannot be traced by JAX: {type(error).__name__}: "
-                f"{str(error).splitlines()[0] if str(error) else ''}"
+                f"FunctionRouting: function raises {type(error).__name__}: {first}; {allowed}"
             ) from None
+        shapes = [np.shape(part) for part in given] if isinstance(given, tuple | list) else given
         if shapes != [(), ()]:
-            raise ParameterError(
-                f"FunctionRouting: function gives shapes {shapes}; allowed is two numbers, x and y"
-            )
+            raise ParameterError(f"FunctionRouting: function gives shapes {shapes}; {allowed}")
 
 
 #: the routings that a robot file can name as a kind
@@ -180,7 +181,7 @@ def routes(
 
 
 def ends(routings: Sequence[Routing]) -> np.ndarray:
-    """The parts of the length (c,) at which the tendons are anchored."""
+    """The parts of the length (c,) at which the tendons are anchored: from there on their tension is 0."""
     return np.array([routing.end for routing in routings], dtype=float)
 
 

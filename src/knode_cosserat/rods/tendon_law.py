@@ -10,8 +10,8 @@ least of the strictly convex energy ½ vᵀK_v v + ½ uᵀK_u u + Σ Tᵢ |ṗ�
 
     J = diag(K_v, K_u) + Σ Tᵢ/|ṗᵢ| (WᵢᵀWᵢ - gᵢgᵢᵀ),     Wᵢ = [I, -r̂ᵢ],     gᵢ = Wᵢᵀtᵢ = (tᵢ, rᵢ × tᵢ)
 
-A few corrections with one J settle it for robots that bend; where they do not, Newton's method goes on, damped.
-How far tendons turn is the measure of all of it: by how much, as a part, a correction changes ṗᵢ.
+Two corrections with one J settle it while tendons hardly turn; where they do, Newton's method goes on,
+damped. The measure of both is by how much, as a part, a correction changes ṗᵢ.
 """
 
 from __future__ import annotations
@@ -77,9 +77,12 @@ def tendon_strains(
     """v and u (1/m) that fulfil the law: see the module's head.
 
     Args:
-        K_v, K_u: symmetric and positive definite (N, N·m²).
-        a, b: what is to be balanced (N, N·m).
-        r, r_s: where the tendons run (m), and its derivative along the rod; the third numbers are not used.
+        K_v: stiffness of shear and extension (N), symmetric and positive definite.
+        K_u: the same of bending and twisting (N·m²).
+        a: what v has to balance (N).
+        b: what u has to balance (N·m).
+        r: where the tendons run (m); its third numbers are not used.
+        r_s: derivative of r along the rod; its third numbers are not used.
         tension: T (N), not negative; 0 of a tendon that has ended.
 
     Returns:
@@ -174,7 +177,7 @@ def _solved(K_v: Any, K_u: Any, ab: Any, r: Any, r_s: Any, tension: Any) -> Floa
     for _ in range(CHORDS - 1):
         dx, turned = correction(x, flexibility)
         x = x - dx
-    # the next would be what tangents bend over the whole way (t″ ≤ 3) times this one
+    # the next correction would be about this one times how much J has changed since (|t″| ≤ 3)
     missing = 3.0 * first * turned
 
     def goes_on(reached: Any) -> Any:
