@@ -172,26 +172,31 @@ class _Search:
         self, wanted: _Wanted, u: np.ndarray, found: Response, epsilon: float
     ) -> tuple[np.ndarray, Response, bool]:
         damping, enough = 0.0, 1e-3 if epsilon > STAGES[-1] else 1e-10
+        last = np.inf
         r = wanted.residual(found)
         merit = r @ r + epsilon**2 * u @ u
         for _ in range(MOST_TRIALS):
             J = wanted.slope(found) * self.span
             step = self._step(J, r, u, epsilon, damping)
-            if np.max(np.abs(step), initial=0.0) <= enough:
-                return u, found, damping <= 1e-2 or not np.any(step)
+            size = float(np.max(np.abs(step), initial=0.0))
+            if size <= enough:
+                return u, found, damping <= 1e-2 or size == 0.0
             predicted = np.sum((r + J @ step) ** 2) + epsilon**2 * np.sum((u + step) ** 2)
-            if merit - predicted <= ROUNDING * merit:
+            # what is minimised says no more, but steps still tell: as long as each is shorter than the last
+            below_rounding = bool(merit - predicted <= ROUNDING * merit)
+            if below_rounding and size > 0.9 * last:
                 return u, found, True
+            last = size
             tried = np.clip(u + step, 0.0, 1.0)
             there = self.at(tried, found)
             new = np.inf
             if there is not None:
                 r_there = wanted.residual(there)
                 new = r_there @ r_there + epsilon**2 * tried @ tried
-            if there is None or not new < merit:
+            if there is None or not (new < merit or (below_rounding and new < merit * (1 + 1e-9))):
                 damping = max(10.0 * damping, 1e-4)
                 continue
-            if merit - new > 0.5 * (merit - predicted):
+            if below_rounding or merit - new > 0.5 * (merit - predicted):
                 damping = damping / 10.0 if damping > 1e-6 else 0.0
             u, found, r, merit = tried, there, r_there, new
         return u, found, False
@@ -259,7 +264,7 @@ def inverse_kinematics(
         begin = checked_control(system, initial, "initial")
         if np.any((begin < limits[0]) | (begin > limits[1])):
             raise ValueError(f"initial is {begin.tolist()}; it must be between low and high")
-    if not isinstance(starts, int | np.integer) or starts < 1:
+    if not _whole(starts):
         raise ValueError(f"starts is {starts!r}; allowed is a whole number from 1")
     search = _Search(system, settings, pose, *limits)
     free = np.where(search.free, search.span, 1.0)
@@ -274,6 +279,10 @@ def inverse_kinematics(
     columns = {name: [getattr(row, name) for row in rows] for name in names}
     none = {name: None for name in names if columns[name][0] is None}
     return InverseKinematics(**{name: np.array(columns[name]) for name in names if name not in none}, **none)
+
+
+def _whole(number: Any) -> bool:
+    return isinstance(number, int | np.integer) and number >= 1
 
 
 def _one(

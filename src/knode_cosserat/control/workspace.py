@@ -133,7 +133,7 @@ def _table(path: Any, arrays: dict[str, np.ndarray]) -> None:
 
 def _numpy(path: Any, arrays: dict[str, np.ndarray]) -> None:
     with open(path, "wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+        np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
 def sample(low: np.ndarray, high: np.ndarray, count: int, seed: int = 0) -> np.ndarray:
@@ -187,7 +187,8 @@ def workspace(
         if high is None or count is None:
             raise ValueError("allowed is workspace(robot, controls) or workspace(robot, low, high, count)")
         limits = checked_limits(system, controls, high)
-        if not isinstance(count, int | np.integer) or not 1 <= count <= 2**30:
+        number: Any = count
+        if not isinstance(number, int | np.integer) or not 1 <= number <= 2**30:
             raise ValueError(f"count is {count!r}; allowed is a whole number from 1 to 2^30")
         samples = sample(*limits, int(count), seed)
     else:
@@ -216,9 +217,10 @@ def _found(system: System, settings: Settings, pose: Pose, controls: np.ndarray,
         chunks = [work(firsts[0])]
         with concurrent.futures.ThreadPoolExecutor(usable_cores()) as pool:
             chunks += pool.map(work, firsts[1:])
-    position, quaternion, residual, _, size, strain = (
+    joined: list[Any] = [
         None if parts[0] is None else np.concatenate(parts) for parts in zip(*chunks, strict=True)
-    )
+    ]
+    position, quaternion, residual, _, size, strain = joined
     result = np.full(total, int(Result.CONVERGED))
     found = Workspace(system, controls, position, quaternion, result, residual, strain)
     for i in np.flatnonzero(~((residual <= settings.newton.acceptable) & (size <= SUSPICIOUS))):
