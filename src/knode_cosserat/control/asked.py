@@ -50,10 +50,8 @@ def checked_limits(system: System, low: Any, high: Any) -> tuple[np.ndarray, np.
     """Limits (c,) of the controls, from numbers or (c,)."""
     found = []
     for name, given in (("low", low), ("high", high)):
-        spread = (
-            np.full(system.control_size, float(given)) if np.ndim(given) == 0 and given is not None else given
-        )
-        found.append(checked_control(system, spread, name))
+        number = isinstance(given, int | float | np.number)
+        found.append(checked_control(system, [given] * system.control_size if number else given, name))
     if np.any(found[0] > found[1]):
         i = int(np.argmax(found[0] > found[1]))
         raise ValueError(

@@ -37,6 +37,10 @@ STAGES = (3e-2, 1e-3, 1e-5, 1e-7)
 MOST_TRIALS = 80
 #: a pose is reached when it is off by no more than this part of the robot's length, or this angle (rad)
 TOLERANCE = 1e-9
+#: in natural units: a residual beyond this may be so far that its own curvature counts
+FAR = 1e-4
+#: part of the way between the limits by which curvature is differenced
+DIFFERENCE = 1e-4
 #: rounding, in parts of what is minimised
 ROUNDING = 1e-13
 
@@ -172,21 +176,28 @@ class _Search:
         self, wanted: _Wanted, u: np.ndarray, found: Response, epsilon: float
     ) -> tuple[np.ndarray, Response, bool]:
         damping, enough = 0.0, 1e-3 if epsilon > STAGES[-1] else 1e-10
-        last = np.inf
+        slow = False
+        last, bent = np.inf, np.zeros((0, len(u)))
         r = wanted.residual(found)
         merit = r @ r + epsilon**2 * u @ u
         for _ in range(MOST_TRIALS):
             J = wanted.slope(found) * self.span
-            step = self._step(J, r, u, epsilon, damping)
+            if slow and np.linalg.norm(r) > FAR:
+                bent = self._bending(wanted, u, found, J)
+            step = self._step(J, r, u, (bent, epsilon, damping))
             size = float(np.max(np.abs(step), initial=0.0))
             if size <= enough:
                 return u, found, damping <= 1e-2 or size == 0.0
-            predicted = np.sum((r + J @ step) ** 2) + epsilon**2 * np.sum((u + step) ** 2)
+            predicted = (
+                np.sum((r + J @ step) ** 2)
+                + np.sum((bent @ step) ** 2)
+                + epsilon**2 * np.sum((u + step) ** 2)
+            )
             # what is minimised says no more, but steps still tell: as long as each is shorter than the last
             below_rounding = bool(merit - predicted <= ROUNDING * merit)
             if below_rounding and size > 0.9 * last:
                 return u, found, True
-            last = size
+            slow, last = bool(size > 0.3 * last), size
             tried = np.clip(u + step, 0.0, 1.0)
             there = self.at(tried, found)
             new = np.inf
@@ -194,24 +205,44 @@ class _Search:
                 r_there = wanted.residual(there)
                 new = r_there @ r_there + epsilon**2 * tried @ tried
             if there is None or not (new < merit or (below_rounding and new < merit * (1 + 1e-9))):
-                damping = max(10.0 * damping, 1e-4)
+                damping, slow = max(10.0 * damping, 1e-4), not len(bent)
                 continue
             if below_rounding or merit - new > 0.5 * (merit - predicted):
                 damping = damping / 10.0 if damping > 1e-6 else 0.0
             u, found, r, merit = tried, there, r_there, new
         return u, found, False
 
-    def _step(self, J: np.ndarray, r: np.ndarray, u: np.ndarray, epsilon: float, damping: float) -> Any:
+    def _bending(self, wanted: _Wanted, u: np.ndarray, found: Response, J: np.ndarray) -> np.ndarray:
+        """Rows B with BᵀB the part of Σ rᵢ ∇²rᵢ that is positive, by differences of Jᵀr.
+
+        Far from what is wanted it outweighs JᵀJ, of which Gauss and Newton's method alone knows.
+        """
+        gradient, columns = J.T @ wanted.residual(found), []
+        for i in range(len(u)):
+            h = DIFFERENCE if u[i] < 0.5 else -DIFFERENCE
+            there = self.at(u + h * np.eye(len(u))[i], found) if self.free[i] else None
+            if there is None:
+                columns.append((J.T @ J)[i])
+                continue
+            slope = wanted.slope(there) * self.span
+            columns.append((slope.T @ wanted.residual(there) - gradient) / h)
+        S = np.stack(columns) - J.T @ J
+        values, directions = np.linalg.eigh((S + S.T) / 2)
+        kept = values > 1e-4 * np.max(np.abs(values))
+        return np.sqrt(values[kept])[:, None] * directions[:, kept].T
+
+    def _step(self, J: np.ndarray, r: np.ndarray, u: np.ndarray, quadratic: Any) -> Any:
         """The change of u that is best by the slopes at hand, within the limits."""
         # imported here: it would double this package's import time
         from scipy.optimize import lsq_linear
 
+        bent, epsilon, damping = quadratic
         free, size = self.free, len(u)
         if not np.any(free):
             return np.zeros(size)
         damped = np.sqrt(damping) * np.linalg.norm(J, axis=0).max(initial=0.0)
-        A = np.concatenate([J, epsilon * np.eye(size), damped * np.eye(size)])[:, free]
-        b = -np.concatenate([r, epsilon * u, np.zeros(size)])
+        A = np.concatenate([J, bent, epsilon * np.eye(size), damped * np.eye(size)])[:, free]
+        b = -np.concatenate([r, np.zeros(len(bent)), epsilon * u, np.zeros(size)])
         step = np.zeros(size)
         step[free] = lsq_linear(A, b, (-u[free], 1.0 - u[free]), method="bvls", tol=1e-14).x
         return np.clip(step, -u, 1.0 - u)
@@ -282,7 +313,7 @@ def inverse_kinematics(
 
 
 def _whole(number: Any) -> bool:
-    return isinstance(number, int | np.integer) and number >= 1
+    return isinstance(number, int | np.integer) and bool(number >= 1)
 
 
 def _one(
