@@ -112,6 +112,16 @@ def test_a_quarter_turn_of_the_target_turns_the_controls():
     np.testing.assert_allclose(np.roll(one.control, 1), other.control, atol=1e-5)
 
 
+def test_near_is_reached_if_that_is_enough():
+    """The crude model's tip moves on a surface: a point 1 mm above it is not on it."""
+    position = tip(ROBOT, [4.0, 1.0, 0.0, 0.0])[0] + np.array([0.0, 0.0, 1e-3])
+    exact, near = (
+        kc.inverse_kinematics(ROBOT, position, low=0.0, high=HIGH, tolerance=part) for part in (1e-9, 2e-3)
+    )
+    assert exact.result is kc.Reach.UNREACHABLE and near.result is kc.Reach.REACHED
+    np.testing.assert_allclose(near.position, exact.position, atol=1e-6)
+
+
 def test_a_control_that_is_held_stays():
     low, high = np.array([2.0, 0.0, 0.0, 0.0]), np.array([2.0, 9.0, 9.0, 9.0])
     position, _ = tip(ROBOT, [2.0, 1.0, 3.0, 4.0])
@@ -163,6 +173,7 @@ def test_rotation_vectors_turn_one_into_the_other():
         ({"position": [0, 0, 1], "initial": [20.0] * 4}, "initial is .* between low and high"),
         ({"position": [0, 0, 1], "weights": (1.0, 0.0)}, "weights are .* above 0"),
         ({"position": [0, 0, 1], "starts": 0}, "starts is 0"),
+        ({"position": [0, 0, 1], "tolerance": 0.0}, "tolerance is 0; allowed is above 0"),
     ],
 )
 def test_wrong_arguments_are_named(arguments, message):

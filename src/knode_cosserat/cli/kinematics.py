@@ -38,8 +38,8 @@ High = Annotated[
 
 @app.command(
     epilog=examples(
-        "reach delrin-tendon-robot --position 0.1 0.05 0.6 --high 10",
-        "reach delrin-tendon-robot --quaternion 0.98 -0.1 0.17 0 --low 1 --high 8,8,10,10 --json",
+        "reach delrin-tendon-robot --position 0.2063 0.1032 0.58 --high 10",
+        "reach delrin-tendon-robot --quaternion 0.98 -0.1 0.17 0 --low 1 --high 8,8,10,10 --tolerance 1e-2",
     )
 )
 def reach(
@@ -53,6 +53,9 @@ def reach(
     ] = None,
     low: Low = "0",
     high: High = "10",
+    tolerance: Annotated[
+        float, typer.Option(metavar="PART", help="How near is reached: in parts of the length, and in rad.")
+    ] = 1e-4,
     space: Space = "euler",
     changes: Changes = None,
     nodes: Nodes = None,
@@ -67,8 +70,9 @@ def reach(
 
     system = system_of(robot, changes, nodes)
     found = kc.inverse_kinematics(
-        system, position, quaternion, low=_limits("--low", low), high=_limits("--high", high), space=space
-    )
+        system, position, quaternion, low=_limits("--low", low), high=_limits("--high", high),
+        tolerance=tolerance, space=space,
+    )  # fmt: skip
     facts: dict[str, Any] = {
         "robot": robot,
         "result": found.result.name.lower(),

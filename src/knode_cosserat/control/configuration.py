@@ -14,6 +14,10 @@ from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.space import SpaceScheme
 
 
+#: of a compliance, in parts of its largest eigenvalue: what schemes along the rod may be off by
+ASYMMETRY = 1e-4
+
+
 class Ellipsoid(NamedTuple):
     """How far a unit of control moves something: a Jacobian's singular values, largest first."""
 
@@ -69,6 +73,22 @@ class Configuration:
         if not self._compliance.shape[1]:
             raise ValueError("the robot's tip_layout has no force n or moment m: a wrench cannot be added")
         return self._compliance
+
+    @property
+    def unstable(self) -> bool:
+        """Whether the equilibrium is unstable, by a negative eigenvalue of the tip's compliance.
+
+        The second variation of a conservative robot has as many negative eigenvalues as this compliance and
+        the robot with its tip held together (Haynsworth): what buckles with a free tip is seen,
+        what would buckle even between a clamped base and a held tip is not. For the
+        tip's own pose only.
+        """
+        C = self.compliance
+        if C.shape[0] != C.shape[1]:
+            raise ValueError(f"compliance has shape {C.shape}: the robot's pose and wrench do not match")
+        values = np.linalg.eigvalsh((C + C.T) / 2)
+        # the stiffest directions are as small as the scheme's asymmetry
+        return bool(values[0] < -ASYMMETRY * np.max(np.abs(values)))
 
     @property
     def manipulability(self) -> Manipulability:

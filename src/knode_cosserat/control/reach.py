@@ -35,8 +35,6 @@ from knode_cosserat.solvers.space import SpaceScheme
 STAGES = (3e-2, 1e-3, 1e-5, 1e-7)
 #: equilibria that one search looks at in a stage, at most
 MOST_TRIALS = 80
-#: a pose is reached when it is off by no more than this part of the robot's length, or this angle (rad)
-TOLERANCE = 1e-9
 #: in natural units: a residual beyond this may be so far that its own curvature counts
 FAR = 1e-4
 #: part of the way between the limits by which curvature is differenced
@@ -103,6 +101,7 @@ class _Wanted(NamedTuple):
     quaternion: np.ndarray | None
     length: float
     weights: tuple[float, float]
+    tolerance: float
 
     def errors(self, found: Response) -> tuple[np.ndarray, np.ndarray]:
         """Of position (m) and of orientation (a rotation vector, rad); empty for what is not wanted."""
@@ -130,9 +129,8 @@ class _Wanted(NamedTuple):
 
     def reached(self, found: Response) -> bool:
         position, turned = self.errors(found)
-        return bool(
-            np.linalg.norm(position) <= TOLERANCE * self.length and np.linalg.norm(turned) <= TOLERANCE
-        )
+        off = np.linalg.norm(position) / self.length
+        return bool(max(off, np.linalg.norm(turned)) <= self.tolerance)
 
 
 def rotation_between(one: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -257,6 +255,7 @@ def inverse_kinematics(
     high: Any,
     initial: Any = None,
     weights: tuple[float, float] = (1.0, 1.0),
+    tolerance: float = 1e-9,
     starts: int = 6,
     space: str | SpaceScheme = "euler",
     newton: NewtonOptions = NewtonOptions(),
@@ -278,6 +277,8 @@ def inverse_kinematics(
         high: upper limits.
         initial: (c,), where to begin; by default half-way between the limits.
         weights: of the errors of position, in parts of the robot's length, and of orientation (rad).
+        tolerance: a pose is reached when it is off by no more than this part of the robot's length, and
+            turned from it by no more than this (rad).
         starts: how many beginnings are tried before a pose is called unreachable.
         space: "euler", "rk4", or a scheme.
         newton: tolerances and limits of the solve.
@@ -289,7 +290,7 @@ def inverse_kinematics(
     system = checked_system(robot)
     settings = static_settings(space, newton)
     limits = checked_limits(system, low, high)
-    wanted, single = _checked_wanted(system, pose, position, quaternion, weights)
+    wanted, single = _checked_wanted(system, pose, position, quaternion, (weights, tolerance))
     begin = None
     if initial is not None:
         begin = checked_control(system, initial, "initial")
@@ -377,7 +378,7 @@ def _nothing(search: _Search, u: np.ndarray) -> InverseKinematics:
 
 
 def _checked_wanted(
-    system: System, pose: Pose, position: Any, quaternion: Any, weights: Any
+    system: System, pose: Pose, position: Any, quaternion: Any, measured_by: Any
 ) -> tuple[list[_Wanted], bool]:
     """The wanted poses, and whether one was given rather than several."""
     here, turned = pose(system, system.rest(system.length)[0])
@@ -393,7 +394,10 @@ def _checked_wanted(
             raise ValueError("quaternion is zero; allowed is any other length")
     if not given:
         raise ValueError("neither position nor quaternion is given; give one or both")
-    weights = checked_numbers("weights", weights, 2, "(2,): of position and of orientation", most=1)
+    tolerance = float(checked_numbers("tolerance", np.atleast_1d(measured_by[1]), 1, "a number", most=1)[0])
+    if tolerance <= 0.0:
+        raise ValueError(f"tolerance is {tolerance:g}; allowed is above 0")
+    weights = checked_numbers("weights", measured_by[0], 2, "(2,): of position and of orientation", most=1)
     if np.any(weights <= 0.0):
         raise ValueError(f"weights are {weights.tolist()}; allowed is above 0")
     if len({array.shape[:-1] for array in given.values()}) > 1:
@@ -407,4 +411,6 @@ def _checked_wanted(
     def row(name: str, i: int) -> np.ndarray | None:
         return poses[name][i] if name in poses else None
 
-    return [_Wanted(row("position", i), row("quaternion", i), length, weight) for i in range(count)], single
+    return [
+        _Wanted(row("position", i), row("quaternion", i), length, weight, tolerance) for i in range(count)
+    ], single

@@ -6,14 +6,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from knode_cosserat.control.workspace import Workspace
 from knode_cosserat.evaluation.drawing import TIME_COLOURS, new_figure, require_matplotlib, style
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from knode_cosserat.control.workspace import Workspace
+
 #: points that are drawn, at most: more only make the file large
-MOST_POINTS = 20_000
+MOST_POINTS = 100_000
 
 
 def workspace_seen(found: Workspace) -> Figure:
@@ -33,7 +34,7 @@ def workspace_seen(found: Workspace) -> Figure:
         figure = new_figure(9.0, 4.2)
         for k, (across, up, names) in enumerate(((x, z, "xz"), (x, y, "xy"))):
             axes = figure.add_subplot(1, 2, k + 1)
-            points = axes.scatter(across, up, c=total, s=2, cmap=TIME_COLOURS, rasterized=True, linewidths=0)
+            points = axes.scatter(across, up, c=total, s=1, cmap=TIME_COLOURS, rasterized=True, linewidths=0)
             axes.set(xlabel=f"{names[0]} [m]", ylabel=f"{names[1]} [m]", aspect="equal")
         figure.colorbar(points, ax=figure.axes, label="sum of the controls")
     return figure
