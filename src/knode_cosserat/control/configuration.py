@@ -13,7 +13,6 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.space import SpaceScheme
 
-
 #: of a compliance, in parts of its largest eigenvalue: what schemes along the rod may be off by
 ASYMMETRY = 1e-4
 

@@ -39,6 +39,8 @@ MOST_TRIALS = 80
 FAR = 1e-4
 #: part of the way between the limits by which curvature is differenced
 DIFFERENCE = 1e-4
+#: slope of the distance, in parts of what it could be, that counts as none
+FLAT = 1e-6
 #: rounding, in parts of what is minimised
 ROUNDING = 1e-13
 
@@ -165,14 +167,18 @@ class _Search:
 
     def descend(self, wanted: _Wanted, u: np.ndarray, found: Response) -> tuple[np.ndarray, Response, bool]:
         """The nearest pose from there, and whether the search ended for that reason."""
-        settled = True
         for epsilon in STAGES:
-            u, found, settled = self._stage(wanted, u, found, epsilon)
-        return u, found, settled
+            u, found = self._stage(wanted, u, found, epsilon)
+        J, r = wanted.slope(found) * self.span, wanted.residual(found)
+        slope = J.T @ r
+        # what points out of the limits is no way to go
+        slope = np.where(((u <= 0.0) & (slope > 0.0)) | ((u >= 1.0) & (slope < 0.0)), 0.0, slope)
+        steepest = np.linalg.norm(r) * np.max(np.linalg.norm(J, axis=0))
+        return u, found, bool(np.max(np.abs(slope)) <= FLAT * steepest + 1e-12)
 
     def _stage(
         self, wanted: _Wanted, u: np.ndarray, found: Response, epsilon: float
-    ) -> tuple[np.ndarray, Response, bool]:
+    ) -> tuple[np.ndarray, Response]:
         damping, enough = 0.0, 1e-3 if epsilon > STAGES[-1] else 1e-10
         slow = False
         last, bent = np.inf, np.zeros((0, len(u)))
@@ -185,7 +191,7 @@ class _Search:
             step = self._step(J, r, u, (bent, epsilon, damping))
             size = float(np.max(np.abs(step), initial=0.0))
             if size <= enough:
-                return u, found, damping <= 1e-2 or size == 0.0
+                return u, found
             predicted = (
                 np.sum((r + J @ step) ** 2)
                 + np.sum((bent @ step) ** 2)
@@ -194,7 +200,7 @@ class _Search:
             # what is minimised says no more, but steps still tell: as long as each is shorter than the last
             below_rounding = bool(merit - predicted <= ROUNDING * merit)
             if below_rounding and size > 0.9 * last:
-                return u, found, True
+                return u, found
             slow, last = bool(size > 0.3 * last), size
             tried = np.clip(u + step, 0.0, 1.0)
             there = self.at(tried, found)
@@ -208,7 +214,7 @@ class _Search:
             if below_rounding or merit - new > 0.5 * (merit - predicted):
                 damping = damping / 10.0 if damping > 1e-6 else 0.0
             u, found, r, merit = tried, there, r_there, new
-        return u, found, False
+        return u, found
 
     def _bending(self, wanted: _Wanted, u: np.ndarray, found: Response, J: np.ndarray) -> np.ndarray:
         """Rows B with BᵀB the part of Σ rᵢ ∇²rᵢ that is positive, by differences of Jᵀr.

@@ -164,8 +164,8 @@ def workspace(
 
     Every equilibrium is looked for from the unloaded robot, as `kc.equilibrium` does, so a sample does not
     depend on the others. A robot with several gives the one that is found from there; whether it is stable
-    is not looked at (`kc.configuration(…).unstable` says). What one iteration does not find goes through all that `kc.equilibrium` tries. Only the
-    poses are kept: memory does not grow with the nodes.
+    is not looked at (`kc.configuration(…).unstable` says). What one iteration does not find goes through all
+    that `kc.equilibrium` tries. Only the poses are kept: memory does not grow with the nodes.
 
     Args:
         robot: one robot or model.
