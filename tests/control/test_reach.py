@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.control.reach import rotation_between
+from knode_cosserat.control.search import rotation_between
 from knode_cosserat.learning.structured.residual import Structured
 
 ROBOT = kc.load_robot("delrin-tendon-robot")
