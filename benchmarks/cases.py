@@ -144,7 +144,27 @@ def memory() -> dict[str, Any]:
     return {"megabytes": peak / (1024 if sys.platform != "darwin" else 1024**2)}
 
 
-CASES = {case.__name__: case for case in (steps, batch, gradient, first_call, memory)}
+def workspace(count: int = 8192) -> dict[str, Any]:
+    """Equilibria of a workspace, and what memory they took beyond the package and its programs."""
+    import knode_cosserat as kc
+
+    robot = kc.load_robot("delrin-tendon-robot")
+    kc.workspace(robot, 0.0, 10.0, 2048)
+    unit = 1024 if sys.platform != "darwin" else 1024**2
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    taken = statistics.median(seconds(lambda: kc.workspace(robot, 0.0, 10.0, count)) for _ in range(3))
+    more = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / unit
+    return {"equilibria": count, "seconds": taken, "per_second": count / taken, "more_megabytes": more}
+
+
+def workspace_full() -> dict[str, Any]:
+    """100,000 of them; not among those of `make bench`."""
+    return workspace(100_000)
+
+
+CASES = {
+    case.__name__: case for case in (steps, batch, gradient, first_call, memory, workspace, workspace_full)
+}
 
 if __name__ == "__main__":
     print(json.dumps(CASES[sys.argv[1]]()))

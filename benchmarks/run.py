@@ -64,7 +64,7 @@ def measure() -> dict[str, Any]:
                 cold.append(case("first_call", empty))
         command_seconds(cache)
         second = [command_seconds(cache) for _ in range(ROUNDS)]
-        found = {name: case(name, cache) for name in ("steps", "batch", "gradient", "memory")}
+        found = {name: case(name, cache) for name in ("steps", "batch", "gradient", "memory", "workspace")}
         found |= {name: case(name, cache, "learning") for name in ("fits", "learned_steps")}
     with tempfile.TemporaryDirectory() as empty:
         found["study"] = case("study", empty, "learning")
@@ -91,6 +91,11 @@ def table(found: dict[str, Any]) -> str:
             "1024 robots at once, all cores",
             f"{found['batch']['robot_steps_per_second']:,.0f} robot-steps/s",
             ">= 40,000",
+        ),
+        (
+            "equilibria of a workspace, all cores",
+            f"{found['workspace']['per_second']:,.0f} a second",
+            ">= 1,700",
         ),
         ("first call (nothing compiled yet)", f"{found['first_call']['first_call']:.1f} s", "<= 6 s"),
         ("second process, command to result", f"{found['second_process']['seconds']:.1f} s", "<= 3 s"),

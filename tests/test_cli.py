@@ -14,8 +14,9 @@ from knode_cosserat.cli import app
 from knode_cosserat.evaluation.metrics import dtw_distance
 
 ROBOT = "delrin-tendon-robot"
-COMMANDS = ("simulate", "equilibrium", "info", "fit", "evaluate", "plot", "inspect", "study simulation",
-            "study imperfections", "study data", "study estimation", "record-virtual")  # fmt: skip
+COMMANDS = ("simulate", "equilibrium", "info", "reach", "workspace", "fit", "evaluate", "plot", "inspect",
+            "study simulation", "study imperfections", "study data", "study estimation",
+            "record-virtual")  # fmt: skip
 
 
 def run(*arguments):

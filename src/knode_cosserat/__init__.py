@@ -5,6 +5,16 @@ Everything public is here; see `simulate`, `load_robot` and `Trajectory` first.
 
 from knode_cosserat import _jax as _jax  # isort: split  (first: it sets JAX up)
 from knode_cosserat import controls
+from knode_cosserat.control.configuration import (
+    Configuration,
+    Manipulability,
+    compliance,
+    configuration,
+    jacobian,
+    manipulability,
+)
+from knode_cosserat.control.reach import InverseKinematics, Reach, inverse_kinematics
+from knode_cosserat.control.workspace import Workspace, workspace
 from knode_cosserat.evaluation.metrics import node_error, pose_mse, tip_dtw, tip_rmse
 from knode_cosserat.evaluation.state_errors import StateError, state_errors
 from knode_cosserat.learning.calibration.calibrate import Calibration, CalibrationError, calibrate
@@ -61,6 +71,7 @@ __all__ = [
     "CalibrationError",
     "CheckpointError",
     "ConfigError",
+    "Configuration",
     "DataError",
     "Differences",
     "Ensemble",
@@ -70,12 +81,15 @@ __all__ = [
     "FitError",
     "FunctionSection",
     "History",
+    "InverseKinematics",
     "Layout",
+    "Manipulability",
     "Measurements",
     "ModelFileError",
     "NetworkOptions",
     "NewtonOptions",
     "ParameterError",
+    "Reach",
     "Recording",
     "RecordingConfig",
     "RecordingError",
@@ -98,8 +112,11 @@ __all__ = [
     "Trajectory",
     "TrajectoryFileError",
     "Trapezoidal",
+    "Workspace",
     "calibrate",
     "catalog",
+    "compliance",
+    "configuration",
     "controls",
     "ends",
     "equilibrium",
@@ -108,12 +125,15 @@ __all__ = [
     "explain",
     "fit",
     "identify",
+    "inverse_kinematics",
+    "jacobian",
     "load_ensemble",
     "load_model",
     "load_recording",
     "load_robot",
     "load_trajectory",
     "loads",
+    "manipulability",
     "node_error",
     "parameter",
     "pose_mse",
@@ -123,4 +143,5 @@ __all__ = [
     "surroundings",
     "tip_dtw",
     "tip_rmse",
+    "workspace",
 ]

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
+from knode_cosserat.rods.parts import kinds_of
 from knode_cosserat.rods.routing import (
-    KINDS,
     FunctionRouting,
     Helical,
     Polynomial,
+    Routing,
     Straight,
     Tapered,
     ends,
@@ -65,8 +66,8 @@ def test_offsets_have_slopes():
 
 
 def test_kinds_are_named_once_each():
-    assert list(KINDS) == ["straight", "tapered", "helical", "polynomial"]
-    assert FunctionRouting.kind not in KINDS
+    assert list(kinds_of(Routing)) == ["helical", "polynomial", "straight", "tapered"]
+    assert not FunctionRouting.kind
 
 
 @pytest.mark.parametrize(
@@ -78,7 +79,7 @@ def test_kinds_are_named_once_each():
         (lambda: Helical(-0.01, 0.0, 1.0), "Helical: radius is -0.01; allowed is a number 0 to 1 m"),
         (lambda: Helical(0.01, 0.0, np.nan), "Helical: turns is nan"),
         (lambda: Polynomial([], [0.0]), r"Polynomial: x has shape \(0,\); allowed is a list"),
-        (lambda: Straight(0.0, 0.0, end=0.0), "Straight: end is 0.0; allowed is a number above 0, up to 1"),
+        (lambda: Straight(0.0, 0.0, end=0.0), "Straight: end is 0.0; allowed is a number 0.001 to 1"),
         (lambda: Straight(0.0, 0.0, end=1.2), "Straight: end is 1.2"),
         (lambda: Straight(0.0, 0.0, end="tip"), "Straight: end is 'tip'"),
         (lambda: Straight(0.0, 0.0, end=True), "Straight: end is True"),

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 
-from knode_cosserat.rods.parameters import Parameter, check_fields, parameters_of
+from knode_cosserat.rods.parameters import Parameter, ParameterError, check_fields, parameters_of
 from knode_cosserat.rods.system import Field
 
 
@@ -32,7 +32,10 @@ class Part(eqx.Module):
         return parameters_of(cls)
 
     def __check_init__(self) -> None:
-        check_fields(self)
+        try:
+            check_fields(self)
+        except ParameterError as error:
+            raise ParameterError(f"{type(self).__name__}: {error}") from None
 
 
 def kinds_of(family: type) -> dict[str, type[Part]]:

@@ -155,7 +155,7 @@ def run_batch(
     """
     size = controls.shape[0]
     lockstep = jax.default_backend() != "cpu"
-    workers = 1 if lockstep else _cores()
+    workers = 1 if lockstep else usable_cores()
     chunk = size if lockstep else min(CHUNK, -(-size // workers))
     padded = _padded(controls)
 
@@ -206,7 +206,8 @@ def _program(system: System, past: Any, controls: np.ndarray, *static: Any) -> A
     return structure, tuple(np.shape(leaf) for leaf in leaves), controls.shape, static
 
 
-def _cores() -> int:
+def usable_cores() -> int:
+    """How many cores this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

@@ -1,0 +1,60 @@
+"""Checks of what is asked of a robot at rest; every error is one line."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.boundary import NewtonOptions
+from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.solvers.time import Static
+
+
+def static_settings(space: str | SpaceScheme, newton: NewtonOptions) -> Settings:
+    """What `kc.equilibrium` solves with."""
+    return Settings.of(Static(), space, "paper", newton)
+
+
+def checked_system(robot: Any) -> System:
+    """One system."""
+    if not isinstance(robot, System):
+        raise ValueError(f"robot is {type(robot).__name__}; allowed is one robot or model")
+    return robot
+
+
+def checked_numbers(name: str, given: Any, size: int, allowed: str, most: int = 2) -> np.ndarray:
+    """Finite numbers (size,), or with `most` 2 also (B, size)."""
+    try:
+        numbers = np.asarray(given, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} is not numbers ({error}); allowed is {allowed}") from None
+    if not 1 <= numbers.ndim <= most or numbers.shape[-1] != size or 0 in numbers.shape:
+        raise ValueError(f"{name} has shape {numbers.shape}; allowed is {allowed}")
+    if not np.all(np.isfinite(numbers)):
+        bad = tuple(np.argwhere(~np.isfinite(numbers))[0].tolist())
+        raise ValueError(f"{name} is {numbers[bad]} at index {bad}; it must be finite")
+    return numbers
+
+
+def checked_control(system: System, control: Any, name: str = "control") -> np.ndarray:
+    """One control (c,)."""
+    size = system.control_size
+    names = ", ".join(f"{field.name} ({field.unit})" for field in system.control_layout.fields)
+    return checked_numbers(name, control, size, f"({size},): {names}", most=1)
+
+
+def checked_limits(system: System, low: Any, high: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Limits (c,) of the controls, from numbers or (c,)."""
+    found = []
+    for name, given in (("low", low), ("high", high)):
+        number = isinstance(given, int | float | np.number)
+        found.append(checked_control(system, [given] * system.control_size if number else given, name))
+    if np.any(found[0] > found[1]):
+        i = int(np.argmax(found[0] > found[1]))
+        raise ValueError(
+            f"low is {found[0][i]:g} and high {found[1][i]:g} for control {i}; low must not be above high"
+        )
+    return found[0], found[1]

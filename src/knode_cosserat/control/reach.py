@@ -1,0 +1,242 @@
+"""Inverse kinematics: the controls under which a robot at rest has a wanted pose."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+from typing import Any
+
+import numpy as np
+
+from knode_cosserat.control.asked import (
+    checked_control,
+    checked_limits,
+    checked_numbers,
+    checked_system,
+    static_settings,
+)
+from knode_cosserat.control.search import Search, Wanted
+from knode_cosserat.control.statics import Pose, Response, first_solved, respond, rest_guess, tip_pose
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.boundary import NewtonOptions
+from knode_cosserat.solvers.result import SimulationError
+from knode_cosserat.solvers.space import SpaceScheme
+
+
+class Reach(enum.IntEnum):
+    """What came of a wanted pose. Zero: reached. Below zero: not, and the pose is another."""
+
+    REACHED = 0
+    UNREACHABLE = -1
+    NOT_CONVERGED = -2
+    NO_EQUILIBRIUM = -3
+
+    @property
+    def message(self) -> str:
+        """The result in words."""
+        return {
+            Reach.REACHED: "reached",
+            Reach.UNREACHABLE: "not reachable from there: the nearest pose that was found",
+            Reach.NOT_CONVERGED: "stopped before it was certain that nothing is nearer",
+            Reach.NO_EQUILIBRIUM: "no equilibrium to begin with",
+        }[self]
+
+
+@dataclasses.dataclass(frozen=True)
+class InverseKinematics:
+    """Controls that reach a pose, or come nearest; with several poses every array has their axis in front.
+
+    Only where `result` is `Reach.REACHED` (`converged`) is the pose the wanted one.
+    """
+
+    #: a `Reach`
+    result: Any
+    #: (c,)
+    control: Any
+    #: where the pose is then: (3,) in m, and (4,) or None of a robot without orientation
+    position: Any
+    quaternion: Any
+    #: how far that is from what was wanted (m), and how turned from it (rad); zero for what was not asked
+    position_error: Any
+    angle_error: Any
+    #: which controls are at their limits (c,)
+    at_low: Any
+    at_high: Any
+    #: whether `kc.equilibrium`, which begins at the unloaded robot, finds the same shape; where it does not
+    #: the robot has several, and has to be led here
+    from_rest: Any
+    #: equilibria that were looked at
+    iterations: Any
+
+    @property
+    def converged(self) -> Any:
+        """Whether the pose was reached."""
+        return self.result == Reach.REACHED
+
+
+def inverse_kinematics(
+    robot: System,
+    position: Any = None,
+    quaternion: Any = None,
+    *,
+    low: Any,
+    high: Any,
+    initial: Any = None,
+    weights: tuple[float, float] = (1.0, 1.0),
+    tolerance: float = 1e-9,
+    starts: int = 6,
+    space: str | SpaceScheme = "euler",
+    newton: NewtonOptions = NewtonOptions(),
+    pose: Pose = tip_pose,
+) -> InverseKinematics:
+    """The controls under which a robot at rest has its tip at a position, in an orientation, or both.
+
+    Of all controls that reach a pose those nearest to `low` are taken (least squares, in parts of the way
+    from `low` to `high`). A pose that cannot be reached gives the nearest that was found, by weights, and
+    says so. The search is local: it begins at `initial`, then, as long as the pose is not reached, at up to
+    `starts` other controls. Shapes are followed from there: of a robot with several equilibria the one found
+    may not be the one of `kc.equilibrium` (see `from_rest`).
+
+    Args:
+        robot: one robot or model.
+        position: wanted position (3,) in m, or (B, 3): a path, each pose looked for from the last.
+        quaternion: wanted orientation (4,) or (B, 4), scalar first, of any length.
+        low: lower limits of the controls, a number or (c,).
+        high: upper limits.
+        initial: (c,), where to begin; by default half-way between the limits.
+        weights: of the errors of position, in parts of the robot's length, and of orientation (rad).
+        tolerance: a pose is reached when it is off by no more than this part of the robot's length, and
+            turned from it by no more than this (rad).
+        starts: how many beginnings are tried before a pose is called unreachable.
+        space: "euler", "rk4", or a scheme.
+        newton: tolerances and limits of the solve.
+        pose: whose pose, as for `kc.configuration`.
+
+    Raises:
+        ValueError: arguments of a wrong shape, not finite, or low above high.
+    """
+    system = checked_system(robot)
+    settings = static_settings(space, newton)
+    limits = checked_limits(system, low, high)
+    wanted, single = _checked_wanted(system, pose, position, quaternion, (weights, tolerance))
+    begin = None
+    if initial is not None:
+        begin = checked_control(system, initial, "initial")
+        if np.any((begin < limits[0]) | (begin > limits[1])):
+            raise ValueError(f"initial is {begin.tolist()}; it must be between low and high")
+    if not _whole(starts):
+        raise ValueError(f"starts is {starts!r}; allowed is a whole number from 1")
+    search = Search(system, settings, pose, *limits)
+    free = np.where(search.free, search.span, 1.0)
+    last = np.where(search.free, 0.5, 0.0) if begin is None else (begin - limits[0]) / free
+    rows, shape = [], None
+    for each in wanted:
+        row, last, shape = _one(search, each, last, shape, int(starts))
+        rows.append(row)
+    if single:
+        return rows[0]
+    names = [field.name for field in dataclasses.fields(InverseKinematics)]
+    columns = {name: [getattr(row, name) for row in rows] for name in names}
+    none = {name: None for name in names if columns[name][0] is None}
+    return InverseKinematics(**{name: np.array(columns[name]) for name in names if name not in none}, **none)
+
+
+def _whole(number: Any) -> bool:
+    return isinstance(number, int | np.integer) and bool(number >= 1)
+
+
+def _one(
+    search: Search, wanted: Wanted, begin: np.ndarray, shape: Response | None, starts: int
+) -> tuple[InverseKinematics, np.ndarray, Response | None]:
+    """One pose, from a beginning and the equilibrium there (None: from rest), then from others."""
+    best: tuple[float, np.ndarray, Response, bool] | None = None
+    search.trials = 0
+    for u in (begin, *_others(len(begin), starts - 1, search.free)):
+        found = shape
+        if best is not None or shape is None:
+            try:
+                found = first_solved(search.system, search.settings, search.pose, search.control(u))
+            except SimulationError:
+                continue
+            search.trials += 1
+        assert found is not None
+        u, found, settled = search.descend(wanted, u, found)
+        merit = float(np.sum(wanted.residual(found) ** 2))
+        if best is None or merit < best[0]:
+            best = (merit, u, found, settled)
+        if wanted.reached(found):
+            break
+    if best is None:
+        return _nothing(search, begin), begin, None
+    _, u, found, settled = best
+    result = Reach.UNREACHABLE if settled else Reach.NOT_CONVERGED
+    return _told(search, wanted, u, found, Reach.REACHED if wanted.reached(found) else result), u, found
+
+
+def _others(size: int, count: int, free: np.ndarray) -> np.ndarray:
+    from knode_cosserat.control.workspace import sample
+
+    return np.where(free, sample(np.zeros(size), np.ones(size), max(count, 1))[:count], 0.0)
+
+
+def _told(search: Search, wanted: Wanted, u: np.ndarray, found: Response, result: Reach) -> InverseKinematics:
+    control = search.control(u)
+    position, turned = wanted.errors(found)
+    cold = respond(search.system, search.settings, search.pose, control, *rest_guess(search.system))
+    scale = np.asarray(search.system.scales().y)
+    same = float(np.max(np.abs(np.asarray(cold.y) - np.asarray(found.y)) / scale)) < 1e-6
+    return InverseKinematics(
+        result, control, np.asarray(found.position),
+        None if found.quaternion is None else np.asarray(found.quaternion),
+        float(np.linalg.norm(position)), float(np.linalg.norm(turned)),
+        control <= search.low, control >= search.high, same, search.trials,
+    )  # fmt: skip
+
+
+def _nothing(search: Search, u: np.ndarray) -> InverseKinematics:
+    control = search.control(u)
+    position, quaternion = search.pose(search.system, np.full(search.system.y_layout.size, np.nan))
+    return InverseKinematics(
+        Reach.NO_EQUILIBRIUM, control, np.asarray(position),
+        None if quaternion is None else np.asarray(quaternion), np.nan, np.nan,
+        control <= search.low, control >= search.high, False, search.trials,
+    )  # fmt: skip
+
+
+def _checked_wanted(
+    system: System, pose: Pose, position: Any, quaternion: Any, measured_by: Any
+) -> tuple[list[Wanted], bool]:
+    """The wanted poses, and whether one was given rather than several."""
+    here, turned = pose(system, system.rest(system.length)[0])
+    given: dict[str, np.ndarray] = {}
+    if position is not None:
+        size = len(here)
+        given["position"] = checked_numbers("position", position, size, f"({size},) or (B, {size}) in m")
+    if quaternion is not None:
+        if turned is None:
+            raise ValueError(f"quaternion is given, but {type(system).__name__} has no orientation")
+        given["quaternion"] = checked_numbers("quaternion", quaternion, 4, "(4,) or (B, 4), scalar first")
+        if np.any(np.linalg.norm(given["quaternion"], axis=-1) < 1e-9):
+            raise ValueError("quaternion is zero; allowed is any other length")
+    if not given:
+        raise ValueError("neither position nor quaternion is given; give one or both")
+    tolerance = float(checked_numbers("tolerance", np.atleast_1d(measured_by[1]), 1, "a number", most=1)[0])
+    if tolerance <= 0.0:
+        raise ValueError(f"tolerance is {tolerance:g}; allowed is above 0")
+    weights = checked_numbers("weights", measured_by[0], 2, "(2,): of position and of orientation", most=1)
+    if np.any(weights <= 0.0):
+        raise ValueError(f"weights are {weights.tolist()}; allowed is above 0")
+    if len({array.shape[:-1] for array in given.values()}) > 1:
+        shapes = [array.shape for array in given.values()]
+        raise ValueError(f"position and quaternion have shapes {shapes}; give as many of both")
+    single = next(iter(given.values())).ndim == 1
+    poses = {name: np.atleast_2d(array) for name, array in given.items()}
+    length, weight = float(system.length), (float(weights[0]), float(weights[1]))
+    count = len(next(iter(poses.values())))
+
+    def row(name: str, i: int) -> np.ndarray | None:
+        return poses[name][i] if name in poses else None
+
+    return [
+        Wanted(row("position", i), row("quaternion", i), length, weight, tolerance) for i in range(count)
+    ], single

@@ -1,0 +1,191 @@
+"""The search of inverse kinematics: bounded least squares over equilibria.
+
+With u the controls between their limits (0 to 1) and r the pose's error in natural units,
+
+    minimise |r(u)|² + ε² |u|²,     0 ≤ u ≤ 1
+
+by Levenberg's method, each of whose steps is a bounded linear least-squares problem, solved exactly. ε goes
+down in stages to 1e-7: of all controls that reach a pose it finds those nearest to the lower limits, and
+what is left of it in the pose is of the size ε². Slopes are exact, by the implicit function theorem.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from knode_cosserat.control.statics import Pose, Response, respond
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.settings import Settings
+
+#: ε in turn: a strong one first, so that controls do not run off along what the pose hardly feels
+STAGES = (3e-2, 1e-3, 1e-5, 1e-7)
+#: equilibria that one search looks at in a stage, at most
+MOST_TRIALS = 80
+#: in natural units: a residual beyond this may be so far that its own curvature counts
+FAR = 1e-4
+#: part of the way between the limits by which curvature is differenced
+DIFFERENCE = 1e-4
+#: slope of the distance, in parts of what it could be, that counts as none
+FLAT = 1e-6
+#: rounding, in parts of what is minimised
+ROUNDING = 1e-13
+
+
+class Wanted(NamedTuple):
+    """A pose, with what its errors are divided by."""
+
+    position: np.ndarray | None
+    quaternion: np.ndarray | None
+    length: float
+    weights: tuple[float, float]
+    tolerance: float
+
+    def errors(self, found: Response) -> tuple[np.ndarray, np.ndarray]:
+        """Of position (m) and of orientation (a rotation vector, rad); empty for what is not wanted."""
+        position = turned = np.zeros(0)
+        if self.position is not None:
+            position = np.asarray(found.position) - self.position
+        if self.quaternion is not None:
+            turned = rotation_between(self.quaternion, np.asarray(found.quaternion))
+        return position, turned
+
+    def residual(self, found: Response) -> np.ndarray:
+        """The errors in natural units, weighted: what is minimised."""
+        position, turned = self.errors(found)
+        return np.concatenate([position / self.length * self.weights[0], turned * self.weights[1]])
+
+    def slope(self, found: Response) -> np.ndarray:
+        """∂residual/∂control.
+
+        Of a rotation vector θ the angular velocity stands for its rate: Jᵀθ, and so where the least is, is
+        exact; the rest is for small θ.
+        """
+        J, count = np.asarray(found.jacobian), len(found.position)
+        moved = J[:count] / self.length * self.weights[0] if self.position is not None else J[:0]
+        turned = J[count:] * self.weights[1] if self.quaternion is not None else J[:0]
+        return np.concatenate([moved, turned])
+
+    def reached(self, found: Response) -> bool:
+        """Whether the pose is near enough."""
+        position, turned = self.errors(found)
+        off = np.linalg.norm(position) / self.length
+        return bool(max(off, np.linalg.norm(turned)) <= self.tolerance)
+
+
+def rotation_between(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """The rotation vector (rad, global axes, at most π long) that turns `one` into `other`."""
+    (w, *v), (a, *b) = one / np.linalg.norm(one), other / np.linalg.norm(other)
+    v, b = np.asarray(v), np.asarray(b)
+    scalar, vector = a * w + b @ v, w * b - a * v - np.cross(b, v)
+    if scalar < 0.0:
+        scalar, vector = -scalar, -vector
+    sine = np.linalg.norm(vector)
+    return vector * (2.0 if sine < 1e-9 else 2.0 * np.arctan2(sine, scalar) / sine)
+
+
+class Search:
+    """Searches of one call: the robot, the limits, and the equilibria that were looked at."""
+
+    def __init__(self, system: System, settings: Settings, pose: Pose, low: np.ndarray, high: np.ndarray):
+        self.system, self.settings, self.pose = system, settings, pose
+        self.low, self.high, self.span = low, high, high - low
+        self.free = self.span > 0.0
+        self.trials = 0
+
+    def control(self, u: np.ndarray) -> np.ndarray:
+        """Controls within their limits, and exactly at them for u = 0 and 1."""
+        return np.where(u >= 1.0, self.high, np.minimum(self.low + u * self.span, self.high))
+
+    def at(self, u: np.ndarray, guess: Response) -> Response | None:
+        """The equilibrium near another, or None."""
+        self.trials += 1
+        found = respond(self.system, self.settings, self.pose, self.control(u), guess.y, guess.unknowns)
+        return found if found.error <= self.settings.newton.acceptable else None
+
+    def descend(self, wanted: Wanted, u: np.ndarray, found: Response) -> tuple[np.ndarray, Response, bool]:
+        """The nearest pose from there, and whether the search ended for that reason."""
+        for epsilon in STAGES:
+            u, found = self._stage(wanted, u, found, epsilon)
+        J, r = wanted.slope(found) * self.span, wanted.residual(found)
+        slope = J.T @ r
+        # what points out of the limits is no way to go
+        slope = np.where(((u <= 0.0) & (slope > 0.0)) | ((u >= 1.0) & (slope < 0.0)), 0.0, slope)
+        steepest = np.linalg.norm(r) * np.max(np.linalg.norm(J, axis=0))
+        return u, found, bool(np.max(np.abs(slope)) <= FLAT * steepest + 1e-12)
+
+    def _stage(
+        self, wanted: Wanted, u: np.ndarray, found: Response, epsilon: float
+    ) -> tuple[np.ndarray, Response]:
+        damping, enough = 0.0, 1e-3 if epsilon > STAGES[-1] else 1e-10
+        slow = False
+        last, bent = np.inf, np.zeros((0, len(u)))
+        r = wanted.residual(found)
+        merit = r @ r + epsilon**2 * u @ u
+        for _ in range(MOST_TRIALS):
+            J = wanted.slope(found) * self.span
+            if slow and np.linalg.norm(r) > FAR:
+                bent = self._bending(wanted, u, found, J)
+            step = self._step(J, r, u, (bent, epsilon, damping))
+            size = float(np.max(np.abs(step), initial=0.0))
+            if size <= enough:
+                return u, found
+            predicted = (
+                np.sum((r + J @ step) ** 2)
+                + np.sum((bent @ step) ** 2)
+                + epsilon**2 * np.sum((u + step) ** 2)
+            )
+            # what is minimised says no more, but steps still tell: as long as each is shorter than the last
+            below_rounding = bool(merit - predicted <= ROUNDING * merit)
+            if below_rounding and size > 0.9 * last:
+                return u, found
+            slow, last = bool(size > 0.3 * last), size
+            tried = np.clip(u + step, 0.0, 1.0)
+            there = self.at(tried, found)
+            new = np.inf
+            if there is not None:
+                r_there = wanted.residual(there)
+                new = r_there @ r_there + epsilon**2 * tried @ tried
+            if there is None or not (new < merit or (below_rounding and new < merit * (1 + 1e-9))):
+                damping, slow = max(10.0 * damping, 1e-4), not len(bent)
+                continue
+            if below_rounding or merit - new > 0.5 * (merit - predicted):
+                damping = damping / 10.0 if damping > 1e-6 else 0.0
+            u, found, r, merit = tried, there, r_there, new
+        return u, found
+
+    def _bending(self, wanted: Wanted, u: np.ndarray, found: Response, J: np.ndarray) -> np.ndarray:
+        """Rows B with BᵀB the part of Σ rᵢ ∇²rᵢ that is positive, by differences of Jᵀr.
+
+        Far from what is wanted it outweighs JᵀJ, of which Gauss and Newton's method alone knows.
+        """
+        gradient, columns = J.T @ wanted.residual(found), []
+        for i in range(len(u)):
+            h = DIFFERENCE if u[i] < 0.5 else -DIFFERENCE
+            there = self.at(u + h * np.eye(len(u))[i], found) if self.free[i] else None
+            if there is None:
+                columns.append((J.T @ J)[i])
+                continue
+            slope = wanted.slope(there) * self.span
+            columns.append((slope.T @ wanted.residual(there) - gradient) / h)
+        S = np.stack(columns) - J.T @ J
+        values, directions = np.linalg.eigh((S + S.T) / 2)
+        kept = values > 1e-4 * np.max(np.abs(values))
+        return np.sqrt(values[kept])[:, None] * directions[:, kept].T
+
+    def _step(self, J: np.ndarray, r: np.ndarray, u: np.ndarray, quadratic: Any) -> Any:
+        """The change of u that is best by the slopes at hand, within the limits."""
+        # imported here: it would double this package's import time
+        from scipy.optimize import lsq_linear
+
+        bent, epsilon, damping = quadratic
+        free, size = self.free, len(u)
+        if not np.any(free):
+            return np.zeros(size)
+        damped = np.sqrt(damping) * np.linalg.norm(J, axis=0).max(initial=0.0)
+        A = np.concatenate([J, bent, epsilon * np.eye(size), damped * np.eye(size)])[:, free]
+        b = -np.concatenate([r, np.zeros(len(bent)), epsilon * u, np.zeros(size)])
+        step = np.zeros(size)
+        step[free] = lsq_linear(A, b, (-u[free], 1.0 - u[free]), method="bvls", tol=1e-14).x
+        return np.clip(step, -u, 1.0 - u)

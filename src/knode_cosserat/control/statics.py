@@ -1,0 +1,159 @@
+"""One equilibrium and everything that is linear about it, compiled: for inverse kinematics and the like.
+
+At an equilibrium G(y, ξ; control) = 0, and with a small wrench W at the tip G + e W = 0. The linearisation
+that found it gives, by the implicit function theorem, what the task's pose does for either.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.boundary import Solution, StepProblem, linearise, newton, residuals
+from knode_cosserat.solvers.linear import Condensed
+from knode_cosserat.solvers.march import rest_record
+from knode_cosserat.solvers.settings import Settings
+
+#: position (d,) in m and orientation (quaternion, scalar first), or None, from a system and its last node's y
+Pose = Callable[[System, Any], tuple[Any, Any]]
+#: the time at which `kc.equilibrium` solves
+TIME = 1.0
+
+
+def tip_pose(system: System, y: Any) -> tuple[Any, Any]:
+    """Where the last node is and how it is turned; no orientation of a system that has none."""
+    turned = system.quaternions(y) if "h" in system.y_layout.names else None
+    return system.positions(y), turned
+
+
+class Response(NamedTuple):
+    """An equilibrium (`error` above `acceptable`: none) and its pose's slopes.
+
+    Twists are of the pose: velocity of its position (m), then, of a pose that turns, its angular velocity
+    (rad), both along the global axes.
+    """
+
+    y: Any
+    unknowns: Any
+    error: Any
+    corrections: Any
+    position: Any
+    quaternion: Any
+    #: twist per control (p, c)
+    jacobian: Any
+    #: twist per force (N) and moment (N m) at the tip along the global axes (p, w); w is 0 where unknown
+    compliance: Any
+
+
+def static_problem(system: System, settings: Settings, control: Any) -> StepProblem:
+    """The boundary-value problem of `kc.equilibrium`."""
+    ny, nz = system.y_layout.size, system.z_layout.size
+    nothing = jnp.zeros((system.nodes, ny + nz + (ny if system.mixed else 0)))
+    return StepProblem(system, jnp.asarray(TIME), control, jnp.zeros(()), nothing, settings.space)
+
+
+def at_rest(system: System) -> tuple[Any, Any]:
+    """The first guess of y at all nodes and of ξ: unloaded."""
+    y = rest_record(system)[:, : system.y_layout.size]
+    return y, system.unknowns(y[0])
+
+
+rest_guess = jax.jit(at_rest)
+
+
+def solve(system: System, settings: Settings, control: Any, y: Any, unknowns: Any) -> Solution:
+    """An equilibrium from a guess; its `error` says whether it is one."""
+    return newton(static_problem(system, settings, control), y, unknowns, Condensed(), settings.newton)
+
+
+def wrench_fields(system: System) -> tuple[str, ...]:
+    """The tip's conditions to which a force and a moment at the tip are added."""
+    return tuple(name for name in ("n", "m") if name in system.tip_layout.names)
+
+
+def twist(system: System, pose: Pose, y: Any, dy: Any) -> Any:
+    """The pose's twist when the last node's y changes by dy."""
+    (_, h), (dp, dh) = jax.jvp(lambda y: pose(system, y), (y,), (dy,))
+    if h is None:
+        return dp
+    # ω = 2 (δh ∘ h⁻¹), whatever the length of h
+    w, v, dw, dv = h[0], h[1:], dh[0], dh[1:]
+    return jnp.concatenate([dp, 2.0 * (w * dv - dw * v - jnp.cross(dv, v)) / jnp.sum(h * h)])
+
+
+@functools.partial(jax.jit, static_argnames=("settings", "pose"))
+def respond(system, settings, pose, control, y, unknowns):  # type: ignore[no-untyped-def]
+    """A `Response`: the equilibrium found from a guess, its pose, and the pose's slopes."""
+    found = solve(system, settings, control, y, unknowns)
+    problem = static_problem(system, settings, control)
+    linear = Condensed()
+    linearisation = linearise(problem, found.y, found.unknowns)
+    factors, _, _ = linear.start(linearisation, system.scales().y)
+
+    def by_control(d_control: Any) -> Any:
+        def at_solution(control: Any) -> Any:
+            problem = static_problem(system, settings, control)
+            return *residuals(problem, found.y), problem.base(found.unknowns)
+
+        defects, tip, base = jax.jvp(at_solution, (control,), (d_control,))[1]
+        # a base that moves by itself enters through the first segment
+        defects = defects.at[0].add(jnp.sum(linearisation.F[0] * base, axis=1))
+        dy, _ = linear.solve(factors, defects, tip)
+        return twist(system, pose, found.y[-1], dy[-1])
+
+    def by_wrench(tip: Any) -> Any:
+        dy, _ = linear.solve(factors, jnp.zeros_like(linearisation.defects), tip)
+        return twist(system, pose, found.y[-1], dy[-1])
+
+    names = wrench_fields(system)
+    columns = np.eye(system.unknown_count)[system.tip_layout.indices(names) if names else []]
+    position, quaternion = pose(system, found.y[-1])
+    jacobian = jax.vmap(by_control, out_axes=-1)(jnp.eye(system.control_size))
+    empty = jnp.zeros((jacobian.shape[0], 0))
+    compliance = jax.vmap(by_wrench, out_axes=-1)(jnp.asarray(columns)) if names else empty
+    return Response(
+        found.y, found.unknowns, found.error, found.corrections, position, quaternion, jacobian, compliance
+    )
+
+
+@functools.partial(jax.jit, static_argnames=("settings", "pose"))
+def poses_of(system, settings, pose, controls):  # type: ignore[no-untyped-def]
+    """Poses of many equilibria (B, c), each from rest, one after the other: nothing else is kept of them.
+
+    Position, quaternion, error, corrections, and the largest change of each strain's length from rest.
+    """
+    begin = at_rest(system)
+    ny = system.y_layout.size
+    z_rest = rest_record(system)[:, ny : ny + system.z_layout.size]
+
+    def one(control: Any) -> Any:
+        found = solve(system, settings, control, *begin)
+        record = static_problem(system, settings, control).record(found.y)
+        strain = record[:, ny : ny + system.z_layout.size] - z_rest
+        lengths = [jnp.max(jnp.linalg.norm(part, axis=-1)) for part in system.z_layout.split(strain)]
+        size = jnp.max(jnp.abs(found.y) / system.scales().y)
+        return *pose(system, found.y[-1]), found.error, found.corrections, size, jnp.stack(lengths)
+
+    return jax.lax.map(one, controls)
+
+
+def first_solved(system: System, settings: Settings, pose: Pose, control: Any, guess: Any = None) -> Response:
+    """The response at a control: from the guess or rest, and if that fails by all that `equilibrium` tries.
+
+    Raises `SimulationError` if there is no equilibrium.
+    """
+    from knode_cosserat.solvers.equilibrium import equilibrium
+
+    control = np.asarray(control, dtype=float)
+    found = respond(system, settings, pose, control, *(guess or rest_guess(system)))
+    if not found.error <= settings.newton.acceptable:
+        recovered = equilibrium(system, control, space=settings.space, newton=settings.newton)
+        y = jnp.asarray(recovered.y[0])
+        found = respond(system, settings, pose, control, y, system.unknowns(y[0]))
+    return found

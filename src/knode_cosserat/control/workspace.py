@@ -1,0 +1,245 @@
+"""Where a robot reaches: poses of very many equilibria."""
+
+from __future__ import annotations
+
+import concurrent.futures
+import csv
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from knode_cosserat._files import replacing
+from knode_cosserat.control.asked import (
+    checked_limits,
+    checked_numbers,
+    checked_system,
+    static_settings,
+)
+from knode_cosserat.control.statics import Pose, poses_of, tip_pose
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.boundary import NewtonOptions
+from knode_cosserat.solvers.equilibrium import equilibrium
+from knode_cosserat.solvers.result import Result
+from knode_cosserat.solvers.run import usable_cores
+from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.solvers.stability import SUSPICIOUS
+
+#: samples that one thread takes at a time; fewer are filled up to a power of two
+CHUNK = 1024
+#: how a workspace is written, by its file's ending
+FORMATS = (".nc", ".csv", ".npz")
+
+
+@dataclasses.dataclass(frozen=True)
+class Workspace:
+    """Poses of B equilibria. Where there is none (`result` < 0) the pose is NaN."""
+
+    system: System
+    #: (B, c)
+    controls: np.ndarray
+    #: (B, 3) in m
+    position: np.ndarray
+    #: (B, 4), scalar first, or None of a robot without orientation
+    quaternion: np.ndarray | None
+    #: (B,), a `Result` each
+    result: np.ndarray
+    #: (B,), largest residual in natural units
+    residual: np.ndarray
+    #: (B, fields): the length of each strain's largest change from rest along the rod, in z's own units
+    strain: np.ndarray
+
+    @property
+    def valid(self) -> np.ndarray:
+        """Which samples are solutions (B,)."""
+        return self.result >= 0
+
+    @property
+    def unsolved(self) -> int:
+        """How many are not."""
+        return int(np.sum(~self.valid))
+
+    def peak(self, name: str) -> np.ndarray:
+        """(B,): the largest change from rest of a strain, such as `u` (1/m), anywhere along the rod."""
+        names = self.system.z_layout.names
+        if name not in names:
+            raise ValueError(f"there is no strain {name!r}; there are {', '.join(names)}")
+        return self.strain[:, names.index(name)]
+
+    def within(self, **limits: float) -> np.ndarray:
+        """Which samples (B,) are solved with no strain above its limit, such as `u=4.0` (1/m)."""
+        inside = self.valid.copy()
+        for name, limit in limits.items():
+            with np.errstate(invalid="ignore"):
+                inside &= self.peak(name) <= limit
+        return inside
+
+    def save(self, path: str | Path) -> None:
+        """Write a labelled netCDF file (.nc), a table (.csv), or NumPy's arrays (.npz).
+
+        Raises:
+            ValueError: another ending.
+        """
+        path = Path(path)
+        if path.suffix not in FORMATS:
+            raise ValueError(f"{path}: allowed is a name that ends in {', '.join(FORMATS)}")
+        arrays = {"control": self.controls, "position": self.position, "quaternion": self.quaternion}
+        arrays |= {"result": self.result, "residual": self.residual, "strain": self.strain}
+        known = {name: array for name, array in arrays.items() if array is not None}
+        with replacing(path) as temporary:
+            {".nc": self._netcdf, ".csv": _table, ".npz": _numpy}[path.suffix](temporary, known)
+
+    def _netcdf(self, path: Any, arrays: dict[str, np.ndarray]) -> None:
+        import xarray
+
+        said = {
+            "control": ("", "control"),
+            "position": ("m", "position of the tip, global frame"),
+            "quaternion": ("1", "orientation of the tip, scalar first"),
+            "result": ("1", "how it was solved; below zero: not solved"),
+            "residual": ("1", "largest residual, in natural units"),
+            "strain": ("", f"largest change from rest of {', '.join(self.system.z_layout.names)}"),
+        }
+        variables = {
+            name: (
+                ("sample", f"{name}_component")[: array.ndim],
+                array,
+                {"units": said[name][0], "long_name": said[name][1]},
+            )
+            for name, array in arrays.items()
+        }
+        xarray.Dataset(variables).to_netcdf(path, engine="h5netcdf")
+
+
+def _columns(arrays: dict[str, np.ndarray]) -> tuple[list[str], list[np.ndarray]]:
+    names, columns = [], []
+    for name, array in arrays.items():
+        wide = array.reshape(len(array), -1)
+        names += [name] if array.ndim == 1 else [f"{name}_{i}" for i in range(wide.shape[1])]
+        columns += list(wide.T)
+    return names, columns
+
+
+def _table(path: Any, arrays: dict[str, np.ndarray]) -> None:
+    names, columns = _columns(arrays)
+    with open(path, "w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(names)
+        writer.writerows(zip(*(column.tolist() for column in columns), strict=True))
+
+
+def _numpy(path: Any, arrays: dict[str, np.ndarray]) -> None:
+    with open(path, "wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
+
+
+def sample(low: np.ndarray, high: np.ndarray, count: int, seed: int = 0) -> np.ndarray:
+    """`count` controls (count, c) spread evenly between limits: the first of a scrambled Sobol sequence."""
+    from scipy.stats import qmc
+
+    power = max(0, int(np.ceil(np.log2(count))))
+    points = qmc.Sobol(len(low), rng=np.random.default_rng(seed)).random_base2(power)[:count]
+    return low + points * (high - low)
+
+
+def workspace(
+    robot: System,
+    controls: Any,
+    high: Any = None,
+    count: int | None = None,
+    *,
+    seed: int = 0,
+    space: str | SpaceScheme = "euler",
+    newton: NewtonOptions = NewtonOptions(),
+    pose: Pose = tip_pose,
+    progress: bool = False,
+) -> Workspace:
+    """Where a robot reaches: its pose at rest under many controls.
+
+    Either `workspace(robot, controls)` or `workspace(robot, low, high, count)`, which spreads `count`
+    controls evenly between limits (scrambled Sobol sequence with a seed).
+
+    Every equilibrium is looked for from the unloaded robot, as `kc.equilibrium` does, so a sample does not
+    depend on the others. A robot with several gives the one that is found from there; whether it is stable
+    is not looked at (`kc.configuration(…).unstable` says). What one iteration does not find goes through all
+    that `kc.equilibrium` tries. Only the poses are kept: memory does not grow with the nodes.
+
+    Args:
+        robot: one robot or model.
+        controls: (B, c); or the lower limits, numbers or (c,), with `high` and `count`.
+        high: the upper limits.
+        count: how many samples.
+        seed: of the samples.
+        space: "euler", "rk4", or a scheme.
+        newton: tolerances and limits of the solve.
+        pose: what is looked at, as for `kc.configuration`.
+        progress: show a progress bar.
+
+    Raises:
+        ValueError: arguments of a wrong shape.
+    """
+    system = checked_system(robot)
+    settings = static_settings(space, newton)
+    if high is not None or count is not None:
+        if high is None or count is None:
+            raise ValueError("allowed is workspace(robot, controls) or workspace(robot, low, high, count)")
+        limits = checked_limits(system, controls, high)
+        number: Any = count
+        if not isinstance(number, int | np.integer) or not 1 <= number <= 2**30:
+            raise ValueError(f"count is {count!r}; allowed is a whole number from 1 to 2^30")
+        samples = sample(*limits, int(count), seed)
+    else:
+        size = system.control_size
+        samples = checked_numbers("controls", controls, size, f"(B, {size})")
+        if samples.ndim != 2:
+            raise ValueError(f"controls have shape {samples.shape}; allowed is (B, {size})")
+    return _found(system, settings, pose, samples, progress)
+
+
+def _found(system: System, settings: Settings, pose: Pose, controls: np.ndarray, progress: bool) -> Workspace:
+    total = len(controls)
+    chunk = min(CHUNK, 2 ** int(np.ceil(np.log2(max(1, -(-total // usable_cores()))))))
+    with tqdm(total=total, disable=not progress, unit="sample", leave=False) as bar:
+
+        def work(first: int) -> Any:
+            # the last chunk is filled up with its last sample: one shape, one program
+            index = np.minimum(np.arange(first, first + chunk), total - 1)
+            found = poses_of(system, settings, pose, controls[index])
+            count = min(chunk, total - first)
+            bar.update(count)
+            return [None if leaf is None else np.asarray(leaf)[:count] for leaf in found]
+
+        firsts = range(0, total, chunk)
+        # the first alone: JAX may crash where one thread compiles what another does
+        chunks = [work(firsts[0])]
+        with concurrent.futures.ThreadPoolExecutor(usable_cores()) as pool:
+            chunks += pool.map(work, firsts[1:])
+    joined: list[Any] = [
+        None if parts[0] is None else np.concatenate(parts) for parts in zip(*chunks, strict=True)
+    ]
+    position, quaternion, residual, _, size, strain = joined
+    result = np.full(total, int(Result.CONVERGED))
+    found = Workspace(system, controls, position, quaternion, result, residual, strain)
+    for i in np.flatnonzero(~((residual <= settings.newton.acceptable) & (size <= SUSPICIOUS))):
+        _recovered(found, int(i), settings, pose)
+    return found
+
+
+def _recovered(found: Workspace, i: int, settings: Settings, pose: Pose) -> None:
+    """Put in what `kc.equilibrium` finds of sample i with all that it tries, or that there is nothing."""
+    rest = equilibrium(
+        found.system, found.controls[i], space=settings.space, newton=settings.newton, on_failure="return"
+    )
+    found.result[i], found.residual[i] = rest.result[0], rest.residual[0]
+    position, quaternion = pose(found.system, rest.y[0, -1])
+    found.position[i] = np.asarray(position)
+    if found.quaternion is not None:
+        found.quaternion[i] = np.asarray(quaternion)
+    length = float(found.system.length)
+    nodes = np.linspace(0.0, 1.0, found.system.nodes) * length
+    changes = np.asarray(rest.z[0]) - np.stack([np.asarray(found.system.rest(s)[1]) for s in nodes])
+    parts = found.system.z_layout.split(changes)
+    found.strain[i] = [np.max(np.linalg.norm(part, axis=-1)) for part in parts]

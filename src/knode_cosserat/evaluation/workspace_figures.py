@@ -1,0 +1,40 @@
+"""The figure of a workspace; it needs matplotlib, the extra `viz`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from knode_cosserat.evaluation.drawing import TIME_COLOURS, new_figure, require_matplotlib, style
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from knode_cosserat.control.workspace import Workspace
+
+#: points that are drawn, at most: more only make the file large
+MOST_POINTS = 100_000
+
+
+def workspace_seen(found: Workspace) -> Figure:
+    """Tips from the side and from above, coloured by the sum of the controls.
+
+    Raises:
+        ImportError: matplotlib is not installed.
+        ValueError: nothing was solved, or positions are not of three numbers.
+    """
+    require_matplotlib()
+    if found.position.shape[1] != 3 or not found.valid.any():
+        raise ValueError("there is no solved sample with three coordinates to draw")
+    shown = np.flatnonzero(found.valid)[:MOST_POINTS]
+    x, y, z = found.position[shown].T
+    total = found.controls[shown].sum(axis=1)
+    with style():
+        figure = new_figure(9.0, 4.2)
+        for k, (across, up, names) in enumerate(((x, z, "xz"), (x, y, "xy"))):
+            axes = figure.add_subplot(1, 2, k + 1)
+            points = axes.scatter(across, up, c=total, s=1, cmap=TIME_COLOURS, rasterized=True, linewidths=0)
+            axes.set(xlabel=f"{names[0]} [m]", ylabel=f"{names[1]} [m]", aspect="equal")
+        figure.colorbar(points, ax=figure.axes, label="sum of the controls")
+    return figure

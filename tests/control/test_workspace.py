@@ -1,0 +1,95 @@
+"""Poses of many equilibria: each is `kc.equilibrium`'s, and none is wrong in silence."""
+
+import csv
+
+import numpy as np
+import pytest
+import xarray
+
+import knode_cosserat as kc
+
+ROBOT = kc.load_robot("delrin-tendon-robot")
+
+
+@pytest.fixture(scope="module")
+def found():
+    return kc.workspace(ROBOT, 0.0, [10.0, 8.0, 6.0, 4.0], 40, seed=3)
+
+
+def test_every_sample_is_the_equilibrium_of_its_control(found):
+    for i in range(0, 40, 4):
+        alone = kc.equilibrium(ROBOT, found.controls[i])
+        np.testing.assert_allclose(found.position[i], alone.tip_position[0], atol=1e-9)
+        np.testing.assert_allclose(found.quaternion[i], alone.quaternion[0, -1], atol=1e-9)
+        bent = np.max(np.linalg.norm(alone.part("u")[0], axis=-1))
+        assert found.peak("u")[i] == pytest.approx(bent, rel=1e-7)
+    assert found.unsolved == 0
+    assert np.all(found.residual <= 1e-8)
+
+
+def test_samples_fill_the_box_and_follow_the_seed(found):
+    high = [10.0, 8.0, 6.0, 4.0]
+    assert np.all(found.controls >= 0.0) and np.all(found.controls <= high)
+    first = found.controls[:32] / high
+    # each sixteenth of every axis has two of the first 32 points of a Sobol sequence
+    for axis in range(4):
+        np.testing.assert_array_equal(np.histogram(first[:, axis], bins=16, range=(0, 1))[0], 2)
+    again, other = (kc.workspace(ROBOT, 0.0, high, 40, seed=seed) for seed in (3, 4))
+    np.testing.assert_array_equal(again.position, found.position)
+    assert np.any(other.controls != found.controls)
+
+
+def test_limits_of_strain_leave_samples_out(found):
+    limit = np.median(found.peak("u"))
+    inside = found.within(u=limit, v=0.1)
+    assert inside.sum() == 20
+    np.testing.assert_array_equal(inside, found.peak("u") <= limit)
+    with pytest.raises(ValueError, match="no strain 'curvature'; there are v, u"):
+        found.within(curvature=1.0)
+
+
+def test_what_has_no_equilibrium_is_nan_and_counted():
+    """Tensions so large that the equations overflow, among others."""
+    controls = np.array([[1.0, 0.0, 0.0, 0.0], [1e160, 0.0, 0.0, 0.0], [0.0, 2.0, 0.0, 0.0]])
+    found = kc.workspace(ROBOT, controls)
+    np.testing.assert_array_equal(found.valid, [True, False, True])
+    assert found.unsolved == 1
+    assert np.all(np.isnan(found.position[1])) and np.all(np.isnan(found.quaternion[1]))
+    assert not found.within(u=np.inf)[1]
+    for i in (0, 2):
+        alone = kc.equilibrium(ROBOT, controls[i]).tip_position[0]
+        np.testing.assert_allclose(found.position[i], alone, atol=1e-9)
+
+
+def test_files_hold_what_was_found(found, tmp_path):
+    for name in ("a.nc", "a.csv", "a.npz"):
+        found.save(tmp_path / name)
+    with xarray.open_dataset(tmp_path / "a.nc", engine="h5netcdf") as read:
+        np.testing.assert_array_equal(read["position"], found.position)
+        assert read["position"].attrs["units"] == "m"
+    with np.load(tmp_path / "a.npz") as read:
+        np.testing.assert_array_equal(read["quaternion"], found.quaternion)
+        np.testing.assert_array_equal(read["control"], found.controls)
+    with open(tmp_path / "a.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 40
+    assert float(rows[7]["position_2"]) == found.position[7, 2]
+    with pytest.raises(ValueError, match=r"a\.txt: allowed is a name that ends in \.nc, \.csv, \.npz"):
+        found.save(tmp_path / "a.txt")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (([1.0, 2.0, 3.0, 4.0],), r"controls have shape \(4,\); allowed is \(B, 4\)"),
+        ((np.full((3, 4), np.nan),), r"controls is nan at index \(0, 0\)"),
+        ((0.0, 10.0), r"allowed is workspace\(robot, controls\) or"),
+        ((0.0, 10.0, 0), "count is 0; allowed is a whole number"),
+        ((0.0, 10.0, 2.5), "count is 2.5; allowed is a whole number"),
+        ((5.0, [10.0, 4.0, 10.0, 10.0], 8), "low is 5 and high 4 for control 1"),
+        (("a", 10.0, 8), "low is not numbers"),
+    ],
+)
+def test_wrong_arguments_are_named(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        kc.workspace(ROBOT, *arguments)
