@@ -4,7 +4,7 @@ Everything public is here; see `simulate`, `load_robot` and `Trajectory` first.
 """
 
 from knode_cosserat import _jax as _jax  # isort: split  (first: it sets JAX up)
-from knode_cosserat import controls
+from knode_cosserat import controls, named_controls
 from knode_cosserat.control.configuration import (
     Configuration,
     Manipulability,
@@ -134,6 +134,7 @@ __all__ = [
     "load_trajectory",
     "loads",
     "manipulability",
+    "named_controls",
     "node_error",
     "parameter",
     "pose_mse",

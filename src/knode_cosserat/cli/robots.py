@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 from time import perf_counter
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
@@ -29,12 +29,16 @@ from knode_cosserat.cli.facts import at_rest, derived, learned, outcome, paramet
 from knode_cosserat.cli.program import app, examples
 from knode_cosserat.cli.telling import shown, table, tell, vector
 
+if TYPE_CHECKING:
+    from knode_cosserat.rods.system import System
+
 
 @app.command(
     epilog=examples(
         "simulate delrin-tendon-robot --controls sine:1.5 --steps 100 --out truth.nc",
         "simulate delrin-tendon-robot --controls step:1.5,at=2 --steps 200 --dt 0.02 --out step.nc",
         "simulate my-robot.yaml --controls tensions.csv --set youngs_modulus=10e9 --out stiff.nc",
+        "simulate my-rod.yaml --controls 'base_z=ramp:0.1;base_rx=sine:2' --steps 100 --out pushed.nc",
         "simulate my-robot.yaml --controls random:0 --steps 100 --out r.nc --figure r.png --json",
     )
 )
@@ -44,7 +48,8 @@ def simulate(
         str,
         typer.Option(
             metavar="CONTROLS",
-            help="sine:PERIOD, step:HEIGHT, ramp:HEIGHT, random:SEED, constant:TENSION or a CSV file.",
+            help="sine:PERIOD, step:HEIGHT, ramp:HEIGHT, random:SEED, constant:TENSION or a CSV file; "
+            "of a robot that is driven otherwise NAME=SIGNAL;…, such as base_z=ramp:0.1, or none.",
         ),
     ],
     out: Annotated[Path, NetCDF],
@@ -67,15 +72,16 @@ def simulate(
     progress: Progress = None,
     as_json: Json = False,
 ) -> None:
-    """Simulate a robot under tendon tensions."""
+    """Simulate a robot under tendon tensions, or whatever drives it."""
     require_writable(out, figure)
     drawing = figures() if figure else None
     import knode_cosserat as kc
 
     system = system_of(robot, changes, nodes)
     if dt is None:
-        dt = kc.controls.load(controls).dt if os.path.isfile(controls) else 0.05
-    tensions = kc.controls.parse(controls, steps, dt, tendons=system.control_size)
+        tensions_only = system.control_layout.names == ("tension",)
+        dt = kc.controls.load(controls).dt if os.path.isfile(controls) and tensions_only else 0.05
+    tensions = kc.named_controls.parse(system, controls, steps, dt)
     began = perf_counter()
     trajectory = kc.simulate(
         system, tensions, dt, time=time, space=space, progress=wanted(progress),
@@ -103,20 +109,24 @@ def simulate(
 def equilibrium(
     robot: Robot,
     tension: Annotated[
-        str, typer.Option(metavar="N,N,…", help="Tension of every tendon in N, such as 7,5,5,7.")
-    ],
+        str | None, typer.Option(metavar="N,N,…", help="Tension of every tendon in N, such as 7,5,5,7.")
+    ] = None,
+    control: Annotated[
+        str | None,
+        typer.Option(metavar="NAME=VALUE,…", help="Controls by name, such as base_z=0.1; others are zero."),
+    ] = None,
     space: Space = "euler",
     changes: Changes = None,
     nodes: Nodes = None,
     out: Annotated[Path | None, NetCDF] = None,
     as_json: Json = False,
 ) -> None:
-    """Find a robot's shape at rest under constant tensions."""
+    """Find a robot's shape at rest under a constant control."""
     require_writable(out)
     import knode_cosserat as kc
 
     system = system_of(robot, changes, nodes)
-    rest = kc.equilibrium(system, _tensions(tension, system.control_size), space=space)
+    rest = kc.equilibrium(system, _control(system, tension, control), space=space)
     if out:
         rest.save(out)
     facts = {"robot": robot, **at_rest(rest)}
@@ -162,6 +172,24 @@ def info(
         {"robot": robot, "kind": type(system).__name__, **parts, **facts},
         [heading, *table(rows), *(["", *lines] if lines else [])],
     )
+
+
+def _control(system: System, tension: str | None, control: str | None) -> Any:
+    """What is held: tensions, or controls by name."""
+    from knode_cosserat import named_controls
+
+    tensions = [field.size for field in system.control_layout.fields if field.name == "tension"]
+    if tension is None and control is None and system.control_size:
+        names = ", ".join(named_controls.labels(system.control_layout))
+        raise ValueError(f"no control is given: --tension N,N,… or --control NAME=VALUE,…; there are {names}")
+    if tension is not None and not tensions:
+        raise ValueError("--tension: the robot is not driven by tensions; give --control NAME=VALUE,…")
+    words = [] if control is None else [f"{name}=constant:{value}" for name, _, value in (
+        each.partition("=") for each in control.split(","))]  # fmt: skip
+    held = named_controls.parse_signals(system.control_layout, words, np.ones(1))[0]
+    if tension is not None:
+        held[system.control_layout.slice("tension")] = _tensions(tension, tensions[0])
+    return held
 
 
 def _tensions(text: str, count: int) -> list[float]:

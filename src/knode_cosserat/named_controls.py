@@ -1,0 +1,169 @@
+"""Controls of any robot, by the names of its control layout, such as `base_z`, `reel_1` or `load0_scale`.
+
+What `controls` is for tensions, for robots that are driven otherwise, or by more. Row i is what `simulate`
+applies from time i dt to (i + 1) dt, and signals are evaluated at that step's end.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat import controls
+from knode_cosserat.controls import SAME_TIME, ControlsError
+from knode_cosserat.rods.system import Layout, System
+
+Array = Float[np.ndarray, "steps c"]
+
+
+def labels(layout: Layout) -> list[str]:
+    """The name of every number of a control: its field's, numbered from 1 where that has several."""
+    return [
+        field.name if field.size == 1 else f"{field.name}_{k + 1}"
+        for field in layout.fields
+        for k in range(field.size)
+    ]
+
+
+def parse(robot: System, specification: str, steps: int | None, dt: float) -> Array:
+    """Controls (steps, c) of a robot from one word, as on the command line.
+
+    For a robot that has tensions only, as `controls.parse`. Otherwise signals by name, `base_z=ramp:0.1;
+    reel_1=sine:2,amplitude=0.01`, where the name of a field stands for all its numbers and what is not
+    named is zero: `constant:VALUE`, `ramp:HEIGHT[,base=,start=,end=]`, `step:HEIGHT[,base=,at=]`,
+    `sine:PERIOD[,base=,amplitude=,phase=]`; or a CSV file with the columns `time [s]` and any of these
+    names with their units. `none` stands for zeros.
+
+    Raises:
+        ControlsError: the specification is not understood, or the file is not right or too short.
+    """
+    layout = robot.control_layout
+    if layout.names == ("tension",):
+        return controls.parse(specification, steps, dt, tendons=layout.size)
+    if os.path.isfile(specification):
+        return _sampled(specification, layout, steps, dt)
+    if steps is None:
+        raise ControlsError(f"controls {specification!r}: the number of steps is not given")
+    if isinstance(steps, bool) or steps < 1:
+        raise ControlsError(f"steps is {steps!r}; allowed is a whole number from 1 on")
+    words = [] if specification.strip() == "none" else specification.split(";")
+    return parse_signals(layout, words, np.arange(1, steps + 1) * dt)
+
+
+def parse_signals(layout: Layout, words: list[str], t: Float[np.ndarray, " steps"]) -> Array:
+    """Controls (steps, c) at the times t (s) from words `NAME=SIGNAL`; see `parse`."""
+    found = np.zeros((len(t), layout.size))
+    for entry in words:
+        name, equals, word = (part.strip() for part in entry.partition("="))
+        if not equals:
+            raise ControlsError(
+                f"controls {entry.strip()!r}: allowed is NAME=SIGNAL;…, `none` or a CSV file; "
+                f"names are {', '.join(labels(layout)) or 'none'}"
+            )
+        found[:, _columns(layout, name)] = _signal(word, t)[:, None]
+    return found
+
+
+def _columns(layout: Layout, name: str) -> list[int]:
+    known = labels(layout)
+    if name in layout.names:
+        return list(range(*layout.slice(name).indices(layout.size)))
+    if name in known:
+        return [known.index(name)]
+    close = difflib.get_close_matches(name, known, n=1)
+    hint = f"; did you mean {close[0]}?" if close else ""
+    raise ControlsError(f"the control {name!r} is unknown; there are {', '.join(known) or 'none'}{hint}")
+
+
+def _ramp(t: Any, height: float, *, base: float = 0.0, start: float = 0.0, end: float | None = None) -> Any:
+    last = float(t[-1]) if end is None else end
+    if last <= start:
+        raise ControlsError(f"ramp: end is {last!r} s; allowed is a time after its start, {start!r} s")
+    return base + height * np.clip((t - start) / (last - start), 0.0, 1.0)
+
+
+def _step(t: Any, height: float, *, base: float = 0.0, at: float = 0.0) -> Any:
+    return base + height * (t >= at - SAME_TIME * t[0])
+
+
+def _sine(t: Any, period: float, *, base: float = 0.0, amplitude: float = 1.0, phase: float = 0.0) -> Any:
+    if period <= 0.0:
+        raise ControlsError(f"sine: the period is {period!r} s; allowed is a number above 0")
+    return base + amplitude * np.sin(2.0 * np.pi * t / period + phase)
+
+
+def _constant(t: Any, value: float) -> Any:
+    return np.full(len(t), value)
+
+
+_SIGNALS: dict[str, tuple[Callable[..., Any], tuple[str, ...]]] = {
+    "constant": (_constant, ()),
+    "ramp": (_ramp, ("base", "start", "end")),
+    "step": (_step, ("base", "at")),
+    "sine": (_sine, ("base", "amplitude", "phase")),
+}
+
+
+def _signal(word: str, t: Float[np.ndarray, " steps"]) -> Float[np.ndarray, " steps"]:
+    name, _, rest = word.partition(":")
+    if name not in _SIGNALS:
+        raise ControlsError(f"the signal {word!r} is unknown; allowed is {', '.join(_SIGNALS)}")
+    function, options = _SIGNALS[name]
+    first, *others = rest.split(",")
+    given = {}
+    for other in others:
+        key, _, text = (part.strip() for part in other.partition("="))
+        if key not in options or key in given:
+            allowed = ", ".join(f"{option}=…" for option in options) or "nothing"
+            raise ControlsError(f"{name}: {other!r} is not understood; allowed is {allowed}")
+        given[key] = _number(name, text)
+    return np.asarray(function(t, _number(name, first), **given))
+
+
+def _number(where: str, text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value):
+        raise ControlsError(f"{where}: {text.strip()!r} is not a number")
+    return value
+
+
+def _sampled(path: str, layout: Layout, steps: int | None, dt: float) -> Array:
+    """A file's columns, each row held until the next row's time."""
+    import pandas  # type: ignore[import-untyped]
+
+    try:
+        table = pandas.read_csv(path)
+    except (OSError, ValueError) as error:
+        raise ControlsError(f"{path}: not a CSV file of numbers: {str(error).splitlines()[0]}") from None
+    units = dict(zip(labels(layout), (f.unit for f in layout.fields for _ in range(f.size)), strict=True))
+    titles = {f"{name} [{unit}]": name for name, unit in units.items()} | {"time [s]": "time"}
+    wrong = [title for title in table.columns if title.strip() not in titles]
+    if wrong or "time [s]" not in [title.strip() for title in table.columns]:
+        raise ControlsError(
+            f"{path}: the columns are {', '.join(table.columns)}; allowed is {', '.join(titles)}"
+        )
+    table.columns = [titles[title.strip()] for title in table.columns]
+    values = table.apply(pandas.to_numeric, errors="coerce").to_numpy(dtype=float)
+    if not len(values) or not np.all(np.isfinite(values)):
+        line = 2 + int(np.argwhere(~np.isfinite(values))[0][0]) if len(values) else 2
+        raise ControlsError(f"{path}: line {line}: allowed is a finite number in every column")
+    time = table["time"].to_numpy(dtype=float)
+    if np.any(np.diff(time) <= 0.0):
+        raise ControlsError(f"{path}: line {3 + int(np.argmax(np.diff(time) <= 0.0))}: times must grow")
+    count = int(np.floor((time[-1] - time[0]) / dt + SAME_TIME)) + 1
+    if steps is not None and steps > count:
+        raise ControlsError(f"{path}: there are {count} steps of {dt:g} s; {steps} are asked for")
+    at = time[0] + (np.arange(count if steps is None else steps) + SAME_TIME) * dt
+    rows = np.searchsorted(time, at, side="right") - 1
+    found = np.zeros((len(rows), layout.size))
+    for name in table.columns.drop("time"):
+        found[:, labels(layout).index(name)] = table[name].to_numpy(dtype=float)[rows]
+    return found
