@@ -55,8 +55,11 @@ class Trajectory(eqx.Module):
 
     @property
     def tension(self) -> Any:
-        """Tendon tensions (…, T, tendons) in N; zero in row 0 of a robot that starts at rest."""
-        return self.part("tension")
+        """Tendon tensions (…, T, tendons) in N, at the base; zero in row 0 of a robot that starts at rest."""
+        if "tension" in self.system.control_layout.names:
+            return self.system.control_layout.get(self.control, "tension")
+        tension = self.part("tension")
+        return tension[..., 0, :] if "tension" in self.system.y_layout.names else tension
 
     @property
     def arclength(self) -> Any:

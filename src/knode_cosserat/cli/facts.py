@@ -60,12 +60,14 @@ def parameters(system: System) -> dict[str, dict[str, Any]]:
 
 def derived(system: System) -> dict[str, dict[str, Any]]:
     """What follows from the parameters, in the same form."""
-    from knode_cosserat.rods.tendon_robot import TendonRobot
+    from knode_cosserat.rods.loads import AttachedMass
+    from knode_cosserat.rods.rod import Rod
 
     system = _knowledge(system)
-    if not isinstance(system, TendonRobot):
+    if not isinstance(system, Rod):
         return {}
     Kse, Kbt, mass = np.asarray(system.Kse), np.asarray(system.Kbt), system.mass_per_length * system.length
+    attached = sum(float(load.mass) for load in system.loads if isinstance(load, AttachedMass))
     # 1.875… is the first root of cos(x) cosh(x) = -1
     frequency = 1.875104068711961**2 / (2 * np.pi) * np.sqrt(Kbt[0, 0] / (mass * system.length**3))
     return {
@@ -73,10 +75,20 @@ def derived(system: System) -> dict[str, dict[str, Any]]:
         "Kse": _quantity(np.diag(Kse), "N", "stiffness of shear, shear and extension"),
         "Kbt": _quantity(np.diag(Kbt), "N m2", "stiffness of bending, bending and twisting"),
         "mass": _quantity(mass, "kg", "mass of the rod"),
-        "frequency": _quantity(
-            frequency, "Hz", "first bending mode, by beam theory without damping, drag and gravity"
-        ),
+        **({"attached_mass": _quantity(attached, "kg", "mass of what is on it")} if attached else {}),
+        "frequency": _quantity(frequency, "Hz", "first bending mode of the bare rod, by beam theory"),
     }
+
+
+def more_lines(system: System) -> list[str]:
+    """Choices and parts of a robot that are not as they are by default, as its file would have them."""
+    from knode_cosserat.rods.robot_file import KINDS, RobotFileError, more_of
+
+    system = _knowledge(system)
+    try:
+        return more_of(system) if type(system) in KINDS.values() else []
+    except RobotFileError as error:
+        return [f"  {error}"]
 
 
 def _quantity(value: Any, unit: str, meaning: str) -> dict[str, Any]:

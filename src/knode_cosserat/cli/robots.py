@@ -25,7 +25,7 @@ from knode_cosserat.cli.arguments import (
     system_of,
     wanted,
 )
-from knode_cosserat.cli.facts import at_rest, derived, learned, outcome, parameters
+from knode_cosserat.cli.facts import at_rest, derived, learned, more_lines, outcome, parameters
 from knode_cosserat.cli.program import app, examples
 from knode_cosserat.cli.telling import shown, table, tell, vector
 
@@ -165,12 +165,13 @@ def info(
         rows += [
             [f"  {name}", shown(it["value"]), it["unit"], it["meaning"]] for name, it in quantities.items()
         ]
+    more = more_lines(system)
     heading = f"{robot}: {robots[robot]}" if robot in robots else robot
     facts, lines = learned(system)
     tell(
         as_json,
-        {"robot": robot, "kind": type(system).__name__, **parts, **facts},
-        [heading, *table(rows), *(["", *lines] if lines else [])],
+        {"robot": robot, "kind": type(system).__name__, **parts, "parts": more, **facts},
+        [heading, *table(rows), *(["", "parts", *more] if more else []), *(["", *lines] if lines else [])],
     )
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from knode_cosserat.named_controls import labels
 from knode_cosserat.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -106,13 +107,20 @@ def require_span(axes: Axes, span: float) -> None:
 
 
 def draw_tensions(axes: Axes, trajectory: Trajectory) -> None:
-    """The tension of every tendon, held from row to row."""
-    values, time = np.asarray(one_of(trajectory).tension), np.asarray(trajectory.time)
+    """The tension of every tendon, held from row to row; of a robot without tensions, its controls."""
+    one, layout = one_of(trajectory), trajectory.system.control_layout
+    if "tension" in layout.names:
+        values, names, label = np.asarray(one.tension), None, "tension [N]"
+    else:
+        values, names = np.asarray(one.control), labels(layout)
+        units = {field.unit for field in layout.fields}
+        label = f"control [{units.pop()}]" if len(units) == 1 else "control, in its units"
+    time = np.asarray(trajectory.time)
     for k in range(values.shape[1]):
         # thinner and thinner: where tensions are equal, all of them are still to be seen
         width = max(0.9, 3.2 - 0.75 * k)
         style: dict[str, Any] = {
-            "label": f"tendon {k + 1}",
+            "label": names[k] if names else f"tendon {k + 1}",
             "color": PALETTE[k % len(PALETTE)],
             "linewidth": width,
         }
@@ -121,9 +129,10 @@ def draw_tensions(axes: Axes, trajectory: Trajectory) -> None:
         else:
             # row i holds what acted from row i - 1 on
             axes.stairs(values[1:, k], time, baseline=None, **style)
-    axes.set(xlabel="time [s]", ylabel="tension [N]")
+    axes.set(xlabel="time [s]", ylabel=label)
     axes.margins(y=0.1)
-    legend_above(axes)
+    if values.shape[1]:
+        legend_above(axes)
 
 
 def line(i: int, rows: int = 2) -> dict[str, Any]:

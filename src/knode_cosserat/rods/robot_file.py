@@ -295,7 +295,7 @@ def format_robot(robot: System, description: str = "") -> str:
         raise RobotFileError("a batch of robots cannot be written to one robot file; write them one by one")
     if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(robot)):
         raise RobotFileError("a robot cannot be written to a file inside jit, grad or vmap")
-    more = _more_lines(robot)
+    more = more_of(robot)
     head = {"format": FORMATS[1 if more else 0], "kind": kind, "description": description}
     lines = [f"{key}: {flow(value)}" for key, value in head.items() if value != ""]
     lines.append("parameters:")
@@ -307,8 +307,8 @@ def format_robot(robot: System, description: str = "") -> str:
     return "\n".join(lines + more) + "\n"
 
 
-def _more_lines(robot: System) -> list[str]:
-    """The choices and parts of a robot that are not as they are by default."""
+def more_of(robot: System) -> list[str]:
+    """Lines for the choices and parts of a robot that are not as they are by default."""
     lines = []
     defaults = {field.name: field.default for field in dataclasses.fields(robot)}
     for name, choice in choices_of(type(robot)).items():
