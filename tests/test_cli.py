@@ -395,7 +395,7 @@ def bad_inputs():
         (("equilibrium", ROBOT, "--tension", "7,5,5,-7"), "0 or more"),
         (("equilibrium", ROBOT, "--tension", "7,5,5,inf"), "0 or more"),
         (("equilibrium", ROBOT, "--tension", "strong"), "strong"),
-        (("info", "nobot"), "the catalog has delrin-tendon-robot"),
+        (("info", "nobot"), "the catalog has delrin-"),
         (("info", "--set", "length=1"), "name it"),
         (("fit", ROBOT, "nowhere.nc", "--out", "m"), "nowhere.nc: no such file"),
         (("fit", ROBOT, "--out", "m"), "TRAJECTORY"),
@@ -504,7 +504,8 @@ def test_the_program_simulates(tmp_path):
 def test_the_program_fails_in_one_line(tmp_path):
     done = program("info", "nobot", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == "error: nobot: no such file or robot; the catalog has delrin-tendon-robot\n"
+    names = ", ".join(kc.catalog())
+    assert done.stderr == f"error: nobot: no such file or robot; the catalog has {names}\n"
 
 
 def test_the_demonstration_runs_and_says_what_it_shows(tmp_path):

@@ -261,8 +261,8 @@ def test_no_unit_is_suggested_where_none_would_be_typical():
         ("just text", ["the file is 'just text'", "a mapping"]),
         ("[1, 2]", ["the file is [1, 2]", "a mapping"]),
         (text().replace("format: 1\n", ""), ["the key 'format' is missing", "format, kind, parameters"]),
-        (text().replace("format: 1", "format: 2"), ["format is 2", "allowed is 1"]),
-        (text().replace("format: 1", "format: 2\nrods: 3"), ["format is 2", "allowed is 1"]),
+        (text().replace("format: 1", "format: 3"), ["format is 3", "allowed is 1 or 2"]),
+        (text().replace("format: 1", "format: 3\nrods: 3"), ["format is 3", "allowed is 1 or 2"]),
         (text().replace("format: 1", "format: true"), ["format is True", "allowed is 1"]),
         (text().replace("kind: tendon-robot\n", ""), ["the key 'kind' is missing"]),
         (

@@ -133,21 +133,24 @@ def test_what_was_not_seen_is_ignored(seen, found):
     result = kc.calibrate(NEAR, [holes], NAMES, by="rollouts")
     assert set(result.remainder) == {"position", "orientation"}
     for name in ("youngs_modulus", "friction_wobble", "sleeve_stiffening"):
-        assert result.estimates[name] == pytest.approx(np.max(getattr(TRUE, name)), rel=0.03)
+        away = abs(result.estimates[name] - np.max(getattr(TRUE, name)))
+        assert away < 4.0 * result.standard_errors[name] < 0.25 * np.max(getattr(TRUE, name)), name
         assert result.standard_errors[name] > found.standard_errors[name]
 
 
 def test_bodies_without_orientation(seen):
     result = kc.calibrate(NEAR, [blinded(seen)], NAMES, by="rollouts")
     assert set(result.remainder) == {"position"}
-    assert result.estimates["youngs_modulus"] == pytest.approx(2.2e9, rel=5e-3)
+    away = abs(result.estimates["youngs_modulus"] - 2.2e9)
+    assert away < 4.0 * result.standard_errors["youngs_modulus"] < 0.05 * 2.2e9
     both = kc.calibrate(NEAR, [blinded(seen), seen], NAMES, by="rollouts")
     assert tuple(both.remainder) == (
         "position in sine (1)",
         "position in sine (2)",
         "orientation in sine (2)",
     )
-    assert both.estimates["youngs_modulus"] == pytest.approx(2.2e9, rel=5e-3)
+    away = abs(both.estimates["youngs_modulus"] - 2.2e9)
+    assert away < 4.0 * both.standard_errors["youngs_modulus"] < 4.0 * result.standard_errors["youngs_modulus"]
 
 
 def test_of_several_recordings_each_has_its_own_remainder(seen):
@@ -200,11 +203,11 @@ def test_what_is_not_searched_is_as_the_knowledge_has_it():
     names = ["youngs_modulus", "friction_wobble"]
     plain = _beginning(KNOWN, names)
     assert float(plain.friction_wobble) == 0.3
-    assert float(plain.sleeve_stiffening) == 0.0 and float(plain.friction_curvature) == 0.0
+    assert plain.sleeve_stiffening is None and plain.friction_curvature is None
     routed = kc.RoutedTendonRobot.like(KNOWN, bending_damping=0.01, sleeve_stiffening=0.7)
     begun = _beginning(routed, [*names, "sleeve_stiffening"])
     assert float(begun.sleeve_stiffening) == 0.7 and begun.bending_damping[0, 0] == 0.01
-    assert float(begun.friction_wobble) == 0.3 and float(begun.friction_curvature) == 0.0
+    assert float(begun.friction_wobble) == 0.3 and begun.friction_curvature is None
 
 
 @pytest.mark.parametrize("fails", ["search", "value"])
