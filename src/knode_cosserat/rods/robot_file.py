@@ -25,6 +25,7 @@ import jax
 import numpy as np
 
 from knode_cosserat._yaml import YAMLTextError, did_you_mean, flow, mapping_of, shown
+from knode_cosserat.rods.parallel_robot import ParallelRobot
 from knode_cosserat.rods.parameters import Parameter, ParameterError, checked
 from knode_cosserat.rods.routed_robot import RoutedTendonRobot
 from knode_cosserat.rods.system import System
@@ -38,6 +39,7 @@ KINDS: dict[str, type[System]] = {
     "tendon-robot": TendonRobot,
     "routed-tendon-robot": RoutedTendonRobot,
     "virtual-robot": VirtualRobot,
+    "parallel-robot": ParallelRobot,
 }
 
 

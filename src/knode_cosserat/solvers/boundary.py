@@ -23,7 +23,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float, Int
 
-from knode_cosserat.rods.system import History, System, unpacked_history
+from knode_cosserat.rods.system import (
+    History,
+    System,
+    in_strands,
+    records_in_strands,
+    unpacked_history,
+)
 from knode_cosserat.solvers.linear import Linearisation, LinearSolver
 from knode_cosserat.solvers.space import SpaceScheme, middles
 
@@ -55,8 +61,9 @@ class StepProblem(eqx.Module):
     space: SpaceScheme = eqx.field(static=True)
 
     def point_rates(self, s: Any, y: Float[Any, " y"], history: Float[Any, " x"]) -> Any:
-        """y_s and z at one point, from a packed record of history."""
-        return self.system.derivatives(s, self.t, y, self.control, self._unpack(history))
+        """y_s and z at one point of a strand, from a packed record of its history."""
+        strand = self.system.strand
+        return strand.derivatives(s, self.t, y, self.control, unpacked_history(strand, self.c0, history))
 
     def _unpack(self, history: Float[Any, " x"]) -> History:
         return unpacked_history(self.system, self.c0, history)
@@ -75,11 +82,15 @@ class StepProblem(eqx.Module):
         return jnp.linspace(0.0, 1.0, self.system.nodes) * self.system.length
 
     def segments(self, each: Callable[..., Any], y: Float[Any, "nodes y"]) -> Any:
-        """Apply `each(advance, y_j)` to all segments side by side; `advance` maps y_j to y_{j+1}."""
-        s = self.arclength
+        """Apply `each(advance, y_j)` to all segments of all strands side by side (strands inside).
+
+        `advance` maps y_j of a strand to its y_{j+1}.
+        """
+        s = self._each_strand(self.arclength[:-1])
         ds = self.system.length / (self.system.nodes - 1)
-        start, end = self.history[:-1], self.history[1:]
-        middle = middles(self.history) if self.space.uses_middle else start
+        history = self.history
+        inner = middles(history) if self.space.uses_middle else history[:-1]
+        start, middle, end = (self._past_points(rows) for rows in (history[:-1], inner, history[1:]))
 
         def segment(s_j: Any, y_j: Any, *history: Any) -> Any:
             def advance(y: Any) -> Any:
@@ -88,12 +99,29 @@ class StepProblem(eqx.Module):
             return each(advance, y_j)
 
         # nodes last inside: XLA then vectorises over them
-        lanes = (y[:-1].T, start.T, middle.T, end.T)
-        return jax.vmap(segment, in_axes=(0, -1, -1, -1, -1))(s[:-1], *lanes)
+        lanes = (self._points(y[:-1]).T, start.T, middle.T, end.T)
+        return jax.vmap(segment, in_axes=(0, -1, -1, -1, -1))(s, *lanes)
+
+    def at_points(self, function: Callable[..., Any], y: Float[Any, "nodes y"]) -> Any:
+        """Apply `function(s, y, record of history)` to all nodes of all strands (strands inside)."""
+        at = self._each_strand(self.arclength), self._points(y), self._past_points(self.history)
+        return jax.vmap(function)(*at)
+
+    def _each_strand(self, values: Float[Any, " n"]) -> Float[Any, " points"]:
+        return jnp.repeat(values, self.system.strands) if self.system.strands > 1 else values
+
+    def _points(self, rows: Float[Any, "n x"]) -> Float[Any, "points x_of_strand"]:
+        own = in_strands(self.system, rows)
+        return own.reshape(-1, own.shape[-1])
+
+    def _past_points(self, rows: Float[Any, "n x"]) -> Float[Any, "points x_of_strand"]:
+        own = records_in_strands(self.system, rows)
+        return own.reshape(-1, own.shape[-1])
 
     def record(self, y: Float[Any, "nodes y"]) -> Float[Any, "nodes x"]:
         """What must be kept of a solved step at every node: y, z and, if B is not zero, y_s."""
-        y_s, z = jax.vmap(self.point_rates)(self.arclength, y, self.history)
+        rates = self.at_points(self.point_rates, y)
+        y_s, z = (part.reshape(y.shape[0], -1) for part in rates)
         return jnp.concatenate([y, z, y_s] if self.system.mixed else [y, z], axis=1)
 
 
@@ -128,7 +156,7 @@ def _error(problem: StepProblem, defects: Any, tip: Any) -> Any:
 def residuals(problem: StepProblem, y: Float[Any, "nodes y"]) -> tuple[Any, Any]:
     """Defects y_{j+1} - Φ_j(y_j), with their sign turned, and the tip's residuals."""
     reached = problem.segments(lambda advance, y_j: advance(y_j), y)
-    return reached - y[1:], problem.tip_residual(y[-1])
+    return reached.reshape(y[1:].shape) - y[1:], problem.tip_residual(y[-1])
 
 
 def linearise(problem: StepProblem, y: Float[Any, "nodes y"], unknowns: Any) -> Linearisation:
@@ -142,9 +170,11 @@ def linearise(problem: StepProblem, y: Float[Any, "nodes y"], unknowns: Any) -> 
         return jax.jacfwd(twice, has_aux=True)(at)
 
     F, reached = problem.segments(with_value, y)
+    if problem.system.strands > 1:
+        F = F.reshape(y.shape[0] - 1, problem.system.strands, *F.shape[1:])
     M, tip = with_value(problem.tip_residual, y[-1])
     S = jax.jacfwd(problem.base)(unknowns)
-    return Linearisation(F, S, M, reached - y[1:], tip)
+    return Linearisation(F, S, M, reached.reshape(y[1:].shape) - y[1:], tip)
 
 
 class _Search(NamedTuple):

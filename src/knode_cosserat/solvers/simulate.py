@@ -45,7 +45,8 @@ def simulate(
         time: "bdf1", "bdf2", "bdf-alpha", "trapezoidal", or a scheme.
         space: "euler", "rk4", or a scheme.
         start: how the first step is made from one state; see `Settings`.
-        initial: start from this trajectory's last row instead of the robot's state at rest. If its time step
+        initial: start from this trajectory's last row instead of the robot's state at rest (where that is
+            only a guess, such as of a platform on bent legs, the equilibrium under no control). If its time step
             is the same the motion goes on exactly, with the history of its last rows; only the trapezoidal
             rule makes one step by BDF1 after a trajectory that itself began in motion.
         newton: tolerances and limits of the solve in each step.
@@ -166,10 +167,50 @@ def beginning(run: Run) -> tuple[Any, Start, Any, Any]:
     if initial is not None:
         return _going_on(system, initial, settings, dt)
     record, past = (_jit_all_at_rest if many else _jit_at_rest)(system)
+    if system.rest_is_guess and not isinstance(settings.time, Static):
+        record, past = _settled(run, past)
     if batch and not many:
         record, past = jax.tree.map(lambda x: jnp.broadcast_to(x, (batch, *x.shape)), (record, past))
     none_yet = np.zeros((*np.shape(controls)[:-2], system.control_size))
     return record, Start(past, none_yet), 0.0, "start"
+
+
+def _settled(run: Run, past: Any) -> tuple[Any, Any]:
+    """The equilibrium under no control, looked for from rest: its record, and the past of it alone."""
+    system, many = run.system, run.many
+    task = Task(run.settings, run.dt, 1, "still")
+    none = np.zeros((1, system.control_size))
+    if is_traced((system, past)):
+        find = sensitivity.rollout(task)
+        rows = jax.vmap(find, in_axes=(0, None, 0))(system, none, past) if many else find(system, none, past)
+        found = rows.records[..., 0, :, :]
+    else:
+        each = range(np.shape(past.t0)[0]) if many else [...]
+        found = np.stack([_settled_one(task, _part(system, i), none, _part(past, i), i) for i in each])
+        found = found if many else found[0]
+    kept = found[..., : system.y_layout.size + system.z_layout.size]
+    return kept, (_jit_all_pasts if many else _jit_past)(system, kept)
+
+
+def _settled_one(task: Task, system: System, none: Any, past: Any, i: Any) -> Any:
+    """As `_settled`, of one robot. Without an equilibrium there is nothing to begin with, whatever is asked."""
+    steps, cause = run_one(task, system, none, Start(past, none[0]))
+    if steps.result[0] < 0:
+        robot = None if i is ... else i
+        raise SimulationError(0, 0.0, float(steps.error[0]), Result(int(steps.result[0])), cause, robot)
+    return np.asarray(steps.records[0])
+
+
+def _part(tree: Any, i: Any) -> Any:
+    return tree if i is ... else jax.tree.map(lambda leaf: leaf[i], tree)
+
+
+def _past_of(system: System, record: Any) -> Any:
+    return initial_past(system, record, jnp.zeros(system.control_size))
+
+
+_jit_past = jax.jit(_past_of)
+_jit_all_pasts = jax.jit(jax.vmap(_past_of))
 
 
 def _going_on(
