@@ -112,7 +112,8 @@ class ParallelRobot(Bundle):
         base, platform = np.shape(self.base_angles), np.shape(self.platform_angles)
         if base != platform:
             raise ParameterError(
-                f"there are {base[-1]} base_angles and {platform[-1]} platform_angles; allowed is one of each a leg"
+                f"there are {base[-1]} base_angles and {platform[-1]} platform_angles; "
+                "allowed is one of each for every leg"
             )
 
     # what follows from the parameters
@@ -161,7 +162,7 @@ class ParallelRobot(Bundle):
         return self.legs(y)[1]
 
     def positions(self, y: Any) -> Any:
-        """The robot's axis (…, 3) in m, of states y (…, y): see the class. At the tip, the platform's centre."""
+        """The robot's axis (…, 3) in m, of states y (…, y); at the tip, the platform's centre."""
         numeric: Any = jnp if is_traced((self, y)) else np
         p, h, *_ = self.legs(y)
         w, x = h[..., :1], h[..., 1:]
@@ -195,10 +196,9 @@ class ParallelRobot(Bundle):
         L, EI, count = self.length, self.strand.Kbt[0, 0], self.strands
         begin, end = _on_circle(self.base_radius, self.base_angles), self.joints
         facing, off = jnp.sum(begin * end), jnp.sum(begin[:, 1] * end[:, 0] - begin[:, 0] * end[:, 1])
-        # the turn of the platform that brings its joints nearest to the base's, if they say anything
-        turn = jnp.where(
-            facing**2 + off**2 > 0.0, jnp.arctan2(off, jnp.where(facing**2 + off**2 > 0.0, facing, 1.0)), 0.0
-        )
+        # the turn of the platform that brings its joints nearest to the base's, where there is one
+        known = facing**2 + off**2 > 0.0
+        turn = jnp.where(known, jnp.arctan2(off, jnp.where(known, facing, 1.0)), 0.0)
         x, y = end[:, 0], end[:, 1]
         c, d = jnp.cos(turn), jnp.sin(turn)
         away = jnp.stack([c * x - d * y, d * x + c * y], axis=1) - begin[:, :2]
@@ -231,9 +231,9 @@ class ParallelRobot(Bundle):
         return jnp.concatenate([p, h, own, q, jnp.zeros((count, 3))], axis=1).reshape(-1)
 
     def tip(self, t: Any, control: Any, y: Float[Any, " y"], history: History) -> Float[Any, " k"]:
-        """The platform's equations of motion, and that all legs hold it in the pose in which the first does."""
+        """The platform's equations of motion, and that all legs hold it in the first one's pose."""
         p, h, n, m, _, _ = self.legs(y)
-        R, M, inertia = rotation_matrix(h[0]), self.platform_mass, self.inertia
+        R, M = rotation_matrix(h[0]), self.platform_mass
         arms = jax.vmap(lambda joint: dot(R, joint))(self.joints)
         acceleration, momentum_rate = self._inertial(y, history.c0 * y + history.y)
         force = M * (self.gravity - dot(R, acceleration)) + self.platform_force - jnp.sum(n, axis=0)
@@ -247,7 +247,7 @@ class ParallelRobot(Bundle):
     def _inertial(self, y: Any, y_t: Any) -> tuple[Any, Any]:
         """Acceleration of the platform's centre and rate of its spin's momentum, both in its frame.
 
-        Of the mean of the legs' velocities, so that none counts more: a coarse grid lets them differ a little.
+        Of the mean of the legs' velocities: on a coarse grid these differ a little, and none counts more.
         """
         q, w = self._velocity(y)
         q_t, w_t = self._velocity(y_t)

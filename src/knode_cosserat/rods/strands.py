@@ -12,7 +12,7 @@ from knode_cosserat.rods.system import Field, History, Layout, System, of_strand
 
 
 class Bundle(System):
-    """Rods alike, side by side: y, z and the unknowns hold those of the first rod, then of the second, …
+    """Rods alike, side by side: y, z and the unknowns hold those of the first rod, then of the next.
 
     A subclass gives `strand` (the equations along every rod), `strands`, `rest`, `base`, `tip` and what else
     is its own. Fields are named as the strand's with the rod's number behind: `p1`, `n6`.

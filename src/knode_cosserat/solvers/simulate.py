@@ -46,8 +46,8 @@ def simulate(
         space: "euler", "rk4", or a scheme.
         start: how the first step is made from one state; see `Settings`.
         initial: start from this trajectory's last row instead of the robot's state at rest (where that is
-            only a guess, such as of a platform on bent legs, the equilibrium under no control). If its time step
-            is the same the motion goes on exactly, with the history of its last rows; only the trapezoidal
+            only a guess, such as of a platform on bent legs, the equilibrium under no control). If its time
+            step is the same the motion goes on exactly, with the history of its last rows; only the trapezoidal
             rule makes one step by BDF1 after a trajectory that itself began in motion.
         newton: tolerances and limits of the solve in each step.
         on_failure: "raise" a `SimulationError`, or "return" the trajectory with the rest marked invalid.
@@ -193,7 +193,7 @@ def _settled(run: Run, past: Any) -> tuple[Any, Any]:
 
 
 def _settled_one(task: Task, system: System, none: Any, past: Any, i: Any) -> Any:
-    """As `_settled`, of one robot. Without an equilibrium there is nothing to begin with, whatever is asked."""
+    """As `_settled`, of one robot; without an equilibrium there is nothing to begin with."""
     steps, cause = run_one(task, system, none, Start(past, none[0]))
     if steps.result[0] < 0:
         robot = None if i is ... else i
