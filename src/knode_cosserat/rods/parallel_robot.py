@@ -71,6 +71,7 @@ class ParallelRobot(Bundle):
     the theory of slender beams; a simulation therefore begins in the equilibrium under no control.
     """
 
+    strand_class: ClassVar[type[System]] = Leg
     rest_is_guess: ClassVar[bool] = True
     #: observables of the platform; those of the legs are the strand's
     velocities: ClassVar[tuple[str, ...]] = ("q", "w")
@@ -166,7 +167,10 @@ class ParallelRobot(Bundle):
         numeric: Any = jnp if is_traced((self, y)) else np
         p, h, *_ = self.legs(y)
         w, x = h[..., :1], h[..., 1:]
-        joints = numeric.broadcast_to(numeric.asarray(self.joints), p.shape)
+        joints = numeric.asarray(self.joints)
+        # each robot of a batch has its own
+        lead = joints.shape[:-2] + (1,) * (p.ndim - joints.ndim)
+        joints = numeric.broadcast_to(joints.reshape(*lead, *joints.shape[-2:]), p.shape)
         across = numeric.cross(x, joints)
         k = 2.0 / numeric.sum(h * h, axis=-1, keepdims=True)
         arms = joints + k * (w * across + numeric.cross(x, across))
@@ -224,7 +228,7 @@ class ParallelRobot(Bundle):
         height = jnp.asarray(control)
         speed = history.c0 * height + self.legs(history.y)[0][:, 2]
         zero = jnp.zeros(count)
-        p = _on_circle(self.base_radius, self.base_angles).at[:, 2].set(height)
+        p = _on_circle(self.base_radius, self.base_angles) + height[:, None] * np.array([0.0, 0.0, 1.0])
         h = jnp.tile(np.array([1.0, 0.0, 0.0, 0.0]), (count, 1))
         q = jnp.stack([zero, zero, speed], axis=1)
         own = in_strands(self, unknowns)
@@ -311,6 +315,7 @@ def _split(own: Any) -> list[Any]:
 
 def _on_circle(radius: Any, angles: Any) -> Float[Any, "legs 3"]:
     numeric: Any = jnp if is_traced((radius, angles)) else np
+    radius = numeric.asarray(radius)[..., None]
     x, y = radius * numeric.cos(angles), radius * numeric.sin(angles)
     return numeric.stack([x, y, numeric.zeros(numeric.shape(angles))], axis=-1)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 import functools
-from typing import Any
+from typing import Any, ClassVar
 
 from jaxtyping import Float
 
@@ -18,6 +18,9 @@ class Bundle(System):
     is its own. Fields are named as the strand's with the rod's number behind: `p1`, `n6`.
     """
 
+    #: the strand's class: of a batch of robots only this can be asked
+    strand_class: ClassVar[type[System]]
+
     @property
     @abc.abstractmethod
     def strand(self) -> System:
@@ -26,23 +29,23 @@ class Bundle(System):
     @property
     def y_layout(self) -> Layout:  # type: ignore[override]
         """The strand's, numbered."""
-        return numbered(self.strand.y_layout, self.strands)
+        return numbered(self.strand_class.y_layout, self.strands)
 
     @property
     def z_layout(self) -> Layout:  # type: ignore[override]
         """The strand's, numbered."""
-        return numbered(self.strand.z_layout, self.strands)
+        return numbered(self.strand_class.z_layout, self.strands)
 
     @property
     def base_unknowns(self) -> tuple[str, ...]:  # type: ignore[override]
         """The strand's, numbered."""
-        names = self.strand.base_unknowns
+        names = self.strand_class.base_unknowns
         return tuple(f"{name}{k + 1}" for k in range(self.strands) for name in names)
 
     @property
     def mixed(self) -> bool:  # type: ignore[override]
         """The strand's."""
-        return self.strand.mixed
+        return self.strand_class.mixed
 
     def derivatives(
         self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History

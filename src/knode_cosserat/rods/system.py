@@ -162,7 +162,7 @@ class System(eqx.Module):
     #: whether B is not zero: the history of y_s is then kept
     mixed: ClassVar[bool] = True
 
-    #: whether the state at rest is a mere guess: a simulation then begins in equilibrium, without control
+    #: whether the state at rest is a guess: a simulation then begins in the equilibrium under no control
     rest_is_guess: ClassVar[bool] = False
 
     #: observables that are velocities, on which drag and friction depend; none: the system does not say
