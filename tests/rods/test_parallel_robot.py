@@ -212,6 +212,7 @@ def test_the_actuators_move_as_they_are_told():
     np.testing.assert_allclose(speed, (1.5 * z[10:] - 2 * z[9:-1] + 0.5 * z[8:-2]) / DT, atol=1e-9)
 
 
+@pytest.mark.campaign
 def test_a_batch_is_as_its_robots_one_by_one():
     controls = np.stack([smooth(0, 20), smooth(1, 20)])
     robots = [ROBOT, ROBOT.replace(youngs_modulus=1.8e11)]
@@ -233,7 +234,6 @@ def test_large_displacements_are_recovered():
 @pytest.mark.campaign
 def test_random_robots_are_solved():
     rng = np.random.default_rng(0)
-    results = []
     for _ in range(60):
         base = np.sort(rng.uniform(0, 2 * np.pi, 6))
         length, radius, modulus = (

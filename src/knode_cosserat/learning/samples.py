@@ -116,9 +116,8 @@ def of_strands(knowledge: System, data: Dataset) -> Dataset:
             len(records) * count, -1
         )
 
-    every = {
-        name: np.repeat(part, count, axis=0) for name, part in segments._asdict().items() if name != "history"
-    }
+    shared = ("place", "t", "c0", "control", "weight", "origin")
+    every: dict[str, Any] = {name: np.repeat(getattr(segments, name), count, axis=0) for name in shared}
     every |= {name: own(getattr(segments, name)) for name in ("y", "z", "y_next", "slope")}
     every |= {"history": tuple(map(past, segments.history)), "weight": every["weight"] / count}
     doubt = np.sqrt(np.mean(np.square(in_strands(knowledge, data.doubt)), axis=0))

@@ -177,7 +177,7 @@ class System(eqx.Module):
 
     @property
     def strands(self) -> int:
-        """Of how many rods alike, joined at their ends only, the system is made: y and z are theirs in turn."""
+        #: whether rest is a guess only: a simulation then begins in the equilibrium under no control
         return 1
 
     @property

@@ -47,8 +47,8 @@ def simulate(
         start: how the first step is made from one state; see `Settings`.
         initial: start from this trajectory's last row instead of the robot's state at rest (where that is
             only a guess, such as of a platform on bent legs: the equilibrium under no control). If its time
-            step is the same the motion goes on exactly, with the history of its last rows; only the trapezoidal
-            rule makes one step by BDF1 after a trajectory that itself began in motion.
+            step is the same the motion goes on exactly, with the history of its last rows; only the
+            trapezoidal rule makes one step by BDF1 after a trajectory that itself began in motion.
         newton: tolerances and limits of the solve in each step.
         on_failure: "raise" a `SimulationError`, or "return" the trajectory with the rest marked invalid.
         progress: show a progress bar.
