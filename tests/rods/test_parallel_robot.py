@@ -122,9 +122,9 @@ def test_lateral_stiffness_and_its_loss_under_weight(load):
 
 
 @pytest.mark.campaign
-@pytest.mark.parametrize(("space", "nodes", "order"), [("euler", (17, 33, 65), 1), ("rk4", (5, 9, 17), 4)])
+@pytest.mark.parametrize(("space", "nodes", "order"), [("euler", (17, 33, 65), 1), ("rk4", (9, 17, 33), 4)])
 def test_order_of_convergence_in_space(space, nodes, order):
-    tips = [still(ROBOT.replace(nodes=n), 2 * SOME, space=space)[0].tip_position[0] for n in nodes]
+    tips = [still(ROBOT.replace(nodes=n), SOME, space=space)[0].tip_position[0] for n in nodes]
     coarse, fine = np.linalg.norm(tips[0] - tips[1]), np.linalg.norm(tips[1] - tips[2])
     assert np.log2(coarse / fine) == pytest.approx(order, abs=0.3)
 
