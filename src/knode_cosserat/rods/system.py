@@ -177,7 +177,7 @@ class System(eqx.Module):
 
     @property
     def strands(self) -> int:
-            """Of how many rods alike, joined at their ends only, it is made: y and z are theirs in turn."""
+        """Of how many rods alike, joined at their ends only, it is made: y and z are theirs in turn."""
         return 1
 
     @property
