@@ -43,6 +43,7 @@ from knode_cosserat.recordings.load import load_recording
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
 from knode_cosserat.rods import ends, loads, surroundings
+from knode_cosserat.rods.parallel_robot import ParallelRobot
 from knode_cosserat.rods.parameters import ParameterError, parameter
 from knode_cosserat.rods.robot_file import RobotFileError, catalog, load_robot, save_robot
 from knode_cosserat.rods.rod import Rod
@@ -88,6 +89,7 @@ __all__ = [
     "ModelFileError",
     "NetworkOptions",
     "NewtonOptions",
+    "ParallelRobot",
     "ParameterError",
     "Reach",
     "Recording",

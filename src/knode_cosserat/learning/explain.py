@@ -42,7 +42,7 @@ def explain(model: KNODE) -> list[Finding]:
     Raises:
         TypeError: the model's residual is not a structured one.
     """
-    residual, knowledge = model.residual, model.knowledge
+    residual, knowledge = model.residual, model.knowledge.strand
     if not isinstance(residual, Structured):
         raise TypeError(f"a {type(residual).__name__} has no terms to read; allowed is a structured residual")
     found = []
@@ -53,13 +53,15 @@ def explain(model: KNODE) -> list[Finding]:
         *((f"{name}_t", size, f"{unit}/s", meaning) for name, size, unit, meaning, *_ in strain.fields)
     )
     found += _terms("stress", strain, residual.stress, strain + rates)
-    parts: list[tuple[str, Layout, Any]] = [
-        ("load", loaded(knowledge), residual.load), ("tip", knowledge.tip_layout, residual.tip_load)
-    ]  # fmt: skip
-    for part, targets, load in parts:
+    whole = model.knowledge
+    parts: list[tuple[str, System, Layout, Any]] = [
+        ("load", knowledge, loaded(knowledge), residual.load),
+        ("tip", whole, whole.tip_layout, residual.tip_load),
+    ]
+    for part, system, targets, load in parts:
         if load is not None:
-            found += _terms(part, targets, load.material, material_layout(knowledge))
-            found += _terms(f"{part}*", targets, load.ambient, ambient_layout(knowledge))
+            found += _terms(part, targets, load.material, material_layout(system))
+            found += _terms(f"{part}*", targets, load.ambient, ambient_layout(system))
     return found
 
 

@@ -18,7 +18,7 @@ from knode_cosserat.learning.config import FitConfig, NetworkOptions
 from knode_cosserat.learning.ensemble import Ensemble
 from knode_cosserat.learning.knode import KNODE, About
 from knode_cosserat.learning.residual import Residual, network
-from knode_cosserat.learning.samples import Dataset, samples
+from knode_cosserat.learning.samples import Dataset, of_strands, samples
 from knode_cosserat.learning.structured.regression import solve
 from knode_cosserat.learning.training.checkpoint import Checkpoints, Identity, data_hash
 from knode_cosserat.learning.training.courses import Courses, courses, held_out_courses, tip_error
@@ -143,13 +143,14 @@ def _first(knowledge: System, trajectories: Sequence[Trajectory], config: FitCon
     if config.segments is not None or (isinstance(options, NetworkOptions) and options.standardised):
         nodes = None if config.segments is None else config.segments.nodes
         noise = 0.0 if config.segments is None else config.segments.data_noise
-        dataset = samples(knowledge, [_noisy(each, noise, k) for k, each in enumerate(trajectories)], nodes)
+        noisy = [_noisy(each, noise, k) for k, each in enumerate(trajectories)]
+        dataset = of_strands(knowledge, samples(knowledge, noisy, nodes))
     if isinstance(options, NetworkOptions):
-        networks = [network(knowledge, options, jax.random.key(seed)) for seed in config.seeds]
+        networks = [network(knowledge.strand, options, jax.random.key(seed)) for seed in config.seeds]
         if options.standardised and dataset is not None:
-            networks = [standardised(net, knowledge, dataset.segments) for net in networks]
+            networks = [standardised(net, knowledge.strand, dataset.segments) for net in networks]
         return _First(dataset, list(networks))
-    every = samples(knowledge, trajectories)
+    every = of_strands(knowledge, samples(knowledge, trajectories))
     return _First(dataset, list(solve(knowledge, every, options, config.seeds)))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.learning.residual import Residual
-from knode_cosserat.rods.system import History, Layout, Scales, System
+from knode_cosserat.rods.system import History, Layout, Scales, System, of_strands
 
 
 class About:
@@ -84,9 +84,19 @@ class KNODE(System):
         return self.knowledge.jumps
 
     @property
-    def starts_at_rest(self) -> bool:  # type: ignore[override]
+    def rest_is_guess(self) -> bool:  # type: ignore[override]
         """The knowledge's."""
-        return self.knowledge.starts_at_rest
+        return self.knowledge.rest_is_guess
+
+    @property
+    def strands(self) -> int:
+        """The knowledge's."""
+        return self.knowledge.strands
+
+    @property
+    def strand(self) -> System:
+        """The knowledge's strand with the residual: what is learned along the rod holds for every strand."""
+        return self if self.strands == 1 else type(self)(self.knowledge.strand, self.residual, self.about)
 
     @property
     def velocities(self) -> tuple[str, ...]:  # type: ignore[override]
@@ -104,6 +114,8 @@ class KNODE(System):
         self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
         """y_s and z of knowledge and residual together."""
+        if self.strands > 1:
+            return of_strands(self, s, t, y, control, history)
         return self.residual.derivatives(self.adapted, s, t, y, control, history)
 
     def crossed(

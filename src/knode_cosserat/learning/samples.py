@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.rods.system import System, unpacked_history
+from knode_cosserat.rods.system import System, in_strands, records_in_strands, unpacked_history
 from knode_cosserat.solvers.crossing import Crossing, carried, crossing_of, within
 from knode_cosserat.solvers.march import coefficient_table
 from knode_cosserat.solvers.settings import Settings
@@ -116,6 +116,28 @@ def samples(
     segments, tips = (jax.tree.map(lambda *leaves: np.concatenate(leaves), *each) for each in joined)
     doubt = np.sqrt(np.mean(np.square(doubts), axis=0))
     return Dataset(segments, tips, settings_of(trajectories[0]).space, len(ends), doubt)
+
+
+def of_strands(knowledge: System, data: Dataset) -> Dataset:
+    """The same segments strand by strand, as samples of `knowledge.strand`; the tips stay as they are."""
+    count, segments = knowledge.strands, data.segments
+    if count == 1:
+        return data
+
+    def own(values: Any) -> Any:
+        return np.asarray(in_strands(knowledge, values)).reshape(len(values) * count, -1)
+
+    def past(records: Any) -> Any:
+        return np.asarray(records_in_strands(knowledge, np.asarray(records))).reshape(
+            len(records) * count, -1
+        )
+
+    shared = ("place", "t", "c0", "control", "weight", "origin")
+    every: dict[str, Any] = {name: np.repeat(getattr(segments, name), count, axis=0) for name in shared}
+    every |= {name: own(getattr(segments, name)) for name in ("y", "z", "y_next", "slope")}
+    every |= {"history": tuple(map(past, segments.history)), "weight": every["weight"] / count}
+    doubt = np.sqrt(np.mean(np.square(in_strands(knowledge, data.doubt)), axis=0))
+    return dataclasses.replace(data, segments=Samples(**every), per_row=data.per_row * count, doubt=doubt)
 
 
 def settings_of(trajectory: Trajectory) -> Settings:

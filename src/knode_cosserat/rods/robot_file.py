@@ -26,6 +26,7 @@ import jax
 import numpy as np
 
 from knode_cosserat._yaml import YAMLTextError, did_you_mean, flow, mapping_of, shown
+from knode_cosserat.rods.parallel_robot import ParallelRobot
 from knode_cosserat.rods.parameters import (
     Parameter,
     ParameterError,
@@ -51,6 +52,7 @@ KINDS: dict[str, type[System]] = {
     "routed-tendon-robot": RoutedTendonRobot,
     "slender-rod": SlenderRod,
     "virtual-robot": VirtualRobot,
+    "parallel-robot": ParallelRobot,
 }
 
 

@@ -139,9 +139,9 @@ class Rod(System):
         return [control[spot] for spot in spots]
 
     @property
-    def starts_at_rest(self) -> bool:  # type: ignore[override]
-        """Not where its tip is held, which the straight rod need not meet."""
-        return not self.tip_end.held
+    def rest_is_guess(self) -> bool:  # type: ignore[override]
+        """Where its tip is held, which the rod as it is by itself need not meet."""
+        return self.tip_end.held
 
     @property
     def section(self) -> CircularSection:

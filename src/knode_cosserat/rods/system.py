@@ -111,6 +111,34 @@ def unpacked_history(system: System, c0: Any, record: Float[Any, " x"]) -> Histo
     return History(c0, record[:ny], record[ny : ny + nz], y_s)
 
 
+def in_strands(system: System, packed: Any) -> Any:
+    """Numbers (…, y), or z or the unknowns, strand by strand: (…, strands, those of one)."""
+    return packed.reshape(*packed.shape[:-1], system.strands, packed.shape[-1] // system.strands)
+
+
+def records_in_strands(system: System, records: Any) -> Any:
+    """Packed records of history (…, x), strand by strand: (…, strands, x of one)."""
+    if system.strands == 1:
+        return in_strands(system, records)
+    ny, nz = system.y_layout.size, system.z_layout.size
+    parts = jnp.split(records, [ny, ny + nz], axis=-1)
+    return jnp.concatenate([in_strands(system, part) for part in parts], axis=-1)
+
+
+def of_strands(
+    system: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
+) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
+    """y_s and z of a system at one place, from the equations of its strands."""
+    strand = system.strand
+    own = [in_strands(system, part) for part in (y, history.y, history.z, history.y_s)]
+
+    def each(y: Any, *past: Any) -> Any:
+        return strand.derivatives(s, t, y, control, History(history.c0, *past))
+
+    y_s, z = jax.vmap(each)(*own)
+    return y_s.reshape(-1), z.reshape(-1)
+
+
 class Scales(NamedTuple):
     """Natural sizes of the numbers in y (y,) and of the tip's residuals (k,): what "small" is measured by."""
 
@@ -134,6 +162,9 @@ class System(eqx.Module):
     #: whether B is not zero: the history of y_s is then kept
     mixed: ClassVar[bool] = True
 
+    #: whether the state at rest is a guess: a simulation then begins in the equilibrium under no control
+    rest_is_guess: ClassVar[bool] = False
+
     #: observables that are velocities, on which drag and friction depend; none: the system does not say
     velocities: ClassVar[tuple[str, ...]] = ()
 
@@ -141,14 +172,27 @@ class System(eqx.Module):
     cuts: ClassVar[tuple[float, ...]] = ()
     #: whether y jumps at some of them
     jumps: ClassVar[bool] = False
-    #: whether the state of `rest` meets the conditions at both ends, so that a simulation can start there;
-    #: one of a robot that is held at its tip starts at the equilibrium under its first control
-    starts_at_rest: ClassVar[bool] = True
 
     if TYPE_CHECKING:  # every system has a length (m) among its own parameters
         length: Any
     #: how many nodes the rod is divided into, both ends counted
     nodes: int = eqx.field(static=True, default=10, kw_only=True)
+
+    # strands: rods that touch each other at their ends only, such as the legs of a platform
+
+    @property
+    def strands(self) -> int:
+        """Of how many rods alike, joined at their ends only, it is made: y and z are theirs in turn."""
+        return 1
+
+    @property
+    def strand(self) -> System:
+        """The equations that all strands have in common: a system with y and z of one of them.
+
+        Solvers and learning use its equations along the rod, and nothing of its ends. It is given the whole
+        control.
+        """
+        return self
 
     # the equations
 

@@ -23,7 +23,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float, Int
 
-from knode_cosserat.rods.system import History, System, unpacked_history
+from knode_cosserat.rods.system import (
+    History,
+    System,
+    in_strands,
+    records_in_strands,
+    unpacked_history,
+)
 from knode_cosserat.solvers.crossing import Crossing, carried, crossing_of, within
 from knode_cosserat.solvers.linear import Linearisation, LinearSolver
 from knode_cosserat.solvers.space import SpaceScheme, middles
@@ -58,8 +64,9 @@ class StepProblem(eqx.Module):
     tip_offset: Any = None
 
     def point_rates(self, s: Any, y: Float[Any, " y"], history: Float[Any, " x"]) -> Any:
-        """y_s and z at one point, from a packed record of history."""
-        return self.system.derivatives(s, self.t, y, self.control, self._unpack(history))
+        """y_s and z at one point of a strand, from a packed record of its history."""
+        strand = self.system.strand
+        return strand.derivatives(s, self.t, y, self.control, unpacked_history(strand, self.c0, history))
 
     def _unpack(self, history: Float[Any, " x"]) -> History:
         return unpacked_history(self.system, self.c0, history)
@@ -85,11 +92,15 @@ class StepProblem(eqx.Module):
         return jnp.linspace(0.0, 1.0, self.system.nodes) * self.system.length
 
     def segments(self, each: Callable[..., Any], y: Float[Any, "nodes y"]) -> Any:
-        """Apply `each(advance, y_j)` to all segments side by side; `advance` maps y_j to y_{j+1}."""
-        s = self.arclength
+        """Apply `each(advance, y_j)` to all segments of all strands side by side (strands inside).
+
+        `advance` maps y_j of a strand to its y_{j+1}.
+        """
+        s = self._each_strand(self.arclength[:-1])
         ds = self.system.length / (self.system.nodes - 1)
-        start, end = self.history[:-1], self.history[1:]
-        middle = middles(self.history) if self.space.uses_middle else start
+        history = self.history
+        inner = middles(history) if self.space.uses_middle else history[:-1]
+        start, middle, end = (self._past_points(rows) for rows in (history[:-1], inner, history[1:]))
 
         def rates(*at: Any) -> Any:
             return self.point_rates(*at)[0]
@@ -103,24 +114,42 @@ class StepProblem(eqx.Module):
             return each(advance, y_j)
 
         # nodes last inside: XLA then vectorises over them
-        lanes = (y[:-1].T, start.T, middle.T, end.T)
+        lanes = (self._points(y[:-1]).T, start.T, middle.T, end.T)
         crossings = crossing_of(self.system)
         if crossings is None:
-            return jax.vmap(segment, in_axes=(0, -1, -1, -1, -1))(s[:-1], *lanes)
+            return jax.vmap(segment, in_axes=(0, -1, -1, -1, -1))(s, *lanes)
         return jax.vmap(
             lambda crossing, *lane: segment(*lane, crossing=crossing), in_axes=(0, 0, -1, -1, -1, -1)
-        )(Crossing(*map(jnp.asarray, crossings)), s[:-1], *lanes)
+        )(Crossing(*map(jnp.asarray, crossings)), s, *lanes)
+
+    def at_points(self, function: Callable[..., Any], y: Float[Any, "nodes y"]) -> Any:
+        """Apply `function(s, y, record of history)` to all nodes of all strands (strands inside)."""
+        at = self._each_strand(self.arclength), self._points(y), self._past_points(self.history)
+        return jax.vmap(function)(*at)
+
+    def _beyond_cuts(self, y: Float[Any, "nodes y"]) -> tuple[Any, Any]:
+        """y_s and z at the nodes, on the far side of what is cut there, and at the tip on the near side."""
+        crossings, s = crossing_of(self.system), self.arclength
+        assert crossings is not None
+        s = jnp.concatenate([within(s[:-1], s[:-1], s[1:]), within(s[-1:], s[-2:-1], s[-1:])])
+        across = jax.vmap(self.crossed)(jnp.asarray(crossings.acting[:, 0]), y[:-1], self.history[:-1])
+        return jax.vmap(self.point_rates)(s, jnp.concatenate([across, y[-1:]]), self.history)
+
+    def _each_strand(self, values: Float[Any, " n"]) -> Float[Any, " points"]:
+        return jnp.repeat(values, self.system.strands) if self.system.strands > 1 else values
+
+    def _points(self, rows: Float[Any, "n x"]) -> Float[Any, "points x_of_strand"]:
+        own = in_strands(self.system, rows)
+        return own.reshape(-1, own.shape[-1])
+
+    def _past_points(self, rows: Float[Any, "n x"]) -> Float[Any, "points x_of_strand"]:
+        own = records_in_strands(self.system, rows)
+        return own.reshape(-1, own.shape[-1])
 
     def record(self, y: Float[Any, "nodes y"]) -> Float[Any, "nodes x"]:
         """What must be kept of a solved step at every node: y, z and, if B is not zero, y_s."""
-        s, crossings = self.arclength, crossing_of(self.system)
-        here = y
-        if crossings is not None:
-            # on the far side of what is at a node, and at the tip on the near side
-            s = jnp.concatenate([within(s[:-1], s[:-1], s[1:]), within(s[-1:], s[-2:-1], s[-1:])])
-            across = jax.vmap(self.crossed)(jnp.asarray(crossings.acting[:, 0]), y[:-1], self.history[:-1])
-            here = jnp.concatenate([across, y[-1:]])
-        y_s, z = jax.vmap(self.point_rates)(s, here, self.history)
+        rates = self._beyond_cuts(y) if crossing_of(self.system) else self.at_points(self.point_rates, y)
+        y_s, z = (part.reshape(y.shape[0], -1) for part in rates)
         return jnp.concatenate([y, z, y_s] if self.system.mixed else [y, z], axis=1)
 
 
@@ -155,7 +184,7 @@ def _error(problem: StepProblem, defects: Any, tip: Any) -> Any:
 def residuals(problem: StepProblem, y: Float[Any, "nodes y"]) -> tuple[Any, Any]:
     """Defects y_{j+1} - Φ_j(y_j), with their sign turned, and the tip's residuals."""
     reached = problem.segments(lambda advance, y_j: advance(y_j), y)
-    return reached - y[1:], problem.tip_residual(y[-1])
+    return reached.reshape(y[1:].shape) - y[1:], problem.tip_residual(y[-1])
 
 
 def linearise(problem: StepProblem, y: Float[Any, "nodes y"], unknowns: Any) -> Linearisation:
@@ -169,9 +198,11 @@ def linearise(problem: StepProblem, y: Float[Any, "nodes y"], unknowns: Any) -> 
         return jax.jacfwd(twice, has_aux=True)(at)
 
     F, reached = problem.segments(with_value, y)
+    if problem.system.strands > 1:
+        F = F.reshape(y.shape[0] - 1, problem.system.strands, *F.shape[1:])
     M, tip = with_value(problem.tip_residual, y[-1])
     S = jax.jacfwd(problem.base)(unknowns)
-    return Linearisation(F, S, M, reached - y[1:], tip)
+    return Linearisation(F, S, M, reached.reshape(y[1:].shape) - y[1:], tip)
 
 
 class _Search(NamedTuple):

@@ -6,6 +6,9 @@ Two ways to solve them share one interface. `Condensed` carries the recursion fr
 δξ there: the fastest, but what grows along the rod (small time steps, soft and long rods) multiplies rounding
 errors. `Decoupled` first carries the tip's conditions down to the base, orthonormalised at every node, and
 projects on them on the way up: growth does no harm, at several times the cost. Measured: docs/solver.md.
+
+Strands (`System.strands`) meet at the ends only: F_j has a block for each, S and M are of all of them.
+A single rod's F has no axis of strands: with one of length one a step takes 1.3 times as long.
 """
 
 from __future__ import annotations
@@ -22,7 +25,7 @@ from jaxtyping import Float
 class Linearisation(NamedTuple):
     """Residuals at a point and their exact derivatives: of each segment, of the base and of the tip."""
 
-    F: Float[Any, "segments y y"]
+    F: Float[Any, "segments *strands b b"]
     base: Float[Any, "y k"]
     tip: Float[Any, "k y"]
     defects: Float[Any, "segments y"]
@@ -49,7 +52,7 @@ class LinearSolver(abc.ABC):
 class CondensedFactors(NamedTuple):
     """F, the response X_j = ∂y_j/∂ξ at every node, the tip's matrix, and the inverse of ∂tip/∂ξ."""
 
-    F: Float[Any, "segments y y"]
+    F: Float[Any, "segments *strands b b"]
     X: Float[Any, "k nodes y"]
     tip: Float[Any, "k y"]
     inverse: Float[Any, "k k"]
@@ -57,11 +60,16 @@ class CondensedFactors(NamedTuple):
 
 def _product(F: Any, X: Any) -> Any:
     """F @ X as a fused multiply and sum: for sizes this small the library's product is twice as slow."""
-    return jnp.sum(F[:, :, None] * X[None], axis=1)
+    return jnp.sum(F[..., :, :, None] * X[..., None, :, :], axis=-2)
 
 
 def _apply(F: Any, x: Any) -> Any:
-    return jnp.sum(F * x[None], axis=1)
+    return jnp.sum(F * x[..., None, :], axis=-1)
+
+
+def carried(F: Float[Any, "*strands b b"], dy: Float[Any, " y"]) -> Float[Any, " y"]:
+    """δy at a segment's end from δy at its start."""
+    return _apply(F, dy.reshape(F.shape[:-1])).reshape(-1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,13 +83,14 @@ class Condensed(LinearSolver):
 
         def along(X: Any, step: Any) -> Any:
             F_j, r_j = step
-            X = _product(F_j, X).at[:, k].add(r_j)
+            X = _product(F_j, X).at[..., k].add(r_j)
             return X, X
 
-        first = jnp.concatenate([S, jnp.zeros((S.shape[0], 1))], axis=1)
-        last, X = jax.lax.scan(along, first, (F, defects))
-        X = jnp.transpose(jnp.concatenate([first[None], X]), (2, 0, 1))
-        at_tip = _product(M, last)
+        first = jnp.concatenate([S, jnp.zeros((S.shape[0], 1))], axis=1).reshape(*F.shape[1:-1], k + 1)
+        last, X = jax.lax.scan(along, first, (F, defects.reshape(F.shape[:-1])))
+        X = jnp.concatenate([first[None], X]).reshape(-1, S.shape[0], k + 1)
+        X = jnp.transpose(X, (2, 0, 1))
+        at_tip = _product(M, last.reshape(S.shape[0], k + 1))
         factors = CondensedFactors(F, X[:k], M, jnp.linalg.inv(at_tip[:, :k]))
         return factors, *self._combine(factors, X[k], at_tip[:, k] + tip)
 
@@ -95,7 +104,7 @@ class Condensed(LinearSolver):
 
         def along(w: Any, step: Any) -> Any:
             F, r = step
-            w = _apply(F, w) + r
+            w = carried(F, w) + r
             return w, w
 
         last, w = jax.lax.scan(along, jnp.zeros(defects.shape[1]), (factors.F, defects))
@@ -106,7 +115,7 @@ class Condensed(LinearSolver):
 class DecoupledFactors(NamedTuple):
     """Per node the orthonormal conditions Q and the triangular factors L; all in natural units."""
 
-    F: Float[Any, "segments y y"]
+    F: Float[Any, "segments *strands b b"]
     Q: Float[Any, "nodes k y"]
     L: Float[Any, "nodes k k"]
     base: Float[Any, "y k"]
@@ -120,7 +129,8 @@ class Decoupled(LinearSolver):
 
     def start(self, linearisation, y_scale):  # type: ignore[no-untyped-def]
         """Carry the tip's conditions down to the base."""
-        F = linearisation.F * y_scale[None, None, :] / y_scale[None, :, None]
+        of_strand = y_scale.reshape(linearisation.F.shape[1:-1])
+        F = linearisation.F * of_strand[..., None, :] / of_strand[..., :, None]
 
         def normalised(conditions: Any) -> Any:
             Q, R = jnp.linalg.qr(conditions.T)
@@ -129,7 +139,8 @@ class Decoupled(LinearSolver):
         Q_tip, L_tip = normalised(linearisation.tip * y_scale)
 
         def down(Q: Any, F: Any) -> Any:
-            Q, L = normalised(Q @ F)
+            across = jnp.einsum("k...b,...bc->k...c", Q.reshape(-1, *F.shape[:-1]), F)
+            Q, L = normalised(across.reshape(Q.shape))
             return Q, (Q, L)
 
         _, (Q, L) = jax.lax.scan(down, Q_tip, F, reverse=True)
@@ -158,7 +169,7 @@ class Decoupled(LinearSolver):
 
         def up(dy: Any, node: Any) -> Any:
             F_j, r_j, Q_next, c_next = node
-            dy = F_j @ dy + r_j
+            dy = carried(F_j, dy) + r_j
             dy = dy + (c_next - Q_next @ dy) @ Q_next
             return dy, dy
 

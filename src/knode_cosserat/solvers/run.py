@@ -17,6 +17,7 @@ from knode_cosserat.solvers.recovery import Outcome, recover
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.stability import SAFE_DECAY, SUSPICIOUS, decay_per_segment
+from knode_cosserat.solvers.time import Static
 
 #: robots that one thread takes at a time
 CHUNK = 16
@@ -51,12 +52,15 @@ class Task:
     settings: Settings
     dt: float
     steps: int
-    #: the first step: as the settings say, like any other (the past holds real states), or by BDF1
-    first: Literal["start", "regular", "consistent"] = "start"
+    #: the first step: as the settings say, like any other (the past holds real states), or by BDF1; or every
+    #: step without rates, an equilibrium (by the program of a simulation with these settings)
+    first: Literal["start", "regular", "consistent", "still"] = "start"
 
     @property
     def table(self) -> np.ndarray:
         """Coefficients of the first step and of every other."""
+        if self.first == "still":
+            return np.zeros((2, 4))
         if self.first == "consistent":
             return coefficient_table(dataclasses.replace(self.settings, start="consistent"), self.dt)
         table = coefficient_table(self.settings, self.dt)
@@ -129,8 +133,11 @@ def _with_recovery(
             reached = int(reached)
             rows = _merged(rows, new, done, reached, total)
             if reached < stop:
+                settings = task.settings
+                if task.first == "still":
+                    settings = dataclasses.replace(settings, time=Static())
                 outcome = recover(
-                    system, task.settings, past, table[min(reached, 1)],
+                    system, settings, past, table[min(reached, 1)],
                     (controls[reached - 1] if reached else start.control, controls[reached]),
                     float(past.t0) + (reached + 1) * task.dt, task.dt,
                 )  # fmt: skip

@@ -17,7 +17,7 @@ import numpy as np
 
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import StepProblem, linearise, residuals
-from knode_cosserat.solvers.linear import Condensed
+from knode_cosserat.solvers.linear import Condensed, carried
 from knode_cosserat.solvers.march import Past, Rows, history_of, march_one
 from knode_cosserat.solvers.run import Task
 from knode_cosserat.solvers.settings import Settings
@@ -93,7 +93,7 @@ def tangent_march(
         given, d_given = (system, control, history), (d_system, d_control, d_history)
         defects, tip, base = jax.jvp(at_solution, given, d_given)[1]
         # a base that moves by itself enters through the first segment
-        defects = defects.at[0].add(jnp.sum(linearisation.F[0] * base, axis=1))
+        defects = defects.at[0].add(carried(linearisation.F[0], base))
         dy, dxi = linear.solve(factors, defects, tip)
         dy = dy.at[0].add(base)
 

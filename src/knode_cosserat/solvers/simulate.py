@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
@@ -39,17 +38,17 @@ def simulate(
     """Simulate a robot, or a batch of them, under given controls.
 
     Args:
-        robot: one system, or a sequence of systems that differ in their parameters only. It starts at rest,
-            or, if it is held at its tip (see `System`), at its equilibrium under the first control.
+        robot: one system, or a sequence of systems that differ in their parameters only.
         controls: (T, c), or (B, T, c) for a batch; for a tendon robot the tensions in N. Control i is held
             from row i to row i + 1.
         dt: time step (s).
         time: "bdf1", "bdf2", "bdf-alpha", "trapezoidal", or a scheme.
         space: "euler", "rk4", or a scheme.
         start: how the first step is made from one state; see `Settings`.
-        initial: start from this trajectory's last row instead of the robot's state at rest. If its time step
-            is the same the motion goes on exactly, with the history of its last rows; only the trapezoidal
-            rule makes one step by BDF1 after a trajectory that itself began in motion.
+        initial: start from this trajectory's last row instead of the robot's state at rest (where that is
+            only a guess, such as of a platform on bent legs: the equilibrium under no control). If its time
+            step is the same the motion goes on exactly, with the history of its last rows; only the
+            trapezoidal rule makes one step by BDF1 after a trajectory that itself began in motion.
         newton: tolerances and limits of the solve in each step.
         on_failure: "raise" a `SimulationError`, or "return" the trajectory with the rest marked invalid.
         progress: show a progress bar.
@@ -167,29 +166,51 @@ def beginning(run: Run) -> tuple[Any, Start, Any, Any]:
     system, controls, initial, settings, dt, batch, many = run
     if initial is not None:
         return _going_on(system, initial, settings, dt)
-    if not system.starts_at_rest and not isinstance(settings.time, Static):
-        return _at_equilibrium(run)
     record, past = (_jit_all_at_rest if many else _jit_at_rest)(system)
+    if system.rest_is_guess and not isinstance(settings.time, Static):
+        record, past = _settled(run, past)
     if batch and not many:
         record, past = jax.tree.map(lambda x: jnp.broadcast_to(x, (batch, *x.shape)), (record, past))
     none_yet = np.zeros((*np.shape(controls)[:-2], system.control_size))
     return record, Start(past, none_yet), 0.0, "start"
 
 
-def _at_equilibrium(run: Run) -> tuple[Any, Start, Any, str]:
-    """Where a robot starts whose straight shape does not meet the conditions at its ends."""
-    settings = dataclasses.replace(run.settings, time=Static())
-    still = run._replace(controls=run.controls[..., :1, :], settings=settings, dt=1.0)
-    if is_traced((run.system, run.controls)):
-        found = _traced(*still)
+def _settled(run: Run, past: Any) -> tuple[Any, Any]:
+    """The equilibrium under no control, looked for from rest: its record, and the past of it alone."""
+    system, many = run.system, run.many
+    task = Task(run.settings, run.dt, 1, "still")
+    none = np.zeros((1, system.control_size))
+    if is_traced((system, past)):
+        find = sensitivity.rollout(task)
+        rows = jax.vmap(find, in_axes=(0, None, 0))(system, none, past) if many else find(system, none, past)
+        found = rows.records[..., 0, :, :]
     else:
-        found = _batch(still, "raise", False) if run.batch else _single(still, "raise", False)
-    row = jnp.concatenate([found.y, found.z], axis=-1)[..., 1, :, :]
-    control = run.controls[..., 0, :]
-    if not run.batch:
-        return row, Start(initial_past(run.system, row, control), control), 0.0, "start"
-    pasts = jax.vmap(initial_past, in_axes=(0 if run.many else None, 0, 0))(run.system, row, control)
-    return row, Start(pasts, control), 0.0, "start"
+        each = range(np.shape(past.t0)[0]) if many else [...]
+        found = np.stack([_settled_one(task, _part(system, i), none, _part(past, i), i) for i in each])
+        found = found if many else found[0]
+    kept = found[..., : system.y_layout.size + system.z_layout.size]
+    return kept, (_jit_all_pasts if many else _jit_past)(system, kept)
+
+
+def _settled_one(task: Task, system: System, none: Any, past: Any, i: Any) -> Any:
+    """As `_settled`, of one robot; without an equilibrium there is nothing to begin with."""
+    steps, cause = run_one(task, system, none, Start(past, none[0]))
+    if steps.result[0] < 0:
+        robot = None if i is ... else i
+        raise SimulationError(0, 0.0, float(steps.error[0]), Result(int(steps.result[0])), cause, robot)
+    return np.asarray(steps.records[0])
+
+
+def _part(tree: Any, i: Any) -> Any:
+    return tree if i is ... else jax.tree.map(lambda leaf: leaf[i], tree)
+
+
+def _past_of(system: System, record: Any) -> Any:
+    return initial_past(system, record, jnp.zeros(system.control_size))
+
+
+_jit_past = jax.jit(_past_of)
+_jit_all_pasts = jax.jit(jax.vmap(_past_of))
 
 
 def _going_on(

@@ -150,7 +150,9 @@ def test_bodies_without_orientation(seen):
         "orientation in sine (2)",
     )
     away = abs(both.estimates["youngs_modulus"] - 2.2e9)
-    assert away < 4.0 * both.standard_errors["youngs_modulus"] < 4.0 * result.standard_errors["youngs_modulus"]
+    assert (
+        away < 4.0 * both.standard_errors["youngs_modulus"] < 4.0 * result.standard_errors["youngs_modulus"]
+    )
 
 
 def test_of_several_recordings_each_has_its_own_remainder(seen):

@@ -66,40 +66,35 @@ def solve(
 
 
 class _Seen:
-    """What has to be explained, and what may explain it: the same however samples count."""
+    """What has to be explained, and what may explain it: the same however samples count.
+
+    Its segments are those of strands.
+    """
 
     def __init__(self, knowledge: System, data: Dataset, options: StructuredOptions):
         self.knowledge, self.data, self.options = knowledge, data, options
-        self.material_layout, self.ambient_layout = material_layout(knowledge), ambient_layout(knowledge)
-        self.scales = knowledge.scales()
+        #: what is learned along the rod is the law of a strand
+        self.strand = knowledge.strand
 
     @functools.cached_property
     def law(self) -> tuple[list[Offer], list[Target]]:
         """Of the law of the strains."""
-        return _law(self.knowledge, self.data.segments, self.options)
+        return _law(self.strand, self.data.segments, self.options)
 
     @functools.cached_property
     def views(self) -> _Views:
         """Along the rod."""
-        return jax.tree.map(np.asarray, _views(self.knowledge, self.data.segments))
+        return jax.tree.map(np.asarray, _views(self.strand, self.data.segments))
 
     @functools.cached_property
     def rates(self) -> Float[np.ndarray, "S y"]:
         """The knowledge's y_s at the true strains."""
-        return np.asarray(_rates(self.knowledge, self.data.segments))
+        return np.asarray(_rates(self.strand, self.data.segments))
 
     @functools.cached_property
     def along(self) -> _Sides:
         """What a load along the rod may be a sum of."""
-        return self.sides(loaded(self.knowledge), self.data.segments.y, self.views, self.options.curved)
-
-    def sides(self, layout: Layout, y: Any, views: _Views, curved: bool) -> _Sides:
-        """What a load of this layout may be a sum of, of the material and ambient, and its frames."""
-        material = _candidates(self.knowledge, self.material_layout, layout, views, curved)
-        ambient = expansion(self.ambient_layout, views.ambient, {}, layout.size)
-        frames = _frames(self.knowledge, layout, y)
-        return _Sides(layout, [Offer(part, views.material) for part in material],
-                      Offer(ambient, views.ambient), frames)  # fmt: skip
+        return _sides(self.strand, loaded(self.strand), self.data.segments.y, self.views, self.options.curved)
 
 
 class _Sides(NamedTuple):
@@ -109,6 +104,14 @@ class _Sides(NamedTuple):
     material: list[Offer]
     ambient: Offer
     frames: dict[str, Any]
+
+
+def _sides(system: System, layout: Layout, y: Any, views: _Views, curved: bool) -> _Sides:
+    """What a load of this layout may be a sum of, of the material and ambient, and its frames."""
+    material = _candidates(system, material_layout(system), layout, views, curved)
+    ambient = expansion(ambient_layout(system), views.ambient, {}, layout.size)
+    offers = [Offer(part, views.material) for part in material]
+    return _Sides(layout, offers, Offer(ambient, views.ambient), _frames(system, layout, y))
 
 
 def _counting(data: Samples | TipSamples, options: StructuredOptions, seed: int) -> Counting:
@@ -213,7 +216,7 @@ def _rates(knowledge: System, data: Samples) -> Any:
 
 def _with_loads(seen: _Seen, residual: Structured, counting: Counting) -> Structured:
     """The residual with its stretch and its loads."""
-    knowledge, data, rates = seen.knowledge, seen.data, seen.rates
+    knowledge, data, rates = seen.strand, seen.data, seen.rates
     length = float(knowledge.length)
     moved, doubt = data.segments.slope / length, data.doubt / length
     longer = _longer(knowledge, moved, rates, counting.shares)
@@ -222,7 +225,7 @@ def _with_loads(seen: _Seen, residual: Structured, counting: Counting) -> Struct
         missing = np.einsum("sij,sj->si", seen.views.matrix, missing)
     ds = length / (knowledge.nodes - 1)
     floors = _floors(knowledge.y_layout, np.abs(rates) + np.abs(moved))
-    floors = np.maximum(floors, TOLERANCE * np.asarray(seen.scales.y) / ds)
+    floors = np.maximum(floors, TOLERANCE * np.asarray(knowledge.scales().y) / ds)
     where = knowledge.y_layout.indices(seen.along.layout.names)
     load = _load(seen.along, missing[:, where], np.maximum(floors, doubt)[where], counting)
     residual = dataclasses.replace(residual, stretch=np.array(longer - 1.0), load=load)
@@ -306,5 +309,5 @@ def _at_tip(adapted: System, data: TipSamples) -> tuple[Any, _Views]:
 def _tip_load(seen: _Seen, residual: Structured, counting: Counting) -> Load | None:
     knowledge, tips = seen.knowledge, seen.data.tips
     left, views = jax.tree.map(np.asarray, _at_tip(residual.adapted(knowledge), tips))
-    sides = seen.sides(knowledge.tip_layout, tips.y, views, curved=False)
-    return _load(sides, -left, TOLERANCE * np.asarray(seen.scales.tip), counting)
+    sides = _sides(knowledge, knowledge.tip_layout, tips.y, views, curved=False)
+    return _load(sides, -left, TOLERANCE * np.asarray(knowledge.scales().tip), counting)

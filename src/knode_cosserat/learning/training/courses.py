@@ -101,7 +101,9 @@ def _course(trajectory: Trajectory, first: int | None, start: int, stop: int) ->
 
 def _checked_names(knowledge: System, given: tuple[str, ...] | None) -> tuple[str, ...]:
     known = knowledge.y_layout.names
-    names = tuple(name for name in POSE if name in known) if given is None else given
+    # a strand's number may follow
+    pose = tuple(name for name in known if name.rstrip("0123456789") in POSE)
+    names = pose if given is None else given
     for name in names:
         if name not in known:
             raise DataError(f"RolloutTraining.compared has {name!r}; y has {', '.join(known)}")
@@ -164,9 +166,11 @@ def held_out_courses(knowledge: System, trajectories: Sequence[Trajectory]) -> C
     """
     if not trajectories:
         return None
-    if "p" not in knowledge.y_layout.names:
-        raise DataError(f"held-out rollouts need positions; y has {', '.join(knowledge.y_layout.names)}")
-    return courses(knowledge, trajectories, RolloutTraining(compared=("p",)), what="held-out ")
+    known = knowledge.y_layout.names
+    places = tuple(name for name in known if name.rstrip("0123456789") == "p")
+    if not places:
+        raise DataError(f"held-out rollouts need positions; y has {', '.join(known)}")
+    return courses(knowledge, trajectories, RolloutTraining(compared=places), what="held-out ")
 
 
 def tip_error(model: System, courses: Courses) -> float:

@@ -42,7 +42,7 @@ class SegmentRun(Run):
         self.name = "-".join(["segments", *map(str, seeds)])
         self.seeds, self.steps = seeds, training.epochs
         self._knowledge, self._training, self._held_out = knowledge, training, held_out
-        self._given = prepared(knowledge, residuals[0], dataset, training)
+        self._given = prepared(knowledge.strand, residuals[0], dataset, training)
         self._state = started(residuals, training, seeds)
         self._losses = np.zeros((0, len(seeds)))
         self._rates = np.zeros((0, len(seeds)))

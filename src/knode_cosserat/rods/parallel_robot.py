@@ -1,0 +1,335 @@
+"""A parallel continuum robot: elastic legs from linear actuators to one rigid platform.
+
+The layout is that of Stewart and Gough where there are six legs in pairs (Black, Till & Rucker 2018; Till,
+Aloi & Rucker 2019). Symbols as in `rod`, for each leg.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.rods.parameters import ParameterError, parameter
+from knode_cosserat.rods.rod import Rod
+from knode_cosserat.rods.strands import Bundle
+from knode_cosserat.rods.system import History, Layout, Scales, System, in_strands, is_traced
+from knode_cosserat.rotation import cross, dot, rotation_matrix
+
+#: what a leg has of a rod's parameters
+LEG = (
+    "length", "radius", "density", "youngs_modulus", "shear_modulus", "shear_damping", "bending_damping",
+    "drag", "linear_drag", "gravity", "shear_stiffness", "bending_stiffness",
+)  # fmt: skip
+#: numbers of y of one leg, before which of them a field begins: p, h, n, m, q, w
+FIELDS = (3, 7, 10, 13, 16)
+
+
+class Leg(Rod):
+    """The rod between base and platform. Its control is the whole robot's."""
+
+    base_unknowns: ClassVar[tuple[str, ...]] = ("n", "m")
+
+    legs: int = eqx.field(static=True, default=6)
+
+    @property
+    def control_layout(self) -> Layout:  # type: ignore[override]
+        """The robot's."""
+        return displacements(self.legs)
+
+    def strains(
+        self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
+    ) -> Float[Any, " z"]:
+        """v and u (paper eq. 15)."""
+        return self.linear_strains(s, y, control, history)
+
+    def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
+        """C, D, f2 of the material's law."""
+        return self.linear_law(s, y, control)
+
+
+def displacements(count: int) -> Layout:
+    """The control of a robot with so many legs."""
+    return Layout(("displacement", count, "m", "displacement of each leg's base along z"))
+
+
+def _of_rod(name: str) -> Any:
+    """A rod's parameter, as it is stated there."""
+    stated = Leg.__dataclass_fields__[name]
+    given = {} if stated.default is dataclasses.MISSING else {"default": stated.default}
+    return dataclasses.field(metadata=stated.metadata, **given)
+
+
+class ParallelRobot(Bundle):
+    """Legs clamped in actuators that move along z, and clamped again in a rigid platform.
+
+    The base of leg i stands at the angle base_angles[i] on the base's circle, at the height that control i
+    says. On the platform it is at platform_angles[i], with the platform's orientation: legs that are not
+    bent stand straight along z, and the platform lies at height `length`, not turned. The platform is a
+    rigid body whose centre of mass is the centre of its circle of joints.
+
+    `positions` and `quaternions` are those of one line, the robot's axis, which ends in the platform's
+    centre: at every node the mean of where its legs would hold the platform. `leg_positions` has the legs.
+
+    Where the angles or radii of base and platform differ the legs are bent at rest, and `rest` is a guess by
+    the theory of slender beams; a simulation therefore begins in the equilibrium under no control.
+    """
+
+    strand_class: ClassVar[type[System]] = Leg
+    rest_is_guess: ClassVar[bool] = True
+    #: observables of the platform; those of the legs are the strand's
+    velocities: ClassVar[tuple[str, ...]] = ("q", "w")
+
+    length: Any = _of_rod("length")
+    radius: Any = _of_rod("radius")
+    density: Any = _of_rod("density")
+    youngs_modulus: Any = _of_rod("youngs_modulus")
+    base_radius: Any = parameter("m", "radius of the circle on which the legs begin", low=0.0, high=20.0)
+    platform_radius: Any = parameter("m", "radius of the platform's circle of joints", low=0.0, high=20.0)
+    base_angles: Any = parameter(
+        "rad", "angles of the legs on the base, one a leg", shape="list", low=-10.0, high=10.0
+    )
+    platform_angles: Any = parameter(
+        "rad", "angles of the legs on the platform, one a leg", shape="list", low=-10.0, high=10.0
+    )
+    platform_mass: Any = parameter("kg", "mass of the platform", low=0.0, high=1e4)
+    platform_inertia: Any = parameter(
+        "kg m2", "inertia of the platform about its centre; by default of a disc as wide as its joints",
+        shape="matrix", low=0.0, high=1e6, default=None,
+    )  # fmt: skip
+    platform_force: Any = parameter(
+        "N", "load on the platform's centre, global frame", shape="vector", low=-1e6, high=1e6,
+        default=(0.0, 0.0, 0.0),
+    )  # fmt: skip
+    platform_moment: Any = parameter(
+        "N m", "moment on the platform, global frame", shape="vector", low=-1e6, high=1e6,
+        default=(0.0, 0.0, 0.0),
+    )  # fmt: skip
+    shear_modulus: Any = _of_rod("shear_modulus")
+    shear_damping: Any = _of_rod("shear_damping")
+    bending_damping: Any = _of_rod("bending_damping")
+    drag: Any = _of_rod("drag")
+    linear_drag: Any = _of_rod("linear_drag")
+    gravity: Any = _of_rod("gravity")
+    shear_stiffness: Any = _of_rod("shear_stiffness")
+    bending_stiffness: Any = _of_rod("bending_stiffness")
+
+    def __check_init__(self) -> None:
+        base, platform = np.shape(self.base_angles), np.shape(self.platform_angles)
+        if base != platform:
+            raise ParameterError(
+                f"there are {base[-1]} base_angles and {platform[-1]} platform_angles; "
+                "allowed is one of each for every leg"
+            )
+
+    # what follows from the parameters
+
+    @property
+    def strands(self) -> int:
+        """How many legs there are."""
+        return np.shape(self.base_angles)[-1]
+
+    @property
+    def strand(self) -> Leg:
+        """The equations along every leg."""
+        return Leg(**{name: getattr(self, name) for name in LEG}, legs=self.strands, nodes=self.nodes)
+
+    @property
+    def control_layout(self) -> Layout:  # type: ignore[override]
+        """One displacement per leg."""
+        return displacements(self.strands)
+
+    @property
+    def inertia(self) -> Float[Any, "3 3"]:
+        """The platform's inertia about its centre, in its frame (kg m²)."""
+        if self.platform_inertia is not None:
+            return self.platform_inertia
+        return self.platform_mass * self.platform_radius**2 / 4.0 * np.diag([1.0, 1.0, 2.0])
+
+    @property
+    def joints(self) -> Float[Any, "legs 3"]:
+        """Where the legs end, from the platform's centre and in its frame (m)."""
+        return _on_circle(self.platform_radius, self.platform_angles)
+
+    # the state of each leg
+
+    def legs(self, y: Float[Any, "*n y"]) -> list[Any]:
+        """p, h, n, m, q and w (…, legs, size) of states y."""
+        return _split(in_strands(self, y))
+
+    def leg_positions(self, y: Any) -> Any:
+        """Positions (…, legs, 3) of the legs' points, in m, of states y (…, y)."""
+        return self.legs(y)[0]
+
+    def leg_quaternions(self, y: Any) -> Any:
+        """Orientations (…, legs, 4) of the legs' points, scalar first, of states y (…, y)."""
+        return self.legs(y)[1]
+
+    def positions(self, y: Any) -> Any:
+        """The robot's axis (…, 3) in m, of states y (…, y); at the tip, the platform's centre."""
+        numeric: Any = jnp if is_traced((self, y)) else np
+        p, h, *_ = self.legs(y)
+        w, x = h[..., :1], h[..., 1:]
+        joints = numeric.asarray(self.joints)
+        # each robot of a batch has its own
+        lead = joints.shape[:-2] + (1,) * (p.ndim - joints.ndim)
+        joints = numeric.broadcast_to(joints.reshape(*lead, *joints.shape[-2:]), p.shape)
+        across = numeric.cross(x, joints)
+        k = 2.0 / numeric.sum(h * h, axis=-1, keepdims=True)
+        arms = joints + k * (w * across + numeric.cross(x, across))
+        return numeric.mean(p - arms, axis=-2)
+
+    def quaternions(self, y: Any) -> Any:
+        """Mean orientations of the legs (…, 4), scalar first, of states y. At the tip, the platform's."""
+        numeric: Any = jnp if is_traced((self, y)) else np
+        h = self.legs(y)[1]
+        h = h / numeric.sqrt(numeric.sum(h * h, axis=-1, keepdims=True))
+        same = numeric.sum(h * h[..., :1, :], axis=-1, keepdims=True) >= 0.0
+        total = numeric.sum(numeric.where(same, h, -h), axis=-2)
+        return total / numeric.sqrt(numeric.sum(total * total, axis=-1, keepdims=True))
+
+    def platform_position(self, y: Any) -> Any:
+        """The platform's centre (…, 3) in m, of the robot's states y (…, nodes, y)."""
+        return self.positions(y[..., -1, :])
+
+    def platform_orientation(self, y: Any) -> Any:
+        """The platform's orientation (…, 4), scalar first, of the robot's states y (…, nodes, y)."""
+        return self.quaternions(y[..., -1, :])
+
+    # the two ends, and rest
+
+    def rest(self, s: Any) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
+        """Where the joints face each other, straight and unloaded; else about as slender beams would bend."""
+        L, EI, count = self.length, self.strand.Kbt[0, 0], self.strands
+        begin, end = _on_circle(self.base_radius, self.base_angles), self.joints
+        facing, off = jnp.sum(begin * end), jnp.sum(begin[:, 1] * end[:, 0] - begin[:, 0] * end[:, 1])
+        # the turn of the platform that brings its joints nearest to the base's, where there is one
+        known = facing**2 + off**2 > 0.0
+        turn = jnp.where(known, jnp.arctan2(off, jnp.where(known, facing, 1.0)), 0.0)
+        x, y = end[:, 0], end[:, 1]
+        c, d = jnp.cos(turn), jnp.sin(turn)
+        away = jnp.stack([c * x - d * y, d * x + c * y], axis=1) - begin[:, :2]
+        part = jnp.asarray(s / L, dtype=float)
+        moved, slope = part * part * (3.0 - 2.0 * part), 6.0 * part * (1.0 - part) / L
+        bent, sheared = (6.0 - 12.0 * part) / L**2, 12.0 / L**3
+        zero, one = jnp.zeros(count), jnp.ones(count)
+        twist = 0.5 * turn * part
+        p = jnp.concatenate([begin[:, :2] + moved * away, (s * one)[:, None]], axis=1)
+        across = jnp.stack([-away[:, 1], away[:, 0]], axis=1)
+        h = jnp.concatenate(
+            [(jnp.cos(twist) * one)[:, None], 0.5 * slope * across, (jnp.sin(twist) * one)[:, None]], axis=1
+        )
+        n = jnp.concatenate([EI * sheared * away, zero[:, None]], axis=1)
+        m = jnp.concatenate([EI * bent * across, zero[:, None]], axis=1)
+        v = jnp.tile(self.strand.v_star, (count, 1))
+        state = jnp.concatenate([p, h, n, m, jnp.zeros((count, 6))], axis=1)
+        return state.reshape(-1), jnp.concatenate([v, m / EI], axis=1).reshape(-1)
+
+    def base(self, t: Any, control: Any, unknowns: Float[Any, " k"], history: History) -> Float[Any, " y"]:
+        """The actuators' places and velocities along z."""
+        count = self.strands
+        height = jnp.asarray(control)
+        speed = history.c0 * height + self.legs(history.y)[0][:, 2]
+        zero = jnp.zeros(count)
+        p = _on_circle(self.base_radius, self.base_angles) + height[:, None] * np.array([0.0, 0.0, 1.0])
+        h = jnp.tile(np.array([1.0, 0.0, 0.0, 0.0]), (count, 1))
+        q = jnp.stack([zero, zero, speed], axis=1)
+        own = in_strands(self, unknowns)
+        return jnp.concatenate([p, h, own, q, jnp.zeros((count, 3))], axis=1).reshape(-1)
+
+    def tip(self, t: Any, control: Any, y: Float[Any, " y"], history: History) -> Float[Any, " k"]:
+        """The platform's equations of motion, and that all legs hold it in the first one's pose."""
+        p, h, n, m, _, _ = self.legs(y)
+        R, M = rotation_matrix(h[0]), self.platform_mass
+        arms = jax.vmap(lambda joint: dot(R, joint))(self.joints)
+        acceleration, momentum_rate = self._inertial(y, history.c0 * y + history.y)
+        force = M * (self.gravity - dot(R, acceleration)) + self.platform_force - jnp.sum(n, axis=0)
+        twisting = jnp.sum(m + jax.vmap(cross)(arms, n), axis=0)
+        moment = self.platform_moment - dot(R, momentum_rate) - twisting
+        centres = p - arms
+        gaps = centres[1:] - centres[0]
+        turns = jax.vmap(lambda other: _turn(h[0], other))(h[1:])
+        return jnp.concatenate([force, moment, jnp.concatenate([gaps, turns], axis=1).reshape(-1)])
+
+    def _inertial(self, y: Any, y_t: Any) -> tuple[Any, Any]:
+        """Acceleration of the platform's centre and rate of its spin's momentum, both in its frame.
+
+        Of the mean of the legs' velocities: on a coarse grid these differ a little, and none counts more.
+        """
+        q, w = self._velocity(y)
+        q_t, w_t = self._velocity(y_t)
+        inertia = self.inertia
+        return q_t + cross(w, q), dot(inertia, w_t) + cross(w, dot(inertia, w))
+
+    def _velocity(self, y: Any) -> tuple[Any, Any]:
+        """Velocity of the platform's centre and angular velocity, both in its frame; or their rates."""
+        *_, q, w = self.legs(y)
+        w = jnp.mean(w, axis=0)
+        return jnp.mean(q, axis=0) - cross(w, jnp.mean(jnp.asarray(self.joints), axis=0)), w
+
+    @property
+    def tip_layout(self) -> Layout:
+        """Force and moment on the platform, and how far the legs' tips are from where the first has them."""
+        gaps = [
+            field
+            for k in range(2, self.strands + 1)
+            for field in (
+                (f"gap{k}", 3, "m", f"distance of leg {k}'s tip from its joint"),
+                (f"turn{k}", 3, "rad", f"turn of leg {k}'s tip from the platform"),
+            )
+        ]
+        return Layout(
+            ("force", 3, "N", "force on the platform, global frame", "h1", "N"),
+            ("moment", 3, "N m", "moment on the platform, global frame", "h1", "N m"),
+            *gaps,
+        )
+
+    def scales(self) -> Scales:
+        """A leg's, for each; of the conditions a leg's force and moment, its length, and one radian."""
+        leg = self.strand.scales()
+        gaps = jnp.concatenate([jnp.full(3, self.length), jnp.ones(3)])
+        rest = jnp.tile(gaps, self.strands - 1)
+        return Scales(jnp.tile(leg.y, self.strands), jnp.concatenate([leg.tip, rest]))
+
+    # what learning looks at
+
+    @property
+    def observable_layout(self) -> Layout:
+        """The platform's motion, in its frame; the legs' own observables are the strand's."""
+        return Layout(
+            ("acceleration", 3, "m/s2", "acceleration of the platform"),
+            ("spin", 3, "1/s2", "rate of the platform's angular velocity, as a rigid body's"),
+            ("q", 3, "m/s", "velocity of the platform"),
+            ("w", 3, "rad/s", "angular velocity of the platform"),
+        )
+
+    def observables(self, s: Any, y: Any, y_t: Any, z: Any, z_t: Any, control: Any) -> Float[Any, " o"]:
+        """See `observable_layout`."""
+        q, w = self._velocity(y)
+        q_t, w_t = self._velocity(y_t)
+        return jnp.concatenate([q_t + cross(w, q), w_t, q, w])
+
+
+def _split(own: Any) -> list[Any]:
+    """p, h, n, m, q and w of states (…, legs, 19)."""
+    numeric: Any = jnp if is_traced(own) else np
+    return numeric.split(own, FIELDS, axis=-1)
+
+
+def _on_circle(radius: Any, angles: Any) -> Float[Any, "legs 3"]:
+    numeric: Any = jnp if is_traced((radius, angles)) else np
+    radius = numeric.asarray(radius)[..., None]
+    x, y = radius * numeric.cos(angles), radius * numeric.sin(angles)
+    return numeric.stack([x, y, numeric.zeros(numeric.shape(angles))], axis=-1)
+
+
+def _turn(one: Float[Any, "4"], other: Float[Any, "4"]) -> Float[Any, "3"]:
+    """Twice the sine of half the angle from one orientation to the other, times its axis (seen from one)."""
+    a, b = one[0], other[0]
+    vector = a * other[1:] - b * one[1:] - cross(one[1:], other[1:])
+    return 2.0 * vector / jnp.sqrt(jnp.sum(one * one) * jnp.sum(other * other))
