@@ -58,12 +58,14 @@ def draw_rods(figure: Any, axes: Any, trajectory: Trajectory, count: int) -> Non
         raise ValueError("the trajectory has no valid row to draw")
     shown = valid[np.unique(np.linspace(0, len(valid) - 1, count).round().astype(int))]
     colours = ScalarMappable(Normalize(time[0], time[-1]), TIME_COLOURS)
+    curves = [np.asarray(curve) for curve in trajectory.system.curves(one_of(trajectory).y)]
     for row in shown:
-        axes.plot(*position[row].T, color=colours.to_rgba(time[row]), linewidth=2.0, solid_capstyle="round")
+        for curve in curves:
+            axes.plot(*curve[row].T, color=colours.to_rgba(time[row]), linewidth=2.0, solid_capstyle="round")
     label = "path of the tip" if len(time) > 1 else None
     axes.plot(*position[:, -1].T, color="#777777", linewidth=0.9, label=label)
     axes.plot(*position[shown[0], :1].T, "s", color="#333333", markersize=5, label="base")
-    equal_scales(axes, position[valid])
+    equal_scales(axes, np.concatenate([curve[valid] for curve in curves], axis=1))
     axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
     axes.legend(loc="upper left")
     if len(time) > 1:

@@ -166,6 +166,10 @@ class KNODE(System):
         """The knowledge's."""
         return self.knowledge.positions(y)
 
+    def curves(self, y: Any) -> list[Any]:
+        """The knowledge's."""
+        return self.knowledge.curves(y)
+
     def quaternions(self, y: Any) -> Any:
         """The knowledge's."""
         return self.knowledge.quaternions(y)

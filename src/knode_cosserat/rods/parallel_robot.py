@@ -166,6 +166,13 @@ class ParallelRobot(Bundle):
         """Positions (…, legs, 3) of the legs' points, in m, of states y (…, y)."""
         return self.legs(y)[0]
 
+    def curves(self, y: Any) -> list[Any]:
+        """Every leg, and the platform: the polygon of its joints."""
+        legs = np.moveaxis(np.asarray(self.leg_positions(y)), -2, 0)
+        order = np.argsort(np.asarray(self.platform_angles) % (2.0 * np.pi))
+        joints = np.moveaxis(legs[np.append(order, order[0]), ..., -1, :], 0, -2)
+        return [*legs, joints]
+
     def leg_quaternions(self, y: Any) -> Any:
         """Orientations (…, legs, 4) of the legs' points, scalar first, of states y (…, y)."""
         return self.legs(y)[1]

@@ -314,6 +314,10 @@ class System(eqx.Module):
         """Positions (…, 3) in metres of states y (…, y)."""
         return self._named(y, "p", "position")
 
+    def curves(self, y: Any) -> list[Any]:
+        """What is drawn of the states y (…, N, y) of one robot: lines (…, points, 3) in m; by default the rod."""
+        return [np.asarray(self.positions(y))]
+
     def quaternions(self, y: Any) -> Any:
         """Orientations (…, 4), scalar first, of states y (…, y)."""
         return self._named(y, "h", "orientation")
