@@ -12,6 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.linear import Decoupled
 from knode_cosserat.solvers.march import Past, Rows, coefficient_table, march_many, march_one
 from knode_cosserat.solvers.recovery import Outcome, recover
 from knode_cosserat.solvers.result import Result
@@ -23,6 +24,8 @@ from knode_cosserat.solvers.time import Static
 CHUNK = 16
 #: what every run of one robot has room for: short ones, and equilibria, then share a program
 LEAST_CAPACITY = 128
+#: steps that need the stable elimination before a run changes to it, which costs a program
+ENOUGH_RESCUES = 2
 #: how far segments are divided when they are too long to be stable
 MOST_NODES = 400
 
@@ -121,15 +124,15 @@ def _with_finer_segments(
 def _with_recovery(
     task: Task, system: System, controls: np.ndarray, start: Start, progress: bool
 ) -> tuple[Steps, str]:
-    past, total, table = start.past, task.steps, task.table
+    past, total, table, settings = start.past, task.steps, task.table, task.settings
     padded = _padded(controls, least=LEAST_CAPACITY)
     piece = max(1, total // 100) if progress else total
     rows: Steps | None = None
-    done = 0
+    done = rescues = 0
     with tqdm(total=total, disable=not progress, unit="step", leave=False) as bar:
         while done < total:
             stop = min(total, done + piece)
-            reached, past, new = march_one(system, task.settings, table, padded, task.dt, past, done, stop)
+            reached, past, new = march_one(system, settings, table, padded, task.dt, past, done, stop)
             reached = int(reached)
             rows = _merged(rows, new, done, reached, total)
             if reached < stop:
@@ -146,6 +149,9 @@ def _with_recovery(
                 if not outcome.result.solved:
                     return rows, outcome.cause
                 reached += 1
+                rescues += outcome.result is Result.RECOVERED_STABLE_ELIMINATION
+                if rescues == ENOUGH_RESCUES:
+                    settings = dataclasses.replace(settings, elimination=Decoupled())
             bar.update(reached - done)
             done = reached
     assert rows is not None

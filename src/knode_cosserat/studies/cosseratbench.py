@@ -3,7 +3,8 @@
 A scenario says physics only; here it becomes a `SlenderRod` for each of its rods, and the rod's states become the
 frames that are asked for. What is chosen of the numerics:
 
-- Arclength: RK4, one segment for each element.
+- Arclength: RK4, with as many segments in an element as keep what grows or decays along the rod (bending under
+  tension, waves within a time step, twist) below e^½ in each.
 - A quasi-static scenario in which nothing is driven has one equilibrium, and that is what is solved for: the
   first frame is the shape given, every other the equilibrium.
 - A quasi-static scenario with a driven end is a motion, under a drag that would damp its slowest vibration
@@ -29,6 +30,8 @@ from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
 import knode_cosserat as kc
+from knode_cosserat.rods.ends import AXES
+from knode_cosserat.studies.shapes import resting
 
 #: steps of one call, so that every run of a rod shares one program
 CHUNK = 128
@@ -36,7 +39,9 @@ CHUNK = 128
 PERIOD_ERROR = 1e-5
 #: almost the trapezoidal rule: what it damps of a slow vibration is far below its error in time
 SCHEME = kc.BDFAlpha(-0.45)
-#: points for each element at which the tangent and the curvature of the given shape are taken
+#: growth of what grows along the rod, as an exponent, that one segment may have
+STEEPEST = 0.5
+#: points for each segment at which the tangent and the curvature of the given shape are taken
 FINER = 10
 
 
@@ -52,15 +57,13 @@ class KnodeCosserat:
 
     def settings(self, scenario: Scenario, *, n_elements: int, n_frames: int) -> dict[str, Any]:
         """The numerics chosen for a run, to be shown beside its result."""
-        if _at_rest(scenario):
-            return {"space": "rk4", "time": "equilibrium"}
-        interval = scenario.duration / (n_frames - 1)
-        return {
-            "space": "rk4",
-            "time": f"bdf-alpha({SCHEME.alpha})",
-            "time_step": interval / self._steps(scenario, interval),
-            "drag_rate": _drag_rate(scenario),
-        }
+        dt = self._time_step(scenario, scenario.duration / (n_frames - 1))
+        segments = max(_segments(rod, scenario, n_elements, dt) for rod in scenario.rods)
+        chosen: dict[str, Any] = {"space": "rk4", "segments_per_element": segments}
+        if dt is None:
+            return chosen | {"time": "equilibrium"}
+        drag = _drag_rate(scenario)
+        return chosen | {"time": f"bdf-alpha({SCHEME.alpha})", "time_step": dt, "drag_rate": drag}
 
     def run(self, scenario: Scenario, *, n_elements: int, n_frames: int) -> Trajectory:
         """Positions (n_frames, n_elements + 1, 3) and directors of every rod; see the module.
@@ -70,14 +73,16 @@ class KnodeCosserat:
             NotImplementedError: of the scenario something is outside the model.
         """
         times = np.linspace(0.0, scenario.duration, n_frames)
-        steps = self._steps(scenario, times[1])
-        shapes = [_frames(rod, scenario, times, steps, n_elements) for rod in scenario.rods]
+        dt = self._time_step(scenario, times[1])
+        shapes = [_frames(rod, scenario, times, dt, n_elements) for rod in scenario.rods]
         return Trajectory(times, *(tuple(each) for each in zip(*shapes, strict=True)))
 
-    def _steps(self, scenario: Scenario, interval: float) -> int:
-        """Steps from frame to frame; the trapezoidal rule's period is off by (ω dt)² / 12."""
+    def _time_step(self, scenario: Scenario, interval: float) -> float | None:
+        """A part of the interval between frames, or none at rest; the period is off by (ω dt)² / 12."""
+        if scenario.quasi_static and not any(rod.motion(end) for rod in scenario.rods for end in End):
+            return None
         dt = self.time_step_scale * math.sqrt(12.0 * PERIOD_ERROR) / scenario.slowest_frequency()
-        return math.ceil(interval / dt)
+        return interval / math.ceil(interval / dt)
 
 
 class Shape(NamedTuple):
@@ -89,14 +94,14 @@ class Shape(NamedTuple):
     u: np.ndarray
 
     @classmethod
-    def of(cls, rod: Rod, n_elements: int) -> Shape:
+    def of(cls, rod: Rod, segments: int) -> Shape:
         """From the scenario's polyline; the rod starts without shear and, as the suite has it, without twist."""
         points = np.asarray(rod.centerline, dtype=float)
         along = rod.rest_arc_length
         if along is None:
             along = (0.0, *np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
         curve = make_interp_spline(along, points, k=min(3, len(points) - 1))
-        s = np.linspace(0.0, along[-1], FINER * n_elements + 1)
+        s = np.linspace(0.0, along[-1], FINER * segments + 1)
         tangent = curve(s, 1)
         stretch = np.linalg.norm(tangent, axis=1, keepdims=True)
         tangent /= stretch
@@ -114,27 +119,39 @@ class Shape(NamedTuple):
         return cls(*(each[::FINER] for each in (curve(s), h, v, u)))
 
 
-def _frames(rod: Rod, scenario: Scenario, times: np.ndarray, steps: int, n_elements: int) -> Any:
-    """Positions and directors of one rod at these times."""
-    shape = Shape.of(rod, n_elements)
+def _frames(rod: Rod, scenario: Scenario, times: np.ndarray, dt: float | None, n_elements: int) -> Any:
+    """Positions and directors of one rod at these times, in steps of dt or at rest."""
+    segments = _segments(rod, scenario, n_elements, dt)
+    shape = Shape.of(rod, segments * n_elements)
     system = _system(rod, scenario, shape)
-    start = _start(system, shape)
+    start = resting(system, *shape)
     try:
-        if _at_rest(scenario):
+        if dt is None:
             still = kc.equilibrium(system, start.control[0], space="rk4", initial=start)
             states = np.repeat(np.asarray(still.y), len(times), axis=0)
         else:
-            states = _motion(system, start, rod, times, steps)
+            states = _motion(system, start, rod, times, dt)
     except kc.SimulationError as error:
         raise Diverged(str(error), error.time) from error
+    states = states[:, ::segments]
     position, directors = np.array(system.positions(states)), _directors(system, states)
     position[0], directors[0] = rod.nodes(n_elements), rod.directors(n_elements)
     return position, directors
 
 
-def _at_rest(scenario: Scenario) -> bool:
-    """Whether the result is one equilibrium."""
-    return scenario.quasi_static and not any(rod.motion(end) for rod in scenario.rods for end in End)
+def _segments(rod: Rod, scenario: Scenario, n_elements: int, dt: float | None) -> int:
+    """How many RK4 makes of an element: the steepest exponential along the rod decides."""
+    EI = rod.material.youngs_modulus * rod.second_moment_of_area
+    mass = rod.material.density * rod.area
+    weight = mass * rod.length * np.linalg.norm(scenario.gravity)
+    pull = weight + sum(np.linalg.norm(load.force) for load in rod.loads)
+    rate = math.sqrt(pull / EI)
+    if dt is not None:
+        # waves from one time step to the next: EI w_ssss + ρA c0² w = 0
+        rate = max(rate, (mass * SCHEME.coefficients(dt, dt).c0 ** 2 / EI) ** 0.25)
+    for motion in filter(None, (rod.start_motion, rod.end_motion)):
+        rate = max(rate, float(np.linalg.norm(motion.rotation, axis=1).max()) / rod.length)
+    return max(1, math.ceil(rate * rod.length / n_elements / STEEPEST))
 
 
 def _drag_rate(scenario: Scenario) -> float:
@@ -179,10 +196,10 @@ def _end(rod: Rod, which: End, p: np.ndarray, h: np.ndarray) -> Any:
         return kc.ends.Driven(position=p, orientation=h, axes=AXES)
     if which is End.START:
         raise NotImplementedError("a start that slides")
-    return kc.ends.Driven(position=p, orientation=h, axes=AXES, slides=_axis(motion))
+    return kc.ends.Sliding(position=p, orientation=h, axes=AXES, along=_axis(motion))
 
 
-AXES = ("x", "y", "z", "rx", "ry", "rz")
+
 
 
 def _axis(motion: Motion) -> str:
@@ -193,32 +210,18 @@ def _axis(motion: Motion) -> str:
     return AXES[int(np.argmax(along))]
 
 
-def _start(system: kc.SlenderRod, shape: Shape) -> kc.Trajectory:
-    """The rod at rest in its given shape, with the loads that this takes of its material."""
-    frames = Rotation.from_quat(shape.h, scalar_first=True)
-    n = frames.apply((shape.v - [0.0, 0.0, 1.0]) @ np.asarray(system.Kse).T)
-    m = frames.apply(shape.u @ np.asarray(system.Kbt).T)
-    still = np.zeros((len(shape.p), 6))
-    y = np.concatenate([shape.p, shape.h, n, m, still], axis=1)
-    z = np.concatenate([shape.v, shape.u], axis=1)
-    row = np.zeros(1)
-    return kc.Trajectory(
-        system, None, row, y[None], z[None], np.zeros((1, system.control_size)), row.astype(int), row, row.astype(int)
-    )
-
-
 def _motion(
-    system: kc.SlenderRod, start: kc.Trajectory, rod: Rod, times: np.ndarray, steps: int
+    system: kc.SlenderRod, start: kc.Trajectory, rod: Rod, times: np.ndarray, dt: float
 ) -> np.ndarray:
-    """States at these times, `steps` steps apart."""
-    total = steps * (len(times) - 1)
-    dt = (times[-1] - times[0]) / total
-    controls = _controls(rod, dt * (1.0 + np.arange(total)))
+    """States at these times, in steps of dt."""
+    steps = round(times[1] / dt)
+    controls = _controls(rod, dt * (1.0 + np.arange(steps * (len(times) - 1))))
     states, going = [np.asarray(start.y)], start
-    for first in range(0, total, CHUNK):
+    for first in range(0, len(controls), CHUNK):
         going = kc.simulate(
-            system, controls[first : first + CHUNK], dt, time=SCHEME, space="rk4", start="consistent", initial=going
-        )
+            system, controls[first : first + CHUNK], dt, time=SCHEME, space="rk4", start="consistent",
+            initial=going,
+        )  # fmt: skip
         states.append(np.asarray(going.y)[1:])
     return np.concatenate(states)[::steps]
 
