@@ -1,6 +1,6 @@
-"""Rods whose shape is known in closed form: how far the solver's is from it. For tests and for docs/validation.md.
+"""Rods of which something is known in closed form: how far the solver is from it.
 
-All rods have the length 1 m and the bending stiffness of `rod()`; loads are in its natural units, EI / L² and EI / L.
+For tests and for docs/validation.md. Rods are 1 m long; loads are in natural units, EI / L² and EI / L.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from benchmarks.buckling import critical_load
 from knode_cosserat.rods.section import Differences, FunctionSection
 from knode_cosserat.studies.shapes import resting
 
-LENGTH, RADIUS, YOUNGS_MODULUS, DENSITY = 1.0, 1e-3, 3e9, 1200.0
+#: so thin that its rotary inertia does not show
+LENGTH, RADIUS, YOUNGS_MODULUS, DENSITY = 1.0, 1e-4, 3e9, 1200.0
 AREA, EI = np.pi * RADIUS**2, YOUNGS_MODULUS * np.pi * RADIUS**4 / 4
 FORCE, MOMENT = EI / LENGTH**2, EI / LENGTH
 #: of a rod that neither shears nor stretches
@@ -30,22 +31,26 @@ NEWTON = kc.NewtonOptions(tolerance=1e-13)
 UP = np.array([1.0, 0.0, 0.0, 0.0])
 
 
-def rod(nodes: int, *, force: Any = (0, 0, 0), moment: Any = (0, 0, 0), even: Any = (0, 0, 0), **changes: Any) -> Any:
-    """Clamped at its foot, upright, with a force and a moment at its tip and an even load; resists twist as bending."""
+def rod(
+    nodes: int, *, force: Any = (0, 0, 0), moment: Any = (0, 0, 0), even: Any = (0, 0, 0), **changes: Any
+) -> Any:
+    """Clamped at its foot, upright, loaded at its tip and evenly; it resists twist as it does bending."""
     loads = (
         kc.loads.PointWrench(force=np.multiply(force, FORCE), moment=np.multiply(moment, MOMENT)),
         kc.loads.DistributedWrench(force=np.multiply(even, FORCE / LENGTH)),
     )
     parameters = {
         "length": LENGTH, "radius": RADIUS, "youngs_modulus": YOUNGS_MODULUS, "density": DENSITY,
-        "gravity": (0.0, 0.0, 0.0), "shear_stiffness": (RIGID, RIGID, RIGID), "bending_stiffness": (EI, EI, EI),
+        "gravity": (0, 0, 0), "shear_stiffness": (RIGID, RIGID, RIGID), "bending_stiffness": (EI, EI, EI),
     }  # fmt: skip
     return kc.SlenderRod(nodes=nodes, loads=loads, **{**parameters, **changes})
 
 
 def positions(robot: Any, space: str, control: Any = (), initial: Any = None) -> np.ndarray:
     """Of the nodes at rest (nodes, 3)."""
-    found = kc.equilibrium(robot, np.asarray(control, dtype=float), space=space, newton=NEWTON, initial=initial)
+    found = kc.equilibrium(
+        robot, np.asarray(control, dtype=float), space=space, newton=NEWTON, initial=initial
+    )
     return np.asarray(found.position[0])
 
 
@@ -162,7 +167,10 @@ STATICS = {
     "half circle": Case("tip moment: half a circle", bent_by_moment((0, np.pi, 0))),
     "circle": Case("tip moment: a full circle", bent_by_moment((0, 2 * np.pi, 0))),
     "helix": Case("bending and twisting moment: a helix", bent_by_moment((3, -1, 4))),
-    **{f"elastica {load}": Case(f"elastica, F L²/EI = {load}", elastica(load)) for load in closed_forms.ELASTICA},
+    **{
+        f"elastica {load}": Case(f"elastica, F L²/EI = {load}", elastica(load))
+        for load in closed_forms.ELASTICA
+    },
     "tendon": Case("straight tendon: a circle", tendon_circle),
     "catenary": Case("between two pins: the catenary", catenary),
 }
@@ -215,12 +223,13 @@ BUCKLING = {
 
 # vibration
 
-#: steps of a period, and of a run
+BDF2 = kc.BDF2()
+#: steps of a period, of a run, and of the time in which it settles
 PERIOD_STEPS, STEPS, SETTLED = 16, 96, 32
 
 
-def swinging(mode: int, nodes: int, space: str = "rk4", scheme: Any = kc.BDF2()) -> tuple[np.ndarray, float]:
-    """How much of a mode of a clamped and free rod is in every row, let go from its shape, and the time step."""
+def swinging(mode: int, nodes: int, space: str = "rk4", scheme: Any = BDF2) -> tuple[np.ndarray, float]:
+    """How much of a mode is in every row of a rod that is let go from its shape, and the time step."""
     robot = rod(nodes)
     part = np.linspace(0, 1, nodes)
     shape, slope = (1e-4 * each for each in closed_forms.mode_shape(mode, part))
@@ -253,9 +262,8 @@ def frequency_error(mode: int) -> Callable[[int, str], float]:
     """Relative error of a mode's frequency."""
 
     def error(nodes: int, space: str) -> float:
-        scheme = kc.BDF2()
-        amplitude, dt = swinging(mode, nodes, space, scheme)
-        found = rate(amplitude[SETTLED:], dt, scheme)
+        amplitude, dt = swinging(mode, nodes, space)
+        found = rate(amplitude[SETTLED:], dt, BDF2)
         return abs(found.imag) / closed_forms.frequency(mode, LENGTH, EI, DENSITY * AREA) - 1
 
     return error

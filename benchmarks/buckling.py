@@ -1,9 +1,9 @@
 """The load at which an equilibrium of a rod loses its stability, as the solver's own equations have it.
 
-At an equilibrium the linearised equations say what the base's unknowns do to the tip's conditions, A = ∂tip/∂ξ.
+At an equilibrium the linearised equations say what the base's unknowns do to the tip's: A = ∂tip/∂ξ.
 Where A is singular a second equilibrium branches off, or the path turns. The load where that is comes from
-successive linear problems (Ruhe 1973): (A + μ dA/dload) ξ = 0, load += μ. They converge fast to multiple roots
-too, which a round rod has by symmetry, and at which the determinant touches zero without changing its sign.
+successive linear problems (Ruhe 1973), (A + μ dA/dload) ξ = 0, load += μ. They converge fast to multiple
+roots too, which a round rod has by symmetry: there the determinant touches zero and keeps its sign.
 """
 
 from __future__ import annotations

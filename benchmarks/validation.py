@@ -1,4 +1,4 @@
-"""`python -m benchmarks.validation`: the tables and pictures of docs/validation.md, written in their places."""
+"""`python -m benchmarks.validation`: the tables and pictures of docs/validation.md, put in their places."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.ticker import NullLocator
 
 import knode_cosserat as kc
 from benchmarks import beams, closed_forms
@@ -19,7 +20,7 @@ from benchmarks.buckling import tip_response
 
 DOCS = Path(__file__).parents[1] / "docs"
 GRID = (10, 20, 40)
-#: cases whose order by Euler is shown too; the others are as much the same program as takes longest to compile
+#: cases that are shown by Euler too: of one program
 EULER = ("even load", "half circle", "circle", "helix", "elastica 1", "elastica 10")
 #: below this what is left is rounding, and has no order
 EXACT = 1e-8
@@ -52,7 +53,7 @@ def convergence(families: dict[str, dict[str, list[float]]], path: Path) -> None
             if max(np.abs(found)) > EXACT:
                 ax.loglog(GRID, np.abs(found), "o-", ms=4, lw=1.2, label=name)
         ax.set(title=title, xlabel="nodes", ylabel="relative error", xticks=GRID)
-        ax.minorticks_off()
+        ax.xaxis.set_minor_locator(NullLocator())
         ax.set_xticklabels([str(nodes) for nodes in GRID])
         slope = 1 if "Euler" in title else 4
         largest = max(abs(each[0]) for each in family.values())
@@ -68,14 +69,18 @@ def shapes(path: Path) -> None:
     """Closed forms as lines, the solver's nodes as dots."""
     figure, axes = plt.subplots(1, 3, figsize=(12.6, 4.0), layout="constrained")
     nodes = 20
-    fine, s = np.linspace(0, 1, 400), np.linspace(0, 1, nodes)
+    fine = np.linspace(0, 1, 400)
     for load in closed_forms.ELASTICA:
         found = beams.positions(beams.rod(nodes, force=(load, 0, 0)), "rk4")
         (dots,) = axes[0].plot(found[:, 0], found[:, 2], ".-", lw=0.8, label=f"F L²/EI = {load}")
         deflection, shortening = closed_forms.elastica(load)
         axes[0].plot(deflection, 1 - shortening, "o", mfc="none", ms=10, color=dots.get_color())
-    axes[0].set(title="elastica; circles: the tip by elliptic integrals", xlabel="x / L", ylabel="z / L")
-    for name, moment in (("half circle", (0, np.pi, 0)), ("circle", (0, 2 * np.pi, 0)), ("helix", (3, -1, 4))):
+    axes[0].set(title="elastica; circles: exact tips", xlabel="x / L", ylabel="z / L")
+    for name, moment in (
+        ("half circle", (0, np.pi, 0)),
+        ("circle", (0, 2 * np.pi, 0)),
+        ("helix", (3, -1, 4)),
+    ):
         exact = closed_forms.helix(np.multiply(moment, beams.MOMENT), fine, beams.EI)
         found = beams.positions(beams.rod(nodes, moment=moment), "rk4")
         (line,) = axes[1].plot(exact[:, 0], exact[:, 2], lw=1, label=name)
@@ -94,7 +99,6 @@ def shapes(path: Path) -> None:
         ax.grid(alpha=0.3)
     figure.savefig(path, dpi=130)
     plt.close(figure)
-    del s
 
 
 def dynamics(path: Path) -> None:
@@ -112,8 +116,10 @@ def dynamics(path: Path) -> None:
     axes[0].set(title="upright column", xlabel="ρ A g L³ / EI", ylabel="smallest singular value of ∂tip/∂ξ")
     axes[0].legend(fontsize=8)
     for scheme, name in ((kc.BDF2(), "BDF2"), (kc.Trapezoidal(), "trapezoidal")):
-        amplitude, dt = beams.swinging(1, 40, scheme=scheme)
-        axes[1].plot(np.arange(len(amplitude)) / beams.PERIOD_STEPS, amplitude / amplitude[0], lw=1, label=name)
+        amplitude, _ = beams.swinging(1, 40, scheme=scheme)
+        axes[1].plot(
+            np.arange(len(amplitude)) / beams.PERIOD_STEPS, amplitude / amplitude[0], lw=1, label=name
+        )
     axes[1].set(title="first mode, 16 steps a period", xlabel="periods", ylabel="amplitude")
     axes[1].legend(fontsize=8)
     for ax in axes:
@@ -126,18 +132,25 @@ def written(page: Path, tables: dict[str, str]) -> None:
     """Put each table between its marks in the page."""
     text = page.read_text()
     for name, each in tables.items():
-        marks = rf"(<!-- {name} -->\n).*?(\n<!-- end -->)"
-        text, count = re.subn(marks, lambda found, each=each: found[1] + each + found[2], text, flags=re.S)
+        marks = rf"(<!-- {name} -->\n)(?:(?!<!-- end -->).)*"
+        text, count = re.subn(marks, lambda found, each=each: f"{found[1]}{each}\n", text, flags=re.DOTALL)
         if count != 1:
             raise ValueError(f"{page} has {count} places for the table {name!r}; it must have one")
     page.write_text(text)
 
 
-def _all(family: dict[str, beams.Case], space: str, keys: Iterable[str] | None = None) -> dict[str, list[float]]:
+def _all(
+    family: dict[str, beams.Case], space: str, keys: Iterable[str] | None = None
+) -> dict[str, list[float]]:
     found = {}
     for key in keys or family:
         found[key] = errors(family[key], space)
-        print(f"{key:14s} {space:6s}", " ".join(f"{abs(e):.1e}" for e in found[key]), _order(found[key]), flush=True)
+        print(
+            f"{key:14s} {space:6s}",
+            " ".join(f"{abs(e):.1e}" for e in found[key]),
+            _order(found[key]),
+            flush=True,
+        )
     return found
 
 

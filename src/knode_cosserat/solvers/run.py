@@ -75,7 +75,7 @@ def run_one(
 ) -> tuple[Steps, str]:
     """All steps of one robot, and the likely cause if one of them (`result` < 0) could not be solved."""
     steps, cause = _with_recovery(task, system, controls, start, progress)
-    if _trustworthy(steps):
+    if _trustworthy(task, steps, _size(system, start)):
         return steps, cause
     record = start.past.records[0]
     decay = decay_per_segment(system, task.settings, task.table[1], record, controls[0])
@@ -94,9 +94,21 @@ def run_one(
     ).strip()
 
 
-def _trustworthy(steps: Steps) -> bool:
-    """Solved, and not of a size that suggests an instability in space."""
-    return bool(steps.result.min() >= 0 and steps.size.max() <= SUSPICIOUS)
+def _trustworthy(task: Task, steps: Steps, start: float) -> bool:
+    """Solved, and not grown to a size that suggests an instability in space, which only a motion has.
+
+    What hangs like a cable carries forces far beyond its natural ones from the start.
+    """
+    solved = bool(steps.result.min() >= 0)
+    return solved and (
+        isinstance(task.settings.time, Static) or steps.size.max() <= SUSPICIOUS * max(1.0, start)
+    )
+
+
+def _size(system: System, start: Start) -> float:
+    """The largest number of y at the start, in natural units."""
+    y = np.asarray(start.past.records[0])[:, : system.y_layout.size]
+    return float(np.max(np.abs(y) / np.asarray(system.scales().y)))
 
 
 def _with_finer_segments(
@@ -114,7 +126,7 @@ def _with_finer_segments(
 
     past = start.past._replace(records=refined(start.past.records, 1), rate=refined(start.past.rate, 0))
     steps, _ = _with_recovery(task, fine, controls, start._replace(past=past), progress)
-    if not _trustworthy(steps):
+    if not _trustworthy(task, steps, _size(fine, start._replace(past=past))):
         return None
     records = np.ascontiguousarray(steps.records[:, ::parts])
     finer = np.full(task.steps, int(Result.RECOVERED_FINER_SEGMENTS))

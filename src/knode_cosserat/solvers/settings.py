@@ -28,7 +28,7 @@ class Settings:
     start: Start = "paper"
     newton: NewtonOptions = NewtonOptions()
     #: of a correction's linear equations; a run changes to the stable one by itself where it needs it
-    elimination: LinearSolver = Condensed()
+    elimination: LinearSolver = Condensed()  # noqa: RUF009
 
     @classmethod
     def of(cls, time: str | TimeScheme, space: str | SpaceScheme, start: str, newton: NewtonOptions) -> Self:

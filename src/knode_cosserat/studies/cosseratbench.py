@@ -1,10 +1,10 @@
 """This package as a solver of `cosseratbench`, an independent suite of rod scenarios.
 
-A scenario says physics only; here it becomes a `SlenderRod` for each of its rods, and the rod's states become the
-frames that are asked for. What is chosen of the numerics:
+A scenario says physics only; here it becomes a `SlenderRod` for each of its rods, and the rod's states become
+the frames that are asked for. What is chosen of the numerics:
 
-- Arclength: RK4, with as many segments in an element as keep what grows or decays along the rod (bending under
-  tension, waves within a time step, twist) below e^½ in each.
+- Arclength: RK4, with as many segments in an element as keep what grows or decays along the rod (bending
+  under tension, waves within a time step, twist) below e^½ in each.
 - A quasi-static scenario in which nothing is driven has one equilibrium, and that is what is solved for: the
   first frame is the shape given, every other the equilibrium.
 - A quasi-static scenario with a driven end is a motion, under a drag that would damp its slowest vibration
@@ -12,8 +12,8 @@ frames that are asked for. What is chosen of the numerics:
 - Any other scenario is a motion without damping.
 
 Motions are stepped by BDF-α close to the trapezoidal rule, in steps so short that the period of the slowest
-vibration is off by a hundred-thousandth. The suite runs the beginning of every scenario before it measures, so its
-wall times are without compilation.
+vibration is off by a hundred-thousandth. The suite runs the beginning of every scenario before it measures,
+so its wall times are without compilation.
 """
 
 from __future__ import annotations
@@ -35,6 +35,8 @@ from knode_cosserat.studies.shapes import resting
 
 #: steps of one call, so that every run of a rod shares one program
 CHUNK = 128
+#: from frame to frame, so that the run that the suite does not time compiles what a longer one needs
+LEAST_STEPS = 4
 #: error of the period of the slowest vibration that the time step may make
 PERIOD_ERROR = 1e-5
 #: almost the trapezoidal rule: what it damps of a slow vibration is far below its error in time
@@ -82,7 +84,7 @@ class KnodeCosserat:
         if scenario.quasi_static and not any(rod.motion(end) for rod in scenario.rods for end in End):
             return None
         dt = self.time_step_scale * math.sqrt(12.0 * PERIOD_ERROR) / scenario.slowest_frequency()
-        return interval / math.ceil(interval / dt)
+        return interval / max(LEAST_STEPS, math.ceil(interval / dt))
 
 
 class Shape(NamedTuple):
@@ -95,7 +97,7 @@ class Shape(NamedTuple):
 
     @classmethod
     def of(cls, rod: Rod, segments: int) -> Shape:
-        """From the scenario's polyline; the rod starts without shear and, as the suite has it, without twist."""
+        """From the scenario's polyline; the rod starts without shear and, as the suite wants it, twist."""
         points = np.asarray(rod.centerline, dtype=float)
         along = rod.rest_arc_length
         if along is None:
@@ -121,16 +123,16 @@ class Shape(NamedTuple):
 
 def _frames(rod: Rod, scenario: Scenario, times: np.ndarray, dt: float | None, n_elements: int) -> Any:
     """Positions and directors of one rod at these times, in steps of dt or at rest."""
-    segments = _segments(rod, scenario, n_elements, dt)
+    segments, newton = _segments(rod, scenario, n_elements, dt), _newton(rod, scenario)
     shape = Shape.of(rod, segments * n_elements)
     system = _system(rod, scenario, shape)
     start = resting(system, *shape)
     try:
         if dt is None:
-            still = kc.equilibrium(system, start.control[0], space="rk4", initial=start)
+            still = kc.equilibrium(system, start.control[0], space="rk4", initial=start, newton=newton)
             states = np.repeat(np.asarray(still.y), len(times), axis=0)
         else:
-            states = _motion(system, start, rod, times, dt)
+            states = _motion(start, rod, times, dt, newton)
     except kc.SimulationError as error:
         raise Diverged(str(error), error.time) from error
     states = states[:, ::segments]
@@ -143,15 +145,27 @@ def _segments(rod: Rod, scenario: Scenario, n_elements: int, dt: float | None) -
     """How many RK4 makes of an element: the steepest exponential along the rod decides."""
     EI = rod.material.youngs_modulus * rod.second_moment_of_area
     mass = rod.material.density * rod.area
-    weight = mass * rod.length * np.linalg.norm(scenario.gravity)
-    pull = weight + sum(np.linalg.norm(load.force) for load in rod.loads)
-    rate = math.sqrt(pull / EI)
+    rate = math.sqrt(_pull(rod, scenario)) / rod.length
     if dt is not None:
         # waves from one time step to the next: EI w_ssss + ρA c0² w = 0
         rate = max(rate, (mass * SCHEME.coefficients(dt, dt).c0 ** 2 / EI) ** 0.25)
     for motion in filter(None, (rod.start_motion, rod.end_motion)):
         rate = max(rate, float(np.linalg.norm(motion.rotation, axis=1).max()) / rod.length)
     return max(1, math.ceil(rate * rod.length / n_elements / STEEPEST))
+
+
+def _pull(rod: Rod, scenario: Scenario) -> float:
+    """The largest tension that its loads can give the rod, in EI / L²."""
+    EI = rod.material.youngs_modulus * rod.second_moment_of_area
+    weight = rod.material.density * rod.area * rod.length * np.linalg.norm(scenario.gravity)
+    pull = weight + sum(np.linalg.norm(load.force) for load in rod.loads)
+    return float(pull * rod.length**2 / EI)
+
+
+def _newton(rod: Rod, scenario: Scenario) -> kc.NewtonOptions:
+    """Residuals as small beside the loads of a cable as they are, by default, beside EI / L²."""
+    usual, size = kc.NewtonOptions(), max(1.0, _pull(rod, scenario))
+    return kc.NewtonOptions(tolerance=size * usual.tolerance, acceptable=size * usual.acceptable)
 
 
 def _drag_rate(scenario: Scenario) -> float:
@@ -199,9 +213,6 @@ def _end(rod: Rod, which: End, p: np.ndarray, h: np.ndarray) -> Any:
     return kc.ends.Sliding(position=p, orientation=h, axes=AXES, along=_axis(motion))
 
 
-
-
-
 def _axis(motion: Motion) -> str:
     """The global axis that an end slides along."""
     along = np.abs(motion.axis)
@@ -211,7 +222,7 @@ def _axis(motion: Motion) -> str:
 
 
 def _motion(
-    system: kc.SlenderRod, start: kc.Trajectory, rod: Rod, times: np.ndarray, dt: float
+    start: kc.Trajectory, rod: Rod, times: np.ndarray, dt: float, newton: kc.NewtonOptions
 ) -> np.ndarray:
     """States at these times, in steps of dt."""
     steps = round(times[1] / dt)
@@ -219,8 +230,8 @@ def _motion(
     states, going = [np.asarray(start.y)], start
     for first in range(0, len(controls), CHUNK):
         going = kc.simulate(
-            system, controls[first : first + CHUNK], dt, time=SCHEME, space="rk4", start="consistent",
-            initial=going,
+            start.system, controls[first : first + CHUNK], dt, time=SCHEME, space="rk4", start="consistent",
+            initial=going, newton=newton,
         )  # fmt: skip
         states.append(np.asarray(going.y)[1:])
     return np.concatenate(states)[::steps]
