@@ -41,7 +41,7 @@ def test_critical_loads(key):
 @pytest.mark.parametrize("key", of(beams.VIBRATION, "mode 2", "mode 3"))
 def test_frequencies(key):
     errors = [beams.VIBRATION[key].error(nodes, "rk4") for nodes in GRID]
-    assert abs(errors[-1]) < 1e-4
+    assert abs(errors[-1]) < 5e-4
     assert beams.order(errors, GRID) == pytest.approx(4.0, abs=0.2)
 
 
