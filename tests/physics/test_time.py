@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 
 import knode_cosserat as kc
+from benchmarks import closed_forms
 from knode_cosserat.solvers.march import coefficient_table
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.time import Static
@@ -140,19 +141,10 @@ def test_order_in_time(robot, finely_stepped, time, order, start):
 
 # a frequency
 
-BETA = 1.8751040687  # of the first mode of a clamped and free beam, cos β cosh β = -1
-
-
-def first_mode(part):
-    """Its shape at this part of the length."""
-    ratio = (np.cosh(BETA) + np.cos(BETA)) / (np.sinh(BETA) + np.sin(BETA))
-    x = BETA * part
-    return np.cosh(x) - np.cos(x) - ratio * (np.sinh(x) - np.sin(x))
-
 
 def test_free_vibration_of_the_first_mode(robot):
     EI, rhoA = float(robot.Kbt[0, 0]), float(robot.mass_per_length)
-    frequency = BETA**2 * np.sqrt(EI / (rhoA * float(robot.length) ** 4))
+    frequency = closed_forms.frequency(1, float(robot.length), EI, rhoA)
     ratio = 0.01  # of damping to its critical value
     free = robot.replace(
         gravity=(0.0, 0.0, 0.0), drag=0.0, bending_damping=2 * ratio * EI / frequency, nodes=21
@@ -163,7 +155,9 @@ def test_free_vibration_of_the_first_mode(robot):
     swinging = kc.simulate(free, tensions, dt, time="bdf-alpha", space="rk4")
     sideways = swinging.position @ [np.sqrt(0.5), np.sqrt(0.5), 0.0]
     part = np.linspace(0, 1, free.nodes)
-    amplitude = np.trapezoid(sideways * first_mode(part), part, axis=1)[50:]  # higher modes have gone by then
+    amplitude = np.trapezoid(sideways * closed_forms.mode_shape(1, part)[0], part, axis=1)[
+        50:
+    ]  # higher modes have gone by then
 
     # amplitude[i + 1] = a amplitude[i] + b amplitude[i - 1] of a vibration whose steps multiply it by z
     past = np.stack([amplitude[1:-1], amplitude[:-2]], axis=1)

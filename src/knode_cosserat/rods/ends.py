@@ -129,6 +129,25 @@ class Driven(Clamped):
         return Pose(held.p + motion[:3], quaternion_product(quaternion_of(motion[3:]), held.h))
 
 
+class Sliding(Driven):
+    """A driven end at the tip that slides freely along a global axis, under whatever pulls it there."""
+
+    kind: ClassVar[str] = "sliding"
+    conditions: ClassVar[tuple[tuple[Any, ...], ...]] = (
+        ("p", 2, "m", "position at the tip across the axis, global frame"),
+        ("n", 1, "N", "force at the tip along the axis"),
+        _TURN,
+    )
+
+    along: str = choice("the global axis that it slides along", AXES[:3], "z")
+
+    def left(self, held: Pose, y: Pose, n: Any, m: Any) -> Float[Any, " k"]:
+        """As clamped, but with no force along the axis instead of a place on it."""
+        left, k = super().left(held, y, n, m), AXES.index(self.along)
+        across = [i for i in range(3) if i != k]
+        return jnp.concatenate([jnp.stack([left[i] for i in across]), -n[k : k + 1], left[3:]])
+
+
 def velocities(pose: Pose, pose_t: Pose) -> tuple[Any, Any]:
     """q and ω (material frame) of what is at a pose, whose rates are p_t and h_t."""
     h, h_t = pose.h, pose_t.h

@@ -12,7 +12,6 @@ from jaxtyping import Float, Int
 
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import StepProblem, newton
-from knode_cosserat.solvers.linear import Condensed
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import Euler
 from knode_cosserat.solvers.time import BDF1
@@ -128,7 +127,7 @@ def step(system: System, settings: Settings, past: Past, coefficients: Any, cont
     weights = jnp.asarray(EXTRAPOLATIONS)[past.order]
     guess = jnp.sum(weights[:, None, None] * past.records[:, :, :ny], axis=0)
     unknowns = jnp.sum(weights[:, None] * past.unknowns, axis=0)
-    solution = newton(problem, guess, unknowns, Condensed(), settings.newton)
+    solution = newton(problem, guess, unknowns, settings.elimination, settings.newton)
     record = problem.record(solution.y)
     scale = system.scales().y
     misfit = jnp.max(jnp.abs(guesses - solution.y) / scale, axis=(1, 2))

@@ -12,6 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.linear import Decoupled
 from knode_cosserat.solvers.march import Past, Rows, coefficient_table, march_many, march_one
 from knode_cosserat.solvers.recovery import Outcome, recover
 from knode_cosserat.solvers.result import Result
@@ -23,6 +24,8 @@ from knode_cosserat.solvers.time import Static
 CHUNK = 16
 #: what every run of one robot has room for: short ones, and equilibria, then share a program
 LEAST_CAPACITY = 128
+#: steps that need the stable elimination before a run changes to it, which costs a program
+ENOUGH_RESCUES = 2
 #: how far segments are divided when they are too long to be stable
 MOST_NODES = 400
 
@@ -72,7 +75,7 @@ def run_one(
 ) -> tuple[Steps, str]:
     """All steps of one robot, and the likely cause if one of them (`result` < 0) could not be solved."""
     steps, cause = _with_recovery(task, system, controls, start, progress)
-    if _trustworthy(steps):
+    if _trustworthy(task, steps, _size(system, start)):
         return steps, cause
     record = start.past.records[0]
     decay = decay_per_segment(system, task.settings, task.table[1], record, controls[0])
@@ -91,9 +94,21 @@ def run_one(
     ).strip()
 
 
-def _trustworthy(steps: Steps) -> bool:
-    """Solved, and not of a size that suggests an instability in space."""
-    return bool(steps.result.min() >= 0 and steps.size.max() <= SUSPICIOUS)
+def _trustworthy(task: Task, steps: Steps, start: float) -> bool:
+    """Solved, and not grown to a size that suggests an instability in space, which only a motion has.
+
+    What hangs like a cable carries forces far beyond its natural ones from the start.
+    """
+    solved = bool(steps.result.min() >= 0)
+    return solved and (
+        isinstance(task.settings.time, Static) or steps.size.max() <= SUSPICIOUS * max(1.0, start)
+    )
+
+
+def _size(system: System, start: Start) -> float:
+    """The largest number of y at the start, in natural units."""
+    y = np.asarray(start.past.records[0])[:, : system.y_layout.size]
+    return float(np.max(np.abs(y) / np.asarray(system.scales().y)))
 
 
 def _with_finer_segments(
@@ -111,7 +126,7 @@ def _with_finer_segments(
 
     past = start.past._replace(records=refined(start.past.records, 1), rate=refined(start.past.rate, 0))
     steps, _ = _with_recovery(task, fine, controls, start._replace(past=past), progress)
-    if not _trustworthy(steps):
+    if not _trustworthy(task, steps, _size(fine, start._replace(past=past))):
         return None
     records = np.ascontiguousarray(steps.records[:, ::parts])
     finer = np.full(task.steps, int(Result.RECOVERED_FINER_SEGMENTS))
@@ -121,15 +136,15 @@ def _with_finer_segments(
 def _with_recovery(
     task: Task, system: System, controls: np.ndarray, start: Start, progress: bool
 ) -> tuple[Steps, str]:
-    past, total, table = start.past, task.steps, task.table
+    past, total, table, settings = start.past, task.steps, task.table, task.settings
     padded = _padded(controls, least=LEAST_CAPACITY)
     piece = max(1, total // 100) if progress else total
     rows: Steps | None = None
-    done = 0
+    done = rescues = 0
     with tqdm(total=total, disable=not progress, unit="step", leave=False) as bar:
         while done < total:
             stop = min(total, done + piece)
-            reached, past, new = march_one(system, task.settings, table, padded, task.dt, past, done, stop)
+            reached, past, new = march_one(system, settings, table, padded, task.dt, past, done, stop)
             reached = int(reached)
             rows = _merged(rows, new, done, reached, total)
             if reached < stop:
@@ -146,6 +161,9 @@ def _with_recovery(
                 if not outcome.result.solved:
                     return rows, outcome.cause
                 reached += 1
+                rescues += outcome.result is Result.RECOVERED_STABLE_ELIMINATION
+                if rescues == ENOUGH_RESCUES:
+                    settings = dataclasses.replace(settings, elimination=Decoupled())
             bar.update(reached - done)
             done = reached
     assert rows is not None

@@ -8,6 +8,7 @@ from typing import Any, Literal, Self
 from knode_cosserat.solvers import space as space_schemes
 from knode_cosserat.solvers import time as time_schemes
 from knode_cosserat.solvers.boundary import NewtonOptions
+from knode_cosserat.solvers.linear import Condensed, LinearSolver
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.time import TimeScheme
 
@@ -26,6 +27,8 @@ class Settings:
     space: SpaceScheme = space_schemes.Euler()
     start: Start = "paper"
     newton: NewtonOptions = NewtonOptions()
+    #: of a correction's linear equations; a run changes to the stable one by itself where it needs it
+    elimination: LinearSolver = Condensed()  # noqa: RUF009
 
     @classmethod
     def of(cls, time: str | TimeScheme, space: str | SpaceScheme, start: str, newton: NewtonOptions) -> Self:
