@@ -305,13 +305,14 @@ class Rod(System):
             *(load for load in self.loads if isinstance(load, SpreadLoad)),
         ]
         found = {end for each in stretches for end in (each.begin, each.end)}
+        found -= {0.0}
         found |= {load.at for load in self.loads if isinstance(load, PointLoad)}
-        return tuple(sorted(cut for cut in found if 0.0 < cut < 1.0))
+        return tuple(sorted(cut for cut in found if cut < 1.0))
 
     @property
     def jumps(self) -> bool:  # type: ignore[override]
         """Whether a load acts at one place."""
-        return any(isinstance(load, PointLoad) and 0.0 < load.at < 1.0 for load in self.loads)
+        return any(isinstance(load, PointLoad) and load.at < 1.0 for load in self.loads)
 
     def crossed(
         self, acting: Float[Any, " cuts"], t: Any, y: Float[Any, " y"], control: Any, history: History

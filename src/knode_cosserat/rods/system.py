@@ -315,7 +315,7 @@ class System(eqx.Module):
         return self._named(y, "p", "position")
 
     def curves(self, y: Any) -> list[Any]:
-        """What is drawn of the states y (…, N, y) of one robot: lines (…, points, 3) in m; by default the rod."""
+        """What is drawn of the states y (…, N, y) of one robot: lines (…, points, 3) in m."""
         return [np.asarray(self.positions(y))]
 
     def quaternions(self, y: Any) -> Any:

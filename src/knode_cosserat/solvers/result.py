@@ -34,7 +34,7 @@ _MESSAGES = {
     Result.RECOVERED_STABLE_ELIMINATION: "converged with the stable elimination and a longer search",
     Result.RECOVERED_LOAD_CONTINUATION: "converged by applying the change of control in smaller parts",
     Result.RECOVERED_STEP_HALVING: "converged by several smaller time steps",
-    Result.RECOVERED_RELAXATION: "converged after a damped motion towards rest",
+    Result.RECOVERED_RELAXATION: "converged after a damped motion towards rest: it may have snapped",
     Result.RECOVERED_FINER_SEGMENTS: "converged with every segment divided, being too long to be stable",
     Result.NO_CONVERGENCE: "no solution found",
     Result.NOT_FINITE: "the equations overflow or are undefined there",

@@ -75,7 +75,7 @@ def run_one(
 ) -> tuple[Steps, str]:
     """All steps of one robot, and the likely cause if one of them (`result` < 0) could not be solved."""
     steps, cause = _with_recovery(task, system, controls, start, progress)
-    if _trustworthy(task, steps, _size(system, start)):
+    if _trustworthy(task, steps, system, start):
         return steps, cause
     record = start.past.records[0]
     decay = decay_per_segment(system, task.settings, task.table[1], record, controls[0])
@@ -94,15 +94,16 @@ def run_one(
     ).strip()
 
 
-def _trustworthy(task: Task, steps: Steps, start: float) -> bool:
+def _trustworthy(task: Task, steps: Steps, system: System, start: Start) -> bool:
     """Solved, and not grown to a size that suggests an instability in space, which only a motion has.
 
     What hangs like a cable carries forces far beyond its natural ones from the start.
     """
-    solved = bool(steps.result.min() >= 0)
-    return solved and (
-        isinstance(task.settings.time, Static) or steps.size.max() <= SUSPICIOUS * max(1.0, start)
-    )
+    if steps.result.min() < 0:
+        return False
+    if isinstance(task.settings.time, Static) or steps.size.max() <= SUSPICIOUS:
+        return True
+    return bool(steps.size.max() <= SUSPICIOUS * max(1.0, _size(system, start)))
 
 
 def _size(system: System, start: Start) -> float:
@@ -126,7 +127,7 @@ def _with_finer_segments(
 
     past = start.past._replace(records=refined(start.past.records, 1), rate=refined(start.past.rate, 0))
     steps, _ = _with_recovery(task, fine, controls, start._replace(past=past), progress)
-    if not _trustworthy(task, steps, _size(fine, start._replace(past=past))):
+    if not _trustworthy(task, steps, fine, start._replace(past=past)):
         return None
     records = np.ascontiguousarray(steps.records[:, ::parts])
     finer = np.full(task.steps, int(Result.RECOVERED_FINER_SEGMENTS))
