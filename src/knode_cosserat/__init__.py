@@ -42,7 +42,7 @@ from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.load import load_recording
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
-from knode_cosserat.rods import ends, loads, surroundings
+from knode_cosserat.rods import ends, loads, routing, surroundings
 from knode_cosserat.rods.parallel_robot import ParallelRobot
 from knode_cosserat.rods.parameters import ParameterError, parameter
 from knode_cosserat.rods.robot_file import RobotFileError, catalog, load_robot, save_robot
@@ -140,6 +140,7 @@ __all__ = [
     "node_error",
     "parameter",
     "pose_mse",
+    "routing",
     "save_robot",
     "simulate",
     "state_errors",

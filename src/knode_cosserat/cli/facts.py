@@ -39,15 +39,20 @@ def outcome(trajectory: Trajectory) -> dict[str, Any]:
 def at_rest(rest: Trajectory) -> dict[str, Any]:
     """The shape of an equilibrium, and what holds it (m, rad, N, N·m)."""
     position, (w, x, y, z) = np.asarray(rest.position)[0], np.asarray(rest.quaternion)[0, -1]
-    return {
-        "tension": np.asarray(rest.tension)[0].tolist(),
+    facts = {
+        "control": np.asarray(rest.control)[0].tolist(),
         "position": position.tolist(),
         "tip_position": position[-1].tolist(),
         "tip_inclination": float(2 * np.arctan2(np.hypot(x, y), np.hypot(w, z))),
-        "base_force": np.asarray(rest.force)[0, 0].tolist(),
-        "base_moment": np.asarray(rest.moment)[0, 0].tolist(),
         "residual": float(rest.residual[0]),
+        "result": Result(int(rest.result[0])).message,
     }
+    if "tension" in (*rest.system.control_layout.names, *rest.system.y_layout.names):
+        facts["tension"] = np.asarray(rest.tension)[0].tolist()
+    if {"n", "m"} <= set(rest.system.y_layout.names):
+        facts["base_force"] = np.asarray(rest.force)[0, 0].tolist()
+        facts["base_moment"] = np.asarray(rest.moment)[0, 0].tolist()
+    return facts
 
 
 def parameters(system: System) -> dict[str, dict[str, Any]]:

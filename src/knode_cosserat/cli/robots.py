@@ -129,13 +129,18 @@ def equilibrium(
     rest = kc.equilibrium(system, _control(system, tension, control), space=space)
     if out:
         rest.save(out)
-    facts = {"robot": robot, **at_rest(rest)}
+    facts = {"robot": robot, **at_rest(rest), "unstable": _unstable(system, rest, space)}
     lines = [
         f"tip: {vector(facts['tip_position'])} m",
         f"the tip leans {np.degrees(facts['tip_inclination']):.2f} degrees from the z axis",
-        f"internal force at the base: {vector(facts['base_force'])} N",
-        f"internal moment at the base: {vector(facts['base_moment'])} N m",
     ]
+    if "base_force" in facts:
+        lines.append(f"internal force at the base: {vector(facts['base_force'])} N")
+        lines.append(f"internal moment at the base: {vector(facts['base_moment'])} N m")
+    if facts["unstable"]:
+        lines.append("UNSTABLE: the least push, and the robot leaves this shape")
+    if facts["result"] != "converged":
+        lines.append(f"found on a detour: {facts['result']}")
     tell(as_json, facts, lines, out=out)
 
 
@@ -173,6 +178,15 @@ def info(
         {"robot": robot, "kind": type(system).__name__, **parts, "parts": more, **facts},
         [heading, *table(rows), *(["", "parts", *more] if more else []), *(["", *lines] if lines else [])],
     )
+
+
+def _unstable(system: System, rest: Any, space: str) -> bool | None:
+    """Whether an equilibrium is unstable; None where that cannot be told by the tip's compliance."""
+    import knode_cosserat as kc
+
+    if not {"n", "m"} <= set(system.tip_layout.names):
+        return None
+    return bool(kc.configuration(system, rest.control[0], space=space).unstable)
 
 
 def _control(system: System, tension: str | None, control: str | None) -> Any:
