@@ -33,7 +33,13 @@ def draw(found: kc.Trajectory, path: Path) -> None:
     rows = np.linspace(0, len(found.time) - 1, 10).astype(int)
     for k, row in enumerate(rows):
         axes.plot(found.position[row, :, 0], found.position[row, :, 2], color="C0", alpha=0.2 + 0.08 * k)
-    axes.set(xlabel="x (m)", ylabel="z (m)", aspect="equal", ylim=(-0.02, 0.08), title="A soft robot climbs over a cylinder")
+    axes.set(
+        xlabel="x (m)",
+        ylabel="z (m)",
+        aspect="equal",
+        ylim=(-0.02, 0.08),
+        title="A soft robot climbs over a cylinder",
+    )
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=150)
 

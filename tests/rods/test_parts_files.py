@@ -77,7 +77,12 @@ ROUTED = {
     "routing": st.none() | st.lists(parts(Routing), min_size=2, max_size=2).map(tuple),
     "friction_wobble": st.none() | st.floats(0.0, 1.0), "tendon_compliance": st.floats(0.0, 1.0),
 }  # fmt: skip
-FIELDS = {"slender-rod": ROD, "routed-tendon-robot": ROUTED, "tendon-robot": ROD, "virtual-robot": {**ROD, **TENDONS}}
+FIELDS = {
+    "slender-rod": ROD,
+    "routed-tendon-robot": ROUTED,
+    "tendon-robot": ROD,
+    "virtual-robot": {**ROD, **TENDONS},
+}
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -104,30 +109,69 @@ def test_a_file_of_the_first_format_is_read_and_written_as_it_was():
 
 # errors
 
-HEAD = "format: 2\nkind: slender-rod\nparameters:\n  " + "\n  ".join(f"{k}: {v}" for k, v in BODY.items()) + "\n"
+HEAD = (
+    "format: 2\nkind: slender-rod\nparameters:\n  " + "\n  ".join(f"{k}: {v}" for k, v in BODY.items()) + "\n"
+)
 
 
 @pytest.mark.parametrize(
     ("more", "words"),
     [
         ("loads: [{kind: attached-mass, mass: -1}]", "loads.0.mass is -1; allowed is a number 0 to 10000 kg"),
-        ("loads: [{kind: attached-mass}, {kind: attached-mass, at: 2}]", "loads.1.at is 2; allowed is a number 0 to 1"),
-        ("loads: [{kind: attached-mas}]", "loads.0.kind is 'attached-mas'; allowed is attached-mass, distributed-wrench, point-wrench; did you mean attached-mass?"),
+        (
+            "loads: [{kind: attached-mass}, {kind: attached-mass, at: 2}]",
+            "loads.1.at is 2; allowed is a number 0 to 1",
+        ),
+        (
+            "loads: [{kind: attached-mas}]",
+            "loads.0.kind is 'attached-mas'; allowed is attached-mass, distributed-wrench, "
+            "point-wrench; did you mean attached-mass?",
+        ),
         ("loads: [{mass: 1}]", "loads.0 is {'mass': 1}; allowed is a mapping with a kind: attached-mass"),
         ("loads: {kind: attached-mass}", "loads is {'kind': 'attached-mass'}; allowed is a list of mappings"),
         ("loads: 3", "loads is 3; allowed is a list of mappings, each with a kind"),
-        ("loads: [{kind: attached-mass, weight: 1}]", "loads.0: the key 'weight' is unknown; allowed is at, mass"),
-        ("loads: [{kind: point-wrench, follows: maybe}]", "loads.0.follows is 'maybe'; allowed is false, true"),
-        ("loads: [{kind: point-wrench, force: [1, 2]}]", "loads.0.force is [1, 2]; allowed is three numbers, each"),
+        (
+            "loads: [{kind: attached-mass, weight: 1}]",
+            "loads.0: the key 'weight' is unknown; allowed is at, mass",
+        ),
+        (
+            "loads: [{kind: point-wrench, follows: maybe}]",
+            "loads.0.follows is 'maybe'; allowed is false, true",
+        ),
+        (
+            "loads: [{kind: point-wrench, force: [1, 2]}]",
+            "loads.0.force is [1, 2]; allowed is three numbers, each",
+        ),
         ("base_end: {kind: driven, axes: [[x]]}", "base_end.axes is [['x']]; allowed is a list of different"),
-        ("base_end: clamped", "base_end is 'clamped'; allowed is a mapping with a kind: clamped, driven, free, pinned"),
-        ("base_end: {kind: driven, axes: [x, x]}", "base_end.axes is ['x', 'x']; allowed is a list of different ones of x, y"),
-        ("base_end: {kind: driven, axes: [q]}", "base_end.axes is ['q']; allowed is a list of different ones of x, y"),
-        ("tip_end: {kind: pinned, orientation: [0, 0, 0, 0]}", "tip_end.orientation is [0, 0, 0, 0]; allowed is four numbers, not all zero"),
-        ("surroundings: [{kind: sphere, radius: 0}]", "surroundings.0.radius is 0; allowed is a number 1e-06 to 1000 m"),
+        (
+            "base_end: clamped",
+            "base_end is 'clamped'; allowed is a mapping with a kind: clamped, driven, free, pinned",
+        ),
+        (
+            "base_end: {kind: driven, axes: [x, x]}",
+            "base_end.axes is ['x', 'x']; allowed is a list of different ones of x, y",
+        ),
+        (
+            "base_end: {kind: driven, axes: [q]}",
+            "base_end.axes is ['q']; allowed is a list of different ones of x, y",
+        ),
+        (
+            "tip_end: {kind: pinned, orientation: [0, 0, 0, 0]}",
+            "tip_end.orientation is [0, 0, 0, 0]; allowed is four numbers, not all zero",
+        ),
+        (
+            "surroundings: [{kind: sphere, radius: 0}]",
+            "surroundings.0.radius is 0; allowed is a number 1e-06 to 1000 m",
+        ),
         ("sections: [{kind: stretch, radius: []}]", "sections.0.radius is []; allowed is a list of numbers"),
-        ("sections: [{kind: stretch, begin: 0.5, end: 0.5}]", "sections.0: .*end is 0.5; allowed is a place beyond begin, 0.5"),
-        ("loads: [{kind: distributed-wrench, begin: 0.7, end: 0.2}]", "loads.0: .*end is 0.2; allowed is a place beyond begin, 0.7"),
+        (
+            "sections: [{kind: stretch, begin: 0.5, end: 0.5}]",
+            "sections.0: .*end is 0.5; allowed is a place beyond begin, 0.5",
+        ),
+        (
+            "loads: [{kind: distributed-wrench, begin: 0.7, end: 0.2}]",
+            "loads.0: .*end is 0.2; allowed is a place beyond begin, 0.7",
+        ),
     ],
 )  # fmt: skip
 def test_errors_name_file_place_value_and_what_is_allowed(more, words):
@@ -143,7 +187,10 @@ def test_code_cannot_be_saved(tmp_path):
     with pytest.raises(RobotFileError, match=r"^a FunctionSection cannot be written .* made of code"):
         kc.save_robot(rod, tmp_path / "rod.yaml")
     routed = kc.RoutedTendonRobot(
-        **BODY, tendon_offset=0.01, tendon_angles=[0.0], routing=(FunctionRouting(lambda s: (0.01 * s, 0.0 * s)),)
+        **BODY,
+        tendon_offset=0.01,
+        tendon_angles=[0.0],
+        routing=(FunctionRouting(lambda s: (0.01 * s, 0.0 * s)),),
     )
     with pytest.raises(RobotFileError, match=r"^a FunctionRouting cannot be written"):
         kc.save_robot(routed, tmp_path / "rod.yaml")
@@ -161,8 +208,8 @@ LADEN = kc.SlenderRod(
 
 def test_parameters_of_parts_by_name():
     changed = LADEN.replace(**{
-        "loads.0.mass": 0.3, "loads.1.force": [1, 2, 3], "surroundings.0.radius": 0.2, "base_end.position": [1, 0, 0],
-        "loads.0.at": 0.6,
+        "loads.0.mass": 0.3, "loads.1.force": [1, 2, 3], "surroundings.0.radius": 0.2,
+        "base_end.position": [1, 0, 0], "loads.0.at": 0.6,
     })  # fmt: skip
     assert changed.loads[0].mass == 0.3 and changed.loads[0].at == 0.6 and 0.6 in changed.cuts
     np.testing.assert_array_equal(changed.loads[1].force, [1, 2, 3])
@@ -175,7 +222,11 @@ def test_parameters_of_parts_by_name():
     ("name", "value", "words"),
     [
         ("loads.3.mass", 1.0, r"no parameter 'loads.3.mass': no '3' among 0, 1, 2"),
-        ("loads.0.weight", 1.0, r"no parameter 'loads.0.weight': no 'weight' among at, mass, inertia, offset"),
+        (
+            "loads.0.weight",
+            1.0,
+            r"no parameter 'loads.0.weight': no 'weight' among at, mass, inertia, offset",
+        ),
         ("loads.0.mass", -1.0, r"AttachedMass: mass is -1.0; allowed is a number 0 to 10000 kg"),
         ("cargo.0.mass", 1.0, r"no parameter 'cargo"),
         ("loads.0", 3.0, r"loads holds a float; allowed is a load"),
@@ -209,8 +260,9 @@ def made(robots):
 def test_trajectories_of_robots_that_differ_in_their_parts_come_back(tmp_path, count):
     robots = [
         LADEN.replace(**{
-            "loads.0.mass": 0.1 * k, "loads.1.moment": [k, 0, 1], "surroundings.0.radius": 0.1 + k, "length": 0.5 + k,
-            "sections.0.stiffness": [1.0 + k, 2.0], "base_end.position": [0, 0, k], "loads.2.force": [0, k, 0],
+            "loads.0.mass": 0.1 * k, "loads.1.moment": [k, 0, 1], "surroundings.0.radius": 0.1 + k,
+            "length": 0.5 + k, "sections.0.stiffness": [1.0 + k, 2.0], "base_end.position": [0, 0, k],
+            "loads.2.force": [0, k, 0],
         })
         for k in range(count)
     ]  # fmt: skip
@@ -229,7 +281,9 @@ def test_a_batch_from_a_damaged_file_is_refused(tmp_path):
     made([LADEN, LADEN]).save(path)
     with h5py.File(path, "r+") as file:
         file["robot_loads.0.mass"][1] = -1.0
-    with pytest.raises(kc.TrajectoryFileError, match=r"a robot of the batch is not possible: AttachedMass: mass"):
+    with pytest.raises(
+        kc.TrajectoryFileError, match=r"a robot of the batch is not possible: AttachedMass: mass"
+    ):
         kc.load_trajectory(path)
 
 

@@ -108,8 +108,9 @@ def test_a_slack_tendon_does_nothing_until_it_is_pulled_in_again():
 
 
 def test_a_tendon_that_gives_takes_more_pulling():
+    taken_in = np.array([0.003, -0.05, -0.05, -0.05])
     T = [
-        field(kc.equilibrium(REELED.replace(tendon_compliance=C), np.array([0.003, -0.05, -0.05, -0.05])), "tension")[0, 0]
+        field(kc.equilibrium(REELED.replace(tendon_compliance=C), taken_in), "tension")[0, 0]
         for C in (0.0, 1e-4, 1e-3)
     ]  # fmt: skip
     assert T[0] > T[1] > T[2] > 0.0

@@ -58,7 +58,7 @@ def test_it_closes_with_order_four():
 
 
 def test_a_cone_bends_as_the_integral_of_its_stiffness():
-    """Half as thick at its tip, in two stretches; the second as thick at its start as the first at its end."""
+    """Half as thick at its tip, in two stretches that meet."""
     F = 1e-3 * EI / L**2
     cone = changed(radius_0=[1.0, -0.235], radius_1=[0.765, -0.265], force=[F, 0.0, 0.0])
 
@@ -91,7 +91,9 @@ def arc(curvature, length):
 def test_a_robot_of_controlled_curvature_bends_to_arcs(control):
     robot = changed({"curvature_gain": [0.0, 6.0, 0.0]})
     found = rest(robot, control)
-    (one, turn), (other, more) = (arc(6.0 * c, part * L) for c, part in zip(control, (0.47, 0.53), strict=True))
+    (one, turn), (other, more) = (
+        arc(6.0 * c, part * L) for c, part in zip(control, (0.47, 0.53), strict=True)
+    )
     turned = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
     expected = one + turned @ other
     np.testing.assert_allclose(found.tip_position[0, [0, 2]], expected, atol=1e-5 * L)
@@ -100,7 +102,8 @@ def test_a_robot_of_controlled_curvature_bends_to_arcs(control):
 
 
 def test_one_stretch_is_two():
-    """A function over all of the rod is the polynomials in its two parts; nothing is seen of where they meet."""
+    """A function over all of the rod is the polynomials in its two parts."""
+
     def function(part, control):
         return kc.Differences(radius=1.0 - 0.3 * part, curvature=np.array([1.0, 0.0, 2.0]) * control[0])
 

@@ -72,7 +72,9 @@ OBSTACLES = [
 ]
 
 
-@pytest.mark.parametrize("obstacle", OBSTACLES, ids=lambda each: each.kind + "-in" * getattr(each, "inside", 0))
+@pytest.mark.parametrize(
+    "obstacle", OBSTACLES, ids=lambda each: each.kind + "-in" * getattr(each, "inside", 0)
+)
 @pytest.mark.parametrize("depth", [-0.004, 0.0, 0.004])
 def test_the_force_of_contact_is_smooth(obstacle, depth):
     """Its slope in place, velocity and spin, in front of the surface, on it and beneath."""

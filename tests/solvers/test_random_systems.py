@@ -100,10 +100,13 @@ def in_contact(seed):
         "stiffness": k, "smoothing": draws.log(3e-4, 3e-2) * L, "damping": 1.0,
         "friction": draws.generator.uniform(0.0, 0.6), "slip": 0.02 * L,
     }  # fmt: skip
+    across = np.array([0.0, 3.0, 0.0])
     surroundings = (
         Plane(point=[-0.1 * L, 0.0, 0.0], normal=[1.0, 0.0, 0.0], **law),
         Sphere(center=[0.25 * L, 0.1 * L, 0.6 * L], radius=0.15 * L, **law),
-        Cylinder(point=[0.0, 0.0, 1.2 * L], axis=draws.vector(1.0) + [0.0, 3.0, 0.0], radius=0.15 * L, **law),
+        Cylinder(
+            point=[0.0, 0.0, 1.2 * L], axis=np.add(draws.vector(1.0), [0.0, 3.0, 0.0]), radius=0.15 * L, **law
+        ),
     )
     base = Driven(axes=("x", "z", "ry"))
     control = draws.signals(3, 0.0, 1.0) * np.array([0.2 * L, 0.2 * L, 0.5])
