@@ -15,9 +15,9 @@ def simulate(seconds: float = 6.0, dt: float = 0.02) -> kc.Trajectory:
     part = np.arange(1, steps + 1) / steps
     forward = 0.32 * (3 * part**2 - 2 * part**3)
     lifted = 0.02 * np.sin(np.pi * part) ** 2
-    lying = kc.equilibrium(robot, np.zeros(3), space="rk4")
+    lying = kc.equilibrium(robot, np.zeros(3))
     control = np.stack([forward, lifted, 0.0 * part], axis=1)
-    return kc.simulate(robot, control, dt, space="rk4", initial=lying)
+    return kc.simulate(robot, control, dt, initial=lying)
 
 
 def draw(found: kc.Trajectory, path: Path) -> None:

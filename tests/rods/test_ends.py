@@ -210,7 +210,7 @@ BEAM = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("tip", [Clamped(), Pinned()])
+@pytest.mark.parametrize("tip", [Clamped(), pytest.param(Pinned(), marks=pytest.mark.campaign)])
 def test_beams_held_at_both_ends(tip):
     w = 1e-3 * BEAM_EI
     beam = kc.SlenderRod(**BEAM, tip_end=tip)
@@ -236,6 +236,7 @@ DRIVEN = kc.SlenderRod(
 )  # fmt: skip
 
 
+@pytest.mark.campaign
 def test_a_driven_base_is_where_it_is_driven():
     t = np.arange(1, 101) * 0.05
     control = np.stack([0.03 * np.sin(t), 0.2 * np.sin(0.7 * t), 0.02 * np.cos(0.9 * t)], axis=1)

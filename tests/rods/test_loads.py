@@ -244,6 +244,7 @@ def test_derivatives_with_respect_to_a_load_and_its_control():
     assert dotted == pytest.approx(expected, rel=1e-5)
 
 
+@pytest.mark.campaign
 def test_a_batch_of_robots_with_different_loads_is_each_by_itself():
     control = np.sin(np.arange(20)[:, None] / 4.0)
     robots = [

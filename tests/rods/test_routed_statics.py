@@ -46,7 +46,7 @@ def exact(tensions):
         pytest.param((0.0, 8.0, 0.0, 0.0), id="helical", marks=pytest.mark.campaign),
         pytest.param((0.0, 0.0, 8.0, 0.0), id="ends at a node", marks=pytest.mark.campaign),
         pytest.param((0.0, 0.0, 0.0, 8.0), id="ends between nodes", marks=pytest.mark.campaign),
-        pytest.param((4.0, 6.0, 3.0, 5.0), id="all"),
+        pytest.param((4.0, 6.0, 3.0, 5.0), id="all", marks=pytest.mark.campaign),
     ],
 )
 def test_statics_are_those_of_rucker_and_webster(tensions):
@@ -81,16 +81,17 @@ def test_a_taut_reel_is_the_tension_that_it_has():
     for compliance in (0.0, 2e-4):
         reeled = kc.equilibrium(REELED.replace(tendon_compliance=compliance), taken_in)
         T = field(reeled, "tension")[0]
-        assert T[0] > 0.5 and T[1] > 0.5
         pulled = kc.equilibrium(PULLED, T)
         np.testing.assert_allclose(field(pulled, "p"), field(reeled, "p"), atol=1e-7 * L)
         np.testing.assert_allclose(field(pulled, "u"), field(reeled, "u"), atol=1e-6)
         # what is taut is as long as its reel leaves it; what is not has no tension
         missing = L - taken_in + compliance * T - field(reeled, "path")[-1]
-        taut = T > 1e-3
+        taut = T > 1.0
+        assert taut[[0, 2]].all() and taut.all() == (compliance > 0.0)
         np.testing.assert_allclose(missing[taut], 0.0, atol=1e-6 * L)
         assert np.all(missing > -1e-6 * L) and np.all(T >= -1e-6)
         np.testing.assert_allclose(T[~taut], 0.0, atol=1e-3)
+        assert np.all(missing[~taut] > 1e-8)
 
 
 def test_a_slack_tendon_does_nothing_until_it_is_pulled_in_again():
@@ -167,11 +168,12 @@ def test_a_slow_pull_loses_tension_as_on_a_capstan():
     bent = np.sqrt(u[:, 0] ** 2 + u[:, 1] ** 2 + 1e-4) - 1e-2
     # the trapezium rule's sums are Euler's but for where they begin and end
     np.testing.assert_allclose(np.diff(loss), ds * (k + μ * bent[:-1]), rtol=1e-9)
-    assert loss[-1] > 0.5
+    assert loss[-1] > 0.4
     at_tip = [float(robot.tension_at(L * 0.999, found.y[-1, -1], control[-1])[0]), 5.0 * np.exp(-loss[-1])]
     assert at_tip[0] == pytest.approx(at_tip[1], rel=1e-12)
 
 
+@pytest.mark.campaign
 def test_turned_tendons_turn_the_robot():
     control = kc.controls.parse("random:3", 60, 0.05)
     one, other = (kc.simulate(helices(turn), control, 0.05) for turn in (0.0, np.pi / 2))
@@ -180,6 +182,7 @@ def test_turned_tendons_turn_the_robot():
     assert np.abs(one.position[..., :2]).max() > 0.01
 
 
+@pytest.mark.campaign
 def test_what_the_tendons_do_is_what_is_stored():
     """No friction, no damping, no gravity: dE/dT = -(way of the tendon) between equilibria (Castigliano)."""
     robot = ROBOT.replace(gravity=[0.0, 0.0, 0.0], nodes=41)

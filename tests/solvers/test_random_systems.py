@@ -104,9 +104,7 @@ def in_contact(seed):
     surroundings = (
         Plane(point=[-0.1 * L, 0.0, 0.0], normal=[1.0, 0.0, 0.0], **law),
         Sphere(center=[0.25 * L, 0.1 * L, 0.6 * L], radius=0.15 * L, **law),
-        Cylinder(
-            point=[0.0, 0.0, 1.2 * L], axis=np.add(draws.vector(1.0), [0.0, 3.0, 0.0]), radius=0.15 * L, **law
-        ),
+        Cylinder(point=[0.0, 0.0, 1.2 * L], axis=draws.vector(1.0) + across, radius=0.15 * L, **law),
     )
     base = Driven(axes=("x", "z", "ry"))
     control = draws.signals(3, 0.0, 1.0) * np.array([0.2 * L, 0.2 * L, 0.5])
