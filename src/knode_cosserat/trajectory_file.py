@@ -20,7 +20,7 @@ import numpy as np
 
 from knode_cosserat._files import package_version, replacing
 from knode_cosserat.rods import robot_file
-from knode_cosserat.rods.parameters import ParameterError
+from knode_cosserat.rods.parameters import Parameter, ParameterError, parameters_of, slots_of
 from knode_cosserat.rods.system import Field, Layout, System
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.result import Result
@@ -204,15 +204,30 @@ def _robot(system: System, index: int) -> System:
 
 
 def _parameters(system: System) -> dict[str, Any]:
-    """The parameters of a batch of robots as variables."""
+    """The parameters of a batch of robots, and of their parts, as variables."""
     variables: dict[str, Any] = {}
-    for name, parameter in system.parameters().items():
-        values = getattr(system, name)
-        if values is not None:
-            values = np.asarray(values)
-            dimensions = ("batch", *(f"{_PARAMETER}{name}_{k}" for k in range(1, values.ndim)))
-            variables[_PARAMETER + name] = (dimensions, values, _labels(parameter.unit, parameter.meaning))
+    for name, parameter, values in _numbers(system):
+        values = np.asarray(values)
+        dimensions = ("batch", *(f"{_PARAMETER}{name}_{k}" for k in range(1, values.ndim)))
+        variables[_PARAMETER + name] = (dimensions, values, _labels(parameter.unit, parameter.meaning))
     return variables
+
+
+def _numbers(owner: Any, before: str = "") -> Iterator[tuple[str, Parameter, Any]]:
+    """Every parameter that is set, of a robot and its parts: its name as `System.replace` has it, and value.
+
+    Places are not among them: they are the same for all robots of a batch.
+    """
+    fixed = {field.name for field in dataclasses.fields(owner) if field.metadata.get("static")}
+    for name, parameter in parameters_of(type(owner)).items():
+        value = getattr(owner, name)
+        if value is not None and name not in fixed:
+            yield before + name, parameter, value
+    for name in slots_of(type(owner)):
+        held = getattr(owner, name)
+        for k, each in enumerate(held) if isinstance(held, tuple) else [(None, held)]:
+            if each is not None:
+                yield from _numbers(each, f"{before}{name}." if k is None else f"{before}{name}.{k}.")
 
 
 def _attributes(trajectory: Trajectory, source: str) -> dict[str, Any]:
@@ -318,13 +333,12 @@ def _system(path: Path, data: xarray.Dataset) -> System:
         robot = robot_file.parse_robot(str(text), f"{path}: attribute 'robot'")
         if not any(str(name).startswith(_PARAMETER) for name in data.variables):
             return robot
-        own = {name for name in robot.parameters() if getattr(robot, name) is not None}
         count = data.sizes.get("batch", 0)
         values = {
-            name: _values(path, data, _PARAMETER + name, (count, *np.shape(getattr(robot, name))))
-            for name in own
+            name: _values(path, data, _PARAMETER + name, (count, *np.shape(value)))
+            for name, _, value in _numbers(robot)
         }
-        robots = [robot.replace(**{name: values[name][i] for name in own}) for i in range(count)]
+        robots = [robot.replace(**{name: each[i] for name, each in values.items()}) for i in range(count)]
     except robot_file.RobotFileError as error:
         raise TrajectoryFileError(str(error)) from None
     except ParameterError as error:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.learning.knode import KNODE
-from knode_cosserat.learning.samples import Samples, samples
+from knode_cosserat.learning.samples import Samples, samples, start_of
 from knode_cosserat.learning.structured.expansion import Expansion, Term
 from knode_cosserat.learning.structured.residual import Structured, ambient_layout, loaded, material_layout
 from knode_cosserat.rods.system import Layout, System, unpacked_history
@@ -141,7 +141,7 @@ def added(model: KNODE, trajectory: Trajectory) -> Added:
 def _derivatives(system: System, data: Samples) -> Any:
     def one(sample: Samples) -> Any:
         history = unpacked_history(system, sample.c0, sample.history[0])
-        s = sample.place * system.length
+        s = start_of(system, sample.place)
         return system.derivatives(s, sample.t, sample.y, sample.control, history)
 
     return jax.vmap(one)(data)

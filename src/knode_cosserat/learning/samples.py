@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.learning.sides import far_side, slopes_of
 from knode_cosserat.rods.system import System, in_strands, records_in_strands, unpacked_history
 from knode_cosserat.solvers.crossing import Crossing, carried, crossing_of, within
 from knode_cosserat.solvers.march import coefficient_table
@@ -35,9 +36,10 @@ class Samples(NamedTuple):
     place: Float[Any, " S"]
     t: Float[Any, " S"]
     c0: Float[Any, " S"]
+    #: beyond what acts at the segment's start
     y: Float[Any, "S y"]
     z: Float[Any, "S z"]
-    #: y at the segment's end
+    #: y at the segment's end, before what acts there
     y_next: Float[Any, "S y"]
     #: y_s times the length at the segment's start, from the states alone
     slope: Float[Any, "S y"]
@@ -97,8 +99,13 @@ def predict(system: System, space: SpaceScheme, sample: Samples) -> tuple[Float[
         segment = jnp.round(sample.place * (system.nodes - 1)).astype(int)
         crossing = Crossing(*(jnp.asarray(each)[segment] for each in crossings))
         y_next = carried(space, rates, jump, crossing, (s, ds), sample.y, sample.history, first=1)
-        s = within(s, s, s + ds)
-    return y_next, derivatives(s, sample.y, sample.history[0])[1]
+    return y_next, derivatives(start_of(system, sample.place), sample.y, sample.history[0])[1]
+
+
+def start_of(system: System, place: Any) -> Any:
+    """Arclength (m) where a segment begins; moved a little into it where the rod has cuts."""
+    s, ds = place * system.length, system.length / (system.nodes - 1)
+    return within(s, s, s + ds) if system.cuts else s
 
 
 def samples(
@@ -154,6 +161,9 @@ def _of_one(
     slope, doubt = slopes_of(settings, y)
     record = np.concatenate([y, z, slope / knowledge.length] if knowledge.mixed else [y, z], axis=-1)
     c0, history = histories(settings, dt, record)
+    beyond = far_side(knowledge, time, c0, y, control, history)
+    if knowledge.cuts:
+        slope, doubt = slopes_of(settings, y, beyond, knowledge.cuts)
     # the rows before the first are its own if it is a start, and not known otherwise
     first = 1 if time[0] == 0.0 else 2
     rows = np.arange(first, len(time))
@@ -172,7 +182,7 @@ def _of_one(
         place=np.tile(starts / (knowledge.nodes - 1.0), len(rows)),
         t=spread(time[rows]),
         c0=spread(c0),
-        y=flat(y[at]),
+        y=flat(beyond[at]),
         z=flat(z[at]),
         y_next=flat(y[np.ix_(rows, ends)]),
         slope=flat(slope[at]),
@@ -198,25 +208,6 @@ def histories(settings: Settings, dt: float, record: np.ndarray) -> tuple[np.nda
         history[i] = c1 * record[i - 1] + c2 * record[max(i - 2, 0)] + d1 * rate
         rate = c0[i] * record[i] + history[i]
     return c0, history
-
-
-def slopes_of(settings: Settings, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """y_s times the length (T, N, y), from the states alone, and by how much it may be wrong (y,).
-
-    Exact where a segment is one Euler step; of splines otherwise, judged by those of the next lower order.
-    """
-    last = y.shape[1] - 1
-    if settings.space.order == 1:
-        forward = np.diff(y, axis=1) * last
-        return np.concatenate([forward, forward[:, -1:]], axis=1), np.zeros(y.shape[-1])
-    # imported here: it takes a third of a second
-    from scipy.interpolate import make_interp_spline
-
-    place = np.linspace(0.0, 1.0, last + 1)
-    orders = [max(1, min(order, 2 * ((last - 1) // 2) + 1)) for order in (7, 5)]
-    high, low = (make_interp_spline(place, y, k=order, axis=1).derivative()(place) for order in orders)
-    # that is the lower order's error; the higher one's is a small part of it
-    return high, 0.1 * np.sqrt(np.mean(np.square(high - low), axis=(0, 1)))
 
 
 # checking

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from knode_cosserat.rods.parameters import choice, parameter, place
-from knode_cosserat.rods.parts import Part
+from knode_cosserat.rods.parts import Part, require_stretch
 from knode_cosserat.rods.system import Field
 from knode_cosserat.rotation import cross, dot, rotation_matrix
 
@@ -69,6 +69,10 @@ class SpreadLoad(Load):
 
     begin: float = place("where it begins", default=0.0)
     end: float = place("where it ends", default=1.0)
+
+    def __check_init__(self) -> None:
+        super().__check_init__()
+        require_stretch(self.begin, self.end, type(self).__name__)
 
     @abc.abstractmethod
     def wrench(self, motion: Motion, control: Any) -> Wrench:

@@ -81,6 +81,12 @@ class Choice:
     allowed: tuple[Any, ...]
     many: bool
 
+    def allows(self, value: Any) -> bool:
+        """Whether a value is one of them, or several different ones."""
+        several = list(value) if self.many and isinstance(value, tuple | list) else [value]
+        known = all(any(each is word or each == word for word in self.allowed) for each in several)
+        return known and len({str(each) for each in several}) == len(several)
+
     @property
     def words(self) -> str:
         """The allowed values, in words."""
@@ -130,8 +136,7 @@ def check_fields(owner: Any) -> None:
         checked(name, getattr(owner, name), parameter)
     for name, stated in choices_of(type(owner)).items():
         given = getattr(owner, name)
-        several = given if stated.many and isinstance(given, tuple) else (given,)
-        if any(each not in stated.allowed for each in several) or len(set(several)) < len(several):
+        if not stated.allows(given):
             raise ParameterError(f"{name} is {given!r}; allowed is {stated.words}")
     for name, slot in slots_of(type(owner)).items():
         given = getattr(owner, name)

@@ -38,6 +38,12 @@ class Part(eqx.Module):
             raise ParameterError(f"{type(self).__name__}: {error}") from None
 
 
+def require_stretch(begin: Any, end: Any, who: str) -> None:
+    """Raise `ParameterError` unless a stretch of the rod ends beyond where it begins."""
+    if not end > begin:
+        raise ParameterError(f"{who}: end is {end:g}; allowed is a place beyond begin, {begin:g}")
+
+
 def kinds_of(family: type) -> dict[str, type[Part]]:
     """The classes of a family that robot files can name."""
     found: dict[str, type[Part]] = {}

@@ -168,15 +168,13 @@ def _made(cls: type, values: dict[Any, Any], source: str, where: str, more: tupl
             value = _parts(value, parts[key], source, inner + key)
         elif key not in words and (not isinstance(value, int) or isinstance(value, bool)):
             raise RobotFileError(f"{source}: {key} is {shown(value)}; allowed is a whole number, 2 or more")
-        elif key in words and not isinstance(value, str | bool | list):
+        elif key in words and not words[key].allows(value):
             raise RobotFileError(f"{source}: {inner}{key} is {shown(value)}; allowed is {words[key].words}")
         given[key] = value
     try:
         return cls(**given)
     except ParameterError as error:
         raise RobotFileError(f"{source}: {inner and where + ': '}{error}") from None
-    except TypeError:  # a word that is a list within a list cannot be compared
-        raise RobotFileError(f"{source}: {where}: a choice is neither a word nor a list of words") from None
 
 
 def _parts(value: Any, slot: Slot, source: str, where: str) -> Any:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.parameters import choice, parameter, place
-from knode_cosserat.rods.parts import Part
+from knode_cosserat.rods.parts import Part, require_stretch
 from knode_cosserat.rods.system import Field
 
 #: The paper's G = E / (2 (1 + 0.3)), for a robot that gives no shear modulus.
@@ -66,6 +66,10 @@ class SectionChange(Part):
 
     begin: float = place("where it begins", default=0.0)
     end: float = place("where it ends", default=1.0)
+
+    def __check_init__(self) -> None:
+        super().__check_init__()
+        require_stretch(self.begin, self.end, type(self).__name__)
 
     @abc.abstractmethod
     def differences(self, part: Any, control: Any) -> Differences:

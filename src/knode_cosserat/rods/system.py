@@ -368,7 +368,8 @@ def with_value(owner: Any, path: str, value: Any, name: str) -> Any:
     """A part, or a tuple of parts, with another value at a path such as `0.mass`."""
     first, _, rest = path.partition(".")
     several = isinstance(owner, tuple)
-    known = [str(k) for k in range(len(owner))] if several else getattr(owner, "__dataclass_fields__", {})
+    stated = dataclasses.fields(owner) if dataclasses.is_dataclass(owner) else ()
+    known = [str(k) for k in range(len(owner))] if several else [field.name for field in stated]
     if first not in known:
         raise ParameterError(
             f"there is no parameter {name!r}: no {first!r} among {', '.join(known) or 'nothing'}"

@@ -16,7 +16,8 @@ from jaxtyping import Float
 
 from knode_cosserat.learning.calibration.misfit import Differences, SegmentMisfit, by_group
 from knode_cosserat.learning.calibration.search import Fit, Misfit
-from knode_cosserat.learning.samples import histories, settings_of, slopes_of
+from knode_cosserat.learning.samples import histories, settings_of
+from knode_cosserat.learning.sides import slopes_of
 from knode_cosserat.solvers.space import middles
 from knode_cosserat.trajectory import Trajectory
 

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.learning.config import StructuredOptions
-from knode_cosserat.learning.samples import Dataset, Samples, TipSamples
+from knode_cosserat.learning.samples import Dataset, Samples, TipSamples, start_of
 from knode_cosserat.learning.structured.expansion import CURVED, DRAG, LINEAR, Expansion, expansion
 from knode_cosserat.learning.structured.polish import polished
 from knode_cosserat.learning.structured.residual import (
@@ -140,7 +140,7 @@ def _left_of_law(knowledge: System, data: Samples) -> tuple[Any, Any, Any]:
     """What C z + D z_t = f2 leaves at the true strains, its natural size, and what stress may depend on."""
 
     def one(sample: Samples) -> Any:
-        s = sample.place * knowledge.length
+        s = start_of(knowledge, sample.place)
         history = unpacked_history(knowledge, sample.c0, sample.history[0])
         z, z_t = sample.z, sample.c0 * sample.z + history.z
         _, z_rest = knowledge.rest(s)
@@ -187,7 +187,7 @@ class _Views(NamedTuple):
 @jax.jit
 def _views(knowledge: System, data: Samples) -> _Views:
     def one(sample: Samples) -> Any:
-        s = sample.place * knowledge.length
+        s = start_of(knowledge, sample.place)
         history = unpacked_history(knowledge, sample.c0, sample.history[0])
         y_t, z_t = sample.c0 * sample.y + history.y, sample.c0 * sample.z + history.z
         observables = knowledge.observables(s, sample.y, y_t, sample.z, z_t, sample.control)
@@ -208,7 +208,7 @@ def _rates(knowledge: System, data: Samples) -> Any:
     def one(sample: Samples) -> Any:
         history = unpacked_history(knowledge, sample.c0, sample.history[0])
         return knowledge.rates(
-            sample.place * knowledge.length, sample.t, sample.y, sample.z, sample.control, history
+            start_of(knowledge, sample.place), sample.t, sample.y, sample.z, sample.control, history
         )
 
     return jax.vmap(one)(data)

@@ -22,9 +22,10 @@ from jaxtyping import Float, Int, UInt32
 from knode_cosserat.learning.config import Training
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import Network, Residual, elu, input_layout
-from knode_cosserat.learning.samples import Dataset, Samples, predict
+from knode_cosserat.learning.samples import Dataset, Samples, predict, start_of
 from knode_cosserat.learning.training.losses import Loss, loss_for, sizes, spread
 from knode_cosserat.rods.system import System, unpacked_history
+from knode_cosserat.solvers.crossing import crossing_of
 from knode_cosserat.solvers.space import Euler, SpaceScheme
 
 #: the most epochs of one call of the program
@@ -73,7 +74,7 @@ def known(net: Network, knowledge: System, samples: Samples) -> Known:
 
     def one(sample: Samples) -> Any:
         history = unpacked_history(knowledge, sample.c0, sample.history[0])
-        at = sample.place * knowledge.length, sample.t, sample.y, sample.control, history
+        at = start_of(knowledge, sample.place), sample.t, sample.y, sample.control, history
         y_s, z = knowledge.derivatives(*at)
         inputs = net.inputs(knowledge, sample.y, z, sample.control, history)
         return (inputs - net.input_mean) / net.input_scale, sample.y + ds * y_s, z
@@ -184,15 +185,17 @@ def _loss(weights: Any, recipe: Recipe, data: Data, noise: Any, key: Any) -> Any
     samples: Any = data.samples
     if recipe.noisy:
         samples = _noisy(samples, data, noise, key)
-    if _adds(residual, recipe.space):
+    if _adds(residual, recipe.space, data.knowledge):
         return data.loss(*corrected(residual, known(residual, data.knowledge, samples)))
     model = KNODE(data.knowledge, residual)
     return data.loss(*jax.vmap(lambda one: predict(model, recipe.space, one), out_axes=-1)(samples))
 
 
-def _adds(residual: Residual, space: SpaceScheme) -> bool:
+def _adds(residual: Residual, space: SpaceScheme, knowledge: System) -> bool:
     """Whether a prediction is what the knowledge alone predicts, and something added to that."""
-    return isinstance(residual, Network) and isinstance(space, Euler)
+    crossing = crossing_of(knowledge)
+    parted = crossing is not None and crossing.acting.shape[1] > 1
+    return isinstance(residual, Network) and isinstance(space, Euler) and not parted
 
 
 def _noisy(samples: Samples, data: Data, noise: Any, key: Any) -> Samples:
@@ -290,7 +293,9 @@ def prepared(
     _, rest = split(residual)
     given: Any = residual
     ready = (
-        _known(given, knowledge, segments) if _adds(residual, dataset.space) and not recipe.noisy else None
+        _known(given, knowledge, segments)
+        if _adds(residual, dataset.space, knowledge) and not recipe.noisy
+        else None
     )
     per_y, per_z = sizes(knowledge.y_layout), sizes(knowledge.z_layout)
     fields = [*per_y, *per_z, *(per_y if knowledge.mixed else [])]

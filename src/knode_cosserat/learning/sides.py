@@ -1,0 +1,111 @@
+"""Where something acts at a node: the state on its far side, and the slopes on either side of it.
+
+A trajectory holds y on the near side of a cut and z on the far side. What is predicted or regressed at a
+node is the segment that begins there, so that it needs y, and its slope, on the far side.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.rods.system import System, unpacked_history
+from knode_cosserat.solvers.crossing import crossings
+from knode_cosserat.solvers.settings import Settings
+
+
+def far_side(
+    knowledge: System, t: Float[Any, " T"], c0: Float[Any, " T"], y: Float[Any, "T N y"],
+    control: Float[Any, "T c"], history: Float[Any, "T N x"],
+) -> Float[Any, "T N y"]:  # fmt: skip
+    """y at all nodes, beyond what the knowledge has acting there; the same y where nothing does."""
+    if not (knowledge.cuts and knowledge.jumps):
+        return y
+    # of each segment, the cuts at its very start
+    acting = crossings(knowledge.cuts, knowledge.nodes).acting[:, 0]
+    jumping = np.flatnonzero(acting.any(axis=1))
+    if not len(jumping):
+        return y
+    beyond = y.copy()
+    beyond[:, jumping] = _crossed(
+        knowledge, acting[jumping], t, c0, y[:, jumping], control, history[:, jumping]
+    )
+    return beyond
+
+
+@jax.jit
+def _crossed(knowledge, acting, t, c0, y, control, history):  # type: ignore[no-untyped-def]
+    def at_node(acting: Any, t: Any, c0: Any, y: Any, control: Any, record: Any) -> Any:
+        return knowledge.crossed(acting, t, y, control, unpacked_history(knowledge, c0, record))
+
+    at_row = jax.vmap(at_node, in_axes=(0, None, None, 0, None, 0))
+    return jax.vmap(at_row, in_axes=(None, 0, 0, 0, 0, 0))(
+        jnp.asarray(acting), *map(jnp.asarray, (t, c0, y, control, history))
+    )
+
+
+def slopes_of(
+    settings: Settings, y: np.ndarray, beyond: np.ndarray | None = None, cuts: tuple[float, ...] = ()
+) -> tuple[np.ndarray, np.ndarray]:
+    """y_s times the length (T, N, y), from the states alone, and by how much it may be wrong (y,).
+
+    Exact where a segment is one Euler step; of splines otherwise, judged by those of the next lower order.
+    No spline goes over a cut: with `beyond`, y on the far side of the cuts, slopes at cuts are those there.
+    """
+    last = y.shape[1] - 1
+    beyond = y if beyond is None else beyond
+    if settings.space.order == 1:
+        forward = (y[:, 1:] - beyond[:, :-1]) * last
+        return np.concatenate([forward, forward[:, -1:]], axis=1), np.zeros(y.shape[-1])
+    slope, wrong = np.zeros_like(y), np.zeros_like(y)
+    for first, end in pieces(cuts, last + 1):
+        values = y[:, first : end + 1].copy()
+        values[:, 0] = beyond[:, first]
+        slope[:, first : end + 1], wrong[:, first : end + 1] = _spline_slopes(values, last)
+    # where a cut is between nodes there may be a node by itself: that of the segment must do, and is in doubt
+    alone = [first for first, end in pieces(cuts, last + 1) if first == end]
+    for node in alone:
+        other = node if node < last else node - 1
+        slope[:, node] = (y[:, other + 1] - beyond[:, other]) * last
+        wrong[:, node] = slope[:, node]
+    return slope, 0.1 * np.sqrt(np.mean(np.square(wrong), axis=(0, 1)))
+
+
+def pieces(cuts: tuple[float, ...], nodes: int) -> list[tuple[int, int]]:
+    """First and last node of each stretch of rod without a cut inside; neighbours share a node on a cut."""
+    along = np.asarray(cuts) * (nodes - 1)
+    nearest = np.round(along).astype(int)
+    on_node = {int(k) for k, a in zip(nearest, along, strict=True) if abs(k - a) < 1e-9 * (nodes - 1)}
+    between = {int(np.floor(a)) for k, a in zip(nearest, along, strict=True) if int(k) not in on_node}
+    found, first = [], 0
+    for node in range(nodes - 1):
+        if node in between:
+            found.append((first, node))
+            first = node + 1
+        elif node + 1 in on_node and node + 1 < nodes - 1:
+            found.append((first, node + 1))
+            first = node + 1
+    return [*found, (first, nodes - 1)]
+
+
+def _spline_slopes(values: np.ndarray, last: int) -> tuple[np.ndarray, np.ndarray]:
+    """Slopes of one stretch between cuts, and the error of those of the next lower order."""
+    # imported here: it takes a third of a second
+    from scipy.interpolate import make_interp_spline
+
+    count = values.shape[1]
+    if count == 1:
+        return np.zeros_like(values), np.zeros_like(values)
+    place = np.arange(count) / last
+    highest = min(7, 2 * ((count - 2) // 2) + 1)
+    high, low = (
+        make_interp_spline(place, values, k=order, axis=1).derivative()(place)
+        if order > 0
+        else np.zeros_like(values)
+        for order in (highest, min(5, highest - 2) if count < 8 else 5)
+    )
+    return high, high - low

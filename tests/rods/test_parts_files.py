@@ -1,0 +1,301 @@
+"""Parts of robots in files: every kind comes back equal, errors say where, and batches keep their own."""
+
+import dataclasses
+import re
+from pathlib import Path
+
+import hypothesis.strategies as st
+import jax
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+
+import knode_cosserat as kc
+from knode_cosserat.learning.config import NetworkOptions
+from knode_cosserat.learning.residual import network
+from knode_cosserat.rods.ends import Driven, End
+from knode_cosserat.rods.loads import AttachedMass, DistributedWrench, Load, PointWrench
+from knode_cosserat.rods.parameters import choices_of, parameters_of
+from knode_cosserat.rods.parts import kinds_of
+from knode_cosserat.rods.robot_file import KINDS, RobotFileError, format_robot, parse_robot
+from knode_cosserat.rods.routing import FunctionRouting, Routing
+from knode_cosserat.rods.section import SectionChange
+from knode_cosserat.rods.surroundings import Obstacle, Sphere
+from knode_cosserat.rods.virtual_robot import VirtualRobot
+
+BODY = {"length": 0.5, "radius": 0.005, "density": 1000.0, "youngs_modulus": 1e6}
+
+
+def assert_equal(a, b):
+    assert jax.tree.structure(a) == jax.tree.structure(b)
+    for one, other in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def numbers(stated):
+    each = st.floats(stated.low, stated.high, allow_subnormal=False)
+    sizes = {"vector": (3, 3), "quaternion": (4, 4), "list": (1, 4)}
+    if stated.shape == "scalar":
+        return each
+    if stated.shape == "matrix":
+        return each.map(lambda size: size * np.eye(3))
+    least, most = sizes[stated.shape]
+    found = st.lists(each, min_size=least, max_size=most)
+    return found.filter(any) if stated.shape == "quaternion" else found
+
+
+@st.composite
+def parts(draw, family):
+    cls = draw(st.sampled_from(list(kinds_of(family).values())))
+    fields = {field.name: field for field in dataclasses.fields(cls)}
+    given = {}
+    for name, stated in parameters_of(cls).items():
+        required = fields[name].default is dataclasses.MISSING
+        if (name not in ("begin", "end") or "begin" not in fields) and (required or draw(st.booleans())):
+            given[name] = draw(numbers(stated))
+    if "begin" in fields and draw(st.booleans()):
+        places = st.lists(st.floats(0.0, 1.0), min_size=2, max_size=2, unique=True)
+        given["begin"], given["end"] = sorted(draw(places))
+    for name, stated in choices_of(cls).items():
+        words = st.sampled_from(stated.allowed)
+        given[name] = draw(st.lists(words, min_size=1, unique=True) if stated.many else words)
+    return cls(**given)
+
+
+def some(family):
+    return st.lists(parts(family), max_size=3).map(tuple)
+
+
+ROD = {
+    "sections": some(SectionChange), "loads": some(Load), "surroundings": some(Obstacle),
+    "base_end": parts(End), "tip_end": parts(End),
+}  # fmt: skip
+TENDONS = {"tendon_offset": st.just(0.01), "tendon_angles": st.just([0.0, 2.0])}
+ROUTED = {
+    **ROD, **TENDONS, "drive": st.sampled_from(["tension", "reel"]),
+    "routing": st.none() | st.lists(parts(Routing), min_size=2, max_size=2).map(tuple),
+    "friction_wobble": st.none() | st.floats(0.0, 1.0), "tendon_compliance": st.floats(0.0, 1.0),
+}  # fmt: skip
+FIELDS = {
+    "slender-rod": ROD,
+    "routed-tendon-robot": ROUTED,
+    "tendon-robot": ROD,
+    "virtual-robot": {**ROD, **TENDONS},
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@settings(max_examples=40, deadline=None)
+@given(data=st.data())
+def test_robots_with_parts_come_back_equal(kind, data):
+    assert set(FIELDS) == set(KINDS)
+    robot = KINDS[kind](**BODY, **data.draw(st.fixed_dictionaries(FIELDS[kind])))
+    text = format_robot(robot)
+    assert_equal(parse_robot(text, "here"), robot)
+    content = yaml.safe_load(text)
+    assert content["kind"] == kind
+    # what needs nothing new is still a file of the first format
+    new = set(content["parameters"]) - set(KINDS[kind].parameters()) - {"nodes"}
+    assert content["format"] == (2 if new else 1)
+
+
+def test_a_file_of_the_first_format_is_read_and_written_as_it_was():
+    robot = kc.load_robot("delrin-tendon-robot")
+    text = format_robot(robot)
+    assert text.startswith("format: 1\n") and "base_end" not in text and "loads" not in text
+    assert_equal(parse_robot(text, "here"), robot)
+
+
+# errors
+
+HEAD = (
+    "format: 2\nkind: slender-rod\nparameters:\n  " + "\n  ".join(f"{k}: {v}" for k, v in BODY.items()) + "\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        ("loads: [{kind: attached-mass, mass: -1}]", "loads.0.mass is -1; allowed is a number 0 to 10000 kg"),
+        (
+            "loads: [{kind: attached-mass}, {kind: attached-mass, at: 2}]",
+            "loads.1.at is 2; allowed is a number 0 to 1",
+        ),
+        (
+            "loads: [{kind: attached-mas}]",
+            "loads.0.kind is 'attached-mas'; allowed is attached-mass, distributed-wrench, "
+            "point-wrench; did you mean attached-mass?",
+        ),
+        ("loads: [{mass: 1}]", "loads.0 is {'mass': 1}; allowed is a mapping with a kind: attached-mass"),
+        ("loads: {kind: attached-mass}", "loads is {'kind': 'attached-mass'}; allowed is a list of mappings"),
+        ("loads: 3", "loads is 3; allowed is a list of mappings, each with a kind"),
+        (
+            "loads: [{kind: attached-mass, weight: 1}]",
+            "loads.0: the key 'weight' is unknown; allowed is at, mass",
+        ),
+        (
+            "loads: [{kind: point-wrench, follows: maybe}]",
+            "loads.0.follows is 'maybe'; allowed is false, true",
+        ),
+        (
+            "loads: [{kind: point-wrench, force: [1, 2]}]",
+            "loads.0.force is [1, 2]; allowed is three numbers, each",
+        ),
+        ("base_end: {kind: driven, axes: [[x]]}", "base_end.axes is [['x']]; allowed is a list of different"),
+        (
+            "base_end: clamped",
+            "base_end is 'clamped'; allowed is a mapping with a kind: clamped, driven, free, pinned",
+        ),
+        (
+            "base_end: {kind: driven, axes: [x, x]}",
+            "base_end.axes is ['x', 'x']; allowed is a list of different ones of x, y",
+        ),
+        (
+            "base_end: {kind: driven, axes: [q]}",
+            "base_end.axes is ['q']; allowed is a list of different ones of x, y",
+        ),
+        (
+            "tip_end: {kind: pinned, orientation: [0, 0, 0, 0]}",
+            "tip_end.orientation is [0, 0, 0, 0]; allowed is four numbers, not all zero",
+        ),
+        (
+            "surroundings: [{kind: sphere, radius: 0}]",
+            "surroundings.0.radius is 0; allowed is a number 1e-06 to 1000 m",
+        ),
+        ("sections: [{kind: stretch, radius: []}]", "sections.0.radius is []; allowed is a list of numbers"),
+        (
+            "sections: [{kind: stretch, begin: 0.5, end: 0.5}]",
+            "sections.0: .*end is 0.5; allowed is a place beyond begin, 0.5",
+        ),
+        (
+            "loads: [{kind: distributed-wrench, begin: 0.7, end: 0.2}]",
+            "loads.0: .*end is 0.2; allowed is a place beyond begin, 0.7",
+        ),
+    ],
+)  # fmt: skip
+def test_errors_name_file_place_value_and_what_is_allowed(more, words):
+    with pytest.raises(RobotFileError) as caught:
+        parse_robot(HEAD + f"  {more}\n", "robots/mine.yaml")
+    pattern = ".*".join(map(re.escape, f"robots/mine.yaml: {words}".split(".*")))
+    assert re.search(pattern, str(caught.value)), caught.value
+    assert "\n" not in str(caught.value)
+
+
+def test_code_cannot_be_saved(tmp_path):
+    rod = kc.SlenderRod(**BODY, sections=(kc.FunctionSection(),))
+    with pytest.raises(RobotFileError, match=r"^a FunctionSection cannot be written .* made of code"):
+        kc.save_robot(rod, tmp_path / "rod.yaml")
+    routed = kc.RoutedTendonRobot(
+        **BODY,
+        tendon_offset=0.01,
+        tendon_angles=[0.0],
+        routing=(FunctionRouting(lambda s: (0.01 * s, 0.0 * s)),),
+    )
+    with pytest.raises(RobotFileError, match=r"^a FunctionRouting cannot be written"):
+        kc.save_robot(routed, tmp_path / "rod.yaml")
+    assert not list(tmp_path.iterdir())
+
+
+# parameters of parts by name
+
+LADEN = kc.SlenderRod(
+    **BODY, nodes=6, base_end=Driven(axes=("x", "ry")),
+    loads=(AttachedMass(mass=0.1, at=0.4), PointWrench(controlled=True), DistributedWrench(begin=0.3)),
+    surroundings=(Sphere(center=[0.0, 0.0, -1.0]),), sections=(kc.Stretch(end=0.4, stiffness=[1.0, 2.0]),),
+)  # fmt: skip
+
+
+def test_parameters_of_parts_by_name():
+    changed = LADEN.replace(**{
+        "loads.0.mass": 0.3, "loads.1.force": [1, 2, 3], "surroundings.0.radius": 0.2,
+        "base_end.position": [1, 0, 0], "loads.0.at": 0.6,
+    })  # fmt: skip
+    assert changed.loads[0].mass == 0.3 and changed.loads[0].at == 0.6 and 0.6 in changed.cuts
+    np.testing.assert_array_equal(changed.loads[1].force, [1, 2, 3])
+    assert changed.surroundings[0].radius == 0.2 and changed.loads[2] is LADEN.loads[2]
+    np.testing.assert_array_equal(changed.base_end.position, [1, 0, 0])
+    assert LADEN.loads[0].mass == 0.1
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("loads.3.mass", 1.0, r"no parameter 'loads.3.mass': no '3' among 0, 1, 2"),
+        (
+            "loads.0.weight",
+            1.0,
+            r"no parameter 'loads.0.weight': no 'weight' among at, mass, inertia, offset",
+        ),
+        ("loads.0.mass", -1.0, r"AttachedMass: mass is -1.0; allowed is a number 0 to 10000 kg"),
+        ("cargo.0.mass", 1.0, r"no parameter 'cargo"),
+        ("loads.0", 3.0, r"loads holds a float; allowed is a load"),
+        ("length.0", 3.0, r"no parameter 'length.0': no '0' among nothing"),
+    ],
+)
+def test_wrong_names_of_parts(name, value, words):
+    with pytest.raises(kc.ParameterError, match=words) as caught:
+        LADEN.replace(**{name: value})
+    assert "\n" not in str(caught.value)
+
+
+# files of trajectories and of models
+
+
+def made(robots):
+    """A trajectory's arrays need not be a solution to be written."""
+    one = robots[0]
+    batch = (len(robots),) if len(robots) > 1 else ()
+    rng = np.random.default_rng(0)
+    numbers = np.zeros((*batch, 3))
+    system = jax.tree.map(lambda *leaves: np.stack(leaves), *robots) if batch else one
+    return kc.Trajectory(
+        system, None, np.arange(3) * 0.1, rng.normal(size=(*batch, 3, one.nodes, one.y_layout.size)),
+        rng.normal(size=(*batch, 3, one.nodes, one.z_layout.size)),
+        rng.normal(size=(*batch, 3, one.control_size)), numbers.astype(int), numbers, numbers.astype(int),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_trajectories_of_robots_that_differ_in_their_parts_come_back(tmp_path, count):
+    robots = [
+        LADEN.replace(**{
+            "loads.0.mass": 0.1 * k, "loads.1.moment": [k, 0, 1], "surroundings.0.radius": 0.1 + k,
+            "length": 0.5 + k, "sections.0.stiffness": [1.0 + k, 2.0], "base_end.position": [0, 0, k],
+            "loads.2.force": [0, k, 0],
+        })
+        for k in range(count)
+    ]  # fmt: skip
+    truth = made(robots)
+    truth.save(tmp_path / "here.nc")
+    found = kc.load_trajectory(tmp_path / "here.nc")
+    assert_equal(found.system, truth.system)
+    for name in ("y", "z", "control"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(truth, name))
+
+
+def test_a_batch_from_a_damaged_file_is_refused(tmp_path):
+    import h5py
+
+    path = tmp_path / "here.nc"
+    made([LADEN, LADEN]).save(path)
+    with h5py.File(path, "r+") as file:
+        file["robot_loads.0.mass"][1] = -1.0
+    with pytest.raises(
+        kc.TrajectoryFileError, match=r"a robot of the batch is not possible: AttachedMass: mass"
+    ):
+        kc.load_trajectory(path)
+
+
+@pytest.mark.parametrize("name", [name for name in kc.catalog() if name != "delrin-tendon-robot"])
+def test_models_of_robots_with_parts_come_back(tmp_path, name):
+    knowledge = kc.load_robot(name)
+    model = kc.KNODE(knowledge, network(knowledge, NetworkOptions(hidden=3), jax.random.PRNGKey(0)))
+    model.save(tmp_path / "model")
+    found = kc.load_model(next(Path(tmp_path).glob("model*")))
+    assert_equal(found.knowledge, knowledge)
+
+
+def test_the_virtual_robot_may_have_parts_too():
+    robot = VirtualRobot(**BODY, tendon_offset=0.01, tendon_angles=[0.0], loads=(AttachedMass(mass=0.1),))
+    assert_equal(parse_robot(format_robot(robot), "here"), robot)

@@ -1,0 +1,154 @@
+"""Sections that differ along the rod, and by control."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+import knode_cosserat as kc
+from knode_cosserat.rods.loads import PointWrench
+
+L, RADIUS, E = 0.4, 0.006, 1e7
+EI, GA = E * np.pi * RADIUS**4 / 4, E / 2.6 * np.pi * RADIUS**2
+CHANGED = kc.SlenderRod(
+    length=L, radius=RADIUS, density=1000.0, youngs_modulus=E, gravity=[0.0, 0.0, 0.0], nodes=11,
+    bending_damping=1e-4,
+    sections=(
+        kc.Stretch(
+            end=0.47, radius=[1.0, 0.0], stiffness=[1.0, 0.0], controlled=True,
+            stiffness_gain=0.0, curvature_gain=[0.0, 0.0, 0.0],
+        ),
+        kc.Stretch(
+            begin=0.47, radius=[1.0, 0.0], stiffness=[1.0, 0.0], controlled=True,
+            stiffness_gain=0.0, curvature_gain=[0.0, 0.0, 0.0],
+        ),
+    ),
+    loads=(PointWrench(at=1.0),),
+)  # fmt: skip
+
+
+def changed(both=None, nodes=11, force=(0.0, 0.0, 0.0), **each):
+    values = {f"sections.{k}.{name}": value for k in (0, 1) for name, value in (both or {}).items()}
+    values |= {f"sections.{key[-1]}.{key[:-2]}": value for key, value in each.items()}
+    return CHANGED.replace(nodes=nodes, **values, **{"loads.0.force": np.asarray(force)})
+
+
+def rest(robot, control=(0.0, 0.0)):
+    return kc.equilibrium(robot, np.asarray(control, dtype=float), space="rk4")
+
+
+def test_a_rod_curved_at_rest_closes_to_a_ring():
+    ring = changed({"curvature": [0.0, 2 * np.pi / L, 0.0]})
+    found = rest(ring)
+    np.testing.assert_allclose(found.tip_position[0], 0.0, atol=5e-4 * L)
+    np.testing.assert_allclose(np.abs(found.quaternion[0, -1]), [1, 0, 0, 0], atol=1e-3)
+    for name in "nm":
+        np.testing.assert_allclose(found.part(name), 0.0, atol=1e-8 * EI)
+
+
+@pytest.mark.campaign
+def test_it_closes_with_order_four():
+    gaps = [
+        np.linalg.norm(rest(changed({"curvature": [0.0, 2 * np.pi / L, 0.0]}, nodes)).tip_position[0])
+        for nodes in (11, 21, 41)
+    ]
+    assert np.all(np.log2(np.divide(gaps[:-1], gaps[1:])) > 3.5), gaps
+
+
+def test_a_cone_bends_as_the_integral_of_its_stiffness():
+    """Half as thick at its tip, in two stretches that meet."""
+    F = 1e-3 * EI / L**2
+    cone = changed(radius_0=[1.0, -0.235], radius_1=[0.765, -0.265], force=[F, 0.0, 0.0])
+
+    def rate(s):
+        factor = 1.0 - 0.5 * s / L
+        return F * (L - s) ** 2 / (EI * factor**4) + F / (GA * factor**2)
+
+    expected, _ = quad(rate, 0.0, L, epsabs=1e-14)
+    # of RK4 on ten segments, and of the beam's small angles
+    assert rest(cone).tip_position[0, 0] == pytest.approx(expected, rel=2e-5)
+
+
+def test_stiffness_along_the_rod_and_by_control():
+    M = 0.5 * EI / L
+    robot = changed({"stiffness_gain": 0.5}, stiffness_0=[2.0, 0.0], stiffness_1=[3.0, 2.0])
+    robot = robot.replace(**{"loads.0.moment": [0.0, M, 0.0]})
+    u = np.asarray(rest(robot, [0.4, -0.2]).part("u"))[0, :, 1]
+    s = np.arange(11) / 10
+    along = np.where(s < 0.47, 2.0 * 1.2, (3.0 + 2.0 * (s - 0.47) / 0.53) * 0.9)
+    np.testing.assert_allclose(u, M / EI / along, rtol=1e-8)
+
+
+def arc(curvature, length):
+    """In the plane: displacement across and along, and the turn, of an arc."""
+    turn = curvature * length
+    return np.array([(1 - np.cos(turn)), np.sin(turn)]) / curvature, turn
+
+
+@pytest.mark.parametrize("control", [(1.0, 1.0), (1.0, -0.5), (-0.3, 0.8)])
+def test_a_robot_of_controlled_curvature_bends_to_arcs(control):
+    robot = changed({"curvature_gain": [0.0, 6.0, 0.0]})
+    found = rest(robot, control)
+    (one, turn), (other, more) = (
+        arc(6.0 * c, part * L) for c, part in zip(control, (0.47, 0.53), strict=True)
+    )
+    turned = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    expected = one + turned @ other
+    np.testing.assert_allclose(found.tip_position[0, [0, 2]], expected, atol=1e-5 * L)
+    h = found.quaternion[0, -1]
+    assert 2 * np.arctan2(h[2], h[0]) == pytest.approx(turn + more, abs=1e-5)
+
+
+def test_one_stretch_is_two():
+    """A function over all of the rod is the polynomials in its two parts."""
+
+    def function(part, control):
+        return kc.Differences(radius=1.0 - 0.3 * part, curvature=np.array([1.0, 0.0, 2.0]) * control[0])
+
+    whole = dataclasses.replace(CHANGED, sections=(kc.FunctionSection(function=function, inputs=1),))
+    parts = changed(
+        {"curvature_gain": [1.0, 0.0, 2.0]}, radius_0=[1.0, -0.141], radius_1=[0.859, -0.159]
+    )  # fmt: skip
+    for name in ("Kse", "Kbt", "u_star", "rhoA", "rhoJ", "radius"):
+        for s in (0.0, 0.1, 0.3, 0.4):
+            np.testing.assert_allclose(
+                getattr(whole.material(s, np.array([0.7])), name),
+                getattr(parts.material(s, np.array([0.7, 0.7])), name),
+                rtol=1e-12, atol=1e-14,
+            )  # fmt: skip
+
+
+def test_the_catalogs_robot_of_controlled_curvature():
+    robot = kc.load_robot("variable-curvature-robot").replace(gravity=[0.0, 0.0, 0.0])
+    assert len(robot.sections) == robot.control_size == 3
+    control = np.array([0.5, -0.3, 0.8])
+    u = np.asarray(kc.equilibrium(robot, control).part("u"))[0]
+    s = np.linspace(0.0, 1.0, robot.nodes)
+    for section, c in zip(robot.sections, control, strict=True):
+        inside = (s > section.begin + 1e-9) & (s < section.end - 1e-9)
+        assert inside.any()
+        expected = c * np.asarray(section.curvature_gain)
+        np.testing.assert_allclose(u[inside], np.tile(expected, (inside.sum(), 1)), atol=1e-7)
+        assert np.linalg.norm(expected) > 0.5
+
+
+@pytest.mark.campaign
+def test_derivatives_with_respect_to_a_section_and_its_control():
+    control = np.stack([np.sin(np.arange(20) / 4.0), np.cos(np.arange(20) / 5.0)], axis=1)
+
+    def tip(gain, scale):
+        robot = CHANGED.replace(**{
+            "sections.0.curvature_gain": gain, "sections.1.stiffness_gain": 0.3, "gravity": [1.0, 2.0, -9.0]
+        })  # fmt: skip
+        return kc.simulate(robot, scale * control, 0.02).position[-1, -1, 0]
+
+    at, along = (np.array([1.0, 3.0, 0.2]), 0.8), (np.array([0.4, -0.3, 0.6]), 0.5)
+    slope = float(jax.jvp(tip, at, along)[1])
+    gradient = jax.grad(tip, argnums=(0, 1))(*at)
+    h = 1e-3
+    steps = [float(tip(*(a + k * h * d for a, d in zip(at, along, strict=True)))) for k in (-2, -1, 1, 2)]
+    expected = (steps[0] - 8 * steps[1] + 8 * steps[2] - steps[3]) / (12 * h)
+    assert slope == pytest.approx(expected, rel=1e-5)
+    assert np.sum(gradient[0] * along[0]) + gradient[1] * along[1] == pytest.approx(expected, rel=1e-5)
