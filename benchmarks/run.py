@@ -17,10 +17,10 @@ from typing import Any
 ROUNDS = 3
 
 
-def case(name: str, cache: str, of: str = "cases") -> dict[str, Any]:
+def case(name: str | None, cache: str, of: str = "cases") -> dict[str, Any]:
     """One case in a process of its own, with the given directory of compiled programs."""
     ran = subprocess.run(
-        [sys.executable, "-m", f"benchmarks.{of}", name],
+        [sys.executable, "-m", f"benchmarks.{of}", *([name] if name else [])],
         env={**os.environ, "KNODE_COSSERAT_CACHE": cache},
         stdout=subprocess.PIPE,
         check=True,
@@ -65,6 +65,7 @@ def measure() -> dict[str, Any]:
         command_seconds(cache)
         second = [command_seconds(cache) for _ in range(ROUNDS)]
         found = {name: case(name, cache) for name in ("steps", "batch", "gradient", "memory", "workspace")}
+        found["family"] = case(None, cache, "family")
         found |= {name: case(name, cache, "learning") for name in ("fits", "learned_steps")}
     with tempfile.TemporaryDirectory() as empty:
         found["study"] = case("study", empty, "learning")
@@ -101,10 +102,32 @@ def table(found: dict[str, Any]) -> str:
         ("second process, command to result", f"{found['second_process']['seconds']:.1f} s", "<= 3 s"),
         ("gradient of 100 steps against the steps", f"{gradient['ratio']:.1f}x", "<= 5x"),
         ("peak memory, 1,000 steps", f"{found['memory']['megabytes']:.0f} MB", "<= 700 MB"),
+        *family_rows(found["family"]),
         *learning_rows(found),
     ]
     lines = ["| what | measured | aim |", "| --- | --- | --- |"]
     return "\n".join([*lines, *(f"| {what} | {value} | {aim} |" for what, value, aim in rows)])
+
+
+def family_rows(found: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """What the other robots cost."""
+
+    def ratios(kind: str) -> str:
+        each = [case[kind]["ratio"] for case in found["tendons"].values()]
+        return f"{min(each):.2f}x to {max(each):.2f}x"
+
+    reel = found["reel"]
+    return [
+        ("a step with real tendons, against the crude ones", ratios("straight"), "<= 1.5x"),
+        ("the same with friction", ratios("friction"), "<= 1.5x"),
+        ("the same with helical tendons", ratios("helical"), "<= 1.5x"),
+        (
+            f"500 steps, 200 nodes, a reel and slack ({reel['slack_steps']} slack steps)",
+            f"{reel['seconds']:.2f} s",
+            "<= 1 s",
+        ),
+        ("a step of the six-legged robot", f"{found['parallel']['milliseconds']:.2f} ms", "<= 10 ms"),
+    ]
 
 
 def learning_rows(found: dict[str, Any]) -> list[tuple[str, str, str]]:

@@ -1,0 +1,101 @@
+"""What the other robots cost: `python -m benchmarks.family` prints one JSON object.
+
+Robots with real tendons are measured against the crude one in turn, with controls of which both make the same
+number of corrections; Till's example (2019) is a steel rod whose one tendon is pulled by a reel and let go.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import statistics
+from typing import Any
+
+import numpy as np
+
+from benchmarks.cases import one_core, seconds
+
+STEPS, DT, ROUNDS = 128, 0.05, 15
+
+
+def tendons() -> dict[str, Any]:
+    """A step of real tendons as a multiple of a step of the crude ones: medians of ratios; corrections."""
+    import knode_cosserat as kc
+
+    crude = kc.load_robot("delrin-tendon-robot")
+    helix = [kc.routing.Helical(0.02, angle, 0.5) for angle in np.asarray(crude.tendon_angles)]
+    robots = {
+        "crude": crude,
+        "straight": kc.RoutedTendonRobot.like(crude),
+        "friction": kc.RoutedTendonRobot.like(crude, friction_wobble=0.6, friction_curvature=0.1),
+        "helical": kc.RoutedTendonRobot.like(crude, routing=tuple(helix)),
+    }
+    controls = {
+        "sine": kc.controls.sine(1.5, STEPS, DT),
+        "step": kc.controls.step(1.5, STEPS, DT),
+    }
+    # real tendons bend the robot less: pulled so hard they move it as far, and it takes as many corrections
+    large = {"sine": 5.5 * (controls["sine"] - 6.0) + 8.0, "step": 5.0 * (controls["step"] - 5.0) + 5.0}
+    found: dict[str, Any] = {}
+    for name, control in controls.items():
+        for size, pulled in (("", control), (", as far", np.maximum(large[name], 0.0))):
+            given = {kind: control if kind == "crude" else pulled for kind in robots}
+            moved = {kind: kc.simulate(robot, given[kind], DT) for kind, robot in robots.items()}
+            times: dict[str, list[float]] = {kind: [] for kind in robots}
+            for _ in range(ROUNDS):
+                for kind, robot in robots.items():
+                    times[kind].append(seconds(functools.partial(kc.simulate, robot, given[kind], DT)))
+            found[name + size] = {
+                kind: {
+                    "ratio": statistics.median(
+                        own / other for own, other in zip(times[kind], times["crude"], strict=True)
+                    ),
+                    "microseconds": 1e6 * statistics.median(times[kind]) / STEPS,
+                    "corrections": float(np.mean(moved[kind].iterations[1:])),
+                }
+                for kind in robots
+            }
+    return found
+
+
+def reel() -> dict[str, Any]:
+    """500 steps of Till's example through slack: seconds, and how often the tendon was slack."""
+    import knode_cosserat as kc
+
+    length, radius = 0.7144, 0.675e-3
+    robot = kc.RoutedTendonRobot(
+        length=length, radius=radius, density=0.034 / (length * np.pi * radius**2), youngs_modulus=207e9,
+        bending_damping=5e-4, drag=1e-4, gravity=(9.81, 0.0, 0.0), tendon_offset=0.01506,
+        tendon_angles=(np.pi / 2,), tendon_compliance=1e-4, drive="reel", nodes=200,
+    )  # fmt: skip
+    pulled = kc.named_controls.parse(robot, "reel=ramp:0.01619,start=1,end=1.3", 500, DT)
+    released = kc.named_controls.parse(robot, "reel=ramp:0.01619,start=13,end=13.3", 500, DT)
+    hanging = kc.equilibrium(robot, np.zeros(1))
+    moved = kc.simulate(robot, pulled - released, DT, initial=hanging)
+    times = [seconds(lambda: kc.simulate(robot, pulled - released, DT, initial=hanging)) for _ in range(5)]
+    tension = np.asarray(moved.tension)[:, 0]
+    return {
+        "seconds": statistics.median(times),
+        "slack_steps": int(np.sum(tension < 1e-3)),
+        "largest_tension": float(tension.max()),
+        "least_tension": float(tension.min()),
+        "unsolved": int(np.sum(moved.result < 0)),
+        "corrections": float(np.mean(moved.iterations[1:])),
+    }
+
+
+def parallel() -> dict[str, Any]:
+    """A step of the six-legged robot, its actuators moving by 20 mm (ms)."""
+    import knode_cosserat as kc
+
+    robot = kc.load_robot("six-legged-robot")
+    t = np.arange(1, 101)[:, None]
+    control = 0.02 * np.sin(0.06 * t) * np.cos(np.arange(6))
+    kc.simulate(robot, control, 0.02)
+    times = [seconds(lambda: kc.simulate(robot, control, 0.02)) for _ in range(7)]
+    return {"milliseconds": 1e3 * statistics.median(times) / 100}
+
+
+if __name__ == "__main__":
+    one_core()
+    print(json.dumps({"tendons": tendons(), "reel": reel(), "parallel": parallel()}))
