@@ -58,7 +58,6 @@ def with_ribs():
 SYSTEMS = {
     each.__name__: each for each in (driven_in_contact, variable_curvature, helical_tendons, reels, with_ribs)
 }
-FAST = ("variable_curvature",)
 
 
 def error(found, truth):
@@ -66,9 +65,8 @@ def error(found, truth):
     return float(np.sqrt(np.mean(np.sum((found.position - truth.position) ** 2, axis=-1))))
 
 
-@pytest.mark.parametrize(
-    "name", [name if name in FAST else pytest.param(name, marks=pytest.mark.campaign) for name in SYSTEMS]
-)
+@pytest.mark.campaign
+@pytest.mark.parametrize("name", SYSTEMS)
 def test_a_wrong_modulus_is_made_up_for(name):
     robot, seen, unseen = SYSTEMS[name]()
     knowledge = robot.replace(youngs_modulus=0.7 * robot.youngs_modulus)
@@ -127,9 +125,12 @@ def test_slopes_do_not_go_over_what_acts(laden):
 
     rates = np.asarray(_rates(LADEN, data.segments)).reshape(-1, 10, 19)
     found = np.asarray(data.segments.slope).reshape(-1, 10, 19) / 0.5
-    size = np.abs(rates).max(axis=(0, 1))
-    worst = np.max(np.abs(found - rates) / size)
-    assert worst < (1e-6 if laden.settings.space.order == 1 else 2e-2)
+    # the force's and the moment's, and where it is; what hardly changes is not known as well
+    for name in "pnm":
+        spot = LADEN.y_layout.slice(name)
+        size = np.abs(rates[..., spot]).max()
+        worst = np.abs(found - rates)[..., spot].max() / size
+        assert worst < (1e-6 if laden.settings.space.order == 1 else 2e-3), name
 
 
 @pytest.mark.parametrize(

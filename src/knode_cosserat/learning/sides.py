@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.system import System, unpacked_history
-from knode_cosserat.solvers.crossing import crossings
+from knode_cosserat.solvers.crossing import ON_NODE, crossings
 from knode_cosserat.solvers.settings import Settings
 
 
@@ -78,10 +78,12 @@ def slopes_of(
 def pieces(cuts: tuple[float, ...], nodes: int) -> list[tuple[int, int]]:
     """First and last node of each stretch of rod without a cut inside; neighbours share a node on a cut."""
     along = np.asarray(cuts) * (nodes - 1)
-    nearest = np.round(along).astype(int)
-    on_node = {int(k) for k, a in zip(nearest, along, strict=True) if abs(k - a) < 1e-9 * (nodes - 1)}
-    between = {int(np.floor(a)) for k, a in zip(nearest, along, strict=True) if int(k) not in on_node}
-    found, first = [], 0
+    nearest = np.round(along)
+    is_node = np.abs(nearest - along) < ON_NODE * (nodes - 1)
+    on_node = set(nearest[is_node].astype(int).tolist())
+    between = set(np.floor(along[~is_node]).astype(int).tolist())
+    found: list[tuple[int, int]] = []
+    first = 0
     for node in range(nodes - 1):
         if node in between:
             found.append((first, node))
@@ -101,11 +103,11 @@ def _spline_slopes(values: np.ndarray, last: int) -> tuple[np.ndarray, np.ndarra
     if count == 1:
         return np.zeros_like(values), np.zeros_like(values)
     place = np.arange(count) / last
-    highest = min(7, 2 * ((count - 2) // 2) + 1)
+    orders = min(7, count - 1), min(5, count - 2)
     high, low = (
         make_interp_spline(place, values, k=order, axis=1).derivative()(place)
         if order > 0
         else np.zeros_like(values)
-        for order in (highest, min(5, highest - 2) if count < 8 else 5)
+        for order in orders
     )
     return high, high - low
