@@ -166,6 +166,14 @@ class KNODE(System):
         """The knowledge's."""
         return self.knowledge.positions(y)
 
+    def unstressed(self, s: Any, control: Any) -> Float[Any, " z"]:
+        """The knowledge's."""
+        return self.adapted.unstressed(s, control)
+
+    def law_factors(self, s: Any, control: Any) -> tuple[Any, Any] | None:
+        """The knowledge's."""
+        return self.adapted.law_factors(s, control)
+
     def curves(self, y: Any) -> list[Any]:
         """The knowledge's."""
         return self.knowledge.curves(y)

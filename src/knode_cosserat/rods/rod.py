@@ -197,6 +197,21 @@ class Rod(System):
 
     # what learning looks at
 
+    def unstressed(self, s: Any, control: Any) -> Float[Any, " z"]:
+        """As the sections are curved there, by themselves and by control."""
+        _, z = self.rest(s)
+        return z.at[3:6].set(self.material(s, control).u_star) if self.sections else z
+
+    def law_factors(self, s: Any, control: Any) -> tuple[Any, Any] | None:
+        """Those of the sections on stiffness and damping."""
+        if not self.sections:
+            return None
+        controls = self._controls(control)[2 : 2 + len(self.sections)]
+        found = differences_at(self.sections, s / self.length, controls)
+        area = found.radius * found.radius
+        damping = jnp.concatenate([jnp.full(3, 1.0) * area, jnp.full(3, 1.0) * area * area])
+        return damping * found.stiffness, damping
+
     @property
     def observable_layout(self) -> Layout:
         """Motion and bending, as seen from the material."""

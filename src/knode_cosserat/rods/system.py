@@ -270,6 +270,14 @@ class System(eqx.Module):
         """What of the control enters the equations; the control itself unless a system knows better."""
         return control
 
+    def unstressed(self, s: Any, control: Any) -> Float[Any, " z"]:
+        """z at s that the material has without stress, under this control; by default that of rest."""
+        return self.rest(s)[1]
+
+    def law_factors(self, s: Any, control: Any) -> tuple[Any, Any] | None:
+        """By what C and D of the strains' law differ at s from elsewhere, by number of z; None: not."""
+        return None
+
     @property
     def observable_layout(self) -> Layout:
         """What `observables` gives: by default y, its rate, the strains from rest, and their rate."""
@@ -285,8 +293,8 @@ class System(eqx.Module):
         self, s: Any, y: Float[Any, " y"], y_t: Any, z: Float[Any, " z"], z_t: Any, control: Any
     ) -> Float[Any, " o"]:
         """What a load that the equations miss may depend on beside the control, as seen from the material."""
-        _, z_rest = self.rest(s)
-        return jnp.concatenate([self.turned(y, y), self.turned(y, y_t), z - z_rest, z_t])
+        bent = z - self.unstressed(s, control)
+        return jnp.concatenate([self.turned(y, y), self.turned(y, y_t), bent, z_t])
 
     def turned(self, y: Float[Any, " y"], vectors: Float[Any, " y"]) -> Float[Any, " y"]:
         """Numbers laid out like y with those of the global frame turned into the material's."""

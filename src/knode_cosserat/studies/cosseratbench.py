@@ -245,8 +245,8 @@ def _controls(rod: Rod, times: np.ndarray) -> np.ndarray:
         if motion is None:
             continue
         for path in (motion.displacement, motion.rotation):
-            path = np.asarray(path, dtype=float)
-            found.append(np.stack([np.interp(times, motion.times, each) for each in path.T], axis=1))
+            columns = np.asarray(path, dtype=float).T
+            found.append(np.stack([np.interp(times, motion.times, each) for each in columns], axis=1))
     return np.concatenate(found, axis=1)
 
 

@@ -28,6 +28,7 @@ from knode_cosserat.learning.structured.residual import (
     ambient_inputs,
     ambient_layout,
     geometric,
+    law_inputs,
     loaded,
     material_layout,
     tip_observables,
@@ -143,8 +144,7 @@ def _left_of_law(knowledge: System, data: Samples) -> tuple[Any, Any, Any]:
         s = start_of(knowledge, sample.place)
         history = unpacked_history(knowledge, sample.c0, sample.history[0])
         z, z_t = sample.z, sample.c0 * sample.z + history.z
-        _, z_rest = knowledge.rest(s)
-        inputs = jnp.concatenate([z - z_rest, z_t])
+        inputs = law_inputs(knowledge, s, sample.control, z, z_t)
         if type(knowledge).constitutive is System.constitutive:
             own = knowledge.strains(s, sample.t, sample.y, sample.control, history)
             return own - z, own, inputs

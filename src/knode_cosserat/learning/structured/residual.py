@@ -60,11 +60,15 @@ class _Law(NamedTuple):
     z0: Float[Any, " z"]
     hz: Float[Any, " z"]
 
+    #: by what strain and rate count there (see `law_inputs`); None: by one
+    factors: Any = None
+
     def left(self, z: Float[Any, " z"]) -> Float[Any, " z"]:
         """What is left of the law."""
-        return dot(self.M, z - self.z0) + self.stress(
-            jnp.concatenate([z - self.z_rest, self.c0 * z + self.hz])
-        )
+        strain, rate = z - self.z_rest, self.c0 * z + self.hz
+        if self.factors is not None:
+            strain, rate = strain * self.factors[0], rate * self.factors[1]
+        return dot(self.M, z - self.z0) + self.stress(jnp.concatenate([strain, rate]))
 
 
 def solved(law: _Law) -> Float[Any, " z"]:
@@ -133,9 +137,9 @@ class Structured(Residual):
         z0 = knowledge.strains(s, t, y, control, history)
         if self.stress is None:
             return z0
-        _, z_rest = knowledge.rest(s)
+        z_rest = knowledge.unstressed(s, control)
         M = strain_matrix(knowledge, s, t, y, control, history)
-        law = _Law(self.stress, M, history.c0, z_rest, z0, history.z)
+        law = _Law(self.stress, M, history.c0, z_rest, z0, history.z, factors_at(knowledge, s, control))
         if not self.stress.curved:
             # linear: one correction from z0 is exact, and its matrix is the same along the whole rod
             n = jnp.zeros_like(z_rest)
@@ -166,6 +170,21 @@ class Structured(Residual):
             return None
         y_t, z_t = history.c0 * y + history.y, history.c0 * z + history.z
         return knowledge.observables(s, y, y_t, z, z_t, control)
+
+
+def factors_at(knowledge: System, s: Any, control: Any) -> tuple[Any, Any] | None:
+    """By what the law differs at s, of a law that is one of stresses; one of strains is alike everywhere."""
+    if type(knowledge).constitutive is System.constitutive:
+        return None
+    return knowledge.law_factors(s, control)
+
+
+def law_inputs(knowledge: System, s: Any, control: Any, z: Any, z_t: Any) -> Float[Any, " 2z"]:
+    """What stress may depend on: strain and rate, as much of them as the section there makes of it."""
+    strain, factors = z - knowledge.unstressed(s, control), factors_at(knowledge, s, control)
+    if factors is None:
+        return jnp.concatenate([strain, z_t])
+    return jnp.concatenate([strain * factors[0], z_t * factors[1]])
 
 
 def tip_observables(knowledge: System, y: Float[Any, " y"], control: Any, history: History) -> Any:
