@@ -82,6 +82,7 @@ def test_simulate_writes_what_the_package_computes(tmp_path):
     np.testing.assert_array_equal(kc.load_trajectory(tmp_path / "truth.nc").y, expected.y)
 
 
+@pytest.mark.campaign
 def test_simulate_takes_schemes_and_parameters(tmp_path):
     facts = told(
         *simulated(tmp_path / "a.nc", "--dt", 0.02, "--time", "bdf1", "--space", "rk4", "--nodes", 7),
@@ -266,6 +267,7 @@ def test_fit_tells_what_it_did(data, tmp_path):
     assert text.endswith(f"wrote {tmp_path / 'm'}\n")
 
 
+@pytest.mark.campaign
 def test_fit_trains_an_ensemble_of_networks_at_once(data, tmp_path):
     out = tmp_path / "models"
     facts = told(
@@ -508,6 +510,7 @@ def test_the_program_fails_in_one_line(tmp_path):
     assert done.stderr == f"error: nobot: no such file or robot; the catalog has {names}\n"
 
 
+@pytest.mark.campaign
 def test_the_demonstration_runs_and_says_what_it_shows(tmp_path):
     demo = Path(__file__).parents[1] / "examples" / "demo.py"
     done = python(demo, "--out", "pictures", cwd=tmp_path)

@@ -35,6 +35,7 @@ def test_it_hangs_as_a_catenary(string):
     assert np.log2(errors[0] / errors[1]) > 3.5 and np.log2(errors[1] / errors[2]) > 3.5
 
 
+@pytest.mark.campaign
 def test_it_swings_and_comes_to_rest(string):
     rest = kc.equilibrium(string, HAND, space="rk4")
     t = np.arange(1, 201) * 0.05
@@ -83,6 +84,7 @@ def test_what_it_does_not_have_is_said(string):
         string.replace(youngs_modulus=1.0)
 
 
+@pytest.mark.campaign
 def test_the_example_runs(tmp_path, capsys):
     main(tmp_path)
     assert (tmp_path / "hanging_string.png").stat().st_size > 10_000

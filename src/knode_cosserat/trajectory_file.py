@@ -23,6 +23,7 @@ from knode_cosserat.rods import robot_file
 from knode_cosserat.rods.parameters import Parameter, ParameterError, parameters_of, slots_of
 from knode_cosserat.rods.system import Field, Layout, System
 from knode_cosserat.solvers.boundary import NewtonOptions
+from knode_cosserat.solvers.linear import Condensed, Decoupled, LinearSolver
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
@@ -388,12 +389,14 @@ def _first_line(error: Exception) -> str:
 def _settings_text(settings: Settings | None, source: str) -> str:
     if settings is None:
         return "null"
-    described = {
+    described: dict[str, Any] = {
         "time": {"scheme": type(settings.time).__name__, **dataclasses.asdict(settings.time)},
         "space": {"scheme": type(settings.space).__name__, **dataclasses.asdict(settings.space)},
         "start": settings.start,
         "newton": dataclasses.asdict(settings.newton),
     }
+    if isinstance(settings.elimination, Decoupled):
+        described["elimination"] = Decoupled.__name__
     try:
         return json.dumps(described)
     except (TypeError, ValueError) as error:
@@ -410,6 +413,7 @@ def _settings(path: Path, data: xarray.Dataset) -> Settings | None:
             space=_scheme(SpaceScheme, **described["space"]),
             start=described["start"],
             newton=NewtonOptions(**described["newton"]),
+            elimination=_scheme(LinearSolver, scheme=described.get("elimination", Condensed.__name__)),
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise TrajectoryFileError(

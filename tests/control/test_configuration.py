@@ -30,7 +30,9 @@ def test_a_cantilever_is_compliant_as_a_beam():
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("robot", [ROBOT, ROUTED], ids=["crude", "routed"])
+@pytest.mark.parametrize(
+    "robot", [ROBOT, pytest.param(ROUTED, marks=pytest.mark.campaign)], ids=["crude", "routed"]
+)
 def test_slopes_are_those_of_the_equilibrium(robot):
     """All 4 columns of the Jacobian against central differences of equilibria."""
     found = kc.configuration(robot, CONTROL)

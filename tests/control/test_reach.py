@@ -23,7 +23,9 @@ def learned():
     return kc.fit(ROBOT.replace(youngs_modulus=10e9), [truth], kc.FitConfig(seed=0))
 
 
-@pytest.mark.parametrize("robot", [ROBOT, ROUTED], ids=["crude", "routed"])
+@pytest.mark.parametrize(
+    "robot", [ROBOT, pytest.param(ROUTED, marks=pytest.mark.campaign)], ids=["crude", "routed"]
+)
 def test_reachable_positions_are_reached(robot):
     generator = np.random.default_rng(7)
     for control in generator.uniform(0.0, HIGH, (30, 4)):
@@ -39,6 +41,7 @@ def test_reachable_positions_are_reached(robot):
     assert found.from_rest
 
 
+@pytest.mark.campaign
 def test_a_model_that_was_learned_is_led_as_well():
     model = learned()
     assert isinstance(model.residual, Structured)

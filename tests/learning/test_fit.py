@@ -221,6 +221,7 @@ def _scalars(folder):
     return found
 
 
+@pytest.mark.campaign
 def test_metrics_for_tensorboard(bars, unseen, tmp_path):
     pytest.importorskip("tensorboardX")
     config = dataclasses.replace(

@@ -88,6 +88,7 @@ LINEAR = {
 }
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize("loading", LINEAR)
 def test_cantilever_of_small_deflection(loading):
     errors = []
@@ -147,6 +148,7 @@ def test_elastica_in_another_direction():
 # the order in space: what doubling the segments does to the distance from the closed form
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize(("space", "order", "grids"), SPACES)
 def test_order_in_space_of_the_elastica(space, order, grids):
     errors = [np.abs(bent(5, nodes=nodes, space=space) - elastica(5)) for nodes in grids]

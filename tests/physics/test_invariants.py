@@ -166,6 +166,7 @@ def test_trapezoidal_motion_goes_on_exactly_from_rest_and_by_one_bdf1_step_from_
     assert 0.0 < away < 0.1 * moved
 
 
+@pytest.mark.campaign
 def test_batch_of_controls_is_each_by_itself(robot):
     many = np.stack([kc.controls.random(STEPS, seed=seed) for seed in range(3)])
     batch = kc.simulate(robot, many, DT)

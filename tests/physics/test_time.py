@@ -142,6 +142,7 @@ def test_order_in_time(robot, finely_stepped, time, order, start):
 # a frequency
 
 
+@pytest.mark.campaign
 def test_free_vibration_of_the_first_mode(robot):
     EI, rhoA = float(robot.Kbt[0, 0]), float(robot.mass_per_length)
     frequency = closed_forms.frequency(1, float(robot.length), EI, rhoA)

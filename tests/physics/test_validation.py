@@ -25,6 +25,7 @@ def test_statics_by_rk4(key):
         assert beams.order(errors, GRID) == pytest.approx(4.0, abs=0.1)
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize("key", ["even load", "half circle", "circle", "helix", "elastica 1", "elastica 10"])
 def test_statics_by_euler(key):
     errors = [beams.STATICS[key].error(nodes, "euler") for nodes in GRID]
@@ -38,6 +39,7 @@ def test_critical_loads(key):
     assert errors[-1] < 5e-6
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize("key", of(beams.VIBRATION, "mode 2", "mode 3"))
 def test_frequencies(key):
     errors = [beams.VIBRATION[key].error(nodes, "rk4") for nodes in GRID]

@@ -112,6 +112,7 @@ def test_the_paper_s_velocities_are_of_order_two_in_time():
     assert np.all(np.abs(orders - 2.0) < 0.25)
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize("method", ["best", "paper"])
 def test_turning_everything_about_z_turns_the_states(method):
     noise, angle = (0.15e-3, 2e-3), 0.7
@@ -128,6 +129,7 @@ def test_turning_everything_about_z_turns_the_states(method):
         assert np.abs(difference[2:-2]).max() < (most if method == "best" else 1e-9), name
 
 
+@pytest.mark.campaign
 def test_a_loaded_equilibrium_has_its_own_forces():
     robot = ROBOT.replace(nodes=28)
     truth = kc.equilibrium(robot, np.array([5.0, 5.0, 5.3, 5.2]), space="rk4")
@@ -150,6 +152,7 @@ def test_a_loaded_equilibrium_has_its_own_forces():
         np.testing.assert_allclose(np.asarray(states.part(name))[10], true, atol=allowed)
 
 
+@pytest.mark.campaign
 def test_on_the_virtual_robot_the_best_is_three_times_better(virtual):
     path, truth = virtual
     recording = kc.load_recording(path)

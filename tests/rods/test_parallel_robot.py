@@ -63,6 +63,7 @@ def test_equal_displacements_lift_the_platform_without_tilting_it(displacement):
     np.testing.assert_allclose(height, still(ROBOT, np.zeros(6))[0].tip_position[0, 2], atol=1e-9)
 
 
+@pytest.mark.campaign
 def test_a_turned_layout_turns_everything():
     angle = 0.7
     other = ROBOT.replace(
@@ -107,6 +108,7 @@ def test_the_platform_is_in_balance():
     np.testing.assert_allclose(moment, 0.0, atol=1e-9)
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize("load", [0.0, 0.2, 0.6])
 def test_lateral_stiffness_and_its_loss_under_weight(load):
     """A given part of the load under which the legs buckle; Timoshenko, Theory of elastic stability, 2.6."""
@@ -171,6 +173,7 @@ def pose_and_slope():
     return jax.jit(jax.jacfwd(pose, has_aux=True))
 
 
+@pytest.mark.campaign
 def test_derivatives_of_the_pose_are_those_of_finite_differences():
     given, step = jnp.concatenate([SOME, jnp.zeros(3)]), 1e-4
     slope, _ = pose_and_slope()(given)

@@ -323,9 +323,7 @@ def test_files_that_cannot_be_read(tmp_path):
     with fails("delrin-tendn-robot: no such file or robot", PAPER, f"did you mean {PAPER}?"):
         load_robot("delrin-tendn-robot")
     (tmp_path / "mine.yaml").write_text(text())
-    with fails(
-        "mine.yml: no such file or robot", "the catalog has ", PAPER, f"did you mean {tmp_path}/mine.yaml?"
-    ):
+    with fails("mine.yml: no such file or robot", "the catalog has ", f"did you mean {tmp_path}/mine.yaml?"):
         load_robot(tmp_path / "mine.yml")
     with fails("no/where.yaml: no such file or robot"):
         load_robot(tmp_path / "no" / "where.yaml")

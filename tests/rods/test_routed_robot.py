@@ -102,6 +102,7 @@ def test_friction_stays_between_none_and_all_and_opposes_motion():
     assert np.all(np.sign(f[1:][sliding]) == np.sign(rate[sliding]))
 
 
+@pytest.mark.campaign
 def test_vibration_frees_the_tendons_and_stays_until_tension_falls():
     robot = kc.RoutedTendonRobot.like(
         KNOWLEDGE, **RUBBING, vibration_tension=20.0, vibration_rate=1.0, vibration_softening=1e-3

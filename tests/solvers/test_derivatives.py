@@ -150,6 +150,7 @@ def bar_loss(at, **options):
 bar_gradient = jax.jit(jax.grad(bar_loss))
 
 
+@pytest.mark.campaign
 def test_gradient_by_other_schemes():
     @jax.jit
     @jax.value_and_grad
@@ -183,6 +184,7 @@ FACTORS = np.array([1.0, 0.9, 1.2])
 MANY = {**{name: value * FACTORS for name, value in BAR.items()}, "load": LOADS}
 
 
+@pytest.mark.campaign
 def test_gradient_of_a_batch_is_each_by_itself():
     def loss(many):
         bars = [Bar(**{name: many[name][i] for name in BAR}) for i in range(3)]

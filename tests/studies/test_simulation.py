@@ -83,6 +83,7 @@ main()
 """
 
 
+@pytest.mark.campaign
 def test_killed_in_the_middle_it_goes_on_to_the_same_table(tmp_path, baseline):
     arguments = [
         "study",

@@ -177,10 +177,15 @@ class Rod(System):
         """v of the unloaded rod: along z, unstretched."""
         return ALONG
 
+    @property
+    def u_star(self) -> np.ndarray:
+        """u of the unloaded rod (1/m), where no section says otherwise: straight."""
+        return np.zeros(3)
+
     def material(self, s: Any, control: Any) -> Material:
         """Section and material at arclength s (m)."""
         plain = Material(
-            self.Kse, self.shear_damping, self.Kbt, self.bending_damping, np.zeros(3),
+            self.Kse, self.shear_damping, self.Kbt, self.bending_damping, self.u_star,
             self.mass_per_length, self.density * self.section.inertia, self.radius,
         )  # fmt: skip
         if not self.sections:

@@ -76,8 +76,8 @@ class BDFAlpha(TimeScheme):
         a, r = self.alpha, dt / previous_dt
         scale = 1.0 / (dt * (1.0 + a))
         return Coefficients(
-            c0=scale * ((1.0 + 2.0 * r) + 2.0 * a * r) / (1.0 + r),
-            c1=-scale * ((1.0 + r) + 2.0 * a * r),
+            c0=scale * (1.0 + 2.0 * r * (1.0 + a)) / (1.0 + r),
+            c1=-scale * (1.0 + r * (1.0 + 2.0 * a)),
             c2=scale * r * r * (1.0 + 2.0 * a) / (1.0 + r),
             d1=a / (1.0 + a),
         )

@@ -87,6 +87,7 @@ def as_measured(trajectories: list[kc.Trajectory], noise: float, seed: int) -> l
 # what is found in data without noise
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize(
     ("truth", "start"),
     [
@@ -279,6 +280,7 @@ def test_how_states_enter_is_known_exactly(time, space, string_swing):
     np.testing.assert_allclose(predicted, expected, rtol=1e-5)
 
 
+@pytest.mark.campaign
 def test_rollouts_need_positions_and_orientations_only(training):
     """Signs and lengths of quaternions do not matter; what was not measured may be missing."""
     [measured] = as_measured(training[1:], 0.0, 0)

@@ -673,6 +673,7 @@ def test_the_command_line_reads_predictions(prediction, tmp_path):
     assert (tmp_path / "prediction.png").stat().st_size > 10_000
 
 
+@pytest.mark.campaign
 def test_batches_of_models(tmp_path):
     members = [KNODE(ROBOT, network(seed=seed)) for seed in (1, 2)]
     batch = kc.simulate(members, TENSIONS, 0.05)

@@ -54,6 +54,7 @@ def at_points(robot, y, control, history):
 # the truths
 
 
+@pytest.mark.campaign
 def test_a_truth_is_the_knowledge_where_its_one_thing_more_is_nothing():
     expected = at_points(ROBOT, *points())
     assert set(NEUTRAL) == set(imperfections.KINDS) - {"TendonRobot"}

@@ -157,6 +157,7 @@ def kill_during(stage, folder, delay):
 _newest: dict[Path, int] = {}
 
 
+@pytest.mark.campaign
 def test_killed_and_resumed(bars, tmp_path):
     expected = fit(WRONG, bars, LONG)
     random.seed(3)
