@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from knode_cosserat.learning.calibration import search
 from knode_cosserat.learning.calibration.misfit import SegmentMisfit, by_group
-from knode_cosserat.learning.calibration.noise import Errors, errors_of
+from knode_cosserat.learning.calibration.noise import Errors, errors_of, hidden_by_rounding
 from knode_cosserat.learning.calibration.rollouts import RolloutMisfit
 from knode_cosserat.learning.calibration.search import CalibrationError as CalibrationError
 from knode_cosserat.learning.calibration.search import Fit, Misfit
@@ -178,6 +178,10 @@ def _ended(misfit: Misfit, start: np.ndarray, may_leave_out: bool) -> tuple[Fit,
     left_out: tuple[str, ...] = ()
     while True:
         ended = search.fit(misfit, start, may_leave_out, left_out)
+        hidden = hidden_by_rounding(misfit, ended) & ended.free
+        if may_leave_out and np.any(hidden):
+            left_out = (*ended.left_out, search.labels_of(misfit.unknowns)[int(np.argmax(hidden))])
+            continue
         errors = errors_of(misfit, ended)
         numbers = np.abs(found(misfit.unknowns, ended.coordinates))
         size = np.where(logarithmic(misfit.unknowns), 1.0, numbers)[ended.free]

@@ -21,6 +21,8 @@ from knode_cosserat.learning.sides import slopes_of
 from knode_cosserat.solvers.space import middles
 from knode_cosserat.trajectory import Trajectory
 
+#: numbers of states are not known better than to this part
+ROUNDING = 1e-14
 #: draws from which it is taken how large differences become by noise in each field
 PROBES = 3
 
@@ -57,13 +59,34 @@ def errors_of(misfit: Misfit, ended: Fit) -> Errors:
     return Errors(covariance, _shift(misfit, ended, sizes))
 
 
+def hidden_by_rounding(misfit: Misfit, ended: Fit) -> np.ndarray:
+    """Which coordinates the data tell of by their last digits only: (n,), true or false.
+
+    Noise as small as rounding then changes their slopes by more than a little: what multiplies a rate that is
+    zero, say, in a robot that is at rest.
+    """
+    hidden = np.zeros(len(ended.free), dtype=bool)
+    if not isinstance(misfit, SegmentMisfit):
+        return hidden
+    slopes = misfit(ended.coordinates).slopes
+    rounded = misfit.moved(misfit.draws[0], ROUNDING * typical_sizes(misfit)[misfit.state_groups])
+    changed = np.linalg.norm(misfit(ended.coordinates, rounded).slopes - slopes, axis=0)
+    return changed > 0.1 * np.linalg.norm(slopes, axis=0)
+
+
+def typical_sizes(misfit: SegmentMisfit) -> Float[np.ndarray, " fields"]:
+    """How large the numbers of each field of y and z are (rms)."""
+    segments = misfit.data.segments
+    squares = np.mean(np.square(np.hstack([segments.y, segments.z])), axis=0)
+    return np.sqrt(by_group(squares, misfit.state_groups))
+
+
 def noise_sizes(misfit: SegmentMisfit, ended: Fit) -> Float[np.ndarray, " x"]:
     """Standard deviations of white noise in y and z that explain how large the differences are."""
     # imported here: it takes a third of a second
     from scipy.optimize import nnls
 
-    groups, segments = misfit.state_groups, misfit.data.segments
-    typical = np.sqrt(by_group(np.mean(np.square(np.hstack([segments.y, segments.z])), axis=0), groups))
+    groups, typical = misfit.state_groups, typical_sizes(misfit)
     # small enough for the differences to be linear in it
     small = 1e-6 * np.maximum(typical, 1e-6 * typical.max())
     still = misfit(ended.coordinates).values
