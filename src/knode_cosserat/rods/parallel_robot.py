@@ -42,16 +42,6 @@ class Leg(Rod):
         """The robot's."""
         return displacements(self.legs)
 
-    def strains(
-        self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
-    ) -> Float[Any, " z"]:
-        """v and u (paper eq. 15)."""
-        return self.linear_strains(s, y, control, history)
-
-    def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
-        """C, D, f2 of the material's law."""
-        return self.linear_law(s, y, control)
-
 
 def displacements(count: int) -> Layout:
     """The control of a robot with so many legs."""

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from typing import Any, ClassVar, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -22,36 +21,35 @@ from knode_cosserat.rods.ends import Clamped, End, Free, Pose, velocities
 from knode_cosserat.rods.loads import Load, Motion, PointLoad, SpreadLoad, Wrench, square_law_drag
 from knode_cosserat.rods.parameters import parameter, part
 from knode_cosserat.rods.parts import placed, shares
-from knode_cosserat.rods.section import CircularSection, SectionChange, differences_at, shear_modulus
+from knode_cosserat.rods.section import (
+    ALONG,
+    CircularSection,
+    Differences,
+    Material,
+    SectionChange,
+    differences_at,
+    shape_at_rest,
+    shear_modulus,
+)
 from knode_cosserat.rods.surroundings import Obstacle
 from knode_cosserat.rods.system import History, Layout, Scales, System
 from knode_cosserat.rotation import cross, dot, inverse, quaternion_rate, rotation_matrix
 
-#: d₃: along the rod
-ALONG = np.array([0.0, 0.0, 1.0])
-#: steps in which the shape at rest of a rod that is curved at rest is integrated
-REST_STEPS = 100
 
+class PartControls(NamedTuple):
+    """The controls of a rod's parts, those of sections and loads in their order."""
 
-class Material(NamedTuple):
-    """The rod's section and material at one place: the law K (z - z*) + B z_t and the inertia."""
-
-    Kse: Float[Any, "3 3"]
-    Bse: Float[Any, "3 3"]
-    Kbt: Float[Any, "3 3"]
-    Bbt: Float[Any, "3 3"]
-    u_star: Float[Any, "3"]
-    #: ρA (kg/m)
-    rhoA: Any
-    #: ρJ (kg·m)
-    rhoJ: Float[Any, "3 3"]
-    radius: Any
+    base: Any
+    tip: Any
+    sections: list[Any]
+    loads: list[Any]
 
 
 class Rod(System):
     """A round rod with gravity, drag, material damping, loads, ends and surroundings (paper eqs. 13-15).
 
-    A subclass says what its actuators do: `strains`, and if they load it from outside `actuator_force`.
+    A subclass says what its actuators do: by a law of its own, `strains`, which then has no `constitutive`,
+    or by what they load the rod with, `actuator_force`.
     """
 
     y_layout: ClassVar[Layout] = Layout(
@@ -133,10 +131,11 @@ class Rod(System):
         sections = [(f"section{k}", each) for k, each in enumerate(self.sections)]
         return [*ends, *sections, *((f"load{k}", each) for k, each in enumerate(self.loads))]
 
-    def _controls(self, control: Any) -> list[Any]:
-        """The controls of the base, the tip, each section and each load."""
+    def _controls(self, control: Any) -> PartControls:
+        """What of the control is each part's own."""
         spots = shares(tuple(each for _, each in self._driven), self.actuator_layout.size)
-        return [control[spot] for spot in spots]
+        base, tip, *others = (control[spot] for spot in spots)
+        return PartControls(base, tip, others[: len(self.sections)], others[len(self.sections) :])
 
     @property
     def rest_is_guess(self) -> bool:  # type: ignore[override]
@@ -190,15 +189,16 @@ class Rod(System):
         )  # fmt: skip
         if not self.sections:
             return plain
-        found = differences_at(
-            self.sections, s / self.length, self._controls(control)[2 : 2 + len(self.sections)]
-        )
+        found = self._differences(s, control)
         area = found.radius * found.radius
         return Material(
             plain.Kse * (area * found.stiffness), plain.Bse * area,
             plain.Kbt * (area * area * found.stiffness), plain.Bbt * (area * area), found.curvature,
             plain.rhoA * area, plain.rhoJ * (area * area), plain.radius * found.radius,
         )  # fmt: skip
+
+    def _differences(self, s: Any, control: Any) -> Differences:
+        return differences_at(self.sections, s / self.length, self._controls(control).sections)
 
     # what learning looks at
 
@@ -211,8 +211,7 @@ class Rod(System):
         """Those of the sections on stiffness and damping."""
         if not self.sections:
             return None
-        controls = self._controls(control)[2 : 2 + len(self.sections)]
-        found = differences_at(self.sections, s / self.length, controls)
+        found = self._differences(s, control)
         area = found.radius * found.radius
         damping = jnp.concatenate([jnp.full(3, 1.0) * area, jnp.full(3, 1.0) * area * area])
         return damping * found.stiffness, damping
@@ -246,8 +245,10 @@ class Rod(System):
         R = rotation_matrix(self.y_layout.get(y, "h"))
         return dot(R.T, self.y_layout.get(y, "n")), dot(R.T, self.y_layout.get(y, "m"))
 
-    def linear_strains(self, s: Any, y: Float[Any, " y"], control: Any, history: History) -> Float[Any, " 6"]:
-        """v and u of the rod's own linear law (paper eq. 15)."""
+    def strains(
+        self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
+    ) -> Float[Any, " z"]:
+        """v and u of the linear law (paper eq. 15)."""
         c0, material = history.c0, self.material(s, control)
         n, m = self.stresses(y)
         hv, hu = self.z_layout.get(history.z, "v"), self.z_layout.get(history.z, "u")
@@ -257,8 +258,8 @@ class Rod(System):
         u = dot(inverse(Kbt + c0 * Bbt), bent - dot(Bbt, hu))
         return jnp.concatenate([v, u])
 
-    def linear_law(self, s: Any, y: Float[Any, " y"], control: Any) -> tuple[Any, Any, Any]:
-        """C, D, f2 of the same law: K (z - z*) + B z_t = Rᵀ (n, m)."""
+    def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
+        """C, D, f2 of the same law, K (z - z*) + B z_t = Rᵀ (n, m)."""
         material = self.material(s, control)
         n, m = self.stresses(y)
         zero = jnp.zeros((3, 3))
@@ -305,7 +306,7 @@ class Rod(System):
     def _distributed(self, s: Any, motion: Motion, radius: Any, control: Any) -> list[Wrench]:
         """What loads and surroundings do, per length."""
         found = [obstacle.wrench(motion, radius) for obstacle in self.surroundings]
-        for load, own in zip(self.loads, self._controls(control)[2 + len(self.sections) :], strict=True):
+        for load, own in zip(self.loads, self._controls(control).loads, strict=True):
             if not isinstance(load, SpreadLoad):
                 continue
             wrench = load.wrench(motion, own)
@@ -349,7 +350,7 @@ class Rod(System):
 
     def _point_wrench(self, weights: Any, y: Any, control: Any, history: History) -> Wrench:
         """The sum of the loads at places, each times its weight."""
-        controls = self._controls(control)[2 + len(self.sections) :]
+        controls = self._controls(control).loads
         motion = Motion.of(self.y_layout, y, history.c0 * y + history.y)
         total = Wrench(jnp.zeros(3), jnp.zeros(3))
         for k, weight in weights.items():
@@ -381,23 +382,14 @@ class Rod(System):
         def curvature(at: Any) -> Any:
             return self.material(at, still).u_star
 
-        def on(k: Any, pose: tuple[Any, Any]) -> tuple[Any, Any]:
-            p, h = pose
-            ds = s / REST_STEPS
-            # the middle of each step is exact enough for a start, and an equilibrium is found from there
-            half = h + 0.5 * ds * quaternion_rate(h, curvature(k * ds))
-            h = h + ds * quaternion_rate(half, curvature((k + 0.5) * ds))
-            return p + ds * dot(rotation_matrix(half), ALONG), h / jnp.sqrt(jnp.sum(h * h))
-
-        p, h = jax.lax.fori_loop(0, REST_STEPS, on, (base.p, base.h))
-        return p, h, curvature(s)
+        return *shape_at_rest(base.p, base.h, s, curvature), curvature(s)
 
     def base(self, t: Any, control: Any, unknowns: Float[Any, " k"], history: History) -> Float[Any, " y"]:
         """y at s = 0: held as its end has it, and moving as that moves."""
         y, _ = self.rest(jnp.zeros(()))
         if type(self.base_end) is Clamped:
             return y.at[self.y_layout.indices(self.base_unknowns)].set(unknowns)
-        own = self._controls(control)[0]
+        own = self._controls(control).base
         held = self.base_end.pose(Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])), own)
         y = jnp.concatenate([held.p, held.h, y[7:]])
         y = y.at[self.y_layout.indices(self.base_unknowns)].set(unknowns)
@@ -419,7 +411,7 @@ class Rod(System):
             left = jnp.concatenate([-n, -m])
         else:
             rest = self._pose(self.rest(self.length)[0])
-            held = self.tip_end.pose(rest, self._controls(control)[1])
+            held = self.tip_end.pose(rest, self._controls(control).tip)
             left = self.tip_end.left(held, self._pose(y), n, m)
         if "h" not in self.base_unknowns:
             return left

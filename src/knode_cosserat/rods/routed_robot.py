@@ -40,9 +40,10 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.parameters import choice, parameter, part
-from knode_cosserat.rods.rod import Material, Rod
+from knode_cosserat.rods.rod import Rod
 from knode_cosserat.rods.routing import Routing, Straight, ends, routes
-from knode_cosserat.rods.system import History, Layout
+from knode_cosserat.rods.section import Material
+from knode_cosserat.rods.system import History, Layout, System
 from knode_cosserat.rods.tendon_law import stretches, tendon_strains
 from knode_cosserat.rods.tendon_rod import TendonRod
 from knode_cosserat.rotation import dot
@@ -255,6 +256,9 @@ class RoutedTendonRobot(TendonRod):
         return jnp.stack(ways)
 
     # the equations
+
+    # not of the form C z + D z_t = f2
+    constitutive = System.constitutive
 
     def strains(
         self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -14,7 +15,12 @@ from jaxtyping import Float
 from knode_cosserat.rods.parameters import choice, parameter, place
 from knode_cosserat.rods.parts import Part, require_stretch
 from knode_cosserat.rods.system import Field
+from knode_cosserat.rotation import dot, quaternion_rate, rotation_matrix
 
+#: d₃: along the rod
+ALONG = np.array([0.0, 0.0, 1.0])
+#: steps in which the shape of a rod that is curved at rest is integrated
+REST_STEPS = 100
 #: The paper's G = E / (2 (1 + 0.3)), for a robot that gives no shear modulus.
 POISSON_RATIO = 0.3
 
@@ -51,6 +57,21 @@ class CircularSection(NamedTuple):
 def shear_modulus(youngs_modulus: Any) -> Any:
     """Shear modulus G = E / (2 (1 + ν)) of an isotropic material (Pa)."""
     return youngs_modulus / (2.0 * (1.0 + POISSON_RATIO))
+
+
+class Material(NamedTuple):
+    """The rod's section and material at one place: the law K (z - z*) + B z_t and the inertia."""
+
+    Kse: Float[Any, "3 3"]
+    Bse: Float[Any, "3 3"]
+    Kbt: Float[Any, "3 3"]
+    Bbt: Float[Any, "3 3"]
+    u_star: Float[Any, "3"]
+    #: ρA (kg/m)
+    rhoA: Any
+    #: ρJ (kg·m)
+    rhoJ: Float[Any, "3 3"]
+    radius: Any
 
 
 class Differences(NamedTuple):
@@ -171,3 +192,20 @@ def differences_at(changes: tuple[SectionChange, ...], part: Any, controls: list
             found.curvature + jnp.where(within, own.curvature, 0.0),
         )
     return found
+
+
+def shape_at_rest(
+    p: Float[Any, "3"], h: Float[Any, "4"], s: Any, curvature: Callable[[Any], Any]
+) -> tuple[Float[Any, "3"], Float[Any, "4"]]:
+    """Position (m) and orientation at s of a rod without strain, from those at its base and its curvature."""
+
+    def on(k: Any, pose: tuple[Any, Any]) -> tuple[Any, Any]:
+        p, h = pose
+        ds = s / REST_STEPS
+        # the middle of each step is exact enough for a start, and an equilibrium is found from there
+        half = h + 0.5 * ds * quaternion_rate(h, curvature(k * ds))
+        h = h + ds * quaternion_rate(half, curvature((k + 0.5) * ds))
+        return p + ds * dot(rotation_matrix(half), ALONG), h / jnp.sqrt(jnp.sum(h * h))
+
+    p, h = jax.lax.fori_loop(0, REST_STEPS, on, (p, h))
+    return p, h

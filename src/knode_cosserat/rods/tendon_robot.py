@@ -7,7 +7,6 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from knode_cosserat.rods.system import History
 from knode_cosserat.rods.tendon_rod import TendonRod
 from knode_cosserat.rods.tendons import transverse_force
 
@@ -28,16 +27,6 @@ class TendonRobot(TendonRod):
     def actuator_force(self, control: Float[Any, " c"]) -> Float[Any, "3"]:
         """The resultant of the tendons' forces per length (N/m), global frame: all that these tendons do."""
         return transverse_force(control[: self.actuator_layout.size], self.tendon_angles)
-
-    def strains(
-        self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
-    ) -> Float[Any, " z"]:
-        """v and u (paper eq. 15)."""
-        return self.linear_strains(s, y, control, history)
-
-    def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
-        """C, D, f2 of the material's law."""
-        return self.linear_law(s, y, control)
 
     def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
         """A = I, B = 0, and f1 the right-hand side of paper eq. 13."""

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.parameters import parameter
-from knode_cosserat.rods.system import History
+from knode_cosserat.rods.system import History, System
 from knode_cosserat.rods.tendon_rod import TendonRod
 from knode_cosserat.rotation import cross, dot, inverse, rotation_matrix
 
@@ -69,6 +69,9 @@ class VirtualRobot(TendonRod):
         loss = self.friction * s / self.length * jnp.tanh(pulled_in / self.sliding)
         T = jnp.asarray(control) * (1.0 - loss)
         return self.tendon_offset * jnp.stack([jnp.sum(T * y), -jnp.sum(T * x), jnp.zeros(())])
+
+    # not of the form C z + D z_t = f2
+    constitutive = System.constitutive
 
     def strains(
         self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
