@@ -183,13 +183,19 @@ def test_derivatives_of_the_pose_are_those_of_finite_differences():
 
 
 def test_displacements_for_a_wanted_pose_are_found_again():
-    force = np.array([0.2, -0.1, 0.0])
-    _, wanted = pose_and_slope()(np.concatenate([SOME / 2, force]))
-    guess = np.zeros(6)
-    for _ in range(6):
-        slope, pose = pose_and_slope()(np.concatenate([guess, force]))
-        guess = guess - np.linalg.solve(slope[:, :6], pose - wanted)
-    np.testing.assert_allclose(guess, SOME / 2, atol=1e-7)
+    """Inverse statics is inverse kinematics: the platform's pose is that of the last node."""
+    wanted = kc.equilibrium(ROBOT, SOME)
+    found = kc.inverse_kinematics(
+        ROBOT, wanted.position[0, -1], wanted.quaternion[0, -1], low=-0.05, high=0.05
+    )
+    assert found.result is kc.Reach.REACHED
+    np.testing.assert_allclose(found.control, SOME, atol=1e-7)
+
+
+@pytest.mark.campaign
+def test_a_pose_beyond_the_actuators_is_not_reached():
+    found = kc.inverse_kinematics(ROBOT, [0.0, 0.0, 0.6], low=-0.05, high=0.05)
+    assert found.result is kc.Reach.UNREACHABLE and np.all(found.control >= 0.05 - 1e-6)
 
 
 # motion

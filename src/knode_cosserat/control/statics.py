@@ -16,7 +16,7 @@ import numpy as np
 
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import Solution, StepProblem, linearise, newton, residuals
-from knode_cosserat.solvers.linear import Condensed
+from knode_cosserat.solvers.linear import Condensed, carried
 from knode_cosserat.solvers.march import rest_record
 from knode_cosserat.solvers.settings import Settings
 
@@ -28,7 +28,10 @@ TIME = 1.0
 
 def tip_pose(system: System, y: Any) -> tuple[Any, Any]:
     """Where the last node is and how it is turned; no orientation of a system that has none."""
-    turned = system.quaternions(y) if "h" in system.y_layout.names else None
+    try:
+        turned = system.quaternions(y)
+    except AttributeError:
+        turned = None
     return system.positions(y), turned
 
 
@@ -103,7 +106,7 @@ def respond(system, settings, pose, control, y, unknowns):  # type: ignore[no-un
 
         defects, tip, base = jax.jvp(at_solution, (control,), (d_control,))[1]
         # a base that moves by itself enters through the first segment
-        defects = defects.at[0].add(jnp.sum(linearisation.F[0] * base, axis=1))
+        defects = defects.at[0].add(carried(linearisation.F[0], base))
         dy, _ = linear.solve(factors, defects, tip)
         return twist(system, pose, found.y[-1], dy[-1])
 
