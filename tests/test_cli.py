@@ -329,6 +329,7 @@ def test_evaluate_simulates_a_robot_as_the_papers_table_has_it(tmp_path):
     assert row["pose_mse"] == pytest.approx(12.52, abs=0.005)
 
 
+@pytest.mark.campaign
 def test_evaluate_simulates_by_the_references_settings(tmp_path):
     out, robot = tmp_path / "a.nc", tmp_path / "robot.yaml"
     succeeded(*simulated(out, "--dt", 0.02, "--time", "bdf1", "--space", "rk4", "--nodes", 7))

@@ -63,6 +63,7 @@ def test_its_velocity_is_that_of_its_position(string):
     assert errors[1] < 5e-4 and errors[0] / errors[1] > 8.0
 
 
+@pytest.mark.campaign
 def test_it_is_differentiable_and_runs_in_batches(string):
     def sag(density):
         return jnp.min(

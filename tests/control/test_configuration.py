@@ -89,6 +89,7 @@ def test_a_quarter_turn_of_the_controls_turns_everything():
     np.testing.assert_allclose(*measures, atol=1e-8)
 
 
+@pytest.mark.campaign
 def test_manipulability_is_that_of_the_jacobian():
     found = kc.configuration(ROUTED, CONTROL)
     J, L = found.jacobian, float(ROUTED.length)

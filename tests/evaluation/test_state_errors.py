@@ -52,6 +52,7 @@ def test_an_orientation_s_error_is_an_angle_whatever_the_quaternion_s_sign_or_si
     assert kc.state_errors(dataclasses.replace(truth, y=y), truth)["h"].rms == pytest.approx(angle, rel=1e-6)
 
 
+@pytest.mark.campaign
 def test_a_finer_truth_is_looked_up(truth):
     fine = ROBOT.replace(nodes=28)
     finer = kc.simulate(fine, kc.controls.constant(5.0, 20, tendons=4), 0.025)

@@ -85,7 +85,7 @@ LADEN = kc.SlenderRod(
 )  # fmt: skip
 
 
-@pytest.fixture(scope="module", params=["euler", "rk4"])
+@pytest.fixture(scope="module", params=["euler", pytest.param("rk4", marks=pytest.mark.campaign)])
 def laden(request):
     control = pushed(1.0, 1.0, np.zeros(1))[:30]
     return kc.simulate(LADEN, control, DT, space=request.param)

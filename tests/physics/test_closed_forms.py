@@ -111,6 +111,7 @@ MOMENTS = {
 }
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize("moment", MOMENTS)
 def test_moment_bends_the_rod_to_a_circle_and_with_twist_to_a_helix(moment):
     found = shape(rod(tip_moment=MOMENTS[moment]))
@@ -155,6 +156,7 @@ def test_order_in_space_of_the_elastica(space, order, grids):
     np.testing.assert_allclose(np.log2(errors[0] / errors[1]), order, rtol=0, atol=0.15)
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize(("space", "order", "grids"), SPACES)
 def test_order_in_space_of_the_helix(space, order, grids):
     moment = np.array(MOMENTS["helix"]) / 2

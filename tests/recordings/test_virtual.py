@@ -51,6 +51,7 @@ def test_the_robot_begins_in_equilibrium_and_rests(virtual):
     assert truth.all_valid and truth.dt == pytest.approx(0.01)
 
 
+@pytest.mark.campaign
 def test_friction_and_ribs_make_it_another_robot(virtual):
     from knode_cosserat.recordings.virtual import virtual_robot
 

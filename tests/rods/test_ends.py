@@ -253,6 +253,7 @@ def test_a_driven_base_is_where_it_is_driven():
     np.testing.assert_allclose(found.tip_position, np.tile([0.12, 0.2, 0.75], (101, 1)), atol=1e-8)
 
 
+@pytest.mark.campaign
 def test_a_slowly_driven_rod_is_in_equilibrium():
     ramp = np.linspace(0.0, 1.0, 60)
     way = np.concatenate([3 * ramp**2 - 2 * ramp**3, np.ones(60)])

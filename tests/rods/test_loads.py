@@ -36,6 +36,7 @@ def field(found, name):
     return np.asarray(found.part(name))[0]
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize(("load", "at"), [("OFF_NODE", 0.35), ("ON_NODE", 0.6), ("TIP", 1.0)])
 def test_a_small_force_at_a_place_bends_as_a_beam(load, at):
     F, a, s = 1e-3 * EI / L**2, at * L, np.linspace(0.0, L, 11)
@@ -208,6 +209,7 @@ def eigenvalue(dt, pull=1.0):
     return np.roots([1.0, -twice, -minus_square])[0]
 
 
+@pytest.mark.campaign
 def test_a_heavy_tip_swings_at_the_frequency_of_a_light_rod():
     m = float(SWINGING.mass_per_length) * L
     # Rayleigh's part of the rod's mass, and shear

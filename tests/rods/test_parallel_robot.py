@@ -182,6 +182,7 @@ def test_derivatives_of_the_pose_are_those_of_finite_differences():
         np.testing.assert_allclose(slope[:, k], (up - down) / (2 * step), rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.campaign
 def test_displacements_for_a_wanted_pose_are_found_again():
     """Inverse statics is inverse kinematics: the platform's pose is that of the last node."""
     wanted = kc.equilibrium(ROBOT, SOME)

@@ -85,11 +85,12 @@ FIELDS = {
 }
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "parallel-robot"])
 @settings(max_examples=40, deadline=None)
 @given(data=st.data())
 def test_robots_with_parts_come_back_equal(kind, data):
-    assert set(FIELDS) == set(KINDS)
+    # a robot of several rods has no parts
+    assert {*FIELDS, "parallel-robot"} == set(KINDS)
     robot = KINDS[kind](**BODY, **data.draw(st.fixed_dictionaries(FIELDS[kind])))
     text = format_robot(robot)
     assert_equal(parse_robot(text, "here"), robot)
@@ -290,7 +291,7 @@ def test_a_batch_from_a_damaged_file_is_refused(tmp_path):
 @pytest.mark.parametrize("name", [name for name in kc.catalog() if name != "delrin-tendon-robot"])
 def test_models_of_robots_with_parts_come_back(tmp_path, name):
     knowledge = kc.load_robot(name)
-    model = kc.KNODE(knowledge, network(knowledge, NetworkOptions(hidden=3), jax.random.PRNGKey(0)))
+    model = kc.KNODE(knowledge, network(knowledge.strand, NetworkOptions(hidden=3), jax.random.PRNGKey(0)))
     model.save(tmp_path / "model")
     found = kc.load_model(next(Path(tmp_path).glob("model*")))
     assert_equal(found.knowledge, knowledge)

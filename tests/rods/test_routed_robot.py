@@ -58,6 +58,7 @@ def test_a_quarter_turn_of_the_tendons_is_a_quarter_turn_of_the_robot():
     np.testing.assert_allclose(other.position.reshape(-1, 3), turned, atol=1e-8)
 
 
+@pytest.mark.campaign
 def test_nothing_is_remembered_without_friction():
     robot = kc.RoutedTendonRobot.like(KNOWLEDGE)
     assert robot.z_layout.names == ("v", "u") and "loss" not in robot.y_layout.names

@@ -39,6 +39,7 @@ def rest(robot, control=(0.0, 0.0)):
     return kc.equilibrium(robot, np.asarray(control, dtype=float), space="rk4")
 
 
+@pytest.mark.campaign
 def test_a_rod_curved_at_rest_closes_to_a_ring():
     ring = changed({"curvature": [0.0, 2 * np.pi / L, 0.0]})
     found = rest(ring)

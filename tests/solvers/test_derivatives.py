@@ -163,6 +163,7 @@ def test_gradient_by_other_schemes():
         assert along_gradient(gradient, along) == pytest.approx(expected, rel=RELATIVE, abs=0), name
 
 
+@pytest.mark.campaign
 def test_compiled_gradient_is_the_eager_one():
     assert_equal_trees(jax.grad(bar_loss)(ONE), bar_gradient(ONE))
 

@@ -166,6 +166,7 @@ def share_solved(name, seeds):
     return share
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize("name", ["with_loads"])
 def test_some_random_cases(name):
     assert share_solved(name, range(SOME)) == 1.0

@@ -89,6 +89,7 @@ def test_a_robot_that_knows_nothing_does_not_move():
     assert nothing.replace(nodes=19).nodes == 19
 
 
+@pytest.mark.campaign
 def test_what_knows_nothing_does_not_see_the_imperfection():
     training = [kc.simulate(ROBOT, kc.controls.sine(0.5, 10, DT), DT)]
     config = kc.FitConfig.paper(seed=(0,))

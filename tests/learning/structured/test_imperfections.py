@@ -131,6 +131,7 @@ def test_a_body_at_the_tip_hangs_by_its_weight_and_resists_being_moved():
 LEARNED = ("damping and stiffness", "tip mass")
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize("name", LEARNED)
 def test_two_short_sines_are_enough(name):
     case = imperfections.IMPERFECTIONS[name]
@@ -152,6 +153,7 @@ def moved(robot, control, rows):
     return kc.simulate(robot, kc.controls.parse(control, rows, DT), DT)[:rows]
 
 
+@pytest.mark.campaign
 def test_a_job_says_how_well_its_knowledge_does():
     job = imperfections.jobs(["no drag"], [0], steps=20, method="baseline", controls={"sine": "sine:1.5"})[0]
     json.dumps(job.settings)

@@ -77,6 +77,7 @@ def test_a_missing_weight_is_an_ambient_load(robot):
     np.testing.assert_allclose(found.coefficient, 9.81 * robot.mass_per_length, rtol=1e-7)
 
 
+@pytest.mark.campaign
 def test_a_missing_tip_mass_is_weighed(robot):
     truth = like(robot, truths.TipMass)
     model = learned(robot, recorded(truth))
@@ -96,7 +97,8 @@ def test_what_is_learned_does_not_depend_on_the_time_step(robot):
     assert left(model, robot, truth, controls, 0.02) < 1e-8
 
 
-@pytest.mark.parametrize("kind", ["Stiffening", pytest.param("InternalFriction", marks=pytest.mark.campaign)])
+@pytest.mark.campaign
+@pytest.mark.parametrize("kind", ["Stiffening", "InternalFriction"])
 def test_a_law_that_is_not_linear(robot, kind):
     truth = like(robot, getattr(truths, kind))
     model = learned(robot, recorded(truth))
@@ -132,6 +134,7 @@ def test_noise_does_not_make_terms_up(robot):
     assert left(model, knowledge, robot) < 0.05
 
 
+@pytest.mark.campaign
 def test_segments_that_are_not_one_euler_step():
     """A bar's y_s comes from splines, and what they give first is polished on the segments."""
     bar = BAR.replace(nodes=12, drag=0.0)
