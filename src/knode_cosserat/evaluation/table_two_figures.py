@@ -89,7 +89,7 @@ def paths(recordings: Mapping[str, Predicted]) -> Figure:
             axes.plot(*it.measured.T, **MEASURED)
             for method, tip in it.predicted.items():
                 axes.plot(*tip.T, label=method, **LINES.get(method, {}))
-            axes.set_title(name)
+            axes.set_title(name, y=0.94)
             axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
             axes.locator_params(nbins=4)
             points = np.concatenate([it.measured, *it.predicted.values()])
