@@ -144,8 +144,12 @@ def line(i: int, rows: int = 2) -> dict[str, Any]:
 
 
 def legend_above(axes: Axes) -> None:
-    """A legend in one line above the axes."""
-    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, columnspacing=1.2, handlelength=1.8)
+    """A legend above the axes, in as few lines as its words allow."""
+    _, words = axes.get_legend_handles_labels()
+    columns = 2 if len(words) > 4 and max(map(len, words)) > 10 else 4
+    axes.legend(
+        loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=columns, columnspacing=1.2, handlelength=1.8
+    )
 
 
 def tips_of(trajectory: Tips) -> NDArray[np.float64]:
