@@ -47,6 +47,7 @@ def test_it_swings_and_comes_to_rest(string):
     np.testing.assert_allclose(moved.part("p")[1:, -1], hand, atol=1e-9)
 
 
+@pytest.mark.campaign
 def test_its_velocity_is_that_of_its_position(string):
     """q_s = p_st holds through the history of y_s: q is the rate of p at every node, to RK4's order."""
     t = np.arange(1, 41) * 0.05

@@ -17,6 +17,7 @@ def relative_turn(one, other):
     return 2.0 * (w * b - a * v - np.cross(b, v)) / np.sum(one * other, axis=-1, keepdims=True)
 
 
+@pytest.mark.campaign
 def test_a_cantilever_is_compliant_as_a_beam():
     """L³/3EI and L/GA against force, L²/2EI of both, L/EI and L/GJ against moment, L/EA along."""
     robot = ROBOT.replace(gravity=(0.0, 0.0, 0.0))

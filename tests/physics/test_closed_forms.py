@@ -120,6 +120,7 @@ def test_moment_bends_the_rod_to_a_circle_and_with_twist_to_a_helix(moment):
     np.testing.assert_allclose(found, expected, rtol=0, atol=3e-5 * LENGTH)
 
 
+@pytest.mark.campaign
 def test_full_circle_closes():
     tip = shape(rod(tip_moment=(0.0, 2 * np.pi * MOMENT, 0.0)))[-1]
     np.testing.assert_allclose(tip, 0.0, atol=1e-4 * LENGTH)

@@ -32,6 +32,7 @@ def test_statics_by_euler(key):
     assert beams.order(errors, GRID) == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize("key", of(beams.BUCKLING, "shaft"))
 def test_critical_loads(key):
     errors = [beams.BUCKLING[key].error(nodes, "rk4") for nodes in GRID]

@@ -191,6 +191,7 @@ def quarter_period(amplitude, steps):
     return np.polyval(np.polyfit(x[k - 1 : k + 3], t[k - 1 : k + 3], 3), 0.0) / small
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize("degrees", [10.0, 60.0, 150.0])
 def test_a_pendulum_has_its_period(degrees):
     amplitude = np.deg2rad(degrees)

@@ -47,6 +47,7 @@ def test_a_small_force_at_a_place_bends_as_a_beam(load, at):
     np.testing.assert_allclose(found, np.where(s <= a, before, behind), rtol=2e-6, atol=1e-13)
 
 
+@pytest.mark.campaign
 def test_a_moment_at_a_place_bends_to_a_circle_up_to_it():
     M = 0.8 * EI / L
     found = rest(ON_NODE__moment=[0.0, M, 0.0])

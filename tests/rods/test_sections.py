@@ -58,6 +58,7 @@ def test_it_closes_with_order_four():
     assert np.all(np.log2(np.divide(gaps[:-1], gaps[1:])) > 3.5), gaps
 
 
+@pytest.mark.campaign
 def test_a_cone_bends_as_the_integral_of_its_stiffness():
     """Half as thick at its tip, in two stretches that meet."""
     F = 1e-3 * EI / L**2

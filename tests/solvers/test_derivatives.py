@@ -168,6 +168,7 @@ def test_compiled_gradient_is_the_eager_one():
     assert_equal_trees(jax.grad(bar_loss)(ONE), bar_gradient(ONE))
 
 
+@pytest.mark.campaign
 def test_tangent_is_along_the_gradient():
     along = {name: np.asarray(value) * 0.3 for name, value in ONE.items()}
     value, tangent = jax.jvp(bar_loss, (ONE,), (along,))

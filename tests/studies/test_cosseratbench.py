@@ -15,6 +15,7 @@ def ran(name, n_elements=20):
     return found
 
 
+@pytest.mark.campaign
 def test_cantilever():
     # what is left is that the suite's reference neither shears nor bends far
     assert ran("cantilever").metrics["tip_deflection_error"] < 1e-3

@@ -120,6 +120,7 @@ def test_imperfections_are_found(truth, start):
     assert kc.tip_dtw(again, kc.simulate(true, controls, DT)[:100]) < 1e-6
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize(
     ("truth", "start"),
     [

@@ -90,6 +90,7 @@ def test_a_missing_tip_mass_is_weighed(robot):
     assert left(model, robot, truth) < 1e-7
 
 
+@pytest.mark.campaign
 def test_what_is_learned_does_not_depend_on_the_time_step(robot):
     truth = robot.replace(bending_damping=0.2, youngs_modulus=5e9)
     model = learned(robot, recorded(truth))
@@ -153,6 +154,7 @@ def test_segments_of_the_robot_that_are_not_one_euler_step(robot):
     assert left(model, knowledge, robot, space="rk4") < 1e-7
 
 
+@pytest.mark.campaign
 def test_derivatives_of_an_implicit_law(robot):
     """∂z/∂y of the corrected strains against differences."""
     model = learned(robot, recorded(like(robot, truths.Stiffening)))
