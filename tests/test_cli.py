@@ -288,6 +288,7 @@ def test_fit_trains_an_ensemble_of_networks_at_once(data, tmp_path):
     assert row["tip_dtw"] == dtw_distance(mean.tip_position[:5], reference.tip_position[:5])
 
 
+@pytest.mark.campaign
 def test_a_model_is_taken_where_a_robot_is(data, fitted, tmp_path):
     model, out = data / "model", tmp_path / "a.nc"
     succeeded("simulate", model, "--controls", "sine:1.5", "--steps", 40, "--out", out)

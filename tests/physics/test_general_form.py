@@ -79,6 +79,7 @@ class GeneralRobot(kc.TendonRobot):
     rates = kc.System.rates
 
 
+@pytest.mark.campaign
 def test_simulations_agree():
     robot = kc.load_robot("delrin-tendon-robot")
     general = GeneralRobot(**{name: getattr(robot, name) for name in robot.parameters()}, nodes=robot.nodes)

@@ -122,6 +122,7 @@ def test_one_stretch_is_two():
             )  # fmt: skip
 
 
+@pytest.mark.campaign
 def test_the_catalogs_robot_of_controlled_curvature():
     robot = kc.load_robot("variable-curvature-robot").replace(gravity=[0.0, 0.0, 0.0])
     assert len(robot.sections) == robot.control_size == 3

@@ -209,6 +209,7 @@ def test_settings_and_a_loss_history_come_back(tmp_path):
     assert found["data"] == facts["data"]
 
 
+@pytest.mark.campaign
 def test_a_loaded_model_simulates_the_same_with_the_same_program(tmp_path, caplog):
     model = MODELS["jax arrays"]
     with jax.log_compiles(), caplog.at_level(logging.WARNING):

@@ -119,6 +119,7 @@ def test_ten_rows_of_one_sine_are_enough(robot):
     assert left(model, knowledge, robot) < 1e-7
 
 
+@pytest.mark.campaign
 def test_noise_does_not_make_terms_up(robot):
     """A thousandth of each number's spread on all states: the weight is found, and little else."""
     knowledge = robot.replace(gravity=(0, 0, 0))
@@ -193,6 +194,7 @@ def test_a_system_of_ones_own_learns_too():
     assert np.abs(ours - true).max() < 0.1 * np.abs(base - true).max()
 
 
+@pytest.mark.campaign
 def test_a_mirrored_robot_learns_the_mirror_image(robot):
     """Tendons and data mirrored in the plane y = x: the same model, mirrored."""
     knowledge = robot.replace(youngs_modulus=5e9, gravity=(1.0, 0.5, -9.0))

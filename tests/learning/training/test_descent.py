@@ -119,6 +119,7 @@ def test_elu_and_its_derivative():
     np.testing.assert_allclose(twice, expected, atol=1e-15)
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize("system", ["robot", "bar with history"])
 def test_what_no_weight_changes_is_found_once(robot, moved, bars, system):
     """Prediction and gradient are those of `predict` on the KNODE, sample by sample."""
