@@ -5,6 +5,7 @@ from typing import Any
 import hypothesis.strategies as st
 import jax
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis.extra.numpy import arrays
 
