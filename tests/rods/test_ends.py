@@ -61,6 +61,7 @@ def momenta(found):
     return (np.einsum("n,tnk->tk", SIMPSON * L, each) for each in (moving, np.cross(p, moving) + spinning))
 
 
+@pytest.mark.campaign
 def test_a_free_rod_falls():
     lag = []
     for steps in (50, 100):

@@ -158,6 +158,7 @@ def helices(turn=0.0):
     )  # fmt: skip
 
 
+@pytest.mark.campaign
 def test_a_slow_pull_loses_tension_as_on_a_capstan():
     robot = helices()
     control = np.outer(np.linspace(0.0, 5.0, 100), [1.0, 0.0, 0.0, 0.0])
