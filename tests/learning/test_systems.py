@@ -66,18 +66,7 @@ def error(found, truth):
 
 
 @pytest.mark.campaign
-@pytest.mark.parametrize(
-    "name",
-    [
-        *(name for name in SYSTEMS if name != "with_ribs"),
-        pytest.param(
-            "with_ribs",
-            marks=pytest.mark.xfail(
-                reason="stiffness that varies along s, with damping and tendons: sevenfold"
-            ),
-        ),
-    ],
-)
+@pytest.mark.parametrize("name", SYSTEMS)
 def test_a_wrong_modulus_is_made_up_for(name):
     robot, seen, unseen = SYSTEMS[name]()
     knowledge = robot.replace(youngs_modulus=0.7 * robot.youngs_modulus)

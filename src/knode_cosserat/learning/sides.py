@@ -75,6 +75,15 @@ def slopes_of(
     return slope, 0.1 * np.sqrt(np.mean(np.square(wrong), axis=(0, 1)))
 
 
+def whole(knowledge: System, place: Float[Any, " S"]) -> Float[np.ndarray, " S"]:
+    """1 for each segment, begun at that part of the length, that no cut parts; 0 for others."""
+    if not knowledge.cuts:
+        return np.ones(len(place))
+    bounds = crossings(knowledge.cuts, knowledge.nodes).bounds
+    segment = np.round(np.asarray(place) * (knowledge.nodes - 1)).astype(int)
+    return (bounds[segment, 1] == 1.0).astype(float)
+
+
 def pieces(cuts: tuple[float, ...], nodes: int) -> list[tuple[int, int]]:
     """First and last node of each stretch of rod without a cut inside; neighbours share a node on a cut."""
     along = np.asarray(cuts) * (nodes - 1)

@@ -44,7 +44,7 @@ from knode_cosserat.rods.rod import Rod
 from knode_cosserat.rods.routing import Routing, Straight, ends, routes
 from knode_cosserat.rods.section import Material
 from knode_cosserat.rods.system import History, Layout, System
-from knode_cosserat.rods.tendon_law import stretches, tendon_strains
+from knode_cosserat.rods.tendon_law import stretches, tendon_balance, tendon_strains
 from knode_cosserat.rods.tendon_rod import TendonRod
 from knode_cosserat.rotation import dot
 
@@ -227,8 +227,21 @@ class RoutedTendonRobot(TendonRod):
         found = super().material(s, control)
         if self.sleeve_stiffening is None:
             return found
-        stiffer = 1.0 + self.sleeve_stiffening * jnp.exp(-((s / self.sleeve_length) ** 4))
-        return found._replace(Kbt=found.Kbt * stiffer)
+        return found._replace(Kbt=found.Kbt * self._sleeve(s))
+
+    def _sleeve(self, s: Any) -> Any:
+        return 1.0 + self.sleeve_stiffening * jnp.exp(-((s / self.sleeve_length) ** 4))
+
+    def law_factors(self, s: Any, control: Any) -> tuple[Any, Any] | None:
+        """Those of the rod's sections, and the sleeve's on its stiffness."""
+        found = super().law_factors(s, control)
+        if found is None and self.sleeve_stiffening is None:
+            return None
+        stiffness, damping = (jnp.ones(6), jnp.ones(6)) if found is None else found
+        if self.sleeve_stiffening is not None:
+            stiffness = stiffness * jnp.concatenate([jnp.ones(3), jnp.full(3, self._sleeve(s))])
+        others = jnp.ones(self.z_layout.size - 6)
+        return jnp.concatenate([stiffness, others]), jnp.concatenate([damping, others])
 
     def rest(self, s: Any) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
         """That of the rod; no tension, and no friction."""
@@ -264,6 +277,25 @@ class RoutedTendonRobot(TendonRod):
         self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> Float[Any, " z"]:
         """v and u by the material's law, f and x by their own."""
+        given, more = self._law_at(s, y, control, history)
+        v, u = tendon_strains(*given)
+        if self.rubs:
+            more.insert(0, self._friction(s, history.c0 * u + self.z_layout.get(history.z, "u"), history))
+        return jnp.concatenate([v, u, *more])
+
+    linear_law = False
+
+    def left_of_law(self, s, t, y, z, control, history):  # type: ignore[no-untyped-def]
+        """Rod and tendons together less n and m; of friction and vibration, what they differ by."""
+        given, more = self._law_at(s, y, control, history)
+        v, u = self.z_layout.get(z, "v"), self.z_layout.get(z, "u")
+        if self.rubs:
+            more.insert(0, self._friction(s, history.c0 * u + self.z_layout.get(history.z, "u"), history))
+        left = tendon_balance(v, u, *given)
+        return jnp.concatenate([left, z[6:] - jnp.concatenate(more)]) if more else left
+
+    def _law_at(self, s: Any, y: Any, control: Any, history: History) -> tuple[tuple[Any, ...], list[Any]]:
+        """K_v, K_u, a, b, r, r′ and T of the law (see `tendon_law`), and x if there is vibration."""
         c0, material = history.c0, self.material(s, control)
         n, m = self.stresses(y)
         hv, hu = self.z_layout.get(history.z, "v"), self.z_layout.get(history.z, "u")
@@ -277,10 +309,7 @@ class RoutedTendonRobot(TendonRod):
         a = n + dot(Kse, self.v_star) - dot(Bse, hv)
         b = m - dot(Bbt, hu) if not self.sections else m + dot(Kbt, material.u_star) - dot(Bbt, hu)
         tension = self.tension_at(s, y, control)
-        v, u = tendon_strains(Kse + c0 * Bse, Kbt + c0 * Bbt, a, b, *self.routes_at(s), tension)
-        if self.rubs:
-            more.insert(0, self._friction(s, c0 * u + hu, history))
-        return jnp.concatenate([v, u, *more])
+        return (Kse + c0 * Bse, Kbt + c0 * Bbt, a, b, *self.routes_at(s), tension), more
 
     def _vibration(self, y: Any, control: Any, history: History) -> Float[Any, " 1"]:
         total = jnp.sum(self.base_tension(y, control))

@@ -165,6 +165,9 @@ class System(eqx.Module):
     #: whether the state at rest is a guess: a simulation then begins in the equilibrium under no control
     rest_is_guess: ClassVar[bool] = False
 
+    #: whether `left_of_law` is linear in the strains
+    linear_law: ClassVar[bool] = True
+
     #: observables that are velocities, on which drag and friction depend; none: the system does not say
     velocities: ClassVar[tuple[str, ...]] = ()
 
@@ -211,6 +214,19 @@ class System(eqx.Module):
         c0 = history.c0
         C, D, f2 = self.constitutive(s, t, y, c0 * y + history.y, control)
         return jnp.linalg.solve(C + c0 * D, f2 - D @ history.z)
+
+    def left_of_law(
+        self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
+    ) -> Float[Any, " z"]:
+        """What the law of the strains leaves at z, zero at `strains`: C z + D z_t - f2, or z less those.
+
+        A system whose law is one of stresses, but not linear, states it here, and says so (`linear_law`).
+        """
+        c0 = history.c0
+        if type(self).constitutive is System.constitutive:
+            return z - self.strains(s, t, y, control, history)
+        C, D, f2 = self.constitutive(s, t, y, c0 * y + history.y, control)
+        return C @ z + D @ (c0 * z + history.z) - f2
 
     def rates(
         self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History

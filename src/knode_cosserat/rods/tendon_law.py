@@ -94,6 +94,21 @@ def tendon_strains(
     return x[:3], x[3:]
 
 
+def tendon_balance(
+    v: Float[Any, "3"],
+    u: Float[Any, "3"],
+    K_v: Float[Any, "3 3"],
+    K_u: Float[Any, "3 3"],
+    a: Float[Any, "3"],
+    b: Float[Any, "3"],
+    r: Float[Any, "c 3"],
+    r_s: Float[Any, "c 3"],
+    tension: Float[Any, " c"],
+) -> Float[Any, "6"]:
+    """What the law leaves at any v and u (N, N·m): zero at those of `tendon_strains`."""
+    return _balance(jnp.concatenate([v, u]), K_v, K_u, jnp.concatenate([a, b]), r, r_s, tension)
+
+
 # x is v and u together
 
 

@@ -20,6 +20,7 @@ from jaxtyping import Float
 
 from knode_cosserat.learning.config import StructuredOptions
 from knode_cosserat.learning.samples import Dataset, Samples, TipSamples, start_of
+from knode_cosserat.learning.sides import whole
 from knode_cosserat.learning.structured.expansion import CURVED, DRAG, LINEAR, Expansion, expansion
 from knode_cosserat.learning.structured.polish import polished
 from knode_cosserat.learning.structured.residual import (
@@ -138,19 +139,20 @@ def _floors(layout: Layout, values: Float[Any, "S n"]) -> Float[Any, " n"]:
 
 @jax.jit
 def _left_of_law(knowledge: System, data: Samples) -> tuple[Any, Any, Any]:
-    """What C z + D z_t = f2 leaves at the true strains, its natural size, and what stress may depend on."""
+    """What the law leaves at the true strains, its natural size, and what stress may depend on."""
 
     def one(sample: Samples) -> Any:
         s = start_of(knowledge, sample.place)
         history = unpacked_history(knowledge, sample.c0, sample.history[0])
         z, z_t = sample.z, sample.c0 * sample.z + history.z
         inputs = law_inputs(knowledge, s, sample.control, z, z_t)
-        if type(knowledge).constitutive is System.constitutive:
-            own = knowledge.strains(s, sample.t, sample.y, sample.control, history)
-            return own - z, own, inputs
-        y_t = sample.c0 * sample.y + history.y
-        C, D, f2 = knowledge.constitutive(s, sample.t, sample.y, y_t, sample.control)
-        return f2 - C @ z - D @ z_t, f2, inputs
+
+        def law(z: Any) -> Any:
+            return knowledge.left_of_law(s, sample.t, sample.y, z, sample.control, history)
+
+        # its slope along z sums up what the law's terms are made of
+        left, size = jax.jvp(law, (z,), (z,))
+        return -left, size, inputs
 
     return jax.vmap(one)(data)
 
@@ -218,6 +220,10 @@ def _with_loads(seen: _Seen, residual: Structured, counting: Counting) -> Struct
     """The residual with its stretch and its loads."""
     knowledge, data, rates = seen.strand, seen.data, seen.rates
     length = float(knowledge.length)
+    if isinstance(data.space, Euler):
+        # only of a segment that is one step its ends tell the slope
+        counts = counting.shares * whole(knowledge, data.segments.place)
+        counting = counting._replace(shares=counts / np.mean(counts))
     moved, doubt = data.segments.slope / length, data.doubt / length
     longer = _longer(knowledge, moved, rates, counting.shares)
     missing = moved / longer - rates

@@ -51,9 +51,10 @@ class Load(eqx.Module):
 
 
 class _Law(NamedTuple):
-    """M (z - z0) + σ(z - z*, c0 z + ʰz) = 0, for the strains z at one point."""
+    """The knowledge's law and σ(z - z*, c0 z + ʰz) together, for the strains z at one point."""
 
     stress: Expansion
+    #: of the knowledge's law at z0: all of it if it is linear
     M: Float[Any, "z z"]
     c0: Any
     z_rest: Float[Any, " z"]
@@ -62,13 +63,21 @@ class _Law(NamedTuple):
 
     #: by what strain and rate count there (see `law_inputs`); None: by one
     factors: Any = None
+    #: the knowledge and its arguments, if its law is not linear
+    point: Any = None
 
     def left(self, z: Float[Any, " z"]) -> Float[Any, " z"]:
         """What is left of the law."""
         strain, rate = z - self.z_rest, self.c0 * z + self.hz
         if self.factors is not None:
             strain, rate = strain * self.factors[0], rate * self.factors[1]
-        return dot(self.M, z - self.z0) + self.stress(jnp.concatenate([strain, rate]))
+        return self._own(z) + self.stress(jnp.concatenate([strain, rate]))
+
+    def _own(self, z: Float[Any, " z"]) -> Any:
+        if self.point is None:
+            return dot(self.M, z - self.z0)
+        knowledge, s, t, y, control, history = self.point
+        return knowledge.left_of_law(s, t, y, z, control, history)
 
 
 def solved(law: _Law) -> Float[Any, " z"]:
@@ -133,14 +142,15 @@ class Structured(Residual):
     def strains(
         self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> Float[Any, " z"]:
-        """z of the corrected law, M (z - z0) + σ(z - z*, c0 z + ʰz) = 0 with z0 the knowledge's strains."""
+        """z of the corrected law, the knowledge's plus σ(z - z*, c0 z + ʰz), from the knowledge's z0."""
         z0 = knowledge.strains(s, t, y, control, history)
         if self.stress is None:
             return z0
-        z_rest = knowledge.unstressed(s, control)
-        M = strain_matrix(knowledge, s, t, y, control, history)
-        law = _Law(self.stress, M, history.c0, z_rest, z0, history.z, factors_at(knowledge, s, control))
-        if not self.stress.curved:
+        z_rest, factors = knowledge.unstressed(s, control), factors_at(knowledge, s, control)
+        M = strain_matrix(knowledge, s, t, y, z0, control, history)
+        point = None if knowledge.linear_law else (knowledge, s, t, y, control, history)
+        law = _Law(self.stress, M, history.c0, z_rest, z0, history.z, factors, point)
+        if knowledge.linear_law and not self.stress.curved:
             # linear: one correction from z0 is exact, and its matrix is the same along the whole rod
             n = jnp.zeros_like(z_rest)
             inverse = small_inverse(jax.jacfwd(law._replace(z0=n, hz=n).left)(n))
@@ -174,9 +184,13 @@ class Structured(Residual):
 
 def factors_at(knowledge: System, s: Any, control: Any) -> tuple[Any, Any] | None:
     """By what the law differs at s, of a law that is one of stresses; one of strains is alike everywhere."""
-    if type(knowledge).constitutive is System.constitutive:
-        return None
-    return knowledge.law_factors(s, control)
+    return None if _in_strains(knowledge) else knowledge.law_factors(s, control)
+
+
+def _in_strains(knowledge: System) -> bool:
+    """Whether a system gives its strains directly, and states no law of stresses."""
+    kind = type(knowledge)
+    return kind.left_of_law is System.left_of_law and kind.constitutive is System.constitutive
 
 
 def law_inputs(knowledge: System, s: Any, control: Any, z: Any, z_t: Any) -> Float[Any, " 2z"]:
@@ -227,10 +241,14 @@ def ambient_inputs(knowledge: System, control: Any) -> Any:
     return jnp.concatenate([control, knowledge.actuation(control)])
 
 
-def strain_matrix(knowledge: System, s: Any, t: Any, y: Any, control: Any, history: History) -> Any:
-    """C + c0 D of the law of the strains; the identity where a system gives its strains directly."""
-    if type(knowledge).constitutive is System.constitutive:
+def strain_matrix(
+    knowledge: System, s: Any, t: Any, y: Any, z: Any, control: Any, history: History
+) -> Float[Any, "z z"]:
+    """The derivative of the law of the strains: C + c0 D; the identity where a system gives them directly."""
+    if _in_strains(knowledge):
         return jnp.eye(knowledge.z_layout.size)
+    if not knowledge.linear_law:
+        return jax.jacfwd(lambda z: knowledge.left_of_law(s, t, y, z, control, history))(z)
     C, D, _ = knowledge.constitutive(s, t, y, history.c0 * y + history.y, control)
     return C + history.c0 * D
 
