@@ -182,6 +182,11 @@ class KNODE(System):
         """The knowledge's."""
         return self.knowledge.quaternions(y)
 
+    def eased(self, part: float) -> Self:
+        """With the knowledge's."""
+        easier = self.knowledge.eased(part)
+        return self if easier is self.knowledge else type(self)(easier, self.residual, self.about)
+
     def replace(self, **changes: Any) -> Self:
         """A copy whose knowledge has other parameters (or nodes), by name."""
         return type(self)(self.knowledge.replace(**changes), self.residual, self.about)

@@ -11,7 +11,7 @@ paper's table of notations:
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self
 
 import jax.numpy as jnp
 import numpy as np
@@ -199,6 +199,12 @@ class Rod(System):
 
     def _differences(self, s: Any, control: Any) -> Differences:
         return differences_at(self.sections, s / self.length, self._controls(control).sections)
+
+    def eased(self, part: float) -> Self:
+        """With softer obstacles, on which the rod slides more easily."""
+        if not self.surroundings:
+            return self
+        return self.replace(surroundings=tuple(each.eased(part) for each in self.surroundings))
 
     # what learning looks at
 

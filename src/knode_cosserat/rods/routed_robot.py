@@ -114,6 +114,13 @@ class RoutedTendonRobot(TendonRod):
         same = {field.name: getattr(robot, field.name) for field in dataclasses.fields(TendonRod)}
         return cls(**same).replace(**changes)
 
+    def eased(self, part: float) -> Self:
+        """With friction that builds up over a longer reach."""
+        found = super().eased(part)
+        if not self.rubs:
+            return found
+        return found.replace(friction_reach=np.minimum(self.friction_reach / part, 100.0))
+
     # what its tendons have: which states there are
 
     @property

@@ -14,10 +14,12 @@ equilibrium, with all velocities zero, has no friction.
 from __future__ import annotations
 
 import abc
-from typing import Any, ClassVar
+import dataclasses
+from typing import Any, ClassVar, Self
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.loads import Motion, Wrench
@@ -58,6 +60,12 @@ class Obstacle(Part):
         held = self.friction * pressed / jnp.sqrt(jnp.sum(sliding**2) + self.slip**2)
         force = pressed * normal - held * sliding
         return Wrench(force, cross(arm, force))
+
+    def eased(self, part: float) -> Self:
+        """The same with contact and sliding that set in over 1/part of the depth and the speed."""
+        return dataclasses.replace(
+            self, smoothing=np.minimum(self.smoothing / part, 1.0), slip=np.minimum(self.slip / part, 1e3)
+        )
 
 
 def _length(vector: Any) -> Any:

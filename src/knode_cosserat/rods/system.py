@@ -280,6 +280,13 @@ class System(eqx.Module):
         """Natural sizes of y and of the tip's residuals; ones unless a system knows better."""
         return Scales(jnp.ones(self.y_layout.size), jnp.ones(self.unknown_count))
 
+    def eased(self, part: float) -> Self:
+        """The same system, with what is nearly a jump (friction, contact) spread over 1/part of its width.
+
+        Solvers go by way of it where they find no other. By default nothing is, and it is the system itself.
+        """
+        return self
+
     # what learning looks at
 
     def actuation(self, control: Float[Any, " c"]) -> Float[Any, " a"]:

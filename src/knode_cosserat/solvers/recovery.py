@@ -1,4 +1,4 @@
-"""What is tried when a step does not converge, in order: a stable elimination, load continuation, halving.
+"""What is tried when a step does not converge: a stable elimination, continuation, halving, in this order.
 
 This runs outside the compiled loop, step by step in plain Python: it is rare, and its program is compiled
 only when it is first needed.
@@ -27,6 +27,8 @@ from knode_cosserat.solvers.time import BDF1, Static
 HALVINGS = 6
 #: the smallest part of a change of control that continuation goes down to
 LEAST_PART = 1.0 / 512.0
+#: how much gentler friction and contact are, where continuation in them begins
+EASIEST = 1e-3
 #: what part of the way a tip is brought in one step while a robot comes to rest
 DRAWN = 0.05
 
@@ -70,11 +72,12 @@ class _Step:
         self.corrections = 0
 
     def solve(
-        self, control: Any, y: Any, unknowns: Any, part: float = 1.0, from_y: Any = None
-    ) -> tuple[Solution, Any]:
+        self, control: Any, y: Any, unknowns: Any, part: float = 1.0, from_y: Any = None,
+        system: System | None = None,
+    ) -> tuple[Solution, Any]:  # fmt: skip
         solution, record = attempt(
-            self.system, self.settings, self.coefficients[0], self.history, control, self.t, y, unknowns,
-            part, y if from_y is None else from_y,
+            system or self.system, self.settings, self.coefficients[0], self.history, control, self.t, y,
+            unknowns, part, y if from_y is None else from_y,
         )  # fmt: skip
         self.corrections += int(solution.corrections)
         return solution, record
@@ -113,6 +116,9 @@ def recover(
     continued = _continue_load(step, *controls)
     if continued is not None:
         return _outcome(Result.RECOVERED_LOAD_CONTINUATION, step, continued)
+    eased = _ease(step, controls[1])
+    if eased is not None:
+        return _outcome(Result.RECOVERED_EASING, step, eased)
     if isinstance(settings.time, Static):
         relaxed = _relax(step, controls[1])
         if relaxed is not None:
@@ -157,6 +163,26 @@ def _continue_load(step: _Step, before: Any, now: Any) -> tuple[Solution, Any] |
     return None
 
 
+def _ease(step: _Step, control: Any) -> tuple[Solution, Any] | None:
+    """From friction and contact that set in gently to those that the system has."""
+    system = step.system
+    if system.eased(EASIEST) is system:
+        return None
+    for guess in step.guesses():
+        found = step.solve(control, *guess, system=system.eased(EASIEST))
+        if not step.solved(found[0]):
+            continue
+
+        def at_part(part: float, at: Solution) -> tuple[Solution, Any]:
+            easier = system.eased(EASIEST ** (1.0 - part)) if part < 1.0 else system
+            return step.solve(control, at.y, at.unknowns, system=easier)
+
+        whole = _in_parts(step, found, at_part)
+        if whole is not None:
+            return whole
+    return None
+
+
 def _in_parts(
     step: _Step, found: tuple[Solution, Any], solve: Callable[[float, Solution], tuple[Solution, Any]]
 ) -> tuple[Solution, Any] | None:
@@ -187,7 +213,10 @@ def _halve(
             guess = step.guesses()[0]
             found = step.solve(control, *guess)
             if not step.solved(found[0]):
-                break
+                eased = _ease(step, control)
+                if eased is None:
+                    break
+                found = eased
             now, previous_dt = step.after(*found), small
         else:
             assert step is not None and found is not None

@@ -14,9 +14,11 @@ class Result(enum.IntEnum):
     RECOVERED_STEP_HALVING = 3
     RECOVERED_RELAXATION = 4
     RECOVERED_FINER_SEGMENTS = 5
+    RECOVERED_EASING = 6
     NO_CONVERGENCE = -1
     NOT_FINITE = -2
     NOT_REACHED = -3
+    UNSTABLE = -4
 
     @property
     def solved(self) -> bool:
@@ -36,8 +38,10 @@ _MESSAGES = {
     Result.RECOVERED_STEP_HALVING: "converged by several smaller time steps",
     Result.RECOVERED_RELAXATION: "converged after a damped motion towards rest: it may have snapped",
     Result.RECOVERED_FINER_SEGMENTS: "converged with every segment divided, being too long to be stable",
+    Result.RECOVERED_EASING: "converged by way of friction or contact that set in more gently",
     Result.NO_CONVERGENCE: "no solution found",
     Result.NOT_FINITE: "the equations overflow or are undefined there",
+    Result.UNSTABLE: "the equations are solved, but their segments are too long for them to be the rod's",
     Result.NOT_REACHED: "not simulated: an earlier step failed",
 }
 

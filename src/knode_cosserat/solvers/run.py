@@ -26,6 +26,8 @@ CHUNK = 16
 LEAST_CAPACITY = 128
 #: steps that need the stable elimination before a run changes to it, which costs a program
 ENOUGH_RESCUES = 2
+#: of its largest value: how far y of two grids may be apart if it is to be believed
+GRIDS_APART = 0.2
 #: how far segments are divided when they are too long to be stable
 MOST_NODES = 400
 
@@ -75,6 +77,8 @@ def run_one(
 ) -> tuple[Steps, str]:
     """All steps of one robot, and the likely cause if one of them (`result` < 0) could not be solved."""
     steps, cause = _with_recovery(task, system, controls, start, progress)
+    if _refuse(steps, ~_finite(steps, system), Result.NOT_FINITE):
+        cause = "At the tip strains are undefined."
     if _trustworthy(task, steps, system, start):
         return steps, cause
     record = start.past.records[0]
@@ -83,15 +87,31 @@ def run_one(
         return steps, cause
     # powers of two: few different node counts, so few programs to compile
     parts = 2 ** max(1, int(np.ceil(np.log2(decay / SAFE_DECAY))))
+    before = steps
     while parts * (system.nodes - 1) < MOST_NODES:
         finer = _with_finer_segments(task, system, parts, controls, start, progress)
-        if finer is not None:
-            return finer, ""
-        parts *= 2
+        if _trustworthy(task, finer, system, start) or _agree(finer, before, system):
+            return finer._replace(result=np.full(task.steps, int(Result.RECOVERED_FINER_SEGMENTS))), ""
+        parts, before = 2 * parts, finer
+    _refuse(steps, steps.size > _trusted_size(system, start), Result.UNSTABLE)
     return steps, (
         f"{cause} At this time step its waves decay by e^{decay:.2g} within a segment, too much for an "
         "explicit scheme in space, and dividing the segments did not help: use longer time steps."
     ).strip()
+
+
+def _finite(steps: Steps, system: System) -> Any:
+    """Whether each step's strains at the tip are: those at all other nodes have served to find y."""
+    return np.isfinite(steps.records[..., -1, system.y_layout.size :]).all(axis=-1)
+
+
+def _refuse(steps: Steps, wrong: Any, why: Result) -> bool:
+    """Take back the first solved step that is wrong, and all after it; whether there was one."""
+    found = np.flatnonzero(wrong & (steps.result >= 0))
+    if len(found):
+        steps.result[found[0]] = int(why)
+        steps.result[found[0] + 1 :] = int(Result.NOT_REACHED)
+    return len(found) > 0
 
 
 def _trustworthy(task: Task, steps: Steps, system: System, start: Start) -> bool:
@@ -103,19 +123,28 @@ def _trustworthy(task: Task, steps: Steps, system: System, start: Start) -> bool
         return False
     if isinstance(task.settings.time, Static) or steps.size.max() <= SUSPICIOUS:
         return True
-    return bool(steps.size.max() <= SUSPICIOUS * max(1.0, _size(system, start)))
+    return bool(steps.size.max() <= _trusted_size(system, start))
 
 
-def _size(system: System, start: Start) -> float:
-    """The largest number of y at the start, in natural units."""
+def _trusted_size(system: System, start: Start) -> float:
+    """Numbers of y up to this, in natural units, are not suspicious: more if it starts with large ones."""
     y = np.asarray(start.past.records[0])[:, : system.y_layout.size]
-    return float(np.max(np.abs(y) / np.asarray(system.scales().y)))
+    return SUSPICIOUS * max(1.0, float(np.max(np.abs(y) / np.asarray(system.scales().y))))
+
+
+def _agree(finer: Steps, coarser: Steps, system: System) -> bool:
+    """Whether two grids are both solved and agree on y where it is largest: then it is as large as that."""
+    if min(finer.result.min(), coarser.result.min()) < 0:
+        return False
+    scale, ny = np.asarray(system.scales().y), system.y_layout.size
+    apart = np.max(np.abs(finer.records - coarser.records)[..., :ny] / scale)
+    return bool(apart <= GRIDS_APART * finer.size.max())
 
 
 def _with_finer_segments(
     task: Task, system: System, parts: int, controls: np.ndarray, start: Start, progress: bool
-) -> Steps | None:
-    """The same robot with every segment divided, given at its own nodes; None if that fails too."""
+) -> Steps:
+    """The same robot with every segment divided, given at its own nodes."""
     # imported here, where it is rarely needed: it would double this package's import time
     from scipy.interpolate import make_interp_spline
 
@@ -127,11 +156,8 @@ def _with_finer_segments(
 
     past = start.past._replace(records=refined(start.past.records, 1), rate=refined(start.past.rate, 0))
     steps, _ = _with_recovery(task, fine, controls, start._replace(past=past), progress)
-    if not _trustworthy(task, steps, fine, start._replace(past=past)):
-        return None
-    records = np.ascontiguousarray(steps.records[:, ::parts])
-    finer = np.full(task.steps, int(Result.RECOVERED_FINER_SEGMENTS))
-    return steps._replace(records=records, result=finer)
+    _refuse(steps, ~_finite(steps, fine), Result.NOT_FINITE)
+    return steps._replace(records=np.ascontiguousarray(steps.records[:, ::parts]))
 
 
 def _with_recovery(
@@ -211,7 +237,8 @@ def run_batch(
     done, *rows = (np.concatenate(parts) for parts in zip(*chunks, strict=True))
     steps = Steps._make([*rows, np.zeros((*done.shape, task.steps), dtype=int)])
     causes = {}
-    for i in np.flatnonzero((done < task.steps) | (steps.size.max(axis=1) > SUSPICIOUS)):
+    doubtful = (steps.size.max(axis=1) > SUSPICIOUS) | ~_finite(steps, system).all(axis=1)
+    for i in np.flatnonzero((done < task.steps) | doubtful):
         own = Start(jax.tree.map(lambda leaf, i=i: leaf[i], start.past), start.control[i])
         alone, cause = run_one(task, robot(i), controls[i], own)
         for all_robots, one in zip(steps, alone, strict=True):
