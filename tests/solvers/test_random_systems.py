@@ -167,6 +167,16 @@ def share_solved(name, seeds):
 
 
 @pytest.mark.campaign
+@pytest.mark.parametrize(("name", "seed"), [("with_tendons", 5), ("with_tendons", 27), ("in_contact", 29)])
+def test_friction_that_flips_is_reached_from_a_gentler_one(name, seed):
+    """Without it no solution is found: friction of tendons, or in contact, turns round within a step."""
+    case = KINDS[name](seed)
+    found = kc.simulate(case.robot, case.tensions, case.dt)
+    assert np.all(found.result >= 0) and np.all(found.residual <= 1e-8)
+    print(collections.Counter(kc.Result(int(each)).name for each in found.result))
+
+
+@pytest.mark.campaign
 @pytest.mark.parametrize("name", ["with_loads"])
 def test_some_random_cases(name):
     assert share_solved(name, range(SOME)) == 1.0
