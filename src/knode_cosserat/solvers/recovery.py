@@ -24,7 +24,7 @@ from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.time import BDF1, Static
 
 #: a step is halved at most this many times
-HALVINGS = 6
+HALVINGS = 8
 #: the smallest part of a change of control that continuation goes down to
 LEAST_PART = 1.0 / 512.0
 #: how much gentler friction and contact are, where continuation in them begins
@@ -124,7 +124,7 @@ def recover(
         if relaxed is not None:
             return _outcome(Result.RECOVERED_RELAXATION, step, relaxed)
     else:
-        halved = _halve(system, settings, past, controls[1], t, dt)
+        halved = _halve(step, controls, dt)
         if halved is not None:
             return _outcome(Result.RECOVERED_STEP_HALVING, *halved)
     assert best is not None
@@ -198,32 +198,40 @@ def _in_parts(
     return found if reached == 1.0 else None
 
 
-def _halve(
-    system: System, settings: Settings, past: Past, control: Any, t: float, dt: float
-) -> tuple[_Step, tuple[Solution, Any]] | None:
-    """The step in 2, 4, 8 … parts, with coefficients for unequal steps. The control is held."""
+def _halve(whole: _Step, controls: tuple[Any, Any], dt: float) -> tuple[_Step, tuple[Solution, Any]] | None:
+    """The step in 2, 4, 8 … parts: the control as it is held throughout, or brought there bit by bit."""
     for halving in range(1, HALVINGS + 1):
-        parts = 2**halving
-        small, now, previous_dt = dt / parts, past, dt
-        step, found = None, None
-        for i in range(parts):
-            scheme = settings.time if settings.start == "paper" or i > 0 else BDF1()
-            coefficients = scheme.coefficients(small, previous_dt)
-            step = _Step(system, settings, now, coefficients, t - dt + (i + 1) * small)
-            guess = step.guesses()[0]
-            found = step.solve(control, *guess)
-            if not step.solved(found[0]):
-                eased = _ease(step, control)
-                if eased is None:
-                    break
-                found = eased
-            now, previous_dt = step.after(*found), small
-        else:
-            assert step is not None and found is not None
-            # the next whole step looks back on whole steps, not on the parts
-            step.past = past
-            return step, found
+        for before in (None, controls[0]):
+            found = _parted(whole, 2**halving, before, controls[1], dt)
+            if found is not None:
+                return found
     return None
+
+
+def _parted(
+    whole: _Step, parts: int, before: Any, now: Any, dt: float
+) -> tuple[_Step, tuple[Solution, Any]] | None:
+    """The step in so many parts, with coefficients for unequal steps."""
+    settings, past = whole.settings, whole.past
+    small, previous_dt = dt / parts, dt
+    now = np.asarray(now, dtype=float)
+    before = now if before is None else np.asarray(before, dtype=float)
+    step, found = whole, None
+    for i in range(parts):
+        control = before + (i + 1) / parts * (now - before)
+        scheme = settings.time if settings.start == "paper" or i > 0 else BDF1()
+        coefficients = scheme.coefficients(small, previous_dt)
+        step = _Step(whole.system, settings, past, coefficients, whole.t - dt + (i + 1) * small)
+        found = step.solve(control, *step.guesses()[0])
+        if not step.solved(found[0]):
+            found = _ease(step, control)
+            if found is None:
+                return None
+        past, previous_dt = step.after(*found), small
+    assert found is not None
+    # the next whole step looks back on whole steps, not on the parts
+    step.past = whole.past
+    return step, found
 
 
 def _relax(step: _Step, control: Any) -> tuple[Solution, Any] | None:
