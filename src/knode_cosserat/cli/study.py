@@ -197,7 +197,7 @@ def recordings(
         typer.Option(
             metavar="A,B,…",
             help="Some of those, and of what the parts of best are worth: calibrated (the model given, its "
-            "numbers found), no-memory, no-vibration.",
+            "numbers found), no-memory, no-vibration, euler.",
         ),
     ] = "baseline,paper-a,paper-b,best",
     simulated: Annotated[

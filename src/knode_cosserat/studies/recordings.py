@@ -37,6 +37,8 @@ from knode_cosserat.studies.runner import Job, Product, StudyError
 ROBOT = "delrin-tendon-robot"
 #: time step of the comparison, and of the paper's models (s); the best model takes steps of a part of it
 DT, FINER = 0.05, 2
+#: and its scheme in arclength: by Euler's, the ends of long segments are turned too far for where they are
+SPACE = "rk4"
 #: what is learned from, if nothing else is said: the paper's two sines, and one random recording
 TRAIN = ("sine_1p0", "sine_3p0", "rand_0")
 #: recordings of steps are compared from their beginning; all others rest for as long (s) first
@@ -211,8 +213,9 @@ class Learned(NamedTuple):
     """A system for each seed, or why there is none."""
 
     systems: dict[int, System | str]
-    #: steps of the model in one of the comparison
+    #: steps of the model in one of the comparison, and its scheme in arclength
     finer: int = 1
+    space: str = "euler"
     loss: Mapping[str, list[float]] = {}
     #: what is told of the fit, a text
     told: str = ""
@@ -244,6 +247,10 @@ def _paper(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence
 
 
 def _best(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence[int]) -> Learned:
+    return _identified(knowledge, train, read, None, SPACE)
+
+
+def _by_euler(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence[int]) -> Learned:
     return _identified(knowledge, train, read, None)
 
 
@@ -258,9 +265,13 @@ def _no_memory(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequ
 
 
 def _identified(
-    knowledge: System, train: Sequence[str], read: _Read, names: tuple[str, ...] | None
+    knowledge: System,
+    train: Sequence[str],
+    read: _Read,
+    names: tuple[str, ...] | None,
+    space: str = "euler",
 ) -> Learned:
-    return _found(lambda rows: identify(knowledge, rows, names), train, read)
+    return _found(lambda rows: identify(knowledge, rows, names, space=space), train, read, space)
 
 
 def _calibrated(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence[int]) -> Learned:
@@ -270,16 +281,21 @@ def _calibrated(knowledge: System, train: Sequence[str], read: _Read, seeds: Seq
     )
 
 
-def _found(search: Callable[[list[Measurements]], Calibration], train: Sequence[str], read: _Read) -> Learned:
+def _found(
+    search: Callable[[list[Measurements]], Calibration],
+    train: Sequence[str],
+    read: _Read,
+    space: str = "euler",
+) -> Learned:
     """No chance in it: one seed."""
     try:
         calibration = search([read.rows(name, FINER) for name in train])
     except CalibrationError as error:
         return Learned({0: str(error)}, FINER)
-    return Learned({0: calibration.robot}, FINER, told=str(calibration))
+    return Learned({0: calibration.robot}, FINER, space, told=str(calibration))
 
 
-#: those of the paper's Table II, and what of the best each part of it buys
+#: those of the paper's Table II, and what of the best each part of it buys, which is without all later ones
 TABLE = ("baseline", "paper-a", "paper-b", "best")
 METHODS: dict[str, Callable[[System, Sequence[str], _Read, Sequence[int]], Learned]] = {
     "baseline": _baseline,
@@ -289,6 +305,7 @@ METHODS: dict[str, Callable[[System, Sequence[str], _Read, Sequence[int]], Learn
     "calibrated": _calibrated,
     "no-memory": _no_memory,
     "no-vibration": _no_vibration,
+    "euler": _by_euler,
 }
 
 
@@ -304,7 +321,7 @@ def predicted(settings: Any) -> Product:
     tips: dict[str, Any] = {}
     for name in settings["recordings"]:
         for seed, system in learned.systems.items():
-            outcome = _outcome(system, read, name, learned.finer)
+            outcome = _outcome(system, read, name, learned.finer, learned.space)
             cells.append({"recording": name, "method": method, "seed": seed, **outcome.figures})
             if outcome.tip is not None:
                 tips.setdefault(name, _plain(outcome.tip, 6))
@@ -313,9 +330,8 @@ def predicted(settings: Any) -> Product:
         if isinstance(system, KNODE):
             files[f"models/{method}-{seed}"] = encoded(system, f"{method}-{seed}")
         elif isinstance(system, System) and method != "baseline":
-            files[f"models/{method}.yaml"] = format_robot(
-                system, f"identified from {settings['train']}"
-            ).encode()
+            about = f"identified from {', '.join(settings['train'])}, for space={learned.space!r}"
+            files[f"models/{method}.yaml"] = format_robot(system, about).encode()
     facts = {"cells": cells, "tips": tips, "loss": learned.loss, "told": learned.told}
     return Product(facts, files)
 
@@ -330,7 +346,7 @@ class _Poses(NamedTuple):
     quaternion: Float[np.ndarray, "T M 4"]
 
 
-def _outcome(system: System | str, read: _Read, name: str, finer: int) -> _Outcome:
+def _outcome(system: System | str, read: _Read, name: str, finer: int, space: str = "euler") -> _Outcome:
     """The three figures over the rows in which everything was seen, or why there are none."""
     none = {"tip_dtw": None, "pose_mse": None, "tip_rmse": None}
     if isinstance(system, str):
@@ -338,7 +354,7 @@ def _outcome(system: System | str, read: _Read, name: str, finer: int) -> _Outco
     driven = read.rows(name, finer)
     rows = _compared(read.rows(name), read.window(name).seconds)
     try:
-        trajectory = simulate(system, driven.tension[:-1], driven.dt)
+        trajectory = simulate(system, driven.tension[:-1], driven.dt, space=space)
     except SimulationError as error:
         return _Outcome({**none, "failed": str(error)}, None)
     y = np.asarray(trajectory.y)[::finer][: len(rows.time)]

@@ -31,6 +31,7 @@ from knode_cosserat.learning.calibration.unknowns import (
 from knode_cosserat.learning.samples import DataError
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
 
 #: noise may move an estimate by this part of it, on average, and be corrected for
@@ -99,6 +100,7 @@ def calibrate(
     by: Literal["segments", "rollouts"] = "segments",
     undetermined: Literal["stop", "keep"] | None = None,
     level: float = 0.95,
+    space: str | SpaceScheme = "euler",
 ) -> Calibration:
     """Find physical parameters of a robot from trajectories, by least squares.
 
@@ -116,6 +118,8 @@ def calibrate(
         undetermined: what to do about a parameter that the data do not determine: "stop" with an error, or
             "keep" it as it was, which `Calibration.undetermined` says. None: stop if it was named.
         level: how probable it is that an interval holds the truth.
+        space: the scheme in arclength by which measurements are simulated, as in `simulate`: what is found is
+            a robot for that scheme. Trajectories bring their own.
 
     Returns:
         The estimates, their intervals and the robot that has them. Intervals take what is left for white
@@ -125,23 +129,26 @@ def calibrate(
         CalibrationError: the data do not determine a named parameter, or the search does not converge.
         ParameterError: a name that does not exist, or a parameter that cannot be calibrated.
         DataError: trajectories that do not fit the robot, or are too short or not finite.
+        ValueError: a scheme that does not exist.
     """
     _check(robot, trajectories, by, level)
     if undetermined not in (None, "stop", "keep"):
         raise CalibrationError(f'undetermined is {undetermined!r}; allowed is "stop", "keep" or None')
     may_leave_out = names is None if undetermined is None else undetermined == "keep"
     unknowns = unknowns_of(robot, names)
-    misfit, start = _misfit(robot, trajectories, unknowns, by)
+    misfit, start = _misfit(robot, trajectories, unknowns, by, space)
     return _calibration(misfit, *_ended(misfit, start, may_leave_out), level)
 
 
-def _misfit(robot: System, given: Any, unknowns: Unknowns, by: str) -> tuple[Misfit, np.ndarray]:
+def _misfit(
+    robot: System, given: Any, unknowns: Unknowns, by: str, space: str | SpaceScheme
+) -> tuple[Misfit, np.ndarray]:
     """What is to become small, and where the search begins."""
     start = searched(unknowns, values(robot, unknowns))
     if by == "segments":
         return SegmentMisfit(robot, given, unknowns), start
     if any(isinstance(each, Measurements) for each in given):
-        return RolloutMisfit(robot, given, unknowns, near=True), start
+        return RolloutMisfit(robot, given, unknowns, near=True, space=space), start
     near = _by_segments(robot, given, unknowns)
     return RolloutMisfit(robot, given, unknowns, near is not None), start if near is None else near
 

@@ -25,12 +25,14 @@ from knode_cosserat.learning.calibration.unknowns import Unknowns, found, with_c
 from knode_cosserat.learning.samples import DataError, samples
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.march import Past, initial_past, rest_record
 from knode_cosserat.solvers.places import Places, places_at, positions_at, quaternions_at
 from knode_cosserat.solvers.run import Task, run_one
 from knode_cosserat.solvers.sensitivity import tangent_march
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.simulate import Run, beginning
+from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
 
 #: a far start is brought near on the first two rows, then on this many times as many, and so on
@@ -130,8 +132,9 @@ class RolloutMisfit:
         given: Sequence[Trajectory] | Sequence[Measurements],
         unknowns: Unknowns,
         near: bool = False,
+        space: str | SpaceScheme = "euler",
     ):
-        """`near`: a search begins where the robot is close to the real one."""
+        """`near`: a search begins where the robot is close to the real one; `space` is for measurements."""
         self.robot, self.unknowns, self.near = robot, unknowns, near
         y = np.zeros(robot.y_layout.size)
         try:
@@ -149,7 +152,7 @@ class RolloutMisfit:
         self.rollouts = [
             _of_trajectory(robot, self.oriented, each)
             if isinstance(each, Trajectory)
-            else _of_measurements(robot, self.oriented, each)
+            else _of_measurements(robot, self.oriented, each, space)
             for each in given
         ]
         if not self.rollouts:
@@ -283,7 +286,7 @@ def _of_trajectory(robot: System, oriented: bool, trajectory: Trajectory) -> _Ro
     return _Rollout(settings, trajectory.dt, initial, control, places, target)
 
 
-def _of_measurements(robot: System, oriented: bool, given: Any) -> _Rollout:
+def _of_measurements(robot: System, oriented: bool, given: Any, space: str | SpaceScheme) -> _Rollout:
     """Measurements, with row 0 where the robot rests.
 
     Raises:
@@ -309,7 +312,8 @@ def _of_measurements(robot: System, oriented: bool, given: Any) -> _Rollout:
     if oriented:
         length = np.linalg.norm(given.quaternion[1:], axis=-1, keepdims=True)
         target = np.concatenate([target, given.quaternion[1:] / length], axis=-1)
-    return _Rollout(Settings(), given.dt, None, given.tension[:-1], places, target)
+    settings = Settings.of("bdf2", space, "paper", NewtonOptions())
+    return _Rollout(settings, given.dt, None, given.tension[:-1], places, target)
 
 
 def _names(given: Sequence[Measurements]) -> list[str]:
