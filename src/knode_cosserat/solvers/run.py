@@ -26,6 +26,8 @@ CHUNK = 16
 LEAST_CAPACITY = 128
 #: steps that need the stable elimination before a run changes to it, which costs a program
 ENOUGH_RESCUES = 2
+#: segments that it then condenses to one: one that a scheme carries safely lets nothing grow beyond e in it
+GROUP = 8
 #: how far segments are divided when they are too long to be stable
 MOST_NODES = 400
 
@@ -163,12 +165,23 @@ def _with_recovery(
                     return rows, outcome.cause
                 reached += 1
                 rescues += outcome.result is Result.RECOVERED_STABLE_ELIMINATION
-                if rescues == ENOUGH_RESCUES:
-                    settings = dataclasses.replace(settings, elimination=Decoupled())
+                if rescues >= ENOUGH_RESCUES:
+                    settings = with_stable_elimination(settings)
             bar.update(reached - done)
             done = reached
     assert rows is not None
     return rows, ""
+
+
+def with_stable_elimination(settings: Settings) -> Settings:
+    """What a run goes on with that needs the stable elimination again and again."""
+    return dataclasses.replace(settings, elimination=Decoupled(GROUP))
+
+
+def as_ended(settings: Settings, steps: Steps) -> Settings:
+    """The settings that one robot's run ended with: what goes on from it begins so."""
+    rescues = np.count_nonzero(steps.result == Result.RECOVERED_STABLE_ELIMINATION)
+    return with_stable_elimination(settings) if rescues >= ENOUGH_RESCUES else settings
 
 
 def run_batch(

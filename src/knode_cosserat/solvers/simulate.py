@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
@@ -15,7 +16,7 @@ from knode_cosserat.solvers import sensitivity
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.march import going_on_past, initial_past, rest_record
 from knode_cosserat.solvers.result import Result, SimulationError
-from knode_cosserat.solvers.run import Start, Steps, Task, run_batch, run_one
+from knode_cosserat.solvers.run import Start, Steps, Task, as_ended, run_batch, run_one
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.time import Static, TimeScheme
@@ -237,13 +238,22 @@ def _going_on(
 
 
 def _single(run: Run, on_failure: str, progress: bool) -> Trajectory:
+    run = run._replace(settings=_as_before(run))
     system, controls, _, settings, dt, _, _ = run
     record, start, t0, first = beginning(run)
     task = Task(settings, dt, len(controls), first)
     steps, cause = run_one(task, system, controls, start, progress)
     if on_failure == "raise" and steps.result.min() < 0:
         raise _failure(task, float(t0), steps, cause, None)
-    return _trajectory(run, record, start.control, t0, steps)
+    return _trajectory(run._replace(settings=as_ended(settings, steps)), record, start.control, t0, steps)
+
+
+def _as_before(run: Run) -> Settings:
+    """The settings, with the elimination that the trajectory to go on from found that it needs."""
+    before = None if run.initial is None else run.initial.settings
+    if before is None or isinstance(run.settings.time, Static):
+        return run.settings
+    return dataclasses.replace(run.settings, elimination=before.elimination)
 
 
 def _batch(run: Run, on_failure: str, progress: bool) -> Trajectory:
