@@ -304,9 +304,7 @@ def newton_keeping(
             factors, dy, dxi, error = anew(at)
         else:
             old = kept.usable
-            factors, dy, dxi, error = jax.lax.cond(
-                old, again, lambda _, at: anew(at), kept.factors, at
-            )
+            factors, dy, dxi, error = jax.lax.cond(old, again, lambda _, at: anew(at), kept.factors, at)
         at = at._replace(error=error)
         size = size_of(dy)
         usable = jnp.isfinite(size)
@@ -319,7 +317,8 @@ def newton_keeping(
         search = jax.lax.while_loop(lambda s: s.go, lambda s: correct(factors, old, s), search)
         # what an old linearisation did not solve says nothing of the damping that a new one needs
         search = search._replace(fresh=search.fresh | old)
-        return search, jnp.where(old, count, count + 1), None if kept is None else Kept(factors, jnp.array(False))
+        kept = None if kept is None else Kept(factors, jnp.array(False))
+        return search, jnp.where(old, count, count + 1), kept
 
     def unsolved(state: tuple[_Search, Any, Kept | None]) -> Any:
         search, count, _ = state

@@ -5,8 +5,8 @@
 Two ways to solve them share one interface. `Condensed` carries the recursion from base to tip and solves for
 δξ there: the fastest, but what grows along the rod (small time steps, soft and long rods) multiplies rounding
 errors. `Decoupled` first carries the tip's conditions down to the base, orthonormalised at every node, and
-projects on them on the way up: growth does no harm, at several times the cost. It need not do so at every node:
-a few segments condensed to one are harmless, and short enough to be done side by side. Measured: docs/solver.md.
+projects on them on the way up: growth does no harm, at several times the cost. Every eighth node or so is
+enough where segments are short: what lies between is condensed, side by side. Measured: docs/solver.md.
 
 Strands (`System.strands`) meet at the ends only: F_j has a block for each, S and M are of all of them.
 A single rod's F has no axis of strands: with one of length one a step takes 1.3 times as long.
@@ -137,7 +137,7 @@ class Decoupled(LinearSolver):
     """From tip to base and back, stable whatever grows along the rod.
 
     `every` so many segments are condensed to one first, all such groups side by side, and the conditions are
-    orthonormalised at their ends only. What grows within a group costs digits; the serial recursion is shorter.
+    orthonormalised at their ends only. What grows within a group costs digits; the recursion is shorter.
     """
 
     every: int = 1
@@ -219,6 +219,10 @@ class Decoupled(LinearSolver):
         filled = jnp.broadcast_to(filling, (left, *values.shape[1:]))
         values = jnp.concatenate([values, filled]) if left else values
         return jnp.swapaxes(values.reshape(-1, self.every, *values.shape[1:]), 0, 1)
+
+
+#: by their names; where a scheme carries a segment safely nothing grows beyond e in it: eight cost few digits
+ELIMINATIONS: dict[str, LinearSolver] = {"condensed": Condensed(), "decoupled": Decoupled(every=8)}
 
 
 def _scan(along: Any, first: Any, rest: Any) -> Any:

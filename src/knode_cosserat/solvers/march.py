@@ -165,7 +165,7 @@ def _attempt(
     system: System, settings: Settings, table: Any, past: Past, control: Any, i: Any, dt: Any,
     kept: Kept | None,
 ) -> tuple[Any, Past, Rows, Kept | None]:  # fmt: skip
-    """Step i: whether it failed, the past of the step that is next (this one, if it failed), row, and kept."""
+    """Step i: whether it failed, the past of the step that is next (this one, if it failed), row, kept."""
     coefficients = jnp.where(i == 0, table[0], table[1])
     t = past.t0 + (i + 1) * dt
     after, row, kept = step(system, settings, past, coefficients, control, t, kept)

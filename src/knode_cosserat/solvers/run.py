@@ -12,7 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.linear import Decoupled
+from knode_cosserat.solvers.linear import ELIMINATIONS
 from knode_cosserat.solvers.march import Past, Rows, coefficient_table, march_many, march_one
 from knode_cosserat.solvers.recovery import Outcome, recover
 from knode_cosserat.solvers.result import Result
@@ -26,8 +26,6 @@ CHUNK = 16
 LEAST_CAPACITY = 128
 #: steps that need the stable elimination before a run changes to it, which costs a program
 ENOUGH_RESCUES = 2
-#: segments that it then condenses to one: one that a scheme carries safely lets nothing grow beyond e in it
-GROUP = 8
 #: how far segments are divided when they are too long to be stable
 MOST_NODES = 400
 
@@ -175,7 +173,7 @@ def _with_recovery(
 
 def with_stable_elimination(settings: Settings) -> Settings:
     """What a run goes on with that needs the stable elimination again and again."""
-    return dataclasses.replace(settings, elimination=Decoupled(GROUP))
+    return dataclasses.replace(settings, elimination=ELIMINATIONS["decoupled"])
 
 
 def as_ended(settings: Settings, steps: Steps) -> Settings:
