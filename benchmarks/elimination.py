@@ -18,7 +18,7 @@ import numpy as np
 import knode_cosserat as kc
 from benchmarks.cases import DT, STEPS, medians, one_core
 from knode_cosserat.solvers.boundary import StepProblem, newton
-from knode_cosserat.solvers.linear import Condensed, Decoupled
+from knode_cosserat.solvers.linear import ELIMINATIONS, Condensed, Decoupled
 from knode_cosserat.solvers.march import rest_record
 
 Solve = Callable[[StepProblem, Any, Any], tuple[Any, Any, Any]]
@@ -69,6 +69,7 @@ WAYS: dict[str, Solve] = {
     "single shooting": shooting,
     "all nodes, condensed": functools.partial(all_nodes, Condensed()),
     "all nodes, decoupled": functools.partial(all_nodes, Decoupled()),
+    "all nodes, decoupled in groups": functools.partial(all_nodes, ELIMINATIONS["decoupled"]),
 }
 
 

@@ -396,7 +396,7 @@ def _settings_text(settings: Settings | None, source: str) -> str:
         "newton": dataclasses.asdict(settings.newton),
     }
     if isinstance(settings.elimination, Decoupled):
-        described["elimination"] = Decoupled.__name__
+        described["elimination"] = {"scheme": Decoupled.__name__, **dataclasses.asdict(settings.elimination)}
     try:
         return json.dumps(described)
     except (TypeError, ValueError) as error:
@@ -413,12 +413,17 @@ def _settings(path: Path, data: xarray.Dataset) -> Settings | None:
             space=_scheme(SpaceScheme, **described["space"]),
             start=described["start"],
             newton=NewtonOptions(**described["newton"]),
-            elimination=_scheme(LinearSolver, scheme=described.get("elimination", Condensed.__name__)),
+            elimination=_elimination(described.get("elimination", Condensed.__name__)),
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise TrajectoryFileError(
             f"{path}: attribute 'settings' is not understood: {_first_line(error)}"
         ) from None
+
+
+def _elimination(described: Any) -> Any:
+    """From its name and options, or from its name alone, as files had it at first."""
+    return _scheme(LinearSolver, **({"scheme": described} if isinstance(described, str) else described))
 
 
 def _scheme(base: type, *, scheme: str, **options: Any) -> Any:

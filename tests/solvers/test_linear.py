@@ -7,7 +7,7 @@ import pytest
 from knode_cosserat.solvers.linear import Condensed, Decoupled, Linearisation
 
 STATES, UNKNOWNS = 6, 3
-SOLVERS = {"condensed": Condensed(), "decoupled": Decoupled()}
+SOLVERS = {"condensed": Condensed(), "decoupled": Decoupled(), "in groups": Decoupled(every=4)}
 
 
 SCALES = {"ones": np.ones(STATES), "natural": np.array([1e-3, 1.0, 1e3, 10.0, 1e-2, 1e2])}

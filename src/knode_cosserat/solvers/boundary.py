@@ -49,6 +49,9 @@ class NewtonOptions:
     #: linearise again when the old linearisation is expected to need more corrections than this
     patience: int = 6
     least_damping: float = 1e-3
+    #: begin a step with the last one's linearisation, as long as it converges: many short steps of a rod with
+    #: many nodes then take less time each. Residuals end up nearer to `tolerance`.
+    across_steps: bool = False
 
 
 class StepProblem(eqx.Module):
@@ -171,6 +174,20 @@ class Solution(NamedTuple):
     linearisations: Int[Any, ""]
 
 
+class Kept(NamedTuple):
+    """The linear solver's factors of an earlier linearisation, and whether there are any."""
+
+    factors: Any
+    usable: Any
+
+
+def none_kept(problem: StepProblem, y: Any, unknowns: Any, linear: LinearSolver) -> Kept:
+    """What is kept before the first step."""
+    y_scale = problem.system.scales().y
+    like = jax.eval_shape(lambda: linear.start(linearise(problem, y, unknowns), y_scale)[0])
+    return Kept(jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), like), jnp.array(False))
+
+
 def _with_base(problem: StepProblem, y: Any, unknowns: Any) -> Any:
     return jnp.concatenate([problem.base(unknowns)[None], y[1:]])
 
@@ -227,12 +244,20 @@ def newton(
     options: NewtonOptions,
 ) -> Solution:
     """Solve one step from a first guess. Never fails: the solution's `error` says what came of it."""
+    return newton_keeping(problem, y, unknowns, linear, options, None)[0]
+
+
+def newton_keeping(
+    problem: StepProblem, y: Float[Any, "nodes y"], unknowns: Float[Any, " k"], linear: LinearSolver,
+    options: NewtonOptions, kept: Kept | None,
+) -> tuple[Solution, Kept | None]:  # fmt: skip
+    """`newton` that begins with what is kept, and what is to be kept of it; None keeps nothing."""
     y_scale = problem.system.scales().y
 
     def size_of(dy: Any) -> Any:
         return jnp.max(jnp.abs(dy) / y_scale)
 
-    def correct(factors: Any, search: _Search) -> _Search:
+    def correct(factors: Any, old: Any, search: _Search) -> _Search:
         at, damping = search.at, search.damping
         xi = at.unknowns + damping * search.dxi
         y = _with_base(problem, at.y + damping * search.dy, xi)
@@ -249,7 +274,7 @@ def newton(
         remaining = jnp.log(trial.error / options.tolerance) / rate
         keep = accept & (damping == 1.0) & (remaining <= options.patience)
         shorten = ~accept & search.fresh & (damping > options.least_damping)
-        rounding = ~accept & (at.error <= options.acceptable)
+        rounding = ~accept & (at.error <= options.acceptable) & ~old
         return _Search(
             at=Iterate(*(jnp.where(accept, new, old) for new, old in zip(trial, at, strict=True))),
             dy=jnp.where(accept, dy, search.dy),
@@ -262,24 +287,41 @@ def newton(
             dead=rounding | (~accept & search.fresh & ~shorten),
         )
 
-    def linearised(state: tuple[_Search, Any]) -> tuple[_Search, Any]:
-        search, count = state
-        at = search.at
+    def anew(at: Iterate) -> Any:
         linearisation = linearise(problem, at.y, at.unknowns)
-        factors, dy, dxi = linear.start(linearisation, y_scale)
-        at = at._replace(error=_error(problem, linearisation.defects, linearisation.tip_residual))
+        found = linear.start(linearisation, y_scale)
+        return *found, _error(problem, linearisation.defects, linearisation.tip_residual)
+
+    def again(factors: Any, at: Iterate) -> Any:
+        defects, tip = residuals(problem, at.y)
+        return factors, *linear.solve(factors, defects, tip), _error(problem, defects, tip)
+
+    def linearised(state: tuple[_Search, Any, Kept | None]) -> tuple[_Search, Any, Kept | None]:
+        search, count, kept = state
+        at = search.at
+        if kept is None:
+            old = jnp.array(False)
+            factors, dy, dxi, error = anew(at)
+        else:
+            old = kept.usable
+            factors, dy, dxi, error = jax.lax.cond(old, again, lambda _, at: anew(at), kept.factors, at)
+        at = at._replace(error=error)
         size = size_of(dy)
         usable = jnp.isfinite(size)
         # a damping that this point itself asked for is kept; one left from a stale linearisation is not
         damping = jnp.where(search.fresh, 1.0, jnp.maximum(search.damping, 0.25))
         search = _Search(
             at, dy, dxi, size, damping, search.corrections,
-            fresh=jnp.array(True), go=usable & (at.error > options.tolerance), dead=~usable,
+            fresh=~old, go=usable & (at.error > options.tolerance), dead=~usable & ~old,
         )  # fmt: skip
-        return jax.lax.while_loop(lambda s: s.go, lambda s: correct(factors, s), search), count + 1
+        search = jax.lax.while_loop(lambda s: s.go, lambda s: correct(factors, old, s), search)
+        # what an old linearisation did not solve says nothing of the damping that a new one needs
+        search = search._replace(fresh=search.fresh | old)
+        kept = None if kept is None else Kept(factors, jnp.array(False))
+        return search, jnp.where(old, count, count + 1), kept
 
-    def unsolved(state: tuple[_Search, Any]) -> Any:
-        search, count = state
+    def unsolved(state: tuple[_Search, Any, Kept | None]) -> Any:
+        search, count, _ = state
         return (search.at.error > options.tolerance) & (count < options.max_linearisations) & ~search.dead
 
     first = _Search(
@@ -287,5 +329,7 @@ def newton(
         jnp.zeros_like(y), jnp.zeros_like(unknowns), size=jnp.array(0.0), damping=jnp.array(1.0),
         corrections=jnp.array(0), fresh=jnp.array(True), go=jnp.array(True), dead=jnp.array(False),
     )  # fmt: skip
-    search, count = jax.lax.while_loop(unsolved, linearised, (first, jnp.array(0)))
-    return Solution(search.at.y, search.at.unknowns, search.at.error, search.corrections, count)
+    search, count, kept = jax.lax.while_loop(unsolved, linearised, (first, jnp.array(0), kept))
+    if kept is not None:
+        kept = kept._replace(usable=search.at.error <= options.acceptable)
+    return Solution(search.at.y, search.at.unknowns, search.at.error, search.corrections, count), kept

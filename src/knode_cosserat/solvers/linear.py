@@ -5,7 +5,8 @@
 Two ways to solve them share one interface. `Condensed` carries the recursion from base to tip and solves for
 δξ there: the fastest, but what grows along the rod (small time steps, soft and long rods) multiplies rounding
 errors. `Decoupled` first carries the tip's conditions down to the base, orthonormalised at every node, and
-projects on them on the way up: growth does no harm, at several times the cost. Measured: docs/solver.md.
+projects on them on the way up: growth does no harm, at several times the cost. Every eighth node or so is
+enough where segments are short: what lies between is condensed, side by side. Measured: docs/solver.md.
 
 Strands (`System.strands`) meet at the ends only: F_j has a block for each, S and M are of all of them.
 A single rod's F has no axis of strands: with one of length one a step takes 1.3 times as long.
@@ -112,12 +113,20 @@ class Condensed(LinearSolver):
         return self._combine(factors, w, _apply(factors.tip, last) + tip)
 
 
-class DecoupledFactors(NamedTuple):
-    """Per node the orthonormal conditions Q and the triangular factors L; all in natural units."""
+class Groups(NamedTuple):
+    """Segments in groups of as many each, filled up with ones that change nothing; in natural units."""
 
-    F: Float[Any, "segments *strands b b"]
-    Q: Float[Any, "nodes k y"]
-    L: Float[Any, "nodes k k"]
+    F: Float[Any, "each groups *strands b b"]
+    #: from a group's start to each of its segments' ends
+    X: Float[Any, "each groups *strands b b"]
+
+
+class DecoupledFactors(NamedTuple):
+    """Where a group ends: orthonormal conditions Q, inverse factors N. In natural units."""
+
+    groups: Groups
+    Q: Float[Any, "groups k y"]
+    N: Float[Any, "groups+1 k k"]
     base: Float[Any, "y k"]
     inverse: Float[Any, "k k"]
     y_scale: Float[Any, " y"]
@@ -125,55 +134,98 @@ class DecoupledFactors(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Decoupled(LinearSolver):
-    """From tip to base and back, stable whatever grows along the rod."""
+    """From tip to base and back, stable whatever grows along the rod.
+
+    `every` so many segments are condensed to one first, all such groups side by side, and the conditions are
+    orthonormalised at their ends only. What grows within a group costs digits; the recursion is shorter.
+    """
+
+    every: int = 1
+
+    def __post_init__(self) -> None:
+        if self.every < 1:
+            raise ValueError(f"every is {self.every!r}; allowed is a number of segments, 1 or more")
 
     def start(self, linearisation, y_scale):  # type: ignore[no-untyped-def]
-        """Carry the tip's conditions down to the base."""
+        """Condense the groups, and carry the tip's conditions down to the base."""
         of_strand = y_scale.reshape(linearisation.F.shape[1:-1])
-        F = linearisation.F * of_strand[..., None, :] / of_strand[..., :, None]
+        groups = self._groups(linearisation.F * of_strand[..., None, :] / of_strand[..., :, None])
+        # the conditions see all strands; a group's matrix has a block for each
+        blocks = groups.X[-1].shape[1:-1]
 
         def normalised(conditions: Any) -> Any:
             Q, R = jnp.linalg.qr(conditions.T)
-            return Q.T, R.T
+            one = jnp.eye(R.shape[0])
+            return Q.T, jax.scipy.linalg.solve_triangular(R.T, one, lower=True)
 
-        Q_tip, L_tip = normalised(linearisation.tip * y_scale)
+        def down(Q: Any, A: Any) -> Any:
+            across = jnp.sum(Q.reshape(-1, *blocks)[..., :, None] * A, axis=-2).reshape(Q.shape)
+            Q, N = normalised(across)
+            return Q, (Q, N)
 
-        def down(Q: Any, F: Any) -> Any:
-            across = jnp.einsum("k...b,...bc->k...c", Q.reshape(-1, *F.shape[:-1]), F)
-            Q, L = normalised(across.reshape(Q.shape))
-            return Q, (Q, L)
-
-        _, (Q, L) = jax.lax.scan(down, Q_tip, F, reverse=True)
-        Q, L = jnp.concatenate([Q, Q_tip[None]]), jnp.concatenate([L, L_tip[None]])
+        Q_tip, N_tip = normalised(linearisation.tip * y_scale)
+        Q_base, (Q, N) = jax.lax.scan(down, Q_tip, groups.X[-1], reverse=True)
+        Q, N = jnp.concatenate([Q[1:], Q_tip[None]]), jnp.concatenate([N, N_tip[None]])
         base = linearisation.base / y_scale[:, None]
-        factors = DecoupledFactors(F, Q, L, base, jnp.linalg.inv(Q[0] @ base), y_scale)
+        factors = DecoupledFactors(groups, Q, N, base, jnp.linalg.inv(Q_base @ base), y_scale)
         return factors, *self.solve(factors, linearisation.defects, linearisation.tip_residual)
 
     def solve(self, factors, defects, tip):  # type: ignore[no-untyped-def]
-        """Conditions Q_j δy_j = c_j from the tip down, then δy from the base up, projected on them."""
-        F, Q, L, base, inverse, y_scale = factors
-        r = defects / y_scale
+        """Conditions Q δy = c from the tip down, then δy from the base up, projected on them."""
+        (F, X), Q, N, base, inverse, y_scale = factors
+        r = self._in_groups(defects / y_scale, 0.0).reshape(F.shape[:-1])
 
-        def triangular(L: Any, right: Any) -> Any:
-            return jax.scipy.linalg.solve_triangular(L, right, lower=True)
+        def within(w: Any, segment: Any) -> Any:
+            F_i, r_i = segment
+            w = _apply(F_i, w) + r_i
+            return w, w
 
-        c_tip = triangular(L[-1], -tip)
+        _, w = _scan(within, jnp.zeros(r.shape[1:]), (F, r))
+        d = w[-1].reshape(Q.shape[0], -1)
 
-        def down(c: Any, node: Any) -> Any:
-            Q_next, L_j, r_j = node
-            c = triangular(L_j, c - Q_next @ r_j)
-            return c, c
+        def down(c: Any, group: Any) -> Any:
+            N_g, Q_g, d_g = group
+            return _apply(N_g, c - _apply(Q_g, d_g)), c
 
-        _, c = jax.lax.scan(down, c_tip, (Q[1:], L[:-1], r), reverse=True)
-        dxi = inverse @ c[0]
+        c_base, c = jax.lax.scan(down, _apply(N[-1], -tip), (N[:-1], Q, d), reverse=True)
+        dxi = inverse @ c_base
 
-        def up(dy: Any, node: Any) -> Any:
-            F_j, r_j, Q_next, c_next = node
-            dy = carried(F_j, dy) + r_j
-            dy = dy + (c_next - Q_next @ dy) @ Q_next
-            return dy, dy
+        def up(dy: Any, group: Any) -> Any:
+            A_g, d_g, Q_g, c_g = group
+            after = carried(A_g, dy) + d_g
+            return after + jnp.sum((c_g - _apply(Q_g, after))[:, None] * Q_g, axis=0), dy
 
         first = base @ dxi
-        c_next = jnp.concatenate([c[1:], c_tip[None]])
-        _, dy = jax.lax.scan(up, first, (F, r, Q[1:], c_next))
+        _, begins = jax.lax.scan(up, first, (X[-1], d, Q, c))
+        dy = _apply(X, begins.reshape(r.shape[1:])) + w
+        dy = jnp.swapaxes(dy, 0, 1).reshape(-1, defects.shape[1])[: defects.shape[0]]
         return jnp.concatenate([first[None], dy]) * y_scale, dxi
+
+    def _groups(self, F: Any) -> Groups:
+        """The segments' matrices in groups, and their products from each group's start."""
+        F = self._in_groups(F, jnp.eye(F.shape[-1]))
+
+        def within(X: Any, F_i: Any) -> Any:
+            # as a sum of outer products: of many matrices at once it takes a quarter of `_product`'s time
+            X = sum(F_i[..., :, j, None] * X[..., j, None, :] for j in range(F_i.shape[-1]))
+            return X, X
+
+        _, X = _scan(within, F[0], F[1:])
+        return Groups(F, jnp.concatenate([F[:1], X]))
+
+    def _in_groups(self, values: Any, filling: Any) -> Any:
+        """(segments, …) as (each, groups, …)."""
+        left = -values.shape[0] % self.every
+        filled = jnp.broadcast_to(filling, (left, *values.shape[1:]))
+        values = jnp.concatenate([values, filled]) if left else values
+        return jnp.swapaxes(values.reshape(-1, self.every, *values.shape[1:]), 0, 1)
+
+
+#: by their names; where a scheme carries a segment safely nothing grows beyond e in it: eight cost few digits
+ELIMINATIONS: dict[str, LinearSolver] = {"condensed": Condensed(), "decoupled": Decoupled(every=8)}
+
+
+def _scan(along: Any, first: Any, rest: Any) -> Any:
+    """`lax.scan`, without a loop where there is but one turn or none."""
+    length = jax.tree.leaves(rest)[0].shape[0]
+    return jax.lax.scan(along, first, rest, unroll=max(1, length) if length < 2 else 1)

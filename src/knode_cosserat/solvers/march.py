@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.boundary import StepProblem, newton
+from knode_cosserat.solvers.boundary import Kept, StepProblem, newton_keeping, none_kept
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import Euler
 from knode_cosserat.solvers.time import BDF1
@@ -117,8 +117,11 @@ def advanced(past: Past, record: Any, unknowns: Any, rate: Any, order: Any) -> P
     )
 
 
-def step(system: System, settings: Settings, past: Past, coefficients: Any, control: Any, t: Any) -> Any:
-    """One time step: the next past, and the step's row."""
+def step(
+    system: System, settings: Settings, past: Past, coefficients: Any, control: Any, t: Any,
+    kept: Kept | None,
+) -> Any:  # fmt: skip
+    """One time step: the next past, the step's row, and what is kept of its linearisation."""
     ny = system.y_layout.size
     history = history_of(past, coefficients, settings)
     problem = StepProblem(system, t, control, coefficients[0], history, settings.space)
@@ -127,14 +130,24 @@ def step(system: System, settings: Settings, past: Past, coefficients: Any, cont
     weights = jnp.asarray(EXTRAPOLATIONS)[past.order]
     guess = jnp.sum(weights[:, None, None] * past.records[:, :, :ny], axis=0)
     unknowns = jnp.sum(weights[:, None] * past.unknowns, axis=0)
-    solution = newton(problem, guess, unknowns, settings.elimination, settings.newton)
+    solution, kept = newton_keeping(problem, guess, unknowns, settings.elimination, settings.newton, kept)
     record = problem.record(solution.y)
     scale = system.scales().y
     misfit = jnp.max(jnp.abs(guesses - solution.y) / scale, axis=(1, 2))
     rate = coefficients[0] * record + history if settings.time.uses_rate else past.rate
     size = jnp.max(jnp.abs(solution.y) / scale)
     row = Rows(record, solution.unknowns, solution.error, solution.corrections, size)
-    return advanced(past, record, solution.unknowns, rate, jnp.argmin(misfit)), row
+    return advanced(past, record, solution.unknowns, rate, jnp.argmin(misfit)), row, kept
+
+
+def _none_kept(system: System, settings: Settings, past: Past, control: Any) -> Kept | None:
+    """What is kept before the first step: nothing at all, unless linearisations are kept across steps."""
+    if not settings.newton.across_steps:
+        return None
+    zero = jnp.zeros(())
+    problem = StepProblem(system, zero, control, zero, jnp.zeros_like(past.records[0]), settings.space)
+    y = past.records[0, :, : system.y_layout.size]
+    return none_kept(problem, y, past.unknowns[0], settings.elimination)
 
 
 def _no_rows(shape: tuple[int, ...], past: Past) -> Rows:
@@ -149,13 +162,15 @@ def _no_rows(shape: tuple[int, ...], past: Past) -> Rows:
 
 
 def _attempt(
-    system: System, settings: Settings, table: Any, past: Past, control: Any, i: Any, dt: Any
-) -> tuple[Any, Past, Rows]:
-    """Step i: whether it failed, the past of the step that is next (this one, if it failed), and its row."""
+    system: System, settings: Settings, table: Any, past: Past, control: Any, i: Any, dt: Any,
+    kept: Kept | None,
+) -> tuple[Any, Past, Rows, Kept | None]:  # fmt: skip
+    """Step i: whether it failed, the past of the step that is next (this one, if it failed), row, kept."""
     coefficients = jnp.where(i == 0, table[0], table[1])
-    after, row = step(system, settings, past, coefficients, control, past.t0 + (i + 1) * dt)
+    t = past.t0 + (i + 1) * dt
+    after, row, kept = step(system, settings, past, coefficients, control, t, kept)
     failed = ~(row.error <= settings.newton.acceptable)
-    return failed, _where(failed, past, after), row
+    return failed, _where(failed, past, after), row, kept
 
 
 def _where(condition: Any, one: Any, other: Any) -> Any:
@@ -172,17 +187,18 @@ def march(
     """
 
     def going(state: Any) -> Any:
-        i, failed, _, _ = state
+        i, failed, *_ = state
         return (i < stop) & ~failed
 
     def one(state: Any) -> Any:
-        i, _, past, rows = state
-        failed, past, row = _attempt(system, settings, table, past, controls[i], i, dt)
+        i, _, past, rows, kept = state
+        failed, past, row, kept = _attempt(system, settings, table, past, controls[i], i, dt, kept)
         rows = jax.tree.map(lambda all_rows, value: all_rows.at[i].set(value), rows, row)
-        return jnp.where(failed, i, i + 1), failed, past, rows
+        return jnp.where(failed, i, i + 1), failed, past, rows, kept
 
-    state = (start, jnp.array(False), past, _no_rows(controls.shape[:1], past))
-    done, _, past, rows = jax.lax.while_loop(going, one, state)
+    kept = _none_kept(system, settings, past, controls[0])
+    state = (start, jnp.array(False), past, _no_rows(controls.shape[:1], past), kept)
+    done, _, past, rows, _ = jax.lax.while_loop(going, one, state)
     return done, past, rows
 
 
@@ -206,19 +222,22 @@ def march_in_turn(
         return jax.tree.map(lambda leaf: leaf[robot], tree)
 
     def one(state: Any) -> Any:
-        robot, i, past, done, rows = state
+        robot, i, past, done, rows, kept = state
         this = own(system, robot) if batched else system
-        failed, past, row = _attempt(this, settings, table, past, controls[robot, i], i, dt)
+        failed, past, row, kept = _attempt(this, settings, table, past, controls[robot, i], i, dt, kept)
         rows = jax.tree.map(lambda all_rows, value: all_rows.at[robot, i].set(value), rows, row)
         done = done.at[robot].set(jnp.where(failed, i, i + 1))
         ended = failed | (i + 1 >= stop)
         following = jnp.where(ended, robot + 1, robot)
         past = _where(ended, own(pasts, jnp.minimum(following, size - 1)), past)
-        return following, jnp.where(ended, 0, i + 1), past, done, rows
+        if kept is not None:
+            kept = kept._replace(usable=kept.usable & ~ended)
+        return following, jnp.where(ended, 0, i + 1), past, done, rows, kept
 
+    kept = _none_kept(own(system, 0) if batched else system, settings, own(pasts, 0), controls[0, 0])
     zero = jnp.zeros((), dtype=int)
-    state = (zero, zero, own(pasts, 0), jnp.zeros(size, dtype=int), _no_rows(controls.shape[:2], pasts))
-    _, _, _, done, rows = jax.lax.while_loop(lambda state: state[0] < size, one, state)
+    state = (zero, zero, own(pasts, 0), jnp.zeros(size, dtype=int), _no_rows(controls.shape[:2], pasts), kept)
+    _, _, _, done, rows, _ = jax.lax.while_loop(lambda state: state[0] < size, one, state)
     return done, rows
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.linear import Decoupled
+from knode_cosserat.solvers.linear import ELIMINATIONS
 from knode_cosserat.solvers.march import Past, Rows, coefficient_table, march_many, march_one
 from knode_cosserat.solvers.recovery import Outcome, recover
 from knode_cosserat.solvers.result import Result
@@ -189,12 +189,23 @@ def _with_recovery(
                     return rows, outcome.cause
                 reached += 1
                 rescues += outcome.result is Result.RECOVERED_STABLE_ELIMINATION
-                if rescues == ENOUGH_RESCUES:
-                    settings = dataclasses.replace(settings, elimination=Decoupled())
+                if rescues >= ENOUGH_RESCUES:
+                    settings = with_stable_elimination(settings)
             bar.update(reached - done)
             done = reached
     assert rows is not None
     return rows, ""
+
+
+def with_stable_elimination(settings: Settings) -> Settings:
+    """What a run goes on with that needs the stable elimination again and again."""
+    return dataclasses.replace(settings, elimination=ELIMINATIONS["decoupled"])
+
+
+def as_ended(settings: Settings, steps: Steps) -> Settings:
+    """The settings that one robot's run ended with: what goes on from it begins so."""
+    rescues = np.count_nonzero(steps.result == Result.RECOVERED_STABLE_ELIMINATION)
+    return with_stable_elimination(settings) if rescues >= ENOUGH_RESCUES else settings
 
 
 def run_batch(

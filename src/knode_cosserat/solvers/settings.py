@@ -8,7 +8,7 @@ from typing import Any, Literal, Self
 from knode_cosserat.solvers import space as space_schemes
 from knode_cosserat.solvers import time as time_schemes
 from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.linear import Condensed, LinearSolver
+from knode_cosserat.solvers.linear import ELIMINATIONS, Condensed, LinearSolver
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.time import TimeScheme
 
@@ -31,7 +31,10 @@ class Settings:
     elimination: LinearSolver = Condensed()  # noqa: RUF009
 
     @classmethod
-    def of(cls, time: str | TimeScheme, space: str | SpaceScheme, start: str, newton: NewtonOptions) -> Self:
+    def of(
+        cls, time: str | TimeScheme, space: str | SpaceScheme, start: str, newton: NewtonOptions,
+        elimination: str | LinearSolver = "condensed",
+    ) -> Self:  # fmt: skip
         """Settings from names or schemes. `ValueError` names what is allowed."""
         if start not in ("paper", "consistent"):
             raise ValueError(f'start is {start!r}; allowed is "paper" or "consistent"')
@@ -40,6 +43,7 @@ class Settings:
             _scheme("space", space, SpaceScheme, space_schemes.SCHEMES),
             start,  # type: ignore[arg-type]
             newton,
+            _scheme("elimination", elimination, LinearSolver, ELIMINATIONS),
         )
 
 

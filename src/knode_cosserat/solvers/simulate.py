@@ -13,9 +13,10 @@ import numpy as np
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.solvers import sensitivity
 from knode_cosserat.solvers.boundary import NewtonOptions
+from knode_cosserat.solvers.linear import LinearSolver
 from knode_cosserat.solvers.march import going_on_past, initial_past, rest_record
 from knode_cosserat.solvers.result import Result, SimulationError
-from knode_cosserat.solvers.run import Start, Steps, Task, run_batch, run_one
+from knode_cosserat.solvers.run import Start, Steps, Task, as_ended, run_batch, run_one
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.time import Static, TimeScheme
@@ -32,6 +33,7 @@ def simulate(
     start: Literal["paper", "consistent"] = "paper",
     initial: Trajectory | None = None,
     newton: NewtonOptions = NewtonOptions(),
+    elimination: str | LinearSolver | None = None,
     on_failure: Literal["raise", "return"] = "raise",
     progress: bool = False,
 ) -> Trajectory:
@@ -50,6 +52,9 @@ def simulate(
             step is the same the motion goes on exactly, with the history of its last rows; only the
             trapezoidal rule makes one step by BDF1 after a trajectory that itself began in motion.
         newton: tolerances and limits of the solve in each step.
+        elimination: of the linear equations: "condensed", or "decoupled" for rods along which much grows
+            (soft or long ones in short time steps), to which a run changes by itself where it needs it. None
+            begins with what `initial` ended with, or else with the first.
         on_failure: "raise" a `SimulationError`, or "return" the trajectory with the rest marked invalid.
         progress: show a progress bar.
 
@@ -61,7 +66,10 @@ def simulate(
         SimulationError: a step has no solution, and nothing that was tried helped.
         ValueError: arguments of a wrong shape or name.
     """
-    settings = Settings.of(time, space, start, newton)
+    if elimination is None:
+        before = None if initial is None else initial.settings
+        elimination = "condensed" if before is None else before.elimination
+    settings = Settings.of(time, space, start, newton, elimination)
     if on_failure not in ("raise", "return"):
         raise ValueError(f'on_failure is {on_failure!r}; allowed is "raise" or "return"')
     dt = _checked_dt(dt)
@@ -243,7 +251,7 @@ def _single(run: Run, on_failure: str, progress: bool) -> Trajectory:
     steps, cause = run_one(task, system, controls, start, progress)
     if on_failure == "raise" and steps.result.min() < 0:
         raise _failure(task, float(t0), steps, cause, None)
-    return _trajectory(run, record, start.control, t0, steps)
+    return _trajectory(run._replace(settings=as_ended(settings, steps)), record, start.control, t0, steps)
 
 
 def _batch(run: Run, on_failure: str, progress: bool) -> Trajectory:
