@@ -90,6 +90,9 @@ def run_one(
     before = steps
     while parts * (system.nodes - 1) < MOST_NODES:
         finer = _with_finer_segments(task, system, parts, controls, start, progress)
+        if _agree(finer, steps, system):
+            # as large as that, and no instability
+            return steps, cause
         if _trustworthy(task, finer, system, start) or _agree(finer, before, system):
             return finer._replace(result=np.full(task.steps, int(Result.RECOVERED_FINER_SEGMENTS))), ""
         parts, before = 2 * parts, finer
