@@ -1,7 +1,10 @@
 """Simulate Cosserat-rod robots, learn what the physics misses, predict real robots.
 
-Everything public is here; see `simulate`, `load_robot` and `Trajectory` first.
+Everything public is here; see `simulate`, `load_robot` and `Trajectory` first. What goes on inside is told
+to the logger "knode_cosserat", which is quiet unless a handler is added.
 """
+
+import logging
 
 from knode_cosserat import _jax as _jax  # isort: split  (first: it sets JAX up)
 from knode_cosserat import controls, named_controls
@@ -15,6 +18,7 @@ from knode_cosserat.control.configuration import (
 )
 from knode_cosserat.control.reach import InverseKinematics, Reach, inverse_kinematics
 from knode_cosserat.control.workspace import Workspace, workspace
+from knode_cosserat.diagnosis import Diagnosis, doctor
 from knode_cosserat.evaluation.metrics import node_error, pose_mse, tip_dtw, tip_rmse
 from knode_cosserat.evaluation.state_errors import StateError, state_errors
 from knode_cosserat.learning.calibration.calibrate import Calibration, CalibrationError, calibrate
@@ -62,6 +66,8 @@ from knode_cosserat.solvers.time import BDF1, BDF2, BDFAlpha, Trapezoidal
 from knode_cosserat.trajectory import Trajectory
 from knode_cosserat.trajectory_file import TrajectoryFileError, load_trajectory
 
+logging.getLogger(__name__).addHandler(logging.NullHandler())
+
 __all__ = [
     "BDF1",
     "BDF2",
@@ -74,6 +80,7 @@ __all__ = [
     "ConfigError",
     "Configuration",
     "DataError",
+    "Diagnosis",
     "Differences",
     "Ensemble",
     "Euler",
@@ -120,6 +127,7 @@ __all__ = [
     "compliance",
     "configuration",
     "controls",
+    "doctor",
     "ends",
     "equilibrium",
     "estimate_parts",

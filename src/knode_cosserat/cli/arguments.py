@@ -20,7 +20,16 @@ FORMATS = (".png", ".pdf", ".svg")
 TRAJECTORY_MARK, MODEL_MARK = b"\x89HDF", b"knode-cosserat model,"
 
 ROBOT = "A robot of the catalog (`knode-cosserat info` lists them), a YAML file, or a model that was fitted."
-Robot = Annotated[str, typer.Argument(metavar="ROBOT", help=ROBOT)]
+
+
+def _robots(incomplete: str) -> list[str]:
+    """For the shell: what the catalog has; files it completes by itself."""
+    from knode_cosserat.rods.robot_file import catalog
+
+    return [name for name in catalog() if name.startswith(incomplete)]
+
+
+Robot = Annotated[str, typer.Argument(metavar="ROBOT", help=ROBOT, autocompletion=_robots)]
 Changes = Annotated[
     list[str] | None,
     typer.Option(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -41,7 +42,7 @@ class _Program(TyperGroup):
 
 def _app(**options: Any) -> typer.Typer:
     return typer.Typer(
-        add_completion=False,
+        add_completion=options.pop("add_completion", False),
         rich_markup_mode=None,
         pretty_exceptions_enable=False,
         context_settings={"help_option_names": ["--help", "-h"]},
@@ -49,7 +50,7 @@ def _app(**options: Any) -> typer.Typer:
     )
 
 
-app = _app(cls=_Program)
+app = _app(cls=_Program, add_completion=True)
 #: the commands under `study`
 studies = _app(help="Rerun a study of the paper.")
 
@@ -82,8 +83,18 @@ def program(
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
     ] = False,
+    verbose: Annotated[
+        bool,
+        typer.Option("--verbose", "-v", help="Tell on stderr what goes on inside: recovered steps, fits."),
+    ] = False,
 ) -> None:
     """Simulate tendon-driven Cosserat-rod robots, and learn what the physics misses.
 
     Units are SI: m, s, N, Pa, rad.
     """
+    if verbose:
+        handler = logging.StreamHandler()
+        handler.setFormatter(logging.Formatter("%(name)s: %(message)s"))
+        logger = logging.getLogger("knode_cosserat")
+        logger.addHandler(handler)
+        logger.setLevel(logging.INFO)

@@ -172,6 +172,11 @@ def _comparable_poses(
 
 
 def _poses(name: str, history: PoseHistory) -> tuple[Array, Array]:
+    if not (hasattr(history, "position") and hasattr(history, "quaternion")):
+        raise ValueError(
+            f"{name} is a {type(history).__name__}; allowed is a Trajectory, or anything with position "
+            "(T, N, 3) in m and quaternion (T, N, 4)"
+        )
     position = np.asarray(history.position, dtype=float)
     quaternion = np.asarray(history.quaternion, dtype=float)
     if position.ndim == 4:

@@ -42,6 +42,8 @@ def state_errors(
         ValueError: the truth has no row at a time of the estimate, or no node at a place.
     """
     for name, it in (("estimate", estimate), ("truth", truth)):
+        if not isinstance(it, Trajectory):
+            raise ValueError(f"the {name} is a {type(it).__name__}; allowed is a Trajectory")
         if np.ndim(it.y) != 3:
             raise ValueError(f"the {name} is a batch of {len(it.y)}; allowed is one robot")
     time = np.asarray(estimate.time)

@@ -40,8 +40,10 @@ def explain(model: KNODE) -> list[Finding]:
     C z + D z_t + stress = f2; loads are added to the rates of what they balance, or to the tip's conditions.
 
     Raises:
-        TypeError: the model's residual is not a structured one.
+        TypeError: it is no model, or its residual is not a structured one.
     """
+    if not isinstance(model, KNODE):
+        raise TypeError(f"model is a {type(model).__name__}; allowed is a KNODE, which `fit` gives")
     residual, knowledge = model.residual, model.knowledge.strand
     if not isinstance(residual, Structured):
         raise TypeError(f"a {type(residual).__name__} has no terms to read; allowed is a structured residual")

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+import logging
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,6 +29,8 @@ from knode_cosserat.learning.training.stages import RolloutRun, SegmentRun
 from knode_cosserat.learning.training.watch import Watch
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.trajectory import Trajectory
+
+log = logging.getLogger(__name__)
 
 #: the best preset
 BEST = FitConfig()
@@ -77,7 +80,7 @@ def fit(
     """
     began = time.perf_counter()
     _check(knowledge, config, held_out, checkpoint_every)
-    trajectories, held_out = list(trajectories), list(held_out)
+    trajectories, held_out = _listed("trajectories", trajectories), _listed("held_out", held_out)
     first = _first(knowledge, trajectories, config)
     given = _Given(knowledge, trajectories, config, first.dataset, held_out_courses(knowledge, held_out))
     kept = None
@@ -103,6 +106,7 @@ def fit(
             own["held_out_error"] = tip_error(KNODE(knowledge, residual), given.held_out)
         own["seconds"] = time.perf_counter() - began
         models.append(KNODE(knowledge, residual, About(own)))
+        log.info("learned from %d trajectories in %.2f s, seed %s", len(trajectories), own["seconds"], seed)
     return Ensemble(models) if isinstance(config.seed, tuple) else models[0]
 
 
@@ -119,6 +123,12 @@ def _check(knowledge: Any, config: Any, held_out: Any, checkpoint_every: Any) ->
         stage = getattr(config, name)
         if stage is not None and stage.stop_after is not None and not held_out:
             raise FitError(f"{name}.stop_after is {stage.stop_after}, but there are no held_out trajectories")
+
+
+def _listed(name: str, given: Any) -> list[Trajectory]:
+    if isinstance(given, Trajectory) or not isinstance(given, Iterable):
+        raise FitError(f"{name} is a {type(given).__name__}; allowed is a list of trajectories")
+    return list(given)
 
 
 class _First(NamedTuple):

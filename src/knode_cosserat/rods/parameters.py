@@ -115,7 +115,13 @@ class Slot:
 def part(meaning: str, family: type, *, many: bool = False, default: Any) -> Any:
     """A dataclass field that holds a part, or parts (see `parts.Part`); a default of None: optional."""
     stated = Slot(meaning, family, many, optional=default is None)
-    convert = (lambda given: tuple(given) if isinstance(given, list) else given) if many else None
+
+    def several(given: Any) -> Any:
+        if isinstance(given, family):
+            return (given,)
+        return tuple(given) if isinstance(given, list) else given
+
+    convert = several if many else None
     extra: dict[str, Any] = {} if convert is None else {"converter": convert}
     return eqx.field(default=default, metadata={"part": stated}, **extra)
 

@@ -39,7 +39,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.rods.parameters import choice, parameter, part
+from knode_cosserat.rods.parameters import ParameterError, choice, parameter, part
 from knode_cosserat.rods.rod import Rod
 from knode_cosserat.rods.routing import Routing, Straight, ends, routes
 from knode_cosserat.rods.section import Material
@@ -111,6 +111,8 @@ class RoutedTendonRobot(TendonRod):
         Raises:
             ParameterError: a change that is not allowed.
         """
+        if not isinstance(robot, TendonRod):
+            raise ParameterError(f"robot is a {type(robot).__name__}; allowed is a tendon-driven robot")
         same = {field.name: getattr(robot, field.name) for field in dataclasses.fields(TendonRod)}
         return cls(**same).replace(**changes)
 

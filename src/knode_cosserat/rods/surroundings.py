@@ -23,8 +23,9 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.loads import Motion, Wrench
-from knode_cosserat.rods.parameters import choice, parameter
+from knode_cosserat.rods.parameters import ParameterError, choice, parameter
 from knode_cosserat.rods.parts import Part
+from knode_cosserat.rods.system import is_traced
 from knode_cosserat.rotation import cross, dot
 
 
@@ -68,6 +69,13 @@ class Obstacle(Part):
         )
 
 
+def _require_direction(who: Obstacle, name: str) -> None:
+    """Raise `ParameterError` if that vector of an obstacle has no length."""
+    given = getattr(who, name)
+    if not is_traced(given) and not np.any(np.asarray(given)):
+        raise ParameterError(f"{type(who).__name__}: {name} is {np.asarray(given)}; allowed is a direction")
+
+
 def _length(vector: Any) -> Any:
     """Length, never zero, so that it has a slope at the centre of a sphere too."""
     return jnp.sqrt(jnp.sum(vector * vector) + 1e-24)
@@ -85,6 +93,9 @@ class Plane(Obstacle):
     normal: Any = parameter(
         "1", "its normal, of any length", shape="vector", low=-1e3, high=1e3, default=(0.0, 0.0, 1.0)
     )
+
+    def __check_init__(self) -> None:
+        _require_direction(self, "normal")
 
     def distance(self, p: Float[Any, "3"]) -> tuple[Any, Float[Any, "3"]]:
         """See `Obstacle.distance`."""
@@ -121,6 +132,9 @@ class Cylinder(Obstacle):
     )  # fmt: skip
     radius: Any = parameter("m", "its radius", low=1e-6, high=1e3, default=0.1)
     inside: bool = choice(_INSIDE, (False, True), False)
+
+    def __check_init__(self) -> None:
+        _require_direction(self, "axis")
 
     def distance(self, p: Float[Any, "3"]) -> tuple[Any, Float[Any, "3"]]:
         """See `Obstacle.distance`."""

@@ -15,6 +15,7 @@ shorter than the last one (Deuflhard, Newton Methods for Nonlinear Problems, 200
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -52,6 +53,18 @@ class NewtonOptions:
     #: begin a step with the last one's linearisation, as long as it converges: many short steps of a rod with
     #: many nodes then take less time each. Residuals end up nearer to `tolerance`.
     across_steps: bool = False
+
+    def __post_init__(self) -> None:
+        for name, allowed, holds in (
+            ("tolerance", "a number above 0", lambda x: 0.0 < x < math.inf),
+            ("acceptable", "a number from the tolerance on", lambda x: x >= self.tolerance),
+            ("max_linearisations", "a whole number from 1", lambda x: x >= 1 and x == int(x)),
+            ("patience", "a whole number from 1", lambda x: x >= 1 and x == int(x)),
+            ("least_damping", "a number above 0, at most 1", lambda x: 0.0 < x <= 1.0),
+        ):
+            given = getattr(self, name)
+            if not isinstance(given, int | float) or not holds(given):
+                raise ValueError(f"NewtonOptions: {name} is {given!r}; allowed is {allowed}")
 
 
 class StepProblem(eqx.Module):

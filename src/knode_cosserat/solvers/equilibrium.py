@@ -45,7 +45,14 @@ def equilibrium(
         ValueError: arguments of a wrong shape or name.
     """
     if not hasattr(control, "ndim"):
-        control = np.asarray(control, dtype=float)
+        try:
+            if control is None:
+                raise TypeError("None")
+            control = np.asarray(control, dtype=float)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"control is not numbers ({error}); allowed is (c,), or (B, c)") from None
+    if not control.ndim:
+        raise ValueError(f"control is one number, {control}; allowed is (c,), or (B, c) for a batch")
     found = simulate(
         robot, control[..., None, :], 1.0, time=Static(), space=space, initial=initial, newton=newton,
         on_failure=on_failure,

@@ -29,6 +29,8 @@ HALVINGS = 8
 LEAST_PART = 1.0 / 512.0
 #: how much gentler friction and contact are, where continuation in them begins
 EASIEST = 1e-3
+#: forces in the control so many times EI/L² are taken for a wrong unit
+ABSURD = 1e4
 #: what part of the way a tip is brought in one step while a robot comes to rest
 DRAWN = 0.05
 
@@ -129,10 +131,10 @@ def recover(
             return _outcome(Result.RECOVERED_STEP_HALVING, *halved)
     assert best is not None
     result = Result.NO_CONVERGENCE if np.isfinite(best[0].error) else Result.NOT_FINITE
-    return _outcome(result, step, best)._replace(past=past)
+    return _outcome(result, step, best, controls[1])._replace(past=past)
 
 
-def _outcome(result: Result, step: _Step, found: tuple[Solution, Any]) -> Outcome:
+def _outcome(result: Result, step: _Step, found: tuple[Solution, Any], control: Any = None) -> Outcome:
     solution, record = found
     return Outcome(
         result,
@@ -142,7 +144,7 @@ def _outcome(result: Result, step: _Step, found: tuple[Solution, Any]) -> Outcom
         float(solution.error),
         step.corrections,
         float(np.max(np.abs(solution.y) / np.asarray(step.system.scales().y))),
-        likely_cause(result, step),
+        likely_cause(result, step, control),
     )
 
 
@@ -257,10 +259,13 @@ def _relax(step: _Step, control: Any) -> tuple[Solution, Any] | None:
     return found if step.solved(found[0]) else None
 
 
-def likely_cause(result: Result, step: _Step) -> str:
+def likely_cause(result: Result, step: _Step, control: Any) -> str:
     """A hint at what to change, from what can be seen."""
     if result.solved:
         return ""
+    unit = _other_unit(step.system, np.asarray(control))
+    if unit:
+        return unit
     nodes = step.system.nodes
     if result is Result.NOT_FINITE:
         return (
@@ -270,3 +275,18 @@ def likely_cause(result: Result, step: _Step) -> str:
         "Likely cause: the control changes too much in one step, the rod buckles or snaps, "
         f"or it has too few nodes ({nodes})."
     )
+
+
+def _other_unit(system: System, control: np.ndarray) -> str:
+    """Of a force in the control that is absurdly large: that it may be meant in another unit."""
+    if "n" not in system.y_layout.names:
+        return ""
+    natural = float(np.asarray(system.scales().y)[system.y_layout.slice("n")][0])
+    for field in system.control_layout.fields:
+        largest = float(np.max(np.abs(system.control_layout.get(control, field.name)), initial=0.0))
+        if field.unit == "N" and largest > ABSURD * natural:
+            return (
+                f"Likely cause: {field.name} is {largest:.3g} N, {largest / natural:.2g} times what bends "
+                "this robot by its own length; is it meant in another unit?"
+            )
+    return ""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import concurrent.futures
 import dataclasses
+import logging
 import os
 from typing import Any, Literal, NamedTuple
 
@@ -19,6 +20,8 @@ from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.stability import SAFE_DECAY, SUSPICIOUS, decay_per_segment
 from knode_cosserat.solvers.time import Static
+
+log = logging.getLogger(__name__)
 
 #: robots that one thread takes at a time
 CHUNK = 16
@@ -88,7 +91,9 @@ def run_one(
     # powers of two: few different node counts, so few programs to compile
     parts = 2 ** max(1, int(np.ceil(np.log2(decay / SAFE_DECAY))))
     before = steps
+    log.info("states are large or not found, and waves decay by e^%.2g within a segment", decay)
     while parts * (system.nodes - 1) < MOST_NODES:
+        log.info("every segment in %d parts", parts)
         finer = _with_finer_segments(task, system, parts, controls, start, progress)
         if _agree(finer, steps, system):
             # as large as that, and no instability
@@ -187,11 +192,14 @@ def _with_recovery(
                     float(past.t0) + (reached + 1) * task.dt, task.dt,
                 )  # fmt: skip
                 past = outcome.past
+                log.info("step %d: %s", reached + 1, outcome.result.message)
                 _set_row(rows, reached, outcome)
                 if not outcome.result.solved:
                     return rows, outcome.cause
                 reached += 1
                 rescues += outcome.result is Result.RECOVERED_STABLE_ELIMINATION
+                if rescues == ENOUGH_RESCUES:
+                    log.info("step %d: from here on by the stable elimination", reached)
                 if rescues >= ENOUGH_RESCUES:
                     settings = with_stable_elimination(settings)
             bar.update(reached - done)

@@ -36,6 +36,8 @@ class Settings:
         elimination: str | LinearSolver = "condensed",
     ) -> Self:  # fmt: skip
         """Settings from names or schemes. `ValueError` names what is allowed."""
+        if not isinstance(newton, NewtonOptions):
+            raise ValueError(f"newton is {newton!r}; allowed is a NewtonOptions")
         if start not in ("paper", "consistent"):
             raise ValueError(f'start is {start!r}; allowed is "paper" or "consistent"')
         return cls(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import warnings
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
@@ -21,6 +22,9 @@ from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.time import Static, TimeScheme
 from knode_cosserat.trajectory import Trajectory
+
+#: time steps from this (s), and so many times the rod's natural time, look like milliseconds
+LONG_STEP, LONG_STEPS = 1.0, 100.0
 
 
 def simulate(
@@ -66,6 +70,8 @@ def simulate(
         SimulationError: a step has no solution, and nothing that was tried helped.
         ValueError: arguments of a wrong shape or name.
     """
+    if initial is not None and not isinstance(initial, Trajectory):
+        raise ValueError(f"initial is a {type(initial).__name__}; allowed is a Trajectory, or None")
     if elimination is None:
         before = None if initial is None else initial.settings
         elimination = "condensed" if before is None else before.elimination
@@ -75,6 +81,8 @@ def simulate(
     dt = _checked_dt(dt)
     system, batch = _stacked(robot)
     controls, batch = _checked_controls(system, controls, batch)
+    if not isinstance(settings.time, Static):
+        _warn_of_long_steps(system, dt)
     if initial is not None:
         _check_initial(system, initial, batch)
     run = Run(system, controls, initial, settings, dt, batch, isinstance(robot, Sequence))
@@ -117,12 +125,29 @@ def _checked_dt(dt: Any) -> float:
     return float(dt)
 
 
+def _warn_of_long_steps(system: System, dt: float) -> None:
+    """Say so where a time step looks like milliseconds: seconds long, and far beyond what the rod does."""
+    names = system.y_layout.names
+    if dt < LONG_STEP or is_traced(system) or "p" not in names or "q" not in names:
+        return
+    scale = np.asarray(system.scales().y)
+    natural = float(np.min(scale[..., system.y_layout.slice("p")] / scale[..., system.y_layout.slice("q")]))
+    if dt > LONG_STEPS * natural:
+        warnings.warn(
+            f"dt is {dt:g} s, {dt / natural:.2g} times this rod's natural time ({natural:.2g} s): "
+            "is it meant in seconds?",
+            stacklevel=3,
+        )
+
+
 def _checked_controls(system: System, controls: Any, batch: int | None) -> tuple[Any, int | None]:
     names = ", ".join(f"{field.name} ({field.unit})" for field in system.control_layout.fields)
     size = system.control_size
     allowed = f"allowed is (steps, {size}) or (batch, steps, {size}): {names}"
     if not is_traced(controls):
         try:
+            if np.iscomplexobj(controls):
+                raise ValueError("they are complex")
             controls = np.asarray(controls, dtype=float)
         except (TypeError, ValueError) as error:
             raise ValueError(f"controls are not numbers ({error}); {allowed}") from None

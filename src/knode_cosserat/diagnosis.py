@@ -1,0 +1,152 @@
+"""Whether this installation works: what it is made of, where it runs, and a short simulation."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.metadata
+import os
+import platform
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from knode_cosserat._files import package_version
+from knode_cosserat.rods.robot_file import load_robot
+from knode_cosserat.solvers.equilibrium import equilibrium
+from knode_cosserat.solvers.run import usable_cores
+from knode_cosserat.solvers.simulate import simulate
+
+#: what has to be there
+NEEDED = ("jax", "jaxlib", "equinox", "numpy", "scipy")
+#: what extras bring, by extra
+OPTIONAL = {
+    "matplotlib": "viz", "rosbags": "ros", "pyarrow": "parquet", "tensorboardX": "tensorboard",
+    "distributed": "dask", "pydmd": "bench",
+}  # fmt: skip
+#: how far the force at the base may be from the rod's weight, as a part of it
+WEIGHT_ERROR = 1e-9
+
+
+class Check(NamedTuple):
+    """One thing that was looked at: whether it is well, and what was seen."""
+
+    name: str
+    well: bool
+    seen: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Diagnosis:
+    """What `doctor` found."""
+
+    #: by name: this package, Python, JAX, …; None for an extra that is not installed
+    versions: dict[str, str | None]
+    machine: str
+    cores: int
+    devices: list[str]
+    cache: str
+    programs: int
+    checks: list[Check]
+
+    @property
+    def well(self) -> bool:
+        """Whether every check is."""
+        return all(check.well for check in self.checks)
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON has it."""
+        own = dataclasses.asdict(self)
+        return {**own, "checks": [check._asdict() for check in self.checks], "well": self.well}
+
+    def __str__(self) -> str:
+        """A page of text."""
+        there = [f"{name} {version}" for name, version in self.versions.items() if version]
+        missing = [name for name, version in self.versions.items() if not version]
+        extras = sorted({OPTIONAL[name] for name in missing if name in OPTIONAL})
+        lines = [
+            f"versions   {', '.join(there)}",
+            f"machine    {self.machine}, {self.cores} cores to use",
+            f"devices    {', '.join(self.devices)}",
+            f"cache      {self.cache} ({self.programs} compiled programs)",
+        ]
+        if extras:
+            lines.append(f"not here   {', '.join(missing)}: pip install 'knode-cosserat[{','.join(extras)}]'")
+        lines += [
+            f"{'ok' if check.well else 'WRONG':<10} {check.name}: {check.seen}" for check in self.checks
+        ]
+        lines.append("all is well" if self.well else "something is wrong: see above")
+        return "\n".join(lines)
+
+
+def doctor() -> Diagnosis:
+    """Look at this installation, and simulate a little: a few seconds, less once it is compiled.
+
+    Nothing is raised for what is found wrong: the checks say so.
+    """
+    versions: dict[str, str | None] = {
+        "knode-cosserat": package_version(),
+        "Python": platform.python_version(),
+    }
+    versions |= {name: _version(name) for name in (*NEEDED, *OPTIONAL)}
+    cache = Path(getattr(jax.config, "jax_compilation_cache_dir", None) or "")
+    checks = [_precision(), _cache(cache), *_simulated()]
+    programs = sum(1 for _ in cache.glob("*-cache")) if cache.is_dir() else 0
+    return Diagnosis(
+        versions, f"{platform.system()} {platform.machine()}", usable_cores(),
+        [f"{device.device_kind} ({device.platform})" for device in jax.devices()], str(cache), programs,
+        checks,
+    )  # fmt: skip
+
+
+def _version(name: str) -> str | None:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _precision() -> Check:
+    kind = jax.numpy.zeros(()).dtype
+    return Check("precision", kind == np.float64, f"numbers are {kind}; float64 is needed")
+
+
+def _cache(folder: Path) -> Check:
+    """Whether compiled programs can be kept, here or where it will be made."""
+    place = folder
+    while not place.exists() and place != place.parent:
+        place = place.parent
+    kept = bool(folder.name) and os.access(place, os.W_OK)
+    said = (
+        "can be written"
+        if kept
+        else "cannot be written: set KNODE_COSSERAT_CACHE, or every run compiles anew"
+    )
+    return Check("cache", kept, f"{folder} {said}")
+
+
+def _simulated() -> list[Check]:
+    robot: Any = load_robot("delrin-tendon-robot")
+    tensions = np.tile([7.0, 5.0, 5.0, 7.0], (20, 1))
+    times = []
+    try:
+        for _ in range(2):
+            began = time.perf_counter()
+            moved = simulate(robot, tensions, 0.05)
+            times.append(time.perf_counter() - began)
+        carried = float(equilibrium(robot, np.zeros(4)).part("n")[0, 0, 2])
+    except Exception as error:  # whatever it is, it is what was asked for
+        return [Check("simulation", False, f"{type(error).__name__}: {' '.join(str(error).split())}")]
+    solved = bool(moved.all_valid and np.max(moved.residual) <= 1e-8)
+    weight = float(robot.density * np.pi * robot.radius**2 * robot.length * robot.gravity[2])
+    off = abs(carried / weight - 1.0)
+    return [
+        Check("simulation", solved, f"20 steps in {times[0]:.2f} s, and again in {1e3 * times[1]:.1f} ms"),
+        Check(
+            "balance",
+            off <= WEIGHT_ERROR,
+            f"the base carries {-carried:.6f} N, the rod's weight to {off:.0e}",
+        ),
+    ]

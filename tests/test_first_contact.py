@@ -1,0 +1,197 @@
+"""What a newcomer meets: wrong calls say what was given and what is allowed; the doctor; the logger."""
+
+import logging
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import knode_cosserat as kc
+from knode_cosserat.cli import app
+
+ROBOT = kc.load_robot("delrin-tendon-robot")
+TENSIONS = kc.controls.sine(1.5, 5, 0.05)
+
+
+@pytest.fixture(scope="module")
+def moved():
+    return kc.simulate(ROBOT, TENSIONS, 0.05)
+
+
+# each: a call that is wrong, what of it the error repeats, and what of the allowed it names
+
+WRONG = {
+    "a robot by its name": (lambda t: kc.simulate("delrin", TENSIONS, 0.05), "str", "a robot or"),
+    "no robot": (lambda t: kc.simulate(None, TENSIONS, 0.05), "NoneType", "a robot or"),
+    "robots mixed with text": (lambda t: kc.simulate([ROBOT, "x"], TENSIONS, 0.05), "list", "list of robots"),
+    "controls as text": (lambda t: kc.simulate(ROBOT, "sine", 0.05), "'sine'", r"\(steps, 4\)"),
+    "three tendons": (
+        lambda t: kc.simulate(ROBOT, TENSIONS[:, :3], 0.05), r"\(5, 3\)", r"\(steps, 4\).*\(N\)",
+    ),
+    "one row": (lambda t: kc.simulate(ROBOT, TENSIONS[0], 0.05), r"\(4,\)", r"\(steps, 4\)"),
+    "controls that are NaN": (lambda t: kc.simulate(ROBOT, TENSIONS * np.nan, 0.05), "nan", "finite"),
+    "complex controls": (lambda t: kc.simulate(ROBOT, TENSIONS * 1j, 0.05), "complex", r"\(steps, 4\)"),
+    "dt below zero": (lambda t: kc.simulate(ROBOT, TENSIONS, -0.05), "-0.05", "positive number of seconds"),
+    "dt as text": (lambda t: kc.simulate(ROBOT, TENSIONS, "0.05"), "'0.05'", "positive number of seconds"),
+    "dt as an array": (lambda t: kc.simulate(ROBOT, TENSIONS, np.ones(2)), "array", "seconds"),
+    "a scheme of space for time": (lambda t: kc.simulate(ROBOT, TENSIONS, 0.05, time="rk4"), "'rk4'", "bdf2"),
+    "initial as text": (lambda t: kc.simulate(ROBOT, TENSIONS, 0.05, initial="x"), "str", "a Trajectory"),
+    "newton as a number": (lambda t: kc.simulate(ROBOT, TENSIONS, 0.05, newton=3), "3", "a NewtonOptions"),
+    "a tolerance below zero": (lambda t: kc.NewtonOptions(tolerance=-1.0), "-1", "above 0"),
+    "an unknown way to fail": (
+        lambda t: kc.simulate(ROBOT, TENSIONS, 0.05, on_failure="x"), "'x'", '"raise" or "return"',
+    ),
+    "a rest under nothing": (lambda t: kc.equilibrium(ROBOT, None), "None", r"\(c,\)"),
+    "a rest under a number": (lambda t: kc.equilibrium(ROBOT, 3.0), "3.0", r"\(c,\)"),
+    "a robot that is not there": (lambda t: kc.load_robot("nope"), "nope", "catalog has"),
+    "a robot that is a number": (lambda t: kc.load_robot(3), "expected str", "not int"),
+    "a length in mm": (lambda t: ROBOT.replace(length=635), "635", "0.001 to 20 m"),
+    "a length as text": (lambda t: ROBOT.replace(length="long"), "'long'", "0.001 to 20 m"),
+    "a parameter misspelt": (lambda t: ROBOT.replace(lenght=1), "'lenght'", "there are length"),
+    "gravity as a number": (lambda t: ROBOT.replace(gravity=-9.81), r"\(\)", "three numbers.*m/s2"),
+    "half a node": (lambda t: ROBOT.replace(nodes=10.5), "10.5", "whole number from 2"),
+    "a fit of text": (lambda t: kc.fit("x", [t]), "str", "a robot or another System"),
+    "a fit to one trajectory": (lambda t: kc.fit(ROBOT, t), "Trajectory", "list of trajectories"),
+    "a fit to arrays": (lambda t: kc.fit(ROBOT, [np.zeros(3)]), "ndarray", "a Trajectory"),
+    "a fit to nothing": (lambda t: kc.fit(ROBOT, []), "no trajectories", "at least one"),
+    "a config by its name": (lambda t: kc.fit(ROBOT, [t], "paper"), "str", "a FitConfig"),
+    "a metric of text": (lambda t: kc.tip_dtw(t, "x"), "str", "a Trajectory"),
+    "a metric of an array": (lambda t: kc.pose_mse(np.zeros((3, 3)), t), "ndarray", "a Trajectory"),
+    "trajectories of other lengths": (lambda t: kc.tip_rmse(t, t[:3]), "6 rows.*3", "the same number"),
+    "errors of a number": (lambda t: kc.state_errors(t, 3), "int", "a Trajectory"),
+    "to explain a robot": (lambda t: kc.explain(ROBOT), "TendonRobot", "a KNODE"),
+    "a missing trajectory": (lambda t: kc.load_trajectory("nope.nc"), "nope.nc", "no such file"),
+    "a trajectory of text": (lambda t: kc.load_trajectory(__file__), "test_first_contact", "netCDF"),
+    "a missing model": (lambda t: kc.load_model("nope"), "nope", "no such file"),
+    "a model of text": (lambda t: kc.load_model(__file__), "test_first_contact", "not a file of the kind"),
+    "a missing recording": (lambda t: kc.load_recording("nope.bag"), "nope.bag", "no such file"),
+    "a field that is not there": (lambda t: t.part("k"), "'k'", "there are p, h"),
+    "a tip in two dimensions": (
+        lambda t: kc.inverse_kinematics(ROBOT, [0, 0], low=0, high=9), r"\(2,\)", r"\(3,\)",
+    ),
+    "limits the wrong way round": (
+        lambda t: kc.inverse_kinematics(ROBOT, [0, 0, 0.6], low=5, high=1), "low is 5", "not be above",
+    ),
+    "a workspace of text": (lambda t: kc.workspace(ROBOT, "many"), "'many'", r"\(B, 4\)"),
+    "a configuration of two": (lambda t: kc.configuration(ROBOT, [1, 2]), r"\(2,\)", r"\(4,\).*\(N\)"),
+    "a compliance of text": (lambda t: kc.compliance(ROBOT, "x"), "'x'", r"\(4,\).*\(N\)"),
+    "to calibrate text": (lambda t: kc.calibrate("x", [t]), "str", "one robot"),
+    "to calibrate by one": (lambda t: kc.calibrate(ROBOT, t), "Trajectory", "list of trajectories"),
+    "to identify from states": (lambda t: kc.identify(ROBOT, [t]), "Trajectory", "sampled"),
+    "to estimate from text": (lambda t: kc.estimate_states("x", ROBOT), "str", "a Recording"),
+    "a sine of no period": (lambda t: kc.controls.sine(0, 5, 0.05), "0", "seconds above 0"),
+    "half a step": (lambda t: kc.controls.sine(1.5, 5.5, 0.05), "5.5", "whole number from 1"),
+    "a load beyond the rod": (lambda t: kc.loads.PointWrench(at=2), "2", "0 to 1"),
+    "a force as a number": (lambda t: kc.loads.PointWrench(force=3), r"\(\)", "three numbers.* N"),
+    "an unknown axis": (lambda t: kc.ends.Driven(axes=("a",)), "'a'", "x, y, z, rx"),
+    "a plane that faces nowhere": (lambda t: kc.surroundings.Plane(normal=[0, 0, 0]), "0", "a direction"),
+    "a stretch backwards": (lambda t: kc.Stretch(begin=0.5, end=0.2), "0.2", "beyond begin, 0.5"),
+    "tendons along text": (lambda t: kc.RoutedTendonRobot.like("x"), "str", "tendon-driven robot"),
+    "loads that are text": (
+        lambda t: kc.SlenderRod(length=1, radius=0.01, density=1e3, youngs_modulus=1e6, loads="x"),
+        "str", "a load",
+    ),
+    "a save to nowhere": (lambda t: t.save("/nonexistent/x.nc"), "/nonexistent/x.nc", "No such file"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_a_wrong_call_says_what_it_got_and_what_it_takes(wrong, moved):
+    call, given, allowed = WRONG[wrong]
+    with pytest.raises((ValueError, TypeError, OSError, KeyError), match=f"(?s){given}.*{allowed}") as caught:
+        call(moved)
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 500
+
+
+def test_tensions_that_are_no_newtons_are_suspected():
+    with pytest.raises(kc.SimulationError, match=r"tension is .* N, .* is it meant in another unit\?"):
+        kc.simulate(ROBOT, 1e5 * TENSIONS, 0.05)
+
+
+def test_milliseconds_are_suspected():
+    with pytest.warns(UserWarning, match=r"dt is 50 s, .* natural time .* meant in seconds\?"):
+        kc.simulate(ROBOT, TENSIONS, 50)
+
+
+def test_one_load_does_for_a_list_of_one():
+    load = kc.loads.PointWrench(force=[1.0, 0.0, 0.0])
+    rod = {"length": 1.0, "radius": 0.01, "density": 1e3, "youngs_modulus": 1e6}
+    assert kc.SlenderRod(**rod, loads=load).loads == kc.SlenderRod(**rod, loads=[load]).loads == (load,)
+
+
+# the doctor
+
+
+def test_the_doctor_finds_this_installation_well():
+    found = kc.doctor()
+    assert found.well and {check.name for check in found.checks} == {
+        "precision", "cache", "simulation", "balance",
+    }  # fmt: skip
+    assert "all is well" in str(found) and found.versions["jax"]
+
+
+def test_the_doctor_says_what_is_wrong(monkeypatch):
+    monkeypatch.setattr("knode_cosserat.diagnosis.simulate", lambda *_: 1 / 0)
+    found = kc.doctor()
+    assert not found.well and "ZeroDivisionError" in str(found)
+    done = CliRunner().invoke(app, ["doctor"])
+    assert done.exit_code == 1 and "WRONG" in done.output
+
+
+# the logger
+
+
+def test_it_is_quiet_unless_it_is_listened_to():
+    program = (
+        "import numpy as np, knode_cosserat as kc; r = kc.load_robot('delrin-tendon-robot');"
+        "kc.simulate(r, np.zeros((2, 4)), 0.05)"
+    )
+    done = subprocess.run([sys.executable, "-W", "error", "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0 and done.stdout == done.stderr == ""
+
+
+def test_recovered_steps_are_told_to_the_logger(caplog):
+    pulled = np.zeros((3, 4))
+    pulled[1, [0, 3]] = pulled[2, [1, 2]] = 40.0
+    with caplog.at_level(logging.INFO, "knode_cosserat"):
+        found = kc.simulate(ROBOT, pulled, 0.05)
+    assert found.result.tolist() == [0, 0, 0, int(kc.Result.RECOVERED_STABLE_ELIMINATION)]
+    assert [record.getMessage() for record in caplog.records] == [
+        f"step 3: {kc.Result.RECOVERED_STABLE_ELIMINATION.message}"
+    ]
+
+
+# the shell, and types seen from outside
+
+
+def test_the_shell_completes_robots_and_commands():
+    line = "knode-cosserat simulate delrin-"
+    env = {
+        **os.environ, "COMP_WORDS": line, "COMP_CWORD": "2", "_KNODE_COSSERAT_COMPLETE": "complete_bash",
+    }  # fmt: skip
+    program = "from knode_cosserat.cli import main; main()"
+    done = subprocess.run([sys.executable, "-c", program], env=env, capture_output=True, text=True)
+    assert done.stdout.split() == ["delrin-routed-tendon-robot", "delrin-tendon-robot"], done.stderr
+
+
+def test_a_type_checker_sees_the_types_from_outside(tmp_path):
+    """`py.typed` counts: a stranger's program is checked against our signatures."""
+    (tmp_path / "user.py").write_text(
+        "import knode_cosserat as kc\n"
+        'robot = kc.load_robot("delrin-tendon-robot")\n'
+        "reveal_type(kc.equilibrium(robot, [1.0, 2.0, 3.0, 4.0]))\n"
+        'kc.simulate(robot, [[1.0] * 4], dt="fast")\n'
+    )
+    marker = Path(kc.__file__).with_name("py.typed")
+    assert marker.exists()
+    done = subprocess.run(
+        [sys.executable, "-m", "mypy", "--follow-imports=silent", "user.py"],
+        cwd=tmp_path, capture_output=True, text=True,
+        env={**os.environ, "MYPYPATH": str(marker.parent.parent)},
+    )  # fmt: skip
+    assert 'Revealed type is "knode_cosserat.trajectory.Trajectory"' in done.stdout, done.stdout + done.stderr
+    assert 'Argument "dt" to "simulate" has incompatible type "str"' in done.stdout
