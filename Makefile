@@ -11,7 +11,7 @@ unexport PYTHONPATH
 unexport PYTHONHOME
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all lint types format bench lock clean distclean
+.PHONY: help demo test test-all lint types format bench package lock clean distclean
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' Makefile
@@ -42,6 +42,9 @@ format: $(READY) ## format the code, and fix what can be fixed without a decisio
 
 bench: $(READY) ## run the benchmarks
 	$(BIN)/python -m benchmarks.run
+
+package: $(READY) ## build wheel and sdist into dist/, and use the wheel in an environment of its own
+	$(BIN)/python tools/check_package.py
 
 lock: ## write requirements.lock anew from pyproject.toml (UPGRADE=1: with the newest versions)
 	$(PYTHON) tools/bootstrap.py lock $(if $(UPGRADE),--upgrade)
