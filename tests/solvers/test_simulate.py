@@ -114,7 +114,8 @@ def test_step_halving_is_the_same_motion_in_smaller_steps(robot):
     """Two halves by hand, with the coefficients for unequal steps, give the row that halving gives."""
     _, past = _step(robot)
     control = np.array([7.0, 5.0, 5.0, 7.0])
-    step, found = _halve(robot, Settings(), past, control, DT, DT)
+    whole = _Step(robot, Settings(), past, kc.BDF2().coefficients(DT, DT), DT)
+    step, found = _halve(whole, (control, control), DT)
     by_hand = past
     for previous in (DT, DT / 2):
         half = _Step(robot, Settings(), by_hand, kc.BDF2().coefficients(DT / 2, previous), DT)
