@@ -197,9 +197,10 @@ def _with_recovery(
                 if not outcome.result.solved:
                     return rows, outcome.cause
                 reached += 1
-                rescues += outcome.result is Result.RECOVERED_STABLE_ELIMINATION
-                if rescues == ENOUGH_RESCUES:
-                    log.info("step %d: from here on by the stable elimination", reached)
+                if outcome.result is Result.RECOVERED_STABLE_ELIMINATION:
+                    rescues += 1
+                    if rescues == ENOUGH_RESCUES:
+                        log.info("step %d: from here on by the stable elimination", reached)
                 if rescues >= ENOUGH_RESCUES:
                     settings = with_stable_elimination(settings)
             bar.update(reached - done)
