@@ -192,9 +192,9 @@ def test_some_random_cases(name):
     assert share_solved(name, range(SOME)) == 1.0
 
 
-#: the least share that is to be solved, a little below what was when this was written (docs/solver.md). Most of
-#: what is not solved is violent: bases that jump by a tenth of the rod in a thousandth of its natural time,
-#: columns pressed to a hundred times what buckles them
+#: the least share that is to be solved, a little below what was when this was written (docs/solver.md). Most
+#: of what is not solved is violent: bases that jump by a tenth of the rod in a thousandth of its natural
+#: time, columns pressed to a hundred times what buckles them
 LEAST = {
     "with_loads": 0.98, "with_sections": 0.98, "with_tendons": 0.9, "with_reels": 0.8, "in_contact": 0.8,
     "with_ends": 0.75,
