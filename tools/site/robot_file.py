@@ -35,6 +35,7 @@ def page() -> str:
     rod = set(parameters_of(Rod)) | set(slots_of(Rod)) | set(choices_of(Rod))
     of_a_rod = [cls for cls in KINDS.values() if issubclass(cls, Rod)]
     shared = [
+        "[Download the schema](robot.schema.json)",
         "## Robots of one rod",
         "What `" + "`, `".join(kind for kind, cls in KINDS.items() if cls in of_a_rod) + "` have in common.",
         HEAD + "\n".join([*_rows(Rod, rod), _nodes()]),
