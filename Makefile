@@ -11,7 +11,7 @@ unexport PYTHONPATH
 unexport PYTHONHOME
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all lint types format bench package lock clean distclean
+.PHONY: help demo test test-all lint types docs format bench package lock clean distclean
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' Makefile
@@ -35,6 +35,9 @@ lint: $(READY) ## check style and formatting
 
 types: $(READY) ## check the types
 	$(BIN)/mypy
+
+docs: $(READY) ## build the documentation as a site in build/site
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --clean
 
 format: $(READY) ## format the code, and fix what can be fixed without a decision
 	$(BIN)/ruff check --fix-only

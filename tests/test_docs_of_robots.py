@@ -3,8 +3,6 @@
 import re
 from pathlib import Path
 
-import pytest
-
 import knode_cosserat as kc
 from knode_cosserat.rods import ends, loads, routing, section, surroundings
 from knode_cosserat.rods.parts import kinds_of
@@ -27,11 +25,3 @@ def test_every_kind_is_on_the_page():
     kinds = {kind for family in families for kind in kinds_of(family)}
     assert not [kind for kind in {*kinds, *KINDS} - {"virtual-robot"} if f"`{kind}`" not in PAGE]
     assert not [name for name in kc.catalog() if f"`{name}`" not in PAGE]
-
-
-@pytest.mark.campaign
-def test_the_code_on_the_page_runs():
-    for code in blocks("python"):
-        shown = {}
-        exec(code, shown)  # our own documentation
-        assert shown["pushed"].all_valid

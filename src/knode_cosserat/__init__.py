@@ -50,6 +50,7 @@ from knode_cosserat.rods import ends, loads, routing, surroundings
 from knode_cosserat.rods.parallel_robot import ParallelRobot
 from knode_cosserat.rods.parameters import ParameterError, parameter
 from knode_cosserat.rods.robot_file import RobotFileError, catalog, load_robot, save_robot
+from knode_cosserat.rods.robot_schema import robot_schema
 from knode_cosserat.rods.rod import Rod
 from knode_cosserat.rods.routed_robot import RoutedTendonRobot
 from knode_cosserat.rods.section import Differences, FunctionSection, Stretch
@@ -148,6 +149,7 @@ __all__ = [
     "node_error",
     "parameter",
     "pose_mse",
+    "robot_schema",
     "routing",
     "save_robot",
     "simulate",

@@ -180,6 +180,18 @@ def info(
     )
 
 
+@app.command(epilog=examples("schema > robot.schema.json"))
+def schema(
+    as_json: Annotated[bool, typer.Option("--json", help="Print it on one line.")] = False,
+) -> None:
+    """Print the JSON Schema of robot files, by which editors complete and check them."""
+    import json
+
+    import knode_cosserat as kc
+
+    typer.echo(json.dumps(kc.robot_schema(), indent=None if as_json else 2, ensure_ascii=False))
+
+
 def _unstable(system: System, rest: Any, space: str) -> bool | None:
     """Whether an equilibrium is unstable; None where that cannot be told by the tip's compliance."""
     import knode_cosserat as kc

@@ -83,8 +83,13 @@ class Choice:
 
     def allows(self, value: Any) -> bool:
         """Whether a value is one of them, or several different ones."""
-        several = list(value) if self.many and isinstance(value, tuple | list) else [value]
-        known = all(any(each is word or each == word for word in self.allowed) for each in several)
+        if self.many and not isinstance(value, tuple | list):
+            return False
+        several = list(value) if self.many else [value]
+        # of the same class too: 1 is not True
+        known = all(
+            any(type(each) is type(word) and each == word for word in self.allowed) for each in several
+        )
         return known and len({str(each) for each in several}) == len(several)
 
     @property

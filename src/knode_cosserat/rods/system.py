@@ -26,6 +26,9 @@ from jaxtyping import Float
 from knode_cosserat.rods.parameters import Parameter, ParameterError, check_fields, parameters_of
 from knode_cosserat.rotation import dot, rotation_matrix
 
+#: how many nodes a rod may be divided into
+FEWEST_NODES, MOST_NODES = 2, 10_000
+
 
 class Field(NamedTuple):
     """A named part of y or z: its size, unit and meaning.
@@ -390,8 +393,10 @@ class System(eqx.Module):
 
     def __check_init__(self) -> None:
         given: Any = self.nodes
-        if not isinstance(given, int) or not 2 <= self.nodes <= 10_000:
-            raise ParameterError(f"nodes is {self.nodes!r}; allowed is a whole number from 2 to 10000")
+        if not isinstance(given, int) or not FEWEST_NODES <= self.nodes <= MOST_NODES:
+            raise ParameterError(
+                f"nodes is {self.nodes!r}; allowed is a whole number from {FEWEST_NODES} to {MOST_NODES}"
+            )
         check_fields(self)
 
 

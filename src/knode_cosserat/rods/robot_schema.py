@@ -1,0 +1,135 @@
+"""What a robot file may hold, as a JSON Schema: an editor then completes names and marks what is not allowed.
+
+It is made of the same statements that the loader checks (`parameters`, `parts`). The loader knows more, such
+as the eigenvalues of a matrix, or that a stretch ends beyond its beginning; what the schema refuses it
+refuses too.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from knode_cosserat.rods.parameters import Choice, Parameter, Slot, choices_of, parameters_of, slots_of
+from knode_cosserat.rods.parts import kinds_of
+from knode_cosserat.rods.robot_file import FORMATS, KINDS
+from knode_cosserat.rods.system import FEWEST_NODES, MOST_NODES
+
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
+NODES = {
+    "type": "integer",
+    "minimum": FEWEST_NODES,
+    "maximum": MOST_NODES,
+    "default": 10,
+    "description": "nodes along the rod, base and tip included",
+}
+
+
+def robot_schema() -> dict[str, Any]:
+    """The JSON Schema (draft 2020-12) of robot files, as a mapping that `json.dumps` writes.
+
+    `knode-cosserat schema` prints it. A robot file names it in a comment for the editor:
+    `# yaml-language-server: $schema=robot.schema.json`.
+    """
+    parts: dict[str, Any] = {}
+    robots = {name: _mapping(cls, parts, nodes=NODES) for name, cls in KINDS.items()}
+    return {
+        "$schema": DIALECT,
+        "title": "robot file of KNODE-Cosserat",
+        "type": "object",
+        "required": ["format", "kind", "parameters"],
+        "additionalProperties": False,
+        "properties": {
+            "format": {"enum": list(FORMATS), "description": "2 if there are choices or parts, else 1"},
+            "kind": {"enum": list(KINDS), "description": "what robot it is"},
+            "description": {"type": "string", "description": "what it is, in one line"},
+            "parameters": {"type": "object", "description": "names and values, in SI units and radians"},
+        },
+        "allOf": [
+            _if_kind(name, {"properties": {"parameters": {"$ref": f"#/$defs/{name}"}}}) for name in robots
+        ],
+        "$defs": robots | parts,
+    }
+
+
+def _mapping(cls: type, parts: dict[str, Any], **more: Any) -> dict[str, Any]:
+    """What a mapping for this class may hold; the families of its parts are added to `parts`."""
+    fields = {field.name: field.default for field in dataclasses.fields(cls)}
+    numbers = parameters_of(cls)
+    known = {name: _number(each, fields[name]) for name, each in numbers.items()}
+    known |= {name: _word(each, fields[name]) for name, each in choices_of(cls).items()}
+    known |= {name: _slot(each, parts) for name, each in slots_of(cls).items()}
+    return {
+        "type": "object",
+        "description": (cls.__doc__ or cls.__name__).splitlines()[0],
+        "properties": known | more,
+        "required": [name for name in numbers if fields[name] is dataclasses.MISSING],
+        "additionalProperties": False,
+    }
+
+
+def _number(stated: Parameter, default: Any) -> dict[str, Any]:
+    one = {"type": "number", "minimum": stated.low, "maximum": stated.high}
+    shape: dict[str, Any] = {
+        "scalar": one,
+        "vector": _array(one, 3),
+        # none of it is all zeros
+        "quaternion": {**_array(one, 4), "contains": {"not": {"const": 0}}},
+        "list": {"type": "array", "items": one, "minItems": 1},
+        "matrix": {"anyOf": [one, _array(one, 3), _square(one, stated.high)]},
+    }[stated.shape]
+    unit = f" ({stated.unit})" if stated.unit else ""
+    found = {**_or_null(shape, stated.optional), "description": f"{stated.meaning}{unit}"}
+    if default is not dataclasses.MISSING and default is not None:
+        found["default"] = np.asarray(default, dtype=float).tolist()
+    return found
+
+
+def _array(one: Any, count: int) -> dict[str, Any]:
+    return {"type": "array", "items": one, "minItems": count, "maxItems": count}
+
+
+def _square(one: Any, high: float) -> dict[str, Any]:
+    """A 3x3 matrix: the diagonal keeps to the eigenvalues' bounds, and no entry exceeds the upper one."""
+    other = {"type": "number", "minimum": -high, "maximum": high}
+    rows = [[one if row == column else other for column in range(3)] for row in range(3)]
+    whole = [{"type": "array", "prefixItems": row, "minItems": 3, "maxItems": 3} for row in rows]
+    return {"type": "array", "prefixItems": whole, "minItems": 3, "maxItems": 3}
+
+
+def _word(stated: Choice, default: Any) -> dict[str, Any]:
+    one = {"enum": list(stated.allowed)}
+    if not stated.many:
+        return {**one, "description": stated.meaning, "default": default}
+    several = {"type": "array", "items": one, "uniqueItems": True}
+    return {**several, "description": stated.meaning, "default": list(default)}
+
+
+def _slot(slot: Slot, parts: dict[str, Any]) -> dict[str, Any]:
+    family = slot.family.__name__.lower()
+    if family not in parts:
+        kinds = kinds_of(slot.family)
+        parts[family] = {}  # before its members, which may hold parts of the same family
+        for kind, cls in kinds.items():
+            named = {"const": kind, "description": "what it is"}
+            made = _mapping(cls, parts, kind=named)
+            parts[f"{family}.{kind}"] = {**made, "required": ["kind", *made["required"]]}
+        parts[family] = {
+            "type": "object",
+            "required": ["kind"],
+            "properties": {"kind": {"enum": list(kinds)}},
+            "allOf": [_if_kind(kind, {"$ref": f"#/$defs/{family}.{kind}"}) for kind in kinds],
+        }
+    one = {"$ref": f"#/$defs/{family}"}
+    shape = {"type": "array", "items": one} if slot.many else one
+    return {**_or_null(shape, slot.optional), "description": slot.meaning}
+
+
+def _or_null(shape: dict[str, Any], optional: bool) -> dict[str, Any]:
+    return {"anyOf": [shape, {"type": "null"}]} if optional else shape
+
+
+def _if_kind(kind: str, then: dict[str, Any]) -> dict[str, Any]:
+    return {"if": {"properties": {"kind": {"const": kind}}, "required": ["kind"]}, "then": then}

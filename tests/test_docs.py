@@ -1,0 +1,200 @@
+"""Every piece of code in README and docs: Python runs, commands parse, and they print what is said there.
+
+The blocks of a page share their names, in order. A block after `<!-- test: long -->`, and all that follows it
+on its page, are run by `make test-all` only.
+"""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+import typer
+import typer.testing
+
+from examples import your_own_robot
+from knode_cosserat.cli import app
+from knode_cosserat.recordings.virtual import record_virtual
+
+ROOT = Path(__file__).parents[1]
+PAGES = {
+    page.relative_to(ROOT).as_posix(): page.read_text(encoding="utf-8")
+    for page in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
+}
+BLOCK = re.compile(r"(<!-- test: long -->\n)?^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+LONG = "<!-- test: long -->"
+#: pages whose code takes long as a whole: recordings are made and learned from
+LONG_PAGES = ("docs/estimation.md", "docs/recordings.md", "docs/your-own-robot.md")
+#: pages whose commands are cheap enough to be run, and checked by what the page says they print
+RUN = ("docs/first-ten-minutes.md",)
+
+
+def blocks(page, language):
+    """Line, text and length mark of the blocks of a language."""
+    text = PAGES[page]
+    for found in BLOCK.finditer(text):
+        if found[2] == language:
+            yield text.count("\n", 0, found.start(3)) + 1, found[3], bool(found[1])
+
+
+def with_code(long):
+    """Pages that have Python, long or not."""
+    first = {page: next(blocks(page, "python"), None) for page in PAGES}
+    if long:
+        return [page for page in first if first[page] and (page in LONG_PAGES or LONG in PAGES[page])]
+    return [page for page in first if first[page] and not first[page][2] and page not in LONG_PAGES]
+
+
+def run(page, long, printed):
+    """Run a page's Python; line numbers in errors are the page's. A number after a `print` is printed."""
+    names = {"__name__": "__docs__"}
+    for line, code, is_long in blocks(page, "python"):
+        if is_long and not long:
+            break
+        exec(compile("\n" * (line - 1) + code, ROOT / page, "exec"), names)  # our own documentation
+        output = printed().out
+        for said in re.findall(r"^ *print\(.*\)  # (.*\d.*)$", code, re.MULTILINE):
+            assert said.rstrip("…") in output, f"{page}, in the block from line {line} on: {output}"
+    return names
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder with what pages name: the examples and the tests' results are beside it."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    return tmp_path
+
+
+def prepare(page, folder):
+    """The recordings that a page has the reader make, or bring."""
+    if page == "docs/estimation.md":
+        record_virtual("x.bag", "sine:1.0", seconds=6.0, seed=1)
+    if page == "docs/recordings.md":
+        signals = {
+            "sine_1p0": "sine:1.0",
+            "sine_3p0": "sine:3.0",
+            "rand_0": "random:0",
+            "sine_2p0": "sine:2.0",
+        }
+        for seed, (name, signal) in enumerate(signals.items()):
+            record_virtual(f"{name}.bag", signal, seconds=6.0, seed=seed)
+    if page == "docs/your-own-robot.md":
+        (folder / "afternoon").mkdir()
+        for name, signal in your_own_robot.SIGNALS.items():
+            your_own_robot.record(folder / "afternoon" / f"{name}.csv", signal, 6.0)
+
+
+@pytest.mark.parametrize("page", with_code(long=False))
+def test_its_python_runs(page, folder, capsys):
+    assert run(page, False, capsys.readouterr)
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("page", with_code(long=True))
+def test_its_long_python_runs(page, folder, capsys):
+    prepare(page, folder)
+    assert run(page, True, capsys.readouterr)
+
+
+# commands
+
+
+def commands(text):
+    """Lines of a shell that call our program, as lists of words."""
+    for line in text.replace("\\\n", " ").splitlines():
+        line = re.sub(r"\s+#.*", "", line.strip().removeprefix("$ "))
+        if line.startswith("knode-cosserat ") and "$" not in line and "--version" not in line:
+            yield shlex.split(re.split(r"\s[>|]", line)[0])[1:]
+
+
+def parsed(words, whole=True):
+    """The command that some words name; fails on one, or an option, that does not exist."""
+    command = typer.main.get_command(app)
+    words = list(words)
+    while hasattr(command, "commands") and words and not words[0].startswith("-"):
+        name = words.pop(0)
+        assert name in command.commands, f"there is no command {name}"
+        command = command.commands[name]
+    if whole:
+        command.make_context(command.name, words)
+        return
+    known = {
+        option for parameter in command.params for option in (*parameter.opts, *parameter.secondary_opts)
+    }
+    unknown = [
+        word for word in words if word.startswith("--") and word.split("=")[0] not in {*known, "--help"}
+    ]
+    assert not unknown, f"{command.name} has no {unknown[0]}"
+
+
+COMMANDS = [
+    pytest.param(words, id=f"{page}: {shlex.join(words)}"[:110])
+    for page in PAGES
+    for language in ("sh", "")
+    for _, text, _ in blocks(page, language)
+    for words in commands(text)
+]
+
+
+@pytest.mark.parametrize("words", COMMANDS)
+def test_a_command_parses(words, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    parsed(words)
+
+
+def test_commands_within_sentences_exist():
+    found = [
+        (page, name)
+        for page, text in PAGES.items()
+        for name in re.findall(r"`knode-cosserat ([^`]+)`", BLOCK.sub("", text))
+    ]
+    assert len(found) > 10
+    for page, name in found:
+        words = name.replace("…", " ").replace("--version", "").split()
+        try:
+            parsed(words, whole=False)
+        except AssertionError as error:
+            raise AssertionError(f"{page}: knode-cosserat {name}: {error}") from None
+
+
+def test_targets_and_programs_exist():
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    for page, text in PAGES.items():
+        for target in re.findall(r"^make ([a-z-]+)|`make ([a-z-]+)", text, re.MULTILINE):
+            assert (target[0] or target[1]) in targets, f"{page}: make {target}"
+        for program in re.findall(r"^(?:\$ )?python ([a-z_/]+\.py)", text, re.MULTILINE):
+            assert (ROOT / program).is_file(), f"{page}: {program}"
+
+
+def lasting(text):
+    """What is printed, without the times that it took, rounding errors, and the order of what is as large."""
+    text = re.sub(r"in [\d.]+ s of computing|[\d.]+ s$", "…", text, flags=re.MULTILINE)
+    return sorted(re.sub(r" *\d\.\d+e-(0[89]|[1-9]\d)", " 0", text).splitlines())
+
+
+@pytest.mark.parametrize("page", RUN)
+def test_commands_print_what_the_page_shows(page, folder):
+    shell = [(found[2], found[3]) for found in BLOCK.finditer(PAGES[page])]
+    for k, (language, text) in enumerate(shell):
+        if language != "sh":
+            continue
+        printed = ""
+        for words in commands(text):
+            result = typer.testing.CliRunner().invoke(app, words)
+            assert result.exit_code == 0, result.output
+            printed = result.stdout
+        if k + 1 < len(shell) and shell[k + 1][0] == "":
+            assert lasting(printed) == lasting(shell[k + 1][1])
+
+
+# README's table of figures
+
+
+def test_the_readme_has_the_measured_figures():
+    import json
+
+    from benchmarks.run import table
+
+    measured = table(json.loads((ROOT / "benchmarks" / "results.json").read_text(encoding="utf-8")))
+    assert measured in PAGES["README.md"]

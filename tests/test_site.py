@@ -1,0 +1,98 @@
+"""What the site is made of: sources by path, the reference of robot files, pages of the API, equations."""
+
+import inspect
+import re
+import textwrap
+from pathlib import Path
+
+import pytest
+import yaml
+
+import knode_cosserat as kc
+from knode_cosserat.rods import ends, loads, routing, section, surroundings
+from knode_cosserat.rods.parts import kinds_of
+from knode_cosserat.rods.robot_file import KINDS
+from knode_cosserat.solvers.time import BDFAlpha
+from tools.site import api, examples, performance, robot_file, source
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+
+
+def test_a_source_is_that_of_the_object():
+    file, line, code = source.found("knode_cosserat.solvers.time.BDFAlpha.coefficients")
+    lines, first = inspect.getsourcelines(BDFAlpha.coefficients)
+    assert (file.name, line) == ("time.py", first)
+    assert code == textwrap.dedent("".join(lines)).rstrip()
+    decorated = source.found("knode_cosserat.rods.rod.Rod.section")[2]
+    assert decorated.startswith("@property\ndef section") and decorated.endswith("(self.radius)")
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "knode_cosserat.solvers.time",
+        "knode_cosserat.solvers.time.BDF7",
+        "knode_cosserat.solvers.time.BDFAlpha.cofficients",
+        "knode_cosserat.nowhere.at_all",
+    ],
+)
+def test_a_source_that_is_not_there_is_an_error(path):
+    with pytest.raises(LookupError, match=re.escape(path)):
+        source.found(path)
+
+
+def test_every_source_on_a_page_is_there():
+    pages = [page.read_text(encoding="utf-8") for page in DOCS.rglob("*.md")]
+    found = [block for page in pages for block in re.findall(r"^```source\n(.*?)^```$", page, re.M | re.S)]
+    paths = " ".join(found).split()
+    assert len(paths) > 15
+    for path in paths:
+        assert source.found(path)[2]
+
+
+def test_the_reference_has_every_name_with_its_meaning():
+    page = robot_file.page()
+    families = ends.End, loads.Load, surroundings.Obstacle, section.SectionChange, routing.Routing
+    classes = [*KINDS.values(), *(cls for family in families for cls in kinds_of(family).values())]
+    for cls in classes:
+        for name, parameter in cls.parameters().items():
+            assert f"| `{name}` | {parameter.meaning} | " in page
+    for kind in [*KINDS, *(kind for family in families for kind in kinds_of(family))]:
+        assert re.search(rf"^###? `{kind}`$", page, re.MULTILINE)
+    rows = [line for line in page.splitlines() if line.startswith("| ")]
+    assert {line.replace("\\|", "").count("|") for line in rows} == {7}
+
+
+def test_every_public_name_is_on_one_page_of_the_api():
+    shown = api.shown(DOCS / "api")
+    assert sorted(shown) == sorted(api.rooms())
+    named = [line for room in shown for line in api.page(room).split("\n\n")]
+    assert len(named) == len(set(named)) == len(kc.__all__)
+
+
+def test_every_example_has_its_section():
+    page = examples.page()
+    for file in (ROOT / "examples").glob("*.py"):
+        assert f"`examples/{file.name}`" in page
+    assert "    ```python\n" in page
+
+
+def test_the_figures_are_those_of_the_readme():
+    table = [line for line in performance.page().splitlines() if "against fsolve" in line]
+    assert len(table) == 3 and all(line in (ROOT / "README.md").read_text(encoding="utf-8") for line in table)
+
+
+def test_the_navigation_names_every_page():
+    class Loader(yaml.SafeLoader):
+        pass
+
+    nav = yaml.load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"), Loader)["nav"]
+    named = set(re.findall(r"[\w/-]+\.md", str(nav)))
+    assert {page.relative_to(DOCS).as_posix() for page in DOCS.rglob("*.md")} <= named
+
+
+def test_equations_become_mathml_but_not_in_code():
+    equations = pytest.importorskip("tools.site.equations")
+    page = equations.rendered("$$\ny_s = R\\,v\n$$\n\n```sh\n$$\nx\n$$\n```\n")
+    assert page.count("<math") == 1 and "$$\nx\n$$" in page

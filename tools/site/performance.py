@@ -1,0 +1,27 @@
+"""The measured figures, from the file that `make bench` writes."""
+
+from __future__ import annotations
+
+import json
+
+from benchmarks.run import table
+from tools.site.source import ROOT
+
+RESULTS = ROOT / "benchmarks" / "results.json"
+
+
+def page() -> str:
+    """The table of all figures, where they were measured, and what single cases took."""
+    found = json.loads(RESULTS.read_text(encoding="utf-8"))
+    steps = found["steps"]
+    kinds = [kind for kind in steps if "ratio" in steps[kind]]
+    against = "\n".join(
+        f"| {kind} | {1e3 * steps[kind]['package']:.1f} | {1e3 * steps[kind]['transcription']:.0f} "
+        f"| {steps[kind]['ratio']:.0f} |"
+        for kind in kinds
+    )
+    return (
+        f"Measured on {found['machine']}.\n\n{table(found)}\n\n"
+        "## The paper's way, case by case\n\n"
+        "| controls | here [ms] | fsolve [ms] | ratio |\n| --- | --- | --- | --- |\n" + against
+    )

@@ -1,0 +1,115 @@
+"""The reference of robot files, from what each class states of its parameters, choices and parts."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from knode_cosserat.rods.parameters import Parameter, choices_of, parameters_of, slots_of
+from knode_cosserat.rods.parts import kinds_of
+from knode_cosserat.rods.robot_file import KINDS
+from knode_cosserat.rods.robot_schema import NODES
+from knode_cosserat.rods.rod import Rod
+
+SHAPES = {
+    "scalar": "number",
+    "vector": "three numbers",
+    "quaternion": "four numbers, scalar first",
+    "matrix": "number, diagonal or 3×3",
+    "list": "list of numbers",
+}
+HEAD = "| name | what | kind | unit | allowed | default |\n| --- | --- | --- | --- | --- | --- |\n"
+FAMILIES = {
+    "End": "Ends: `base_end`, `tip_end`",
+    "Load": "Loads: `loads`",
+    "Obstacle": "Surroundings: `surroundings`",
+    "SectionChange": "Sections: `sections`",
+    "Routing": "Tendon routing: `routing`",
+}
+
+
+def page() -> str:
+    """Kinds of robots, and then the families of their parts."""
+    rod = set(parameters_of(Rod)) | set(slots_of(Rod)) | set(choices_of(Rod))
+    of_a_rod = [cls for cls in KINDS.values() if issubclass(cls, Rod)]
+    shared = [
+        "[Download the schema](robot.schema.json)",
+        "## Robots of one rod",
+        "What `" + "`, `".join(kind for kind, cls in KINDS.items() if cls in of_a_rod) + "` have in common.",
+        HEAD + "\n".join([*_rows(Rod, rod), _nodes()]),
+    ]
+    parts = []
+    for kind, cls in KINDS.items():
+        one = issubclass(cls, Rod)
+        rows = _rows(cls, None, without=rod) if one else [*_rows(cls, None), _nodes()]
+        after = "No parameters beside those of a rod." if one and not rows else HEAD + "\n".join(rows)
+        parts += [f"## `{kind}`", _first(cls), after]
+    families: dict[str, type] = {}
+    for cls in KINDS.values():
+        families |= {slot.family.__name__: slot.family for slot in slots_of(cls).values()}
+    for name, family in families.items():
+        parts += [f"## {FAMILIES[name]}", _first(family)]
+        for kind, cls in kinds_of(family).items():
+            rows = _rows(cls, None)
+            parts += [f"### `{kind}`", _first(cls), HEAD + "\n".join(rows) if rows else "No parameters."]
+    return "\n\n".join([*shared, *parts])
+
+
+def _first(cls: type) -> str:
+    return (cls.__doc__ or "").strip().split("\n\n")[0].replace("\n", " ")
+
+
+def _rows(cls: type, only: set[str] | None, without: Any = ()) -> list[str]:
+    defaults = {field.name: field.default for field in dataclasses.fields(cls)}
+    rows = {
+        name: _row(name, each.meaning, SHAPES[each.shape], each.unit, _range(each), _default(defaults[name]))
+        for name, each in parameters_of(cls).items()
+    }
+    for name, each in choices_of(cls).items():
+        words = ", ".join(f"`{str(word).lower()}`" for word in each.allowed)
+        kind = "list of different words" if each.many else "word"
+        rows[name] = _row(name, each.meaning, kind, "", words, _default(defaults[name]))
+    for name, slot in slots_of(cls).items():
+        kind = "list of mappings" if slot.many else "mapping"
+        words = ", ".join(f"`{word}`" for word in kinds_of(slot.family))
+        rows[name] = _row(name, slot.meaning, kind, "", words, _part(defaults[name]))
+    return [row for name, row in rows.items() if name not in without and (only is None or name in only)]
+
+
+def _row(*cells: str) -> str:
+    name, *others = cells
+    return "| " + " | ".join([f"`{name}`", *(cell.replace("|", "\\|") for cell in others)]) + " |"
+
+
+def _range(stated: Parameter) -> str:
+    each = {"scalar": "", "matrix": "eigenvalues ", "quaternion": "not all zero, each "}.get(
+        stated.shape, "each "
+    )
+    return f"{each}{stated.low:g} to {stated.high:g}"
+
+
+def _default(value: Any) -> str:
+    if value is dataclasses.MISSING:
+        return "**required**"
+    if value is None:
+        return "none"
+    if isinstance(value, bool | str):
+        return f"`{str(value).lower()}`"
+    if isinstance(value, tuple) and value and isinstance(value[0], str):
+        return f"`[{', '.join(value)}]`"
+    array = np.asarray(value, dtype=float)
+    numbers = [f"{each:.4g}" for each in array.reshape(-1)]
+    return numbers[0] if not array.ndim else f"[{', '.join(numbers)}]"
+
+
+def _part(value: Any) -> str:
+    if value is None or value == ():
+        return "none"
+    return f"`{value.kind}`"
+
+
+def _nodes() -> str:
+    allowed = f"{NODES['minimum']} to {NODES['maximum']}"
+    return _row("nodes", str(NODES["description"]), "whole number", "", allowed, str(NODES["default"]))
