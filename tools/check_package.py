@@ -117,9 +117,7 @@ def main() -> None:
     if not seen["well"]:
         sys.exit("error: the doctor finds something wrong in the installed package")
     if seen["import_s"] > LONGEST_IMPORT:
-        print(
-            f"note: importing takes {seen['import_s']} s here; wanted is {LONGEST_IMPORT} s if it is quiet"
-        )
+        print(f"note: importing takes {seen['import_s']} s here; wanted is {LONGEST_IMPORT} s if it is quiet")
 
 
 if __name__ == "__main__":
