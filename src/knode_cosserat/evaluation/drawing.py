@@ -73,17 +73,18 @@ def equal_scales(axes: Any, points: NDArray[np.float64], zoom: float = 0.95) -> 
     half = 1.05 * np.maximum(half, 0.55 * half.max())
     axes.set(**{f"{name}lim": (c - h, c + h) for name, c, h in zip(AXES, centre, half, strict=True)})
     axes.set_box_aspect(tuple(half), zoom=zoom)
+    small = axes.get_figure(root=False).bbox.width < 4.5 * axes.get_figure(root=True).dpi
+    steps = 3 if small else 4
     for axis, c, h in zip((axes.xaxis, axes.yaxis, axes.zaxis), centre, half, strict=True):
         # not near the ends: where two axes meet, their labels would too
         axis.set_ticks(
-            [tick for tick in MaxNLocator(4).tick_values(c - h, c + h) if abs(tick - c) < 0.75 * h]
+            [tick for tick in MaxNLocator(steps).tick_values(c - h, c + h) if abs(tick - c) < 0.75 * h]
         )
-    small = axes.get_figure(root=False).bbox.width < 4.5 * axes.get_figure(root=True).dpi
-    for axis, pad in ((axes.xaxis, 4.0), (axes.yaxis, 7.0), (axes.zaxis, 8.5)):
+    for axis, pad in ((axes.xaxis, 4.0), (axes.yaxis, 7.0), (axes.zaxis, 9.5)):
         axis.labelpad = pad - 7.0 * small
     axes.tick_params(axis="x", pad=-2.0 * small)
     axes.tick_params(axis="y", pad=-2.0 * small)
-    axes.tick_params(axis="z", pad=3.0 - 2.0 * small)
+    axes.tick_params(axis="z", pad=3.0)
 
 
 def draw_tips(axes: Any, paths: Mapping[str, tuple[ArrayLike, NDArray[np.float64]]]) -> None:

@@ -323,6 +323,9 @@ def curves(
         for i, (label, given) in enumerate(by_values(lines, len(at)).items()):
             axes.plot(at, given, **{**line(i), "marker": marker or None, "label": label or None})
         axes.set(xlabel=xlabel, ylabel=ylabel, **{f"{name}scale": "log" for name in log})
+        if "x" in log and len(at) <= 8:
+            axes.set_xticks(at, [f"{each:g}" for each in at])
+            axes.set_xticks([], minor=True)
         if any(lines):
             legend_above(axes)
     return figure

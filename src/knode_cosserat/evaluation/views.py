@@ -161,4 +161,4 @@ def flat_height(points: NDArray[np.float64], view: str, width: float, beside: fl
     span = np.nanmax(points, axis=0) - np.nanmin(points, axis=0)
     across, up = (span[AXES.index(name)] for name in view)
     shape = up / across if across > 0.0 else 4.0
-    return float(np.clip((width - beside) * max(shape, 0.12) + 0.6, 1.3, 1.15 * width))
+    return float(np.clip((width - beside) * max(shape, 0.12) + 0.85, 1.6, 1.15 * width))

@@ -36,5 +36,10 @@ def workspace_seen(found: Workspace) -> Figure:
             axes = figure.add_subplot(1, 2, k + 1)
             points = axes.scatter(across, up, c=total, s=1, cmap=TIME_COLOURS, rasterized=True, linewidths=0)
             axes.set(xlabel=f"{names[0]} [m]", ylabel=f"{names[1]} [m]", aspect="equal")
-        figure.colorbar(points, ax=figure.axes, label="sum of the controls")
+        figure.colorbar(points, ax=figure.axes, label=f"sum of the controls{_unit(found)}")
     return figure
+
+
+def _unit(found: Workspace) -> str:
+    units = {field.unit for field in found.system.control_layout.fields}
+    return f" [{units.pop()}]" if len(units) == 1 else ""
