@@ -11,7 +11,7 @@ unexport PYTHONPATH
 unexport PYTHONHOME
 
 .DEFAULT_GOAL := help
-.PHONY: help demo pictures test test-all lint types format bench lock clean distclean
+.PHONY: help demo pictures notebooks test test-all lint types format bench lock clean distclean
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' Makefile
@@ -25,6 +25,9 @@ demo: $(READY) ## simulate the demonstration robot and write the results to demo
 
 pictures: $(READY) ## run all the examples, and draw their pictures for the documentation
 	$(BIN)/python -m tools.pictures
+
+notebooks: $(READY) ## run the notebooks' texts, and write docs/notebooks/*.ipynb
+	$(BIN)/python -m tools.notebooks
 
 test: $(READY) ## run the tests, but for the long ones
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile -m "not campaign" $(PYTEST_ARGS)

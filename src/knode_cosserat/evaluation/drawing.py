@@ -76,10 +76,12 @@ def equal_scales(axes: Any, points: NDArray[np.float64], zoom: float = 0.95) -> 
     small = axes.get_figure(root=False).bbox.width < 4.5 * axes.get_figure(root=True).dpi
     steps = 3 if small else 4
     for axis, c, h in zip((axes.xaxis, axes.yaxis, axes.zaxis), centre, half, strict=True):
-        # not near the ends: where two axes meet, their labels would too
-        axis.set_ticks(
-            [tick for tick in MaxNLocator(steps).tick_values(c - h, c + h) if abs(tick - c) < 0.75 * h]
-        )
+        # not near the ends: where two axes meet, their labels would too; but two, or there is no scale
+        for most in range(steps, steps + 4):
+            ticks = [tick for tick in MaxNLocator(most).tick_values(c - h, c + h) if abs(tick - c) < 0.75 * h]
+            if len(ticks) > 1:
+                break
+        axis.set_ticks(ticks)
     for axis, pad in ((axes.xaxis, 4.0), (axes.yaxis, 7.0), (axes.zaxis, 9.5)):
         axis.labelpad = pad - 7.0 * small
     axes.tick_params(axis="x", pad=-2.0 * small)

@@ -93,10 +93,10 @@ def comparison(reference: Trajectory, predictions: Mapping[str, Trajectory], cou
     require_some(predictions)
     with style():
         figure = new_figure(TWO_COLUMNS, 3.8)
-        left, right = figure.subfigures(1, 2, width_ratios=(1.0, 1.35))
+        left, right = figure.subfigures(1, 2, width_ratios=(1.0, 1.35), wspace=0.03)
         axes = left.add_subplot(projection="3d")
         _draw_shapes(axes, reference, predictions, count)
-        _show_all(axes, [reference, *predictions.values()], zoom=0.95)
+        _show_all(axes, [reference, *predictions.values()], zoom=0.87)
         column = right.subplots(3, 1, sharex=True)
         _draw_tips(column, reference, predictions)
         right.align_ylabels()
