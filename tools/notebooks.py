@@ -2,8 +2,8 @@
 
 python -m tools.notebooks [NAME ...]
 
-The text files are what is edited: cells begin with `# %%`, or `# %% [markdown]` where every line is a comment.
-Cells are run here and not by Jupyter, so that no kernel is needed; text and pictures are kept, and no paths.
+The text files are what is edited: cells begin with `# %%`, or `# %% [markdown]` where every line is a
+comment. Cells are run here and not by Jupyter, so that no kernel is needed. Text and pictures are kept.
 """
 
 import ast

@@ -7,6 +7,7 @@ import pytest
 from PIL import Image
 
 import knode_cosserat as kc
+from examples.hanging_string import HangingString
 
 pytestmark = pytest.mark.filterwarnings("error")
 
@@ -75,10 +76,7 @@ def test_several_are_overlaid_and_named(tmp_path, trajectory):
     assert all(each.sum() > 200 for each in grey)
 
 
-def test_a_robot_in_a_plane_and_one_of_many_legs_move(tmp_path, trajectory):
-    pytest.importorskip("examples.hanging_string")
-    from examples.hanging_string import HangingString
-
+def test_what_lives_in_a_plane_moves_too(tmp_path, trajectory):
     string = HangingString(length=1.0, density=0.1, stiffness=1e3, friction=0.05, nodes=21)
     hanging = kc.equilibrium(string, np.array([0.6, -0.1]), space="rk4")
     two = dataclasses.replace(

@@ -73,7 +73,9 @@ def equal_scales(axes: Any, points: NDArray[np.float64], zoom: float = 0.95) -> 
     half = 1.05 * np.maximum(half, 0.55 * half.max())
     axes.set(**{f"{name}lim": (c - h, c + h) for name, c, h in zip(AXES, centre, half, strict=True)})
     axes.set_box_aspect(tuple(half), zoom=zoom)
-    small = axes.get_figure(root=False).bbox.width < 4.5 * axes.get_figure(root=True).dpi
+    beside = axes.get_subplotspec().get_gridspec().ncols
+    inches = axes.get_figure(root=False).bbox.width / axes.get_figure(root=True).dpi / beside
+    small = inches < 4.5
     steps = 3 if small else 4
     for axis, c, h in zip((axes.xaxis, axes.yaxis, axes.zaxis), centre, half, strict=True):
         # not near the ends: where two axes meet, their labels would too; but two, or there is no scale

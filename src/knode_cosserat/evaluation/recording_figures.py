@@ -197,7 +197,7 @@ def _draw_noise(axes: Any, report: Health) -> None:
     axes.bar(at - 0.2, [1e3 * (each.noise or 0.0) for each in bodies], 0.38, color=PALETTE[0])
     axes.set_ylabel("noise of position [mm]", color=PALETTE[0])
     axes.set_xticks(at, [each.what for each in bodies], rotation=30, ha="right")
-    axes.set_title("noise, one standard deviation")
+    axes.set_title("noise (one σ)")
     if any(each.turn_noise is not None for each in bodies):
         other = axes.twinx()
         other.bar(at + 0.2, [1e3 * (each.turn_noise or 0.0) for each in bodies], 0.38, color=PALETTE[1])
@@ -222,4 +222,4 @@ def _draw_errors(axes: Any, recording: Recording, report: Health) -> None:
     late = ""
     if report.latency is not None:
         late = f"\ncommands {1e3 * report.latency.shift:.0f} ms later; lag {1e3 * report.latency.lag:.0f} ms"
-    axes.set_title(f"tension error: root mean square, and bias as diamonds{late}")
+    axes.set_title(f"tension error: RMS, and bias (diamonds){late}")

@@ -65,11 +65,16 @@ def shapes(reference: Trajectory, predictions: Mapping[str, Trajectory], count: 
     """The robot at `count` times beside the reference and the paths of the tips, for each prediction."""
     require_some(predictions)
     with style():
-        figure = new_figure(TWO_COLUMNS, 3.2)
-        panels = figure.subplots(1, len(predictions), subplot_kw={"projection": "3d"}, squeeze=False)[0]
+        columns = min(2, len(predictions))
+        rows = -(-len(predictions) // columns)
+        figure = new_figure(TWO_COLUMNS, 2.9 * rows + 0.3)
+        grid = figure.subplots(rows, columns, subplot_kw={"projection": "3d"}, squeeze=False).ravel()
+        panels = grid[: len(predictions)]
+        for axes in grid[len(predictions) :]:
+            axes.remove()
         for axes, (label, prediction) in zip(panels, predictions.items(), strict=True):
             _draw_shapes(axes, reference, {label: prediction}, count)
-            _show_all(axes, [reference, *predictions.values()], zoom=0.93)
+            _show_all(axes, [reference, *predictions.values()], zoom=0.85)
         legend_below(figure, panels)
     return figure
 

@@ -29,7 +29,7 @@ LINES: dict[str, dict[str, Any]] = {
     "euler": {"color": PALETTE[3], "linestyle": ":", "linewidth": 1.1},
 }
 MEASURED = {**REFERENCE, "label": "measured"}
-COLUMNS = 3
+COLUMNS = 2
 
 
 class Predicted(NamedTuple):
@@ -84,7 +84,7 @@ def paths(recordings: Mapping[str, Predicted]) -> Figure:
     with style():
         columns = min(COLUMNS, len(recordings))
         rows = -(-len(recordings) // columns)
-        figure = new_figure(TWO_COLUMNS, max(2.4, TWO_COLUMNS / columns) * rows + 0.4)
+        figure = new_figure(TWO_COLUMNS, 2.6 * rows + 0.4)
         grid = figure.subplots(rows, columns, subplot_kw={"projection": "3d"}, squeeze=False).ravel()
         for axes, (name, it) in zip(grid, recordings.items(), strict=False):
             axes.plot(*it.measured.T, **MEASURED)
