@@ -77,6 +77,11 @@ def test_hit_a_target(run):
 def test_follow_a_path(run):
     found = run("follow_a_path", points=9)
     assert np.all(found.converged) and np.all(found.position_error < 1e-8)
+    # what the robot does under these tensions by themselves
+    robot = kc.load_robot("delrin-tendon-robot")
+    for k in (1, 6):
+        tip = kc.equilibrium(robot, found.control[k]).tip_position[0, :2]
+        np.testing.assert_allclose(tip, found.position[k], atol=1e-8)
     # by symmetry the eight's second half is the first, turned by 180 degrees about the rod
     np.testing.assert_allclose(found.control[::-1], np.roll(found.control, 2, axis=1), atol=1e-6)
 
@@ -173,6 +178,7 @@ def test_cut_the_thread(run):
     assert found == pytest.approx(known * np.arctan(np.pi / 40) / (np.pi / 40), rel=5e-4)
 
 
+@CAMPAIGN
 def test_hanging_string(run):
     swing = run("hanging_string", steps=100)
     assert swing.all_valid

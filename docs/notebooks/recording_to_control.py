@@ -37,7 +37,7 @@ print("bodies:", ", ".join(body.name for body in recording.bodies), "| simulated
 # %%
 crude = kc.load_robot("delrin-tendon-robot")
 states = kc.estimate_states(recording, crude, dt=0.05)
-kc.figures.tips({"truth": truths["sine:1.5"], "estimated": states})
+kc.figures.states({"truth": truths["sine:1.5"], "estimated": states}, ("q", "w"))
 
 # %% [markdown]
 # ## A model from measured poses alone
