@@ -109,7 +109,7 @@ def test_over_an_obstacle(run):
     # never through the table or the cylinder, but for how far contact gives way
     points = np.asarray(pushed.position)
     radius = float(pushed.system.radius)
-    assert points[..., 2].min() > 0.0
+    assert points[..., 2].min() > 0.5 * radius
     axis = np.array([0.65, -0.12])
     assert np.linalg.norm(points[..., [0, 2]] - axis, axis=-1).min() > 0.15 + 0.5 * radius
     tip = points[:, -1]

@@ -63,7 +63,7 @@ def test_learn_what_is_missed(tmp_path):
 
 @pytest.mark.campaign
 def test_recording_to_control(tmp_path):
-    _, names = run(source("recording_to_control"), tmp_path, seconds=3.0, points=6)
+    _, names = run(source("recording_to_control"), tmp_path, seconds=3.0, points=24)
     assert np.all(names["reached"].converged)
     true, seen = (
         names["unseen"].tip_position,
