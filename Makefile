@@ -11,7 +11,7 @@ unexport PYTHONPATH
 unexport PYTHONHOME
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all lint types docs format bench package lock clean distclean
+.PHONY: help demo test test-all lint types docs pictures notebooks format bench package lock clean distclean
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' Makefile
@@ -22,6 +22,12 @@ $(READY): requirements.lock pyproject.toml tools/bootstrap.py
 
 demo: $(READY) ## simulate the demonstration robot and write the results to demo/
 	$(BIN)/python examples/demo.py --out demo/
+
+pictures: $(READY) ## run all the examples, and draw their pictures for the documentation
+	$(BIN)/python -m tools.pictures
+
+notebooks: $(READY) ## run the notebooks' texts, and write docs/notebooks/*.ipynb
+	$(BIN)/python -m tools.notebooks
 
 test: $(READY) ## run the tests, but for the long ones
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile -m "not campaign" $(PYTEST_ARGS)

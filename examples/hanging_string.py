@@ -8,12 +8,11 @@ what y and z hold, and what is known at the two ends. Simulation, equilibrium, d
     p_s = (1 + T/EA) n/T            n_s = ρ q_t + c q - ρ g            q_s = p_st            T = |n|
 """
 
-import argparse
-from pathlib import Path
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
+import typer
 
 import knode_cosserat as kc
 
@@ -64,28 +63,17 @@ class HangingString(kc.System):
         return kc.Scales(jnp.repeat(sizes, 2), jnp.full(2, self.length))
 
 
-def main(out: Path) -> None:
+def main(out: str = "hanging_string.png", steps: int = 100) -> kc.Trajectory:
     """Let the string hang, then swing it by moving the hand."""
-    from matplotlib.figure import Figure
-
     string = HangingString(length=1.0, density=0.1, stiffness=1e3, friction=0.05, nodes=41)
     hanging = kc.equilibrium(string, np.array([0.6, 0.0]), space="rk4")
-    t = np.arange(1, 101) * 0.02
+    t = np.arange(1, steps + 1) * 0.02
     hand = np.stack([0.6 + 0.05 * np.sin(2 * np.pi * t), np.zeros_like(t)], axis=1)
     swing = kc.simulate(string, hand, 0.02, space="rk4", initial=hanging)
-
-    figure = Figure(figsize=(6, 4), layout="constrained")
-    axes = figure.subplots()
-    for row in range(0, 101, 4):
-        axes.plot(*swing.part("p")[row].T, color="C0", alpha=0.2 + 0.8 * row / 100)
-    axes.set(xlabel="x (m)", ylabel="z (m)", aspect="equal", title="A string swung by hand, 2 s")
-    out.mkdir(parents=True, exist_ok=True)
-    figure.savefig(out / "hanging_string.png", dpi=150)
-    lowest = hanging.part("p")[0, :, 1].min()
-    print(f"lowest point at rest {lowest:.4f} m; picture: {out / 'hanging_string.png'}")
+    kc.figures.shape(swing, count=9).savefig(out)
+    print(f"lowest point at rest {hanging.part('p')[0, :, 1].min():.4f} m; picture: {out}")
+    return swing
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("examples-out"))
-    main(parser.parse_args().out)
+    typer.run(main)

@@ -61,14 +61,14 @@ def main(out: Path, seconds: float = 8.0) -> tuple[float, float]:
     recordings = {name: kc.load_recording(out / f"{name}.csv", config) for name in SIGNALS}
     unseen = recordings.pop("unseen").sampled(DT, mean=True)
     first = recordings["sine-1"]
-    recording_figures.health(first, first.health()).savefig(out / "health.png", dpi=80)
+    recording_figures.health(first, first.health()).savefig(out / "health.png", dpi=130)
     found = kc.identify(knowledge, [each.sampled(DT, mean=True) for each in recordings.values()], NAMES)
     print(found, *(f"left of the {name}: {size:.2g}" for name, size in found.remainder.items()), sep="\n")
     kc.save_robot(found.robot, out / "found.yaml")
     errors = []
     for label, robot in (("before", knowledge), ("after", found.robot)):
         prediction = kc.simulate(robot, unseen.tension[:-1], DT)
-        figures.prediction_against_measurement(prediction, unseen).savefig(out / f"{label}.png", dpi=80)
+        figures.prediction_against_measurement(prediction, unseen).savefig(out / f"{label}.png", dpi=130)
         errors.append(float(rms_distance(np.asarray(prediction.tip_position), unseen.tip_position)))
     print(f"tip RMSE on an unseen recording: {100 * errors[0]:.1f} cm before, {100 * errors[1]:.2f} cm after")
     return errors[0], errors[1]

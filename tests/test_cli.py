@@ -14,9 +14,9 @@ from knode_cosserat.cli import app
 from knode_cosserat.evaluation.metrics import dtw_distance
 
 ROBOT = "delrin-tendon-robot"
-COMMANDS = ("simulate", "equilibrium", "info", "reach", "workspace", "fit", "evaluate", "plot", "inspect",
-            "study simulation", "study imperfections", "study data", "study estimation",
-            "record-virtual", "schema")  # fmt: skip
+COMMANDS = ("simulate", "equilibrium", "info", "reach", "workspace", "fit", "evaluate", "plot", "animate",
+            "inspect", "study simulation", "study imperfections", "study data", "study estimation",
+            "record-virtual", "schema", "doctor")  # fmt: skip
 
 
 def run(*arguments):
@@ -342,7 +342,7 @@ def test_evaluate_simulates_by_the_references_settings(tmp_path):
 # plot
 
 
-@pytest.mark.parametrize("kind", ["overview", "rods", "tip", "tensions"])
+@pytest.mark.parametrize("kind", ["overview", "shape", "path", "tip", "states", "tensions"])
 def test_plot_draws(tmp_path, truth, kind):
     out = tmp_path / "figure.svg"
     text = succeeded("plot", truth, "--out", out, "--kind", kind)
@@ -353,8 +353,37 @@ def test_plot_draws(tmp_path, truth, kind):
 def test_plot_tells_in_json(tmp_path, truth):
     out = tmp_path / "figure.pdf"
     facts = told("plot", truth, "--out", out)
-    assert facts == {"trajectory": str(truth), "kind": "overview", "out": str(out)}
+    assert facts == {"trajectories": [str(truth)], "kind": "overview", "out": str(out)}
     assert out.read_bytes().startswith(b"%PDF")
+
+
+def test_plot_draws_several_over_each_other(tmp_path, truth):
+    other = tmp_path / "other.nc"
+    succeeded(*simulated(other, "--set", "youngs_modulus=5e9"))
+    for kind in ("compare", "error", "path"):
+        out = tmp_path / f"{kind}.svg"
+        succeeded("plot", truth, other, "--out", out, "--kind", kind, "--view", "xy", "--columns", 2)
+        assert "<svg" in out.read_text()
+    assert told("plot", truth, other, "--out", out)["kind"] == "compare"
+    for given, words in (
+        ((truth, other, "--kind", "shape"), "draws one"),
+        ((truth, "--kind", "error"), "needs"),
+    ):
+        failed = run("plot", *given, "--out", out)
+        assert failed.exit_code == 2 and words in failed.stderr
+
+
+# animate
+
+
+def test_animate_writes_a_motion(tmp_path, truth):
+    out = tmp_path / "it.gif"
+    assert succeeded("animate", truth, "--out", out, "--fps", 10, "--view", "xz") == f"wrote {out}\n"
+    assert out.read_bytes().startswith(b"GIF89a")
+    failed = run("animate", truth, "--out", tmp_path / "it.mov")
+    assert failed.exit_code == 2 and "ends in .gif, .mp4" in failed.stderr
+    failed = run("animate", truth, truth, "--out", out)
+    assert failed.exit_code == 2 and "given twice" in failed.stderr
 
 
 # what is wrong

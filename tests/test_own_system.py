@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import brentq
 
 import knode_cosserat as kc
-from examples.hanging_string import HangingString, main
+from examples.hanging_string import HangingString
 
 HAND = np.array([0.6, -0.1])
 
@@ -84,10 +84,3 @@ def test_what_it_does_not_have_is_said(string):
         _ = kc.equilibrium(string, HAND, space="rk4").quaternion
     with pytest.raises(kc.ParameterError, match=r"no parameter 'youngs_modulus'.*stiffness"):
         string.replace(youngs_modulus=1.0)
-
-
-@pytest.mark.campaign
-def test_the_example_runs(tmp_path, capsys):
-    main(tmp_path)
-    assert (tmp_path / "hanging_string.png").stat().st_size > 10_000
-    assert "lowest point at rest -0.36" in capsys.readouterr().out

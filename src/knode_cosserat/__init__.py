@@ -19,6 +19,7 @@ from knode_cosserat.control.configuration import (
 from knode_cosserat.control.reach import InverseKinematics, Reach, inverse_kinematics
 from knode_cosserat.control.workspace import Workspace, workspace
 from knode_cosserat.diagnosis import Diagnosis, doctor
+from knode_cosserat.evaluation import figures
 from knode_cosserat.evaluation.metrics import node_error, pose_mse, tip_dtw, tip_rmse
 from knode_cosserat.evaluation.state_errors import StateError, state_errors
 from knode_cosserat.learning.calibration.calibrate import Calibration, CalibrationError, calibrate
@@ -134,6 +135,7 @@ __all__ = [
     "estimate_parts",
     "estimate_states",
     "explain",
+    "figures",
     "fit",
     "identify",
     "inverse_kinematics",

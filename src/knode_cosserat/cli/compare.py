@@ -1,4 +1,4 @@
-"""Commands on trajectories: evaluate, plot."""
+"""Commands on trajectories: evaluate, plot, animate."""
 
 from __future__ import annotations
 
@@ -35,9 +35,31 @@ class Kind(enum.StrEnum):
     """The figures of a trajectory that `plot` can draw."""
 
     overview = "overview"
-    rods = "rods"
+    shape = "shape"
+    path = "path"
     tip = "tip"
+    states = "states"
     tensions = "tensions"
+    error = "error"
+    compare = "compare"
+
+
+class Seen(enum.StrEnum):
+    """From where a robot is looked at."""
+
+    xyz = "xyz"
+    xy = "xy"
+    xz = "xz"
+    yz = "yz"
+
+
+Several = Annotated[
+    list[Path], typer.Argument(metavar="TRAJECTORY…", help="Trajectory files; the first is the reference.")
+]
+View = Annotated[Seen, typer.Option(help="In space, or along an axis.")]
+Columns = Annotated[
+    int, typer.Option(min=1, max=2, metavar="N", help="As wide as one column of a paper, or as two.")
+]
 
 
 @app.command(
@@ -99,31 +121,91 @@ def evaluate(
     tell(as_json, {"prediction": prediction, "references": found}, table(rows_told))
 
 
-@app.command(epilog=examples("plot truth.nc --out truth.png", "plot truth.nc --kind rods --out rods.pdf"))
+@app.command(
+    epilog=examples(
+        "plot truth.nc --out truth.png",
+        "plot truth.nc --kind shape --view xz --out side.pdf",
+        "plot truth.nc prediction.nc --kind error --out error.svg",
+    )
+)
 def plot(
-    trajectory: Annotated[Path, typer.Argument(metavar="TRAJECTORY", help="A trajectory file.")],
+    trajectories: Several,
     out: Annotated[Path, Picture],
-    kind: Annotated[Kind, typer.Option(help="What to draw.")] = Kind.overview,
+    kind: Annotated[
+        Kind, typer.Option(help="What to draw.", show_default="overview, and compare of several")
+    ] = Kind.overview,
+    view: View = Seen.xyz,
+    columns: Columns = 1,
     as_json: Json = False,
 ) -> None:
-    """Draw a trajectory.
+    """Draw one trajectory, or several over each other.
 
-    The rod's shapes over time, the path of its tip, the tensions, or an overview of all three.
+    One: its shapes over time, tensions, or an overview. Any number: path of the tip, the tip or the states
+    over time. Two or more: how far the tips are from the first one's (error), or shapes and tips (compare).
     """
     require_writable(figure=out)
     drawing = figures()
-    states = trajectory_of(trajectory)
-    if kind is Kind.tip:
-        figure = drawing.tip_path({trajectory.stem: states})
-    else:
-        draw = {
-            Kind.overview: drawing.overview,
-            Kind.rods: drawing.rod_shapes,
-            Kind.tensions: drawing.tensions,
-        }
-        figure = draw[kind](states)
-    figure.savefig(out)
-    tell(as_json, {"trajectory": str(trajectory), "kind": kind.value}, [], out=out)
+    states = _by_stem(trajectories)
+    first, *others = states.values()
+    if others and kind is Kind.overview:
+        kind = Kind.compare
+    if others and kind in (Kind.shape, Kind.tensions):
+        raise ValueError(f"--kind {kind} draws one trajectory; {len(states)} were given")
+    if not others and kind in (Kind.error, Kind.compare):
+        raise ValueError(f"--kind {kind} needs a reference and one trajectory or more; one was given")
+    rest = dict(list(states.items())[1:])
+    draw = {
+        Kind.overview: lambda: drawing.overview(first),
+        Kind.shape: lambda: drawing.shape(first, view=_seen(first, view), columns=columns),
+        Kind.path: lambda: drawing.path(states, view=_seen(first, view), columns=columns),
+        Kind.tip: lambda: drawing.tips(states, columns=columns),
+        Kind.states: lambda: drawing.states(states, columns=columns),
+        Kind.tensions: lambda: drawing.tensions(first, columns=columns),
+        Kind.error: lambda: drawing.error(first, rest, columns=columns),
+        Kind.compare: lambda: drawing.compare(first, rest),
+    }
+    draw[kind]().savefig(out)
+    tell(as_json, {"trajectories": [str(path) for path in trajectories], "kind": kind.value}, [], out=out)
+
+
+@app.command(
+    epilog=examples(
+        "animate truth.nc --out truth.gif", "animate truth.nc prediction.nc --fps 20 --view xz --out both.mp4"
+    )
+)
+def animate(
+    trajectories: Several,
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Write the motion to this GIF or MP4 file.")],
+    fps: Annotated[float, typer.Option(metavar="F", help="Pictures a second, 1 to 50.")] = 25.0,
+    speed: Annotated[float, typer.Option(metavar="S", help="1 is real time, 0.5 half as fast.")] = 1.0,
+    view: View = Seen.xyz,
+    columns: Columns = 1,
+    as_json: Json = False,
+) -> None:
+    """Show how robots move: one trajectory, or several over each other, in real time.
+
+    A GIF needs matplotlib only, an MP4 the program ffmpeg.
+    """
+    require_writable(out)
+    drawing = figures()
+    states = _by_stem(trajectories)
+    seen = _seen(next(iter(states.values())), view)
+    drawing.animate(states, out, fps=fps, speed=speed, view=seen, columns=columns)
+    tell(as_json, {"trajectories": [str(path) for path in trajectories]}, [], out=out)
+
+
+def _by_stem(paths: list[Path]) -> dict[str, Trajectory]:
+    """Trajectories by their files' names, or whole paths where names are the same."""
+    stems = [path.stem for path in paths]
+    names = stems if len(set(stems)) == len(stems) else [str(path) for path in paths]
+    if len(set(names)) < len(names):
+        raise ValueError(f"{names[0]}: given twice")
+    return {name: trajectory_of(path) for name, path in zip(names, paths, strict=True)}
+
+
+def _seen(trajectory: Trajectory, view: Seen) -> str | None:
+    """What was asked for; the only view of a system in a plane."""
+    return None if np.shape(trajectory.position)[-1] == 2 and view is Seen.xyz else view.value
 
 
 def _measures() -> tuple[Any, ...]:

@@ -19,17 +19,35 @@ PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0
 #: the second trajectory and so on, which may lie on the first
 DASHES = ("-", "--", "-.", ":")
 TIME_COLOURS = "viridis"
+#: inches: the width of a figure in one column of a paper, and in both
+ONE_COLUMN, TWO_COLUMNS = 3.5, 7.16
 STYLE: Any = {
-    "font.size": 10,
-    "axes.titlesize": 11,
+    "font.size": 8,
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],
+    "mathtext.fontset": "dejavusans",
+    "axes.titlesize": 8,
     "axes.axisbelow": True,
     "axes.grid": True,
+    "axes.linewidth": 0.6,
     "axes.spines.top": False,
     "axes.spines.right": False,
+    "figure.titlesize": 9,
     "grid.color": "#DDDDDD",
-    "grid.linewidth": 0.6,
+    "grid.linewidth": 0.5,
     "legend.frameon": False,
-    "lines.linewidth": 1.6,
+    "legend.fontsize": 7.5,
+    "lines.linewidth": 1.3,
+    "lines.markersize": 4,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    # TrueType: fonts are part of the file and its text can be searched; journals turn down Type 3
+    "pdf.fonttype": 42,
+    "ps.fonttype": 42,
+    # letters as shapes: they look the same where the font is missing
+    "svg.fonttype": "path",
+    "svg.hashsalt": "knode-cosserat",
+    "savefig.dpi": 220,
 }
 AXES = ("x", "y", "z")
 
@@ -46,32 +64,6 @@ class Tips(Protocol):
         """(T, 3) m."""
 
 
-def draw_rods(figure: Any, axes: Any, trajectory: Trajectory, count: int) -> None:
-    """Rods at `count` times, coloured by time, and the path of the tip."""
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
-
-    position, time = one_of(trajectory).position, np.asarray(trajectory.time)
-    position = np.asarray(position)
-    valid = np.flatnonzero(np.isfinite(position).all(axis=(1, 2)))
-    if len(valid) == 0:
-        raise ValueError("the trajectory has no valid row to draw")
-    shown = valid[np.unique(np.linspace(0, len(valid) - 1, count).round().astype(int))]
-    colours = ScalarMappable(Normalize(time[0], time[-1]), TIME_COLOURS)
-    curves = [np.asarray(curve) for curve in trajectory.system.curves(one_of(trajectory).y)]
-    for row in shown:
-        for curve in curves:
-            axes.plot(*curve[row].T, color=colours.to_rgba(time[row]), linewidth=2.0, solid_capstyle="round")
-    label = "path of the tip" if len(time) > 1 else None
-    axes.plot(*position[:, -1].T, color="#777777", linewidth=0.9, label=label)
-    axes.plot(*position[shown[0], :1].T, "s", color="#333333", markersize=5, label="base")
-    equal_scales(axes, np.concatenate([curve[valid] for curve in curves], axis=1))
-    axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
-    axes.legend(loc="upper left")
-    if len(time) > 1:
-        figure.colorbar(colours, ax=axes, label="time [s]", shrink=0.6, pad=0.1)
-
-
 def equal_scales(axes: Any, points: NDArray[np.float64], zoom: float = 0.95) -> None:
     """A metre is as long in every direction, and a thin box is still deep enough to see."""
     from matplotlib.ticker import MaxNLocator
@@ -81,24 +73,34 @@ def equal_scales(axes: Any, points: NDArray[np.float64], zoom: float = 0.95) -> 
     half = 1.05 * np.maximum(half, 0.55 * half.max())
     axes.set(**{f"{name}lim": (c - h, c + h) for name, c, h in zip(AXES, centre, half, strict=True)})
     axes.set_box_aspect(tuple(half), zoom=zoom)
+    beside = axes.get_subplotspec().get_gridspec().ncols
+    inches = axes.get_figure(root=False).bbox.width / axes.get_figure(root=True).dpi / beside
+    small = inches < 4.5
+    steps = 3 if small else 4
     for axis, c, h in zip((axes.xaxis, axes.yaxis, axes.zaxis), centre, half, strict=True):
-        # not near the ends: where two axes meet, their labels would too
-        axis.set_ticks([tick for tick in MaxNLocator(4).tick_values(c - h, c + h) if abs(tick - c) < 0.9 * h])
-    axes.tick_params(axis="z", pad=6.0)
-    for axis, pad in ((axes.xaxis, 6.0), (axes.yaxis, 10.0), (axes.zaxis, 10.0)):
-        axis.labelpad = pad
+        # not near the ends: where two axes meet, their labels would too; but two, or there is no scale
+        for most in range(steps, steps + 4):
+            ticks = [tick for tick in MaxNLocator(most).tick_values(c - h, c + h) if abs(tick - c) < 0.75 * h]
+            if len(ticks) > 1:
+                break
+        axis.set_ticks(ticks)
+    for axis, pad in ((axes.xaxis, 4.0), (axes.yaxis, 7.0), (axes.zaxis, 9.5)):
+        axis.labelpad = pad - 7.0 * small
+    axes.tick_params(axis="x", pad=-2.0 * small)
+    axes.tick_params(axis="y", pad=-2.0 * small)
+    axes.tick_params(axis="z", pad=3.0)
 
 
 def draw_tips(axes: Any, paths: Mapping[str, tuple[ArrayLike, NDArray[np.float64]]]) -> None:
     """x, y and z, one below the other, of paths given as times and positions."""
     for i, (label, (time, tip)) in enumerate(paths.items()):
-        for axis in range(3):
-            axes[axis].plot(time, tip[:, axis], label=label, **line(i, np.size(time)))
+        for axis, each in enumerate(axes):
+            each.plot(time, tip[:, axis], label=label, **line(i, np.size(time)))
     farthest = max((np.nanmax(np.abs(tip), initial=0.0) for _, tip in paths.values()), default=0.0)
-    for axis, name in enumerate(AXES):
-        axes[axis].set_ylabel(f"tip {name} [m]")
-        require_span(axes[axis], 0.01 * farthest)
-    axes[2].set_xlabel("time [s]")
+    for name, each in zip(AXES, axes, strict=False):
+        each.set_ylabel(f"tip {name} [m]")
+        require_span(each, 0.01 * farthest)
+    axes[-1].set_xlabel("time [s]")
 
 
 def require_span(axes: Axes, span: float) -> None:
@@ -120,7 +122,7 @@ def draw_tensions(axes: Axes, trajectory: Trajectory) -> None:
     time = np.asarray(trajectory.time)
     for k in range(values.shape[1]):
         # thinner and thinner: where tensions are equal, all of them are still to be seen
-        width = max(0.9, 3.2 - 0.75 * k)
+        width = max(0.7, 2.4 - 0.55 * k)
         style: dict[str, Any] = {
             "label": names[k] if names else f"tendon {k + 1}",
             "color": PALETTE[k % len(PALETTE)],
@@ -189,6 +191,17 @@ def style() -> Any:
 
 def new_figure(width: float, height: float) -> Any:
     """An empty figure of so many inches."""
-    from matplotlib.figure import Figure
+    from knode_cosserat.evaluation.styled import StyledFigure
 
-    return Figure(figsize=(width, height), layout="constrained", dpi=150)
+    return StyledFigure(figsize=(width, height), layout="constrained", dpi=150)
+
+
+def width_of(columns: int) -> float:
+    """Inches of a figure that is as wide as one column of a paper, or as two.
+
+    Raises:
+        ValueError: another number.
+    """
+    if columns not in (1, 2):
+        raise ValueError(f"columns is {columns!r}; allowed is 1 or 2, the columns of a paper")
+    return ONE_COLUMN if columns == 1 else TWO_COLUMNS

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from knode_cosserat.evaluation.drawing import new_figure, style
+from knode_cosserat.evaluation.drawing import TWO_COLUMNS, new_figure, style
 from knode_cosserat.evaluation.study_figures import METHODS, REFERENCE
 from knode_cosserat.trajectory import Trajectory
 
@@ -30,7 +30,7 @@ def states(truth: Trajectory, estimates: Mapping[str, Trajectory], span: tuple[f
         ImportError: matplotlib is not installed.
     """
     with style():
-        figure = new_figure(9.0, 8.0)
+        figure = new_figure(TWO_COLUMNS, 6.2)
         grid = figure.subplots(4, 2, sharex=True, height_ratios=(2, 1, 2, 1))
         for k, (name, component, node, title) in enumerate(_SHOWN):
             above, below = grid[2 * (k // 2), k % 2], grid[2 * (k // 2) + 1, k % 2]

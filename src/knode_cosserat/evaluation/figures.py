@@ -1,126 +1,331 @@
-"""Figures of trajectories, all in one style; they need matplotlib, the extra `viz`.
+"""Figures of trajectories, all in one style, for a screen or a paper; they need matplotlib, the extra `viz`.
 
 Every function returns a `matplotlib.figure.Figure` of its own: no window is opened, nothing global changes,
-and `figure.savefig(path)` writes it. A trajectory is of one robot; rows that were not solved stay empty.
+and `figure.savefig("it.pdf")` (or .svg, .png) writes it with fonts that are part of the file. Colours are
+those of Okabe and Ito, every axis says its unit, and `columns` makes a figure as wide as one column of a
+paper (3.5 in) or as two (7.16 in). `trajectories` is one trajectory, or a dict of several by their labels,
+which are drawn over each other. Each is of one robot; rows that were not solved stay empty.
+
+Raises, from every function here:
+    ImportError: matplotlib is not installed.
+    ValueError: there is nothing to draw, or a batch is given where one robot can be drawn.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from knode_cosserat.evaluation.animation import animate
 from knode_cosserat.evaluation.drawing import (
+    AXES,
     PALETTE,
+    TIME_COLOURS,
+    TWO_COLUMNS,
     Tips,
-    draw_rods,
     draw_tensions,
     draw_tips,
     legend_above,
     line,
     new_figure,
+    one_of,
     require_matplotlib,
+    require_span,
     style,
     tips_of,
+    width_of,
 )
-from knode_cosserat.evaluation.metrics import dtw_distance, rms_distance
+from knode_cosserat.evaluation.recording_figures import prediction_against_measurement
+from knode_cosserat.evaluation.study_figures import comparison as compare
+from knode_cosserat.evaluation.views import (
+    View,
+    by_label,
+    by_values,
+    checked_view,
+    curves_of,
+    flat_height,
+    path_of,
+    spread_rows,
+    valid_rows,
+)
+from knode_cosserat.evaluation.workspace_figures import workspace_seen as workspace
 from knode_cosserat.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from knode_cosserat.recordings.measurements import Measurements
-
 __all__ = [
+    "animate",
+    "compare",
+    "curves",
+    "error",
     "overview",
+    "path",
     "prediction_against_measurement",
     "require_matplotlib",
-    "rod_shapes",
+    "shape",
+    "spread",
+    "states",
     "tensions",
-    "tip_path",
+    "tips",
+    "workspace",
 ]
 
+#: what `states` draws if nothing else is asked for, as far as a system has it
+FIELDS = ("q", "w", "n", "m", "v", "u")
 
-def rod_shapes(trajectory: Trajectory, count: int = 12) -> Figure:
-    """The rod at `count` times, evenly spread and coloured by time, and the path of its tip.
 
-    Raises:
-        ImportError: matplotlib is not installed; from every function here.
-        ValueError: a batch is given, or no row is valid; from every function of a trajectory.
+def shape(trajectory: Trajectory, *, count: int = 12, view: str | None = None, columns: int = 1) -> Figure:
+    """The robot at `count` times, evenly spread and coloured by time, and the path of its tip.
+
+    Seen in space ("xyz"), or along an axis: "xy", "xz", "yz", where what surrounds the robot is drawn too.
     """
+    curves = curves_of(trajectory)
+    view = checked_view(view, curves[0].shape[-1])
+    points = np.concatenate([curve.reshape(-1, curve.shape[-1]) for curve in curves])
+    width = width_of(columns)
+    several = len(trajectory.time) > 1
     with style():
-        figure = new_figure(6.0, 5.2)
-        draw_rods(figure, figure.add_subplot(projection="3d"), trajectory, count)
+        height = flat_height(points, view, width, 1.2 if several else 0.6)
+        figure = new_figure(width, height if len(view) == 2 else 0.85 * width)
+        _draw_shape(figure, trajectory, count, view)
     return figure
 
 
-def tip_path(trajectories: Mapping[str, Tips]) -> Figure:
-    """x, y and z of the tips over time, several trajectories (or recordings) by their labels in each."""
+def _draw_shape(figure: Any, trajectory: Trajectory, count: int, view: str) -> None:
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    curves, time, path = curves_of(trajectory), np.asarray(trajectory.time), tips_of(trajectory)
+    valid = valid_rows(curves)
+    seen = View(figure, 111, view)
+    colours = ScalarMappable(Normalize(time[0], time[-1]), TIME_COLOURS)
+    shown = spread_rows(valid, count)
+    for row in shown:
+        for curve in curves:
+            seen.axes.plot(
+                *seen.of(curve[row]), color=colours.to_rgba(time[row]), linewidth=1.6, solid_capstyle="round"
+            )
+    label = "path of the tip" if len(time) > 1 else None
+    seen.axes.plot(*seen.of(path), color="#777777", linewidth=0.8, label=label)
+    bases = np.stack([curve[shown[0], 0] for curve in curves[: max(1, len(curves) - 1)]])
+    seen.axes.plot(*seen.of(bases), "s", color="#333333", markersize=3.5, linestyle="none", label="base")
+    points = np.concatenate([curve[valid].reshape(-1, curve.shape[-1]) for curve in curves])
+    seen.frame(points, zoom=0.82)
+    seen.obstacles(trajectory, points)
+    if seen.flat:
+        legend_above(seen.axes)
+    else:
+        seen.axes.legend(loc="upper left", borderaxespad=0.0)
+    if len(time) > 1:
+        looks = {"pad": 0.02} if seen.flat else {"shrink": 0.55, "pad": 0.1}
+        figure.colorbar(colours, ax=seen.axes, label="time [s]", **looks)
+
+
+def path(
+    trajectories: Tips | Mapping[str, Tips | ArrayLike], *, view: str | None = None, columns: int = 1
+) -> Figure:
+    """Where tips went, in space ("xyz") or along an axis ("xy", "xz", "yz"); also paths (points, 3) in m.
+
+    A label that begins with "wanted" is drawn as a wide, pale line under the others.
+    """
+    given = dict(trajectories) if isinstance(trajectories, Mapping) else {"": trajectories}
+    if not given:
+        raise ValueError("there are no trajectories to draw; at least one is needed")
+    paths = {label: path_of(one) for label, one in given.items()}
+    points = np.concatenate(list(paths.values()))
+    view, width = checked_view(view, points.shape[1]), width_of(columns)
     with style():
-        figure = new_figure(7.0, 5.6)
-        axes = figure.subplots(3, 1, sharex=True)
-        draw_tips(axes, {label: (one.time, tips_of(one)) for label, one in trajectories.items()})
-        if len(trajectories) > 1:
+        height = flat_height(points, view, width, 0.8)
+        figure = new_figure(width, height + 0.25 if len(view) == 2 else 0.9 * width)
+        seen = View(figure, 111, view)
+        for i, (label, tip) in enumerate(paths.items()):
+            look = {**line(i), "label": label or None}
+            if label.startswith("wanted"):
+                look |= {"color": "#AAAAAA", "linewidth": 4.0, "linestyle": "-"}
+            seen.axes.plot(*seen.of(tip), **look)
+        seen.frame(points, zoom=0.8)
+        if any(paths):
+            legend_above(seen.axes)
+    return figure
+
+
+def tips(trajectories: Tips | Mapping[str, Tips], *, columns: int = 1) -> Figure:
+    """x, y and z of the tips over time, of trajectories or of recordings."""
+    given = by_label(trajectories)
+    paths = {label: (one.time, tips_of(one)) for label, one in given.items()}
+    size = min(tip.shape[1] for _, tip in paths.values())
+    with style():
+        figure = new_figure(width_of(columns), 0.4 + 1.15 * size)
+        axes = figure.subplots(size, 1, sharex=True, squeeze=False)[:, 0]
+        draw_tips(axes, paths)
+        figure.align_ylabels()
+        if any(paths):
             legend_above(axes[0])
     return figure
 
 
-def tensions(trajectory: Trajectory) -> Figure:
-    """The tension of every tendon over time, as it was held from row to row."""
+def states(
+    trajectories: Trajectory | Mapping[str, Trajectory],
+    fields: Sequence[str] | None = None,
+    *,
+    node: int = -1,
+    columns: int = 2,
+) -> Figure:
+    """Fields of the state at one node over time: a panel for each, a colour for each component.
+
+    `fields` are names of y, z or the controls (`Trajectory.part`); by default velocities, loads and strains.
+    Several trajectories differ by their dashes.
+
+    Raises:
+        KeyError: a field that there is not.
+        ValueError: a node that there is not.
+    """
+    given = by_label(trajectories)
+    first = one_of(next(iter(given.values())))
+    layouts = (first.system.y_layout, first.system.z_layout, first.system.control_layout)
+    known = {field.name: field for layout in layouts for field in layout.fields}
+    names = [name for name in FIELDS if name in known] if fields is None else list(fields)
+    names = names or list(known)
+    if not -first.y.shape[1] <= node < first.y.shape[1]:
+        raise ValueError(f"node is {node}; the trajectory has {first.y.shape[1]} nodes")
+    across = min(columns, 2, len(names))
+    rows = -(-len(names) // across)
     with style():
-        figure = new_figure(7.0, 3.2)
+        figure = new_figure(width_of(columns), 0.5 + 1.5 * rows)
+        grid = figure.subplots(rows, across, sharex=True, squeeze=False).ravel()
+        for axes, name in zip(grid, names, strict=False):
+            for i, (label, one) in enumerate(given.items()):
+                values = np.asarray(one_of(one).part(name))
+                values = values[:, node] if values.ndim == 3 else values
+                for k in range(values.shape[1]):
+                    colour = PALETTE[k % len(PALETTE)]
+                    component = AXES[k] if values.shape[1] == 3 else f"{k + 1}"
+                    said = f"{component}, {label}" if label else component
+                    axes.plot(one.time, values[:, k], **{**line(i), "color": colour}, label=said)
+            sizes = [np.nanmax(np.abs(np.asarray(one.part(name))), initial=0.0) for one in given.values()]
+            require_span(axes, 0.01 * max(sizes))
+            unit = f" [{known[name].unit}]" if name in known and known[name].unit else ""
+            axes.set(ylabel=f"{name}{unit}", title=known[name].meaning if name in known else "")
+        for axes in grid[len(names) :]:
+            axes.remove()
+        for axes in grid[max(0, len(names) - across) : len(names)]:
+            axes.set_xlabel("time [s]")
+            axes.tick_params(labelbottom=True)
+        figure.align_ylabels()
+        handles, labels = grid[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=6 if columns == 2 else 3)
+    return figure
+
+
+def error(truth: Tips, predictions: Tips | Mapping[str, Tips], *, columns: int = 1) -> Figure:
+    """How far the tips of predictions are from the true one, over time, on a logarithmic scale.
+
+    Raises:
+        ValueError: a prediction has not the rows of the truth.
+    """
+    given, true = by_label(predictions, "predictions"), tips_of(truth)
+    with style():
+        figure = new_figure(width_of(columns), 2.4)
+        axes = figure.subplots()
+        for i, (label, one) in enumerate(given.items()):
+            tip = tips_of(one)
+            if tip.shape != true.shape or not np.allclose(one.time, truth.time, rtol=0.0, atol=1e-9):
+                raise ValueError(
+                    f"the prediction{f' {label!r}' if label else ''} has {len(tip)} rows and the truth "
+                    f"{len(true)}; both must have the same times"
+                )
+            distance = np.linalg.norm(tip - true, axis=1)
+            # both begin at one place, and a logarithm has no zero
+            axes.plot(truth.time, np.where(distance > 0.0, distance, np.nan), label=label or None, **line(i))
+        axes.set(xlabel="time [s]", ylabel="distance of the tips [m]", yscale="log")
+        axes.margins(x=0.02)
+        if any(given):
+            legend_above(axes)
+    return figure
+
+
+def tensions(trajectory: Trajectory, *, columns: int = 1) -> Figure:
+    """The tension of every tendon over time, as it was held from row to row; or the controls."""
+    with style():
+        figure = new_figure(width_of(columns), 2.4)
         draw_tensions(figure.subplots(), trajectory)
     return figure
 
 
 def overview(trajectory: Trajectory, count: int = 12) -> Figure:
-    """Rod shapes, tip path and tensions of one trajectory in one picture."""
+    """Shapes, tip path and tensions of one trajectory in one picture, two columns wide."""
+    curves = curves_of(trajectory)
     with style():
-        figure = new_figure(11.0, 5.6)
+        figure = new_figure(TWO_COLUMNS, 4.2)
         left, right = figure.subfigures(1, 2, width_ratios=(1.1, 1.0))
-        draw_rods(left, left.add_subplot(projection="3d"), trajectory, count)
-        axes = right.subplots(4, 1, sharex=True, height_ratios=(1.0, 1.0, 1.0, 1.5))
-        draw_tips(axes[:3], {"": (trajectory.time, tips_of(trajectory))})
-        axes[2].set_xlabel("")
-        draw_tensions(axes[3], trajectory)
+        _draw_shape(left, trajectory, count, checked_view(None, curves[0].shape[-1]))
+        size = curves[0].shape[-1]
+        axes = right.subplots(size + 1, 1, sharex=True, height_ratios=(*[1.0] * size, 1.5))
+        draw_tips(axes[:size], {"": (trajectory.time, tips_of(trajectory))})
+        axes[size - 1].set_xlabel("")
+        draw_tensions(axes[size], trajectory)
+        right.align_ylabels()
     return figure
 
 
-def prediction_against_measurement(prediction: Tips, recording: Measurements) -> Figure:
-    """Two tip paths row by row: over the recording's time, seen from above, and how far apart they are.
-
-    The title gives their DTW distance, and the root mean square of their distance in each row. A recording of
-    a simulated robot is named as one.
+def spread(batch: Trajectory, *, columns: int = 1) -> Figure:
+    """x, y and z of the tips of a batch over time: the median, where nine tenths are, and where all.
 
     Raises:
-        ValueError: the numbers of rows differ, or a position is not finite.
+        ValueError: a trajectory of one robot.
     """
-    predicted, measured = tips_of(prediction), tips_of(recording)
-    if len(predicted) != len(measured):
-        raise ValueError(
-            f"the prediction has {len(predicted)} rows and the recording {len(measured)}; "
-            "both must have the same number"
-        )
-    error = np.linalg.norm(predicted - measured, axis=-1)
-    dtw, rmse = dtw_distance(predicted, measured), float(rms_distance(predicted, measured))
-    robot = "simulated stand-in robot" if recording.simulated else "robot"
-    time = recording.time
+    if np.ndim(batch.y) != 4:
+        raise ValueError("the trajectory is of one robot; allowed is a batch")
+    tip = np.asarray(batch.tip_position)
     with style():
-        figure = new_figure(11.0, 6.0)
-        figure.suptitle(
-            f"Tip, predicted and measured: DTW {dtw:.2f} m over {len(error)} rows, RMSE {100 * rmse:.1f} cm"
-        )
-        left, right = figure.subfigures(1, 2, width_ratios=(1.25, 1.0))
-        axes = left.subplots(4, 1, sharex=True)
-        draw_tips(axes[:3], {f"measured on a {robot}": (time, measured), "predicted": (time, predicted)})
-        axes[2].set_xlabel("")
-        legend_above(axes[0])
-        axes[3].plot(time, error, color=PALETTE[-1])
-        axes[3].set(xlabel="time [s]", ylabel="distance [m]", ylim=(0.0, None))
-        above = right.subplots()
-        for i, tip in enumerate((measured, predicted)):
-            above.plot(tip[:, 0], tip[:, 1], **line(i))
-        above.set(xlabel="tip x [m]", ylabel="tip y [m]", title="seen from above")
-        above.set_aspect("equal", adjustable="datalim")
+        figure = new_figure(width_of(columns), 0.4 + 1.15 * tip.shape[2])
+        rows = figure.subplots(tip.shape[2], 1, sharex=True, squeeze=False)[:, 0]
+        for k, axes in enumerate(rows):
+            for (low, high), strength, label in (((0, 100), 0.18, "all"), ((5, 95), 0.4, "nine tenths")):
+                edges = np.nanpercentile(tip[:, :, k], [low, high], axis=0)
+                axes.fill_between(
+                    batch.time, *edges, color=PALETTE[0], alpha=strength, linewidth=0, label=label
+                )
+            axes.plot(batch.time, np.nanmedian(tip[:, :, k], axis=0), color=PALETTE[-1], label="median")
+            axes.set_ylabel(f"tip {AXES[k]} [m]")
+            require_span(axes, 0.01 * float(np.nanmax(np.abs(tip))))
+        rows[-1].set_xlabel("time [s]")
+        figure.align_ylabels()
+        legend_above(rows[0])
+    return figure
+
+
+def curves(
+    x: ArrayLike,
+    lines: Mapping[str, ArrayLike],
+    xlabel: str,
+    ylabel: str,
+    *,
+    log: str = "",
+    marker: str = "",
+    columns: int = 1,
+) -> Figure:
+    """Any curves over x in the same style, by their labels; `log` names axes that are logarithmic, "xy" both.
+
+    Raises:
+        ValueError: a curve that has not as many values as x, or another `log`.
+    """
+    if log not in ("", "x", "y", "xy"):
+        raise ValueError(f"log is {log!r}; allowed is '', 'x', 'y' or 'xy'")
+    at = np.asarray(x, dtype=float)
+    with style():
+        figure = new_figure(width_of(columns), 2.4)
+        axes = figure.subplots()
+        for i, (label, given) in enumerate(by_values(lines, len(at)).items()):
+            axes.plot(at, given, **{**line(i), "marker": marker or None, "label": label or None})
+        axes.set(xlabel=xlabel, ylabel=ylabel, **{f"{name}scale": "log" for name in log})
+        if "x" in log and len(at) <= 8:
+            axes.set_xticks(at, [f"{each:g}" for each in at])
+            axes.set_xticks([], minor=True)
+        if any(lines):
+            legend_above(axes)
     return figure

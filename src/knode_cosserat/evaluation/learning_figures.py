@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from knode_cosserat.evaluation.drawing import PALETTE, new_figure, style
+from knode_cosserat.evaluation.drawing import PALETTE, TWO_COLUMNS, new_figure, style
 from knode_cosserat.learning.explain import added
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.rods.system import Field
@@ -33,7 +33,7 @@ def residual(model: KNODE, trajectory: Trajectory) -> Figure:
         *((field, 0, f"{field.name}_s [{field.load or field.unit + '/m'}]") for field in stated),
     ]
     with style():
-        figure = new_figure(7.0, 1.2 + 1.5 * len(rows))
+        figure = new_figure(TWO_COLUMNS, 0.8 + 1.1 * len(rows))
         axes = figure.subplots(len(rows), 1, sharex=True, squeeze=False)[:, 0]
         for axis, (field, part, label) in zip(axes, rows, strict=True):
             layout = (y_layout, z_layout)[part]

@@ -6,12 +6,25 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from knode_cosserat.evaluation.drawing import AXES, PALETTE, legend_above, new_figure, style
+from knode_cosserat.evaluation.drawing import (
+    AXES,
+    PALETTE,
+    TWO_COLUMNS,
+    Tips,
+    draw_tips,
+    legend_above,
+    line,
+    new_figure,
+    style,
+    tips_of,
+)
+from knode_cosserat.evaluation.metrics import dtw_distance, rms_distance
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from knode_cosserat.recordings.health import Health
+    from knode_cosserat.recordings.measurements import Measurements
     from knode_cosserat.recordings.recording import Body, Recording
 
 #: how what happened at a time is marked: what the finding says, its colour and its name
@@ -29,7 +42,7 @@ def health(recording: Recording, report: Health) -> Figure:
         ImportError: matplotlib is not installed.
     """
     with style():
-        figure = new_figure(11.0, 8.2)
+        figure = new_figure(TWO_COLUMNS, 6.0)
         figure.suptitle(_title(recording, report))
         left, right = figure.subfigures(1, 2, width_ratios=(2.3, 1.0))
         axes = left.subplots(5, 1, sharex=True, height_ratios=(1.3, 1.0, 1.0, 1.0, 0.9))
@@ -42,6 +55,47 @@ def health(recording: Recording, report: Health) -> Figure:
         above, below = right.subplots(2, 1)
         _draw_noise(above, report)
         _draw_errors(below, recording, report)
+    return figure
+
+
+def prediction_against_measurement(prediction: Tips, recording: Measurements) -> Figure:
+    """Two tip paths row by row: over the recording's time, seen from above, and how far apart they are.
+
+    The title gives their DTW distance, and the root mean square of their distance in each row. A recording of
+    a simulated robot is named as one.
+
+    Raises:
+        ValueError: the numbers of rows differ, or a position is not finite.
+    """
+    predicted, measured = tips_of(prediction), tips_of(recording)
+    if len(predicted) != len(measured):
+        raise ValueError(
+            f"the prediction has {len(predicted)} rows and the recording {len(measured)}; "
+            "both must have the same number"
+        )
+    distance = np.linalg.norm(predicted - measured, axis=-1)
+    dtw, rmse = dtw_distance(predicted, measured), float(rms_distance(predicted, measured))
+    robot = "simulated stand-in robot" if recording.simulated else "robot"
+    time = recording.time
+    with style():
+        figure = new_figure(TWO_COLUMNS, 4.4)
+        figure.suptitle(
+            f"Tip, predicted and measured: DTW {dtw:.2f} m over {len(distance)} rows, "
+            f"RMSE {100 * rmse:.1f} cm"
+        )
+        left, right = figure.subfigures(1, 2, width_ratios=(1.25, 1.0))
+        axes = left.subplots(4, 1, sharex=True)
+        draw_tips(axes[:3], {f"measured on a {robot}": (time, measured), "predicted": (time, predicted)})
+        axes[2].set_xlabel("")
+        legend_above(axes[0])
+        axes[3].plot(time, distance, color=PALETTE[-1])
+        axes[3].set(xlabel="time [s]", ylabel="distance [m]", ylim=(0.0, None))
+        left.align_ylabels()
+        above = right.subplots()
+        for i, tip in enumerate((measured, predicted)):
+            above.plot(tip[:, 0], tip[:, 1], **line(i))
+        above.set(xlabel="tip x [m]", ylabel="tip y [m]", title="seen from above")
+        above.set_aspect("equal", adjustable="datalim")
     return figure
 
 
@@ -143,7 +197,7 @@ def _draw_noise(axes: Any, report: Health) -> None:
     axes.bar(at - 0.2, [1e3 * (each.noise or 0.0) for each in bodies], 0.38, color=PALETTE[0])
     axes.set_ylabel("noise of position [mm]", color=PALETTE[0])
     axes.set_xticks(at, [each.what for each in bodies], rotation=30, ha="right")
-    axes.set_title("noise, one standard deviation")
+    axes.set_title("noise (one σ)")
     if any(each.turn_noise is not None for each in bodies):
         other = axes.twinx()
         other.bar(at + 0.2, [1e3 * (each.turn_noise or 0.0) for each in bodies], 0.38, color=PALETTE[1])
@@ -168,4 +222,4 @@ def _draw_errors(axes: Any, recording: Recording, report: Health) -> None:
     late = ""
     if report.latency is not None:
         late = f"\ncommands {1e3 * report.latency.shift:.0f} ms later; lag {1e3 * report.latency.lag:.0f} ms"
-    axes.set_title(f"tension error: root mean square, and bias as diamonds{late}", fontsize=10)
+    axes.set_title(f"tension error: RMS, and bias (diamonds){late}")

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from knode_cosserat.evaluation.drawing import (
     AXES,
     PALETTE,
+    TWO_COLUMNS,
     draw_tensions,
     equal_scales,
     new_figure,
@@ -25,13 +26,20 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 #: how each is drawn, whatever others are there: the reference is wide and pale, so that what lies on it shows
-REFERENCE: dict[str, Any] = {"color": "#AAAAAA", "linewidth": 4.0, "linestyle": "-"}
+REFERENCE: dict[str, Any] = {"color": "#AAAAAA", "linewidth": 3.0, "linestyle": "-"}
 METHODS: dict[str, dict[str, Any]] = {
-    "baseline": {"color": PALETTE[1], "linestyle": "-", "linewidth": 1.3},
-    "paper": {"color": PALETTE[0], "linestyle": "-", "linewidth": 1.3},
-    "calibrated": {"color": PALETTE[3], "linestyle": (0, (1, 1.5)), "linewidth": 2.0},
-    "best": {"color": PALETTE[6], "linestyle": (0, (4, 2)), "linewidth": 1.4},
+    "baseline": {"color": PALETTE[1], "linestyle": "-", "linewidth": 1.0},
+    "paper": {"color": PALETTE[0], "linestyle": "-", "linewidth": 1.0},
+    "calibrated": {"color": PALETTE[3], "linestyle": (0, (1, 1.5)), "linewidth": 1.6},
+    "best": {"color": PALETTE[6], "linestyle": (0, (4, 2)), "linewidth": 1.1},
 }
+#: others, by where they stand among all that are drawn
+_OTHERS = ("baseline", "best", "paper", "calibrated")
+
+
+def look_of(label: str, place: int) -> dict[str, Any]:
+    """How a prediction is drawn: a method of the studies as ever, anything else by its place."""
+    return METHODS[label if label in METHODS else _OTHERS[place % len(_OTHERS)]]
 
 
 def controls(trajectories: Mapping[str, Trajectory]) -> Figure:
@@ -43,7 +51,7 @@ def controls(trajectories: Mapping[str, Trajectory]) -> Figure:
     """
     require_some(trajectories)
     with style():
-        figure = new_figure(7.0, 2.6 * len(trajectories))
+        figure = new_figure(TWO_COLUMNS, 1.8 * len(trajectories))
         rows = figure.subplots(len(trajectories), 1, squeeze=False)[:, 0]
         for axes, (title, trajectory) in zip(rows, trajectories.items(), strict=True):
             draw_tensions(axes, trajectory)
@@ -57,11 +65,16 @@ def shapes(reference: Trajectory, predictions: Mapping[str, Trajectory], count: 
     """The robot at `count` times beside the reference and the paths of the tips, for each prediction."""
     require_some(predictions)
     with style():
-        figure = new_figure(3.3 * len(predictions) + 0.4, 4.8)
-        panels = figure.subplots(1, len(predictions), subplot_kw={"projection": "3d"}, squeeze=False)[0]
+        columns = min(2, len(predictions))
+        rows = -(-len(predictions) // columns)
+        figure = new_figure(TWO_COLUMNS, 2.9 * rows + 0.3)
+        grid = figure.subplots(rows, columns, subplot_kw={"projection": "3d"}, squeeze=False).ravel()
+        panels = grid[: len(predictions)]
+        for axes in grid[len(predictions) :]:
+            axes.remove()
         for axes, (label, prediction) in zip(panels, predictions.items(), strict=True):
             _draw_shapes(axes, reference, {label: prediction}, count)
-            _show_all(axes, [reference, *predictions.values()], zoom=0.93)
+            _show_all(axes, [reference, *predictions.values()], zoom=0.85)
         legend_below(figure, panels)
     return figure
 
@@ -70,7 +83,7 @@ def tips(cases: Mapping[str, tuple[Trajectory, Mapping[str, Trajectory]]]) -> Fi
     """x, y and z of the tips over time: a column for each case, given as its reference and predictions."""
     require_some(cases)
     with style():
-        figure = new_figure(4.6 * len(cases) + 0.6, 5.4)
+        figure = new_figure(TWO_COLUMNS, 4.0)
         grid = figure.subplots(3, len(cases), sharex="col", squeeze=False)
         for column, (title, (reference, predictions)) in zip(grid.T, cases.items(), strict=True):
             _draw_tips(column, reference, predictions)
@@ -84,11 +97,11 @@ def comparison(reference: Trajectory, predictions: Mapping[str, Trajectory], cou
     """Shapes and tips of several predictions in one picture, each drawn over the reference."""
     require_some(predictions)
     with style():
-        figure = new_figure(10.0, 5.2)
-        left, right = figure.subfigures(1, 2, width_ratios=(1.0, 1.35))
+        figure = new_figure(TWO_COLUMNS, 3.8)
+        left, right = figure.subfigures(1, 2, width_ratios=(1.0, 1.35), wspace=0.03)
         axes = left.add_subplot(projection="3d")
         _draw_shapes(axes, reference, predictions, count)
-        _show_all(axes, [reference, *predictions.values()], zoom=0.95)
+        _show_all(axes, [reference, *predictions.values()], zoom=0.87)
         column = right.subplots(3, 1, sharex=True)
         _draw_tips(column, reference, predictions)
         right.align_ylabels()
@@ -101,10 +114,10 @@ def _draw_shapes(axes: Any, reference: Trajectory, predictions: Mapping[str, Tra
     rows = np.unique(np.linspace(0, len(true) - 1, count).round().astype(int))
     for row in rows:
         axes.plot(*true[row].T, **REFERENCE, solid_capstyle="round")
-    axes.plot(*true[:, -1].T, **{**REFERENCE, "linewidth": 2.5}, label="reference")
-    for label, prediction in predictions.items():
+    axes.plot(*true[:, -1].T, **{**REFERENCE, "linewidth": 2.0}, label="reference")
+    for place, (label, prediction) in enumerate(predictions.items()):
         points = np.asarray(one_of(prediction).position)
-        look = {**METHODS.get(label, {"color": PALETTE[0]}), "linestyle": "-"}
+        look = {**look_of(label, place), "linestyle": "-"}
         for row in rows:
             axes.plot(*points[row].T, **look)
         axes.plot(*points[:, -1].T, **{**look, "linewidth": 0.9}, label=label)
@@ -120,8 +133,8 @@ def _draw_tips(column: Any, reference: Trajectory, predictions: Mapping[str, Tra
     true = tips_of(reference)
     for k, axes in enumerate(column):
         axes.plot(reference.time, true[:, k], label="reference", **REFERENCE)
-        for label, each in predictions.items():
-            axes.plot(each.time, tips_of(each)[:, k], label=label, **METHODS.get(label, {}))
+        for place, (label, each) in enumerate(predictions.items()):
+            axes.plot(each.time, tips_of(each)[:, k], label=label, **look_of(label, place))
         axes.set_ylabel(f"tip {AXES[k]} [m]")
         require_span(axes, 0.01 * float(np.nanmax(np.abs(true))))
     column[-1].set_xlabel("time [s]")
@@ -131,7 +144,7 @@ def losses(runs: Mapping[str, Sequence[ArrayLike]]) -> Figure:
     """The loss over epochs: for each label the median of its runs (seeds), and a band from least to most."""
     require_some(runs)
     with style():
-        figure = new_figure(7.0, 4.2)
+        figure = new_figure(TWO_COLUMNS, 3.2)
         axes = figure.subplots()
         for k, (label, histories) in enumerate(runs.items()):
             values = np.stack([np.asarray(history, dtype=float) for history in histories])

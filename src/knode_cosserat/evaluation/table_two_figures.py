@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.evaluation.drawing import PALETTE, equal_scales, new_figure, style
+from knode_cosserat.evaluation.drawing import PALETTE, TWO_COLUMNS, equal_scales, new_figure, style
 from knode_cosserat.evaluation.study_figures import METHODS, REFERENCE, legend_below, require_some
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ LINES: dict[str, dict[str, Any]] = {
     "euler": {"color": PALETTE[3], "linestyle": ":", "linewidth": 1.1},
 }
 MEASURED = {**REFERENCE, "label": "measured"}
-COLUMNS = 3
+COLUMNS = 2
 
 
 class Predicted(NamedTuple):
@@ -84,7 +84,7 @@ def paths(recordings: Mapping[str, Predicted]) -> Figure:
     with style():
         columns = min(COLUMNS, len(recordings))
         rows = -(-len(recordings) // columns)
-        figure = new_figure(3.6 * columns, 3.6 * rows + 0.4)
+        figure = new_figure(TWO_COLUMNS, 2.6 * rows + 0.4)
         grid = figure.subplots(rows, columns, subplot_kw={"projection": "3d"}, squeeze=False).ravel()
         for axes, (name, it) in zip(grid, recordings.items(), strict=False):
             axes.plot(*it.measured.T, **MEASURED)
@@ -105,7 +105,7 @@ def horizon(recordings: Mapping[str, Predicted]) -> Figure:
     """How far the tips are off as time goes on: the root mean square over the recordings, and the worst."""
     require_some(recordings)
     with style():
-        figure = new_figure(7.0, 4.2)
+        figure = new_figure(TWO_COLUMNS, 3.2)
         axes = figure.subplots()
         methods = list(dict.fromkeys(method for it in recordings.values() for method in it.predicted))
         for method in methods:
@@ -132,7 +132,6 @@ def horizon(recordings: Mapping[str, Predicted]) -> Figure:
             xlabel="time since the prediction began [s]", ylabel="distance of the tips [cm]", yscale="log"
         )
         axes.set_title("Lines: root mean square of all recordings over the last second; bands: least to most")
-        axes.title.set_fontsize(9)
         axes.margins(x=0.0)
         legend_below(figure, [axes])
     return figure
@@ -161,7 +160,7 @@ def _grid(given: Mapping[str, Any], height: float) -> tuple[Any, Any]:
     require_some(given)
     columns = 1 if len(given) < 3 else 2
     rows = -(-len(given) // columns)
-    figure = new_figure(7.0 * columns, height * rows + 0.6)
+    figure = new_figure(TWO_COLUMNS, 0.7 * height * rows + 0.5)
     return figure, figure.subplots(rows, columns, squeeze=False).ravel()
 
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from knode_cosserat.evaluation.drawing import TIME_COLOURS, new_figure, require_matplotlib, style
+from knode_cosserat.evaluation.drawing import TIME_COLOURS, TWO_COLUMNS, new_figure, require_matplotlib, style
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -31,10 +31,15 @@ def workspace_seen(found: Workspace) -> Figure:
     x, y, z = found.position[shown].T
     total = found.controls[shown].sum(axis=1)
     with style():
-        figure = new_figure(9.0, 4.2)
+        figure = new_figure(TWO_COLUMNS, 3.2)
         for k, (across, up, names) in enumerate(((x, z, "xz"), (x, y, "xy"))):
             axes = figure.add_subplot(1, 2, k + 1)
             points = axes.scatter(across, up, c=total, s=1, cmap=TIME_COLOURS, rasterized=True, linewidths=0)
             axes.set(xlabel=f"{names[0]} [m]", ylabel=f"{names[1]} [m]", aspect="equal")
-        figure.colorbar(points, ax=figure.axes, label="sum of the controls")
+        figure.colorbar(points, ax=figure.axes, label=f"sum of the controls{_unit(found)}")
     return figure
+
+
+def _unit(found: Workspace) -> str:
+    units = {field.unit for field in found.system.control_layout.fields}
+    return f" [{units.pop()}]" if len(units) == 1 else ""

@@ -142,11 +142,11 @@ def figure(cells: Sequence[Mapping[str, Any]]) -> Figure:
     Raises:
         ImportError: matplotlib is not installed.
     """
-    from knode_cosserat.evaluation.drawing import PALETTE, new_figure, style
+    from knode_cosserat.evaluation.drawing import PALETTE, TWO_COLUMNS, new_figure, style
 
     names = list(dict.fromkeys(cell["imperfection"] for cell in cells))
     with style():
-        whole = new_figure(9.5, 0.24 * len(names) + 1.8)
+        whole = new_figure(TWO_COLUMNS, 0.19 * len(names) + 1.4)
         panels = whole.subplots(1, len(MEASURES), sharey=True)
         for axes, (measure, title) in zip(panels, MEASURES.items(), strict=True):
             left = ratios(cells, measure)

@@ -1,0 +1,36 @@
+"""Find stiffness and damping of a robot from one noisy motion, with intervals that say how sure they are.
+
+Where the equations are right and only numbers are wrong, calibration is the shortest way: least squares on
+whole simulations needs positions and orientations only.
+"""
+
+import dataclasses
+
+import numpy as np
+import typer
+
+import knode_cosserat as kc
+
+DT, NAMES = 0.05, ("youngs_modulus", "bending_damping")
+
+
+def main(out: str = "calibrate_parameters.png", steps: int = 60, noise: float = 1e-3) -> kc.Calibration:
+    """Calibrate from a sine with noise (m, and of other states alike), and predict random tensions."""
+    robot = kc.load_robot("delrin-tendon-robot")  # stands for the real one
+    guess = robot.replace(youngs_modulus=1.5e9, bending_damping=0.05)
+    seen = kc.simulate(robot, kc.controls.sine(1.0, steps, DT), DT)
+    rng = np.random.default_rng(0)
+    noisy = np.asarray(seen.y) + rng.normal(0.0, noise, seen.y.shape)
+    noisy[0] = seen.y[0]  # it begins at rest, and that is known
+    found = kc.calibrate(guess, [dataclasses.replace(seen, y=noisy)], NAMES, by="rollouts")
+    print(found)
+
+    unseen = kc.controls.random(steps, seed=1, hold=10)
+    truth, before, after = (kc.simulate(each, unseen, DT) for each in (robot, guess, found.robot))
+    kc.figures.error(truth, {"before": before, "after": after}).savefig(out)
+    print(f"tip RMSE {kc.tip_rmse(before, truth):.2g} m before, {kc.tip_rmse(after, truth):.2g} m after")
+    return found
+
+
+if __name__ == "__main__":
+    typer.run(main)

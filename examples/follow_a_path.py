@@ -1,0 +1,29 @@
+"""Follow a figure of eight with the tip: inverse kinematics, each point from the last.
+
+The paper's robot bends in two directions, so that its tip can be asked for x and y but not for z as well.
+`pose` says what is asked for: here two coordinates of the last node.
+"""
+
+import numpy as np
+import typer
+
+import knode_cosserat as kc
+
+
+def main(out: str = "follow_a_path.png", points: int = 60) -> kc.InverseKinematics:
+    """The tensions (points, 4) in N that follow the eight, and how far off each point is."""
+    robot = kc.load_robot("delrin-tendon-robot")
+    turn = np.linspace(0.0, 2.0 * np.pi, points)
+    wanted = np.stack([0.25 * np.sin(turn), 0.15 * np.sin(2.0 * turn)], axis=1)
+    found = kc.inverse_kinematics(
+        robot, wanted, low=1.0, high=10.0, pose=lambda robot, y: (robot.positions(y)[:2], None)
+    )
+    kc.figures.path({"wanted": wanted, "reached": found.position}).savefig(out)
+    reached, worst = np.sum(found.converged), np.max(found.position_error)
+    print(f"{reached} of {points} points reached; the farthest is off by {worst:.1e} m")
+    print(f"tensions from {found.control.min():.2f} to {found.control.max():.2f} N")
+    return found
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,36 @@
+"""A tendon that winds around the rod twists it as well as bending it, by its handedness.
+
+Routings are parts of a robot: straight, tapered, helical, polynomial or any function. Left and right windings
+are mirror images, and so are the shapes that they make.
+"""
+
+import numpy as np
+import typer
+
+import knode_cosserat as kc
+
+
+def wound(turns: float) -> kc.RoutedTendonRobot:
+    """A soft rod of 30 cm with one tendon, 8 mm from its axis."""
+    return kc.RoutedTendonRobot(
+        length=0.3, radius=0.004, density=1100.0, youngs_modulus=5e7, bending_damping=1e-3, nodes=21,
+        gravity=(0.0, 0.0, 0.0), tendon_offset=0.008, tendon_angles=(0.0,),
+        routing=(kc.routing.Helical(radius=0.008, phase=0.0, turns=turns),),
+    )  # fmt: skip
+
+
+def main(out: str = "helical_tendons.png", tension: float = 6.0, turns: float = 1.0) -> list[kc.Trajectory]:
+    """Shapes at rest of a rod with a straight tendon, and with one wound to the left and to the right."""
+    windings = (0.0, turns, -turns)
+    shapes = [kc.equilibrium(wound(each), [tension], space="rk4") for each in windings]
+    names = ("straight", f"{turns:g} turn to the left", f"{turns:g} turn to the right")
+    rods = {name: np.asarray(shape.position[0]) for name, shape in zip(names, shapes, strict=True)}
+    kc.figures.path(rods, view="xyz").savefig(out)
+    for name, shape in zip(names, shapes, strict=True):
+        twist = np.mean(np.asarray(shape.part("u"))[0, :, 2])
+        print(f"{name}: tip at {np.round(shape.tip_position[0], 3)} m, twisted by {twist:.2f} rad/m")
+    return shapes
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,26 @@
+"""Where can the tip be at all? Thousands of equilibria, spread evenly over all tensions.
+
+Each is solved from the unloaded robot, so that none depends on another; what is not solved says so and is not
+drawn. A limit of the curvature leaves out what would break the rod.
+"""
+
+import numpy as np
+import typer
+
+import knode_cosserat as kc
+
+
+def main(out: str = "where_it_reaches.png", count: int = 5000) -> kc.Workspace:
+    """The workspace for tensions from 0 to 10 N."""
+    robot = kc.load_robot("delrin-tendon-robot")
+    found = kc.workspace(robot, 0.0, 10.0, count)
+    kc.figures.workspace(found).savefig(out)
+    gentle = found.within(u=4.0)  # 1/m: bent to a radius of 25 cm at most
+    low, high = np.nanmin(found.position, axis=0), np.nanmax(found.position, axis=0)
+    print(f"{count} equilibria, {found.unsolved} of them not solved; {np.sum(gentle)} bent less than 4 1/m")
+    print(f"the tip is between {np.round(low, 3)} and {np.round(high, 3)} m")
+    return found
+
+
+if __name__ == "__main__":
+    typer.run(main)

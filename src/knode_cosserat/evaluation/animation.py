@@ -1,0 +1,242 @@
+"""Motions as moving pictures: GIF by Pillow, which comes with matplotlib, MP4 by ffmpeg if there is one.
+
+What stands still is drawn once; for each frame the lines that move and the time are put onto a copy of it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from knode_cosserat._files import replacing
+from knode_cosserat.evaluation.drawing import PALETTE, legend_above, style, width_of
+from knode_cosserat.evaluation.views import View, by_label, checked_view, curves_of, flat_height, valid_rows
+from knode_cosserat.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+#: what motions can be written as
+ENDINGS = (".gif", ".mp4")
+#: pictures a second: what eyes and the files' format can do with
+SLOWEST, FASTEST = 1.0, 50.0
+#: frames, at most: more would be a film, and fill the memory
+MOST_FRAMES = 5000
+
+
+class _Moved(NamedTuple):
+    """Lines of a robot (frames, points, d), the path of its tip, and how many of its rows each frame has."""
+
+    curves: list[NDArray[np.float64]]
+    path: NDArray[np.float64]
+    until: NDArray[np.intp]
+
+
+def animate(
+    trajectories: Trajectory | Mapping[str, Trajectory],
+    path: str | Path,
+    *,
+    fps: float = 25.0,
+    speed: float = 1.0,
+    view: str | None = None,
+    columns: int = 1,
+    dpi: int = 150,
+) -> Path:
+    """Write a motion, or several over each other by their labels, as a GIF or MP4 in real time.
+
+    Between rows that are solved positions are interpolated linearly; where one is not the robot is not there.
+
+    Args:
+        trajectories: one trajectory, or a dict of several; the first is wide and pale if there are more.
+        path: a name that ends in .gif or .mp4.
+        fps: pictures a second, 1 to 50. A GIF counts in hundredths of a second: it takes the nearest rate.
+        speed: 1 is real time, 0.5 half as fast.
+        view: "xyz" (in space), "xy", "xz" or "yz".
+        columns: as wide as one column of a paper (3.5 in) or as two (7.16 in).
+        dpi: dots in an inch.
+
+    Returns:
+        The path.
+
+    Raises:
+        ImportError: matplotlib is not installed.
+        FileNotFoundError: an MP4 is wanted and there is no ffmpeg.
+        ValueError: a path with another ending, a number that is not possible, a batch, nothing that moves, or
+            trajectories of which some are in a plane and some in space.
+    """
+    path = Path(path)
+    given = by_label(trajectories)
+    seconds, delay = _timing(given, path, fps, speed)
+    with style():
+        frames = _frames(given, seconds, view, width_of(columns), dpi)
+        with replacing(path) as temporary:
+            (_write_gif if path.suffix == ".gif" else _write_mp4)(frames, temporary, delay)
+    return path
+
+
+def _timing(
+    given: Mapping[str, Trajectory], path: Path, fps: float, speed: float
+) -> tuple[NDArray[np.float64], float]:
+    """At which times of the motion its pictures are, and how long each is shown (s)."""
+    if path.suffix not in ENDINGS:
+        raise ValueError(f"{path}: allowed for a motion is a name that ends in {', '.join(ENDINGS)}")
+    for name, value, low, high in (("fps", fps, SLOWEST, FASTEST), ("speed", speed, 1e-3, 1e3)):
+        if not low <= value <= high:
+            raise ValueError(f"{name} is {value!r}; allowed is {low:g} to {high:g}")
+    begin = min(float(one.time[0]) for one in given.values())
+    end = max(float(one.time[-1]) for one in given.values())
+    if not end > begin:
+        raise ValueError("the trajectory has one row: nothing moves; figures.shape draws it")
+    delay = max(2, round(100.0 / fps)) / 100.0 if path.suffix == ".gif" else 1.0 / fps
+    count = int((end - begin) / (speed * delay) + 1e-9) + 1
+    if count > MOST_FRAMES:
+        raise ValueError(
+            f"that is {count} pictures; allowed is up to {MOST_FRAMES}: lower fps, or raise speed"
+        )
+    return np.asarray(begin + speed * delay * np.arange(count), dtype=float), delay
+
+
+def _moved(trajectory: Trajectory, seconds: NDArray[np.float64]) -> _Moved:
+    curves, time = curves_of(trajectory), np.asarray(trajectory.time, dtype=float)
+    valid_rows(curves)
+    if len(time) == 1:
+        time, curves = np.array([time[0], np.inf]), [np.repeat(curve, 2, axis=0) for curve in curves]
+    at = np.clip(seconds, time[0], time[-1])
+    row = np.clip(np.searchsorted(time, at + 1e-9, side="right") - 1, 0, len(time) - 2)
+    part = ((at - time[row]) / (time[row + 1] - time[row]))[:, None, None]
+    # at a row the next one is not needed, and need not be solved
+    between = [
+        np.where(part < 1e-6, curve[row], (1.0 - part) * curve[row] + part * curve[row + 1])
+        for curve in curves
+    ]
+    path = np.asarray(trajectory.tip_position, dtype=float)
+    return _Moved(between, path, np.searchsorted(np.asarray(trajectory.time), seconds + 1e-9, side="right"))
+
+
+def _frames(
+    given: Mapping[str, Trajectory],
+    seconds: NDArray[np.float64],
+    view: str | None,
+    width: float,
+    dpi: int,
+) -> Iterator[Image]:
+    """The pictures, one by one; what is wrong is said before the first."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    moved = [_moved(one, seconds) for one in given.values()]
+    if len({robot.path.shape[1] for robot in moved}) > 1:
+        raise ValueError("some trajectories are in a plane and some in space; allowed is one kind")
+    view = checked_view(view, moved[0].path.shape[1])
+    points = [each.reshape(-1, each.shape[-1]) for robot in moved for each in (*robot.curves, robot.path)]
+    everything = np.concatenate(points)
+    height = flat_height(everything, view, width, 0.6) + 0.3
+    figure = Figure(figsize=(width, height), dpi=dpi, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    seen = View(figure, 111, view)
+    seen.frame(everything, zoom=0.82)
+    seen.obstacles(next(iter(given.values())), everything)
+    lines = [
+        _lines(seen, label, robot, i, len(moved))
+        for i, (label, robot) in enumerate(zip(given, moved, strict=True))
+    ]
+    if any(given):
+        legend_above(seen.axes)
+    clock = figure.text(0.01, 0.99, "", ha="left", va="top", animated=True)
+    canvas.draw()
+    # the layout is done; and once more, now that axes are where they stay
+    figure.set_layout_engine("none")
+    canvas.draw()
+    return _drawn(canvas, seen, list(zip(lines, moved, strict=True)), clock, seconds)
+
+
+def _lines(seen: View, label: str, robot: _Moved, i: int, count: int) -> tuple[list[Any], Any]:
+    """The lines of a robot, and of the path of its tip."""
+    under = i == 0 and count > 1
+    colour = "#AAAAAA" if under else PALETTE[max(0, i - 1) % len(PALETTE)]
+    width = 4.0 if under else 1.8
+    nothing: list[list[float]] = [[]] * len(seen.index)
+    rods = [
+        seen.axes.plot(
+            *nothing, color=colour, linewidth=width, solid_capstyle="round", animated=True,
+            label=label if label and k == 0 else None,
+        )[0]
+        for k in range(len(robot.curves))
+    ]  # fmt: skip
+    return rods, seen.axes.plot(*nothing, color=colour, linewidth=0.45 * width, alpha=0.7, animated=True)[0]
+
+
+def _drawn(
+    canvas: Any, seen: View, robots: list[tuple[tuple[list[Any], Any], _Moved]], clock: Any, seconds: Any
+) -> Iterator[Image]:
+    from PIL import Image
+
+    background = canvas.copy_from_bbox(canvas.figure.bbox)
+
+    def put(artist: Any, points: NDArray[np.float64]) -> None:
+        (artist.set_data if seen.flat else artist.set_data_3d)(*seen.of(points))
+        seen.axes.draw_artist(artist)
+
+    for k, second in enumerate(seconds):
+        canvas.restore_region(background)
+        for (rods, path), robot in robots:
+            put(path, robot.path[: robot.until[k]])
+            for rod, curve in zip(rods, robot.curves, strict=True):
+                put(rod, curve[k])
+        clock.set_text(f"{second:.2f} s")
+        canvas.figure.draw_artist(clock)
+        yield Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
+
+
+def _write_gif(frames: Iterator[Image], path: Path, delay: float) -> None:
+    from PIL.Image import Dither
+
+    first = next(frames)
+    second = next(frames, None)
+    # colours of both ends of what can be seen; the same for all, so that nothing flickers
+    palette = first.quantize(128)
+    palette.putpalette([255 if value > 249 else value for value in palette.getpalette() or ()])
+    rest = (each.quantize(palette=palette, dither=Dither.NONE) for each in frames)
+    others = [] if second is None else [second.quantize(palette=palette, dither=Dither.NONE), *rest]
+    palette.save(
+        path, format="GIF", save_all=True, append_images=others, duration=round(1000 * delay), loop=0
+    )
+
+
+def _write_mp4(frames: Iterator[Image], path: Path, delay: float) -> None:
+    program = shutil.which("ffmpeg")
+    if program is None:
+        raise FileNotFoundError(
+            "an MP4 needs the program ffmpeg, which is not on the PATH; a .gif needs nothing"
+        )
+    first = next(frames)
+    command = [
+        program, "-loglevel", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24",
+        "-s", f"{first.width}x{first.height}", "-r", f"{1.0 / delay:.6g}", "-i", "-",
+        # sides of an even number of dots, as the encoder wants them
+        "-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p", "-f", "mp4", str(path),
+    ]  # fmt: skip
+    with tempfile.TemporaryFile() as said:
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=said)
+        assert process.stdin is not None
+        try:
+            process.stdin.write(first.tobytes())
+            for frame in frames:
+                process.stdin.write(frame.tobytes())
+        except BrokenPipeError:
+            pass  # its own words tell more
+        finally:
+            with contextlib.suppress(BrokenPipeError):
+                process.stdin.close()
+        if process.wait() != 0:
+            said.seek(0)
+            words = said.read().decode(errors="replace").strip().splitlines() or ["no reason given"]
+            raise ValueError(f"ffmpeg could not write {path.name}: {words[-1]}")
