@@ -58,6 +58,7 @@ from knode_cosserat.solvers.result import Result, SimulationError
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.solvers.space import RK4, Euler
+from knode_cosserat.solvers.stepper import Stepper
 from knode_cosserat.solvers.time import BDF1, BDF2, BDFAlpha, Trapezoidal
 from knode_cosserat.trajectory import Trajectory
 from knode_cosserat.trajectory_file import TrajectoryFileError, load_trajectory
@@ -106,6 +107,7 @@ __all__ = [
     "SimulationError",
     "SlenderRod",
     "StateError",
+    "Stepper",
     "Stretch",
     "StructuredOptions",
     "System",
