@@ -62,6 +62,7 @@ from knode_cosserat.solvers.stepper import Stepper
 from knode_cosserat.solvers.time import BDF1, BDF2, BDFAlpha, Trapezoidal
 from knode_cosserat.trajectory import Trajectory
 from knode_cosserat.trajectory_file import TrajectoryFileError, load_trajectory
+from knode_cosserat.viewer import export_scene, view, view_live
 
 __all__ = [
     "BDF1",
@@ -127,6 +128,7 @@ __all__ = [
     "estimate_parts",
     "estimate_states",
     "explain",
+    "export_scene",
     "fit",
     "identify",
     "inverse_kinematics",
@@ -149,5 +151,7 @@ __all__ = [
     "surroundings",
     "tip_dtw",
     "tip_rmse",
+    "view",
+    "view_live",
     "workspace",
 ]

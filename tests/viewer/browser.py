@@ -90,7 +90,8 @@ class Browser:
     def drag(self, selector, part):
         """Press on a slider's middle and drag to a part of its width, as a hand does."""
         x, y, width, height = self.run(
-            f"(() => {{ const e = document.querySelector({json.dumps(selector)}); e.scrollIntoView({{block: 'center'}});"
+            f"(() => {{ const e = document.querySelector({json.dumps(selector)});"
+            " e.scrollIntoView({block: 'center'});"
             " const r = e.getBoundingClientRect(); return [r.x, r.y, r.width, r.height]; })()"
         )
         points = [x + 0.5 * width + k / 5 * (part - 0.5) * (width - 16) for k in range(6)]

@@ -1,4 +1,4 @@
-"""What of a system is drawn beside its states: radii, tendons, ribs, obstacles, its fields' names and units."""
+"""What of a system is drawn beside its states: radii, tendons, ribs, obstacles, and its fields."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def _up(robot: Any) -> list[float]:
 
 
 def _tendons(robot: Any, s: np.ndarray, radii: np.ndarray) -> dict[str, Any] | None:
-    """Where the tendons run (c, nodes, 3) in the material frame, where they end, and what their tension is."""
+    """Where the tendons run (c, nodes, 3) in the material frame, where they end, and their tension."""
     if not isinstance(robot, TendonRod):
         return None
     if isinstance(robot, RoutedTendonRobot):
@@ -200,7 +200,8 @@ def positions_of(system: System, y: np.ndarray) -> np.ndarray:
         found = np.stack([found[..., 0], np.zeros(found.shape[:-1]), found[..., 1]], axis=-1)
     if found.ndim != 3 or found.shape[-1] != 3:
         raise ValueError(
-            f"a {type(system).__name__} gives positions of shape {found.shape}; allowed is (T, N, 3) or (T, N, 2)"
+            f"a {type(system).__name__} gives positions of shape {found.shape}; "
+            "allowed is (T, N, 3) or (T, N, 2)"
         )
     return found
 
@@ -227,8 +228,8 @@ def offset_of(layout: Layout, packed: np.ndarray, values: np.ndarray) -> int | N
     """Where in packed numbers these values stand as they are, so that they need not be sent again."""
     start = 0
     for field in layout.fields:
-        if field.size == values.shape[-1]:
-            if np.array_equal(packed[..., start : start + field.size], values, equal_nan=True):
-                return start
-        start += field.size
+        stop = start + field.size
+        if field.size == values.shape[-1] and np.array_equal(packed[..., start:stop], values, equal_nan=True):
+            return start
+        start = stop
     return None

@@ -107,7 +107,7 @@ async def _serve(
         if path == "/live":
             return None
         if path not in ("/", "/index.html"):
-            return connection.respond(http.HTTPStatus.NOT_FOUND, "not found\n")  # type: ignore[no-any-return]
+            return connection.respond(http.HTTPStatus.NOT_FOUND, "not found\n")
         headers = Headers({
             "Content-Type": "text/html; charset=utf-8", "Content-Length": str(len(page)),
             "Cache-Control": "no-store", "Connection": "close",
@@ -137,7 +137,7 @@ class Session:
 
     def __init__(self, robot: System, dt: float, space: str, connection: Any):
         self.robot, self.dt, self.space, self.connection = robot, dt, space, connection
-        self.names = [name for name in track(Stepper(robot, dt, space=space).state, "robot")["arrays"]]
+        self.names = list(track(Stepper(robot, dt, space=space).state, "robot")["arrays"])
         self.stepper = Stepper(robot, dt, space=space)
         self.control = np.array([slider["start"] for slider in sliders(robot)])
         self.sequence, self.paused, self.begin_anew = 0, False, False
@@ -180,7 +180,7 @@ class Session:
         self.wanted.set()
 
     async def _move(self) -> None:
-        """The clock: a step ends every dt, and the one in progress is solved again when the control changes."""
+        """A step ends every dt, and the one in progress is solved again when the control changes."""
         loop = asyncio.get_running_loop()
         # of its own, so that the page is heard while a step is looked for
         with concurrent.futures.ThreadPoolExecutor(1) as worker:
@@ -213,7 +213,7 @@ class Session:
         return Stepper(self.robot, self.dt, space=self.space)
 
     def _solve(self, control: np.ndarray, sequence: int, over: bool) -> tuple[bytes | str, bool]:
-        """Go on if the step in progress is over, solve the one in progress; a message, and whether it failed."""
+        """Go on if the step is over, solve the one in progress; a message, and whether it failed."""
         began = perf_counter()
         try:
             if over:

@@ -45,7 +45,8 @@ def named(trajectories: Given) -> dict[str, Trajectory]:
     if isinstance(trajectories, Trajectory):
         trajectories = {"trajectory": trajectories}
     if not isinstance(trajectories, Mapping):
-        given = list(trajectories) if isinstance(trajectories, Sequence) else [trajectories]
+        given: Any = trajectories
+        given = list(given) if isinstance(given, Sequence) else [given]
         trajectories = {f"trajectory {k + 1}": each for k, each in enumerate(given)}
     found: dict[str, Trajectory] = {}
     for name, each in trajectories.items():
@@ -57,7 +58,7 @@ def named(trajectories: Given) -> dict[str, Trajectory]:
             found |= {f"{name} [{k}]": _one(each, k) for k in range(len(each.y))}
     if not 1 <= len(found) <= MOST:
         raise ValueError(
-            f"there are {len(found)} trajectories, those of batches counted one by one; allowed is 1 to {MOST}"
+            f"there are {len(found)} trajectories, those of batches counted singly; allowed is 1 to {MOST}"
         )
     return found
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import http.server
 import sys
-import webbrowser
 from collections.abc import Callable
 
 from knode_cosserat.viewer.document import document
@@ -35,6 +33,8 @@ def view(
         ValueError: no trajectory, more than 12, one that has nothing to be drawn, or an impossible port.
         OSError: the port is taken.
     """
+    import http.server
+
     page = document(scene(trajectories, title)).encode("utf-8")
 
     class Handler(http.server.BaseHTTPRequestHandler):
@@ -59,7 +59,7 @@ def view(
 
 def checked_port(port: int) -> int:
     """A port, or 0 for any; `ValueError` for what is none."""
-    if isinstance(port, bool) or not isinstance(port, int) or not 0 <= port <= 65535:
+    if not 0 <= port <= 65535:
         raise ValueError(f"port is {port!r}; allowed is 0 (any that is free) to 65535")
     return port
 
@@ -71,4 +71,6 @@ def announce(address: str, open_browser: bool, ready: Callable[[str], None] | No
     else:
         print(f"the viewer is at {address} (Ctrl-C ends it)", file=sys.stderr, flush=True)
     if open_browser:
+        import webbrowser
+
         webbrowser.open(address)

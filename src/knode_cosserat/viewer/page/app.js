@@ -98,11 +98,15 @@ class Viewer {
   }
 
   #tension() {
-    const live = this.scene.live?.sliders.filter((slider) => slider.name.startsWith("tension")).map((slider) => slider.high);
-    this.largest = Math.max(1e-9, ...this.robots.map((robot) => robot.largestTension), ...(live ?? []));
+    const sliders = this.scene.live?.sliders.filter((slider) => slider.name.startsWith("tension")) ?? [];
+    const tensions = [...this.robots.flatMap((robot) => robot.tensions), ...sliders.flatMap(({ low, high }) => [low, high])];
+    const high = Math.max(1e-3, ...tensions);
+    const low = Math.min(high, ...tensions);
+    // where they hardly differ the colours should not either
+    this.range = [low > 0.9 * high ? 0 : low, high];
     $("tension").hidden = !this.robots.some((robot) => robot.tendons);
     $("tension").querySelector("i").style.background = `linear-gradient(90deg, ${rampColours().join(", ")})`;
-    $("tension").querySelector("b").textContent = `0 to ${short(this.largest)} N`;
+    $("tension").querySelector("b").textContent = `${this.range.map((x) => +x.toPrecision(2)).join(" to ")} N`;
   }
 
   // the bars above and below
@@ -266,6 +270,7 @@ class Viewer {
   #repaint() {
     this.robots.forEach((robot, k) => robot.recolour(this.colour(k)));
     document.querySelectorAll("#legend i").forEach((mark, k) => (mark.style.background = this.colour(k)));
+    this.labelled = null;
     this.stage.paint();
     this.#seen();
   }
@@ -315,17 +320,20 @@ class Viewer {
       }
       this.last = now;
     }
-    if (this.stage.dirty) this.#draw();
+    if (this.stage.dirty) {
+      this.#draw(false);
+      this.moving = now;
+    } else if (this.stage.soft && !this.stage.fine && now - this.moving > 250) this.#draw(true);
     requestAnimationFrame((again) => this.#frame(again));
   }
 
-  #draw() {
+  #draw(fine) {
     const unsolved = [];
     this.robots.forEach((robot, k) => {
-      const moment = robot.update(this.time, this.largest);
+      const moment = robot.update(this.time, this.range);
       if (!moment.solved && this.tracks[k].wanted) unsolved.push(this.tracks[k]);
     });
-    const cells = this.stage.draw();
+    const cells = this.stage.draw(fine);
     if (this.measured) this.stage.finish();
     if (this.live) {
       this.live.drawn(this.answers);
@@ -361,15 +369,17 @@ class Viewer {
     if (key === this.labelled) return;
     this.labelled = key;
     const shown = this.tracks.map((track, k) => [track, k]).filter(([track]) => track.wanted);
-    $("labels").replaceChildren(...cells.map(({ x, y }, k) => {
+    $("labels").replaceChildren(...cells.map(({ x, y, width, height }, k) => {
+      const cell = document.createElement("div");
       const label = document.createElement("span");
       const mark = document.createElement("i");
       mark.className = "swatch";
       mark.style.background = this.colour(shown[k][1]);
-      label.style.left = `${x}px`;
-      label.style.top = `${y}px`;
+      Object.assign(cell.style, { left: `${x}px`, top: `${y}px`, width: `${width}px`, height: `${height}px` });
+      cell.style.borderWidth = `${y > 0 ? 1 : 0}px 0 0 ${x > 0 ? 1 : 0}px`;
       label.append(mark, shown[k][0].name);
-      return label;
+      cell.append(label);
+      return cell;
     }));
   }
 

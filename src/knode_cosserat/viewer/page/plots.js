@@ -35,8 +35,8 @@ export class Plot {
       padding: [10, 10, 0, 0], legend: { show: false }, scales: { x: { time: false } },
       cursor: { drag: { x: false, y: false }, points: { size: 6 } },
       axes: [
-        { ...axis, size: 34, label: "time (s)", labelSize: 16, labelGap: 0 },
-        { ...axis, size: 52, values: (_, ticks) => ticks.map(short), label: unit || "1", labelSize: 18 },
+        { ...axis, size: 24, label: "time (s)", labelSize: 18, labelGap: -2 },
+        { ...axis, size: 46, values: (_, ticks) => ticks.map(short), label: unit || "1", labelSize: 16, labelGap: 0 },
       ],
       series: [{}, ...lines.map(({ label, colour, dash }) => ({
         label, stroke: colour, width: 1.8, dash: DASHES[dash % DASHES.length], points: { show: false }, spanGaps: false,
@@ -74,6 +74,7 @@ export class Plot {
     u.ctx.strokeStyle = style("--text");
     u.ctx.globalAlpha = 0.65;
     u.ctx.lineWidth = devicePixelRatio;
+    u.ctx.setLineDash([]);
     u.ctx.beginPath();
     u.ctx.moveTo(x, u.bbox.top);
     u.ctx.lineTo(x, u.bbox.top + u.bbox.height);

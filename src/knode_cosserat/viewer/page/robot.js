@@ -26,7 +26,7 @@ export class RobotModel {
     this.group = new THREE.Group();
     this.colour = new THREE.Color(colour);
     this.material = new THREE.MeshStandardMaterial({
-      color: this.colour, roughness: 0.45, metalness: 0.05, transparent: true,
+      color: this.colour, emissive: this.colour, emissiveIntensity: 0.22, roughness: 0.5, transparent: true,
       // trajectories that lie on each other do not flicker
       polygonOffset: true, polygonOffsetFactor: index, polygonOffsetUnits: index,
     });
@@ -91,7 +91,7 @@ export class RobotModel {
 
   #tendons({ routes, ends }) {
     const { nodes, drawing } = this.track;
-    const material = new THREE.MeshStandardMaterial({ vertexColors: true, roughness: 0.5, emissive: 0x111111 });
+    const material = new THREE.MeshStandardMaterial({ vertexColors: true, roughness: 0.6 });
     const radius = Math.max(0.22 * Math.max(...drawing.radii), 0.0014 * this.size);
     this.tendons = routes.map((route, k) => {
       const count = Math.max(2, Math.round(ends[k] * (nodes - 1)) + 1);
@@ -110,7 +110,7 @@ export class RobotModel {
         : new THREE.CylinderGeometry(radius, radius, thick, 40);
       const material = new THREE.MeshStandardMaterial({
         color: shape === "guide" ? this.colour : 0x8a94a6, transparent: true, depthWrite: shape !== "guide",
-        opacity: { ball: 0.95, rib: 0.8, guide: 0.22 }[shape], roughness: 0.55,
+        opacity: { ball: 0.95, rib: 0.8, guide: 0.28 }[shape], roughness: 0.55,
       });
       return { at, mesh: this.#add("ribs", new THREE.Mesh(geometry, material), shape !== "guide") };
     });
@@ -173,8 +173,8 @@ export class RobotModel {
     this.show("path", visible);
   }
 
-  /** The state at a time, and tension as a part of `largest`. Gives the moment that is drawn. */
-  update(time, largest) {
+  /** The state at a time, tensions (N) coloured within a range. Gives the moment that is drawn. */
+  update(time, range) {
     const { track, points } = this;
     const moment = track.at(time);
     track.perNode(track.position, 3, moment, points);
@@ -194,7 +194,7 @@ export class RobotModel {
       geometry.attributes.position.needsUpdate = true;
       geometry.computeVertexNormals();
     }
-    if (this.tendons) this.#pull(moment, largest);
+    if (this.tendons) this.#pull(moment, range);
     for (const { at, mesh } of this.ribs) this.#place(mesh, at);
     for (const { mesh, rod } of this.bases) {
       mesh.position.fromArray(rod.points, 0);
@@ -235,7 +235,7 @@ export class RobotModel {
     mesh.quaternion.copy(this.#turn(low).slerp(this.#turn(low + 1), part)).multiply(ALONG);
   }
 
-  #pull(moment, largest) {
+  #pull(moment, [low, high]) {
     const { track } = this;
     const { tension, loss } = track.drawing.tendons;
     const base = track.arrays[tension.array];
@@ -250,7 +250,7 @@ export class RobotModel {
         points[3 * n + 1] = this.points[3 * n + 1] + r.y;
         points[3 * n + 2] = this.points[3 * n + 2] + r.z;
         const left = losses ? Math.exp(-losses[n * this.tendons.length + k]) : 1;
-        rampColour((pulled * left) / largest, colours, 3 * n);
+        rampColour((pulled * left - low) / (high - low), colours, 3 * n);
       }
       tube.update(points, radius, colours);
     });
@@ -272,23 +272,24 @@ export class RobotModel {
     this.axes.geometry.attributes.position.needsUpdate = true;
   }
 
-  /** The largest base tension of all rows (N), or 0. */
-  get largestTension() {
+  /** The smallest and largest base tension (N); of row 0, where a robot may be at rest, only if there is no other. */
+  get tensions() {
     const { tendons } = this.track.drawing;
-    if (!this.tendons) return 0;
+    if (!this.tendons) return [];
     const { values, width } = this.track.arrays[tendons.tension.array];
-    let largest = 0;
-    for (let row = 0; row < this.track.rows; row++)
+    const found = [];
+    for (let row = Math.min(1, this.track.rows - 1); row < this.track.rows; row++)
       for (let k = 0; k < this.tendons.length; k++) {
         const value = values[row * width + tendons.tension.offset + k];
-        if (value > largest) largest = value;
+        if (this.track.solved[row]) found.push(value);
       }
-    return largest;
+    return found.length ? [Math.min(...found), Math.max(...found)] : [];
   }
 
   recolour(colour) {
     this.colour.set(colour);
     this.material.color.set(colour);
+    this.material.emissive.set(colour);
     this.pathMaterial.color.set(colour);
     this.ghostMaterial.color.set(colour);
   }

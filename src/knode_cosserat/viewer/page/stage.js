@@ -10,19 +10,25 @@ export function nice(value) {
   return [1, 2, 5, 10].find((step) => step * power >= 0.7 * value) * power;
 }
 
+/** Whether the processor draws, and not a graphics card: what is fine then has to wait for the motion to end. */
+function software() {
+  const gl = document.createElement("canvas").getContext("webgl2");
+  const info = gl?.getExtension("WEBGL_debug_renderer_info");
+  const drawnBy = info ? gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : "";
+  gl?.getExtension("WEBGL_lose_context")?.loseContext();
+  return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(drawnBy);
+}
+
 export class Stage {
   constructor(canvas, [low, high], up) {
     this.canvas = canvas;
-    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true, preserveDrawingBuffer: false });
-    const gl = this.renderer.getContext();
-    const info = gl.getExtension("WEBGL_debug_renderer_info");
-    const drawnBy = info ? gl.getParameter(info.UNMASKED_RENDERER_WEBGL) : "";
-    // without a graphics card shadows and fine pixels would cost the motion its smoothness
-    this.soft = /swiftshader|llvmpipe|software/i.test(drawnBy);
-    this.renderer.setPixelRatio(this.soft ? 1 : Math.min(2, window.devicePixelRatio));
+    const soft = software();
+    this.soft = soft;
+    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: !soft, preserveDrawingBuffer: false });
+    this.renderer.setPixelRatio(Math.min(2, window.devicePixelRatio));
     this.renderer.setScissorTest(true);
     this.renderer.shadowMap.enabled = true;
-    this.renderer.shadowMap.type = this.soft ? THREE.BasicShadowMap : THREE.PCFSoftShadowMap;
+    this.renderer.shadowMap.type = THREE.PCFSoftShadowMap;
     this.scene = new THREE.Scene();
     this.up = new THREE.Vector3(...up).normalize();
     this.low = new THREE.Vector3(...low);
@@ -49,20 +55,21 @@ export class Stage {
     const turn = new THREE.Quaternion().setFromUnitVectors(new THREE.Vector3(0, 1, 0), this.up);
     const across = new THREE.Vector3(0.75, 0, 0.66).applyQuaternion(turn);
     this.across = across;
-    const light = new THREE.DirectionalLight(0xffffff, 2.3);
+    const light = new THREE.DirectionalLight(0xffffff, 2.6);
     light.position.copy(this.centre).addScaledVector(this.up, 2.2 * size);
     light.position.add(new THREE.Vector3(-0.7 * size, 0, 1.1 * size).applyQuaternion(turn));
     light.target.position.copy(this.centre);
     light.castShadow = true;
-    light.shadow.mapSize.set(...(this.soft ? [512, 512] : [2048, 2048]));
+    light.shadow.mapSize.set(2048, 2048);
+    this.light = light;
     light.shadow.normalBias = 0.004 * size;
     light.shadow.radius = 5;
     Object.assign(light.shadow.camera, {
       left: -1.3 * size, right: 1.3 * size, top: 1.3 * size, bottom: -1.3 * size, near: 0.1 * size, far: 6 * size,
     });
-    this.sky = new THREE.HemisphereLight(0xffffff, 0xb8bcc6, 1.35);
+    this.sky = new THREE.HemisphereLight(0xffffff, 0xd5d8de, 2);
     this.sky.position.copy(this.up);
-    const fill = new THREE.DirectionalLight(0xffffff, 0.5);
+    const fill = new THREE.DirectionalLight(0xffffff, 1.2);
     fill.position.copy(this.centre).add(new THREE.Vector3(size, 0.4 * size, -size).applyQuaternion(turn));
     fill.target.position.copy(this.centre);
     this.scene.add(light, light.target, this.sky, fill, fill.target);
@@ -173,8 +180,18 @@ export class Stage {
     }));
   }
 
+  /** Without a graphics card shadows and smooth edges wait until nothing moves. */
+  #quality(fine) {
+    if (!this.soft || fine === this.fine) return;
+    this.fine = fine;
+    this.light.castShadow = this.shade.visible = fine;
+    this.renderer.setPixelRatio(fine ? 2 : 1);
+    this.resize();
+  }
+
   /** Draw; gives where each robot that is shown was drawn. */
-  draw() {
+  draw(fine = false) {
+    this.#quality(fine);
     const { clientHeight: height } = this.canvas.parentElement;
     const cells = this.#cells();
     const apart = cells.length > 1;
