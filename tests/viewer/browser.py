@@ -1,6 +1,7 @@
 """A headless Chromium, driven by its DevTools protocol: just enough for the tests of the viewer."""
 
 import base64
+import contextlib
 import json
 import os
 import re
@@ -36,7 +37,9 @@ class Browser:
             pages = [each for each in json.load(answer) if each["type"] == "page"]
         from websockets.sync.client import connect
 
-        self.socket = connect(pages[0]["webSocketDebuggerUrl"], max_size=None, compression=None)
+        self.opened = contextlib.ExitStack()
+        address = pages[0]["webSocketDebuggerUrl"]
+        self.socket = self.opened.enter_context(connect(address, max_size=None, compression=None))
         self.number, self.messages = 0, []
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.call(f"{domain}.enable")
@@ -132,7 +135,7 @@ class Browser:
         Path(path).write_bytes(base64.b64decode(data))
 
     def close(self):
-        self.socket.close()
+        self.opened.close()
         self.process.terminate()
         self.process.wait(10)
         self.folder.cleanup()

@@ -196,7 +196,7 @@ class Session:
                 self.wanted.clear()
                 sequence, control = self.sequence, self.control
                 over = not self.paused and not stuck and loop.time() >= end
-                message, stuck = await loop.run_in_executor(worker, self._solve, control, sequence, over)
+                message, stuck = await loop.run_in_executor(worker, self.solve, control, sequence, over)
                 await self.connection.send(message)
                 if over:
                     late = loop.time() - end
@@ -212,7 +212,7 @@ class Session:
     def _anew(self) -> Stepper:
         return Stepper(self.robot, self.dt, space=self.space)
 
-    def _solve(self, control: np.ndarray, sequence: int, over: bool) -> tuple[bytes | str, bool]:
+    def solve(self, control: np.ndarray, sequence: int, over: bool) -> tuple[bytes | str, bool]:
         """Go on if the step is over, solve the one in progress; a message, and whether it failed."""
         began = perf_counter()
         try:
