@@ -1,22 +1,12 @@
 """Trajectories that the tests of the viewer share, and a browser to show them in."""
 
-import importlib.util
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 import knode_cosserat as kc
+from tests.viewer import browser as driver
 
 DT = 0.05
-
-
-def _load_browser():
-    """Beside this file: the tests are no package."""
-    spec = importlib.util.spec_from_file_location("viewer_browser", Path(__file__).parent / "browser.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture(scope="session")
@@ -57,10 +47,9 @@ def failed(truth):
 
 @pytest.fixture(scope="session")
 def browser():
-    module = _load_browser()
-    if module.find() is None:
-        pytest.skip(f"no browser: none of {', '.join(module.NAMES)} is installed")
+    if driver.find() is None:
+        pytest.skip(f"no browser: none of {', '.join(driver.NAMES)} is installed")
     pytest.importorskip("websockets", reason="websockets, of the extra viz, drives the browser")
-    started = module.Browser()
+    started = driver.Browser()
     yield started
     started.close()

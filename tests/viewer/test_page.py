@@ -73,7 +73,8 @@ def test_two_lie_on_each_other_or_stand_side_by_side(page, truth, prediction):
     browser.run("document.getElementById('apart').click()")
     settled(browser)
     cells = browser.run(
-        "[...document.querySelectorAll('#labels div')].map((e) => [e.textContent, e.getBoundingClientRect().x])"
+        "[...document.querySelectorAll('#labels div')]"
+        ".map((e) => [e.textContent, e.getBoundingClientRect().x])"
     )
     assert [cell[0] for cell in cells] == ["truth", "prediction"] and cells[1][1] > cells[0][1] + 200
     browser.run("document.querySelectorAll('#legend button')[1].click()")
