@@ -6,7 +6,7 @@ browser's time stamp of the slider's event:
 
     simulated   the step in progress, solved again by the server: its part alone, without the way there
     answered    until the page has the new shape
-    drawn       until it is drawn (`readPixels` waits for that)
+    drawn       until it is drawn (a fence behind the drawing says when)
 
 `--load N` measures beside N processes that do nothing but compute.
 """
@@ -37,21 +37,18 @@ EVENTS = 150
 #: notes the times of what a slider's event leads to
 PROBE = """(() => {
   const live = viewer.live;
-  viewer.measured = true;
   window.samples = [];
-  let now = null;
+  const asked = new Map();
   const moved = live.moved;
   live.moved = (row) => {
-    if (row.since !== undefined) now = { since: row.since, answered: performance.now(), step: live.step };
+    if (row.since !== undefined) asked.set(row.since, [live.step, performance.now()]);
     moved(row);
   };
   const drawn = live.drawn.bind(live);
   live.drawn = (since) => {
     drawn(since);
-    if (since !== undefined && now) {
-      samples.push([now.step, now.answered - since, performance.now() - since]);
-      now = null;
-    }
+    const [step, answered] = asked.get(since);
+    samples.push([step, answered - since, performance.now() - since]);
   };
 })()"""
 

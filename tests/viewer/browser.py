@@ -23,10 +23,8 @@ def find():
 class Browser:
     def __init__(self, width=1280, height=800):
         self.folder = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
-        # drawn by the processor: the same on every machine
-        flags = (
-            "--headless --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader --no-first-run "
-        )
+        # drawn by the processor, as where there is no graphics card
+        flags = "--headless --disable-gpu --enable-unsafe-swiftshader --no-first-run "
         flags += "--no-sandbox --disable-dev-shm-usage --hide-scrollbars --remote-debugging-port=0 "
         flags += f"--window-size={width},{height} --user-data-dir={self.folder.name}"
         self.process = subprocess.Popen(

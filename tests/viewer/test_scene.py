@@ -274,5 +274,10 @@ def test_the_command_writes_a_scene_with_the_files_names(truth, prediction, tmp_
     with pytest.raises(SystemExit) as ended:
         main()
     assert ended.value.code == 0 and capsys.readouterr().out.strip() == "wrote scene.html"
-    shown = json.loads(Scripts((tmp_path / "scene.html").read_text(encoding="utf-8")).found["scene"])
+    monkeypatch.setattr("sys.argv", ["x", "view", "truth.nc", "--export", "scene.html", "--json"])
+    written = (tmp_path / "scene.html").read_text(encoding="utf-8")
+    with pytest.raises(SystemExit):
+        main()
+    assert json.loads(capsys.readouterr().out) == {"trajectories": ["truth"], "export": "scene.html"}
+    shown = json.loads(Scripts(written).found["scene"])
     assert [each["name"] for each in shown["tracks"]] == ["truth", "prediction"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,6 +10,7 @@ import typer
 
 from knode_cosserat.cli.arguments import (
     Changes,
+    Json,
     Nodes,
     Space,
     is_trajectory,
@@ -17,6 +19,7 @@ from knode_cosserat.cli.arguments import (
     trajectory_of,
 )
 from knode_cosserat.cli.program import app, examples
+from knode_cosserat.cli.telling import tell
 
 if TYPE_CHECKING:
     from knode_cosserat.trajectory import Trajectory
@@ -62,11 +65,16 @@ def view(
     space: Space = "euler",
     changes: Changes = None,
     nodes: Nodes = None,
+    as_json: Json = False,
 ) -> None:
     """Show trajectories in 3-D in the browser, or move a robot by sliders."""
     from knode_cosserat import viewer
 
     names = files or []
+
+    def ready(address: str) -> None:
+        tell(as_json, {"address": address}, [f"the viewer is at {address} (Ctrl-C ends it)"])
+
     if live:
         if export:
             raise ValueError("--live and --export exclude each other: a file has nobody to simulate")
@@ -74,11 +82,13 @@ def view(
             raise ValueError(f"--live moves one robot or model; given are {', '.join(names)}")
         name = names[0] if names else EXAMPLE
         viewer.live.require_websockets()
-        typer.echo(f"preparing {name} …", err=True)
         robot = system_of(name, changes, nodes)
+        if sys.stderr.isatty():
+            typer.echo(f"preparing {name} …", err=True)
         viewer.view_live(
-            robot, dt=0.05 if dt is None else dt, space=space, title=name, port=port, open_browser=not no_open
-        )
+            robot, dt=0.05 if dt is None else dt, space=space, title=name, port=port,
+            open_browser=not no_open, ready=ready,
+        )  # fmt: skip
         return
     if not names:
         raise ValueError("no trajectory is given: knode-cosserat view FILE…, or view --live ROBOT")
@@ -88,9 +98,9 @@ def view(
     trajectories = _by_name(names)
     if export:
         viewer.export_scene(trajectories, export)
-        typer.echo(f"wrote {export}")
+        tell(as_json, {"trajectories": list(trajectories)}, [], export=export)
     else:
-        viewer.view(trajectories, port=port, open_browser=not no_open)
+        viewer.view(trajectories, port=port, open_browser=not no_open, ready=ready)
 
 
 def _by_name(files: list[str]) -> dict[str, Trajectory]:

@@ -62,6 +62,7 @@ def view_live(
         SimulationError: the robot cannot even begin to move.
     """
     require_websockets()
+    checked_port(port)
     page = live_page(robot, dt, space, title)
     asyncio.run(_serve(robot, dt, space, page, checked_port(port), open_browser, ready))
 

@@ -298,6 +298,12 @@ class Viewer {
     this.answers ??= since;
     this.robots[0].rebuildPath(TRAIL);
     this.stage.dirty = true;
+    // what a slider asked for is drawn at once, but once a frame
+    if (since !== undefined && !this.early) {
+      this.early = true;
+      this.#draw(false);
+      this.moving = performance.now();
+    }
   }
 
   #plotLive() {
@@ -312,6 +318,7 @@ class Viewer {
   // the clock
 
   #frame(now) {
+    this.early = false;
     if (this.playing && !this.live) {
       if (this.last) {
         const next = this.time + (this.speed * Math.min(200, now - this.last)) / 1000;
@@ -334,10 +341,10 @@ class Viewer {
       if (!moment.solved && this.tracks[k].wanted) unsolved.push(this.tracks[k]);
     });
     const cells = this.stage.draw(fine);
-    if (this.measured) this.stage.finish();
     if (this.live) {
-      this.live.drawn(this.answers);
+      const since = this.answers;
       this.answers = undefined;
+      if (since !== undefined) this.stage.finished().then(() => this.live.drawn(since));
       $("clock").textContent = `${this.time.toFixed(2)} s`;
     } else {
       $("clock").textContent = `${this.time.toFixed(2)} / ${this.span[1].toFixed(2)} s`;

@@ -208,6 +208,15 @@ export class Stage {
     return apart ? cells : [];
   }
 
+  /** When what was asked for is drawn: nothing waits for it in the meantime. */
+  async finished() {
+    const gl = this.renderer.getContext();
+    const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+    while (gl.getSyncParameter(fence, gl.SYNC_STATUS) !== gl.SIGNALED) await new Promise((again) => setTimeout(again, 1));
+    gl.deleteSync(fence);
+  }
+
   /** Wait until what was drawn is drawn, for measurements. */
   finish() {
     const gl = this.renderer.getContext();
