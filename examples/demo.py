@@ -48,7 +48,7 @@ def predict_a_recording(out: Path) -> None:
     print("   The recording comes from a simulated stand-in robot (PyElastica), not from a physical one.")
 
 
-def learn_what_a_model_misses(out: Path) -> None:
+def learn_what_a_model_misses(out: Path) -> dict[str, kc.Trajectory]:
     """The hardest case of the paper's simulation study: a model of the wrong length and stiffness."""
     robot = kc.load_robot("delrin-tendon-robot")
     imperfect = robot.replace(length=0.4, youngs_modulus=10e9)
@@ -93,6 +93,17 @@ def learn_what_a_model_misses(out: Path) -> None:
     print()
     print(f"   model:   {out / 'model'}")
     print(f"   picture: {out / 'learning.png'}")
+    return {"robot": truth["sine"], "model, before": sines["baseline"], "this package's model": sines["best"]}
+
+
+def show(compared: dict[str, kc.Trajectory], out: Path) -> None:
+    """All of the third part in one page, and what else the viewer does."""
+    kc.export_scene(compared, out / "scene.html", title="What the model missed")
+    print("4. Drew the robot, the wrong model and the corrected one in motion; open it in a browser:")
+    print(f"   page:    {out / 'scene.html'}")
+    print("   To see the first part, and to pull the robot's tendons yourself:")
+    print(f"     .venv/bin/knode-cosserat view {out / 'truth.nc'}")
+    print(f"     .venv/bin/knode-cosserat view --live {out / 'model'}")
 
 
 def moved(system: kc.System, control: str, rows: int) -> kc.Trajectory:
@@ -109,7 +120,9 @@ def main() -> None:
     print()
     predict_a_recording(out)
     print()
-    learn_what_a_model_misses(out)
+    compared = learn_what_a_model_misses(out)
+    print()
+    show(compared, out)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from knode_cosserat.evaluation.metrics import dtw_distance
 ROBOT = "delrin-tendon-robot"
 COMMANDS = ("simulate", "equilibrium", "info", "reach", "workspace", "fit", "evaluate", "plot", "animate",
             "inspect", "study simulation", "study imperfections", "study data", "study estimation",
-            "record-virtual", "schema", "doctor")  # fmt: skip
+            "record-virtual", "schema", "doctor", "view")  # fmt: skip
 
 
 def run(*arguments):

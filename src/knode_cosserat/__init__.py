@@ -64,9 +64,11 @@ from knode_cosserat.solvers.result import Result, SimulationError
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.solvers.space import RK4, Euler
+from knode_cosserat.solvers.stepper import Stepper
 from knode_cosserat.solvers.time import BDF1, BDF2, BDFAlpha, Trapezoidal
 from knode_cosserat.trajectory import Trajectory
 from knode_cosserat.trajectory_file import TrajectoryFileError, load_trajectory
+from knode_cosserat.viewer import export_scene, view, view_live
 
 logging.getLogger(__name__).addHandler(logging.NullHandler())
 
@@ -115,6 +117,7 @@ __all__ = [
     "SimulationError",
     "SlenderRod",
     "StateError",
+    "Stepper",
     "Stretch",
     "StructuredOptions",
     "System",
@@ -135,6 +138,7 @@ __all__ = [
     "estimate_parts",
     "estimate_states",
     "explain",
+    "export_scene",
     "figures",
     "fit",
     "identify",
@@ -159,5 +163,7 @@ __all__ = [
     "surroundings",
     "tip_dtw",
     "tip_rmse",
+    "view",
+    "view_live",
     "workspace",
 ]

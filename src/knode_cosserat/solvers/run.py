@@ -101,7 +101,7 @@ def run_one(
         if _trustworthy(task, finer, system, start) or _agree(finer, before, system):
             return finer._replace(result=np.full(task.steps, int(Result.RECOVERED_FINER_SEGMENTS))), ""
         parts, before = 2 * parts, finer
-    _refuse(steps, steps.size > _trusted_size(system, start), Result.UNSTABLE)
+    _refuse(steps, steps.size > trusted_size(system, start), Result.UNSTABLE)
     return steps, (
         f"{cause} At this time step its waves decay by e^{decay:.2g} within a segment, too much for an "
         "explicit scheme in space, and dividing the segments did not help: use longer time steps."
@@ -131,10 +131,10 @@ def _trustworthy(task: Task, steps: Steps, system: System, start: Start) -> bool
         return False
     if isinstance(task.settings.time, Static) or steps.size.max() <= SUSPICIOUS:
         return True
-    return bool(steps.size.max() <= _trusted_size(system, start))
+    return bool(steps.size.max() <= trusted_size(system, start))
 
 
-def _trusted_size(system: System, start: Start) -> float:
+def trusted_size(system: System, start: Start) -> float:
     """Numbers of y up to this, in natural units, are not suspicious: more if it starts with large ones."""
     y = np.asarray(start.past.records[0])[:, : system.y_layout.size]
     return SUSPICIOUS * max(1.0, float(np.max(np.abs(y) / np.asarray(system.scales().y))))
@@ -183,14 +183,8 @@ def _with_recovery(
             reached = int(reached)
             rows = _merged(rows, new, done, reached, total)
             if reached < stop:
-                settings = task.settings
-                if task.first == "still":
-                    settings = dataclasses.replace(settings, time=Static())
-                outcome = recover(
-                    system, settings, past, table[min(reached, 1)],
-                    (controls[reached - 1] if reached else start.control, controls[reached]),
-                    float(past.t0) + (reached + 1) * task.dt, task.dt,
-                )  # fmt: skip
+                before = controls[reached - 1] if reached else start.control
+                outcome = rescue(task, system, past, (before, controls[reached]), reached)
                 past = outcome.past
                 log.info("step %d: %s", reached + 1, outcome.result.message)
                 _set_row(rows, reached, outcome)
@@ -202,11 +196,20 @@ def _with_recovery(
                     if rescues == ENOUGH_RESCUES:
                         log.info("step %d: from here on by the stable elimination", reached)
                 if rescues >= ENOUGH_RESCUES:
-                    settings = with_stable_elimination(settings)
+                    settings = with_stable_elimination(task.settings)
             bar.update(reached - done)
             done = reached
     assert rows is not None
     return rows, ""
+
+
+def rescue(task: Task, system: System, past: Past, controls: tuple[Any, Any], i: int) -> Outcome:
+    """All that is tried of step i where the compiled march fails; with the controls before it and of it."""
+    settings = task.settings
+    if task.first == "still":
+        settings = dataclasses.replace(settings, time=Static())
+    t = float(past.t0) + (i + 1) * task.dt
+    return recover(system, settings, past, task.table[min(i, 1)], controls, t, task.dt)
 
 
 def with_stable_elimination(settings: Settings) -> Settings:

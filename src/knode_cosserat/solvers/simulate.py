@@ -72,19 +72,16 @@ def simulate(
     """
     if initial is not None and not isinstance(initial, Trajectory):
         raise ValueError(f"initial is a {type(initial).__name__}; allowed is a Trajectory, or None")
-    if elimination is None:
-        before = None if initial is None else initial.settings
-        elimination = "condensed" if before is None else before.elimination
-    settings = Settings.of(time, space, start, newton, elimination)
+    settings = settings_of(time, space, start, newton, elimination, initial)
     if on_failure not in ("raise", "return"):
         raise ValueError(f'on_failure is {on_failure!r}; allowed is "raise" or "return"')
-    dt = _checked_dt(dt)
+    dt = checked_dt(dt)
     system, batch = _stacked(robot)
     controls, batch = _checked_controls(system, controls, batch)
     if not isinstance(settings.time, Static):
         _warn_of_long_steps(system, dt)
     if initial is not None:
-        _check_initial(system, initial, batch)
+        check_initial(system, initial, batch)
     run = Run(system, controls, initial, settings, dt, batch, isinstance(robot, Sequence))
     if is_traced((system, controls, initial)):
         return _traced(*run)
@@ -108,6 +105,17 @@ class Run(NamedTuple):
 # checking what was given
 
 
+def settings_of(
+    time: str | TimeScheme, space: str | SpaceScheme, start: str, newton: NewtonOptions,
+    elimination: str | LinearSolver | None, initial: Trajectory | None,
+) -> Settings:  # fmt: skip
+    """What was chosen; of the elimination, what `initial` ended with unless it is given."""
+    if elimination is None:
+        before = None if initial is None else initial.settings
+        elimination = "condensed" if before is None else before.elimination
+    return Settings.of(time, space, start, newton, elimination)
+
+
 def _stacked(robot: Any) -> tuple[System, int | None]:
     if isinstance(robot, System):
         return robot, None
@@ -119,7 +127,8 @@ def _stacked(robot: Any) -> tuple[System, int | None]:
     return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(x) for x in leaves]), *robots), len(robots)
 
 
-def _checked_dt(dt: Any) -> float:
+def checked_dt(dt: Any) -> float:
+    """A time step (s); `ValueError` for what is none."""
     if not isinstance(dt, int | float | np.number) or not 0.0 < dt < np.inf:
         raise ValueError(f"dt is {dt!r}; allowed is a positive number of seconds")
     return float(dt)
@@ -169,7 +178,8 @@ def _checked_controls(system: System, controls: Any, batch: int | None) -> tuple
     return controls, batch
 
 
-def _check_initial(system: System, initial: Trajectory, batch: int | None) -> None:
+def check_initial(system: System, initial: Trajectory, batch: int | None) -> None:
+    """That a trajectory is one robot's, fits the system, and is solved; `ValueError` otherwise."""
     if batch or initial.y.ndim == 4:
         raise ValueError("initial is for one robot, not for a batch")
     wanted = (system.nodes, system.y_layout.size)

@@ -1,0 +1,235 @@
+"""What of a system is drawn beside its states: radii, tendons, ribs, obstacles, and its fields."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import numpy as np
+
+from knode_cosserat.learning.knode import KNODE
+from knode_cosserat.rods.loads import AttachedMass
+from knode_cosserat.rods.rod import Rod
+from knode_cosserat.rods.routed_robot import RoutedTendonRobot
+from knode_cosserat.rods.routing import ends
+from knode_cosserat.rods.surroundings import Cylinder, Obstacle, Plane, Sphere
+from knode_cosserat.rods.system import Field, Layout, System
+from knode_cosserat.rods.tendon_rod import TendonRod
+
+#: the radius of what has none, as a part of its length
+SLIM = 0.006
+#: how far tendons that have no place are drawn from the axis, in radii of the rod
+BESIDE = 2.5
+#: how much wider ribs are than the circle of their tendons
+RIM = 1.3
+#: where sliders may end, between powers of ten
+NICE = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
+
+
+def physics_of(system: System) -> Any:
+    """The robot itself: of a model its knowledge, as what it learned corrects it."""
+    return system.adapted if isinstance(system, KNODE) else system
+
+
+def drawing(system: System, nodes: np.ndarray) -> dict[str, Any]:
+    """What the page needs to know of a system to draw its states at these of its nodes."""
+    robot = physics_of(system)
+    s = nodes / max(1, system.nodes - 1) * float(system.length)
+    radii = _radii(robot, s)
+    tendons = _tendons(robot, s, radii)
+    return {
+        "kind": type(robot).__name__,
+        "model": isinstance(system, KNODE),
+        "length": float(system.length),
+        "up": _up(robot),
+        "radii": _short(radii),
+        "tendons": tendons,
+        "ribs": _ribs(robot, system.nodes, tendons, float(np.mean(radii))),
+        "obstacles": [_obstacle(each) for each in getattr(robot, "surroundings", ())],
+    }
+
+
+def _short(values: Any) -> Any:
+    """Numbers as they are written, no longer than a drawing needs."""
+    return np.round(np.asarray(values, dtype=float), 7).tolist()
+
+
+def _radii(robot: Any, s: np.ndarray) -> np.ndarray:
+    radius = getattr(robot, "radius", None)
+    if radius is None or np.ndim(radius):
+        return np.full(len(s), SLIM * float(robot.length))
+    if isinstance(robot, Rod) and robot.sections:
+        none = np.zeros(robot.control_size)
+        return np.asarray(jax.vmap(lambda at: robot.material(at, none).radius + 0.0 * at)(s))
+    return np.full(len(s), float(radius))
+
+
+def _up(robot: Any) -> list[float]:
+    """The direction against gravity; z where there is none. Positions of two numbers are drawn in x and z."""
+    gravity = np.asarray(getattr(robot, "gravity", np.zeros(3)), dtype=float)
+    size = np.linalg.norm(gravity) if gravity.shape == (3,) else 0.0
+    return _short(-gravity / size) if size > 0.0 else [0.0, 0.0, 1.0]
+
+
+def _tendons(robot: Any, s: np.ndarray, radii: np.ndarray) -> dict[str, Any] | None:
+    """Where the tendons run (c, nodes, 3) in the material frame, where they end, and their tension."""
+    if not isinstance(robot, TendonRod):
+        return None
+    if isinstance(robot, RoutedTendonRobot):
+        where = np.stack(
+            [np.broadcast_to(np.asarray(robot.routes_at(at)[0]), (robot.tendon_count, 3)) for at in s]
+        )
+        last = ends(robot.routings).tolist()
+    else:
+        angles = np.asarray(robot.tendon_angles, dtype=float)
+        around = np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=-1)
+        offset = float(robot.tendon_offset) or BESIDE * float(np.max(radii))
+        where, last = np.broadcast_to(offset * around, (len(s), *around.shape)), [1.0] * len(angles)
+    y, control = robot.y_layout, robot.control_layout
+    array, layout = ("control", control) if "tension" in control.names else ("y", y)
+    return {
+        "routes": _short(np.moveaxis(where, 0, 1)),
+        "ends": last,
+        "tension": {"array": array, "offset": layout.slice("tension").start},
+        "loss": {"array": "y", "offset": y.slice("loss").start} if "loss" in y.names else None,
+    }
+
+
+def _ribs(robot: Any, nodes: int, tendons: dict[str, Any] | None, radius: float) -> list[dict[str, Any]]:
+    """Discs that hold tendons, and masses: at the robot's masses, or else at its nodes."""
+    masses = [load for load in getattr(robot, "loads", ()) if isinstance(load, AttachedMass)]
+    if tendons is None:
+        return [{"at": float(load.at), "shape": "ball", "radius": 2.5 * radius} for load in masses]
+    width = RIM * max(float(np.linalg.norm(tendons["routes"], axis=-1).max()), 2.0 * radius)
+    if masses:
+        return [{"at": float(load.at), "shape": "rib", "radius": width} for load in masses]
+    count = min(nodes, 21)
+    return [{"at": k / (count - 1), "shape": "guide", "radius": width} for k in range(1, count)]
+
+
+def _obstacle(obstacle: Obstacle) -> dict[str, Any]:
+    if isinstance(obstacle, Plane):
+        return {"shape": "plane", "point": _short(obstacle.point), "normal": _short(obstacle.normal)}
+    if isinstance(obstacle, Sphere):
+        more = {"shape": "sphere", "point": _short(obstacle.center)}
+    elif isinstance(obstacle, Cylinder):
+        more = {"shape": "cylinder", "point": _short(obstacle.point), "axis": _short(obstacle.axis)}
+    else:  # one of the user's own, of which nothing is known but its distance
+        return {"shape": "unknown", "name": type(obstacle).__name__}
+    return {**more, "radius": float(obstacle.radius), "inside": bool(obstacle.inside)}
+
+
+def fields(system: System) -> list[dict[str, Any]]:
+    """What can be plotted: every field of y, z and the control, with its components' names."""
+    layouts = (("y", system.y_layout), ("z", system.z_layout), ("control", system.control_layout))
+    return [
+        {
+            "array": array, "name": field.name, "unit": field.unit, "meaning": field.meaning,
+            "offset": layout.slice(field.name).start, "components": _components(field, array == "control"),
+        }
+        for array, layout in layouts
+        for field in layout.fields
+    ]  # fmt: skip
+
+
+def _components(field: Field, control: bool) -> list[str]:
+    """As in a trajectory's file."""
+    if field.size == 1:
+        return [""]
+    if field.size == 4 and field.name.rstrip("0123456789") == "h":
+        return ["w", "x", "y", "z"]
+    if field.size == 3 and not control:
+        return ["x", "y", "z"]
+    return [str(k + 1) for k in range(field.size)]
+
+
+def sliders(system: System) -> list[dict[str, Any]]:
+    """A slider for each number of the control: its name and unit, a sensible range, where it begins."""
+    robot, layout = physics_of(system), system.control_layout
+    found = []
+    for field in layout.fields:
+        low, high, start = _range(robot, field)
+        for component in _components(field, control=True):
+            name = f"{field.name} {component}".strip()
+            found.append(
+                {"name": name, "unit": field.unit, "meaning": field.meaning, "low": low, "high": high,
+                 "start": start, "step": (high - low) / 500.0}
+            )  # fmt: skip
+    return found
+
+
+def _range(robot: Any, field: Field) -> tuple[float, float, float]:
+    length = float(robot.length)
+    if field.name == "tension" and isinstance(robot, TendonRod):
+        bending = float(np.asarray(robot.Kbt)[0, 0])
+        if isinstance(robot, RoutedTendonRobot):  # one radian by a single tendon
+            arm = max(float(np.linalg.norm(np.asarray(robot.routes_at(0.0)[0]), axis=-1).max()), 1e-6)
+            return 0.0, _nice(bending / (length * arm)), 0.0
+        # about two radians by a load of so many N/m; the paper's middle tension
+        high = _nice(12.0 * bending / length**3)
+        return 0.0, high, high / 2.0
+    if field.unit == "N":
+        high = _nice(2.0 * float(np.max(np.abs(np.asarray(robot.scales().y)))))
+        return -high, high, 0.0
+    if field.name == "reel":
+        arm = float(np.linalg.norm(np.asarray(robot.routes_at(0.0)[0]), axis=-1).max())
+        return 0.0, _nice(1.2 * arm), 0.0
+    if field.unit == "m":
+        reach = _nice(0.2 * length)
+        return -reach, reach, 0.0
+    return (-0.8, 0.8, 0.0) if field.unit == "rad" else (-1.0, 1.0, 0.0)
+
+
+def _nice(value: float) -> float:
+    """A round number, not below the given one."""
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(next(step * power for step in NICE if step * power >= value * (1.0 - 1e-9)))
+
+
+def positions_of(system: System, y: np.ndarray) -> np.ndarray:
+    """Positions (T, N, 3) of states, those of two numbers in x and z.
+
+    Raises:
+        ValueError: the system does not say where its nodes are.
+    """
+    try:
+        found = np.asarray(system.positions(y), dtype=float)
+    except AttributeError as error:
+        raise ValueError(f"{error}; without positions there is nothing to draw") from None
+    if found.ndim == 3 and found.shape[-1] == 2:
+        found = np.stack([found[..., 0], np.zeros(found.shape[:-1]), found[..., 1]], axis=-1)
+    if found.ndim != 3 or found.shape[-1] != 3:
+        raise ValueError(
+            f"a {type(system).__name__} gives positions of shape {found.shape}; "
+            "allowed is (T, N, 3) or (T, N, 2)"
+        )
+    return found
+
+
+def quaternions_of(system: System, y: np.ndarray) -> np.ndarray | None:
+    """Orientations (T, N, 4), scalar first, if the system has any."""
+    try:
+        return np.asarray(system.quaternions(y), dtype=float)
+    except AttributeError:
+        return None
+
+
+def curves_of(system: System, y: np.ndarray, positions: np.ndarray) -> list[dict[str, Any]]:
+    """Lines to be drawn beside that of the positions, if there are others: rods, and outlines that close."""
+    flat = type(system).curves is System.curves
+    found = [] if flat else [np.asarray(curve, dtype=float) for curve in system.curves(y)]
+    if not found or (len(found) == 1 and np.array_equal(found[0], positions, equal_nan=True)):
+        return []
+    rods = system.strands if system.strands > 1 else len(found)
+    return [{"shape": "rod" if k < rods else "outline", "points": curve} for k, curve in enumerate(found)]
+
+
+def offset_of(layout: Layout, packed: np.ndarray, values: np.ndarray) -> int | None:
+    """Where in packed numbers these values stand as they are, so that they need not be sent again."""
+    start = 0
+    for field in layout.fields:
+        stop = start + field.size
+        if field.size == values.shape[-1] and np.array_equal(packed[..., start:stop], values, equal_nan=True):
+            return start
+        start = stop
+    return None

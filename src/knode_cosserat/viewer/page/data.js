@@ -1,0 +1,195 @@
+// The scene's numbers: unpacking them, and trajectories that can be asked for any time.
+
+const TYPES = { f4: Float32Array, f8: Float64Array };
+
+/** An array as `scene.packed` writes it: {shape, values}, values in the order of the shape. */
+export async function unpack({ shape, type, bytes }) {
+  const zipped = Uint8Array.from(atob(bytes), (c) => c.charCodeAt(0));
+  const stream = new Blob([zipped]).stream().pipeThrough(new DecompressionStream("gzip"));
+  const shuffled = new Uint8Array(await new Response(stream).arrayBuffer());
+  const size = TYPES[type].BYTES_PER_ELEMENT;
+  const count = shuffled.length / size;
+  const plain = new Uint8Array(shuffled.length);
+  for (let p = 0; p < size; p++) for (let k = 0; k < count; k++) plain[k * size + p] = shuffled[p * count + k];
+  const byColumn = new TYPES[type](plain.buffer);
+  const rows = shape[0];
+  const width = count / Math.max(1, rows);
+  const values = new TYPES[type](count);
+  for (let w = 0; w < width; w++) for (let t = 0; t < rows; t++) values[t * width + w] = byColumn[w * rows + t];
+  return { shape, width, values };
+}
+
+/** States over time of one robot. Rows that are not solved are never given: the last solved one stands for them. */
+export class Track {
+  static async of(packed) {
+    const [time, result] = await Promise.all([unpack(packed.time), unpack(packed.result)]);
+    const names = Object.keys(packed.arrays);
+    const arrays = await Promise.all(names.map((name) => unpack(packed.arrays[name])));
+    return new Track(packed, time.values, result.values, Object.fromEntries(names.map((n, k) => [n, arrays[k]])));
+  }
+
+  constructor(about, time, result, arrays) {
+    Object.assign(this, about); // name, drawing, fields, curves, position, orientation, failure …
+    this.times = Array.from(time);
+    this.results = Array.from(result);
+    this.arrays = arrays;
+    this.nodes = arrays.y.shape[1];
+    this.solved = this.results.map((r) => r >= 0);
+  }
+
+  get rows() {
+    return this.times.length;
+  }
+
+  /** The last row at or before a time; `solved` says whether it is a solution, `drawn` is the row to be drawn. */
+  at(t) {
+    let low = 0;
+    let high = this.rows - 1;
+    const slack = 1e-9 * Math.max(1, Math.abs(t));
+    while (low < high) {
+      const middle = (low + high + 1) >> 1;
+      if (this.times[middle] <= t + slack) low = middle;
+      else high = middle - 1;
+    }
+    let drawn = low;
+    while (drawn > 0 && !this.solved[drawn]) drawn--;
+    // a start that is not solved: the first that is
+    while (!this.solved[drawn] && drawn < this.rows - 1) drawn++;
+    let part = 0;
+    if (low === drawn && low + 1 < this.rows && this.solved[low + 1]) {
+      part = Math.min(1, Math.max(0, (t - this.times[low]) / (this.times[low + 1] - this.times[low])));
+      if (part < 1e-6) part = 0;
+    }
+    return { row: low, drawn, part, solved: this.solved[low] };
+  }
+
+  /** Numbers of every node (nodes × size) at a moment from `at`; between two rows, what lies between them. */
+  perNode({ array, offset = 0 }, size, { drawn, part }, into) {
+    const { values, width } = this.arrays[array];
+    const stride = width / this.nodes;
+    const a = drawn * width;
+    const b = part > 0 ? a + width : a;
+    for (let n = 0; n < this.nodes; n++)
+      for (let k = 0; k < size; k++) {
+        const i = n * stride + offset + k;
+        into[n * size + k] = values[a + i] + part * (values[b + i] - values[a + i]);
+      }
+    return into;
+  }
+
+  /** One array's whole row at a moment. */
+  whole(array, { drawn, part }, into) {
+    const { values, width } = this.arrays[array];
+    const a = drawn * width;
+    const b = part > 0 ? a + width : a;
+    for (let i = 0; i < width; i++) into[i] = values[a + i] + part * (values[b + i] - values[a + i]);
+    return into;
+  }
+
+  /** Every row of one component of a field, at one node (of a control: of the robot); NaN where not solved. */
+  series(field, component, node) {
+    const { values, width } = this.arrays[field.array];
+    const at = field.array === "control" ? 0 : node * (width / this.nodes);
+    return this.times.map((_, row) =>
+      this.solved[row] ? values[row * width + at + field.offset + component] : null,
+    );
+  }
+
+  /** The tip at a row, [x, y, z]. */
+  tip(row) {
+    const { array, offset } = this.position;
+    const { values, width } = this.arrays[array];
+    const at = row * width + (this.nodes - 1) * (width / this.nodes) + offset;
+    return [values[at], values[at + 1], values[at + 2]];
+  }
+
+  /** The tip at any time between two rows that are solved, or null. */
+  tipAt(t) {
+    if (t < this.times[0] - 1e-9 || t > this.times[this.rows - 1] + 1e-9) return null;
+    const { drawn, part, solved } = this.at(t);
+    if (!solved) return null;
+    const a = this.tip(drawn);
+    if (!part) return a;
+    const b = this.tip(drawn + 1);
+    return a.map((x, k) => x + part * (b[k] - x));
+  }
+
+  /** Put a row in the place of the last one if it is of the same time, or else after it. */
+  put(time, result, row) {
+    if (time < this.times[this.rows - 1]) this.forget();
+    else if (time > this.times[this.rows - 1]) return this.append(time, result, row);
+    let from = 0;
+    for (const { values, width } of Object.values(this.arrays)) {
+      values.set(row.subarray(from, from + width), (this.rows - 1) * width);
+      from += width;
+    }
+    this.times[this.rows - 1] = time;
+    this.results[this.rows - 1] = result;
+    this.solved[this.rows - 1] = result >= 0;
+  }
+
+  /** Add a row to a trajectory that grows; the oldest are forgotten. */
+  append(time, result, row, most = 600) {
+    const full = this.rows >= most;
+    let from = 0;
+    for (const array of Object.values(this.arrays)) {
+      const { width } = array;
+      if (!array.grown) {
+        const grown = new Float32Array(2 * most * width);
+        grown.set(array.values);
+        Object.assign(array, { buffer: grown, grown: true, first: 0 });
+      }
+      if (full) array.first++;
+      if (array.first >= most) {
+        array.buffer.copyWithin(0, array.first * width, (array.first + most) * width);
+        array.first = 0;
+      }
+      const kept = full ? most - 1 : this.rows;
+      array.values = array.buffer.subarray(array.first * width, (array.first + kept + 1) * width);
+      array.values.set(row.subarray(from, from + width), kept * width);
+      from += width;
+    }
+    if (full) for (const list of [this.times, this.results, this.solved]) list.shift();
+    this.times.push(time);
+    this.results.push(result);
+    this.solved.push(result >= 0);
+  }
+
+  /** Begin anew: only the last row is left, to be written over. */
+  forget() {
+    for (const array of Object.values(this.arrays)) {
+      array.values = array.values.slice(-array.width);
+      array.grown = false;
+    }
+    for (const name of ["results", "solved"]) this[name] = this[name].slice(-1);
+    this.times = [-Infinity];
+  }
+
+  /** Where the rod begins, [x, y, z], in the first row that is solved. */
+  firstPoint() {
+    const { array, offset } = this.position;
+    const { values, width } = this.arrays[array];
+    const at = Math.max(0, this.solved.indexOf(true)) * width + offset;
+    return [values[at], values[at + 1], values[at + 2]];
+  }
+
+  /** The smallest and largest coordinates of all solved rows, [[x, y, z], [x, y, z]]. */
+  box() {
+    const low = [Infinity, Infinity, Infinity];
+    const high = [-Infinity, -Infinity, -Infinity];
+    const places = [this.position, ...this.curves.map(({ array }) => ({ array, offset: 0, flat: true }))];
+    for (const { array, offset, flat } of places) {
+      const { values, width } = this.arrays[array];
+      const stride = flat ? 3 : width / this.nodes;
+      for (let i = offset; i + 2 < values.length; i += stride)
+        for (let k = 0; k < 3; k++) {
+          const x = values[i + k];
+          if (Number.isFinite(x)) {
+            low[k] = Math.min(low[k], x);
+            high[k] = Math.max(high[k], x);
+          }
+        }
+    }
+    return [low, high];
+  }
+}

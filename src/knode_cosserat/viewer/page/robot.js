@@ -1,0 +1,296 @@
+// One robot as it is drawn: rods, tendons, ribs, frames, base, and the path of its tip.
+import * as THREE from "three";
+import { Tube } from "viewer/tube";
+
+//: colours of tension, from none to the largest: dark to bright, for the colour-blind too
+const RAMP = ["#5b6c8f", "#a0617f", "#dd6a4b", "#f5b335"].map((c) => new THREE.Color(c));
+const AXES = ["#D55E00", "#009E73", "#0072B2"].map((c) => new THREE.Color(c));
+const UP = new THREE.Vector3(0, 1, 0);
+const ALONG = new THREE.Quaternion().setFromUnitVectors(UP, new THREE.Vector3(0, 0, 1));
+
+export const rampColours = () => RAMP.map((c) => `#${c.getHexString()}`);
+
+function rampColour(part, into, at) {
+  const place = Math.min(0.9999, Math.max(0, part)) * (RAMP.length - 1);
+  const low = Math.floor(place);
+  const [a, b] = [RAMP[low], RAMP[low + 1]];
+  into[at] = a.r + (place - low) * (b.r - a.r);
+  into[at + 1] = a.g + (place - low) * (b.g - a.g);
+  into[at + 2] = a.b + (place - low) * (b.b - a.b);
+}
+
+export class RobotModel {
+  constructor(track, colour, index, size) {
+    Object.assign(this, { track, size, index });
+    const { drawing, nodes } = track;
+    this.group = new THREE.Group();
+    this.colour = new THREE.Color(colour);
+    this.material = new THREE.MeshStandardMaterial({
+      color: this.colour, emissive: this.colour, emissiveIntensity: 0.22, roughness: 0.5, transparent: true,
+      // trajectories that lie on each other do not flicker
+      polygonOffset: true, polygonOffsetFactor: index, polygonOffsetUnits: index,
+    });
+    this.points = new Float32Array(3 * nodes);
+    this.turns = track.orientation ? new Float32Array(4 * nodes) : null;
+    this.parts = { rods: [], tendons: [], ribs: [], frames: [], path: [], base: [] };
+    this.#rods();
+    if (this.turns && drawing.tendons) this.#tendons(drawing.tendons);
+    this.#ribs(drawing.ribs);
+    if (this.turns) this.#frames();
+    this.#base();
+    this.#path();
+  }
+
+  #add(part, object, shadow = true) {
+    object.castShadow = shadow;
+    this.parts[part].push(object);
+    this.group.add(object);
+    return object;
+  }
+
+  show(part, wanted) {
+    for (const object of this.parts[part]) object.visible = wanted;
+  }
+
+  #rods() {
+    const { track } = this;
+    const parts = Math.max(1, Math.min(6, Math.ceil(60 / track.nodes)));
+    this.rods = [];
+    this.outlines = [];
+    // a segment should be seen even of a rod that is very thin
+    const seen = (r) => Math.max(r, 0.0025 * this.size);
+    this.radii = track.drawing.radii.map(seen);
+    if (track.curves.length === 0) {
+      const tube = new Tube(track.nodes, this.material, { parts });
+      this.rods.push({ tube, radii: this.radii, points: this.points });
+      this.#add("rods", tube.mesh);
+    }
+    for (const { shape, array } of track.curves) {
+      const count = track.arrays[array].width / 3;
+      const points = new Float32Array(3 * count);
+      const rod = shape === "rod";
+      const tube = new Tube(count, this.material, { parts: rod ? parts : 1 });
+      const own = rod && this.radii.length === count ? this.radii : Math.max(...this.radii);
+      this.rods.push({ tube, array, points, radii: rod ? own : 1.3 * own });
+      this.#add("rods", tube.mesh);
+      if (!rod) this.#plate(count, points);
+    }
+  }
+
+  #plate(count, points) {
+    const geometry = new THREE.BufferGeometry();
+    geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(3 * (count + 1)), 3));
+    geometry.setIndex(Array.from({ length: count - 1 }, (_, k) => [k, k + 1, count]).flat());
+    const material = new THREE.MeshStandardMaterial({
+      color: this.colour, side: THREE.DoubleSide, transparent: true, opacity: 0.45, roughness: 0.6,
+    });
+    const mesh = this.#add("rods", new THREE.Mesh(geometry, material));
+    mesh.frustumCulled = false;
+    this.outlines.push({ geometry, points, count });
+  }
+
+  #tendons({ routes, ends }) {
+    const { nodes, drawing } = this.track;
+    const material = new THREE.MeshStandardMaterial({ vertexColors: true, roughness: 0.6 });
+    const radius = Math.max(0.22 * Math.max(...drawing.radii), 0.0014 * this.size);
+    this.tendons = routes.map((route, k) => {
+      const count = Math.max(2, Math.round(ends[k] * (nodes - 1)) + 1);
+      const tube = new Tube(count, material, { parts: 3, sides: 8, coloured: true });
+      this.#add("tendons", tube.mesh);
+      return { tube, route, count, radius, points: new Float32Array(3 * count), colours: new Float32Array(3 * count) };
+    });
+  }
+
+  #ribs(ribs) {
+    this.ribs = ribs.map(({ at, shape, radius }) => {
+      const thick = shape === "rib" ? 0.16 * radius : 0.06 * radius;
+      const ball = shape === "ball" || !this.turns;
+      const geometry = ball
+        ? new THREE.SphereGeometry(Math.min(radius, 0.03 * this.size), 24, 16)
+        : new THREE.CylinderGeometry(radius, radius, thick, 40);
+      const material = new THREE.MeshStandardMaterial({
+        color: shape === "guide" ? this.colour : 0x8a94a6, transparent: true, depthWrite: shape !== "guide",
+        opacity: { ball: 0.95, rib: 0.8, guide: 0.28 }[shape], roughness: 0.55,
+      });
+      return { at, mesh: this.#add("ribs", new THREE.Mesh(geometry, material), shape !== "guide") };
+    });
+  }
+
+  #frames() {
+    const { nodes } = this.track;
+    const geometry = new THREE.BufferGeometry();
+    geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(18 * nodes), 3));
+    const colours = new Float32Array(18 * nodes);
+    for (let v = 0; v < 6 * nodes; v++) AXES[Math.floor((v % 6) / 2)].toArray(colours, 3 * v);
+    geometry.setAttribute("color", new THREE.BufferAttribute(colours, 3));
+    this.axes = new THREE.LineSegments(geometry, new THREE.LineBasicMaterial({ vertexColors: true }));
+    this.axes.frustumCulled = false;
+    this.#add("frames", this.axes, false);
+  }
+
+  #base() {
+    const legs = this.track.curves.filter(({ shape }) => shape === "rod");
+    const sole = legs.length < 2;
+    const rim = sole ? Math.max(0, ...this.track.drawing.ribs.map((rib) => rib.radius)) : 0;
+    const radius = Math.max(1.15 * rim, 3.2 * Math.max(...this.radii), 0.012 * this.size);
+    const height = Math.min(0.5 * radius, 0.02 * this.size);
+    this.baseHeight = height;
+    const geometry = new THREE.CylinderGeometry(radius, 1.08 * radius, height, 48);
+    geometry.translate(0, -0.5 * height, 0);
+    const material = new THREE.MeshStandardMaterial({ color: 0x5d6675, roughness: 0.7, metalness: 0.1 });
+    this.bases = this.rods
+      .filter((_, k) => sole ? k === 0 : k < legs.length)
+      .map((rod) => ({ rod, mesh: this.#add("base", new THREE.Mesh(geometry, material)) }));
+  }
+
+  #path() {
+    this.pathMaterial = new THREE.MeshBasicMaterial({ color: this.colour, transparent: true, opacity: 0.55 });
+    this.ghostMaterial = new THREE.LineBasicMaterial({ color: this.colour, transparent: true, opacity: 0.3 });
+    this.rebuildPath();
+  }
+
+  /** The tip's path of all rows: drawn once, and then shown as far as it has come. */
+  rebuildPath(last = Infinity) {
+    for (const object of this.parts.path) {
+      this.group.remove(object);
+      object.geometry.dispose();
+    }
+    const visible = this.parts.path[0]?.visible ?? true;
+    this.parts.path = [];
+    const { track } = this;
+    this.pathRows = [];
+    for (let row = Math.max(0, track.rows - last); row < track.rows; row++)
+      if (track.solved[row]) this.pathRows.push(row);
+    const points = new Float32Array(this.pathRows.flatMap((row) => track.tip(row)));
+    if (this.pathRows.length < 2) return;
+    this.path = new Tube(this.pathRows.length, this.pathMaterial, { parts: 1, sides: 5 });
+    this.path.update(points, 0.0016 * this.size);
+    this.#add("path", this.path.mesh, false);
+    if (last === Infinity) {
+      const ghost = new THREE.BufferGeometry().setAttribute("position", new THREE.BufferAttribute(points, 3));
+      this.#add("path", new THREE.Line(ghost, this.ghostMaterial), false);
+    }
+    this.show("path", visible);
+  }
+
+  /** The state at a time, tensions (N) coloured within a range. Gives the moment that is drawn. */
+  update(time, range) {
+    const { track, points } = this;
+    const moment = track.at(time);
+    track.perNode(track.position, 3, moment, points);
+    if (this.turns) track.perNode(track.orientation, 4, moment, this.turns);
+    for (const rod of this.rods) {
+      if (rod.array) track.whole(rod.array, moment, rod.points);
+      rod.tube.update(rod.points, rod.radii);
+    }
+    for (const { geometry, points: edge, count } of this.outlines) {
+      const array = geometry.attributes.position.array;
+      array.set(edge.subarray(0, 3 * count));
+      for (let k = 0; k < 3; k++) {
+        let sum = 0;
+        for (let i = 0; i < count - 1; i++) sum += edge[3 * i + k];
+        array[3 * count + k] = sum / (count - 1);
+      }
+      geometry.attributes.position.needsUpdate = true;
+      geometry.computeVertexNormals();
+    }
+    if (this.tendons) this.#pull(moment, range);
+    for (const { at, mesh } of this.ribs) this.#place(mesh, at);
+    for (const { mesh, rod } of this.bases) {
+      mesh.position.fromArray(rod.points, 0);
+      if (this.turns && !rod.array) mesh.quaternion.copy(this.#turn(0)).multiply(ALONG);
+      else mesh.quaternion.setFromUnitVectors(UP, this.#heading(rod.points));
+    }
+    if (this.axes) this.#orient();
+    this.path?.until(Math.max(0, this.pathRows.filter((row) => row <= moment.drawn).length - 1));
+    const opacity = moment.solved ? 1 : 0.35;
+    if (this.material.opacity !== opacity) this.material.opacity = opacity;
+    this.moment = moment;
+    return moment;
+  }
+
+  /** Where the tip is drawn. */
+  get tip() {
+    return Array.from(this.points.slice(-3));
+  }
+
+  #heading(points) {
+    return new THREE.Vector3(points[3] - points[0], points[4] - points[1], points[5] - points[2]).normalize();
+  }
+
+  #turn(node) {
+    const [w, x, y, z] = this.turns.subarray(4 * node, 4 * node + 4);
+    return new THREE.Quaternion(x, y, z, w).normalize();
+  }
+
+  #place(mesh, at) {
+    const last = this.track.nodes - 1;
+    const low = Math.min(last - 1, Math.floor(at * last + 1e-9));
+    const part = at * last - low;
+    for (let k = 0; k < 3; k++) {
+      const a = this.points[3 * low + k];
+      mesh.position.setComponent(k, a + part * (this.points[3 * low + 3 + k] - a));
+    }
+    if (!this.turns) return;
+    mesh.quaternion.copy(this.#turn(low).slerp(this.#turn(low + 1), part)).multiply(ALONG);
+  }
+
+  #pull(moment, [low, high]) {
+    const { track } = this;
+    const { tension, loss } = track.drawing.tendons;
+    const base = track.arrays[tension.array];
+    const row = moment.drawn * base.width + tension.offset;
+    const losses = loss && track.perNode(loss, this.tendons.length, moment, (this.losses ??= new Float32Array(track.nodes * this.tendons.length)));
+    const r = new THREE.Vector3();
+    this.tendons.forEach(({ tube, route, count, radius, points, colours }, k) => {
+      const pulled = base.values[row + k];
+      for (let n = 0; n < count; n++) {
+        r.fromArray(route[n]).applyQuaternion(this.#turn(n));
+        points[3 * n] = this.points[3 * n] + r.x;
+        points[3 * n + 1] = this.points[3 * n + 1] + r.y;
+        points[3 * n + 2] = this.points[3 * n + 2] + r.z;
+        const left = losses ? Math.exp(-losses[n * this.tendons.length + k]) : 1;
+        rampColour((pulled * left - low) / (high - low), colours, 3 * n);
+      }
+      tube.update(points, radius, colours);
+    });
+  }
+
+  #orient() {
+    const array = this.axes.geometry.attributes.position.array;
+    const length = 0.055 * this.size;
+    const axis = new THREE.Vector3();
+    for (let n = 0; n < this.track.nodes; n++)
+      for (let k = 0; k < 3; k++) {
+        const at = 18 * n + 6 * k;
+        axis.set(0, 0, 0).setComponent(k, length).applyQuaternion(this.#turn(n));
+        for (let c = 0; c < 3; c++) {
+          array[at + c] = this.points[3 * n + c];
+          array[at + 3 + c] = this.points[3 * n + c] + axis.getComponent(c);
+        }
+      }
+    this.axes.geometry.attributes.position.needsUpdate = true;
+  }
+
+  /** The smallest and largest base tension (N); of row 0, where a robot may be at rest, only if there is no other. */
+  get tensions() {
+    const { tendons } = this.track.drawing;
+    if (!this.tendons) return [];
+    const { values, width } = this.track.arrays[tendons.tension.array];
+    const found = [];
+    for (let row = Math.min(1, this.track.rows - 1); row < this.track.rows; row++)
+      for (let k = 0; k < this.tendons.length; k++) {
+        const value = values[row * width + tendons.tension.offset + k];
+        if (this.track.solved[row]) found.push(value);
+      }
+    return found.length ? [Math.min(...found), Math.max(...found)] : [];
+  }
+
+  recolour(colour) {
+    this.colour.set(colour);
+    this.material.color.set(colour);
+    this.material.emissive.set(colour);
+    this.pathMaterial.color.set(colour);
+    this.ghostMaterial.color.set(colour);
+  }
+}

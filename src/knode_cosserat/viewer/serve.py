@@ -1,0 +1,76 @@
+"""A page on a small server of this machine, for this machine only."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Callable
+
+from knode_cosserat.viewer.document import document
+from knode_cosserat.viewer.scene import Given, scene
+
+HOST = "127.0.0.1"
+
+
+def view(
+    trajectories: Given,
+    *,
+    title: str | None = None,
+    port: int = 0,
+    open_browser: bool = True,
+    ready: Callable[[str], None] | None = None,
+) -> None:
+    """Show trajectories in the browser until interrupted (Ctrl-C).
+
+    Args:
+        trajectories: a `Trajectory`, several, or several by name; those of a batch are shown one by one.
+        title: what stands above it; by default the names.
+        port: of the server, which only this machine reaches; 0 for any that is free.
+        open_browser: whether to open the page; its address is printed in any case.
+        ready: called with the address, instead of printing it.
+
+    Raises:
+        ValueError: no trajectory, more than 12, one that has nothing to be drawn, or an impossible port.
+        OSError: the port is taken.
+    """
+    import http.server
+
+    page = document(scene(trajectories, title)).encode("utf-8")
+
+    class Handler(http.server.BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            found = self.path.split("?")[0] in ("/", "/index.html")
+            body = page if found else b"not found"
+            self.send_response(200 if found else 404)
+            self.send_header("Content-Type", "text/html; charset=utf-8" if found else "text/plain")
+            self.send_header("Content-Length", str(len(body)))
+            self.send_header("Cache-Control", "no-store")
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, format: str, *args: object) -> None:
+            pass
+
+    with http.server.ThreadingHTTPServer((HOST, checked_port(port)), Handler) as server:
+        announce(f"http://{HOST}:{server.server_address[1]}/", open_browser, ready)
+        with contextlib.suppress(KeyboardInterrupt):
+            server.serve_forever()
+
+
+def checked_port(port: int) -> int:
+    """A port, or 0 for any; `ValueError` for what is none."""
+    if not 0 <= port <= 65535:
+        raise ValueError(f"port is {port!r}; allowed is 0 (any that is free) to 65535")
+    return port
+
+
+def announce(address: str, open_browser: bool, ready: Callable[[str], None] | None) -> None:
+    """Say where the page is, and open it if wanted."""
+    if ready is not None:
+        ready(address)
+    else:
+        print(f"the viewer is at {address} (Ctrl-C ends it)", file=sys.stderr, flush=True)
+    if open_browser:
+        import webbrowser
+
+        webbrowser.open(address)

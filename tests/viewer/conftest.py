@@ -1,0 +1,55 @@
+"""Trajectories that the tests of the viewer share, and a browser to show them in."""
+
+import numpy as np
+import pytest
+
+import knode_cosserat as kc
+from tests.viewer import browser as driver
+
+DT = 0.05
+
+
+@pytest.fixture(scope="session")
+def robot():
+    return kc.load_robot("delrin-tendon-robot")
+
+
+@pytest.fixture(scope="session")
+def truth(robot):
+    return kc.simulate(robot, kc.controls.sine(1.5, 60, DT), DT)
+
+
+@pytest.fixture(scope="session")
+def prediction(robot):
+    return kc.simulate(robot.replace(length=0.5), kc.controls.sine(1.5, 60, DT), DT)
+
+
+@pytest.fixture(scope="session")
+def failed(truth):
+    """Its rows from 40 on are not solved, as a simulation leaves them with `on_failure="return"`."""
+    result = np.array(truth.result)
+    result[40:] = int(kc.Result.NOT_REACHED)
+    result[40] = int(kc.Result.NO_CONVERGENCE)
+    y, z = np.array(truth.y), np.array(truth.z)
+    y[40:], z[40:] = np.nan, np.nan
+    return kc.Trajectory(
+        truth.system,
+        truth.settings,
+        truth.time,
+        y,
+        z,
+        truth.control,
+        result,
+        truth.residual,
+        truth.iterations,
+    )
+
+
+@pytest.fixture(scope="session")
+def browser():
+    if driver.find() is None:
+        pytest.skip(f"no browser: none of {', '.join(driver.NAMES)} is installed")
+    pytest.importorskip("websockets", reason="websockets, of the extra viz, drives the browser")
+    started = driver.Browser()
+    yield started
+    started.close()

@@ -1,0 +1,181 @@
+"""A robot that follows sliders: the page, what it says to the simulation, and who may speak to that."""
+
+import asyncio
+import json
+import threading
+import urllib.error
+import urllib.request
+
+import numpy as np
+import pytest
+
+import knode_cosserat as kc
+from knode_cosserat.viewer import view_live
+from knode_cosserat.viewer.live import Session, require_websockets
+
+websockets = pytest.importorskip("websockets", reason="the live mode is of the extra viz")
+DT = 0.05
+
+
+@pytest.fixture(scope="module")
+def address(robot):
+    found, known = [], threading.Event()
+
+    def ready(address):
+        found.append(address)
+        known.set()
+
+    threading.Thread(
+        target=view_live, args=(robot,), kwargs={"open_browser": False, "ready": ready}, daemon=True
+    ).start()
+    assert known.wait(120)
+    return found[0]
+
+
+@pytest.fixture
+def session(robot):
+    return Session(robot, DT, "euler", None)
+
+
+def numbers(message):
+    """Head and row of a frame."""
+    values = np.frombuffer(message, np.float32)
+    return values[:6], values[6:]
+
+
+def test_a_frame_is_the_step_in_progress_under_the_newest_control(session, robot):
+    first, then = np.array([7.0, 5.0, 5.0, 7.0]), np.array([5.0, 7.0, 7.0, 5.0])
+    stepper = kc.Stepper(robot, DT)
+    # both of the same step, until it is over
+    for sequence, control in ((1, first), (2, then)):
+        message, stuck = session.solve(control, sequence, over=False)
+        wanted = stepper.preview(control)
+        head, row = numbers(message)
+        assert not stuck and head[0] == sequence and head[2] == np.float32(DT)
+        np.testing.assert_array_equal(row[:190], wanted.y.astype(np.float32).ravel())
+        np.testing.assert_array_equal(row[-4:], control)
+    message, _ = session.solve(then, 3, over=True)
+    stepper.step(then)
+    head, row = numbers(message)
+    assert head[2] == np.float32(2 * DT)
+    np.testing.assert_array_equal(row[:190], stepper.preview(then).y.astype(np.float32).ravel())
+
+
+def test_what_cannot_be_solved_is_said_and_nothing_moves(session):
+    fair, hopeless = np.full(4, 6.0), np.array([5000.0, 0.0, 0.0, 5000.0])
+    for _ in range(2):
+        session.solve(fair, 1, over=True)
+    before = session.stepper.state
+    stuck, count = False, 0
+    while not stuck:
+        message, stuck = session.solve(hopeless, 7, over=count > 0)
+        count += 1
+        reached = session.stepper.state
+    said = json.loads(message)
+    assert said["sequence"] == 7 and said["unsolved"].startswith("Not solved: no solution found.")
+    assert session.stepper.state is reached and (count > 1 or reached is before)
+    message, stuck = session.solve(fair, 8, over=False)
+    assert not stuck and np.all(np.isfinite(numbers(message)[1]))
+
+
+@pytest.mark.parametrize(
+    ("message", "error"),
+    [
+        ({"control": [1.0], "sequence": 1}, "4 finite numbers"),
+        ({"control": [1.0, 2.0, 3.0, None], "sequence": 1}, "4 finite numbers"),
+        ({"control": ["x"] * 4, "sequence": 1}, "could not convert"),
+        ({"command": "rm"}, "command is 'rm'"),
+    ],
+)
+def test_a_wrong_message_changes_nothing(session, message, error):
+    before = session.control.copy()
+    with pytest.raises(ValueError, match=error):
+        session.understand(message)
+    np.testing.assert_array_equal(session.control, before)
+
+
+def test_without_its_package_one_line_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "websockets.asyncio.server", None)
+    with pytest.raises(
+        ImportError, match=r"^the live mode needs websockets: pip install 'knode-cosserat\[viz\]'$"
+    ):
+        require_websockets()
+
+
+def test_only_its_own_page_may_speak_to_it(address):
+    from websockets.asyncio.client import connect
+
+    async def speak(origin, **headers):
+        async with connect(
+            address.replace("http", "ws") + "live", origin=origin, additional_headers=headers
+        ) as own:
+            await own.send(json.dumps({"sequence": 5, "control": [6.0] * 4}))
+            while True:
+                message = await asyncio.wait_for(own.recv(), 30)
+                if isinstance(message, bytes) and numbers(message)[0][0] == 5:
+                    return numbers(message)
+
+    head, row = asyncio.run(speak(address.rstrip("/")))
+    assert head[3] >= 0 and np.all(np.isfinite(row))
+    for origin in ("http://elsewhere.example", None):
+        with pytest.raises(websockets.exceptions.ConnectionClosed) as closed:
+            asyncio.run(speak(origin))
+        assert closed.value.rcvd.code == 1008
+
+
+def test_under_another_name_it_answers_nothing(address):
+    request = urllib.request.Request(address, headers={"Host": "elsewhere.example"})
+    with pytest.raises(urllib.error.HTTPError, match="403"):
+        urllib.request.urlopen(request)
+    with pytest.raises(urllib.error.HTTPError, match="404"):
+        urllib.request.urlopen(address + "pyproject.toml")
+
+
+def test_a_slider_bends_the_robot_that_is_drawn(browser, address, robot):
+    browser.size(1280, 800)
+    browser.open(address)
+    browser.wait(lambda: browser.run("viewer.time > 0.2"))
+    before = np.array(browser.run("viewer.tip()"))
+    browser.drag(".slider:nth-child(1) input[type=range]", 0.7)
+    browser.wait(lambda: np.linalg.norm(np.array(browser.run("viewer.tip()")) - before) > 0.03)
+    control = browser.run("viewer.live.control")
+    assert control[0] > 6.5 and control[1:] == [6.0, 6.0, 6.0]
+    rest = kc.simulate(robot, np.tile(control, (100, 1)), DT).tip_position[-1]
+
+    def settled():
+        return np.linalg.norm(np.array(browser.run("viewer.tip()")) - rest) < 2e-3
+
+    assert browser.wait(settled)
+    assert browser.run("viewer.live.latencies.length") > 0
+    assert browser.errors() == []
+
+
+def test_it_stops_and_starts_again(browser, address):
+    browser.open(address)
+    browser.wait(lambda: browser.run("viewer.time > 0.2"))
+    browser.run("document.getElementById('play').click()")
+    browser.run("new Promise((done) => setTimeout(done, 300))")
+    stopped = browser.run("viewer.time")
+    browser.run("new Promise((done) => setTimeout(done, 300))")
+    assert browser.run("viewer.time") == stopped
+    browser.run("document.getElementById('reset').click(); document.getElementById('play').click()")
+    browser.wait(lambda: browser.run("viewer.time") < stopped)
+    assert browser.errors() == []
+
+
+@pytest.mark.campaign
+def test_the_page_says_what_cannot_be_solved_and_goes_on_after_it(browser, address):
+    browser.open(address)
+    browser.wait(lambda: browser.run("viewer.time > 0.2"))
+    pull = (
+        "(() => { const n = document.querySelectorAll('.slider input[type=number]')[0]; n.value = %s;"
+        " n.dispatchEvent(new Event('change')); })()"
+    )
+    browser.run(pull % 1e6)
+    browser.wait(lambda: "Not solved" in browser.run("document.getElementById('message').textContent"), 120)
+    tip = browser.run("viewer.tip()")
+    browser.run("new Promise((done) => setTimeout(done, 500))")
+    assert browser.run("viewer.tip()") == tip and np.all(np.isfinite(tip))
+    browser.run(pull % 7)
+    browser.wait(lambda: browser.run("document.getElementById('message').hidden"), 60)
+    assert browser.wait(lambda: browser.run("viewer.tip()") != tip)
