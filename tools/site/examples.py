@@ -6,6 +6,9 @@ import ast
 
 from tools.site.source import ROOT
 
+#: pictures of those that have a page of their own elsewhere
+PICTURES = {"demo": "images/learning.png", "your_own_robot": "images/own-robot-after.png"}
+
 
 def page() -> str:
     """One section an example, in the order of their names."""
@@ -17,7 +20,7 @@ def _section(name: str, code: str) -> str:
     said = (ast.get_docstring(ast.parse(code)) or "").splitlines()
     if not said:
         raise LookupError(f"examples/{name}.py has no docstring")
-    picture = f"images/examples/{name}.png"
+    picture = PICTURES.get(name, f"images/examples/{name}.png")
     parts = [f"## {name.replace('_', ' ').capitalize()}", said[0], f"`examples/{name}.py`"]
     if (ROOT / "docs" / picture).is_file():
         parts.append(f"![{said[0].rstrip('.')}]({picture})")
