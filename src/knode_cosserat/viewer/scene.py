@@ -1,7 +1,7 @@
 """What the page is given: trajectories as compact arrays, with what it needs to draw and to plot them.
 
 Arrays are float32, their bytes sorted by significance and compressed, in base64: 500 steps of the paper's
-robot take about 0.3 MB. What is longer is thinned: at most 41 nodes of a rod are kept, and of the rows so
+robot take 0.5 MB at most. What is longer is thinned: at most 41 nodes of a rod are kept, and of the rows so
 many (evenly, the last one among them) that a trajectory takes 2 MB before compression, at least 200. The
 page says so. Nothing that is not a number or a text leaves here, and texts are shown as texts only.
 """

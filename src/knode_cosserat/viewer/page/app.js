@@ -366,7 +366,7 @@ class Viewer {
     const a = first.tipAt(this.time);
     const words = others.flatMap((track) => {
       const b = a && track.wanted && track.tipAt(this.time);
-      return b ? [`${short(1000 * Math.hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2]))} mm`] : [];
+      return b ? [distance(Math.hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2]))] : [];
     });
     $("error-now").textContent = `to ${first.name}${words.length ? `: ${words.join(", ")}` : ""}`;
   }
@@ -394,6 +394,11 @@ class Viewer {
   tip(k = 0) {
     return this.robots[k].tip;
   }
+}
+
+/** Positions are float32: what is below a micrometre is not known. */
+function distance(metres) {
+  return metres < 1e-6 ? "less than 0.001 mm" : `${short(1000 * metres)} mm`;
 }
 
 function length(metres) {

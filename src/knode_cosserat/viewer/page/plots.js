@@ -103,7 +103,8 @@ export function fieldLines(tracks, colours, name, component, node) {
       if (component !== "all" && Number(component) !== c) return;
       lines.push({
         label: `${track.name} ${label}`.trim(), times: track.times, values: track.series(field, c, place),
-        colour: colours[k], dash: component === "all" ? c : 0, component: label,
+        // what may lie on what was drawn before lets it shine through
+        colour: colours[k], dash: component === "all" ? c : k, component: label,
       });
     });
   });
