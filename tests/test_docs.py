@@ -12,6 +12,7 @@ import pytest
 import typer
 import typer.testing
 
+import knode_cosserat as kc
 from examples import your_own_robot
 from knode_cosserat.cli import app
 from knode_cosserat.recordings.virtual import record_virtual
@@ -62,6 +63,9 @@ def run(page, long, printed):
 def folder(tmp_path, monkeypatch):
     """A folder with what pages name: the examples and the tests' results are beside it."""
     monkeypatch.chdir(tmp_path)
+    # these show until somebody closes them: here it is enough that there is something to show
+    monkeypatch.setattr("knode_cosserat.view", lambda scene: kc.export_scene(scene, "shown.html"))
+    monkeypatch.setattr("knode_cosserat.view_live", lambda robot: kc.Stepper(robot, 0.05))
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     return tmp_path
 

@@ -61,7 +61,8 @@ def built(out: pathlib.Path) -> tuple[pathlib.Path, pathlib.Path]:
     (wheel,), (sdist,) = out.glob("*.whl"), out.glob("*.tar.gz")
     with tempfile.TemporaryDirectory() as scratch:
         with tarfile.open(sdist) as archive:
-            archive.extractall(scratch, filter="data")
+            # Debian 12's Python has no filters yet; it is our own archive
+            archive.extractall(scratch, **({"filter": "data"} if hasattr(tarfile, "data_filter") else {}))
         (source,) = pathlib.Path(scratch).iterdir()
         again = pathlib.Path(scratch) / "again"
         run(sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", again, cwd=source)

@@ -53,7 +53,8 @@ def parts(draw, family):
     for name, stated in parameters_of(cls).items():
         required = fields[name].default is dataclasses.MISSING
         if (name not in ("begin", "end") or "begin" not in fields) and (required or draw(st.booleans())):
-            given[name] = draw(numbers(stated))
+            direction = name in ("normal", "axis")
+            given[name] = draw(numbers(stated).filter(any) if direction else numbers(stated))
     if "begin" in fields and draw(st.booleans()):
         places = st.lists(st.floats(0.0, 1.0), min_size=2, max_size=2, unique=True)
         given["begin"], given["end"] = sorted(draw(places))
