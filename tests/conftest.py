@@ -1,7 +1,13 @@
 """Every test runs with the annotated shapes of equations and solver checked at each call.
 
 Not the public functions: they say themselves, in one line, what is wrong with their arguments.
+
+Most of the time of the tests is compiling programs that run for milliseconds, so XLA is asked to spend less on
+optimising machine code. The long campaigns run what users run.
 """
+
+import os
+import sys
 
 from jaxtyping import install_import_hook
 
@@ -9,3 +15,11 @@ EQUATIONS = ("rotation", "rods.loads", "rods.section", "rods.tendons")
 SOLVER = ("solvers.boundary", "solvers.linear", "solvers.march", "solvers.space", "solvers.time")
 
 install_import_hook([f"knode_cosserat.{name}" for name in EQUATIONS + SOLVER], "beartype.beartype")
+
+#: quick to compile; set before JAX is imported, and inherited by the programs that tests start
+QUICK = "--xla_backend_optimization_level=0"
+
+
+def pytest_configure(config):  # noqa: D103
+    if "not campaign" in config.option.markexpr and "jax" not in sys.modules:
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICK}".strip()
