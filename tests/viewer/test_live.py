@@ -11,7 +11,7 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.viewer import view_live
-from knode_cosserat.viewer.live import Session, require_websockets
+from knode_cosserat.viewer.live import Session, require_websockets, usual_step
 
 websockets = pytest.importorskip("websockets", reason="the live mode is of the extra viz")
 DT = 0.05
@@ -76,6 +76,15 @@ def test_what_cannot_be_solved_is_said_and_nothing_moves(session):
     assert session.stepper.state is reached and (count > 1 or reached is before)
     message, stuck = session.solve(fair, 8, over=False)
     assert not stuck and np.all(np.isfinite(numbers(message)[1]))
+
+
+def test_a_model_moves_at_the_step_it_learned_at(robot):
+    model = kc.KNODE(robot, None)
+    assert usual_step(robot) == usual_step(model) == 0.05
+    model.about.facts["trajectories"] = [{"dt": 0.02, "rows": 30}]
+    assert usual_step(model) == 0.02
+    model.about.facts["trajectories"] = "none of yours"
+    assert usual_step(model) == 0.05
 
 
 @pytest.mark.parametrize(
