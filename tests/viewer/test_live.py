@@ -40,7 +40,7 @@ def session(robot):
 def numbers(message):
     """Head and row of a frame."""
     values = np.frombuffer(message, np.float32)
-    return values[:6], values[6:]
+    return values[:5], values[5:]
 
 
 def test_a_frame_is_the_step_in_progress_under_the_newest_control(session, robot):
@@ -51,13 +51,13 @@ def test_a_frame_is_the_step_in_progress_under_the_newest_control(session, robot
         message, stuck = session.solve(control, sequence, over=False)
         wanted = stepper.preview(control)
         head, row = numbers(message)
-        assert not stuck and head[0] == sequence and head[2] == np.float32(DT)
+        assert not stuck and head[0] == sequence and head[1] == np.float32(DT)
         np.testing.assert_array_equal(row[:190], wanted.y.astype(np.float32).ravel())
         np.testing.assert_array_equal(row[-4:], control)
     message, _ = session.solve(then, 3, over=True)
     stepper.step(then)
     head, row = numbers(message)
-    assert head[2] == np.float32(2 * DT)
+    assert head[1] == np.float32(2 * DT)
     np.testing.assert_array_equal(row[:190], stepper.preview(then).y.astype(np.float32).ravel())
 
 
@@ -125,7 +125,7 @@ def test_only_its_own_page_may_speak_to_it(address):
                     return numbers(message)
 
     head, row = asyncio.run(speak(address.rstrip("/")))
-    assert head[3] >= 0 and np.all(np.isfinite(row))
+    assert head[2] >= 0 and np.all(np.isfinite(row))
     for origin in ("http://elsewhere.example", None):
         with pytest.raises(websockets.exceptions.ConnectionClosed) as closed:
             asyncio.run(speak(origin))

@@ -244,6 +244,6 @@ class Session:
 
     def frame(self, ahead: Trajectory, sequence: int) -> bytes:
         """A shape for the page: what it answers, time, result, pace, computing time (ms), then the row."""
-        head = [sequence, 1.0, ahead.time[0], ahead.result[0], self.pace, self.spent]
+        head = [sequence, ahead.time[0], ahead.result[0], self.pace, self.spent]
         row = row_of(self.robot, ahead, self.names)
         return np.concatenate([np.array(head, dtype=np.float32), row]).tobytes()
