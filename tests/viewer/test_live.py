@@ -11,7 +11,7 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.viewer import view_live
-from knode_cosserat.viewer.live import Session, require_websockets
+from knode_cosserat.viewer.live import Session, require_websockets, usual_step
 
 websockets = pytest.importorskip("websockets", reason="the live mode is of the extra viz")
 DT = 0.05
@@ -40,7 +40,7 @@ def session(robot):
 def numbers(message):
     """Head and row of a frame."""
     values = np.frombuffer(message, np.float32)
-    return values[:6], values[6:]
+    return values[:5], values[5:]
 
 
 def test_a_frame_is_the_step_in_progress_under_the_newest_control(session, robot):
@@ -51,13 +51,13 @@ def test_a_frame_is_the_step_in_progress_under_the_newest_control(session, robot
         message, stuck = session.solve(control, sequence, over=False)
         wanted = stepper.preview(control)
         head, row = numbers(message)
-        assert not stuck and head[0] == sequence and head[2] == np.float32(DT)
+        assert not stuck and head[0] == sequence and head[1] == np.float32(DT)
         np.testing.assert_array_equal(row[:190], wanted.y.astype(np.float32).ravel())
         np.testing.assert_array_equal(row[-4:], control)
     message, _ = session.solve(then, 3, over=True)
     stepper.step(then)
     head, row = numbers(message)
-    assert head[2] == np.float32(2 * DT)
+    assert head[1] == np.float32(2 * DT)
     np.testing.assert_array_equal(row[:190], stepper.preview(then).y.astype(np.float32).ravel())
 
 
@@ -76,6 +76,15 @@ def test_what_cannot_be_solved_is_said_and_nothing_moves(session):
     assert session.stepper.state is reached and (count > 1 or reached is before)
     message, stuck = session.solve(fair, 8, over=False)
     assert not stuck and np.all(np.isfinite(numbers(message)[1]))
+
+
+def test_a_model_moves_at_the_step_it_learned_at(robot):
+    model = kc.KNODE(robot, None)
+    assert usual_step(robot) == usual_step(model) == 0.05
+    model.about.facts["trajectories"] = [{"dt": 0.02, "rows": 30}]
+    assert usual_step(model) == 0.02
+    model.about.facts["trajectories"] = "none of yours"
+    assert usual_step(model) == 0.05
 
 
 @pytest.mark.parametrize(
@@ -116,7 +125,7 @@ def test_only_its_own_page_may_speak_to_it(address):
                     return numbers(message)
 
     head, row = asyncio.run(speak(address.rstrip("/")))
-    assert head[3] >= 0 and np.all(np.isfinite(row))
+    assert head[2] >= 0 and np.all(np.isfinite(row))
     for origin in ("http://elsewhere.example", None):
         with pytest.raises(websockets.exceptions.ConnectionClosed) as closed:
             asyncio.run(speak(origin))

@@ -60,7 +60,10 @@ def view(
     ] = 0,
     no_open: Annotated[bool, typer.Option("--no-open", help="Do not open the browser.")] = False,
     dt: Annotated[
-        float | None, typer.Option(metavar="S", help="With --live: time step in s.", show_default="0.05")
+        float | None,
+        typer.Option(
+            metavar="S", help="With --live: time step in s.", show_default="what a model learned at, or 0.05"
+        ),
     ] = None,
     space: Space = "euler",
     changes: Changes = None,
@@ -81,12 +84,14 @@ def view(
         if len(names) > 1:
             raise ValueError(f"--live moves one robot or model; given are {', '.join(names)}")
         name = names[0] if names else EXAMPLE
+        from knode_cosserat.rods.robot_file import catalog
+
         viewer.live.require_websockets()
         robot = system_of(name, changes, nodes)
         if sys.stderr.isatty():
             typer.echo(f"preparing {name} …", err=True)
         viewer.view_live(
-            robot, dt=0.05 if dt is None else dt, space=space, title=name, port=port,
+            robot, dt=dt, space=space, title=name if name in catalog() else Path(name).name, port=port,
             open_browser=not no_open, ready=ready,
         )  # fmt: skip
         return

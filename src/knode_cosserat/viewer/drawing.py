@@ -22,6 +22,8 @@ SLIM = 0.006
 BESIDE = 2.5
 #: how much wider ribs are than the circle of their tendons
 RIM = 1.3
+#: about which the paper pulls its tendons (N)
+MEAN_TENSION = 6.0
 #: where sliders may end, between powers of ten
 NICE = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
 
@@ -145,10 +147,9 @@ def _components(field: Field, control: bool) -> list[str]:
 
 def sliders(system: System) -> list[dict[str, Any]]:
     """A slider for each number of the control: its name and unit, a sensible range, where it begins."""
-    robot, layout = physics_of(system), system.control_layout
     found = []
-    for field in layout.fields:
-        low, high, start = _range(robot, field)
+    for field in system.control_layout.fields:
+        low, high, start = _range(system, field)
         for component in _components(field, control=True):
             name = f"{field.name} {component}".strip()
             found.append(
@@ -158,15 +159,17 @@ def sliders(system: System) -> list[dict[str, Any]]:
     return found
 
 
-def _range(robot: Any, field: Field) -> tuple[float, float, float]:
+def _range(system: System, field: Field) -> tuple[float, float, float]:
+    robot = physics_of(system)
     length = float(robot.length)
     if field.name == "tension" and isinstance(robot, TendonRod):
         bending = float(np.asarray(robot.Kbt)[0, 0])
         if isinstance(robot, RoutedTendonRobot):  # one radian by a single tendon
             arm = max(float(np.linalg.norm(np.asarray(robot.routes_at(0.0)[0]), axis=-1).max()), 1e-6)
             return 0.0, _nice(bending / (length * arm)), 0.0
-        # about two radians by a load of so many N/m; the paper's middle tension
-        high = _nice(12.0 * bending / length**3)
+        # about two radians by a load of so many N/m: twice the paper's mean tension for its robot. The
+        # stiffness that a model begins with may be far from the robot's.
+        high = 2.0 * MEAN_TENSION if isinstance(system, KNODE) else _nice(12.0 * bending / length**3)
         return 0.0, high, high / 2.0
     if field.unit == "N":
         high = _nice(2.0 * float(np.max(np.abs(np.asarray(robot.scales().y)))))

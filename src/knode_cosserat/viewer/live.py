@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.result import SimulationError
 from knode_cosserat.solvers.stepper import Stepper
@@ -31,6 +32,8 @@ from knode_cosserat.viewer.serve import HOST, announce, checked_port
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
 
+#: time step (s) of what does not say better
+USUAL = 0.05
 #: time over which the pace is averaged (s)
 PACE = 1.0
 
@@ -38,7 +41,7 @@ PACE = 1.0
 def view_live(
     robot: System,
     *,
-    dt: float = 0.05,
+    dt: float | None = None,
     space: str = "euler",
     title: str | None = None,
     port: int = 0,
@@ -49,7 +52,8 @@ def view_live(
 
     Args:
         robot: a robot, or a model (`KNODE`).
-        dt: time step (s), and how often the page gets a new shape; a model is best at the one it learned at.
+        dt: time step (s), and how often the page gets a new shape; by default what a model learned at,
+            or 0.05 s.
         space: scheme along the rod, "euler" or "rk4".
         title: what stands above it; by default the robot's class.
         port: of the server, which only this machine reaches; 0 for any that is free.
@@ -63,8 +67,18 @@ def view_live(
     """
     require_websockets()
     checked_port(port)
+    dt = usual_step(robot) if dt is None else dt
     page = live_page(robot, dt, space, title)
     asyncio.run(_serve(robot, dt, space, page, checked_port(port), open_browser, ready))
+
+
+def usual_step(robot: System) -> float:
+    """The time step (s) of the trajectories that a model learned from, or else 0.05 s."""
+    learned = robot.about.facts.get("trajectories") if isinstance(robot, KNODE) else None
+    try:
+        return float(learned[0]["dt"]) if learned else USUAL
+    except (KeyError, TypeError, ValueError):  # facts are the user's to change
+        return USUAL
 
 
 def require_websockets() -> None:
@@ -230,6 +244,6 @@ class Session:
 
     def frame(self, ahead: Trajectory, sequence: int) -> bytes:
         """A shape for the page: what it answers, time, result, pace, computing time (ms), then the row."""
-        head = [sequence, 1.0, ahead.time[0], ahead.result[0], self.pace, self.spent]
+        head = [sequence, ahead.time[0], ahead.result[0], self.pace, self.spent]
         row = row_of(self.robot, ahead, self.names)
         return np.concatenate([np.array(head, dtype=np.float32), row]).tobytes()

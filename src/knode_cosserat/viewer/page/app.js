@@ -69,8 +69,14 @@ class Viewer {
       high.max(new THREE.Vector3(...box[1]));
     }
     const longest = Math.max(...this.tracks.map((track) => track.drawing.length));
-    const size = Math.max(high.distanceTo(low), 0.6 * longest, 1e-6);
     const up = this.tracks[0].drawing.up;
+    // a live robot has been nowhere yet: there is room for it to bend to every side
+    if (this.scene.live) for (const k of [0, 1, 2]) {
+      const room = 0.45 * longest * Math.sqrt(1 - up[k] ** 2);
+      low.setComponent(k, low.getComponent(k) - room);
+      high.setComponent(k, high.getComponent(k) + room);
+    }
+    const size = Math.max(high.distanceTo(low), 0.6 * longest, 1e-6);
     this.stage = new Stage($("canvas"), [low.toArray(), high.toArray()], up);
     this.robots = this.tracks.map((track, k) => new RobotModel(track, this.colour(k), k, size));
     // the ground is under everything, and under the foot of the base
@@ -398,7 +404,7 @@ class Viewer {
 
 /** Positions are float32: what is below a micrometre is not known. */
 function distance(metres) {
-  return metres < 1e-6 ? "less than 0.001 mm" : `${short(1000 * metres)} mm`;
+  return metres < 1e-6 ? "< 0.001 mm" : `${short(1000 * metres)} mm`;
 }
 
 function length(metres) {

@@ -1,7 +1,7 @@
 // The live mode: sliders on one side, a simulation that follows them on the other end of a socket.
 
 /** What is in front of the numbers of a row: see `live.frame`. */
-const HEAD = 6;
+const HEAD = 5;
 
 export class Live {
   /** `moved` is called for every row, `told` with texts to be shown ("" for none). */
@@ -95,14 +95,14 @@ export class Live {
 
   #row(data) {
     const numbers = new Float32Array(data);
-    const [sequence, ahead, time, result, pace, step] = numbers;
+    const [sequence, time, result, pace, step] = numbers;
     const since = this.sent.get(sequence);
     for (const key of this.sent.keys()) if (key <= sequence) this.sent.delete(key);
     this.#answer(sequence);
     this.told("");
     this.pace = pace;
     this.step = step;
-    this.moved({ time, result, ahead: ahead > 0, row: numbers.subarray(HEAD), since });
+    this.moved({ time, result, row: numbers.subarray(HEAD), since });
   }
 
   /** Called when what answers a slider has been drawn. */
