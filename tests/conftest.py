@@ -2,8 +2,8 @@
 
 Not the public functions: they say themselves, in one line, what is wrong with their arguments.
 
-Most of the time of the tests is compiling programs that run for milliseconds, so XLA is asked to spend less on
-optimising machine code. The long campaigns run what users run.
+Most of the time of the tests is compiling programs that run for milliseconds, so XLA is asked to spend less
+on optimising machine code. The long campaigns run what users run.
 """
 
 import os
@@ -20,6 +20,6 @@ install_import_hook([f"knode_cosserat.{name}" for name in EQUATIONS + SOLVER], "
 QUICK = "--xla_backend_optimization_level=0"
 
 
-def pytest_configure(config):  # noqa: D103
+def pytest_configure(config):
     if "not campaign" in config.option.markexpr and "jax" not in sys.modules:
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICK}".strip()
