@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from knode_cosserat._files import replacing
-from knode_cosserat.evaluation.drawing import PALETTE, legend_above, style, width_of
+from knode_cosserat.evaluation.drawing import legend_above
+from knode_cosserat.evaluation.style import PALETTE, style, width_of
 from knode_cosserat.evaluation.views import View, by_label, checked_view, curves_of, flat_height, valid_rows
 from knode_cosserat.trajectory import Trajectory
 

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from knode_cosserat.evaluation.drawing import TWO_COLUMNS, new_figure, style
+from knode_cosserat.evaluation.drawing import new_figure
 from knode_cosserat.evaluation.study_figures import METHODS, REFERENCE
+from knode_cosserat.evaluation.style import TWO_COLUMNS, style
 from knode_cosserat.trajectory import Trajectory
 
 if TYPE_CHECKING:

@@ -22,9 +22,6 @@ from numpy.typing import ArrayLike
 from knode_cosserat.evaluation.animation import animate
 from knode_cosserat.evaluation.drawing import (
     AXES,
-    PALETTE,
-    TIME_COLOURS,
-    TWO_COLUMNS,
     Tips,
     draw_tensions,
     draw_tips,
@@ -32,14 +29,19 @@ from knode_cosserat.evaluation.drawing import (
     line,
     new_figure,
     one_of,
-    require_matplotlib,
     require_span,
-    style,
     tips_of,
-    width_of,
 )
 from knode_cosserat.evaluation.recording_figures import prediction_against_measurement
 from knode_cosserat.evaluation.study_figures import comparison as compare
+from knode_cosserat.evaluation.style import (
+    PALETTE,
+    TIME_COLOURS,
+    TWO_COLUMNS,
+    require_matplotlib,
+    style,
+    width_of,
+)
 from knode_cosserat.evaluation.views import (
     View,
     by_label,

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from knode_cosserat.evaluation.drawing import PALETTE, TWO_COLUMNS, new_figure, style
+from knode_cosserat.evaluation.drawing import new_figure
+from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
 from knode_cosserat.learning.explain import added
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.rods.system import Field

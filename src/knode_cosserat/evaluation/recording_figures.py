@@ -8,17 +8,15 @@ import numpy as np
 
 from knode_cosserat.evaluation.drawing import (
     AXES,
-    PALETTE,
-    TWO_COLUMNS,
     Tips,
     draw_tips,
     legend_above,
     line,
     new_figure,
-    style,
     tips_of,
 )
 from knode_cosserat.evaluation.metrics import dtw_distance, rms_distance
+from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -10,16 +10,14 @@ from numpy.typing import ArrayLike
 
 from knode_cosserat.evaluation.drawing import (
     AXES,
-    PALETTE,
-    TWO_COLUMNS,
     draw_tensions,
     equal_scales,
     new_figure,
     one_of,
     require_span,
-    style,
     tips_of,
 )
+from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
 from knode_cosserat.trajectory import Trajectory
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from knode_cosserat.evaluation.drawing import style
+from knode_cosserat.evaluation.style import style
 
 
 class StyledFigure(Figure):

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.evaluation.drawing import PALETTE, TWO_COLUMNS, equal_scales, new_figure, style
+from knode_cosserat.evaluation.drawing import equal_scales, new_figure
 from knode_cosserat.evaluation.study_figures import METHODS, REFERENCE, legend_below, require_some
+from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

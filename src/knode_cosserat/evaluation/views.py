@@ -8,7 +8,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from knode_cosserat.evaluation.drawing import AXES, Tips, equal_scales, one_of, tips_of
+from knode_cosserat.evaluation.drawing import (
+    AXES,
+    Tips,
+    equal_scales,
+    one_of,
+    tips_of,
+)
 from knode_cosserat.trajectory import Trajectory
 
 #: in space, or two axes: across and up

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from knode_cosserat.evaluation.drawing import TIME_COLOURS, TWO_COLUMNS, new_figure, require_matplotlib, style
+from knode_cosserat.evaluation.drawing import new_figure
+from knode_cosserat.evaluation.style import TIME_COLOURS, TWO_COLUMNS, require_matplotlib, style
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

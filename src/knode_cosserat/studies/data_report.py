@@ -90,7 +90,8 @@ def figure(cells: Sequence[Any], measure: str = "tip_dtw") -> Figure:
     Raises:
         ImportError: matplotlib is not installed.
     """
-    from knode_cosserat.evaluation.drawing import new_figure, style
+    from knode_cosserat.evaluation.drawing import new_figure
+    from knode_cosserat.evaluation.style import style
 
     imperfections = [name for name in dict.fromkeys(cell["imperfection"] for cell in cells) if name != ANY]
     controls = list(dict.fromkeys(cell["control"] for cell in cells))
@@ -138,7 +139,7 @@ def _draw_panel(axes: Any, cells: Sequence[Any], measure: str) -> None:
 
 
 def _draw_curve(axes: Any, cells: Sequence[Any], measure: str, method: str, sines: int) -> None:
-    from knode_cosserat.evaluation.drawing import PALETTE
+    from knode_cosserat.evaluation.style import PALETTE
 
     rows = sorted({cell["rows"] for cell in cells})
     values = {row: [c[measure] for c in cells if c["rows"] == row and c[measure] is not None] for row in rows}

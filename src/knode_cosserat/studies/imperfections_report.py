@@ -142,7 +142,8 @@ def figure(cells: Sequence[Mapping[str, Any]]) -> Figure:
     Raises:
         ImportError: matplotlib is not installed.
     """
-    from knode_cosserat.evaluation.drawing import PALETTE, TWO_COLUMNS, new_figure, style
+    from knode_cosserat.evaluation.drawing import new_figure
+    from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
 
     names = list(dict.fromkeys(cell["imperfection"] for cell in cells))
     with style():
