@@ -11,7 +11,7 @@ unexport PYTHONPATH
 unexport PYTHONHOME
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all lint types docs pictures notebooks format bench package lock clean distclean
+.PHONY: help demo test test-all samples lint types docs pictures notebooks format bench package lock clean distclean
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' Makefile
@@ -34,6 +34,9 @@ test: $(READY) ## run the tests, but for the long ones
 
 test-all: $(READY) ## run all the tests, the long ones too
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile $(PYTEST_ARGS)
+
+samples: $(READY) ## run the long code of README, docs, examples and notebooks, which `make test` leaves out
+	$(BIN)/python -m pytest -n $(JOBS) --dist load -m campaign tests/test_docs.py tests/test_examples.py tests/test_notebooks.py
 
 lint: $(READY) ## check style and formatting
 	$(BIN)/ruff check
