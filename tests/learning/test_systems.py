@@ -1,5 +1,7 @@
 """Every kind of robot is learned from one short trajectory: a modulus 30 % off, and an unseen control."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -24,7 +26,7 @@ def pushed(period, size, phases):
 
 def driven_in_contact():
     robot = kc.SlenderRod(
-        length=0.4, radius=0.005, density=1100.0, youngs_modulus=2e6, nodes=11,
+        length=0.4, radius=0.005, density=1100.0, youngs_modulus=2e6, nodes=41,
         bending_damping=2e-4, drag=0.01,
         base_end=Driven(axes=("x", "ry")), gravity=[0.0, 0.0, 9.81],
         surroundings=(
@@ -75,6 +77,15 @@ def test_a_wrong_modulus_is_made_up_for(name):
     before, after = (error(kc.simulate(each, unseen, DT), truth) for each in (knowledge, model))
     print(f"\n{name}: from {before:.3g} m to {after:.3g} m, {before / after:.0f}-fold")
     assert before > 1e-4 and after < 0.1 * before
+
+
+def test_segments_that_were_divided_are_no_samples_by_euler():
+    moved = kc.simulate(DELRIN, kc.controls.sine(1.5, 10, DT), DT)
+    divided = dataclasses.replace(
+        moved, result=np.full(len(moved.time), int(kc.Result.RECOVERED_FINER_SEGMENTS))
+    )
+    with pytest.raises(kc.DataError, match="trajectory 1 was solved with every segment divided.*more nodes"):
+        kc.fit(DELRIN, [moved, divided])
 
 
 # samples where something acts

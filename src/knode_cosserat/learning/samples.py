@@ -20,6 +20,7 @@ from knode_cosserat.learning.sides import far_side, slopes_of
 from knode_cosserat.rods.system import System, in_strands, records_in_strands, unpacked_history
 from knode_cosserat.solvers.crossing import Crossing, carried, crossing_of, within
 from knode_cosserat.solvers.march import coefficient_table
+from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme, middles
 from knode_cosserat.trajectory import Trajectory
@@ -238,6 +239,7 @@ def _check(knowledge: System, trajectories: Sequence[Trajectory]) -> None:
                 f"{name} has {controls} controls a row; the knowledge has {knowledge.control_size} ({names})"
             )
         _check_finite(name, trajectory)
+        _check_segments(name, trajectory)
         _check_time(name, trajectory)
     first = trajectories[0]
     for k, trajectory in enumerate(trajectories):
@@ -261,6 +263,16 @@ def _check_finite(name: str, trajectory: Trajectory) -> None:
             raise DataError(
                 f"{name} has {what} that is not finite in row {row}; learn from the rows before it"
             )
+
+
+def _check_segments(name: str, trajectory: Trajectory) -> None:
+    """By Euler's scheme a segment is one step, and what is learned rests on that."""
+    divided = np.asarray(trajectory.result) == Result.RECOVERED_FINER_SEGMENTS
+    if settings_of(trajectory).space.order == 1 and np.any(divided):
+        raise DataError(
+            f"{name} was solved with every segment divided, its own being too long; "
+            'give the robot more nodes, or learn from a simulation with space="rk4"'
+        )
 
 
 def _check_time(name: str, trajectory: Trajectory) -> None:
