@@ -95,6 +95,27 @@ WRONG = {
         lambda t: kc.SlenderRod(length=1, radius=0.01, density=1e3, youngs_modulus=1e6, loads="x"),
         "str", "a load",
     ),
+    "a stepper of text": (lambda t: kc.Stepper("x", 0.05), "str", "one robot"),
+    "a step of two": (lambda t: kc.Stepper(ROBOT, 0.05).step([1, 2]), r"\(2,\)", r"\(4,\).*N\)"),
+    "a scene of text": (lambda t: kc.export_scene("x", "x.html"), "str", "a Trajectory"),
+    "a view of a number": (lambda t: kc.view(3), "int", "a Trajectory"),
+    "a live view of text": (lambda t: kc.view_live("x"), "str", "one robot"),
+    "no ensemble": (lambda t: kc.load_ensemble("nope"), "nope", "member-000"),
+    "to estimate parts of text": (lambda t: kc.estimate_parts("x", ROBOT), "str", "a Recording"),
+    "nodes of a number": (lambda t: kc.node_error(t, 3), "int", "a Trajectory"),
+    "a jacobian of two": (lambda t: kc.jacobian(ROBOT, [1, 2]), r"\(2,\)", r"\(4,\).*\(N\)"),
+    "a manipulability of text": (lambda t: kc.manipulability("x", [1, 2, 3, 4]), "str", "one robot"),
+    **{
+        f"a figure of text: {name}": (lambda t, name=name: getattr(kc.figures, name)("x"), "str", allowed)
+        for name, allowed in (
+            ("shape", "a Trajectory"), ("path", "a trajectory"), ("tips", "a trajectory"),
+            ("states", "a trajectory"), ("tensions", "a Trajectory"), ("overview", "a Trajectory"),
+            ("spread", "a Trajectory"), ("workspace", "a Workspace"),
+        )
+    },
+    "an error of text": (lambda t: kc.figures.error(t, "x"), "str", "a trajectory"),
+    "a motion of text": (lambda t: kc.figures.animate("x", "x.gif"), "str", "a trajectory"),
+    "a motion in a text": (lambda t: kc.figures.animate(t, "x.txt"), "x.txt", ".gif, .mp4"),
     "a save to nowhere": (lambda t: t.save("/nonexistent/x.nc"), "/nonexistent/x.nc", "No such file"),
 }  # fmt: skip
 

@@ -128,7 +128,9 @@ def tips_of(trajectory: Tips) -> NDArray[np.float64]:
 
 
 def one_of(trajectory: Trajectory) -> Trajectory:
-    """The trajectory, if it is of one robot."""
+    """The trajectory, if it is one, and of one robot."""
+    if not isinstance(trajectory, Trajectory):
+        raise TypeError(f"trajectory is a {type(trajectory).__name__}; allowed is a Trajectory")
     if np.ndim(trajectory.y) == 4:
         raise ValueError(
             f"a batch of {len(trajectory.y)} trajectories cannot be drawn in one figure; index one, batch[0]"

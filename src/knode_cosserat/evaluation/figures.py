@@ -85,7 +85,7 @@ def shape(trajectory: Trajectory, *, count: int = 12, view: str | None = None, c
 
     Seen in space ("xyz"), or along an axis: "xy", "xz", "yz", where what surrounds the robot is drawn too.
     """
-    curves = curves_of(trajectory)
+    curves = curves_of(one_of(trajectory))
     view = checked_view(view, curves[0].shape[-1])
     points = np.concatenate([curve.reshape(-1, curve.shape[-1]) for curve in curves])
     width = width_of(columns)
@@ -252,6 +252,7 @@ def error(truth: Tips, predictions: Tips | Mapping[str, Tips], *, columns: int =
 
 def tensions(trajectory: Trajectory, *, columns: int = 1) -> Figure:
     """The tension of every tendon over time, as it was held from row to row; or the controls."""
+    one_of(trajectory)
     with style():
         figure = new_figure(width_of(columns), 2.4)
         draw_tensions(figure.subplots(), trajectory)
@@ -260,7 +261,7 @@ def tensions(trajectory: Trajectory, *, columns: int = 1) -> Figure:
 
 def overview(trajectory: Trajectory, count: int = 12) -> Figure:
     """Shapes, tip path and tensions of one trajectory in one picture, two columns wide."""
-    curves = curves_of(trajectory)
+    curves = curves_of(one_of(trajectory))
     with style():
         figure = new_figure(TWO_COLUMNS, 4.2)
         left, right = figure.subfigures(1, 2, width_ratios=(1.1, 1.0))
@@ -280,6 +281,8 @@ def spread(batch: Trajectory, *, columns: int = 1) -> Figure:
     Raises:
         ValueError: a trajectory of one robot.
     """
+    if not isinstance(batch, Trajectory):
+        raise TypeError(f"batch is a {type(batch).__name__}; allowed is a Trajectory of several robots")
     if np.ndim(batch.y) != 4:
         raise ValueError("the trajectory is of one robot; allowed is a batch")
     tip = np.asarray(batch.tip_position)

@@ -64,7 +64,12 @@ def path_of(one: Tips | ArrayLike) -> NDArray[np.float64]:
     if hasattr(one, "tip_position"):
         tip: Any = one
         return tips_of(tip)
-    points = np.asarray(one, dtype=float)
+    try:
+        points = np.asarray(one, dtype=float)
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"a path is a {type(one).__name__}; allowed is a trajectory, or points (points, 3) in m"
+        ) from None
     if points.ndim != 2 or points.shape[1] not in (2, 3):
         raise ValueError(
             f"a path has shape {points.shape}; allowed is (points, 3), or (points, 2) in a plane"

@@ -26,6 +26,8 @@ def workspace_seen(found: Workspace) -> Figure:
         ValueError: nothing was solved, or positions are not of three numbers.
     """
     require_matplotlib()
+    if not (hasattr(found, "position") and hasattr(found, "valid")):
+        raise TypeError(f"found is a {type(found).__name__}; allowed is a Workspace")
     if found.position.shape[1] != 3 or not found.valid.any():
         raise ValueError("there is no solved sample with three coordinates to draw")
     shown = np.flatnonzero(found.valid)[:MOST_POINTS]
