@@ -6,7 +6,9 @@ Most of the time of the tests is compiling programs that run for milliseconds, s
 on optimising machine code. The long campaigns run what users run.
 """
 
+import gc
 import os
+import pathlib
 import sys
 
 from jaxtyping import install_import_hook
@@ -23,3 +25,15 @@ QUICK = "--xla_backend_optimization_level=0"
 def pytest_configure(config):
     if "not campaign" in config.option.markexpr and "jax" not in sys.modules:
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICK}".strip()
+
+
+#: memory maps of one process at which its programs are forgotten: Linux allows 65530, each program takes some
+#: fifty, and the compiler crashes when there are no more
+MANY_MAPS = 30_000
+
+
+def pytest_runtest_teardown(nextitem):
+    maps = pathlib.Path("/proc/self/maps")
+    if nextitem is not None and maps.exists() and maps.read_bytes().count(b"\n") > MANY_MAPS:
+        sys.modules["jax"].clear_caches()
+        gc.collect()

@@ -5,7 +5,8 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.rods.surroundings import Plane
-from knode_cosserat.solvers.run import Steps, _agree, _refuse
+from knode_cosserat.solvers.task import Steps
+from knode_cosserat.solvers.trust import agree, refuse
 
 ROBOT = kc.load_robot("delrin-tendon-robot")
 
@@ -20,7 +21,7 @@ def steps(size, result=None, records=None):
 
 def test_the_first_wrong_row_is_taken_back_and_all_after_it():
     found = steps([1.0, 2.0, 50.0, 3.0, 60.0])
-    assert _refuse(found, found.size > 30.0, kc.Result.UNSTABLE)
+    assert refuse(found, found.size > 30.0, kc.Result.UNSTABLE)
     wanted = [kc.Result.CONVERGED] * 2 + [kc.Result.UNSTABLE] + [kc.Result.NOT_REACHED] * 2
     assert found.result.tolist() == [int(each) for each in wanted]
 
@@ -28,7 +29,7 @@ def test_the_first_wrong_row_is_taken_back_and_all_after_it():
 def test_rows_that_failed_already_keep_their_reason():
     result = [0, int(kc.Result.NO_CONVERGENCE), int(kc.Result.NOT_REACHED)]
     found = steps([1.0, 50.0, 50.0], result)
-    assert not _refuse(found, found.size > 30.0, kc.Result.UNSTABLE)
+    assert not refuse(found, found.size > 30.0, kc.Result.UNSTABLE)
     assert found.result.tolist() == result
 
 
@@ -40,9 +41,9 @@ def test_two_grids_have_to_be_solved_and_alike():
     near[1, 4, 7] += 5.0 * scale[7]
     far[1, 4, 7] += 15.0 * scale[7]
     big = steps([50.0] * 3, records=records)
-    assert _agree(big, steps([50.0] * 3, records=near), ROBOT)
-    assert not _agree(big, steps([50.0] * 3, records=far), ROBOT)
-    assert not _agree(big, steps([50.0] * 3, [0, -1, -3], near), ROBOT)
+    assert agree(big, steps([50.0] * 3, records=near), ROBOT)
+    assert not agree(big, steps([50.0] * 3, records=far), ROBOT)
+    assert not agree(big, steps([50.0] * 3, [0, -1, -3], near), ROBOT)
 
 
 def test_a_smooth_system_is_as_gentle_as_it_gets():

@@ -26,7 +26,7 @@ from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.run import usable_cores
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.solvers.stability import SUSPICIOUS
+from knode_cosserat.solvers.trust import SUSPICIOUS
 
 #: samples that one thread takes at a time; fewer are filled up to a power of two
 CHUNK = 1024

@@ -15,6 +15,7 @@ shorter than the last one (Deuflhard, Newton Methods for Nonlinear Problems, 200
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -215,6 +216,16 @@ def residuals(problem: StepProblem, y: Float[Any, "nodes y"]) -> tuple[Any, Any]
     """Defects y_{j+1} - Φ_j(y_j), with their sign turned, and the tip's residuals."""
     reached = problem.segments(lambda advance, y_j: advance(y_j), y)
     return reached.reshape(y[1:].shape) - y[1:], problem.tip_residual(y[-1])
+
+
+@functools.partial(jax.jit, static_argnames="space")
+def static_error(system: System, space: SpaceScheme, record: Any, control: Any, t: Any) -> Any:
+    """How far a record is from an equilibrium: its largest residual in natural units, all rates zero."""
+    problem = StepProblem(system, t, control, jnp.zeros(()), jnp.zeros_like(record), space)
+    y = record[:, : system.y_layout.size]
+    base = problem.base(system.unknowns(y[0])) - y[0]
+    error = _error(problem, *residuals(problem, y))
+    return jnp.maximum(error, jnp.max(jnp.abs(base) / system.scales().y))
 
 
 def linearise(problem: StepProblem, y: Float[Any, "nodes y"], unknowns: Any) -> Linearisation:

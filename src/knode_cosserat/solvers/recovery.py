@@ -1,4 +1,4 @@
-"""What is tried when a step does not converge: a stable elimination, continuation, halving, in this order.
+"""What is tried when a step does not converge: a stable elimination, continuation, shorter steps, in order.
 
 This runs outside the compiled loop, step by step in plain Python: it is rare, and its program is compiled
 only when it is first needed.
@@ -21,10 +21,13 @@ from knode_cosserat.solvers.linear import Decoupled
 from knode_cosserat.solvers.march import EXTRAPOLATIONS, Past, advanced, history_of
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.stability import natural_time
 from knode_cosserat.solvers.time import BDF1, Static
 
-#: a step is halved at most this many times
-HALVINGS = 8
+#: the smallest part of a time step that it is divided into, and how many parts are tried
+LEAST_SUBSTEP, MOST_SUBSTEPS = 2.0**-14, 400
+#: friction and contact are eased only in parts of a step below this: smaller parts alone mostly do
+EASE_BELOW = 1.0 / 16.0
 #: the smallest part of a change of control that continuation goes down to
 LEAST_PART = 1.0 / 512.0
 #: how much gentler friction and contact are, where continuation in them begins
@@ -126,9 +129,9 @@ def recover(
         if relaxed is not None:
             return _outcome(Result.RECOVERED_RELAXATION, step, relaxed)
     else:
-        halved = _halve(step, controls, dt)
-        if halved is not None:
-            return _outcome(Result.RECOVERED_STEP_HALVING, *halved)
+        divided = _substeps(step, controls, dt)
+        if divided is not None:
+            return _outcome(Result.RECOVERED_STEP_HALVING, *divided)
     assert best is not None
     result = Result.NO_CONVERGENCE if np.isfinite(best[0].error) else Result.NOT_FINITE
     return _outcome(result, step, best, controls[1])._replace(past=past)
@@ -200,40 +203,48 @@ def _in_parts(
     return found if reached == 1.0 else None
 
 
-def _halve(whole: _Step, controls: tuple[Any, Any], dt: float) -> tuple[_Step, tuple[Solution, Any]] | None:
-    """The step in 2, 4, 8 … parts: the control as it is held throughout, or brought there bit by bit."""
-    for halving in range(1, HALVINGS + 1):
-        for before in (None, controls[0]):
-            found = _parted(whole, 2**halving, before, controls[1], dt)
-            if found is not None:
-                return found
+def _substeps(
+    whole: _Step, controls: tuple[Any, Any], dt: float
+) -> tuple[_Step, tuple[Solution, Any]] | None:
+    """The step in parts: the control as it is held throughout, or brought there bit by bit."""
+    for before in (controls[1], controls[0]):
+        found = _in_substeps(whole, before, controls[1], dt)
+        if found is not None:
+            return found
     return None
 
 
-def _parted(
-    whole: _Step, parts: int, before: Any, now: Any, dt: float
-) -> tuple[_Step, tuple[Solution, Any]] | None:
-    """The step in so many parts, with coefficients for unequal steps."""
+def _in_substeps(whole: _Step, before: Any, now: Any, dt: float) -> tuple[_Step, tuple[Solution, Any]] | None:
+    """The step in time steps as long as go well, with coefficients for unequal ones."""
     settings, past = whole.settings, whole.past
-    small, previous_dt = dt / parts, dt
-    now = np.asarray(now, dtype=float)
-    before = now if before is None else np.asarray(before, dtype=float)
-    step, found = whole, None
-    for i in range(parts):
-        control = before + (i + 1) / parts * (now - before)
-        scheme = settings.time if settings.start == "paper" or i > 0 else BDF1()
-        coefficients = scheme.coefficients(small, previous_dt)
-        step = _Step(whole.system, settings, past, coefficients, whole.t - dt + (i + 1) * small)
-        found = step.solve(control, *step.guesses()[0])
-        if not step.solved(found[0]):
-            found = _ease(step, control)
-            if found is None:
+    before, now = np.asarray(before, dtype=float), np.asarray(now, dtype=float)
+    reached, part, previous = 0.0, 0.5, 1.0
+    scheme = settings.time if settings.start == "paper" else BDF1()
+    for _ in range(MOST_SUBSTEPS):
+        until = min(1.0, reached + part)
+        coefficients = scheme.coefficients((until - reached) * dt, previous * dt)
+        step = _Step(whole.system, settings, past, coefficients, whole.t - (1.0 - until) * dt)
+        found = _one_substep(step, before + until * (now - before), ease=part < EASE_BELOW)
+        if found is None:
+            part /= 4.0
+            if part < LEAST_SUBSTEP:
                 return None
-        past, previous_dt = step.after(*found), small
-    assert found is not None
-    # the next whole step looks back on whole steps, not on the parts
-    step.past = whole.past
-    return step, found
+            continue
+        if until == 1.0:
+            # the next whole step looks back on whole steps, not on the parts
+            step.past = whole.past
+            return step, found
+        past, previous, scheme = step.after(*found), until - reached, settings.time
+        reached, part = until, 2.0 * previous
+    return None
+
+
+def _one_substep(step: _Step, control: Any, ease: bool) -> tuple[Solution, Any] | None:
+    for guess in step.guesses():
+        found = step.solve(control, *guess)
+        if step.solved(found[0]):
+            return found
+    return _ease(step, control) if ease else None
 
 
 def _relax(step: _Step, control: Any) -> tuple[Solution, Any] | None:
@@ -241,7 +252,9 @@ def _relax(step: _Step, control: Any) -> tuple[Solution, Any] | None:
 
     A tip that is held elsewhere than where it is, or loaded, is brought there in the first steps.
     """
-    now, dt, part = step.past, 0.01, 0.0
+    now, part = step.past, 0.0
+    natural = natural_time(step.system) or 0.1
+    dt, longest = 0.1 * natural, 1e5 * natural
     at_first = step.guesses()[0][0]
     for _ in range(80):
         moving = _Step(step.system, step.settings, now, BDF1().coefficients(dt, dt), 0.0)
@@ -253,7 +266,7 @@ def _relax(step: _Step, control: Any) -> tuple[Solution, Any] | None:
         # short steps until the tip is where it belongs
         now, dt = moving.after(*found), 2.0 * dt if part == 1.0 else dt
         part = target
-        if dt > 1e3:
+        if dt > longest:
             break
     found = step.solve(control, now.records[0][:, : step.system.y_layout.size], now.unknowns[0])
     return found if step.solved(found[0]) else None
@@ -263,7 +276,7 @@ def likely_cause(result: Result, step: _Step, control: Any) -> str:
     """A hint at what to change, from what can be seen."""
     if result.solved:
         return ""
-    unit = _other_unit(step.system, np.asarray(control))
+    unit = other_unit(step.system, np.asarray(control))
     if unit:
         return unit
     nodes = step.system.nodes
@@ -277,7 +290,7 @@ def likely_cause(result: Result, step: _Step, control: Any) -> str:
     )
 
 
-def _other_unit(system: System, control: np.ndarray) -> str:
+def other_unit(system: System, control: np.ndarray) -> str:
     """Of a force in the control that is absurdly large: that it may be meant in another unit."""
     if "n" not in system.y_layout.names:
         return ""

@@ -6,20 +6,23 @@ import concurrent.futures
 import dataclasses
 import logging
 import os
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
 from tqdm import tqdm
 
 from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.boundary import static_error
 from knode_cosserat.solvers.linear import ELIMINATIONS
-from knode_cosserat.solvers.march import Past, Rows, coefficient_table, march_many, march_one
-from knode_cosserat.solvers.recovery import Outcome, recover
+from knode_cosserat.solvers.march import Past, Rows, initial_past, march_many, march_one
+from knode_cosserat.solvers.recovery import Outcome, other_unit, recover
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.stability import SAFE_DECAY, SUSPICIOUS, decay_per_segment
+from knode_cosserat.solvers.stability import SAFE_DECAY, decay_per_segment
+from knode_cosserat.solvers.task import Start, Steps, Task
 from knode_cosserat.solvers.time import Static
+from knode_cosserat.solvers.trust import SUSPICIOUS, agree, finite, refuse, trusted_size, trustworthy
 
 log = logging.getLogger(__name__)
 
@@ -29,50 +32,10 @@ CHUNK = 16
 LEAST_CAPACITY = 128
 #: steps that need the stable elimination before a run changes to it, which costs a program
 ENOUGH_RESCUES = 2
-#: of its largest value: how far y of two grids may be apart if it is to be believed
-GRIDS_APART = 0.2
 #: how far segments are divided when they are too long to be stable
 MOST_NODES = 400
-
-
-class Steps(NamedTuple):
-    """The steps of one robot (or, with a batch axis in front, of several), and what came of each."""
-
-    records: Any
-    unknowns: Any
-    error: Any
-    corrections: Any
-    size: Any
-    result: Any
-
-
-class Start(NamedTuple):
-    """Where a run begins: the past, and the control before the first step."""
-
-    past: Past
-    control: Any
-
-
-@dataclasses.dataclass(frozen=True)
-class Task:
-    """What is the same for every robot of a run."""
-
-    settings: Settings
-    dt: float
-    steps: int
-    #: the first step: as the settings say, like any other (the past holds real states), or by BDF1; or every
-    #: step without rates, an equilibrium (by the program of a simulation with these settings)
-    first: Literal["start", "regular", "consistent", "still"] = "start"
-
-    @property
-    def table(self) -> np.ndarray:
-        """Coefficients of the first step and of every other."""
-        if self.first == "still":
-            return np.zeros((2, 4))
-        if self.first == "consistent":
-            return coefficient_table(dataclasses.replace(self.settings, start="consistent"), self.dt)
-        table = coefficient_table(self.settings, self.dt)
-        return table[[1, 1]] if self.first == "regular" else table
+#: into how many parts, where a step is not found though they seem short enough
+MOST_PARTS = 4
 
 
 def run_one(
@@ -80,92 +43,79 @@ def run_one(
 ) -> tuple[Steps, str]:
     """All steps of one robot, and the likely cause if one of them (`result` < 0) could not be solved."""
     steps, cause = _with_recovery(task, system, controls, start, progress)
-    if _refuse(steps, ~_finite(steps, system), Result.NOT_FINITE):
+    if refuse(steps, ~finite(steps, system), Result.NOT_FINITE):
         cause = "At the tip strains are undefined."
-    if _trustworthy(task, steps, system, start):
+    still = isinstance(task.settings.time, Static)
+    if trustworthy(steps, system, start, still):
         return steps, cause
-    record = start.past.records[0]
-    decay = decay_per_segment(system, task.settings, task.table[1], record, controls[0])
-    if decay < SAFE_DECAY / 4.0:
+    decay = decay_per_segment(
+        system, task.settings, task.table[1], start.past.records[0], np.asarray(controls[0])
+    )
+    steep = decay >= SAFE_DECAY / 4.0
+    failed = np.flatnonzero(steps.result < 0)
+    if not steep and (len(failed) == 0 or other_unit(system, controls[failed[0]])):
         return steps, cause
     # powers of two: few different node counts, so few programs to compile
-    parts = 2 ** max(1, int(np.ceil(np.log2(decay / SAFE_DECAY))))
+    parts = 2 ** int(np.ceil(np.log2(max(2.0, decay / SAFE_DECAY))))
+    # a step may also fail because the rod bends too sharply, or snaps too fast, for its segments
+    most = MOST_NODES if steep else MOST_PARTS * (system.nodes - 1)
+    log.info("states are large or not found; waves decay by e^%.2g within a segment", decay)
     before = steps
-    log.info("states are large or not found, and waves decay by e^%.2g within a segment", decay)
-    while parts * (system.nodes - 1) < MOST_NODES:
+    while parts * (system.nodes - 1) <= most:
         log.info("every segment in %d parts", parts)
         finer = _with_finer_segments(task, system, parts, controls, start, progress)
-        if _agree(finer, steps, system):
+        if agree(finer, steps, system):
             # as large as that, and no instability
             return steps, cause
-        if _trustworthy(task, finer, system, start) or _agree(finer, before, system):
+        if trustworthy(finer, system, start, still) or agree(finer, before, system):
             return finer._replace(result=np.full(task.steps, int(Result.RECOVERED_FINER_SEGMENTS))), ""
         parts, before = 2 * parts, finer
-    _refuse(steps, steps.size > trusted_size(system, start), Result.UNSTABLE)
-    return steps, (
-        f"{cause} At this time step its waves decay by e^{decay:.2g} within a segment, too much for an "
-        "explicit scheme in space, and dividing the segments did not help: use longer time steps."
-    ).strip()
-
-
-def _finite(steps: Steps, system: System) -> Any:
-    """Whether each step's strains at the tip are: those at all other nodes have served to find y."""
-    return np.isfinite(steps.records[..., -1, system.y_layout.size :]).all(axis=-1)
-
-
-def _refuse(steps: Steps, wrong: Any, why: Result) -> bool:
-    """Take back the first solved step that is wrong, and all after it; whether there was one."""
-    found = np.flatnonzero(wrong & (steps.result >= 0))
-    if len(found):
-        steps.result[found[0]] = int(why)
-        steps.result[found[0] + 1 :] = int(Result.NOT_REACHED)
-    return len(found) > 0
-
-
-def _trustworthy(task: Task, steps: Steps, system: System, start: Start) -> bool:
-    """Solved, and not grown to a size that suggests an instability in space, which only a motion has.
-
-    What hangs like a cable carries forces far beyond its natural ones from the start.
-    """
-    if steps.result.min() < 0:
-        return False
-    if isinstance(task.settings.time, Static) or steps.size.max() <= SUSPICIOUS:
-        return True
-    return bool(steps.size.max() <= trusted_size(system, start))
-
-
-def trusted_size(system: System, start: Start) -> float:
-    """Numbers of y up to this, in natural units, are not suspicious: more if it starts with large ones."""
-    y = np.asarray(start.past.records[0])[:, : system.y_layout.size]
-    return SUSPICIOUS * max(1.0, float(np.max(np.abs(y) / np.asarray(system.scales().y))))
-
-
-def _agree(finer: Steps, coarser: Steps, system: System) -> bool:
-    """Whether two grids are both solved and agree on y where it is largest: then it is as large as that."""
-    if min(finer.result.min(), coarser.result.min()) < 0:
-        return False
-    scale, ny = np.asarray(system.scales().y), system.y_layout.size
-    apart = np.max(np.abs(finer.records - coarser.records)[..., :ny] / scale)
-    return bool(apart <= GRIDS_APART * finer.size.max())
+    refuse(steps, steps.size > trusted_size(system, start), Result.UNSTABLE)
+    if steep:
+        cause = (
+            f"{cause} At this time step its waves decay by e^{decay:.2g} within a segment, too much for an "
+            "explicit scheme in space, and dividing the segments did not help: use longer time steps."
+        ).strip()
+    return steps, cause
 
 
 def _with_finer_segments(
     task: Task, system: System, parts: int, controls: np.ndarray, start: Start, progress: bool
 ) -> Steps:
     """The same robot with every segment divided, given at its own nodes."""
+    fine = system.replace(nodes=parts * (system.nodes - 1) + 1)
+    steps, _ = _with_recovery(task, fine, controls, _refined(task, system, fine, start), progress)
+    refuse(steps, ~finite(steps, fine), Result.NOT_FINITE)
+    return steps._replace(records=np.ascontiguousarray(steps.records[:, ::parts]))
+
+
+def _refined(task: Task, system: System, fine: System, start: Start) -> Start:
+    """The start on a finer grid; an equilibrium is the finer grid's own, or the motion began with a jolt."""
     # imported here, where it is rarely needed: it would double this package's import time
     from scipy.interpolate import make_interp_spline
 
-    fine = system.replace(nodes=parts * (system.nodes - 1) + 1)
     coarse_s, fine_s = np.linspace(0.0, 1.0, system.nodes), np.linspace(0.0, 1.0, fine.nodes)
 
     def refined(values: Any, axis: int) -> Any:
         return make_interp_spline(coarse_s, np.asarray(values), k=min(3, system.nodes - 1), axis=axis)(fine_s)
 
     past = start.past._replace(records=refined(start.past.records, 1), rate=refined(start.past.rate, 0))
-    steps, _ = _with_recovery(task, fine, controls, start._replace(past=past), progress)
-    _refuse(steps, ~_finite(steps, fine), Result.NOT_FINITE)
-    return steps._replace(records=np.ascontiguousarray(steps.records[:, ::parts]))
+    if _is_still(task, system, start):
+        still = dataclasses.replace(task, steps=1, first="still")
+        found, _ = _with_recovery(still, fine, start.control[None], start._replace(past=past), False)
+        if found.result[0] >= 0:
+            rests = initial_past(fine, found.records[0], start.control)
+            past = rests._replace(t0=start.past.t0)
+    return start._replace(past=past)
+
+
+def _is_still(task: Task, system: System, start: Start) -> bool:
+    """Whether a motion begins in an equilibrium of its grid, under the control before it."""
+    records = np.asarray(start.past.records)
+    if isinstance(task.settings.time, Static) or np.any(records != records[0]):
+        return False
+    error = static_error(system, task.settings.space, records[0], start.control, start.past.t0)
+    return bool(error <= task.settings.newton.acceptable)
 
 
 def _with_recovery(
@@ -263,7 +213,7 @@ def run_batch(
     done, *rows = (np.concatenate(parts) for parts in zip(*chunks, strict=True))
     steps = Steps._make([*rows, np.zeros((*done.shape, task.steps), dtype=int)])
     causes = {}
-    doubtful = (steps.size.max(axis=1) > SUSPICIOUS) | ~_finite(steps, system).all(axis=1)
+    doubtful = (steps.size.max(axis=1) > SUSPICIOUS) | ~finite(steps, system).all(axis=1)
     for i in np.flatnonzero((done < task.steps) | doubtful):
         own = Start(jax.tree.map(lambda leaf, i=i: leaf[i], start.past), start.control[i])
         alone, cause = run_one(task, robot(i), controls[i], own)

@@ -19,8 +19,8 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import StepProblem, linearise, residuals
 from knode_cosserat.solvers.linear import Condensed, carried
 from knode_cosserat.solvers.march import Past, Rows, history_of, march_one
-from knode_cosserat.solvers.run import Task
 from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.task import Task
 
 
 @functools.lru_cache(maxsize=64)

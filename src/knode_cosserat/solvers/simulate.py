@@ -17,9 +17,11 @@ from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.linear import LinearSolver
 from knode_cosserat.solvers.march import going_on_past, initial_past, rest_record
 from knode_cosserat.solvers.result import Result, SimulationError
-from knode_cosserat.solvers.run import Start, Steps, Task, as_ended, run_batch, run_one
+from knode_cosserat.solvers.run import as_ended, run_batch, run_one
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.solvers.stability import natural_time
+from knode_cosserat.solvers.task import Start, Steps, Task
 from knode_cosserat.solvers.time import Static, TimeScheme
 from knode_cosserat.trajectory import Trajectory
 
@@ -136,12 +138,10 @@ def checked_dt(dt: Any) -> float:
 
 def _warn_of_long_steps(system: System, dt: float) -> None:
     """Say so where a time step looks like milliseconds: seconds long, and far beyond what the rod does."""
-    names = system.y_layout.names
-    if dt < LONG_STEP or is_traced(system) or "p" not in names or "q" not in names:
+    if dt < LONG_STEP or is_traced(system):
         return
-    scale = np.asarray(system.scales().y)
-    natural = float(np.min(scale[..., system.y_layout.slice("p")] / scale[..., system.y_layout.slice("q")]))
-    if dt > LONG_STEPS * natural:
+    natural = natural_time(system)
+    if natural is not None and dt > LONG_STEPS * natural:
         warnings.warn(
             f"dt is {dt:g} s, {dt / natural:.2g} times this rod's natural time ({natural:.2g} s): "
             "is it meant in seconds?",

@@ -17,10 +17,17 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import StepProblem
 from knode_cosserat.solvers.settings import Settings
 
-#: in natural units: a state beyond this is checked for instability
-SUSPICIOUS = 30.0
 #: |λ| ds of a decaying wave that an explicit scheme carries safely
 SAFE_DECAY = 1.0
+
+
+def natural_time(system: System) -> float | None:
+    """In what time (s) the system moves by its own length, by its natural units; None if they do not say."""
+    layout = system.strand.y_layout
+    if "p" not in layout.names or "q" not in layout.names:
+        return None
+    scale = np.asarray(system.strand.scales().y)
+    return float(np.min(scale[..., layout.slice("p")] / scale[..., layout.slice("q")]))
 
 
 @jax.jit

@@ -14,15 +14,15 @@ from knode_cosserat.solvers.result import Result, SimulationError
 from knode_cosserat.solvers.run import (
     ENOUGH_RESCUES,
     LEAST_CAPACITY,
-    Task,
     rescue,
-    trusted_size,
     with_stable_elimination,
 )
 from knode_cosserat.solvers.simulate import Run, beginning, check_initial, checked_dt, settings_of
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.stability import SAFE_DECAY, decay_per_segment
+from knode_cosserat.solvers.task import Task
 from knode_cosserat.solvers.time import Static, TimeScheme
+from knode_cosserat.solvers.trust import trusted_size
 from knode_cosserat.trajectory import Trajectory
 
 

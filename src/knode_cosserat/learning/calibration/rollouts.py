@@ -28,11 +28,12 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.march import Past, initial_past, rest_record
 from knode_cosserat.solvers.places import Places, places_at, positions_at, quaternions_at
-from knode_cosserat.solvers.run import Task, run_one
+from knode_cosserat.solvers.run import run_one
 from knode_cosserat.solvers.sensitivity import tangent_march
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.simulate import Run, beginning
 from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.solvers.task import Task
 from knode_cosserat.trajectory import Trajectory
 
 #: a far start is brought near on the first two rows, then on this many times as many, and so on

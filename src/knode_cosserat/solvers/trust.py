@@ -1,0 +1,55 @@
+"""Whether rows that are solved are to be believed: finite, of a likely size, or alike on two grids."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.result import Result
+from knode_cosserat.solvers.task import Start, Steps
+
+#: in natural units: a state beyond this is checked for instability
+SUSPICIOUS = 30.0
+#: of its largest value: how far y of two grids may be apart if it is to be believed
+GRIDS_APART = 0.2
+
+
+def finite(steps: Steps, system: System) -> Any:
+    """Whether each step's strains at the tip are: those at all other nodes have served to find y."""
+    return np.isfinite(steps.records[..., -1, system.y_layout.size :]).all(axis=-1)
+
+
+def refuse(steps: Steps, wrong: Any, why: Result) -> bool:
+    """Take back the first solved step that is wrong, and all after it; whether there was one."""
+    found = np.flatnonzero(wrong & (steps.result >= 0))
+    if len(found):
+        steps.result[found[0]] = int(why)
+        steps.result[found[0] + 1 :] = int(Result.NOT_REACHED)
+    return len(found) > 0
+
+
+def trustworthy(steps: Steps, system: System, start: Start, still: bool) -> bool:
+    """Solved, and not grown to a size that suggests an instability in space, which only a motion has.
+
+    What hangs like a cable carries forces far beyond its natural ones from the start.
+    """
+    if steps.result.min() < 0:
+        return False
+    return bool(still or steps.size.max() <= trusted_size(system, start))
+
+
+def trusted_size(system: System, start: Start) -> float:
+    """Numbers of y up to this, in natural units, are not suspicious: more if it starts with large ones."""
+    y = np.asarray(start.past.records[0])[:, : system.y_layout.size]
+    return SUSPICIOUS * max(1.0, float(np.max(np.abs(y) / np.asarray(system.scales().y))))
+
+
+def agree(finer: Steps, coarser: Steps, system: System) -> bool:
+    """Whether two grids are both solved and agree on y where it is largest: then it is as large as that."""
+    if min(finer.result.min(), coarser.result.min()) < 0:
+        return False
+    scale, ny = np.asarray(system.scales().y), system.y_layout.size
+    apart = np.max(np.abs(finer.records - coarser.records)[..., :ny] / scale)
+    return bool(apart <= GRIDS_APART * finer.size.max())
