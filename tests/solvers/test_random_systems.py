@@ -2,8 +2,8 @@
 
 What is drawn is of everyday sizes, without regard to whether it is easy: rods of 0.1 to 1 m and 1 to 10 mm
 from silicone to steel, loaded up to a few times EI/L², pushed at obstacles, pulled by tendons or reels. All
-of one kind have the same parts, and so one program. Time steps of 1 to 100 ms are from a hundred thousandth to
-a thousand of a rod's natural times.
+of one kind have the same parts, and so one program. Time steps of 1 to 100 ms are a hundred thousandth to a
+thousand of a rod's natural times.
 """
 
 import collections

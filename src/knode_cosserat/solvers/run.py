@@ -70,8 +70,8 @@ def run_one(
         if trustworthy(finer, system, start, still) or agree(finer, before, system):
             return finer._replace(result=np.full(task.steps, int(Result.RECOVERED_FINER_SEGMENTS))), ""
         parts, before = 2 * parts, finer
-    refuse(steps, steps.size > trusted_size(system, start), Result.UNSTABLE)
     if steep:
+        refuse(steps, steps.size > trusted_size(system, start), Result.UNSTABLE)
         cause = (
             f"{cause} At this time step its waves decay by e^{decay:.2g} within a segment, too much for an "
             "explicit scheme in space, and dividing the segments did not help: use longer time steps."
