@@ -37,8 +37,7 @@ def test_an_example_is_short_says_its_idea_and_has_a_picture(name):
     idea, empty, why, *_ = module.__doc__.splitlines()
     assert idea.endswith((".", "?")) or "." in idea
     assert len(idea) <= 110 and not empty and why
-    # one whose idea is a class of equations has these beside
-    assert len(lines) <= (85 if name == "hanging_string" else 60)
+    assert len(lines) <= 60
     parameters = inspect.signature(module.main).parameters
     assert parameters["out"].default == f"{name}.png"
     assert all(each.default is not inspect.Parameter.empty for each in parameters.values())
