@@ -105,6 +105,8 @@ WRONG = {
     "nodes of a number": (lambda t: kc.node_error(t, 3), "int", "a Trajectory"),
     "a jacobian of two": (lambda t: kc.jacobian(ROBOT, [1, 2]), r"\(2,\)", r"\(4,\).*\(N\)"),
     "a manipulability of text": (lambda t: kc.manipulability("x", [1, 2, 3, 4]), "str", "one robot"),
+    "the stability of a number": (lambda t: kc.stability(3), "int", "a Trajectory"),
+    "the stability of no row": (lambda t: kc.stability(t, row="x"), "'x'", "allowed is -"),
     **{
         f"a figure of text: {name}": (lambda t, name=name: getattr(kc.figures, name)("x"), "str", allowed)
         for name, allowed in (

@@ -17,6 +17,7 @@ from knode_cosserat.control.configuration import (
     manipulability,
 )
 from knode_cosserat.control.reach import InverseKinematics, Reach, inverse_kinematics
+from knode_cosserat.control.stability import Stability, stability
 from knode_cosserat.control.workspace import Workspace, workspace
 from knode_cosserat.diagnosis import Diagnosis, doctor
 from knode_cosserat.evaluation import figures
@@ -116,6 +117,7 @@ __all__ = [
     "Settings",
     "SimulationError",
     "SlenderRod",
+    "Stability",
     "StateError",
     "Stepper",
     "Stretch",
@@ -159,6 +161,7 @@ __all__ = [
     "routing",
     "save_robot",
     "simulate",
+    "stability",
     "state_errors",
     "surroundings",
     "tip_dtw",

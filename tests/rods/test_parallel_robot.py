@@ -249,7 +249,6 @@ def test_large_displacements_are_recovered():
     np.testing.assert_allclose(ROBOT.platform_position(y)[:2], 0.0, atol=1e-9)
 
 
-
 # learning
 
 

@@ -46,8 +46,10 @@ BEGIN_VIBRATION: dict[str, Any] = {"vibration_rate": 0.3, "vibration_softening":
 BEGINS = (0.35, 0.5, 0.65)
 #: vibration has to explain this part of what is left, on average, or it is not there
 WORTH = 0.02
-#: the sleeve's length, a part of the rod's
+#: the sleeve's length, a part of the rod's; RK4 finds it itself: by Euler's scheme it would take up what
+#: positions lag behind orientations
 SLEEVE = 0.11
+BY_RK4 = ("sleeve_length",)
 #: robots begin to vibrate somewhere between the least and the greatest tension of all tendons together, if
 #: these are further apart than this part of the greatest
 SPREAD = 0.2
@@ -81,7 +83,7 @@ def identify(
             says little, the offset stays as it is known.
         space: the scheme in arclength that the model is for; simulate it with the same. With Euler's, the
             positions of ten nodes lag behind their orientations by half a segment, and "rk4" takes three
-            times as long. It is searched from where Euler's scheme leads.
+            times as long. It is searched from where Euler's scheme leads, and finds the sleeve's length too.
 
     Returns:
         The `Calibration`; its `robot` is the model.
@@ -95,11 +97,11 @@ def identify(
     rough = _by_euler(knowledge, measurements, names)
     if isinstance(scheme, Euler):
         return rough
-    every = tuple(rough.estimates)
+    every = (*rough.estimates, *(BY_RK4 if names is None else ()))
     fine = calibrate(rough.robot, measurements, every, by="rollouts", undetermined="keep", space=scheme)
     return dataclasses.replace(
         fine,
-        before={name: rough.before[name] for name in fine.estimates},
+        before={**fine.before, **{name: rough.before[name] for name in rough.estimates}},
         undetermined=(*rough.undetermined, *fine.undetermined),
     )
 

@@ -1,0 +1,158 @@
+"""Stability of equilibria: classical buckling loads from both sides, an arch that snaps, several rods."""
+
+import numpy as np
+import pytest
+
+import knode_cosserat as kc
+from knode_cosserat.rods.ends import Clamped, Free, Pinned
+from knode_cosserat.rods.loads import PointWrench
+
+L, RADIUS, E = 0.5, 2e-3, 2e9
+EI, EA = E * np.pi * RADIUS**4 / 4, E * np.pi * RADIUS**2
+ROD = kc.SlenderRod(
+    length=L, radius=RADIUS, density=1200.0, youngs_modulus=E, bending_damping=1e-3, drag=1e-3,
+    gravity=[0.0, 0.0, 0.0], nodes=21,
+)  # fmt: skip
+PINNED = 4.493409457909064**2
+
+
+def squeezed(end, load):
+    """Straight, its tip held where `load` EI/L² press it to."""
+    held = end(position=[0.0, 0.0, (1.0 - load * EI / L**2 / EA) * L])
+    return kc.equilibrium(ROD.replace(tip_end=held), np.zeros(0), space="rk4")
+
+
+# columns
+
+
+@pytest.mark.parametrize(
+    ("end", "loads"),
+    [
+        # Timoshenko & Gere, Theory of elastic stability, 2.1: the symmetric and the antisymmetric mode
+        (Clamped, (4.0 * np.pi**2, 4.0 * PINNED)),
+        pytest.param(Pinned, (PINNED, 7.725251836937707**2), marks=pytest.mark.campaign),
+    ],
+)
+def test_a_column_buckles_every_way_at_once_at_each_of_its_loads(end, loads):
+    counts = [
+        kc.stability(squeezed(end, part * load)).unstable_directions
+        for load in loads
+        for part in (0.98, 1.02)
+    ]
+    # in two planes each
+    assert counts == [0, 2, 2, 4]
+
+
+@pytest.mark.campaign
+def test_the_least_eigenvalue_crosses_zero_at_the_load_whatever_the_nodes():
+    critical = []
+    for nodes in (11, 21):
+        rod = ROD.replace(nodes=nodes)
+        at = np.array([0.99, 1.01]) * 4.0 * np.pi**2
+        found = []
+        for load in at:
+            end = Clamped(position=[0.0, 0.0, (1.0 - load * EI / L**2 / EA) * L])
+            rest = kc.equilibrium(rod.replace(tip_end=end), np.zeros(0), space="rk4")
+            found.append(kc.stability(rest).least)
+        critical.append(at[0] - found[0] * (at[1] - at[0]) / (found[1] - found[0]))
+    errors = np.abs(np.array(critical) - 4.0 * np.pi**2)
+    assert errors[0] < 3e-3 * 4.0 * np.pi**2 and errors[1] < errors[0] / 8
+
+
+@pytest.mark.parametrize("part", [0.5, 0.98, 1.02, 4.0])
+@pytest.mark.parametrize("space", [pytest.param("euler", marks=pytest.mark.campaign), "rk4"])
+def test_an_upright_column_falls_beyond_greenhills_load_by_either_scheme(part, space):
+    density = 7.83735 * EI / L**3 * part / (np.pi * RADIUS**2 * 98.1)
+    rod = ROD.replace(density=density, gravity=[0.0, 0.0, -98.1], tip_end=Free())
+    found = kc.stability(kc.equilibrium(rod, np.zeros(0), space=space))
+    assert found.unstable_directions == (2 if part > 1.0 else 0)
+    assert found.stable == (part < 1.0) and (found.least > 0.0) == (part < 1.0)
+    # it falls over: the tip moves most, and sideways
+    moved = np.linalg.norm(found.mode[:, :2], axis=1)
+    assert np.argmax(moved) == len(moved) - 1 and moved[-1] == pytest.approx(1.0, abs=1e-6)
+
+
+@pytest.mark.campaign
+def test_a_buckled_column_has_nothing_to_lose_but_its_plane():
+    """Pushed aside while it is squeezed, then let go: it may turn about its line for nothing, and no more."""
+    load = 2.0 * 4.0 * np.pi**2
+    end = Clamped(position=[0.0, 0.0, (1.0 - load * EI / L**2 / EA) * L])
+    pushed = ROD.replace(tip_end=end, loads=(PointWrench(at=0.5, force=[1.0, 0.0, 0.0], controlled=True),))
+    rest = None
+    for push in (5.0, 2.0, 1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01):
+        rest = kc.equilibrium(pushed, [push * EI / L**2], space="rk4", initial=rest)
+    assert np.max(np.abs(rest.position[0, :, 0])) > 0.005 * L
+    found = kc.stability(rest)
+    assert found.stable and found.least < 0.1
+    # the way that costs least is across the plane in which it has buckled
+    assert np.max(np.abs(found.mode[:, 1])) > 0.99
+
+
+# an arch
+
+
+@pytest.mark.campaign
+def test_an_arch_snaps_where_it_is_no_longer_stable_and_says_so():
+    """Pushed in its middle against its bend, step by step: one row has snapped, and says so."""
+    arch = ROD.replace(
+        nodes=21, tip_end=Pinned(position=[0.0, 0.0, 0.9 * L]),
+        loads=(PointWrench(at=0.5, force=[1.0, 0.0, 0.0], controlled=True),),
+    )  # fmt: skip
+    unit = EI / L**2
+    rest = kc.equilibrium(arch, [20.0 * unit], space="rk4")
+    side = np.sign(rest.position[0, 10, 0])
+    middle, least, results = [], [], []
+    for load in np.linspace(20.0, -40.0, 31) * unit * side:
+        rest = kc.equilibrium(arch, [load], space="rk4", initial=rest)
+        middle.append(side * float(rest.position[0, 10, 0]) / L)
+        least.append(kc.stability(rest).least)
+        results.append(int(rest.result[0]))
+    jumps = np.flatnonzero(np.abs(np.diff(middle)) > 0.1) + 1
+    assert len(jumps) == 1
+    snapped = int(jumps[0])
+    assert results[snapped] == kc.Result.RECOVERED_RELAXATION
+    assert set(np.delete(results, snapped)) == {kc.Result.CONVERGED}
+    assert middle[snapped - 1] > 0.0 > middle[snapped]
+    # out of its plane it gives way before, which a push in the plane does not tell it
+    print("least eigenvalue by load:", np.round(least, 2))
+
+
+# several rods, and others
+
+
+@pytest.mark.campaign
+def test_a_platform_on_upright_legs_falls_under_its_buckling_load():
+    """Legs clamped at both ends of a platform that can move sideways: π² EI/L² each."""
+    robot = kc.load_robot("six-legged-robot")
+    even = np.arange(6) * np.pi / 3
+    stiffness, length = float(robot.strand.Kbt[0, 0]), float(robot.length)
+    for part in (0.95, 1.05):
+        mass = part * 6.0 * np.pi**2 * stiffness / length**2 / 9.81
+        loaded = robot.replace(
+            base_angles=even, platform_angles=even, platform_radius=float(robot.base_radius), density=1.0,
+            platform_mass=mass,
+        )  # fmt: skip
+        found = kc.stability(kc.equilibrium(loaded, np.zeros(6), space="rk4"))
+        assert found.stable == (part < 1.0)
+        assert found.mode.shape == (robot.nodes, 6, 3)
+
+
+@pytest.mark.campaign
+def test_tendons_keep_a_potential():
+    robot = kc.RoutedTendonRobot.like(kc.load_robot("delrin-tendon-robot"))
+    found = kc.stability(kc.equilibrium(robot, [5.0, 2.0, 1.0, 3.0], space="rk4"))
+    assert found.stable and found.asymmetry < 1e-3
+
+
+def test_what_is_no_equilibrium_is_refused():
+    robot = kc.load_robot("delrin-tendon-robot")
+    moved = kc.simulate(robot, kc.controls.step(1.0, 5, 0.05), 0.05)
+    with pytest.raises(ValueError, match=r"row 3 is no equilibrium"):
+        kc.stability(moved, row=3)
+    with pytest.raises(ValueError, match=r"row is 9; allowed is -6 to 5"):
+        kc.stability(moved, row=9)
+    with pytest.raises(ValueError, match=r"of a batch"):
+        kc.stability(kc.equilibrium(robot, np.zeros((2, 4))))
+    reels = kc.RoutedTendonRobot.like(robot, drive="reel", tendon_compliance=1e-3)
+    with pytest.raises(ValueError, match=r"RoutedTendonRobot has y = .*tension"):
+        kc.stability(kc.equilibrium(reels, np.zeros(4)))
