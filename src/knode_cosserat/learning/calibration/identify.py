@@ -97,13 +97,27 @@ def identify(
     rough = _by_euler(knowledge, measurements, names)
     if isinstance(scheme, Euler):
         return rough
-    every = (*rough.estimates, *(BY_RK4 if names is None else ()))
+    every = tuple(rough.estimates)
     fine = calibrate(rough.robot, measurements, every, by="rollouts", undetermined="keep", space=scheme)
+    if names is None:
+        fine = _freer(fine, measurements, every, scheme)
     return dataclasses.replace(
         fine,
-        before={**fine.before, **{name: rough.before[name] for name in rough.estimates}},
-        undetermined=(*rough.undetermined, *fine.undetermined),
+        before={name: rough.before.get(name, fine.before[name]) for name in fine.estimates},
+        undetermined=tuple(dict.fromkeys((*rough.undetermined, *fine.undetermined))),
     )
+
+
+def _freer(
+    fine: Calibration, measurements: Sequence[Measurements], names: Sequence[str], space: SpaceScheme
+) -> Calibration:
+    """With what only a scheme without a lag can tell, from where all else is found; if it explains more."""
+    try:
+        more = (*names, *BY_RK4)
+        other = calibrate(fine.robot, measurements, more, by="rollouts", undetermined="keep", space=space)
+    except CalibrationError:
+        return fine
+    return other if _left(other) < _left(fine) else fine
 
 
 def _by_euler(
