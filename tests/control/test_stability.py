@@ -153,6 +153,11 @@ def test_what_is_no_equilibrium_is_refused():
         kc.stability(moved, row=9)
     with pytest.raises(ValueError, match=r"of a batch"):
         kc.stability(kc.equilibrium(robot, np.zeros((2, 4))))
+
+
+@pytest.mark.campaign
+def test_reels_are_refused():
+    robot = kc.load_robot("delrin-tendon-robot")
     reels = kc.RoutedTendonRobot.like(robot, drive="reel", tendon_compliance=1e-3)
     with pytest.raises(ValueError, match=r"RoutedTendonRobot has y = .*tension"):
         kc.stability(kc.equilibrium(reels, np.zeros(4)))
