@@ -29,7 +29,7 @@ class HangingString(kc.System):
 
     def balance(self, s, t, y, y_t, z, z_t, control):  # A y_s + B y_st = f1
         p_s = (1.0 + z / self.stiffness) * y[2:4] / z
-        n_s = self.density * (y_t[4:] + jnp.array([0.0, 9.81])) + self.friction * y[4:]
+        n_s = self.density * (y_t[4:6] + jnp.array([0.0, 9.81])) + self.friction * y[4:6]
         B = jnp.zeros((6, 6)).at[4:, :2].set(-jnp.eye(2))
         return jnp.eye(6), B, jnp.concatenate([p_s, n_s, jnp.zeros(2)])
 

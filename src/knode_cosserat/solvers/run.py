@@ -104,7 +104,8 @@ def _refined(task: Task, system: System, fine: System, start: Start) -> Start:
         still = dataclasses.replace(task, steps=1, first="still")
         found, _ = _with_recovery(still, fine, start.control[None], start._replace(past=past), False)
         if found.result[0] >= 0:
-            rests = initial_past(fine, found.records[0], start.control)
+            kept = fine.y_layout.size + fine.z_layout.size
+            rests = initial_past(fine, found.records[0][:, :kept], start.control)
             past = rests._replace(t0=start.past.t0)
     return start._replace(past=past)
 
