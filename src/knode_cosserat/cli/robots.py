@@ -129,7 +129,7 @@ def equilibrium(
     rest = kc.equilibrium(system, _control(system, tension, control), space=space)
     if out:
         rest.save(out)
-    facts = {"robot": robot, **at_rest(rest), "unstable": _unstable(rest)}
+    facts = {"robot": robot, **at_rest(rest), "unstable": _unstable(rest, space)}
     lines = [
         f"tip: {vector(facts['tip_position'])} m",
         f"the tip leans {np.degrees(facts['tip_inclination']):.2f} degrees from the z axis",
@@ -192,14 +192,17 @@ def schema(
     typer.echo(json.dumps(kc.robot_schema(), indent=None if as_json else 2, ensure_ascii=False))
 
 
-def _unstable(rest: Any) -> bool | None:
-    """Whether an equilibrium is unstable; None where that cannot be told."""
+def _unstable(rest: Any, space: str) -> bool | None:
+    """Whether an equilibrium is unstable: by its energy, or else the tip's compliance, or else None."""
     import knode_cosserat as kc
 
     try:
         return not kc.stability(rest).stable
     except ValueError:
-        return None
+        # on reels, with friction, or no rod
+        if not {"n", "m"} <= set(rest.system.tip_layout.names):
+            return None
+        return bool(kc.configuration(rest.system, rest.control[0], space=space).unstable)
 
 
 def _control(system: System, tension: str | None, control: str | None) -> Any:
