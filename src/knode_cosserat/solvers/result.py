@@ -37,7 +37,7 @@ _MESSAGES = {
     Result.RECOVERED_LOAD_CONTINUATION: "converged by applying the change of control in smaller parts",
     Result.RECOVERED_STEP_HALVING: "converged by several smaller time steps",
     Result.RECOVERED_RELAXATION: "converged after a damped motion towards rest: it may have snapped",
-    Result.RECOVERED_FINER_SEGMENTS: "converged with every segment divided: they were too long for what happens within them",
+    Result.RECOVERED_FINER_SEGMENTS: "converged with every segment divided: they were too long",
     Result.RECOVERED_EASING: "converged by way of friction or contact that set in more gently",
     Result.NO_CONVERGENCE: "no solution found",
     Result.NOT_FINITE: "the equations overflow or are undefined there",
