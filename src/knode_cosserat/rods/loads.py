@@ -10,6 +10,7 @@ import abc
 from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.parameters import choice, parameter, place
@@ -48,6 +49,28 @@ class Wrench(NamedTuple):
 
     def __add__(self, other: Any) -> Wrench:
         return Wrench(self.force + other.force, self.moment + other.moment)
+
+
+class Body(NamedTuple):
+    """A rigid body by its moments about a point of the rod, material frame; bodies at one point add up."""
+
+    mass: Any
+    #: mass times its centre's place (kg·m)
+    first: Float[Any, "3"]
+    #: moments of inertia about the point (kg·m²)
+    inertia: Float[Any, "3 3"]
+
+    def wrench(self, motion: Motion, gravity: Any) -> Wrench:
+        """Weight less what its motion takes: F = m a - ω_t × S - ω × (ω × S), M = S × a - (J ω_t + ω × J ω).
+
+        S and J are the moments, and a the gravity less the acceleration of the point.
+        """
+        _, R, q, w, q_t, w_t = motion
+        S, J = self.first, self.inertia
+        a = dot(R.T, jnp.asarray(gravity)) - q_t - cross(w, q)
+        force = self.mass * a - cross(w_t, S) - cross(w, cross(w, S))
+        moment = cross(S, a) - (dot(J, w_t) + cross(w, dot(J, w)))
+        return Wrench(dot(R, force), dot(R, moment))
 
 
 class Load(Part):
@@ -151,11 +174,13 @@ class AttachedMass(PointLoad):
         default=(0.0, 0.0, 0.0),
     )  # fmt: skip
 
-    def wrench(self, motion: Motion, gravity: Any, control: Any) -> Wrench:
-        """Weight less what its motion takes: F = M (g - a), M = r × F - (I ω_t + ω × I ω)."""
-        _, R, q, w, q_t, w_t = motion
+    @property
+    def body(self) -> Body:
+        """It as a body about the rod's axis, the material's axes."""
         r, I = jnp.asarray(self.offset), jnp.asarray(self.inertia)
-        acceleration = q_t + cross(w, q) + cross(w_t, r) + cross(w, cross(w, r))
-        force = self.mass * (dot(R.T, jnp.asarray(gravity)) - acceleration)
-        moment = cross(r, force) - (I * w_t + cross(w, I * w))
-        return Wrench(dot(R, force), dot(R, moment))
+        off_axis = self.mass * (jnp.sum(r * r) * np.eye(3) - r[:, None] * r)
+        return Body(self.mass, self.mass * r, np.eye(3) * I + off_axis)
+
+    def wrench(self, motion: Motion, gravity: Any, control: Any) -> Wrench:
+        """Weight less what its motion takes."""
+        return self.body.wrench(motion, gravity)

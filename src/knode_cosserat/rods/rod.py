@@ -18,7 +18,16 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.ends import Clamped, End, Free, Pose, velocities
-from knode_cosserat.rods.loads import Load, Motion, PointLoad, SpreadLoad, Wrench, square_law_drag
+from knode_cosserat.rods.loads import (
+    AttachedMass,
+    Body,
+    Load,
+    Motion,
+    PointLoad,
+    SpreadLoad,
+    Wrench,
+    square_law_drag,
+)
 from knode_cosserat.rods.parameters import parameter, part
 from knode_cosserat.rods.parts import placed, shares
 from knode_cosserat.rods.section import (
@@ -34,6 +43,9 @@ from knode_cosserat.rods.section import (
 from knode_cosserat.rods.surroundings import Obstacle
 from knode_cosserat.rods.system import History, Layout, Scales, System
 from knode_cosserat.rotation import cross, dot, inverse, quaternion_rate, rotation_matrix
+
+#: where ends are placed from
+AT_ORIGIN = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 
 
 class PartControls(NamedTuple):
@@ -358,20 +370,26 @@ class Rod(System):
         """The sum of the loads at places, each times its weight."""
         controls = self._controls(control).loads
         motion = Motion.of(self.y_layout, y, history.c0 * y + history.y)
-        total = Wrench(jnp.zeros(3), jnp.zeros(3))
+        total, bodies = Wrench(jnp.zeros(3), jnp.zeros(3)), []
         for k, weight in weights.items():
             load: Any = self.loads[k]
+            if isinstance(load, AttachedMass):
+                bodies.append([weight * moment for moment in load.body])
+                continue
             own = load.wrench(motion, self.gravity, controls[k])
             total = total + Wrench(weight * own.force, weight * own.moment)
+        if bodies:
+            # as one: their equations are compiled once, however many there are
+            body = Body(*(sum(moments) for moments in zip(*bodies, strict=True)))
+            total = total + body.wrench(motion, self.gravity)
         return total
 
     # the two ends, and rest
 
     def rest(self, s: Any) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
         """Unloaded, at rest, from the base on: straight, or as it is curved there."""
-        base = self.base_end.pose(Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])), self._no_control(0))
         s = jnp.asarray(s, dtype=float)
-        p, h, u = self._rest_shape(base, s)
+        p, h, u = self._rest_shape(self.base_end.pose(AT_ORIGIN, self._no_control(0)), s)
         y = jnp.concatenate([p, h, np.zeros(self.y_layout.size - 7)])
         return y, jnp.concatenate([self.v_star, u])
 
@@ -392,13 +410,11 @@ class Rod(System):
 
     def base(self, t: Any, control: Any, unknowns: Float[Any, " k"], history: History) -> Float[Any, " y"]:
         """y at s = 0: held as its end has it, and moving as that moves."""
-        y, _ = self.rest(jnp.zeros(()))
-        if type(self.base_end) is Clamped:
-            return y.at[self.y_layout.indices(self.base_unknowns)].set(unknowns)
-        own = self._controls(control).base
-        held = self.base_end.pose(Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])), own)
-        y = jnp.concatenate([held.p, held.h, y[7:]])
+        held = self.base_end.pose(AT_ORIGIN, self._controls(control).base)
+        y = jnp.concatenate([held.p, held.h, np.zeros(self.y_layout.size - 7)])
         y = y.at[self.y_layout.indices(self.base_unknowns)].set(unknowns)
+        if type(self.base_end) is Clamped:
+            return y
         y_t = history.c0 * y + history.y
         q, w = velocities(self._pose(y), self._pose(y_t))
         return jnp.concatenate([y[:13], q, w, y[19:]])

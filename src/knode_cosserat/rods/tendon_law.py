@@ -10,8 +10,8 @@ least of the strictly convex energy ½ vᵀK_v v + ½ uᵀK_u u + Σ Tᵢ |ṗ�
 
     J = diag(K_v, K_u) + Σ Tᵢ/|ṗᵢ| (WᵢᵀWᵢ - gᵢgᵢᵀ),     Wᵢ = [I, -r̂ᵢ],     gᵢ = Wᵢᵀtᵢ = (tᵢ, rᵢ × tᵢ)
 
-Two corrections with one J settle it while tendons hardly turn; where they do, Newton's method goes on,
-damped. The measure of both is by how much, as a part, a correction changes ṗᵢ.
+Newton's method solves it, each J used twice: while tendons hardly turn one is enough. It is damped where
+they do. The measure of both is by how much, as a part, a correction changes ṗᵢ.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from jaxtyping import Float
 
 from knode_cosserat.rotation import dot, inverse, small_inverse
 
-#: corrections with the first J, before Newton's method
-CHORDS = 2
-#: corrections of Newton's method at most
-CORRECTIONS = 50
+#: pairs of corrections at most
+ROUNDS = 50
+#: a tendon's turn by which a whole correction is safe
+SMALL = 0.05
 #: what may be missing of a tendon's tangent
 MISSING = 1e-13
 
@@ -178,36 +178,28 @@ def _solved(K_v: Any, K_u: Any, ab: Any, r: Any, r_s: Any, tension: Any) -> Floa
         dx = dot(flexibility, _balance(x, K_v, K_u, ab, r, r_s, tension))
         return dx, _turn(dx, _units(x, r, r_s)[1], r)
 
-    def flexibility_at(x: Any) -> Any:
-        return _flexibility(x, K_v, K_u, r, r_s, tension)
+    def goes_on(reached: Any) -> Any:
+        count, _, missing = reached
+        return (count < ROUNDS) & ~(missing <= MISSING)
+
+    def corrected(reached: Any) -> Any:
+        """One step of Newton's method, and another with the same J."""
+        count, x, _ = reached
+        flexibility = _flexibility(x, K_v, K_u, r, r_s, tension)
+        dx, first = correction(x, flexibility)
+        # the damping that keeps a convex function with |f‴| ≤ 3 f″ going down (Sun & Tran-Dinh 2019)
+        damping = jnp.where(first < SMALL, 1.0, jnp.log1p(3.0 * first) / jnp.maximum(3.0 * first, 1e-300))
+        x = x - damping * dx
+        dx, turned = correction(x, flexibility)
+        # the next correction would be about this one times how much J has changed since (|t″| ≤ 3)
+        nearer = turned <= first
+        return count + 1, jnp.where(nearer, x - dx, x), jnp.where(nearer, 3.0 * first * turned, jnp.inf)
 
     dx, dy = _columns(r_s)
     shorter = 1.0 / jnp.sqrt(1.0 + dx * dx + dy * dy)
     free = ab - _loads((dx * shorter, dy * shorter, shorter), tension, r)
     start = jnp.concatenate([dot(inverse(K_v), free[:3]), dot(inverse(K_u), free[3:])])
-
-    flexibility = flexibility_at(start)
-    dx, first = correction(start, flexibility)
-    x, turned = start - dx, first
-    for _ in range(CHORDS - 1):
-        dx, turned = correction(x, flexibility)
-        x = x - dx
-    # the next correction would be about this one times how much J has changed since (|t″| ≤ 3)
-    missing = 3.0 * first * turned
-
-    def goes_on(reached: Any) -> Any:
-        count, _, missing = reached
-        return (count < CORRECTIONS) & ~(missing <= MISSING)
-
-    def corrected(reached: Any) -> Any:
-        count, x, _ = reached
-        dx, turned = correction(x, flexibility_at(x))
-        # the damping that keeps a convex function with |f‴| ≤ 3 f″ going down (Sun & Tran-Dinh 2019)
-        damping = jnp.log1p(3.0 * turned) / jnp.maximum(3.0 * turned, 1e-300)
-        return count + 1, x - damping * dx, 3.0 * turned**2
-
-    x = jnp.where(turned <= first, x, start)
-    _, x, missing = jax.lax.while_loop(goes_on, corrected, (0, x, missing))
+    _, x, missing = jax.lax.while_loop(goes_on, corrected, (0, start, jnp.inf))
     return jnp.where(missing <= MISSING, x, jnp.nan)
 
 

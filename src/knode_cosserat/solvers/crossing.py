@@ -12,6 +12,7 @@ import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -77,17 +78,19 @@ def carried(
     """
     s, ds = where
     parts = crossing.acting.shape[0]
-    for k in range(parts):
-        begin, end = crossing.bounds[k], crossing.bounds[k + 1]
+    acting = jnp.asarray(crossing.acting).at[:first].set(0.0)
+
+    def part(y: Any, given: tuple[Any, Any, Any]) -> Any:
+        begin, end, acts = given
         past = history if parts == 1 else _part_of(space, history, begin, end)
-        if k >= first:
-            y = jump(crossing.acting[k], y, past[0])
         low, high = s + begin * ds, s + end * ds
 
-        def inside(at: Any, y: Any, record: Any, low: Any = low, high: Any = high) -> Any:
+        def inside(at: Any, y: Any, record: Any) -> Any:
             return rates(within(at, low, high), y, record)
 
-        y = space.advance(inside, low, high - low, y, past)
+        return space.advance(inside, low, high - low, jump(acts, y, past[0]), past), None
+
+    y, _ = jax.lax.scan(part, y, (crossing.bounds[:-1], crossing.bounds[1:], acting))
     return y
 
 
