@@ -10,7 +10,7 @@ from scipy.optimize import root
 from scipy.spatial.transform import Rotation
 
 import knode_cosserat as kc
-from knode_cosserat.rods.loads import AttachedMass, DistributedWrench, Motion, PointWrench
+from knode_cosserat.rods.loads import AttachedMass, DistributedWrench, Motion, PointWrench, point_wrench
 
 L, RADIUS, E = 0.5, 0.005, 1e8
 EI, GA = E * np.pi * RADIUS**4 / 4, E / 2.6 * np.pi * RADIUS**2
@@ -187,6 +187,22 @@ def test_the_wrench_of_a_moving_body_is_the_rate_of_its_momentum():
     taken = weight - rate(momentum, t, 1e-3)
     np.testing.assert_allclose(force, taken[:3], atol=1e-6)
     np.testing.assert_allclose(moment + np.cross(p, force), taken[3:], atol=1e-6)
+
+
+def test_loads_at_one_place_do_what_each_does():
+    rng = np.random.default_rng(0)
+    motion = Motion(rng.normal(size=3), Rotation.random(rng=rng).as_matrix(), *rng.normal(size=(4, 3)))
+    gravity = np.array([1.0, 2.0, -9.0])
+    loads = [
+        AttachedMass(mass=rng.uniform(0.1, 1.0), offset=rng.normal(size=3), inertia=rng.uniform(size=3))
+        for _ in range(3)
+    ]
+    loads.append(PointWrench(force=rng.normal(size=3), moment=rng.normal(size=3), follows=True))
+    acting = [(load, weight, np.zeros(0)) for load, weight in zip(loads, [1.0, 0.0, 1.0, 1.0], strict=True)]
+    force, moment = point_wrench(acting, motion, gravity)
+    each = [(weight, load.wrench(motion, gravity, control)) for load, weight, control in acting]
+    np.testing.assert_allclose(force, sum(weight * own.force for weight, own in each), rtol=1e-12)
+    np.testing.assert_allclose(moment, sum(weight * own.moment for weight, own in each), rtol=1e-12)
 
 
 # in motion: a light rod with a heavy tip, pulled aside and let go

@@ -184,3 +184,18 @@ class AttachedMass(PointLoad):
     def wrench(self, motion: Motion, gravity: Any, control: Any) -> Wrench:
         """Weight less what its motion takes."""
         return self.body.wrench(motion, gravity)
+
+
+def point_wrench(acting: list[tuple[Any, Any, Any]], motion: Motion, gravity: Any) -> Wrench:
+    """What loads at one place do together: each with its weight (0 where it is not there) and control."""
+    total, bodies = Wrench(jnp.zeros(3), jnp.zeros(3)), []
+    for load, weight, control in acting:
+        if isinstance(load, AttachedMass):
+            bodies.append([weight * moment for moment in load.body])
+            continue
+        own = load.wrench(motion, gravity, control)
+        total = total + Wrench(weight * own.force, weight * own.moment)
+    if bodies:
+        # as one: their equations are compiled once, however many there are
+        total = total + Body(*(sum(moments) for moments in zip(*bodies, strict=True))).wrench(motion, gravity)
+    return total

@@ -19,13 +19,12 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.ends import Clamped, End, Free, Pose, velocities
 from knode_cosserat.rods.loads import (
-    AttachedMass,
-    Body,
     Load,
     Motion,
     PointLoad,
     SpreadLoad,
     Wrench,
+    point_wrench,
     square_law_drag,
 )
 from knode_cosserat.rods.parameters import parameter, part
@@ -370,19 +369,8 @@ class Rod(System):
         """The sum of the loads at places, each times its weight."""
         controls = self._controls(control).loads
         motion = Motion.of(self.y_layout, y, history.c0 * y + history.y)
-        total, bodies = Wrench(jnp.zeros(3), jnp.zeros(3)), []
-        for k, weight in weights.items():
-            load: Any = self.loads[k]
-            if isinstance(load, AttachedMass):
-                bodies.append([weight * moment for moment in load.body])
-                continue
-            own = load.wrench(motion, self.gravity, controls[k])
-            total = total + Wrench(weight * own.force, weight * own.moment)
-        if bodies:
-            # as one: their equations are compiled once, however many there are
-            body = Body(*(sum(moments) for moments in zip(*bodies, strict=True)))
-            total = total + body.wrench(motion, self.gravity)
-        return total
+        acting = [(self.loads[k], weight, controls[k]) for k, weight in weights.items()]
+        return point_wrench(acting, motion, self.gravity)
 
     # the two ends, and rest
 
