@@ -142,7 +142,7 @@ def test_a_platform_on_upright_legs_falls_under_its_buckling_load():
 
 @pytest.mark.campaign
 def test_tendons_keep_a_potential():
-    robot = kc.RoutedTendonRobot.like(kc.load_robot("delrin-tendon-robot"))
+    robot = kc.RoutedTendonRobot.like(kc.load_robot("delrin-tendon-robot"), length=1.0)
     found = kc.stability(kc.equilibrium(robot, [5.0, 2.0, 1.0, 3.0], space="rk4"))
     assert found.stable and found.asymmetry < 1e-3
 
@@ -162,5 +162,20 @@ def test_what_is_no_equilibrium_is_refused():
 def test_reels_are_refused():
     robot = kc.load_robot("delrin-tendon-robot")
     reels = kc.RoutedTendonRobot.like(robot, drive="reel", tendon_compliance=1e-3)
-    with pytest.raises(ValueError, match=r"RoutedTendonRobot has y = .*tension"):
+    with pytest.raises(ValueError, match=r"RoutedTendonRobot has (tension|path) \(.*energy of its own"):
         kc.stability(kc.equilibrium(reels, np.zeros(4)))
+
+
+@pytest.mark.campaign
+def test_friction_is_not_counted():
+    """All tendons together push a column down, with or without friction in it."""
+    robot = kc.RoutedTendonRobot.like(kc.load_robot("delrin-tendon-robot"), length=1.0)
+    rough = robot.replace(friction_wobble=0.5, friction_curvature=0.1, vibration_rate=0.0)
+    for gravity in (-9.81, -60.0):
+        found = [
+            kc.stability(kc.equilibrium(each.replace(gravity=[0.0, 0.0, gravity]), np.full(4, 5.0)))
+            for each in (robot, rough)
+        ]
+        assert found[0].stable == (gravity > -20.0)
+        assert found[1].unstable_directions == found[0].unstable_directions
+        assert found[1].least == pytest.approx(found[0].least, rel=1e-6)

@@ -199,7 +199,7 @@ def _unstable(rest: Any, space: str) -> bool | None:
     try:
         return not kc.stability(rest).stable
     except ValueError:
-        # on reels, with friction, or no rod
+        # on reels, or no rod
         if not {"n", "m"} <= set(rest.system.tip_layout.names):
             return None
         return bool(kc.configuration(rest.system, rest.control[0], space=space).unstable)

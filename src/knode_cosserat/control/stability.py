@@ -29,8 +29,10 @@ from knode_cosserat.trajectory import Trajectory
 BALANCED = 1e-6
 #: of the largest singular value: what counts as held
 HELD = 1e-9
-#: y of a rod's strand; more, such as tensions of reels, has energies of its own
-NEEDED, ALLOWED = {"p", "h", "n", "m"}, {"p", "h", "n", "m", "q", "w"}
+#: y of a strand that has a pose and a stress; whatever more there is must rest when these move
+NEEDED = ("p", "h", "n", "m")
+#: in natural units: what moves less than this by them rests
+RESTING = 1e-9
 #: roots of the equations that are found from a root nearby
 NEARBY = (Result.CONVERGED, Result.RECOVERED_STABLE_ELIMINATION, Result.RECOVERED_LOAD_CONTINUATION)
 
@@ -61,15 +63,15 @@ def stability(equilibrium: Trajectory, row: int = -1) -> Stability:
     For whatever holds its ends: it finds what buckles between clamps, an arch that is about to snap, a column
     that would fall. The robot is looked at as by RK4 along the rod, whatever it was solved by, since Euler's
     scheme has no potential. Loads that follow the rod have none either: of those it sees what
-    gives way, and not what flutters.
+    gives way, and not what flutters. Friction, which only helps, is not counted.
 
     Args:
         equilibrium: of one robot: what `kc.equilibrium` gives, or a trajectory that has come to rest.
         row: which row of it.
 
     Raises:
-        ValueError: no equilibrium, or a system that is not rods with positions and orientations only
-            (tendons on reels and friction have energies of their own).
+        ValueError: no equilibrium, a system that is not rods with positions and orientations, or one with
+            more in y that moves with them (tendons on reels have an energy of their own).
     """
     system, y, z, control = _checked(equilibrium, row)
     space = equilibrium.settings.space
@@ -81,8 +83,10 @@ def stability(equilibrium: Trajectory, row: int = -1) -> Stability:
         found = rests(system, control, space="rk4", initial=one, on_failure="return")
         if found.result[0] in NEARBY:
             y = np.asarray(found.y[0])
-    linearisation = _linearised(system, jnp.asarray(y), jnp.asarray(control), z.shape[-1])
-    return _of_stiffness(*_stiffness(system, y, *(np.asarray(part) for part in linearisation)), system)
+    linearised = _linearised(system, jnp.asarray(y), jnp.asarray(control), z.shape[-1])
+    F, base, tip = (np.asarray(part) for part in linearised)
+    _require_rest(system, F, base)
+    return _of_stiffness(*_stiffness(system, y, F, base, tip), system)
 
 
 def _checked(equilibrium: Any, row: Any) -> tuple[System, np.ndarray, np.ndarray, np.ndarray]:
@@ -96,11 +100,10 @@ def _checked(equilibrium: Any, row: Any) -> tuple[System, np.ndarray, np.ndarray
     if not isinstance(row, int | np.integer) or not -len(y) <= row < len(y):
         raise ValueError(f"row is {row!r}; allowed is {-len(y)} to {len(y) - 1}")
     system = equilibrium.system
-    names = set(system.strand.y_layout.names)
-    if not NEEDED <= names <= ALLOWED:
+    names = system.strand.y_layout.names
+    if not set(NEEDED) <= set(names):
         raise ValueError(
-            f"a {type(system).__name__} has y = {', '.join(system.strand.y_layout.names)}; allowed are rods "
-            "with p, h, n, m and no more than their velocities"
+            f"a {type(system).__name__} has y = {', '.join(names)}; allowed are rods with p, h, n and m"
         )
     y, z, control = y[row], np.asarray(equilibrium.z)[row], np.asarray(equilibrium.control)[row]
     record = np.concatenate([y, z] + ([np.zeros_like(y)] if system.mixed else []), axis=1)
@@ -125,6 +128,24 @@ def _linearised(system: System, y: Any, control: Any, nz: int) -> tuple[Any, Any
     ny = y.shape[1]
     F, base, tip = _find(system, y, control, jnp.zeros((len(y), ny + nz + (ny if system.mixed else 0))))
     return F.reshape(len(y) - 1, system.strands, *F.shape[-2:]), base, tip
+
+
+def _require_rest(system: System, F: np.ndarray, base: np.ndarray) -> None:
+    """That what y has beside poses and stresses, such as velocities, rests whatever those do."""
+    layout, scale = system.strand.y_layout, np.asarray(system.strand.scales().y)
+    F = F * scale / scale[:, None]
+    base = base.reshape(system.strands, layout.size, -1)
+    named = layout.indices(NEEDED)
+    for field in layout.fields:
+        if field.name in NEEDED:
+            continue
+        own = layout.indices((field.name,))
+        moved = np.abs(F[..., own, :][..., named]).max(), np.abs(base[:, own]).max()
+        if max(moved) > RESTING:
+            raise ValueError(
+                f"a {type(system).__name__} has {field.name} ({field.meaning}) in y, which has an energy of "
+                "its own; allowed are rods whose equilibria are of p, h, n and m alone"
+            )
 
 
 class _Poses:
