@@ -28,7 +28,7 @@ from knode_cosserat.rotation import dot, inverse, small_inverse
 
 #: pairs of corrections at most
 ROUNDS = 50
-#: a tendon's turn by which a whole correction is safe
+#: a tendon's turn up to which a correction is not damped
 SMALL = 0.05
 #: what may be missing of a tendon's tangent
 MISSING = 1e-13
@@ -183,17 +183,17 @@ def _solved(K_v: Any, K_u: Any, ab: Any, r: Any, r_s: Any, tension: Any) -> Floa
         return (count < ROUNDS) & ~(missing <= MISSING)
 
     def corrected(reached: Any) -> Any:
-        """One step of Newton's method, and another with the same J."""
+        """One step of Newton's method, damped; where that was short, another with the same J."""
         count, x, _ = reached
         flexibility = _flexibility(x, K_v, K_u, r, r_s, tension)
         dx, first = correction(x, flexibility)
         # the damping that keeps a convex function with |f‴| ≤ 3 f″ going down (Sun & Tran-Dinh 2019)
-        damping = jnp.where(first < SMALL, 1.0, jnp.log1p(3.0 * first) / jnp.maximum(3.0 * first, 1e-300))
-        x = x - damping * dx
+        near = first < SMALL
+        x = x - jnp.where(near, 1.0, jnp.log1p(3.0 * first) / jnp.maximum(3.0 * first, 1e-300)) * dx
         dx, turned = correction(x, flexibility)
-        # the next correction would be about this one times how much J has changed since (|t″| ≤ 3)
-        nearer = turned <= first
-        return count + 1, jnp.where(nearer, x - dx, x), jnp.where(nearer, 3.0 * first * turned, jnp.inf)
+        # the next correction would be about the last one times how much J has changed since (|t″| ≤ 3)
+        again = near & (turned <= first)
+        return count + 1, jnp.where(again, x - dx, x), 3.0 * first * jnp.where(again, turned, first)
 
     dx, dy = _columns(r_s)
     shorter = 1.0 / jnp.sqrt(1.0 + dx * dx + dy * dy)
