@@ -131,7 +131,9 @@ def first_call() -> dict[str, Any]:
     robot = kc.load_robot("delrin-tendon-robot")
     tensions = kc.controls.sine(1.5, STEPS, DT)
     call = seconds(lambda: kc.simulate(robot, tensions, DT))
-    return {"import": imported, "first_call": call}
+    ribs = kc.load_robot("delrin-routed-tendon-robot")
+    family = seconds(lambda: kc.simulate(ribs, tensions, DT, space="rk4"))
+    return {"import": imported, "first_call": call, "ribs": family}
 
 
 def memory() -> dict[str, Any]:

@@ -99,6 +99,11 @@ def table(found: dict[str, Any]) -> str:
             ">= 1,700",
         ),
         ("first call (nothing compiled yet)", f"{found['first_call']['first_call']:.1f} s", "<= 6 s"),
+        (
+            "the same of the robot with ribs and real tendons, RK4",
+            f"{found['first_call']['ribs']:.1f} s",
+            "<= 6 s",
+        ),
         ("second process, command to result", f"{found['second_process']['seconds']:.1f} s", "<= 3 s"),
         ("gradient of 100 steps against the steps", f"{gradient['ratio']:.1f}x", "<= 5x"),
         ("peak memory, 1,000 steps", f"{found['memory']['megabytes']:.0f} MB", "<= 700 MB"),

@@ -49,6 +49,7 @@ from knode_cosserat.recordings.load import load_recording
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
 from knode_cosserat.rods import ends, loads, routing, surroundings
+from knode_cosserat.rods.layout import Field, Layout
 from knode_cosserat.rods.parallel_robot import ParallelRobot
 from knode_cosserat.rods.parameters import ParameterError, parameter
 from knode_cosserat.rods.robot_file import RobotFileError, catalog, load_robot, save_robot
@@ -57,7 +58,7 @@ from knode_cosserat.rods.rod import Rod
 from knode_cosserat.rods.routed_robot import RoutedTendonRobot
 from knode_cosserat.rods.section import Differences, FunctionSection, Stretch
 from knode_cosserat.rods.slender_rod import SlenderRod
-from knode_cosserat.rods.system import Field, History, Layout, Scales, System
+from knode_cosserat.rods.system import History, Scales, System
 from knode_cosserat.rods.tendon_robot import TendonRobot
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.equilibrium import equilibrium

@@ -16,7 +16,8 @@ from jaxtyping import Float
 
 from knode_cosserat import controls
 from knode_cosserat.controls import SAME_TIME, ControlsError
-from knode_cosserat.rods.system import Layout, System
+from knode_cosserat.rods.layout import Layout
+from knode_cosserat.rods.system import System
 
 Array = Float[np.ndarray, "steps c"]
 

@@ -20,14 +20,11 @@ import numpy as np
 
 from knode_cosserat._files import package_version, replacing
 from knode_cosserat.rods import robot_file
+from knode_cosserat.rods.layout import Field, Layout
 from knode_cosserat.rods.parameters import Parameter, ParameterError, parameters_of, slots_of
-from knode_cosserat.rods.system import Field, Layout, System
-from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.linear import Condensed, Decoupled, LinearSolver
+from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.solvers.time import TimeScheme
 from knode_cosserat.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -387,18 +384,8 @@ def _first_line(error: Exception) -> str:
 
 
 def _settings_text(settings: Settings | None, source: str) -> str:
-    if settings is None:
-        return "null"
-    described: dict[str, Any] = {
-        "time": {"scheme": type(settings.time).__name__, **dataclasses.asdict(settings.time)},
-        "space": {"scheme": type(settings.space).__name__, **dataclasses.asdict(settings.space)},
-        "start": settings.start,
-        "newton": dataclasses.asdict(settings.newton),
-    }
-    if isinstance(settings.elimination, Decoupled):
-        described["elimination"] = {"scheme": Decoupled.__name__, **dataclasses.asdict(settings.elimination)}
     try:
-        return json.dumps(described)
+        return json.dumps(None if settings is None else settings.described())
     except (TypeError, ValueError) as error:
         raise TrajectoryFileError(f"{source}: the settings cannot be written: {error}") from None
 
@@ -406,37 +393,8 @@ def _settings_text(settings: Settings | None, source: str) -> str:
 def _settings(path: Path, data: xarray.Dataset) -> Settings | None:
     try:
         described = json.loads(data.attrs["settings"])
-        if described is None:
-            return None
-        return Settings(
-            time=_scheme(TimeScheme, **described["time"]),
-            space=_scheme(SpaceScheme, **described["space"]),
-            start=described["start"],
-            newton=NewtonOptions(**described["newton"]),
-            elimination=_elimination(described.get("elimination", Condensed.__name__)),
-        )
+        return None if described is None else Settings.from_description(described)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise TrajectoryFileError(
             f"{path}: attribute 'settings' is not understood: {_first_line(error)}"
         ) from None
-
-
-def _elimination(described: Any) -> Any:
-    """From its name and options, or from its name alone, as files had it at first."""
-    return _scheme(LinearSolver, **({"scheme": described} if isinstance(described, str) else described))
-
-
-def _scheme(base: type, *, scheme: str, **options: Any) -> Any:
-    """A scheme of a class that exists already: the package's, or one that the user has defined by now."""
-    ours_last = sorted(_subclasses(base), key=lambda cls: cls.__module__.startswith("knode_cosserat."))
-    known = {cls.__name__: cls for cls in ours_last}
-    if scheme not in known:
-        raise ValueError(f"no {base.__name__} is called {scheme!r} here; there are {', '.join(known)}")
-    return known[scheme](**options)
-
-
-def _subclasses(cls: type) -> Iterator[type]:
-    subclasses: list[type] = cls.__subclasses__()
-    for subclass in subclasses:
-        yield subclass
-        yield from _subclasses(subclass)

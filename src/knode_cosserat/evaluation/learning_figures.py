@@ -10,7 +10,7 @@ from knode_cosserat.evaluation.drawing import new_figure
 from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
 from knode_cosserat.learning.explain import added
 from knode_cosserat.learning.knode import KNODE
-from knode_cosserat.rods.system import Field
+from knode_cosserat.rods.layout import Field
 from knode_cosserat.trajectory import Trajectory
 
 if TYPE_CHECKING:

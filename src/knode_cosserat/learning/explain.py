@@ -12,7 +12,8 @@ from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.samples import Samples, samples, start_of
 from knode_cosserat.learning.structured.expansion import Expansion, Term
 from knode_cosserat.learning.structured.residual import Structured, ambient_layout, loaded, material_layout
-from knode_cosserat.rods.system import Layout, System, unpacked_history
+from knode_cosserat.rods.layout import Layout
+from knode_cosserat.rods.system import System, unpacked_history
 from knode_cosserat.trajectory import Trajectory
 
 

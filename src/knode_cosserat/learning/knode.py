@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.learning.residual import Residual
-from knode_cosserat.rods.system import History, Layout, Scales, System, of_strands
+from knode_cosserat.rods.layout import Layout
+from knode_cosserat.rods.system import History, Scales, System, of_strands
 
 
 class About:

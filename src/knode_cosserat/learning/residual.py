@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.learning.config import NetworkOptions
-from knode_cosserat.rods.system import Field, History, Layout, System
+from knode_cosserat.rods.layout import Field, Layout
+from knode_cosserat.rods.system import History, System
 
 
 class Residual(eqx.Module):

@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.rods.layout import Field
 from knode_cosserat.rods.parameters import choice, parameter
 from knode_cosserat.rods.parts import Part
-from knode_cosserat.rods.system import Field
 from knode_cosserat.rotation import conjugate, dot, quaternion_of, quaternion_product, rotation_matrix
 
 #: where an end may be moved by control: along a global axis, or about one

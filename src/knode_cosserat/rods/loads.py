@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.rods.layout import Field
 from knode_cosserat.rods.parameters import choice, parameter, place
 from knode_cosserat.rods.parts import Part, require_stretch
-from knode_cosserat.rods.system import Field
 from knode_cosserat.rotation import cross, dot, rotation_matrix
 
 

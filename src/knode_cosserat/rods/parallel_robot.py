@@ -15,10 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parameters import ParameterError, parameter
 from knode_cosserat.rods.rod import Rod
 from knode_cosserat.rods.strands import Bundle
-from knode_cosserat.rods.system import History, Layout, Scales, System, in_strands, is_traced
+from knode_cosserat.rods.system import History, Scales, System, in_strands, is_traced
 from knode_cosserat.rotation import cross, dot, rotation_matrix
 
 #: what a leg has of a rod's parameters

@@ -11,8 +11,8 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 
+from knode_cosserat.rods.layout import Field
 from knode_cosserat.rods.parameters import Parameter, ParameterError, check_fields, parameters_of
-from knode_cosserat.rods.system import Field
 
 
 class Part(eqx.Module):

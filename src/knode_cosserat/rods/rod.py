@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.ends import Clamped, End, Free, Pose, velocities
+from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.loads import (
     Load,
     Motion,
@@ -40,7 +41,7 @@ from knode_cosserat.rods.section import (
     shear_modulus,
 )
 from knode_cosserat.rods.surroundings import Obstacle
-from knode_cosserat.rods.system import History, Layout, Scales, System
+from knode_cosserat.rods.system import History, Scales, System
 from knode_cosserat.rotation import cross, dot, inverse, quaternion_rate, rotation_matrix
 
 #: where ends are placed from

@@ -39,11 +39,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parameters import ParameterError, choice, parameter, part
 from knode_cosserat.rods.rod import Rod
 from knode_cosserat.rods.routing import Routing, Straight, ends, routes
 from knode_cosserat.rods.section import Material
-from knode_cosserat.rods.system import History, Layout, System
+from knode_cosserat.rods.system import History, System
 from knode_cosserat.rods.tendon_law import stretches, tendon_balance, tendon_strains
 from knode_cosserat.rods.tendon_rod import TendonRod
 from knode_cosserat.rotation import dot

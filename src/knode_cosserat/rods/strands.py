@@ -8,7 +8,8 @@ from typing import Any, ClassVar
 
 from jaxtyping import Float
 
-from knode_cosserat.rods.system import Field, History, Layout, System, of_strands
+from knode_cosserat.rods.layout import Field, Layout
+from knode_cosserat.rods.system import History, System, of_strands
 
 
 class Bundle(System):

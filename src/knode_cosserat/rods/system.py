@@ -23,76 +23,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parameters import Parameter, ParameterError, check_fields, parameters_of
 from knode_cosserat.rotation import dot, rotation_matrix
 
 #: how many nodes a rod may be divided into
 FEWEST_NODES, MOST_NODES = 2, 10_000
-
-
-class Field(NamedTuple):
-    """A named part of y or z: its size, unit and meaning.
-
-    `frame` names the orientation (a quaternion in y) by whose rotation a vector of the global frame is seen
-    from the material; none for what is not turned. `load` is the unit of the load that the field's rate along
-    s balances, such as N/m of an internal force, none for a field whose rate is geometry; of a strain, the
-    unit of its stress.
-    """
-
-    name: str
-    size: int
-    unit: str
-    meaning: str
-    frame: str = ""
-    load: str = ""
-
-
-@dataclasses.dataclass(frozen=True)
-class Layout:
-    """The fields of a packed vector, in order."""
-
-    fields: tuple[Field, ...]
-
-    def __init__(self, *fields: tuple[Any, ...]):
-        object.__setattr__(self, "fields", tuple(Field(*field) for field in fields))
-
-    @property
-    def size(self) -> int:
-        """How many numbers a packed vector has."""
-        return sum(field.size for field in self.fields)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The fields' names, in order."""
-        return tuple(field.name for field in self.fields)
-
-    def slice(self, name: str) -> slice:
-        """Where a field stands in a packed vector. `KeyError` if there is no such field."""
-        start = 0
-        for field in self.fields:
-            if field.name == name:
-                return slice(start, start + field.size)
-            start += field.size
-        raise KeyError(f"no field {name!r}; there are {', '.join(self.names)}")
-
-    def get(self, packed: Any, name: str) -> Any:
-        """One field of a packed vector (or of an array of them: the last axis is packed)."""
-        where = self.slice(name)
-        if isinstance(packed, jax.core.Tracer):  # brackets take ten times as long to trace
-            return jax.lax.slice_in_dim(packed, where.start, where.stop, axis=-1)
-        return packed[..., where]
-
-    def split(self, packed: Any) -> tuple[Any, ...]:
-        """All fields of a packed vector, in order."""
-        return tuple(self.get(packed, field.name) for field in self.fields)
-
-    def indices(self, names: tuple[str, ...]) -> np.ndarray:
-        """Positions in the packed vector of the numbers of the named fields."""
-        every = np.arange(self.size)
-        return np.concatenate([every[self.slice(name)] for name in names])
-
-    def __add__(self, other: Layout) -> Layout:
-        return Layout(*self.fields, *other.fields)
 
 
 class History(NamedTuple):

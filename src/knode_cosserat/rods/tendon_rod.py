@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parameters import parameter
 from knode_cosserat.rods.rod import Rod
-from knode_cosserat.rods.system import Layout
 
 #: angles of the paper's four tendons about the rod, π/4 + iπ/2
 FOUR_TENDONS = tuple(np.pi / 4 + i * np.pi / 2 for i in range(4))

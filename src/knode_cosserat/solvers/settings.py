@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from typing import Any, Literal, Self
 
 from knode_cosserat.solvers import space as space_schemes
 from knode_cosserat.solvers import time as time_schemes
 from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.linear import ELIMINATIONS, Condensed, LinearSolver
+from knode_cosserat.solvers.linear import ELIMINATIONS, Condensed, Decoupled, LinearSolver
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.time import TimeScheme
 
@@ -48,6 +49,32 @@ class Settings:
             _scheme("elimination", elimination, LinearSolver, ELIMINATIONS),
         )
 
+    def described(self) -> dict[str, Any]:
+        """As plain data, for a file: schemes by their class's name and options."""
+        found: dict[str, Any] = {
+            "time": {"scheme": type(self.time).__name__, **dataclasses.asdict(self.time)},
+            "space": {"scheme": type(self.space).__name__, **dataclasses.asdict(self.space)},
+            "start": self.start,
+            "newton": dataclasses.asdict(self.newton),
+        }
+        if isinstance(self.elimination, Decoupled):
+            found["elimination"] = {"scheme": Decoupled.__name__, **dataclasses.asdict(self.elimination)}
+        return found
+
+    @classmethod
+    def from_description(cls, described: Any) -> Self:
+        """The settings that `described` gives; `KeyError`, `TypeError` or `ValueError` if it is not that."""
+        elimination = described.get("elimination", Condensed.__name__)
+        if isinstance(elimination, str):  # its name alone, as files had it at first
+            elimination = {"scheme": elimination}
+        return cls(
+            time=_named(TimeScheme, **described["time"]),
+            space=_named(SpaceScheme, **described["space"]),
+            start=described["start"],
+            newton=NewtonOptions(**described["newton"]),
+            elimination=_named(LinearSolver, **elimination),
+        )
+
 
 def _scheme(what: str, given: Any, kind: Any, known: Any) -> Any:
     if isinstance(given, kind):
@@ -56,3 +83,19 @@ def _scheme(what: str, given: Any, kind: Any, known: Any) -> Any:
         return known[given]
     names = ", ".join(f'"{name}"' for name in known)
     raise ValueError(f"{what} is {given!r}; allowed is {names}, or a {kind.__name__}")
+
+
+def _named(base: type, *, scheme: str, **options: Any) -> Any:
+    """A scheme of a class that exists already: the package's, or one that the user has defined by now."""
+    ours_last = sorted(_subclasses(base), key=lambda cls: cls.__module__.startswith("knode_cosserat."))
+    known = {cls.__name__: cls for cls in ours_last}
+    if scheme not in known:
+        raise ValueError(f"no {base.__name__} is called {scheme!r} here; there are {', '.join(known)}")
+    return known[scheme](**options)
+
+
+def _subclasses(cls: type) -> Iterator[type]:
+    subclasses: list[type] = cls.__subclasses__()
+    for subclass in subclasses:
+        yield subclass
+        yield from _subclasses(subclass)

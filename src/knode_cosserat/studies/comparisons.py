@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.evaluation.metrics import PoseHistory, pose_mse, tip_dtw
-from knode_cosserat.rods.system import History, Layout, Scales, System
+from knode_cosserat.rods.layout import Layout
+from knode_cosserat.rods.system import History, Scales, System
 from knode_cosserat.trajectory import Trajectory
 
 

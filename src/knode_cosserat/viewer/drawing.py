@@ -8,12 +8,13 @@ import jax
 import numpy as np
 
 from knode_cosserat.learning.knode import KNODE
+from knode_cosserat.rods.layout import Field, Layout
 from knode_cosserat.rods.loads import AttachedMass
 from knode_cosserat.rods.rod import Rod
 from knode_cosserat.rods.routed_robot import RoutedTendonRobot
 from knode_cosserat.rods.routing import ends
 from knode_cosserat.rods.surroundings import Cylinder, Obstacle, Plane, Sphere
-from knode_cosserat.rods.system import Field, Layout, System
+from knode_cosserat.rods.system import System
 from knode_cosserat.rods.tendon_rod import TendonRod
 
 #: the radius of what has none, as a part of its length

@@ -9,7 +9,7 @@ from knode_cosserat.learning.structured.evidence import relevant
 from knode_cosserat.learning.structured.expansion import CURVED, LINEAR, expansion
 from knode_cosserat.learning.structured.selection import folds, held_out_error, moments, selected
 from knode_cosserat.learning.structured.slopes import refined
-from knode_cosserat.rods.system import Layout
+from knode_cosserat.rods.layout import Layout
 
 
 def one(features, target, floor):

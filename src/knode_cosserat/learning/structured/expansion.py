@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.rods.system import Layout
+from knode_cosserat.rods.layout import Layout
 
 LINEAR = ("linear",)
 #: what a velocity may do: drag is linear or quadratic

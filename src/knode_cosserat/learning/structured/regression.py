@@ -36,7 +36,8 @@ from knode_cosserat.learning.structured.residual import (
 )
 from knode_cosserat.learning.structured.selection import folds
 from knode_cosserat.learning.structured.sums import Counting, Offer, Target, fitted_load, fitted_stress
-from knode_cosserat.rods.system import Layout, System, unpacked_history
+from knode_cosserat.rods.layout import Layout
+from knode_cosserat.rods.system import System, unpacked_history
 from knode_cosserat.rotation import rotation_matrix
 from knode_cosserat.solvers.space import Euler
 

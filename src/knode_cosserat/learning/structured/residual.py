@@ -22,7 +22,8 @@ from jaxtyping import Float
 
 from knode_cosserat.learning.residual import Residual
 from knode_cosserat.learning.structured.expansion import Expansion
-from knode_cosserat.rods.system import Field, History, Layout, System
+from knode_cosserat.rods.layout import Field, Layout
+from knode_cosserat.rods.system import History, System
 from knode_cosserat.rotation import dot, rotation_matrix, small_inverse
 
 #: Newton corrections of a material's law that is not linear, at most, and the parts of each that are tried

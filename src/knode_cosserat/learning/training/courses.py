@@ -20,7 +20,8 @@ from jaxtyping import Float
 from knode_cosserat.learning.config import RolloutTraining
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.samples import DataError, samples
-from knode_cosserat.rods.system import Layout, System
+from knode_cosserat.rods.layout import Layout
+from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.trajectory import Trajectory

@@ -16,7 +16,8 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.learning.samples import Samples
-from knode_cosserat.rods.system import Layout, System
+from knode_cosserat.rods.layout import Layout
+from knode_cosserat.rods.system import System
 from knode_cosserat.rotation import rotation_matrix
 
 #: the fields of y that the paper's loss speaks of
