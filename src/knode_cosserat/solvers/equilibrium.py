@@ -38,7 +38,7 @@ def equilibrium(
     Returns:
         A `Trajectory` of one row, at time 0; it can be the `initial` of a simulation. If direct iteration
         fails the load is applied in parts, and then the robot is let move, damped, until it rests; a robot
-        with several equilibria gives the one that this finds.
+        with several equilibria gives the one that this finds, stable or not: `kc.stability` tells.
 
     Raises:
         SimulationError: no equilibrium was found.
