@@ -37,7 +37,9 @@ def trustworthy(steps: Steps, system: System, start: Start, still: bool) -> bool
     """
     if steps.result.min() < 0:
         return False
-    return bool(still or steps.size.max() <= trusted_size(system, start))
+    largest = steps.size.max()
+    # the first is nearly always so, and what is natural of a system takes a millisecond to say
+    return bool(still or largest <= SUSPICIOUS or largest <= trusted_size(system, start))
 
 
 def trusted_size(system: System, start: Start) -> float:
