@@ -119,7 +119,7 @@ def small_inverse(matrix: Float[Any, "n n"]) -> Float[Any, "n n"]:
     A, B, C, D = matrix[:3, :3], matrix[:3, 3:], matrix[3:, :3], matrix[3:, 3:]
 
     def product(left: Any, right: Any) -> Any:
-        return jnp.sum(left[:, :, None] * right[None], axis=1)
+        return jnp.stack([dot(left, column) for column in _columns(right)], axis=1)
 
     inverse_A = inverse(A)
     across = product(inverse_A, B)
