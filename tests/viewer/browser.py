@@ -37,7 +37,9 @@ class Browser:
 
         self.opened = contextlib.ExitStack()
         address = pages[0]["webSocketDebuggerUrl"]
-        self.socket = self.opened.enter_context(connect(address, max_size=None, compression=None))
+        # no pings: what the page tells while nobody listens fills the queue, and their answers wait behind it
+        socket = connect(address, max_size=None, compression=None, ping_interval=None)
+        self.socket = self.opened.enter_context(socket)
         self.number, self.messages = 0, []
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.call(f"{domain}.enable")

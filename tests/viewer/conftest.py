@@ -45,7 +45,8 @@ def failed(truth):
     )
 
 
-@pytest.fixture(scope="session")
+# one a file: a page that stays open draws on, and takes the processor from whatever is tested next
+@pytest.fixture(scope="module")
 def browser():
     if driver.find() is None:
         pytest.skip(f"no browser: none of {', '.join(driver.NAMES)} is installed")
