@@ -29,7 +29,10 @@ def test_matrices_in_three_ways(robot, given):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"youngs_modulo": 1e9}, "no parameter 'youngs_modulo'; there are length, radius"),
+        (
+            {"youngs_modulo": 1e9},
+            "no parameter 'youngs_modulo'; did you mean youngs_modulus\\?; there are length, radius",
+        ),
         ({"length": -0.1}, "length is -0.1; allowed is a number 0.001 to 20 m"),
         ({"length": "long"}, "length is 'long'"),
         ({"length": [1.0, 2.0]}, r"length has shape \(2,\)"),
@@ -48,3 +51,24 @@ def test_what_is_refused(robot, change, message):
     with pytest.raises(kc.ParameterError, match=message) as caught:
         robot.replace(**change)
     assert "\n" not in str(caught.value)
+
+
+def test_a_misspelt_name_of_a_constructor_is_answered_with_the_names():
+    with pytest.raises(
+        kc.ParameterError, match=r"^TendonRobot has no parameter 'yongs_modulus'; did you mean"
+    ):
+        kc.TendonRobot(length=1.0, radius=0.01, density=1e3, yongs_modulus=1e9)
+    with pytest.raises(
+        kc.ParameterError, match=r"'trns'; did you mean turns\?; there are radius, phase, turns"
+    ):
+        kc.routing.Helical(0.02, 0.0, trns=1.0)
+
+
+def test_a_class_may_have_a_constructor_of_its_own():
+    class Wire(kc.SlenderRod):
+        def __init__(self, gauge):
+            super().__init__(length=1.0, radius=1e-3 / gauge, density=8e3, youngs_modulus=2e11)
+
+    assert Wire(gauge=2.0).radius == 5e-4
+    with pytest.raises(kc.ParameterError, match=r"^Wire has no parameter 'gage'; did you mean gauge"):
+        Wire(gage=2.0)

@@ -7,8 +7,10 @@ state choices (words), and parts: tendons' routings, loads, ends, obstacles, eac
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
-from typing import Any, Literal
+import difflib
+import inspect
+from collections.abc import Callable, Iterable
+from typing import Any, Literal, Self
 
 import equinox as eqx
 import jax
@@ -129,6 +131,33 @@ def part(meaning: str, family: type, *, many: bool = False, default: Any) -> Any
     convert = several if many else None
     extra: dict[str, Any] = {} if convert is None else {"converter": convert}
     return eqx.field(default=default, metadata={"part": stated}, **extra)
+
+
+class Parametrised(eqx.Module):
+    """What systems and their parts have in common: parameters, stated in the class, given by name."""
+
+    def __new__(cls, *args: Any, **given: Any) -> Self:
+        """Say which names there are, before Python says no more than that one is not among them."""
+        for name in given.keys() - {field.name for field in dataclasses.fields(cls)}:
+            # a class may have a constructor of its own
+            stated = inspect.signature(cls.__init__).parameters
+            if name in stated or any(each.kind is each.VAR_KEYWORD for each in stated.values()):
+                continue
+            raise ParameterError(unknown_parameter(cls, name, [each for each in stated if each != "self"]))
+        return super().__new__(cls, *args, **given)
+
+    @classmethod
+    def parameters(cls) -> dict[str, Parameter]:
+        """The physical parameters by name, with unit, meaning and allowed range."""
+        return parameters_of(cls)
+
+
+def unknown_parameter(cls: type, name: Any, known: Iterable[str]) -> str:
+    """What to say of a name that is not a parameter's."""
+    known = list(known)
+    close = difflib.get_close_matches(str(name), known, n=1)
+    hint = f"; did you mean {close[0]}?" if close else ""
+    return f"{cls.__name__} has no parameter {name!r}{hint}; there are {', '.join(known)}"
 
 
 def choices_of(cls: type) -> dict[str, Choice]:

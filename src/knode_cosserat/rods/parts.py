@@ -9,13 +9,11 @@ from __future__ import annotations
 import inspect
 from typing import Any, ClassVar
 
-import equinox as eqx
-
 from knode_cosserat.rods.layout import Field
-from knode_cosserat.rods.parameters import Parameter, ParameterError, check_fields, parameters_of
+from knode_cosserat.rods.parameters import ParameterError, Parametrised, check_fields
 
 
-class Part(eqx.Module):
+class Part(Parametrised):
     """What all parts have in common."""
 
     #: how robot files call it; none: it cannot be written to one
@@ -25,11 +23,6 @@ class Part(eqx.Module):
     def control_fields(self) -> tuple[Field, ...]:
         """What of the robot's control is this part's own; the robot puts its place before the names."""
         return ()
-
-    @classmethod
-    def parameters(cls) -> dict[str, Parameter]:
-        """The physical parameters by name, with unit, meaning and allowed range."""
-        return parameters_of(cls)
 
     def __check_init__(self) -> None:
         try:

@@ -24,7 +24,13 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.layout import Layout
-from knode_cosserat.rods.parameters import Parameter, ParameterError, check_fields, parameters_of
+from knode_cosserat.rods.parameters import (
+    ParameterError,
+    Parametrised,
+    check_fields,
+    parameters_of,
+    unknown_parameter,
+)
 from knode_cosserat.rotation import dot, rotation_matrix
 
 #: how many nodes a rod may be divided into
@@ -85,7 +91,7 @@ class Scales(NamedTuple):
     tip: Float[Any, " k"]
 
 
-class System(eqx.Module):
+class System(Parametrised):
     """A rod robot of the general class.
 
     A subclass states the layouts below, `rest`, `base`, `tip`, and either `constitutive` and `balance`
@@ -300,11 +306,6 @@ class System(eqx.Module):
             )
         return self.y_layout.get(y, name)
 
-    @classmethod
-    def parameters(cls) -> dict[str, Parameter]:
-        """The physical parameters by name, with unit, meaning and allowed range."""
-        return parameters_of(cls)
-
     def replace(self, **changes: Any) -> Self:
         """A copy with other parameters, by name; what depends on them follows.
 
@@ -322,9 +323,7 @@ class System(eqx.Module):
         settable = [*known, *(f.name for f in dataclasses.fields(self) if f.name not in known)]
         for name in changes:
             if name not in settable:
-                raise ParameterError(
-                    f"{type(self).__name__} has no parameter {name!r}; there are {', '.join(settable)}"
-                )
+                raise ParameterError(unknown_parameter(type(self), name, settable))
         return dataclasses.replace(self, **changes)
 
     def __check_init__(self) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.learning.knode import KNODE
-from knode_cosserat.rods.parameters import Parameter, ParameterError
+from knode_cosserat.rods.parameters import Parameter, ParameterError, unknown_parameter
 from knode_cosserat.rods.system import System
 
 
@@ -70,9 +70,7 @@ def unknowns_of(robot: System, names: Sequence[str] | None) -> Unknowns:
     found = []
     for name in names:
         if name not in known:
-            raise ParameterError(
-                f"{type(owner).__name__} has no parameter {name!r}; there are {', '.join(known)}"
-            )
+            raise ParameterError(unknown_parameter(type(owner), name, known))
         if list(names).count(name) > 1:
             raise ParameterError(f"names has {name} twice")
         unknown = _unknown(owner, name, known[name])
