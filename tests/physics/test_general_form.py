@@ -28,6 +28,8 @@ def matrices(draw, low, high):
     return (matrix + matrix.T) / 2
 
 
+# conditions up to 100: the two solve with K + c0 B in different ways, one with its inverse by cofactors,
+# whose rounding errors grow with the square of the condition (measured: a twenty-fifth of it, times 2e-16)
 @st.composite
 def robots(draw):
     return kc.TendonRobot(
@@ -35,8 +37,8 @@ def robots(draw):
         radius=draw(st.floats(1e-3, 2e-2)),
         density=draw(st.floats(500, 8000)),
         youngs_modulus=1e9,  # not used: the stiffness is given
-        shear_damping=draw(matrices(1e-3, 10.0)),
-        bending_damping=draw(matrices(1e-3, 10.0)),
+        shear_damping=draw(matrices(0.1, 10.0)),
+        bending_damping=draw(matrices(0.1, 10.0)),
         drag=draw(matrices(1e-4, 1.0)),
         gravity=10 * draw(vectors(3)),
         tendon_angles=7 * draw(vectors(3)),

@@ -82,6 +82,11 @@ class PointLoad(Load):
 
     at: float = place("where it acts", default=1.0)
 
+    @property
+    def body(self) -> Body | None:
+        """What it is as a rigid body about the rod's axis, if it is one: those at one place are summed up."""
+        return None
+
     @abc.abstractmethod
     def wrench(self, motion: Motion, gravity: Any, control: Any) -> Wrench:
         """What it does to the rod (N, N·m)."""
@@ -176,7 +181,7 @@ class AttachedMass(PointLoad):
 
     @property
     def body(self) -> Body:
-        """It as a body about the rod's axis, the material's axes."""
+        """About the rod's axis, the material's axes."""
         r, I = jnp.asarray(self.offset), jnp.asarray(self.inertia)
         off_axis = self.mass * (jnp.sum(r * r) * np.eye(3) - r[:, None] * r)
         return Body(self.mass, self.mass * r, np.eye(3) * I + off_axis)
@@ -190,7 +195,7 @@ def point_wrench(acting: list[tuple[Any, Any, Any]], motion: Motion, gravity: An
     """What loads at one place do together: each with its weight (0 where it is not there) and control."""
     total, bodies = Wrench(jnp.zeros(3), jnp.zeros(3)), []
     for load, weight, control in acting:
-        if isinstance(load, AttachedMass):
+        if load.body is not None:
             bodies.append([weight * moment for moment in load.body])
             continue
         own = load.wrench(motion, gravity, control)

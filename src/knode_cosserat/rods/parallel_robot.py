@@ -1,7 +1,7 @@
 """A parallel continuum robot: elastic legs from linear actuators to one rigid platform.
 
 The layout is that of Stewart and Gough where there are six legs in pairs (Black, Till & Rucker 2018; Till,
-Aloi & Rucker 2019). Symbols as in `rod`, for each leg.
+Aloi & Rucker 2019). Symbols as in `elastic_rod`, for each leg.
 """
 
 from __future__ import annotations

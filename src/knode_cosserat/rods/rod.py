@@ -1,12 +1,7 @@
 """A Cosserat rod with everything that may load it, hold it and touch it: what all robots of one rod share.
 
-`slender_rod` is a rod by itself; `tendon_robot` and `routed_robot` add what tendons do. Symbols follow the
-paper's table of notations:
-
-    p  position (m)            h  orientation, quaternion, scalar first     R  its rotation matrix
-    n  internal force (N)      m  internal moment (N·m), both in the global frame
-    q  velocity (m/s)          w  angular velocity ω (1/s), both in the material frame
-    v  rate of p along s       u  curvature (1/m), both in the material frame
+`elastic_rod` is what it is made of, and has the symbols; `slender_rod` is a rod by itself; `tendon_robot` and
+`routed_robot` add what tendons do.
 """
 
 from __future__ import annotations
@@ -17,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.rods.elastic_rod import ElasticRod
 from knode_cosserat.rods.ends import Clamped, End, Free, Pose, velocities
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.loads import (
@@ -30,19 +26,10 @@ from knode_cosserat.rods.loads import (
 )
 from knode_cosserat.rods.parameters import parameter, part
 from knode_cosserat.rods.parts import placed, shares
-from knode_cosserat.rods.section import (
-    ALONG,
-    CircularSection,
-    Differences,
-    Material,
-    SectionChange,
-    differences_at,
-    shape_at_rest,
-    shear_modulus,
-)
+from knode_cosserat.rods.section import shape_at_rest
 from knode_cosserat.rods.surroundings import Obstacle
-from knode_cosserat.rods.system import History, Scales, System
-from knode_cosserat.rotation import cross, dot, inverse, quaternion_rate, rotation_matrix
+from knode_cosserat.rods.system import History, Scales
+from knode_cosserat.rotation import cross, dot, quaternion_rate, rotation_matrix
 
 #: where ends are placed from
 AT_ORIGIN = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
@@ -57,41 +44,16 @@ class PartControls(NamedTuple):
     loads: list[Any]
 
 
-class Rod(System):
-    """A round rod with gravity, drag, material damping, loads, ends and surroundings (paper eqs. 13-15).
+class Rod(ElasticRod):
+    """A round rod with gravity, drag, loads, ends and surroundings (paper eqs. 13 and 14).
 
     A subclass says what its actuators do: by a law of its own, `strains`, which then has no `constitutive`,
     or by what they load the rod with, `actuator_force`.
     """
 
-    y_layout: ClassVar[Layout] = Layout(
-        ("p", 3, "m", "position, global frame"),
-        ("h", 4, "1", "orientation, quaternion, scalar first"),
-        ("n", 3, "N", "internal force, global frame", "h", "N/m"),
-        ("m", 3, "N m", "internal moment, global frame", "h", "N"),
-        ("q", 3, "m/s", "velocity, material frame"),
-        ("w", 3, "rad/s", "angular velocity, material frame"),
-    )
-    z_layout: ClassVar[Layout] = Layout(
-        ("v", 3, "1", "rate of position along the rod, material frame", "", "N"),
-        ("u", 3, "1/m", "curvature, material frame", "", "N m"),
-    )
     mixed: ClassVar[bool] = False
     velocities: ClassVar[tuple[str, ...]] = ("q", "w", "u_t")
 
-    length: Any = parameter("m", "length of the rod", low=1e-3, high=20.0)
-    radius: Any = parameter("m", "radius of the rod", low=1e-6, high=0.5)
-    density: Any = parameter("kg/m3", "density of the rod, ribs spread over it included", low=1.0, high=100e3)
-    youngs_modulus: Any = parameter("Pa", "Young's modulus", low=1e3, high=2e12)
-    shear_modulus: Any = parameter(
-        "Pa", "shear modulus; by default E / 2.6", low=1e2, high=1e12, default=None
-    )
-    shear_damping: Any = parameter(
-        "N s", "Bse, damping of shear and extension", shape="matrix", low=0.0, high=1e6, default=0.0
-    )
-    bending_damping: Any = parameter(
-        "N m2 s", "Bbt, damping of bending and twisting", shape="matrix", low=0.0, high=1e4, default=0.0
-    )
     drag: Any = parameter("kg/m2", "C, square-law drag", shape="matrix", low=0.0, high=1e3, default=0.0)
     linear_drag: Any = parameter(
         "kg/(m s)", "drag in proportion to velocity", shape="matrix", low=0.0, high=1e4, default=None
@@ -103,15 +65,6 @@ class Rod(System):
         low=-100.0,
         high=100.0,
         default=(0.0, 0.0, -9.81),
-    )
-    shear_stiffness: Any = parameter(
-        "N", "Kse; by default diag(GA, GA, EA)", shape="matrix", low=1e-9, high=1e15, default=None
-    )
-    bending_stiffness: Any = parameter(
-        "N m2", "Kbt; by default diag(EI, EI, 2GI)", shape="matrix", low=1e-15, high=1e9, default=None
-    )
-    sections: tuple[SectionChange, ...] = part(
-        "where the section differs", SectionChange, many=True, default=()
     )
     loads: tuple[Load, ...] = part("what loads it beside gravity and drag", Load, many=True, default=())
     surroundings: tuple[Obstacle, ...] = part("what it may touch", Obstacle, many=True, default=())
@@ -149,68 +102,14 @@ class Rod(System):
         base, tip, *others = (control[spot] for spot in spots)
         return PartControls(base, tip, others[: len(self.sections)], others[len(self.sections) :])
 
+    def section_controls(self, control: Any) -> list[Any]:
+        """What of the control is each section's own."""
+        return self._controls(control).sections
+
     @property
     def rest_is_guess(self) -> bool:  # type: ignore[override]
         """Where its tip is held, which the rod as it is by itself need not meet."""
         return self.tip_end.held
-
-    @property
-    def section(self) -> CircularSection:
-        """The rod's cross-section, where nothing is said of another."""
-        return CircularSection(self.radius)
-
-    @property
-    def mass_per_length(self) -> Any:
-        """ρA (kg/m)."""
-        return self.density * self.section.area
-
-    @property
-    def G(self) -> Any:
-        """Shear modulus (Pa): as given, or from Young's."""
-        return shear_modulus(self.youngs_modulus) if self.shear_modulus is None else self.shear_modulus
-
-    @property
-    def Kse(self) -> Float[Any, "3 3"]:
-        """Stiffness of shear and extension (N): as given, or from moduli and section."""
-        if self.shear_stiffness is not None:
-            return self.shear_stiffness
-        return self.section.shear_stiffness(self.youngs_modulus, self.G)
-
-    @property
-    def Kbt(self) -> Float[Any, "3 3"]:
-        """Stiffness of bending and twisting (N·m²): as given, or from moduli and section."""
-        if self.bending_stiffness is not None:
-            return self.bending_stiffness
-        return self.section.bending_stiffness(self.youngs_modulus, self.G)
-
-    @property
-    def v_star(self) -> np.ndarray:
-        """v of the unloaded rod: along z, unstretched."""
-        return ALONG
-
-    @property
-    def u_star(self) -> np.ndarray:
-        """u of the unloaded rod (1/m), where no section says otherwise: straight."""
-        return np.zeros(3)
-
-    def material(self, s: Any, control: Any) -> Material:
-        """Section and material at arclength s (m)."""
-        plain = Material(
-            self.Kse, self.shear_damping, self.Kbt, self.bending_damping, self.u_star,
-            self.mass_per_length, self.density * self.section.inertia, self.radius,
-        )  # fmt: skip
-        if not self.sections:
-            return plain
-        found = self._differences(s, control)
-        area = found.radius * found.radius
-        return Material(
-            plain.Kse * (area * found.stiffness), plain.Bse * area,
-            plain.Kbt * (area * area * found.stiffness), plain.Bbt * (area * area), found.curvature,
-            plain.rhoA * area, plain.rhoJ * (area * area), plain.radius * found.radius,
-        )  # fmt: skip
-
-    def _differences(self, s: Any, control: Any) -> Differences:
-        return differences_at(self.sections, s / self.length, self._controls(control).sections)
 
     def eased(self, part: float) -> Self:
         """With softer obstacles, on which the rod slides more easily."""
@@ -219,20 +118,6 @@ class Rod(System):
         return self.replace(surroundings=tuple(each.eased(part) for each in self.surroundings))
 
     # what learning looks at
-
-    def unstressed(self, s: Any, control: Any) -> Float[Any, " z"]:
-        """As the sections are curved there, by themselves and by control."""
-        _, z = self.rest(s)
-        return z.at[3:6].set(self.material(s, control).u_star) if self.sections else z
-
-    def law_factors(self, s: Any, control: Any) -> tuple[Any, Any] | None:
-        """Those of the sections on stiffness and damping."""
-        if not self.sections:
-            return None
-        found = self._differences(s, control)
-        area = found.radius * found.radius
-        damping = jnp.concatenate([jnp.full(3, 1.0) * area, jnp.full(3, 1.0) * area * area])
-        return damping * found.stiffness, damping
 
     @property
     def observable_layout(self) -> Layout:
@@ -257,33 +142,6 @@ class Rod(System):
         return jnp.concatenate([acceleration, spin, q, w, bent, u_t])
 
     # the equations, as the paper gives them
-
-    def stresses(self, y: Float[Any, " y"]) -> tuple[Float[Any, "3"], Float[Any, "3"]]:
-        """Rᵀn (N) and Rᵀm (N·m)."""
-        R = rotation_matrix(self.y_layout.get(y, "h"))
-        return dot(R.T, self.y_layout.get(y, "n")), dot(R.T, self.y_layout.get(y, "m"))
-
-    def strains(
-        self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
-    ) -> Float[Any, " z"]:
-        """v and u of the linear law (paper eq. 15)."""
-        c0, material = history.c0, self.material(s, control)
-        n, m = self.stresses(y)
-        hv, hu = self.z_layout.get(history.z, "v"), self.z_layout.get(history.z, "u")
-        Kse, Bse, Kbt, Bbt = material[:4]
-        bent = m if not self.sections else m + dot(Kbt, material.u_star)
-        v = dot(inverse(Kse + c0 * Bse), n + Kse @ self.v_star - dot(Bse, hv))
-        u = dot(inverse(Kbt + c0 * Bbt), bent - dot(Bbt, hu))
-        return jnp.concatenate([v, u])
-
-    def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
-        """C, D, f2 of the same law, K (z - z*) + B z_t = Rᵀ (n, m)."""
-        material = self.material(s, control)
-        n, m = self.stresses(y)
-        zero = jnp.zeros((3, 3))
-        C = jnp.block([[material.Kse, zero], [zero, material.Kbt]])
-        D = jnp.block([[material.Bse, zero], [zero, material.Bbt]])
-        return C, D, jnp.concatenate([n + material.Kse @ self.v_star, m + material.Kbt @ material.u_star])
 
     def actuator_force(self, control: Float[Any, " c"]) -> Float[Any, "3"] | None:
         """What actuators add to the load per length (N/m), global frame; none, unless a robot says so."""

@@ -1,4 +1,4 @@
-"""A robot whose tendons run through holes in its ribs: they bend it, and rub. Symbols as in `rod`.
+"""A robot whose tendons run through holes in its ribs: they bend it, and rub. Symbols as in `elastic_rod`.
 
 n and m carry rod and tendons together, so that their balance has no tendon in it, and where a tendon is
 anchored nothing of theirs jumps. What the tendons take of them stands in the material's law (Till 2019,

@@ -1,4 +1,4 @@
-"""The paper's tendon-driven continuum robot: tendons that push the rod sideways. Symbols as in `rod`."""
+"""The paper's tendon-driven continuum robot: tendons push the rod sideways. Symbols as in `elastic_rod`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A rod that tendons bend: what all models of its tendons have in common. Symbols as in `rod`."""
+"""A rod that tendons bend: what all models of its tendons have in common. Symbols as in `elastic_rod`."""
 
 from __future__ import annotations
 
