@@ -32,9 +32,9 @@ from knode_cosserat.rods.system import (
     records_in_strands,
     unpacked_history,
 )
-from knode_cosserat.solvers.crossing import Crossing, carried, crossing_of, within
+from knode_cosserat.solvers.crossing import carried_part, crossing_of, rounds_of, taken, within
 from knode_cosserat.solvers.linear import Linearisation, LinearSolver
-from knode_cosserat.solvers.space import SpaceScheme, middles
+from knode_cosserat.solvers.space import SLOPES, VALUES, Along, SpaceScheme, middles
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,36 +108,59 @@ class StepProblem(eqx.Module):
         """s at the nodes (m)."""
         return jnp.linspace(0.0, 1.0, self.system.nodes) * self.system.length
 
-    def segments(self, each: Callable[..., Any], y: Float[Any, "nodes y"]) -> Any:
-        """Apply `each(advance, y_j)` to all segments of all strands side by side (strands inside).
-
-        `advance` maps y_j of a strand to its y_{j+1}.
-        """
+    def segments(self, along: Along, y: Float[Any, "nodes y"]) -> Any:
+        """What `along` makes of y at the nodes by the ends of all segments of all strands, those inside."""
         s = self._each_strand(self.arclength[:-1])
-        ds = self.system.length / (self.system.nodes - 1)
-        history = self.history
-        inner = middles(history) if self.space.uses_middle else history[:-1]
-        start, middle, end = (self._past_points(rows) for rows in (history[:-1], inner, history[1:]))
+        inner = middles(self.history) if self.space.uses_middle else self.history[:-1]
+        past = (self._past_points(rows) for rows in (self.history[:-1], inner, self.history[1:]))
+        lanes = (s, self._points(y[:-1]), *past)
+        if self.system.cuts:
+            return self._in_rounds(along, lanes)
 
-        def rates(*at: Any) -> Any:
-            return self.point_rates(*at)[0]
-
-        def segment(s_j: Any, y_j: Any, *history: Any, crossing: Crossing | None = None) -> Any:
+        def segment(s_j: Any, y_j: Any, *history: Any) -> Any:
             def advance(y: Any) -> Any:
-                if crossing is None:
-                    return self.space.advance(rates, s_j, ds, y, history)
-                return carried(self.space, rates, self.crossed, crossing, (s_j, ds), y, history)
+                return self.space.advance(self._rates, s_j, self._ds, y, history)
 
-            return each(advance, y_j)
+            return along.on(advance, along.begin(y_j))
 
-        # nodes last inside: XLA then vectorises over them
-        lanes = (self._points(y[:-1]).T, start.T, middle.T, end.T)
-        crossings = crossing_of(self.system)
-        if crossings is None:
-            return jax.vmap(segment, in_axes=(0, -1, -1, -1, -1))(s, *lanes)
-        return jax.vmap(
-            lambda crossing, *lane: segment(*lane, crossing=crossing), in_axes=(0, 0, -1, -1, -1, -1)
-        )(Crossing(*map(jnp.asarray, crossings)), s, *lanes)
+        return _side_by_side(segment, lanes)
+
+    def _in_rounds(self, along: Along, lanes: tuple[Any, ...]) -> Any:
+        """The same of segments that are parted, or where y jumps."""
+        rounds = rounds_of(self.system.cuts, self.system.nodes)
+        parted = len(rounds.segment) > 1
+
+        def part(state: Any, begins: Any, part: Any, s_j: Any, y_j: Any, *history: Any) -> Any:
+            def advance(y: Any) -> Any:
+                where = s_j, self._ds
+                return carried_part(self.space, self._rates, self.crossed, part, where, y, history, parted)
+
+            begun = along.begin(y_j)
+            if parted:
+                begun = jax.tree.map(lambda new, old: jnp.where(begins, new, old), begun, state)
+            return along.on(advance, begun)
+
+        def one(state: Any, given: Any) -> Any:
+            *steered, lanes = given
+            state = _side_by_side(part, lanes, state, *steered)
+            return state, state
+
+        shape, rows = rounds.segment.shape, rounds.segment.reshape(-1)
+        lanes = tuple(taken(each, rows).reshape(*shape, *each.shape[1:]) for each in lanes)
+        parts = (rounds.bounds[..., 0], rounds.bounds[..., 1], rounds.acting)
+        given = jax.tree.map(jnp.asarray, (rounds.begins, parts, lanes))
+        first = jax.vmap(along.begin)(lanes[1][0])
+        if not parted:
+            return one(first, jax.tree.map(lambda each: each[0], given))[0]
+        _, found = jax.lax.scan(one, first, given)
+        return jax.tree.map(lambda each: taken(each.reshape(-1, *each.shape[2:]), rounds.last), found)
+
+    def _rates(self, s: Any, y: Any, history: Any) -> Any:
+        return self.point_rates(s, y, history)[0]
+
+    @property
+    def _ds(self) -> Any:
+        return self.system.length / (self.system.nodes - 1)
 
     def at_points(self, function: Callable[..., Any], y: Float[Any, "nodes y"]) -> Any:
         """Apply `function(s, y, record of history)` to all nodes of all strands (strands inside)."""
@@ -202,6 +225,14 @@ def none_kept(problem: StepProblem, y: Any, unknowns: Any, linear: LinearSolver)
     return Kept(jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), like), jnp.array(False))
 
 
+def _side_by_side(each: Callable[..., Any], lanes: tuple[Any, ...], *more: Any) -> Any:
+    """`each(*more, *lanes)` of all rows; arclength first, then rows of numbers."""
+    s, *rows = lanes
+    # nodes last inside: XLA then vectorises over them
+    axes = (*(0 for _ in more), 0, *(-1 for _ in rows))
+    return jax.vmap(each, in_axes=axes)(*more, s, *(row.T for row in rows))
+
+
 def _with_base(problem: StepProblem, y: Any, unknowns: Any) -> Any:
     return jnp.concatenate([problem.base(unknowns)[None], y[1:]])
 
@@ -214,7 +245,7 @@ def _error(problem: StepProblem, defects: Any, tip: Any) -> Any:
 
 def residuals(problem: StepProblem, y: Float[Any, "nodes y"]) -> tuple[Any, Any]:
     """Defects y_{j+1} - Φ_j(y_j), with their sign turned, and the tip's residuals."""
-    reached = problem.segments(lambda advance, y_j: advance(y_j), y)
+    reached = problem.segments(VALUES, y)
     return reached.reshape(y[1:].shape) - y[1:], problem.tip_residual(y[-1])
 
 
@@ -230,18 +261,10 @@ def static_error(system: System, space: SpaceScheme, record: Any, control: Any, 
 
 def linearise(problem: StepProblem, y: Float[Any, "nodes y"], unknowns: Any) -> Linearisation:
     """Residuals and their exact derivatives by forward mode, all segments in one batch."""
-
-    def with_value(function: Callable[[Any], Any], at: Any) -> tuple[Any, Any]:
-        def twice(x: Any) -> tuple[Any, Any]:
-            value = function(x)
-            return value, value
-
-        return jax.jacfwd(twice, has_aux=True)(at)
-
-    F, reached = problem.segments(with_value, y)
+    reached, F = problem.segments(SLOPES, y)
     if problem.system.strands > 1:
         F = F.reshape(y.shape[0] - 1, problem.system.strands, *F.shape[1:])
-    M, tip = with_value(problem.tip_residual, y[-1])
+    tip, M = SLOPES.on(problem.tip_residual, SLOPES.begin(y[-1]))
     S = jax.jacfwd(problem.base)(unknowns)
     return Linearisation(F, S, M, reached.reshape(y[1:].shape) - y[1:], tip)
 

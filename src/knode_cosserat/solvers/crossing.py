@@ -64,6 +64,64 @@ def within(s: Any, low: Any, high: Any) -> Any:
     return jnp.clip(s, low + margin, high - margin)
 
 
+class Rounds(NamedTuple):
+    """How the parts of all segments are shared out: in rounds one after the other, side by side in each.
+
+    The parts of one segment follow each other at one place. Most segments have but one part, so that as many
+    rounds of all segments would take about as many times as long.
+    """
+
+    #: which segment is at a place (rounds, places)
+    segment: np.ndarray
+    #: whether it begins there, or goes on from where the last round left it
+    begins: np.ndarray
+    #: from where to where in the segment (rounds, places, 2): from 1 to 1 where nothing is left to do
+    bounds: np.ndarray
+    #: which cuts act where it begins (rounds, places, cuts)
+    acting: np.ndarray
+    #: where each segment ends, among all places of all rounds
+    last: np.ndarray
+
+
+@functools.lru_cache(maxsize=256)
+def rounds_of(cuts: tuple[float, ...], nodes: int) -> Rounds:
+    """As many rounds as the segment with most parts needs, all as narrow as can be."""
+    bounds, acting = crossings(cuts, nodes)
+    counts = [max(1, int(np.sum(np.diff(row) > 0.0))) for row in bounds]
+    most = max(counts)
+    places: list[list[tuple[int, int]]] = [[] for _ in range(-(-sum(counts) // most))]
+    for j in sorted((j for j, count in enumerate(counts) if count > 1), key=lambda j: -counts[j]):
+        place = next((each for each in places if len(each) + counts[j] <= most), None)
+        if place is None:
+            places.append(place := [])
+        place += [(j, k) for k in range(counts[j])]
+    # row by row, so that neighbours stay neighbours
+    single = (j for j, count in enumerate(counts) if count == 1)
+    for k in range(most):
+        for place in places:
+            if len(place) == k:
+                place.append((next(single, -1), 0))
+    shape = most, len(places)
+    found = Rounds(
+        np.zeros(shape, dtype=int), np.ones(shape, dtype=bool), np.ones((*shape, 2)),
+        np.zeros((*shape, len(cuts))), np.zeros(nodes - 1, dtype=int),
+    )  # fmt: skip
+    for k, row in enumerate(zip(*places, strict=True)):
+        for at, (j, part) in enumerate(row):
+            if j >= 0:
+                found.segment[k, at], found.begins[k, at] = j, part == 0
+                found.bounds[k, at] = bounds[j, part : part + 2]
+                found.acting[k, at] = acting[j, part]
+                found.last[j] = k * len(places) + at
+    return found
+
+
+def taken(values: Any, rows: np.ndarray) -> Any:
+    """Rows of an array by numbers that are known: runs of neighbours, each copied as a whole."""
+    runs = np.split(rows, np.flatnonzero(np.diff(rows) != 1) + 1)
+    return jnp.concatenate([values[run[0] : run[-1] + 1] for run in runs])
+
+
 #: y at the far side of cuts: (acting, y, record of history)
 Jump = Callable[[Any, Any, Any], Any]
 
@@ -76,22 +134,31 @@ def carried(
 
     `first` of 1 leaves out the jump at the start: y is then that on the far side.
     """
-    s, ds = where
-    parts = crossing.acting.shape[0]
     acting = jnp.asarray(crossing.acting).at[:first].set(0.0)
 
     def part(y: Any, given: tuple[Any, Any, Any]) -> Any:
-        begin, end, acts = given
-        past = history if parts == 1 else _part_of(space, history, begin, end)
-        low, high = s + begin * ds, s + end * ds
-
-        def inside(at: Any, y: Any, record: Any) -> Any:
-            return rates(within(at, low, high), y, record)
-
-        return space.advance(inside, low, high - low, jump(acts, y, past[0]), past), None
+        return carried_part(space, rates, jump, given, where, y, history, parted=acting.shape[0] > 1), None
 
     y, _ = jax.lax.scan(part, y, (crossing.bounds[:-1], crossing.bounds[1:], acting))
     return y
+
+
+def carried_part(
+    space: SpaceScheme, rates: Callable[[Any, Any, Any], Any], jump: Jump, part: tuple[Any, Any, Any],
+    where: tuple[Any, Any], y: Float[Any, " y"], history: tuple[Any, Any, Any], parted: bool,
+) -> Float[Any, " y"]:  # fmt: skip
+    """The same over one part: from where to where, as parts of the segment, and which cuts act before it.
+
+    Where no segment is parted, which is known before, the past need not be interpolated.
+    """
+    (s, ds), (begin, end, acting) = where, part
+    past = _part_of(space, history, begin, end) if parted else history
+    low, high = s + begin * ds, s + end * ds
+
+    def inside(at: Any, y: Any, record: Any) -> Any:
+        return rates(within(at, low, high), y, record)
+
+    return space.advance(inside, low, high - low, jump(acting, y, past[0]), past)
 
 
 def _part_of(space: SpaceScheme, history: tuple[Any, Any, Any], begin: Any, end: Any) -> tuple[Any, Any, Any]:

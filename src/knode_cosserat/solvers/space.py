@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -88,3 +88,29 @@ def middles(values: Float[Any, "nodes x"]) -> Float[Any, "segments x"]:
     first = (5 * values[0] + 15 * values[1] - 5 * values[2] + values[3]) / 16
     last = (5 * values[-1] + 15 * values[-2] - 5 * values[-3] + values[-4]) / 16
     return jnp.concatenate([first[None], inner, last[None]])
+
+
+class Along(NamedTuple):
+    """What is carried along a segment: `begin(y)` at its start, then `on(advance, state)` over each part."""
+
+    begin: Callable[[Any], Any]
+    on: Callable[[Callable[[Any], Any], Any], Any]
+
+
+def _with_slopes(y: Any) -> tuple[Any, Any]:
+    return y, jnp.eye(y.shape[0])
+
+
+def _pushed(advance: Callable[[Any], Any], state: tuple[Any, Any]) -> tuple[Any, Any]:
+    y, slopes = state
+
+    def along(direction: Any) -> Any:
+        return jax.jvp(advance, (y,), (direction,))
+
+    return jax.vmap(along, in_axes=-1, out_axes=(None, -1))(slopes)
+
+
+#: y itself
+VALUES = Along(lambda y: y, lambda advance, y: advance(y))
+#: y and its exact derivatives with respect to y where the segment begins, by forward mode
+SLOPES = Along(_with_slopes, _pushed)
