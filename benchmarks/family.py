@@ -29,6 +29,7 @@ def tendons() -> dict[str, Any]:
         "straight": kc.RoutedTendonRobot.like(crude),
         "friction": kc.RoutedTendonRobot.like(crude, friction_wobble=0.6, friction_curvature=0.1),
         "helical": kc.RoutedTendonRobot.like(crude, routing=tuple(helix)),
+        "ribs": kc.load_robot("delrin-routed-tendon-robot"),
     }
     controls = {
         "sine": kc.controls.sine(1.5, STEPS, DT),

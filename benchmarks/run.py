@@ -126,6 +126,7 @@ def family_rows(found: dict[str, Any]) -> list[tuple[str, str, str]]:
         ("a step with real tendons, against the crude ones", ratios("straight"), "<= 1.5x"),
         ("the same with friction", ratios("friction"), "<= 1.5x"),
         ("the same with helical tendons", ratios("helical"), "<= 1.5x"),
+        ("the same with ribs and a sleeve, the catalog's robot", ratios("ribs"), "none"),
         (
             f"500 steps, 200 nodes, a reel and slack ({reel['slack_steps']} slack steps)",
             f"{reel['seconds']:.2f} s",
