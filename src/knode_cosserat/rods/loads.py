@@ -195,8 +195,9 @@ def point_wrench(acting: list[tuple[Any, Any, Any]], motion: Motion, gravity: An
     """What loads at one place do together: each with its weight (0 where it is not there) and control."""
     total, bodies = Wrench(jnp.zeros(3), jnp.zeros(3)), []
     for load, weight, control in acting:
-        if load.body is not None:
-            bodies.append([weight * moment for moment in load.body])
+        body = load.body
+        if body is not None:
+            bodies.append([weight * moment for moment in body])
             continue
         own = load.wrench(motion, gravity, control)
         total = total + Wrench(weight * own.force, weight * own.moment)

@@ -7,7 +7,6 @@ state choices (words), and parts: tendons' routings, loads, ends, obstacles, eac
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import inspect
 from collections.abc import Callable, Iterable
 from typing import Any, Literal, Self
@@ -15,6 +14,8 @@ from typing import Any, Literal, Self
 import equinox as eqx
 import jax
 import numpy as np
+
+from knode_cosserat._yaml import did_you_mean
 
 
 class ParameterError(ValueError):
@@ -155,9 +156,9 @@ class Parametrised(eqx.Module):
 def unknown_parameter(cls: type, name: Any, known: Iterable[str]) -> str:
     """What to say of a name that is not a parameter's."""
     known = list(known)
-    close = difflib.get_close_matches(str(name), known, n=1)
-    hint = f"; did you mean {close[0]}?" if close else ""
-    return f"{cls.__name__} has no parameter {name!r}{hint}; there are {', '.join(known)}"
+    return (
+        f"{cls.__name__} has no parameter {name!r}{did_you_mean(name, known)}; there are {', '.join(known)}"
+    )
 
 
 def choices_of(cls: type) -> dict[str, Choice]:
