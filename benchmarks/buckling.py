@@ -18,7 +18,8 @@ import numpy as np
 import scipy.linalg
 
 import knode_cosserat as kc
-from knode_cosserat.solvers.boundary import StepProblem, linearise
+from knode_cosserat.solvers.boundary import linearise
+from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.space import SCHEMES
 
 #: part of the load by which its derivative is taken

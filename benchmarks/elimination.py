@@ -17,9 +17,10 @@ import numpy as np
 
 import knode_cosserat as kc
 from benchmarks.cases import DT, STEPS, medians, one_core
-from knode_cosserat.solvers.boundary import StepProblem, newton
+from knode_cosserat.solvers.boundary import newton
 from knode_cosserat.solvers.linear import ELIMINATIONS, Condensed, Decoupled
 from knode_cosserat.solvers.march import rest_record
+from knode_cosserat.solvers.problem import StepProblem
 
 Solve = Callable[[StepProblem, Any, Any], tuple[Any, Any, Any]]
 OPTIONS = kc.NewtonOptions()

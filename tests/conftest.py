@@ -14,7 +14,7 @@ import sys
 from jaxtyping import install_import_hook
 
 EQUATIONS = ("rotation", "rods.loads", "rods.section", "rods.tendons")
-SOLVER = ("solvers.boundary", "solvers.linear", "solvers.march", "solvers.space", "solvers.time")
+SOLVER = tuple(f"solvers.{name}" for name in ("boundary", "linear", "march", "problem", "space", "time"))
 
 install_import_hook([f"knode_cosserat.{name}" for name in EQUATIONS + SOLVER], "beartype.beartype")
 

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 
 import knode_cosserat as kc
-from knode_cosserat.solvers.boundary import StepProblem
 from knode_cosserat.solvers.crossing import Crossing, carried, crossings, rounds_of, taken
 from knode_cosserat.solvers.march import rest_record
+from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.space import SCHEMES, SLOPES, VALUES, middles
 
 CUTS = st.lists(st.floats(1e-3, 1.0 - 1e-3), min_size=1, max_size=8, unique=True)

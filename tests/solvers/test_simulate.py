@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.solvers.boundary import StepProblem, residuals
+from knode_cosserat.solvers.boundary import residuals
 from knode_cosserat.solvers.march import advanced, history_of, initial_past, march_many, rest_record
+from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.recovery import _continue_load, _Step, _substeps
 from knode_cosserat.solvers.run import _padded
 from knode_cosserat.solvers.settings import Settings

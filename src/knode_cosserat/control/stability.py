@@ -19,8 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from knode_cosserat.rods.system import System, in_strands
-from knode_cosserat.solvers.boundary import StepProblem, linearise, static_error
+from knode_cosserat.solvers.boundary import linearise, static_error
 from knode_cosserat.solvers.equilibrium import equilibrium as rests
+from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.space import RK4
 from knode_cosserat.trajectory import Trajectory

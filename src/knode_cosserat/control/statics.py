@@ -15,9 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.boundary import Solution, StepProblem, linearise, newton, residuals
+from knode_cosserat.solvers.boundary import Solution, linearise, newton, residuals
 from knode_cosserat.solvers.linear import Condensed, carried
 from knode_cosserat.solvers.march import rest_record
+from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.settings import Settings
 
 #: position (d,) in m and orientation (quaternion, scalar first), or None, from a system and its last node's y
@@ -72,7 +73,8 @@ rest_guess = jax.jit(at_rest)
 
 def solve(system: System, settings: Settings, control: Any, y: Any, unknowns: Any) -> Solution:
     """An equilibrium from a guess; its `error` says whether it is one."""
-    return newton(static_problem(system, settings, control), y, unknowns, Condensed(), settings.newton)
+    problem = static_problem(system, settings, control).ready()
+    return newton(problem, y, unknowns, Condensed(), settings.newton)
 
 
 def wrench_fields(system: System) -> tuple[str, ...]:

@@ -45,7 +45,7 @@ from knode_cosserat.rods.rod import Rod
 from knode_cosserat.rods.routing import Routing, Straight, ends, routes
 from knode_cosserat.rods.section import Material
 from knode_cosserat.rods.system import History, System
-from knode_cosserat.rods.tendon_law import stretches, tendon_balance, tendon_strains
+from knode_cosserat.rods.tendon_law import stretches, tendon_balance, tendon_strains, unbent_flexibility
 from knode_cosserat.rods.tendon_rod import TendonRod
 from knode_cosserat.rotation import dot
 
@@ -205,9 +205,13 @@ class RoutedTendonRobot(TendonRod):
         T = self.base_tension(y, control)
         if self.rubs:
             T = T * jnp.exp(-self.y_layout.get(y, "loss"))
-        if min(self._ends) < 1.0:
-            T = jnp.where(s < np.array(self._ends) * self.length, T, 0.0)
-        return T
+        return self._where_it_runs(s, T)
+
+    def _where_it_runs(self, s: Any, values: Float[Any, " c"]) -> Float[Any, " c"]:
+        """Values of the tendons, and zero for those that have ended before s."""
+        if min(self._ends) >= 1.0:
+            return values
+        return jnp.where(s < np.array(self._ends) * self.length, values, 0.0)
 
     def routes_at(self, s: Any) -> tuple[Float[Any, "c 3"], Float[Any, "c 3"]]:
         """r and r′ of the tendons at s."""
@@ -288,7 +292,7 @@ class RoutedTendonRobot(TendonRod):
     ) -> Float[Any, " z"]:
         """v and u by the material's law, f and x by their own."""
         given, more = self._law_at(s, y, control, history)
-        v, u = tendon_strains(*given)
+        v, u = tendon_strains(*given, flexibility=self._unbent_flexibility(s, y, control, history.c0))
         if self.rubs:
             more.insert(0, self._friction(s, history.c0 * u + self.z_layout.get(history.z, "u"), history))
         return jnp.concatenate([v, u, *more])
@@ -321,6 +325,12 @@ class RoutedTendonRobot(TendonRod):
         tension = self.tension_at(s, y, control)
         return (Kse + c0 * Bse, Kbt + c0 * Bbt, a, b, *self.routes_at(s), tension), more
 
+    def _unbent_flexibility(self, s: Any, y: Any, control: Any, c0: Any) -> Float[Any, "6 6"]:
+        """What the law is solved by: of what is known before y, where tensions are given."""
+        Kse, Bse, Kbt, Bbt = self.material(s, control)[:4]
+        tension = self._where_it_runs(s, self.base_tension(y, control))
+        return unbent_flexibility(Kse + c0 * Bse, Kbt + c0 * Bbt, *self.routes_at(s), tension)
+
     def _vibration(self, y: Any, control: Any, history: History) -> Float[Any, " 1"]:
         total = jnp.sum(self.base_tension(y, control))
         growth = self.vibration_rate * (total - self.vibration_tension)
@@ -348,9 +358,7 @@ class RoutedTendonRobot(TendonRod):
             rates.append(path * held)
         if self.drive == "reel":
             way = stretches(v, u, *map(jnp.asarray, self.routes_at(s)))
-            if min(self._ends) < 1.0:
-                way = jnp.where(s < np.array(self._ends) * self.length, way, 0.0)
-            rates += [jnp.zeros(self.tendon_count), way]
+            rates += [jnp.zeros(self.tendon_count), self._where_it_runs(s, way)]
         return jnp.concatenate(rates)
 
     def tip(self, t: Any, control: Any, y: Float[Any, " y"], history: History) -> Float[Any, " k"]:

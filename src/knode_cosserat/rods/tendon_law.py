@@ -10,8 +10,11 @@ least of the strictly convex energy ½ vᵀK_v v + ½ uᵀK_u u + Σ Tᵢ |ṗ�
 
     J = diag(K_v, K_u) + Σ Tᵢ/|ṗᵢ| (WᵢᵀWᵢ - gᵢgᵢᵀ),     Wᵢ = [I, -r̂ᵢ],     gᵢ = Wᵢᵀtᵢ = (tᵢ, rᵢ × tᵢ)
 
-Newton's method solves it, each J used twice: while tendons hardly turn one is enough. It is damped where
-they do. The measure of both is by how much, as a part, a correction changes ṗᵢ.
+Tendons hardly turn against a rod, and so J hardly changes: most often the law is solved by three corrections
+with J where rod and tendons are not bent, `unbent_flexibility`. That depends on nothing that solvers iterate
+on, and they evaluate it once for a step (`solvers/ahead.py`). Where tendons turn more Newton's method goes on
+from there, each J used twice, and damped. The measure of it all is by how much, as a part, a correction
+changes ṗᵢ.
 """
 
 from __future__ import annotations
@@ -26,12 +29,16 @@ from jaxtyping import Float
 
 from knode_cosserat.rotation import dot, inverse, small_inverse
 
-#: pairs of corrections at most
+#: pairs of corrections of Newton's method at most
 ROUNDS = 50
+#: by what part the second correction with one J must be less than the first, if those are to do
+LESS = 0.1
 #: a tendon's turn up to which a correction is not damped
 SMALL = 0.05
 #: what may be missing of a tendon's tangent
-MISSING = 1e-13
+MISSING = 1e-14
+#: v and u of a rod that is not bent
+UNBENT = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 
 
 def path_rates(
@@ -53,16 +60,26 @@ def tangents(
     v: Float[Any, "3"], u: Float[Any, "3"], r: Float[Any, "c 3"], r_s: Float[Any, "c 3"]
 ) -> Float[Any, "c 3"]:
     """tᵢ, unit tangents of the tendons, material frame."""
-    direction, _ = _units(jnp.concatenate([v, u]), r, r_s)
-    return jnp.stack(direction, axis=1)
+    return _units(jnp.concatenate([v, u]), r, r_s)[0].T
 
 
 def tendon_wrench(
     v: Float[Any, "3"], u: Float[Any, "3"], r: Float[Any, "c 3"], r_s: Float[Any, "c 3"], tension: Any
 ) -> tuple[Float[Any, "3"], Float[Any, "3"]]:
     """Σ Tᵢ tᵢ (N) and Σ Tᵢ rᵢ × tᵢ (N·m), material frame: what tendons take of Rᵀn and Rᵀm."""
-    loads = _loads(_units(jnp.concatenate([v, u]), r, r_s)[0], tension, r)
+    loads = dot(_levers(jnp.concatenate([v, u]), r, r_s)[0], tension)
     return loads[:3], loads[3:]
+
+
+def unbent_flexibility(
+    K_v: Float[Any, "3 3"],
+    K_u: Float[Any, "3 3"],
+    r: Float[Any, "c 3"],
+    r_s: Float[Any, "c 3"],
+    tension: Float[Any, " c"],
+) -> Float[Any, "6 6"]:
+    """J⁻¹ where rod and tendons are not bent; arguments as those of `tendon_strains`."""
+    return _flexibility(*_levers(UNBENT, r, r_s), K_v, K_u, r, tension)
 
 
 def tendon_strains(
@@ -73,6 +90,8 @@ def tendon_strains(
     r: Float[Any, "c 3"],
     r_s: Float[Any, "c 3"],
     tension: Float[Any, " c"],
+    *,
+    flexibility: Float[Any, "6 6"] | None = None,
 ) -> tuple[Float[Any, "3"], Float[Any, "3"]]:
     """v and u (1/m) that fulfil the law: see the module's head.
 
@@ -84,13 +103,17 @@ def tendon_strains(
         r: where the tendons run (m); its third numbers are not used.
         r_s: derivative of r along the rod; its third numbers are not used.
         tension: T (N), not negative; 0 of a tendon that has ended.
+        flexibility: `unbent_flexibility` of these, or about: it decides how fast the solution is found, not
+            which.
 
     Returns:
         v and u, solved to rounding; NaN where Newton's method did not find them. Derivatives of any order
         and mode are those of the solution.
     """
+    if flexibility is None:
+        flexibility = unbent_flexibility(K_v, K_u, r, r_s, tension)
     ab = jnp.concatenate([a, b])
-    x = _solution(K_v, K_u, ab, r, r_s, tension)
+    x = _solution(jax.lax.stop_gradient(flexibility), K_v, K_u, ab, r, r_s, tension)
     return x[:3], x[3:]
 
 
@@ -106,7 +129,8 @@ def tendon_balance(
     tension: Float[Any, " c"],
 ) -> Float[Any, "6"]:
     """What the law leaves at any v and u (N, N·m): zero at those of `tendon_strains`."""
-    return _balance(jnp.concatenate([v, u]), K_v, K_u, jnp.concatenate([a, b]), r, r_s, tension)
+    x = jnp.concatenate([v, u])
+    return _left(x, _levers(x, r, r_s)[0], K_v, K_u, jnp.concatenate([a, b]), tension)
 
 
 # x is v and u together
@@ -129,32 +153,28 @@ def _rates(x: Float[Any, "6"], r: Float[Any, "c 3"], r_s: Float[Any, "c 3"]) -> 
 
 
 def _units(x: Float[Any, "6"], r: Float[Any, "c 3"], r_s: Float[Any, "c 3"]) -> tuple[Any, Any]:
-    """Tangents, in parts (c,), and 1/|ṗᵢ|."""
-    px, py, pz = _rates(x, r, r_s)
-    shorter = 1.0 / jnp.sqrt(px * px + py * py + pz * pz)
-    return (px * shorter, py * shorter, pz * shorter), shorter
+    """Tangents (3, c) and 1/|ṗᵢ| (c,)."""
+    rates = jnp.stack(_rates(x, r, r_s))
+    shorter = 1.0 / jnp.sqrt(jnp.sum(rates * rates, axis=0))
+    return rates * shorter, shorter
 
 
-def _levers(t: tuple[Any, Any, Any], r: Float[Any, "c 3"]) -> tuple[Any, ...]:
-    """gᵢ = (tᵢ, rᵢ × tᵢ), in parts (c,)."""
-    (tx, ty, tz), (rx, ry) = t, _columns(r)
-    return tx, ty, tz, ry * tz, -rx * tz, rx * ty - ry * tx
+def _levers(x: Float[Any, "6"], r: Float[Any, "c 3"], r_s: Float[Any, "c 3"]) -> tuple[Any, Any]:
+    """gᵢ = (tᵢ, rᵢ × tᵢ), (6, c), and 1/|ṗᵢ|."""
+    (tx, ty, tz), shorter = _units(x, r, r_s)
+    rx, ry = _columns(r)
+    return jnp.stack([tx, ty, tz, ry * tz, -rx * tz, rx * ty - ry * tx]), shorter
 
 
-def _loads(t: tuple[Any, Any, Any], tension: Any, r: Float[Any, "c 3"]) -> Float[Any, "6"]:
-    return jnp.stack([jnp.sum(tension * part, axis=0) for part in _levers(t, r)])
-
-
-def _balance(x: Any, K_v: Any, K_u: Any, ab: Any, r: Any, r_s: Any, tension: Any) -> Float[Any, "6"]:
+def _left(x: Any, g: Any, K_v: Any, K_u: Any, ab: Any, tension: Any) -> Float[Any, "6"]:
     """What is left of the law at x."""
     elastic = jnp.concatenate([dot(K_v, x[:3]), dot(K_u, x[3:])])
-    return elastic + _loads(_units(x, r, r_s)[0], tension, r) - ab
+    return elastic + dot(g, tension) - ab
 
 
-def _flexibility(x: Any, K_v: Any, K_u: Any, r: Any, r_s: Any, tension: Any) -> Float[Any, "6 6"]:
-    """J⁻¹ at x."""
-    t, shorter = _units(x, r, r_s)
-    g, (rx, ry) = jnp.stack(_levers(t, r)), _columns(r)
+def _flexibility(g: Any, shorter: Any, K_v: Any, K_u: Any, r: Any, tension: Any) -> Float[Any, "6 6"]:
+    """J⁻¹."""
+    rx, ry = _columns(r)
     o, one = jnp.zeros_like(rx), jnp.ones_like(rx)
     # rows of Wᵢ: apart from x, and so constants where r is
     W = [jnp.stack(row) for row in ((one, o, o, o, o, -ry), (o, one, o, o, o, rx), (o, o, one, ry, -rx, o))]
@@ -165,41 +185,55 @@ def _flexibility(x: Any, K_v: Any, K_u: Any, r: Any, r_s: Any, tension: Any) -> 
     return small_inverse(jnp.concatenate([upper, lower]) + stiffer)
 
 
-def _turn(dx: Float[Any, "6"], shorter: Any, r: Any) -> Any:
-    """The largest |Wᵢ dx|/|ṗᵢ|: by how much dx turns or stretches a tendon."""
-    x, y, z = _turned(dx, r)
-    return jnp.sqrt(jnp.max((x * x + y * y + z * z) * shorter * shorter, axis=0))
+#: what is computed is used as it is: XLA would otherwise do what is early again for all that is late
+_in_turn = jax.lax.optimization_barrier
 
 
-def _solved(K_v: Any, K_u: Any, ab: Any, r: Any, r_s: Any, tension: Any) -> Float[Any, "6"]:
-    """The law's solution, from where it is if tendons run along the unbent rod."""
+def _solved(flexibility: Any, K_v: Any, K_u: Any, ab: Any, r: Any, r_s: Any, tension: Any) -> Float[Any, "6"]:
+    """The law's solution, from where rod and tendons are not bent."""
 
     def correction(x: Any, flexibility: Any) -> tuple[Any, Any]:
-        dx = dot(flexibility, _balance(x, K_v, K_u, ab, r, r_s, tension))
-        return dx, _turn(dx, _units(x, r, r_s)[1], r)
+        """-J⁻¹ times what is left at x, and the largest |Wᵢ dx|/|ṗᵢ|: by how much it turns a tendon."""
+        g, shorter = _levers(x, r, r_s)
+        dx = -jnp.sum(flexibility * _left(x, g, K_v, K_u, ab, tension), axis=1)
+        turned = jnp.stack(_turned(dx, r)) * shorter
+        return dx, jnp.sqrt(jnp.max(jnp.sum(turned * turned, axis=0)))
 
-    def goes_on(reached: Any) -> Any:
+    def unsolved(reached: Any) -> Any:
         count, _, missing = reached
         return (count < ROUNDS) & ~(missing <= MISSING)
 
     def corrected(reached: Any) -> Any:
         """One step of Newton's method, damped; where that was short, another with the same J."""
         count, x, _ = reached
-        flexibility = _flexibility(x, K_v, K_u, r, r_s, tension)
+        x = jnp.where(count == 0, unturned(), x)
+        flexibility = _flexibility(*_levers(x, r, r_s), K_v, K_u, r, tension)
         dx, first = correction(x, flexibility)
         # the damping that keeps a convex function with |f‴| ≤ 3 f″ going down (Sun & Tran-Dinh 2019)
         near = first < SMALL
-        x = x - jnp.where(near, 1.0, jnp.log1p(3.0 * first) / jnp.maximum(3.0 * first, 1e-300)) * dx
+        x = x + jnp.where(near, 1.0, jnp.log1p(3.0 * first) / jnp.maximum(3.0 * first, 1e-300)) * dx
         dx, turned = correction(x, flexibility)
         # the next correction would be about the last one times how much J has changed since (|t″| ≤ 3)
         again = near & (turned <= first)
-        return count + 1, jnp.where(again, x - dx, x), 3.0 * first * jnp.where(again, turned, first)
+        return count + 1, jnp.where(again, x + dx, x), 3.0 * first * jnp.where(again, turned, first)
 
-    dx, dy = _columns(r_s)
-    shorter = 1.0 / jnp.sqrt(1.0 + dx * dx + dy * dy)
-    free = ab - _loads((dx * shorter, dy * shorter, shorter), tension, r)
-    start = jnp.concatenate([dot(inverse(K_v), free[:3]), dot(inverse(K_u), free[3:])])
-    _, x, missing = jax.lax.while_loop(goes_on, corrected, (0, start, jnp.inf))
+    def unturned() -> Any:
+        """Where the rod would be if its tendons had not turned: from far away a better beginning."""
+        free = -_left(np.zeros(6), _levers(UNBENT, r, r_s)[0], K_v, K_u, ab, tension)
+        return jnp.concatenate([dot(inverse(K_v), free[:3]), dot(inverse(K_u), free[3:])])
+
+    # written out: a loop's bookkeeping takes as long as a correction
+    x = _in_turn(UNBENT + correction(UNBENT, flexibility)[0])
+    dx, first = correction(x, flexibility)
+    x, first = _in_turn((x + dx, first))
+    dx, turned = correction(x, flexibility)
+    x, turned = _in_turn((x + dx, turned))
+    # with one J, each correction is the same part of the one before it
+    less = turned <= LESS * first
+    missing = jnp.where(less, turned * (turned / jnp.maximum(first, 1e-300)), jnp.inf)
+    # near enough to go on from there
+    begun = jnp.where(turned < SMALL, 1, 0)
+    _, x, missing = jax.lax.while_loop(unsolved, corrected, (begun, x, missing))
     return jnp.where(missing <= MISSING, x, jnp.nan)
 
 
@@ -209,17 +243,23 @@ _solution = jax.custom_jvp(_solved)
 def _slope(primals: Any, tangents: Any) -> tuple[Any, Any]:
     """J dx = -d(law) at the solution, for those arguments that have slopes (most often a and b only)."""
     x = _solution(*primals)
+    # how it was solved does not matter
+    primals, tangents = primals[1:], tangents[1:]
     moves = [not isinstance(tangent, SymbolicZero) for tangent in tangents]
+
+    K_v, K_u, _, r, r_s, tension = primals
+    g, shorter = _in_turn(_levers(x, r, r_s))
+    runs_elsewhere = moves[3] or moves[4]
 
     def left(*moving: Any) -> Any:
         given = iter(moving)
-        return _balance(x, *(next(given) if m else p for m, p in zip(moves, primals, strict=True)))
+        K_v, K_u, ab, r, r_s, T = (next(given) if m else p for m, p in zip(moves, primals, strict=True))
+        return _left(x, _levers(x, r, r_s)[0] if runs_elsewhere else g, K_v, K_u, ab, T)
 
     moving = [p for m, p in zip(moves, primals, strict=True) if m]
     along = [t for m, t in zip(moves, tangents, strict=True) if m]
-    K_v, K_u, _, r, r_s, tension = primals
     _, change = jax.jvp(left, moving, along)
-    return x, -dot(_flexibility(x, K_v, K_u, r, r_s, tension), change)
+    return x, -dot(_flexibility(g, shorter, K_v, K_u, r, tension), change)
 
 
 _solution.defjvp(_slope, symbolic_zeros=True)

@@ -17,24 +17,16 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Float, Int
 
-from knode_cosserat.rods.system import (
-    History,
-    System,
-    in_strands,
-    records_in_strands,
-    unpacked_history,
-)
-from knode_cosserat.solvers.crossing import carried_part, crossing_of, rounds_of, taken, within
+from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.linear import Linearisation, LinearSolver
-from knode_cosserat.solvers.space import SLOPES, VALUES, Along, SpaceScheme, middles
+from knode_cosserat.solvers.problem import StepProblem
+from knode_cosserat.solvers.space import SLOPES, VALUES, SpaceScheme
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,131 +60,6 @@ class NewtonOptions:
                 raise ValueError(f"NewtonOptions: {name} is {given!r}; allowed is {allowed}")
 
 
-class StepProblem(eqx.Module):
-    """One step: the system, its control, and what the time scheme remembers."""
-
-    system: System
-    t: Float[Any, ""]
-    control: Float[Any, " c"]
-    c0: Float[Any, ""]
-    history: Float[Any, "nodes x"]
-    space: SpaceScheme = eqx.field(static=True)
-    #: what the tip's conditions are to leave: zero, but on the way to a solution
-    tip_offset: Any = None
-
-    def point_rates(self, s: Any, y: Float[Any, " y"], history: Float[Any, " x"]) -> Any:
-        """y_s and z at one point of a strand, from a packed record of its history."""
-        strand = self.system.strand
-        return strand.derivatives(s, self.t, y, self.control, unpacked_history(strand, self.c0, history))
-
-    def _unpack(self, history: Float[Any, " x"]) -> History:
-        return unpacked_history(self.system, self.c0, history)
-
-    def base(self, unknowns: Float[Any, " k"]) -> Float[Any, " y"]:
-        """y at the first node, for these unknowns."""
-        return self.system.base(self.t, self.control, unknowns, self._unpack(self.history[0]))
-
-    def tip_residual(self, y: Float[Any, " y"]) -> Float[Any, " k"]:
-        """What is left of the tip's conditions at this y of the last node."""
-        left = self.system.tip(self.t, self.control, y, self._unpack(self.history[-1]))
-        return left if self.tip_offset is None else left - self.tip_offset
-
-    def crossed(self, acting: Any, y: Float[Any, " y"], history: Float[Any, " x"]) -> Float[Any, " y"]:
-        """y on the far side of the cuts that are acting."""
-        if not self.system.jumps:
-            return y
-        return self.system.crossed(acting, self.t, y, self.control, self._unpack(history))
-
-    @property
-    def arclength(self) -> Float[Any, " nodes"]:
-        """s at the nodes (m)."""
-        return jnp.linspace(0.0, 1.0, self.system.nodes) * self.system.length
-
-    def segments(self, along: Along, y: Float[Any, "nodes y"]) -> Any:
-        """What `along` makes of y at the nodes by the ends of all segments of all strands, those inside."""
-        s = self._each_strand(self.arclength[:-1])
-        inner = middles(self.history) if self.space.uses_middle else self.history[:-1]
-        past = (self._past_points(rows) for rows in (self.history[:-1], inner, self.history[1:]))
-        lanes = (s, self._points(y[:-1]), *past)
-        if self.system.cuts:
-            return self._in_rounds(along, lanes)
-
-        def segment(s_j: Any, y_j: Any, *history: Any) -> Any:
-            def advance(y: Any) -> Any:
-                return self.space.advance(self._rates, s_j, self._ds, y, history)
-
-            return along.on(advance, along.begin(y_j))
-
-        return _side_by_side(segment, lanes)
-
-    def _in_rounds(self, along: Along, lanes: tuple[Any, ...]) -> Any:
-        """The same of segments that are parted, or where y jumps."""
-        rounds = rounds_of(self.system.cuts, self.system.nodes)
-        parted = len(rounds.segment) > 1
-
-        def part(state: Any, begins: Any, part: Any, s_j: Any, y_j: Any, *history: Any) -> Any:
-            def advance(y: Any) -> Any:
-                where = s_j, self._ds
-                return carried_part(self.space, self._rates, self.crossed, part, where, y, history, parted)
-
-            begun = along.begin(y_j)
-            if parted:
-                begun = jax.tree.map(lambda new, old: jnp.where(begins, new, old), begun, state)
-            return along.on(advance, begun)
-
-        def one(state: Any, given: Any) -> Any:
-            *steered, lanes = given
-            state = _side_by_side(part, lanes, state, *steered)
-            return state, state
-
-        shape, rows = rounds.segment.shape, rounds.segment.reshape(-1)
-        lanes = tuple(taken(each, rows).reshape(*shape, *each.shape[1:]) for each in lanes)
-        parts = (rounds.bounds[..., 0], rounds.bounds[..., 1], rounds.acting)
-        given = jax.tree.map(jnp.asarray, (rounds.begins, parts, lanes))
-        first = jax.vmap(along.begin)(lanes[1][0])
-        if not parted:
-            return one(first, jax.tree.map(lambda each: each[0], given))[0]
-        _, found = jax.lax.scan(one, first, given)
-        return jax.tree.map(lambda each: taken(each.reshape(-1, *each.shape[2:]), rounds.last), found)
-
-    def _rates(self, s: Any, y: Any, history: Any) -> Any:
-        return self.point_rates(s, y, history)[0]
-
-    @property
-    def _ds(self) -> Any:
-        return self.system.length / (self.system.nodes - 1)
-
-    def at_points(self, function: Callable[..., Any], y: Float[Any, "nodes y"]) -> Any:
-        """Apply `function(s, y, record of history)` to all nodes of all strands (strands inside)."""
-        at = self._each_strand(self.arclength), self._points(y), self._past_points(self.history)
-        return jax.vmap(function)(*at)
-
-    def _beyond_cuts(self, y: Float[Any, "nodes y"]) -> tuple[Any, Any]:
-        """y_s and z at the nodes, on the far side of what is cut there, and at the tip on the near side."""
-        crossings, s = crossing_of(self.system), self.arclength
-        assert crossings is not None
-        s = jnp.concatenate([within(s[:-1], s[:-1], s[1:]), within(s[-1:], s[-2:-1], s[-1:])])
-        across = jax.vmap(self.crossed)(jnp.asarray(crossings.acting[:, 0]), y[:-1], self.history[:-1])
-        return jax.vmap(self.point_rates)(s, jnp.concatenate([across, y[-1:]]), self.history)
-
-    def _each_strand(self, values: Float[Any, " n"]) -> Float[Any, " points"]:
-        return jnp.repeat(values, self.system.strands) if self.system.strands > 1 else values
-
-    def _points(self, rows: Float[Any, "n x"]) -> Float[Any, "points x_of_strand"]:
-        own = in_strands(self.system, rows)
-        return own.reshape(-1, own.shape[-1])
-
-    def _past_points(self, rows: Float[Any, "n x"]) -> Float[Any, "points x_of_strand"]:
-        own = records_in_strands(self.system, rows)
-        return own.reshape(-1, own.shape[-1])
-
-    def record(self, y: Float[Any, "nodes y"]) -> Float[Any, "nodes x"]:
-        """What must be kept of a solved step at every node: y, z and, if B is not zero, y_s."""
-        rates = self._beyond_cuts(y) if crossing_of(self.system) else self.at_points(self.point_rates, y)
-        y_s, z = (part.reshape(y.shape[0], -1) for part in rates)
-        return jnp.concatenate([y, z, y_s] if self.system.mixed else [y, z], axis=1)
-
-
 class Iterate(NamedTuple):
     """A point of the iteration; `error` is its largest residual in natural units, infinite for a NaN."""
 
@@ -223,14 +90,6 @@ def none_kept(problem: StepProblem, y: Any, unknowns: Any, linear: LinearSolver)
     y_scale = problem.system.scales().y
     like = jax.eval_shape(lambda: linear.start(linearise(problem, y, unknowns), y_scale)[0])
     return Kept(jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), like), jnp.array(False))
-
-
-def _side_by_side(each: Callable[..., Any], lanes: tuple[Any, ...], *more: Any) -> Any:
-    """`each(*more, *lanes)` of all rows; arclength first, then rows of numbers."""
-    s, *rows = lanes
-    # nodes last inside: XLA then vectorises over them
-    axes = (*(0 for _ in more), 0, *(-1 for _ in rows))
-    return jax.vmap(each, in_axes=axes)(*more, s, *(row.T for row in rows))
 
 
 def _with_base(problem: StepProblem, y: Any, unknowns: Any) -> Any:

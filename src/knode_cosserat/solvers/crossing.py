@@ -136,8 +136,11 @@ def carried(
     """
     acting = jnp.asarray(crossing.acting).at[:first].set(0.0)
 
+    def of_past(s: Any, y: Any, known: tuple[Any, Any]) -> Any:
+        return rates(s, y, known[0])
+
     def part(y: Any, given: tuple[Any, Any, Any]) -> Any:
-        return carried_part(space, rates, jump, given, where, y, history, parted=acting.shape[0] > 1), None
+        return carried_part(space, of_past, jump, given, where, y, history, parted=acting.shape[0] > 1), None
 
     y, _ = jax.lax.scan(part, y, (crossing.bounds[:-1], crossing.bounds[1:], acting))
     return y
@@ -146,19 +149,27 @@ def carried(
 def carried_part(
     space: SpaceScheme, rates: Callable[[Any, Any, Any], Any], jump: Jump, part: tuple[Any, Any, Any],
     where: tuple[Any, Any], y: Float[Any, " y"], history: tuple[Any, Any, Any], parted: bool,
+    ahead: tuple[Any, Any, Any] | None = None,
 ) -> Float[Any, " y"]:  # fmt: skip
     """The same over one part: from where to where, as parts of the segment, and which cuts act before it.
 
-    Where no segment is parted, which is known before, the past need not be interpolated.
+    Where no segment is parted, which is known before, the past need not be interpolated. `rates` is given
+    what `known_at` says of the past and of what was evaluated `ahead` for this part.
     """
     (s, ds), (begin, end, acting) = where, part
     past = _part_of(space, history, begin, end) if parted else history
     low, high = s + begin * ds, s + end * ds
 
-    def inside(at: Any, y: Any, record: Any) -> Any:
-        return rates(within(at, low, high), y, record)
+    def inside(at: Any, y: Any, known: Any) -> Any:
+        return rates(within(at, low, high), y, known)
 
-    return space.advance(inside, low, high - low, jump(acting, y, past[0]), past)
+    return space.advance(inside, low, high - low, jump(acting, y, past[0]), known_at(past, ahead))
+
+
+def known_at(history: tuple[Any, Any, Any], ahead: tuple[Any, Any, Any] | None) -> tuple[Any, Any, Any]:
+    """What is known where a segment begins, is half-way and ends: (past there, what was evaluated ahead)."""
+    start, middle, end = zip(history, (None, None, None) if ahead is None else ahead, strict=True)
+    return start, middle, end
 
 
 def _part_of(space: SpaceScheme, history: tuple[Any, Any, Any], begin: Any, end: Any) -> tuple[Any, Any, Any]:

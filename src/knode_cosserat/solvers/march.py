@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.boundary import Kept, StepProblem, newton_keeping, none_kept
+from knode_cosserat.solvers.boundary import Kept, newton_keeping, none_kept
+from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import Euler
 from knode_cosserat.solvers.time import BDF1
@@ -124,7 +125,7 @@ def step(
     """One time step: the next past, the step's row, and what is kept of its linearisation."""
     ny = system.y_layout.size
     history = history_of(past, coefficients, settings)
-    problem = StepProblem(system, t, control, coefficients[0], history, settings.space)
+    problem = StepProblem(system, t, control, coefficients[0], history, settings.space).ready()
     # as sums of products, not as matrix products: XLA fuses these with what follows
     guesses = jnp.sum(EXTRAPOLATIONS[:, :, None, None] * past.records[None, :, :, :ny], axis=1)
     weights = jnp.asarray(EXTRAPOLATIONS)[past.order]

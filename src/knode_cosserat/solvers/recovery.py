@@ -16,9 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.boundary import Solution, StepProblem, newton
+from knode_cosserat.solvers.boundary import Solution, newton
 from knode_cosserat.solvers.linear import Decoupled
 from knode_cosserat.solvers.march import EXTRAPOLATIONS, Past, advanced, history_of
+from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.stability import natural_time
@@ -60,7 +61,7 @@ def attempt(
 
     The tip's conditions hold in `part`: of what they leave at `from_y` the rest is still left.
     """
-    problem = StepProblem(system, t, control, c0, history, settings.space)
+    problem = StepProblem(system, t, control, c0, history, settings.space).ready()
     problem = dataclasses.replace(problem, tip_offset=(1.0 - part) * problem.tip_residual(from_y[-1]))
     patient = dataclasses.replace(settings.newton, max_linearisations=40)
     solution = newton(problem, y, unknowns, Decoupled(), patient)

@@ -16,9 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.boundary import StepProblem, linearise, residuals
+from knode_cosserat.solvers.boundary import linearise, residuals
 from knode_cosserat.solvers.linear import Condensed, carried
 from knode_cosserat.solvers.march import Past, Rows, history_of, march_one
+from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.task import Task
 

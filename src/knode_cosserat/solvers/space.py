@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-#: y_s at (s, y, record of history)
+#: y_s at (s, y, what is known there: a record of history)
 SpatialDerivative = Callable[[Any, Any, Any], Any]
 
 
@@ -30,9 +30,9 @@ class SpaceScheme(abc.ABC):
 
     @abc.abstractmethod
     def advance(
-        self, y_s: SpatialDerivative, s: Any, ds: Any, y: Float[Any, " y"], history: tuple[Any, Any, Any]
+        self, y_s: SpatialDerivative, s: Any, ds: Any, y: Float[Any, " y"], known: tuple[Any, Any, Any]
     ) -> Float[Any, " y"]:
-        """y at s + ds from y at s; `history` is the time scheme's, at s, s + ds/2 and s + ds."""
+        """y at s + ds from y at s; `known` is what `y_s` is given of s, s + ds/2 and s + ds: the history."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,9 +41,9 @@ class Euler(SpaceScheme):
 
     order = 1
 
-    def advance(self, y_s, s, ds, y, history):  # type: ignore[no-untyped-def]
+    def advance(self, y_s, s, ds, y, known):  # type: ignore[no-untyped-def]
         """One evaluation, at the segment's start."""
-        return y + ds * y_s(s, y, history[0])
+        return y + ds * y_s(s, y, known[0])
 
 
 #: where the stages of the classical scheme are, as parts of the segment, and what each counts
@@ -57,19 +57,19 @@ class RK4(SpaceScheme):
     order = 4
     uses_middle = True
 
-    def advance(self, y_s, s, ds, y, history):  # type: ignore[no-untyped-def]
+    def advance(self, y_s, s, ds, y, known):  # type: ignore[no-untyped-def]
         """Evaluations at the start, twice in the middle, and at the end."""
-        start, middle, end = history
+        start, middle, end = known
         # a loop, for four copies of the equations take several times as long to compile, and are no faster
-        stages = RK4_PARTS, RK4_WEIGHTS, jnp.stack([start, middle, middle, end])
+        stages = jax.tree.map(lambda *each: jnp.stack(each), start, middle, middle, end)
 
         def stage(reached: tuple[Any, Any], given: tuple[Any, Any, Any]) -> Any:
             total, k = reached
-            part, weight, past = given
-            k = y_s(s + part * ds, y + part * ds * k, past)
+            part, weight, there = given
+            k = y_s(s + part * ds, y + part * ds * k, there)
             return (total + weight * ds * k, k), None
 
-        (total, _), _ = jax.lax.scan(stage, (y, jnp.zeros_like(y)), stages)
+        (total, _), _ = jax.lax.scan(stage, (y, jnp.zeros_like(y)), (RK4_PARTS, RK4_WEIGHTS, stages))
         return total
 
 

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.boundary import StepProblem
+from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.settings import Settings
 
 #: |λ| ds of a decaying wave that an explicit scheme carries safely

@@ -141,15 +141,16 @@ def simulated_error(model, trajectory):
 
 def test_it_learns_from_positions_alone(bars):
     """Nothing is known of forces, velocities and strains, and there is no stage before."""
-    options = dataclasses.replace(OPTIONS, updates=400, learning_rate=0.02)
+    # of half as many rows what is learned, and so the error, is a matter of rounding
+    options = dataclasses.replace(OPTIONS, horizon=12, updates=400, learning_rate=0.02)
     config = FitConfig(NetworkOptions(hidden=5, convex=False), None, options)
     model = fit(WRONG, [only_positions(each) for each in bars], config)
     history = model.about.facts["rollouts"]
     assert history["loss"].shape == (401,) and history["learning_rate"].shape == (400,)
-    assert history["loss"].min() < 0.03 * history["loss"][0]
+    assert history["loss"].min() < 1e-5 * history["loss"][0]
     # also of the rows after those that it saw, and of a motion that it has not seen
     for truth in (*bars, pulled(1.4)):
-        assert simulated_error(model, truth) < 0.7 * simulated_error(WRONG, truth)
+        assert simulated_error(model, truth) < 0.2 * simulated_error(WRONG, truth)
 
 
 def test_any_residual_is_fine_tuned(bars):

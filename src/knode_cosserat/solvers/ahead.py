@@ -1,0 +1,90 @@
+"""What of the equations does not depend on what is iterated on: evaluated once, before.
+
+A step evaluates the equations many times at the same places, under the same control. What depends on neither
+y nor the past (where tendons run, how stiff a section is, by which matrix a law is solved) is the same every
+time. It is found in the traced equations: no system has to say what that is, and none can say it wrong.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+import jax
+from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun
+
+
+class _On(enum.IntEnum):
+    """What a value depends on, and on nothing beyond."""
+
+    NOTHING = 0
+    PARAMETERS = 1
+    PLACE = 2
+    STATE = 3
+
+
+class InTwo(NamedTuple):
+    """`function(place, state)` in two: `then(first(place), place, state)` is the same.
+
+    What depends on neither is evaluated once, when it is parted.
+    """
+
+    first: Callable[[Any], list[Any]]
+    then: Callable[[list[Any], Any, Any], Any]
+
+
+def in_two(function: Callable[[Any, Any], Any], place: Any, state: Any) -> InTwo:
+    """A function parted into what follows from its first argument, and the rest.
+
+    Args:
+        function: of a place (an array) and a state (a pytree); JAX-traceable.
+        place: one like those it will be given.
+        state: the same.
+    """
+    closed, shape = jax.make_jaxpr(function, return_shape=True)(place, state)
+    jaxpr = closed.jaxpr
+    at_place, given = jaxpr.invars[:1], jaxpr.invars[1:]
+    # what depends on nothing at all stays where it is used: XLA makes more of a constant it can see
+    depends: dict[Var, _On] = dict.fromkeys(jaxpr.constvars, _On.PARAMETERS)
+    depends |= {at_place[0]: _On.PLACE, **dict.fromkeys(given, _On.STATE)}
+    steps: dict[_On, list[JaxprEqn]] = {on: [] for on in _On}
+    for step in jaxpr.eqns:
+        on = max((depends[each] for each in _variables(step.invars)), default=_On.NOTHING)
+        on = _On.STATE if step.effects else on
+        steps[on].append(step)
+        depends |= dict.fromkeys(step.outvars, on)
+
+    def needed(on: _On, *groups: Iterable[Any]) -> list[Var]:
+        return [each for each in _variables(*groups) if depends[each] is on and each not in at_place]
+
+    late = [*(step.invars for step in steps[_On.STATE]), jaxpr.outvars]
+    early = [step.invars for step in steps[_On.PLACE]]
+    handed, shared = needed(_On.PLACE, *late), needed(_On.PARAMETERS, *late, *early)
+
+    def evaluated(on: _On, inputs: dict[Var, Any], outputs: list[Any]) -> list[Any]:
+        part = jaxpr.replace(
+            constvars=[], invars=[*inputs], outvars=[*outputs], eqns=steps[_On.NOTHING] + steps[on]
+        )
+        return jaxpr_as_fun(ClosedJaxpr(part, []))(*inputs.values())
+
+    parameters = dict(zip(jaxpr.constvars, closed.consts, strict=True))
+    everywhere = dict(zip(shared, evaluated(_On.PARAMETERS, parameters, shared), strict=True))
+
+    def first(place: Any) -> list[Any]:
+        return evaluated(_On.PLACE, {**everywhere, at_place[0]: place}, handed)
+
+    def then(ahead: list[Any], place: Any, state: Any) -> Any:
+        inputs = {**everywhere, at_place[0]: place}
+        inputs |= dict(zip(given, jax.tree.leaves(state), strict=True)) | dict(
+            zip(handed, ahead, strict=True)
+        )
+        found = evaluated(_On.STATE, inputs, jaxpr.outvars)
+        return jax.tree.unflatten(jax.tree.structure(shape), found)
+
+    return InTwo(first, then)
+
+
+def _variables(*groups: Iterable[Any]) -> list[Var]:
+    """Each variable once, in the order in which they come."""
+    return list(dict.fromkeys(each for group in groups for each in group if not isinstance(each, Literal)))
