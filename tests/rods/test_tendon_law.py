@@ -13,11 +13,25 @@ from knode_cosserat.rods.tendon_law import (
     tangents,
     tendon_strains,
     tendon_wrench,
+    unbent_flexibility,
 )
 
 COUNT = 3
 #: of many lanes at once, so that hypothesis runs one program
 solve = jax.jit(jax.vmap(lambda given: tendon_strains(*given)))
+
+
+@jax.jit
+def solve_by(factor, rods):
+    """With so many times the matrix that it is solved by otherwise."""
+
+    def one(K_v, K_u, a, b, *way):
+        flexibility = factor * unbent_flexibility(K_v, K_u, *way)
+        return tendon_strains(K_v, K_u, a, b, *way, flexibility=flexibility)
+
+    return jax.vmap(one)(*rods)
+
+
 slopes = jax.jit(jax.jacfwd(lambda given: jnp.concatenate(tendon_strains(*given))))
 slopes_backward = jax.jit(jax.jacrev(lambda given: jnp.concatenate(tendon_strains(*given))))
 LANES = 8
@@ -144,6 +158,19 @@ def test_a_tendon_that_the_rod_cannot_hold_is_not_a_number():
     one = (K_v, K_u, K_v[2], np.zeros(3), r, r, np.full(COUNT, 16e4 / COUNT))
     v, u = solve(tuple(np.stack([part] * LANES) for part in one))
     assert np.all(np.isnan(v)) and np.all(np.isnan(u))
+
+
+@pytest.mark.parametrize("kind", ["Delrin", "silicone"])
+@given(seed=st.integers(0, 2**32 - 1), factor=st.sampled_from([1e-6, 0.97, 1.3, -1.0, 1e6, np.nan]))
+@settings(max_examples=25, deadline=None)
+def test_by_which_matrix_it_is_solved_does_not_matter(kind, seed, factor):
+    rng = np.random.default_rng(seed)
+    rods = tuple(
+        np.stack(parts) for parts in zip(*(rod(rng, *KINDS[kind]) for _ in range(LANES)), strict=True)
+    )
+    found, expected = solve_by(factor, rods), solve(rods)
+    for k, size in enumerate((1.0, 1.0 / KINDS[kind][0])):
+        np.testing.assert_allclose(found[k] / size, expected[k] / size, rtol=0, atol=1e-12)
 
 
 @given(seed=st.integers(0, 2**32 - 1))

@@ -103,8 +103,8 @@ def tendon_strains(
         r: where the tendons run (m); its third numbers are not used.
         r_s: derivative of r along the rod; its third numbers are not used.
         tension: T (N), not negative; 0 of a tendon that has ended.
-        flexibility: `unbent_flexibility` of these, or about: it decides how fast the solution is found, not
-            which.
+        flexibility: `unbent_flexibility` of these, or about. It decides how fast the solution is found, not
+            which, as long as it is not zero.
 
     Returns:
         v and u, solved to rounding; NaN where Newton's method did not find them. Derivatives of any order
