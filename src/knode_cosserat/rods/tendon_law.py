@@ -10,11 +10,11 @@ least of the strictly convex energy ½ vᵀK_v v + ½ uᵀK_u u + Σ Tᵢ |ṗ�
 
     J = diag(K_v, K_u) + Σ Tᵢ/|ṗᵢ| (WᵢᵀWᵢ - gᵢgᵢᵀ),     Wᵢ = [I, -r̂ᵢ],     gᵢ = Wᵢᵀtᵢ = (tᵢ, rᵢ × tᵢ)
 
-Tendons hardly turn against a rod, and so J hardly changes: most often the law is solved by three corrections
-with J where rod and tendons are not bent, `unbent_flexibility`. That depends on nothing that solvers iterate
-on, and they evaluate it once for a step (`solvers/ahead.py`). Where tendons turn more Newton's method goes on
-from there, each J used twice, and damped. The measure of it all is by how much, as a part, a correction
-changes ṗᵢ.
+Tendons hardly turn against a rod, and so J hardly changes: most often the law is solved by three or four
+corrections with J where rod and tendons are not bent, `unbent_flexibility`. That depends on nothing that
+solvers iterate on, and they evaluate it once for a step (`solvers/ahead.py`). Where tendons turn so far that
+this converges slowly Newton's method goes on from there, each J used twice, and damped. The measure of it all
+is by how much, as a part, a correction changes ṗᵢ.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from knode_cosserat.rotation import dot, inverse, small_inverse
 
 #: pairs of corrections of Newton's method at most
 ROUNDS = 50
-#: by what part the second correction with one J must be less than the first, if those are to do
+#: by what part each correction with one J must be less than the one before it
 LESS = 0.1
 #: a tendon's turn up to which a correction is not damped
 SMALL = 0.05
@@ -222,15 +222,27 @@ def _solved(flexibility: Any, K_v: Any, K_u: Any, ab: Any, r: Any, r_s: Any, ten
         free = -_left(np.zeros(6), _levers(UNBENT, r, r_s)[0], K_v, K_u, ab, tension)
         return jnp.concatenate([dot(inverse(K_v), free[:3]), dot(inverse(K_u), free[3:])])
 
-    # written out: a loop's bookkeeping takes as long as a correction
+    def left_over(turned: Any, before: Any) -> Any:
+        """What is missing after a correction: with one J each is the same part of the one before it."""
+        less = turned * (turned / jnp.maximum(before, 1e-300))
+        return jnp.where(turned <= LESS * before, less, jnp.inf)
+
+    def converges(reached: Any) -> Any:
+        _, _, missing = reached
+        return (missing > MISSING) & (missing < jnp.inf)
+
+    def once_more(reached: Any) -> Any:
+        x, before, _ = reached
+        dx, turned = correction(x, flexibility)
+        return x + dx, turned, left_over(turned, before)
+
+    # those that do most often are written out: a loop's bookkeeping takes as long as a correction
     x = _in_turn(UNBENT + correction(UNBENT, flexibility)[0])
     dx, first = correction(x, flexibility)
     x, first = _in_turn((x + dx, first))
     dx, turned = correction(x, flexibility)
     x, turned = _in_turn((x + dx, turned))
-    # with one J, each correction is the same part of the one before it
-    less = turned <= LESS * first
-    missing = jnp.where(less, turned * (turned / jnp.maximum(first, 1e-300)), jnp.inf)
+    x, turned, missing = jax.lax.while_loop(converges, once_more, (x, turned, left_over(turned, first)))
     # near enough to go on from there
     begun = jnp.where(turned < SMALL, 1, 0)
     _, x, missing = jax.lax.while_loop(unsolved, corrected, (begun, x, missing))
