@@ -66,16 +66,21 @@ class StepProblem(eqx.Module):
         record = self._past_points(self.history[:1])[0]
         parts = in_two(at_point, s[0], (jnp.zeros(strand.y_layout.size), record))
 
-        def at(places: Any) -> Any:
-            found = jax.vmap(parts.first)(places.reshape(-1))
-            return [each.reshape(*places.shape, *each.shape[1:]) for each in found]
+        def at(*places: Any) -> list[Any]:
+            # together, to be compiled once
+            found = jax.vmap(parts.first)(jnp.concatenate([each.reshape(-1) for each in places]))
+            ends = np.cumsum([each.size for each in places])[:-1]
+            pieces = [jnp.split(each, ends) for each in found]
+            return [
+                [each[k].reshape(*like.shape, *each[k].shape[1:]) for each in pieces]
+                for k, like in enumerate(places)
+            ]
 
-        nodes = at(self._inside)
         if self.system.cuts:
-            begin, middle, end = map(at, self._part_places())
+            nodes, begin, middle, end = at(self._inside, *self._part_places())
         else:
+            nodes, middle = at(s, (s[:-1] + s[1:]) / 2)
             begin, end = ([each[rows] for each in nodes] for rows in (np.s_[:-1], np.s_[1:]))
-            middle = at((s[:-1] + s[1:]) / 2) if self.space.uses_middle else begin
         ahead = jax.tree.map(self._each_strand, (nodes, (begin, middle, end)))
         return dataclasses.replace(self, ahead=Ahead(parts.then, *ahead))
 
