@@ -50,16 +50,13 @@ def a_step(robot, space):
 
 
 #: the others take as long to compile, and are looked at in the long campaign
-SPACE = {
-    "crude": "rk4", "ribs, a sleeve and masses": "euler", "helical, one ends": "rk4", "friction": "euler",
-    "reel": "euler", "sections that are controlled": "rk4", "six legs": "euler",
-}  # fmt: skip
+QUICK = {("ribs, a sleeve and masses", "euler"), ("helical, one ends", "rk4"), ("six legs", "euler")}
 
 
 @pytest.mark.parametrize(
     ("name", "space"),
     [
-        pytest.param(name, space, marks=() if SPACE[name] == space else pytest.mark.campaign)
+        pytest.param(name, space, marks=() if (name, space) in QUICK else pytest.mark.campaign)
         for name in ROBOTS
         for space in ("euler", "rk4")
     ],
