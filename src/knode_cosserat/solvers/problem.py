@@ -76,11 +76,16 @@ class StepProblem(eqx.Module):
                 for k, like in enumerate(places)
             ]
 
+        # a scheme that asks only for what is known where a segment begins is given that for all of it
+        everywhere = self.space.uses_middle
         if self.system.cuts:
-            nodes, begin, middle, end = at(self._inside, *self._part_places())
+            places = self._part_places()
+            nodes, begin, *others = at(self._inside, *(places if everywhere else places[:1]))
         else:
-            nodes, middle = at(s, (s[:-1] + s[1:]) / 2)
+            nodes, *others = at(s, (s[:-1] + s[1:]) / 2) if everywhere else at(s)
             begin, end = ([each[rows] for each in nodes] for rows in (np.s_[:-1], np.s_[1:]))
+            others = [*others, end] if everywhere else []
+        middle, end = others or (begin, begin)
         ahead = jax.tree.map(self._each_strand, (nodes, (begin, middle, end)))
         return dataclasses.replace(self, ahead=Ahead(parts.then, *ahead))
 
