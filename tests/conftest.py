@@ -18,8 +18,12 @@ SOLVER = tuple(f"solvers.{name}" for name in ("boundary", "linear", "march", "pr
 
 install_import_hook([f"knode_cosserat.{name}" for name in EQUATIONS + SOLVER], "beartype.beartype")
 
-#: quick to compile; set before JAX is imported, and inherited by the programs that tests start
-QUICK = "--xla_backend_optimization_level=0"
+#: quick to compile: no effort for fast machine code, and for one core each, for the tests keep all of them
+#: busy; set before JAX is imported, and inherited by the programs that tests start
+QUICK = (
+    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false "
+    "--xla_cpu_parallel_codegen_split_count=1"
+)
 
 
 def pytest_configure(config):

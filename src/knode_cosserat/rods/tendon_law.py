@@ -13,8 +13,8 @@ least of the strictly convex energy ½ vᵀK_v v + ½ uᵀK_u u + Σ Tᵢ |ṗ�
 Tendons hardly turn against a rod, and so J hardly changes: most often the law is solved by three or four
 corrections with J where rod and tendons are not bent, `unbent_flexibility`. That depends on nothing that
 solvers iterate on, and they evaluate it once for a step (`solvers/ahead.py`). Where tendons turn so far that
-this converges slowly Newton's method goes on from there, each J used twice, and damped. The measure of it all
-is by how much, as a part, a correction changes ṗᵢ.
+this converges slowly Newton's method goes on from there, damped. The measure of it all is by how much, as a
+part, a correction changes ṗᵢ.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from jaxtyping import Float
 
 from knode_cosserat.rotation import dot, inverse, small_inverse
 
-#: pairs of corrections of Newton's method at most
+#: corrections of Newton's method at most
 ROUNDS = 50
 #: by what part each correction with one J must be less than the one before it
 LESS = 0.1
@@ -172,8 +172,8 @@ def _left(x: Any, g: Any, K_v: Any, K_u: Any, ab: Any, tension: Any) -> Float[An
     return elastic + dot(g, tension) - ab
 
 
-def _flexibility(g: Any, shorter: Any, K_v: Any, K_u: Any, r: Any, tension: Any) -> Float[Any, "6 6"]:
-    """J⁻¹."""
+def _stiffness(g: Any, shorter: Any, K_v: Any, K_u: Any, r: Any, tension: Any) -> Float[Any, "6 6"]:
+    """J."""
     rx, ry = _columns(r)
     o, one = jnp.zeros_like(rx), jnp.ones_like(rx)
     # rows of Wᵢ: apart from x, and so constants where r is
@@ -182,7 +182,17 @@ def _flexibility(g: Any, shorter: Any, K_v: Any, K_u: Any, r: Any, tension: Any)
     stiffer = jnp.sum(tension * shorter * (spread - g[:, None] * g[None, :]), axis=2)
     nothing = np.zeros((3, 3))
     upper, lower = jnp.concatenate([K_v, nothing], axis=1), jnp.concatenate([nothing, K_u], axis=1)
-    return small_inverse(jnp.concatenate([upper, lower]) + stiffer)
+    return jnp.concatenate([upper, lower]) + stiffer
+
+
+def _flexibility(g: Any, shorter: Any, K_v: Any, K_u: Any, r: Any, tension: Any) -> Float[Any, "6 6"]:
+    """J⁻¹."""
+    return small_inverse(_stiffness(g, shorter, K_v, K_u, r, tension))
+
+
+def _solved_by_cholesky(J: Any, right: Any) -> Float[Any, "6"]:
+    """J⁻¹ times a vector by the library: slower than an inverse that is written out, but quick to compile."""
+    return jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(J), True), right)
 
 
 #: what is computed is used as it is: XLA would otherwise do what is early again for all that is late
@@ -196,26 +206,29 @@ def _solved(flexibility: Any, K_v: Any, K_u: Any, ab: Any, r: Any, r_s: Any, ten
         """-J⁻¹ times what is left at x, and the largest |Wᵢ dx|/|ṗᵢ|: by how much it turns a tendon."""
         g, shorter = _levers(x, r, r_s)
         dx = -jnp.sum(flexibility * _left(x, g, K_v, K_u, ab, tension), axis=1)
+        return dx, turn(dx, shorter)
+
+    def turn(dx: Any, shorter: Any) -> Any:
         turned = jnp.stack(_turned(dx, r)) * shorter
-        return dx, jnp.sqrt(jnp.max(jnp.sum(turned * turned, axis=0)))
+        return jnp.sqrt(jnp.max(jnp.sum(turned * turned, axis=0)))
 
     def unsolved(reached: Any) -> Any:
         count, _, missing = reached
         return (count < ROUNDS) & ~(missing <= MISSING)
 
     def corrected(reached: Any) -> Any:
-        """One step of Newton's method, damped; where that was short, another with the same J."""
+        """One step of Newton's method, damped."""
         count, x, _ = reached
         x = jnp.where(count == 0, unturned(), x)
-        flexibility = _flexibility(*_levers(x, r, r_s), K_v, K_u, r, tension)
-        dx, first = correction(x, flexibility)
+        g, shorter = _levers(x, r, r_s)
+        J = _stiffness(g, shorter, K_v, K_u, r, tension)
+        dx = -_solved_by_cholesky(J, _left(x, g, K_v, K_u, ab, tension))
+        turned = turn(dx, shorter)
         # the damping that keeps a convex function with |f‴| ≤ 3 f″ going down (Sun & Tran-Dinh 2019)
-        near = first < SMALL
-        x = x + jnp.where(near, 1.0, jnp.log1p(3.0 * first) / jnp.maximum(3.0 * first, 1e-300)) * dx
-        dx, turned = correction(x, flexibility)
-        # the next correction would be about the last one times how much J has changed since (|t″| ≤ 3)
-        again = near & (turned <= first)
-        return count + 1, jnp.where(again, x + dx, x), 3.0 * first * jnp.where(again, turned, first)
+        near = turned < SMALL
+        x = x + jnp.where(near, 1.0, jnp.log1p(3.0 * turned) / jnp.maximum(3.0 * turned, 1e-300)) * dx
+        # the next correction would be about this one times how much J has changed since (|t″| ≤ 3)
+        return count + 1, x, jnp.where(near, 3.0 * turned * turned, jnp.inf)
 
     def unturned() -> Any:
         """Where the rod would be if its tendons had not turned: from far away a better beginning."""
@@ -225,7 +238,8 @@ def _solved(flexibility: Any, K_v: Any, K_u: Any, ab: Any, r: Any, r_s: Any, ten
     def left_over(turned: Any, before: Any) -> Any:
         """What is missing after a correction: with one J each is the same part of the one before it."""
         less = turned * (turned / jnp.maximum(before, 1e-300))
-        return jnp.where(turned <= LESS * before, less, jnp.inf)
+        # where nothing is missing both are rounding errors
+        return jnp.where(turned <= jnp.maximum(LESS * before, MISSING), jnp.minimum(less, turned), jnp.inf)
 
     def converges(reached: Any) -> Any:
         _, _, missing = reached
