@@ -36,7 +36,7 @@ test-all: $(READY) ## run all the tests, the long ones too
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile $(PYTEST_ARGS)
 
 samples: $(READY) ## run the long code of README, docs, examples and notebooks, which `make test` leaves out
-	$(BIN)/python -m pytest -n $(JOBS) --dist load -m campaign tests/test_docs.py tests/test_examples.py tests/test_notebooks.py
+	$(BIN)/python -m pytest -n $(JOBS) --dist load --quick -m campaign tests/test_docs.py tests/test_examples.py tests/test_notebooks.py
 
 lint: $(READY) ## check style and formatting
 	$(BIN)/ruff check

@@ -3,7 +3,7 @@
 Not the public functions: they say themselves, in one line, what is wrong with their arguments.
 
 Most of the time of the tests is compiling programs that run for milliseconds, so XLA is asked to spend less
-on optimising machine code. The long campaigns run what users run.
+on optimising machine code. The long campaigns run what users run, unless asked not to (`--quick`).
 """
 
 import gc
@@ -26,8 +26,13 @@ QUICK = (
 )
 
 
+def pytest_addoption(parser):
+    parser.addoption("--quick", action="store_true", help="compile quickly rather than well")
+
+
 def pytest_configure(config):
-    if "not campaign" in config.option.markexpr and "jax" not in sys.modules:
+    quick = config.option.quick or "not campaign" in config.option.markexpr
+    if quick and "jax" not in sys.modules:
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICK}".strip()
 
 
