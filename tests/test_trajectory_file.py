@@ -1,14 +1,11 @@
-import dataclasses
 import os
 import re
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any, ClassVar
 
 import h5py
 import hypothesis.strategies as st
-import jax
 import numpy as np
 import pytest
 import xarray
@@ -16,61 +13,9 @@ from hypothesis import given, settings
 
 import knode_cosserat as kc
 from knode_cosserat import trajectory_file
-from knode_cosserat.rods.parameters import parameter
-from knode_cosserat.solvers.time import Static, TimeScheme
-from knode_cosserat.trajectory_file import TrajectoryFileError, load_trajectory, save
-
-ROBOT = kc.load_robot("delrin-tendon-robot")
-PAPER = kc.Settings()
-ARRAYS = ("time", "y", "z", "control", "result", "residual", "iterations")
-
-
-def fails(*parts):
-    """A `TrajectoryFileError` of one line that has all the parts, in order."""
-    return pytest.raises(TrajectoryFileError, match=r"^(?!.*\n).*" + ".*".join(map(re.escape, parts)))
-
-
-def assert_same(a, b):
-    """Equal to the last bit, the sign of zeros and the payload of NaN included."""
-    for name in ARRAYS:
-        one, other = np.asarray(getattr(a, name)), np.asarray(getattr(b, name))
-        assert (one.dtype, one.shape) == (other.dtype, other.shape), name
-        assert one.tobytes() == other.tobytes(), name
-    assert a.settings == b.settings
-    assert jax.tree.structure(a.system) == jax.tree.structure(b.system)
-    for one, other in zip(jax.tree.leaves(a.system), jax.tree.leaves(b.system), strict=True):
-        assert np.array_equal(one, other)
-
-
-def synthetic(batch=(), steps=4, nodes=5, robot=ROBOT, settings=PAPER, seed=0):
-    """A trajectory of random numbers, and of what a file could spoil: -0, NaN, infinity, a subnormal."""
-    rng = np.random.default_rng(seed)
-    rows = (*batch, steps)
-    y = rng.normal(size=(*rows, nodes, robot.y_layout.size))
-    y.flat[:4] = [-0.0, np.nan, np.inf, 5e-324]
-    return kc.Trajectory(
-        system=robot,
-        settings=settings,
-        time=0.3 + np.arange(steps) * 0.1,
-        y=y,
-        z=rng.normal(size=(*rows, nodes, robot.z_layout.size)),
-        control=rng.uniform(size=(*rows, robot.control_size)),
-        result=rng.choice([int(result) for result in kc.Result], size=rows),
-        residual=rng.normal(size=rows),
-        iterations=rng.integers(0, 100, size=rows),
-    )
-
-
-def stacked(*robots):
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *robots)
-
-
-ROBOTS = stacked(
-    ROBOT,
-    ROBOT.replace(length=0.4, drag=[1.0, 2.0, 3.0], gravity=[0.0, 0.0, 0.0]),
-    ROBOT.replace(youngs_modulus=1e9 / 3, tendon_angles=[0.1, 0.2, 0.3, 0.4]),
-)
-
+from knode_cosserat.solvers.time import Static
+from knode_cosserat.trajectory_file import load_trajectory, save
+from tests.trajectories import ROBOT, ROBOTS, Leapfrog, Pendulum, assert_same, fails, stacked, synthetic
 
 # round trips
 
@@ -133,17 +78,6 @@ def test_settings_come_back_the_same(tmp_path, chosen):
     assert hash(loaded) == hash(chosen)
 
 
-@dataclasses.dataclass(frozen=True)
-class Leapfrog(TimeScheme):
-    """A user's scheme."""
-
-    weight: float = 0.5
-    order = 2
-
-    def coefficients(self, dt, previous_dt):
-        raise NotImplementedError
-
-
 def test_a_users_scheme_is_found_while_it_exists(tmp_path):
     path = tmp_path / "a.nc"
     trajectory = synthetic(settings=kc.Settings(time=Leapfrog(0.25)))
@@ -153,22 +87,6 @@ def test_a_users_scheme_is_found_while_it_exists(tmp_path):
         file.attrs["settings"] = file.attrs["settings"].replace("Leapfrog", "Hopfrog")
     with fails("attribute 'settings'", "no TimeScheme is called 'Hopfrog'", "BDF2"):
         load_trajectory(path)
-
-
-class Pendulum(kc.System):
-    """A class that no robot file can name, with z and controls that hold nothing."""
-
-    y_layout: ClassVar[kc.Layout] = kc.Layout(("angle", 1, "rad", "angle"), ("force", 3, "N", "force"))
-    z_layout: ClassVar[kc.Layout] = kc.Layout()
-    control_layout: ClassVar[kc.Layout] = kc.Layout()
-    base_unknowns: ClassVar[tuple[str, ...]] = ()
-    length: Any = parameter("m", "length", low=0.0, high=1.0)
-
-    def rest(self, s):
-        return np.zeros(4), np.zeros(0)
-
-    def tip(self, t, control, y, history):
-        return np.zeros(0)
 
 
 @pytest.mark.parametrize("batch", [(), (2,)])
@@ -299,167 +217,6 @@ def test_labels_of_a_batch_of_robots(tmp_path):
         assert data["robot_length"].attrs == {"units": "m", "long_name": "length of the rod"}
         assert data["robot_drag"].shape == (3, 3, 3)
         assert "robot_shear_modulus" not in data
-
-
-# errors
-
-
-@pytest.fixture
-def path(tmp_path):
-    path = tmp_path / "a.nc"
-    synthetic().save(path)
-    return path
-
-
-def edited(path, edit):
-    with h5py.File(path, "a") as file:
-        edit(file)
-    return path
-
-
-def test_files_that_are_something_else(tmp_path, path):
-    with fails("nothing.nc: no such file"):
-        load_trajectory(tmp_path / "nothing.nc")
-    with fails(str(tmp_path), "cannot be read"):
-        load_trajectory(tmp_path)
-    for content in (b"", b"CDF\x01 an older netCDF", b"time,p\n0,1\n"):
-        (tmp_path / "other.nc").write_bytes(content)
-        with fails("other.nc: not a netCDF-4 file"):
-            load_trajectory(tmp_path / "other.nc")
-    xarray.Dataset({"p": ("time", [1.0, 2.0])}).to_netcdf(tmp_path / "foreign.nc", engine="h5netcdf")
-    with fails("foreign.nc: not a trajectory of this package"):
-        load_trajectory(tmp_path / "foreign.nc")
-    with h5py.File(tmp_path / "plain.h5", "w") as file:
-        file["a"] = np.zeros((3, 3))
-    with fails("plain.h5: not a trajectory of this package"):
-        load_trajectory(tmp_path / "plain.h5")
-
-
-@pytest.mark.parametrize("part", [0.1, 0.5, 0.9, 0.999])
-def test_truncated_files(path, part):
-    content = path.read_bytes()
-    path.write_bytes(content[: int(part * len(content))])
-    with fails("a.nc: truncated or damaged: "):
-        load_trajectory(path)
-
-
-# h5netcdf stumbles once more when what it could not open is collected
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-@pytest.mark.parametrize("seed", range(20))
-def test_damaged_files_give_an_error_or_a_trajectory(path, seed):
-    rng = np.random.default_rng(seed)
-    content = bytearray(path.read_bytes())
-    for i in rng.integers(0, len(content), size=20):
-        content[i] = rng.integers(256)
-    path.write_bytes(content)
-    try:
-        load_trajectory(path)
-    except TrajectoryFileError as error:
-        assert "\n" not in str(error)  # noqa: PT017 - most seeds give an error, not all
-
-
-def test_newer_and_older_versions(path):
-    edited(path, lambda file: file.attrs.__setitem__("format_version", 2))
-    edited(path, lambda file: file.attrs.__setitem__("knode_cosserat_version", "9.1"))
-    with fails("a.nc: format_version is 2; allowed is 1", "knode-cosserat 9.1"):
-        load_trajectory(path)
-    edited(path, lambda file: file.attrs.__delitem__("format_version"))
-    with fails("a.nc: format_version is None; allowed is 1"):
-        load_trajectory(path)
-
-
-@pytest.mark.parametrize("name", ["time", "p", "u", "tension", "result", "residual", "iterations"])
-def test_missing_variables(path, name):
-    data = xarray.load_dataset(path, decode_cf=False)
-    data.drop_vars(name).to_netcdf(path, engine="h5netcdf")
-    with fails(f"a.nc: the variable '{name}' is missing"):
-        load_trajectory(path)
-
-
-def test_variables_of_another_shape_or_type(path):
-    data = xarray.load_dataset(path, decode_cf=False)
-    data.assign(n=(("time", "node", "a"), data["n"].values[..., :2])).to_netcdf(path, engine="h5netcdf")
-    with fails("a.nc: the variable 'n' has shape (4, 5, 2); allowed is (4, 5, 3)"):
-        load_trajectory(path)
-    data.assign(residual=data["result"].astype(str)).to_netcdf(path, engine="h5netcdf")
-    with fails("a.nc: the variable 'residual' has type", "allowed is numbers"):
-        load_trajectory(path)
-    data.assign(time=("time", np.zeros(4, dtype="S1"))).to_netcdf(path, engine="h5netcdf")
-    with fails("a.nc: the variable 'time' has"):
-        load_trajectory(path)
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "parts"),
-    [
-        ("robot", "format: 1\nkind: tendon-robt", ["attribute 'robot': ", "is missing"]),
-        ("robot", "[", ["attribute 'robot': line ", "not YAML"]),
-        ("robot", "format: 3\nkind: a\nparameters:\n", ["attribute 'robot': format is 3"]),
-        ("settings", "{", ["attribute 'settings' is not understood"]),
-        ("settings", "{}", ["attribute 'settings' is not understood", "time"]),
-        ("settings", "[1]", ["attribute 'settings' is not understood"]),
-        (
-            "settings",
-            '{"time": {"scheme": "BDFAlpha", "alpha": 2.0}}',
-            ["attribute 'settings'", "alpha is 2.0"],
-        ),
-        ("settings", '{"time": {"scheme": "BDF1", "magic": 2.0}}', ["attribute 'settings'", "magic"]),
-        ("settings", '{"time": {"scheme": "os.system"}}', ["attribute 'settings'", "'os.system'"]),
-    ],
-)
-def test_attributes_that_are_not_right(path, name, value, parts):
-    edited(path, lambda file: file.attrs.__setitem__(name, value))
-    with fails("a.nc: ", *parts):
-        load_trajectory(path)
-
-
-def test_robots_of_a_batch_that_are_not_right(tmp_path):
-    path = tmp_path / "a.nc"
-    synthetic((3,), robot=ROBOTS).save(path)
-    edited(path, lambda file: file["robot_length"].__setitem__(1, -1.0))
-    with fails("a.nc: a robot of the batch is not possible: length is -1.0", "0.001 to 20 m"):
-        load_trajectory(path)
-    data = xarray.load_dataset(path, decode_cf=False)
-    data.drop_vars("robot_drag").to_netcdf(path, engine="h5netcdf")
-    with fails("a.nc: the variable 'robot_drag' is missing"):
-        load_trajectory(path)
-
-
-def test_what_cannot_be_saved(tmp_path):
-    trajectory = synthetic()
-    with fails("a.nc: cannot be written: No such file or directory"):
-        trajectory.save(tmp_path / "no" / "a.nc")
-    (tmp_path / "folder.nc").mkdir()
-    with fails("folder.nc: cannot be written"):
-        trajectory.save(tmp_path / "folder.nc")
-    with fails("the trajectory's arrays do not fit together", "time"):
-        dataclasses.replace(trajectory, residual=np.zeros(3)).save(tmp_path / "a.nc")
-    with fails("the settings cannot be written"):
-        synthetic(settings=kc.Settings(time=Leapfrog(object()))).save(tmp_path / "a.nc")
-    assert os.listdir(tmp_path) == ["folder.nc"]
-
-
-@pytest.mark.parametrize(
-    "name", ["time", "result", "a/b", "force", "robot_length", "force_index", "system_bytes", "system_sizes"]
-)
-def test_fields_whose_names_are_taken(tmp_path, monkeypatch, name):
-    layout = kc.Layout(("angle", 1, "rad", "angle"), ("force", 3, "N", "force"), (name, 1, "1", "taken"))
-    monkeypatch.setattr(Pendulum, "y_layout", layout)
-    with fails(f"a Pendulum has a field '{name}'", "taken"):
-        synthetic(robot=Pendulum(0.5)).save(tmp_path / "a.nc")
-
-
-def test_a_crash_leaves_the_old_file(path, monkeypatch):
-    before = path.read_bytes()
-
-    def crash(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "replace", crash)
-    with fails("a.nc: cannot be written: No space left on device"):
-        synthetic(seed=1).save(path)
-    assert path.read_bytes() == before
-    assert os.listdir(path.parent) == ["a.nc"]
 
 
 def test_importing_the_package_loads_no_file_libraries():

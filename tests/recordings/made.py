@@ -3,11 +3,18 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from knode_cosserat.recordings import RecordingConfig
+from knode_cosserat.recordings import CommandSource, MarkerSource, RecordingConfig, TensionSource
 from knode_cosserat.recordings.write import Poses, Pulls, write_recording
 
 LENGTH = 0.635
 PAPER = RecordingConfig.paper_robot()
+#: of three tendons and one body that has no orientation
+SMALL = RecordingConfig(
+    markers=(MarkerSource("tip", "tip", 1.0),),
+    tension=TensionSource("tension", (1, 2, 3)),
+    command=CommandSource("command", (1, 2, 3), latency=0.04),
+    description="three tendons, one body",
+)
 #: the constant rotations of the bodies' axes, and where motion capture has the clamped end
 TURNED = Rotation.from_euler("z", [[0.0], [90.0], [180.0], [-90.0]], degrees=True)
 CLAMP = np.array([0.3, -0.2, 0.8])

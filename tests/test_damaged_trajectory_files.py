@@ -1,0 +1,169 @@
+import dataclasses
+import os
+
+import h5py
+import numpy as np
+import pytest
+import xarray
+
+import knode_cosserat as kc
+from knode_cosserat.trajectory_file import TrajectoryFileError, load_trajectory
+from tests.trajectories import ROBOTS, Leapfrog, Pendulum, fails, synthetic
+
+
+@pytest.fixture
+def path(tmp_path):
+    path = tmp_path / "a.nc"
+    synthetic().save(path)
+    return path
+
+
+def edited(path, edit):
+    with h5py.File(path, "a") as file:
+        edit(file)
+    return path
+
+
+def test_files_that_are_something_else(tmp_path, path):
+    with fails("nothing.nc: no such file"):
+        load_trajectory(tmp_path / "nothing.nc")
+    with fails(str(tmp_path), "cannot be read"):
+        load_trajectory(tmp_path)
+    for content in (b"", b"CDF\x01 an older netCDF", b"time,p\n0,1\n"):
+        (tmp_path / "other.nc").write_bytes(content)
+        with fails("other.nc: not a netCDF-4 file"):
+            load_trajectory(tmp_path / "other.nc")
+    xarray.Dataset({"p": ("time", [1.0, 2.0])}).to_netcdf(tmp_path / "foreign.nc", engine="h5netcdf")
+    with fails("foreign.nc: not a trajectory of this package"):
+        load_trajectory(tmp_path / "foreign.nc")
+    with h5py.File(tmp_path / "plain.h5", "w") as file:
+        file["a"] = np.zeros((3, 3))
+    with fails("plain.h5: not a trajectory of this package"):
+        load_trajectory(tmp_path / "plain.h5")
+
+
+@pytest.mark.parametrize("part", [0.1, 0.5, 0.9, 0.999])
+def test_truncated_files(path, part):
+    content = path.read_bytes()
+    path.write_bytes(content[: int(part * len(content))])
+    with fails("a.nc: truncated or damaged: "):
+        load_trajectory(path)
+
+
+# h5netcdf stumbles once more when what it could not open is collected
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize("seed", range(20))
+def test_damaged_files_give_an_error_or_a_trajectory(path, seed):
+    rng = np.random.default_rng(seed)
+    content = bytearray(path.read_bytes())
+    for i in rng.integers(0, len(content), size=20):
+        content[i] = rng.integers(256)
+    path.write_bytes(content)
+    try:
+        load_trajectory(path)
+    except TrajectoryFileError as error:
+        assert "\n" not in str(error)  # noqa: PT017 - most seeds give an error, not all
+
+
+def test_newer_and_older_versions(path):
+    edited(path, lambda file: file.attrs.__setitem__("format_version", 2))
+    edited(path, lambda file: file.attrs.__setitem__("knode_cosserat_version", "9.1"))
+    with fails("a.nc: format_version is 2; allowed is 1", "knode-cosserat 9.1"):
+        load_trajectory(path)
+    edited(path, lambda file: file.attrs.__delitem__("format_version"))
+    with fails("a.nc: format_version is None; allowed is 1"):
+        load_trajectory(path)
+
+
+@pytest.mark.parametrize("name", ["time", "p", "u", "tension", "result", "residual", "iterations"])
+def test_missing_variables(path, name):
+    data = xarray.load_dataset(path, decode_cf=False)
+    data.drop_vars(name).to_netcdf(path, engine="h5netcdf")
+    with fails(f"a.nc: the variable '{name}' is missing"):
+        load_trajectory(path)
+
+
+def test_variables_of_another_shape_or_type(path):
+    data = xarray.load_dataset(path, decode_cf=False)
+    data.assign(n=(("time", "node", "a"), data["n"].values[..., :2])).to_netcdf(path, engine="h5netcdf")
+    with fails("a.nc: the variable 'n' has shape (4, 5, 2); allowed is (4, 5, 3)"):
+        load_trajectory(path)
+    data.assign(residual=data["result"].astype(str)).to_netcdf(path, engine="h5netcdf")
+    with fails("a.nc: the variable 'residual' has type", "allowed is numbers"):
+        load_trajectory(path)
+    data.assign(time=("time", np.zeros(4, dtype="S1"))).to_netcdf(path, engine="h5netcdf")
+    with fails("a.nc: the variable 'time' has"):
+        load_trajectory(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "parts"),
+    [
+        ("robot", "format: 1\nkind: tendon-robt", ["attribute 'robot': ", "is missing"]),
+        ("robot", "[", ["attribute 'robot': line ", "not YAML"]),
+        ("robot", "format: 3\nkind: a\nparameters:\n", ["attribute 'robot': format is 3"]),
+        ("settings", "{", ["attribute 'settings' is not understood"]),
+        ("settings", "{}", ["attribute 'settings' is not understood", "time"]),
+        ("settings", "[1]", ["attribute 'settings' is not understood"]),
+        (
+            "settings",
+            '{"time": {"scheme": "BDFAlpha", "alpha": 2.0}}',
+            ["attribute 'settings'", "alpha is 2.0"],
+        ),
+        ("settings", '{"time": {"scheme": "BDF1", "magic": 2.0}}', ["attribute 'settings'", "magic"]),
+        ("settings", '{"time": {"scheme": "os.system"}}', ["attribute 'settings'", "'os.system'"]),
+    ],
+)
+def test_attributes_that_are_not_right(path, name, value, parts):
+    edited(path, lambda file: file.attrs.__setitem__(name, value))
+    with fails("a.nc: ", *parts):
+        load_trajectory(path)
+
+
+def test_robots_of_a_batch_that_are_not_right(tmp_path):
+    path = tmp_path / "a.nc"
+    synthetic((3,), robot=ROBOTS).save(path)
+    edited(path, lambda file: file["robot_length"].__setitem__(1, -1.0))
+    with fails("a.nc: a robot of the batch is not possible: length is -1.0", "0.001 to 20 m"):
+        load_trajectory(path)
+    data = xarray.load_dataset(path, decode_cf=False)
+    data.drop_vars("robot_drag").to_netcdf(path, engine="h5netcdf")
+    with fails("a.nc: the variable 'robot_drag' is missing"):
+        load_trajectory(path)
+
+
+def test_what_cannot_be_saved(tmp_path):
+    trajectory = synthetic()
+    with fails("a.nc: cannot be written: No such file or directory"):
+        trajectory.save(tmp_path / "no" / "a.nc")
+    (tmp_path / "folder.nc").mkdir()
+    with fails("folder.nc: cannot be written"):
+        trajectory.save(tmp_path / "folder.nc")
+    with fails("the trajectory's arrays do not fit together", "time"):
+        dataclasses.replace(trajectory, residual=np.zeros(3)).save(tmp_path / "a.nc")
+    with fails("the settings cannot be written"):
+        synthetic(settings=kc.Settings(time=Leapfrog(object()))).save(tmp_path / "a.nc")
+    assert os.listdir(tmp_path) == ["folder.nc"]
+
+
+@pytest.mark.parametrize(
+    "name", ["time", "result", "a/b", "force", "robot_length", "force_index", "system_bytes", "system_sizes"]
+)
+def test_fields_whose_names_are_taken(tmp_path, monkeypatch, name):
+    layout = kc.Layout(("angle", 1, "rad", "angle"), ("force", 3, "N", "force"), (name, 1, "1", "taken"))
+    monkeypatch.setattr(Pendulum, "y_layout", layout)
+    with fails(f"a Pendulum has a field '{name}'", "taken"):
+        synthetic(robot=Pendulum(0.5)).save(tmp_path / "a.nc")
+
+
+def test_a_crash_leaves_the_old_file(path, monkeypatch):
+    before = path.read_bytes()
+
+    def crash(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", crash)
+    with fails("a.nc: cannot be written: No space left on device"):
+        synthetic(seed=1).save(path)
+    assert path.read_bytes() == before
+    assert os.listdir(path.parent) == ["a.nc"]

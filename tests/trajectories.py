@@ -1,0 +1,92 @@
+"""Trajectories of random numbers to be saved, and what tests of their files have in common."""
+
+import dataclasses
+import re
+from typing import Any, ClassVar
+
+import jax
+import numpy as np
+import pytest
+
+import knode_cosserat as kc
+from knode_cosserat.rods.parameters import parameter
+from knode_cosserat.solvers.time import TimeScheme
+from knode_cosserat.trajectory_file import TrajectoryFileError
+
+ROBOT = kc.load_robot("delrin-tendon-robot")
+PAPER = kc.Settings()
+ARRAYS = ("time", "y", "z", "control", "result", "residual", "iterations")
+
+
+@dataclasses.dataclass(frozen=True)
+class Leapfrog(TimeScheme):
+    """A user's scheme."""
+
+    weight: float = 0.5
+    order = 2
+
+    def coefficients(self, dt, previous_dt):
+        raise NotImplementedError
+
+
+class Pendulum(kc.System):
+    """A class that no robot file can name, with z and controls that hold nothing."""
+
+    y_layout: ClassVar[kc.Layout] = kc.Layout(("angle", 1, "rad", "angle"), ("force", 3, "N", "force"))
+    z_layout: ClassVar[kc.Layout] = kc.Layout()
+    control_layout: ClassVar[kc.Layout] = kc.Layout()
+    base_unknowns: ClassVar[tuple[str, ...]] = ()
+    length: Any = parameter("m", "length", low=0.0, high=1.0)
+
+    def rest(self, s):
+        return np.zeros(4), np.zeros(0)
+
+    def tip(self, t, control, y, history):
+        return np.zeros(0)
+
+
+def fails(*parts):
+    """A `TrajectoryFileError` of one line that has all the parts, in order."""
+    return pytest.raises(TrajectoryFileError, match=r"^(?!.*\n).*" + ".*".join(map(re.escape, parts)))
+
+
+def assert_same(a, b):
+    """Equal to the last bit, the sign of zeros and the payload of NaN included."""
+    for name in ARRAYS:
+        one, other = np.asarray(getattr(a, name)), np.asarray(getattr(b, name))
+        assert (one.dtype, one.shape) == (other.dtype, other.shape), name
+        assert one.tobytes() == other.tobytes(), name
+    assert a.settings == b.settings
+    assert jax.tree.structure(a.system) == jax.tree.structure(b.system)
+    for one, other in zip(jax.tree.leaves(a.system), jax.tree.leaves(b.system), strict=True):
+        assert np.array_equal(one, other)
+
+
+def synthetic(batch=(), steps=4, nodes=5, robot=ROBOT, settings=PAPER, seed=0):
+    """A trajectory of random numbers, and of what a file could spoil: -0, NaN, infinity, a subnormal."""
+    rng = np.random.default_rng(seed)
+    rows = (*batch, steps)
+    y = rng.normal(size=(*rows, nodes, robot.y_layout.size))
+    y.flat[:4] = [-0.0, np.nan, np.inf, 5e-324]
+    return kc.Trajectory(
+        system=robot,
+        settings=settings,
+        time=0.3 + np.arange(steps) * 0.1,
+        y=y,
+        z=rng.normal(size=(*rows, nodes, robot.z_layout.size)),
+        control=rng.uniform(size=(*rows, robot.control_size)),
+        result=rng.choice([int(result) for result in kc.Result], size=rows),
+        residual=rng.normal(size=rows),
+        iterations=rng.integers(0, 100, size=rows),
+    )
+
+
+def stacked(*robots):
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *robots)
+
+
+ROBOTS = stacked(
+    ROBOT,
+    ROBOT.replace(length=0.4, drag=[1.0, 2.0, 3.0], gravity=[0.0, 0.0, 0.0]),
+    ROBOT.replace(youngs_modulus=1e9 / 3, tendon_angles=[0.1, 0.2, 0.3, 0.4]),
+)
