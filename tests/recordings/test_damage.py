@@ -178,10 +178,10 @@ def refusal(read):
 
 
 def survives(path, data, config):
-    """Whether a file loads; if it does not, by one line. It takes two seconds of work at most either way."""
+    """Whether a file loads; if it does not, by one line. It takes no longer than two seconds either way."""
     path.write_bytes(data)
     loaded = []
-    began = time.process_time()
+    began = time.perf_counter()
     said = refusal(lambda: loaded.append(kc.load_recording(path, config)))
     if said is None:
         loaded[0].health()
@@ -190,7 +190,7 @@ def survives(path, data, config):
     else:
         assert said.startswith(f"{path}: ")
         assert "\n" not in said
-    assert time.process_time() - began < 2.0
+    assert time.perf_counter() - began < 2.0
     return said is None
 
 
