@@ -202,13 +202,14 @@ _in_turn = jax.lax.optimization_barrier
 def _solved(flexibility: Any, K_v: Any, K_u: Any, ab: Any, r: Any, r_s: Any, tension: Any) -> Float[Any, "6"]:
     """The law's solution, from where rod and tendons are not bent."""
 
-    def correction(x: Any, flexibility: Any) -> tuple[Any, Any]:
-        """-J⁻¹ times what is left at x, and the largest |Wᵢ dx|/|ṗᵢ|: by how much it turns a tendon."""
+    def correction(x: Any) -> tuple[Any, Any]:
+        """Minus the flexibility times what is left at x, and by how much that turns a tendon."""
         g, shorter = _levers(x, r, r_s)
         dx = -jnp.sum(flexibility * _left(x, g, K_v, K_u, ab, tension), axis=1)
         return dx, turn(dx, shorter)
 
     def turn(dx: Any, shorter: Any) -> Any:
+        """The largest |Wᵢ dx|/|ṗᵢ|."""
         turned = jnp.stack(_turned(dx, r)) * shorter
         return jnp.sqrt(jnp.max(jnp.sum(turned * turned, axis=0)))
 
@@ -247,14 +248,14 @@ def _solved(flexibility: Any, K_v: Any, K_u: Any, ab: Any, r: Any, r_s: Any, ten
 
     def once_more(reached: Any) -> Any:
         x, before, _ = reached
-        dx, turned = correction(x, flexibility)
+        dx, turned = correction(x)
         return x + dx, turned, left_over(turned, before)
 
     # those that do most often are written out: a loop's bookkeeping takes as long as a correction
-    x = _in_turn(UNBENT + correction(UNBENT, flexibility)[0])
-    dx, first = correction(x, flexibility)
+    x = _in_turn(UNBENT + correction(UNBENT)[0])
+    dx, first = correction(x)
     x, first = _in_turn((x + dx, first))
-    dx, turned = correction(x, flexibility)
+    dx, turned = correction(x)
     x, turned = _in_turn((x + dx, turned))
     x, turned, missing = jax.lax.while_loop(converges, once_more, (x, turned, left_over(turned, first)))
     # near enough to go on from there
