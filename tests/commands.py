@@ -1,0 +1,36 @@
+"""The program, called in the process of the tests."""
+
+import json
+
+import pytest
+import typer.testing
+
+from knode_cosserat.cli import app
+
+ROBOT = "delrin-tendon-robot"
+COMMANDS = ("simulate", "equilibrium", "info", "reach", "workspace", "fit", "evaluate", "plot", "animate",
+            "inspect", "study simulation", "study imperfections", "study data", "study estimation",
+            "record-virtual", "schema", "doctor", "view")  # fmt: skip
+
+
+def run(*arguments):
+    """What the program prints and exits with, in this process."""
+    return typer.testing.CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def succeeded(*arguments):
+    result = run(*arguments)
+    assert result.exit_code == 0, result.stderr
+    assert result.stderr == ""
+    return result.stdout
+
+
+def told(*arguments):
+    """The one JSON object on stdout."""
+    text = succeeded(*arguments, "--json")
+    assert text.count("\n") == 1
+    return json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+
+
+def simulated(path, *more, controls="sine:0.5", steps=16):
+    return ("simulate", ROBOT, "--controls", controls, "--steps", steps, "--out", path, *more)

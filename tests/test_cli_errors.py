@@ -1,0 +1,112 @@
+"""What is wrong with a command is said in one line."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+import knode_cosserat as kc
+from tests.commands import ROBOT, run
+
+
+def bad_inputs():
+    simulation = ("simulate", ROBOT, "--out", "a.nc")
+    sine = (*simulation, "--controls", "sine:1.5")
+    full = (*sine, "--steps", "3")
+    return [
+        (("simulat",), "simulate"),
+        (("info", "--colour"), "--colour"),
+        ((*simulation, "--steps", "3"), "--controls"),
+        (("simulate", ROBOT, "--controls", "sine:1.5", "--steps", "3"), "--out"),
+        ((*sine, "--steps", "three"), "--steps"),
+        ((*sine, "--steps", "0"), "steps"),
+        ((*sine, "--steps", "-3"), "steps"),
+        ((*sine, "--steps", str(10**13)), "allocate"),
+        (sine, "number of steps"),
+        ((*full, "--dt", "0"), "dt is 0"),
+        ((*full, "--dt", "nan"), "dt is nan"),
+        ((*full, "--time", "rk4"), "trapezoidal"),
+        ((*full, "--space", "bdf2"), "rk4"),
+        ((*full, "--nodes", "1"), "nodes is 1"),
+        ((*full, "--set", "colour=red"), "no parameter 'colour'"),
+        ((*full, "--set", "length"), "NAME=VALUE"),
+        ((*full, "--set", "length=["), "NAME=VALUE"),
+        ((*full, "--set", "length=long"), "length is 'long'"),
+        ((*full, "--set", "length=-1"), "length is -1"),
+        ((*full, "--set", "youngs_modulus=2.7"), "youngs_modulus is 2.7"),
+        ((*full, "--figure", "a.doc"), ".png"),
+        ((*full, "--figure", "nowhere/a.png"), "no folder nowhere"),
+        (("simulate", ROBOT, "--controls", "sine:1.5", "--steps", "3", "--out", "nowhere/a.nc"), "no folder"),
+        (("simulate", ROBOT, "--controls", "sine:1.5", "--steps", "3", "--out", "."), "folder"),
+        ((*simulation, "--steps", "3", "--controls", "sinus:1.5"), "did you mean sine:PERIOD?"),
+        ((*simulation, "--steps", "3", "--controls", "nowhere.csv"), "no such signal or file"),
+        ((*simulation, "--controls", "broken.csv"), "broken.csv"),
+        (("simulate", "nobot", "--controls", "sine:1", "--steps", "3", "--out", "a.nc"), "nobot"),
+        (("simulate", "broken.yaml", "--controls", "sine:1", "--steps", "3", "--out", "a.nc"), "broken.yaml"),
+        (("equilibrium", ROBOT), "--tension"),
+        (("equilibrium", ROBOT, "--tension", "7,5"), "4 numbers"),
+        (("equilibrium", ROBOT, "--tension", "7,5,5,-7"), "0 or more"),
+        (("equilibrium", ROBOT, "--tension", "7,5,5,inf"), "0 or more"),
+        (("equilibrium", ROBOT, "--tension", "strong"), "strong"),
+        (("info", "nobot"), "the catalog has delrin-"),
+        (("info", "--set", "length=1"), "name it"),
+        (("fit", ROBOT, "nowhere.nc", "--out", "m"), "nowhere.nc: no such file"),
+        (("fit", ROBOT, "--out", "m"), "TRAJECTORY"),
+        (("fit", ROBOT, "broken.nc", "--out", "m"), "broken.nc: not a netCDF-4 file"),
+        (("fit", ROBOT, "broken.nc"), "--out"),
+        (("fit", ROBOT, "broken.nc", "--out", "nowhere/m"), "no folder nowhere"),
+        (("fit", ROBOT, "broken.nc", "--out", "m", "--preset", "worst"), "worst"),
+        (("fit", ROBOT, "broken.nc", "--out", "m", "--seeds", "a,b"), "whole numbers, such as 0,1,2"),
+        (("fit", ROBOT, "broken.nc", "--out", "m", "--seeds", "1,1"), "several different ones"),
+        (("fit", ROBOT, "broken.nc", "--out", "m", "--seed", "1", "--seeds", "1,2"), "give one of them"),
+        (("fit", ROBOT, "broken.nc", "--out", "m", "--seed", "-1"), "whole number from 0"),
+        (("fit", ROBOT, "broken.nc", "--out", "m", "--epochs", "5"), "the preset best has none"),
+        (("fit", ROBOT, "broken.nc", "--out", "m", "--preset", "paper", "--epochs", "0"), "epochs is 0"),
+        (("fit", "nobot", "broken.nc", "--out", "m"), "nobot"),
+        (("fit", "broken.model", "broken.nc", "--out", "m"), "broken.model"),
+        (("fit", ROBOT, "broken.nc", "--out", "broken.nc", "--seeds", "1,2"), "this is a file"),
+        (("info", "broken.model"), "broken.model"),
+        (("info", "."), "this is a folder"),
+        (("evaluate", ".", "broken.nc"), "no ensemble here"),
+        (("study",), "command"),
+        (("study", "simulation"), "--out"),
+        (("study", "simulation", "--out", "broken.nc"), "this is a file"),
+        (("study", "simulation", "--out", "o", "--seeds", "0"), "--seeds"),
+        (("study", "simulation", "--out", "o", "--methods", "best,worst"), "'worst' is unknown"),
+        (("study", "imperfections", "--out", "o", "--only", "damping,rust"), "'rust' is unknown"),
+        (("study", "data", "--out", "o", "--methods", "paper, no knowledge,magic"), "'magic' is unknown"),
+        (("study", "simulation", "--out", "o", "--workers", "2", "--dask", "a:1"), "give one of them"),
+        (("evaluate", "nowhere.nc", "nowhere.nc"), "nowhere.nc: no such file"),
+        (("evaluate", "nobot", "nowhere.nc"), "nobot"),
+        (("evaluate", ROBOT, "broken.nc"), "broken.nc: not a netCDF-4 file"),
+        (("evaluate", ROBOT), "REFERENCE"),
+        (("plot", "nowhere.nc", "--out", "a.png"), "nowhere.nc: no such file"),
+        (("plot", "broken.nc", "--out", "a.png"), "broken.nc: not a netCDF-4 file"),
+        (("plot", "broken.nc", "--out", "a"), "ends in .png"),
+        (("plot", "broken.nc", "--out", "a.png", "--kind", "cake"), "--kind"),
+    ]
+
+
+@pytest.mark.parametrize(("arguments", "words"), bad_inputs())
+@pytest.mark.parametrize("as_json", [False, True])
+def test_bad_input_gives_status_2_and_one_line(tmp_path, monkeypatch, arguments, words, as_json):
+    monkeypatch.chdir(tmp_path)
+    for name in ("broken.csv", "broken.yaml", "broken.nc"):
+        Path(name).write_text("this: [is\nnot right")
+    Path("broken.model").write_text("knode-cosserat model, format 1, package 0.1.0\nbroken")
+    # a group of commands has no --json
+    result = run(*arguments, *(["--json"] if as_json and arguments != ("study",) else []))
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    assert result.stderr.startswith("error: ")
+    assert words in result.stderr
+    assert result.stderr.count("\n") == 1 and result.stderr.endswith("\n")
+    assert not {"a.nc", "a.png", "m", "o"} & set(os.listdir())
+
+
+def test_a_mistake_of_ours_is_not_taken_for_one_of_the_users(monkeypatch):
+    def broken(name):
+        raise TypeError("a bug")
+
+    monkeypatch.setattr(kc, "load_robot", broken)
+    assert isinstance(run("info", ROBOT).exception, TypeError)
