@@ -36,6 +36,17 @@ def dot(matrix: Float[Any, "i j"], vector: Float[Any, " j"]) -> Float[Any, " i"]
     return total
 
 
+def dot_by_rows(matrix: Float[Any, "i j"], vector: Float[Any, " j"]) -> Float[Any, " i"]:
+    """The same product, each of its numbers by itself.
+
+    Where one matrix meets many vectors, such as slopes in all directions, XLA then vectorises over these.
+    """
+    factors = _parts(vector)
+    return jnp.stack(
+        [sum(a * b for a, b in zip(_parts(row), factors, strict=True)) for row in _parts(matrix)]
+    )
+
+
 def cross(a: Float[Any, "3"], b: Float[Any, "3"]) -> Float[Any, "3"]:
     """Cross product: the paper's hat operator applied, a × b = â b."""
     (ax, ay, az), (bx, by, bz) = _parts(a), _parts(b)

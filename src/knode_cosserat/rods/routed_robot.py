@@ -350,7 +350,7 @@ class RoutedTendonRobot(TendonRod):
         rates = [super().spatial_rates(s, y, y_t, z, z_t, control)]
         v, u = self.z_layout.get(z, "v"), self.z_layout.get(z, "u")
         if self.rubs:
-            turn = jnp.sqrt(jnp.sum(u[:2] ** 2) + STRAIGHT**2) - STRAIGHT
+            turn = jnp.sqrt(u[0] * u[0] + u[1] * u[1] + STRAIGHT**2) - STRAIGHT
             path = _or_zero(self.friction_wobble) + _or_zero(self.friction_curvature) * turn
             held = self.z_layout.get(z, "f")
             if self.vibrates:

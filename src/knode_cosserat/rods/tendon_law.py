@@ -27,7 +27,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Float
 
-from knode_cosserat.rotation import dot, inverse, small_inverse
+from knode_cosserat.rotation import dot, dot_by_rows, inverse, small_inverse
 
 #: corrections of Newton's method at most
 ROUNDS = 50
@@ -199,19 +199,28 @@ def _solved_by_cholesky(J: Any, right: Any) -> Float[Any, "6"]:
 _in_turn = jax.lax.optimization_barrier
 
 
+def _turn(dx: Any, shorter: Any, r: Any) -> Any:
+    """By how much dx turns a tendon: the largest |Wᵢ dx|/|ṗᵢ|."""
+    turned = jnp.stack(_turned(dx, r)) * shorter
+    return jnp.sqrt(jnp.max(jnp.sum(turned * turned, axis=0)))
+
+
+def _unturned(K_v: Any, K_u: Any, ab: Any, r: Any, r_s: Any, tension: Any) -> Float[Any, "6"]:
+    """Where the rod would be if its tendons had not turned: from far away a better beginning."""
+    free = -_left(np.zeros(6), _levers(UNBENT, r, r_s)[0], K_v, K_u, ab, tension)
+    return jnp.concatenate([dot(inverse(K_v), free[:3]), dot(inverse(K_u), free[3:])])
+
+
 def _solved(flexibility: Any, K_v: Any, K_u: Any, ab: Any, r: Any, r_s: Any, tension: Any) -> Float[Any, "6"]:
     """The law's solution, from where rod and tendons are not bent."""
+    law = flexibility, K_v, K_u, ab, r, r_s, tension
 
-    def correction(x: Any) -> tuple[Any, Any]:
+    def correction(x: Any, law: Any) -> tuple[Any, Any]:
         """Minus the flexibility times what is left at x, and by how much that turns a tendon."""
+        flexibility, K_v, K_u, ab, r, r_s, tension = law
         g, shorter = _levers(x, r, r_s)
         dx = -jnp.sum(flexibility * _left(x, g, K_v, K_u, ab, tension), axis=1)
-        return dx, turn(dx, shorter)
-
-    def turn(dx: Any, shorter: Any) -> Any:
-        """The largest |Wᵢ dx|/|ṗᵢ|."""
-        turned = jnp.stack(_turned(dx, r)) * shorter
-        return jnp.sqrt(jnp.max(jnp.sum(turned * turned, axis=0)))
+        return dx, _turn(dx, shorter, r)
 
     def unsolved(reached: Any) -> Any:
         count, _, missing = reached
@@ -219,22 +228,17 @@ def _solved(flexibility: Any, K_v: Any, K_u: Any, ab: Any, r: Any, r_s: Any, ten
 
     def corrected(reached: Any) -> Any:
         """One step of Newton's method, damped."""
-        count, x, _ = reached
-        x = jnp.where(count == 0, unturned(), x)
+        (count, x, _), (_, K_v, K_u, ab, r, r_s, tension) = _in_turn((reached, law))
+        x = jnp.where(count == 0, _unturned(K_v, K_u, ab, r, r_s, tension), x)
         g, shorter = _levers(x, r, r_s)
         J = _stiffness(g, shorter, K_v, K_u, r, tension)
         dx = -_solved_by_cholesky(J, _left(x, g, K_v, K_u, ab, tension))
-        turned = turn(dx, shorter)
+        turned = _turn(dx, shorter, r)
         # the damping that keeps a convex function with |f‴| ≤ 3 f″ going down (Sun & Tran-Dinh 2019)
         near = turned < SMALL
         x = x + jnp.where(near, 1.0, jnp.log1p(3.0 * turned) / jnp.maximum(3.0 * turned, 1e-300)) * dx
         # the next correction would be about this one times how much J has changed since (|t″| ≤ 3)
         return count + 1, x, jnp.where(near, 3.0 * turned * turned, jnp.inf)
-
-    def unturned() -> Any:
-        """Where the rod would be if its tendons had not turned: from far away a better beginning."""
-        free = -_left(np.zeros(6), _levers(UNBENT, r, r_s)[0], K_v, K_u, ab, tension)
-        return jnp.concatenate([dot(inverse(K_v), free[:3]), dot(inverse(K_u), free[3:])])
 
     def left_over(turned: Any, before: Any) -> Any:
         """What is missing after a correction: with one J each is the same part of the one before it."""
@@ -247,15 +251,16 @@ def _solved(flexibility: Any, K_v: Any, K_u: Any, ab: Any, r: Any, r_s: Any, ten
         return (missing > MISSING) & (missing < jnp.inf)
 
     def once_more(reached: Any) -> Any:
-        x, before, _ = reached
-        dx, turned = correction(x)
+        # with the law in turn: what a loop may never need XLA would otherwise evaluate before it
+        (x, before, _), own = _in_turn((reached, law))
+        dx, turned = correction(x, own)
         return x + dx, turned, left_over(turned, before)
 
     # those that do most often are written out: a loop's bookkeeping takes as long as a correction
-    x = _in_turn(UNBENT + correction(UNBENT)[0])
-    dx, first = correction(x)
+    x = _in_turn(UNBENT + correction(UNBENT, law)[0])
+    dx, first = correction(x, law)
     x, first = _in_turn((x + dx, first))
-    dx, turned = correction(x)
+    dx, turned = correction(x, law)
     x, turned = _in_turn((x + dx, turned))
     x, turned, missing = jax.lax.while_loop(converges, once_more, (x, turned, left_over(turned, first)))
     # near enough to go on from there
@@ -286,7 +291,7 @@ def _slope(primals: Any, tangents: Any) -> tuple[Any, Any]:
     moving = [p for m, p in zip(moves, primals, strict=True) if m]
     along = [t for m, t in zip(moves, tangents, strict=True) if m]
     _, change = jax.jvp(left, moving, along)
-    return x, -dot(_flexibility(g, shorter, K_v, K_u, r, tension), change)
+    return x, -dot_by_rows(_flexibility(g, shorter, K_v, K_u, r, tension), change)
 
 
 _solution.defjvp(_slope, symbolic_zeros=True)

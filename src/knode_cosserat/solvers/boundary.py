@@ -41,7 +41,7 @@ class NewtonOptions:
     acceptable: float = 1e-8
     max_linearisations: int = 12
     #: linearise again when the old linearisation is expected to need more corrections than this
-    patience: int = 6
+    patience: int = 8
     least_damping: float = 1e-3
     #: begin a step with the last one's linearisation, as long as it converges: many short steps of a rod with
     #: many nodes then take less time each. Residuals end up nearer to `tolerance`.

@@ -51,17 +51,26 @@ class LinearSolver(abc.ABC):
 
 
 class CondensedFactors(NamedTuple):
-    """F, the response X_j = ∂y_j/∂ξ at every node, the tip's matrix, and the inverse of ∂tip/∂ξ."""
+    """Fᵀ, the response X_j = ∂y_j/∂ξ at every node, the tip's matrix, and the inverse of ∂tip/∂ξ."""
 
-    F: Float[Any, "segments *strands b b"]
-    X: Float[Any, "k nodes y"]
+    Ft: Float[Any, "segments *strands b b"]
+    X: Float[Any, "nodes y k"]
     tip: Float[Any, "k y"]
     inverse: Float[Any, "k k"]
 
 
-def _product(F: Any, X: Any) -> Any:
-    """F @ X as a fused multiply and sum: for sizes this small the library's product is twice as slow."""
-    return jnp.sum(F[..., :, :, None] * X[..., None, :, :], axis=-2)
+# As sums of products: for sizes this small the library's products are twice as slow. From Fᵀ XLA vectorises over
+# the rows of F, which are neighbours then.
+
+
+def _product(Ft: Any, X: Any) -> Any:
+    """F X."""
+    return jnp.sum(Ft[..., :, :, None] * X[..., :, None, :], axis=-3)
+
+
+def _times(Ft: Any, x: Any) -> Any:
+    """F x."""
+    return jnp.sum(Ft * x[..., :, None], axis=-2)
 
 
 def _apply(F: Any, x: Any) -> Any:
@@ -80,37 +89,39 @@ class Condensed(LinearSolver):
     def start(self, linearisation, y_scale):  # type: ignore[no-untyped-def]
         """The response of every node to ξ and, in the same pass, to the residuals."""
         F, S, M, defects, tip = linearisation
-        k = S.shape[1]
+        k, of_strands = S.shape[1], F.shape[1:-1]
+        Ft = jnp.swapaxes(F, -1, -2)
 
         def along(X: Any, step: Any) -> Any:
-            F_j, r_j = step
-            X = _product(F_j, X).at[..., k].add(r_j)
+            Ft_j, r_j = step
+            X = _product(Ft_j, X).at[..., k].add(r_j)
             return X, X
 
-        first = jnp.concatenate([S, jnp.zeros((S.shape[0], 1))], axis=1).reshape(*F.shape[1:-1], k + 1)
-        last, X = jax.lax.scan(along, first, (F, defects.reshape(F.shape[:-1])))
+        first = jnp.concatenate([S, jnp.zeros((S.shape[0], 1))], axis=1).reshape(*of_strands, k + 1)
+        last, X = jax.lax.scan(along, first, (Ft, defects.reshape(-1, *of_strands)))
         X = jnp.concatenate([first[None], X]).reshape(-1, S.shape[0], k + 1)
-        X = jnp.transpose(X, (2, 0, 1))
-        at_tip = _product(M, last.reshape(S.shape[0], k + 1))
-        factors = CondensedFactors(F, X[:k], M, jnp.linalg.inv(at_tip[:, :k]))
-        return factors, *self._combine(factors, X[k], at_tip[:, k] + tip)
+        at_tip = _product(M.T, X[-1])
+        factors = CondensedFactors(Ft, X[..., :k], M, jnp.linalg.inv(at_tip[:, :k]))
+        return factors, *self._combine(factors, X[..., k], at_tip[:, k] + tip)
 
     @staticmethod
     def _combine(factors: CondensedFactors, w: Any, tip: Any) -> tuple[Any, Any]:
         dxi = -_apply(factors.inverse, tip)
-        return w + jnp.sum(factors.X * dxi[:, None, None], axis=0), dxi
+        return w + jnp.sum(factors.X * dxi, axis=-1), dxi
 
     def solve(self, factors, defects, tip):  # type: ignore[no-untyped-def]
         """The recursion for the residuals alone, then δξ from the tip."""
+        of_strands = factors.Ft.shape[1:-1]
 
         def along(w: Any, step: Any) -> Any:
-            F, r = step
-            w = carried(F, w) + r
+            Ft, r = step
+            w = _times(Ft, w) + r
             return w, w
 
-        last, w = jax.lax.scan(along, jnp.zeros(defects.shape[1]), (factors.F, defects))
-        w = jnp.concatenate([jnp.zeros((1, defects.shape[1])), w])
-        return self._combine(factors, w, _apply(factors.tip, last) + tip)
+        r = defects.reshape(-1, *of_strands)
+        last, w = jax.lax.scan(along, jnp.zeros(of_strands), (factors.Ft, r))
+        w = jnp.concatenate([jnp.zeros((1, defects.shape[1])), w.reshape(defects.shape)])
+        return self._combine(factors, w, _apply(factors.tip, last.reshape(-1)) + tip)
 
 
 class Groups(NamedTuple):
@@ -206,7 +217,7 @@ class Decoupled(LinearSolver):
         F = self._in_groups(F, jnp.eye(F.shape[-1]))
 
         def within(X: Any, F_i: Any) -> Any:
-            # as a sum of outer products: of many matrices at once it takes a quarter of `_product`'s time
+            # as a sum of outer products: of many matrices at once it takes a quarter of the time
             X = sum(F_i[..., :, j, None] * X[..., j, None, :] for j in range(F_i.shape[-1]))
             return X, X
 
