@@ -59,8 +59,8 @@ class CondensedFactors(NamedTuple):
     inverse: Float[Any, "k k"]
 
 
-# As sums of products: for sizes this small the library's products are twice as slow. From Fᵀ XLA vectorises over
-# the rows of F, which are neighbours then.
+# As sums of products: for sizes this small the library's products are twice as slow. From Fᵀ XLA vectorises
+# over the rows of F, which are neighbours then.
 
 
 def _product(Ft: Any, X: Any) -> Any:
@@ -98,7 +98,7 @@ class Condensed(LinearSolver):
             return X, X
 
         first = jnp.concatenate([S, jnp.zeros((S.shape[0], 1))], axis=1).reshape(*of_strands, k + 1)
-        last, X = jax.lax.scan(along, first, (Ft, defects.reshape(-1, *of_strands)))
+        _, X = jax.lax.scan(along, first, (Ft, defects.reshape(-1, *of_strands)))
         X = jnp.concatenate([first[None], X]).reshape(-1, S.shape[0], k + 1)
         at_tip = _product(M.T, X[-1])
         factors = CondensedFactors(Ft, X[..., :k], M, jnp.linalg.inv(at_tip[:, :k]))
