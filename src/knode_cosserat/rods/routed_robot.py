@@ -12,21 +12,8 @@ robot is ℓᵢ = ∫|ṗᵢ| ds. Either the tendon is taut and they are equal, 
 
     0 ≤ Tᵢ  ⊥  ℓᵢ* - dᵢ + C Tᵢ - ℓᵢ ≥ 0
 
-Friction. A tendon that slides loses tension on its way, as a rope on a capstan: τᵢ = Tᵢ exp(-λᵢ) with λᵢ_s
-= fᵢ (k + μ |u|), the wobble coefficient k and the curvature friction coefficient μ. fᵢ, from -1 to 1, is
-how much of the friction holds the tendon and which way. It is a memory, the part of z that remembers where
-the robot has come from: it grows as the rod bends in the tendon's direction eᵢ, up to where the tendon
-slides (an elastic, perfectly plastic element: Prandtl 1928)
-
-    fᵢ_t = eᵢ·u_t / κ₀    while |fᵢ| < 1
-
-so that a robot that is held stays where it is, whatever noise its tensions have. (Dahl's smooth law lets it
-creep: with it a step of 10 s was predicted with three times the error.) An equilibrium, with all rates
-zero, is the one without friction.
-
-Vibration. Above some tension of all tendons together robots begin to shake, and what shakes does not stick:
-x, from 0 to 1, is the part of the friction that is gone. It is a memory too, x_t = k_v (Σ Tᵢ - T_v), and
-takes a part c x Σ Tᵢ of the rod's stiffness with it.
+Friction and vibration are memories (`tendon_friction` has them): a tendon loses tension on its way, τᵢ =
+Tᵢ exp(-λᵢ). λ is a part of y; how much of the friction holds, f, and how much is shaken loose, x, of z.
 """
 
 from __future__ import annotations
@@ -45,12 +32,11 @@ from knode_cosserat.rods.rod import Rod
 from knode_cosserat.rods.routing import Routing, Straight, ends, routes
 from knode_cosserat.rods.section import Material
 from knode_cosserat.rods.system import History, System
+from knode_cosserat.rods.tendon_friction import held, loss_rates, shaking
 from knode_cosserat.rods.tendon_law import stretches, tendon_balance, tendon_strains, unbent_flexibility
 from knode_cosserat.rods.tendon_rod import TendonRod
 from knode_cosserat.rotation import dot
 
-#: turns (1/m) below this hardly count in friction, so that it has a slope everywhere
-STRAIGHT = 1e-2
 #: of the rod's length: how far slack and taut are blended, so that Newton's method has a slope between them
 BLEND = 1e-7
 #: points of Gauss's rule for the length of a tendon in the unloaded robot
@@ -60,8 +46,9 @@ GAUSS = 24
 class RoutedTendonRobot(TendonRod):
     """A round rod with tendons that run beside it, anywhere, and bend it, with friction where they run.
 
-    Without friction and vibration (the defaults) it has no memory beyond that of its damping. The module's
-    head has the equations. Tendons are at `tendon_offset` and `tendon_angles`, or where `routing` has them.
+    Without friction and vibration (the defaults) it has no memory beyond that of its damping. The heads of
+    this module and of `tendon_friction` have the equations. Tendons are at `tendon_offset` and
+    `tendon_angles`, or where `routing` has them.
     """
 
     routing: tuple[Routing, ...] | None = part(
@@ -334,28 +321,21 @@ class RoutedTendonRobot(TendonRod):
     def _vibration(self, y: Any, control: Any, history: History) -> Float[Any, " 1"]:
         total = jnp.sum(self.base_tension(y, control))
         growth = self.vibration_rate * (total - self.vibration_tension)
-        # at rest (c0 = 0) it has grown as far as it will
-        moving = history.c0 > 0.0
-        grown = (growth - self.z_layout.get(history.z, "x")) / jnp.where(moving, history.c0, 1.0)
-        return jnp.clip(jnp.where(moving, grown, jnp.sign(growth)), 0.0, 1.0)
+        return shaking(growth, self.z_layout.get(history.z, "x"), history.c0)
 
     def _friction(self, s: Any, u_t: Float[Any, "3"], history: History) -> Float[Any, " c"]:
-        rate = dot(self.bending_directions(s), u_t) / self.friction_reach
-        moving = history.c0 > 0.0
-        held = (rate - self.z_layout.get(history.z, "f")) / jnp.where(moving, history.c0, 1.0)
-        return jnp.where(moving, jnp.clip(held, -1.0, 1.0), 0.0)
+        bending = dot(self.bending_directions(s), u_t) / self.friction_reach
+        return held(bending, self.z_layout.get(history.z, "f"), history.c0)
 
     def spatial_rates(self, s, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
         """Those of the rod, of the tension, and of the tendons' way."""
         rates = [super().spatial_rates(s, y, y_t, z, z_t, control)]
         v, u = self.z_layout.get(z, "v"), self.z_layout.get(z, "u")
         if self.rubs:
-            turn = jnp.sqrt(u[0] * u[0] + u[1] * u[1] + STRAIGHT**2) - STRAIGHT
-            path = _or_zero(self.friction_wobble) + _or_zero(self.friction_curvature) * turn
-            held = self.z_layout.get(z, "f")
+            f = self.z_layout.get(z, "f")
             if self.vibrates:
-                held = held * (1.0 - self.z_layout.get(z, "x"))
-            rates.append(path * held)
+                f = f * (1.0 - self.z_layout.get(z, "x"))
+            rates.append(loss_rates(u, f, self.friction_wobble, self.friction_curvature))
         if self.drive == "reel":
             way = stretches(v, u, *map(jnp.asarray, self.routes_at(s)))
             rates += [jnp.zeros(self.tendon_count), self._where_it_runs(s, way)]
@@ -388,7 +368,3 @@ class RoutedTendonRobot(TendonRod):
         """Tension of a rod's own force, ways of its length."""
         more = {"loss": 1.0, "tension": sizes["n"], "path": sizes["p"], "slack": sizes["p"]}
         return more[name] if name in more else super().scale_of(name, sizes)
-
-
-def _or_zero(value: Any) -> Any:
-    return 0.0 if value is None else value
