@@ -1,4 +1,4 @@
-"""The memories of tendons in their holes by themselves: an elastic, perfectly plastic element, and shaking."""
+"""The memories of tendons in their holes by themselves: elastic, perfectly plastic friction, and shaking."""
 
 import hypothesis
 import hypothesis.strategies as st
