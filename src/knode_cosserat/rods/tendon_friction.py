@@ -32,22 +32,24 @@ STRAIGHT = 1e-2
 
 def held(bending: Float[Any, " c"], past: Float[Any, " c"], c0: Any) -> Float[Any, " c"]:
     """fᵢ from eᵢ·u_t / κ₀ (1/s): none at rest."""
-    moving = c0 > 0.0
-    found = (bending - past) / jnp.where(moving, c0, 1.0)
-    return jnp.where(moving, jnp.clip(found, -1.0, 1.0), 0.0)
+    return jnp.clip(_grown(bending, past, c0, at_rest=0.0), -1.0, 1.0)
 
 
-def loss_rates(u: Float[Any, "3"], held: Float[Any, " c"], wobble: Any, curvature: Any) -> Float[Any, " c"]:
-    """λᵢ_s (1/m) where the curvature is u (1/m) and fᵢ of the friction holds; k and μ may be None."""
+def loss_rates(u: Float[Any, "3"], f: Float[Any, " c"], wobble: Any, curvature: Any) -> Float[Any, " c"]:
+    """λᵢ_s (1/m) where the curvature is u (1/m) and f of the friction holds; k and μ may be None."""
     turn = jnp.sqrt(u[0] * u[0] + u[1] * u[1] + STRAIGHT**2) - STRAIGHT
-    return (_or_zero(wobble) + _or_zero(curvature) * turn) * held
+    return (_or_zero(wobble) + _or_zero(curvature) * turn) * f
 
 
 def shaking(growth: Any, past: Float[Any, " 1"], c0: Any) -> Float[Any, " 1"]:
     """x from its rate k_v (Σ Tᵢ - T_v) (1/s): at rest it has grown as far as it will."""
+    return jnp.clip(_grown(growth, past, c0, at_rest=jnp.sign(growth)), 0.0, 1.0)
+
+
+def _grown(rate: Any, past: Any, c0: Any, at_rest: Any) -> Any:
+    """What a memory is by its rate, were there no bounds."""
     moving = c0 > 0.0
-    grown = (growth - past) / jnp.where(moving, c0, 1.0)
-    return jnp.clip(jnp.where(moving, grown, jnp.sign(growth)), 0.0, 1.0)
+    return jnp.where(moving, (rate - past) / jnp.where(moving, c0, 1.0), at_rest)
 
 
 def _or_zero(value: Any) -> Any:

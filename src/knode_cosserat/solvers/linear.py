@@ -217,7 +217,7 @@ class Decoupled(LinearSolver):
         F = self._in_groups(F, jnp.eye(F.shape[-1]))
 
         def within(X: Any, F_i: Any) -> Any:
-            # as a sum of outer products: of many matrices at once it takes a quarter of the time
+            # as a sum of outer products: of many matrices at once a quarter of a summed product's time
             X = sum(F_i[..., :, j, None] * X[..., j, None, :] for j in range(F_i.shape[-1]))
             return X, X
 
