@@ -152,9 +152,12 @@ def test_a_mass_at_rest_is_its_weight():
     np.testing.assert_allclose(field(body, "m")[-1], expected, rtol=1e-7, atol=1e-8 * EI / L)
 
 
-def test_the_wrench_of_a_moving_body_is_the_rate_of_its_momentum():
+@pytest.mark.parametrize("offset", [None, [0.05, -0.02, 0.08]])
+@pytest.mark.parametrize("inertia", [None, [2e-3, 3e-3, 1e-3]])
+def test_the_wrench_of_a_moving_body_is_the_rate_of_its_momentum(offset, inertia):
     """Momentum and angular momentum of a body that tumbles along a path, differentiated numerically."""
-    mass, r, I, g = 0.3, np.array([0.05, -0.02, 0.08]), np.array([2e-3, 3e-3, 1e-3]), np.array([1.0, 2, -9])
+    mass, g = 0.3, np.array([1.0, 2, -9])
+    r, I = (np.zeros(3) if given is None else np.array(given) for given in (offset, inertia))
 
     def pose(t):
         p = np.array([np.sin(2 * t), t**2, np.cos(3 * t)])
@@ -181,7 +184,7 @@ def test_the_wrench_of_a_moving_body_is_the_rate_of_its_momentum():
     t = 0.7
     p, R = pose(t)
     q, w, q_t, w_t = np.split(np.concatenate([velocities(t), rate(velocities, t)]), 4)
-    body = AttachedMass(mass=mass, offset=r, inertia=I)
+    body = AttachedMass(mass=mass, offset=offset, inertia=inertia)
     force, moment = body.wrench(Motion(p, R, q, w, q_t, w_t), g, np.zeros(0))
     weight = np.concatenate([mass * g, np.cross(p + R @ r, mass * g)])
     taken = weight - rate(momentum, t, 1e-3)
@@ -194,11 +197,15 @@ def test_loads_at_one_place_do_what_each_does():
     motion = Motion(rng.normal(size=3), Rotation.random(rng=rng).as_matrix(), *rng.normal(size=(4, 3)))
     gravity = np.array([1.0, 2.0, -9.0])
     loads = [
-        AttachedMass(mass=rng.uniform(0.1, 1.0), offset=rng.normal(size=3), inertia=rng.uniform(size=3))
-        for _ in range(3)
+        AttachedMass(mass=rng.uniform(0.1, 1.0), offset=rng.normal(size=3), inertia=rng.uniform(size=3)),
+        AttachedMass(mass=rng.uniform(0.1, 1.0), offset=rng.normal(size=3)),
+        AttachedMass(mass=rng.uniform(0.1, 1.0)),
+        AttachedMass(mass=rng.uniform(0.1, 1.0), inertia=rng.uniform(size=3)),
     ]
     loads.append(PointWrench(force=rng.normal(size=3), moment=rng.normal(size=3), follows=True))
-    acting = [(load, weight, np.zeros(0)) for load, weight in zip(loads, [1.0, 0.0, 1.0, 1.0], strict=True)]
+    acting = [
+        (load, weight, np.zeros(0)) for load, weight in zip(loads, [1.0, 0.0, 1.0, 0.5, 1.0], strict=True)
+    ]
     force, moment = point_wrench(acting, motion, gravity)
     each = [(weight, load.wrench(motion, gravity, control)) for load, weight, control in acting]
     np.testing.assert_allclose(force, sum(weight * own.force for weight, own in each), rtol=1e-12)

@@ -7,10 +7,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import knode_cosserat as kc
 from knode_cosserat.solvers.boundary import residuals
-from knode_cosserat.solvers.march import advanced, history_of, initial_past, march_many, rest_record
+from knode_cosserat.solvers.march import (
+    EXTRAPOLATIONS,
+    advanced,
+    history_of,
+    initial_past,
+    march_many,
+    rest_record,
+    weights_by,
+)
 from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.recovery import _continue_load, _Step, _substeps
 from knode_cosserat.solvers.run import _padded
@@ -196,13 +206,26 @@ def test_equilibria_in_a_batch(robot):
 def test_the_past_keeps_the_newest_first(robot):
     past = initial_past(robot, rest_record(robot), jnp.zeros(4))
     record = past.records[0] + 1.0
-    after = advanced(past, record, past.unknowns[0] + 1.0, past.rate, past.order)
+    after = advanced(past, record, past.rate, past.weights)
     np.testing.assert_array_equal(after.records[0], record)
     np.testing.assert_array_equal(after.records[1], past.records[0])
     ones = jnp.array([2.0, 3.0, 5.0, 0.0])
     np.testing.assert_allclose(
         history_of(after, ones, Settings()), 3.0 * after.records[0] + 5.0 * after.records[1]
     )
+
+
+@pytest.mark.parametrize(("misfit", "order"), [([1e-2, 1e-5, 1e-3], 1), ([0.0, 1e-3, 1e-2], 0)])
+def test_the_first_guess_trusts_what_was_right_before(misfit, order):
+    weights = weights_by(np.array(misfit))
+    np.testing.assert_allclose(weights, EXTRAPOLATIONS[order], atol=1e-4)
+
+
+@given(st.lists(st.floats(0.0, 1e3), min_size=len(EXTRAPOLATIONS), max_size=len(EXTRAPOLATIONS)))
+def test_the_first_guess_of_what_stands_still_is_where_it_stands(misfit):
+    weights = np.asarray(weights_by(np.array(misfit)))
+    assert weights.sum() == pytest.approx(1.0, abs=1e-12)
+    assert np.abs(weights).sum() <= np.abs(EXTRAPOLATIONS).sum(axis=1).max() + 1e-12
 
 
 # bad input

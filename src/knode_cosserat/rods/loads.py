@@ -52,13 +52,26 @@ class Wrench(NamedTuple):
 
 
 class Body(NamedTuple):
-    """A rigid body by its moments about a point of the rod, material frame; bodies at one point add up."""
+    """A rigid body by its moments about a point of the rod, material frame; bodies at one point add up.
+
+    None where there is none: what only has a mass, as most ribs, takes a third of the equations.
+    """
 
     mass: Any
     #: mass times its centre's place (kg·m)
-    first: Float[Any, "3"]
+    first: Float[Any, "3"] | None
     #: moments of inertia about the point (kg·m²)
-    inertia: Float[Any, "3 3"]
+    inertia: Float[Any, "3 3"] | None
+
+    @classmethod
+    def of(cls, bodies: list[tuple[Body, Any]]) -> Body:
+        """Bodies as one, each times its weight."""
+        found = []
+        for moments in zip(*(body for body, _ in bodies), strict=True):
+            weighed = zip(moments, (weight for _, weight in bodies), strict=True)
+            own = [weight * moment for moment, weight in weighed if moment is not None]
+            found.append(sum(own) if own else None)
+        return cls(*found)
 
     def wrench(self, motion: Motion, gravity: Any) -> Wrench:
         """Weight less what its motion takes: F = m a - ω_t × S - ω × (ω × S), M = S × a - (J ω_t + ω × J ω).
@@ -68,9 +81,13 @@ class Body(NamedTuple):
         _, R, q, w, q_t, w_t = motion
         S, J = self.first, self.inertia
         a = dot(R.T, jnp.asarray(gravity)) - q_t - cross(w, q)
-        force = self.mass * a - cross(w_t, S) - cross(w, cross(w, S))
-        moment = cross(S, a) - (dot(J, w_t) + cross(w, dot(J, w)))
-        return Wrench(dot(R, force), dot(R, moment))
+        force, moments = self.mass * a, []
+        if S is not None:
+            force = force - cross(w_t, S) - cross(w, cross(w, S))
+            moments.append(cross(S, a))
+        if J is not None:
+            moments.append(-(dot(J, w_t) + cross(w, dot(J, w))))
+        return Wrench(dot(R, force), dot(R, sum(moments)) if moments else jnp.zeros(3))
 
 
 class Load(Part):
@@ -171,20 +188,22 @@ class AttachedMass(PointLoad):
 
     mass: Any = parameter("kg", "mass", low=0.0, high=1e4, default=0.0)
     inertia: Any = parameter(
-        "kg m2", "moments of inertia about its centre", shape="vector", low=0.0, high=1e6,
-        default=(0.0, 0.0, 0.0),
+        "kg m2", "moments of inertia about its centre", shape="vector", low=0.0, high=1e6, default=None
     )  # fmt: skip
     offset: Any = parameter(
         "m", "its centre of mass from the rod's axis, material frame", shape="vector", low=-10.0, high=10.0,
-        default=(0.0, 0.0, 0.0),
+        default=None,
     )  # fmt: skip
 
     @property
     def body(self) -> Body:
         """About the rod's axis, the material's axes."""
-        r, I = jnp.asarray(self.offset), jnp.asarray(self.inertia)
+        J = None if self.inertia is None else np.eye(3) * jnp.asarray(self.inertia)
+        if self.offset is None:
+            return Body(self.mass, None, J)
+        r = jnp.asarray(self.offset)
         off_axis = self.mass * (jnp.sum(r * r) * np.eye(3) - r[:, None] * r)
-        return Body(self.mass, self.mass * r, np.eye(3) * I + off_axis)
+        return Body(self.mass, self.mass * r, off_axis if J is None else J + off_axis)
 
     def wrench(self, motion: Motion, gravity: Any, control: Any) -> Wrench:
         """Weight less what its motion takes."""
@@ -197,11 +216,11 @@ def point_wrench(acting: list[tuple[Any, Any, Any]], motion: Motion, gravity: An
     for load, weight, control in acting:
         body = load.body
         if body is not None:
-            bodies.append([weight * moment for moment in body])
+            bodies.append((body, weight))
             continue
         own = load.wrench(motion, gravity, control)
         total = total + Wrench(weight * own.force, weight * own.moment)
     if bodies:
         # as one: their equations are compiled once, however many there are
-        total = total + Body(*(sum(moments) for moments in zip(*bodies, strict=True))).wrench(motion, gravity)
+        total = total + Body.of(bodies).wrench(motion, gravity)
     return total

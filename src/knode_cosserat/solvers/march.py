@@ -17,10 +17,15 @@ from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import Euler
 from knode_cosserat.solvers.time import BDF1
 
-#: how many past states the warm start looks at, and the extrapolations it chooses from: constant, linear,
-#: quadratic in time
+#: how many past states the first guess of a step looks at, and the extrapolations it is a mean of: constant,
+#: linear, quadratic in time
 PAST = 3
 EXTRAPOLATIONS = np.array([[1.0, 0.0, 0.0], [2.0, -1.0, 0.0], [3.0, -3.0, 1.0]])
+#: the mean is by this power of how far each was off in the newest step: a lower one lets a bad one in, a
+#: higher one trusts chance
+TRUST = -3
+#: misfits below this are rounding errors (natural units)
+ROUNDING = 1e-12
 
 
 class Past(NamedTuple):
@@ -28,9 +33,8 @@ class Past(NamedTuple):
 
     records: Float[Any, "past nodes x"]
     rate: Float[Any, "nodes x"]
-    unknowns: Float[Any, "past k"]
-    #: the extrapolation that would have been best for the newest step
-    order: Int[Any, ""]
+    #: what each state counts in the first guess of the next step
+    weights: Float[Any, " past"]
     #: time of row 0 (s): step i ends at t0 + (i + 1) dt
     t0: Float[Any, ""]
 
@@ -63,12 +67,8 @@ def initial_past(system: System, record: Any, control: Any) -> Past:
         nothing = jnp.zeros((system.nodes, ny + nz + ny))
         still = StepProblem(system, jnp.zeros(()), control, jnp.zeros(()), nothing, Euler())
         record = jnp.concatenate([record, still.record(record[:, :ny])[:, ny + nz :]], axis=1)
-    unknowns = system.unknowns(record[0, :ny])
-    # an order of a definite type: a weak one would cost a second compilation when a march goes on
-    order = jnp.zeros((), dtype=int)
-    return Past(
-        jnp.stack([record] * PAST), jnp.zeros_like(record), jnp.stack([unknowns] * PAST), order, jnp.zeros(())
-    )
+    weights = jnp.asarray(EXTRAPOLATIONS[0])
+    return Past(jnp.stack([record] * PAST), jnp.zeros_like(record), weights, jnp.zeros(()))
 
 
 def going_on_past(system: System, settings: Settings, dt: float, records: Any, t0: Any) -> Past:
@@ -76,8 +76,7 @@ def going_on_past(system: System, settings: Settings, dt: float, records: Any, t
 
     The rate of a row is its scheme's own, from the first row on, where there was none.
     """
-    newest = [records[max(-k, -len(records))] for k in (1, 2, 3)]
-    unknowns = [system.unknowns(record[0, : system.y_layout.size]) for record in newest]
+    newest = [records[max(-k, -len(records))] for k in range(1, PAST + 1)]
     rate = jnp.zeros_like(newest[0])
     if settings.time.uses_rate:
         table = jnp.asarray(coefficient_table(settings, dt))
@@ -90,8 +89,8 @@ def going_on_past(system: System, settings: Settings, dt: float, records: Any, t
 
         rows = (jnp.arange(len(records) - 1), records[1:], before[1:], before[:-1])
         rate, _ = jax.lax.scan(one, rate, rows)
-    order = jnp.ones((), dtype=int)
-    return Past(jnp.stack(newest), rate, jnp.stack(unknowns), order, jnp.asarray(t0, dtype=float))
+    weights = jnp.asarray(EXTRAPOLATIONS[1])
+    return Past(jnp.stack(newest), rate, weights, jnp.asarray(t0, dtype=float))
 
 
 def coefficient_table(settings: Settings, dt: float) -> np.ndarray:
@@ -108,13 +107,12 @@ def history_of(past: Past, coefficients: Any, settings: Settings) -> Any:
     return history + d1 * past.rate if settings.time.uses_rate else history
 
 
-def advanced(past: Past, record: Any, unknowns: Any, rate: Any, order: Any) -> Past:
+def advanced(past: Past, record: Any, rate: Any, weights: Any) -> Past:
     """The past of the next step."""
     return past._replace(
         records=jnp.concatenate([record[None], past.records[:-1]]),
         rate=rate,
-        unknowns=jnp.concatenate([unknowns[None], past.unknowns[:-1]]),
-        order=order,
+        weights=weights,
     )
 
 
@@ -126,19 +124,25 @@ def step(
     ny = system.y_layout.size
     history = history_of(past, coefficients, settings)
     problem = StepProblem(system, t, control, coefficients[0], history, settings.space).ready()
+    recent = past.records[:, :, :ny]
     # as sums of products, not as matrix products: XLA fuses these with what follows
-    guesses = jnp.sum(EXTRAPOLATIONS[:, :, None, None] * past.records[None, :, :, :ny], axis=1)
-    weights = jnp.asarray(EXTRAPOLATIONS)[past.order]
-    guess = jnp.sum(weights[:, None, None] * past.records[:, :, :ny], axis=0)
-    unknowns = jnp.sum(weights[:, None] * past.unknowns, axis=0)
+    guess = jnp.sum(past.weights[:, None, None] * recent, axis=0)
+    unknowns = system.unknowns(guess[0])
     solution, kept = newton_keeping(problem, guess, unknowns, settings.elimination, settings.newton, kept)
     record = problem.record(solution.y)
     scale = system.scales().y
-    misfit = jnp.max(jnp.abs(guesses - solution.y) / scale, axis=(1, 2))
     rate = coefficients[0] * record + history if settings.time.uses_rate else past.rate
     size = jnp.max(jnp.abs(solution.y) / scale)
     row = Rows(record, solution.unknowns, solution.error, solution.corrections, size)
-    return advanced(past, record, solution.unknowns, rate, jnp.argmin(misfit)), row, kept
+    extrapolated = jnp.sum(EXTRAPOLATIONS[:, :, None, None] * recent, axis=1)
+    weights = weights_by(jnp.max(jnp.abs(extrapolated - solution.y) / scale, axis=(1, 2)))
+    return advanced(past, record, rate, weights), row, kept
+
+
+def weights_by(misfit: Float[Any, " extrapolations"]) -> Float[Any, " past"]:
+    """What each past state counts in the mean of the extrapolations, by how far these were off."""
+    trust = jnp.maximum(misfit / jnp.maximum(jnp.min(misfit), ROUNDING), 1.0) ** TRUST
+    return jnp.sum((trust / jnp.sum(trust))[:, None] * EXTRAPOLATIONS, axis=0)
 
 
 def _none_kept(system: System, settings: Settings, past: Past, control: Any) -> Kept | None:
@@ -148,14 +152,14 @@ def _none_kept(system: System, settings: Settings, past: Past, control: Any) -> 
     zero = jnp.zeros(())
     problem = StepProblem(system, zero, control, zero, jnp.zeros_like(past.records[0]), settings.space)
     y = past.records[0, :, : system.y_layout.size]
-    return none_kept(problem, y, past.unknowns[0], settings.elimination)
+    return none_kept(problem, y, system.unknowns(y[0]), settings.elimination)
 
 
-def _no_rows(shape: tuple[int, ...], past: Past) -> Rows:
+def _no_rows(system: System, shape: tuple[int, ...], past: Past) -> Rows:
     """Rows of zeros, (steps,) or (robots, steps), for what a past is like."""
     return Rows(
         jnp.zeros((*shape, *past.records.shape[-2:])),
-        jnp.zeros((*shape, past.unknowns.shape[-1])),
+        jnp.zeros((*shape, system.unknown_count)),
         jnp.zeros(shape),
         jnp.zeros(shape, dtype=int),
         jnp.zeros(shape),
@@ -198,7 +202,7 @@ def march(
         return jnp.where(failed, i, i + 1), failed, past, rows, kept
 
     kept = _none_kept(system, settings, past, controls[0])
-    state = (start, jnp.array(False), past, _no_rows(controls.shape[:1], past), kept)
+    state = (start, jnp.array(False), past, _no_rows(system, controls.shape[:1], past), kept)
     done, _, past, rows, _ = jax.lax.while_loop(going, one, state)
     return done, past, rows
 
@@ -237,7 +241,8 @@ def march_in_turn(
 
     kept = _none_kept(own(system, 0) if batched else system, settings, own(pasts, 0), controls[0, 0])
     zero = jnp.zeros((), dtype=int)
-    state = (zero, zero, own(pasts, 0), jnp.zeros(size, dtype=int), _no_rows(controls.shape[:2], pasts), kept)
+    rows = _no_rows(system, controls.shape[:2], pasts)
+    state = (zero, zero, own(pasts, 0), jnp.zeros(size, dtype=int), rows, kept)
     _, _, _, done, rows, _ = jax.lax.while_loop(lambda state: state[0] < size, one, state)
     return done, rows
 

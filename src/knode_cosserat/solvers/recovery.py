@@ -90,15 +90,15 @@ class _Step:
 
     def guesses(self) -> list[tuple[Any, Any]]:
         ny = self.system.y_layout.size
-        y = [jnp.einsum("p,pny->ny", w, self.past.records[:, :, :ny]) for w in EXTRAPOLATIONS[:2]]
-        return [(y[i], EXTRAPOLATIONS[i] @ self.past.unknowns) for i in range(2)]
+        guesses = [jnp.einsum("p,pny->ny", w, self.past.records[:, :, :ny]) for w in EXTRAPOLATIONS[:2]]
+        return [(y, self.system.unknowns(y[0])) for y in guesses]
 
     def solved(self, solution: Solution) -> bool:
         return bool(solution.error <= self.settings.newton.acceptable)
 
     def after(self, solution: Solution, record: Any) -> Past:
         rate = self.coefficients[0] * record + self.history
-        return advanced(self.past, record, solution.unknowns, rate, jnp.zeros((), dtype=int))
+        return advanced(self.past, record, rate, jnp.asarray(EXTRAPOLATIONS[0]))
 
 
 def recover(
@@ -269,7 +269,8 @@ def _relax(step: _Step, control: Any) -> tuple[Solution, Any] | None:
         part = target
         if dt > longest:
             break
-    found = step.solve(control, now.records[0][:, : step.system.y_layout.size], now.unknowns[0])
+    y = now.records[0][:, : step.system.y_layout.size]
+    found = step.solve(control, y, step.system.unknowns(y[0]))
     return found if step.solved(found[0]) else None
 
 
