@@ -69,7 +69,9 @@ class RK4(SpaceScheme):
             k = y_s(s + part * ds, y + part * ds * k, there)
             return (total + weight * ds * k, k), None
 
-        (total, _), _ = jax.lax.scan(stage, (y, jnp.zeros_like(y)), (RK4_PARTS, RK4_WEIGHTS, stages))
+        # the first stage takes nothing of k: any will do that has slopes and batches as it will have, or JAX
+        # traces the equations twice to find out
+        (total, _), _ = jax.lax.scan(stage, (y, y), (RK4_PARTS, RK4_WEIGHTS, stages))
         return total
 
 
