@@ -20,6 +20,9 @@ ROBOTS = {
         kc.load_robot("delrin-tendon-robot"), routing=HELIX
     ),
     "friction": lambda: kc.RoutedTendonRobot.like(kc.load_robot("delrin-tendon-robot"), friction_wobble=0.6),
+    "friction, one ends": lambda: kc.RoutedTendonRobot.like(
+        kc.load_robot("delrin-tendon-robot"), routing=HELIX, friction_curvature=0.1
+    ),
     "reel": lambda: kc.RoutedTendonRobot.like(
         kc.load_robot("delrin-tendon-robot"), drive="reel", tendon_compliance=1e-4
     ),
@@ -50,7 +53,10 @@ def a_step(robot, space):
 
 
 #: the others take as long to compile, and are looked at in the long campaign
-QUICK = {("ribs, a sleeve and masses", "euler"), ("helical, one ends", "rk4"), ("six legs", "euler")}
+QUICK = {
+    ("ribs, a sleeve and masses", "euler"), ("helical, one ends", "rk4"), ("friction, one ends", "euler"),
+    ("six legs", "euler"),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 
 from knode_cosserat.rods.system import (
     History,
@@ -199,7 +199,7 @@ class StepProblem(eqx.Module):
         at = self._each_strand(self.arclength), self._points(y), self._past_points(self.history)
         return jax.vmap(function)(*at)
 
-    def _each_strand(self, values: Float[Any, "n ..."]) -> Float[Any, "points ..."]:
+    def _each_strand(self, values: Shaped[Any, "n ..."]) -> Shaped[Any, "points ..."]:
         return jnp.repeat(values, self.system.strands, axis=0) if self.system.strands > 1 else values
 
     def _points(self, rows: Float[Any, "n x"]) -> Float[Any, "points x_of_strand"]:
