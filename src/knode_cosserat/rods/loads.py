@@ -54,7 +54,7 @@ class Wrench(NamedTuple):
 class Body(NamedTuple):
     """A rigid body by its moments about a point of the rod, material frame; bodies at one point add up.
 
-    None where there is none: what only has a mass, as most ribs, takes a third of the equations.
+    None where there is none: what only has a mass, as most ribs, goes without their equations.
     """
 
     mass: Any
