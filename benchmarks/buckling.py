@@ -31,7 +31,7 @@ def _tip_response(system: Any, control: Any, y: Any, space: Any) -> Any:
     record = system.y_layout.size + system.z_layout.size + (system.y_layout.size if system.mixed else 0)
     still = jnp.zeros((system.nodes, record))
     problem = StepProblem(system, jnp.zeros(()), control, jnp.zeros(()), still, space)
-    F, base, tip, _, _ = linearise(problem, y, system.unknowns(y[0]))
+    F, base, tip, _, _ = linearise(problem, problem.filled(y), system.unknowns(y[0]))
     last, _ = jax.lax.scan(lambda X, F_j: (F_j @ X, None), base, F)
     return tip @ last
 

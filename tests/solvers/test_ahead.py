@@ -7,6 +7,7 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.solvers.ahead import in_two
+from knode_cosserat.solvers.crossing import spread
 from knode_cosserat.solvers.march import rest_record
 from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.space import SCHEMES, SLOPES, VALUES
@@ -49,7 +50,7 @@ def a_step(robot, space):
     problem = StepProblem(
         robot, jnp.array(0.3), jnp.asarray(control), jnp.array(20.0), jnp.asarray(history), SCHEMES[space]
     )
-    return problem, jnp.asarray(y)
+    return problem, spread(problem.points, jnp.asarray(y))
 
 
 #: the others take as long to compile, and are looked at in the long campaign
@@ -73,7 +74,7 @@ def test_nothing_comes_out_differently(name, space):
 
     def all_of(prepared):
         own = problem.ready() if prepared else problem
-        return own.segments(SLOPES, y), own.segments(VALUES, y), own.record(y)
+        return own.pieces(SLOPES, y), own.pieces(VALUES, y), own.record(y)
 
     scale = np.asarray(robot.strand.scales().y)
     natural = scale / scale[:, None]
@@ -138,7 +139,7 @@ def test_slopes_by_the_control_go_through_what_was_evaluated_before():
 
     def ends(control, prepared):
         own = StepProblem(problem.system, problem.t, control, problem.c0, problem.history, problem.space)
-        return (own.ready() if prepared else own).segments(VALUES, y)
+        return (own.ready() if prepared else own).pieces(VALUES, y)
 
     found, expected = (jax.jacfwd(ends)(problem.control, prepared) for prepared in (True, False))
     assert np.max(np.abs(expected)) > 0.0

@@ -1,4 +1,7 @@
-"""Segments on which something begins, ends or pulls: how they are parted, and shared out among rounds."""
+"""Segments on which something begins, ends or pulls: how they are parted, and carried over in pieces."""
+
+import functools
+import itertools
 
 import hypothesis.strategies as st
 import jax
@@ -8,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 
 import knode_cosserat as kc
-from knode_cosserat.solvers.crossing import Crossing, carried, crossings, rounds_of, taken
+from knode_cosserat.solvers.crossing import Crossing, carried, crossings, points_between, spread, taken
 from knode_cosserat.solvers.march import rest_record
 from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.space import SCHEMES, SLOPES, VALUES, middles
@@ -18,25 +21,33 @@ CUTS = st.lists(st.floats(1e-3, 1.0 - 1e-3), min_size=1, max_size=8, unique=True
 
 @settings(max_examples=300, deadline=None)
 @given(CUTS, st.integers(2, 30))
-def test_every_part_has_its_turn_after_the_one_before_it(places, nodes):
+def test_pieces_follow_each_other_from_base_to_tip(places, nodes):
     cuts = tuple(sorted(places))
-    bounds, acting = crossings(cuts, nodes)
-    shared = rounds_of(cuts, nodes)
-    parts = [[each for each in np.stack([row[:-1], row[1:]], axis=1) if each[1] > each[0]] for row in bounds]
-    assert len(shared.segment) == max(map(len, parts))
-    for j, own in enumerate(parts):
-        last, place = divmod(shared.last[j], shared.segment.shape[1])
-        first = last - len(own) + 1
-        turns = slice(first, last + 1)
-        assert np.all(shared.segment[turns, place] == j)
-        np.testing.assert_array_equal(shared.begins[turns, place], [True, *[False] * (len(own) - 1)])
-        np.testing.assert_array_equal(shared.bounds[turns, place], own)
-        np.testing.assert_array_equal(shared.acting[turns, place], acting[j, : len(own)])
-    # what is left over has nothing to do
-    busy = np.sum(shared.bounds[..., 1] > shared.bounds[..., 0])
-    assert busy == sum(map(len, parts)) and np.sum(shared.acting) == len(cuts)
-    # and there is less of it than a place per segment that is parted
-    assert shared.segment.size - busy < len(shared.segment) * (1 + sum(len(own) > 1 for own in parts))
+    points = points_between(cuts, nodes)
+    begin, end = (points.segment[:, None] + points.bounds).T
+    # without a gap, none empty
+    np.testing.assert_array_equal(end[:-1], begin[1:])
+    assert begin[0] == 0.0 and end[-1] == nodes - 1 and np.all(end > begin)
+    # nodes are where nodes are, and every cut acts once, where it is
+    along = np.append(begin, nodes - 1)
+    np.testing.assert_array_equal(along[points.nodes], np.arange(nodes))
+    np.testing.assert_array_equal(
+        np.sort(np.concatenate([points.nodes, points.between])), np.arange(len(along))
+    )
+    np.testing.assert_array_equal(points.acting.sum(axis=0), 1.0)
+    at = begin[np.argmax(points.acting, axis=0)]
+    np.testing.assert_allclose(at, np.array(cuts) * (nodes - 1), atol=1e-8)
+    # no point but for a reason
+    assert set(points.between.tolist()) <= set(np.flatnonzero(points.acting.any(axis=1)).tolist())
+
+
+@settings(max_examples=100, deadline=None)
+@given(CUTS, st.integers(2, 30))
+def test_what_is_linear_along_the_rod_is_spread_exactly(places, nodes):
+    points = points_between(tuple(sorted(places)), nodes)
+    along = np.append(points.segment + points.bounds[:, 0], nodes - 1.0)
+    found = spread(points, jnp.stack([2.0 * np.arange(nodes), 1.0 - np.arange(nodes)], axis=1))
+    np.testing.assert_allclose(found, np.stack([2.0 * along, 1.0 - along], axis=1), atol=1e-12)
 
 
 @settings(max_examples=100, deadline=None)
@@ -58,7 +69,7 @@ STIFFER = (kc.Stretch(end=0.1, stiffness=[2.0]), kc.Stretch(begin=0.105, stiffne
     ],
     ids=["parted", "whole"],
 )
-def test_side_by_side_as_one_after_the_other(space, changes):
+def test_pieces_side_by_side_as_parts_one_after_the_other(space, changes):
     robot = kc.load_robot("delrin-routed-tendon-robot").replace(**{"sections": (), "loads": (), **changes})
     generator = np.random.default_rng(0)
     record = np.asarray(rest_record(robot))
@@ -85,9 +96,18 @@ def test_side_by_side_as_one_after_the_other(space, changes):
     scale = np.asarray(robot.scales().y)
     reached = np.stack([value(*each) for each in own]) / scale
     slopes = np.stack([slope(*each) for each in own])
-    values = jax.jit(lambda y: problem.segments(VALUES, y))(y)
-    np.testing.assert_allclose(values / scale, reached, atol=1e-12)
-    values, found = jax.jit(lambda y: problem.segments(SLOPES, y))(y)
-    np.testing.assert_allclose(values / scale, reached, atol=1e-12)
+    # piece by piece, from what the pieces before reached
+    filled = jax.jit(lambda y: problem.filled(y))(jnp.asarray(y))
+    points = problem.points
+    np.testing.assert_array_equal(filled[points.nodes], y)
+    values = jax.jit(lambda y: problem.pieces(VALUES, y))(filled)
+    np.testing.assert_allclose(values[points.nodes[1:] - 1] / scale, reached, atol=1e-12)
+    np.testing.assert_allclose(values[points.between - 1] / scale, filled[points.between] / scale, atol=1e-12)
+    values, F = jax.jit(lambda y: problem.pieces(SLOPES, y))(filled)
+    np.testing.assert_allclose(values[points.nodes[1:] - 1] / scale, reached, atol=1e-12)
+    found = [
+        functools.reduce(lambda before, after: after @ before, F[j:k])
+        for j, k in itertools.pairwise(points.nodes)
+    ]
     natural = scale / scale[:, None]
     np.testing.assert_allclose(found * natural, slopes * natural, rtol=1e-9, atol=1e-9)

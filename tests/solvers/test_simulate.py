@@ -206,7 +206,7 @@ def test_equilibria_in_a_batch(robot):
 def test_the_past_keeps_the_newest_first(robot):
     past = initial_past(robot, rest_record(robot), jnp.zeros(4))
     record = past.records[0] + 1.0
-    after = advanced(past, record, past.rate, past.weights)
+    after = advanced(past, record, past.rate, past.between[0], past.weights)
     np.testing.assert_array_equal(after.records[0], record)
     np.testing.assert_array_equal(after.records[1], past.records[0])
     ones = jnp.array([2.0, 3.0, 5.0, 0.0])

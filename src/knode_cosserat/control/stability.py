@@ -12,6 +12,8 @@ segment buckles between its own two nodes.
 
 from __future__ import annotations
 
+import functools
+import itertools
 from typing import Any, NamedTuple
 
 import jax
@@ -20,6 +22,7 @@ import numpy as np
 
 from knode_cosserat.rods.system import System, in_strands
 from knode_cosserat.solvers.boundary import linearise, static_error
+from knode_cosserat.solvers.crossing import points_of
 from knode_cosserat.solvers.equilibrium import equilibrium as rests
 from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.result import Result
@@ -84,8 +87,7 @@ def stability(equilibrium: Trajectory, row: int = -1) -> Stability:
         found = rests(system, control, space="rk4", initial=one, on_failure="return")
         if found.result[0] in NEARBY:
             y = np.asarray(found.y[0])
-    linearised = _linearised(system, jnp.asarray(y), jnp.asarray(control), z.shape[-1])
-    F, base, tip = (np.asarray(part) for part in linearised)
+    F, base, tip = _linearised(system, jnp.asarray(y), jnp.asarray(control), z.shape[-1])
     _require_rest(system, F, base)
     return _of_stiffness(*_stiffness(system, y, F, base, tip), system)
 
@@ -120,7 +122,7 @@ def _checked(equilibrium: Any, row: Any) -> tuple[System, np.ndarray, np.ndarray
 @jax.jit
 def _find(system: System, y: Any, control: Any, history: Any) -> tuple[Any, Any, Any]:
     problem = StepProblem(system, jnp.zeros(()), control, jnp.zeros(()), history, RK4())
-    found = linearise(problem, y, system.unknowns(y[0]))
+    found = linearise(problem, problem.filled(y), system.unknowns(y[0]))
     return found.F, found.base, found.tip
 
 
@@ -128,7 +130,10 @@ def _linearised(system: System, y: Any, control: Any, nz: int) -> tuple[Any, Any
     """F of the segments (segments, strands, b, b), and what base and tip ask."""
     ny = y.shape[1]
     F, base, tip = _find(system, y, control, jnp.zeros((len(y), ny + nz + (ny if system.mixed else 0))))
-    return F.reshape(len(y) - 1, system.strands, *F.shape[-2:]), base, tip
+    pieces = np.asarray(F).reshape(-1, system.strands, *F.shape[-2:])
+    between = itertools.pairwise(points_of(system).nodes)
+    segments = [functools.reduce(lambda before, after: after @ before, pieces[j:k]) for j, k in between]
+    return np.stack(segments), np.asarray(base), np.asarray(tip)
 
 
 def _require_rest(system: System, F: np.ndarray, base: np.ndarray) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import Solution, linearise, newton, residuals
+from knode_cosserat.solvers.crossing import points_of, spread
 from knode_cosserat.solvers.linear import Condensed, carried
 from knode_cosserat.solvers.march import rest_record
 from knode_cosserat.solvers.problem import StepProblem
@@ -63,8 +64,8 @@ def static_problem(system: System, settings: Settings, control: Any) -> StepProb
 
 
 def at_rest(system: System) -> tuple[Any, Any]:
-    """The first guess of y at all nodes and of ξ: unloaded."""
-    y = rest_record(system)[:, : system.y_layout.size]
+    """The first guess of y at all points and of ξ: unloaded."""
+    y = spread(points_of(system), rest_record(system)[:, : system.y_layout.size])
     return y, system.unknowns(y[0])
 
 
@@ -75,6 +76,12 @@ def solve(system: System, settings: Settings, control: Any, y: Any, unknowns: An
     """An equilibrium from a guess; its `error` says whether it is one."""
     problem = static_problem(system, settings, control).ready()
     return newton(problem, y, unknowns, Condensed(), settings.newton)
+
+
+@functools.partial(jax.jit, static_argnames="settings")
+def _filled(system, settings, control, y):  # type: ignore[no-untyped-def]
+    """y of an equilibrium at all points, from that at the nodes."""
+    return static_problem(system, settings, control).filled(y)
 
 
 def wrench_fields(system: System) -> tuple[str, ...]:
@@ -159,6 +166,6 @@ def first_solved(system: System, settings: Settings, pose: Pose, control: Any, g
     found = respond(system, settings, pose, control, *(guess or rest_guess(system)))
     if not found.error <= settings.newton.acceptable:
         recovered = equilibrium(system, control, space=settings.space, newton=settings.newton)
-        y = jnp.asarray(recovered.y[0])
+        y = _filled(system, settings, control, jnp.asarray(recovered.y[0]))
         found = respond(system, settings, pose, control, y, system.unknowns(y[0]))
     return found

@@ -63,7 +63,7 @@ class NewtonOptions:
 class Iterate(NamedTuple):
     """A point of the iteration; `error` is its largest residual in natural units, infinite for a NaN."""
 
-    y: Float[Any, "nodes y"]
+    y: Float[Any, "points y"]
     unknowns: Float[Any, " k"]
     error: Float[Any, ""]
 
@@ -71,7 +71,7 @@ class Iterate(NamedTuple):
 class Solution(NamedTuple):
     """What Newton's method ended with: solved if `error` is at most `acceptable`, and not otherwise."""
 
-    y: Float[Any, "nodes y"]
+    y: Float[Any, "points y"]
     unknowns: Float[Any, " k"]
     error: Float[Any, ""]
     corrections: Int[Any, ""]
@@ -102,9 +102,9 @@ def _error(problem: StepProblem, defects: Any, tip: Any) -> Any:
     return jnp.where(jnp.isnan(error), jnp.inf, error)
 
 
-def residuals(problem: StepProblem, y: Float[Any, "nodes y"]) -> tuple[Any, Any]:
+def residuals(problem: StepProblem, y: Float[Any, "points y"]) -> tuple[Any, Any]:
     """Defects y_{j+1} - Φ_j(y_j), with their sign turned, and the tip's residuals."""
-    reached = problem.segments(VALUES, y)
+    reached = problem.pieces(VALUES, y)
     return reached.reshape(y[1:].shape) - y[1:], problem.tip_residual(y[-1])
 
 
@@ -112,15 +112,15 @@ def residuals(problem: StepProblem, y: Float[Any, "nodes y"]) -> tuple[Any, Any]
 def static_error(system: System, space: SpaceScheme, record: Any, control: Any, t: Any) -> Any:
     """How far a record is from an equilibrium: its largest residual in natural units, all rates zero."""
     problem = StepProblem(system, t, control, jnp.zeros(()), jnp.zeros_like(record), space)
-    y = record[:, : system.y_layout.size]
+    y = problem.filled(record[:, : system.y_layout.size])
     base = problem.base(system.unknowns(y[0])) - y[0]
     error = _error(problem, *residuals(problem, y))
     return jnp.maximum(error, jnp.max(jnp.abs(base) / system.scales().y))
 
 
-def linearise(problem: StepProblem, y: Float[Any, "nodes y"], unknowns: Any) -> Linearisation:
+def linearise(problem: StepProblem, y: Float[Any, "points y"], unknowns: Any) -> Linearisation:
     """Residuals and their exact derivatives by forward mode, all segments in one batch."""
-    reached, F = problem.segments(SLOPES, y)
+    reached, F = problem.pieces(SLOPES, y)
     if problem.system.strands > 1:
         F = F.reshape(y.shape[0] - 1, problem.system.strands, *F.shape[1:])
     tip, M = SLOPES.on(problem.tip_residual, SLOPES.begin(y[-1]))
@@ -132,7 +132,7 @@ class _Search(NamedTuple):
     """State while one linearisation is in use: the point, and the correction proposed there."""
 
     at: Iterate
-    dy: Float[Any, "nodes y"]
+    dy: Float[Any, "points y"]
     dxi: Float[Any, " k"]
     size: Float[Any, ""]
     damping: Float[Any, ""]
@@ -144,7 +144,7 @@ class _Search(NamedTuple):
 
 def newton(
     problem: StepProblem,
-    y: Float[Any, "nodes y"],
+    y: Float[Any, "points y"],
     unknowns: Float[Any, " k"],
     linear: LinearSolver,
     options: NewtonOptions,
@@ -154,7 +154,7 @@ def newton(
 
 
 def newton_keeping(
-    problem: StepProblem, y: Float[Any, "nodes y"], unknowns: Float[Any, " k"], linear: LinearSolver,
+    problem: StepProblem, y: Float[Any, "points y"], unknowns: Float[Any, " k"], linear: LinearSolver,
     options: NewtonOptions, kept: Kept | None,
 ) -> tuple[Solution, Kept | None]:  # fmt: skip
     """`newton` that begins with what is kept, and what is to be kept of it; None keeps nothing."""

@@ -1,9 +1,12 @@
-"""Carrying y over one segment of a rod on which something may begin, end or pull in between.
+"""Carrying y along a rod on which something may begin, end or pull between two nodes.
 
 A scheme in arclength keeps its order only where the right-hand side is smooth. A segment is therefore
 parted where the system has a cut, and y jumps there if the system says so. A cut on a node parts nothing: y
 at a node is that on its near side, z that on its far side. What is known of the past at a cut is
 interpolated, to order 3.
+
+A step is solved for y at the cuts as for y at the nodes, so that all pieces lie side by side. What has only
+the nodes carries y over a segment piece by piece.
 """
 
 from __future__ import annotations
@@ -15,7 +18,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.space import SpaceScheme
@@ -64,62 +67,52 @@ def within(s: Any, low: Any, high: Any) -> Any:
     return jnp.clip(s, low + margin, high - margin)
 
 
-class Rounds(NamedTuple):
-    """How the parts of all segments are shared out: in rounds one after the other, side by side in each.
+class Points(NamedTuple):
+    """The nodes, and the cuts that lie between them: from each to the next y is carried over a piece."""
 
-    The parts of one segment follow each other at one place. Most segments have but one part, so that as many
-    rounds of all segments would take about as many times as long.
-    """
-
-    #: which segment is at a place (rounds, places)
-    segment: np.ndarray
-    #: whether it begins there, or goes on from where the last round left it
-    begins: np.ndarray
-    #: from where to where in the segment (rounds, places, 2): from 1 to 1 where nothing is left to do
-    bounds: np.ndarray
-    #: which cuts act where it begins (rounds, places, cuts)
-    acting: np.ndarray
-    #: where each segment ends, among all places of all rounds
-    last: np.ndarray
+    #: which of them the nodes are, and which the cuts
+    nodes: Int[np.ndarray, " nodes"]
+    between: Int[np.ndarray, " between"]
+    #: in which segment each piece is
+    segment: Int[np.ndarray, " pieces"]
+    #: from where to where in it, as parts of the segment
+    bounds: Float[np.ndarray, "pieces 2"]
+    #: which cuts act where it begins
+    acting: Float[np.ndarray, "pieces cuts"]
 
 
 @functools.lru_cache(maxsize=256)
-def rounds_of(cuts: tuple[float, ...], nodes: int) -> Rounds:
-    """As many rounds as the segment with most parts needs, all as narrow as can be."""
+def points_between(cuts: tuple[float, ...], nodes: int) -> Points:
+    """The points of a rod with these cuts."""
     bounds, acting = crossings(cuts, nodes)
-    counts = [max(1, int(np.sum(np.diff(row) > 0.0))) for row in bounds]
-    most = max(counts)
-    places: list[list[tuple[int, int]]] = [[] for _ in range(-(-sum(counts) // most))]
-    for j in sorted((j for j, count in enumerate(counts) if count > 1), key=lambda j: -counts[j]):
-        place = next((each for each in places if len(each) + counts[j] <= most), None)
-        if place is None:
-            places.append(place := [])
-        place += [(j, k) for k in range(counts[j])]
-    # row by row, so that neighbours stay neighbours
-    single = (j for j, count in enumerate(counts) if count == 1)
-    for k in range(most):
-        for place in places:
-            if len(place) == k:
-                place.append((next(single, -1), 0))
-    shape = most, len(places)
-    found = Rounds(
-        np.zeros(shape, dtype=int), np.ones(shape, dtype=bool), np.ones((*shape, 2)),
-        np.zeros((*shape, len(cuts))), np.zeros(nodes - 1, dtype=int),
-    )  # fmt: skip
-    for k, row in enumerate(zip(*places, strict=True)):
-        for at, (j, part) in enumerate(row):
-            if j >= 0:
-                found.segment[k, at], found.begins[k, at] = j, part == 0
-                found.bounds[k, at] = bounds[j, part : part + 2]
-                found.acting[k, at] = acting[j, part]
-                found.last[j] = k * len(places) + at
-    return found
+    pieces = [(j, k) for j, row in enumerate(bounds) for k in np.flatnonzero(np.diff(row) > 0.0)]
+    segment, part = np.array(pieces).T
+    whole = np.flatnonzero(part == 0)
+    return Points(
+        np.append(whole, len(segment)),
+        np.flatnonzero(part > 0),
+        segment,
+        np.stack([bounds[segment, part], bounds[segment, part + 1]], axis=1),
+        acting[segment, part],
+    )
+
+
+def points_of(system: System) -> Points:
+    """The points of a system."""
+    return points_between(system.cuts, system.nodes)
 
 
 def taken(values: Any, rows: np.ndarray) -> Any:
     """Rows of an array by numbers that are known: runs of neighbours, each copied as a whole."""
     runs = np.split(rows, np.flatnonzero(np.diff(rows) != 1) + 1)
     return jnp.concatenate([values[run[0] : run[-1] + 1] for run in runs])
+
+
+def spread(points: Points, values: Float[Any, "nodes ..."]) -> Float[Any, "points ..."]:
+    """What is known at the nodes, at all points: between nodes on a line."""
+    part = points.bounds[:, 0].reshape(-1, *(1 for _ in values.shape[1:]))
+    start, end = (taken(values, points.segment + k) for k in (0, 1))
+    return jnp.concatenate([start + part * (end - start), values[-1:]])
 
 
 #: y at the far side of cuts: (acting, y, record of history)
@@ -135,44 +128,46 @@ def carried(
     `first` of 1 leaves out the jump at the start: y is then that on the far side.
     """
     acting = jnp.asarray(crossing.acting).at[:first].set(0.0)
+    s, ds = where
 
     def of_past(s: Any, y: Any, known: tuple[Any, Any]) -> Any:
         return rates(s, y, known[0])
 
     def part(y: Any, given: tuple[Any, Any, Any]) -> Any:
-        return carried_part(space, of_past, jump, given, where, y, history, parted=acting.shape[0] > 1), None
+        begin, end, acting = given
+        past = past_of_part(space, history, begin, end)
+        return carried_on(space, of_past, jump, acting, (s + begin * ds, s + end * ds), y, past), None
 
     y, _ = jax.lax.scan(part, y, (crossing.bounds[:-1], crossing.bounds[1:], acting))
     return y
 
 
-def carried_part(
-    space: SpaceScheme, rates: Callable[[Any, Any, Any], Any], jump: Jump, part: tuple[Any, Any, Any],
-    where: tuple[Any, Any], y: Float[Any, " y"], history: tuple[Any, Any, Any], parted: bool,
+def carried_on(
+    space: SpaceScheme, rates: Callable[[Any, Any, Any], Any], jump: Jump, acting: Any,
+    where: tuple[Any, Any], y: Float[Any, " y"], history: tuple[Any, Any, Any],
     ahead: tuple[Any, Any, Any] | None = None,
 ) -> Float[Any, " y"]:  # fmt: skip
-    """The same over one part: from where to where, as parts of the segment, and which cuts act before it.
+    """y at the end of one piece, from the near side of its start; `where` is from where to where (m).
 
-    Where no segment is parted, which is known before, the past need not be interpolated. `rates` is given
-    what `known_at` says of the past and of what was evaluated `ahead` for this part.
+    `rates` is given what `known_at` says of the past and of what was evaluated `ahead` for this piece.
     """
-    (s, ds), (begin, end, acting) = where, part
-    past = _part_of(space, history, begin, end) if parted else history
-    low, high = s + begin * ds, s + end * ds
+    low, high = where
 
     def inside(at: Any, y: Any, known: Any) -> Any:
         return rates(within(at, low, high), y, known)
 
-    return space.advance(inside, low, high - low, jump(acting, y, past[0]), known_at(past, ahead))
+    return space.advance(inside, low, high - low, jump(acting, y, history[0]), known_at(history, ahead))
 
 
 def known_at(history: tuple[Any, Any, Any], ahead: tuple[Any, Any, Any] | None) -> tuple[Any, Any, Any]:
-    """What is known where a segment begins, is half-way and ends: (past there, what was evaluated ahead)."""
+    """What is known where a piece begins, is half-way and ends: (past there, what was evaluated ahead)."""
     start, middle, end = zip(history, (None, None, None) if ahead is None else ahead, strict=True)
     return start, middle, end
 
 
-def _part_of(space: SpaceScheme, history: tuple[Any, Any, Any], begin: Any, end: Any) -> tuple[Any, Any, Any]:
+def past_of_part(
+    space: SpaceScheme, history: tuple[Any, Any, Any], begin: Any, end: Any
+) -> tuple[Any, Any, Any]:
     """What is known of the past at the begin, middle and end of a part, from that of the whole segment."""
     start, middle, last = history
 

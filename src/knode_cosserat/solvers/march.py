@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import Kept, newton_keeping, none_kept
+from knode_cosserat.solvers.crossing import points_of, spread, taken
 from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import Euler
@@ -33,6 +34,8 @@ class Past(NamedTuple):
 
     records: Float[Any, "past nodes x"]
     rate: Float[Any, "nodes x"]
+    #: y at the cuts between nodes: of that only the first guess is made
+    between: Float[Any, "past cuts y"]
     #: what each state counts in the first guess of the next step
     weights: Float[Any, " past"]
     #: time of row 0 (s): step i ends at t0 + (i + 1) dt
@@ -67,8 +70,9 @@ def initial_past(system: System, record: Any, control: Any) -> Past:
         nothing = jnp.zeros((system.nodes, ny + nz + ny))
         still = StepProblem(system, jnp.zeros(()), control, jnp.zeros(()), nothing, Euler())
         record = jnp.concatenate([record, still.record(record[:, :ny])[:, ny + nz :]], axis=1)
+    records = jnp.stack([record] * PAST)
     weights = jnp.asarray(EXTRAPOLATIONS[0])
-    return Past(jnp.stack([record] * PAST), jnp.zeros_like(record), weights, jnp.zeros(()))
+    return Past(records, jnp.zeros_like(record), guessed_between(system, records), weights, jnp.zeros(()))
 
 
 def going_on_past(system: System, settings: Settings, dt: float, records: Any, t0: Any) -> Past:
@@ -76,7 +80,7 @@ def going_on_past(system: System, settings: Settings, dt: float, records: Any, t
 
     The rate of a row is its scheme's own, from the first row on, where there was none.
     """
-    newest = [records[max(-k, -len(records))] for k in range(1, PAST + 1)]
+    newest = jnp.stack([records[max(-k, -len(records))] for k in range(1, PAST + 1)])
     rate = jnp.zeros_like(newest[0])
     if settings.time.uses_rate:
         table = jnp.asarray(coefficient_table(settings, dt))
@@ -90,7 +94,22 @@ def going_on_past(system: System, settings: Settings, dt: float, records: Any, t
         rows = (jnp.arange(len(records) - 1), records[1:], before[1:], before[:-1])
         rate, _ = jax.lax.scan(one, rate, rows)
     weights = jnp.asarray(EXTRAPOLATIONS[1])
-    return Past(jnp.stack(newest), rate, weights, jnp.asarray(t0, dtype=float))
+    return Past(newest, rate, guessed_between(system, newest), weights, jnp.asarray(t0, dtype=float))
+
+
+def guessed_between(system: System, records: Float[Any, "past nodes x"]) -> Float[Any, "past cuts y"]:
+    """y at the cuts between nodes, where no more than the nodes' records is known."""
+    points = points_of(system)
+    return jax.vmap(lambda y: spread(points, y)[points.between])(records[..., : system.y_layout.size])
+
+
+def past_y(system: System, past: Past) -> Float[Any, "past points y"]:
+    """y of the past at all points."""
+    points, y = points_of(system), past.records[..., : system.y_layout.size]
+    if not len(points.between):
+        return y
+    order = np.argsort(np.concatenate([points.nodes, points.between]))
+    return jax.vmap(lambda y: taken(y, order))(jnp.concatenate([y, past.between], axis=1))
 
 
 def coefficient_table(settings: Settings, dt: float) -> np.ndarray:
@@ -107,11 +126,12 @@ def history_of(past: Past, coefficients: Any, settings: Settings) -> Any:
     return history + d1 * past.rate if settings.time.uses_rate else history
 
 
-def advanced(past: Past, record: Any, rate: Any, weights: Any) -> Past:
+def advanced(past: Past, record: Any, rate: Any, between: Any, weights: Any) -> Past:
     """The past of the next step."""
     return past._replace(
         records=jnp.concatenate([record[None], past.records[:-1]]),
         rate=rate,
+        between=jnp.concatenate([between[None], past.between[:-1]]),
         weights=weights,
     )
 
@@ -121,10 +141,9 @@ def step(
     kept: Kept | None,
 ) -> Any:  # fmt: skip
     """One time step: the next past, the step's row, and what is kept of its linearisation."""
-    ny = system.y_layout.size
     history = history_of(past, coefficients, settings)
     problem = StepProblem(system, t, control, coefficients[0], history, settings.space).ready()
-    recent = past.records[:, :, :ny]
+    recent = past_y(system, past)
     # as sums of products, not as matrix products: XLA fuses these with what follows
     guess = jnp.sum(past.weights[:, None, None] * recent, axis=0)
     unknowns = system.unknowns(guess[0])
@@ -136,7 +155,8 @@ def step(
     row = Rows(record, solution.unknowns, solution.error, solution.corrections, size)
     extrapolated = jnp.sum(EXTRAPOLATIONS[:, :, None, None] * recent, axis=1)
     weights = weights_by(jnp.max(jnp.abs(extrapolated - solution.y) / scale, axis=(1, 2)))
-    return advanced(past, record, rate, weights), row, kept
+    between = solution.y[points_of(system).between]
+    return advanced(past, record, rate, between, weights), row, kept
 
 
 def weights_by(misfit: Float[Any, " extrapolations"]) -> Float[Any, " past"]:
@@ -151,7 +171,7 @@ def _none_kept(system: System, settings: Settings, past: Past, control: Any) -> 
         return None
     zero = jnp.zeros(())
     problem = StepProblem(system, zero, control, zero, jnp.zeros_like(past.records[0]), settings.space)
-    y = past.records[0, :, : system.y_layout.size]
+    y = past_y(system, past)[0]
     return none_kept(problem, y, system.unknowns(y[0]), settings.elimination)
 
 

@@ -21,14 +21,16 @@ from knode_cosserat.rods.system import (
 )
 from knode_cosserat.solvers.ahead import in_two
 from knode_cosserat.solvers.crossing import (
-    carried_part,
-    crossing_of,
+    Points,
+    carried_on,
     known_at,
-    rounds_of,
+    past_of_part,
+    points_of,
+    spread,
     taken,
     within,
 )
-from knode_cosserat.solvers.space import Along, SpaceScheme, middles
+from knode_cosserat.solvers.space import VALUES, Along, SpaceScheme, middles
 
 
 class Ahead(NamedTuple):
@@ -38,8 +40,8 @@ class Ahead(NamedTuple):
     then: Callable[[Any, Any, Any], Any]
     #: at the nodes of all strands
     nodes: Any
-    #: where segments, or parts of them in their rounds, begin, are half-way and end
-    segments: tuple[Any, Any, Any]
+    #: where pieces begin, are half-way and end
+    pieces: tuple[Any, Any, Any]
 
 
 class StepProblem(eqx.Module):
@@ -63,29 +65,23 @@ class StepProblem(eqx.Module):
         def at_point(s: Any, state: tuple[Any, Any]) -> Any:
             return self.point_rates(s, *state)
 
-        record = self._past_points(self.history[:1])[0]
+        record = self._past_by_strand(self.history[:1])[0]
         parts = in_two(at_point, s[0], (jnp.zeros(strand.y_layout.size), record))
 
         def at(*places: Any) -> list[Any]:
             # together, to be compiled once
-            found = jax.vmap(parts.first)(jnp.concatenate([each.reshape(-1) for each in places]))
+            found = jax.vmap(parts.first)(jnp.concatenate(places))
             ends = np.cumsum([each.size for each in places])[:-1]
             pieces = [jnp.split(each, ends) for each in found]
-            return [
-                [each[k].reshape(*like.shape, *each[k].shape[1:]) for each in pieces]
-                for k, like in enumerate(places)
-            ]
+            return [[each[k] for each in pieces] for k in range(len(places))]
 
-        # a scheme that asks only for what is known where a segment begins is given that for all of it
-        everywhere = self.space.uses_middle
-        if self.system.cuts:
-            places = self._part_places()
-            nodes, begin, *others = at(self._inside, *(places if everywhere else places[:1]))
-        else:
-            nodes, *others = at(s, (s[:-1] + s[1:]) / 2) if everywhere else at(s)
-            begin, end = ([each[rows] for each in nodes] for rows in (np.s_[:-1], np.s_[1:]))
-            others = [*others, end] if everywhere else []
+        # a scheme that asks only for what is known where a piece begins is given that for all of it
+        found, *others = at(self._inside, *(self._later if self.space.uses_middle else ()))
+        begin = [each[:-1] for each in found]
+        if self.space.uses_middle and not self.system.cuts:
+            others.append([each[1:] for each in found])
         middle, end = others or (begin, begin)
+        nodes = [taken(each, self.points.nodes) for each in found]
         ahead = jax.tree.map(self._each_strand, (nodes, (begin, middle, end)))
         return dataclasses.replace(self, ahead=Ahead(parts.then, *ahead))
 
@@ -117,55 +113,50 @@ class StepProblem(eqx.Module):
         """s at the nodes (m)."""
         return jnp.linspace(0.0, 1.0, self.system.nodes) * self.system.length
 
-    def segments(self, along: Along, y: Float[Any, "nodes y"]) -> Any:
-        """What `along` makes of y at the nodes by the ends of all segments of all strands, those inside."""
-        s = self._each_strand(self.arclength[:-1])
-        inner = middles(self.history) if self.space.uses_middle else self.history[:-1]
-        past = (self._past_points(rows) for rows in (self.history[:-1], inner, self.history[1:]))
-        lanes = (s, self._points(y[:-1]), *past)
-        ahead = None if self.ahead is None else self.ahead.segments
-        if self.system.cuts:
-            return self._in_rounds(along, lanes, ahead)
+    @property
+    def points(self) -> Points:
+        """Where y is unknown: the nodes, and the cuts between them."""
+        return points_of(self.system)
 
-        def segment(ahead: Any, s_j: Any, y_j: Any, *history: Any) -> Any:
+    def filled(self, y: Float[Any, "nodes y"]) -> Float[Any, "points y"]:
+        """y at all points from that at the nodes: at a cut as carried there from the node before it."""
+        points, found = self.points, spread(self.points, y)
+        between = np.ones(len(points.segment), dtype=bool)
+        between[points.nodes[1:] - 1] = False
+        # one cut after the other, of all segments together
+        for _ in range(np.max(np.diff(points.nodes)) - 1):
+            reached = self.pieces(VALUES, found).reshape(found[1:].shape)
+            found = found.at[1:].set(jnp.where(between[:, None], reached, found[1:]))
+        return found
+
+    def pieces(self, along: Along, y: Float[Any, "points y"]) -> Any:
+        """What `along` makes of y at the points by the ends of all pieces of all strands, those inside."""
+        low, high = self._ends
+        acting = jnp.asarray(self.points.acting)
+        lanes = (self._each_strand(low), self._by_strand(y[:-1]), *map(self._past_by_strand, self._past))
+
+        def piece(ahead: Any, high: Any, acting: Any, low: Any, y: Any, *history: Any) -> Any:
             def advance(y: Any) -> Any:
-                return self.space.advance(self._rates, s_j, self._ds, y, known_at(history, ahead))
+                if not self.system.cuts:
+                    return self.space.advance(self._rates, low, self._ds, y, known_at(history, ahead))
+                where = low, high
+                return carried_on(self.space, self._rates, self.crossed, acting, where, y, history, ahead)
 
-            return along.on(advance, along.begin(y_j))
+            return along.on(advance, along.begin(y))
 
-        return _side_by_side(segment, lanes, ahead)
+        ahead = None if self.ahead is None else self.ahead.pieces
+        return _side_by_side(piece, lanes, ahead, self._each_strand(high), self._each_strand(acting))
 
-    def _in_rounds(self, along: Along, lanes: tuple[Any, ...], ahead: Any) -> Any:
-        """The same of segments that are parted, or where y jumps."""
-        rounds = rounds_of(self.system.cuts, self.system.nodes)
-        parted = len(rounds.segment) > 1
-
-        def part(state: Any, begins: Any, part: Any, ahead: Any, s_j: Any, y_j: Any, *history: Any) -> Any:
-            def advance(y: Any) -> Any:
-                where = s_j, self._ds
-                return carried_part(
-                    self.space, self._rates, self.crossed, part, where, y, history, parted, ahead
-                )
-
-            begun = along.begin(y_j)
-            if parted:
-                begun = jax.tree.map(lambda new, old: jnp.where(begins, new, old), begun, state)
-            return along.on(advance, begun)
-
-        def one(state: Any, given: Any) -> Any:
-            *steered, lanes = given
-            state = _side_by_side(part, lanes, state, *steered)
-            return state, state
-
-        shape, rows = rounds.segment.shape, rounds.segment.reshape(-1)
-        lanes = tuple(taken(each, rows).reshape(*shape, *each.shape[1:]) for each in lanes)
-        parts = (rounds.bounds[..., 0], rounds.bounds[..., 1], rounds.acting)
-        given = jax.tree.map(jnp.asarray, (rounds.begins, parts, ahead, lanes))
-        first = jax.vmap(along.begin)(lanes[1][0])
-        if not parted:
-            return one(first, jax.tree.map(lambda each: each[0], given))[0]
-        _, found = jax.lax.scan(one, first, given)
-        return jax.tree.map(lambda each: taken(each.reshape(-1, *each.shape[2:]), rounds.last), found)
+    @property
+    def _past(self) -> tuple[Any, Any, Any]:
+        """What is known of the past where pieces begin, are half-way and end."""
+        points = self.points
+        start, end = self.history[:-1], self.history[1:]
+        segments = start, middles(self.history) if self.space.uses_middle else start, end
+        if len(points.segment) == len(start):
+            return segments
+        begin, end = (points.bounds[:, k, None] for k in (0, 1))
+        return past_of_part(self.space, tuple(taken(each, points.segment) for each in segments), begin, end)
 
     def _rates(self, s: Any, y: Any, known: Any) -> Any:
         return self._at_point(s, y, *known)[0]
@@ -181,43 +172,54 @@ class StepProblem(eqx.Module):
         return self.system.length / (self.system.nodes - 1)
 
     @property
-    def _inside(self) -> Any:
-        """Where the equations are evaluated for the nodes: on the far side of cuts, but at the tip."""
-        s = self.arclength
+    def _ends(self) -> tuple[Any, Any]:
+        """Where pieces begin and end (m)."""
         if not self.system.cuts:
-            return s
-        return jnp.concatenate([within(s[:-1], s[:-1], s[1:]), within(s[-1:], s[-2:-1], s[-1:])])
+            return self.arclength[:-1], self.arclength[1:]
+        low, high = (self._ds * (self.points.segment + self.points.bounds[:, k]) for k in (0, 1))
+        return low, high
 
-    def _part_places(self) -> tuple[Any, Any, Any]:
-        """Where all parts of segments begin, are half-way and end, (rounds, places) each."""
-        rounds = rounds_of(self.system.cuts, self.system.nodes)
-        low, high = (self._ds * (rounds.segment + rounds.bounds[..., k]) for k in range(2))
-        return within(low, low, high), (low + high) / 2, within(high, low, high)
+    @property
+    def _inside(self) -> Any:
+        """Where the equations are evaluated for the points: on the far side of cuts, but at the tip."""
+        if not self.system.cuts:
+            return self.arclength
+        low, high = self._ends
+        return jnp.concatenate([within(low, low, high), within(high, low, high)[-1:]])
 
-    def at_points(self, function: Callable[..., Any], y: Float[Any, "nodes y"]) -> Any:
+    @property
+    def _later(self) -> tuple[Any, ...]:
+        """Where pieces are half-way and, if that is not where the next one begins, end."""
+        low, high = self._ends
+        middle = (low + high) / 2
+        return (middle, within(high, low, high)) if self.system.cuts else (middle,)
+
+    def at_nodes(self, function: Callable[..., Any], y: Float[Any, "nodes y"]) -> Any:
         """Apply `function(s, y, record of history)` to all nodes of all strands (strands inside)."""
-        at = self._each_strand(self.arclength), self._points(y), self._past_points(self.history)
+        at = self._each_strand(self.arclength), self._by_strand(y), self._past_by_strand(self.history)
         return jax.vmap(function)(*at)
 
-    def _each_strand(self, values: Shaped[Any, "n ..."]) -> Shaped[Any, "points ..."]:
+    def _each_strand(self, values: Shaped[Any, "n ..."]) -> Shaped[Any, "n_strands ..."]:
         return jnp.repeat(values, self.system.strands, axis=0) if self.system.strands > 1 else values
 
-    def _points(self, rows: Float[Any, "n x"]) -> Float[Any, "points x_of_strand"]:
+    def _by_strand(self, rows: Float[Any, "n x"]) -> Float[Any, "n_strands x_of_strand"]:
         own = in_strands(self.system, rows)
         return own.reshape(-1, own.shape[-1])
 
-    def _past_points(self, rows: Float[Any, "n x"]) -> Float[Any, "points x_of_strand"]:
+    def _past_by_strand(self, rows: Float[Any, "n x"]) -> Float[Any, "n_strands x_of_strand"]:
         own = records_in_strands(self.system, rows)
         return own.reshape(-1, own.shape[-1])
 
-    def record(self, y: Float[Any, "nodes y"]) -> Float[Any, "nodes x"]:
+    def record(self, y: Float[Any, "points y"]) -> Float[Any, "nodes x"]:
         """What must be kept of a solved step at every node: y, z and, if B is not zero, y_s."""
-        beyond, crossings = y, crossing_of(self.system)
-        if crossings is not None:
-            acting = jnp.asarray(crossings.acting[:, 0])
+        nodes = self.points.nodes
+        y, inside = taken(y, nodes), taken(self._inside, nodes)
+        beyond = y
+        if self.system.cuts:
+            acting = jnp.asarray(self.points.acting[nodes[:-1]])
             beyond = jnp.concatenate([jax.vmap(self.crossed)(acting, y[:-1], self.history[:-1]), y[-1:]])
-        points = self._each_strand(self._inside), self._points(beyond), self._past_points(self.history)
-        rates = jax.vmap(self._at_point)(*points, None if self.ahead is None else self.ahead.nodes)
+        at = self._each_strand(inside), self._by_strand(beyond), self._past_by_strand(self.history)
+        rates = jax.vmap(self._at_point)(*at, None if self.ahead is None else self.ahead.nodes)
         y_s, z = (part.reshape(y.shape[0], -1) for part in rates)
         return jnp.concatenate([y, z, y_s] if self.system.mixed else [y, z], axis=1)
 

@@ -17,8 +17,9 @@ import numpy as np
 
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import Solution, newton
+from knode_cosserat.solvers.crossing import points_of
 from knode_cosserat.solvers.linear import Decoupled
-from knode_cosserat.solvers.march import EXTRAPOLATIONS, Past, advanced, history_of
+from knode_cosserat.solvers.march import EXTRAPOLATIONS, Past, advanced, history_of, past_y
 from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
@@ -89,8 +90,8 @@ class _Step:
         return solution, record
 
     def guesses(self) -> list[tuple[Any, Any]]:
-        ny = self.system.y_layout.size
-        guesses = [jnp.einsum("p,pny->ny", w, self.past.records[:, :, :ny]) for w in EXTRAPOLATIONS[:2]]
+        recent = past_y(self.system, self.past)
+        guesses = [jnp.einsum("p,pny->ny", w, recent) for w in EXTRAPOLATIONS[:2]]
         return [(y, self.system.unknowns(y[0])) for y in guesses]
 
     def solved(self, solution: Solution) -> bool:
@@ -98,7 +99,8 @@ class _Step:
 
     def after(self, solution: Solution, record: Any) -> Past:
         rate = self.coefficients[0] * record + self.history
-        return advanced(self.past, record, rate, jnp.asarray(EXTRAPOLATIONS[0]))
+        between = solution.y[points_of(self.system).between]
+        return advanced(self.past, record, rate, between, jnp.asarray(EXTRAPOLATIONS[0]))
 
 
 def recover(
@@ -269,7 +271,7 @@ def _relax(step: _Step, control: Any) -> tuple[Solution, Any] | None:
         part = target
         if dt > longest:
             break
-    y = now.records[0][:, : step.system.y_layout.size]
+    y = past_y(step.system, now)[0]
     found = step.solve(control, y, step.system.unknowns(y[0]))
     return found if step.solved(found[0]) else None
 

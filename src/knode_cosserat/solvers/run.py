@@ -15,7 +15,7 @@ from tqdm import tqdm
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import static_error
 from knode_cosserat.solvers.linear import ELIMINATIONS
-from knode_cosserat.solvers.march import Past, Rows, initial_past, march_many, march_one
+from knode_cosserat.solvers.march import Past, Rows, guessed_between, initial_past, march_many, march_one
 from knode_cosserat.solvers.recovery import Outcome, other_unit, recover
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
@@ -99,7 +99,10 @@ def _refined(task: Task, system: System, fine: System, start: Start) -> Start:
     def refined(values: Any, axis: int) -> Any:
         return make_interp_spline(coarse_s, np.asarray(values), k=min(3, system.nodes - 1), axis=axis)(fine_s)
 
-    past = start.past._replace(records=refined(start.past.records, 1), rate=refined(start.past.rate, 0))
+    records = refined(start.past.records, 1)
+    past = start.past._replace(
+        records=records, rate=refined(start.past.rate, 0), between=guessed_between(fine, records)
+    )
     if _is_still(task, system, start):
         still = dataclasses.replace(task, steps=1, first="still")
         found, _ = _with_recovery(still, fine, start.control[None], start._replace(past=past), False)

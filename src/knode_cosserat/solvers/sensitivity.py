@@ -84,6 +84,7 @@ def tangent_march(
 
         problem = problem_of(system, control, history)
         linear = Condensed()
+        y = problem.filled(y)
         linearisation = linearise(problem, y, xi)
         factors, _, _ = linear.start(linearisation, y_scale)
 

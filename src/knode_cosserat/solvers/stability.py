@@ -35,7 +35,7 @@ def _jacobians(problem: StepProblem, y: Any) -> Any:
     def at_node(s: Any, y: Any, history: Any) -> Any:
         return jax.jacfwd(lambda y: problem.point_rates(s, y, history)[0])(y)
 
-    return problem.at_points(at_node, y)
+    return problem.at_nodes(at_node, y)
 
 
 def decay_per_segment(
