@@ -11,10 +11,19 @@ import pytest
 from hypothesis import given, settings
 
 import knode_cosserat as kc
-from knode_cosserat.solvers.crossing import Crossing, carried, crossings, points_between, spread, taken
+from knode_cosserat.solvers.between import along_pieces
+from knode_cosserat.solvers.crossing import (
+    Crossing,
+    carried,
+    crossings,
+    parts_of,
+    points_between,
+    spread,
+    taken,
+)
 from knode_cosserat.solvers.march import rest_record
 from knode_cosserat.solvers.problem import StepProblem
-from knode_cosserat.solvers.space import SCHEMES, SLOPES, VALUES, middles
+from knode_cosserat.solvers.space import SCHEMES, SLOPES, VALUES
 
 CUTS = st.lists(st.floats(1e-3, 1.0 - 1e-3), min_size=1, max_size=8, unique=True)
 
@@ -79,7 +88,8 @@ def test_pieces_side_by_side_as_parts_one_after_the_other(space, changes):
         robot, jnp.zeros(()), jnp.array([6.0, 7.0, 5.0, 6.0]), jnp.array(20.0), jnp.asarray(history),
         SCHEMES[space],
     )  # fmt: skip
-    inner = middles(history) if SCHEMES[space].uses_middle else history[:-1]
+    past = along_pieces(robot, SCHEMES[space], jnp.asarray(history))
+    parts = parts_of(robot.cuts, robot.nodes)
     ds = robot.length / (robot.nodes - 1)
 
     def one(j, crossing, y_j, past):
@@ -89,7 +99,7 @@ def test_pieces_side_by_side_as_parts_one_after_the_other(space, changes):
         return carried(SCHEMES[space], rates, problem.crossed, crossing, (j * ds, ds), y_j, past)
 
     own = [
-        (float(j), Crossing(bounds, acting), y[j], (history[j], inner[j], history[j + 1]))
+        (float(j), Crossing(bounds, acting), y[j], tuple(each[parts[j]] for each in past))
         for j, (bounds, acting) in enumerate(zip(*crossings(robot.cuts, robot.nodes), strict=True))
     ]
     value, slope = jax.jit(one), jax.jit(jax.jacfwd(one, argnums=2))

@@ -18,11 +18,12 @@ from jaxtyping import Float
 
 from knode_cosserat.learning.sides import far_side, slopes_of
 from knode_cosserat.rods.system import System, in_strands, records_in_strands, unpacked_history
-from knode_cosserat.solvers.crossing import Crossing, carried, crossing_of, within
+from knode_cosserat.solvers.between import along_pieces
+from knode_cosserat.solvers.crossing import Crossing, carried, crossing_of, parts_of, within
 from knode_cosserat.solvers.march import coefficient_table
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.space import SpaceScheme, middles
+from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
 
 
@@ -45,8 +46,10 @@ class Samples(NamedTuple):
     #: y_s times the length at the segment's start, from the states alone
     slope: Float[Any, "S y"]
     control: Float[Any, "S c"]
-    #: packed records of history at the segment's start, middle and end
+    #: packed records of history where its first part, most often all of it, begins, is half-way and ends
     history: tuple[Float[Any, "S x"], Float[Any, "S x"], Float[Any, "S x"]]
+    #: the same of the parts after cuts within it, if the robot has such segments
+    later: Float[Any, "S parts-1 3 x"]
     #: one over how many samples the same trajectory gave
     weight: Float[Any, " S"]
     #: which trajectory, and which of its rows
@@ -99,7 +102,10 @@ def predict(system: System, space: SpaceScheme, sample: Samples) -> tuple[Float[
     else:
         segment = jnp.round(sample.place * (system.nodes - 1)).astype(int)
         crossing = Crossing(*(jnp.asarray(each)[segment] for each in crossings))
-        y_next = carried(space, rates, jump, crossing, (s, ds), sample.y, sample.history, first=1)
+        start, middle, end = (
+            jnp.concatenate([each[None], sample.later[:, k]]) for k, each in enumerate(sample.history)
+        )
+        y_next = carried(space, rates, jump, crossing, (s, ds), sample.y, (start, middle, end), first=1)
     return y_next, derivatives(start_of(system, sample.place), sample.y, sample.history[0])[1]
 
 
@@ -136,14 +142,14 @@ def of_strands(knowledge: System, data: Dataset) -> Dataset:
         return np.asarray(in_strands(knowledge, values)).reshape(len(values) * count, -1)
 
     def past(records: Any) -> Any:
-        return np.asarray(records_in_strands(knowledge, np.asarray(records))).reshape(
-            len(records) * count, -1
-        )
+        own = np.asarray(records_in_strands(knowledge, np.asarray(records)))
+        return np.moveaxis(own, -2, 1).reshape(len(records) * count, *own.shape[1:-2], own.shape[-1])
 
     shared = ("place", "t", "c0", "control", "weight", "origin")
     every: dict[str, Any] = {name: np.repeat(getattr(segments, name), count, axis=0) for name in shared}
     every |= {name: own(getattr(segments, name)) for name in ("y", "z", "y_next", "slope")}
-    every |= {"history": tuple(map(past, segments.history)), "weight": every["weight"] / count}
+    every |= {"history": tuple(map(past, segments.history)), "later": past(segments.later)}
+    every |= {"weight": every["weight"] / count}
     doubt = np.sqrt(np.mean(np.square(in_strands(knowledge, data.doubt)), axis=0))
     return dataclasses.replace(data, segments=Samples(**every), per_row=data.per_row * count, doubt=doubt)
 
@@ -169,7 +175,8 @@ def _of_one(
     first = 1 if time[0] == 0.0 else 2
     rows = np.arange(first, len(time))
     history, c0 = history[rows], c0[rows]
-    between = np.stack([np.asarray(middles(each)) for each in history])
+    past = jax.vmap(lambda each: past_of_segments(knowledge, settings.space, each))(history)
+    (begin, middle, end), later = jax.tree.map(np.asarray, past)
     starts, count = ends - 1, len(rows) * len(ends)
 
     def flat(values: Any) -> Any:
@@ -188,7 +195,8 @@ def _of_one(
         y_next=flat(y[np.ix_(rows, ends)]),
         slope=flat(slope[at]),
         control=spread(control[rows]),
-        history=(flat(history[:, starts]), flat(between[:, starts]), flat(history[:, ends])),
+        history=(flat(begin[:, starts]), flat(middle[:, starts]), flat(end[:, starts])),
+        later=flat(later[:, starts]),
         weight=np.full(count, 1.0 / count),
         origin=np.stack([np.full(count, k), spread(rows)], axis=1),
     )
@@ -197,6 +205,13 @@ def _of_one(
         weight=np.full(len(rows), 1.0 / len(rows)), origin=np.stack([np.full(len(rows), k), rows], axis=1),
     )  # fmt: skip
     return segments, tips, doubt
+
+
+def past_of_segments(knowledge: System, space: SpaceScheme, records: Float[Any, "nodes x"]) -> Any:
+    """`Samples.history` and `Samples.later` of all segments of one row, from its history at the nodes."""
+    pieces = jnp.stack(along_pieces(knowledge, space, records), axis=1)
+    found = pieces[parts_of(knowledge.cuts, knowledge.nodes)]
+    return (found[:, 0, 0], found[:, 0, 1], found[:, 0, 2]), found[:, 1:]
 
 
 def histories(settings: Settings, dt: float, record: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

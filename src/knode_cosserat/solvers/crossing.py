@@ -2,8 +2,7 @@
 
 A scheme in arclength keeps its order only where the right-hand side is smooth. A segment is therefore
 parted where the system has a cut, and y jumps there if the system says so. A cut on a node parts nothing: y
-at a node is that on its near side, z that on its far side. What is known of the past at a cut is
-interpolated, to order 3.
+at a node is that on its near side, z that on its far side.
 
 A step is solved for y at the cuts as for y at the nodes, so that all pieces lie side by side. What has only
 the nodes carries y over a segment piece by piece.
@@ -97,6 +96,12 @@ def points_between(cuts: tuple[float, ...], nodes: int) -> Points:
     )
 
 
+def parts_of(cuts: tuple[float, ...], nodes: int) -> Int[np.ndarray, "segments parts"]:
+    """Which pieces are a segment's parts, the last one again for those that it does not have."""
+    first, parts = points_between(cuts, nodes).nodes, crossings(cuts, nodes).acting.shape[1]
+    return np.minimum(first[:-1, None] + np.arange(parts), first[1:, None] - 1)
+
+
 def points_of(system: System) -> Points:
     """The points of a system."""
     return points_between(system.cuts, system.nodes)
@@ -105,7 +110,8 @@ def points_of(system: System) -> Points:
 def taken(values: Any, rows: np.ndarray) -> Any:
     """Rows of an array by numbers that are known: runs of neighbours, each copied as a whole."""
     runs = np.split(rows, np.flatnonzero(np.diff(rows) != 1) + 1)
-    return jnp.concatenate([values[run[0] : run[-1] + 1] for run in runs])
+    found = [values[run[0] : run[-1] + 1] for run in runs]
+    return found[0] if len(found) == 1 else jnp.concatenate(found)
 
 
 def spread(points: Points, values: Float[Any, "nodes ..."]) -> Float[Any, "points ..."]:
@@ -125,7 +131,8 @@ def carried(
 ) -> Float[Any, " y"]:  # fmt: skip
     """y at a segment's end from y at its start; `where` is its start and its length (m).
 
-    `first` of 1 leaves out the jump at the start: y is then that on the far side.
+    `history` is that where each part begins, is half-way and ends. `first` of 1 leaves out the jump at the
+    start: y is then that on the far side.
     """
     acting = jnp.asarray(crossing.acting).at[:first].set(0.0)
     s, ds = where
@@ -133,12 +140,11 @@ def carried(
     def of_past(s: Any, y: Any, known: tuple[Any, Any]) -> Any:
         return rates(s, y, known[0])
 
-    def part(y: Any, given: tuple[Any, Any, Any]) -> Any:
-        begin, end, acting = given
-        past = past_of_part(space, history, begin, end)
+    def part(y: Any, given: tuple[Any, Any, Any, Any]) -> Any:
+        begin, end, acting, past = given
         return carried_on(space, of_past, jump, acting, (s + begin * ds, s + end * ds), y, past), None
 
-    y, _ = jax.lax.scan(part, y, (crossing.bounds[:-1], crossing.bounds[1:], acting))
+    y, _ = jax.lax.scan(part, y, (crossing.bounds[:-1], crossing.bounds[1:], acting, history))
     return y
 
 
@@ -163,18 +169,3 @@ def known_at(history: tuple[Any, Any, Any], ahead: tuple[Any, Any, Any] | None) 
     """What is known where a piece begins, is half-way and ends: (past there, what was evaluated ahead)."""
     start, middle, end = zip(history, (None, None, None) if ahead is None else ahead, strict=True)
     return start, middle, end
-
-
-def past_of_part(
-    space: SpaceScheme, history: tuple[Any, Any, Any], begin: Any, end: Any
-) -> tuple[Any, Any, Any]:
-    """What is known of the past at the begin, middle and end of a part, from that of the whole segment."""
-    start, middle, last = history
-
-    def at(part: Any) -> Any:
-        if not space.uses_middle:
-            return start + part * (last - start)
-        weights = (2 * part - 1) * (part - 1), 4 * part * (1 - part), part * (2 * part - 1)
-        return weights[0] * start + weights[1] * middle + weights[2] * last
-
-    return at(begin), at((begin + end) / 2), at(end)

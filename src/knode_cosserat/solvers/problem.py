@@ -20,17 +20,17 @@ from knode_cosserat.rods.system import (
     unpacked_history,
 )
 from knode_cosserat.solvers.ahead import in_two
+from knode_cosserat.solvers.between import along_pieces
 from knode_cosserat.solvers.crossing import (
     Points,
     carried_on,
     known_at,
-    past_of_part,
     points_of,
     spread,
     taken,
     within,
 )
-from knode_cosserat.solvers.space import VALUES, Along, SpaceScheme, middles
+from knode_cosserat.solvers.space import VALUES, Along, SpaceScheme
 
 
 class Ahead(NamedTuple):
@@ -133,7 +133,8 @@ class StepProblem(eqx.Module):
         """What `along` makes of y at the points by the ends of all pieces of all strands, those inside."""
         low, high = self._ends
         acting = jnp.asarray(self.points.acting)
-        lanes = (self._each_strand(low), self._by_strand(y[:-1]), *map(self._past_by_strand, self._past))
+        past = along_pieces(self.system, self.space, self.history)
+        lanes = (self._each_strand(low), self._by_strand(y[:-1]), *map(self._past_by_strand, past))
 
         def piece(ahead: Any, high: Any, acting: Any, low: Any, y: Any, *history: Any) -> Any:
             def advance(y: Any) -> Any:
@@ -146,17 +147,6 @@ class StepProblem(eqx.Module):
 
         ahead = None if self.ahead is None else self.ahead.pieces
         return _side_by_side(piece, lanes, ahead, self._each_strand(high), self._each_strand(acting))
-
-    @property
-    def _past(self) -> tuple[Any, Any, Any]:
-        """What is known of the past where pieces begin, are half-way and end."""
-        points = self.points
-        start, end = self.history[:-1], self.history[1:]
-        segments = start, middles(self.history) if self.space.uses_middle else start, end
-        if len(points.segment) == len(start):
-            return segments
-        begin, end = (points.bounds[:, k, None] for k in (0, 1))
-        return past_of_part(self.space, tuple(taken(each, points.segment) for each in segments), begin, end)
 
     def _rates(self, s: Any, y: Any, known: Any) -> Any:
         return self._at_point(s, y, *known)[0]

@@ -23,6 +23,8 @@ from knode_cosserat.trajectory import Trajectory
 
 #: ten times the solver's tolerance, of natural sizes: what is less is its error, and not even white
 LEAST = 1e-9
+#: what a sample holds of states
+SEEN = ("y", "z", "y_next", "history", "later")
 #: draws of noise; what is found with both signs of each hardly depends on how many there are
 DRAWS = 6
 
@@ -51,11 +53,12 @@ def _differences(robot, coordinates, data, length, unknowns, space):  # type: ig
         if not system.mixed:
             return record
         ny = system.y_layout.size
-        return jnp.concatenate([record[:-ny], record[-ny:] * (length / system.length)])
+        return jnp.concatenate([record[..., :-ny], record[..., -ny:] * (length / system.length)], axis=-1)
 
     def of_segment(sample: Samples) -> Any:
         history: Any = tuple(scaled(record) for record in sample.history)
-        y_next, z = predict(system, space, sample._replace(history=history))
+        own = sample._replace(history=history, later=scaled(sample.later))
+        y_next, z = predict(system, space, own)
         return jnp.concatenate([y_next - sample.y_next, z - sample.z])
 
     def of_tip(sample: TipSamples) -> Any:
@@ -82,14 +85,13 @@ def _pulled_back(robot, coordinates, data, length, unknowns, space, factors):  #
 
     def of(measured: Any) -> Any:
         s, t = measured
-        y, z, y_next, history = s
         moved = (
-            segments._replace(y=y, z=z, y_next=y_next, history=history),
+            segments._replace(**dict(zip(SEEN, s, strict=True))),
             tips._replace(y=t[0], history=t[1]),
         )
         return _differences(robot, coordinates, moved, length, unknowns, space)
 
-    measured = (segments.y, segments.z, segments.y_next, segments.history), (tips.y, tips.history)
+    measured = tuple(getattr(segments, name) for name in SEEN), (tips.y, tips.history)
     _, pull = jax.vjp(of, measured)
     return jax.vmap(lambda factor: pull(factor)[0])(factors)
 
@@ -210,6 +212,7 @@ class SegmentMisfit:
                 z=own.z + in_z * segments.z,
                 y_next=own.y_next + in_y * segments.y_next,
                 history=history,
+                later=remembered(own.later, segments.later),
             ),
             own_tips._replace(
                 y=own_tips.y + in_y * tips.y, history=remembered(own_tips.history, tips.history)

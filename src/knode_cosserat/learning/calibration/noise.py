@@ -11,14 +11,14 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.learning.calibration.misfit import Differences, SegmentMisfit, by_group
 from knode_cosserat.learning.calibration.search import Fit, Misfit
-from knode_cosserat.learning.samples import histories, settings_of
+from knode_cosserat.learning.samples import histories, past_of_segments, settings_of
 from knode_cosserat.learning.sides import slopes_of
-from knode_cosserat.solvers.space import middles
 from knode_cosserat.trajectory import Trajectory
 
 #: numbers of states are not known better than to this part
@@ -145,18 +145,19 @@ def _by_states(
     (count, nodes), (n, ny) = np.shape(trajectory.y)[:2], (len(tip_y), robot.y_layout.size)
 
     def per_row(values: Any) -> Any:
-        return values[:, mine].reshape(n, len(rows), nodes - 1, -1)
+        return values[:, mine].reshape(n, len(rows), nodes - 1, *values.shape[2:])
 
-    y, z, y_next, (start, middle, end) = segments
+    y, z, y_next, *past = segments
     total = np.zeros((n, count, nodes, ny + robot.z_layout.size))
     total[:, rows, :-1, :ny] += per_row(y)
     total[:, rows, :-1, ny:] += per_row(z)
     total[:, rows, 1:, :ny] += per_row(y_next)
     total[:, rows, -1, :ny] += tip_y[:, tips]
 
-    history = np.einsum("sj,nrsx->nrjx", middles(np.eye(nodes)), per_row(middle))
-    history[:, :, :-1] += per_row(start)
-    history[:, :, 1:] += per_row(end)
+    still = np.zeros((nodes, tip_history.shape[-1]))
+    _, back = jax.vjp(lambda records: past_of_segments(robot, settings.space, records), still)
+    own = jax.tree.map(per_row, tuple(past))
+    history = np.array(jax.vmap(jax.vmap(lambda *each: back(each)[0]))(*own))
     history[:, :, -1] += tip_history[:, tips]
     _, in_time = histories(settings, trajectory.dt, np.eye(count))
     records = np.einsum("rt,nrjx->ntjx", in_time[rows], history)

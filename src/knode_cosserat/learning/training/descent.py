@@ -205,7 +205,8 @@ def _noisy(samples: Samples, data: Data, noise: Any, key: Any) -> Samples:
     # the same along the segment: as if the whole past were a little different
     shift = noise * data.history_spread * jax.random.normal(for_history, samples.history[0].shape)
     start, middle, end = (part + shift for part in samples.history)
-    return samples._replace(y=y, history=(start, middle, end))
+    later = samples.later + shift[:, None, None]
+    return samples._replace(y=y, history=(start, middle, end), later=later)
 
 
 def _rate(recipe: Recipe, numbers: Numbers, epoch: Any, rate: Any) -> Any:
