@@ -21,12 +21,12 @@ def rod(cuts, nodes):
     )
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(st.data(), st.sampled_from(["euler", "rk4"]))
 def test_what_jumps_at_cuts_is_exact_on_both_sides(data, space):
-    """Another cubic in each stretch, if this has four nodes; in y one that goes on."""
+    """Another polynomial in each stretch, cubic if this has four nodes; in y one that goes on."""
     nodes = data.draw(st.integers(15, 30))
-    cuts = [data.draw(st.floats(5.0, 9.0).map(lambda x, n=nodes: x / (n - 1.0)))]
+    cuts = [data.draw(st.floats(0.6, 9.4).map(lambda x, n=nodes: x / (n - 1.0)))]
     on_node = data.draw(st.booleans())
     if on_node:
         cuts = [round(cuts[0] * (nodes - 1)) / (nodes - 1)]
@@ -34,6 +34,9 @@ def test_what_jumps_at_cuts_is_exact_on_both_sides(data, space):
     random = np.random.default_rng(data.draw(st.integers(0, 1000)))
     ny, nz = system.y_layout.size, system.z_layout.size
     smooth, before, after = random.normal(size=(4, ny)), *random.normal(size=(2, 4, nz))
+    few = int(np.ceil(cuts[0] * (nodes - 1) - 1e-9))
+    before[few:] = 0.0
+    smooth[few + on_node :] = 0.0
 
     def cubic(numbers, s):
         return np.stack([s**k for k in range(4)], axis=1) @ numbers
@@ -54,7 +57,7 @@ def test_what_jumps_at_cuts_is_exact_on_both_sides(data, space):
         np.testing.assert_allclose(each[:, ny:], expected, atol=1e-9)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(st.lists(st.floats(0.001, 0.999), max_size=6, unique=True), st.integers(2, 12))
 def test_what_is_the_same_everywhere_stays_so(cuts, nodes):
     """However many cuts there are, and stretches without a node."""

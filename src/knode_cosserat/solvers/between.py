@@ -40,25 +40,24 @@ def plan(cuts: tuple[float, ...], nodes: int) -> Plan:
     along = np.append(points.segment + points.bounds[:, 0], nodes - 1.0)
     edges = np.concatenate([[0.0], along[:-1][points.acting.any(axis=1)], [nodes - 1.0]])
     rows = np.stack([points.segment, points.segment, points.segment + 1])
-    regular = np.broadcast_to(np.array([[False], [True], [False]]), rows.shape).copy()
-    whole = np.diff(along) == 1.0
+    # those that are as in a rod without cuts
+    regular = np.full(rows.shape, True)
     weights: list[list[np.ndarray]] = []
     for piece, (low, high) in enumerate(itertools.pairwise(along)):
         first, last = edges[edges <= low].max(), edges[edges >= high].min()
-        before, after = first > 0.0, last < nodes - 1.0
         stretch = np.arange(np.ceil(first), np.floor(last) + 1.0)
         # at a cut on a node what jumps is known on the far side
-        jumping = stretch[stretch < last] if after else stretch
-        near_edge = (before and low - first < 1.0) or (after and last - high <= 1.0)
+        jumping = stretch if last == nodes - 1.0 else stretch[stretch < last]
+        lowest = min(max(low - 1.0, 0.0), max(nodes - NEAREST, 0.0))
+        used = np.array([low]), np.arange(lowest, min(lowest + NEAREST, nodes)), np.array([high])
         for k, place in enumerate((low, (low + high) / 2.0, high)):
-            if whole[piece] and (k == 0 or not near_edge) and not (k == 2 and after and high == last):
-                continue
-            rows[k, piece], regular[k, piece] = nodes + len(weights), False
-            nearby = np.array([points.segment[piece], points.segment[piece] + 1.0])
-            weights.append(
-                [_weights(own if len(own) else nearby, place, nodes) for own in (stretch, jumping)]
-            )
-    rows[regular] += nodes + len(weights)
+            if cuts and not np.isin(used[k], jumping).all():
+                rows[k, piece], regular[k, piece] = nodes + len(weights), False
+                nearby = np.array([points.segment[piece], points.segment[piece] + 1.0])
+                weights.append(
+                    [_weights(own if len(own) else nearby, place, nodes) for own in (stretch, jumping)]
+                )
+    rows[1, regular[1]] += nodes + len(weights)
     return Plan(np.array(weights).reshape(-1, 2, nodes).swapaxes(0, 1), rows)
 
 
