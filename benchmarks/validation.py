@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.ticker import NullLocator
 
 import knode_cosserat as kc
-from benchmarks import beams, closed_forms
+from benchmarks import beams, closed_forms, motions
 from benchmarks.buckling import tip_response
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -52,13 +52,14 @@ def convergence(families: dict[str, dict[str, list[float]]], path: Path) -> None
         for name, found in family.items():
             if max(np.abs(found)) > EXACT:
                 ax.loglog(GRID, np.abs(found), "o-", ms=4, lw=1.2, label=name)
-        ax.set(title=title, xlabel="nodes", ylabel="relative error", xticks=GRID)
-        ax.xaxis.set_minor_locator(NullLocator())
-        ax.set_xticklabels([str(nodes) for nodes in GRID])
         slope = 1 if "Euler" in title else 4
         largest = max(abs(each[0]) for each in family.values())
         line = 2 * largest * ((np.array(GRID) - 1) / (GRID[0] - 1)) ** -float(slope)
         ax.loglog(GRID, line, "k--", lw=0.8, label=f"order {slope}")
+        # after the last line: each sets the axes' scale anew, and with it their ticks
+        ax.set(title=title, xlabel="nodes", ylabel="relative error")
+        ax.set_xticks(GRID, [str(nodes) for nodes in GRID])
+        ax.xaxis.set_minor_locator(NullLocator())
         ax.legend(fontsize=7, loc="lower left")
         ax.grid(alpha=0.3)
     figure.savefig(path, dpi=130)
@@ -161,14 +162,17 @@ def main() -> None:
         "euler": _all(beams.STATICS, "euler", EULER),
         "buckling": _all(beams.BUCKLING, "rk4"),
         "vibration": _all(beams.VIBRATION, "rk4"),
+        "motion": _all(motions.MOTIONS, "rk4"),
     }
-    names = {key: case.name for key, case in {**beams.STATICS, **beams.BUCKLING, **beams.VIBRATION}.items()}
+    families = beams.STATICS, beams.BUCKLING, beams.VIBRATION, motions.MOTIONS
+    names = {key: case.name for family in families for key, case in family.items()}
     written(DOCS / "validation.md", {name: table(found, names) for name, found in every.items()})
     convergence(
         {
             "statics, RK4": every["statics"],
             "statics, Euler": every["euler"],
             "buckling and vibration, RK4": {**every["buckling"], **every["vibration"]},
+            "damped motion, RK4": every["motion"],
         },
         DOCS / "images" / "validation-convergence.png",
     )

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks import beams, closed_forms
+from benchmarks import beams, closed_forms, motions
 
 GRID = (20, 40)
 #: by RK4, to rounding: polynomials of degree four, and a circle so flat that they nearly are
@@ -46,6 +46,15 @@ def test_frequencies(key):
     errors = [beams.VIBRATION[key].error(nodes, "rk4") for nodes in GRID]
     assert abs(errors[-1]) < 5e-4
     assert beams.order(errors, GRID) == pytest.approx(4.0, abs=0.2)
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("key", motions.MOTIONS)
+def test_damped_motions(key):
+    """Where the strains jump too: with one past for both sides of a cut errors were of order 1."""
+    errors = [motions.MOTIONS[key].error(nodes, "rk4") for nodes in GRID]
+    assert errors[-1] < 1e-6
+    assert beams.order(errors, GRID) > 3.8
 
 
 # the formulas, against what is published or known otherwise

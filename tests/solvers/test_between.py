@@ -3,10 +3,10 @@
 import hypothesis.strategies as st
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from hypothesis import given, settings
 
 import knode_cosserat as kc
+from benchmarks.motions import soft_rod
 from knode_cosserat.solvers.between import along_pieces
 from knode_cosserat.solvers.crossing import points_of
 from knode_cosserat.solvers.space import SCHEMES, middles
@@ -77,52 +77,11 @@ def test_a_rod_without_cuts_is_as_its_nodes_and_middles():
     np.testing.assert_array_equal(end, records[1:])
 
 
-def errors(robot, controls, dt, nodes, finest, **settings):
-    """How far the tip's path is from that of the finest, for each number of nodes."""
-
-    def path(count):
-        return kc.simulate(robot.replace(nodes=count), controls, dt, space="rk4", **settings).tip_position
-
-    truth = path(finest)
-    return np.array([np.max(np.abs(path(count) - truth)) for count in nodes])
-
-
-DAMPED = kc.SlenderRod(
-    **BEAM, bending_damping=1e-3 * np.eye(3), linear_drag=1e-2 * np.eye(3), gravity=(2.0, 0.0, -2.0)
-)  # fmt: skip
-
-
-def changing(*ends):
-    return DAMPED.replace(sections=tuple(kc.Stretch(end=end, stiffness=[2.0]) for end in ends))
-
-
 def test_a_damped_motion_is_as_accurate_where_sections_change():
     """On a node, and between two. With one past for both sides it was a thousandth of the length."""
-    (found,) = errors(changing(0.3, 0.617), np.zeros((15, 0)), 0.02, (21,), 81)
-    assert found < 1e-5 * BEAM["length"]
-
-
-@pytest.mark.campaign
-@pytest.mark.parametrize("end", [0.3, 0.317])
-def test_a_damped_motion_keeps_its_order_where_the_section_changes(end):
-    still, nodes = np.zeros((15, 0)), (21, 41, 81)
-    found = errors(changing(end), still, 0.02, nodes, 161)
-    assert np.all(found < 2.0 * errors(DAMPED, still, 0.02, nodes, 161))
-    assert found[2] < found[1] / 8.0
-
-
-@pytest.mark.campaign
-@pytest.mark.parametrize("end", [0.6, 0.63])
-def test_a_damped_motion_keeps_its_order_where_a_tendon_ends(end):
-    crude = kc.load_robot("delrin-tendon-robot")
-    helices = tuple(kc.routing.Helical(0.02, angle, 0.5, end=e) for angle, e in ((0.3, 1.0), (2.4, end)))
-    robot = kc.RoutedTendonRobot.like(crude, routing=helices)
-    found = errors(robot, kc.controls.sine(1.5, 60, 0.05)[:, :2], 0.05, (21, 41, 81), 161)
-    assert found[1] < 1e-6 * float(robot.length) and found[2] < found[1] / 8
-
-
-@pytest.mark.campaign
-def test_a_damped_motion_of_the_robot_with_ribs_and_a_sleeve_keeps_its_order():
-    robot = kc.load_robot("delrin-routed-tendon-robot")
-    found = errors(robot, kc.controls.sine(1.5, 60, 0.05), 0.05, (21, 41, 81), 161)
-    assert found[1] < 1e-6 * float(robot.length) and found[2] < found[1] / 8
+    robot = soft_rod(0.3, 0.617)
+    coarse, fine = (
+        kc.simulate(robot.replace(nodes=nodes), np.zeros((15, 0)), 0.02, space="rk4").tip_position
+        for nodes in (21, 81)
+    )
+    assert np.max(np.abs(coarse - fine)) < 1e-5 * robot.length
