@@ -1,6 +1,7 @@
 """Trajectories of the paper's robot and of a bar to calibrate by, and what measuring makes of them."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
@@ -11,9 +12,10 @@ FOUR = ["youngs_modulus", "length", "bending_damping", "drag"]
 DT = 0.05
 
 
-def sines(robot: kc.System) -> list[kc.Trajectory]:
+def sines(robot: kc.System, **solved: Any) -> list[kc.Trajectory]:
     """The training data of the paper's study."""
-    return [kc.simulate(robot, kc.controls.sine(period, 30, DT), DT)[:30] for period in (0.5, 1.0)]
+    controls = [kc.controls.sine(period, 30, DT) for period in (0.5, 1.0)]
+    return [kc.simulate(robot, each, DT, **solved)[:30] for each in controls]
 
 
 def noisy(trajectories: list[kc.Trajectory], part: float, seed: int) -> list[kc.Trajectory]:
