@@ -21,7 +21,7 @@ from knode_cosserat.solvers.crossing import (
     spread,
     taken,
 )
-from knode_cosserat.solvers.march import rest_record
+from knode_cosserat.solvers.march import initial_past, rest_record
 from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.space import SCHEMES, SLOPES, VALUES
 
@@ -121,3 +121,22 @@ def test_pieces_side_by_side_as_parts_one_after_the_other(space, changes):
     ]
     natural = scale / scale[:, None]
     np.testing.assert_allclose(found * natural, slopes * natural, rtol=1e-9, atol=1e-9)
+
+
+class RememberingSlopes(kc.SlenderRod):
+    """The same rod, as if its equations asked for the past of y_s."""
+
+    mixed = True
+
+
+def test_what_remembers_slopes_too_begins_with_those_of_its_nodes():
+    beam = {"length": 0.5, "radius": 0.005, "density": 1200.0, "youngs_modulus": 5e6, "nodes": 8}
+    plain, other = (
+        rod(**beam, sections=(kc.Stretch(end=0.317, stiffness=[2.0]),))
+        for rod in (kc.SlenderRod, RememberingSlopes)
+    )
+    past = initial_past(other, rest_record(other), jnp.zeros(0))
+    # straight, and so alike all along
+    np.testing.assert_allclose(past.records[0, :, -plain.y_layout.size :][:, 2], 1.0, atol=1e-12)
+    found, expected = (kc.simulate(rod, np.zeros((3, 0)), 0.02).y for rod in (other, plain))
+    np.testing.assert_allclose(found, expected, atol=1e-9)

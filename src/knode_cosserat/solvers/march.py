@@ -69,7 +69,8 @@ def initial_past(system: System, record: Any, control: Any) -> Past:
     if system.mixed:
         nothing = jnp.zeros((system.nodes, ny + nz + ny))
         still = StepProblem(system, jnp.zeros(()), control, jnp.zeros(()), nothing, Euler())
-        record = jnp.concatenate([record, still.record(record[:, :ny])[:, ny + nz :]], axis=1)
+        y_s = still.record(still.filled(record[:, :ny]))[:, ny + nz :]
+        record = jnp.concatenate([record, y_s], axis=1)
     records = jnp.stack([record] * PAST)
     weights = jnp.asarray(EXTRAPOLATIONS[0])
     return Past(records, jnp.zeros_like(record), guessed_between(system, records), weights, jnp.zeros(()))
