@@ -304,7 +304,7 @@ def test_the_demonstration_runs_and_says_what_it_shows(tmp_path):
     done = python(demo, "--out", "pictures", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     written = {path.name for path in (tmp_path / "pictures").iterdir()}
-    assert written == {"truth.nc", "overview.png", "recording.png", "model", "learning.png"}
+    assert written == {"truth.nc", "overview.png", "recording.png", "model", "learning.png", "scene.html"}
     assert "tip DTW 61." in done.stdout
     assert "simulated stand-in robot" in done.stdout.replace("\n   ", " ")
     rows = {line[3:33].strip(): line[33:].split() for line in done.stdout.splitlines()}

@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import knode_cosserat as kc
-from knode_cosserat.control.search import rotation_between
+from knode_cosserat.control.search import at_limits, rotation_between
 from knode_cosserat.learning.structured.residual import Structured
 
 ROBOT = kc.load_robot("delrin-tendon-robot")
@@ -94,6 +96,27 @@ def test_what_cannot_be_reached_gives_the_nearest(target):
     # and nothing among many samples is nearer
     sampled = kc.workspace(ROBOT, 0.0, 3.0, 1024).position
     assert found.position_error <= np.min(np.linalg.norm(sampled - target, axis=1)) + 1e-9
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.floats(0.0, 1.0))
+def test_a_step_up_to_a_limit_ends_there(u):
+    """In floating point u + (1 - u) may be a little less than 1, and a limit would not seem active."""
+    assert at_limits(np.array(u + (1.0 - u))) == 1.0
+    assert at_limits(np.array(u - u)) == 0.0
+    assert at_limits(np.array(u)) == pytest.approx(u, abs=1e-12)
+
+
+def test_a_beginning_beside_a_limit_is_at_it():
+    """What cannot be reached is known by active limits: with one missed by rounding it was not known."""
+    target = (0.5, 0.2, 0.6)
+    found = kc.inverse_kinematics(ROBOT, target, low=0.0, high=3.0)
+    assert np.any(found.at_high)
+    beside = np.where(found.at_high, np.nextafter(3.0, 0.0), found.control)
+    again = kc.inverse_kinematics(ROBOT, target, low=0.0, high=3.0, initial=beside, starts=1)
+    assert again.result is kc.Reach.UNREACHABLE
+    np.testing.assert_array_equal(again.at_high, found.at_high)
+    np.testing.assert_allclose(again.control, found.control, atol=1e-6)
 
 
 def test_a_path_is_followed():

@@ -31,6 +31,8 @@ DIFFERENCE = 1e-4
 FLAT = 1e-6
 #: rounding, in parts of what is minimised
 ROUNDING = 1e-13
+#: of the way between the limits: what is nearer to one than this is at it
+AT_LIMIT = 1e-12
 
 
 class Wanted(NamedTuple):
@@ -85,6 +87,11 @@ def rotation_between(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return vector * (2.0 if sine < 1e-9 else 2.0 * np.arctan2(sine, scalar) / sine)
 
 
+def at_limits(u: np.ndarray) -> np.ndarray:
+    """Controls between 0 and 1, at a limit where rounding alone keeps them away: u + (1 - u) may not be 1."""
+    return np.where(u < AT_LIMIT, 0.0, np.where(u > 1.0 - AT_LIMIT, 1.0, u))
+
+
 class Search:
     """Searches of one call: the robot, the limits, and the equilibria that were looked at."""
 
@@ -106,6 +113,7 @@ class Search:
 
     def descend(self, wanted: Wanted, u: np.ndarray, found: Response) -> tuple[np.ndarray, Response, bool]:
         """The nearest pose from there, and whether the search ended for that reason."""
+        u = at_limits(u)
         for epsilon in STAGES:
             u, found = self._stage(wanted, u, found, epsilon)
         J, r = wanted.slope(found) * self.span, wanted.residual(found)
@@ -141,7 +149,7 @@ class Search:
             if below_rounding and size > 0.9 * last:
                 return u, found
             slow, last = bool(size > 0.3 * last), size
-            tried = np.clip(u + step, 0.0, 1.0)
+            tried = at_limits(u + step)
             there = self.at(tried, found)
             new = np.inf
             if there is not None:
