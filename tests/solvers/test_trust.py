@@ -60,3 +60,31 @@ def test_easing_spreads_contact_and_friction_and_nothing_else(part):
     assert float(easier.surroundings[0].friction) == 0.3 and float(easier.length) == 0.4
     rubbing = kc.RoutedTendonRobot.like(ROBOT, friction_curvature=0.2, friction_reach=0.05)
     assert float(rubbing.eased(part).friction_reach) == pytest.approx(0.05 / part)
+
+
+def line(nodes, **changes):
+    """A thin line that is pulled at its tip, far more than bends it."""
+    pull = kc.loads.PointWrench(force=[0.1, 0.0, 1.0])
+    return kc.SlenderRod(
+        length=1.0, radius=5e-4, density=1150.0, youngs_modulus=2e9, bending_damping=1e-6,
+        gravity=[0.0, 0.0, 0.0], nodes=nodes, loads=(pull,), **changes,
+    )  # fmt: skip
+
+
+def test_equilibria_on_too_long_segments_are_those_of_finer_ones():
+    """Euler's segments make grow what decays along a stretched line: solved, and nowhere near its shape."""
+    still = kc.equilibrium(line(41), np.zeros(0))
+    assert still.result[0] == kc.Result.RECOVERED_FINER_SEGMENTS
+    # along the force but for what bends where it is held: √(EI/T) of its length
+    bending = np.sqrt(2e9 * np.pi / 4 * 5e-4**4 / np.hypot(0.1, 1.0))
+    lag = bending * np.array([0.1, 0.0, 1.0]) / np.hypot(0.1, 1.0)
+    expected = np.array([0.1, 0.0, 1.0]) / np.hypot(0.1, 1.0) - np.array([lag[0], 0.0, 0.0])
+    np.testing.assert_allclose(still.tip_position[0], expected, atol=2e-3)
+
+
+def test_a_motion_from_such_an_equilibrium_stays_there():
+    robot = line(41)
+    still = kc.equilibrium(robot, np.zeros(0))
+    moved = kc.simulate(robot, np.zeros((5, 0)), 0.05, initial=still)
+    assert np.max(np.abs(moved.tip_position - moved.tip_position[0])) < 1e-3
+    assert np.max(np.abs(moved.velocity)) < 1e-2

@@ -22,7 +22,7 @@ from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.stability import SAFE_DECAY, decay_per_segment
 from knode_cosserat.solvers.task import Start, Steps, Task
 from knode_cosserat.solvers.time import Static
-from knode_cosserat.solvers.trust import SUSPICIOUS, agree, finite, refuse, trusted_size, trustworthy
+from knode_cosserat.solvers.trust import GROWS, SUSPICIOUS, agree, finite, refuse, trusted_size, trustworthy
 
 log = logging.getLogger(__name__)
 
@@ -46,11 +46,24 @@ def run_one(
     if refuse(steps, ~finite(steps, system), Result.NOT_FINITE):
         cause = "At the tip strains are undefined."
     still = isinstance(task.settings.time, Static)
-    if trustworthy(steps, system, start, still):
+
+    def decay_of(steps: Steps, parts: int = 1) -> float:
+        """By how much waves decay within a segment, or a part of it: of equilibria, in the largest.
+
+        A motion is judged by its first state, as if it rested there.
+        """
+        i = int(np.argmax(steps.size)) if still and steps.result.min() >= 0 else 0
+        record = steps.records[i] if still else start.past.records[0]
+        return (
+            decay_per_segment(system, task.settings, task.table[1], record, np.asarray(controls[i])) / parts
+        )
+
+    def to_be_believed(steps: Steps, parts: int = 1) -> bool:
+        return trustworthy(steps, system, start, still, lambda: decay_of(steps, parts))
+
+    if to_be_believed(steps):
         return steps, cause
-    decay = decay_per_segment(
-        system, task.settings, task.table[1], start.past.records[0], np.asarray(controls[0])
-    )
+    decay = decay_of(steps)
     steep = decay >= SAFE_DECAY / 4.0
     failed = np.flatnonzero(steps.result < 0)
     if not steep and (len(failed) == 0 or other_unit(system, controls[failed[0]])):
@@ -64,14 +77,15 @@ def run_one(
     while parts * (system.nodes - 1) <= most:
         log.info("every segment in %d parts", parts)
         finer = _with_finer_segments(task, system, parts, controls, start, progress)
-        if agree(finer, steps, system):
+        if agree(finer, steps, system, still):
             # as large as that, and no instability
             return steps, cause
-        if trustworthy(finer, system, start, still) or agree(finer, before, system):
+        if to_be_believed(finer, parts) or agree(finer, before, system, still):
             return finer._replace(result=np.full(task.steps, int(Result.RECOVERED_FINER_SEGMENTS))), ""
         parts, before = 2 * parts, finer
     if steep:
-        refuse(steps, steps.size > trusted_size(system, start), Result.UNSTABLE)
+        trusted = SUSPICIOUS if decay > GROWS else trusted_size(system, start)
+        refuse(steps, steps.size > trusted, Result.UNSTABLE)
         cause = (
             f"{cause} At this time step its waves decay by e^{decay:.2g} within a segment, too much for an "
             "explicit scheme in space, and dividing the segments did not help: use longer time steps."
@@ -115,6 +129,8 @@ def _refined(task: Task, system: System, fine: System, start: Start) -> Start:
 
 def _is_still(task: Task, system: System, start: Start) -> bool:
     """Whether a motion begins in an equilibrium of its grid, under the control before it."""
+    if start.equilibrium:
+        return True
     records = np.asarray(start.past.records)
     if isinstance(task.settings.time, Static) or np.any(records != records[0]):
         return False

@@ -27,6 +27,8 @@ class Start(NamedTuple):
 
     past: Past
     control: Any
+    #: whether it was found as an equilibrium, be it on a finer grid than its nodes
+    equilibrium: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
