@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ellipk
 
 import knode_cosserat as kc
-from knode_cosserat.rods.ends import Clamped, Driven, Free, Pinned
+from knode_cosserat.rods.ends import Clamped, Driven, Free, Pinned, Sliding
 from knode_cosserat.rods.surroundings import Plane
 
 G = 9.81
@@ -264,3 +264,9 @@ def test_a_slowly_driven_rod_is_in_equilibrium():
     still = kc.equilibrium(DRIVEN, control[-1], initial=found)
     for name, size in (("p", L), ("n", float(DRIVEN.Kbt[0, 0]) / L**2)):
         np.testing.assert_allclose(found.part(name)[-1], still.part(name)[0], atol=1e-5 * size)
+
+
+def test_what_slides_is_no_base():
+    """It would be clamped there, without a word."""
+    with pytest.raises(ValueError, match="base_end is sliding; that is allowed as tip_end only"):
+        LOOSE.replace(base_end=Sliding(axes=("x",), along="z"))

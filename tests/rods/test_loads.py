@@ -279,3 +279,19 @@ def test_a_batch_of_robots_with_different_loads_is_each_by_itself():
     together = kc.simulate(robots, control, 0.02)
     for k, robot in enumerate(robots):
         np.testing.assert_allclose(together.y[k], kc.simulate(robot, control, 0.02).y, atol=1e-9)
+
+
+@pytest.mark.parametrize("load", [PointWrench(force=[0.2, 0.0, 0.0]), AttachedMass(mass=0.01)])
+def test_what_rounding_keeps_from_the_tip_is_at_the_tip(load):
+    """Ten tenths are a digit less than one, and the load was not there at all."""
+    beside = dataclasses.replace(load, at=sum([0.1] * 10))
+    assert beside.at == 1.0 and dataclasses.replace(load, at=1.0 - 1e-8).at < 1.0
+    beam = kc.SlenderRod(length=0.5, radius=0.005, density=1e3, youngs_modulus=5e6, nodes=11)
+    tips = [
+        kc.equilibrium(beam.replace(loads=(each,)), np.zeros(0), space="rk4").tip_position[-1]
+        for each in (beside, dataclasses.replace(load, at=1.0), dataclasses.replace(load, at=1.0 - 1e-8))
+    ]
+    unloaded = kc.equilibrium(beam, np.zeros(0), space="rk4").tip_position[-1]
+    assert np.linalg.norm(tips[0] - unloaded) > 1e-6
+    np.testing.assert_array_equal(tips[0], tips[1])
+    np.testing.assert_allclose(tips[0], tips[2], atol=1e-8)

@@ -155,3 +155,34 @@ def test_derivatives_with_respect_to_a_section_and_its_control():
     expected = (steps[0] - 8 * steps[1] + 8 * steps[2] - steps[3]) / (12 * h)
     assert slope == pytest.approx(expected, rel=1e-5)
     assert np.sum(gradient[0] * along[0]) + gradient[1] * along[1] == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"stiffness": [-1.0]}, "stiffness is .* which is -1 at ξ = 0"),
+        ({"stiffness": [1.0, -2.0]}, "stiffness is .* which is -1 at ξ = 1"),
+        ({"radius": [1.0, -4.0, 4.0]}, "radius is .* which is 0 at ξ = 0.5"),
+        ({"radius": [0.0]}, "radius"),
+    ],
+)
+def test_nothing_is_left_of_no_section(given, said):
+    with pytest.raises(ValueError, match=said):
+        kc.Stretch(**given)
+    kc.Stretch(radius=[1.0, -3.9, 4.0])
+
+
+@pytest.mark.parametrize("gain", [0.2, -0.2])
+def test_a_control_leaves_some_stiffness(gain):
+    rod = kc.SlenderRod(
+        length=L, radius=RADIUS, density=1000.0, youngs_modulus=E,
+        sections=(kc.Stretch(controlled=True, stiffness_gain=gain),),
+    )  # fmt: skip
+    limit = -1.0 / gain
+    assert kc.equilibrium(rod, np.array([0.9 * limit])).all_valid
+    for beyond in (limit, 1.2 * limit):
+        with pytest.raises(ValueError, match=r"section0_input is .* allowed is (above|below)"):
+            kc.equilibrium(rod, np.array([beyond]))
+    stepper = kc.Stepper(rod, 0.02)
+    with pytest.raises(ValueError, match="section0_input"):
+        stepper.step(np.array([1.2 * limit]))

@@ -140,3 +140,19 @@ def test_what_remembers_slopes_too_begins_with_those_of_its_nodes():
     np.testing.assert_allclose(past.records[0, :, -plain.y_layout.size :][:, 2], 1.0, atol=1e-12)
     found, expected = (kc.simulate(rod, np.zeros((3, 0)), 0.02).y for rod in (other, plain))
     np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("off", [1e-12, 9e-11, 2e-10, 9e-10, 2e-9])
+def test_a_cut_close_beside_a_node_costs_no_accuracy(off):
+    """Taken to be on the node, and looked at from beyond where it is, it was of order 1."""
+
+    def tip(at):
+        rod = kc.SlenderRod(
+            length=0.5, radius=0.005, density=1200.0, youngs_modulus=5e6, nodes=11,
+            sections=(kc.Stretch(begin=at, stiffness=[0.2]),),
+            loads=(kc.loads.PointWrench(force=[0.1, 0.0, 0.0]),),
+        )  # fmt: skip
+        return kc.equilibrium(rod, np.zeros(0), space="rk4").tip_position[-1]
+
+    for at in (0.5 - off, 0.5 + off):
+        np.testing.assert_allclose(tip(at), tip(0.5), atol=2e-8)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -268,3 +269,34 @@ def test_batches_that_do_not_fit(robot, sine):
     )
     with pytest.raises(ValueError, match="12 nodes"):
         kc.simulate(robot, sine, DT, initial=other)
+
+
+@pytest.mark.parametrize(
+    ("before", "said"),
+    [
+        ({"length": 0.3}, "is of a robot 0.3 m long, this one is 0.635 m long"),
+        ({"nodes": 12}, "has 12 nodes, the robot 10"),
+    ],
+)
+def test_another_robot_does_not_go_on(robot, sine, before, said):
+    other = kc.simulate(robot.replace(**before), sine[:3], DT)
+    with pytest.raises(ValueError, match=said):
+        kc.simulate(robot, sine, DT, initial=other)
+
+
+def test_a_robot_with_more_to_remember_does_not_go_on(sine):
+    robot = kc.RoutedTendonRobot.like(kc.load_robot("delrin-tendon-robot"))
+    before = kc.simulate(robot, sine[:3], DT)
+    with pytest.raises(ValueError, match="numbers in z"):
+        kc.simulate(robot.replace(vibration_tension=20.0, vibration_rate=1.0), sine, DT, initial=before)
+    with pytest.raises(ValueError, match="no rows"):
+        kc.simulate(robot, sine, DT, initial=before[5:])
+
+
+def test_tendons_that_push_are_warned_of(robot, sine):
+    with pytest.warns(UserWarning, match="a tendon only pulls"):
+        kc.equilibrium(robot, np.array([5.0, -3.0, 0.0, 0.0]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # noise of what was measured
+        kc.equilibrium(robot, np.array([5.0, -0.01, 0.0, 0.0]))

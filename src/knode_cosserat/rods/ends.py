@@ -43,6 +43,8 @@ class End(Part):
     unknowns: ClassVar[tuple[str, ...]]
     #: whether anything holds it in its place
     held: ClassVar[bool] = True
+    #: whether it can be a rod's base as well as its tip
+    anywhere: ClassVar[bool] = True
     #: of the tip's conditions: names, sizes, units
     conditions: ClassVar[tuple[tuple[Any, ...], ...]]
 
@@ -133,6 +135,7 @@ class Sliding(Driven):
     """A driven end at the tip that slides freely along a global axis, under whatever pulls it there."""
 
     kind: ClassVar[str] = "sliding"
+    anywhere: ClassVar[bool] = False
     conditions: ClassVar[tuple[tuple[Any, ...], ...]] = (
         ("p", 2, "m", "position at the tip across the axis, global frame"),
         ("n", 1, "N", "force at the tip along the axis"),

@@ -15,7 +15,7 @@ class Field(NamedTuple):
     `frame` names the orientation (a quaternion in y) by whose rotation a vector of the global frame is seen
     from the material; none for what is not turned. `load` is the unit of the load that the field's rate along
     s balances, such as N/m of an internal force, none for a field whose rate is geometry; of a strain, the
-    unit of its stress.
+    unit of its stress. `low` and `high` are what a control has to stay between.
     """
 
     name: str
@@ -24,6 +24,8 @@ class Field(NamedTuple):
     meaning: str
     frame: str = ""
     load: str = ""
+    low: float = -np.inf
+    high: float = np.inf
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,6 +71,20 @@ class Layout:
         """Positions in the packed vector of the numbers of the named fields."""
         every = np.arange(self.size)
         return np.concatenate([every[self.slice(name)] for name in names])
+
+    def beyond(self, packed: Any) -> str:
+        """What of some controls (…, size) is outside its field's limits, in words; empty if nothing is."""
+        for field in self.fields:
+            values = np.asarray(self.get(packed, field.name))
+            wrong = (values < field.low) | (values > field.high)
+            if np.any(wrong):
+                *row, k = (int(i) for i in np.argwhere(wrong)[0])
+                name = field.name if field.size == 1 else f"{field.name}_{k + 1}"
+                where = f" at index {tuple(row)}" if row else ""
+                value = values[(*row, k)]
+                limit = f"above {field.low:.6g}" if value < field.low else f"below {field.high:.6g}"
+                return f"{name} is {value:.6g} {field.unit}{where}; allowed is {limit}"
+        return ""
 
     def __add__(self, other: Layout) -> Layout:
         return Layout(*self.fields, *other.fields)

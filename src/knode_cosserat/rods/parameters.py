@@ -24,6 +24,9 @@ class ParameterError(ValueError):
 
 Shape = Literal["scalar", "vector", "quaternion", "matrix", "list"]
 
+#: of the length: what is nearer to an end of the rod than this is at it
+AT_END = 1e-9
+
 
 @dataclasses.dataclass(frozen=True)
 class Parameter:
@@ -72,7 +75,7 @@ def place(
     stated = Parameter("", f"{meaning}, as a part of the length", "scalar", low, 1.0, optional=False)
     extra: dict[str, Any] = {} if default is dataclasses.MISSING else {"default": default}
     return eqx.field(
-        static=True, kw_only=kw_only, converter=_plain_number, metadata={"parameter": stated}, **extra
+        static=True, kw_only=kw_only, converter=_place_number, metadata={"parameter": stated}, **extra
     )
 
 
@@ -249,6 +252,13 @@ def _plain_number(value: Any) -> Any:
     return (
         float(value) if isinstance(value, int | float | np.number) and not isinstance(value, bool) else value
     )
+
+
+def _place_number(value: Any) -> Any:
+    """The same, and at an end of the rod if only rounding keeps it away: a tip load is at 1, not beside."""
+    number = _plain_number(value)
+    near = [end for end in (0.0, 1.0) if isinstance(number, float) and abs(number - end) < AT_END]
+    return near[0] if near else number
 
 
 def _as_matrix(value: Any) -> Any:

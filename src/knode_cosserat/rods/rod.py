@@ -24,7 +24,7 @@ from knode_cosserat.rods.loads import (
     point_wrench,
     square_law_drag,
 )
-from knode_cosserat.rods.parameters import parameter, part
+from knode_cosserat.rods.parameters import ParameterError, parameter, part
 from knode_cosserat.rods.parts import placed, shares
 from knode_cosserat.rods.section import shape_at_rest
 from knode_cosserat.rods.surroundings import Obstacle
@@ -70,6 +70,10 @@ class Rod(ElasticRod):
     surroundings: tuple[Obstacle, ...] = part("what it may touch", Obstacle, many=True, default=())
     base_end: End = part("what holds it at s = 0", End, default=Clamped())
     tip_end: End = part("what holds it at s = length", End, default=Free())
+
+    def __check_init__(self) -> None:
+        if not self.base_end.anywhere:
+            raise ParameterError(f"base_end is {self.base_end.kind}; that is allowed as tip_end only")
 
     # what follows from the parameters
 

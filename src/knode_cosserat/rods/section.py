@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.layout import Field
-from knode_cosserat.rods.parameters import choice, parameter, place
+from knode_cosserat.rods.parameters import ParameterError, choice, parameter, place
 from knode_cosserat.rods.parts import Part, require_stretch
 from knode_cosserat.rotation import dot, quaternion_rate, rotation_matrix
 
@@ -134,10 +134,36 @@ class Stretch(SectionChange):
         default=(0.0, 0.0, 0.0),
     )  # fmt: skip
 
+    def __check_init__(self) -> None:
+        super().__check_init__()
+        for name in ("radius", "stiffness"):
+            coefficients = getattr(self, name)
+            if isinstance(coefficients, jax.core.Tracer) or np.ndim(coefficients) != 1:
+                continue
+            least, where = _least(np.asarray(coefficients, dtype=float))
+            if not least > 0.0:
+                given = np.asarray(coefficients).tolist()
+                raise ParameterError(
+                    f"{type(self).__name__}: {name} is {given}, which is {least:.3g} at ξ = {where:.3g}; "
+                    "allowed is what is above 0 all along the stretch"
+                )
+
     @property
     def control_fields(self) -> tuple[Field, ...]:
-        """One number, if it is controlled."""
-        return (Field("input", 1, "1", "what acts on the section"),) if self.controlled else ()
+        """One number, if it is controlled; as large as leaves some stiffness."""
+        input = Field("input", 1, "1", "what acts on the section")._replace(**self._range)
+        return (input,) if self.controlled else ()
+
+    @property
+    def _range(self) -> dict[str, Any]:
+        """Limits of the control, where the gain is one number that is known."""
+        gain = self.stiffness_gain
+        if isinstance(gain, jax.core.Tracer) or np.ndim(gain) or gain == 0.0:
+            return {}
+        none_left = float(-1.0 / gain)
+        # the limit itself leaves nothing
+        name, inside = ("low", np.inf) if gain > 0.0 else ("high", -np.inf)
+        return {name: float(np.nextafter(none_left, inside))}
 
     def differences(self, part: Any, control: Any) -> Differences:
         """See the class."""
@@ -171,6 +197,15 @@ class FunctionSection(SectionChange):
     def differences(self, part: Any, control: Any) -> Differences:
         """What the function says."""
         return self.function(part, control)
+
+
+def _least(coefficients: Float[np.ndarray, " k"]) -> tuple[float, float]:
+    """The least value of a polynomial between 0 and 1, and where it is."""
+    polynomial = np.polynomial.Polynomial(coefficients)
+    turns = np.asarray(polynomial.deriv().roots(), dtype=complex)
+    at = np.concatenate([[0.0, 1.0], np.clip(turns[turns.imag == 0.0].real, 0.0, 1.0)])
+    values = polynomial(at)
+    return float(values.min()), float(at[np.argmin(values)])
 
 
 def _polynomial(coefficients: Any, at: Any) -> Any:

@@ -22,10 +22,10 @@ from jaxtyping import Float, Int
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.space import SpaceScheme
 
-#: cuts closer to a node than this part of the length are on it
-ON_NODE = 1e-9
 #: by this part of a segment points are moved into it, so that what is smooth within is seen up to its ends
 INWARD = 1e-9
+#: cuts closer to a node than this part of a segment are on it, and from inside all of them is on one side
+ON_NODE = 0.1 * INWARD
 
 
 class Crossing(NamedTuple):
@@ -40,7 +40,7 @@ def crossings(cuts: tuple[float, ...], nodes: int) -> Crossing:
     """The crossings of all segments, stacked: as many parts each as the segment with most cuts needs."""
     along = np.asarray(cuts) * (nodes - 1)
     nearest = np.round(along)
-    along = np.where(np.abs(along - nearest) < ON_NODE * (nodes - 1), nearest, along)
+    along = np.where(np.abs(along - nearest) < ON_NODE, nearest, along)
     segment = np.minimum(np.floor(along).astype(int), nodes - 2)
     inner = [sorted({a - j for a in along[segment == j] if a > j}) for j in range(nodes - 1)]
     parts = 1 + max(map(len, inner))

@@ -27,6 +27,10 @@ from knode_cosserat.trajectory import Trajectory
 
 #: time steps from this (s), and so many times the rod's natural time, look like milliseconds
 LONG_STEP, LONG_STEPS = 1.0, 100.0
+#: of the largest tension: so much below zero may be noise of a measurement
+PUSHING = 0.02
+#: of its length: so much may a robot differ from the one whose motion it goes on with
+OTHER_LENGTH = 1e-3
 
 
 def simulate(
@@ -166,6 +170,7 @@ def _checked_controls(system: System, controls: Any, batch: int | None) -> tuple
     if not is_traced(controls) and not np.all(np.isfinite(controls)):
         bad = tuple(np.argwhere(~np.isfinite(controls))[0].tolist())
         raise ValueError(f"controls are {controls[bad]} at index {bad}; they must be finite")
+    check_limits(system, controls)
     if batch is None:
         return controls, shape[0] if len(shape) == 3 else None
     if len(shape) == 2:
@@ -178,18 +183,47 @@ def _checked_controls(system: System, controls: Any, batch: int | None) -> tuple
     return controls, batch
 
 
+def check_limits(system: System, controls: Any) -> None:
+    """That controls are within their fields' limits (`ValueError`); and warn of tendons that would push."""
+    if is_traced(controls):
+        return
+    layout = system.control_layout
+    beyond = layout.beyond(controls)
+    if beyond:
+        raise ValueError(f"controls: {beyond}")
+    if "tension" in layout.names:
+        tension = np.asarray(layout.get(controls, "tension"))
+        # of what was measured some may be a little less than nothing
+        if np.min(tension) < -PUSHING * np.max(np.abs(tension)):
+            warnings.warn(
+                f"a tension is {np.min(tension):g} N: a tendon only pulls, but is computed as if it pushed",
+                stacklevel=4,
+            )
+
+
 def check_initial(system: System, initial: Trajectory, batch: int | None) -> None:
     """That a trajectory is one robot's, fits the system, and is solved; `ValueError` otherwise."""
     if batch or initial.y.ndim == 4:
         raise ValueError("initial is for one robot, not for a batch")
-    wanted = (system.nodes, system.y_layout.size)
-    if initial.y.shape[-2:] != wanted:
+    if not len(initial.time):
+        raise ValueError("the initial trajectory has no rows; at least one is needed")
+    for what, given, wanted in (
+        ("nodes", initial.y.shape[-2], system.nodes),
+        ("numbers in y", initial.y.shape[-1], system.y_layout.size),
+        ("numbers in z", initial.z.shape[-1], system.z_layout.size),
+        ("controls", initial.control.shape[-1], system.control_size),
+    ):
+        if given != wanted:
+            raise ValueError(f"the initial trajectory has {given} {what}, the robot {wanted}")
+    if is_traced((initial, system)):
+        return
+    initial.require_valid()
+    length, before = float(system.length), float(initial.system.length)
+    if abs(length - before) > OTHER_LENGTH * before:
         raise ValueError(
-            f"the initial trajectory has {initial.y.shape[-2]} nodes of {initial.y.shape[-1]} numbers, "
-            f"the robot {wanted[0]} of {wanted[1]}"
+            f"the initial trajectory is of a robot {before:g} m long, this one is {length:g} m long: "
+            "it cannot go on from there"
         )
-    if not is_traced(initial):
-        initial.require_valid()
 
 
 # where to start
@@ -273,7 +307,8 @@ def _going_on(
             past, first = going_on_past(system, settings, dt, records, time[-1]), "regular"
         else:
             first = "consistent"
-    return records[-1], Start(past, initial.control[-1]), time[-1], first
+    found = initial.settings is not None and isinstance(initial.settings.time, Static)
+    return records[-1], Start(past, initial.control[-1], found), time[-1], first
 
 
 # the three ways to run

@@ -145,6 +145,9 @@ class Stepper:
             )
         if not np.all(np.isfinite(control)):
             raise ValueError(f"the control is {control.tolist()}; it must be finite")
+        beyond = self.robot.control_layout.beyond(control)
+        if beyond:
+            raise ValueError(f"the control: {beyond}")
         return control
 
     def _solve(self, control: np.ndarray) -> _Solved:
