@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import knode_cosserat as kc
+from knode_cosserat.control.reach import _same_shape
 from knode_cosserat.control.search import at_limits, rotation_between
 from knode_cosserat.learning.structured.residual import Structured
 
@@ -172,6 +173,50 @@ def test_no_equilibrium_to_begin_with_is_said():
     found = kc.inverse_kinematics(ROBOT, [0.0, 0.0, 0.5], **held, starts=1)
     assert found.result is kc.Reach.NO_EQUILIBRIUM
     assert np.all(np.isnan(found.position)) and np.isnan(found.position_error)
+
+
+#: inextensible tendons on reels: their tensions feel any residual far more than the shape does
+REELED = kc.RoutedTendonRobot(
+    length=0.3, radius=0.0015, density=1500.0, youngs_modulus=3.0e9, bending_damping=2.0e-3,
+    tendon_offset=0.01, tendon_angles=[0.0, 2.0943951, 4.1887902], gravity=[0.0, 0.0, 0.0], drive="reel",
+    nodes=21,
+)  # fmt: skip
+
+
+def test_of_reels_the_shape_is_compared_and_not_the_tensions():
+    found = kc.inverse_kinematics(
+        REELED, [0.0441, 0.0, 0.2955], low=-0.01, high=0.01, tolerance=1e-4, space="rk4"
+    )
+    assert found.converged and found.from_rest
+    y = np.asarray(kc.equilibrium(REELED, found.control, space="rk4").y[0])
+    for name, factor, same in (
+        ("tension", 1.01, True),
+        ("h", -1.0, True),
+        ("h", -3.0, True),
+        ("p", 1.01, False),
+    ):
+        other = y.copy()
+        other[:, REELED.y_layout.slice(name)] *= factor
+        assert _same_shape(REELED, y, other) == same
+
+
+def test_of_several_rods_every_shape_is_compared():
+    robot = kc.load_robot("six-legged-robot")
+    y = np.asarray(kc.equilibrium(robot, np.zeros(6)).y[0])
+    bent, turned = y.copy(), y.copy()
+    bent[5, 0] += 1e-4
+    turned[5, robot.y_layout.slice(robot.y_layout.names[1])] += [0.0, 1e-4, 0.0, 0.0]
+    assert _same_shape(robot, y, y)
+    assert not _same_shape(robot, y, bent) and not _same_shape(robot, y, turned)
+
+
+def test_of_reels_it_is_certain_that_nothing_is_nearer():
+    """What Newton's method leaves of a residual hid from the search that it was at the nearest."""
+    found = kc.inverse_kinematics(
+        REELED, [0.0441, 0.0, 0.2955], low=0.0, high=0.01, tolerance=1e-4, space="rk4"
+    )
+    assert found.result is kc.Reach.UNREACHABLE and found.from_rest
+    np.testing.assert_array_equal(found.at_low, [False, True, True])
 
 
 def test_rotation_vectors_turn_one_into_the_other():

@@ -16,11 +16,17 @@ from knode_cosserat.control.asked import (
     static_settings,
 )
 from knode_cosserat.control.search import Search, Wanted
-from knode_cosserat.control.statics import Pose, Response, first_solved, respond, rest_guess, tip_pose
-from knode_cosserat.rods.system import System
+from knode_cosserat.control.statics import Pose, Response, first_solved, tip_pose
+from knode_cosserat.rods.system import System, in_strands
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.result import SimulationError
 from knode_cosserat.solvers.space import SpaceScheme
+
+#: in natural units: what equilibria are solved to, at least. The search compares distances to rounding, and
+#: what Newton's method leaves at its own tolerance would hide from it that nothing is nearer
+EXACT = 1e-13
+#: parts of the length, and rad: shapes that are nowhere further apart are the same
+SAME_SHAPE = 1e-5
 
 
 class Reach(enum.IntEnum):
@@ -116,7 +122,7 @@ def inverse_kinematics(
         ValueError: arguments of a wrong shape, not finite, or low above high.
     """
     system = checked_system(robot)
-    settings = static_settings(space, newton)
+    settings = static_settings(space, dataclasses.replace(newton, tolerance=min(newton.tolerance, EXACT)))
     limits = checked_limits(system, low, high)
     wanted, single = _checked_wanted(system, pose, position, quaternion, (weights, tolerance))
     begin = None
@@ -182,15 +188,46 @@ def _others(size: int, count: int, free: np.ndarray) -> np.ndarray:
 def _told(search: Search, wanted: Wanted, u: np.ndarray, found: Response, result: Reach) -> InverseKinematics:
     control = search.control(u)
     position, turned = wanted.errors(found)
-    cold = respond(search.system, search.settings, search.pose, control, *rest_guess(search.system))
-    scale = np.asarray(search.system.scales().y)
-    same = float(np.max(np.abs(np.asarray(cold.y) - np.asarray(found.y)) / scale)) < 1e-6
+    same = _from_rest(search, control, found)
     return InverseKinematics(
         result, control, np.asarray(found.position),
         None if found.quaternion is None else np.asarray(found.quaternion),
         float(np.linalg.norm(position)), float(np.linalg.norm(turned)),
         control <= search.low, control >= search.high, same, search.trials,
     )  # fmt: skip
+
+
+def _from_rest(search: Search, control: np.ndarray, found: Response) -> bool:
+    """Whether the equilibrium that is found from the unloaded robot has the same shape."""
+    try:
+        cold = first_solved(search.system, search.settings, search.pose, control)
+    except SimulationError:
+        return False
+    solved = bool(cold.error <= search.settings.newton.acceptable)
+    return solved and _same_shape(search.system, np.asarray(cold.y), np.asarray(found.y))
+
+
+def _same_shape(system: System, one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether positions and orientations agree at all points, of every rod.
+
+    Forces are not asked: where reels or actuators hold lengths, what is left of a residual moves them by far
+    more than it moves the robot.
+    """
+    states = [in_strands(system, y) for y in (one, other)]
+    try:
+        p, q = (np.asarray(system.strand.positions(y)) for y in states)
+    except AttributeError:
+        # it does not say where it is: all that it has
+        return float(np.max(np.abs(one - other) / np.asarray(system.scales().y))) <= SAME_SHAPE
+    off = float(np.max(np.abs(p - q))) / float(system.length)
+    try:
+        g, h = (np.asarray(system.strand.quaternions(y)) for y in states)
+    except AttributeError:
+        return off <= SAME_SHAPE
+    g, h = (each / np.linalg.norm(each, axis=-1, keepdims=True) for each in (g, h))
+    # unit quaternions, of either sign, are half as far apart as one is turned from the other
+    turned = 2.0 * np.minimum(np.linalg.norm(g - h, axis=-1), np.linalg.norm(g + h, axis=-1))
+    return max(off, float(np.max(turned))) <= SAME_SHAPE
 
 
 def _nothing(search: Search, u: np.ndarray) -> InverseKinematics:
