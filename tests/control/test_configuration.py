@@ -102,6 +102,26 @@ def test_manipulability_is_that_of_the_jacobian():
     np.testing.assert_allclose(turned.singular_values, np.linalg.svd(J[3:])[1], atol=1e-12)
 
 
+def test_a_rod_without_controls_has_a_compliance():
+    """L³/3EI of a slender cantilever; there is nothing that moves it."""
+    length, radius, E = 0.3, 1e-3, 70e9
+    rod = kc.SlenderRod(
+        length=length, radius=radius, density=6450.0, youngs_modulus=E, gravity=[0.0, 0.0, 0.0]
+    )
+    found = kc.configuration(rod, np.zeros(0), space="rk4")
+    assert found.jacobian.shape == (6, 0) and not found.unstable
+    softness = length**3 / (3 * E * np.pi * radius**4 / 4)
+    np.testing.assert_allclose(np.diag(kc.compliance(rod, [], space="rk4"))[:2], softness, rtol=1e-4)
+    for ellipsoid in found.manipulability:
+        assert not len(ellipsoid.singular_values)
+        assert ellipsoid.measure == 0.0 and ellipsoid.condition == np.inf
+    with pytest.raises(ValueError, match=r"control has shape .*there are no controls"):
+        kc.compliance(rod, [1.0])
+    with pytest.raises(ValueError, match="a SlenderRod without controls is given"):
+        kc.inverse_kinematics(rod, [0.0, 0.0, 0.3], low=0.0, high=1.0)
+    assert kc.workspace(rod, np.zeros((2, 0)), space="rk4").unsolved == 0
+
+
 def test_wrong_arguments_are_named():
     with pytest.raises(ValueError, match=r"control has shape \(3,\); allowed is \(4,\): tension"):
         kc.jacobian(ROBOT, [1.0, 2.0, 3.0])

@@ -31,7 +31,8 @@ def checked_numbers(name: str, given: Any, size: int, allowed: str, most: int = 
         numbers = np.asarray(given, dtype=float)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name} is not numbers ({error}); allowed is {allowed}") from None
-    if not 1 <= numbers.ndim <= most or numbers.shape[-1] != size or 0 in numbers.shape:
+    # no rows are nothing to answer; no numbers in a row are the control of a robot that nothing drives
+    if not 1 <= numbers.ndim <= most or numbers.shape[-1] != size or 0 in numbers.shape[:-1]:
         raise ValueError(f"{name} has shape {numbers.shape}; allowed is {allowed}")
     if not np.all(np.isfinite(numbers)):
         bad = tuple(np.argwhere(~np.isfinite(numbers))[0].tolist())
@@ -43,11 +44,13 @@ def checked_control(system: System, control: Any, name: str = "control") -> np.n
     """One control (c,)."""
     size = system.control_size
     names = ", ".join(f"{field.name} ({field.unit})" for field in system.control_layout.fields)
-    return checked_numbers(name, control, size, f"({size},): {names}", most=1)
+    return checked_numbers(name, control, size, f"({size},): {names or 'there are no controls'}", most=1)
 
 
 def checked_limits(system: System, low: Any, high: Any) -> tuple[np.ndarray, np.ndarray]:
     """Limits (c,) of the controls, from numbers or (c,)."""
+    if not system.control_size:
+        raise ValueError(f"a {type(system).__name__} without controls is given; allowed is one with controls")
     found = []
     for name, given in (("low", low), ("high", high)):
         number = isinstance(given, int | float | np.number)

@@ -101,6 +101,9 @@ class Configuration:
 
 def _ellipsoid(J: np.ndarray) -> Ellipsoid:
     directions, values, _ = np.linalg.svd(J, full_matrices=False)
+    if not len(values):
+        # nothing drives it: √det(J Jᵀ) of what never moves
+        return Ellipsoid(values, directions, 0.0, np.inf)
     lost = values[-1] <= np.finfo(float).eps * max(J.shape) * values[0]
     condition = np.inf if lost else float(values[0] / values[-1])
     return Ellipsoid(values, directions, float(np.prod(values)), condition)
@@ -118,7 +121,7 @@ def configuration(
 
     Args:
         robot: one robot or model.
-        control: (c,); for a tendon robot the tensions in N.
+        control: (c,); for a tendon robot the tensions in N. Of a robot without controls `np.zeros(0)`.
         space: "euler", "rk4", or a scheme.
         newton: tolerances and limits of the solve.
         pose: from the system and its last node's y to position (m) and quaternion (or None); the tip's by
