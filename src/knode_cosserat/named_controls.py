@@ -31,6 +31,16 @@ def labels(layout: Layout) -> list[str]:
     ]
 
 
+def units(layout: Layout) -> list[str]:
+    """The unit of every number of a control."""
+    return [field.unit for field in layout.fields for _ in range(field.size)]
+
+
+def titles(layout: Layout) -> list[str]:
+    """The names with their units, as columns of a file have them: `reel_1 [m]`."""
+    return [f"{name} [{unit}]" for name, unit in zip(labels(layout), units(layout), strict=True)]
+
+
 def parse(robot: System, specification: str, steps: int | None, dt: float) -> Array:
     """Controls (steps, c) of a robot from one word, as on the command line.
 
@@ -144,14 +154,13 @@ def _sampled(path: str, layout: Layout, steps: int | None, dt: float) -> Array:
         table = pandas.read_csv(path)
     except (OSError, ValueError) as error:
         raise ControlsError(f"{path}: not a CSV file of numbers: {str(error).splitlines()[0]}") from None
-    units = dict(zip(labels(layout), (f.unit for f in layout.fields for _ in range(f.size)), strict=True))
-    titles = {f"{name} [{unit}]": name for name, unit in units.items()} | {"time [s]": "time"}
-    wrong = [title for title in table.columns if title.strip() not in titles]
+    known = dict(zip(titles(layout), labels(layout), strict=True)) | {"time [s]": "time"}
+    wrong = [title for title in table.columns if title.strip() not in known]
     if wrong or "time [s]" not in [title.strip() for title in table.columns]:
         raise ControlsError(
-            f"{path}: the columns are {', '.join(table.columns)}; allowed is {', '.join(titles)}"
+            f"{path}: the columns are {', '.join(table.columns)}; allowed is {', '.join(known)}"
         )
-    table.columns = [titles[title.strip()] for title in table.columns]
+    table.columns = [known[title.strip()] for title in table.columns]
     values = table.apply(pandas.to_numeric, errors="coerce").to_numpy(dtype=float)
     if not len(values) or not np.all(np.isfinite(values)):
         line = 2 + int(np.argwhere(~np.isfinite(values))[0][0]) if len(values) else 2

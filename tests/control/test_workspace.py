@@ -39,6 +39,17 @@ def test_samples_fill_the_box_and_follow_the_seed(found):
     assert np.any(other.controls != found.controls)
 
 
+def test_limits_may_be_given_by_name(found):
+    named = kc.workspace(ROBOT, low=0.0, high=[10.0, 8.0, 6.0, 4.0], count=40, seed=3)
+    np.testing.assert_array_equal(named.position, found.position)
+    either = r"allowed is workspace\(robot, controls\) or"
+    for wrong in ({}, {"low": 0.0}, {"low": 0.0, "high": 1.0}, {"controls": np.ones((2, 4)), "low": 0.0}):
+        with pytest.raises(ValueError, match=either):
+            kc.workspace(ROBOT, **wrong)
+    with pytest.raises(ValueError, match=either):
+        kc.workspace(ROBOT, np.ones((2, 4)), 1.0, 8, low=0.0)
+
+
 def test_limits_of_strain_leave_samples_out(found):
     limit = np.median(found.peak("u"))
     inside = found.within(u=limit, v=0.1)
@@ -74,6 +85,7 @@ def test_files_hold_what_was_found(found, tmp_path):
         rows = list(csv.DictReader(file))
     assert len(rows) == 40
     assert float(rows[7]["position_2"]) == found.position[7, 2]
+    assert float(rows[7]["tension_4 [N]"]) == found.controls[7, 3]
     with pytest.raises(ValueError, match=r"a\.txt: allowed is a name that ends in \.nc, \.csv, \.npz"):
         found.save(tmp_path / "a.txt")
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from knode_cosserat import named_controls
 from knode_cosserat._files import replacing
 from knode_cosserat.control.asked import (
     checked_limits,
@@ -90,13 +91,13 @@ class Workspace:
         arrays |= {"result": self.result, "residual": self.residual, "strain": self.strain}
         known = {name: array for name, array in arrays.items() if array is not None}
         with replacing(path) as temporary:
-            {".nc": self._netcdf, ".csv": _table, ".npz": _numpy}[path.suffix](temporary, known)
+            {".nc": self._netcdf, ".csv": self._table, ".npz": _numpy}[path.suffix](temporary, known)
 
     def _netcdf(self, path: Any, arrays: dict[str, np.ndarray]) -> None:
         import xarray
 
         said = {
-            "control": ("", "control"),
+            "control": ("", f"control: {', '.join(named_controls.titles(self.system.control_layout))}"),
             "position": ("m", "position of the tip, global frame"),
             "quaternion": ("1", "orientation of the tip, scalar first"),
             "result": ("1", "how it was solved; below zero: not solved"),
@@ -113,22 +114,20 @@ class Workspace:
         }
         xarray.Dataset(variables).to_netcdf(path, engine="h5netcdf")
 
-
-def _columns(arrays: dict[str, np.ndarray]) -> tuple[list[str], list[np.ndarray]]:
-    names, columns = [], []
-    for name, array in arrays.items():
-        wide = array.reshape(len(array), -1)
-        names += [name] if array.ndim == 1 else [f"{name}_{i}" for i in range(wide.shape[1])]
-        columns += list(wide.T)
-    return names, columns
-
-
-def _table(path: Any, arrays: dict[str, np.ndarray]) -> None:
-    names, columns = _columns(arrays)
-    with open(path, "w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(names)
-        writer.writerows(zip(*(column.tolist() for column in columns), strict=True))
+    def _table(self, path: Any, arrays: dict[str, np.ndarray]) -> None:
+        """Controls by their names and units, as files of controls have them; all else numbered from 0."""
+        names, columns = [], []
+        for name, array in arrays.items():
+            wide = array.reshape(len(array), -1)
+            if name == "control":
+                names += named_controls.titles(self.system.control_layout)
+            else:
+                names += [name] if array.ndim == 1 else [f"{name}_{i}" for i in range(wide.shape[1])]
+            columns += list(wide.T)
+        with open(path, "w", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(names)
+            writer.writerows(zip(*(column.tolist() for column in columns), strict=True))
 
 
 def _numpy(path: Any, arrays: dict[str, np.ndarray]) -> None:
@@ -147,10 +146,11 @@ def sample(low: np.ndarray, high: np.ndarray, count: int, seed: int = 0) -> np.n
 
 def workspace(
     robot: System,
-    controls: Any,
+    controls: Any = None,
     high: Any = None,
     count: int | None = None,
     *,
+    low: Any = None,
     seed: int = 0,
     space: str | SpaceScheme = "euler",
     newton: NewtonOptions = NewtonOptions(),
@@ -159,8 +159,8 @@ def workspace(
 ) -> Workspace:
     """Where a robot reaches: its pose at rest under many controls.
 
-    Either `workspace(robot, controls)` or `workspace(robot, low, high, count)`, which spreads `count`
-    controls evenly between limits (scrambled Sobol sequence with a seed).
+    Either `workspace(robot, controls)` or `workspace(robot, low, high, count)`, all of which may be named and
+    which spreads `count` controls evenly between limits (scrambled Sobol sequence with a seed).
 
     Every equilibrium is looked for from the unloaded robot, as `kc.equilibrium` does, so a sample does not
     depend on the others. A robot with several gives the one that is found from there; whether it is stable
@@ -172,6 +172,7 @@ def workspace(
         controls: (B, c); or the lower limits, numbers or (c,), with `high` and `count`.
         high: the upper limits.
         count: how many samples.
+        low: the lower limits by name, instead of `controls`.
         seed: of the samples.
         space: "euler", "rk4", or a scheme.
         newton: tolerances and limits of the solve.
@@ -183,14 +184,18 @@ def workspace(
     """
     system = checked_system(robot)
     settings = static_settings(space, newton)
-    if high is not None or count is not None:
-        if high is None or count is None:
-            raise ValueError("allowed is workspace(robot, controls) or workspace(robot, low, high, count)")
-        limits = checked_limits(system, controls, high)
+    if low is None and high is not None:
+        # by their places
+        low, controls = controls, None
+    given = [argument is not None for argument in (controls, low, high, count)]
+    if given not in ([True, False, False, False], [False, True, True, True]):
+        raise ValueError("allowed is workspace(robot, controls) or workspace(robot, low, high, count)")
+    if controls is None:
+        limits = checked_limits(system, low, high)
         number: Any = count
         if not isinstance(number, int | np.integer) or not 1 <= number <= 2**30:
             raise ValueError(f"count is {count!r}; allowed is a whole number from 1 to 2^30")
-        samples = sample(*limits, int(count), seed)
+        samples = sample(*limits, int(number), seed)
     else:
         size = system.control_size
         samples = checked_numbers("controls", controls, size, f"(B, {size})")
