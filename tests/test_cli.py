@@ -179,6 +179,17 @@ def test_info_tells_every_parameter_with_unit_and_meaning():
     assert facts["parameters"]["nodes"]["value"] == 10
 
 
+def test_info_tells_controls_as_they_are_given():
+    for robot in (ROBOT, "six-legged-robot", "soft-slender-robot"):
+        facts, words = told("info", robot), succeeded("info", robot)
+        layout = kc.load_robot(robot).control_layout
+        assert list(facts["controls"]) == kc.named_controls.labels(layout)
+        for field in layout.fields:
+            names = [name for name in facts["controls"] if name.startswith(field.name)]
+            assert facts["controls"][names[0]] == {"unit": field.unit, "meaning": field.meaning}
+        assert all(f"\n  {name} " in words for name in facts["controls"])
+
+
 def test_info_derives_stiffness_mass_and_frequency():
     values = {name: it["value"] for name, it in told("info", ROBOT, "--set", "length=0.5")["derived"].items()}
     E, r, rho = 2.757903e9, 0.003175, 1411.6751

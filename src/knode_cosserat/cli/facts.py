@@ -85,6 +85,16 @@ def derived(system: System) -> dict[str, dict[str, Any]]:
     }
 
 
+def driven_by(system: System) -> dict[str, dict[str, str]]:
+    """Every control, by the name that `--controls` and `--control` take, with its unit and meaning."""
+    from knode_cosserat import named_controls
+
+    layout = system.control_layout
+    meanings = [field.meaning for field in layout.fields for _ in range(field.size)]
+    each = zip(named_controls.labels(layout), named_controls.units(layout), meanings, strict=True)
+    return {name: {"unit": unit, "meaning": meaning} for name, unit, meaning in each}
+
+
 def more_lines(system: System) -> list[str]:
     """Choices and parts of a robot that are not as they are by default, as its file would have them."""
     from knode_cosserat.rods.robot_file import KINDS, RobotFileError, more_of

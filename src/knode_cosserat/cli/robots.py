@@ -25,7 +25,7 @@ from knode_cosserat.cli.arguments import (
     system_of,
     wanted,
 )
-from knode_cosserat.cli.facts import at_rest, derived, learned, more_lines, outcome, parameters
+from knode_cosserat.cli.facts import at_rest, derived, driven_by, learned, more_lines, outcome, parameters
 from knode_cosserat.cli.program import app, examples
 from knode_cosserat.cli.telling import shown, table, tell, vector
 
@@ -153,7 +153,7 @@ def info(
     nodes: Nodes = None,
     as_json: Json = False,
 ) -> None:
-    """Show a robot's parameters and what a model learned, or list the catalog."""
+    """Show a robot's parameters, its controls and what a model learned, or list the catalog."""
     import knode_cosserat as kc
 
     robots = kc.catalog()
@@ -170,12 +170,17 @@ def info(
         rows += [
             [f"  {name}", shown(it["value"]), it["unit"], it["meaning"]] for name, it in quantities.items()
         ]
+    drives = driven_by(system)
+    rows += [[""] * 4, ["controls", "", "", ""]]
+    rows += [[f"  {name}", "", it["unit"], it["meaning"]] for name, it in drives.items()]
+    if not drives:
+        rows.append(["  none", "", "", "nothing drives it"])
     more = more_lines(system)
     heading = f"{robot}: {robots[robot]}" if robot in robots else robot
     facts, lines = learned(system)
     tell(
         as_json,
-        {"robot": robot, "kind": type(system).__name__, **parts, "parts": more, **facts},
+        {"robot": robot, "kind": type(system).__name__, **parts, "controls": drives, "parts": more, **facts},
         [heading, *table(rows), *(["", "parts", *more] if more else []), *(["", *lines] if lines else [])],
     )
 
