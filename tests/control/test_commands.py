@@ -38,6 +38,50 @@ def test_reach_says_what_it_cannot():
     assert 1.3 < facts["position_error"] < 1.5
 
 
+ROD = """
+format: 2
+kind: slender-rod
+parameters:
+  length: 0.5
+  radius: 0.005
+  density: 1000.0
+  youngs_modulus: 2.0e+7
+  bending_damping: 1.0e-4
+  base_end: {kind: driven, axes: [z, ry]}
+  loads:
+    - {kind: point-wrench, at: 0.5, force: [0.02, 0, 0], controlled: true}
+"""
+
+
+@pytest.fixture
+def rod(tmp_path):
+    (tmp_path / "rod.yaml").write_text(ROD)
+    return tmp_path / "rod.yaml"
+
+
+def test_reach_names_controls_that_are_no_tensions(rod):
+    arguments = ("reach", rod, "--position", 0.1, 0, 0.48, "--low", -0.3, "--high", "0.3,0.3,0.3")
+    facts = told(*arguments)
+    assert facts["names"] == ["base_z", "base_ry", "load0_scale"] and facts["units"] == ["m", "rad", "1"]
+    text = run(*arguments).stdout
+    z, turn, scale = facts["control"]
+    assert f"controls: base_z={z:.6g} m, base_ry={turn:.6g} rad, load0_scale={scale:.6g}\n" in text
+    assert "tension" not in text and " N" not in text
+    held = run("reach", rod, "--position", 0, 0, 0.1, "--low", "-0.1,0,0", "--high", "0.1,0,0").stdout
+    assert "at the lower limit: base_z, base_ry, load0_scale" in held
+    for command in ("reach", "workspace"):
+        assert "controls (N)" not in " ".join(run(command, "--help").stdout.split())
+
+
+def test_reach_says_that_a_pose_is_unstable(rod):
+    """Upright, and beyond Greenhill's load: straight it is in equilibrium, and falls."""
+    arguments = ("--position", 0, 0, 0.5, "--low", 0, "--high", "0.1,0,0", "--tolerance", 1e-2)
+    falls = ("reach", rod, *arguments, "--set", "youngs_modulus=1.0e6")
+    assert told(*falls)["unstable"] is True and "UNSTABLE: the least push" in run(*falls).stdout
+    stands = ("reach", rod, *arguments, "--set", "youngs_modulus=2.0e9")
+    assert told(*stands)["unstable"] is False and "UNSTABLE" not in run(*stands).stdout
+
+
 def test_workspace_writes_and_draws(tmp_path):
     out, picture = tmp_path / "w.nc", tmp_path / "w.png"
     facts = told("workspace", ROBOT, "--count", 40, "--out", out, "--picture", picture)

@@ -173,6 +173,7 @@ def test_no_equilibrium_to_begin_with_is_said():
     found = kc.inverse_kinematics(ROBOT, [0.0, 0.0, 0.5], **held, starts=1)
     assert found.result is kc.Reach.NO_EQUILIBRIUM
     assert np.all(np.isnan(found.position)) and np.isnan(found.position_error)
+    assert found.equilibrium.result[0] < 0 and np.all(np.isnan(found.equilibrium.y))
 
 
 #: inextensible tendons on reels: their tensions feel any residual far more than the shape does
@@ -217,6 +218,19 @@ def test_of_reels_it_is_certain_that_nothing_is_nearer():
     )
     assert found.result is kc.Reach.UNREACHABLE and found.from_rest
     np.testing.assert_array_equal(found.at_low, [False, True, True])
+
+
+def test_the_equilibrium_that_was_reached_is_given():
+    positions = np.array([tip(ROBOT, [pull, 0.0, 0.0, 0.0])[0] for pull in (1.0, 3.0)])
+    path = kc.inverse_kinematics(ROBOT, positions, low=0.0, high=HIGH)
+    assert path.equilibrium.y.shape[:2] == (2, 1)
+    np.testing.assert_allclose(path.equilibrium.tip_position[:, 0], positions, atol=1e-8)
+    one = kc.inverse_kinematics(ROBOT, positions[1], low=0.0, high=HIGH).equilibrium
+    alone = kc.equilibrium(ROBOT, one.control[0])
+    for name in ("y", "z"):
+        np.testing.assert_allclose(getattr(one, name), getattr(alone, name), atol=1e-6)
+    assert kc.stability(one).stable
+    assert kc.simulate(ROBOT, one.control, 0.05, initial=one).y.shape[0] == 2
 
 
 def test_rotation_vectors_turn_one_into_the_other():

@@ -26,13 +26,23 @@ from knode_cosserat.cli.program import app, examples
 from knode_cosserat.cli.telling import tell, vector
 
 if TYPE_CHECKING:
+    from knode_cosserat.control.reach import InverseKinematics
     from knode_cosserat.control.workspace import Workspace
+    from knode_cosserat.rods.system import System
 
 Low = Annotated[
-    str, typer.Option(metavar="N[,N,…]", help="Lower limit of the controls (N): one, or one each.")
+    str,
+    typer.Option(
+        metavar="LIMIT[,LIMIT,…]",
+        help="Lower limit of the controls, in their units (tensions: N): one, or one each.",
+    ),
 ]
 High = Annotated[
-    str, typer.Option(metavar="N[,N,…]", help="Upper limit of the controls (N): one, or one each.")
+    str,
+    typer.Option(
+        metavar="LIMIT[,LIMIT,…]",
+        help="Upper limit of the controls, in their units (tensions: N): one, or one each.",
+    ),
 ]
 
 
@@ -61,12 +71,13 @@ def reach(
     nodes: Nodes = None,
     as_json: Json = False,
 ) -> None:
-    """Find the tensions that bring a robot's tip to a pose at rest.
+    """Find the tensions, or other controls, that bring a robot's tip to a pose at rest.
 
     Of all that do, the least beyond the lower limits. A pose that cannot be reached gives the nearest, and
     says so.
     """
     import knode_cosserat as kc
+    from knode_cosserat import named_controls
 
     system = system_of(robot, changes, nodes)
     found = kc.inverse_kinematics(
@@ -78,6 +89,8 @@ def reach(
         "result": found.result.name.lower(),
         "converged": bool(found.converged),
         "control": found.control.tolist(),
+        "names": named_controls.labels(system.control_layout),
+        "units": named_controls.units(system.control_layout),
         "position": _plain(found.position),
         "quaternion": _plain(found.quaternion),
         "position_error": _number(found.position_error),
@@ -85,11 +98,12 @@ def reach(
         "at_low": found.at_low.tolist(),
         "at_high": found.at_high.tolist(),
         "from_rest": found.from_rest,
+        "unstable": _unstable(found),
         "iterations": found.iterations,
     }
     lines = [
         f"{found.result.message}; {found.iterations} equilibria were looked at",
-        f"tensions: {vector(facts['control'])} N",
+        _held(system, facts["control"]),
     ]
     if facts["position"]:
         lines.append(f"tip: {vector(facts['position'])} m")
@@ -97,11 +111,16 @@ def reach(
         lines.append(f"off by {found.position_error:.3g} m")
     if quaternion is not None:
         lines.append(f"turned from it by {np.degrees(found.angle_error):.3g} degrees")
+    word = "tensions" if _tensions_only(system) else "controls"
+    called = [str(i + 1) for i in range(system.control_size)] if _tensions_only(system) else facts["names"]
     for name, active in (("lower", found.at_low), ("upper", found.at_high)):
         if np.any(active):
-            lines.append(f"at the {name} limit: {', '.join(str(i + 1) for i in np.flatnonzero(active))}")
-    if not found.from_rest:
-        lines.append("the robot has several shapes under these tensions: it has to be led to this one")
+            which = [called[i] for i in np.flatnonzero(active)]
+            lines.append(f"at the {name} limit: {', '.join(which)}")
+    if facts["unstable"]:
+        lines.append("UNSTABLE: the least push, and the robot leaves this shape")
+    if not found.from_rest and facts["position"]:
+        lines.append(f"the robot has several shapes under these {word}: it has to be led to this one")
     tell(as_json, facts, lines)
 
 
@@ -127,7 +146,7 @@ def workspace(
     progress: Progress = None,
     as_json: Json = False,
 ) -> None:
-    """Find where a robot's tip can be at rest: poses under tensions spread evenly between limits."""
+    """Find where a robot's tip can be at rest: poses under controls spread evenly between limits."""
     from knode_cosserat.control.workspace import FORMATS
 
     require_writable(out, picture)
@@ -167,6 +186,33 @@ def _limits(name: str, text: str) -> float | list[float]:
             f"{name} {text!r}: allowed is a number, or one for each control, such as 8,8,10,10"
         ) from None
     return values[0] if len(values) == 1 else values
+
+
+def _tensions_only(system: System) -> bool:
+    return system.control_layout.names == ("tension",)
+
+
+def _held(system: System, control: list[float]) -> str:
+    """The controls in words: tensions, or by name and unit."""
+    from knode_cosserat import named_controls
+
+    if _tensions_only(system):
+        return f"tensions: {vector(control)} N"
+    layout = system.control_layout
+    each = zip(named_controls.labels(layout), control, named_controls.units(layout), strict=True)
+    # a number without a unit has the unit 1
+    words = (f"{name}={value:.6g}" + (f" {unit}" if unit != "1" else "") for name, value, unit in each)
+    return "controls: " + ", ".join(words)
+
+
+def _unstable(found: InverseKinematics) -> bool | None:
+    """Whether the pose is that of an unstable equilibrium; None where `kc.stability` cannot tell."""
+    import knode_cosserat as kc
+
+    try:
+        return not kc.stability(found.equilibrium).stable
+    except ValueError:
+        return None
 
 
 def _number(value: float) -> float | None:

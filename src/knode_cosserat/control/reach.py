@@ -16,12 +16,15 @@ from knode_cosserat.control.asked import (
     static_settings,
 )
 from knode_cosserat.control.search import Search, Wanted
-from knode_cosserat.control.statics import Pose, Response, first_solved, tip_pose
+from knode_cosserat.control.statics import Pose, Response, first_solved, recorded, tip_pose
 from knode_cosserat.rods.system import System, in_strands
 from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.result import SimulationError
+from knode_cosserat.solvers.result import Result, SimulationError
 from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.trajectory import Trajectory
 
+#: of a trajectory, what its row has of its own
+OF_A_ROW = ("y", "z", "control", "result", "residual", "iterations")
 #: in natural units: what equilibria are solved to, at least. The search compares distances to rounding, and
 #: what Newton's method leaves at its own tolerance would hide from it that nothing is nearer
 EXACT = 1e-13
@@ -73,6 +76,8 @@ class InverseKinematics:
     from_rest: Any
     #: equilibria that were looked at
     iterations: Any
+    #: the equilibrium itself, a `Trajectory` as of `kc.equilibrium`: for `kc.stability`, or to begin a motion
+    equilibrium: Any
 
     @property
     def converged(self) -> Any:
@@ -143,8 +148,10 @@ def inverse_kinematics(
         return rows[0]
     names = [field.name for field in dataclasses.fields(InverseKinematics)]
     columns = {name: [getattr(row, name) for row in rows] for name in names}
-    none = {name: None for name in names if columns[name][0] is None}
-    return InverseKinematics(**{name: np.array(columns[name]) for name in names if name not in none}, **none)
+    rests = columns.pop("equilibrium")
+    numbers = {name: None if column[0] is None else np.array(column) for name, column in columns.items()}
+    arrays = {name: np.stack([getattr(rest, name) for rest in rests]) for name in OF_A_ROW}
+    return InverseKinematics(**numbers, equilibrium=dataclasses.replace(rests[0], **arrays))
 
 
 def _whole(number: Any) -> bool:
@@ -189,11 +196,13 @@ def _told(search: Search, wanted: Wanted, u: np.ndarray, found: Response, result
     control = search.control(u)
     position, turned = wanted.errors(found)
     same = _from_rest(search, control, found)
+    y, z = recorded(search.system, search.settings, control, found.y)
     return InverseKinematics(
         result, control, np.asarray(found.position),
         None if found.quaternion is None else np.asarray(found.quaternion),
         float(np.linalg.norm(position)), float(np.linalg.norm(turned)),
         control <= search.low, control >= search.high, same, search.trials,
+        _rest(search, control, (y, z), Result.CONVERGED, float(found.error)),
     )  # fmt: skip
 
 
@@ -232,11 +241,22 @@ def _same_shape(system: System, one: np.ndarray, other: np.ndarray) -> bool:
 
 def _nothing(search: Search, u: np.ndarray) -> InverseKinematics:
     control = search.control(u)
-    position, quaternion = search.pose(search.system, np.full(search.system.y_layout.size, np.nan))
+    system = search.system
+    position, quaternion = search.pose(system, np.full(system.y_layout.size, np.nan))
+    nothing = [np.full((system.nodes, layout.size), np.nan) for layout in (system.y_layout, system.z_layout)]
     return InverseKinematics(
         Reach.NO_EQUILIBRIUM, control, np.asarray(position),
         None if quaternion is None else np.asarray(quaternion), np.nan, np.nan,
         control <= search.low, control >= search.high, False, search.trials,
+        _rest(search, control, nothing, Result.NO_CONVERGENCE, np.inf),
+    )  # fmt: skip
+
+
+def _rest(search: Search, control: np.ndarray, state: Any, result: Result, residual: float) -> Trajectory:
+    y, z = (np.asarray(part)[None] for part in state)
+    return Trajectory(
+        system=search.system, settings=search.settings, time=np.zeros(1), y=y, z=z, control=control[None],
+        result=np.array([int(result)]), residual=np.array([residual]), iterations=np.zeros(1, int),
     )  # fmt: skip
 
 

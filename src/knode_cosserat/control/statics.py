@@ -84,6 +84,14 @@ def _filled(system, settings, control, y):  # type: ignore[no-untyped-def]
     return static_problem(system, settings, control).filled(y)
 
 
+@functools.partial(jax.jit, static_argnames="settings")
+def recorded(system, settings, control, y):  # type: ignore[no-untyped-def]
+    """y and z of an equilibrium at the nodes, from y at all points."""
+    record = static_problem(system, settings, control).record(y)
+    ny = system.y_layout.size
+    return record[:, :ny], record[:, ny : ny + system.z_layout.size]
+
+
 def wrench_fields(system: System) -> tuple[str, ...]:
     """The tip's conditions to which a force and a moment at the tip are added."""
     return tuple(name for name in ("n", "m") if name in system.tip_layout.names)
