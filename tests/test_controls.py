@@ -1,4 +1,6 @@
+import os
 import re
+import stat
 
 import hypothesis.strategies as st
 import numpy as np
@@ -242,6 +244,34 @@ def test_what_cannot_be_saved(tmp_path):
         controls.save(tmp_path / "a.csv", [[1.0]], -1)
     with fails("cannot be written"):
         controls.save(tmp_path / "no" / "a.csv", [[1.0]], DT)
+
+
+def full(*_):
+    raise OSError(28, "No space left on device")
+
+
+def test_a_full_disk_leaves_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "a.csv"
+    controls.save(path, [[1.0, 2.0]], DT)
+    before = path.read_bytes()
+    monkeypatch.setattr(os, "fsync", full)
+    with fails("a.csv: cannot be written: No space left on device"):
+        controls.save(path, [[3.0, 4.0]], DT)
+    assert path.read_bytes() == before and os.listdir(tmp_path) == ["a.csv"]
+
+
+def test_a_link_stays_one_and_a_pipe_too(tmp_path):
+    (tmp_path / "link.csv").symlink_to(tmp_path / "a.csv")
+    controls.save(tmp_path / "link.csv", [[1.0, 2.0]], DT)
+    assert (tmp_path / "link.csv").is_symlink() and (tmp_path / "a.csv").stat().st_size
+    os.mkfifo(tmp_path / "pipe.csv")
+    reader = os.open(tmp_path / "pipe.csv", os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        controls.save(tmp_path / "pipe.csv", [[1.0, 2.0]], DT)
+        assert os.read(reader, 10_000) == (tmp_path / "a.csv").read_bytes()
+    finally:
+        os.close(reader)
+    assert stat.S_ISFIFO((tmp_path / "pipe.csv").stat().st_mode)
 
 
 # the command line

@@ -14,8 +14,13 @@ from pathlib import Path
 def replacing(path: Path) -> Iterator[Path]:
     """A name beside `path` to write to. What is there in the end takes the place of `path` in one go.
 
-    If anything fails, or the process is killed, the old file is still there as it was.
+    If anything fails, or the process is killed, the old file is still there as it was. A link goes on to lead
+    to what it led to, and what is no file, such as a pipe or /dev/null, is written to as it is.
     """
+    if path.exists() and not path.is_file() and not path.is_dir():
+        yield path
+        return
+    path = Path(os.path.realpath(path))
     temporary = path.parent / f".{path.name}.{secrets.token_hex(6)}.tmp"
     try:
         yield temporary

@@ -19,6 +19,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat._files import replacing
+
 Tensions = Float[np.ndarray, "steps tendons"]
 
 #: factor from a unit that a file may use to newtons
@@ -158,7 +160,10 @@ def _is_number(value: Any) -> bool:
 
 
 def save(path: str | Path, tensions: Any, dt: float) -> None:
-    """Write tensions (steps, tendons) in N as CSV: the time (s) from which each row is held, then the row."""
+    """Write tensions (steps, tendons) in N as CSV: the time (s) from which each row is held, then the row.
+
+    The file appears complete or not at all.
+    """
     tensions = np.asarray(tensions, dtype=float)
     if tensions.ndim != 2 or 0 in tensions.shape:
         raise ControlsError(f"tensions have shape {tensions.shape}; allowed is (steps, tendons)")
@@ -166,7 +171,7 @@ def save(path: str | Path, tensions: Any, dt: float) -> None:
     _require_positive("dt", dt)
     names = [f"tension_{k + 1} [N]" for k in range(tensions.shape[1])]
     try:
-        with Path(path).open("w", encoding="utf-8", newline="") as file:
+        with replacing(Path(path)) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
             writer = csv.writer(file, lineterminator="\n")
             writer.writerow(["time [s]", *names])
             # a Python float prints all its digits, so that reading gives back the same number

@@ -1,4 +1,5 @@
 import dataclasses
+import os
 
 import numpy as np
 import pytest
@@ -145,6 +146,19 @@ def test_files_that_cannot_be_read_or_written(tmp_path):
         RecordingConfig.load(tmp_path / "it.yaml")
     with pytest.raises(RecordingError, match="cannot be written"):
         FULL.save(tmp_path)
+
+
+def test_a_full_disk_leaves_the_old_file(tmp_path, monkeypatch):
+    FULL.save(tmp_path / "it.yaml")
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(RecordingError, match=r"it\.yaml: cannot be written: No space left on device"):
+        FULL.replace(clock="header").save(tmp_path / "it.yaml")
+    assert RecordingConfig.load(tmp_path / "it.yaml") == FULL
+    assert os.listdir(tmp_path) == ["it.yaml"]
 
 
 def test_settings_are_changed_by_name():

@@ -1,3 +1,4 @@
+import os
 import re
 from pathlib import Path
 from typing import Any, ClassVar
@@ -363,6 +364,20 @@ def test_what_cannot_be_saved(tmp_path):
     assert not (tmp_path / "a.yaml").exists()
     with pytest.raises(RobotFileError, match="inside jit"):
         jax.jit(format_robot)(robot)
+
+
+def test_a_full_disk_leaves_the_old_file(tmp_path, monkeypatch):
+    robot = load_robot(PAPER)
+    save_robot(robot, tmp_path / "a.yaml")
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with fails("a.yaml: cannot be written: No space left on device"):
+        save_robot(robot.replace(length=0.5), tmp_path / "a.yaml")
+    assert_equal(load_robot(tmp_path / "a.yaml"), robot)
+    assert os.listdir(tmp_path) == ["a.yaml"]
 
 
 def test_other_kinds_can_join(monkeypatch):

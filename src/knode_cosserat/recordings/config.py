@@ -21,6 +21,7 @@ import math
 from pathlib import Path
 from typing import Any, Literal, Self
 
+from knode_cosserat._files import replacing
 from knode_cosserat._yaml import YAMLTextError, did_you_mean, flow, mapping_of, shown
 from knode_cosserat.recordings.findings import RecordingError
 
@@ -245,7 +246,8 @@ class RecordingConfig:
             else:
                 lines.append(f"{name}: {flow(value)}")
         try:
-            Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+            with replacing(Path(path)) as temporary:
+                temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
         except OSError as error:
             raise RecordingError(f"{path}: cannot be written: {error.strerror}") from None
 

@@ -25,6 +25,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from knode_cosserat._files import replacing
 from knode_cosserat._yaml import YAMLTextError, did_you_mean, flow, mapping_of, shown
 from knode_cosserat.rods.parallel_robot import ParallelRobot
 from knode_cosserat.rods.parameters import (
@@ -71,14 +72,15 @@ def load_robot(name_or_path: str | Path) -> System:
 
 
 def save_robot(robot: System, path: str | Path, *, description: str = "") -> None:
-    """Write a robot as a file that `load_robot` reads back equal.
+    """Write a robot as a file that `load_robot` reads back equal. It appears complete or not at all.
 
     Raises:
         RobotFileError: it is of a class that no file can name, a batch, or the file cannot be written.
     """
     text = format_robot(robot, description)
     try:
-        Path(path).write_text(text, encoding="utf-8")
+        with replacing(Path(path)) as temporary:
+            temporary.write_text(text, encoding="utf-8")
     except OSError as error:
         raise RobotFileError(f"{path}: cannot be written: {error.strerror}") from None
 
