@@ -101,6 +101,22 @@ def test_a_users_system_is_asked_for(tmp_path, batch):
         load_trajectory(tmp_path / "a.nc", system=ROBOT)
 
 
+@pytest.mark.parametrize("batch", [(), (2,)])
+@pytest.mark.parametrize("part", ["FunctionRouting", "FunctionSection"])
+def test_a_robot_with_a_part_made_of_code_is_asked_for(tmp_path, part, batch):
+    body = {"length": 0.5, "radius": 0.005, "density": 1000.0, "youngs_modulus": 1e6, "nodes": 5}
+    robot = kc.SlenderRod(**body, sections=(kc.FunctionSection(),))
+    if part == "FunctionRouting":
+        routing = (kc.routing.FunctionRouting(lambda s: (0.01 * s, 0.0 * s)),)
+        robot = kc.RoutedTendonRobot(**body, tendon_offset=0.01, tendon_angles=[0.0], routing=routing)
+    robot = stacked(robot, robot.replace(length=0.25)) if batch else robot
+    trajectory = synthetic(batch, robot=robot)
+    trajectory.save(tmp_path / "a.nc")
+    with fails("does not describe its system", f"(a {part} cannot be written", "made of code", "system=…"):
+        load_trajectory(tmp_path / "a.nc")
+    assert_same(load_trajectory(tmp_path / "a.nc", system=robot), trajectory)
+
+
 @pytest.fixture
 def codec(monkeypatch):
     """Pendulums as text, whose length in mm a file can hold; longer ones cannot be written."""

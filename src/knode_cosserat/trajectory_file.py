@@ -179,7 +179,10 @@ def _described(system: System) -> tuple[dict[str, str], dict[str, Any]]:
     codec = _codecs.get(type(system).__name__)
     batch = np.ndim(system.length) > 0
     if type(system) in robot_file.KINDS.values():
-        described = {"robot": robot_file.format_robot(_robot(system, 0) if batch else system)}
+        try:
+            described = {"robot": robot_file.format_robot(_robot(system, 0) if batch else system)}
+        except robot_file.RobotFileError as error:  # one of its parts is made of code
+            return {"system_missing": _first_line(error)}, {}
         return described, _parameters(system) if batch else {}
     if codec is None or codec.cls is not type(system):
         return {}, {}
