@@ -60,6 +60,15 @@ def did_you_mean(given: Any, known: Any) -> str:
 class _Loader(yaml.SafeLoader):
     """Safe, with the scalars of YAML 1.2 and no key twice."""
 
+    def construct_object(self, node: Any, deep: bool = False) -> Any:
+        try:
+            return super().construct_object(node, deep)
+        except (yaml.YAMLError, RecursionError):
+            raise
+        except Exception:  # PyYAML takes a scalar apart as its tag says without asking whether it can
+            problem = f"{shown(node.value)} cannot be read as !!{node.tag.rpartition(':')[2]}"
+            raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark) from None
+
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
         seen: set[str] = set()
         for key, _ in node.value if isinstance(node, yaml.MappingNode) else ():
