@@ -12,22 +12,20 @@ import difflib
 import inspect
 import os
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat._csv import SAME_TIME, Column, CSVTextError, held_rows, read_rows
 from knode_cosserat._files import replacing
 
 Tensions = Float[np.ndarray, "steps tendons"]
 
 #: factor from a unit that a file may use to newtons
 TENSION_UNITS = {"N": 1.0, "gf": 9.81 / 1000.0}
-
-#: times that differ by less than this part of a step are the same: i dt is rounded, and so are files
-SAME_TIME = 1e-4
 
 
 class ControlsError(ValueError):
@@ -59,11 +57,11 @@ def sine(
     period: float, steps: int, dt: float, *, base: float = 6.0, amplitude: float = 1.0, tendons: int = 4
 ) -> Tensions:
     """τ_k = base + amplitude sin(2πt/period + 2πk/tendons) in N, k = 0, 1, …; period in s."""
-    _require_positive("period", period)
     _require_numbers(base=base, amplitude=amplitude)
     _require_counts(tendons=tendons)
     phase = 2 * np.pi * np.arange(tendons) / tendons
     t = _times(steps, dt)
+    _require_period(period, float(t[-1]))
     return _pulling(base + amplitude * np.sin(2 * np.pi * t[:, None] / period + phase), "sine")
 
 
@@ -144,6 +142,14 @@ def _require_positive(name: str, value: Any) -> None:
         raise ControlsError(f"{name} is {value!r}; allowed is a number of seconds above 0")
 
 
+def _require_period(period: Any, last: float) -> None:
+    """A sine must have a phase at all times up to the last (s): 2πt/period must not be infinite."""
+    _require_positive("period", period)
+    least = 8.0 * (last / np.finfo(float).max)
+    if not period > least:
+        raise ControlsError(f"period is {period!r}; allowed is a number of seconds above {least:g}")
+
+
 def _require_counts(least: int = 1, **values: Any) -> None:
     for name, value in values.items():
         if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
@@ -199,9 +205,10 @@ def load(path: str | Path, dt: float | None = None) -> Controls:
     time, tensions = _read(Path(path))
     if dt is None:
         return Controls(tensions, _own_step(path, time))
-    count = int(np.floor((time[-1] - time[0]) / dt + SAME_TIME)) + 1
-    at = time[0] + (np.arange(count) + SAME_TIME) * dt
-    return Controls(tensions[np.searchsorted(time, at, side="right") - 1], float(dt))
+    try:
+        return Controls(tensions[held_rows(path, time, dt)], float(dt))
+    except CSVTextError as error:
+        raise ControlsError(str(error)) from None
 
 
 def _own_step(path: str | Path, time: np.ndarray) -> float:
@@ -221,63 +228,30 @@ def _own_step(path: str | Path, time: np.ndarray) -> float:
     )
 
 
-class _Column(NamedTuple):
-    title: str
-    tendon: int  # 0 for the time
-    factor: float
-
-
 def _read(path: Path) -> tuple[np.ndarray, Tensions]:
     """Times (rows,) in s and tensions (rows, tendons) in N."""
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            return _rows(path, csv.reader(file))
-    except FileNotFoundError:
-        raise ControlsError(f"{path}: no such file") from None
-    except OSError as error:
-        raise ControlsError(f"{path}: cannot be read: {error.strerror}") from None
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise ControlsError(f"{path}: not a CSV text file: {error}") from None
-
-
-def _rows(path: Path, reader: Any) -> tuple[np.ndarray, Tensions]:
-    filled = (cells for cells in reader if any(cell.strip() for cell in cells))
-    header = next(filled, None)
-    if header is None:
-        raise ControlsError(f"{path}: the file is empty; allowed is {_HEADER}, then rows of numbers")
-    columns = _columns(path, reader.line_num, header)
-    rows: list[list[float]] = []
-    for cells in filled:
-        where = f"{path}: line {reader.line_num}"
-        if len(cells) != len(columns):
-            raise ControlsError(f"{where} has {len(cells)} cells; allowed is {len(columns)}, like the header")
-        row = [_value(where, column, cell) for column, cell in zip(columns, cells, strict=True)]
-        ordered = [value for _, value in sorted(zip((c.tendon for c in columns), row, strict=True))]
-        if rows and ordered[0] <= rows[-1][0]:
-            raise ControlsError(f"{where}: time is {ordered[0]!r} s; allowed is one after {rows[-1][0]!r} s")
-        rows.append(ordered)
-    if not rows:
-        raise ControlsError(f"{path}: no rows of tensions after the header")
-    table = np.array(rows)
-    return table[:, 0], table[:, 1:]
+        time, tensions, _ = read_rows(path, _HEADER, _columns)
+    except CSVTextError as error:
+        raise ControlsError(str(error)) from None
+    return time, tensions
 
 
 _HEADER = "a header `time [s],tension_1 [N],tension_2 [N],…`"
 
 
-def _columns(path: Path, line: int, header: Iterable[str]) -> list[_Column]:
-    columns = [_column(f"{path}: line {line}", title.strip()) for title in header]
-    tendons = sorted(column.tendon for column in columns)
+def _columns(where: str, titles: list[str]) -> list[Column]:
+    columns = [_column(where, title) for title in titles]
+    tendons = sorted(column.place for column in columns)
     if len(tendons) < 2 or tendons != list(range(len(tendons))):
-        titles = ", ".join(column.title for column in columns)
         raise ControlsError(
-            f"{path}: line {line}: the columns are {titles}; "
+            f"{where}: the columns are {', '.join(titles)}; "
             "allowed is time, and tension_1, tension_2, … without a gap, once each"
         )
     return columns
 
 
-def _column(where: str, title: str) -> _Column:
+def _column(where: str, title: str) -> Column:
     match = re.fullmatch(r"(?:(time)|tension_([1-9]\d{0,5})) *(?:\[ *([^\[\]]*?) *\])?", title)
     if match is None:
         raise ControlsError(f"{where}: the column {title!r} is unknown; allowed is {_HEADER}")
@@ -288,18 +262,9 @@ def _column(where: str, title: str) -> _Column:
         raise ControlsError(f"{where}: the column {title!r} has no unit; allowed is {allowed} after its name")
     if unit not in units:
         raise ControlsError(f"{where}: the column {title!r} has the unit {unit!r}; allowed is {allowed}")
-    return _Column(title, 0 if time else int(tendon), units[unit])
-
-
-def _value(where: str, column: _Column, cell: str) -> float:
-    allowed = "a finite number" if column.tendon == 0 else "a finite number, 0 or more (a pull)"
-    try:
-        value = float(cell)
-    except ValueError:
-        value = np.nan
-    if not np.isfinite(value) or (column.tendon > 0 and value < 0.0):
-        raise ControlsError(f"{where}: {column.title} is {cell.strip()!r}; allowed is {allowed}")
-    return value * column.factor
+    if time:
+        return Column(title, 0)
+    return Column(title, int(tendon), units[unit], 0.0, "a finite number, 0 or more (a pull)")
 
 
 # the command line
@@ -348,6 +313,7 @@ def parse(specification: str, steps: int | None, dt: float, *, tendons: int = 4)
     Raises:
         ControlsError: the specification is not understood, or the file is not right or too short.
     """
+    _require_positive("dt", dt)
     name, colon, rest = specification.partition(":")
     if os.path.exists(specification) and not (colon and name in _SIGNALS):
         return _from_file(specification, steps, dt, tendons)

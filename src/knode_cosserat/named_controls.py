@@ -9,13 +9,15 @@ from __future__ import annotations
 import difflib
 import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat import controls
-from knode_cosserat.controls import SAME_TIME, ControlsError
+from knode_cosserat._csv import SAME_TIME, Column, CSVTextError, held_rows, read_rows
+from knode_cosserat.controls import ControlsError
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.system import System
 
@@ -56,12 +58,15 @@ def parse(robot: System, specification: str, steps: int | None, dt: float) -> Ar
     layout = robot.control_layout
     if layout.names == ("tension",):
         return controls.parse(specification, steps, dt, tendons=layout.size)
+    if not 0.0 < dt < np.inf:
+        raise ControlsError(f"dt is {dt!r}; allowed is a number of seconds above 0")
+    whole = isinstance(steps, int | np.integer) and not isinstance(steps, bool)
+    if steps is not None and (not whole or steps < 1):
+        raise ControlsError(f"steps is {steps!r}; allowed is a whole number from 1 on")
     if os.path.isfile(specification):
         return _sampled(specification, layout, steps, dt)
     if steps is None:
         raise ControlsError(f"controls {specification!r}: the number of steps is not given")
-    if isinstance(steps, bool) or steps < 1:
-        raise ControlsError(f"steps is {steps!r}; allowed is a whole number from 1 on")
     words = [] if specification.strip() == "none" else specification.split(";")
     return parse_signals(layout, words, np.arange(1, steps + 1) * dt)
 
@@ -76,7 +81,15 @@ def parse_signals(layout: Layout, words: list[str], t: Float[np.ndarray, " steps
                 f"controls {entry.strip()!r}: allowed is NAME=SIGNAL;…, `none` or a CSV file; "
                 f"names are {', '.join(labels(layout)) or 'none'}"
             )
-        found[:, _columns(layout, name)] = _signal(word, t)[:, None]
+        # too short a period, say: what is not finite is refused here, so that nothing warns of it
+        with np.errstate(all="ignore"):
+            values = _signal(word, t)
+        if not np.all(np.isfinite(values)):
+            raise ControlsError(
+                f"controls {entry.strip()!r}: a value is {values[~np.isfinite(values)][0]}; "
+                "allowed is a signal of finite numbers"
+            )
+        found[:, _columns(layout, name)] = values[:, None]
     return found
 
 
@@ -148,32 +161,23 @@ def _number(where: str, text: str) -> float:
 
 def _sampled(path: str, layout: Layout, steps: int | None, dt: float) -> Array:
     """A file's columns, each row held until the next row's time."""
-    import pandas  # type: ignore[import-untyped]
+    known = ["time [s]", *titles(layout)]
+
+    def columns_of(where: str, found: list[str]) -> list[Column]:
+        if not {"time [s]"} <= set(found) <= set(known) or len(set(found)) < len(found):
+            raise ControlsError(
+                f"{where}: the columns are {', '.join(found)}; "
+                f"allowed is time [s], and any of {', '.join(known[1:]) or 'none'}, once each"
+            )
+        return [Column(title, known.index(title)) for title in found]
 
     try:
-        table = pandas.read_csv(path)
-    except (OSError, ValueError) as error:
-        raise ControlsError(f"{path}: not a CSV file of numbers: {str(error).splitlines()[0]}") from None
-    known = dict(zip(titles(layout), labels(layout), strict=True)) | {"time [s]": "time"}
-    wrong = [title for title in table.columns if title.strip() not in known]
-    if wrong or "time [s]" not in [title.strip() for title in table.columns]:
-        raise ControlsError(
-            f"{path}: the columns are {', '.join(table.columns)}; allowed is {', '.join(known)}"
-        )
-    table.columns = [known[title.strip()] for title in table.columns]
-    values = table.apply(pandas.to_numeric, errors="coerce").to_numpy(dtype=float)
-    if not len(values) or not np.all(np.isfinite(values)):
-        line = 2 + int(np.argwhere(~np.isfinite(values))[0][0]) if len(values) else 2
-        raise ControlsError(f"{path}: line {line}: allowed is a finite number in every column")
-    time = table["time"].to_numpy(dtype=float)
-    if np.any(np.diff(time) <= 0.0):
-        raise ControlsError(f"{path}: line {3 + int(np.argmax(np.diff(time) <= 0.0))}: times must grow")
-    count = int(np.floor((time[-1] - time[0]) / dt + SAME_TIME)) + 1
-    if steps is not None and steps > count:
-        raise ControlsError(f"{path}: there are {count} steps of {dt:g} s; {steps} are asked for")
-    at = time[0] + (np.arange(count if steps is None else steps) + SAME_TIME) * dt
-    rows = np.searchsorted(time, at, side="right") - 1
+        time, values, places = read_rows(Path(path), f"a header `{','.join(known)}`", columns_of)
+        rows = held_rows(path, time, dt)
+    except CSVTextError as error:
+        raise ControlsError(str(error)) from None
+    if steps is not None and steps > len(rows):
+        raise ControlsError(f"{path}: there are {len(rows)} steps of {dt:g} s; {steps} are asked for")
     found = np.zeros((len(rows), layout.size))
-    for name in table.columns.drop("time"):
-        found[:, labels(layout).index(name)] = table[name].to_numpy(dtype=float)[rows]
-    return found
+    found[:, [place - 1 for place in places]] = values[rows]
+    return found[:steps]

@@ -1,0 +1,106 @@
+"""CSV files of numbers over time, read strictly: no cell is guessed at, moved or left out."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+Rows = Float[np.ndarray, "rows columns"]
+Times = Float[np.ndarray, " rows"]
+
+#: times that differ by less than this part of a step are the same: i dt is rounded, and so are files
+SAME_TIME = 1e-4
+
+#: no file is sampled at more steps: they are no file's, and would not fit into memory
+MOST_STEPS = 10**8
+
+
+class CSVTextError(ValueError):
+    """A file that cannot be read or sampled; the message is one line."""
+
+
+class Column(NamedTuple):
+    """What a file's column is."""
+
+    title: str
+    #: where it belongs among the file's numbers, however the file orders them: 0 for the time
+    place: int
+    factor: float = 1.0
+    low: float = -np.inf
+    allowed: str = "a finite number"
+
+
+def read_rows(
+    path: Path, header: str, columns_of: Callable[[str, list[str]], list[Column]]
+) -> tuple[Times, Rows, list[int]]:
+    """Times, which grow, the other numbers of each row in the order of their places, and these places.
+
+    Args:
+        path: the file.
+        header: which header is allowed, for the errors.
+        columns_of: from where the header is and its titles to its columns; raises an error of its own.
+
+    Raises:
+        CSVTextError: the file is not right; the message names file, line and column.
+    """
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            return _rows(path, csv.reader(file), header, columns_of)
+    except FileNotFoundError:
+        raise CSVTextError(f"{path}: no such file") from None
+    except OSError as error:
+        raise CSVTextError(f"{path}: cannot be read: {error.strerror}") from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise CSVTextError(f"{path}: not a CSV text file: {error}") from None
+
+
+def _rows(
+    path: Path, reader: Any, header: str, columns_of: Callable[[str, list[str]], list[Column]]
+) -> tuple[Times, Rows, list[int]]:
+    filled = (cells for cells in reader if any(cell.strip() for cell in cells))
+    titles = next(filled, None)
+    if titles is None:
+        raise CSVTextError(f"{path}: the file is empty; allowed is {header}, then rows of numbers")
+    columns = columns_of(f"{path}: line {reader.line_num}", [title.strip() for title in titles])
+    order = np.argsort([column.place for column in columns])
+    rows: list[list[float]] = []
+    for cells in filled:
+        where = f"{path}: line {reader.line_num}"
+        if len(cells) != len(columns):
+            raise CSVTextError(f"{where} has {len(cells)} cells; allowed is {len(columns)}, like the header")
+        row = [_value(where, column, cell) for column, cell in zip(columns, cells, strict=True)]
+        ordered = [row[k] for k in order]
+        if rows and ordered[0] <= rows[-1][0]:
+            raise CSVTextError(f"{where}: time is {ordered[0]!r} s; allowed is one after {rows[-1][0]!r} s")
+        rows.append(ordered)
+    if not rows:
+        raise CSVTextError(f"{path}: no rows of numbers after the header")
+    table = np.array(rows)
+    return table[:, 0], table[:, 1:], [columns[k].place for k in order[1:]]
+
+
+def _value(where: str, column: Column, cell: str) -> float:
+    try:
+        value = float(cell)
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value) or value < column.low:
+        raise CSVTextError(f"{where}: {column.title} is {cell.strip()!r}; allowed is {column.allowed}")
+    return value * column.factor
+
+
+def held_rows(path: str | Path, time: Times, dt: float) -> np.ndarray:
+    """Which row is held at the first time + i dt, up to the last time. Raises `CSVTextError`."""
+    length = float(time[-1]) - float(time[0])
+    count = length / float(dt) + SAME_TIME
+    if not count < MOST_STEPS:
+        raise CSVTextError(
+            f"{path}: dt is {dt!r}; allowed is one of which the file's {length:g} s are at most {MOST_STEPS}"
+        )
+    at = time[0] + (np.arange(int(count) + 1) + SAME_TIME) * dt
+    return np.searchsorted(time, at, side="right") - 1
