@@ -6,6 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import knode_cosserat as kc
+from knode_cosserat.rods.robot_file import format_robot, parse_robot
 from knode_cosserat.solvers.result import Result
 
 KNOWLEDGE = kc.load_robot("delrin-tendon-robot")
@@ -17,6 +18,18 @@ RUBBING = {
 
 def moved(robot, steps=60, dt=0.025, control="sine:1.0", **options):
     return kc.simulate(robot, kc.controls.parse(control, steps, dt), dt, **options)
+
+
+@pytest.mark.parametrize("empty", [(), []])
+def test_a_robot_without_tendons_is_refused(empty):
+    with pytest.raises(
+        kc.ParameterError, match=r"^routing is \[\]; allowed is one or more, one for each tendon"
+    ):
+        kc.RoutedTendonRobot.like(KNOWLEDGE, routing=empty)
+    text = format_robot(kc.RoutedTendonRobot.like(KNOWLEDGE)).replace("format: 1", "format: 2")
+    with pytest.raises(kc.RobotFileError, match=r"^mine.yaml: routing is \[\]; allowed is") as caught:
+        parse_robot(text + "  routing: []\n", "mine.yaml")
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("tension", [0.5, 3.0])

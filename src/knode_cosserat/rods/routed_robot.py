@@ -92,6 +92,10 @@ class RoutedTendonRobot(TendonRod):
         "m2", "c, loss of bending stiffness by vibration, by tension", low=0.0, high=1.0, default=0.0
     )
 
+    def __check_init__(self) -> None:
+        if isinstance(self.routing, tuple) and not self.routing:
+            raise ParameterError("routing is []; allowed is one or more, one for each tendon")
+
     @classmethod
     def like(cls, robot: TendonRod, **changes: Any) -> Self:
         """A robot with the rod of another, and with tendons at the same places.
