@@ -72,3 +72,10 @@ def test_a_class_may_have_a_constructor_of_its_own():
     assert Wire(gauge=2.0).radius == 5e-4
     with pytest.raises(kc.ParameterError, match=r"^Wire has no parameter 'gage'; did you mean gauge"):
         Wire(gage=2.0)
+
+
+@pytest.mark.parametrize("short", [[1e-200, 0, 0, 0], [0, 0, 1e-9, 0], [0, 0, 0, 0]])
+def test_a_quaternion_has_a_length(short):
+    kc.ends.Clamped(orientation=[1e-8, 0, 0, 0])
+    with pytest.raises(kc.ParameterError, match=r"^Clamped: orientation is \[.* \(length above 1e-09\)"):
+        kc.ends.Clamped(orientation=short)

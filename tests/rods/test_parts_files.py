@@ -42,7 +42,11 @@ def numbers(stated):
         return each.map(lambda size: size * np.eye(3))
     least, most = sizes[stated.shape]
     found = st.lists(each, min_size=least, max_size=most)
-    return found.filter(any) if stated.shape == "quaternion" else found
+    return found.filter(long) if stated.shape == "quaternion" else found
+
+
+def long(vector):
+    return np.linalg.norm(vector) > 1e-9
 
 
 @st.composite
@@ -56,7 +60,7 @@ def parts(draw, family):
             direction = name in ("normal", "axis")
             if family is SectionChange and name in ("radius", "stiffness"):
                 stated = dataclasses.replace(stated, low=1e-3)
-            given[name] = draw(numbers(stated).filter(any) if direction else numbers(stated))
+            given[name] = draw(numbers(stated).filter(long) if direction else numbers(stated))
     if "begin" in fields and draw(st.booleans()):
         # what is nearer to an end than rounding is at it
         places = st.lists(st.floats(0.0, 1.0).map(lambda s: round(s, 6)), min_size=2, max_size=2, unique=True)
@@ -163,6 +167,14 @@ HEAD = (
         (
             "tip_end: {kind: pinned, orientation: [0, 0, 0, 0]}",
             "tip_end.orientation is [0, 0, 0, 0]; allowed is four numbers, not all zero",
+        ),
+        (
+            "tip_end: {kind: clamped, orientation: [1.0e-200, 0, 0, 0]}",
+            "tip_end.orientation is [1e-200, 0, 0, 0]; allowed is four numbers, .*length above 1e-09",
+        ),
+        (
+            "surroundings: [{kind: plane, normal: [0, 0, 1.0e-12]}]",
+            "surroundings.0: .*normal is [0.0, 0.0, 1e-12]; allowed is a direction, .*above 1e-09",
         ),
         (
             "surroundings: [{kind: sphere, radius: 0}]",

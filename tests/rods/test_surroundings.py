@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 
 from knode_cosserat.rods.loads import Motion
+from knode_cosserat.rods.parameters import ParameterError
 from knode_cosserat.rods.surroundings import Cylinder, Plane, Sphere
 
 vectors = st.lists(st.floats(-2.0, 2.0), min_size=3, max_size=3).map(np.array)
@@ -25,6 +26,24 @@ def test_the_distance_from_a_plane(p, point, normal):
     # of any length, and through any of its points
     same = Plane(point=point + along, normal=7.0 * normal).distance(p)[0]
     assert float(same) == pytest.approx(float(distance), abs=1e-9)
+
+
+@pytest.mark.parametrize("length", [2e-9, 1e-5, 1e3])
+def test_a_direction_is_of_any_length(length):
+    normal = length * np.array([0.6, 0.0, 0.8])
+    distance, out = Plane(normal=normal).distance(np.array([0.0, 0.0, 1.0]))
+    np.testing.assert_allclose(out, [0.6, 0.0, 0.8], rtol=1e-15)
+    assert float(distance) == pytest.approx(0.8, rel=1e-15)
+    assert float(Cylinder(axis=normal).distance(np.array([0.0, 0.0, 1.0]))[0]) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("given", [[0, 0, 0], [0, 1e-12, 0], [1e-9, 0, 0], [1e-200, 0, 0]])
+@pytest.mark.parametrize(("cls", "name"), [(Plane, "normal"), (Cylinder, "axis")])
+def test_but_of_some(cls, name, given):
+    with pytest.raises(ParameterError, match=rf"^{cls.__name__}: {name} is \[.*direction.* above 1e-09$"):
+        cls(**{name: given})
+    with pytest.raises(ParameterError, match=rf"^{cls.__name__}: {name} is 'up'; allowed is three numbers"):
+        cls(**{name: "up"})
 
 
 @settings(max_examples=50, deadline=None)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import math
 from collections.abc import Callable, Iterable
 from typing import Any, Literal, Self
 
@@ -16,6 +17,9 @@ import jax
 import numpy as np
 
 from knode_cosserat._yaml import did_you_mean
+
+#: what is only a direction, such as a quaternion, is longer: its square is lost if it is much shorter
+SHORTEST = 1e-9
 
 
 class ParameterError(ValueError):
@@ -46,7 +50,7 @@ class Parameter:
         kind = {
             "scalar": "a number",
             "vector": "three numbers, each",
-            "quaternion": "four numbers, not all zero, scalar first, each",
+            "quaternion": f"four numbers, not all zero (length above {SHORTEST:g}), scalar first, each",
             "matrix": "one number, three (a diagonal) or a symmetric 3x3 matrix, with eigenvalues",
             "list": "a list of numbers, each",
         }[self.shape]
@@ -220,7 +224,7 @@ def checked(name: str, value: Any, parameter: Parameter) -> None:
         raise ParameterError(f"{name} has shape {array.shape}; allowed is {parameter.allowed}")
     if not np.all(np.isfinite(array)):
         raise ParameterError(f"{name} is {array.tolist()}; allowed is {parameter.allowed}")
-    if parameter.shape == "quaternion" and not np.any(array):
+    if parameter.shape == "quaternion" and not math.hypot(*array) > SHORTEST:
         raise ParameterError(f"{name} is {array.tolist()}; allowed is {parameter.allowed}")
     if parameter.shape == "matrix":
         if not np.allclose(array, array.T, rtol=1e-9, atol=0.0):

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+import math
 from typing import Any, ClassVar, Self
 
 import jax
@@ -23,7 +24,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.loads import Motion, Wrench
-from knode_cosserat.rods.parameters import ParameterError, choice, parameter
+from knode_cosserat.rods.parameters import SHORTEST, ParameterError, choice, parameter
 from knode_cosserat.rods.parts import Part
 from knode_cosserat.rods.system import is_traced
 from knode_cosserat.rotation import cross, dot
@@ -72,8 +73,17 @@ class Obstacle(Part):
 def _require_direction(who: Obstacle, name: str) -> None:
     """Raise `ParameterError` if that vector of an obstacle has no length."""
     given = getattr(who, name)
-    if not is_traced(given) and not np.any(np.asarray(given)):
-        raise ParameterError(f"{type(who).__name__}: {name} is {np.asarray(given)}; allowed is a direction")
+    if not is_traced(given) and not math.hypot(*given) > SHORTEST:
+        raise ParameterError(
+            f"{type(who).__name__}: {name} is {np.asarray(given).tolist()}; "
+            f"allowed is a direction, with a length above {SHORTEST:g}"
+        )
+
+
+def _unit(vector: Any) -> Any:
+    """A direction, of length one."""
+    vector = jnp.asarray(vector)
+    return vector / jnp.sqrt(jnp.sum(vector * vector))
 
 
 def _length(vector: Any) -> Any:
@@ -95,11 +105,12 @@ class Plane(Obstacle):
     )
 
     def __check_init__(self) -> None:
+        super().__check_init__()
         _require_direction(self, "normal")
 
     def distance(self, p: Float[Any, "3"]) -> tuple[Any, Float[Any, "3"]]:
         """See `Obstacle.distance`."""
-        normal = jnp.asarray(self.normal) / _length(jnp.asarray(self.normal))
+        normal = _unit(self.normal)
         return jnp.sum((p - self.point) * normal), normal
 
 
@@ -134,11 +145,12 @@ class Cylinder(Obstacle):
     inside: bool = choice(_INSIDE, (False, True), False)
 
     def __check_init__(self) -> None:
+        super().__check_init__()
         _require_direction(self, "axis")
 
     def distance(self, p: Float[Any, "3"]) -> tuple[Any, Float[Any, "3"]]:
         """See `Obstacle.distance`."""
-        axis = jnp.asarray(self.axis) / _length(jnp.asarray(self.axis))
+        axis = _unit(self.axis)
         away = p - self.point
         return _round(away - jnp.sum(away * axis) * axis, self.radius, self.inside)
 
