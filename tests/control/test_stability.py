@@ -55,8 +55,10 @@ def test_the_least_eigenvalue_crosses_zero_at_the_load_whatever_the_nodes():
             rest = kc.equilibrium(rod.replace(tip_end=end), np.zeros(0), space="rk4")
             found.append(kc.stability(rest).least)
         critical.append(at[0] - found[0] * (at[1] - at[0]) / (found[1] - found[0]))
-    errors = np.abs(np.array(critical) - 4.0 * np.pi**2)
-    assert errors[0] < 3e-3 * 4.0 * np.pi**2 and errors[1] < errors[0] / 8
+    # P (1 + P/GA - P/EA) = 4π² EI/L²: shear makes it softer, and squeezing shorter
+    exact = 4.0 * np.pi**2 * (1.0 - 4.0 * np.pi**2 * (EI / L**2) * (2.6 - 1.0) / EA)
+    errors = np.abs(np.array(critical) - exact)
+    assert errors[0] < 1e-4 * exact and errors[1] < errors[0] / 8
 
 
 @pytest.mark.parametrize("part", [0.5, 0.98, 1.02, 4.0])
@@ -118,6 +120,104 @@ def test_an_arch_snaps_where_it_is_no_longer_stable_and_says_so():
     assert middle[snapped - 1] > 0.0 > middle[snapped]
     # out of its plane it gives way before, which a push in the plane does not tell it
     print("least eigenvalue by load:", np.round(least, 2))
+
+
+# slender and bent: a segment's axis is stiffer by orders of magnitude than its bending
+
+
+def wire(slenderness, bend, nodes):
+    """Bent by a force across its tip, which nothing makes unstable."""
+    r, modulus = 0.3 / slenderness, 70e9
+    force = 2.0 * bend * modulus * np.pi * r**4 / 4 / 0.3**2
+    return kc.SlenderRod(
+        length=0.3, radius=r, density=6450.0, youngs_modulus=modulus, gravity=[0.0, 0.0, 0.0], nodes=nodes,
+        loads=(PointWrench(force=[force, 0.0, 0.0]),),
+    )  # fmt: skip
+
+
+def test_a_slender_wire_is_stable_however_it_is_bent_and_at_few_nodes():
+    for slenderness in (50.0, 300.0, 600.0, 6000.0, 60000.0):
+        for bend in (0.1, 1.0, 2.0):
+            found = kc.stability(kc.equilibrium(wire(slenderness, bend, 10), np.zeros(0), space="rk4"))
+            assert found.unstable_directions == 0 and found.least == pytest.approx(1.7, rel=0.25)
+            assert found.asymmetry < 1e-9
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("nodes", [5, 20, 40])
+def test_of_a_slender_wire_the_nodes_do_not_change_what_is_least(nodes):
+    least = [
+        kc.stability(kc.equilibrium(wire(600.0, 1.5, each), np.zeros(0), space=space)).least
+        for each, space in ((10, "euler"), (10, "rk4"), (nodes, "rk4"))
+    ]
+    assert least[0] == pytest.approx(least[1], rel=1e-6) and least[1] == pytest.approx(least[2], rel=0.02)
+
+
+def test_the_six_legs_of_the_catalogs_robot_are_stable():
+    robot = kc.load_robot("six-legged-robot")
+    rest, moved = (
+        kc.stability(kc.equilibrium(robot, [push, 0.0, 0.0, 0.0, 0.0, 0.0])) for push in (0.0, 0.02)
+    )
+    # 7.29 at 40 nodes
+    assert rest.stable and rest.least == pytest.approx(7.2, rel=0.02)
+    assert moved.stable and moved.least == pytest.approx(6.9, rel=0.02)
+
+
+@pytest.mark.campaign
+def test_a_slender_robot_bent_by_its_tendon_is_stable():
+    modulus, r = 70e9, 1e-3
+    robot = kc.RoutedTendonRobot(
+        length=0.6, radius=r, density=6450.0, youngs_modulus=modulus, gravity=[0.0, 0.0, 0.0],
+        tendon_offset=0.01, tendon_angles=[0.0],
+    )  # fmt: skip
+    for bend in (0.5, 1.0, 1.5):
+        tension = bend * modulus * np.pi * r**4 / 4 / 0.6 / 0.01
+        found = kc.stability(kc.equilibrium(robot, [tension], space="rk4"))
+        assert found.stable and found.least == pytest.approx(1.9, rel=0.02)
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("nodes", [10, 20])
+def test_a_slender_arch_pushed_inwards_leaves_its_plane(nodes):
+    """It turns about its line for nothing once nothing pushes it; pushed inwards it gains by that."""
+    length, r = 0.6, 1e-3
+    unit = 70e9 * np.pi * r**4 / 4 / length**2
+    arch = kc.SlenderRod(
+        length=length, radius=r, density=6450.0, youngs_modulus=70e9, bending_damping=1e-3, nodes=nodes,
+        gravity=[0.0, 0.0, 0.0], tip_end=Pinned(position=[0.0, 0.0, 0.9 * length]),
+        loads=(PointWrench(at=0.5, force=[1.0, 0.0, 0.0], controlled=True),),
+    )  # fmt: skip
+    rest = kc.equilibrium(arch, [20.0 * unit], space="rk4")
+    side = np.sign(rest.position[0, nodes // 2, 0])
+    found = []
+    for load in (20.0, 0.0, -5.0, -20.0):
+        rest = kc.equilibrium(arch, [load * unit * side], space="rk4", initial=rest)
+        found.append(kc.stability(rest))
+    assert [each.unstable_directions for each in found] == [0, 0, 1, 1]
+    assert [each.least for each in found] == pytest.approx([1.81, 0.0, -4.27, -19.7], rel=0.02, abs=1e-3)
+    # across the plane of the arch
+    assert np.max(np.abs(found[-1].mode[:, 1])) > 0.99
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("nodes", [2, 3, 5])
+def test_what_buckles_between_two_nodes_is_counted_too(nodes):
+    counts = []
+    for part in (0.98, 1.02, 1.5, 9.0):
+        end = Clamped(position=[0.0, 0.0, (1.0 - part * 4.0 * np.pi**2 * EI / L**2 / EA) * L])
+        rest = kc.equilibrium(ROD.replace(tip_end=end, nodes=nodes), np.zeros(0), space="rk4")
+        counts.append(kc.stability(rest).unstable_directions)
+    assert counts[:3] == [0, 2, 2] and counts[3] >= 8
+
+
+@pytest.mark.campaign
+def test_what_rounding_hides_is_refused():
+    """A rod between two pins turns about itself for nothing: a zero, in a rod so slender of rounding only."""
+    free = wire(1e5, 0.0, 10).replace(
+        loads=(), base_end=Pinned(), tip_end=Pinned(position=[0.0, 0.0, 0.3 * (1.0 + 1e-9)])
+    )
+    with pytest.raises(ValueError, match=r"row -1 cannot be decided: its least eigenvalue, .* less slender"):
+        kc.stability(kc.equilibrium(free, np.zeros(0), space="rk4"))
 
 
 # several rods, and others

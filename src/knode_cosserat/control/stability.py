@@ -1,30 +1,35 @@
-"""Whether an equilibrium is stable: the second variation of its energy, by the segments' stiffness.
+"""Whether an equilibrium is stable: the second variation of its energy, by the stiffness of its segments.
 
-The derivative F of a segment tells how pose x = (p, θ) and stress f = (n, m) at its end follow from those at
-its start. Solved for the stresses it is the segment's stiffness, that of a finite element with exact shapes:
-
-    x⁺ = A x + B f        f⁺ = C x + D f        -f = B⁻¹A x - B⁻¹x⁺        f⁺ = (C - DB⁻¹A) x + DB⁻¹x⁺
-
-Summed up over the segments, and with what the two ends allow and ask, that is the second variation of the
-energy. An equilibrium is stable if it has no negative eigenvalue. Coarse segments can hide one only where a
-segment buckles between its own two nodes.
+Each segment is a finite element (`stiffness`). Summed up over the segments, and with what the two ends allow
+and ask, that is the second variation of the energy. An equilibrium is stable if it has no negative
+eigenvalue. Segments are divided until that no longer changes their number, and what gives way between two
+nodes is counted too.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import functools
-import itertools
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.linalg import block_diag
 
+from knode_cosserat.control.stiffness import (
+    NEEDED,
+    Pieces,
+    divided,
+    firm,
+    joined,
+    narrow,
+    symmetric,
+    wide,
+)
 from knode_cosserat.rods.system import System, in_strands
-from knode_cosserat.solvers.boundary import linearise, static_error
-from knode_cosserat.solvers.crossing import points_of
+from knode_cosserat.solvers.boundary import static_error
 from knode_cosserat.solvers.equilibrium import equilibrium as rests
-from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.space import RK4
 from knode_cosserat.trajectory import Trajectory
@@ -33,10 +38,16 @@ from knode_cosserat.trajectory import Trajectory
 BALANCED = 1e-6
 #: of the largest singular value: what counts as held
 HELD = 1e-9
-#: y of a strand that has a pose and a stress; whatever more there is must rest when these move
-NEEDED = ("p", "h", "n", "m")
-#: in natural units: what moves less than this by them rests
+#: in natural units: what moves less than this by poses and stresses rests
 RESTING = 1e-9
+#: by what segments are divided, until two in a row find the same
+DIVISIONS = (1, 2, 4, 8, 16)
+#: of all strands, as many as eigenvalues are computed of in seconds; by 2 segments are always divided
+POINTS = 400
+#: of the largest eigenvalue: what may be rounding, which may turn the sign of a soft one
+ROUNDING = 1e-14
+#: in natural units: where rounding is beyond this a rod is not called stable for what is less than that
+SEEN = 1e-3
 #: roots of the equations that are found from a root nearby
 NEARBY = (Result.CONVERGED, Result.RECOVERED_STABLE_ELIMINATION, Result.RECOVERED_LOAD_CONTINUATION)
 
@@ -44,7 +55,8 @@ NEARBY = (Result.CONVERGED, Result.RECOVERED_STABLE_ELIMINATION, Result.RECOVERE
 class Stability(NamedTuple):
     """The second variation of an equilibrium's energy."""
 
-    #: how many ways there are to leave it: negative eigenvalues, none of a stable one
+    #: how many ways there are to leave it: negative eigenvalues, none of a stable one. Where segments would
+    #: buckle even in 16 parts it is a count of those that the nodes show
     unstable_directions: int
     #: the least eigenvalue, in natural units (EI/L): zero where the robot is about to buckle or snap
     least: float
@@ -52,7 +64,7 @@ class Stability(NamedTuple):
     #: several rods (nodes, rods, 3)
     mode: np.ndarray
     #: how far the stiffness is from symmetric, as a part of its largest entry: what has a potential is
-    #: symmetric but for the error of the scheme; follower loads are not
+    #: symmetric; follower loads are not
     asymmetry: float
 
     @property
@@ -75,7 +87,8 @@ def stability(equilibrium: Trajectory, row: int = -1) -> Stability:
 
     Raises:
         ValueError: no equilibrium, a system that is not rods with positions and orientations, or one with
-            more in y that moves with them (tendons on reels have an energy of their own).
+            more in y that moves with them (tendons on reels have an energy of their own). Or it cannot be
+            decided: the nodes are too few for the loads, or rounding is more than what holds the rod.
     """
     system, y, z, control = _checked(equilibrium, row)
     space = equilibrium.settings.space
@@ -85,11 +98,14 @@ def stability(equilibrium: Trajectory, row: int = -1) -> Stability:
             control=control[None], result=np.zeros(1, int), residual=np.zeros(1), iterations=np.zeros(1, int),
         )  # fmt: skip
         found = rests(system, control, space="rk4", initial=one, on_failure="return")
-        if found.result[0] in NEARBY:
-            y = np.asarray(found.y[0])
-    F, base, tip = _linearised(system, jnp.asarray(y), jnp.asarray(control), z.shape[-1])
-    _require_rest(system, F, base)
-    return _of_stiffness(*_stiffness(system, y, F, base, tip), system)
+        if found.result[0] not in NEARBY:
+            raise ValueError(
+                f"row {row} cannot be decided: by RK4 along the rod no equilibrium is found near it; allowed "
+                'is one that was solved with space="rk4"'
+            )
+        y = np.asarray(found.y[0])
+    by = [count for count in DIVISIONS if count <= 2 or count * system.nodes * system.strands <= POINTS]
+    return _decided(system, divided(system, y, control, by), row)
 
 
 def _checked(equilibrium: Any, row: Any) -> tuple[System, np.ndarray, np.ndarray, np.ndarray]:
@@ -119,97 +135,126 @@ def _checked(equilibrium: Any, row: Any) -> tuple[System, np.ndarray, np.ndarray
     return system, y, z, control
 
 
-@jax.jit
-def _find(system: System, y: Any, control: Any, history: Any) -> tuple[Any, Any, Any]:
-    problem = StepProblem(system, jnp.zeros(()), control, jnp.zeros(()), history, RK4())
-    found = linearise(problem, problem.filled(y), system.unknowns(y[0]))
-    return found.F, found.base, found.tip
-
-
-def _linearised(system: System, y: Any, control: Any, nz: int) -> tuple[Any, Any, Any]:
-    """F of the segments (segments, strands, b, b), and what base and tip ask."""
-    ny = y.shape[1]
-    F, base, tip = _find(system, y, control, jnp.zeros((len(y), ny + nz + (ny if system.mixed else 0))))
-    pieces = np.asarray(F).reshape(-1, system.strands, *F.shape[-2:])
-    between = itertools.pairwise(points_of(system).nodes)
-    segments = [functools.reduce(lambda before, after: after @ before, pieces[j:k]) for j, k in between]
-    return np.stack(segments), np.asarray(base), np.asarray(tip)
-
-
-def _require_rest(system: System, F: np.ndarray, base: np.ndarray) -> None:
+def _require_rest(system: System, base: np.ndarray, moved: np.ndarray) -> None:
     """That what y has beside poses and stresses, such as velocities, rests whatever those do."""
-    layout, scale = system.strand.y_layout, np.asarray(system.strand.scales().y)
-    F = F * scale / scale[:, None]
+    layout = system.strand.y_layout
     base = base.reshape(system.strands, layout.size, -1)
-    named = layout.indices(NEEDED)
     for field in layout.fields:
         if field.name in NEEDED:
             continue
         own = layout.indices((field.name,))
-        moved = np.abs(F[..., own, :][..., named]).max(), np.abs(base[:, own]).max()
-        if max(moved) > RESTING:
+        if max(np.abs(moved[own]).max(), np.abs(base[:, own]).max()) > RESTING:
             raise ValueError(
                 f"a {type(system).__name__} has {field.name} ({field.meaning}) in y, which has an energy of "
                 "its own; allowed are rods whose equilibria are of p, h, n and m alone"
             )
 
 
-class _Poses:
-    """Small changes of pose and stress at one node, in natural units, and of y: a strand after the other.
+@dataclasses.dataclass(frozen=True)
+class _Variation:
+    """The second variation in what is free to move."""
 
-    δy = `wide` (δx, δf) with all δx first, turns in the global frame; `narrow` is the way back.
-    """
+    energy: np.ndarray
+    #: poses of all points by that, strands inside (6 points strands, free)
+    free: np.ndarray
+    #: which part of the rod each point stands for, so that eigenvalues do not depend on the points
+    part: np.ndarray
+    #: which points are the nodes
+    nodes: np.ndarray
 
-    def __init__(self, system: System, y: np.ndarray):
-        layout, scale = system.strand.y_layout, np.asarray(system.strand.scales().y)
-        p, h, n, m = (layout.slice(name) for name in ("p", "h", "n", "m"))
-        count, size = system.strands, layout.size
-        self.wide, self.narrow = np.zeros((count * size, 12 * count)), np.zeros((12 * count, count * size))
-        for k, own in enumerate(np.asarray(in_strands(system, y))):
-            at, x, f = k * size, 6 * k, 6 * (count + k)
-            for first, rows in ((x, p), (f, n), (f + 3, m)):
-                places = np.arange(3)
-                self.wide[at + rows.start + places, first + places] = scale[rows]
-                self.narrow[first + places, at + rows.start + places] = 1.0 / scale[rows]
-            turn = _turned(own[h])
-            self.wide[at + h.start : at + h.stop, x + 3 : x + 6] = turn
-            self.narrow[x + 3 : x + 6, at + h.start : at + h.stop] = 4.0 * turn.T / (own[h] @ own[h])
+    @functools.cached_property
+    def spectrum(self) -> tuple[np.ndarray, np.ndarray]:
+        """Eigenvalues in natural units, and the poses of all points in their directions (points, ways)."""
+        weight = np.repeat(self.part, len(self.free) // len(self.part))
+        root = 1.0 / np.sqrt(np.sum(self.free**2 * weight[:, None], axis=0))
+        values, vectors = np.linalg.eigh(root[:, None] * symmetric(self.energy) * root)
+        return values, self.free @ (root[:, None] * vectors)
+
+    @property
+    def rounding(self) -> float:
+        """That of the stiffest, which pulls, may turn the sign of a soft one."""
+        return ROUNDING * float(np.max(np.abs(self.spectrum[0]), initial=0.0))
+
+    @property
+    def count(self) -> int:
+        """How many eigenvalues are negative."""
+        return int(np.sum(self.spectrum[0] < -self.rounding))
+
+    def told(self, system: System, row: int) -> Stability:
+        """The result, unless rounding leaves it open."""
+        values, ways = self.spectrum
+        least = float(values[0])
+        if self.rounding > SEEN and abs(least) <= self.rounding:
+            raise ValueError(
+                f"row {row} cannot be decided: its least eigenvalue, {least:.2g} EI/L, is within the "
+                f"rounding of the largest, {self.rounding:.2g} EI/L; allowed is a rod that is less slender"
+            )
+        moves = ways[:, 0].reshape(-1, system.strands, 6)[self.nodes, :, :3]
+        # what only twists does not move the line
+        moves = moves / max(float(np.max(np.linalg.norm(moves, axis=-1))), np.finfo(float).tiny)
+        mode = moves[:, 0] if system.strands == 1 else moves
+        asymmetry = float(np.max(np.abs(self.energy - self.energy.T)) / np.max(np.abs(self.energy)))
+        return Stability(self.count, least, mode, asymmetry)
 
 
-def _turned(h: np.ndarray) -> np.ndarray:
-    """∂h/∂θ (4, 3) of a quaternion that is turned by small angles about the global axes."""
-    w, x, y, z = h
-    return 0.5 * np.array([[-x, -y, -z], [w, z, -y], [-z, w, x], [y, -x, w]])
+def _decided(system: System, divisions: Iterator[Pieces], row: int) -> Stability:
+    """What two divisions in a row agree on; that it is unstable the last one may tell alone."""
+    counts: list[int] = []
+    sure, found = False, None
+    for pieces in divisions:
+        _require_rest(system, pieces.ends.base, pieces.moved)
+        found = _variation(system, pieces)
+        counts.append(found.count)
+        # a piece that would not stay by itself may hide some
+        before, sure = sure, firm(pieces.stiffness)
+        if before and sure and counts[-1] == counts[-2]:
+            return found.told(system, row)
+    if found is not None and all(counts[-2:]):
+        return found.told(system, row)
+    raise ValueError(
+        f"row {row} cannot be decided: with segments divided further and further it has "
+        f"{', '.join(map(str, counts))} unstable directions; allowed is a rod with more nodes than "
+        f"{system.nodes}, by which no segment buckles alone"
+    )
 
 
-def _stiffness(
-    system: System, y: np.ndarray, F: np.ndarray, base: np.ndarray, tip: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """The second variation in what is free to move, and all nodes' poses by that (6 nodes strands, free)."""
-    count = 6 * system.strands
-    poses = [_Poses(system, row) for row in y]
-    K = np.zeros((count * len(y), count * len(y)))
-    for j, F_j in enumerate(F):
-        whole = np.zeros((F_j.shape[0] * F_j.shape[1],) * 2)
-        for k, own in enumerate(F_j):
-            spot = slice(k * len(own), (k + 1) * len(own))
-            whole[spot, spot] = own
-        G = poses[j + 1].narrow @ whole @ poses[j].wide
-        A, B, C, D = G[:count, :count], G[:count, count:], G[count:, :count], G[count:, count:]
-        inverse = np.linalg.inv(B)
-        spot = slice(count * j, count * (j + 2))
-        K[spot, spot] += np.block([[inverse @ A, -inverse], [C - D @ inverse @ A, D @ inverse]])
-    first, pulled_first = _freedom(poses[0].narrow @ base)
+def _variation(system: System, pieces: Pieces) -> _Variation:
+    """The second variation by the nodes' poses; where those would hide a direction, by all pieces'."""
+    elements, part = pieces.stiffness, pieces.part
+    nodes = np.searchsorted(pieces.segment, np.arange(system.nodes))
+    whole, hidden = joined(np.split(elements, nodes[1:-1]))
+    if system.nodes > 2 and not hidden and firm(whole):
+        elements, part, nodes = whole, np.full(len(whole), 1.0 / len(whole)), np.arange(system.nodes)
+    count, points = 6 * system.strands, len(elements) + 1
+    K = np.zeros((count * points, count * points))
+    for j, element in enumerate(elements):
+        for k, own in enumerate(element):
+            spot = np.arange(6) + count * j + 6 * k
+            spots = np.append(spot, spot + count)
+            K[np.ix_(spots, spots)] += own
+    ends = pieces.ends
+    base = _freedom(_at_end(system, ends.y[0], narrow, ends.base))
     # what the tip's conditions leave free: as many ways as they have numbers
-    last, pulled_last = _freedom(np.linalg.svd(tip @ poses[-1].wide)[2][tip.shape[0] :].T)
-    a, b = first.shape[1], last.shape[1]
-    free = np.zeros((len(K), a + count * (len(y) - 2) + b))
-    free[:count, :a], free[-count:, free.shape[1] - b :] = first, last
-    free[count:-count, a : free.shape[1] - b] = np.eye(count * (len(y) - 2))
-    found = free.T @ K @ free
-    found[:a, :a] += first.T @ pulled_first
-    found[found.shape[0] - b :, found.shape[0] - b :] -= last.T @ pulled_last
-    return found, free
+    left = np.linalg.svd(_at_end(system, ends.y[1], wide, ends.tip.T).T)[2][ends.tip.shape[0] :].T
+    tip = _freedom(left)
+    inner = np.eye(count * (points - 2))
+    free = block_diag(base[0], inner, tip[0])
+    energy = free.T @ K @ free
+    a, b = base[0].shape[1], tip[0].shape[1]
+    energy[:a, :a] += base[0].T @ base[1]
+    energy[len(energy) - b :, len(energy) - b :] -= tip[0].T @ tip[1]
+    weight = (np.append(part, 0.0) + np.append(0.0, part)) / 2.0
+    return _Variation(energy, free, weight, nodes)
+
+
+def _at_end(system: System, y: np.ndarray, way: Any, columns: np.ndarray) -> np.ndarray:
+    """Columns of y's numbers in poses and stresses, all poses first; or, by `wide`, of what asks of y."""
+    strands, moved = system.strands, columns.reshape(system.strands, -1, columns.shape[1])
+    own = np.stack([np.asarray(way(system.strand, jnp.asarray(each))) for each in in_strands(system, y)])
+    if way is wide:
+        own = np.swapaxes(own, 1, 2)
+    found = (own @ moved).reshape(strands, 2, 6, -1)
+    return np.swapaxes(found, 0, 1).reshape(12 * strands, -1)
 
 
 def _freedom(ways: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -218,20 +263,3 @@ def _freedom(ways: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     U, size, V = np.linalg.svd(x)
     rank = int(np.sum(size > HELD * max(1.0, size.max(initial=0.0))))
     return U[:, :rank], f @ V[:rank].T / size[:rank]
-
-
-def _of_stiffness(K: np.ndarray, free: np.ndarray, system: System) -> Stability:
-    """By what part of the rod a node stands for, so that eigenvalues do not depend on the nodes."""
-    part = np.full(system.nodes, 1.0 / (system.nodes - 1))
-    part[[0, -1]] /= 2.0
-    root = 1.0 / np.sqrt(np.sum(free**2 * np.repeat(part, 6 * system.strands)[:, None], axis=0))
-    scaled = root[:, None] * (K + K.T) / 2.0 * root
-    values, vectors = np.linalg.eigh(scaled)
-    moves = (free @ (root * vectors[:, 0])).reshape(system.nodes, system.strands, 6)[..., :3]
-    # what only twists does not move the line
-    moves = moves / max(float(np.max(np.linalg.norm(moves, axis=-1))), np.finfo(float).tiny)
-    asymmetry = float(np.max(np.abs(K - K.T)) / np.max(np.abs(K)))
-    # rounding of the stiffest, which pulls, may turn the sign of a soft one
-    rounding = 1e-12 * float(np.max(np.abs(values)))
-    count = int(np.sum(values < -rounding))
-    return Stability(count, float(values[0]), moves[:, 0] if system.strands == 1 else moves, asymmetry)
