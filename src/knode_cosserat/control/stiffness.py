@@ -168,8 +168,8 @@ def _along(
 def divided(system: System, y: Any, control: Any, by: Sequence[int]) -> Iterator[Pieces]:
     """The pieces, what lies between nodes and cuts divided by each of the numbers.
 
-    The equilibrium is made that of the pieces first, by Newton's method. By that of the nodes' scheme, a little
-    off, a rod that turns for nothing would seem to gain by it.
+    The equilibrium is made that of the pieces first, by Newton's method. By that of the nodes' scheme, a
+    little off, a rod that turns for nothing would seem to gain by it.
     """
     size = y.shape[1] * (2 if system.mixed else 1) + system.z_layout.size
     control, history = jnp.asarray(control), jnp.zeros((len(y), size))
