@@ -34,13 +34,13 @@ _APART = np.sqrt(3.0) / 6.0
 PLACES = np.array([0.5 - _APART, 0.5 + _APART])
 STAGES = np.array([[0.25, 0.25 - _APART], [0.25 + _APART, 0.25]])
 #: from where to where y is carried: to each of them, and to the end
+STEPS = np.array([[0.0, PLACES[0]], [PLACES[0], PLACES[1]], [PLACES[1], 1.0]])
 #: Newton's corrections of the equilibrium, while each is at most half the one before
 CORRECTIONS = 6
 #: in natural units: pieces that are less apart than this need none
 MET = 1e-11
 #: of the largest: what of an equilibrium costs less than this to change is left as it is
 NEUTRAL = 1e-3
-STEPS = np.array([[0.0, PLACES[0]], [PLACES[0], PLACES[1]], [PLACES[1], 1.0]])
 
 
 class Ends(NamedTuple):
