@@ -59,6 +59,7 @@ def rod(tmp_path):
     return tmp_path / "rod.yaml"
 
 
+@pytest.mark.campaign
 def test_reach_names_controls_that_are_no_tensions(rod):
     arguments = ("reach", rod, "--position", 0.1, 0, 0.48, "--low", -0.3, "--high", "0.3,0.3,0.3")
     facts = told(*arguments)

@@ -184,6 +184,7 @@ REELED = kc.RoutedTendonRobot(
 )  # fmt: skip
 
 
+@pytest.mark.campaign
 def test_of_reels_the_shape_is_compared_and_not_the_tensions():
     found = kc.inverse_kinematics(
         REELED, [0.0441, 0.0, 0.2955], low=-0.01, high=0.01, tolerance=1e-4, space="rk4"
@@ -211,6 +212,7 @@ def test_of_several_rods_every_shape_is_compared():
     assert not _same_shape(robot, y, bent) and not _same_shape(robot, y, turned)
 
 
+@pytest.mark.campaign
 def test_of_reels_it_is_certain_that_nothing_is_nearer():
     """What Newton's method leaves of a residual hid from the search that it was at the nearest."""
     found = kc.inverse_kinematics(

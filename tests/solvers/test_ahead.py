@@ -133,6 +133,7 @@ def test_what_has_effects_happens_whenever_it_is_evaluated(capfd):
     assert capfd.readouterr().out.count("seen at 0.5") == 2
 
 
+@pytest.mark.campaign
 def test_slopes_by_the_control_go_through_what_was_evaluated_before():
     """Stiffness that a control changes is evaluated ahead, and is no constant for that."""
     problem, y = a_step(ROBOTS["sections that are controlled"](), "euler")

@@ -21,7 +21,7 @@ def rod(cuts, nodes):
     )
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(st.data(), st.sampled_from(["euler", "rk4"]))
 def test_what_jumps_at_cuts_is_exact_on_both_sides(data, space):
     """Another polynomial in each stretch, cubic if this has four nodes; in y one that goes on."""
@@ -57,7 +57,7 @@ def test_what_jumps_at_cuts_is_exact_on_both_sides(data, space):
         np.testing.assert_allclose(each[:, ny:], expected, atol=1e-9)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(st.lists(st.floats(0.001, 0.999), max_size=6, unique=True), st.integers(2, 12))
 def test_what_is_the_same_everywhere_stays_so(cuts, nodes):
     """However many cuts there are, and stretches without a node."""
