@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis.extra.numpy import array_shapes, arrays
 
-import knode_cosserat as kc
-from knode_cosserat import controls, named_controls
+from knode_cosserat import controls
 from knode_cosserat.controls import Controls, ControlsError
 
 DT = 0.05
@@ -354,82 +353,3 @@ def test_a_time_step_that_is_not_right(specification, dt):
 def test_a_signal_needs_a_number_of_steps():
     with fails("'sine:1.5'", "number of steps"):
         controls.parse("sine:1.5", None, DT)
-
-
-# by name: of a robot that is driven otherwise
-
-ROD = kc.SlenderRod(
-    length=0.5, radius=0.005, density=1000.0, youngs_modulus=2e7,
-    base_end=kc.ends.Driven(axes=("x", "z", "ry")),
-)  # fmt: skip
-NAMED = "time [s],base_z [m],base_ry [rad]\n"
-
-
-def test_a_file_of_named_controls(tmp_path):
-    path = written(tmp_path, "\ufeffbase_ry [rad], time [s] ,base_z [m]\n5,0,1\n\n 6,0.1, 2\n7,0.2,3\n")
-    found = named_controls.parse(ROD, str(path), None, 0.1)
-    assert found.tolist() == [[0, 1, 5], [0, 2, 6], [0, 3, 7]]
-    assert np.array_equal(named_controls.parse(ROD, str(path), 2, 0.1), found[:2])
-    assert named_controls.parse(ROD, str(path), 4, 0.05)[:, 1].tolist() == [1, 1, 2, 2]
-    with fails("there are 3 steps of 0.1 s; 4 are asked for"):
-        named_controls.parse(ROD, str(path), 4, 0.1)
-    path = written(tmp_path, "time [s]\n0\n0.1\n")
-    assert named_controls.parse(ROD, str(path), None, 0.1).tolist() == [[0, 0, 0]] * 2
-
-
-@pytest.mark.parametrize(
-    ("text", "parts"),
-    [
-        ("", ["the file is empty", "time [s],base_x [m],base_z [m],base_ry [rad]"]),
-        (NAMED, ["no rows"]),
-        (NAMED + "0,1,2,3\n0.1,1,2,3\n", ["line 2 has 4 cells", "allowed is 3, like the header"]),
-        (NAMED + "0,1,2\n\n0.1,1,2,3\n", ["line 4 has 4 cells"]),
-        (NAMED + "0,1,2\n0.1,1\n", ["line 3 has 2 cells"]),
-        ("time [s],base_z [m], base_z [m]\n0,1,2\n", ["line 1: the columns are", "once each"]),
-        ("time [s],base_z [m],base_z [m]\n0,1,2\n", ["line 1: the columns are", "once each"]),
-        ("time [s],time [s] ,base_z [m]\n0,1,2\n", ["line 1: the columns are", "once each"]),
-        ("time [s],base_z [mm]\n0,1\n", ["line 1: the columns are time [s], base_z [mm]", "base_z [m]"]),
-        ("base_z [m]\n0\n", ["line 1: the columns are base_z [m]", "allowed is time [s]"]),
-        (NAMED + "0,true,2\n0.1,false,2\n", ["line 2: base_z [m] is 'true'", "a finite number"]),
-        (NAMED + "0,1,2\n0.1,,2\n", ["line 3: base_z [m] is ''"]),
-        (NAMED + "0,1,nan\n", ["line 2: base_ry [rad] is 'nan'"]),
-        (NAMED + "0,1,2\n0,1,2\n", ["line 3: time is 0.0 s"]),
-    ],
-)
-def test_files_of_named_controls_that_are_not_right(tmp_path, text, parts):
-    path = written(tmp_path, text)
-    with fails(str(path), *parts):
-        named_controls.parse(ROD, str(path), None, DT)
-
-
-@pytest.mark.parametrize("file", [True, False])
-@pytest.mark.parametrize(
-    ("steps", "dt", "parts"),
-    [
-        (0, DT, ["steps is 0", "from 1 on"]),
-        (-3, DT, ["steps is -3"]),
-        (True, DT, ["steps is True"]),
-        (2.0, DT, ["steps is 2.0", "a whole number"]),
-        (2, 0, ["dt is 0", "above 0"]),
-        (2, -0.1, ["dt is -0.1"]),
-        (2, np.nan, ["dt is nan"]),
-        (2, np.inf, ["dt is inf"]),
-    ],
-)
-def test_steps_that_are_not_right(tmp_path, file, steps, dt, parts):
-    path = written(tmp_path, NAMED + "0,1,2\n1,1,2\n")
-    with fails(*parts):
-        named_controls.parse(ROD, str(path) if file else "base_z=ramp:1", steps, dt)
-
-
-@pytest.mark.parametrize(
-    ("specification", "parts"),
-    [
-        ("base_z=sine:1e-320", ["'base_z=sine:1e-320'", "a value is nan", "finite"]),
-        ("base_z=constant:1; base_ry=ramp:1e308,base=1e308", ["'base_ry=ramp:", "a value is inf"]),
-        ("base_z=sine:0", ["period is 0.0"]),
-    ],
-)
-def test_named_signals_that_are_not_right(specification, parts):
-    with fails(*parts):
-        named_controls.parse(ROD, specification, 5, DT)

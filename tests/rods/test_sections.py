@@ -181,8 +181,9 @@ def test_a_control_leaves_some_stiffness(gain):
     limit = -1.0 / gain
     assert kc.equilibrium(rod, np.array([0.9 * limit])).all_valid
     for beyond in (limit, 1.2 * limit):
-        with pytest.raises(ValueError, match=r"section0_input is .* allowed is (above|below)"):
-            kc.equilibrium(rod, np.array([beyond]))
+        for ask in (kc.equilibrium, kc.configuration, lambda rod, control: kc.workspace(rod, control[None])):
+            with pytest.raises(ValueError, match=r"section0_input is .* allowed is (above|below)"):
+                ask(rod, np.array([beyond]))
     stepper = kc.Stepper(rod, 0.02)
     with pytest.raises(ValueError, match="section0_input"):
         stepper.step(np.array([1.2 * limit]))

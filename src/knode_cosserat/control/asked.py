@@ -44,7 +44,16 @@ def checked_control(system: System, control: Any, name: str = "control") -> np.n
     """One control (c,)."""
     size = system.control_size
     names = ", ".join(f"{field.name} ({field.unit})" for field in system.control_layout.fields)
-    return checked_numbers(name, control, size, f"({size},): {names or 'there are no controls'}", most=1)
+    numbers = checked_numbers(name, control, size, f"({size},): {names or 'there are no controls'}", most=1)
+    return within_limits(system, numbers, name)
+
+
+def within_limits(system: System, controls: np.ndarray, name: str) -> np.ndarray:
+    """Controls (…, c) that are within their fields' limits; `ValueError` otherwise."""
+    beyond = system.control_layout.beyond(controls)
+    if beyond:
+        raise ValueError(f"{name}: {beyond}")
+    return controls
 
 
 def checked_limits(system: System, low: Any, high: Any) -> tuple[np.ndarray, np.ndarray]:

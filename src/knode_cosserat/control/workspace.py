@@ -18,6 +18,7 @@ from knode_cosserat.control.asked import (
     checked_numbers,
     checked_system,
     static_settings,
+    within_limits,
 )
 from knode_cosserat.control.statics import Pose, poses_of, tip_pose
 from knode_cosserat.rods.system import System
@@ -201,6 +202,7 @@ def workspace(
         samples = checked_numbers("controls", controls, size, f"(B, {size})")
         if samples.ndim != 2:
             raise ValueError(f"controls have shape {samples.shape}; allowed is (B, {size})")
+        within_limits(system, samples, "controls")
     return _found(system, settings, pose, samples, progress)
 
 
