@@ -77,8 +77,22 @@ def test_steps_that_are_not_right(tmp_path, file, steps, dt, parts):
         ("base_z=sine:1e-320", ["'base_z=sine:1e-320'", "a value is nan", "finite"]),
         ("base_z=constant:1; base_ry=ramp:1e308,base=1e308", ["'base_ry=ramp:", "a value is inf"]),
         ("base_z=sine:0", ["period is 0.0"]),
+        (
+            "base_z=ramp:1; base_x=ramp:1;base_z=constant:2",
+            [
+                "'base_z=constant:2': base_z is given already, by 'base_z=ramp:1'",
+                "allowed is each control once",
+            ],
+        ),
     ],
 )
 def test_named_signals_that_are_not_right(specification, parts):
     with fails(*parts):
         named_controls.parse(ROD, specification, 5, DT)
+
+
+def test_all_numbers_of_a_field_and_one_of_them_are_given_twice():
+    robot = kc.load_robot("delrin-routed-tendon-robot").replace(drive="reel")
+    for words in ("reel=ramp:0.01;reel_2=constant:0", "reel_2=constant:0;reel=ramp:0.01"):
+        with fails("reel_2 is given already, by"):
+            named_controls.parse(robot, words, 5, DT)

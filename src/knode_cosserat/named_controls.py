@@ -47,10 +47,10 @@ def parse(robot: System, specification: str, steps: int | None, dt: float) -> Ar
     """Controls (steps, c) of a robot from one word, as on the command line.
 
     For a robot that has tensions only, as `controls.parse`. Otherwise signals by name, `base_z=ramp:0.1;
-    reel_1=sine:2,amplitude=0.01`, where the name of a field stands for all its numbers and what is not
-    named is zero: `constant:VALUE`, `ramp:HEIGHT[,base=,start=,end=]`, `step:HEIGHT[,base=,at=]`,
-    `sine:PERIOD[,base=,amplitude=,phase=]`; or a CSV file with the columns `time [s]` and any of these
-    names with their units. `none` stands for zeros.
+    reel_1=sine:2,amplitude=0.01`, where the name of a field stands for all its numbers, each is given once
+    and what is not named is zero: `constant:VALUE`, `ramp:HEIGHT[,base=,start=,end=]`,
+    `step:HEIGHT[,base=,at=]`, `sine:PERIOD[,base=,amplitude=,phase=]`; or a CSV file with the columns
+    `time [s]` and any of these names with their units. `none` stands for zeros.
 
     Raises:
         ControlsError: the specification is not understood, or the file is not right or too short.
@@ -74,6 +74,7 @@ def parse(robot: System, specification: str, steps: int | None, dt: float) -> Ar
 def parse_signals(layout: Layout, words: list[str], t: Float[np.ndarray, " steps"]) -> Array:
     """Controls (steps, c) at the times t (s) from words `NAME=SIGNAL`; see `parse`."""
     found = np.zeros((len(t), layout.size))
+    given: dict[int, str] = {}
     for entry in words:
         name, equals, word = (part.strip() for part in entry.partition("="))
         if not equals:
@@ -89,7 +90,15 @@ def parse_signals(layout: Layout, words: list[str], t: Float[np.ndarray, " steps
                 f"controls {entry.strip()!r}: a value is {values[~np.isfinite(values)][0]}; "
                 "allowed is a signal of finite numbers"
             )
-        found[:, _columns(layout, name)] = values[:, None]
+        columns = _columns(layout, name)
+        for column in columns:
+            if column in given:
+                raise ControlsError(
+                    f"controls {entry.strip()!r}: {labels(layout)[column]} is given already, by "
+                    f"{given[column]!r}; allowed is each control once"
+                )
+            given[column] = entry.strip()
+        found[:, columns] = values[:, None]
     return found
 
 

@@ -99,6 +99,9 @@ def changed(system: System, changes: list[str] | None, nodes: int | None = None)
             raise ValueError(
                 f"--set {change!r}: allowed is NAME=VALUE, such as length=0.4 or gravity=[0, 0, -9.81]"
             )
+        if name in values:
+            other = "--nodes" if name == "nodes" and nodes is not None else "another --set"
+            raise ValueError(f"--set {change!r}: {name} is given by {other} too; allowed is each name once")
         values[name] = value
     return system.replace(**values)
 

@@ -222,10 +222,12 @@ def _control(system: System, tension: str | None, control: str | None) -> Any:
         raise ValueError("--tension: the robot is not driven by tensions; give --control NAME=VALUE,…")
     words = [] if control is None else [f"{name}=constant:{value}" for name, _, value in (
         each.partition("=") for each in control.split(","))]  # fmt: skip
-    held = named_controls.parse_signals(system.control_layout, words, np.ones(1))[0]
     if tension is not None:
-        held[system.control_layout.slice("tension")] = _tensions(tension, tensions[0])
-    return held
+        called = named_controls.labels(system.control_layout)[system.control_layout.slice("tension")]
+        values = zip(called, _tensions(tension, tensions[0]), strict=True)
+        # first, so that a tension that --control gives too is refused
+        words = [f"{name}=constant:{value!r}" for name, value in values] + words
+    return named_controls.parse_signals(system.control_layout, words, np.ones(1))[0]
 
 
 def _tensions(text: str, count: int) -> list[float]:
