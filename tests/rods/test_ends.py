@@ -1,6 +1,7 @@
 """What holds a rod: free motion, pendulums, driven ends, and beams held at both of them."""
 
 import dataclasses
+import types
 
 import numpy as np
 import pytest
@@ -10,6 +11,10 @@ from scipy.special import ellipk
 import knode_cosserat as kc
 from knode_cosserat.rods.ends import Clamped, Driven, Free, Pinned, Sliding
 from knode_cosserat.rods.surroundings import Plane
+from knode_cosserat.solvers.recovery import likely_cause
+from knode_cosserat.solvers.result import Result
+from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.time import BDF2, Static
 
 G = 9.81
 
@@ -270,3 +275,20 @@ def test_what_slides_is_no_base():
     """It would be clamped there, without a word."""
     with pytest.raises(ValueError, match="base_end is sliding; that is allowed as tip_end only"):
         LOOSE.replace(base_end=Sliding(axes=("x",), along="z"))
+
+
+@pytest.mark.parametrize("result", [Result.NO_CONVERGENCE, Result.NOT_FINITE])
+def test_what_nothing_holds_is_said_to_have_no_equilibrium_under_its_weight(result):
+    def cause(robot, time):
+        # no more of a step is looked at; all that is tried before would take a minute
+        step = types.SimpleNamespace(system=robot, settings=Settings(time=time))
+        return likely_cause(result, step, np.zeros(robot.control_size))
+
+    falling = LOOSE.replace(surroundings=())
+    assert "nothing holds the robot" in cause(falling, Static())
+    assert "nothing holds" not in cause(falling, BDF2())
+    for end in ("base_end", "tip_end"):
+        assert "nothing holds" not in cause(falling.replace(**{end: Pinned()}), Static())
+    # it may lie on the plane
+    assert "nothing holds" not in cause(LOOSE, Static())
+    assert "nothing holds" not in cause(kc.load_robot("six-legged-robot"), Static())

@@ -115,6 +115,11 @@ class Rod(ElasticRod):
         """Where its tip is held, which the rod as it is by itself need not meet."""
         return self.tip_end.held
 
+    @property
+    def held(self) -> bool:  # type: ignore[override]
+        """Whether an end is held, or there is something on which it may lie."""
+        return self.base_end.held or self.tip_end.held or bool(self.surroundings)
+
     def eased(self, part: float) -> Self:
         """With softer obstacles, on which the rod slides more easily."""
         if not self.surroundings:

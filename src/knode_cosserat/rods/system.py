@@ -110,6 +110,9 @@ class System(Parametrised):
     #: whether the state at rest is a guess: a simulation then begins in the equilibrium under no control
     rest_is_guess: ClassVar[bool] = False
 
+    #: whether anything holds it in its place: it has no equilibrium else, unless what loads it cancels out
+    held: ClassVar[bool] = True
+
     #: whether `left_of_law` is linear in the strains
     linear_law: ClassVar[bool] = True
 

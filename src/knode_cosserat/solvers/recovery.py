@@ -283,6 +283,11 @@ def likely_cause(result: Result, step: _Step, control: Any) -> str:
     unit = other_unit(step.system, np.asarray(control))
     if unit:
         return unit
+    if not step.system.held and isinstance(step.settings.time, Static):
+        return (
+            "Likely cause: nothing holds the robot, which is at rest only where all loads on it cancel out; "
+            "hold an end of it, or simulate its motion."
+        )
     nodes = step.system.nodes
     if result is Result.NOT_FINITE:
         return (
