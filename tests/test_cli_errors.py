@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 import knode_cosserat as kc
+from knode_cosserat.cli.arguments import require_writable
 from tests.commands import ROBOT, run
 
 
@@ -117,3 +118,51 @@ def test_a_mistake_of_ours_is_not_taken_for_one_of_the_users(monkeypatch):
 
     monkeypatch.setattr(kc, "load_robot", broken)
     assert isinstance(run("info", ROBOT).exception, TypeError)
+
+
+OUTPUTS = {
+    "simulate": ("simulate", ROBOT, "--controls", "sine:1.5", "--steps", "3", "--out", "{}/a.nc"),
+    "simulate, a figure": (
+        "simulate", ROBOT, "--controls", "sine:1.5", "--steps", "3", "--out", "a.nc", "--figure", "{}/a.png",
+    ),
+    "equilibrium": ("equilibrium", ROBOT, "--tension", "7,5,5,7", "--out", "{}/a.nc"),
+    "workspace": ("workspace", ROBOT, "--out", "{}/a.csv"),
+    "fit": ("fit", ROBOT, "b.nc", "--out", "{}/m"),
+    "fit, several seeds": ("fit", ROBOT, "b.nc", "--seeds", "1,2", "--out", "{}/m"),
+    "fit, a checkpoint": ("fit", ROBOT, "b.nc", "--out", "m", "--checkpoint", "{}/c/d"),
+    "fit, a log": ("fit", ROBOT, "b.nc", "--out", "m", "--log", "{}/log"),
+    "plot": ("plot", "b.nc", "--out", "{}/a.png"),
+    "animate": ("animate", "b.nc", "--out", "{}/a.gif"),
+    "inspect": ("inspect", "b.bag", "--plot", "{}/a.png"),
+    "record-virtual": ("record-virtual", "sine:1", "--out", "{}/a.bag"),
+    "study": ("study", "estimation", "--out", "{}/o"),
+    "view": ("view", "b.nc", "--export", "{}/a.html"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("output", OUTPUTS)
+def test_what_cannot_be_written_is_said_before_anything_is_computed_or_read(tmp_path, monkeypatch, output):
+    monkeypatch.chdir(tmp_path)
+    locked = Path("locked")
+    locked.mkdir(mode=0o555)
+    if os.access(locked, os.W_OK):
+        # who may write everywhere may not there
+        locked = Path("/proc")
+    result = run(*(word.format(locked) for word in OUTPUTS[output]))
+    assert result.exit_code == 2 and result.stderr.count("\n") == 1
+    assert result.stderr.startswith(f"error: {locked}/")
+    assert f": nothing can be written in {locked}: " in result.stderr
+    assert {"locked"} == set(os.listdir())
+
+
+def test_an_older_file_is_no_hindrance_and_stays_as_it_is(tmp_path):
+    old = [tmp_path / "a.nc", tmp_path / "a.png"]
+    for path in old:
+        path.write_text("old")
+    folder = tmp_path / "new" / "newer"
+    require_writable(*old, [tmp_path, folder])
+    require_writable(Path(os.devnull))
+    assert [path.read_text() for path in old] == ["old", "old"]
+    assert set(os.listdir(tmp_path)) == {"a.nc", "a.png"}
+    with pytest.raises(ValueError, match=r"a.nc is a file; allowed is a folder"):
+        require_writable(folders=[old[0] / "in"])

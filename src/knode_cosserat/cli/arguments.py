@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import sys
+import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -139,8 +141,10 @@ def _begins(name: str, mark: bytes) -> bool:
         return file.read(len(mark)) == mark
 
 
-def require_writable(file: Path | None = None, figure: Path | None = None) -> None:
-    """Better said before a long computation than after it."""
+def require_writable(
+    file: Path | None = None, figure: Path | None = None, folders: Sequence[Path | None] = ()
+) -> None:
+    """Better said before a long computation than after it; folders are made later, if they are not there."""
     for path in (file, figure):
         if path and not path.parent.is_dir():
             raise ValueError(f"{path}: there is no folder {path.parent}")
@@ -148,6 +152,26 @@ def require_writable(file: Path | None = None, figure: Path | None = None) -> No
             raise ValueError(f"{path}: this is a folder; allowed is a file")
     if figure and figure.suffix not in FORMATS:
         raise ValueError(f"{figure}: allowed for a figure is a name that ends in {', '.join(FORMATS)}")
+    for path in (file, figure, *folders):
+        if path:
+            _try_to_write(path, folder=path in folders, replaced=path is file)
+
+
+def _try_to_write(path: Path, *, folder: bool, replaced: bool) -> None:
+    """Do it and leave nothing: permissions alone do not tell, of a read-only disk say."""
+    # files are written beside where they belong (`_files.replacing`), figures over what is there
+    over = path.exists() and not folder and not (replaced and path.is_file())
+    at = path if folder else Path(os.path.realpath(path)).parent
+    while folder and not at.exists():
+        at = at.parent
+    if folder and not at.is_dir():
+        raise ValueError(f"{path}: {'this' if at == path else at} is a file; allowed is a folder")
+    try:
+        with path.open("ab") if over else tempfile.TemporaryFile(dir=at):
+            pass
+    except OSError as error:
+        where = "" if over or at == path else f" in {at}"
+        raise ValueError(f"{path}: nothing can be written{where}: {error.strerror}") from None
 
 
 def wanted(progress: bool | None) -> bool:

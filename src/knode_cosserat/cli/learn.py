@@ -100,11 +100,11 @@ def fit(
     """
     numbers = _seeds(seed, seeds)
     several = isinstance(numbers, tuple)
-    require_writable(None if several else out, figure)
-    if figure:
-        figures()
     if several and out.exists() and not out.is_dir():
         raise ValueError(f"{out}: this is a file; allowed with several seeds is a folder")
+    require_writable(None if several else out, figure, (out if several else None, checkpoint, log))
+    if figure:
+        figures()
     from knode_cosserat.learning.fit import fit as learn
     from knode_cosserat.learning.samples import DataError
 

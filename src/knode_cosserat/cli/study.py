@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from knode_cosserat.cli.arguments import Json, Progress, figures, wanted
+from knode_cosserat.cli.arguments import Json, Progress, figures, require_writable, wanted
 from knode_cosserat.cli.program import app, examples, studies
 from knode_cosserat.cli.telling import tell
 
@@ -241,8 +241,7 @@ def _prepare(out: Path, workers: int | None, dask: str | None) -> None:
     """Whatever would only be noticed at the end is said at the beginning."""
     if workers and dask:
         raise ValueError("--workers is for this machine and --dask for a cluster; give one of them")
-    if out.exists() and not out.is_dir():
-        raise ValueError(f"{out}: this is a file; allowed is a folder")
+    require_writable(folders=[out])
     figures()
 
 
