@@ -74,11 +74,21 @@ class Trajectory(eqx.Module):
         return float(self.time[1] - self.time[0])
 
     def part(self, name: str) -> Any:
-        """A field of y, z or the controls by its name: `n`, `m`, `v`, `u`, `tension` … (…, T, N, size)."""
+        """A field of y, z or the controls by its name: `n`, `m`, `v`, `u`, `tension` … (…, T, N, size).
+
+        Of a robot of several rods, such as the legs of a platform, `n2` is the second one's and `n` that of
+        all of them, (…, T, N, rods, size).
+        """
+        count, known = self.system.strands, []
         for layout, packed in self._layouts():
             if name in layout.names:
                 return layout.get(packed, name)
-        known = [name for layout, _ in self._layouts() for name in layout.names]
+            known += layout.names
+            rods = tuple(f"{name}{k + 1}" for k in range(count))
+            # with no more of the name than there are rods, it is that of one field of each
+            if set(rods) <= set(layout.names) and f"{name}{count + 1}" not in layout.names:
+                every = packed[..., layout.indices(rods)]
+                return every.reshape(*every.shape[:-1], count, -1)
         raise KeyError(f"no field {name!r}; there are {', '.join(known)}")
 
     def _layouts(self) -> tuple[tuple[Any, Any], ...]:
@@ -87,22 +97,22 @@ class Trajectory(eqx.Module):
 
     @property
     def force(self) -> Any:
-        """Internal force n (…, T, N, 3) in N, global frame."""
+        """Internal force n (…, T, N, 3) in N, global frame; of several rods (…, T, N, rods, 3)."""
         return self.part("n")
 
     @property
     def moment(self) -> Any:
-        """Internal moment m (…, T, N, 3) in N·m, global frame."""
+        """Internal moment m (…, T, N, 3) in N·m, global frame; of several rods (…, T, N, rods, 3)."""
         return self.part("m")
 
     @property
     def velocity(self) -> Any:
-        """Velocity q (…, T, N, 3) in m/s, material frame."""
+        """Velocity q (…, T, N, 3) in m/s, material frame; of several rods (…, T, N, rods, 3)."""
         return self.part("q")
 
     @property
     def angular_velocity(self) -> Any:
-        """Angular velocity ω (…, T, N, 3) in rad/s, material frame."""
+        """Angular velocity ω (…, T, N, 3) in rad/s, material frame; of several rods (…, T, N, rods, 3)."""
         return self.part("w")
 
     @property

@@ -108,6 +108,27 @@ def test_the_platform_is_in_balance():
     np.testing.assert_allclose(moment, 0.0, atol=1e-9)
 
 
+def test_a_trajectory_has_what_its_legs_have():
+    rng = np.random.default_rng(0)
+    legs = rng.normal(size=(2, 3, 10, 6, 19))
+    strains = rng.normal(size=(2, 3, 10, 6, 6))
+    batch = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), ROBOT, ROBOT)
+    y, z = legs.reshape(2, 3, 10, -1), strains.reshape(2, 3, 10, -1)
+    for system, pick in ((ROBOT, 0), (batch, slice(None))):
+        none = np.zeros(3, dtype=int)
+        motion = kc.Trajectory(
+            system, None, np.arange(3.0), y[pick], z[pick], np.zeros((3, 6)), none, 0.0 * none, none
+        )
+        for name, begin in (("force", 7), ("moment", 10), ("velocity", 13), ("angular_velocity", 16)):
+            np.testing.assert_array_equal(getattr(motion, name), legs[pick][..., begin : begin + 3])
+        np.testing.assert_array_equal(motion.part("h"), legs[pick][..., 3:7])
+        np.testing.assert_array_equal(motion.part("u"), strains[pick][..., 3:])
+        np.testing.assert_array_equal(motion.part("n6"), motion.force[..., 5, :])
+        with pytest.raises(KeyError, match=r"no field 'tension'; there are p1, h1, .* displacement"):
+            _ = motion.tension
+    assert jax.jit(lambda motion: motion.force)(motion).shape == (2, 3, 10, 6, 3)
+
+
 @pytest.mark.campaign
 @pytest.mark.parametrize("load", [0.0, 0.2, 0.6])
 def test_lateral_stiffness_and_its_loss_under_weight(load):

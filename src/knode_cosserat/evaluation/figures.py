@@ -192,6 +192,9 @@ def states(
     known = {field.name: field for layout in layouts for field in layout.fields}
     names = [name for name in FIELDS if name in known] if fields is None else list(fields)
     names = names or list(known)
+    # `part` also has those of several rods together, which one panel cannot show
+    for name in set(names) - set(known):
+        raise KeyError(f"no field {name!r}; there are {', '.join(known)}")
     if not -first.y.shape[1] <= node < first.y.shape[1]:
         raise ValueError(f"node is {node}; the trajectory has {first.y.shape[1]} nodes")
     across = min(columns, 2, len(names))
@@ -210,8 +213,8 @@ def states(
                     axes.plot(one.time, values[:, k], **{**line(i), "color": colour}, label=said)
             sizes = [np.nanmax(np.abs(np.asarray(one.part(name))), initial=0.0) for one in given.values()]
             require_span(axes, 0.01 * max(sizes))
-            unit = f" [{known[name].unit}]" if name in known and known[name].unit else ""
-            axes.set(ylabel=f"{name}{unit}", title=known[name].meaning if name in known else "")
+            unit = f" [{known[name].unit}]" if known[name].unit else ""
+            axes.set(ylabel=f"{name}{unit}", title=known[name].meaning)
         for axes in grid[len(names) :]:
             axes.remove()
         for axes in grid[max(0, len(names) - across) : len(names)]:
