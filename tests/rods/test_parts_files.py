@@ -35,14 +35,14 @@ def assert_equal(a, b):
 
 def numbers(stated):
     each = st.floats(stated.low, stated.high, allow_subnormal=False)
-    sizes = {"vector": (3, 3), "quaternion": (4, 4), "list": (1, 4)}
+    sizes = {"vector": (3, 3), "direction": (3, 3), "quaternion": (4, 4), "list": (1, 4)}
     if stated.shape == "scalar":
         return each
     if stated.shape == "matrix":
         return each.map(lambda size: size * np.eye(3))
     least, most = sizes[stated.shape]
     found = st.lists(each, min_size=least, max_size=most)
-    return found.filter(long) if stated.shape == "quaternion" else found
+    return found.filter(long) if stated.shape in ("direction", "quaternion") else found
 
 
 def long(vector):
@@ -174,7 +174,7 @@ HEAD = (
         ),
         (
             "surroundings: [{kind: plane, normal: [0, 0, 1.0e-12]}]",
-            "surroundings.0: .*normal is [0.0, 0.0, 1e-12]; allowed is a direction, .*above 1e-09",
+            "surroundings.0.normal is [0, 0, 1e-12]; allowed is a direction, .*above 1e-09",
         ),
         (
             "surroundings: [{kind: sphere, radius: 0}]",

@@ -102,6 +102,13 @@ def test_it_knows_every_parameter_of_every_kind():
         ("delrin-tendon-robot", ("parameters", "tip_end"), {"kind": "driven", "axes": ["z", "z"]}),
         ("delrin-tendon-robot", ("parameters", "tip_end"), {"kind": "driven", "axes": "rx"}),
         ("delrin-tendon-robot", ("parameters", "tip_end"), {"kind": "clamped", "orientation": [0, 0, 0, 0]}),
+        ("delrin-tendon-robot", ("parameters", "base_end"), {"kind": "sliding"}),
+        ("delrin-tendon-robot", ("parameters", "sections"), [{"kind": "stretch", "begin": 1.0}]),
+        ("delrin-tendon-robot", ("parameters", "sections"), [{"kind": "stretch", "end": 0}]),
+        ("delrin-tendon-robot", ("parameters", "loads"), [{"kind": "distributed-wrench", "end": 0.0}]),
+        ("delrin-tendon-robot", ("parameters", "surroundings"), [{"kind": "plane", "normal": [0, 0.0, 0]}]),
+        ("delrin-tendon-robot", ("parameters", "surroundings"), [{"kind": "cylinder", "axis": [0, 0, 0]}]),
+        ("delrin-routed-tendon-robot", ("parameters", "routing"), []),
         ("soft-slender-robot", ("parameters", "surroundings", 0, "friction"), -0.1),
         ("soft-slender-robot", ("parameters", "surroundings", 1, "inside"), 1),
         ("delrin-routed-tendon-robot", ("parameters", "drive"), "motor"),
@@ -113,6 +120,22 @@ def test_what_is_not_allowed_is_refused_by_both(robot, path, value):
     content = changed(ROBOTS[robot], path, value)
     assert not CHECK.is_valid(content)
     assert not loads(content)
+
+
+@pytest.mark.parametrize(
+    ("robot", "path", "value"),
+    [
+        ("delrin-tendon-robot", ("parameters", "tip_end"), {"kind": "sliding"}),
+        ("delrin-tendon-robot", ("parameters", "loads"), []),
+        ("delrin-tendon-robot", ("parameters", "sections"), [{"kind": "stretch", "begin": 0.99, "end": 1.0}]),
+        ("delrin-tendon-robot", ("parameters", "surroundings"), [{"kind": "plane", "normal": [0, 1e-3, 0]}]),
+        ("delrin-routed-tendon-robot", ("parameters", "routing"), None),
+    ],
+)
+def test_what_is_just_allowed_is_taken_by_both(robot, path, value):
+    content = changed({**ROBOTS[robot], "format": 2}, path, value)
+    assert CHECK.is_valid(content)
+    assert loads(content)
 
 
 @pytest.mark.parametrize("key", ["format", "kind", "parameters"])

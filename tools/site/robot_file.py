@@ -16,6 +16,7 @@ from knode_cosserat.rods.rod import Rod
 SHAPES = {
     "scalar": "number",
     "vector": "three numbers",
+    "direction": "three numbers",
     "quaternion": "four numbers, scalar first",
     "matrix": "number, diagonal or 3×3",
     "list": "list of numbers",
@@ -84,7 +85,8 @@ def _row(*cells: str) -> str:
 
 
 def _range(stated: Parameter) -> str:
-    each = {"scalar": "", "matrix": "eigenvalues ", "quaternion": "not all zero, each "}.get(
+    not_all = "not all zero, each "
+    each = {"scalar": "", "matrix": "eigenvalues ", "direction": not_all, "quaternion": not_all}.get(
         stated.shape, "each "
     )
     return f"{each}{stated.low:g} to {stated.high:g}"

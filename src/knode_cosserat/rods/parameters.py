@@ -26,7 +26,7 @@ class ParameterError(ValueError):
     """A parameter's name or value is not allowed; the message says what was given and what is."""
 
 
-Shape = Literal["scalar", "vector", "quaternion", "matrix", "list"]
+Shape = Literal["scalar", "vector", "direction", "quaternion", "matrix", "list"]
 
 #: of the length: what is nearer to an end of the rod than this is at it
 AT_END = 1e-9
@@ -50,6 +50,7 @@ class Parameter:
         kind = {
             "scalar": "a number",
             "vector": "three numbers, each",
+            "direction": f"a direction, three numbers (length above {SHORTEST:g}), each",
             "quaternion": f"four numbers, not all zero (length above {SHORTEST:g}), scalar first, each",
             "matrix": "one number, three (a diagonal) or a symmetric 3x3 matrix, with eigenvalues",
             "list": "a list of numbers, each",
@@ -213,7 +214,9 @@ def checked(name: str, value: Any, parameter: Parameter) -> None:
         return
     if isinstance(value, jax.core.Tracer):
         return
-    expected = {"scalar": (), "vector": (3,), "quaternion": (4,), "matrix": (3, 3)}.get(parameter.shape)
+    expected = {"scalar": (), "vector": (3,), "direction": (3,), "quaternion": (4,), "matrix": (3, 3)}.get(
+        parameter.shape
+    )
     try:
         array = np.asarray(value)
     except (TypeError, ValueError):
@@ -224,7 +227,7 @@ def checked(name: str, value: Any, parameter: Parameter) -> None:
         raise ParameterError(f"{name} has shape {array.shape}; allowed is {parameter.allowed}")
     if not np.all(np.isfinite(array)):
         raise ParameterError(f"{name} is {array.tolist()}; allowed is {parameter.allowed}")
-    if parameter.shape == "quaternion" and not math.hypot(*array) > SHORTEST:
+    if parameter.shape in ("direction", "quaternion") and not math.hypot(*array) > SHORTEST:
         raise ParameterError(f"{name} is {array.tolist()}; allowed is {parameter.allowed}")
     if parameter.shape == "matrix":
         if not np.allclose(array, array.T, rtol=1e-9, atol=0.0):

@@ -1,7 +1,7 @@
 """What a robot file may hold, as a JSON Schema: an editor then completes names and marks what is not allowed.
 
 It is made of the same statements that the loader checks (`parameters`, `parts`). The loader knows more, such
-as the eigenvalues of a matrix, or that a stretch ends beyond its beginning; what the schema refuses it
+as the eigenvalues of a matrix, or how many angles a platform has; what the schema refuses it
 refuses too.
 """
 
@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from knode_cosserat.rods.ends import End
 from knode_cosserat.rods.parameters import Choice, Parameter, Slot, choices_of, parameters_of, slots_of
 from knode_cosserat.rods.parts import kinds_of
 from knode_cosserat.rods.robot_file import FORMATS, KINDS
@@ -25,6 +26,8 @@ NODES = {
     "default": 10,
     "description": "nodes along the rod, base and tip included",
 }
+#: of an array
+NOT_ALL_ZERO = {"contains": {"not": {"const": 0}}}
 
 
 def robot_schema() -> dict[str, Any]:
@@ -61,6 +64,13 @@ def _mapping(cls: type, parts: dict[str, Any], **more: Any) -> dict[str, Any]:
     known = {name: _number(each, fields[name]) for name, each in numbers.items()}
     known |= {name: _word(each, fields[name]) for name, each in choices_of(cls).items()}
     known |= {name: _slot(each, parts) for name, each in slots_of(cls).items()}
+    if {"begin", "end"} <= known.keys():
+        # neither has a place for the other there
+        known["begin"]["exclusiveMaximum"], known["end"]["exclusiveMinimum"] = 1.0, 0.0
+    if "base_end" in known:
+        ends: Any = kinds_of(End)
+        tip_only = [kind for kind, end in ends.items() if not end.anywhere]
+        known["base_end"]["not"] = {"properties": {"kind": {"enum": tip_only}}, "required": ["kind"]}
     return {
         "type": "object",
         "description": (cls.__doc__ or cls.__name__).splitlines()[0],
@@ -75,8 +85,8 @@ def _number(stated: Parameter, default: Any) -> dict[str, Any]:
     shape: dict[str, Any] = {
         "scalar": one,
         "vector": _array(one, 3),
-        # none of it is all zeros
-        "quaternion": {**_array(one, 4), "contains": {"not": {"const": 0}}},
+        "direction": {**_array(one, 3), **NOT_ALL_ZERO},
+        "quaternion": {**_array(one, 4), **NOT_ALL_ZERO},
         "list": {"type": "array", "items": one, "minItems": 1},
         "matrix": {"anyOf": [one, _array(one, 3), _square(one, stated.high)]},
     }[stated.shape]
@@ -123,7 +133,10 @@ def _slot(slot: Slot, parts: dict[str, Any]) -> dict[str, Any]:
             "allOf": [_if_kind(kind, {"$ref": f"#/$defs/{family}.{kind}"}) for kind in kinds],
         }
     one = {"$ref": f"#/$defs/{family}"}
-    shape = {"type": "array", "items": one} if slot.many else one
+    shape: dict[str, Any] = {"type": "array", "items": one} if slot.many else one
+    if slot.many and slot.optional:
+        # that there are none is said by leaving it out
+        shape["minItems"] = 1
     return {**_or_null(shape, slot.optional), "description": slot.meaning}
 
 

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-import math
 from typing import Any, ClassVar, Self
 
 import jax
@@ -24,9 +23,8 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.loads import Motion, Wrench
-from knode_cosserat.rods.parameters import SHORTEST, ParameterError, choice, parameter
+from knode_cosserat.rods.parameters import choice, parameter
 from knode_cosserat.rods.parts import Part
-from knode_cosserat.rods.system import is_traced
 from knode_cosserat.rotation import cross, dot
 
 
@@ -70,16 +68,6 @@ class Obstacle(Part):
         )
 
 
-def _require_direction(who: Obstacle, name: str) -> None:
-    """Raise `ParameterError` if that vector of an obstacle has no length."""
-    given = getattr(who, name)
-    if not is_traced(given) and not math.hypot(*given) > SHORTEST:
-        raise ParameterError(
-            f"{type(who).__name__}: {name} is {np.asarray(given).tolist()}; "
-            f"allowed is a direction, with a length above {SHORTEST:g}"
-        )
-
-
 def _unit(vector: Any) -> Any:
     """A direction, of length one."""
     vector = jnp.asarray(vector)
@@ -101,12 +89,8 @@ class Plane(Obstacle):
 
     point: Any = parameter("m", "a point of it", shape="vector", low=-1e3, high=1e3, default=(0.0, 0.0, 0.0))
     normal: Any = parameter(
-        "1", "its normal, of any length", shape="vector", low=-1e3, high=1e3, default=(0.0, 0.0, 1.0)
+        "1", "its normal, of any length", shape="direction", low=-1e3, high=1e3, default=(0.0, 0.0, 1.0)
     )
-
-    def __check_init__(self) -> None:
-        super().__check_init__()
-        _require_direction(self, "normal")
 
     def distance(self, p: Float[Any, "3"]) -> tuple[Any, Float[Any, "3"]]:
         """See `Obstacle.distance`."""
@@ -138,15 +122,11 @@ class Cylinder(Obstacle):
         "m", "a point of its axis", shape="vector", low=-1e3, high=1e3, default=(0.0, 0.0, 0.0)
     )
     axis: Any = parameter(
-        "1", "direction of its axis, of any length", shape="vector", low=-1e3, high=1e3,
+        "1", "direction of its axis, of any length", shape="direction", low=-1e3, high=1e3,
         default=(0.0, 1.0, 0.0),
     )  # fmt: skip
     radius: Any = parameter("m", "its radius", low=1e-6, high=1e3, default=0.1)
     inside: bool = choice(_INSIDE, (False, True), False)
-
-    def __check_init__(self) -> None:
-        super().__check_init__()
-        _require_direction(self, "axis")
 
     def distance(self, p: Float[Any, "3"]) -> tuple[Any, Float[Any, "3"]]:
         """See `Obstacle.distance`."""
