@@ -12,6 +12,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Float
 
+#: of angles whose square (rad²) is below this there are series
+SMALL = 1e-8
+
 # `lax` directly, because indexing by brackets takes ten times as long to trace, and these are traced often
 
 
@@ -100,15 +103,35 @@ def conjugate(h: Float[Any, "4"]) -> Float[Any, "4"]:
     return h * np.array([1.0, -1.0, -1.0, -1.0])
 
 
-def quaternion_of(vector: Float[Any, "3"]) -> Float[Any, "4"]:
-    """The rotation about a vector by its length (rad)."""
+def _half(vector: Float[Any, "3"]) -> tuple[Any, Any, Any]:
+    """Of an angle, the vector's length: cos(angle / 2), sin(angle / 2) / angle, and its square."""
     square = jnp.sum(vector * vector)
-    small = square < 1e-8
+    small = square < SMALL
     # the root of zero has no derivative
     angle = jnp.sqrt(jnp.where(small, 1.0, square))
     over = jnp.where(small, 0.5 - square / 48.0, jnp.sin(angle / 2.0) / angle)
-    real = jnp.where(small, 1.0 - square / 8.0, jnp.cos(angle / 2.0))
+    return jnp.where(small, 1.0 - square / 8.0, jnp.cos(angle / 2.0)), over, square
+
+
+def quaternion_of(vector: Float[Any, "3"]) -> Float[Any, "4"]:
+    """The rotation about a vector by its length (rad)."""
+    real, over, _ = _half(vector)
     return jnp.concatenate([real[None], over * vector])
+
+
+def turned(h: Float[Any, "4"], vector: Float[Any, "3"]) -> Float[Any, "3"]:
+    """A vector turned by a quaternion of any length."""
+    return dot(rotation_matrix(h), vector)
+
+
+def mean_turned(turn: Float[Any, "3"], vector: Float[Any, "3"]) -> Float[Any, "3"]:
+    """A vector's mean on the way from itself to where the rotation `turn` (rad) takes it, at even pace."""
+    real, over, square = _half(turn)
+    small = square < SMALL
+    # (1 - sin(angle) / angle) / angle²
+    left = jnp.where(small, 1 / 6 - square / 120.0, (1.0 - 2.0 * over * real) / jnp.where(small, 1.0, square))
+    across = cross(turn, vector)
+    return vector + 2.0 * over * over * across + left * cross(turn, across)
 
 
 def inverse(matrix: Float[Any, "3 3"]) -> Float[Any, "3 3"]:

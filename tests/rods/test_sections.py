@@ -3,12 +3,15 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.integrate import quad
+from scipy.integrate import quad, solve_ivp
 
 import knode_cosserat as kc
+from knode_cosserat.rods import section as sections
 from knode_cosserat.rods.loads import PointWrench
+from knode_cosserat.rotation import rotation_matrix
 
 L, RADIUS, E = 0.4, 0.006, 1e7
 EI, GA = E * np.pi * RADIUS**4 / 4, E / 2.6 * np.pi * RADIUS**2
@@ -87,6 +90,98 @@ def arc(curvature, length):
     """In the plane: displacement across and along, and the turn, of an arc."""
     turn = curvature * length
     return np.array([(1 - np.cos(turn)), np.sin(turn)]) / curvature, turn
+
+
+#: of a rod curved at rest: at its base and at its tip, in two stretches that do not meet in one value
+BENT = {0: ([1.0, 6.0, -2.0], [3.0, 5.0, -1.5]), 1: ([-4.0, 3.0, 5.0], [-4.5, 5.0, 6.5])}
+
+
+def resting(*stretches, cut, nodes=11):
+    """Curved at rest, each stretch from its first curvature to its second."""
+    (a, b), (c, d) = (np.asarray(each) for each in stretches)
+    return kc.SlenderRod(
+        length=L, radius=RADIUS, density=1000.0, youngs_modulus=E, gravity=[0.0, 0.0, 0.0], nodes=nodes,
+        bending_damping=1e-3,
+        sections=(
+            kc.Stretch(end=cut, curvature=a, curvature_slope=b - a),
+            kc.Stretch(begin=cut, curvature=c, curvature_slope=d - c),
+        ),
+    )  # fmt: skip
+
+
+def frames(stretches, cut):
+    """p and R at the tip, by a general solver of differential equations, stretch by stretch."""
+    pose = np.concatenate([np.zeros(3), np.eye(3).ravel()])
+    for (one, other), (low, high) in zip(stretches, ((0.0, cut), (cut, 1.0)), strict=True):
+        first, more = np.asarray(one), np.subtract(other, one)
+
+        def rate(s, pose, first=first, more=more, low=low, high=high):
+            u, R = first + more * (s / L - low) / (high - low), pose[3:].reshape(3, 3)
+            # row by row: R û, where û takes a to u × a
+            return np.concatenate([R[:, 2], -np.cross(u, R).ravel()])
+
+        found = solve_ivp(rate, (low * L, high * L), pose, method="DOP853", rtol=1e-13, atol=1e-15)
+        pose = found.y[:, -1]
+    return pose[:3], pose[3:].reshape(3, 3)
+
+
+@pytest.mark.parametrize("cut", [0.37, 0.5])
+def test_a_rod_rests_as_its_curvature_has_it(cut, monkeypatch):
+    position, R = frames(BENT.values(), cut)
+    robot, errors = resting(*BENT.values(), cut=cut), []
+    for steps in (sections.REST_STEPS // 2, sections.REST_STEPS):
+        monkeypatch.setattr(sections, "REST_STEPS", steps)
+        y, _ = robot.rest(jnp.asarray(L))
+        turned = np.abs(np.asarray(rotation_matrix(y[3:7])) - R).max()
+        errors.append([np.abs(np.asarray(y[:3]) - position).max() / L, turned])
+    assert np.max(errors[-1]) < 2e-8
+    assert np.all(np.log2(np.divide(*errors)) > 3.8)
+
+
+@pytest.mark.parametrize("cut", [1e-6, 0.3, 0.37, 0.5, 0.5 + 1e-12, 0.93])
+def test_a_circle_is_exact_wherever_it_is_cut(cut):
+    circle = [0.0, 2 * np.pi / L, 0.0]
+    robot = resting((circle, circle), (circle, circle), cut=cut)
+    s = np.linspace(0.0, L, 11)
+    y, z = jax.vmap(robot.rest)(s)
+    along = (arc(circle[1], each)[0] for each in s)
+    np.testing.assert_allclose(y[:, [0, 2]], np.stack(list(along)), atol=1e-12 * L)
+    half = np.pi * s / L
+    np.testing.assert_allclose(y[:, [3, 5]], np.stack([np.cos(half), np.sin(half)], axis=1), atol=1e-12)
+    np.testing.assert_allclose(y[:, [1, 4, 6]], 0.0, atol=1e-12)
+    # on a cut too, where both stretches are
+    np.testing.assert_allclose(z[:, 3:], np.tile(circle, (11, 1)), rtol=1e-12)
+
+
+@pytest.mark.parametrize("slopes", [jax.jacfwd, jax.jacrev])
+def test_slopes_of_an_arc_at_rest(slopes):
+    """By its curvature and its length, of a straight one too."""
+
+    def tip(curvature, length):
+        robot = resting(*[[[0.0, 1.0, 0.0]] * 2] * 2, cut=0.37)
+        bent = {f"sections.{k}.curvature": jnp.stack([0.0, curvature, 0.0]) for k in (0, 1)}
+        return robot.replace(length=length, **bent).rest(length)[0][jnp.array([0, 2])]
+
+    def closed(k, length):
+        if k.real == 0.0:  # the first terms of it
+            return np.array([k * length**2 / 2, length - k**2 * length**3 / 6])
+        return np.array([1 - np.cos(k * length), np.sin(k * length)]) / k
+
+    h, found = 1e-30, jax.jit(slopes(tip, argnums=(0, 1)))
+    for k in (0.0, 1.5, 15.0):
+        expected = [closed(k + 1j * h, L).imag / h, closed(k, L + 1j * h).imag / h]
+        np.testing.assert_allclose(found(k, L), expected, atol=1e-12)
+
+
+def test_a_rod_curved_at_rest_stays_so():
+    """Also where a cut is on a node; it moves once, by what RK4 on ten segments makes of its arc."""
+    bend = [0.0, 6.0, 0.0]
+    robot = resting((bend, bend), (bend, bend), cut=0.5)
+    moved = kc.simulate(robot, np.zeros((6, 0)), 0.02, space="rk4")
+    position = np.asarray(moved.position)
+    np.testing.assert_allclose(position[1:], position[:1].repeat(6, axis=0), atol=1e-5 * L)
+    np.testing.assert_allclose(position[2:], position[1:2].repeat(5, axis=0), atol=1e-12 * L)
+    np.testing.assert_allclose(moved.part("m"), 0.0, atol=1e-12 * EI / L)
 
 
 @pytest.mark.parametrize("control", [(1.0, 1.0), (1.0, -0.5), (-0.3, 0.8)])

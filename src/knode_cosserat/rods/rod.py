@@ -26,7 +26,7 @@ from knode_cosserat.rods.loads import (
 )
 from knode_cosserat.rods.parameters import ParameterError, parameter, part
 from knode_cosserat.rods.parts import placed, shares
-from knode_cosserat.rods.section import shape_at_rest
+from knode_cosserat.rods.section import INWARD, shape_at_rest
 from knode_cosserat.rods.surroundings import Obstacle
 from knode_cosserat.rods.system import History, Scales
 from knode_cosserat.rotation import cross, dot, quaternion_rate, rotation_matrix
@@ -262,7 +262,12 @@ class Rod(ElasticRod):
         def curvature(at: Any) -> Any:
             return self.material(at, still).u_star
 
-        return *shape_at_rest(base.p, base.h, s, curvature), curvature(s)
+        ends = {place for each in self.sections for place in (each.begin, each.end)}
+        edges = self.length * np.array(sorted({0.0, *ends, 1.0}))
+        # z at a node is that on its far side, and where two sections meet is both
+        margin = INWARD * self.length / (self.nodes - 1)
+        beyond = jnp.minimum(s + margin, self.length - margin)
+        return *shape_at_rest(base.p, base.h, s, curvature, edges), curvature(beyond)
 
     def base(self, t: Any, control: Any, unknowns: Float[Any, " k"], history: History) -> Float[Any, " y"]:
         """y at s = 0: held as its end has it, and moving as that moves."""

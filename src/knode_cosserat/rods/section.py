@@ -15,12 +15,14 @@ from jaxtyping import Float
 from knode_cosserat.rods.layout import Field
 from knode_cosserat.rods.parameters import ParameterError, choice, parameter, place
 from knode_cosserat.rods.parts import Part, require_stretch
-from knode_cosserat.rotation import dot, quaternion_rate, rotation_matrix
+from knode_cosserat.rotation import cross, mean_turned, quaternion_of, quaternion_product, turned
 
 #: d₃: along the rod
 ALONG = np.array([0.0, 0.0, 1.0])
-#: steps in which the shape of a rod that is curved at rest is integrated
-REST_STEPS = 100
+#: even steps in which the shape of a rod that is curved at rest is integrated; its edges part them further
+REST_STEPS = 50
+#: by this part of a stretch points are moved into it, so that what is smooth within is seen up to its ends
+INWARD = 1e-9
 #: The paper's G = E / (2 (1 + 0.3)), for a robot that gives no shear modulus.
 POISSON_RATIO = 0.3
 
@@ -230,17 +232,37 @@ def differences_at(changes: tuple[SectionChange, ...], part: Any, controls: list
 
 
 def shape_at_rest(
-    p: Float[Any, "3"], h: Float[Any, "4"], s: Any, curvature: Callable[[Any], Any]
+    p: Float[Any, "3"],
+    h: Float[Any, "4"],
+    s: Any,
+    curvature: Callable[[Any], Any],
+    edges: Float[Any, " edges"],
 ) -> tuple[Float[Any, "3"], Float[Any, "4"]]:
-    """Position (m) and orientation at s of a rod without strain, from those at its base and its curvature."""
+    """Position (m) and orientation at s of a rod without strain, from those at its base and its curvature.
 
-    def on(k: Any, pose: tuple[Any, Any]) -> tuple[Any, Any]:
-        p, h = pose
-        ds = s / REST_STEPS
-        # the middle of each step is exact enough for a start, and an equilibrium is found from there
-        half = h + 0.5 * ds * quaternion_rate(h, curvature(k * ds))
-        h = h + ds * quaternion_rate(half, curvature((k + 0.5) * ds))
-        return p + ds * dot(rotation_matrix(half), ALONG), h / jnp.sqrt(jnp.sum(h * h))
+    `edges` are the places (m), from 0 on to the rod's length, between which the curvature (1/m) is smooth. By
+    Magnus' series to order 4, of poses: even curvature gives its helix whatever the steps.
+    """
+    even = edges[-1] * (np.arange(1, REST_STEPS) / REST_STEPS)
+    between = jnp.sort(jnp.concatenate([even, edges[1:-1]]))
+    bounds = jnp.concatenate([edges[:1], between, edges[-1:]])
+    # all steps beyond s are of length 0
+    passed = jnp.concatenate([edges[:1], jnp.minimum(between, s), jnp.reshape(s, 1)])
+    ds = jnp.diff(passed)
+    at = passed[:-1] + (0.5 + np.array([[-1.0], [1.0]]) / np.sqrt(12.0)) * ds
+    margin = INWARD * jnp.diff(bounds)
+    inside = jnp.clip(at, bounds[:-1] + margin, bounds[1:] - margin)
+    seen = jax.vmap(curvature)(inside.ravel())
 
-    p, h = jax.lax.fori_loop(0, REST_STEPS, on, (p, h))
-    return p, h
+    def step(ds: Any, u: Any, v: Any) -> tuple[Any, Any]:
+        more = ds * ds / np.sqrt(48.0)
+        turn = 0.5 * ds * (u + v) + more * cross(u, v)
+        along = ds * ALONG + more * cross(u - v, ALONG)
+        return quaternion_of(turn), mean_turned(turn, along)
+
+    def on(pose: tuple[Any, Any], step: tuple[Any, Any]) -> tuple[tuple[Any, Any], None]:
+        (p, h), (turn, way) = pose, step
+        return (p + turned(h, way), quaternion_product(h, turn)), None
+
+    pose, _ = jax.lax.scan(on, (p, h), jax.vmap(step)(ds, *seen.reshape(2, -1, 3)))
+    return pose

@@ -19,11 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from knode_cosserat.rods.section import INWARD
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.space import SpaceScheme
 
-#: by this part of a segment points are moved into it, so that what is smooth within is seen up to its ends
-INWARD = 1e-9
 #: cuts closer to a node than this part of a segment are on it, and from inside all of them is on one side
 ON_NODE = 0.1 * INWARD
 
