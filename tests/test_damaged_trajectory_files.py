@@ -7,7 +7,8 @@ import pytest
 import xarray
 
 import knode_cosserat as kc
-from knode_cosserat.trajectory_file import TrajectoryFileError, load_trajectory
+from knode_cosserat.trajectory_file import load_trajectory
+from knode_cosserat.trajectory_system import TrajectoryFileError
 from tests.trajectories import ROBOTS, Leapfrog, Pendulum, fails, synthetic
 
 

@@ -12,7 +12,7 @@ import xarray
 from hypothesis import given, settings
 
 import knode_cosserat as kc
-from knode_cosserat import trajectory_file
+from knode_cosserat import trajectory_file, trajectory_system
 from knode_cosserat.solvers.time import Static
 from knode_cosserat.trajectory_file import load_trajectory, save
 from tests.trajectories import ROBOT, ROBOTS, Leapfrog, Pendulum, assert_same, fails, stacked, synthetic
@@ -132,8 +132,8 @@ def codec(monkeypatch):
         except ValueError:
             raise ValueError(f"{source}: not a pendulum: {data!r}") from None
 
-    monkeypatch.setattr(trajectory_file, "_codecs", {})
-    trajectory_file.register_codec(Pendulum, encode, decode)
+    monkeypatch.setattr(trajectory_system, "_codecs", {})
+    trajectory_system.register_codec(Pendulum, encode, decode)
 
 
 @pytest.mark.parametrize(
@@ -178,14 +178,15 @@ def test_bytes_of_systems_that_are_not_right(tmp_path, codec, monkeypatch):
     with fails("the variable 'system_bytes' does not hold"):
         load_trajectory(path)
     data.to_netcdf(path, engine="h5netcdf")
-    monkeypatch.setattr(trajectory_file, "_codecs", {})
+    monkeypatch.setattr(trajectory_system, "_codecs", {})
     with fails("nothing that is imported here reads its system, a Pendulum: give it"):
         load_trajectory(path)
 
 
 def test_reading_asks_nothing_of_pickle_or_eval():
-    source = Path(trajectory_file.__file__).read_text(encoding="utf-8")
-    assert not re.search(r"\b(pickle|eval|exec|import_module)\b", source)
+    for module in (trajectory_file, trajectory_system):
+        source = Path(module.__file__).read_text(encoding="utf-8")
+        assert not re.search(r"\b(pickle|eval|exec|import_module)\b", source)
 
 
 # labels

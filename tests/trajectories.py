@@ -11,7 +11,7 @@ import pytest
 import knode_cosserat as kc
 from knode_cosserat.rods.parameters import parameter
 from knode_cosserat.solvers.time import TimeScheme
-from knode_cosserat.trajectory_file import TrajectoryFileError
+from knode_cosserat.trajectory_system import TrajectoryFileError
 
 ROBOT = kc.load_robot("delrin-tendon-robot")
 PAPER = kc.Settings()

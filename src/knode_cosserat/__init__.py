@@ -69,7 +69,8 @@ from knode_cosserat.solvers.space import RK4, Euler
 from knode_cosserat.solvers.stepper import Stepper
 from knode_cosserat.solvers.time import BDF1, BDF2, BDFAlpha, Trapezoidal
 from knode_cosserat.trajectory import Trajectory
-from knode_cosserat.trajectory_file import TrajectoryFileError, load_trajectory
+from knode_cosserat.trajectory_file import load_trajectory
+from knode_cosserat.trajectory_system import TrajectoryFileError
 from knode_cosserat.viewer import export_scene, view, view_live
 
 logging.getLogger(__name__).addHandler(logging.NullHandler())

@@ -2,30 +2,36 @@
 
 Every field of y, z and the controls is a variable under its own name, with unit and meaning, over the
 dimensions (batch,) time, node and component. The robot is an attribute, as the text of a robot file, and so
-are the settings, as JSON. A system that no robot file describes is there as the bytes of a file of its own,
-if there is a codec for its class. Arrays come back bit for bit. Reading runs no code that a file brings.
+are the settings, as JSON; `trajectory_system` has what other systems are. Arrays come back bit for bit.
+Reading runs no code that a file brings.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
-import jax
 import numpy as np
 
 from knode_cosserat._files import package_version, replacing
-from knode_cosserat.rods import robot_file
 from knode_cosserat.rods.layout import Field, Layout
-from knode_cosserat.rods.parameters import Parameter, ParameterError, parameters_of, slots_of
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.trajectory import Trajectory
+from knode_cosserat.trajectory_system import (
+    BYTES,
+    PARAMETER,
+    SIZES,
+    TrajectoryFileError,
+    described,
+    first_line,
+    labels,
+    system_of,
+    values_of,
+)
 
 if TYPE_CHECKING:
     import xarray
@@ -39,36 +45,6 @@ _ROWS = (
     ("residual", "1", "largest residual, in natural units"),
     ("iterations", "1", "Newton corrections"),
 )
-#: stands before a parameter's name where each robot of a batch has its own
-_PARAMETER = "robot_"
-#: the bytes of a system that has a codec; of a batch, one system's after the other's, with their sizes
-_BYTES, _SIZES = "system_bytes", "system_sizes"
-
-
-class TrajectoryFileError(ValueError):
-    """A trajectory's file that cannot be read or written; the message is one line that says why."""
-
-
-class Codec(NamedTuple):
-    """How systems of a class become bytes and come back; the text is what errors call the file.
-
-    Both raise a `ValueError` of one line for what they cannot write or read.
-    """
-
-    cls: type[System]
-    encode: Callable[[Any, str], bytes]
-    decode: Callable[[bytes, str], System]
-
-
-_codecs: dict[str, Codec] = {}
-
-
-def register_codec(
-    cls: type[System], encode: Callable[[Any, str], bytes], decode: Callable[[bytes, str], System]
-) -> None:
-    """Let files of trajectories hold systems of a class that no robot file can name (see `Codec`)."""
-    _codecs[cls.__name__] = Codec(cls, encode, decode)
-
 
 # writing
 
@@ -91,7 +67,7 @@ def save(trajectory: Trajectory, path: str | Path) -> None:
             data.to_netcdf(temporary, engine="h5netcdf", encoding=plain)
     except (OSError, RuntimeError) as error:  # HDF5 has either for a full disk
         number = error.errno if isinstance(error, OSError) else None
-        reason = os.strerror(number) if number else _first_line(error)
+        reason = os.strerror(number) if number else first_line(error)
         raise TrajectoryFileError(f"{path}: cannot be written: {reason}") from None
 
 
@@ -104,8 +80,8 @@ def _dataset(trajectory: Trajectory, source: str) -> xarray.Dataset:
     rows = (*batch, "time")
     arclength = np.asarray(trajectory.arclength)
     coordinates: dict[str, Any] = {
-        "time": ("time", np.asarray(trajectory.time), _labels("s", "time")),
-        "arclength": ((*batch, "node")[-arclength.ndim :], arclength, _labels("m", "arclength of the nodes")),
+        "time": ("time", np.asarray(trajectory.time), labels("s", "time")),
+        "arclength": ((*batch, "node")[-arclength.ndim :], arclength, labels("m", "arclength of the nodes")),
     }
     variables: dict[str, Any] = {}
     for layout, along, packed in zip(_layouts(system), _ALONG, _packed(trajectory), strict=True):
@@ -113,13 +89,13 @@ def _dataset(trajectory: Trajectory, source: str) -> xarray.Dataset:
             component, names = _component(field, layout is system.control_layout)
             coordinates[component] = (component, names)
             values = layout.get(packed, field.name)
-            variables[field.name] = ((*rows, *along, component), values, _labels(field.unit, field.meaning))
+            variables[field.name] = ((*rows, *along, component), values, labels(field.unit, field.meaning))
     for name, unit, meaning in _ROWS:
-        variables[name] = (rows, np.asarray(getattr(trajectory, name)), _labels(unit, meaning))
+        variables[name] = (rows, np.asarray(getattr(trajectory, name)), labels(unit, meaning))
     variables["result"][2].update(_flags(variables["result"][1].dtype))
-    described, more = _described(system)
+    texts, more = described(system)
     try:
-        return xarray.Dataset(variables | more, coordinates, _attributes(trajectory, source) | described)
+        return xarray.Dataset(variables | more, coordinates, _attributes(trajectory, source) | texts)
     except ValueError as error:
         reason = " ".join(str(error).split())
         raise TrajectoryFileError(
@@ -148,10 +124,6 @@ def _component(field: Field, control: bool) -> tuple[str, list[Any]]:
     return f"{field.name}_index", list(range(1, field.size + 1))
 
 
-def _labels(unit: str, meaning: str) -> dict[str, Any]:
-    return {"units": unit, "long_name": meaning}
-
-
 def _flags(dtype: np.dtype) -> dict[str, Any]:
     """The result codes, as the CF conventions have them."""
     return {
@@ -163,72 +135,15 @@ def _flags(dtype: np.dtype) -> dict[str, Any]:
 def _require_names(system: System, source: str) -> None:
     """A field's name must be free to be a variable's."""
     names = [field.name for layout in _layouts(system) for field in layout.fields]
-    taken = {"time", "node", "batch", "arclength", "axis", "quaternion", _BYTES, _SIZES}
+    taken = {"time", "node", "batch", "arclength", "axis", "quaternion", BYTES, SIZES}
     taken |= {name for name, *_ in _ROWS}
     for name in names:
-        if name in taken or "/" in name or name.startswith(_PARAMETER) or name.endswith("_index"):
+        if name in taken or "/" in name or name.startswith(PARAMETER) or name.endswith("_index"):
             raise TrajectoryFileError(
                 f"{source}: a {type(system).__name__} has a field {name!r}; "
                 "in a file that name is taken, by another field or otherwise, or impossible"
             )
         taken.add(name)
-
-
-def _described(system: System) -> tuple[dict[str, str], dict[str, Any]]:
-    """Attributes and variables from which the system can be made again, if that is possible."""
-    codec = _codecs.get(type(system).__name__)
-    batch = np.ndim(system.length) > 0
-    if type(system) in robot_file.KINDS.values():
-        try:
-            described = {"robot": robot_file.format_robot(_robot(system, 0) if batch else system)}
-        except robot_file.RobotFileError as error:  # one of its parts is made of code
-            return {"system_missing": _first_line(error)}, {}
-        return described, _parameters(system) if batch else {}
-    if codec is None or codec.cls is not type(system):
-        return {}, {}
-    robots = [_robot(system, i) for i in range(len(system.length))] if batch else [system]
-    try:
-        parts = [codec.encode(robot, f"a {type(system).__name__}") for robot in robots]
-    except ValueError as error:
-        return {"system_missing": _first_line(error)}, {}
-    labels = {"long_name": "the system, as the bytes of a file"}
-    variables = {_BYTES: ("system_byte", np.frombuffer(b"".join(parts), np.uint8), labels)}
-    if batch:
-        sizes = np.array([len(part) for part in parts])
-        variables[_SIZES] = ("batch", sizes, {"long_name": "how many bytes each system of the batch has"})
-    return {}, variables
-
-
-def _robot(system: System, index: int) -> System:
-    """One robot of a batch."""
-    return jax.tree.map(lambda leaf: leaf[index], system)
-
-
-def _parameters(system: System) -> dict[str, Any]:
-    """The parameters of a batch of robots, and of their parts, as variables."""
-    variables: dict[str, Any] = {}
-    for name, parameter, values in _numbers(system):
-        values = np.asarray(values)
-        dimensions = ("batch", *(f"{_PARAMETER}{name}_{k}" for k in range(1, values.ndim)))
-        variables[_PARAMETER + name] = (dimensions, values, _labels(parameter.unit, parameter.meaning))
-    return variables
-
-
-def _numbers(owner: Any, before: str = "") -> Iterator[tuple[str, Parameter, Any]]:
-    """Every parameter that is set, of a robot and its parts: its name as `System.replace` has it, and value.
-
-    Places are not among them: they are the same for all robots of a batch.
-    """
-    fixed = {field.name for field in dataclasses.fields(owner) if field.metadata.get("static")}
-    for name, parameter in parameters_of(type(owner)).items():
-        value = getattr(owner, name)
-        if value is not None and name not in fixed:
-            yield before + name, parameter, value
-    for name in slots_of(type(owner)):
-        held = getattr(owner, name)
-        for k, each in enumerate(held) if isinstance(held, tuple) else [(None, held)]:
-            if each is not None:
-                yield from _numbers(each, f"{before}{name}." if k is None else f"{before}{name}.{k}.")
 
 
 def _attributes(trajectory: Trajectory, source: str) -> dict[str, Any]:
@@ -261,15 +176,15 @@ def load_trajectory(path: str | Path, *, system: System | None = None) -> Trajec
     path = Path(path)
     data = _read(path)
     if system is None:
-        system = _system(path, data)
-    time = _values(path, data, "time", None)
+        system = system_of(path, data)
+    time = values_of(path, data, "time", None)
     rows = tuple(data.sizes[name] for name in ("batch", "time") if name in data.sizes)
     packed: list[Any] = []
     for layout, along in zip(_layouts(system), _ALONG, strict=True):
         shape = (*rows, *(data.sizes.get(name, 0) for name in along))
-        fields = [_values(path, data, field.name, (*shape, field.size)) for field in layout.fields]
+        fields = [values_of(path, data, field.name, (*shape, field.size)) for field in layout.fields]
         packed.append(np.concatenate(fields, axis=-1) if fields else np.zeros((*shape, 0)))
-    numbers = [_values(path, data, name, rows) for name, *_ in _ROWS]
+    numbers = [values_of(path, data, name, rows) for name, *_ in _ROWS]
     return Trajectory(system, _settings(path, data), time, *packed, *numbers)
 
 
@@ -284,7 +199,7 @@ def _read(path: Path) -> xarray.Dataset:
     except TrajectoryFileError:
         raise
     except Exception as error:  # each of three libraries has its own for a damaged file
-        raise TrajectoryFileError(f"{path}: truncated or damaged: {_first_line(error)}") from error
+        raise TrajectoryFileError(f"{path}: truncated or damaged: {first_line(error)}") from error
 
 
 def _require_hdf5(path: Path) -> None:
@@ -310,79 +225,6 @@ def _require_format(path: Path, attributes: dict[Any, Any]) -> None:
         )
 
 
-def _values(path: Path, data: xarray.Dataset, name: str, shape: tuple[int, ...] | None) -> Any:
-    if name not in data.variables:
-        raise TrajectoryFileError(f"{path}: the variable {name!r} is missing")
-    values = np.asarray(data[name].values)
-    if values.dtype.kind not in "fiu":
-        raise TrajectoryFileError(
-            f"{path}: the variable {name!r} has type {values.dtype}; allowed is numbers"
-        )
-    if shape is not None and values.shape != shape:
-        raise TrajectoryFileError(
-            f"{path}: the variable {name!r} has shape {values.shape}; allowed is {shape}"
-        )
-    return values
-
-
-def _system(path: Path, data: xarray.Dataset) -> System:
-    """The robot, or the batch of robots, that the file describes."""
-    text = data.attrs.get("robot")
-    if text is None:
-        return _from_bytes(path, data)
-    try:
-        robot = robot_file.parse_robot(str(text), f"{path}: attribute 'robot'")
-        if not any(str(name).startswith(_PARAMETER) for name in data.variables):
-            return robot
-        count = data.sizes.get("batch", 0)
-        values = {
-            name: _values(path, data, _PARAMETER + name, (count, *np.shape(value)))
-            for name, _, value in _numbers(robot)
-        }
-        robots = [robot.replace(**{name: each[i] for name, each in values.items()}) for i in range(count)]
-    except robot_file.RobotFileError as error:
-        raise TrajectoryFileError(str(error)) from None
-    except ParameterError as error:
-        raise TrajectoryFileError(f"{path}: a robot of the batch is not possible: {error}") from None
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *robots)
-
-
-def _from_bytes(path: Path, data: xarray.Dataset) -> System:
-    """The system, or the batch of systems, whose bytes the file holds."""
-    name = str(data.attrs.get("system", "class unknown"))
-    ask = "give it, load_trajectory(path, system=…)"
-    if _BYTES not in data.variables:
-        why = f" ({data.attrs['system_missing']})" if "system_missing" in data.attrs else ""
-        raise TrajectoryFileError(f"{path}: the file does not describe its system, a {name}{why}: {ask}")
-    if name not in _codecs:
-        raise TrajectoryFileError(f"{path}: nothing that is imported here reads its system, a {name}: {ask}")
-    content, sizes = np.asarray(data[_BYTES].values), np.array([data[_BYTES].size])
-    if _SIZES in data.variables:
-        sizes = _values(path, data, _SIZES, (data.sizes.get("batch", 0),))
-    whole = content.dtype == np.uint8 and content.ndim == 1 and sizes.dtype.kind in "iu" and sizes.size > 0
-    if not whole or min(sizes) < 1 or max(sizes) > content.size or sum(sizes.tolist()) != content.size:
-        raise TrajectoryFileError(f"{path}: the variable {_BYTES!r} does not hold what it should")
-    ends = np.cumsum(sizes)
-    try:
-        robots = [
-            _codecs[name].decode(content[end - size : end].tobytes(), f"{path}: variable {_BYTES!r}")
-            for size, end in zip(sizes, ends, strict=True)
-        ]
-    except ValueError as error:
-        raise TrajectoryFileError(f"{_first_line(error)}; or {ask}") from None
-    if _SIZES not in data.variables:
-        return robots[0]
-    try:
-        return jax.tree.map(lambda *leaves: np.stack(leaves), *robots)
-    except ValueError as error:
-        raise TrajectoryFileError(f"{path}: its systems are not a batch: {_first_line(error)}") from None
-
-
-def _first_line(error: Exception) -> str:
-    lines = str(error).splitlines()
-    return lines[0] if lines else type(error).__name__
-
-
 # settings
 
 
@@ -395,9 +237,9 @@ def _settings_text(settings: Settings | None, source: str) -> str:
 
 def _settings(path: Path, data: xarray.Dataset) -> Settings | None:
     try:
-        described = json.loads(data.attrs["settings"])
-        return None if described is None else Settings.from_description(described)
+        description = json.loads(data.attrs["settings"])
+        return None if description is None else Settings.from_description(description)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise TrajectoryFileError(
-            f"{path}: attribute 'settings' is not understood: {_first_line(error)}"
+            f"{path}: attribute 'settings' is not understood: {first_line(error)}"
         ) from None

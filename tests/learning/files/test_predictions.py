@@ -11,7 +11,7 @@ import typer.testing
 import knode_cosserat as kc
 from knode_cosserat.learning.knode import KNODE, About
 from knode_cosserat.learning.structured.residual import Structured
-from knode_cosserat.trajectory_file import TrajectoryFileError
+from knode_cosserat.trajectory_system import TrajectoryFileError
 from tests.learning.files.made import MODELS, ROBOT, STRING, TENSIONS, Pull, assert_same, fails, network
 
 # trajectories

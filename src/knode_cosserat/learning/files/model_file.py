@@ -23,7 +23,7 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 
-from knode_cosserat import trajectory_file
+from knode_cosserat import trajectory_system
 from knode_cosserat.learning.files import container
 from knode_cosserat.learning.files.container import (
     Classes,
@@ -292,4 +292,4 @@ def _equations(model: KNODE, y: Any, control: Any, history: History) -> tuple[An
     return y_s, z, model.tip(np.zeros(()), control, y, history)
 
 
-trajectory_file.register_codec(KNODE, encoded, decoded)
+trajectory_system.register_codec(KNODE, encoded, decoded)
