@@ -19,7 +19,7 @@ import scipy.linalg
 
 import knode_cosserat as kc
 from knode_cosserat.solvers.boundary import linearise
-from knode_cosserat.solvers.problem import StepProblem
+from knode_cosserat.solvers.problem import StepProblem, no_history
 from knode_cosserat.solvers.space import SCHEMES
 
 #: part of the load by which its derivative is taken
@@ -28,9 +28,8 @@ STEP = 1e-4
 
 @functools.partial(jax.jit, static_argnames="space")
 def _tip_response(system: Any, control: Any, y: Any, space: Any) -> Any:
-    record = system.y_layout.size + system.z_layout.size + (system.y_layout.size if system.mixed else 0)
-    still = jnp.zeros((system.nodes, record))
-    problem = StepProblem(system, jnp.zeros(()), control, jnp.zeros(()), still, space)
+    zero = jnp.zeros(())
+    problem = StepProblem(system, zero, control, zero, no_history(system, space), space)
     F, base, tip, _, _ = linearise(problem, problem.filled(y), system.unknowns(y[0]))
     last, _ = jax.lax.scan(lambda X, F_j: (F_j @ X, None), base, F)
     return tip @ last

@@ -19,7 +19,7 @@ import knode_cosserat as kc
 from benchmarks.cases import DT, STEPS, medians, one_core
 from knode_cosserat.solvers.boundary import newton
 from knode_cosserat.solvers.linear import ELIMINATIONS, Condensed, Decoupled
-from knode_cosserat.solvers.march import rest_record
+from knode_cosserat.solvers.past import rest_record
 from knode_cosserat.solvers.problem import StepProblem
 
 Solve = Callable[[StepProblem, Any, Any], tuple[Any, Any, Any]]
@@ -85,9 +85,11 @@ def rollout(solve: Solve) -> Any:
         def step(carry: Any, control: Any) -> Any:
             (x1, x2), (xi1, xi2) = carry
             history = (-2.0 * x1 + 0.5 * x2) / DT
-            problem = StepProblem(robot, jnp.zeros(()), control, jnp.array(1.5 / DT), history, kc.Euler())
+            problem = StepProblem(
+                robot, jnp.zeros(()), control, jnp.array(1.5 / DT), history[None], kc.Euler()
+            )
             y, xi, error = solve(problem, (2.0 * x1 - x2)[:, :ny], 2.0 * xi1 - xi2)
-            return ((problem.record(y), x1), (xi, xi1)), error
+            return ((problem.records(y)[0], x1), (xi, xi1)), error
 
         zero = jnp.zeros(robot.unknown_count)
         carry, errors = jax.lax.scan(step, ((rest, rest), (zero, zero)), controls)
@@ -103,7 +105,7 @@ def reach(solve: Solve, robot: kc.System) -> float:
     def error(tension: Any) -> Any:
         rest = rest_record(robot)
         control = tension * jnp.array([1.0, 0.0, 0.0, 1.0])
-        problem = StepProblem(robot, jnp.zeros(()), control, jnp.zeros(()), 0.0 * rest, kc.Euler())
+        problem = StepProblem(robot, jnp.zeros(()), control, jnp.zeros(()), 0.0 * rest[None], kc.Euler())
         return solve(problem, rest[:, : robot.y_layout.size], jnp.zeros(robot.unknown_count))[2]
 
     largest = 0.0

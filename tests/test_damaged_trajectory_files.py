@@ -121,6 +121,30 @@ def test_attributes_that_are_not_right(path, name, value, parts):
         load_trajectory(path)
 
 
+def test_where_a_motion_began_is_told_whole_or_not_at_all(tmp_path):
+    for name, change, parts in (
+        ("begun", None, ("'begun_step' is missing",)),
+        ("begun", lambda data: data[:2], ("'begun' has shape (2, ", "allowed is (3, ")),
+        ("begun_step", lambda data: data[:4], ("'begun_step' has shape (4,)", "allowed is (5,)")),
+    ):
+        synthetic(stages=1).save(tmp_path / "a.nc")
+        with xarray.open_dataset(tmp_path / "a.nc", engine="h5netcdf", decode_cf=False) as data:
+            kept = data.load()
+        values = kept[name].values
+        if change is None:
+            kept = kept.drop_vars("begun_step")
+        else:
+            changed = change(values)
+            dims = [
+                "other" if n != m else d
+                for n, m, d in zip(changed.shape, values.shape, kept[name].dims, strict=True)
+            ]
+            kept = kept.drop_vars(name).assign({name: (dims, changed)})
+        kept.to_netcdf(tmp_path / "b.nc", engine="h5netcdf")
+        with fails("b.nc", *parts):
+            load_trajectory(tmp_path / "b.nc")
+
+
 def test_robots_of_a_batch_that_are_not_right(tmp_path):
     path = tmp_path / "a.nc"
     synthetic((3,), robot=ROBOTS).save(path)

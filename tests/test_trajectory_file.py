@@ -32,6 +32,8 @@ from tests.trajectories import ROBOT, ROBOTS, Leapfrog, Pendulum, assert_same, f
         synthetic(batch=(1,), steps=1),
         synthetic(batch=(3,), robot=ROBOTS),
         synthetic(batch=(1,), robot=stacked(ROBOT)),
+        synthetic(stages=4),
+        synthetic(batch=(3,), robot=ROBOTS, stages=1),
     ],
     ids=lambda trajectory: f"{type(trajectory.system).__name__}{trajectory.y.shape}",
 )

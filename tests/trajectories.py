@@ -10,6 +10,7 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.rods.parameters import parameter
+from knode_cosserat.solvers.past import Begun
 from knode_cosserat.solvers.time import TimeScheme
 from knode_cosserat.trajectory_system import TrajectoryFileError
 
@@ -56,14 +57,20 @@ def assert_same(a, b):
         one, other = np.asarray(getattr(a, name)), np.asarray(getattr(b, name))
         assert (one.dtype, one.shape) == (other.dtype, other.shape), name
         assert one.tobytes() == other.tobytes(), name
+    assert (a.begun is None) == (b.begun is None)
+    for one, other in zip(jax.tree.leaves(a.begun), jax.tree.leaves(b.begun), strict=True):
+        assert np.shape(one) == np.shape(other) and np.asarray(one).tobytes() == np.asarray(other).tobytes()
     assert a.settings == b.settings
     assert jax.tree.structure(a.system) == jax.tree.structure(b.system)
     for one, other in zip(jax.tree.leaves(a.system), jax.tree.leaves(b.system), strict=True):
         assert np.array_equal(one, other)
 
 
-def synthetic(batch=(), steps=4, nodes=5, robot=ROBOT, settings=PAPER, seed=0):
-    """A trajectory of random numbers, and of what a file could spoil: -0, NaN, infinity, a subnormal."""
+def synthetic(batch=(), steps=4, nodes=5, robot=ROBOT, settings=PAPER, seed=0, stages=0):
+    """A trajectory of random numbers, and of what a file could spoil: -0, NaN, infinity, a subnormal.
+
+    With `stages` it tells where it began, at as many.
+    """
     rng = np.random.default_rng(seed)
     rows = (*batch, steps)
     y = rng.normal(size=(*rows, nodes, robot.y_layout.size))
@@ -78,6 +85,14 @@ def synthetic(batch=(), steps=4, nodes=5, robot=ROBOT, settings=PAPER, seed=0):
         result=rng.choice([int(result) for result in kc.Result], size=rows),
         residual=rng.normal(size=rows),
         iterations=rng.integers(0, 100, size=rows),
+        begun=Begun(
+            rng.normal(size=(*batch, 2, stages, nodes, 25)),
+            rng.normal(size=(*batch, stages, nodes, 25)),
+            rng.normal(size=(*batch, 4)),
+            rng.uniform(size=batch),
+        )
+        if stages
+        else None,
     )
 
 

@@ -30,6 +30,8 @@ class Trajectory(eqx.Module):
     #: largest residual in natural units
     residual: Float[Any, "*batch T"]
     iterations: Int[Any, "*batch T"]
+    #: of a motion: what its first step looked back on (`solvers.past.Begun`), if that is known
+    begun: Any = None
 
     # named parts
 
@@ -147,12 +149,17 @@ class Trajectory(eqx.Module):
         if self.y.ndim == 4 and not isinstance(index, slice | int | np.integer):
             raise TypeError(f"index a batch by a slice or a robot's number, not by {index!r}")
         fields = ("y", "z", "control", "result", "residual", "iterations")
-        picked = [getattr(self, name)[index] for name in fields]
+        picked: dict[str, Any] = {name: getattr(self, name)[index] for name in fields}
         time = self.time if self.y.ndim == 4 else self.time[index]
         system = self.system
         if np.ndim(system.length):
             system = _picked(system, index)
-        return type(self)(system, self.settings, time, *picked)
+        begun = self.begun
+        if begun is not None and self.y.ndim == 4:
+            begun = _picked(begun, index)
+        elif isinstance(index, slice) and index.indices(len(self.time))[0::2] != (0, 1):
+            begun = None  # of rows that were left out, or lie further apart, it tells nothing
+        return type(self)(system, self.settings, time, **picked, begun=begun)
 
     def save(self, path: Any) -> None:
         """Write a labelled netCDF file (see `trajectory_file.save`)."""
@@ -161,7 +168,7 @@ class Trajectory(eqx.Module):
         trajectory_file.save(self, path)
 
 
-def _picked(system: System, index: Any) -> System:
+def _picked(tree: Any, index: Any) -> Any:
     import jax
 
-    return jax.tree.map(lambda leaf: leaf[index], system)
+    return jax.tree.map(lambda leaf: leaf[index], tree)

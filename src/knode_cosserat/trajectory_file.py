@@ -18,6 +18,7 @@ import numpy as np
 from knode_cosserat._files import package_version, replacing
 from knode_cosserat.rods.layout import Field, Layout
 from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.past import Begun
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.trajectory import Trajectory
@@ -45,6 +46,10 @@ _ROWS = (
     ("residual", "1", "largest residual, in natural units"),
     ("iterations", "1", "Newton corrections"),
 )
+#: what the first step of a motion looked back on: two states, newest first, and
+#: the newest one's rate, at the stages of the scheme along the rod; and that step's c0, c1, c2, d1 and dt
+_BEGUN, _BEGUN_STEP = "begun", "begun_step"
+_BEGUN_ALONG = ("begun_state", "begun_stage", "begun_point", "begun_number")
 
 # writing
 
@@ -93,6 +98,20 @@ def _dataset(trajectory: Trajectory, source: str) -> xarray.Dataset:
     for name, unit, meaning in _ROWS:
         variables[name] = (rows, np.asarray(getattr(trajectory, name)), labels(unit, meaning))
     variables["result"][2].update(_flags(variables["result"][1].dtype))
+    if trajectory.begun is not None:
+        begun = Begun(*map(np.asarray, trajectory.begun))
+        states = np.concatenate([begun.records, np.expand_dims(begun.rate, -4)], axis=-4)
+        step = np.concatenate([begun.coefficients, begun.dt[..., None]], axis=-1)
+        variables[_BEGUN] = (
+            (*batch, *_BEGUN_ALONG),
+            states,
+            {"long_name": "what the first step looked back on"},
+        )
+        variables[_BEGUN_STEP] = (
+            (*batch, "begun_coefficient"),
+            step,
+            {"long_name": "c0, c1, c2, d1 and dt of it"},
+        )
     texts, more = described(system)
     try:
         return xarray.Dataset(variables | more, coordinates, _attributes(trajectory, source) | texts)
@@ -135,7 +154,7 @@ def _flags(dtype: np.dtype) -> dict[str, Any]:
 def _require_names(system: System, source: str) -> None:
     """A field's name must be free to be a variable's."""
     names = [field.name for layout in _layouts(system) for field in layout.fields]
-    taken = {"time", "node", "batch", "arclength", "axis", "quaternion", BYTES, SIZES}
+    taken = {"time", "node", "batch", "arclength", "axis", "quaternion", BYTES, SIZES, _BEGUN, _BEGUN_STEP}
     taken |= {name for name, *_ in _ROWS}
     for name in names:
         if name in taken or "/" in name or name.startswith(PARAMETER) or name.endswith("_index"):
@@ -184,8 +203,22 @@ def load_trajectory(path: str | Path, *, system: System | None = None) -> Trajec
         shape = (*rows, *(data.sizes.get(name, 0) for name in along))
         fields = [values_of(path, data, field.name, (*shape, field.size)) for field in layout.fields]
         packed.append(np.concatenate(fields, axis=-1) if fields else np.zeros((*shape, 0)))
-    numbers = [values_of(path, data, name, rows) for name, *_ in _ROWS]
-    return Trajectory(system, _settings(path, data), time, *packed, *numbers)
+    y, z, control = packed
+    numbers = {name: values_of(path, data, name, rows) for name, *_ in _ROWS}
+    settings, begun = _settings(path, data), _begun(path, data)
+    return Trajectory(system, settings, time, y, z, control, **numbers, begun=begun)
+
+
+def _begun(path: Path, data: xarray.Dataset) -> Begun | None:
+    """What the first step looked back on, if the file says so."""
+    if _BEGUN not in data.variables:
+        return None
+    batch = tuple(data.sizes[name] for name in ("batch",) if name in data.sizes)
+    sizes = tuple(data.sizes.get(name, 0) for name in _BEGUN_ALONG[1:])
+    states = values_of(path, data, _BEGUN, (*batch, 3, *sizes))
+    step = values_of(path, data, _BEGUN_STEP, (*batch, 5))
+    newest, before, rate = np.moveaxis(states, -4, 0)
+    return Begun(np.stack([newest, before], axis=-4), rate, step[..., :4], step[..., 4])
 
 
 def _read(path: Path) -> xarray.Dataset:

@@ -7,7 +7,7 @@ from hypothesis import given
 
 import knode_cosserat as kc
 from benchmarks import closed_forms
-from knode_cosserat.solvers.march import coefficient_table
+from knode_cosserat.solvers.past import coefficient_table
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.time import Static
 

@@ -7,8 +7,9 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.solvers.ahead import in_two
+from knode_cosserat.solvers.between import at_stages
 from knode_cosserat.solvers.crossing import spread
-from knode_cosserat.solvers.march import rest_record
+from knode_cosserat.solvers.past import rest_record
 from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.space import SCHEMES, SLOPES, VALUES
 
@@ -47,9 +48,8 @@ def a_step(robot, space):
         history = np.concatenate([history, np.zeros((robot.nodes, ny))], axis=1)
     control = 5.0 * generator.uniform(0.5, 1.0, robot.control_size)
     control *= 1e-3 if "reel" in robot.control_layout.names else 1.0
-    problem = StepProblem(
-        robot, jnp.array(0.3), jnp.asarray(control), jnp.array(20.0), jnp.asarray(history), SCHEMES[space]
-    )
+    past = at_stages(robot, SCHEMES[space], jnp.asarray(history))
+    problem = StepProblem(robot, jnp.array(0.3), jnp.asarray(control), jnp.array(20.0), past, SCHEMES[space])
     return problem, spread(problem.points, jnp.asarray(y))
 
 
@@ -74,7 +74,7 @@ def test_nothing_comes_out_differently(name, space):
 
     def all_of(prepared):
         own = problem.ready() if prepared else problem
-        return own.pieces(SLOPES, y), own.pieces(VALUES, y), own.record(y)
+        return own.pieces(SLOPES, y), own.pieces(VALUES, y), own.records(y)
 
     scale = np.asarray(robot.strand.scales().y)
     natural = scale / scale[:, None]

@@ -6,10 +6,9 @@ import numpy as np
 from hypothesis import given, settings
 
 import knode_cosserat as kc
-from benchmarks.motions import soft_rod
-from knode_cosserat.solvers.between import along_pieces
+from knode_cosserat.solvers.between import at_stages
 from knode_cosserat.solvers.crossing import points_of
-from knode_cosserat.solvers.space import SCHEMES, middles
+from knode_cosserat.solvers.space import SCHEMES
 
 BEAM = {"length": 0.5, "radius": 0.005, "density": 1200.0, "youngs_modulus": 5e6}
 
@@ -21,7 +20,7 @@ def rod(cuts, nodes):
     )
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(st.data(), st.sampled_from(["euler", "rk4"]))
 def test_what_jumps_at_cuts_is_exact_on_both_sides(data, space):
     """Another polynomial in each stretch, cubic if this has four nodes; in y one that goes on."""
@@ -45,43 +44,31 @@ def test_what_jumps_at_cuts_is_exact_on_both_sides(data, space):
     beyond = (s >= cuts[0] - 1e-12)[:, None]
     records = np.concatenate([cubic(smooth, s), np.where(beyond, cubic(after, s), cubic(before, s))], axis=1)
     points = points_of(system)
-    places = (points.segment[:, None] + points.bounds) / (nodes - 1)
-    places = np.stack([places[:, 0], places.mean(axis=1), places[:, 1]])
-    far = places[1] > cuts[0]
-    found = along_pieces(system, SCHEMES[space], jnp.asarray(records))
-    for k, (each, at) in enumerate(zip(found, places, strict=True)):
-        if k and not SCHEMES[space].uses_middle:
-            continue
-        np.testing.assert_allclose(each[:, :ny], cubic(smooth, at), atol=1e-9)
+    begin, end = ((points.segment + points.bounds[:, k]) / (nodes - 1) for k in (0, 1))
+    found = at_stages(system, SCHEMES[space], jnp.asarray(records))
+    for stage, part in zip(found, SCHEMES[space].parts, strict=True):
+        at = np.append(begin + part * (end - begin), 1.0)
+        far = np.append(begin, 1.0) >= cuts[0] - 1e-12
+        np.testing.assert_allclose(stage[:, :ny], cubic(smooth, at), atol=1e-9)
         expected = np.where(far[:, None], cubic(after, at), cubic(before, at))
-        np.testing.assert_allclose(each[:, ny:], expected, atol=1e-9)
+        np.testing.assert_allclose(stage[:, ny:], expected, atol=1e-9)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(st.lists(st.floats(0.001, 0.999), max_size=6, unique=True), st.integers(2, 12))
 def test_what_is_the_same_everywhere_stays_so(cuts, nodes):
     """However many cuts there are, and stretches without a node."""
     system = rod(sorted(cuts), nodes)
     width = system.y_layout.size + system.z_layout.size
     for space in SCHEMES.values():
-        for each in along_pieces(system, space, jnp.full((nodes, width), 0.7)):
-            np.testing.assert_allclose(each, 0.7, rtol=1e-12)
-            assert each.shape == (len(points_of(system).segment), width)
+        found = at_stages(system, space, jnp.full((nodes, width), 0.7))
+        np.testing.assert_allclose(found, 0.7, rtol=1e-12)
+        assert found.shape == (len(space.parts), len(points_of(system).segment) + 1, width)
 
 
-def test_a_rod_without_cuts_is_as_its_nodes_and_middles():
+def test_where_stages_are_at_nodes_they_are_as_those():
     records = jnp.asarray(np.random.default_rng(0).normal(size=(10, 25)))
-    begin, middle, end = along_pieces(rod([], 10), SCHEMES["rk4"], records)
-    np.testing.assert_array_equal(begin, records[:-1])
-    np.testing.assert_array_equal(middle, middles(records))
-    np.testing.assert_array_equal(end, records[1:])
-
-
-def test_a_damped_motion_is_as_accurate_where_sections_change():
-    """On a node, and between two. With one past for both sides it was a thousandth of the length."""
-    robot = soft_rod(0.3, 0.617)
-    coarse, fine = (
-        kc.simulate(robot.replace(nodes=nodes), np.zeros((15, 0)), 0.02, space="rk4").tip_position
-        for nodes in (21, 81)
-    )
-    assert np.max(np.abs(coarse - fine)) < 1e-5 * robot.length
+    start, middle, again, end = at_stages(rod([], 10), SCHEMES["rk4"], records)
+    np.testing.assert_array_equal(start, records)
+    np.testing.assert_array_equal(middle, again)
+    np.testing.assert_array_equal(end, [*records[1:], records[-1]])

@@ -8,10 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
+from hypothesis import settings as given_settings
 
 import knode_cosserat as kc
-from knode_cosserat.solvers.between import along_pieces
+from knode_cosserat.solvers.between import at_stages
 from knode_cosserat.solvers.crossing import (
     Crossing,
     carried,
@@ -21,14 +22,15 @@ from knode_cosserat.solvers.crossing import (
     spread,
     taken,
 )
-from knode_cosserat.solvers.march import initial_past, rest_record
+from knode_cosserat.solvers.past import initial_past, rest_record
 from knode_cosserat.solvers.problem import StepProblem
+from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SCHEMES, SLOPES, VALUES
 
 CUTS = st.lists(st.floats(1e-3, 1.0 - 1e-3), min_size=1, max_size=8, unique=True)
 
 
-@settings(max_examples=300, deadline=None)
+@given_settings(max_examples=300, deadline=None)
 @given(CUTS, st.integers(2, 30))
 def test_pieces_follow_each_other_from_base_to_tip(places, nodes):
     cuts = tuple(sorted(places))
@@ -50,7 +52,7 @@ def test_pieces_follow_each_other_from_base_to_tip(places, nodes):
     assert set(points.between.tolist()) <= set(np.flatnonzero(points.acting.any(axis=1)).tolist())
 
 
-@settings(max_examples=40, deadline=None)
+@given_settings(max_examples=40, deadline=None)
 @given(CUTS, st.integers(2, 30))
 def test_what_is_linear_along_the_rod_is_spread_exactly(places, nodes):
     points = points_between(tuple(sorted(places)), nodes)
@@ -59,7 +61,7 @@ def test_what_is_linear_along_the_rod_is_spread_exactly(places, nodes):
     np.testing.assert_allclose(found, np.stack([2.0 * along, 1.0 - along], axis=1), atol=1e-12)
 
 
-@settings(max_examples=100, deadline=None)
+@given_settings(max_examples=100, deadline=None)
 @given(st.lists(st.integers(0, 9), min_size=1, max_size=20))
 def test_rows_are_taken_by_their_numbers(rows):
     values = jnp.arange(30.0).reshape(10, 3)
@@ -84,11 +86,9 @@ def test_pieces_side_by_side_as_parts_one_after_the_other(space, changes):
     record = np.asarray(rest_record(robot))
     y = record[:, : robot.y_layout.size] + 1e-2 * generator.normal(size=(robot.nodes, robot.y_layout.size))
     history = -20.0 * record + 1e-2 * generator.normal(size=record.shape)
-    problem = StepProblem(
-        robot, jnp.zeros(()), jnp.array([6.0, 7.0, 5.0, 6.0]), jnp.array(20.0), jnp.asarray(history),
-        SCHEMES[space],
-    )  # fmt: skip
-    past = along_pieces(robot, SCHEMES[space], jnp.asarray(history))
+    past = at_stages(robot, SCHEMES[space], jnp.asarray(history))
+    control = jnp.array([6.0, 7.0, 5.0, 6.0])
+    problem = StepProblem(robot, jnp.zeros(()), control, jnp.array(20.0), past, SCHEMES[space])
     parts = parts_of(robot.cuts, robot.nodes)
     ds = robot.length / (robot.nodes - 1)
 
@@ -99,7 +99,7 @@ def test_pieces_side_by_side_as_parts_one_after_the_other(space, changes):
         return carried(SCHEMES[space], rates, problem.crossed, crossing, (j * ds, ds), y_j, past)
 
     own = [
-        (float(j), Crossing(bounds, acting), y[j], tuple(each[parts[j]] for each in past))
+        (float(j), Crossing(bounds, acting), y[j], jnp.swapaxes(past, 0, 1)[parts[j]])
         for j, (bounds, acting) in enumerate(zip(*crossings(robot.cuts, robot.nodes), strict=True))
     ]
     value, slope = jax.jit(one), jax.jit(jax.jacfwd(one, argnums=2))
@@ -135,9 +135,9 @@ def test_what_remembers_slopes_too_begins_with_those_of_its_nodes():
         rod(**beam, sections=(kc.Stretch(end=0.317, stiffness=[2.0]),))
         for rod in (kc.SlenderRod, RememberingSlopes)
     )
-    past = initial_past(other, rest_record(other), jnp.zeros(0))
+    past = initial_past(other, Settings(), rest_record(other), jnp.zeros(0))
     # straight, and so alike all along
-    np.testing.assert_allclose(past.records[0, :, -plain.y_layout.size :][:, 2], 1.0, atol=1e-12)
+    np.testing.assert_allclose(past.records[0, 0, :, -plain.y_layout.size :][:, 2], 1.0, atol=1e-12)
     found, expected = (kc.simulate(rod, np.zeros((3, 0)), 0.02).y for rod in (other, plain))
     np.testing.assert_allclose(found, expected, atol=1e-9)
 

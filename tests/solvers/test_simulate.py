@@ -13,20 +13,11 @@ from hypothesis import strategies as st
 
 import knode_cosserat as kc
 from knode_cosserat.solvers.boundary import residuals
-from knode_cosserat.solvers.march import (
-    EXTRAPOLATIONS,
-    advanced,
-    history_of,
-    initial_past,
-    march_many,
-    rest_record,
-    weights_by,
-)
+from knode_cosserat.solvers.march import march_many, weights_by
+from knode_cosserat.solvers.past import EXTRAPOLATIONS, advanced, history_of, padded_rows, resting_past
 from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.recovery import _continue_load, _Step, _substeps
-from knode_cosserat.solvers.run import _padded
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.simulate import _at_rest
 
 DT = 0.05
 
@@ -60,7 +51,9 @@ def test_the_residual_that_is_reported_is_that_of_the_states_that_are_returned(r
     for i in (1, 2, 50, 100):
         x = np.concatenate([truth.y, truth.z], axis=-1)
         history = (-2.0 * x[i - 1] + 0.5 * x[max(i - 2, 0)]) / DT
-        problem = StepProblem(robot, jnp.array(i * DT), sine[i - 1], jnp.array(1.5 / DT), history, kc.Euler())
+        problem = StepProblem(
+            robot, jnp.array(i * DT), sine[i - 1], jnp.array(1.5 / DT), history[None], kc.Euler()
+        )
         defects, tip = residuals(problem, jnp.asarray(truth.y[i]))
         scales = robot.scales()
         largest = max(np.max(np.abs(defects / scales.y)), np.max(np.abs(tip / scales.tip)))
@@ -107,8 +100,7 @@ def test_on_request_the_rest_is_marked_invalid(robot):
 
 
 def _step(robot, coefficients=None):
-    record = np.asarray(rest_record(robot))
-    past = initial_past(robot, jnp.asarray(record), jnp.zeros(4))
+    past = resting_past(robot, Settings())
     coefficients = coefficients or kc.BDF2().coefficients(DT, DT)
     return _Step(robot, Settings(), past, coefficients, DT), past
 
@@ -175,12 +167,11 @@ def test_jit_equals_plain(robot, sine, truth):
 
 @pytest.mark.campaign
 def test_lockstep_as_on_a_gpu_equals_one_after_the_other(robot, sine):
-    record, past = _at_rest(robot)
-    del record
+    past = resting_past(robot, Settings())
     tensions = np.stack([sine[:16], 1.2 * sine[:16], 0.8 * sine[:16]])
     pasts = jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), past)
     table = np.array([kc.BDF2().coefficients(DT, DT)] * 2)
-    arguments = (robot, Settings(), table, _padded(tensions), DT, pasts, 16, False)
+    arguments = (robot, Settings(), table, padded_rows(tensions), DT, pasts, 16, False)
     one_by_one, together = march_many(*arguments, lockstep=False), march_many(*arguments, lockstep=True)
     np.testing.assert_array_equal(one_by_one[0], [16, 16, 16])
     np.testing.assert_allclose(one_by_one[1].records, together[1].records, atol=1e-8)
@@ -205,9 +196,10 @@ def test_equilibria_in_a_batch(robot):
 
 
 def test_the_past_keeps_the_newest_first(robot):
-    past = initial_past(robot, rest_record(robot), jnp.zeros(4))
+    past = resting_past(robot, Settings())
     record = past.records[0] + 1.0
-    after = advanced(past, record, past.rate, past.between[0], past.weights)
+    after = advanced(past, record, past.rate, past.y[0] + 1.0, past.weights)
+    np.testing.assert_array_equal(after.y[1:], past.y[:-1])
     np.testing.assert_array_equal(after.records[0], record)
     np.testing.assert_array_equal(after.records[1], past.records[0])
     ones = jnp.array([2.0, 3.0, 5.0, 0.0])

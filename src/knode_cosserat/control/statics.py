@@ -18,8 +18,8 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import Solution, linearise, newton, residuals
 from knode_cosserat.solvers.crossing import points_of, spread
 from knode_cosserat.solvers.linear import Condensed, carried
-from knode_cosserat.solvers.march import rest_record
-from knode_cosserat.solvers.problem import StepProblem
+from knode_cosserat.solvers.past import rest_record
+from knode_cosserat.solvers.problem import StepProblem, no_history, row_of
 from knode_cosserat.solvers.settings import Settings
 
 #: position (d,) in m and orientation (quaternion, scalar first), or None, from a system and its last node's y
@@ -58,8 +58,7 @@ class Response(NamedTuple):
 
 def static_problem(system: System, settings: Settings, control: Any) -> StepProblem:
     """The boundary-value problem of `kc.equilibrium`."""
-    ny, nz = system.y_layout.size, system.z_layout.size
-    nothing = jnp.zeros((system.nodes, ny + nz + (ny if system.mixed else 0)))
+    nothing = no_history(system, settings.space)
     return StepProblem(system, jnp.asarray(TIME), control, jnp.zeros(()), nothing, settings.space)
 
 
@@ -87,7 +86,7 @@ def _filled(system, settings, control, y):  # type: ignore[no-untyped-def]
 @functools.partial(jax.jit, static_argnames="settings")
 def recorded(system, settings, control, y):  # type: ignore[no-untyped-def]
     """y and z of an equilibrium at the nodes, from y at all points."""
-    record = static_problem(system, settings, control).record(y)
+    record = row_of(system, y, static_problem(system, settings, control).records(y))
     ny = system.y_layout.size
     return record[:, :ny], record[:, ny : ny + system.z_layout.size]
 
@@ -154,8 +153,8 @@ def poses_of(system, settings, pose, controls):  # type: ignore[no-untyped-def]
 
     def one(control: Any) -> Any:
         found = solve(system, settings, control, *begin)
-        record = static_problem(system, settings, control).record(found.y)
-        strain = record[:, ny : ny + system.z_layout.size] - z_rest
+        records = static_problem(system, settings, control).records(found.y)
+        strain = row_of(system, found.y, records)[:, ny : ny + system.z_layout.size] - z_rest
         lengths = [jnp.max(jnp.linalg.norm(part, axis=-1)) for part in system.z_layout.split(strain)]
         size = jnp.max(jnp.abs(found.y) / system.scales().y)
         return *pose(system, found.y[-1]), found.error, found.corrections, size, jnp.stack(lengths)

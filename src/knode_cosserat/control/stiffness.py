@@ -24,7 +24,7 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.system import System, in_strands
 from knode_cosserat.solvers.crossing import carried_on, points_of
-from knode_cosserat.solvers.problem import StepProblem
+from knode_cosserat.solvers.problem import StepProblem, no_history
 from knode_cosserat.solvers.space import RK4
 
 #: y of a strand that has a pose and a stress
@@ -131,15 +131,12 @@ def _along(
     strand = system.strand
     layout, scale = strand.y_layout, strand.scales().y
     rest = jnp.zeros(layout.size * (2 if strand.mixed else 1) + strand.z_layout.size)
-    problem = StepProblem(system, jnp.zeros(()), control, jnp.zeros(()), jnp.zeros((system.nodes, 0)), RK4())
+    problem = StepProblem(system, jnp.zeros(()), control, jnp.zeros(()), jnp.zeros((0, 0, 0)), RK4())
     kept = np.ones(layout.size)
     kept[layout.indices(NEEDED)] = 0.0
 
     def rates(s: Any, y: Any, known: Any) -> Any:
-        return problem.point_rates(s, y, rest)[0]
-
-    def uncut(acting: Any, y: Any, history: Any) -> Any:
-        return y
+        return problem.point_rates(s, y, rest)[0], None
 
     def piece(y: Any, low: Any, high: Any, acting: Any) -> Any:
         jump = jnp.eye(12)
@@ -149,9 +146,9 @@ def _along(
 
         def on(y: Any, step: Any) -> Any:
             begin, end = low + step * (high - low)
-            y = carried_on(RK4(), rates, uncut, None, (begin, end), y, (rest, rest, rest))
+            y, _ = carried_on(RK4(), rates, (begin, end), y, None)
             ways = wide(strand, y)
-            y_s, pushed = jax.linearize(lambda y: rates(end, y, None), y)
+            y_s, pushed = jax.linearize(lambda y: rates(end, y, None)[0], y)
             ways_s = jax.vmap(pushed, in_axes=-1, out_axes=-1)(ways)
             _, turning = jax.jvp(lambda y: wide(strand, y), (y,), (y_s,))
             moved = jnp.max(jnp.abs(ways_s), axis=1) * kept / scale
@@ -171,8 +168,7 @@ def divided(system: System, y: Any, control: Any, by: Sequence[int]) -> Iterator
     The equilibrium is made that of the pieces first, by Newton's method. By that of the nodes' scheme, a
     little off, a rod that turns for nothing would seem to gain by it.
     """
-    size = y.shape[1] * (2 if system.mixed else 1) + system.z_layout.size
-    control, history = jnp.asarray(control), jnp.zeros((len(y), size))
+    control, history = jnp.asarray(control), no_history(system, RK4())
     points, length = points_of(system), float(system.length)
     bounds = (points.segment[:, None] + points.bounds) * length / (system.nodes - 1)
     found = np.asarray(_filled(system, jnp.asarray(y), control, history))

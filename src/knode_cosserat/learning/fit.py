@@ -20,7 +20,7 @@ from knode_cosserat.learning.ensemble import Ensemble
 from knode_cosserat.learning.knode import KNODE, About
 from knode_cosserat.learning.residual import Residual, network
 from knode_cosserat.learning.samples import Dataset, of_strands, samples
-from knode_cosserat.learning.structured.regression import solve
+from knode_cosserat.learning.structured.solved import solved
 from knode_cosserat.learning.training.checkpoint import Checkpoints, Identity, data_hash
 from knode_cosserat.learning.training.courses import Courses, courses, held_out_courses, tip_error
 from knode_cosserat.learning.training.descent import standardised
@@ -160,8 +160,7 @@ def _first(knowledge: System, trajectories: Sequence[Trajectory], config: FitCon
         if options.standardised and dataset is not None:
             networks = [standardised(net, knowledge.strand, dataset.segments) for net in networks]
         return _First(dataset, list(networks))
-    every = of_strands(knowledge, samples(knowledge, trajectories))
-    return _First(dataset, list(solve(knowledge, every, options, config.seeds)))
+    return _First(dataset, list(solved(knowledge, trajectories, options, config.seeds)))
 
 
 def _noisy(trajectory: Trajectory, size: float, number: int) -> Trajectory:

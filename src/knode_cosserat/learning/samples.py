@@ -18,9 +18,10 @@ from jaxtyping import Float
 
 from knode_cosserat.learning.sides import far_side, slopes_of
 from knode_cosserat.rods.system import System, in_strands, records_in_strands, unpacked_history
-from knode_cosserat.solvers.between import along_pieces
+from knode_cosserat.solvers.begin import histories_along
+from knode_cosserat.solvers.between import at_stages
 from knode_cosserat.solvers.crossing import Crossing, carried, crossing_of, parts_of, within
-from knode_cosserat.solvers.march import coefficient_table
+from knode_cosserat.solvers.past import coefficient_table
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
@@ -46,10 +47,10 @@ class Samples(NamedTuple):
     #: y_s times the length at the segment's start, from the states alone
     slope: Float[Any, "S y"]
     control: Float[Any, "S c"]
-    #: packed records of history where its first part, most often all of it, begins, is half-way and ends
-    history: tuple[Float[Any, "S x"], Float[Any, "S x"], Float[Any, "S x"]]
+    #: packed records of history at the stages of its first part, most often all of it
+    history: Float[Any, "S stages x"]
     #: the same of the parts after cuts within it, if the robot has such segments
-    later: Float[Any, "S parts-1 3 x"]
+    later: Float[Any, "S parts-1 stages x"]
     #: one over how many samples the same trajectory gave
     weight: Float[Any, " S"]
     #: which trajectory, and which of its rows
@@ -92,20 +93,21 @@ def predict(system: System, space: SpaceScheme, sample: Samples) -> tuple[Float[
     def rates(*at: Any) -> Any:
         return derivatives(*at)[0]
 
+    def alone(*at: Any) -> Any:
+        return rates(*at), None
+
     def jump(acting: Any, y: Any, record: Any) -> Any:
         history = unpacked_history(system, sample.c0, record)
         return system.crossed(acting, sample.t, y, sample.control, history) if system.jumps else y
 
     crossings = crossing_of(system)
     if crossings is None:
-        y_next = space.advance(rates, s, ds, sample.y, sample.history)
+        y_next, _ = space.advance(alone, s, ds, sample.y, sample.history)
     else:
         segment = jnp.round(sample.place * (system.nodes - 1)).astype(int)
         crossing = Crossing(*(jnp.asarray(each)[segment] for each in crossings))
-        start, middle, end = (
-            jnp.concatenate([each[None], sample.later[:, k]]) for k, each in enumerate(sample.history)
-        )
-        y_next = carried(space, rates, jump, crossing, (s, ds), sample.y, (start, middle, end), first=1)
+        past = jnp.concatenate([sample.history[None], sample.later])
+        y_next = carried(space, rates, jump, crossing, (s, ds), sample.y, past, first=1)
     return y_next, derivatives(start_of(system, sample.place), sample.y, sample.history[0])[1]
 
 
@@ -116,16 +118,20 @@ def start_of(system: System, place: Any) -> Any:
 
 
 def samples(
-    knowledge: System, trajectories: Sequence[Trajectory], nodes: Sequence[int] | None = None
-) -> Dataset:
+    knowledge: System, trajectories: Sequence[Trajectory], nodes: Sequence[int] | None = None,
+    model: System | None = None,
+) -> Dataset:  # fmt: skip
     """One-segment samples of trajectories; `nodes` chooses the nodes that are predicted (1 to N - 1).
+
+    Trajectories hold the nodes only. What the stages between them look back on is interpolated, or as a
+    `model` has it that is close to what moved.
 
     Raises:
         DataError: a trajectory does not fit the knowledge or the others, is too short or not finite.
     """
     _check(knowledge, trajectories)
     ends = _checked_nodes(knowledge, nodes)
-    parts = [_of_one(knowledge, trajectory, k, ends) for k, trajectory in enumerate(trajectories)]
+    parts = [_of_one(knowledge, trajectory, k, ends, model) for k, trajectory in enumerate(trajectories)]
     *joined, doubts = zip(*parts, strict=True)
     segments, tips = (jax.tree.map(lambda *leaves: np.concatenate(leaves), *each) for each in joined)
     doubt = np.sqrt(np.mean(np.square(doubts), axis=0))
@@ -148,7 +154,7 @@ def of_strands(knowledge: System, data: Dataset) -> Dataset:
     shared = ("place", "t", "c0", "control", "weight", "origin")
     every: dict[str, Any] = {name: np.repeat(getattr(segments, name), count, axis=0) for name in shared}
     every |= {name: own(getattr(segments, name)) for name in ("y", "z", "y_next", "slope")}
-    every |= {"history": tuple(map(past, segments.history)), "later": past(segments.later)}
+    every |= {"history": past(segments.history), "later": past(segments.later)}
     every |= {"weight": every["weight"] / count}
     doubt = np.sqrt(np.mean(np.square(in_strands(knowledge, data.doubt)), axis=0))
     return dataclasses.replace(data, segments=Samples(**every), per_row=data.per_row * count, doubt=doubt)
@@ -160,7 +166,7 @@ def settings_of(trajectory: Trajectory) -> Settings:
 
 
 def _of_one(
-    knowledge: System, trajectory: Trajectory, k: int, ends: np.ndarray
+    knowledge: System, trajectory: Trajectory, k: int, ends: np.ndarray, model: System | None
 ) -> tuple[Samples, TipSamples, np.ndarray]:
     settings, dt = settings_of(trajectory), trajectory.dt
     y, z, control = (np.asarray(a, dtype=float) for a in (trajectory.y, trajectory.z, trajectory.control))
@@ -175,8 +181,7 @@ def _of_one(
     first = 1 if time[0] == 0.0 else 2
     rows = np.arange(first, len(time))
     history, c0 = history[rows], c0[rows]
-    past = jax.vmap(lambda each: past_of_segments(knowledge, settings.space, each))(history)
-    (begin, middle, end), later = jax.tree.map(np.asarray, past)
+    stages, later = _past_of_rows(knowledge, trajectory, rows, history, model)
     starts, count = ends - 1, len(rows) * len(ends)
 
     def flat(values: Any) -> Any:
@@ -195,7 +200,7 @@ def _of_one(
         y_next=flat(y[np.ix_(rows, ends)]),
         slope=flat(slope[at]),
         control=spread(control[rows]),
-        history=(flat(begin[:, starts]), flat(middle[:, starts]), flat(end[:, starts])),
+        history=flat(stages[:, starts]),
         later=flat(later[:, starts]),
         weight=np.full(count, 1.0 / count),
         origin=np.stack([np.full(count, k), spread(rows)], axis=1),
@@ -207,11 +212,30 @@ def _of_one(
     return segments, tips, doubt
 
 
+def _past_of_rows(
+    knowledge: System, trajectory: Trajectory, rows: np.ndarray, history: np.ndarray, model: System | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """`Samples.history` and `Samples.later` of all segments, row by row."""
+    space = settings_of(trajectory).space
+    simulated = trajectory.settings is not None
+    known = histories_along(model, trajectory) if model is not None and simulated else None
+    if known is None:
+        past = jax.vmap(lambda each: past_of_segments(knowledge, space, each))(history)
+    else:
+        first, along = known
+        past = jax.vmap(lambda each: in_segments(knowledge, each))(along[rows - first])
+    return np.asarray(past[0]), np.asarray(past[1])
+
+
 def past_of_segments(knowledge: System, space: SpaceScheme, records: Float[Any, "nodes x"]) -> Any:
     """`Samples.history` and `Samples.later` of all segments of one row, from its history at the nodes."""
-    pieces = jnp.stack(along_pieces(knowledge, space, records), axis=1)
-    found = pieces[parts_of(knowledge.cuts, knowledge.nodes)]
-    return (found[:, 0, 0], found[:, 0, 1], found[:, 0, 2]), found[:, 1:]
+    return in_segments(knowledge, at_stages(knowledge, space, records))
+
+
+def in_segments(knowledge: System, stages: Float[Any, "stages points x"]) -> Any:
+    """Of all segments the first part (segments, stages, x), and others (segments, parts - 1, stages, x)."""
+    found = jnp.swapaxes(stages, 0, 1)[parts_of(knowledge.cuts, knowledge.nodes)]
+    return found[:, 0], found[:, 1:]
 
 
 def histories(settings: Settings, dt: float, record: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -264,8 +264,9 @@ class Rod(ElasticRod):
 
         ends = {place for each in self.sections for place in (each.begin, each.end)}
         edges = self.length * np.array(sorted({0.0, *ends, 1.0}))
-        # z at a node is that on its far side, and where two sections meet is both
-        margin = INWARD * self.length / (self.nodes - 1)
+        # z at a node is that on its far side, and where two sections meet is both; less than by what places
+        # are moved away from that side
+        margin = 0.2 * INWARD * self.length / (self.nodes - 1)
         beyond = jnp.minimum(s + margin, self.length - margin)
         return *shape_at_rest(base.p, base.h, s, curvature, edges), curvature(beyond)
 

@@ -21,7 +21,7 @@ from jaxtyping import Float, Int
 
 from knode_cosserat.rods.section import INWARD
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.solvers.space import Rates, SpaceScheme
 
 #: cuts closer to a node than this part of a segment are on it, and from inside all of them is on one side
 ON_NODE = 0.1 * INWARD
@@ -126,45 +126,38 @@ Jump = Callable[[Any, Any, Any], Any]
 
 def carried(
     space: SpaceScheme, rates: Callable[[Any, Any, Any], Any], jump: Jump, crossing: Crossing,
-    where: tuple[Any, Any], y: Float[Any, " y"], history: tuple[Any, Any, Any], first: int = 0,
+    where: tuple[Any, Any], y: Float[Any, " y"], history: Float[Any, "parts stages x"], first: int = 0,
 ) -> Float[Any, " y"]:  # fmt: skip
     """y at a segment's end from y at its start; `where` is its start and its length (m).
 
-    `history` is that where each part begins, is half-way and ends. `first` of 1 leaves out the jump at the
-    start: y is then that on the far side.
+    `rates` gives y_s, and is given the history of the stage. `first` of 1 leaves out the jump at the start: y
+    is then that on the far side.
     """
     acting = jnp.asarray(crossing.acting).at[:first].set(0.0)
     s, ds = where
 
-    def of_past(s: Any, y: Any, known: tuple[Any, Any]) -> Any:
-        return rates(s, y, known[0])
+    def alone(s: Any, y: Any, past: Any) -> Any:
+        return rates(s, y, past), None
 
     def part(y: Any, given: tuple[Any, Any, Any, Any]) -> Any:
         begin, end, acting, past = given
-        return carried_on(space, of_past, jump, acting, (s + begin * ds, s + end * ds), y, past), None
+        beyond = jump(acting, y, past[0])
+        return carried_on(space, alone, (s + begin * ds, s + end * ds), beyond, past)
 
     y, _ = jax.lax.scan(part, y, (crossing.bounds[:-1], crossing.bounds[1:], acting, history))
     return y
 
 
 def carried_on(
-    space: SpaceScheme, rates: Callable[[Any, Any, Any], Any], jump: Jump, acting: Any,
-    where: tuple[Any, Any], y: Float[Any, " y"], history: tuple[Any, Any, Any],
-    ahead: tuple[Any, Any, Any] | None = None,
-) -> Float[Any, " y"]:  # fmt: skip
-    """y at the end of one piece, from the near side of its start; `where` is from where to where (m).
+    space: SpaceScheme, rates: Rates, where: tuple[Any, Any], y: Float[Any, " y"], known: Any
+) -> tuple[Float[Any, " y"], Any]:
+    """`SpaceScheme.advance` over one piece, from the far side of its start; `where` is from and to where (m).
 
-    `rates` is given what `known_at` says of the past and of what was evaluated `ahead` for this piece.
+    Nothing is evaluated at its very ends, where what jumps may be either.
     """
     low, high = where
 
     def inside(at: Any, y: Any, known: Any) -> Any:
         return rates(within(at, low, high), y, known)
 
-    return space.advance(inside, low, high - low, jump(acting, y, history[0]), known_at(history, ahead))
-
-
-def known_at(history: tuple[Any, Any, Any], ahead: tuple[Any, Any, Any] | None) -> tuple[Any, Any, Any]:
-    """What is known where a piece begins, is half-way and ends: (past there, what was evaluated ahead)."""
-    start, middle, end = zip(history, (None, None, None) if ahead is None else ahead, strict=True)
-    return start, middle, end
+    return space.advance(inside, low, high - low, y, known)

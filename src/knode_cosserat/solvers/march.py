@@ -7,39 +7,19 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Float, Int
 
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import Kept, newton_keeping, none_kept
-from knode_cosserat.solvers.crossing import points_of, spread, taken
-from knode_cosserat.solvers.problem import StepProblem
+from knode_cosserat.solvers.past import EXTRAPOLATIONS, Past, advanced, history_of
+from knode_cosserat.solvers.problem import StepProblem, keeps_stages, no_history, row_of
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.space import Euler
-from knode_cosserat.solvers.time import BDF1
 
-#: how many past states the first guess of a step looks at, and the extrapolations it is a mean of: constant,
-#: linear, quadratic in time
-PAST = 3
-EXTRAPOLATIONS = np.array([[1.0, 0.0, 0.0], [2.0, -1.0, 0.0], [3.0, -3.0, 1.0]])
 #: the mean is by this power of how far each was off in the newest step: a lower one lets a bad one in, a
 #: higher one trusts chance
 TRUST = -3
 #: misfits below this are rounding errors (natural units)
 ROUNDING = 1e-12
-
-
-class Past(NamedTuple):
-    """What a step needs of the steps before it, newest first."""
-
-    records: Float[Any, "past nodes x"]
-    rate: Float[Any, "nodes x"]
-    #: y at the cuts between nodes: of that only the first guess is made
-    between: Float[Any, "past cuts y"]
-    #: what each state counts in the first guess of the next step
-    weights: Float[Any, " past"]
-    #: time of row 0 (s): step i ends at t0 + (i + 1) dt
-    t0: Float[Any, ""]
 
 
 class Rows(NamedTuple):
@@ -53,111 +33,27 @@ class Rows(NamedTuple):
     size: Float[Any, " steps"]
 
 
-def rest_record(system: System) -> Any:
-    """y and z (nodes, y + z) of the system at rest."""
-    s = jnp.linspace(0.0, 1.0, system.nodes) * system.length
-    y, z = jax.vmap(system.rest)(s)
-    return jnp.concatenate([y, z], axis=1)
-
-
-def initial_past(system: System, record: Any, control: Any) -> Past:
-    """A past of one state (y and z, nodes × x) only: every state before the first is the first.
-
-    Where B is not zero y_s belongs to a record too: it is found from y as at rest under the control.
-    """
-    ny, nz = system.y_layout.size, system.z_layout.size
-    if system.mixed:
-        nothing = jnp.zeros((system.nodes, ny + nz + ny))
-        still = StepProblem(system, jnp.zeros(()), control, jnp.zeros(()), nothing, Euler())
-        y_s = still.record(still.filled(record[:, :ny]))[:, ny + nz :]
-        record = jnp.concatenate([record, y_s], axis=1)
-    records = jnp.stack([record] * PAST)
-    weights = jnp.asarray(EXTRAPOLATIONS[0])
-    return Past(records, jnp.zeros_like(record), guessed_between(system, records), weights, jnp.zeros(()))
-
-
-def going_on_past(system: System, settings: Settings, dt: float, records: Any, t0: Any) -> Past:
-    """The past after a trajectory's rows (rows, nodes, x) at the same time step, its last at time t0.
-
-    The rate of a row is its scheme's own, from the first row on, where there was none.
-    """
-    newest = jnp.stack([records[max(-k, -len(records))] for k in range(1, PAST + 1)])
-    rate = jnp.zeros_like(newest[0])
-    if settings.time.uses_rate:
-        table = jnp.asarray(coefficient_table(settings, dt))
-        before = jnp.concatenate([records[:1], records[:-1]])
-
-        def one(rate: Any, row: Any) -> Any:
-            i, now, last, last_but_one = row
-            c0, c1, c2, d1 = jnp.where(i == 0, table[0], table[1])
-            return c0 * now + c1 * last + c2 * last_but_one + d1 * rate, None
-
-        rows = (jnp.arange(len(records) - 1), records[1:], before[1:], before[:-1])
-        rate, _ = jax.lax.scan(one, rate, rows)
-    weights = jnp.asarray(EXTRAPOLATIONS[1])
-    return Past(newest, rate, guessed_between(system, newest), weights, jnp.asarray(t0, dtype=float))
-
-
-def guessed_between(system: System, records: Float[Any, "past nodes x"]) -> Float[Any, "past cuts y"]:
-    """y at the cuts between nodes, where no more than the nodes' records is known."""
-    points = points_of(system)
-    return jax.vmap(lambda y: spread(points, y)[points.between])(records[..., : system.y_layout.size])
-
-
-def past_y(system: System, past: Past) -> Float[Any, "past points y"]:
-    """y of the past at all points."""
-    points, y = points_of(system), past.records[..., : system.y_layout.size]
-    if not len(points.between):
-        return y
-    order = np.argsort(np.concatenate([points.nodes, points.between]))
-    return jax.vmap(lambda y: taken(y, order))(jnp.concatenate([y, past.between], axis=1))
-
-
-def coefficient_table(settings: Settings, dt: float) -> np.ndarray:
-    """Coefficients (2, 4) of the first step and of every other."""
-    regular = settings.time.coefficients(dt, dt)
-    first = BDF1().coefficients(dt, dt) if settings.start == "consistent" else regular
-    return np.array([first, regular])
-
-
-def history_of(past: Past, coefficients: Any, settings: Settings) -> Any:
-    """ʰ = c1 (newest) + c2 (the one before) + d1 (its rate), for y, z and y_s alike."""
-    _, c1, c2, d1 = coefficients
-    history = c1 * past.records[0] + c2 * past.records[1]
-    return history + d1 * past.rate if settings.time.uses_rate else history
-
-
-def advanced(past: Past, record: Any, rate: Any, between: Any, weights: Any) -> Past:
-    """The past of the next step."""
-    return past._replace(
-        records=jnp.concatenate([record[None], past.records[:-1]]),
-        rate=rate,
-        between=jnp.concatenate([between[None], past.between[:-1]]),
-        weights=weights,
-    )
-
-
 def step(
     system: System, settings: Settings, past: Past, coefficients: Any, control: Any, t: Any,
     kept: Kept | None,
 ) -> Any:  # fmt: skip
     """One time step: the next past, the step's row, and what is kept of its linearisation."""
     history = history_of(past, coefficients, settings)
-    problem = StepProblem(system, t, control, coefficients[0], history, settings.space).ready()
-    recent = past_y(system, past)
+    own = keeps_stages(system, settings.time, settings.space)
+    problem = StepProblem(system, t, control, coefficients[0], history, settings.space, own_past=own).ready()
     # as sums of products, not as matrix products: XLA fuses these with what follows
-    guess = jnp.sum(past.weights[:, None, None] * recent, axis=0)
+    guess = jnp.sum(past.weights[:, None, None] * past.y, axis=0)
     unknowns = system.unknowns(guess[0])
     solution, kept = newton_keeping(problem, guess, unknowns, settings.elimination, settings.newton, kept)
-    record = problem.record(solution.y)
+    records = problem.records(solution.y)
     scale = system.scales().y
-    rate = coefficients[0] * record + history if settings.time.uses_rate else past.rate
+    rate = coefficients[0] * records + history if settings.time.uses_rate else past.rate
     size = jnp.max(jnp.abs(solution.y) / scale)
-    row = Rows(record, solution.unknowns, solution.error, solution.corrections, size)
-    extrapolated = jnp.sum(EXTRAPOLATIONS[:, :, None, None] * recent, axis=1)
+    shown = row_of(system, solution.y, records)
+    row = Rows(shown, solution.unknowns, solution.error, solution.corrections, size)
+    extrapolated = jnp.sum(EXTRAPOLATIONS[:, :, None, None] * past.y, axis=1)
     weights = weights_by(jnp.max(jnp.abs(extrapolated - solution.y) / scale, axis=(1, 2)))
-    between = solution.y[points_of(system).between]
-    return advanced(past, record, rate, between, weights), row, kept
+    return advanced(past, records, rate, solution.y, weights), row, kept
 
 
 def weights_by(misfit: Float[Any, " extrapolations"]) -> Float[Any, " past"]:
@@ -171,15 +67,15 @@ def _none_kept(system: System, settings: Settings, past: Past, control: Any) -> 
     if not settings.newton.across_steps:
         return None
     zero = jnp.zeros(())
-    problem = StepProblem(system, zero, control, zero, jnp.zeros_like(past.records[0]), settings.space)
-    y = past_y(system, past)[0]
+    problem = StepProblem(system, zero, control, zero, no_history(system, settings.space), settings.space)
+    y = past.y[0]
     return none_kept(problem, y, system.unknowns(y[0]), settings.elimination)
 
 
 def _no_rows(system: System, shape: tuple[int, ...], past: Past) -> Rows:
     """Rows of zeros, (steps,) or (robots, steps), for what a past is like."""
     return Rows(
-        jnp.zeros((*shape, *past.records.shape[-2:])),
+        jnp.zeros((*shape, system.nodes, past.records.shape[-1])),
         jnp.zeros((*shape, system.unknown_count)),
         jnp.zeros(shape),
         jnp.zeros(shape, dtype=int),

@@ -17,10 +17,9 @@ import numpy as np
 
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import Solution, newton
-from knode_cosserat.solvers.crossing import points_of
 from knode_cosserat.solvers.linear import Decoupled
-from knode_cosserat.solvers.march import EXTRAPOLATIONS, Past, advanced, history_of, past_y
-from knode_cosserat.solvers.problem import StepProblem
+from knode_cosserat.solvers.past import EXTRAPOLATIONS, Past, advanced, history_of
+from knode_cosserat.solvers.problem import StepProblem, keeps_stages, row_of
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.stability import natural_time
@@ -62,11 +61,12 @@ def attempt(
 
     The tip's conditions hold in `part`: of what they leave at `from_y` the rest is still left.
     """
-    problem = StepProblem(system, t, control, c0, history, settings.space).ready()
+    own = keeps_stages(system, settings.time, settings.space)
+    problem = StepProblem(system, t, control, c0, history, settings.space, own_past=own).ready()
     problem = dataclasses.replace(problem, tip_offset=(1.0 - part) * problem.tip_residual(from_y[-1]))
     patient = dataclasses.replace(settings.newton, max_linearisations=40)
     solution = newton(problem, y, unknowns, Decoupled(), patient)
-    return solution, problem.record(solution.y)
+    return solution, problem.records(solution.y)
 
 
 class _Step:
@@ -82,25 +82,23 @@ class _Step:
         self, control: Any, y: Any, unknowns: Any, part: float = 1.0, from_y: Any = None,
         system: System | None = None,
     ) -> tuple[Solution, Any]:  # fmt: skip
-        solution, record = attempt(
+        solution, records = attempt(
             system or self.system, self.settings, self.coefficients[0], self.history, control, self.t, y,
             unknowns, part, y if from_y is None else from_y,
         )  # fmt: skip
         self.corrections += int(solution.corrections)
-        return solution, record
+        return solution, records
 
     def guesses(self) -> list[tuple[Any, Any]]:
-        recent = past_y(self.system, self.past)
-        guesses = [jnp.einsum("p,pny->ny", w, recent) for w in EXTRAPOLATIONS[:2]]
+        guesses = [jnp.einsum("p,pny->ny", w, self.past.y) for w in EXTRAPOLATIONS[:2]]
         return [(y, self.system.unknowns(y[0])) for y in guesses]
 
     def solved(self, solution: Solution) -> bool:
         return bool(solution.error <= self.settings.newton.acceptable)
 
-    def after(self, solution: Solution, record: Any) -> Past:
-        rate = self.coefficients[0] * record + self.history
-        between = solution.y[points_of(self.system).between]
-        return advanced(self.past, record, rate, between, jnp.asarray(EXTRAPOLATIONS[0]))
+    def after(self, solution: Solution, records: Any) -> Past:
+        rate = self.coefficients[0] * records + self.history
+        return advanced(self.past, records, rate, solution.y, jnp.asarray(EXTRAPOLATIONS[0]))
 
 
 def recover(
@@ -141,11 +139,11 @@ def recover(
 
 
 def _outcome(result: Result, step: _Step, found: tuple[Solution, Any], control: Any = None) -> Outcome:
-    solution, record = found
+    solution, records = found
     return Outcome(
         result,
-        step.after(solution, record),
-        np.asarray(record),
+        step.after(solution, records),
+        np.asarray(row_of(step.system, solution.y, records)),
         np.asarray(solution.unknowns),
         float(solution.error),
         step.corrections,
@@ -271,7 +269,7 @@ def _relax(step: _Step, control: Any) -> tuple[Solution, Any] | None:
         part = target
         if dt > longest:
             break
-    y = past_y(step.system, now)[0]
+    y = now.y[0]
     found = step.solve(control, y, step.system.unknowns(y[0]))
     return found if step.solved(found[0]) else None
 

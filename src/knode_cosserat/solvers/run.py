@@ -15,7 +15,8 @@ from tqdm import tqdm
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import static_error
 from knode_cosserat.solvers.linear import ELIMINATIONS
-from knode_cosserat.solvers.march import Past, Rows, guessed_between, initial_past, march_many, march_one
+from knode_cosserat.solvers.march import Rows, march_many, march_one
+from knode_cosserat.solvers.past import Past, initial_past, newest_row, padded_rows, refined
 from knode_cosserat.solvers.recovery import Outcome, other_unit, recover
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
@@ -53,7 +54,7 @@ def run_one(
         A motion is judged by its first state, as if it rested there.
         """
         i = int(np.argmax(steps.size)) if still and steps.result.min() >= 0 else 0
-        record = steps.records[i] if still else start.past.records[0]
+        record = steps.records[i] if still else newest_row(system, start.past)
         return (
             decay_per_segment(system, task.settings, task.table[1], record, np.asarray(controls[i])) / parts
         )
@@ -105,25 +106,14 @@ def _with_finer_segments(
 
 def _refined(task: Task, system: System, fine: System, start: Start) -> Start:
     """The start on a finer grid; an equilibrium is the finer grid's own, or the motion began with a jolt."""
-    # imported here, where it is rarely needed: it would double this package's import time
-    from scipy.interpolate import make_interp_spline
-
-    coarse_s, fine_s = np.linspace(0.0, 1.0, system.nodes), np.linspace(0.0, 1.0, fine.nodes)
-
-    def refined(values: Any, axis: int) -> Any:
-        return make_interp_spline(coarse_s, np.asarray(values), k=min(3, system.nodes - 1), axis=axis)(fine_s)
-
-    records = refined(start.past.records, 1)
-    past = start.past._replace(
-        records=records, rate=refined(start.past.rate, 0), between=guessed_between(fine, records)
-    )
+    space = task.settings.space
+    past = refined(system, fine, space, start.past)
     if _is_still(task, system, start):
         still = dataclasses.replace(task, steps=1, first="still")
         found, _ = _with_recovery(still, fine, start.control[None], start._replace(past=past), False)
         if found.result[0] >= 0:
             kept = fine.y_layout.size + fine.z_layout.size
-            rests = initial_past(fine, found.records[0][:, :kept], start.control)
-            past = rests._replace(t0=start.past.t0)
+            past = initial_past(fine, task.settings, found.records[0][:, :kept], start.control, start.past.t0)
     return start._replace(past=past)
 
 
@@ -134,7 +124,8 @@ def _is_still(task: Task, system: System, start: Start) -> bool:
     records = np.asarray(start.past.records)
     if isinstance(task.settings.time, Static) or np.any(records != records[0]):
         return False
-    error = static_error(system, task.settings.space, records[0], start.control, start.past.t0)
+    row = newest_row(system, start.past)
+    error = static_error(system, task.settings.space, row, start.control, start.past.t0)
     return bool(error <= task.settings.newton.acceptable)
 
 
@@ -142,7 +133,7 @@ def _with_recovery(
     task: Task, system: System, controls: np.ndarray, start: Start, progress: bool
 ) -> tuple[Steps, str]:
     past, total, table, settings = start.past, task.steps, task.table, task.settings
-    padded = _padded(controls, least=LEAST_CAPACITY)
+    padded = padded_rows(controls, least=LEAST_CAPACITY)
     piece = max(1, total // 100) if progress else total
     rows: Steps | None = None
     done = rescues = 0
@@ -205,7 +196,7 @@ def run_batch(
     lockstep = jax.default_backend() != "cpu"
     workers = 1 if lockstep else usable_cores()
     chunk = size if lockstep else min(CHUNK, -(-size // workers))
-    padded = _padded(controls)
+    padded = padded_rows(controls)
 
     def robot(index: Any) -> System:
         return jax.tree.map(lambda leaf: leaf[index], system) if batched else system
@@ -260,15 +251,6 @@ def usable_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-def _padded(controls: Any, least: int = 1) -> np.ndarray:
-    """Controls filled up to a power of two, so that a run a little longer needs no new program."""
-    steps = controls.shape[-2]
-    capacity = max(least, 2 ** int(np.ceil(np.log2(steps))))
-    width = [(0, 0)] * controls.ndim
-    width[-2] = (0, capacity - steps)
-    return np.pad(controls, width, mode="edge")
 
 
 def _merged(rows: Steps | None, new: Rows, first: int, last: int, total: int) -> Steps:

@@ -18,8 +18,9 @@ import numpy as np
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import linearise, residuals
 from knode_cosserat.solvers.linear import Condensed, carried
-from knode_cosserat.solvers.march import Past, Rows, history_of, march_one
-from knode_cosserat.solvers.problem import StepProblem
+from knode_cosserat.solvers.march import Rows, march_one
+from knode_cosserat.solvers.past import Past, advanced, history_of
+from knode_cosserat.solvers.problem import StepProblem, keeps_stages, row_of
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.task import Task
 
@@ -51,7 +52,7 @@ def rollout(task: Task) -> Callable[[System, Any, Past], Rows]:
         d_system, d_controls, d_past = tangents
         d_records, d_unknowns = tangent_march(
             settings, table, dt, rows.records, rows.unknowns, system, controls, past, d_system, d_controls,
-            d_past.records[:2], d_past.rate,
+            d_past.records, d_past.rate,
         )  # fmt: skip
         still = np.zeros(steps, dtype=jax.dtypes.float0)
         return rows, Rows(d_records, d_unknowns, jnp.zeros_like(rows.error), still, jnp.zeros_like(rows.size))
@@ -61,30 +62,30 @@ def rollout(task: Task) -> Callable[[System, Any, Past], Rows]:
 
 @functools.partial(jax.jit, static_argnames="settings")
 def tangent_march(
-    settings: Settings, table: Any, dt: Any, records: Any, unknowns: Any, system: System, controls: Any,
+    settings: Settings, table: Any, dt: Any, rows: Any, unknowns: Any, system: System, controls: Any,
     past: Past, d_system: Any, d_controls: Any, d_records: Any, d_rate: Any,
 ) -> Any:  # fmt: skip
-    """Tangents of all records and unknowns, linear in those of system, controls and past."""
+    """Tangents of all rows and unknowns, linear in those of system, controls and past."""
     ny = system.y_layout.size
     y_scale = system.scales().y
 
     def one(carry: Any, now: Any) -> Any:
         past, d_recent, d_rate = carry
-        i, record, xi, control, d_control = now
+        i, row, xi, control, d_control = now
         coefficients = jnp.where(i == 0, table[0], table[1])
         t = past.t0 + (i + 1) * dt
-        y = record[:, :ny]
         history = history_of(past, coefficients, settings)
         d_history = coefficients[1] * d_recent[0] + coefficients[2] * d_recent[1]
         if settings.time.uses_rate:
             d_history = d_history + coefficients[3] * d_rate
 
         def problem_of(system: Any, control: Any, history: Any) -> StepProblem:
-            return StepProblem(system, t, control, coefficients[0], history, settings.space)
+            own = keeps_stages(system, settings.time, settings.space)
+            return StepProblem(system, t, control, coefficients[0], history, settings.space, own_past=own)
 
         problem = problem_of(system, control, history)
         linear = Condensed()
-        y = problem.filled(y)
+        y = problem.filled(row[:, :ny])
         linearisation = linearise(problem, y, xi)
         factors, _, _ = linear.start(linearisation, y_scale)
 
@@ -99,17 +100,16 @@ def tangent_march(
         dy, dxi = linear.solve(factors, defects, tip)
         dy = dy.at[0].add(base)
 
-        def record_of(system: Any, control: Any, history: Any, y: Any) -> Any:
-            return problem_of(system, control, history).record(y)
+        def kept_of(system: Any, control: Any, history: Any, y: Any) -> Any:
+            records = problem_of(system, control, history).records(y)
+            return records, row_of(system, y, records)
 
-        d_record = jax.jvp(record_of, (*given, y), (*d_given, dy))[1]
-        rate = coefficients[0] * record + history if settings.time.uses_rate else past.rate
-        d_rate = coefficients[0] * d_record + d_history if settings.time.uses_rate else d_rate
-        past = past._replace(records=jnp.concatenate([record[None], past.records[:-1]]), rate=rate)
-        return (past, jnp.stack([d_record, d_recent[0]]), d_rate), (d_record, dxi)
+        (records, _), (d_records, d_row) = jax.jvp(kept_of, (*given, y), (*d_given, dy))
+        rate = coefficients[0] * records + history if settings.time.uses_rate else past.rate
+        d_rate = coefficients[0] * d_records + d_history if settings.time.uses_rate else d_rate
+        past = advanced(past, records, rate, y, past.weights)
+        return (past, jnp.stack([d_records, d_recent[0]]), d_rate), (d_row, dxi)
 
-    steps = jnp.arange(records.shape[0])
-    _, tangents = jax.lax.scan(
-        one, (past, d_records, d_rate), (steps, records, unknowns, controls, d_controls)
-    )
+    steps = jnp.arange(rows.shape[0])
+    _, tangents = jax.lax.scan(one, (past, d_records, d_rate), (steps, rows, unknowns, controls, d_controls))
     return tangents

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import warnings
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -13,15 +13,15 @@ import numpy as np
 
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.solvers import sensitivity
+from knode_cosserat.solvers.begin import Beginning, Run, beginning
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.linear import LinearSolver
-from knode_cosserat.solvers.march import going_on_past, initial_past, rest_record
 from knode_cosserat.solvers.result import Result, SimulationError
 from knode_cosserat.solvers.run import as_ended, run_batch, run_one
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.stability import natural_time
-from knode_cosserat.solvers.task import Start, Steps, Task
+from knode_cosserat.solvers.task import Steps, Task
 from knode_cosserat.solvers.time import Static, TimeScheme
 from knode_cosserat.trajectory import Trajectory
 
@@ -59,8 +59,9 @@ def simulate(
         start: how the first step is made from one state; see `Settings`.
         initial: start from this trajectory's last row instead of the robot's state at rest (where that is
             only a guess, such as of a platform on bent legs: the equilibrium under no control). If its time
-            step is the same the motion goes on exactly, with the history of its last rows; only the
-            trapezoidal rule makes one step by BDF1 after a trajectory that itself began in motion.
+            step is the same the motion goes on exactly. Rows from the middle of a motion, and measured ones,
+            tell less: what lies between nodes is interpolated there, and a scheme that asks for their rates
+            (BDF-α, the trapezoidal rule) may make its first step by BDF1.
         newton: tolerances and limits of the solve in each step.
         elimination: of the linear equations: "condensed", or "decoupled" for rods along which much grows
             (soft or long ones in short time steps), to which a run changes by itself where it needs it. None
@@ -94,18 +95,6 @@ def simulate(
     if batch:
         return _batch(run, on_failure, progress)
     return _single(run, on_failure, progress)
-
-
-class Run(NamedTuple):
-    """The checked arguments of one call; `many` says that the systems themselves are batched."""
-
-    system: System
-    controls: Any
-    initial: Trajectory | None
-    settings: Settings
-    dt: float
-    batch: int | None
-    many: bool
 
 
 # checking what was given
@@ -226,113 +215,28 @@ def check_initial(system: System, initial: Trajectory, batch: int | None) -> Non
         )
 
 
-# where to start
-
-
-def _at_rest(system: System) -> Any:
-    record = rest_record(system)
-    return record, initial_past(system, record, jnp.zeros(system.control_size))
-
-
-_jit_at_rest = jax.jit(_at_rest)
-_jit_all_at_rest = jax.jit(jax.vmap(_at_rest))
-
-
-def beginning(run: Run) -> tuple[Any, Start, Any, Any]:
-    """The initial record(s), the start, its time, and how the first step is made."""
-    system, controls, initial, settings, dt, batch, many = run
-    if initial is not None:
-        return _going_on(system, initial, settings, dt)
-    record, past = (_jit_all_at_rest if many else _jit_at_rest)(system)
-    if system.rest_is_guess and not isinstance(settings.time, Static):
-        record, past = _settled(run, past)
-    if batch and not many:
-        record, past = jax.tree.map(lambda x: jnp.broadcast_to(x, (batch, *x.shape)), (record, past))
-    none_yet = np.zeros((*np.shape(controls)[:-2], system.control_size))
-    return record, Start(past, none_yet), 0.0, "start"
-
-
-def _settled(run: Run, past: Any) -> tuple[Any, Any]:
-    """The equilibrium under no control, looked for from rest: its record, and the past of it alone."""
-    system, many = run.system, run.many
-    task = Task(run.settings, run.dt, 1, "still")
-    none = np.zeros((1, system.control_size))
-    if is_traced((system, past)):
-        find = sensitivity.rollout(task)
-        rows = jax.vmap(find, in_axes=(0, None, 0))(system, none, past) if many else find(system, none, past)
-        found = rows.records[..., 0, :, :]
-    else:
-        each = range(np.shape(past.t0)[0]) if many else [...]
-        found = np.stack([_settled_one(task, _part(system, i), none, _part(past, i), i) for i in each])
-        found = found if many else found[0]
-    kept = found[..., : system.y_layout.size + system.z_layout.size]
-    return kept, (_jit_all_pasts if many else _jit_past)(system, kept)
-
-
-def _settled_one(task: Task, system: System, none: Any, past: Any, i: Any) -> Any:
-    """As `_settled`, of one robot; without an equilibrium there is nothing to begin with."""
-    steps, cause = run_one(task, system, none, Start(past, none[0]))
-    if steps.result[0] < 0:
-        robot = None if i is ... else i
-        raise SimulationError(0, 0.0, float(steps.error[0]), Result(int(steps.result[0])), cause, robot)
-    return np.asarray(steps.records[0])
-
-
-def _part(tree: Any, i: Any) -> Any:
-    return tree if i is ... else jax.tree.map(lambda leaf: leaf[i], tree)
-
-
-def _past_of(system: System, record: Any) -> Any:
-    return initial_past(system, record, jnp.zeros(system.control_size))
-
-
-_jit_past = jax.jit(_past_of)
-_jit_all_pasts = jax.jit(jax.vmap(_past_of))
-
-
-def _going_on(
-    system: System, initial: Trajectory, settings: Settings, dt: float
-) -> tuple[Any, Start, Any, Any]:
-    records = jnp.concatenate([initial.y, initial.z], axis=-1)
-    time = initial.time
-    one_state = initial_past(system, records[-1], initial.control[-1])._replace(t0=jnp.asarray(time[-1]))
-    # of traced times nothing can be said but that a trajectory's rows are as far apart as it is to go on
-    regular = len(time) > 1 and (is_traced(time) or np.isclose(time[-1] - time[-2], dt))
-    # the rate at the first row is not known if that was in motion; long enough after, most schemes forget it
-    unforgotten = abs(settings.time.coefficients(dt, dt).d1) ** (len(time) - 1)
-    rate_known = unforgotten < 1e-9 or (not is_traced(time) and time[0] == 0.0)
-    past, first = one_state, "start"
-    if regular and not system.mixed and not isinstance(settings.time, Static):
-        if rate_known:
-            past, first = going_on_past(system, settings, dt, records, time[-1]), "regular"
-        else:
-            first = "consistent"
-    found = initial.settings is not None and isinstance(initial.settings.time, Static)
-    return records[-1], Start(past, initial.control[-1], found), time[-1], first
-
-
 # the three ways to run
 
 
 def _single(run: Run, on_failure: str, progress: bool) -> Trajectory:
     system, controls, _, settings, dt, _, _ = run
-    record, start, t0, first = beginning(run)
-    task = Task(settings, dt, len(controls), first)
-    steps, cause = run_one(task, system, controls, start, progress)
+    begins = beginning(run)
+    task = Task(settings, dt, len(controls), begins.first)
+    steps, cause = run_one(task, system, controls, begins.start, progress)
     if on_failure == "raise" and steps.result.min() < 0:
-        raise _failure(task, float(t0), steps, cause, None)
-    return _trajectory(run._replace(settings=as_ended(settings, steps)), record, start.control, t0, steps)
+        raise _failure(task, float(begins.t0), steps, cause, None)
+    return _trajectory(run._replace(settings=as_ended(settings, steps)), begins, steps)
 
 
 def _batch(run: Run, on_failure: str, progress: bool) -> Trajectory:
     system, controls, _, settings, dt, _, many = run
-    record, start, t0, _ = beginning(run)
+    begins = beginning(run)
     task = Task(settings, dt, controls.shape[1])
-    steps, causes = run_batch(task, system, many, controls, start, progress)
+    steps, causes = run_batch(task, system, many, controls, begins.start, progress)
     if on_failure == "raise" and causes:
         robot, cause = next(iter(causes.items()))
         raise _failure(task, 0.0, Steps(*(leaf[robot] for leaf in steps)), cause, robot)
-    return _trajectory(run, record, start.control, t0, steps)
+    return _trajectory(run, begins, steps)
 
 
 def _failure(task: Task, t0: float, steps: Steps, cause: str, robot: int | None) -> SimulationError:
@@ -350,20 +254,20 @@ def _traced(system, controls, initial, settings, dt, batch, many):  # type: igno
     One jitted call, so that a transformation traces it once and not at every call.
     """
     run = Run(system, controls, initial, settings, dt, batch, many)
-    record, start, t0, first = beginning(run)
-    one = sensitivity.rollout(Task(settings, dt, np.shape(controls)[-2], first))
+    begins = beginning(run)
+    one = sensitivity.rollout(Task(settings, dt, np.shape(controls)[-2], begins.first))
     if batch:
-        rows = jax.vmap(one, in_axes=(0 if many else None, 0, 0))(system, controls, start.past)
+        rows = jax.vmap(one, in_axes=(0 if many else None, 0, 0))(system, controls, begins.start.past)
     else:
-        rows = one(system, controls, start.past)
+        rows = one(system, controls, begins.start.past)
     result = jnp.where(rows.error <= settings.newton.acceptable, 0, int(Result.NO_CONVERGENCE))
-    return _trajectory(run, record, start.control, t0, Steps._make([*rows, result]))
+    return _trajectory(run, begins, Steps._make([*rows, result]))
 
 
-def _trajectory(run: Run, record: Any, control: Any, t0: Any, steps: Steps) -> Trajectory:
+def _trajectory(run: Run, begins: Beginning, steps: Steps) -> Trajectory:
     """Put the initial row before the steps, and NaN where there is no solution."""
     system, controls, _, settings, dt, batch, _ = run
-    numeric: Any = jnp if is_traced((record, steps)) else np
+    numeric: Any = jnp if is_traced((begins.record, steps)) else np
     axis = 1 if batch else 0
     ny, nz = system.y_layout.size, system.z_layout.size
     invalid = numeric.asarray(steps.result) < 0
@@ -372,16 +276,17 @@ def _trajectory(run: Run, record: Any, control: Any, t0: Any, steps: Steps) -> T
     def joined(first: Any, rest: Any) -> Any:
         return numeric.concatenate([numeric.expand_dims(first, axis), rest], axis)
 
-    states = joined(numeric.asarray(record)[..., : ny + nz], records)
+    states = joined(numeric.asarray(begins.record)[..., : ny + nz], records)
     zero = numeric.zeros(states.shape[:axis])
     return Trajectory(
         system=system,
         settings=settings,
-        time=t0 + np.arange(np.shape(controls)[-2] + 1) * dt,
+        time=begins.t0 + np.arange(np.shape(controls)[-2] + 1) * dt,
         y=states[..., :ny],
         z=states[..., ny:],
-        control=joined(control, controls),
+        control=joined(begins.start.control, controls),
         result=joined(zero.astype(int), steps.result),
         residual=joined(zero, steps.error),
         iterations=joined(zero.astype(int), steps.corrections),
+        begun=jax.tree.map(numeric.asarray, begins.begun),
     )

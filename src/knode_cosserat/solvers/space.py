@@ -5,23 +5,23 @@ from __future__ import annotations
 import abc
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-#: y_s at (s, y, what is known there: a record of history)
-SpatialDerivative = Callable[[Any, Any, Any], Any]
+#: (y_s, whatever else is found there) at (s, y, what is known of that stage)
+Rates = Callable[[Any, Any, Any], tuple[Any, Any]]
 
 
 @dataclasses.dataclass(frozen=True)
 class SpaceScheme(abc.ABC):
     """An explicit one-step scheme in arclength."""
 
-    #: whether history is needed in the middle of a segment
-    uses_middle = False
+    #: where its stages are, as parts of a segment; the first at its start
+    parts: ClassVar[tuple[float, ...]]
 
     @property
     @abc.abstractmethod
@@ -29,10 +29,11 @@ class SpaceScheme(abc.ABC):
         """Order of convergence in the segment's length."""
 
     @abc.abstractmethod
-    def advance(
-        self, y_s: SpatialDerivative, s: Any, ds: Any, y: Float[Any, " y"], known: tuple[Any, Any, Any]
-    ) -> Float[Any, " y"]:
-        """y at s + ds from y at s; `known` is what `y_s` is given of s, s + ds/2 and s + ds: the history."""
+    def advance(self, rates: Rates, s: Any, ds: Any, y: Float[Any, " y"], known: Any) -> tuple[Any, Any]:
+        """y at s + ds from y at s, and what else `rates` found at each stage, stacked.
+
+        `known` is what `rates` is given of each stage, stacked too: its past, and what was evaluated ahead.
+        """
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,14 +41,16 @@ class Euler(SpaceScheme):
     """Forward Euler, the paper's. Order 1: at 10 nodes a few per cent of the tip's deflection."""
 
     order = 1
+    parts = (0.0,)
 
-    def advance(self, y_s, s, ds, y, known):  # type: ignore[no-untyped-def]
+    def advance(self, rates, s, ds, y, known):  # type: ignore[no-untyped-def]
         """One evaluation, at the segment's start."""
-        return y + ds * y_s(s, y, known[0])
+        y_s, found = rates(s, y, jax.tree.map(lambda each: each[0], known))
+        return y + ds * y_s, jax.tree.map(lambda each: each[None], found)
 
 
-#: where the stages of the classical scheme are, as parts of the segment, and what each counts
-RK4_PARTS, RK4_WEIGHTS = np.array([0.0, 0.5, 0.5, 1.0]), np.array([1.0, 2.0, 2.0, 1.0]) / 6
+#: what each stage of the classical scheme counts
+RK4_WEIGHTS = np.array([1.0, 2.0, 2.0, 1.0]) / 6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,41 +58,25 @@ class RK4(SpaceScheme):
     """The classical Runge-Kutta scheme. Order 4, four evaluations a segment."""
 
     order = 4
-    uses_middle = True
+    parts = (0.0, 0.5, 0.5, 1.0)
 
-    def advance(self, y_s, s, ds, y, known):  # type: ignore[no-untyped-def]
+    def advance(self, rates, s, ds, y, known):  # type: ignore[no-untyped-def]
         """Evaluations at the start, twice in the middle, and at the end."""
-        start, middle, end = known
-        # a loop, for four copies of the equations take several times as long to compile, and are no faster
-        stages = jax.tree.map(lambda *each: jnp.stack(each), start, middle, middle, end)
 
+        # a loop, for four copies of the equations take several times as long to compile, and are no faster
         def stage(reached: tuple[Any, Any], given: tuple[Any, Any, Any]) -> Any:
             total, k = reached
             part, weight, there = given
-            k = y_s(s + part * ds, y + part * ds * k, there)
-            return (total + weight * ds * k, k), None
+            k, found = rates(s + part * ds, y + part * ds * k, there)
+            return (total + weight * ds * k, k), found
 
         # the first stage takes nothing of k: any will do that has slopes and batches as it will have, or JAX
         # traces the equations twice to find out
-        (total, _), _ = jax.lax.scan(stage, (y, y), (RK4_PARTS, RK4_WEIGHTS, stages))
-        return total
+        (total, _), found = jax.lax.scan(stage, (y, y), (np.array(self.parts), RK4_WEIGHTS, known))
+        return total, found
 
 
 SCHEMES: dict[str, SpaceScheme] = {"euler": Euler(), "rk4": RK4()}
-
-
-def middles(values: Float[Any, "nodes x"]) -> Float[Any, "segments x"]:
-    """Values half-way between neighbouring nodes, by cubic interpolation.
-
-    Order 4, like RK4: a mean of two neighbours would hold the whole solution to order 2.
-    """
-    count = values.shape[0]
-    if count < 4:
-        return (values[:-1] + values[1:]) / 2
-    inner = (9 * (values[1:-2] + values[2:-1]) - values[:-3] - values[3:]) / 16
-    first = (5 * values[0] + 15 * values[1] - 5 * values[2] + values[3]) / 16
-    last = (5 * values[-1] + 15 * values[-2] - 5 * values[-3] + values[-4]) / 16
-    return jnp.concatenate([first[None], inner, last[None]])
 
 
 class Along(NamedTuple):

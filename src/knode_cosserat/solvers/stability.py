@@ -31,11 +31,11 @@ def natural_time(system: System) -> float | None:
 
 
 @jax.jit
-def _jacobians(problem: StepProblem, y: Any) -> Any:
+def _jacobians(problem: StepProblem, y: Any, history: Any) -> Any:
     def at_node(s: Any, y: Any, history: Any) -> Any:
         return jax.jacfwd(lambda y: problem.point_rates(s, y, history)[0])(y)
 
-    return problem.at_nodes(at_node, y)
+    return problem.at_nodes(at_node, y, history)
 
 
 def decay_per_segment(
@@ -47,8 +47,9 @@ def decay_per_segment(
     """
     c0 = np.asarray(coefficients, dtype=float)[0]
     record = np.asarray(record)
-    problem = StepProblem(system, np.zeros(()), np.asarray(control), c0, -c0 * record, settings.space)
-    jacobians = np.asarray(_jacobians(problem, record[:, : system.y_layout.size]))
+    nothing = np.zeros((0, 0, 0))
+    problem = StepProblem(system, np.zeros(()), np.asarray(control), c0, nothing, settings.space)
+    jacobians = np.asarray(_jacobians(problem, record[:, : system.y_layout.size], -c0 * record))
     if not np.all(np.isfinite(jacobians)):
         return 0.0
     z = np.linalg.eigvals(jacobians).ravel() * float(system.length) / (system.nodes - 1)

@@ -7,9 +7,11 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.begin import Run, beginning
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.linear import LinearSolver
 from knode_cosserat.solvers.march import march_one
+from knode_cosserat.solvers.past import Begun, newest_row
 from knode_cosserat.solvers.result import Result, SimulationError
 from knode_cosserat.solvers.run import (
     ENOUGH_RESCUES,
@@ -17,7 +19,7 @@ from knode_cosserat.solvers.run import (
     rescue,
     with_stable_elimination,
 )
-from knode_cosserat.solvers.simulate import Run, beginning, check_initial, checked_dt, settings_of
+from knode_cosserat.solvers.simulate import check_initial, checked_dt, settings_of
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.stability import SAFE_DECAY, decay_per_segment
 from knode_cosserat.solvers.task import Task
@@ -81,10 +83,9 @@ class Stepper:
         if initial is not None:
             check_initial(robot, initial, None)
         count = robot.control_size
-        record, begun, t0, first = beginning(
-            Run(robot, np.zeros((1, count)), initial, settings, self.dt, None, False)
-        )
-        self._task = Task(settings, self.dt, 1, first)
+        begins = beginning(Run(robot, np.zeros((1, count)), initial, settings, self.dt, None, False))
+        begun, t0 = begins.start, begins.t0
+        self._task = Task(settings, self.dt, 1, begins.first)
         self._settings = settings
         self._past, self._t0, self._index, self._steps = begun.past, float(t0), 0, 0
         self._control = np.asarray(begun.control, dtype=float)
@@ -93,7 +94,8 @@ class Stepper:
         self._rescues = 0
         # as many as in a run of up to 128 steps, so that they share a program
         self._controls = np.zeros((LEAST_CAPACITY, count))
-        self._state = self._row(_Solved(None, np.asarray(record), 0, 0.0, 0), self._control, self.time)
+        first = _Solved(begun.past, np.asarray(begins.record), 0, 0.0, 0)
+        self._state = self._row(first, self._control, self.time, begins.begun)
 
     @property
     def time(self) -> float:
@@ -124,13 +126,14 @@ class Stepper:
             # the march counts from an earlier row on, but not from row 0, whose coefficients may differ
             self._index = 1
             self._past = self._past._replace(t0=np.asarray(self.time - self.dt))
-        self._state = self._row(solved, control, self.time)
+        self._state = self._row(solved, control, self.time, self._begun_after(solved))
         return self._state
 
     def preview(self, control: Any) -> Trajectory:
         """What `step` would give, without going there. Raises what that would raise."""
         control = self._checked(control)
-        return self._row(self._solve(control), control, self.time + self.dt)
+        solved = self._solve(control)
+        return self._row(solved, control, self.time + self.dt, self._begun_after(solved))
 
     def _checked(self, control: Any) -> np.ndarray:
         fields = self.robot.control_layout.fields
@@ -188,13 +191,18 @@ class Stepper:
     def _may_be_unstable(self, control: np.ndarray) -> bool:
         """Whether its segments are long enough for that, as `simulate` judges it: by the first step."""
         if self._decay is None:
-            record = self._begun.past.records[0]
+            record = newest_row(self.robot, self._begun.past)
             self._decay = decay_per_segment(
                 self.robot, self._task.settings, self._task.table[1], record, control
             )
         return self._decay >= SAFE_DECAY / 4.0
 
-    def _row(self, solved: _Solved, control: np.ndarray, time: float) -> Trajectory:
+    def _begun_after(self, solved: _Solved) -> Begun:
+        """What a motion that goes on from a step looks back on."""
+        past = solved.past
+        return Begun(*map(np.asarray, (past.records, past.rate, self._task.table[1], self.dt)))
+
+    def _row(self, solved: _Solved, control: np.ndarray, time: float, begun: Begun | None) -> Trajectory:
         ny, nz = self.robot.y_layout.size, self.robot.z_layout.size
         record = solved.record[None, :, : ny + nz]
         return Trajectory(
@@ -207,4 +215,5 @@ class Stepper:
             result=np.array([solved.result]),
             residual=np.array([solved.residual]),
             iterations=np.array([solved.corrections]),
+            begun=begun,
         )

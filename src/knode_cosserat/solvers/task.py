@@ -7,8 +7,10 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from knode_cosserat.solvers.march import Past, coefficient_table
+from knode_cosserat.solvers.past import Past, coefficient_table
 from knode_cosserat.solvers.settings import Settings
+
+FirstStep = Literal["start", "regular", "consistent", "still"]
 
 
 class Steps(NamedTuple):
@@ -40,7 +42,7 @@ class Task:
     steps: int
     #: the first step: as the settings say, like any other (the past holds real states), or by BDF1; or every
     #: step without rates, an equilibrium (by the program of a simulation with these settings)
-    first: Literal["start", "regular", "consistent", "still"] = "start"
+    first: FirstStep = "start"
 
     @property
     def table(self) -> np.ndarray:

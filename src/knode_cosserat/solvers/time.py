@@ -25,7 +25,7 @@ class Coefficients(NamedTuple):
 class TimeScheme(abc.ABC):
     """An implicit scheme in time."""
 
-    #: whether y_t of the previous step enters, and so must be kept
+    #: whether y_t of the previous step enters, and so must be kept; if not, what is too fast dies out
     uses_rate = False
 
     @property

@@ -52,7 +52,7 @@ def trustworthy(steps: Steps, system: System, start: Start, still: bool, decay: 
 
 def trusted_size(system: System, start: Start) -> float:
     """Numbers of y up to this, in natural units, are not suspicious: more if it starts with large ones."""
-    y = np.asarray(start.past.records[0])[:, : system.y_layout.size]
+    y = np.asarray(start.past.y[0])
     return SUSPICIOUS * max(1.0, float(np.max(np.abs(y) / np.asarray(system.scales().y))))
 
 

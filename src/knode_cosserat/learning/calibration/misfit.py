@@ -56,8 +56,7 @@ def _differences(robot, coordinates, data, length, unknowns, space):  # type: ig
         return jnp.concatenate([record[..., :-ny], record[..., -ny:] * (length / system.length)], axis=-1)
 
     def of_segment(sample: Samples) -> Any:
-        history: Any = tuple(scaled(record) for record in sample.history)
-        own = sample._replace(history=history, later=scaled(sample.later))
+        own = sample._replace(history=scaled(sample.history), later=scaled(sample.later))
         y_next, z = predict(system, space, own)
         return jnp.concatenate([y_next - sample.y_next, z - sample.z])
 
@@ -205,13 +204,12 @@ class SegmentMisfit:
         def remembered(history: Any, noise: Any) -> Any:
             return history + record[: history.shape[-1]] * noise
 
-        history: Any = tuple(map(remembered, own.history, segments.history))
         return (
             own._replace(
                 y=own.y + in_y * segments.y,
                 z=own.z + in_z * segments.z,
                 y_next=own.y_next + in_y * segments.y_next,
-                history=history,
+                history=remembered(own.history, segments.history),
                 later=remembered(own.later, segments.later),
             ),
             own_tips._replace(

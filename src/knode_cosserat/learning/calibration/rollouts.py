@@ -25,13 +25,13 @@ from knode_cosserat.learning.calibration.unknowns import Unknowns, found, with_c
 from knode_cosserat.learning.samples import DataError, samples
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.begin import Run, beginning
 from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.march import Past, initial_past, rest_record
+from knode_cosserat.solvers.past import Past, initial_past, resting_past
 from knode_cosserat.solvers.places import Places, places_at, positions_at, quaternions_at
 from knode_cosserat.solvers.run import run_one
 from knode_cosserat.solvers.sensitivity import tangent_march
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.simulate import Run, beginning
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.task import Task
 from knode_cosserat.trajectory import Trajectory
@@ -82,17 +82,18 @@ class _Rows(NamedTuple):
     target: Float[Any, "T M k"]
 
 
-@functools.partial(jax.jit, static_argnames=("unknowns", "settings", "oriented"))
-def _differences(robot, coordinates, rows, table, dt, unknowns, settings, oriented):  # type: ignore[no-untyped-def]
+@functools.partial(jax.jit, static_argnames=("unknowns", "settings", "oriented", "one_state"))
+def _differences(robot, coordinates, rows, table, dt, unknowns, settings, oriented, one_state):  # type: ignore[no-untyped-def]
     """Differences (M,) of solved rows from what was measured, and their derivatives (M, n)."""
     ny = robot.y_layout.size
 
     def start(x: Any) -> Any:
         system = with_coordinates(robot, unknowns, x)
         if rows.before is None:
-            return system, initial_past(system, rest_record(system), jnp.zeros(system.control_size))
-        if system.mixed:
-            return system, initial_past(system, *rows.before)._replace(t0=rows.past.t0)
+            return system, resting_past(system, settings)
+        if system.mixed and one_state:
+            record, control = rows.before
+            return system, initial_past(system, settings, record, control, rows.past.t0)
         return system, rows.past
 
     def left(y: Any) -> Any:
@@ -109,7 +110,7 @@ def _differences(robot, coordinates, rows, table, dt, unknowns, settings, orient
         (system, past), (d_system, d_past) = jax.jvp(start, (coordinates,), (direction,))
         d_records, _ = tangent_march(
             settings, table, dt, rows.records, rows.unknowns, system, rows.control, past, d_system,
-            jnp.zeros_like(rows.control), d_past.records[:2], d_past.rate,
+            jnp.zeros_like(rows.control), d_past.records, d_past.rate,
         )  # fmt: skip
         return jax.jvp(left, (rows.records[..., :ny],), (d_records[..., :ny],))[1]
 
@@ -225,16 +226,17 @@ class RolloutMisfit:
 
     def _of_one(self, system: System, coordinates: np.ndarray, rollout: _Rollout) -> Differences | None:
         settings, dt, initial, control, places, target = rollout
-        record, begun, _, first = beginning(Run(system, control, initial, settings, dt, None, False))
-        task = Task(settings, dt, len(control), first)
-        steps, _ = run_one(task, system, control, begun)
+        begins = beginning(Run(system, control, initial, settings, dt, None, False))
+        task = Task(settings, dt, len(control), begins.first)
+        steps, _ = run_one(task, system, control, begins.start)
         if steps.result.min() < 0:
             return None
-        before = None if initial is None else (record, np.asarray(initial.control)[-1])
-        rows = _Rows(steps.records, steps.unknowns, begun.past, before, control, places, target)
+        before = None if initial is None else (begins.record, np.asarray(initial.control)[-1])
+        rows = _Rows(steps.records, steps.unknowns, begins.start.past, before, control, places, target)
         values, slopes = _differences(
-            self.robot, coordinates, rows, task.table, dt, self.unknowns, settings, self.oriented
-        )
+            self.robot, coordinates, rows, task.table, dt, self.unknowns, settings, self.oriented,
+            begins.first == "start",
+        )  # fmt: skip
         return Differences(np.asarray(values), np.asarray(slopes))
 
     def blocks(self, values: Float[np.ndarray, " M"]) -> list[tuple[np.ndarray, np.ndarray]]:

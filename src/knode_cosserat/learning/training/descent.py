@@ -203,10 +203,9 @@ def _noisy(samples: Samples, data: Data, noise: Any, key: Any) -> Samples:
     for_y, for_history = jax.random.split(key)
     y = samples.y + noise * data.y_spread * jax.random.normal(for_y, samples.y.shape)
     # the same along the segment: as if the whole past were a little different
-    shift = noise * data.history_spread * jax.random.normal(for_history, samples.history[0].shape)
-    start, middle, end = (part + shift for part in samples.history)
+    shift = noise * data.history_spread * jax.random.normal(for_history, samples.history[:, 0].shape)
     later = samples.later + shift[:, None, None]
-    return samples._replace(y=y, history=(start, middle, end), later=later)
+    return samples._replace(y=y, history=samples.history + shift[:, None], later=later)
 
 
 def _rate(recipe: Recipe, numbers: Numbers, epoch: Any, rate: Any) -> Any:
@@ -303,7 +302,7 @@ def prepared(
     data = Data(
         knowledge, rest, None if ready else segments, ready,
         loss_for(training.loss, knowledge, segments),
-        spread(segments.y, per_y), spread(segments.history[0], fields),
+        spread(segments.y, per_y), spread(segments.history[:, 0], fields),
     )  # fmt: skip
     return recipe, numbers, jax.tree.map(jnp.asarray, data)
 

@@ -1,0 +1,318 @@
+"""Where a simulation begins: at rest, in an equilibrium to be found, or where another motion ends."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.rods.system import System, is_traced
+from knode_cosserat.solvers import sensitivity
+from knode_cosserat.solvers.between import at_stages
+from knode_cosserat.solvers.crossing import points_of, spread
+from knode_cosserat.solvers.past import (
+    Begun,
+    Motion,
+    Past,
+    begun_between,
+    coefficient_table,
+    initial_past,
+    padded_rows,
+    past_along,
+    past_of_one,
+    rest_record,
+    resting_past,
+    rows_tell,
+)
+from knode_cosserat.solvers.problem import no_history
+from knode_cosserat.solvers.result import Result, SimulationError
+from knode_cosserat.solvers.run import run_one
+from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.solvers.task import FirstStep, Start, Task
+from knode_cosserat.solvers.time import Static
+from knode_cosserat.trajectory import Trajectory
+
+#: a rate that was not known counts less than this after so many steps as are looked at
+FORGOTTEN = 1e-9
+#: row 0 is that of rest if it is off by less than this (natural units)
+AT_REST = 1e-12
+
+
+class Run(NamedTuple):
+    """The checked arguments of one call; `many` says that the systems themselves are batched."""
+
+    system: System
+    controls: Any
+    initial: Trajectory | None
+    settings: Settings
+    dt: float
+    batch: int | None
+    many: bool
+
+
+class Beginning(NamedTuple):
+    """Where a run begins."""
+
+    #: y and z at the nodes
+    record: Any
+    start: Start
+    #: time of that (s)
+    t0: Any
+    #: how the first step is made (`Task.first`)
+    first: FirstStep
+    #: of a motion: what its first step looks back on
+    begun: Begun | None
+
+
+def beginning(run: Run) -> Beginning:
+    """Where a run begins."""
+    system, controls, initial, settings, dt, batch, many = run
+    if initial is not None:
+        return _going_on(system, initial, settings, dt)
+    record, past = (_all_at_rest if many else _at_rest)(system, _of_past(settings))
+    still = isinstance(settings.time, Static)
+    if system.rest_is_guess and not still:
+        record, past = _settled(run, past)
+    begun = None if still else _begun(past, Task(settings, dt, 1).table[0], dt)
+
+    def for_each(tree: Any) -> Any:
+        return jax.tree.map(lambda x: jnp.broadcast_to(x, (batch, *jnp.shape(x))), tree)
+
+    if batch and not many:
+        record, past, begun = for_each((record, past, begun))
+    elif batch and begun is not None:
+        begun = begun._replace(coefficients=for_each(begun.coefficients), dt=for_each(begun.dt))
+    none_yet = np.zeros((*np.shape(controls)[:-2], system.control_size))
+    return Beginning(record, Start(past, none_yet), 0.0, "start", begun)
+
+
+# at rest, or in equilibrium
+
+
+def _of_past(settings: Settings) -> Settings:
+    """What of the settings matters for the past: runs that differ in other things share its programs."""
+    return Settings(settings.time, settings.space, settings.start)
+
+
+@functools.partial(jax.jit, static_argnames="settings")
+def _at_rest(system: System, settings: Settings) -> Any:
+    return rest_record(system), resting_past(system, settings)
+
+
+@functools.partial(jax.jit, static_argnames="settings")
+def _all_at_rest(system: System, settings: Settings) -> Any:
+    return jax.vmap(lambda each: _at_rest(each, settings))(system)
+
+
+def _settled(run: Run, past: Any) -> tuple[Any, Any]:
+    """The equilibrium under no control, looked for from rest: its record, and the past of it alone."""
+    system, many = run.system, run.many
+    task = Task(run.settings, run.dt, 1, "still")
+    none = np.zeros((1, system.control_size))
+    if is_traced((system, past)):
+        find = sensitivity.rollout(task)
+        rows = jax.vmap(find, in_axes=(0, None, 0))(system, none, past) if many else find(system, none, past)
+        found = rows.records[..., 0, :, :]
+    else:
+        each = range(np.shape(past.t0)[0]) if many else [...]
+        found = np.stack([_settled_one(task, _part(system, i), none, _part(past, i), i) for i in each])
+        found = found if many else found[0]
+    kept = found[..., : system.y_layout.size + system.z_layout.size]
+    return kept, (_all_pasts if many else _past)(system, _of_past(run.settings), kept, none[0], 0.0)
+
+
+def _settled_one(task: Task, system: System, none: Any, past: Any, i: Any) -> Any:
+    """As `_settled`, of one robot; without an equilibrium there is nothing to begin with."""
+    steps, cause = run_one(task, system, none, Start(past, none[0]))
+    if steps.result[0] < 0:
+        robot = None if i is ... else i
+        raise SimulationError(0, 0.0, float(steps.error[0]), Result(int(steps.result[0])), cause, robot)
+    return np.asarray(steps.records[0])
+
+
+def _part(tree: Any, i: Any) -> Any:
+    return tree if i is ... else jax.tree.map(lambda leaf: leaf[i], tree)
+
+
+_past = jax.jit(initial_past, static_argnames="settings")
+
+
+@functools.partial(jax.jit, static_argnames="settings")
+def _all_pasts(system: System, settings: Settings, rows: Any, control: Any, t0: Any) -> Any:
+    return jax.vmap(lambda each, row: initial_past(each, settings, row, control, t0))(system, rows)
+
+
+# where another motion ends
+
+
+def _going_on(system: System, initial: Trajectory, settings: Settings, dt: float) -> Beginning:
+    record = jnp.concatenate([initial.y[-1], initial.z[-1]], axis=-1)
+    control, t0 = initial.control[-1], initial.time[-1]
+    made = initial.settings
+    rests = made is not None and isinstance(made.time, Static)
+    still = isinstance(settings.time, Static)
+    known = None if rests or still else _known(system, initial, settings, dt)
+    first: FirstStep = "start"
+    if still:
+        past = _shape(system, settings.space, record, t0)
+    elif known is None:
+        past = _past(system, _of_past(settings), record, control, t0)
+    else:
+        past, first = known
+    begun = None if still else _begun(past, Task(settings, dt, 1, first).table[0], dt)
+    # of this robot: one of another is no more than where this one begins
+    found = rests and not is_traced((initial, system)) and _same(initial.system, system)
+    return Beginning(record, Start(past, control, found), t0, first, begun)
+
+
+def _same(one: System, other: System) -> bool:
+    """Whether two systems are the same in all their numbers."""
+    leaves, others = jax.tree.leaves(one), jax.tree.leaves(other)
+    alike: Any = jax.tree.structure(one), jax.tree.structure(other)
+    return bool(alike[0] == alike[1]) and all(map(np.array_equal, leaves, others))
+
+
+@functools.partial(jax.jit, static_argnames="space")
+def _shape(system: System, space: SpaceScheme, record: Any, t0: Any) -> Past:
+    """A past of a shape, where an equilibrium is looked for: what is between nodes is interpolated."""
+    more = no_history(system, space).shape[-1] - record.shape[-1]
+    y = spread(points_of(system), record[:, : system.y_layout.size])
+    return past_of_one(at_stages(system, space, jnp.pad(record, ((0, 0), (0, more)))), y, t0)
+
+
+def _begun(past: Past, coefficients: Any, dt: Any) -> Begun:
+    return Begun(past.records, past.rate, np.asarray(coefficients), np.asarray(dt))
+
+
+def _known(
+    system: System, initial: Trajectory, settings: Settings, dt: float
+) -> tuple[Past, FirstStep] | None:
+    """The past that a motion's rows tell of, and how the first step after it is made; None: of one state.
+
+    What was simulated on the same points and stages is looked at as it moved, and other states as they are
+    between nodes.
+    """
+    rows: Any = jnp.concatenate([initial.y, initial.z], axis=-1)
+    made = initial.settings
+    moved = made is not None and made.space == settings.space and _alike(initial.system, system)
+    if moved:
+        system, made = initial.system, _of_past(made)
+    else:
+        made = _of_past(settings)
+    again = moved or rows_tell(system, settings)
+    known = (_of_first_rows if again else _of_last_rows)(system, made, initial, rows, dt)
+    if known is None:
+        return None
+    begun, row, rate_known, regular = known
+    count = len(rows) - row
+    controls: Any = initial.control[row:]
+    rows = rows[row:]
+    if not is_traced((rows, controls)):
+        packed = padded_rows(np.reshape(rows, (count, -1)))
+        rows, controls = packed.reshape(-1, *np.shape(rows)[1:]), padded_rows(controls)
+    # what was found on finer segments does not solve the equations on these
+    solved = is_traced(initial.result) or not np.any(initial.result == Result.RECOVERED_FINER_SEGMENTS)
+    motion = Motion(begun, regular, rows, controls, initial.time[row], count)
+    past, _ = _along(system, made, motion, solved=bool(solved))
+    alone = past_of_one(past.records[0], past.y[0], past.t0)
+    # of traced times nothing can be said but that a trajectory's rows are as far apart as it is to go on
+    if not is_traced(begun.dt) and not np.isclose(begun.dt, dt):
+        return alone, "start"
+    if settings.time.uses_rate and not rate_known:
+        # the rate at the first row is not known if that was in motion; long enough after, most schemes forget
+        forgotten = float(abs(made.time.coefficients(dt, dt).d1)) ** (count - 1)
+        if forgotten >= FORGOTTEN:
+            return alone, "consistent"
+    return past, "regular"
+
+
+def _alike(one: System, other: System) -> bool:
+    """Whether stages are the same, and what is kept of them."""
+
+    def grid(system: System) -> Any:
+        return system.cuts, system.nodes, system.strands, system.mixed
+
+    return bool(grid(one) == grid(other))
+
+
+class _Known(NamedTuple):
+    """What is known of a motion at one of its rows, whether its rate is, and coefficients of its steps."""
+
+    begun: Begun
+    row: int
+    rate: bool
+    regular: np.ndarray
+
+
+def _apart(times: Any, dt: float) -> float:
+    """By what the last two of these times differ; of traced ones that is not known, but what it is to be."""
+    return dt if is_traced(times) else float(times[-1] - times[-2])
+
+
+def _of_first_rows(
+    system: System, made: Settings, initial: Trajectory, rows: Any, dt: float
+) -> _Known | None:
+    """What is known at a motion's first row, or its second."""
+    time, begun = initial.time, initial.begun
+    if begun is not None and begun.rate.shape == no_history(system, made.space).shape:
+        regular = coefficient_table(made, dt if is_traced(begun) else float(begun.dt))[1]
+        # of one row alone that was the first of a motion nothing before it is known; of a traced one it is
+        # not known whether it was
+        if len(time) > 1 or is_traced(begun) or np.any(begun.records[0] != begun.records[1]):
+            return _Known(begun, 0, made.time.uses_rate, regular)
+    if len(time) < 2:
+        return None
+    if is_traced(time) or time[0] != 0.0:
+        return _of_rows(system, made, rows[:2], _apart(time[:2], dt), 1)
+    apart = _apart(time[:2], dt)
+    record, past = _at_rest(system, made)
+    if not is_traced((record, rows)) and not np.allclose(record, rows[0], rtol=0.0, atol=AT_REST):
+        # as files had them that did not say how a motion began
+        past = _past(system, made, rows[0], initial.control[0], 0.0)
+    first, regular = coefficient_table(made, apart)
+    return _Known(_begun(past, first, apart), 0, True, regular)
+
+
+def _of_last_rows(system: System, made: Settings, initial: Trajectory, rows: Any, dt: float) -> _Known | None:
+    """What is known at the last row of states that solve no equations of this system."""
+    time = initial.time
+    if len(time) < 2:
+        return None
+    return _of_rows(system, made, rows[-2:], _apart(time[-2:], dt), len(time) - 1)
+
+
+def _of_rows(system: System, made: Settings, two: Any, apart: float, row: int) -> _Known | None:
+    """What the nodes tell at the second of two rows; of y_st they do not."""
+    if system.mixed:
+        return None
+    regular = coefficient_table(made, apart)[1]
+    return _Known(_between(system, made.space, two, regular, apart), row, False, regular)
+
+
+_between = jax.jit(begun_between, static_argnames="space")
+
+
+_along = jax.jit(past_along, static_argnames=("settings", "solved"))
+
+
+def histories_along(
+    system: System, moved: Trajectory
+) -> tuple[int, Float[Any, "steps stages points x"]] | None:
+    """What a simulation's steps looked back on at their stages, as a model of it has it, from which row on.
+
+    None where rows tell too little.
+    """
+    made = _of_past(moved.settings)
+    rows = jnp.concatenate([moved.y, moved.z], axis=-1)
+    known = _of_first_rows(system, made, moved, rows, moved.dt)
+    if known is None:
+        return None
+    row, count = known.row, len(rows) - known.row
+    controls = jnp.asarray(moved.control[row:])
+    motion = Motion(known.begun, known.regular, rows[row:], controls, moved.time[row], count)
+    return row + 1, _along(system, made, motion, solved=False)[1]

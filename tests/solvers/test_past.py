@@ -1,0 +1,279 @@
+"""What steps look back on: at a scheme's own stages, however a motion begins or goes on."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import knode_cosserat as kc
+from benchmarks.motions import soft_rod
+from examples.hanging_string import HangingString
+from knode_cosserat.solvers.begin import Run, beginning, histories_along
+from knode_cosserat.solvers.between import at_stages
+from knode_cosserat.solvers.crossing import points_of
+from knode_cosserat.solvers.march import march_one
+from knode_cosserat.solvers.past import refined, resting_past, still_records
+from knode_cosserat.solvers.problem import StepProblem, no_history
+from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.space import SCHEMES
+from knode_cosserat.solvers.task import Task
+
+DT = 0.02
+NONE = np.zeros((12, 0))
+
+
+@pytest.fixture(scope="module")
+def rod():
+    """A damped one that falls, whose section changes between two nodes."""
+    return soft_rod(0.317).replace(nodes=9)
+
+
+@pytest.fixture(scope="module")
+def whole(rod):
+    return kc.simulate(rod, NONE, DT, space="rk4")
+
+
+@pytest.mark.parametrize("dt", [1e-2, 1e-3])
+def test_what_is_in_equilibrium_stays_there_however_short_the_steps(rod, dt):
+    """With strains of the past interpolated between nodes this rod crept by 1.7 mm, or 22 mm."""
+    hanging = kc.equilibrium(rod, np.zeros(0), space="rk4")
+    moved = kc.simulate(rod, np.zeros((60, 0)), dt, space="rk4", initial=hanging)
+    assert np.max(np.abs(moved.tip_position - hanging.tip_position)) < 1e-9 * rod.length
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("control", [np.full(4, 6.0), np.array([8.0, 5.0, 4.0, 7.0])])
+def test_a_robot_with_a_sleeve_and_ribs_stays_in_equilibrium(control):
+    robot = kc.load_robot("delrin-routed-tendon-robot")
+    still = kc.equilibrium(robot, control, space="rk4")
+    moved = kc.simulate(robot, np.tile(control, (40, 1)), 1e-3, space="rk4", initial=still)
+    assert np.max(np.abs(moved.tip_position - still.tip_position)) < 1e-8 * robot.length
+
+
+# going on
+
+
+def gone_on(rod, before, count, **how):
+    return kc.simulate(rod, NONE[:count], DT, space="rk4", initial=before, **how)
+
+
+@pytest.mark.parametrize("time", ["bdf2", pytest.param("trapezoidal", marks=pytest.mark.campaign)])
+def test_a_motion_goes_on_as_if_it_had_not_been_parted(rod, time, tmp_path):
+    """From rows, from what itself went on, from part of that, from a file, and from a stepper's state."""
+    one = kc.simulate(rod, NONE, DT, space="rk4", time=time)
+    first = kc.simulate(rod, NONE[:4], DT, space="rk4", time=time)
+    second = gone_on(rod, first, 4, time=time)
+    second.save(tmp_path / "second.nc")
+    stepper = kc.Stepper(rod, DT, space="rk4", time=time)
+    for _ in range(8):
+        row = stepper.step(np.zeros(0))
+    for before, count in (
+        (one[:9], 4), (second, 4), (second[:3], 6), (kc.load_trajectory(tmp_path / "second.nc"), 4), (row, 4)
+    ):  # fmt: skip
+        found = gone_on(rod, before, count, time=time)
+        np.testing.assert_allclose(found.y, one.y[-count - 1 :], atol=2e-8)
+
+
+def test_what_tells_where_a_motion_began_is_no_more_than_that(rod, whole):
+    second = gone_on(rod, whole[:5], 4)
+    assert np.all(whole.begun.records[0] == whole.begun.records[1])
+    assert second[:3].begun is second.begun
+    # of rows from the middle on, and of others than each, it would tell wrongly
+    assert second[1:].begun is None and second[::2].begun is None
+
+
+def test_the_middle_of_a_motion_is_known_at_its_nodes_only(rod, whole):
+    """What between them is not is forgotten, like the initial state of any damped motion."""
+    near = np.max(np.abs(gone_on(rod, whole[6:9], 4).y - whole.y[8:]), axis=(1, 2))
+    assert 0.0 < near[-1] < 1e-3
+
+
+def test_rows_tell_what_the_last_step_looked_back_on(rod, whole):
+    """The past that is found again is the one that the solver had."""
+    settings = Settings.of("bdf2", "rk4", "paper", kc.NewtonOptions())
+    begins = beginning(Run(rod, NONE, None, settings, DT, None, False))
+    task = Task(settings, DT, len(NONE))
+    _, past, _ = march_one(rod, settings, task.table, NONE, DT, begins.start.past, 0, len(NONE))
+    again = beginning(Run(rod, NONE, whole, settings, DT, None, False))
+    assert again.first == "regular" and again.start.past.t0 == pytest.approx(len(NONE) * DT)
+    np.testing.assert_allclose(again.start.past.records, past.records, atol=2e-8)
+
+
+def test_what_is_at_the_nodes_beside_a_solution_is_carried_over(rod, whole):
+    """States that were changed since are taken as they are."""
+    changed = dataclasses.replace(whole, z=whole.z + 1e-3)
+    (_, plain), (_, moved) = (histories_along(rod, each) for each in (whole, changed))
+    # c1 + c2 of BDF2 is -3/2 of 1/dt, whatever the past
+    shift = (moved - plain)[2:, ..., rod.y_layout.size :] * DT / -1.5e-3
+    np.testing.assert_allclose(shift[:, 0, points_of(rod).nodes], 1.0, atol=1e-6)
+
+
+# beginning
+
+
+@pytest.mark.campaign
+def test_only_an_equilibrium_is_taken_for_one(rod):
+    space, none = SCHEMES["rk4"], jnp.zeros(0)
+    hanging = kc.equilibrium(rod, none, space="rk4")
+    row = jnp.concatenate([hanging.y[0], hanging.z[0]], axis=-1)
+    still = StepProblem(rod, jnp.zeros(()), none, jnp.zeros(()), no_history(rod, space), space)
+    y = still.filled(hanging.y[0])
+    between = at_stages(rod, space, row)
+    found = still_records(still, row, y)
+    np.testing.assert_array_equal(found, still.records(y))
+    assert np.max(np.abs(found - between)) > 1e-6
+    for other in (row.at[:, -1].add(1e-6), row.at[3, 9].add(1e-6), 0.999 * row):
+        seen = still_records(still, other, still.filled(other[:, : rod.y_layout.size]))
+        np.testing.assert_array_equal(seen, at_stages(rod, space, other))
+
+
+@pytest.mark.parametrize("space", [pytest.param("euler", marks=pytest.mark.campaign), "rk4"])
+def test_rest_is_rest_at_all_stages(space):
+    """Also beside a cut, on either side of it."""
+    bent = kc.SlenderRod(
+        length=0.5, radius=0.005, density=1200.0, youngs_modulus=5e6, nodes=6,
+        sections=(
+            kc.Stretch(end=0.4, curvature=[6.0, 0.0, 0.0]), kc.Stretch(begin=0.73, curvature=[0.0, 3.0, 0.0]),
+        ),
+    )  # fmt: skip
+    past = resting_past(bent, kc.Settings(space=SCHEMES[space]))
+    records, points = past.records[0], points_of(bent)
+    u = bent.z_layout.get(records[..., bent.y_layout.size :], "u")
+    middle = (points.segment + points.bounds.mean(axis=1)) / (bent.nodes - 1)
+    inner, outer = middle[:, None] < 0.4, middle[:, None] > 0.73
+    expected = inner * np.array([6.0, 0.0, 0.0]) + outer * np.array([0.0, 3.0, 0.0])
+    np.testing.assert_allclose(u[:, :-1], np.broadcast_to(expected, u[:, :-1].shape), atol=1e-12)
+    np.testing.assert_array_equal(past.records[1], records)
+    np.testing.assert_array_equal(past.rate, 0.0)
+
+
+def test_a_past_on_a_finer_grid_is_that_of_its_nodes(rod, whole):
+    fine = rod.replace(nodes=33)
+    settings = Settings.of("bdf2", "rk4", "paper", kc.NewtonOptions())
+    past = beginning(Run(rod, NONE, whole, settings, DT, None, False)).start.past
+    found = refined(rod, fine, settings.space, past)
+    assert found.records.shape[1:] == no_history(fine, settings.space).shape
+    ny = rod.y_layout.size
+    same, own = found.records[0, 0, [0, 4], :ny], past.records[0, 0, [0, 1], :ny]
+    np.testing.assert_allclose(same, own, atol=1e-9)
+    np.testing.assert_allclose(found.y[:, -1], past.y[:, -1], atol=1e-9)
+
+
+# order
+
+
+def tips(rod, steps, nodes, until=0.4):
+    """Of the second half of a fall, at ten times: what lets go at its beginning has died out."""
+    found = kc.simulate(
+        rod.replace(nodes=nodes), np.zeros((steps, 0)), until / steps, space="rk4", start="consistent"
+    )
+    assert np.all(found.result == kc.Result.CONVERGED)
+    return found.tip_position[steps // 2 :: steps // 20]
+
+
+def orders(found):
+    """Of convergence, from one grid to the next twice as fine."""
+    changes = np.sqrt(np.mean(np.square(np.diff(found, axis=0)), axis=(1, 2)))
+    return np.log2(changes[:-1] / changes[1:])
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("ends", [(), (0.317,), (0.1, 0.104)], ids=["alike", "a cut", "a short stretch"])
+def test_damped_motions_have_the_schemes_orders(ends):
+    """Order 2 in time at any number of nodes, and 4 or more along the rod, short stretches or not."""
+    rod = soft_rod(*ends)
+    assert np.all(orders([tips(rod, steps, 11) for steps in (20, 40, 80, 160)]) > 1.7)
+    assert np.all(orders([tips(rod, 160, nodes) for nodes in (11, 21, 41, 81)]) > 3.5)
+
+
+@pytest.mark.campaign
+def test_derivatives_go_through_what_stages_look_back_on(rod):
+    """Along a motion that goes on, by forward and reverse mode, against differences."""
+
+    def end(stiffness):
+        changed = rod.replace(youngs_modulus=stiffness)
+        hanging = kc.equilibrium(changed, jnp.zeros(0), space="rk4")
+        first = kc.simulate(changed, jnp.zeros((3, 0)), DT, space="rk4", initial=hanging)
+        pulled = changed.replace(gravity=(0.0, 0.0, -2.0))
+        return kc.simulate(pulled, jnp.zeros((3, 0)), DT, space="rk4", initial=first).tip_position[-1, 0]
+
+    value = jax.jit(end)
+    difference = (value(5e6 + 50.0) - value(5e6 - 50.0)) / 100.0
+    for slope in (jax.jacfwd(end), jax.grad(end)):
+        np.testing.assert_allclose(jax.jit(slope)(5e6), difference, rtol=1e-5)
+
+
+@pytest.mark.campaign
+def test_a_robot_that_was_changed_begins_where_the_other_one_rested(rod):
+    """And not in an equilibrium of its own, also where a run is repeated with finer segments."""
+    hanging = kc.equilibrium(rod, np.zeros(0), space="rk4")
+    pushed = rod.replace(gravity=(2.0, 0.3, -2.0))
+    coarse = kc.simulate(pushed, np.zeros((60, 0)), 3e-4, space="rk4", initial=hanging)
+    assert np.all(coarse.result[1:] == kc.Result.RECOVERED_FINER_SEGMENTS)
+    other = rod.replace(nodes=41)
+    fine = kc.simulate(
+        other.replace(gravity=pushed.gravity), np.zeros((60, 0)), 3e-4, space="rk4",
+        initial=kc.equilibrium(other, np.zeros(0), space="rk4"),
+    )  # fmt: skip
+    aside = [each.tip_position[-1, 1] for each in (coarse, fine)]
+    assert aside[0] == pytest.approx(aside[1], rel=0.02) and abs(aside[1]) < 1e-3 * rod.length
+
+
+@pytest.mark.campaign
+def test_waves_do_not_grow_in_time_steps_that_segments_allow():
+    """An undamped string, whose waves go 1.2 segments in a time step where it is slowest."""
+    hand = np.array([[0.6 + 0.05 * np.sin(2.0 * np.pi * 0.02 * i), 0.0] for i in range(1, 61)])
+
+    string = HangingString(length=1.0, density=0.1, stiffness=1e3, friction=0.15, nodes=41)
+    hanging = kc.equilibrium(string, np.array([0.6, 0.0]), space="rk4")
+    found = kc.simulate(string, hand, 0.02, space="rk4", initial=hanging)
+    rough = np.abs(np.diff(found.part("q"), n=4, axis=1)).max(axis=(1, 2))
+    assert rough[-1] < 0.1 * rough.max()
+
+
+def growth(passed):
+    """By how much the waves of an elastic bar grow in a time step in which they pass so many segments.
+
+    The largest amplification of any wavelength (von Neumann), along an endless bar.
+    """
+    c0, c1, c2, _ = kc.BDF2().coefficients(passed, passed)
+
+    def over_a_segment(n_and_q, past):
+        def rates(s, y, known):
+            return jnp.stack([c0 * y[1] + known[0], c0 * y[0] + known[1]]), y
+
+        end, found = SCHEMES["rk4"].advance(rates, 0.0, 1.0, n_and_q, past)
+        return end, found[:, ::-1]
+
+    zero = jnp.zeros(2), jnp.zeros((4, 2))
+    (by_y, by_past), (kept_by_y, kept_by_past) = jax.jacfwd(over_a_segment, argnums=(0, 1))(*zero)
+    by_past, kept_by_y, kept_by_past = (
+        np.reshape(each, shape)
+        for each, shape in ((by_past, (2, 8)), (kept_by_y, (8, 2)), (kept_by_past, (8, 8)))
+    )
+    largest = 0.0
+    for angle in np.linspace(0.02, np.pi, 60):
+        y = np.linalg.solve(np.exp(1j * angle) * np.eye(2) - by_y, by_past)
+        step = kept_by_y @ y + kept_by_past
+        both = np.block([[c1 * step, c2 * step], [np.eye(8), np.zeros((8, 8))]])
+        largest = max(largest, np.abs(np.linalg.eigvals(both)).max())
+    return largest
+
+
+def test_waves_grow_only_in_time_steps_that_are_short_for_the_segments():
+    """By BDF2 there is room up to where waves decay by e in a segment (`SAFE_DECAY`), but for a little."""
+    for passed in (1.6, 3.0, 10.0):
+        assert growth(passed) <= 1.0 + 1e-6
+    assert growth(1.2) > 1.1
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("alpha", [-0.5, -0.3])
+def test_schemes_with_a_memory_of_rates_stay_smooth_along_the_rod(alpha):
+    """With the past of RK4's own stages waves between two nodes grow by up to a half a step."""
+    rod = soft_rod().replace(nodes=11)
+    found = kc.simulate(rod, np.zeros((80, 0)), 5e-3, time=kc.BDFAlpha(alpha), space="rk4")
+    rough = np.abs(np.diff(found.part("q"), n=4, axis=1)).max(axis=(1, 2))
+    assert rough[-1] < 0.1 * np.abs(found.part("q")).max()
