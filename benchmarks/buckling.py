@@ -13,13 +13,12 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 
 import knode_cosserat as kc
 from knode_cosserat.solvers.boundary import linearise
-from knode_cosserat.solvers.problem import StepProblem, no_history
+from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.space import SCHEMES
 
 #: part of the load by which its derivative is taken
@@ -28,8 +27,7 @@ STEP = 1e-4
 
 @functools.partial(jax.jit, static_argnames="space")
 def _tip_response(system: Any, control: Any, y: Any, space: Any) -> Any:
-    zero = jnp.zeros(())
-    problem = StepProblem(system, zero, control, zero, no_history(system, space), space)
+    problem = StepProblem.still(system, space, control)
     F, base, tip, _, _ = linearise(problem, problem.filled(y), system.unknowns(y[0]))
     last, _ = jax.lax.scan(lambda X, F_j: (F_j @ X, None), base, F)
     return tip @ last

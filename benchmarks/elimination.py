@@ -105,7 +105,7 @@ def reach(solve: Solve, robot: kc.System) -> float:
     def error(tension: Any) -> Any:
         rest = rest_record(robot)
         control = tension * jnp.array([1.0, 0.0, 0.0, 1.0])
-        problem = StepProblem(robot, jnp.zeros(()), control, jnp.zeros(()), 0.0 * rest[None], kc.Euler())
+        problem = StepProblem.still(robot, kc.Euler(), control)
         return solve(problem, rest[:, : robot.y_layout.size], jnp.zeros(robot.unknown_count))[2]
 
     largest = 0.0

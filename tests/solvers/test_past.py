@@ -118,7 +118,7 @@ def test_only_an_equilibrium_is_taken_for_one(rod):
     space, none = SCHEMES["rk4"], jnp.zeros(0)
     hanging = kc.equilibrium(rod, none, space="rk4")
     row = jnp.concatenate([hanging.y[0], hanging.z[0]], axis=-1)
-    still = StepProblem(rod, jnp.zeros(()), none, jnp.zeros(()), no_history(rod, space), space)
+    still = StepProblem.still(rod, space, none)
     y = still.filled(hanging.y[0])
     between = at_stages(rod, space, row)
     found = still_records(still, row, y)
@@ -138,7 +138,7 @@ def test_rest_is_rest_at_all_stages(space):
             kc.Stretch(end=0.4, curvature=[6.0, 0.0, 0.0]), kc.Stretch(begin=0.73, curvature=[0.0, 3.0, 0.0]),
         ),
     )  # fmt: skip
-    past = resting_past(bent, kc.Settings(space=SCHEMES[space]))
+    past = jax.jit(resting_past, static_argnums=1)(bent, kc.Settings(space=SCHEMES[space]))
     records, points = past.records[0], points_of(bent)
     u = bent.z_layout.get(records[..., bent.y_layout.size :], "u")
     middle = (points.segment + points.bounds.mean(axis=1)) / (bent.nodes - 1)

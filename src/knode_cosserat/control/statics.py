@@ -19,7 +19,7 @@ from knode_cosserat.solvers.boundary import Solution, linearise, newton, residua
 from knode_cosserat.solvers.crossing import points_of, spread
 from knode_cosserat.solvers.linear import Condensed, carried
 from knode_cosserat.solvers.past import rest_record
-from knode_cosserat.solvers.problem import StepProblem, no_history, row_of
+from knode_cosserat.solvers.problem import StepProblem, row_of
 from knode_cosserat.solvers.settings import Settings
 
 #: position (d,) in m and orientation (quaternion, scalar first), or None, from a system and its last node's y
@@ -58,8 +58,7 @@ class Response(NamedTuple):
 
 def static_problem(system: System, settings: Settings, control: Any) -> StepProblem:
     """The boundary-value problem of `kc.equilibrium`."""
-    nothing = no_history(system, settings.space)
-    return StepProblem(system, jnp.asarray(TIME), control, jnp.zeros(()), nothing, settings.space)
+    return StepProblem.still(system, settings.space, control, TIME)
 
 
 def at_rest(system: System) -> tuple[Any, Any]:

@@ -25,7 +25,7 @@ from jaxtyping import Float, Int
 
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.linear import Linearisation, LinearSolver
-from knode_cosserat.solvers.problem import StepProblem, no_history
+from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.space import SLOPES, VALUES, SpaceScheme
 
 
@@ -111,7 +111,7 @@ def residuals(problem: StepProblem, y: Float[Any, "points y"]) -> tuple[Any, Any
 @functools.partial(jax.jit, static_argnames="space")
 def static_error(system: System, space: SpaceScheme, record: Any, control: Any, t: Any) -> Any:
     """How far a record is from an equilibrium: its largest residual in natural units, all rates zero."""
-    problem = StepProblem(system, t, control, jnp.zeros(()), no_history(system, space), space)
+    problem = StepProblem.still(system, space, control, t)
     y = problem.filled(record[:, : system.y_layout.size])
     base = problem.base(system.unknowns(y[0])) - y[0]
     error = _error(problem, *residuals(problem, y))

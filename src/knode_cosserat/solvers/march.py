@@ -11,8 +11,8 @@ from jaxtyping import Float, Int
 
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import Kept, newton_keeping, none_kept
-from knode_cosserat.solvers.past import EXTRAPOLATIONS, Past, advanced, history_of
-from knode_cosserat.solvers.problem import StepProblem, keeps_stages, no_history, row_of
+from knode_cosserat.solvers.past import EXTRAPOLATIONS, Past, advanced, history_of, problem_of
+from knode_cosserat.solvers.problem import StepProblem, row_of
 from knode_cosserat.solvers.settings import Settings
 
 #: the mean is by this power of how far each was off in the newest step: a lower one lets a bad one in, a
@@ -39,8 +39,7 @@ def step(
 ) -> Any:  # fmt: skip
     """One time step: the next past, the step's row, and what is kept of its linearisation."""
     history = history_of(past, coefficients, settings)
-    own = keeps_stages(system, settings.time, settings.space)
-    problem = StepProblem(system, t, control, coefficients[0], history, settings.space, own_past=own).ready()
+    problem = problem_of(system, settings, t, control, coefficients[0], history).ready()
     # as sums of products, not as matrix products: XLA fuses these with what follows
     guess = jnp.sum(past.weights[:, None, None] * past.y, axis=0)
     unknowns = system.unknowns(guess[0])
@@ -66,8 +65,7 @@ def _none_kept(system: System, settings: Settings, past: Past, control: Any) -> 
     """What is kept before the first step: nothing at all, unless linearisations are kept across steps."""
     if not settings.newton.across_steps:
         return None
-    zero = jnp.zeros(())
-    problem = StepProblem(system, zero, control, zero, no_history(system, settings.space), settings.space)
+    problem = StepProblem.still(system, settings.space, control)
     y = past.y[0]
     return none_kept(problem, y, system.unknowns(y[0]), settings.elimination)
 

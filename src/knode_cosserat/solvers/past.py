@@ -21,7 +21,7 @@ from jaxtyping import Float
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.between import at_stages
 from knode_cosserat.solvers.crossing import points_of, spread
-from knode_cosserat.solvers.problem import StepProblem, keeps_stages, no_history, row_of
+from knode_cosserat.solvers.problem import StepProblem, keeps_stages, row_of
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.time import BDF1
@@ -66,6 +66,14 @@ def coefficient_table(settings: Settings, dt: float) -> np.ndarray:
     return np.array([first, regular])
 
 
+def problem_of(
+    system: System, settings: Settings, t: Any, control: Any, c0: Any, history: Any
+) -> StepProblem:
+    """The equations of a step that looks back on this history."""
+    own = keeps_stages(system, settings.time, settings.space)
+    return StepProblem(system, t, control, c0, history, settings.space, own_past=own)
+
+
 def history_of(past: Past, coefficients: Any, settings: Settings) -> Any:
     """ʰ = c1 (newest) + c2 (the one before) + d1 (its rate), for y, z and y_s alike."""
     _, c1, c2, d1 = coefficients
@@ -95,11 +103,11 @@ def rest_record(system: System) -> Float[Any, "nodes x"]:
 
 def resting_past(system: System, settings: Settings) -> Past:
     """A past of nothing but rest under no control, at time 0."""
-    none, zero, space = jnp.zeros(system.control_size), jnp.zeros(()), settings.space
-    if system.mixed or not keeps_stages(system, settings.time, space):
+    none = jnp.zeros(system.control_size)
+    if system.mixed or not keeps_stages(system, settings.time, settings.space):
         return initial_past(system, settings, rest_record(system), none)
-    still = StepProblem(system, zero, none, zero, no_history(system, space), space)
-    y, z = jax.vmap(jax.vmap(system.rest))(still.stages)
+    stages = StepProblem.still(system, settings.space, none).stages
+    y, z = jax.vmap(jax.vmap(system.rest))(stages)
     return past_of_one(jnp.concatenate([y, z], axis=-1), y[0], 0.0)
 
 
@@ -109,11 +117,12 @@ def initial_past(system: System, settings: Settings, row: Any, control: Any, t0:
     Of an equilibrium under this control, stages are where its solution has them; of other states between
     nodes by interpolation.
     """
-    space, own = settings.space, keeps_stages(system, settings.time, settings.space)
-    nothing, zero = no_history(system, space), jnp.zeros(())
-    still = StepProblem(system, jnp.asarray(t0), control, zero, nothing, space, own_past=own)
+    own = keeps_stages(system, settings.time, settings.space)
+    still = StepProblem.still(system, settings.space, control, t0, own_past=own)
     y = still.filled(row[:, : system.y_layout.size])
-    return past_of_one(still_records(still, row, y), y, t0)
+    told = rows_tell(system, settings)
+    records = at_stages(system, settings.space, row) if told else still_records(still, row, y)
+    return past_of_one(records, y, t0)
 
 
 def past_of_one(records: Float[Any, "stages points x"], y: Float[Any, "points y"], t0: Any) -> Past:
@@ -130,8 +139,6 @@ def past_of_one(records: Float[Any, "stages points x"], y: Float[Any, "points y"
 def still_records(still: StepProblem, row: Any, y: Any) -> Float[Any, "stages points x"]:
     """Records of one row at the stages: those of its equilibrium, if it is one, and between nodes if not."""
     system, ny = still.system, still.system.y_layout.size
-    if not system.mixed and (rows_are_stages(system, still.space) or not still.own_past):
-        return at_stages(system, still.space, row)
     solved = still.records(y)
     own = row_of(system, y, solved)
     nodes = jnp.concatenate([row, own[:, row.shape[1] :]], axis=1)
@@ -144,13 +151,8 @@ def still_records(still: StepProblem, row: Any, y: Any) -> Float[Any, "stages po
 
 def rows_tell(system: System, settings: Settings) -> bool:
     """Whether rows hold all that steps look back on."""
-    own = keeps_stages(system, settings.time, settings.space)
-    return not system.mixed and (rows_are_stages(system, settings.space) or not own)
-
-
-def rows_are_stages(system: System, space: SpaceScheme) -> bool:
-    """Whether nothing is kept beside what a row shows: one stage, at the nodes, and no cut."""
-    return space.parts == (0.0,) and not system.cuts
+    at_nodes = settings.space.parts == (0.0,) and not system.cuts
+    return not system.mixed and (at_nodes or not keeps_stages(system, settings.time, settings.space))
 
 
 def newest_row(system: System, past: Past) -> Float[Any, "nodes x"]:
@@ -221,16 +223,15 @@ def past_along(system: System, settings: Settings, motion: Motion, solved: bool 
     those that were `solved`, but a model's, what pieces reach is brought to where the next ones begin.
     """
     begun, regular, rows, controls, t0, count = motion
-    ny, dt = system.y_layout.size, begun.dt
+    ny, dt, space, told = system.y_layout.size, begun.dt, settings.space, rows_tell(system, settings)
 
     def one(past: Past, step: Any) -> Any:
         i, row, control = step
         coefficients = jnp.where(i == 1, begun.coefficients, jnp.asarray(regular))
         history = history_of(past, coefficients, settings)
-        t, own = t0 + i * dt, keeps_stages(system, settings.time, settings.space)
-        problem = StepProblem(system, t, control, coefficients[0], history, settings.space, own_past=own)
+        problem = problem_of(system, settings, t0 + i * dt, control, coefficients[0], history)
         y = problem.filled(row[:, :ny])
-        records = _records_of_row(problem, row, y, solved)
+        records = at_stages(system, space, row) if told else _records_of_row(problem, row, y, solved)
         after = advanced(past, records, coefficients[0] * records + history, y, past.weights)
         return jax.tree.map(lambda a, b: jnp.where(i < count, a, b), after, past), history
 
@@ -245,8 +246,6 @@ def past_along(system: System, settings: Settings, motion: Motion, solved: bool 
 def _records_of_row(problem: StepProblem, row: Any, y: Any, solved: bool) -> Float[Any, "stages points x"]:
     """Records of a step's solution at the stages, where a row shows it at the nodes."""
     system, space = problem.system, problem.space
-    if not system.mixed and (rows_are_stages(system, space) or not problem.own_past):
-        return at_stages(system, space, row)
     found = problem.records(y) if solved else problem.records_between(y)
     beside = row - row_of(system, y, found)[:, : row.shape[1]]
     width = found.shape[-1] - row.shape[1]

@@ -78,6 +78,14 @@ class StepProblem(eqx.Module):
     #: whether stages between nodes look back on themselves, or on what the nodes say (`keeps_stages`)
     own_past: bool = eqx.field(static=True, default=True)
 
+    @classmethod
+    def still(
+        cls, system: System, space: SpaceScheme, control: Any, t: Any = 0.0, **options: Any
+    ) -> StepProblem:
+        """That of an equilibrium: nothing moves, and nothing did."""
+        t, c0 = jnp.asarray(t, dtype=float), jnp.zeros(())
+        return cls(system, t, jnp.asarray(control), c0, no_history(system, space), space, **options)
+
     def ready(self) -> StepProblem:
         """The same with all evaluated that depends on neither y nor the past, for what is iterated on."""
         strand, (places, stages) = self.system.strand, self._places

@@ -18,8 +18,8 @@ import numpy as np
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import Solution, newton
 from knode_cosserat.solvers.linear import Decoupled
-from knode_cosserat.solvers.past import EXTRAPOLATIONS, Past, advanced, history_of
-from knode_cosserat.solvers.problem import StepProblem, keeps_stages, row_of
+from knode_cosserat.solvers.past import EXTRAPOLATIONS, Past, advanced, history_of, problem_of
+from knode_cosserat.solvers.problem import row_of
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.stability import natural_time
@@ -61,8 +61,7 @@ def attempt(
 
     The tip's conditions hold in `part`: of what they leave at `from_y` the rest is still left.
     """
-    own = keeps_stages(system, settings.time, settings.space)
-    problem = StepProblem(system, t, control, c0, history, settings.space, own_past=own).ready()
+    problem = problem_of(system, settings, t, control, c0, history).ready()
     problem = dataclasses.replace(problem, tip_offset=(1.0 - part) * problem.tip_residual(from_y[-1]))
     patient = dataclasses.replace(settings.newton, max_linearisations=40)
     solution = newton(problem, y, unknowns, Decoupled(), patient)

@@ -19,8 +19,8 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import linearise, residuals
 from knode_cosserat.solvers.linear import Condensed, carried
 from knode_cosserat.solvers.march import Rows, march_one
-from knode_cosserat.solvers.past import Past, advanced, history_of
-from knode_cosserat.solvers.problem import StepProblem, keeps_stages, row_of
+from knode_cosserat.solvers.past import Past, advanced, history_of, problem_of
+from knode_cosserat.solvers.problem import StepProblem, row_of
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.task import Task
 
@@ -79,18 +79,17 @@ def tangent_march(
         if settings.time.uses_rate:
             d_history = d_history + coefficients[3] * d_rate
 
-        def problem_of(system: Any, control: Any, history: Any) -> StepProblem:
-            own = keeps_stages(system, settings.time, settings.space)
-            return StepProblem(system, t, control, coefficients[0], history, settings.space, own_past=own)
+        def now_with(system: Any, control: Any, history: Any) -> StepProblem:
+            return problem_of(system, settings, t, control, coefficients[0], history)
 
-        problem = problem_of(system, control, history)
+        problem = now_with(system, control, history)
         linear = Condensed()
         y = problem.filled(row[:, :ny])
         linearisation = linearise(problem, y, xi)
         factors, _, _ = linear.start(linearisation, y_scale)
 
         def at_solution(system: Any, control: Any, history: Any) -> Any:
-            problem = problem_of(system, control, history)
+            problem = now_with(system, control, history)
             return *residuals(problem, y), problem.base(xi)
 
         given, d_given = (system, control, history), (d_system, d_control, d_history)
@@ -101,7 +100,7 @@ def tangent_march(
         dy = dy.at[0].add(base)
 
         def kept_of(system: Any, control: Any, history: Any, y: Any) -> Any:
-            records = problem_of(system, control, history).records(y)
+            records = now_with(system, control, history).records(y)
             return records, row_of(system, y, records)
 
         (records, _), (d_records, d_row) = jax.jvp(kept_of, (*given, y), (*d_given, dy))
