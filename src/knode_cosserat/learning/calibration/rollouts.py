@@ -43,6 +43,8 @@ GROWTH = 2
 FIRST_ROWS = (2, 5, 10, 20, 50, 100)
 
 
+#: coefficients of a step without rates
+STILL = np.zeros((2, 4))
 #: rollouts at a time: each keeps one core busy
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
@@ -77,6 +79,8 @@ class _Rows(NamedTuple):
     past: Past
     #: the last row and control of the rows that it began from, if there are any
     before: Any
+    #: y and z at the nodes where it began
+    first: Float[Any, "N x"]
     control: Float[Any, "T c"]
     places: Places
     target: Float[Any, "T M k"]
@@ -106,8 +110,24 @@ def _differences(robot, coordinates, rows, table, dt, unknowns, settings, orient
             )
         return jnp.where(jnp.isnan(rows.target), 0.0, seen - target).ravel()
 
+    def settled(system: Any, d_system: Any) -> Any:
+        """The past where it began if that is an equilibrium which had to be found, and its tangent."""
+        none, guess = jnp.zeros(system.control_size), resting_past(system, settings)
+        d_none, d_guess = jax.tree.map(jnp.zeros_like, (none[None], guess))
+        d_first, _ = tangent_march(
+            settings, STILL, dt, rows.first[None], system.unknowns(rows.first[0])[None], system, none[None],
+            guess, d_system, d_none, d_guess.records, d_guess.rate,
+        )  # fmt: skip
+        d_first = d_first[0, :, : rows.first.shape[1]]
+        return jax.jvp(
+            lambda system, row: initial_past(system, settings, row, none),
+            (system, rows.first), (d_system, d_first),
+        )  # fmt: skip
+
     def along(direction: Any) -> Any:
         (system, past), (d_system, d_past) = jax.jvp(start, (coordinates,), (direction,))
+        if rows.before is None and system.rest_is_guess:
+            past, d_past = settled(system, d_system)
         d_records, _ = tangent_march(
             settings, table, dt, rows.records, rows.unknowns, system, rows.control, past, d_system,
             jnp.zeros_like(rows.control), d_past.records, d_past.rate,
@@ -138,7 +158,7 @@ class RolloutMisfit:
     ):
         """`near`: a search begins where the robot is close to the real one; `space` is for measurements."""
         self.robot, self.unknowns, self.near = robot, unknowns, near
-        y = np.zeros(robot.y_layout.size)
+        y = np.asarray(robot.rest(0.0)[0])
         try:
             sizes = [np.size(robot.positions(y))]
         except AttributeError as error:
@@ -232,7 +252,8 @@ class RolloutMisfit:
         if steps.result.min() < 0:
             return None
         before = None if initial is None else (begins.record, np.asarray(initial.control)[-1])
-        rows = _Rows(steps.records, steps.unknowns, begins.start.past, before, control, places, target)
+        past, first = begins.start.past, begins.record
+        rows = _Rows(steps.records, steps.unknowns, past, before, first, control, places, target)
         values, slopes = _differences(
             self.robot, coordinates, rows, task.table, dt, self.unknowns, settings, self.oriented,
             begins.first == "start",
