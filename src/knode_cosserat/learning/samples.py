@@ -21,7 +21,7 @@ from knode_cosserat.rods.system import System, in_strands, records_in_strands, u
 from knode_cosserat.solvers.begin import histories_along
 from knode_cosserat.solvers.between import at_stages
 from knode_cosserat.solvers.crossing import Crossing, carried, crossing_of, parts_of, within
-from knode_cosserat.solvers.past import coefficient_table
+from knode_cosserat.solvers.past import coefficient_table, rows_tell
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
@@ -136,6 +136,12 @@ def samples(
     segments, tips = (jax.tree.map(lambda *leaves: np.concatenate(leaves), *each) for each in joined)
     doubt = np.sqrt(np.mean(np.square(doubts), axis=0))
     return Dataset(segments, tips, settings_of(trajectories[0]).space, len(ends), doubt)
+
+
+def told_by_rows(knowledge: System, trajectories: Sequence[Trajectory]) -> bool:
+    """Whether rows hold all that steps look back on, or come from no simulation."""
+    made = [each.settings for each in trajectories]
+    return all(settings is None or rows_tell(knowledge, settings) for settings in made)
 
 
 def of_strands(knowledge: System, data: Dataset) -> Dataset:

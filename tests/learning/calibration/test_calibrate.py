@@ -98,6 +98,17 @@ def test_any_system(by, swings):
     assert result.labels == ("length", "density", "stiffness", "damping", "drag")
 
 
+@pytest.mark.parametrize("part", [0.0, 1e-6, 1e-4])
+def test_by_rk4_the_past_between_nodes_is_that_of_the_robot_that_is_found(part):
+    """Trajectories have nodes only. By interpolation the drag was a hundredth off, and p not explained."""
+    swings = noisy([pulled(period, space="rk4") for period in (1.0, 2.3)], part, seed=0)
+    result = calibrate(WRONG, swings)
+    for name, value in result.estimates.items():
+        true, error = float(getattr(BAR, name)), result.standard_errors[name]
+        assert value == pytest.approx(true, rel=10.0 * part + 1e-7, abs=4.0 * error), name
+    assert result.estimates["drag"] == pytest.approx(0.5, rel=1e-7 + 30.0 * part) and not result.unexplained
+
+
 def test_b_not_zero_and_the_length(string_swing):
     """Rates along the rod belong to the history then, and follow the length."""
     string = string_swing.system

@@ -36,6 +36,8 @@ from knode_cosserat.trajectory import Trajectory
 
 #: noise may move an estimate by this part of it, on average, and be corrected for
 MOST_SHIFT = 0.3
+#: how often the search is made again with the past between nodes that the robot has which it found
+MOST_ROUNDS = 8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,8 +115,10 @@ def calibrate(
         by: "segments" compares one-segment predictions from the states in the data, all of which must be
             known. It takes a fraction of a second and finds its way from far off. Noise in the states enters
             its predictions too; what that does to the estimates is taken away, to leading order in its
-            variance. "rollouts" compares whole simulations with positions and orientations, and needs nothing
-            else of trajectories that begin at rest. Its search begins where segments lead, if they do.
+            variance. Between nodes, where RK4 looks back on more than a trajectory has, the past is that of
+            the robot that is found, in a few rounds. "rollouts" compares whole simulations with positions and
+            orientations, and needs nothing else of trajectories that begin at rest. Its search begins where
+            segments lead, if they do.
         undetermined: what to do about a parameter that the data do not determine: "stop" with an error, or
             "keep" it as it was, which `Calibration.undetermined` says. None: stop if it was named.
         level: how probable it is that an interval holds the truth.
@@ -137,7 +141,10 @@ def calibrate(
     may_leave_out = names is None if undetermined is None else undetermined == "keep"
     unknowns = unknowns_of(robot, names)
     misfit, start = _misfit(robot, trajectories, unknowns, by, space)
-    return _calibration(misfit, *_ended(misfit, start, may_leave_out), level)
+    ended, errors = _ended(misfit, start, may_leave_out)
+    if isinstance(misfit, SegmentMisfit):
+        misfit, ended, errors = _with_its_own_past(misfit, ended, errors, may_leave_out)
+    return _calibration(misfit, ended, errors, level)
 
 
 def _misfit(
@@ -202,6 +209,25 @@ def _ended(misfit: Misfit, start: np.ndarray, may_leave_out: bool) -> tuple[Fit,
                 'use by="rollouts", or leave it out of names'
             )
         left_out = (*ended.left_out, search.labels_of(misfit.unknowns)[worst])
+
+
+def _with_its_own_past(
+    misfit: SegmentMisfit, ended: Fit, errors: Errors, may_leave_out: bool
+) -> tuple[SegmentMisfit, Fit, Errors]:
+    """The search again, as the robot it ended with has the past between nodes, while that explains more."""
+    for _ in range(MOST_ROUNDS):
+        numbers = found(misfit.unknowns, ended.coordinates)
+        again = misfit.looking_back_on(with_numbers(misfit.robot, misfit.unknowns, numbers))
+        if again is None:
+            break
+        try:
+            after, of_after = _ended(again, ended.coordinates, may_leave_out)
+        except CalibrationError:
+            break
+        if search.remainder(after) >= search.remainder(ended):
+            break
+        misfit, ended, errors = again, after, of_after
+    return misfit, ended, errors
 
 
 def _calibration(misfit: Misfit, ended: Fit, errors: Errors, level: float) -> Calibration:

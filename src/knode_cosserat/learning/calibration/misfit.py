@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.learning.calibration.unknowns import Unknowns, found, with_coordinates, with_numbers
-from knode_cosserat.learning.samples import Dataset, Samples, TipSamples, predict, samples
+from knode_cosserat.learning.samples import Dataset, Samples, TipSamples, predict, samples, told_by_rows
 from knode_cosserat.rods.system import System, unpacked_history
 from knode_cosserat.trajectory import Trajectory
 
@@ -101,9 +101,15 @@ class SegmentMisfit:
     #: whether a search must not go far at once
     cautious = False
 
-    def __init__(self, robot: System, trajectories: Sequence[Trajectory], unknowns: Unknowns):
+    def __init__(
+        self,
+        robot: System,
+        trajectories: Sequence[Trajectory],
+        unknowns: Unknowns,
+        model: System | None = None,
+    ):
         self.robot, self.unknowns, self.trajectories = robot, unknowns, list(trajectories)
-        self.data: Dataset = samples(robot, trajectories)
+        self.data: Dataset = samples(robot, trajectories, model=model)
         self.length = float(np.asarray(robot.length))
         y, z, tip = robot.y_layout, robot.z_layout, robot.tip_layout
         self.fields = (*y.names, *z.names, *(f"tip {name}" if name != "tip" else name for name in tip.names))
@@ -127,6 +133,12 @@ class SegmentMisfit:
             self.robot, coordinates, data, self.length, self.unknowns, self.data.space
         )
         return Differences(np.asarray(values), np.asarray(slopes))
+
+    def looking_back_on(self, model: System) -> SegmentMisfit | None:
+        """The same with the past between nodes as a model has it; None if the nodes tell all of it."""
+        if told_by_rows(self.robot, self.trajectories):
+            return None
+        return SegmentMisfit(self.robot, self.trajectories, self.unknowns, model)
 
     def blocks(self, values: Float[np.ndarray, " M"]) -> list[tuple[np.ndarray, np.ndarray]]:
         """The field (n,) of the differences of a row, and these by row (R, n), of each trajectory."""

@@ -132,7 +132,7 @@ def _search(misfit: Misfit, start: np.ndarray, free: np.ndarray) -> tuple[bool, 
     best: tuple[bool, Fit] | None = None
     for skipped in range(0, len(beginnings) + 1, max(1, len(beginnings) // MOST_WAYS)):
         converged, ended = _one_way(misfit, start, free, beginnings[skipped:])
-        if best is None or (converged, -_left(ended)) > (best[0], -_left(best[1])):
+        if best is None or (converged, -remainder(ended)) > (best[0], -remainder(best[1])):
             best = converged, ended
         if converged and not systematic(misfit, ended):
             break
@@ -140,7 +140,7 @@ def _search(misfit: Misfit, start: np.ndarray, free: np.ndarray) -> tuple[bool, 
     return best
 
 
-def _left(ended: Fit) -> float:
+def remainder(ended: Fit) -> float:
     """How much is left, of all fields together: smaller is better."""
     return float(np.sum(np.log(np.maximum(ended.sizes, 1e-300))))
 

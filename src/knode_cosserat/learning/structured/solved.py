@@ -1,8 +1,7 @@
 """The structured residual from trajectories: solved for, and again with the past that it says itself.
 
 Trajectories hold the nodes. A scheme with stages between them looks back on more: by interpolation at first,
-and then, where the trajectories were simulated, as the model that was found says. Each round leaves a
-hundredth of the error.
+and then, where the trajectories were simulated, as the model that was found says.
 """
 
 from __future__ import annotations
@@ -11,14 +10,13 @@ from collections.abc import Sequence
 
 from knode_cosserat.learning.config import StructuredOptions
 from knode_cosserat.learning.knode import KNODE
-from knode_cosserat.learning.samples import of_strands, samples
+from knode_cosserat.learning.samples import of_strands, samples, told_by_rows
 from knode_cosserat.learning.structured.regression import solve
 from knode_cosserat.learning.structured.residual import Structured
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.past import rows_tell
 from knode_cosserat.trajectory import Trajectory
 
-#: how often it is solved for again
+#: how often it is solved for again: each time leaves a hundredth of the error
 ROUNDS = 2
 
 
@@ -31,7 +29,7 @@ def solved(
         DataError: a trajectory does not fit the knowledge or the others, is too short or not finite.
     """
     found = solve(knowledge, of_strands(knowledge, samples(knowledge, trajectories)), options, seeds)
-    if all(_told_by_rows(knowledge, each) for each in trajectories):
+    if told_by_rows(knowledge, trajectories):
         return found
     for _ in range(ROUNDS):
         found = [
@@ -39,11 +37,6 @@ def solved(
             for seed, residual in zip(seeds, found, strict=True)
         ]
     return found
-
-
-def _told_by_rows(knowledge: System, trajectory: Trajectory) -> bool:
-    """Whether rows hold all that a step looks back on, or come from no simulation."""
-    return trajectory.settings is None or rows_tell(knowledge, trajectory.settings)
 
 
 def _again(
