@@ -66,6 +66,16 @@ def test_a_model_and_what_is_known_of_it(bars, unseen):
         np.testing.assert_allclose(error, tip_rmse(model, unseen), rtol=1e-9)
 
 
+def test_a_model_is_what_its_knowledge_is():
+    """What systems say of themselves a model passes on, or says by itself."""
+    own = {"nodes", "unknown_count", "control_size"}
+    # of knowledge and residual together `derivatives` tells, and none of its parts
+    own |= {"linear_law", "constitutive", "balance", "strains", "left_of_law", "rates", "turned"}
+    assert {name for name in vars(kc.System) if not name.startswith("_")} - set(vars(KNODE)) == own
+    loose = kc.SlenderRod(length=0.5, radius=0.005, density=1e3, youngs_modulus=5e7, base_end=kc.ends.Free())
+    assert not loose.held and not KNODE(loose, None).held
+
+
 def test_noise_in_the_data_is_in_every_number_and_the_same_each_time(bars):
     shaken, again = (module._noisy(bars[0], 0.01, 0) for _ in range(2))
     for name in ("y", "z"):

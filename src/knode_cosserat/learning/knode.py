@@ -90,6 +90,11 @@ class KNODE(System):
         return self.knowledge.rest_is_guess
 
     @property
+    def held(self) -> bool:  # type: ignore[override]
+        """The knowledge's."""
+        return self.knowledge.held
+
+    @property
     def strands(self) -> int:
         """The knowledge's."""
         return self.knowledge.strands
