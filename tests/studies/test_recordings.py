@@ -12,7 +12,7 @@ from knode_cosserat.cli import app
 from knode_cosserat.recordings import RecordingConfig
 from knode_cosserat.recordings.write import Poses, Pulls, write_recording
 from knode_cosserat.studies import recordings as study
-from knode_cosserat.studies.recordings_report import repetitions
+from knode_cosserat.studies.recordings_report import repetitions, table_of
 from knode_cosserat.studies.runner import StudyError
 
 PAPER = RecordingConfig.paper_robot()
@@ -129,6 +129,20 @@ def test_the_whole_table(folder, tmp_path):
     assert isinstance(kc.load_model(tmp_path / "models" / "paper-a-1"), kc.KNODE)
     assert (tmp_path / "figures" / "loss.png").exists()
     assert "recordings are of a physical robot" in (tmp_path / "table2.md").read_text()
+
+
+def test_what_is_nearly_all_is_not_all():
+    cells = [
+        {"recording": "step", "method": method, "seed": 0, "tip_dtw": dtw}
+        for method, dtw in (("baseline", 50.0), ("network", 12.4), ("best", 0.2), ("worse", 60.0))
+    ]
+    row = table_of(cells, "tip_dtw", 1.0, ["baseline", "network", "best", "worse"]).splitlines()[-1]
+    assert [each.strip() for each in row.split("|")[2:-1]] == [
+        "50",
+        "12.4 (75 %)",
+        "0.2 (99.6 %)",
+        "60 (-20 %)",
+    ]
 
 
 def test_which_are_learned_from():

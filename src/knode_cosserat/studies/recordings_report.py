@@ -107,7 +107,7 @@ def as_markdown(cells: Cells, seen: Cells, facts: Facts, methods: Sequence[str],
         "baseline.",
     ]
     for measure, (title, factor) in MEASURES.items():
-        parts += [f"## {title}", _table(cells, measure, factor, methods)]
+        parts += [f"## {title}", table_of(cells, measure, factor, methods)]
     gains = _gains(cells, methods)
     if gains:
         listed = "\n".join(f"- {method}: {gain:.1f} %" for method, gain in gains.items())
@@ -116,7 +116,7 @@ def as_markdown(cells: Cells, seen: Cells, facts: Facts, methods: Sequence[str],
             f"{listed}\n\nThe paper's, on its own robot: {PAPER_GAIN} %.",
         ]
     parts += ["## The recordings that were learned from: tip RMSE [cm]"]
-    parts.append(_table(seen, "tip_rmse", 100.0, methods))
+    parts.append(table_of(seen, "tip_rmse", 100.0, methods))
     told = facts.get("best", {}).get("told")
     if told:
         parts += ["## What `best` found", f"```\n{told}\n```"]
@@ -132,7 +132,8 @@ def _spread(cells: Cells, recording: str, method: str, measure: str, factor: flo
     return Spread(values, tuple(cell["failed"] for cell in own if "failed" in cell))
 
 
-def _table(cells: Cells, measure: str, factor: float, methods: Sequence[str]) -> str:
+def table_of(cells: Cells, measure: str, factor: float, methods: Sequence[str]) -> str:
+    """One figure of all recordings by all methods, in Markdown."""
     rows = []
     for name in dict.fromkeys(cell["recording"] for cell in cells):
         base = _spread(cells, name, "baseline", measure, factor).mean
@@ -141,10 +142,15 @@ def _table(cells: Cells, measure: str, factor: float, methods: Sequence[str]) ->
             spread = _spread(cells, name, method, measure, factor)
             less = ""
             if method != "baseline" and base and spread.mean is not None:
-                less = f" ({100.0 * (1.0 - spread.mean / base):.0f} %)"
+                less = f" ({_in_percent(1.0 - spread.mean / base)})"
             row.append(in_words(spread) + less)
         rows.append(row)
     return markdown_table(["recording", *methods], rows)
+
+
+def _in_percent(part: float) -> str:
+    """Whole percents, but where these would say that nothing is left."""
+    return f"{100.0 * part:.0f} %" if part < 0.995 else f"{100.0 * part:.1f} %"
 
 
 def _gains(cells: Cells, methods: Sequence[str]) -> dict[str, float]:
