@@ -35,8 +35,8 @@ test: $(READY) ## run the tests, but for the long ones
 test-all: $(READY) ## run all the tests, the long ones too
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile $(PYTEST_ARGS)
 
-samples: $(READY) ## run the long code of README, docs, examples and notebooks, which `make test` leaves out
-	$(BIN)/python -m pytest -n $(JOBS) --dist load --quick -m campaign tests/test_docs.py tests/test_examples.py tests/test_notebooks.py
+samples: $(READY) ## what `make test` leaves out of README, docs, examples, notebooks and first contact
+	$(BIN)/python -m pytest -n $(JOBS) --dist load --quick -m campaign tests/test_docs.py tests/test_examples.py tests/test_notebooks.py tests/test_first_contact.py
 
 lint: $(READY) ## check style and formatting
 	$(BIN)/ruff check

@@ -85,7 +85,7 @@ def prepare(page, folder):
             "sine_2p0": "sine:2.0",
         }
         for seed, (name, signal) in enumerate(signals.items()):
-            record_virtual(f"{name}.bag", signal, seconds=6.0, seed=seed)
+            record_virtual(f"{name}.bag", signal, seconds=4.0, seed=seed)
     if page == "docs/your-own-robot.md":
         (folder / "afternoon").mkdir()
         for name, signal in your_own_robot.SIGNALS.items():

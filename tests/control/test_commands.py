@@ -74,6 +74,7 @@ def test_reach_names_controls_that_are_no_tensions(rod):
         assert "controls (N)" not in " ".join(run(command, "--help").stdout.split())
 
 
+@pytest.mark.campaign
 def test_reach_says_that_a_pose_is_unstable(rod):
     """Upright, and beyond Greenhill's load: straight it is in equilibrium, and falls."""
     arguments = ("--position", 0, 0, 0.5, "--low", 0, "--high", "0.1,0,0", "--tolerance", 1e-2)

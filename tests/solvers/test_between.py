@@ -1,6 +1,7 @@
 """What is known at nodes, between them: no interpolation goes over a cut, and a scheme keeps its order."""
 
 import hypothesis.strategies as st
+import jax
 import jax.numpy as jnp
 import numpy as np
 from hypothesis import given, settings
@@ -11,6 +12,8 @@ from knode_cosserat.solvers.crossing import points_of
 from knode_cosserat.solvers.space import SCHEMES
 
 BEAM = {"length": 0.5, "radius": 0.005, "density": 1200.0, "youngs_modulus": 5e6}
+
+stages_of = jax.jit(at_stages, static_argnums=1)
 
 
 def rod(cuts, nodes):
@@ -45,7 +48,7 @@ def test_what_jumps_at_cuts_is_exact_on_both_sides(data, space):
     records = np.concatenate([cubic(smooth, s), np.where(beyond, cubic(after, s), cubic(before, s))], axis=1)
     points = points_of(system)
     begin, end = ((points.segment + points.bounds[:, k]) / (nodes - 1) for k in (0, 1))
-    found = at_stages(system, SCHEMES[space], jnp.asarray(records))
+    found = stages_of(system, SCHEMES[space], jnp.asarray(records))
     for stage, part in zip(found, SCHEMES[space].parts, strict=True):
         at = np.append(begin + part * (end - begin), 1.0)
         far = np.append(begin, 1.0) >= cuts[0] - 1e-12
@@ -61,14 +64,14 @@ def test_what_is_the_same_everywhere_stays_so(cuts, nodes):
     system = rod(sorted(cuts), nodes)
     width = system.y_layout.size + system.z_layout.size
     for space in SCHEMES.values():
-        found = at_stages(system, space, jnp.full((nodes, width), 0.7))
+        found = stages_of(system, space, jnp.full((nodes, width), 0.7))
         np.testing.assert_allclose(found, 0.7, rtol=1e-12)
         assert found.shape == (len(space.parts), len(points_of(system).segment) + 1, width)
 
 
 def test_where_stages_are_at_nodes_they_are_as_those():
     records = jnp.asarray(np.random.default_rng(0).normal(size=(10, 25)))
-    start, middle, again, end = at_stages(rod([], 10), SCHEMES["rk4"], records)
+    start, middle, again, end = stages_of(rod([], 10), SCHEMES["rk4"], records)
     np.testing.assert_array_equal(start, records)
     np.testing.assert_array_equal(middle, again)
     np.testing.assert_array_equal(end, [*records[1:], records[-1]])

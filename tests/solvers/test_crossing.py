@@ -52,7 +52,7 @@ def test_pieces_follow_each_other_from_base_to_tip(places, nodes):
     assert set(points.between.tolist()) <= set(np.flatnonzero(points.acting.any(axis=1)).tolist())
 
 
-@given_settings(max_examples=40, deadline=None)
+@given_settings(max_examples=15, deadline=None)
 @given(CUTS, st.integers(2, 30))
 def test_what_is_linear_along_the_rod_is_spread_exactly(places, nodes):
     points = points_between(tuple(sorted(places)), nodes)
@@ -75,18 +75,21 @@ STIFFER = (kc.Stretch(end=0.1, stiffness=[2.0]), kc.Stretch(begin=0.105, stiffne
 @pytest.mark.parametrize(
     "changes",
     [
-        {"sections": STIFFER, "loads": (kc.loads.AttachedMass(at=0.52, mass=0.01),)},
-        {"loads": (kc.loads.AttachedMass(at=4 / 9, mass=0.01),)},
+        pytest.param(
+            {"sections": STIFFER, "loads": (kc.loads.AttachedMass(at=0.52, mass=0.01),)}, id="parted"
+        ),
+        pytest.param(
+            {"loads": (kc.loads.AttachedMass(at=4 / 9, mass=0.01),)}, id="whole", marks=pytest.mark.campaign
+        ),
     ],
-    ids=["parted", "whole"],
 )
 def test_pieces_side_by_side_as_parts_one_after_the_other(space, changes):
     robot = kc.load_robot("delrin-routed-tendon-robot").replace(**{"sections": (), "loads": (), **changes})
     generator = np.random.default_rng(0)
-    record = np.asarray(rest_record(robot))
+    record = np.asarray(jax.jit(rest_record)(robot))
     y = record[:, : robot.y_layout.size] + 1e-2 * generator.normal(size=(robot.nodes, robot.y_layout.size))
     history = -20.0 * record + 1e-2 * generator.normal(size=record.shape)
-    past = at_stages(robot, SCHEMES[space], jnp.asarray(history))
+    past = jax.jit(at_stages, static_argnums=1)(robot, SCHEMES[space], jnp.asarray(history))
     control = jnp.array([6.0, 7.0, 5.0, 6.0])
     problem = StepProblem(robot, jnp.zeros(()), control, jnp.array(20.0), past, SCHEMES[space])
     parts = parts_of(robot.cuts, robot.nodes)
@@ -130,20 +133,29 @@ class RememberingSlopes(kc.SlenderRod):
 
 
 def test_what_remembers_slopes_too_begins_with_those_of_its_nodes():
-    beam = {"length": 0.5, "radius": 0.005, "density": 1200.0, "youngs_modulus": 5e6, "nodes": 8}
+    beam = {"length": 0.5, "radius": 0.005, "density": 1200.0, "youngs_modulus": 1e8, "nodes": 8}
     plain, other = (
         rod(**beam, sections=(kc.Stretch(end=0.317, stiffness=[2.0]),))
         for rod in (kc.SlenderRod, RememberingSlopes)
     )
-    past = initial_past(other, Settings(), rest_record(other), jnp.zeros(0))
+    begun = jax.jit(lambda rod: initial_past(rod, Settings(), rest_record(rod), jnp.zeros(0)))
+    past = begun(other)
     # straight, and so alike all along
     np.testing.assert_allclose(past.records[0, 0, :, -plain.y_layout.size :][:, 2], 1.0, atol=1e-12)
     found, expected = (kc.simulate(rod, np.zeros((3, 0)), 0.02).y for rod in (other, plain))
     np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
+CLOSE = (1e-12, 9e-11, 2e-10, 9e-10, 2e-9)
+
+
 @pytest.mark.parametrize(
-    "off", [9e-10, *(pytest.param(off, marks=pytest.mark.campaign) for off in (1e-12, 9e-11, 2e-10, 2e-9))]
+    "off",
+    [
+        pytest.param(side * off, marks=() if side * off == 9e-10 else pytest.mark.campaign)
+        for off in CLOSE
+        for side in (-1, 1)
+    ],
 )
 def test_a_cut_close_beside_a_node_costs_no_accuracy(off):
     """Taken to be on the node, and looked at from beyond where it is, it was of order 1."""
@@ -156,5 +168,4 @@ def test_a_cut_close_beside_a_node_costs_no_accuracy(off):
         )  # fmt: skip
         return kc.equilibrium(rod, np.zeros(0), space="rk4").tip_position[-1]
 
-    for at in (0.5 - off, 0.5 + off):
-        np.testing.assert_allclose(tip(at), tip(0.5), atol=2e-8)
+    np.testing.assert_allclose(tip(0.5 + off), tip(0.5), atol=2e-8)

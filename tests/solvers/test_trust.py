@@ -71,6 +71,7 @@ def line(nodes, **changes):
     )  # fmt: skip
 
 
+@pytest.mark.campaign
 def test_equilibria_on_too_long_segments_are_those_of_finer_ones():
     """Euler's segments make grow what decays along a stretched line: solved, and nowhere near its shape."""
     still = kc.equilibrium(line(41), np.zeros(0))
