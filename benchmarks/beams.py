@@ -228,7 +228,7 @@ BDF2 = kc.BDF2()
 PERIOD_STEPS, STEPS, SETTLED = 16, 96, 32
 
 
-def swinging(mode: int, nodes: int, space: str = "rk4", scheme: Any = BDF2) -> tuple[np.ndarray, float]:
+def swinging(mode: int, nodes: int, space: str = "lobatto4", scheme: Any = BDF2) -> tuple[np.ndarray, float]:
     """How much of a mode is in every row of a rod that is let go from its shape, and the time step."""
     robot = rod(nodes)
     part = np.linspace(0, 1, nodes)

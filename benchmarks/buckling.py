@@ -17,7 +17,6 @@ import numpy as np
 import scipy.linalg
 
 import knode_cosserat as kc
-from knode_cosserat.solvers.boundary import linearise
 from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.space import SCHEMES
 
@@ -28,18 +27,21 @@ STEP = 1e-4
 @functools.partial(jax.jit, static_argnames="space")
 def _tip_response(system: Any, control: Any, y: Any, space: Any) -> Any:
     problem = StepProblem.still(system, space, control)
-    F, base, tip, _, _ = linearise(problem, problem.filled(y), system.unknowns(y[0]))
-    last, _ = jax.lax.scan(lambda X, F_j: (F_j @ X, None), base, F)
-    return tip @ last
+    found = problem.linearise(problem.filled(y), system.unknowns(y[0]))
+    last, _ = jax.lax.scan(lambda X, F_j: (F_j @ X, None), found.base, found.F)
+    return found.tip @ last
 
 
-def tip_response(rest: kc.Trajectory, space: str = "rk4") -> np.ndarray:
+def tip_response(rest: kc.Trajectory, space: str = "lobatto4") -> np.ndarray:
     """A = ∂tip/∂ξ at an equilibrium (a trajectory of one row)."""
     return np.asarray(_tip_response(rest.system, rest.control[-1], rest.y[-1], SCHEMES[space]))
 
 
 def critical_load(
-    equilibrium: Callable[[float], kc.Trajectory], guess: float, space: str = "rk4", corrections: int = 20
+    equilibrium: Callable[[float], kc.Trajectory],
+    guess: float,
+    space: str = "lobatto4",
+    corrections: int = 20,
 ) -> float:
     """The load near the guess at which `equilibrium(load)` has a neighbour under the same load."""
     load = guess

@@ -72,7 +72,7 @@ def shapes(path: Path) -> None:
     nodes = 20
     fine = np.linspace(0, 1, 400)
     for load in closed_forms.ELASTICA:
-        found = beams.positions(beams.rod(nodes, force=(load, 0, 0)), "rk4")
+        found = beams.positions(beams.rod(nodes, force=(load, 0, 0)), "lobatto4")
         (dots,) = axes[0].plot(found[:, 0], found[:, 2], ".-", lw=0.8, label=f"F L²/EI = {load}")
         deflection, shortening = closed_forms.elastica(load)
         axes[0].plot(deflection, 1 - shortening, "o", mfc="none", ms=10, color=dots.get_color())
@@ -83,7 +83,7 @@ def shapes(path: Path) -> None:
         ("helix", (3, -1, 4)),
     ):
         exact = closed_forms.helix(np.multiply(moment, beams.MOMENT), fine, beams.EI)
-        found = beams.positions(beams.rod(nodes, moment=moment), "rk4")
+        found = beams.positions(beams.rod(nodes, moment=moment), "lobatto4")
         (line,) = axes[1].plot(exact[:, 0], exact[:, 2], lw=1, label=name)
         axes[1].plot(found[:, 0], found[:, 2], ".", color=line.get_color())
     axes[1].set(title="moment at the tip", xlabel="x / L", ylabel="z / L")
@@ -91,7 +91,7 @@ def shapes(path: Path) -> None:
     axes[2].plot(exact[:, 0], exact[:, 2], lw=1, label="catenary")
     for curved, mark, name in ((True, ".", "rod curved like it at rest"), (False, "x", "straight rod")):
         robot, start = beams.hanging(nodes, curved)
-        found = beams.positions(robot, "rk4", initial=start)
+        found = beams.positions(robot, "lobatto4", initial=start)
         axes[2].plot(found[:, 0], found[:, 2], mark, ms=5, label=name)
     axes[2].set(title="between two pins, w L³/EI = 60", xlabel="x / L", ylabel="z / L")
     for ax in axes:
@@ -109,7 +109,9 @@ def dynamics(path: Path) -> None:
     smallest = []
     for weight in weights:
         gravity = (0, 0, -weight * beams.FORCE / (beams.DENSITY * beams.AREA * beams.LENGTH))
-        rest = kc.equilibrium(beams.rod(40, gravity=gravity), np.zeros(0), space="rk4", newton=beams.NEWTON)
+        rest = kc.equilibrium(
+            beams.rod(40, gravity=gravity), np.zeros(0), space="lobatto4", newton=beams.NEWTON
+        )
         scales = np.array([beams.FORCE] * 3 + [beams.MOMENT] * 3)
         smallest.append(np.linalg.svd(tip_response(rest) * scales / scales[:, None], compute_uv=False)[-1])
     axes[0].plot(weights, smallest, ".-", lw=0.8)
@@ -158,11 +160,11 @@ def _all(
 def main() -> None:
     """Measure, draw, write."""
     every: dict[str, Any] = {
-        "statics": _all(beams.STATICS, "rk4"),
+        "statics": _all(beams.STATICS, "lobatto4"),
         "euler": _all(beams.STATICS, "euler", EULER),
-        "buckling": _all(beams.BUCKLING, "rk4"),
-        "vibration": _all(beams.VIBRATION, "rk4"),
-        "motion": _all(motions.MOTIONS, "rk4"),
+        "buckling": _all(beams.BUCKLING, "lobatto4"),
+        "vibration": _all(beams.VIBRATION, "lobatto4"),
+        "motion": _all(motions.MOTIONS, "lobatto4"),
     }
     families = beams.STATICS, beams.BUCKLING, beams.VIBRATION, motions.MOTIONS
     names = {key: case.name for family in families for key, case in family.items()}

@@ -31,10 +31,10 @@ def main(out: str = "cut_the_thread.png", steps: int = 128, nodes: int = 11) -> 
         length=LENGTH, radius=RADIUS, density=DENSITY, youngs_modulus=E, gravity=(0.0, 0.0, 0.0),
         loads=(kc.loads.AttachedMass(mass=MASS), thread), nodes=nodes,
     )  # fmt: skip
-    held = kc.equilibrium(robot, np.ones(1), space="rk4")
+    held = kc.equilibrium(robot, np.ones(1), space="lobatto4")
     known = known_frequency()
     dt = 1 / (40 * known)
-    swings = kc.simulate(robot, np.zeros((steps, 1)), dt, time="trapezoidal", space="rk4", initial=held)
+    swings = kc.simulate(robot, np.zeros((steps, 1)), dt, time="trapezoidal", space="lobatto4", initial=held)
     x, time = np.asarray(swings.tip_position)[:, 0], np.asarray(swings.time)
     down = np.flatnonzero((x[:-1] > 0) & (x[1:] <= 0))
     crossings = time[down] + dt * x[down] / (x[down] - x[down + 1])

@@ -49,9 +49,9 @@ class HangingString(kc.System):
 def main(out: str = "hanging_string.png", steps: int = 100) -> kc.Trajectory:
     """Let the string hang, then swing it by moving the hand."""
     string = HangingString(length=1.0, density=0.1, stiffness=1e3, friction=0.05, nodes=41)
-    hanging = kc.equilibrium(string, np.array([0.6, 0.0]), space="rk4")
+    hanging = kc.equilibrium(string, np.array([0.6, 0.0]), space="lobatto4")
     hand = [[0.6 + 0.05 * np.sin(0.04 * np.pi * i), 0.0] for i in range(1, steps + 1)]
-    swing = kc.simulate(string, hand, 0.02, space="rk4", initial=hanging)
+    swing = kc.simulate(string, hand, 0.02, space="lobatto4", initial=hanging)
     kc.figures.shape(swing, count=9).savefig(out)
     return swing
 

@@ -22,7 +22,7 @@ def wound(turns: float) -> kc.RoutedTendonRobot:
 def main(out: str = "helical_tendons.png", tension: float = 6.0, turns: float = 1.0) -> list[kc.Trajectory]:
     """Shapes at rest of a rod with a straight tendon, and with one wound to the left and to the right."""
     windings = (0.0, turns, -turns)
-    shapes = [kc.equilibrium(wound(each), [tension], space="rk4") for each in windings]
+    shapes = [kc.equilibrium(wound(each), [tension], space="lobatto4") for each in windings]
     names = ("straight", f"{turns:g} turn to the left", f"{turns:g} turn to the right")
     rods = {name: np.asarray(shape.position[0]) for name, shape in zip(names, shapes, strict=True)}
     kc.figures.path(rods, view="xyz").savefig(out)

@@ -40,8 +40,8 @@ def record(path: Path, signal: str, seconds: float) -> None:
     sent = np.concatenate([np.full((round(RESTING / 0.05), 3), 5.0), pulls])
     time = FINE * np.arange(round(seconds / FINE) + 1)
     tension = lagged(Pulls(0.05 * np.arange(len(sent)), sent), time, 0.06)
-    still = kc.equilibrium(real, tension[0], space="rk4")
-    moved = kc.simulate(real, tension[1:], FINE, space="rk4", initial=still)[::2]
+    still = kc.equilibrium(real, tension[0], space="lobatto4")
+    moved = kc.simulate(real, tension[1:], FINE, space="lobatto4", initial=still)[::2]
     rng = np.random.default_rng(list(signal.encode()))
     config = kc.RecordingConfig.load(HERE / "your_own_recording.yaml")
     config = config.replace(simulated=True, description=f"{path.stem}: a virtual robot")

@@ -10,7 +10,7 @@ from knode_cosserat.cli import app
 ROBOT = "delrin-tendon-robot"
 COMMANDS = ("simulate", "equilibrium", "info", "reach", "workspace", "fit", "evaluate", "plot", "animate",
             "inspect", "study simulation", "study imperfections", "study data", "study estimation",
-            "record-virtual", "schema", "doctor", "view")  # fmt: skip
+            "study beam", "record-virtual", "schema", "doctor", "view")  # fmt: skip
 
 
 def run(*arguments):

@@ -6,15 +6,13 @@ Most of the time of the tests is compiling programs that run for milliseconds, s
 on optimising machine code. The long campaigns run what users run, unless asked not to (`--quick`).
 """
 
-import gc
 import os
-import pathlib
 import sys
 
 from jaxtyping import install_import_hook
 
 EQUATIONS = ("rotation", "rods.loads", "rods.section", "rods.tendons")
-SOLVER = tuple(f"solvers.{name}" for name in ("boundary", "linear", "march", "problem", "space", "time"))
+SOLVER = tuple(f"solvers.{name}" for name in ("boundary", "linear", "problem", "space", "time", "time_loop"))
 
 install_import_hook([f"knode_cosserat.{name}" for name in EQUATIONS + SOLVER], "beartype.beartype")
 
@@ -34,15 +32,3 @@ def pytest_configure(config):
     quick = config.option.quick or "not campaign" in config.option.markexpr
     if quick and "jax" not in sys.modules:
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICK}".strip()
-
-
-#: memory maps of one process at which its programs are forgotten: Linux allows 65530, each program takes some
-#: fifty, and the compiler crashes when there are no more
-MANY_MAPS = 30_000
-
-
-def pytest_runtest_teardown(nextitem):
-    maps = pathlib.Path("/proc/self/maps")
-    if nextitem is not None and maps.exists() and maps.read_bytes().count(b"\n") > MANY_MAPS:
-        sys.modules["jax"].clear_caches()
-        gc.collect()

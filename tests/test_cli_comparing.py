@@ -29,7 +29,7 @@ def test_evaluate_compares_trajectories(tmp_path, truth):
 def test_evaluate_simulates_a_robot_as_the_papers_table_has_it(tmp_path):
     # protocol.md: stiffness, sine: DTW 19.99, MSE 12.52; the paper keeps the first 100 rows
     out = tmp_path / "truth.nc"
-    succeeded(*simulated(out, controls="sine:1.5", steps=100))
+    succeeded(*simulated(out, "--space", "euler", controls="sine:1.5", steps=100))
     (row,) = told("evaluate", ROBOT, out, "--set", "youngs_modulus=10e9", "--rows", 100)["references"]
     assert row["rows"] == 100
     assert row["tip_dtw"] == pytest.approx(19.99, abs=0.005)
@@ -39,7 +39,7 @@ def test_evaluate_simulates_a_robot_as_the_papers_table_has_it(tmp_path):
 @pytest.mark.campaign
 def test_evaluate_simulates_by_the_references_settings(tmp_path):
     out, robot = tmp_path / "a.nc", tmp_path / "robot.yaml"
-    succeeded(*simulated(out, "--dt", 0.02, "--time", "bdf1", "--space", "rk4", "--nodes", 7))
+    succeeded(*simulated(out, "--dt", 0.02, "--time", "bdf1", "--space", "lobatto4", "--nodes", 7))
     kc.save_robot(kc.load_robot(ROBOT).replace(nodes=7), robot)
     (row,) = told("evaluate", robot, out)["references"]
     assert row["tip_rmse"] < 1e-9

@@ -5,8 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray
 
 import knode_cosserat as kc
+from knode_cosserat.learning.files import model_file
+from knode_cosserat.learning.files.container import Writer
 
 FILES = Path(__file__).with_name("files")
 TOLD = json.loads((FILES / "told.json").read_text())
@@ -34,6 +37,61 @@ def test_a_trajectory():
 def test_a_model_predicts_what_it_did():
     model = kc.load_model(FILES / "model-1.model")
     before = kc.load_trajectory(FILES / "prediction-1.nc")
-    found = kc.simulate(model, np.asarray(before.control)[1:], before.dt)
+    found = kc.simulate(model, np.asarray(before.control)[1:], before.dt, space=before.settings.space)
     np.testing.assert_allclose(found.tip_position[-1], TOLD["predicted tip"], atol=1e-9)
     np.testing.assert_allclose(found.y, before.y, atol=1e-7)
+
+
+# choices that are no longer there
+
+NEWTON = {
+    "tolerance": 1e-10,
+    "acceptable": 1e-8,
+    "max_linearisations": 12,
+    "patience": 6,
+    "least_damping": 1e-3,
+}
+DECOUPLED = {"scheme": "Decoupled", "group": 4}
+
+
+@pytest.mark.parametrize("more", [{}, {"elimination": "Condensed"}, {"elimination": DECOUPLED}])
+def test_a_trajectory_with_settings_and_results_of_earlier_versions(tmp_path, more):
+    path = tmp_path / "a.nc"
+    data = xarray.load_dataset(FILES / "trajectory-1.nc", engine="h5netcdf", decode_cf=False)
+    settings = json.loads(data.attrs["settings"])
+    settings |= {"space": {"scheme": "RK4"}, "newton": NEWTON | {"across_steps": True}, **more}
+    data.attrs["settings"] = json.dumps(settings)
+    # the stable elimination, load continuation, finer segments, unstable
+    data["result"].values[1:5] = [1, 2, 5, -4]
+    data["begun"] = ("begun_state", "begun_stage", "begun_point", "begun_number"), np.zeros((3, 4, 5, 25))
+    data["begun_step"] = "begun_coefficient", np.zeros(5)
+    data.to_netcdf(path, engine="h5netcdf")
+    found = kc.load_trajectory(path)
+    assert found.settings == kc.Settings(space=kc.Lobatto4(), newton=kc.NewtonOptions(patience=6))
+    codes = kc.Result
+    expected = [codes.CONVERGED, codes.RECOVERED_LOAD_CONTINUATION, codes.CONVERGED, codes.NO_CONVERGENCE]
+    assert found.result[1:5].tolist() == expected
+    assert found.begun is None and found.position_error is None
+    # saved again it is a file of this version
+    found.save(tmp_path / "b.nc")
+    np.testing.assert_array_equal(kc.load_trajectory(tmp_path / "b.nc").result, found.result)
+
+
+def test_a_model_with_settings_of_earlier_versions(tmp_path):
+    model = kc.load_model(FILES / "model-1.model")
+    writer = Writer()
+    header = model_file._header(writer, model)
+    header["about"]["settings"] = {
+        "$class": "Settings",
+        "fields": {
+            "time": {"$class": "BDF2", "fields": {"alpha": 0.0}},
+            "space": {"$class": "RK4", "fields": {}},
+            "start": "paper",
+            "newton": {"$class": "NewtonOptions", "fields": NEWTON | {"across_steps": True}},
+            "elimination": {"$class": "Decoupled", "fields": {"group": 4}},
+        },
+    }
+    path = tmp_path / "old.model"
+    path.write_bytes(writer.file(model_file.TITLE, header))
+    found = kc.load_model(path).about.facts["settings"]
+    assert found == kc.Settings(space=kc.Lobatto4(), newton=kc.NewtonOptions(patience=6))

@@ -11,7 +11,7 @@ TRUE = {("self-weight", "step"): (1.27, 0.09)}
 
 
 def moved(robot, control):
-    return kc.simulate(robot, kc.controls.parse(CONTROLS[control], ROWS, DT), DT)[:ROWS]
+    return kc.simulate(robot, kc.controls.parse(CONTROLS[control], ROWS, DT), DT, space="euler")[:ROWS]
 
 
 @pytest.fixture(scope="module")

@@ -32,8 +32,8 @@ from tests.trajectories import ROBOT, ROBOTS, Leapfrog, Pendulum, assert_same, f
         synthetic(batch=(1,), steps=1),
         synthetic(batch=(3,), robot=ROBOTS),
         synthetic(batch=(1,), robot=stacked(ROBOT)),
-        synthetic(stages=4),
-        synthetic(batch=(3,), robot=ROBOTS, stages=1),
+        synthetic(places=20),
+        synthetic(batch=(3,), robot=ROBOTS, places=5),
     ],
     ids=lambda trajectory: f"{type(trajectory.system).__name__}{trajectory.y.shape}",
 )
@@ -66,7 +66,7 @@ def test_a_simulation_comes_back_the_same(tmp_path):
 @pytest.mark.parametrize(
     "chosen",
     [
-        kc.Settings(time=kc.BDF1(), space=kc.RK4(), start="consistent"),
+        kc.Settings(time=kc.BDF1(), space=kc.Lobatto4(), start="consistent"),
         kc.Settings(time=kc.BDFAlpha(-1 / 3), newton=kc.NewtonOptions(tolerance=1 / 3e9, patience=2)),
         kc.Settings(time=kc.Trapezoidal()),
         kc.Settings(time=Static()),

@@ -10,7 +10,7 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.rods.parameters import parameter
-from knode_cosserat.solvers.past import Begun
+from knode_cosserat.solvers.history import Begun
 from knode_cosserat.solvers.time import TimeScheme
 from knode_cosserat.trajectory_system import TrajectoryFileError
 
@@ -57,6 +57,9 @@ def assert_same(a, b):
         one, other = np.asarray(getattr(a, name)), np.asarray(getattr(b, name))
         assert (one.dtype, one.shape) == (other.dtype, other.shape), name
         assert one.tobytes() == other.tobytes(), name
+    assert (a.position_error is None) == (b.position_error is None)
+    if a.position_error is not None:
+        assert np.asarray(a.position_error).tobytes() == np.asarray(b.position_error).tobytes()
     assert (a.begun is None) == (b.begun is None)
     for one, other in zip(jax.tree.leaves(a.begun), jax.tree.leaves(b.begun), strict=True):
         assert np.shape(one) == np.shape(other) and np.asarray(one).tobytes() == np.asarray(other).tobytes()
@@ -66,10 +69,10 @@ def assert_same(a, b):
         assert np.array_equal(one, other)
 
 
-def synthetic(batch=(), steps=4, nodes=5, robot=ROBOT, settings=PAPER, seed=0, stages=0):
+def synthetic(batch=(), steps=4, nodes=5, robot=ROBOT, settings=PAPER, seed=0, places=0):
     """A trajectory of random numbers, and of what a file could spoil: -0, NaN, infinity, a subnormal.
 
-    With `stages` it tells where it began, at as many.
+    With `places` it has position errors and an initial history at that number of places.
     """
     rng = np.random.default_rng(seed)
     rows = (*batch, steps)
@@ -85,13 +88,14 @@ def synthetic(batch=(), steps=4, nodes=5, robot=ROBOT, settings=PAPER, seed=0, s
         result=rng.choice([int(result) for result in kc.Result], size=rows),
         residual=rng.normal(size=rows),
         iterations=rng.integers(0, 100, size=rows),
+        position_error=rng.uniform(size=rows) if places else None,
         begun=Begun(
-            rng.normal(size=(*batch, 2, stages, nodes, 25)),
-            rng.normal(size=(*batch, stages, nodes, 25)),
+            rng.normal(size=(*batch, 2, places, 25)),
+            rng.normal(size=(*batch, places, 25)),
             rng.normal(size=(*batch, 4)),
             rng.uniform(size=batch),
         )
-        if stages
+        if places
         else None,
     )
 

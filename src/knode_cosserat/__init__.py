@@ -16,6 +16,7 @@ from knode_cosserat.control.configuration import (
     jacobian,
     manipulability,
 )
+from knode_cosserat.control.path import EquilibriumPath, equilibrium_path
 from knode_cosserat.control.reach import InverseKinematics, Reach, inverse_kinematics
 from knode_cosserat.control.stability import Stability, stability
 from knode_cosserat.control.workspace import Workspace, workspace
@@ -65,7 +66,7 @@ from knode_cosserat.solvers.equilibrium import equilibrium
 from knode_cosserat.solvers.result import Result, SimulationError
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.simulate import simulate
-from knode_cosserat.solvers.space import RK4, Euler
+from knode_cosserat.solvers.space import Euler, Lobatto2, Lobatto4
 from knode_cosserat.solvers.stepper import Stepper
 from knode_cosserat.solvers.time import BDF1, BDF2, BDFAlpha, Trapezoidal
 from knode_cosserat.trajectory import Trajectory
@@ -79,7 +80,6 @@ __all__ = [
     "BDF1",
     "BDF2",
     "KNODE",
-    "RK4",
     "BDFAlpha",
     "Calibration",
     "CalibrationError",
@@ -90,6 +90,7 @@ __all__ = [
     "Diagnosis",
     "Differences",
     "Ensemble",
+    "EquilibriumPath",
     "Euler",
     "Field",
     "FitConfig",
@@ -98,6 +99,8 @@ __all__ = [
     "History",
     "InverseKinematics",
     "Layout",
+    "Lobatto2",
+    "Lobatto4",
     "Manipulability",
     "Measurements",
     "ModelFileError",
@@ -139,6 +142,7 @@ __all__ = [
     "doctor",
     "ends",
     "equilibrium",
+    "equilibrium_path",
     "estimate_parts",
     "estimate_states",
     "explain",

@@ -1,4 +1,4 @@
-"""How this package uses JAX: double precision, and compiled programs kept on disk between processes."""
+"""JAX as this package uses it: double precision; compiled programs kept on disk, and few in memory."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import platform
 from pathlib import Path
 
 import jax
+
+from knode_cosserat._programs import limit_programs
 
 
 def _machine() -> str:
@@ -37,3 +39,5 @@ def configure() -> None:
 
 
 configure()
+#: limits the compiled programs of this process
+program_budget = limit_programs()

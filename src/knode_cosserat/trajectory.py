@@ -30,7 +30,9 @@ class Trajectory(eqx.Module):
     #: largest residual in natural units
     residual: Float[Any, "*batch T"]
     iterations: Int[Any, "*batch T"]
-    #: of a motion: what its first step looked back on (`solvers.past.Begun`), if that is known
+    #: estimated discretisation error of positions along the rod (m), the largest over the nodes; NaN: unknown
+    position_error: Any = None
+    #: initial history of a motion (`solvers.history.Begun`), if it is known
     begun: Any = None
 
     # named parts
@@ -148,7 +150,8 @@ class Trajectory(eqx.Module):
             raise TypeError(f"index a trajectory's rows by a slice, not by {index!r}")
         if self.y.ndim == 4 and not isinstance(index, slice | int | np.integer):
             raise TypeError(f"index a batch by a slice or a robot's number, not by {index!r}")
-        fields = ("y", "z", "control", "result", "residual", "iterations")
+        fields: tuple[str, ...] = ("y", "z", "control", "result", "residual", "iterations")
+        fields += () if self.position_error is None else ("position_error",)
         picked: dict[str, Any] = {name: getattr(self, name)[index] for name in fields}
         time = self.time if self.y.ndim == 4 else self.time[index]
         system = self.system

@@ -18,8 +18,8 @@ import numpy as np
 from knode_cosserat._files import package_version, replacing
 from knode_cosserat.rods.layout import Field, Layout
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.past import Begun
-from knode_cosserat.solvers.result import Result
+from knode_cosserat.solvers.history import Begun
+from knode_cosserat.solvers.result import EARLIER_RESULTS, Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.trajectory import Trajectory
 from knode_cosserat.trajectory_system import (
@@ -40,16 +40,19 @@ if TYPE_CHECKING:
 FORMAT = "knode-cosserat trajectory"
 VERSION = 1
 
-#: what a trajectory has one number of in each row: name, unit and meaning
+#: one number in each row: name, unit and meaning
 _ROWS = (
     ("result", "1", "how the step ended; below zero: not solved"),
     ("residual", "1", "largest residual, in natural units"),
     ("iterations", "1", "Newton corrections"),
 )
-#: what the first step of a motion looked back on: two states, newest first, and
-#: the newest one's rate, at the stages of the scheme along the rod; and that step's c0, c1, c2, d1 and dt
-_BEGUN, _BEGUN_STEP = "begun", "begun_step"
-_BEGUN_ALONG = ("begun_state", "begun_stage", "begun_point", "begun_number")
+_ERROR = ("position_error", "m", "estimated discretisation error of positions, the largest over the nodes")
+#: initial history of a motion: two states, newest first, and the newest one's rate, where the equations are
+#: evaluated along the rod; and c0, c1, c2, d1 and dt of the first step
+_BEGUN, _BEGUN_STEP = "initial_history", "initial_history_step"
+_BEGUN_ALONG = ("history_state", "history_place", "history_number")
+#: names in files of earlier versions, whose initial histories are ignored: they belong to other schemes
+_EARLIER = ("begun", "begun_step")
 
 # writing
 
@@ -97,20 +100,23 @@ def _dataset(trajectory: Trajectory, source: str) -> xarray.Dataset:
             variables[field.name] = ((*rows, *along, component), values, labels(field.unit, field.meaning))
     for name, unit, meaning in _ROWS:
         variables[name] = (rows, np.asarray(getattr(trajectory, name)), labels(unit, meaning))
+    if trajectory.position_error is not None:
+        name, unit, meaning = _ERROR
+        variables[name] = (rows, np.asarray(trajectory.position_error), labels(unit, meaning))
     variables["result"][2].update(_flags(variables["result"][1].dtype))
     if trajectory.begun is not None:
         begun = Begun(*map(np.asarray, trajectory.begun))
-        states = np.concatenate([begun.records, np.expand_dims(begun.rate, -4)], axis=-4)
+        states = np.concatenate([begun.records, np.expand_dims(begun.rate, -3)], axis=-3)
         step = np.concatenate([begun.coefficients, begun.dt[..., None]], axis=-1)
         variables[_BEGUN] = (
             (*batch, *_BEGUN_ALONG),
             states,
-            {"long_name": "what the first step looked back on"},
+            {"long_name": "initial history: newest state, the one before it, and the newest one's rate"},
         )
         variables[_BEGUN_STEP] = (
-            (*batch, "begun_coefficient"),
+            (*batch, "history_coefficient"),
             step,
-            {"long_name": "c0, c1, c2, d1 and dt of it"},
+            {"long_name": "c0, c1, c2, d1 and dt of the first step"},
         )
     texts, more = described(system)
     try:
@@ -154,8 +160,8 @@ def _flags(dtype: np.dtype) -> dict[str, Any]:
 def _require_names(system: System, source: str) -> None:
     """A field's name must be free to be a variable's."""
     names = [field.name for layout in _layouts(system) for field in layout.fields]
-    taken = {"time", "node", "batch", "arclength", "axis", "quaternion", BYTES, SIZES, _BEGUN, _BEGUN_STEP}
-    taken |= {name for name, *_ in _ROWS}
+    taken = {"time", "node", "batch", "arclength", "axis", "quaternion", BYTES, SIZES}
+    taken |= {_BEGUN, _BEGUN_STEP, *_EARLIER, *(name for name, *_ in (*_ROWS, _ERROR))}
     for name in names:
         if name in taken or "/" in name or name.startswith(PARAMETER) or name.endswith("_index"):
             raise TrajectoryFileError(
@@ -205,20 +211,34 @@ def load_trajectory(path: str | Path, *, system: System | None = None) -> Trajec
         packed.append(np.concatenate(fields, axis=-1) if fields else np.zeros((*shape, 0)))
     y, z, control = packed
     numbers = {name: values_of(path, data, name, rows) for name, *_ in _ROWS}
+    numbers["result"] = _current_codes(numbers["result"], data["result"].attrs)
+    if _ERROR[0] in data.variables:
+        numbers[_ERROR[0]] = values_of(path, data, _ERROR[0], rows)
     settings, begun = _settings(path, data), _begun(path, data)
     return Trajectory(system, settings, time, y, z, control, **numbers, begun=begun)
 
 
+def _current_codes(codes: np.ndarray, attributes: dict[Any, Any]) -> np.ndarray:
+    """Return this version's result codes: a file names its codes, and earlier versions had others."""
+    values = np.ravel(attributes.get("flag_values", ()))
+    names = str(attributes.get("flag_meanings", "")).split()
+    current = codes.copy()
+    for value, name in zip(values, names, strict=False):
+        if name in EARLIER_RESULTS and isinstance(value, np.integer):
+            current[codes == value] = int(EARLIER_RESULTS[name])
+    return current
+
+
 def _begun(path: Path, data: xarray.Dataset) -> Begun | None:
-    """What the first step looked back on, if the file says so."""
+    """Return the initial history, if the file has it."""
     if _BEGUN not in data.variables:
         return None
     batch = tuple(data.sizes[name] for name in ("batch",) if name in data.sizes)
     sizes = tuple(data.sizes.get(name, 0) for name in _BEGUN_ALONG[1:])
     states = values_of(path, data, _BEGUN, (*batch, 3, *sizes))
     step = values_of(path, data, _BEGUN_STEP, (*batch, 5))
-    newest, before, rate = np.moveaxis(states, -4, 0)
-    return Begun(np.stack([newest, before], axis=-4), rate, step[..., :4], step[..., 4])
+    newest, before, rate = np.moveaxis(states, -3, 0)
+    return Begun(np.stack([newest, before], axis=-3), rate, step[..., :4], step[..., 4])
 
 
 def _read(path: Path) -> xarray.Dataset:

@@ -27,7 +27,7 @@ def test_a_cantilever_is_compliant_as_a_beam():
     expected = np.diag([across, across, L / EA, L / EI, L / EI, L / GJ])
     expected[0, 4] = expected[4, 0] = lean
     expected[1, 3] = expected[3, 1] = -lean
-    found = kc.compliance(robot, np.zeros(4), space="rk4")
+    found = kc.compliance(robot, np.zeros(4), space="lobatto4")
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
 
 
@@ -51,8 +51,8 @@ def test_slopes_are_those_of_the_equilibrium(robot):
 
 
 def test_compliance_is_symmetric_and_positive():
-    """Held tensions have a potential; Runge and Kutta's scheme keeps that up to its error."""
-    C = kc.compliance(ROBOT, CONTROL, space="rk4")
+    """Held tensions have a potential; the scheme along the rod keeps that up to its error."""
+    C = kc.compliance(ROBOT, CONTROL, space="lobatto4")
     assert np.max(np.abs(C - C.T)) < 1e-5 * np.max(np.abs(C))
     assert np.min(np.linalg.eigvalsh((C + C.T) / 2)) > 0.0
 
@@ -61,7 +61,7 @@ def test_compliance_is_symmetric_and_positive():
 def test_asymmetry_is_of_the_order_of_the_scheme():
     asymmetry = []
     for nodes in (10, 20):
-        C = kc.compliance(ROUTED.replace(nodes=nodes), CONTROL, space="rk4")
+        C = kc.compliance(ROUTED.replace(nodes=nodes), CONTROL, space="lobatto4")
         assert np.min(np.linalg.eigvalsh((C + C.T) / 2)) > 0.0
         asymmetry.append(np.max(np.abs(C - C.T)) / np.max(np.abs(C)))
     assert asymmetry[0] < 1e-5
@@ -74,7 +74,7 @@ def test_an_upright_column_is_unstable_beyond_greenhills_load(part):
     L, E, weight = float(ROBOT.length), float(ROBOT.youngs_modulus), 9.81 * float(ROBOT.mass_per_length)
     soft = weight * L**3 / (7.83735 * float(ROBOT.Kbt[0, 0])) / part
     column = ROBOT.replace(youngs_modulus=E * soft)
-    found = kc.configuration(column, np.zeros(4), space="rk4")
+    found = kc.configuration(column, np.zeros(4), space="lobatto4")
     np.testing.assert_allclose(found.position, [0.0, 0.0, L], atol=1e-3)
     assert found.unstable == (part > 1.0)
 
@@ -108,10 +108,10 @@ def test_a_rod_without_controls_has_a_compliance():
     rod = kc.SlenderRod(
         length=length, radius=radius, density=6450.0, youngs_modulus=E, gravity=[0.0, 0.0, 0.0]
     )
-    found = kc.configuration(rod, np.zeros(0), space="rk4")
+    found = kc.configuration(rod, np.zeros(0), space="lobatto4")
     assert found.jacobian.shape == (6, 0) and not found.unstable
     softness = length**3 / (3 * E * np.pi * radius**4 / 4)
-    np.testing.assert_allclose(np.diag(kc.compliance(rod, [], space="rk4"))[:2], softness, rtol=1e-4)
+    np.testing.assert_allclose(np.diag(kc.compliance(rod, [], space="lobatto4"))[:2], softness, rtol=1e-4)
     for ellipsoid in found.manipulability:
         assert not len(ellipsoid.singular_values)
         assert ellipsoid.measure == 0.0 and ellipsoid.condition == np.inf
@@ -119,7 +119,7 @@ def test_a_rod_without_controls_has_a_compliance():
         kc.compliance(rod, [1.0])
     with pytest.raises(ValueError, match="a SlenderRod without controls is given"):
         kc.inverse_kinematics(rod, [0.0, 0.0, 0.3], low=0.0, high=1.0)
-    assert kc.workspace(rod, np.zeros((2, 0)), space="rk4").unsolved == 0
+    assert kc.workspace(rod, np.zeros((2, 0)), space="lobatto4").unsolved == 0
 
 
 def test_wrong_arguments_are_named():

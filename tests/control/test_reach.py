@@ -187,10 +187,10 @@ REELED = kc.RoutedTendonRobot(
 @pytest.mark.campaign
 def test_of_reels_the_shape_is_compared_and_not_the_tensions():
     found = kc.inverse_kinematics(
-        REELED, [0.0441, 0.0, 0.2955], low=-0.01, high=0.01, tolerance=1e-4, space="rk4"
+        REELED, [0.0441, 0.0, 0.2955], low=-0.01, high=0.01, tolerance=1e-4, space="lobatto4"
     )
     assert found.converged and found.from_rest
-    y = np.asarray(kc.equilibrium(REELED, found.control, space="rk4").y[0])
+    y = np.asarray(kc.equilibrium(REELED, found.control, space="lobatto4").y[0])
     for name, factor, same in (
         ("tension", 1.01, True),
         ("h", -1.0, True),
@@ -216,7 +216,7 @@ def test_of_several_rods_every_shape_is_compared():
 def test_of_reels_it_is_certain_that_nothing_is_nearer():
     """What Newton's method leaves of a residual hid from the search that it was at the nearest."""
     found = kc.inverse_kinematics(
-        REELED, [0.0441, 0.0, 0.2955], low=0.0, high=0.01, tolerance=1e-4, space="rk4"
+        REELED, [0.0441, 0.0, 0.2955], low=0.0, high=0.01, tolerance=1e-4, space="lobatto4"
     )
     assert found.result is kc.Reach.UNREACHABLE and found.from_rest
     np.testing.assert_array_equal(found.at_low, [False, True, True])

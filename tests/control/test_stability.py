@@ -19,7 +19,7 @@ PINNED = 4.493409457909064**2
 def squeezed(end, load):
     """Straight, its tip held where `load` EI/L² press it to."""
     held = end(position=[0.0, 0.0, (1.0 - load * EI / L**2 / EA) * L])
-    return kc.equilibrium(ROD.replace(tip_end=held), np.zeros(0), space="rk4")
+    return kc.equilibrium(ROD.replace(tip_end=held), np.zeros(0), space="lobatto4")
 
 
 # columns
@@ -53,7 +53,7 @@ def test_the_least_eigenvalue_crosses_zero_at_the_load_whatever_the_nodes():
         found = []
         for load in at:
             end = Clamped(position=[0.0, 0.0, (1.0 - load * EI / L**2 / EA) * L])
-            rest = kc.equilibrium(rod.replace(tip_end=end), np.zeros(0), space="rk4")
+            rest = kc.equilibrium(rod.replace(tip_end=end), np.zeros(0), space="lobatto4")
             found.append(kc.stability(rest).least)
         critical.append(at[0] - found[0] * (at[1] - at[0]) / (found[1] - found[0]))
     # P (1 + P/GA - P/EA) = 4π² EI/L²: shear makes it softer, and squeezing shorter
@@ -63,7 +63,7 @@ def test_the_least_eigenvalue_crosses_zero_at_the_load_whatever_the_nodes():
 
 
 @pytest.mark.parametrize("part", [0.5, 0.98, 1.02, 4.0])
-@pytest.mark.parametrize("space", [pytest.param("euler", marks=pytest.mark.campaign), "rk4"])
+@pytest.mark.parametrize("space", [pytest.param("euler", marks=pytest.mark.campaign), "lobatto4"])
 def test_an_upright_column_falls_beyond_greenhills_load_by_either_scheme(part, space):
     density = 7.83735 * EI / L**3 * part / (np.pi * RADIUS**2 * 98.1)
     rod = ROD.replace(density=density, gravity=[0.0, 0.0, -98.1], tip_end=Free())
@@ -83,7 +83,7 @@ def test_a_buckled_column_has_nothing_to_lose_but_its_plane():
     pushed = ROD.replace(tip_end=end, loads=(PointWrench(at=0.5, force=[1.0, 0.0, 0.0], controlled=True),))
     rest, least = None, []
     for push in (5.0, 2.0, 1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01):
-        rest = kc.equilibrium(pushed, [push * EI / L**2], space="rk4", initial=rest)
+        rest = kc.equilibrium(pushed, [push * EI / L**2], space="lobatto4", initial=rest)
         found = kc.stability(rest)
         least.append(found.least)
         assert found.stable
@@ -105,11 +105,11 @@ def test_an_arch_snaps_where_it_is_no_longer_stable_and_says_so():
         loads=(PointWrench(at=0.5, force=[1.0, 0.0, 0.0], controlled=True),),
     )  # fmt: skip
     unit = EI / L**2
-    rest = kc.equilibrium(arch, [20.0 * unit], space="rk4")
+    rest = kc.equilibrium(arch, [20.0 * unit], space="lobatto4")
     side = np.sign(rest.position[0, 10, 0])
     middle, least, results = [], [], []
     for load in np.linspace(20.0, -40.0, 31) * unit * side:
-        rest = kc.equilibrium(arch, [load], space="rk4", initial=rest)
+        rest = kc.equilibrium(arch, [load], space="lobatto4", initial=rest)
         middle.append(side * float(rest.position[0, 10, 0]) / L)
         least.append(kc.stability(rest).least)
         results.append(int(rest.result[0]))
@@ -142,7 +142,7 @@ def wire(slenderness, bend, nodes):
 def test_a_slender_wire_is_stable_however_it_is_bent_and_at_few_nodes(bends):
     for slenderness in (50.0, 300.0, 600.0, 6000.0, 60000.0):
         for bend in bends:
-            found = kc.stability(kc.equilibrium(wire(slenderness, bend, 10), np.zeros(0), space="rk4"))
+            found = kc.stability(kc.equilibrium(wire(slenderness, bend, 10), np.zeros(0), space="lobatto4"))
             assert found.unstable_directions == 0 and found.least == pytest.approx(1.7, rel=0.25)
             assert found.asymmetry < 1e-9
 
@@ -152,7 +152,7 @@ def test_a_slender_wire_is_stable_however_it_is_bent_and_at_few_nodes(bends):
 def test_of_a_slender_wire_the_nodes_do_not_change_what_is_least(nodes):
     least = [
         kc.stability(kc.equilibrium(wire(600.0, 1.5, each), np.zeros(0), space=space)).least
-        for each, space in ((10, "euler"), (10, "rk4"), (nodes, "rk4"))
+        for each, space in ((10, "euler"), (10, "lobatto4"), (nodes, "lobatto4"))
     ]
     assert least[0] == pytest.approx(least[1], rel=1e-6) and least[1] == pytest.approx(least[2], rel=0.02)
 
@@ -176,7 +176,7 @@ def test_a_slender_robot_bent_by_its_tendon_is_stable():
     )  # fmt: skip
     for bend in (0.5, 1.0, 1.5):
         tension = bend * modulus * np.pi * r**4 / 4 / 0.6 / 0.01
-        found = kc.stability(kc.equilibrium(robot, [tension], space="rk4"))
+        found = kc.stability(kc.equilibrium(robot, [tension], space="lobatto4"))
         assert found.stable and found.least == pytest.approx(1.9, rel=0.02)
 
 
@@ -191,11 +191,11 @@ def test_a_slender_arch_pushed_inwards_leaves_its_plane(nodes):
         gravity=[0.0, 0.0, 0.0], tip_end=Pinned(position=[0.0, 0.0, 0.9 * length]),
         loads=(PointWrench(at=0.5, force=[1.0, 0.0, 0.0], controlled=True),),
     )  # fmt: skip
-    rest = kc.equilibrium(arch, [20.0 * unit], space="rk4")
+    rest = kc.equilibrium(arch, [20.0 * unit], space="lobatto4")
     side = np.sign(rest.position[0, nodes // 2, 0])
     found = []
     for load in (20.0, 0.0, -5.0, -20.0):
-        rest = kc.equilibrium(arch, [load * unit * side], space="rk4", initial=rest)
+        rest = kc.equilibrium(arch, [load * unit * side], space="lobatto4", initial=rest)
         found.append(kc.stability(rest))
     assert [each.unstable_directions for each in found] == [0, 0, 1, 1]
     assert [each.least for each in found] == pytest.approx([1.81, 0.0, -4.27, -19.7], rel=0.02, abs=1e-3)
@@ -209,7 +209,7 @@ def test_what_buckles_between_two_nodes_is_counted_too(nodes):
     counts = []
     for part in (0.98, 1.02, 1.5, 9.0):
         end = Clamped(position=[0.0, 0.0, (1.0 - part * 4.0 * np.pi**2 * EI / L**2 / EA) * L])
-        rest = kc.equilibrium(ROD.replace(tip_end=end, nodes=nodes), np.zeros(0), space="rk4")
+        rest = kc.equilibrium(ROD.replace(tip_end=end, nodes=nodes), np.zeros(0), space="lobatto4")
         counts.append(kc.stability(rest).unstable_directions)
     assert counts[:3] == [0, 2, 2] and counts[3] >= 8
 
@@ -221,7 +221,7 @@ def test_what_rounding_hides_is_refused():
         loads=(), base_end=Pinned(), tip_end=Pinned(position=[0.0, 0.0, 0.3 * (1.0 + 1e-9)])
     )
     with pytest.raises(ValueError, match=r"row -1 cannot be decided: its least eigenvalue, .* less slender"):
-        kc.stability(kc.equilibrium(free, np.zeros(0), space="rk4"))
+        kc.stability(kc.equilibrium(free, np.zeros(0), space="lobatto4"))
 
 
 # several rods, and others
@@ -239,7 +239,7 @@ def test_a_platform_on_upright_legs_falls_under_its_buckling_load():
             base_angles=even, platform_angles=even, platform_radius=float(robot.base_radius), density=1.0,
             platform_mass=mass,
         )  # fmt: skip
-        found = kc.stability(kc.equilibrium(loaded, np.zeros(6), space="rk4"))
+        found = kc.stability(kc.equilibrium(loaded, np.zeros(6), space="lobatto4"))
         assert found.stable == (part < 1.0)
         assert found.mode.shape == (robot.nodes, 6, 3)
 
@@ -247,7 +247,7 @@ def test_a_platform_on_upright_legs_falls_under_its_buckling_load():
 @pytest.mark.campaign
 def test_tendons_keep_a_potential():
     robot = kc.RoutedTendonRobot.like(kc.load_robot("delrin-tendon-robot"), length=1.0)
-    found = kc.stability(kc.equilibrium(robot, [5.0, 2.0, 1.0, 3.0], space="rk4"))
+    found = kc.stability(kc.equilibrium(robot, [5.0, 2.0, 1.0, 3.0], space="lobatto4"))
     assert found.stable and found.asymmetry < 1e-3
 
 

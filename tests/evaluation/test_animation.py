@@ -78,7 +78,7 @@ def test_several_are_overlaid_and_named(tmp_path, trajectory):
 
 def test_what_lives_in_a_plane_moves_too(tmp_path, trajectory):
     string = HangingString(length=1.0, density=0.1, stiffness=1e3, friction=0.05, nodes=21)
-    hanging = kc.equilibrium(string, np.array([0.6, -0.1]), space="rk4")
+    hanging = kc.equilibrium(string, np.array([0.6, -0.1]), space="lobatto4")
     two = dataclasses.replace(
         hanging, time=np.array([0.0, 0.2]), y=np.repeat(np.asarray(hanging.y), 2, axis=0),
         result=np.zeros(2, dtype=int),

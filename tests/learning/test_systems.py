@@ -1,7 +1,5 @@
 """Every kind of robot is learned from one short trajectory: a modulus 30 % off, and an unseen control."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -79,15 +77,6 @@ def test_a_wrong_modulus_is_made_up_for(name):
     assert before > 1e-4 and after < 0.1 * before
 
 
-def test_segments_that_were_divided_are_no_samples_by_euler():
-    moved = kc.simulate(DELRIN, kc.controls.sine(1.5, 10, DT), DT)
-    divided = dataclasses.replace(
-        moved, result=np.full(len(moved.time), int(kc.Result.RECOVERED_FINER_SEGMENTS))
-    )
-    with pytest.raises(kc.DataError, match=r"trajectory 1 was solved with every .* more nodes"):
-        kc.fit(DELRIN, [moved, divided])
-
-
 # samples where something acts
 
 LADEN = kc.SlenderRod(
@@ -96,7 +85,16 @@ LADEN = kc.SlenderRod(
 )  # fmt: skip
 
 
-@pytest.fixture(scope="module", params=["euler", pytest.param("rk4", marks=pytest.mark.campaign)])
+@pytest.mark.xfail(
+    strict=True, raises=kc.SimulationError,
+    reason="inside Newton's compiled loop the residual of forward Euler with loads at a node is wrong; such "
+    "steps fail, since rows are tested by a residual that is evaluated outside of it",
+)  # fmt: skip
+def test_forward_euler_moves_a_rod_with_loads_at_a_node():
+    kc.simulate(LADEN, pushed(1.0, 1.0, np.zeros(1))[:4], DT, space="euler", recovery_budget=0.1)
+
+
+@pytest.fixture(scope="module", params=["lobatto2", pytest.param("lobatto4", marks=pytest.mark.campaign)])
 def laden(request):
     control = pushed(1.0, 1.0, np.zeros(1))[:30]
     return kc.simulate(LADEN, control, DT, space=request.param)
@@ -132,9 +130,9 @@ def test_slopes_do_not_go_over_what_acts(laden):
     assert jump > 0.3
     assert np.abs(slope).max() < 0.2 * jump / 0.05
     # and they are those of the equations
-    from knode_cosserat.learning.structured.regression import _rates
+    from knode_cosserat.learning.structured.regression import _rates, starts_of
 
-    rates = np.asarray(_rates(LADEN, data.segments)).reshape(-1, 10, 19)
+    rates = np.asarray(_rates(LADEN, starts_of(LADEN, data.segments))).reshape(-1, 10, 19)
     found = np.asarray(data.segments.slope).reshape(-1, 10, 19) / 0.5
     # the force's and the moment's, and where it is; what hardly changes is not known as well
     for name in "pnm":

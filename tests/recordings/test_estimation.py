@@ -132,7 +132,7 @@ def test_turning_everything_about_z_turns_the_states(method):
 @pytest.mark.campaign
 def test_a_loaded_equilibrium_has_its_own_forces():
     robot = ROBOT.replace(nodes=28)
-    truth = kc.equilibrium(robot, np.array([5.0, 5.0, 5.3, 5.2]), space="rk4")
+    truth = kc.equilibrium(robot, np.array([5.0, 5.0, 5.3, 5.2]), space="lobatto4")
     position, quaternion = np.asarray(truth.position)[0], np.asarray(truth.quaternion)[0]
 
     def still(time, s):

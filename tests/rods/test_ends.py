@@ -42,7 +42,7 @@ SIMPSON = np.array([1, 4, 2, 4, 2, 4, 2, 4, 2, 4, 1]) / 30.0
 
 def loose(steps, dt, initial=None, **changes):
     robot = LOOSE.replace(**{key.replace("__", "."): value for key, value in changes.items()})
-    return kc.simulate(robot, np.zeros((steps, 0)), dt, initial=initial, start="consistent", space="rk4")
+    return kc.simulate(robot, np.zeros((steps, 0)), dt, initial=initial, start="consistent", space="lobatto4")
 
 
 def in_motion(q=(0.0, 0.0, 0.0), w=(0.0, 0.0, 0.0), **changes):
@@ -187,7 +187,7 @@ def quarter_period(amplitude, steps):
     )  # fmt: skip
     small = np.pi / 2 * np.sqrt(2 * L / (3 * G))
     t_end = 1.3 * small * ellipk(np.sin(amplitude / 2) ** 2) / (np.pi / 2)
-    found = kc.simulate(bar, np.zeros((steps, 0)), t_end / steps, space="rk4")
+    found = kc.simulate(bar, np.zeros((steps, 0)), t_end / steps, space="lobatto4")
     p, t = np.asarray(found.part("p"))[:, -1], np.asarray(found.time)
     np.testing.assert_allclose(np.asarray(found.part("p"))[:, 0], 0.0, atol=1e-12)
     np.testing.assert_allclose(np.linalg.norm(p, axis=1), L, atol=1e-6)
@@ -223,7 +223,7 @@ def test_beams_held_at_both_ends(tip):
     beam = kc.SlenderRod(**BEAM, tip_end=tip)
     # the load is sideways: nothing else weighs
     beam = beam.replace(gravity=[w / float(beam.mass_per_length), 0.0, 0.0])
-    found = kc.equilibrium(beam, np.zeros(0), space="rk4")
+    found = kc.equilibrium(beam, np.zeros(0), space="lobatto4")
     s, deflection = np.linspace(0, 1, 11), np.asarray(found.part("p"))[0, :, 0]
     if type(tip) is Clamped:
         expected, most = w * s**2 * (1 - s) ** 2 / (24 * BEAM_EI), w / (384 * BEAM_EI)

@@ -29,7 +29,7 @@ def rest(nodes=11, gravity=(0.0, 0.0, 0.0), **changes):
     """The equilibrium under loads given as `load__name`."""
     named = {f"{globals()[key.split('__')[0]]}.{key.split('__')[1]}": value for key, value in changes.items()}
     robot = LOADED.replace(nodes=nodes, gravity=gravity, **named)
-    return kc.equilibrium(robot, np.zeros(0), space="rk4")
+    return kc.equilibrium(robot, np.zeros(0), space="lobatto4")
 
 
 def field(found, name):
@@ -223,9 +223,9 @@ SWINGING = SWINGING.replace(**{"loads.0.force": [1e-3 * EI / L**2, 0.0, 0.0]})
 
 def eigenvalue(dt, pull=1.0):
     """λ of xᵢ₊₁ = 2 Re(λ) xᵢ - |λ|² xᵢ₋₁, fitted to how the tip swings."""
-    aside = kc.equilibrium(SWINGING, np.array([pull]), space="rk4")
+    aside = kc.equilibrium(SWINGING, np.array([pull]), space="lobatto4")
     along = kc.simulate(
-        SWINGING, np.zeros((60, 1)), dt, space="rk4", initial=aside, start="consistent"
+        SWINGING, np.zeros((60, 1)), dt, space="lobatto4", initial=aside, start="consistent"
     ).tip_position[:, 0]
     twice, minus_square = np.linalg.lstsq(np.stack([along[11:-1], along[10:-2]], 1), along[12:], rcond=None)[
         0
@@ -291,10 +291,10 @@ def test_what_rounding_keeps_from_the_tip_is_at_the_tip(load):
     assert beside.at == 1.0 and dataclasses.replace(load, at=1.0 - 1e-8).at < 1.0
     beam = kc.SlenderRod(length=0.5, radius=0.005, density=1e3, youngs_modulus=5e6, nodes=11)
     tips = [
-        kc.equilibrium(beam.replace(loads=(each,)), np.zeros(0), space="rk4").tip_position[-1]
+        kc.equilibrium(beam.replace(loads=(each,)), np.zeros(0), space="lobatto4").tip_position[-1]
         for each in (beside, dataclasses.replace(load, at=1.0), dataclasses.replace(load, at=1.0 - 1e-8))
     ]
-    unloaded = kc.equilibrium(beam, np.zeros(0), space="rk4").tip_position[-1]
+    unloaded = kc.equilibrium(beam, np.zeros(0), space="lobatto4").tip_position[-1]
     assert np.linalg.norm(tips[0] - unloaded) > 1e-6
     np.testing.assert_array_equal(tips[0], tips[1])
     np.testing.assert_allclose(tips[0], tips[2], atol=1e-8)

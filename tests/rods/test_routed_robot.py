@@ -44,7 +44,7 @@ def test_one_tendon_bends_the_rod_evenly(tension):
 @pytest.mark.campaign
 def test_one_tendon_bends_the_rod_to_a_circle():
     tension, robot = 3.0, kc.RoutedTendonRobot.like(KNOWLEDGE, **NO_LOADS, nodes=40)
-    bent = kc.equilibrium(robot, np.array([tension, 0.0, 0.0, 0.0]), space=kc.RK4())
+    bent = kc.equilibrium(robot, np.array([tension, 0.0, 0.0, 0.0]), space=kc.Lobatto4())
     L, curvature = 0.635, tension * 0.02 / float(robot.Kbt[0, 0])
     squeezed = 1.0 - tension / float(robot.Kse[2, 2])
     away = (1.0 - np.cos(curvature * L)) / curvature * squeezed

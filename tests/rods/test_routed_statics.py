@@ -32,7 +32,7 @@ ROBOT = kc.RoutedTendonRobot.like(DELRIN, routing=ROUTING, bending_damping=0.0)
 
 
 def rest(tensions, nodes=41):
-    return kc.equilibrium(ROBOT.replace(nodes=nodes), np.asarray(tensions), space="rk4")
+    return kc.equilibrium(ROBOT.replace(nodes=nodes), np.asarray(tensions), space="lobatto4")
 
 
 def exact(tensions):
@@ -189,7 +189,7 @@ def test_what_the_tendons_do_is_what_is_stored():
     robot = ROBOT.replace(gravity=[0.0, 0.0, 0.0], nodes=41)
 
     def of(T):
-        found = kc.equilibrium(robot, T, space="rk4")
+        found = kc.equilibrium(robot, T, space="lobatto4")
         v, u = field(found, "v") - [0.0, 0.0, 1.0], field(found, "u")
         elastic = 0.5 * (np.einsum("ni,ij,nj->n", v, ROD.Kse, v) + np.einsum("ni,ij,nj->n", u, ROD.Kbt, u))
         r, r_s = (np.array(x) for x in zip(*(robot.routes_at(s) for s in np.linspace(0, L, 41)), strict=True))

@@ -39,7 +39,7 @@ def changed(both=None, nodes=11, force=(0.0, 0.0, 0.0), **each):
 
 
 def rest(robot, control=(0.0, 0.0)):
-    return kc.equilibrium(robot, np.asarray(control, dtype=float), space="rk4")
+    return kc.equilibrium(robot, np.asarray(control, dtype=float), space="lobatto4")
 
 
 @pytest.mark.campaign
@@ -72,7 +72,7 @@ def test_a_cone_bends_as_the_integral_of_its_stiffness():
         return F * (L - s) ** 2 / (EI * factor**4) + F / (GA * factor**2)
 
     expected, _ = quad(rate, 0.0, L, epsabs=1e-14)
-    # of RK4 on ten segments, and of the beam's small angles
+    # of order 4 on ten segments, and of the beam's small angles
     assert rest(cone).tip_position[0, 0] == pytest.approx(expected, rel=2e-5)
 
 
@@ -174,10 +174,10 @@ def test_slopes_of_an_arc_at_rest(slopes):
 
 
 def test_a_rod_curved_at_rest_stays_so():
-    """Also where a cut is on a node; it moves once, by what RK4 on ten segments makes of its arc."""
+    """Also where a cut is on a node; it moves once, by the error of order 4 on ten segments along its arc."""
     bend = [0.0, 6.0, 0.0]
     robot = resting((bend, bend), (bend, bend), cut=0.5)
-    moved = kc.simulate(robot, np.zeros((6, 0)), 0.02, space="rk4")
+    moved = kc.simulate(robot, np.zeros((6, 0)), 0.02, space="lobatto4")
     position = np.asarray(moved.position)
     np.testing.assert_allclose(position[1:], position[:1].repeat(6, axis=0), atol=1e-5 * L)
     np.testing.assert_allclose(position[2:], position[1:2].repeat(5, axis=0), atol=1e-12 * L)

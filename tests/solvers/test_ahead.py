@@ -7,11 +7,10 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.solvers.ahead import in_two
-from knode_cosserat.solvers.between import at_stages
-from knode_cosserat.solvers.crossing import spread
-from knode_cosserat.solvers.past import rest_record
+from knode_cosserat.solvers.grid import at_places
+from knode_cosserat.solvers.history import rest_record
 from knode_cosserat.solvers.problem import StepProblem
-from knode_cosserat.solvers.space import SCHEMES, SLOPES, VALUES
+from knode_cosserat.solvers.space import SCHEMES
 
 HELIX = tuple(kc.routing.Helical(0.02, phase, 0.5, end=end) for phase, end in ((0.3, 1.0), (2.4, 0.63)))
 BEAM = {"length": 0.5, "radius": 0.005, "density": 1200.0, "youngs_modulus": 5e6}
@@ -48,14 +47,14 @@ def a_step(robot, space):
         history = np.concatenate([history, np.zeros((robot.nodes, ny))], axis=1)
     control = 5.0 * generator.uniform(0.5, 1.0, robot.control_size)
     control *= 1e-3 if "reel" in robot.control_layout.names else 1.0
-    past = jax.jit(at_stages, static_argnums=1)(robot, SCHEMES[space], jnp.asarray(history))
+    past = jax.jit(at_places, static_argnums=1)(robot, SCHEMES[space], jnp.asarray(history))
     problem = StepProblem(robot, jnp.array(0.3), jnp.asarray(control), jnp.array(20.0), past, SCHEMES[space])
-    return problem, spread(problem.points, jnp.asarray(y))
+    return problem, problem.grid.spread(jnp.asarray(y))
 
 
 #: the others take as long to compile, and are looked at in the long campaign
 QUICK = {
-    ("ribs, a sleeve and masses", "euler"), ("friction, one ends", "euler"), ("six legs", "euler"),
+    ("ribs, a sleeve and masses", "lobatto2"), ("friction, one ends", "lobatto2"), ("six legs", "lobatto2"),
 }  # fmt: skip
 
 
@@ -64,7 +63,7 @@ QUICK = {
     [
         pytest.param(name, space, marks=() if (name, space) in QUICK else pytest.mark.campaign)
         for name in ROBOTS
-        for space in ("euler", "rk4")
+        for space in ("lobatto2", "lobatto4")
     ],
 )
 def test_nothing_comes_out_differently(name, space):
@@ -73,17 +72,24 @@ def test_nothing_comes_out_differently(name, space):
 
     def all_of(prepared):
         own = problem.ready() if prepared else problem
-        return own.pieces(SLOPES, y), own.pieces(VALUES, y), own.records(y)
+        return own.linearise(y, robot.unknowns(y[0])), own.reached(y), own.records(y)
 
-    scale = np.asarray(robot.strand.scales().y)
-    natural = scale / scale[:, None]
+    scale, own = (np.asarray(system.scales().y) for system in (robot, robot.strand))
+    natural = own / own[:, None]
     found, expected = (jax.jit(all_of, static_argnums=0)(prepared) for prepared in (True, False))
-    (ends, slopes), values, record = found
-    (true_ends, true_slopes), _, true_record = expected
-    assert np.all(np.isfinite(true_record)) and np.all(np.isfinite(true_slopes))
-    for each in (ends, values):
-        np.testing.assert_allclose(each / scale, true_ends / scale, rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(slopes * natural, true_slopes * natural, rtol=1e-10, atol=1e-10)
+    (slopes, ends, record), (true_slopes, true_ends, true_record) = found, expected
+    assert np.all(np.isfinite(true_record)) and np.all(np.isfinite(true_slopes.F))
+    np.testing.assert_allclose(ends / scale, true_ends / scale, rtol=1e-12, atol=1e-12)
+    for one, other in ((slopes.F, true_slopes.F), (slopes.G, true_slopes.G)):
+        np.testing.assert_allclose(one * natural, other * natural, rtol=1e-10, atol=1e-10)
+    # by y and by history at every place, of rates and of strains
+    nz = robot.strand.z_layout.size
+    units = np.concatenate([own, own, np.ones(nz), own if robot.mixed else []])
+    for one, other, scales in (
+        (slopes.slopes.f, true_slopes.slopes.f, own[:, None]),
+        (slopes.slopes.z, true_slopes.slopes.z, 1.0),
+    ):
+        np.testing.assert_allclose(one * units / scales, other * units / scales, rtol=1e-10, atol=1e-9)
     np.testing.assert_allclose(record, true_record, rtol=1e-10, atol=1e-12)
 
 
@@ -135,11 +141,11 @@ def test_what_has_effects_happens_whenever_it_is_evaluated(capfd):
 @pytest.mark.campaign
 def test_slopes_by_the_control_go_through_what_was_evaluated_before():
     """Stiffness that a control changes is evaluated ahead, and is no constant for that."""
-    problem, y = a_step(ROBOTS["sections that are controlled"](), "euler")
+    problem, y = a_step(ROBOTS["sections that are controlled"](), "lobatto2")
 
     def ends(control, prepared):
         own = StepProblem(problem.system, problem.t, control, problem.c0, problem.history, problem.space)
-        return (own.ready() if prepared else own).pieces(VALUES, y)
+        return (own.ready() if prepared else own).reached(y)
 
     found, expected = (jax.jacfwd(ends)(problem.control, prepared) for prepared in (True, False))
     assert np.max(np.abs(expected)) > 0.0

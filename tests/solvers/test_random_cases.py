@@ -17,13 +17,8 @@ NODES = (5, 10, 25, 60, 100)
 STEPS = 60
 ANGLES = np.pi / 4 + np.arange(4) * np.pi / 2
 
-#: the worst of the campaign, by seed: what each needed is asserted below
-WORST = {
-    2: "RECOVERED_FINER_SEGMENTS",
-    13: "RECOVERED_FINER_SEGMENTS",
-    102: "RECOVERED_FINER_SEGMENTS",
-    197: "RECOVERED_STABLE_ELIMINATION",
-}
+#: seeds whose steps forward Euler could not make on their own grids: unstable, or lost to rounding
+HARD = (2, 13, 102, 197)
 
 
 @dataclasses.dataclass
@@ -105,15 +100,11 @@ def test_a_sample_of_random_cases():
     assert share_solved([draw(seed, nodes=(10, 25)) for seed in range(60)], "sample") >= 0.98
 
 
-@pytest.mark.parametrize("seed", [2])
-def test_a_worst_case(seed):
-    assert worst_result(draw(seed)).name == WORST[seed]
-
-
-@pytest.mark.campaign
-@pytest.mark.parametrize("seed", [seed for seed in WORST if seed != 2])
-def test_the_other_worst_cases(seed):
-    assert worst_result(draw(seed)).name == WORST[seed]
+@pytest.mark.parametrize(
+    "seed", [pytest.param(seed, marks=() if seed == 2 else pytest.mark.campaign) for seed in HARD]
+)
+def test_a_hard_case(seed):
+    assert worst_result(draw(seed)) in (kc.Result.CONVERGED, kc.Result.COARSE)
 
 
 @pytest.mark.campaign
@@ -123,5 +114,5 @@ def test_500_random_cases():
 
 @pytest.mark.campaign
 def test_random_cases_without_damping():
-    """Nothing damps the shortest waves: most need their segments divided, and some cannot be solved."""
+    """Nothing damps the shortest waves."""
     assert share_solved([draw(seed, undamped=True) for seed in range(60)], "undamped") >= 0.9

@@ -24,12 +24,22 @@ def truth(robot, sine):
 
 
 def assert_same(rows, wanted):
-    for name in ("y", "z", "control", "result", "residual", "iterations", "time"):
-        found = np.concatenate([getattr(row, name) for row in rows])
-        np.testing.assert_array_equal(found, getattr(wanted, name), err_msg=name)
+    """To the solver's tolerance: a call begins without the linearisation of the step before."""
+    found = {
+        name: np.concatenate([getattr(row, name) for row in rows])
+        for name in ("y", "z", "control", "result", "residual", "time", "position_error")
+    }
+    for name in ("control", "result", "time"):
+        np.testing.assert_array_equal(found[name], getattr(wanted, name), err_msg=name)
+    for name, scale in (("y", np.asarray(wanted.system.scales().y)), ("z", 1.0)):
+        expected = getattr(wanted, name) / scale
+        np.testing.assert_allclose(found[name] / scale, expected, rtol=1e-7, atol=1e-7, err_msg=name)
+    # estimated by the linearisation that was used last, which is another one
+    np.testing.assert_allclose(found["position_error"], wanted.position_error, rtol=0.1, atol=1e-9)
+    assert np.all(found["residual"] <= 1e-8)
 
 
-def test_its_rows_are_those_of_a_simulation_bit_for_bit(robot, sine, truth):
+def test_its_rows_are_those_of_a_simulation(robot, sine, truth):
     stepper = kc.Stepper(robot, DT)
     rows = [stepper.state, *(stepper.step(control) for control in sine)]
     assert_same(rows, truth)
@@ -58,49 +68,39 @@ def test_a_preview_is_the_step_that_follows_and_changes_nothing(robot, sine, tru
         ahead = stepper.preview(control)
         assert np.max(np.abs(elsewhere.y - ahead.y)) > 1e-6
         np.testing.assert_array_equal(stepper.step(control).y, ahead.y)
-        np.testing.assert_array_equal(ahead.y[0], wanted)
+        np.testing.assert_allclose(ahead.y[0], wanted, rtol=0, atol=1e-7)
 
 
-def test_recovered_steps_are_those_of_a_simulation(robot):
-    """A pull that the compiled march does not solve, and that `recover` does."""
-    hard = np.tile([400.0, 0.0, 0.0, 400.0], (4, 1))
-    wanted = kc.simulate(robot, hard, DT)
-    assert np.any(wanted.result > 0)
+def test_recovered_steps_are_those_of_a_simulation(robot, caplog):
+    """A pull that the compiled time loop does not solve, and that `recover` does."""
+    hard = np.tile([5000.0, 0.0, 0.0, 5000.0], (4, 1))
+    with caplog.at_level("INFO", logger="knode_cosserat.solvers.run"):
+        wanted = kc.simulate(robot, hard, DT)
+    assert wanted.all_valid and "step" in caplog.text
     stepper = kc.Stepper(robot, DT)
     assert_same([stepper.state, *(stepper.step(control) for control in hard)], wanted)
 
 
 def test_a_step_without_a_solution_is_said_and_leaves_the_robot_where_it_is(robot, sine):
-    hopeless = [5000.0, 0.0, 0.0, 5000.0]
-    stepper, reached = kc.Stepper(robot, DT), []
-    error = None
-    while error is None:
-        try:
-            reached.append(stepper.step(hopeless))
-        except kc.SimulationError as raised:
-            error = raised
-    assert error.step == len(reached) + 1 and error.result is kc.Result.NO_CONVERGENCE
-    assert stepper.state.all_valid and (not reached or stepper.state is reached[-1])
+    hopeless = [1e8, 0.0, 0.0, 1e8]
+    stepper, other = (kc.Stepper(robot, DT) for _ in range(2))
+    for control in sine[:2]:
+        row = stepper.step(control)
+        other.step(control)
+    with pytest.raises(kc.SimulationError) as caught:
+        stepper.step(hopeless)
+    assert caught.value.step == 3 and caught.value.result is kc.Result.NO_CONVERGENCE
+    assert stepper.state is row and stepper.time == pytest.approx(2 * DT)
     with pytest.raises(kc.SimulationError):
         stepper.preview(hopeless)
-    other = kc.Stepper(robot, DT)
-    for _ in reached:
-        other.step(hopeless)
-    np.testing.assert_array_equal(stepper.step(sine[0]).y, other.step(sine[0]).y)
+    np.testing.assert_array_equal(stepper.step(sine[2]).y, other.step(sine[2]).y)
 
 
-@pytest.mark.campaign
-def test_what_grows_as_an_instability_does_is_refused():
-    """The robot of `test_a_run_that_blows_up_in_space_is_repeated_with_finer_segments`."""
-    soft = kc.TendonRobot(
-        length=0.87, radius=4.77e-3, density=1411.7, youngs_modulus=18.6e6, bending_damping=0.03, drag=1e-4,
-        gravity=(0.0, 0.0, -0.15), nodes=5,
-    )  # fmt: skip
-    stepper = kc.Stepper(soft, 1.23e-3)
-    tensions = 0.03 * kc.controls.sine(0.05, 16, 1.23e-3, base=1.0)
-    with pytest.raises(kc.SimulationError, match="more nodes") as caught:
-        list(map(stepper.step, tensions))
-    assert caught.value.result is kc.Result.UNSTABLE
+def test_a_row_of_a_coarse_grid_says_so(robot):
+    stepper = kc.Stepper(robot.replace(nodes=3), DT)
+    row = stepper.step([60.0, 0.0, 0.0, 60.0])
+    assert row.position_error[0] > 0.02 * robot.length
+    assert row.result[0] == kc.Result.COARSE and row.all_valid
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def test_what_grows_as_an_instability_does_is_refused():
         ({"robot": []}, "a stepper is of one robot"),
         ({"dt": 0.0}, "dt is 0.0"),
         ({"time": "bdf9"}, "time is 'bdf9'"),
-        ({"newton": kc.NewtonOptions(across_steps=True)}, "across_steps"),
+        ({"newton": "long"}, "newton is 'long'"),
     ],
 )
 def test_wrong_arguments_are_named(robot, change, message):

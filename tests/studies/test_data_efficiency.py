@@ -58,7 +58,7 @@ def test_a_linear_motion_is_predicted_exactly():
 @pydmd
 def test_a_linear_predictor_of_the_robot_beats_standing_still():
     def moved(control, rows):
-        return kc.simulate(ROBOT, kc.controls.parse(control, rows, DT), DT)[:rows]
+        return kc.simulate(ROBOT, kc.controls.parse(control, rows, DT), DT, space="euler")[:rows]
 
     predictor = linear_predictor(ROBOT, [moved(control, 30) for control in simulation.TRAINING])
     truth = moved("sine:1.5", 100)
@@ -91,7 +91,7 @@ def test_a_robot_that_knows_nothing_does_not_move():
 
 @pytest.mark.campaign
 def test_what_knows_nothing_does_not_see_the_imperfection():
-    training = [kc.simulate(ROBOT, kc.controls.sine(0.5, 10, DT), DT)]
+    training = [kc.simulate(ROBOT, kc.controls.sine(0.5, 10, DT), DT, space="euler")]
     config = kc.FitConfig.paper(seed=(0,))
     config = type(config)(config.residual, type(config.segments)(epochs=3, nodes=(3, 5, 7, 9)), seed=(0,))
     models = [

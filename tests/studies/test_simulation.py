@@ -60,7 +60,7 @@ def test_what_is_written_is_complete(baseline):
     truth = kc.load_trajectory(baseline / "trajectories/reference-sine.nc")
     robot = kc.load_robot(simulation.ROBOT)
     tensions = kc.controls.sine(1.5, 100, 0.05)
-    np.testing.assert_array_equal(truth.y, kc.simulate(robot, tensions, 0.05).y[:100])
+    np.testing.assert_array_equal(truth.y, kc.simulate(robot, tensions, 0.05, space="euler").y[:100])
 
 
 KILLED = """
@@ -148,7 +148,7 @@ def test_what_is_learned_is_tabled_beside_the_papers_and_kept(tmp_path, one_impe
     # what is kept predicts what is tabled
     model = load_model(tmp_path / "models/length-best-1")
     truth = kc.load_trajectory(tmp_path / "trajectories/reference-step.nc")
-    prediction = kc.simulate(model, kc.controls.step(1.5, 100, 0.05), 0.05)[:100]
+    prediction = kc.simulate(model, kc.controls.step(1.5, 100, 0.05), 0.05, space="euler")[:100]
     assert kc.tip_dtw(prediction, truth) == cells[-1]["tip_dtw"]
     assert kc.load_trajectory(tmp_path / "trajectories/length-best-sine.nc").y.shape == truth.y.shape
 
@@ -156,11 +156,11 @@ def test_what_is_learned_is_tabled_beside_the_papers_and_kept(tmp_path, one_impe
 def test_what_fails_is_recorded_and_shown(tmp_path, one_imperfection, monkeypatch):
     true = simulation.simulate
 
-    def failing(system, tensions, dt):
+    def failing(system, tensions, dt, **options):
         # the baseline, under the step only
         if len(tensions) == 100 and system.length == 0.4 and np.ptp(tensions[:20]) == 0.0:
             raise kc.SimulationError(31, 31 * dt, 0.5, kc.Result.NO_CONVERGENCE, "It was told to.")
-        return true(system, tensions, dt)
+        return true(system, tensions, dt, **options)
 
     monkeypatch.setattr(simulation, "simulate", failing)
     facts = json.loads(study("--out", tmp_path, "--methods", "baseline", "--workers", 1, "--json").stdout)

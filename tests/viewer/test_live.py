@@ -34,7 +34,7 @@ def address(robot):
 
 @pytest.fixture
 def session(robot):
-    return Session(robot, DT, "euler", None)
+    return Session(robot, DT, "lobatto2", None)
 
 
 def numbers(message):

@@ -39,7 +39,13 @@ Changes = Annotated[
     ),
 ]
 Nodes = Annotated[int | None, typer.Option(metavar="N", help="Nodes along the rod, base and tip included.")]
-Space = Annotated[str, typer.Option(metavar="SCHEME", help="Scheme along the rod: euler or rk4.")]
+Space = Annotated[
+    str,
+    typer.Option(
+        metavar="SCHEME",
+        help="Scheme along the rod: lobatto2 (order 2), lobatto4 (order 4), or euler (order 1, the paper's).",
+    ),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout, and nothing else.")]
 NetCDF = typer.Option(metavar="FILE", help="Write the states to this netCDF file.")
 Picture = typer.Option(metavar="FILE", help="Write the figure to this PNG, PDF or SVG file.")

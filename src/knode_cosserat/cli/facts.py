@@ -32,8 +32,24 @@ def outcome(trajectory: Trajectory) -> dict[str, Any]:
         "all_solved": bool(valid.all()),
         "first_failure": failure,
         "largest_residual": float(np.asarray(trajectory.residual)[valid].max()),
+        "largest_position_error": _largest_error(trajectory),
         "tip_position": np.asarray(trajectory.tip_position)[valid][-1].tolist(),
     }
+
+
+def _largest_error(trajectory: Trajectory) -> float | None:
+    """Return the largest estimated position error (m) of the solved rows; None where it is unknown."""
+    if trajectory.position_error is None:
+        return None
+    largest = float(np.asarray(trajectory.position_error)[np.asarray(trajectory.valid)].max())
+    return largest if np.isfinite(largest) else None
+
+
+def error_text(error: float | None, length: float) -> str:
+    """Return a position error in words: in mm, and as a share of the length."""
+    if error is None:
+        return "unknown"
+    return f"{1e3 * error:.2g} mm ({100 * error / length:.2g} % of the length)"
 
 
 def at_rest(rest: Trajectory) -> dict[str, Any]:
@@ -45,6 +61,7 @@ def at_rest(rest: Trajectory) -> dict[str, Any]:
         "tip_position": position[-1].tolist(),
         "tip_inclination": float(2 * np.arctan2(np.hypot(x, y), np.hypot(w, z))),
         "residual": float(rest.residual[0]),
+        "position_error": _largest_error(rest),
         "result": Result(int(rest.result[0])).message,
     }
     if "tension" in (*rest.system.control_layout.names, *rest.system.y_layout.names):

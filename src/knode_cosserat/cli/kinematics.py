@@ -66,7 +66,7 @@ def reach(
     tolerance: Annotated[
         float, typer.Option(metavar="PART", help="How near is reached: in parts of the length, and in rad.")
     ] = 1e-4,
-    space: Space = "euler",
+    space: Space = "lobatto2",
     changes: Changes = None,
     nodes: Nodes = None,
     as_json: Json = False,
@@ -139,7 +139,7 @@ def workspace(
     low: Low = "0",
     high: High = "10",
     seed: Annotated[int, typer.Option(metavar="N", min=0, help="Seed of the samples.")] = 0,
-    space: Space = "euler",
+    space: Space = "lobatto2",
     changes: Changes = None,
     nodes: Nodes = None,
     picture: Annotated[Path | None, Picture] = None,

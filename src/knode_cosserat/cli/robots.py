@@ -25,12 +25,26 @@ from knode_cosserat.cli.arguments import (
     system_of,
     wanted,
 )
-from knode_cosserat.cli.facts import at_rest, derived, driven_by, learned, more_lines, outcome, parameters
+from knode_cosserat.cli.facts import (
+    at_rest,
+    derived,
+    driven_by,
+    error_text,
+    learned,
+    more_lines,
+    outcome,
+    parameters,
+)
 from knode_cosserat.cli.program import app, examples
 from knode_cosserat.cli.telling import shown, table, tell, vector
 
 if TYPE_CHECKING:
     from knode_cosserat.rods.system import System
+
+COARSE = (
+    "COARSE GRID: the estimated position error is more than 2 % of the length; "
+    "give more --nodes, or --space lobatto4"
+)
 
 
 @app.command(
@@ -62,7 +76,7 @@ def simulate(
     time: Annotated[
         str, typer.Option(metavar="SCHEME", help="Scheme in time: bdf1, bdf2, bdf-alpha or trapezoidal.")
     ] = "bdf2",
-    space: Space = "euler",
+    space: Space = "lobatto2",
     changes: Changes = None,
     nodes: Nodes = None,
     allow_failure: Annotated[
@@ -92,13 +106,17 @@ def simulate(
     if drawing:
         drawing.overview(trajectory).savefig(figure)
     came = outcome(trajectory)
+    error = error_text(came["largest_position_error"], float(system.length))
     facts = {"robot": robot, "steps": len(tensions), "dt": dt, "computing_time": round(seconds, 4), **came}
     results = ", ".join(f"{count} {result}" for result, count in came["results"].items())
     lines = [
         f"simulated {robot}: {len(tensions)} steps of {dt:g} s in {seconds:.2f} s of computing",
         f"steps: {results}; largest residual {came['largest_residual']:.1e} of its natural scale",
+        f"largest position error, by estimate: {error}",
         f"tip after the last step that was solved: {vector(came['tip_position'])} m",
     ]
+    if kc.Result.COARSE in np.asarray(trajectory.result):
+        lines.append(COARSE)
     if came["first_failure"]:
         step, at, message = came["first_failure"].values()
         lines.append(f"NOT SOLVED from step {step} (t = {at:g} s) on: {message}")
@@ -115,7 +133,7 @@ def equilibrium(
         str | None,
         typer.Option(metavar="NAME=VALUE,…", help="Controls by name, such as base_z=0.1; others are zero."),
     ] = None,
-    space: Space = "euler",
+    space: Space = "lobatto2",
     changes: Changes = None,
     nodes: Nodes = None,
     out: Annotated[Path | None, NetCDF] = None,
@@ -133,13 +151,17 @@ def equilibrium(
     lines = [
         f"tip: {vector(facts['tip_position'])} m",
         f"the tip leans {np.degrees(facts['tip_inclination']):.2f} degrees from the z axis",
+        f"residual {facts['residual']:.1e} of its natural scale; largest position error, by estimate: "
+        f"{error_text(facts['position_error'], float(system.length))}",
     ]
     if "base_force" in facts:
         lines.append(f"internal force at the base: {vector(facts['base_force'])} N")
         lines.append(f"internal moment at the base: {vector(facts['base_moment'])} N m")
     if facts["unstable"]:
         lines.append("UNSTABLE: the least push, and the robot leaves this shape")
-    if facts["result"] != "converged":
+    if rest.result[0] == kc.Result.COARSE:
+        lines.append(COARSE)
+    elif facts["result"] != "converged":
         lines.append(f"found on a detour: {facts['result']}")
     tell(as_json, facts, lines, out=out)
 

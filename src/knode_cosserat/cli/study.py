@@ -197,7 +197,7 @@ def recordings(
         typer.Option(
             metavar="A,B,…",
             help="Some of those, and of what the parts of best are worth: calibrated (the model given, its "
-            "numbers found), no-memory, no-vibration, euler.",
+            "numbers found), no-memory, no-vibration.",
         ),
     ] = "baseline,paper-a,paper-b,best",
     simulated: Annotated[
@@ -234,7 +234,115 @@ def recordings(
     )  # fmt: skip
 
 
+@studies.command(
+    epilog=examples(
+        "study beam recordings/ --out results",
+        "study beam recordings/ --train beam_gravity_V2_b,beam_load52_V2_a --out results",
+        "study beam recordings/ --load beam_run3=30 --out results",
+    )
+)
+def beam(
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="Folder with beam_gravity*.csv and beam_load<grams>*.csv.")
+    ],
+    out: Out = Path("beam-study"),
+    train: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME,…",
+            help="Those to learn from, without endings; all others are predicted.",
+            show_default="beam_gravity_V2_b, beam_load52_V2_a; else one of each of the two lightest loads",
+        ),
+    ] = None,
+    load: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=GRAMS",
+            help="Load of a recording whose name does not tell it; may be repeated.",
+        ),
+    ] = None,
+    progress: Progress = None,
+    as_json: Json = False,
+) -> None:
+    """Identify a real silicone beam that is let go by hand, and predict its other recordings.
+
+    Finds the release in each recording, identifies stiffness, damping and creep by least squares through
+    whole rollouts of the training recordings, and writes errors of the tip markers (beam.md, .json) and a
+    figure.
+    """
+    _prepare(out, None, None)
+    from knode_cosserat.studies.beam import rerun
+
+    names = None if train is None else _names(train)
+    loads = _loads(load or [])
+
+    def told(line: str) -> None:
+        if wanted(progress):
+            typer.echo(line, err=True)
+
+    _run(
+        lambda **how: rerun(out, folder, names, loads, progress=told),
+        {"train": names}, out, None, None, None, as_json,
+    )  # fmt: skip
+
+
+@studies.command(
+    epilog=examples("study cables data_set/ --out results", "study cables data_set/DLO1 --train 5 --json")
+)
+def cables(
+    folder: Annotated[
+        Path,
+        typer.Argument(metavar="DIR", help="Folder with NAME/train/*.pkl and NAME/eval/*.pkl, or NAME.npz."),
+    ],
+    out: Out = Path("cables-study"),
+    nodes: Annotated[int, typer.Option(metavar="N", min=5, help="Nodes of the rod.")] = 31,
+    space: Annotated[str, typer.Option(metavar="SCHEME", help="Scheme along the rod.")] = "lobatto2",
+    train: Annotated[
+        int, typer.Option(metavar="N", min=2, help="Motions that are learned from, each cable.")
+    ] = 10,
+    seconds: Annotated[
+        float, typer.Option(metavar="S", min=0.0, help="CPU time for the search of each cable.")
+    ] = 400.0,
+    as_json: Json = False,
+) -> None:
+    """Identify cables held by two grippers, and predict the motions in `eval` open loop.
+
+    Positions of markers at 100 Hz, as in DEFORM's data set; pickles are read without running code of theirs.
+    Writes cables.json, cables.md, a figure, and a scene of prediction and measurement for each cable.
+    """
+    _prepare(out, None, None)
+    from knode_cosserat.studies.cables.study import CableOptions, rerun
+
+    options = CableOptions(nodes=nodes, space=space, train=train, seconds=seconds)
+    _run(
+        lambda **how: rerun(out, folder, options=options, tell=lambda line: typer.echo(line, err=True)),
+        {"train": train}, out, None, None, None, as_json,
+    )  # fmt: skip
+
+
 # what they share
+
+
+def _names(given: Sequence[str]) -> list[str]:
+    """Names separated by commas, without the endings of files."""
+    return [name.strip().removesuffix(".csv") for each in given for name in each.split(",") if name.strip()]
+
+
+def _loads(given: Sequence[str]) -> dict[str, float]:
+    """Masses (kg) by name, from NAME=GRAMS."""
+    found = {}
+    for each in given:
+        name, _, grams = each.rpartition("=")
+        try:
+            mass = 1e-3 * float(grams)
+        except ValueError:
+            mass = -1.0
+        if not name or not 0.0 <= mass < 10.0:
+            raise ValueError(
+                f"--load {each!r}: allowed is NAME=GRAMS with 0 to 10000 g, such as beam_run3=30"
+            )
+        found[name.strip().removesuffix(".csv")] = mass
+    return found
 
 
 def _prepare(out: Path, workers: int | None, dask: str | None) -> None:

@@ -65,7 +65,7 @@ def view(
             metavar="S", help="With --live: time step in s.", show_default="what a model learned at, or 0.05"
         ),
     ] = None,
-    space: Space = "euler",
+    space: Space = "lobatto2",
     changes: Changes = None,
     nodes: Nodes = None,
     as_json: Json = False,
@@ -97,7 +97,7 @@ def view(
         return
     if not names:
         raise ValueError("no trajectory is given: knode-cosserat view FILE…, or view --live ROBOT")
-    if changes or nodes or dt is not None or space != "euler":
+    if changes or nodes or dt is not None or space != "lobatto2":
         raise ValueError("--set, --nodes, --dt and --space change what is simulated: they belong to --live")
     require_writable(export)
     trajectories = _by_name(names)

@@ -64,7 +64,7 @@ class Configuration:
         """(6, 6): twist per force (N) and moment (N·m) that act at the tip, all along the global axes.
 
         Tensions are held. Symmetric and positive definite for a stable, conservative robot whose pose is
-        the tip's, up to the error of the scheme along the rod: use `space="rk4"` where that matters.
+        the tip's, up to the error of the scheme along the rod: use `space="lobatto4"` where that matters.
 
         Raises:
             ValueError: the robot's conditions at the tip are not forces and moments.
@@ -113,7 +113,7 @@ def configuration(
     robot: System,
     control: Any,
     *,
-    space: str | SpaceScheme = "euler",
+    space: str | SpaceScheme = "lobatto2",
     newton: NewtonOptions = NewtonOptions(),
     pose: Pose = tip_pose,
 ) -> Configuration:
@@ -122,7 +122,7 @@ def configuration(
     Args:
         robot: one robot or model.
         control: (c,); for a tendon robot the tensions in N. Of a robot without controls `np.zeros(0)`.
-        space: "euler", "rk4", or a scheme.
+        space: "lobatto2", "lobatto4", "euler", or a scheme.
         newton: tolerances and limits of the solve.
         pose: from the system and its last node's y to position (m) and quaternion (or None); the tip's by
             default. A function that is kept, not a new one at each call: a program is compiled for each.

@@ -96,7 +96,7 @@ def inverse_kinematics(
     weights: tuple[float, float] = (1.0, 1.0),
     tolerance: float = 1e-9,
     starts: int = 6,
-    space: str | SpaceScheme = "euler",
+    space: str | SpaceScheme = "lobatto2",
     newton: NewtonOptions = NewtonOptions(),
     pose: Pose = tip_pose,
 ) -> InverseKinematics:
@@ -119,7 +119,7 @@ def inverse_kinematics(
         tolerance: a pose is reached when it is off by no more than this part of the robot's length, and
             turned from it by no more than this (rad).
         starts: how many beginnings are tried before a pose is called unreachable.
-        space: "euler", "rk4", or a scheme.
+        space: "lobatto2", "lobatto4", "euler", or a scheme.
         newton: tolerances and limits of the solve.
         pose: whose pose, as for `kc.configuration`.
 

@@ -31,7 +31,7 @@ from knode_cosserat.rods.system import System, in_strands
 from knode_cosserat.solvers.boundary import static_error
 from knode_cosserat.solvers.equilibrium import equilibrium as rests
 from knode_cosserat.solvers.result import Result
-from knode_cosserat.solvers.space import RK4
+from knode_cosserat.solvers.space import Lobatto4
 from knode_cosserat.trajectory import Trajectory
 
 #: in natural units: what is further than this from balance is no equilibrium
@@ -49,7 +49,7 @@ ROUNDING = 1e-14
 #: in natural units: where rounding is beyond this a rod is not called stable for what is less than that
 SEEN = 1e-3
 #: roots of the equations that are found from a root nearby
-NEARBY = (Result.CONVERGED, Result.RECOVERED_STABLE_ELIMINATION, Result.RECOVERED_LOAD_CONTINUATION)
+NEARBY = (Result.CONVERGED, Result.COARSE, Result.RECOVERED_LOAD_CONTINUATION)
 
 
 class Stability(NamedTuple):
@@ -77,9 +77,9 @@ def stability(equilibrium: Trajectory, row: int = -1) -> Stability:
     """Whether a robot that rests stays where it is when it is pushed a little.
 
     For whatever holds its ends: it finds what buckles between clamps, an arch that is about to snap, a column
-    that would fall. The robot is looked at as by RK4 along the rod, whatever it was solved by, since Euler's
-    scheme has no potential. Loads that follow the rod have none either: of those it sees what
-    gives way, and not what flutters. Friction, which only helps, is not counted.
+    that would fall. An equilibrium by another scheme along the rod is solved again by Lobatto4. Loads that
+    follow the rod have no potential: it finds their divergence, and not their flutter. Friction, which only
+    helps, is not counted.
 
     Args:
         equilibrium: of one robot: what `kc.equilibrium` gives, or a trajectory that has come to rest.
@@ -92,16 +92,16 @@ def stability(equilibrium: Trajectory, row: int = -1) -> Stability:
     """
     system, y, z, control = _checked(equilibrium, row)
     space = equilibrium.settings.space
-    if not isinstance(space, RK4):
+    if not isinstance(space, Lobatto4):
         one = Trajectory(
             system=system, settings=equilibrium.settings, time=np.zeros(1), y=y[None], z=z[None],
             control=control[None], result=np.zeros(1, int), residual=np.zeros(1), iterations=np.zeros(1, int),
         )  # fmt: skip
-        found = rests(system, control, space="rk4", initial=one, on_failure="return")
+        found = rests(system, control, space="lobatto4", initial=one, on_failure="return")
         if found.result[0] not in NEARBY:
             raise ValueError(
-                f"row {row} cannot be decided: by RK4 along the rod no equilibrium is found near it; allowed "
-                'is one that was solved with space="rk4"'
+                f"row {row} cannot be decided: by Lobatto4 along the rod no equilibrium is found near it; "
+                'allowed is one that was solved with space="lobatto4"'
             )
         y = np.asarray(found.y[0])
     by = [count for count in DIVISIONS if count <= 2 or count * system.nodes * system.strands <= POINTS]

@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.boundary import Solution, linearise, newton, residuals
-from knode_cosserat.solvers.crossing import points_of, spread
-from knode_cosserat.solvers.linear import Condensed, carried
-from knode_cosserat.solvers.past import rest_record
+from knode_cosserat.solvers.boundary import Solution, factors_of, newton, pivots_of
+from knode_cosserat.solvers.grid import grid_of
+from knode_cosserat.solvers.history import rest_record
+from knode_cosserat.solvers.linear import solved
 from knode_cosserat.solvers.problem import StepProblem, row_of
 from knode_cosserat.solvers.settings import Settings
 
@@ -63,7 +63,7 @@ def static_problem(system: System, settings: Settings, control: Any) -> StepProb
 
 def at_rest(system: System) -> tuple[Any, Any]:
     """The first guess of y at all points and of ξ: unloaded."""
-    y = spread(points_of(system), rest_record(system)[:, : system.y_layout.size])
+    y = grid_of(system).spread(rest_record(system)[:, : system.y_layout.size])
     return y, system.unknowns(y[0])
 
 
@@ -73,7 +73,7 @@ rest_guess = jax.jit(at_rest)
 def solve(system: System, settings: Settings, control: Any, y: Any, unknowns: Any) -> Solution:
     """An equilibrium from a guess; its `error` says whether it is one."""
     problem = static_problem(system, settings, control).ready()
-    return newton(problem, y, unknowns, Condensed(), settings.newton)
+    return newton(problem, y, unknowns, settings.newton)[0]
 
 
 @functools.partial(jax.jit, static_argnames="settings")
@@ -110,23 +110,19 @@ def respond(system, settings, pose, control, y, unknowns):  # type: ignore[no-un
     """A `Response`: the equilibrium found from a guess, its pose, and the pose's slopes."""
     found = solve(system, settings, control, y, unknowns)
     problem = static_problem(system, settings, control)
-    linear = Condensed()
-    linearisation = linearise(problem, found.y, found.unknowns)
-    factors, _, _ = linear.start(linearisation, system.scales().y)
+    factors, pivots = factors_of(problem, found.y, found.unknowns), pivots_of(system)
 
     def by_control(d_control: Any) -> Any:
         def at_solution(control: Any) -> Any:
             problem = static_problem(system, settings, control)
-            return *residuals(problem, found.y), problem.base(found.unknowns)
+            return *problem.residuals(found.y), problem.base(found.unknowns)
 
         defects, tip, base = jax.jvp(at_solution, (control,), (d_control,))[1]
-        # a base that moves by itself enters through the first segment
-        defects = defects.at[0].add(carried(linearisation.F[0], base))
-        dy, _ = linear.solve(factors, defects, tip)
+        dy, _ = solved(factors, pivots, defects, tip, base)
         return twist(system, pose, found.y[-1], dy[-1])
 
     def by_wrench(tip: Any) -> Any:
-        dy, _ = linear.solve(factors, jnp.zeros_like(linearisation.defects), tip)
+        dy, _ = solved(factors, pivots, jnp.zeros_like(found.y[1:]), tip)
         return twist(system, pose, found.y[-1], dy[-1])
 
     names = wrench_fields(system)
@@ -155,8 +151,7 @@ def poses_of(system, settings, pose, controls):  # type: ignore[no-untyped-def]
         records = static_problem(system, settings, control).records(found.y)
         strain = row_of(system, found.y, records)[:, ny : ny + system.z_layout.size] - z_rest
         lengths = [jnp.max(jnp.linalg.norm(part, axis=-1)) for part in system.z_layout.split(strain)]
-        size = jnp.max(jnp.abs(found.y) / system.scales().y)
-        return *pose(system, found.y[-1]), found.error, found.corrections, size, jnp.stack(lengths)
+        return *pose(system, found.y[-1]), found.error, found.corrections, jnp.stack(lengths)
 
     return jax.lax.map(one, controls)
 

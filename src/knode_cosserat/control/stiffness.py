@@ -23,9 +23,9 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.system import System, in_strands
-from knode_cosserat.solvers.crossing import carried_on, points_of
+from knode_cosserat.solvers.grid import grid_of, inside
 from knode_cosserat.solvers.problem import StepProblem, no_history
-from knode_cosserat.solvers.space import RK4
+from knode_cosserat.solvers.space import Lobatto4
 
 #: y of a strand that has a pose and a stress
 NEEDED = ("p", "h", "n", "m")
@@ -110,15 +110,30 @@ def _hat(v: Any) -> Float[Any, "3 3"]:
 # along the rod
 
 
+def _carried(rates: Any, begin: Any, end: Any, y: Any) -> Any:
+    """Return y at the end of a short stretch, by the classical Runge-Kutta scheme, inside it."""
+    ds = end - begin
+
+    def stage(reached: tuple[Any, Any], given: tuple[Any, Any]) -> Any:
+        total, k = reached
+        part, weight = given
+        k = rates(inside(begin + part * ds, begin, end), y + part * ds * k)
+        return (total + weight * ds * k, k), None
+
+    weights = np.array([1.0, 2.0, 2.0, 1.0]) / 6.0
+    (total, _), _ = jax.lax.scan(stage, (y, y), (np.array([0.0, 0.5, 0.5, 1.0]), weights))
+    return total
+
+
 @jax.jit
 def _filled(system: System, y: Any, control: Any, history: Any) -> Any:
     """y at the nodes and at the cuts between them."""
-    return StepProblem(system, jnp.zeros(()), control, jnp.zeros(()), history, RK4()).filled(y)
+    return StepProblem(system, jnp.zeros(()), control, jnp.zeros(()), history, Lobatto4()).filled(y)
 
 
 @jax.jit
 def _ends(system: System, base: Any, tip: Any, control: Any, history: Any) -> tuple[Any, Any, Any]:
-    problem = StepProblem(system, jnp.zeros(()), control, jnp.zeros(()), history, RK4())
+    problem = StepProblem(system, jnp.zeros(()), control, jnp.zeros(()), history, Lobatto4())
     changes = jax.jacfwd(problem.base)(system.unknowns(base)), jax.jacfwd(problem.tip_residual)(tip)
     return *changes, problem.tip_residual(tip)
 
@@ -131,12 +146,12 @@ def _along(
     strand = system.strand
     layout, scale = strand.y_layout, strand.scales().y
     rest = jnp.zeros(layout.size * (2 if strand.mixed else 1) + strand.z_layout.size)
-    problem = StepProblem(system, jnp.zeros(()), control, jnp.zeros(()), jnp.zeros((0, 0, 0)), RK4())
+    problem = StepProblem(system, jnp.zeros(()), control, jnp.zeros(()), jnp.zeros((0, 0)), Lobatto4())
     kept = np.ones(layout.size)
     kept[layout.indices(NEEDED)] = 0.0
 
-    def rates(s: Any, y: Any, known: Any) -> Any:
-        return problem.point_rates(s, y, rest)[0], None
+    def rates(s: Any, y: Any) -> Any:
+        return problem.point_rates(s, y, rest)[0]
 
     def piece(y: Any, low: Any, high: Any, acting: Any) -> Any:
         jump = jnp.eye(12)
@@ -146,9 +161,9 @@ def _along(
 
         def on(y: Any, step: Any) -> Any:
             begin, end = low + step * (high - low)
-            y, _ = carried_on(RK4(), rates, (begin, end), y, None)
+            y = _carried(rates, begin, end, y)
             ways = wide(strand, y)
-            y_s, pushed = jax.linearize(lambda y: rates(end, y, None)[0], y)
+            y_s, pushed = jax.linearize(lambda y: rates(end, y), y)
             ways_s = jax.vmap(pushed, in_axes=-1, out_axes=-1)(ways)
             _, turning = jax.jvp(lambda y: wide(strand, y), (y,), (y_s,))
             moved = jnp.max(jnp.abs(ways_s), axis=1) * kept / scale
@@ -168,8 +183,8 @@ def divided(system: System, y: Any, control: Any, by: Sequence[int]) -> Iterator
     The equilibrium is made that of the pieces first, by Newton's method. By that of the nodes' scheme, a
     little off, a rod that turns for nothing would seem to gain by it.
     """
-    control, history = jnp.asarray(control), no_history(system, RK4())
-    points, length = points_of(system), float(system.length)
+    control, history = jnp.asarray(control), no_history(system, Lobatto4())
+    points, length = grid_of(system), float(system.length)
     bounds = (points.segment[:, None] + points.bounds) * length / (system.nodes - 1)
     found = np.asarray(_filled(system, jnp.asarray(y), control, history))
 

@@ -28,7 +28,6 @@ from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.run import usable_cores
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.solvers.trust import SUSPICIOUS
 
 #: samples that one thread takes at a time; fewer are filled up to a power of two
 CHUNK = 1024
@@ -153,7 +152,7 @@ def workspace(
     *,
     low: Any = None,
     seed: int = 0,
-    space: str | SpaceScheme = "euler",
+    space: str | SpaceScheme = "lobatto2",
     newton: NewtonOptions = NewtonOptions(),
     pose: Pose = tip_pose,
     progress: bool = False,
@@ -175,7 +174,7 @@ def workspace(
         count: how many samples.
         low: the lower limits by name, instead of `controls`.
         seed: of the samples.
-        space: "euler", "rk4", or a scheme.
+        space: "lobatto2", "lobatto4", "euler", or a scheme.
         newton: tolerances and limits of the solve.
         pose: what is looked at, as for `kc.configuration`.
         progress: show a progress bar.
@@ -227,10 +226,10 @@ def _found(system: System, settings: Settings, pose: Pose, controls: np.ndarray,
     joined: list[Any] = [
         None if parts[0] is None else np.concatenate(parts) for parts in zip(*chunks, strict=True)
     ]
-    position, quaternion, residual, _, size, strain = joined
+    position, quaternion, residual, _, strain = joined
     result = np.full(total, int(Result.CONVERGED))
     found = Workspace(system, controls, position, quaternion, result, residual, strain)
-    for i in np.flatnonzero(~((residual <= settings.newton.acceptable) & (size <= SUSPICIOUS))):
+    for i in np.flatnonzero(~(residual <= settings.newton.acceptable)):
         _recovered(found, int(i), settings, pose)
     return found
 

@@ -27,7 +27,6 @@ LINES: dict[str, dict[str, Any]] = {
     "calibrated": METHODS["calibrated"],
     "no-memory": {"color": PALETTE[2], "linestyle": "-", "linewidth": 1.1},
     "no-vibration": {"color": PALETTE[4], "linestyle": "--", "linewidth": 1.1},
-    "euler": {"color": PALETTE[3], "linestyle": ":", "linewidth": 1.1},
 }
 MEASURED = {**REFERENCE, "label": "measured"}
 COLUMNS = 2

@@ -158,7 +158,7 @@ def _first(knowledge: System, trajectories: Sequence[Trajectory], config: FitCon
     if isinstance(options, NetworkOptions):
         networks = [network(knowledge.strand, options, jax.random.key(seed)) for seed in config.seeds]
         if options.standardised and dataset is not None:
-            networks = [standardised(net, knowledge.strand, dataset.segments) for net in networks]
+            networks = [standardised(net, knowledge.strand, dataset) for net in networks]
         return _First(dataset, list(networks))
     return _First(dataset, list(solved(knowledge, trajectories, options, config.seeds)))
 

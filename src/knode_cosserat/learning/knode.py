@@ -168,6 +168,10 @@ class KNODE(System):
         """The knowledge's."""
         return self.adapted.observables(s, y, y_t, z, z_t, control)
 
+    def end_poses(self, control: Any) -> tuple[Any, Any]:
+        """The knowledge's."""
+        return self.knowledge.end_poses(control)
+
     def positions(self, y: Any) -> Any:
         """The knowledge's."""
         return self.knowledge.positions(y)

@@ -18,11 +18,9 @@ from jaxtyping import Float
 
 from knode_cosserat.learning.sides import far_side, slopes_of
 from knode_cosserat.rods.system import System, in_strands, records_in_strands, unpacked_history
-from knode_cosserat.solvers.begin import histories_along
-from knode_cosserat.solvers.between import at_stages
-from knode_cosserat.solvers.crossing import Crossing, carried, crossing_of, parts_of, within
-from knode_cosserat.solvers.past import coefficient_table, rows_tell
-from knode_cosserat.solvers.result import Result
+from knode_cosserat.solvers.grid import at_places, grid_of, inside
+from knode_cosserat.solvers.history import coefficient_table, rows_suffice
+from knode_cosserat.solvers.initial import histories_along
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
@@ -44,13 +42,15 @@ class Samples(NamedTuple):
     z: Float[Any, "S z"]
     #: y at the segment's end, before what acts there
     y_next: Float[Any, "S y"]
+    #: z at the segment's end, beyond what acts there
+    z_next: Float[Any, "S z"]
     #: y_s times the length at the segment's start, from the states alone
     slope: Float[Any, "S y"]
     control: Float[Any, "S c"]
-    #: packed records of history at the stages of its first part, most often all of it
-    history: Float[Any, "S stages x"]
-    #: the same of the parts after cuts within it, if the robot has such segments
-    later: Float[Any, "S parts-1 stages x"]
+    #: packed records of history at the places (start, end, stages between) of its first piece
+    history: Float[Any, "S places x"]
+    #: the same of its other pieces, if the robot has segments with discontinuities inside
+    later: Float[Any, "S pieces-1 places x"]
     #: one over how many samples the same trajectory gave
     weight: Float[Any, " S"]
     #: which trajectory, and which of its rows
@@ -82,39 +82,84 @@ class Dataset:
     doubt: Float[Any, " y"]
 
 
+#: Newton's corrections of y at a discontinuity inside a segment
+CORRECTIONS = 4
+
+
 def predict(system: System, space: SpaceScheme, sample: Samples) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-    """y at the end of one segment and z at its start, as the system has them."""
-    s, ds = sample.place * system.length, system.length / (system.nodes - 1)
+    """Return y at the end of one segment and z at its start, as the system predicts them.
+
+    y at the end is that of the scheme's formula, whose stages use the true y at both ends.
+    """
 
     def derivatives(s: Any, y: Any, record: Any) -> Any:
         history = unpacked_history(system, sample.c0, record)
         return system.derivatives(s, sample.t, y, sample.control, history)
 
-    def rates(*at: Any) -> Any:
-        return derivatives(*at)[0]
+    def reached(bounds: tuple[Any, Any], start: Any, end: Any, records: Any) -> Any:
+        low, high = bounds
+        h = high - low
 
-    def alone(*at: Any) -> Any:
-        return rates(*at), None
+        def rates(place: float, y: Any, record: Any) -> Any:
+            s = low + place * h
+            return derivatives(inside(s, low, high) if system.cuts else s, y, record)[0]
 
-    def jump(acting: Any, y: Any, record: Any) -> Any:
-        history = unpacked_history(system, sample.c0, record)
-        return system.crossed(acting, sample.t, y, sample.control, history) if system.jumps else y
+        found = [rates(0.0, start, records[0])]
+        found.append(rates(1.0, end, records[1]) if space.implicit else jnp.zeros_like(start))
+        for k, stage in enumerate(space.formula.stages):
+            moved = sum(x * f for x, f in zip(stage.rates, found, strict=False))
+            y = (1.0 - stage.end) * start + stage.end * end + h * moved
+            found.append(rates(stage.place, y, records[2 + k]))
+        return start + h * sum(b * f for b, f in zip(space.formula.weights, found, strict=True))
 
-    crossings = crossing_of(system)
-    if crossings is None:
-        y_next, _ = space.advance(alone, s, ds, sample.y, sample.history)
-    else:
-        segment = jnp.round(sample.place * (system.nodes - 1)).astype(int)
-        crossing = Crossing(*(jnp.asarray(each)[segment] for each in crossings))
-        past = jnp.concatenate([sample.history[None], sample.later])
-        y_next = carried(space, rates, jump, crossing, (s, ds), sample.y, past, first=1)
-    return y_next, derivatives(start_of(system, sample.place), sample.y, sample.history[0])[1]
+    z = derivatives(start_of(system, sample.place), sample.y, sample.history[0])[1]
+    grid, ds = grid_of(system, space), system.length / (system.nodes - 1)
+    if grid.parts.shape[1] == 1:
+        s = sample.place * system.length
+        return reached((s, s + ds), sample.y, sample.y_next, sample.history), z
+
+    def along(y: Any, piece: Any) -> tuple[Any, None]:
+        k, own, records = piece
+        low, high = (ds * (jnp.asarray(grid.segment)[own] + jnp.asarray(grid.bounds)[own, k]) for k in (0, 1))
+        history = unpacked_history(system, sample.c0, records[0])
+        if system.jumps:
+            acting = jnp.asarray(grid.acting)[own]
+            beyond = system.crossed(acting, sample.t, y, sample.control, history)
+            y = jnp.where(k > 0, beyond, y)
+
+        def corrected(_: Any, end: Any) -> Any:
+            def left(end: Any) -> Any:
+                return reached((low, high), y, end, records) - end
+
+            return end - jnp.linalg.solve(jax.jacfwd(left)(end), left(end))
+
+        inner = jax.lax.fori_loop(0, CORRECTIONS, corrected, y)
+        last = jnp.asarray(grid.bounds)[own, 1] == 1.0
+        found = reached((low, high), y, jnp.where(last, sample.y_next, inner), records)
+        # segments with fewer pieces have their last one repeated
+        return jnp.where((k > 0) & (own == previous(k)), y, found), None
+
+    segment = jnp.round(sample.place * (system.nodes - 1)).astype(int)
+    pieces = jnp.asarray(grid.parts)[segment]
+
+    def previous(k: Any) -> Any:
+        return pieces[jnp.maximum(k - 1, 0)]
+
+    records = jnp.concatenate([sample.history[None], sample.later])
+    y_next, _ = jax.lax.scan(along, sample.y, (jnp.arange(len(pieces)), pieces, records))
+    return y_next, z
 
 
 def start_of(system: System, place: Any) -> Any:
-    """Arclength (m) where a segment begins; moved a little into it where the rod has cuts."""
+    """Return the arclength (m) where a segment starts; a little inside it if the rod has discontinuities."""
     s, ds = place * system.length, system.length / (system.nodes - 1)
-    return within(s, s, s + ds) if system.cuts else s
+    return inside(s, s, s + ds) if system.cuts else s
+
+
+def end_of(system: System, place: Any) -> Any:
+    """Return the arclength (m) where a segment ends; a little inside it if the rod has discontinuities."""
+    s, ds = place * system.length, system.length / (system.nodes - 1)
+    return inside(s + ds, s, s + ds) if system.cuts else s + ds
 
 
 def samples(
@@ -139,9 +184,9 @@ def samples(
 
 
 def told_by_rows(knowledge: System, trajectories: Sequence[Trajectory]) -> bool:
-    """Whether rows hold all that steps look back on, or come from no simulation."""
+    """Return True if rows hold every state that steps need, or come from no simulation."""
     made = [each.settings for each in trajectories]
-    return all(settings is None or rows_tell(knowledge, settings) for settings in made)
+    return all(settings is None or rows_suffice(knowledge, settings.space) for settings in made)
 
 
 def of_strands(knowledge: System, data: Dataset) -> Dataset:
@@ -159,7 +204,7 @@ def of_strands(knowledge: System, data: Dataset) -> Dataset:
 
     shared = ("place", "t", "c0", "control", "weight", "origin")
     every: dict[str, Any] = {name: np.repeat(getattr(segments, name), count, axis=0) for name in shared}
-    every |= {name: own(getattr(segments, name)) for name in ("y", "z", "y_next", "slope")}
+    every |= {name: own(getattr(segments, name)) for name in ("y", "z", "y_next", "z_next", "slope")}
     every |= {"history": past(segments.history), "later": past(segments.later)}
     every |= {"weight": every["weight"] / count}
     doubt = np.sqrt(np.mean(np.square(in_strands(knowledge, data.doubt)), axis=0))
@@ -167,7 +212,7 @@ def of_strands(knowledge: System, data: Dataset) -> Dataset:
 
 
 def settings_of(trajectory: Trajectory) -> Settings:
-    """How a trajectory was solved, or would have been where nothing is said."""
+    """Return the settings of a trajectory; the default ones if it was not simulated."""
     return trajectory.settings or Settings()
 
 
@@ -204,6 +249,7 @@ def _of_one(
         y=flat(beyond[at]),
         z=flat(z[at]),
         y_next=flat(y[np.ix_(rows, ends)]),
+        z_next=flat(z[np.ix_(rows, ends)]),
         slope=flat(slope[at]),
         control=spread(control[rows]),
         history=flat(stages[:, starts]),
@@ -229,18 +275,20 @@ def _past_of_rows(
         past = jax.vmap(lambda each: past_of_segments(knowledge, space, each))(history)
     else:
         first, along = known
-        past = jax.vmap(lambda each: in_segments(knowledge, each))(along[rows - first])
+        past = jax.vmap(lambda each: in_segments(knowledge, space, each))(along[rows - first])
     return np.asarray(past[0]), np.asarray(past[1])
 
 
 def past_of_segments(knowledge: System, space: SpaceScheme, records: Float[Any, "nodes x"]) -> Any:
     """`Samples.history` and `Samples.later` of all segments of one row, from its history at the nodes."""
-    return in_segments(knowledge, at_stages(knowledge, space, records))
+    return in_segments(knowledge, space, at_places(knowledge, space, records))
 
 
-def in_segments(knowledge: System, stages: Float[Any, "stages points x"]) -> Any:
-    """Of all segments the first part (segments, stages, x), and others (segments, parts - 1, stages, x)."""
-    found = jnp.swapaxes(stages, 0, 1)[parts_of(knowledge.cuts, knowledge.nodes)]
+def in_segments(knowledge: System, space: SpaceScheme, records: Float[Any, "places x"]) -> Any:
+    """Records (segments, places, x) of first pieces, and (segments, pieces - 1, places, x) of others."""
+    grid = grid_of(knowledge, space)
+    parts = grid.parts
+    found = records[grid.places_of(parts.ravel()).reshape(*parts.shape, -1)]
     return found[:, 0], found[:, 1:]
 
 
@@ -284,7 +332,6 @@ def _check(knowledge: System, trajectories: Sequence[Trajectory]) -> None:
                 f"{name} has {controls} controls a row; the knowledge has {knowledge.control_size} ({names})"
             )
         _check_finite(name, trajectory)
-        _check_segments(name, trajectory)
         _check_time(name, trajectory)
     first = trajectories[0]
     for k, trajectory in enumerate(trajectories):
@@ -308,16 +355,6 @@ def _check_finite(name: str, trajectory: Trajectory) -> None:
             raise DataError(
                 f"{name} has {what} that is not finite in row {row}; learn from the rows before it"
             )
-
-
-def _check_segments(name: str, trajectory: Trajectory) -> None:
-    """By Euler's scheme a segment is one step, and what is learned rests on that."""
-    divided = np.asarray(trajectory.result) == Result.RECOVERED_FINER_SEGMENTS
-    if settings_of(trajectory).space.order == 1 and np.any(divided):
-        raise DataError(
-            f"{name} was solved with every segment divided, its own being too long; "
-            'give the robot more nodes, or learn from a simulation with space="rk4"'
-        )
 
 
 def _check_time(name: str, trajectory: Trajectory) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.system import System, unpacked_history
-from knode_cosserat.solvers.crossing import ON_NODE, crossings
+from knode_cosserat.solvers.grid import ON_NODE, grid_of
 from knode_cosserat.solvers.settings import Settings
 
 
@@ -26,7 +26,8 @@ def far_side(
     if not (knowledge.cuts and knowledge.jumps):
         return y
     # of each segment, the cuts at its very start
-    acting = crossings(knowledge.cuts, knowledge.nodes).acting[:, 0]
+    grid = grid_of(knowledge)
+    acting = grid.acting[grid.nodes[:-1]]
     jumping = np.flatnonzero(acting.any(axis=1))
     if not len(jumping):
         return y
@@ -54,6 +55,7 @@ def slopes_of(
     """y_s times the length (T, N, y), from the states alone, and by how much it may be wrong (y,).
 
     Exact where a segment is one Euler step; of splines otherwise, judged by those of the next lower order.
+    For the trapezoidal rule the slopes are near the splines', and their means are the changes over segments.
     No spline goes over a cut: with `beyond`, y on the far side of the cuts, slopes at cuts are those there.
     """
     last = y.shape[1] - 1
@@ -65,7 +67,10 @@ def slopes_of(
     for first, end in pieces(cuts, last + 1):
         values = y[:, first : end + 1].copy()
         values[:, 0] = beyond[:, first]
-        slope[:, first : end + 1], wrong[:, first : end + 1] = _spline_slopes(values, last)
+        own, doubt = _spline_slopes(values, last)
+        if settings.space.order == 2:
+            own = _trapezoidal_slopes(values, own, last)
+        slope[:, first : end + 1], wrong[:, first : end + 1] = own, doubt
     # where a cut is between nodes there may be a node by itself: that of the segment must do, and is in doubt
     alone = [first for first, end in pieces(cuts, last + 1) if first == end]
     for node in alone:
@@ -79,9 +84,9 @@ def whole(knowledge: System, place: Float[Any, " S"]) -> Float[np.ndarray, " S"]
     """1 for each segment, begun at that part of the length, that no cut parts; 0 for others."""
     if not knowledge.cuts:
         return np.ones(len(place))
-    bounds = crossings(knowledge.cuts, knowledge.nodes).bounds
+    grid = grid_of(knowledge)
     segment = np.round(np.asarray(place) * (knowledge.nodes - 1)).astype(int)
-    return (bounds[segment, 1] == 1.0).astype(float)
+    return (grid.bounds[grid.nodes[segment], 1] == 1.0).astype(float)
 
 
 def pieces(cuts: tuple[float, ...], nodes: int) -> list[tuple[int, int]]:
@@ -101,6 +106,18 @@ def pieces(cuts: tuple[float, ...], nodes: int) -> list[tuple[int, int]]:
             found.append((first, node + 1))
             first = node + 1
     return [*found, (first, nodes - 1)]
+
+
+def _trapezoidal_slopes(values: np.ndarray, near: np.ndarray, last: int) -> np.ndarray:
+    """Return the slopes nearest to others whose means over segments are the changes of values."""
+    if values.shape[1] < 3:
+        return near
+    signs = (-1.0) ** np.arange(values.shape[1])[:, None]
+    change = np.diff(values, axis=1) * last
+    steps = np.cumsum(2.0 * change * signs[1:], axis=1)
+    found = signs * np.concatenate([np.zeros_like(steps[:, :1]), steps], axis=1)
+    # what alternates is free
+    return found + signs * np.mean(signs * (near - found), axis=1, keepdims=True)
 
 
 def _spline_slopes(values: np.ndarray, last: int) -> tuple[np.ndarray, np.ndarray]:

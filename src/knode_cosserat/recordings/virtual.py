@@ -178,8 +178,8 @@ def driven(sent: Pulls, lag: float) -> Trajectory:
     robot = virtual_robot()
     time = np.arange(round((sent.time[-1] + COMMANDED) / PLANT_STEP) + 1) * PLANT_STEP
     tension = lagged(sent, time, lag)
-    still = equilibrium(robot, tension[0], space="rk4")
-    fine = simulate(robot, tension[1:], PLANT_STEP, space="rk4", initial=still)
+    still = equilibrium(robot, tension[0], space="lobatto4")
+    fine = simulate(robot, tension[1:], PLANT_STEP, space="lobatto4", initial=still)
     rows = fine[:: round(KEPT / PLANT_STEP)]
     return dataclasses.replace(rows, settings=None)
 

@@ -281,6 +281,13 @@ class Rod(ElasticRod):
         q, w = velocities(self._pose(y), self._pose(y_t))
         return jnp.concatenate([y[:13], q, w, y[19:]])
 
+    def end_poses(self, control: Any) -> tuple[Pose | None, Pose | None]:
+        """Return the poses in which the ends are clamped under a control; None for an end that is not."""
+        controls, rest = self._controls(control), self._pose(self.rest(self.length)[0])
+        ends = (self.base_end, AT_ORIGIN, controls.base), (self.tip_end, rest, controls.tip)
+        base, tip = (end.pose(at, own) if isinstance(end, Clamped) else None for end, at, own in ends)
+        return base, tip
+
     def _pose(self, y: Any) -> Pose:
         return Pose(self.y_layout.get(y, "p"), self.y_layout.get(y, "h"))
 

@@ -219,6 +219,10 @@ class System(Parametrised):
     def tip(self, t: Any, control: Any, y: Float[Any, " y"], history: History) -> Float[Any, " k"]:
         """Residuals of the conditions at s = length: zero when they hold."""
 
+    def end_poses(self, control: Any) -> tuple[Any, Any]:
+        """Return the poses in which base and tip are held under a control; None for an end that is not."""
+        return None, None
+
     @property
     def tip_layout(self) -> Layout:
         """What the tip's residuals are; one nameless field unless a system says more."""

@@ -1,4 +1,4 @@
-"""What of the equations does not depend on what is iterated on: evaluated once, before.
+"""Hoists terms that do not change during Newton's iteration: they are evaluated once, before.
 
 A step evaluates the equations many times at the same places, under the same control. What depends on neither
 y nor the past (where tendons run, how stiff a section is, by which matrix a law is solved) is the same every
@@ -16,7 +16,7 @@ from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun
 
 
 class _On(enum.IntEnum):
-    """What a value depends on, and on nothing beyond."""
+    """The furthest input that a value depends on."""
 
     NOTHING = 0
     PARAMETERS = 1

@@ -2,14 +2,13 @@
 
 Unknown are y at every node and the free numbers ξ at the base. Their equations:
 
-    y_0 = base(ξ),     y_{j+1} = Φ_j(y_j)  (one segment of the space scheme),     tip(y_N) = 0
+    y_0 = base(ξ),     y_{j+1} = y_j + h Σ bᵢ f(Yᵢ)  (a piece of the space scheme),     tip(y_N) = 0
 
-Newton's method linearises all segments side by side, F_j = ∂Φ_j/∂y_j, and one linear recursion along the
-rod gives the correction. Measured against single shooting on the paper's robot this is faster (no serial
-chain of nonlinear evaluations) and converges from further away. Because a linearisation costs several times
-as much as the residual, it is kept for further corrections while those still converge fast. Steps are damped
-by the natural monotonicity test: the correction that the old linearisation proposes at the new point must be
-shorter than the last one (Deuflhard, Newton Methods for Nonlinear Problems, 2004, ch. 3).
+Newton's method linearises all pieces side by side, and one linear recursion along the rod gives the
+correction. A linearisation costs as much as several corrections. It is kept, also from one time step to the
+next, while corrections converge fast. Corrections are damped by the natural monotonicity test: the correction
+that the same linearisation proposes at the new point must be shorter than the last one (Deuflhard, Newton
+Methods for Nonlinear Problems, 2004, ch. 3).
 """
 
 from __future__ import annotations
@@ -21,12 +20,13 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float, Int
 
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.linear import Linearisation, LinearSolver
+from knode_cosserat.solvers.linear import Factors, factored, solved
 from knode_cosserat.solvers.problem import StepProblem
-from knode_cosserat.solvers.space import SLOPES, VALUES, SpaceScheme
+from knode_cosserat.solvers.space import SpaceScheme
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,9 +43,6 @@ class NewtonOptions:
     #: linearise again when the old linearisation is expected to need more corrections than this
     patience: int = 8
     least_damping: float = 1e-3
-    #: begin a step with the last one's linearisation, as long as it converges: many short steps of a rod with
-    #: many nodes then take less time each. Residuals end up nearer to `tolerance`.
-    across_steps: bool = False
 
     def __post_init__(self) -> None:
         for name, allowed, holds in (
@@ -61,15 +58,17 @@ class NewtonOptions:
 
 
 class Iterate(NamedTuple):
-    """A point of the iteration; `error` is its largest residual in natural units, infinite for a NaN."""
+    """A point of the iteration and its residuals; `error` is the largest (natural units; inf for NaN)."""
 
     y: Float[Any, "points y"]
     unknowns: Float[Any, " k"]
+    defects: Float[Any, "pieces y"]
+    tip: Float[Any, " k"]
     error: Float[Any, ""]
 
 
 class Solution(NamedTuple):
-    """What Newton's method ended with: solved if `error` is at most `acceptable`, and not otherwise."""
+    """Final iterate of Newton's method: solved if `error` is at most `acceptable`."""
 
     y: Float[Any, "points y"]
     unknowns: Float[Any, " k"]
@@ -79,163 +78,155 @@ class Solution(NamedTuple):
 
 
 class Kept(NamedTuple):
-    """The linear solver's factors of an earlier linearisation, and whether there are any."""
+    """Factors of an earlier linearisation; not usable before the first."""
 
-    factors: Any
+    factors: Factors
     usable: Any
 
 
-def none_kept(problem: StepProblem, y: Any, unknowns: Any, linear: LinearSolver) -> Kept:
-    """What is kept before the first step."""
-    y_scale = problem.system.scales().y
-    like = jax.eval_shape(lambda: linear.start(linearise(problem, y, unknowns), y_scale)[0])
+def pivots_of(system: System) -> Any:
+    """Return the indices in y of the fields that are unknown at the base."""
+    return np.asarray(system.y_layout.indices(system.base_unknowns))
+
+
+def factors_of(problem: StepProblem, y: Any, unknowns: Any) -> Factors:
+    """Return the factored linearisation at a point."""
+    return factored(problem.linearise(y, unknowns), pivots_of(problem.system))
+
+
+def none_kept(problem: StepProblem, y: Any, unknowns: Any) -> Kept:
+    """Return factors of the right shape that are not usable."""
+    like = jax.eval_shape(lambda: factors_of(problem, y, unknowns))
     return Kept(jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), like), jnp.array(False))
 
 
-def _with_base(problem: StepProblem, y: Any, unknowns: Any) -> Any:
-    return jnp.concatenate([problem.base(unknowns)[None], y[1:]])
+def _iterate(problem: StepProblem, y: Any, unknowns: Any) -> Iterate:
+    y = jnp.concatenate([problem.base(unknowns)[None], y[1:]])
+    defects, tip = problem.residuals(y)
+    return Iterate(y, unknowns, defects, tip, largest_residual(problem, defects, tip))
 
 
-def _error(problem: StepProblem, defects: Any, tip: Any) -> Any:
+def largest_residual(problem: StepProblem, defects: Any, tip: Any) -> Any:
+    """Return the largest residual in natural units, infinite for a NaN."""
     scales = problem.system.scales()
     error = jnp.maximum(jnp.max(jnp.abs(defects) / scales.y), jnp.max(jnp.abs(tip) / scales.tip))
     return jnp.where(jnp.isnan(error), jnp.inf, error)
 
 
-def residuals(problem: StepProblem, y: Float[Any, "points y"]) -> tuple[Any, Any]:
-    """Defects y_{j+1} - Φ_j(y_j), with their sign turned, and the tip's residuals."""
-    reached = problem.pieces(VALUES, y)
-    return reached.reshape(y[1:].shape) - y[1:], problem.tip_residual(y[-1])
-
-
 @functools.partial(jax.jit, static_argnames="space")
 def static_error(system: System, space: SpaceScheme, record: Any, control: Any, t: Any) -> Any:
-    """How far a record is from an equilibrium: its largest residual in natural units, all rates zero."""
+    """Return the largest residual of a record in natural units, all rates zero."""
     problem = StepProblem.still(system, space, control, t)
     y = problem.filled(record[:, : system.y_layout.size])
     base = problem.base(system.unknowns(y[0])) - y[0]
-    error = _error(problem, *residuals(problem, y))
+    error = largest_residual(problem, *problem.residuals(y))
     return jnp.maximum(error, jnp.max(jnp.abs(base) / system.scales().y))
 
 
-def linearise(problem: StepProblem, y: Float[Any, "points y"], unknowns: Any) -> Linearisation:
-    """Residuals and their exact derivatives by forward mode, all segments in one batch."""
-    reached, F = problem.pieces(SLOPES, y)
-    if problem.system.strands > 1:
-        F = F.reshape(y.shape[0] - 1, problem.system.strands, *F.shape[1:])
-    tip, M = SLOPES.on(problem.tip_residual, SLOPES.begin(y[-1]))
-    S = jax.jacfwd(problem.base)(unknowns)
-    return Linearisation(F, S, M, reached.reshape(y[1:].shape) - y[1:], tip)
-
-
 class _Search(NamedTuple):
-    """State while one linearisation is in use: the point, and the correction proposed there."""
+    """State of the iteration."""
 
-    at: Iterate
+    #: the next point
+    y: Float[Any, "points y"]
+    unknowns: Float[Any, " k"]
+    #: the last accepted point, and the correction from it
+    before: Iterate
     dy: Float[Any, "points y"]
     dxi: Float[Any, " k"]
+    #: its length, infinite if there is none by the same linearisation
     size: Float[Any, ""]
     damping: Float[Any, ""]
-    corrections: Int[Any, ""]
+    #: a new linearisation is needed at the next point
+    renew: Any
+    #: the next correction is the first of its linearisation, at its point
+    first: Any
+    #: the last correction was made at the point of its linearisation
     fresh: Any
-    go: Any
-    dead: Any
+    #: the linearisation is from an earlier step
+    old: Any
+    #: solved, or no further progress
+    done: Any
+    corrections: Int[Any, ""]
+    linearisations: Int[Any, ""]
 
 
 def newton(
-    problem: StepProblem,
-    y: Float[Any, "points y"],
-    unknowns: Float[Any, " k"],
-    linear: LinearSolver,
-    options: NewtonOptions,
-) -> Solution:
-    """Solve one step from a first guess. Never fails: the solution's `error` says what came of it."""
-    return newton_keeping(problem, y, unknowns, linear, options, None)[0]
+    problem: StepProblem, y: Float[Any, "points y"], unknowns: Float[Any, " k"], options: NewtonOptions,
+    kept: Kept | None = None, batch: str | None = None,
+) -> tuple[Solution, Kept]:  # fmt: skip
+    """Solve one step from a first guess, beginning with kept factors if they are usable.
 
+    `batch` is the name of the axis of robots that are solved in lockstep: they are linearised together, if
+    one of them needs it. Never fails: the `error` of the solution says whether it is one.
+    """
+    y_scale, pivots = problem.system.scales().y, pivots_of(problem.system)
+    kept = none_kept(problem, y, unknowns) if kept is None else kept
 
-def newton_keeping(
-    problem: StepProblem, y: Float[Any, "points y"], unknowns: Float[Any, " k"], linear: LinearSolver,
-    options: NewtonOptions, kept: Kept | None,
-) -> tuple[Solution, Kept | None]:  # fmt: skip
-    """`newton` that begins with what is kept, and what is to be kept of it; None keeps nothing."""
-    y_scale = problem.system.scales().y
-
-    def size_of(dy: Any) -> Any:
-        return jnp.max(jnp.abs(dy) / y_scale)
-
-    def correct(factors: Any, old: Any, search: _Search) -> _Search:
-        at, damping = search.at, search.damping
-        xi = at.unknowns + damping * search.dxi
-        y = _with_base(problem, at.y + damping * search.dy, xi)
-        defects, tip = residuals(problem, y)
-        trial = Iterate(y, xi, _error(problem, defects, tip))
-        solved = trial.error <= options.tolerance
-        dy, dxi = jax.lax.cond(
-            solved, lambda: (search.dy, search.dxi), lambda: linear.solve(factors, defects, tip)
-        )
-        size = size_of(dy)
-        accept = (size <= (1.0 - damping / 4.0) * search.size) | solved
-        # corrections still to come at this rate, were the linearisation kept
+    def correct(factors: Factors, search: _Search) -> _Search:
+        first, damping = search.first, search.damping
+        at = _iterate(problem, search.y, search.unknowns)
+        dy, dxi = solved(factors, pivots, at.defects, at.tip)
+        size = jnp.max(jnp.abs(dy) / y_scale)
+        good = at.error <= options.tolerance
+        shorter = (size <= (1.0 - damping / 4.0) * search.size) & jnp.isfinite(size)
+        accept = good | shorter
+        # corrections still to come at this rate
         rate = jnp.log(jnp.maximum(search.size / size, 1.0 + 1e-6))
-        remaining = jnp.log(trial.error / options.tolerance) / rate
-        keep = accept & (damping == 1.0) & (remaining <= options.patience)
-        shorten = ~accept & search.fresh & (damping > options.least_damping)
-        rounding = ~accept & (at.error <= options.acceptable) & ~old
+        slow = jnp.log(at.error / options.tolerance) / rate > options.patience
+        slow = shorter & ~first & jnp.isfinite(search.size) & (slow | (damping < 1.0))
+        shorten = ~accept & search.fresh & ~first & (damping > options.least_damping)
+        rounding = ~accept & (search.before.error <= options.acceptable) & ~search.old & ~first
+        dead = rounding | (~accept & (first | search.fresh) & ~shorten)
+        # the next point: on from here, again from the one before but shorter, or a new linearisation there
+        origin = _where(accept, at, search.before)
+        direction = _where(accept, (dy, dxi), (search.dy, search.dxi))
+        damping = jnp.where(accept, jnp.where(first, 1.0, jnp.minimum(1.0, 4.0 * damping)), damping / 4.0)
+        renew = ~good & ~dead & (slow | (~accept & ~shorten))
+        step = jnp.where(good | dead | renew, 0.0, damping)
         return _Search(
-            at=Iterate(*(jnp.where(accept, new, old) for new, old in zip(trial, at, strict=True))),
-            dy=jnp.where(accept, dy, search.dy),
-            dxi=jnp.where(accept, dxi, search.dxi),
-            size=jnp.where(accept, size, search.size),
-            damping=jnp.where(accept, jnp.minimum(1.0, 4.0 * damping), damping / 4.0),
-            corrections=search.corrections + 1,
-            fresh=search.fresh & ~accept,
-            go=~solved & ~rounding & (keep | shorten),
-            dead=rounding | (~accept & search.fresh & ~shorten),
-        )
-
-    def anew(at: Iterate) -> Any:
-        linearisation = linearise(problem, at.y, at.unknowns)
-        found = linear.start(linearisation, y_scale)
-        return *found, _error(problem, linearisation.defects, linearisation.tip_residual)
-
-    def again(factors: Any, at: Iterate) -> Any:
-        defects, tip = residuals(problem, at.y)
-        return factors, *linear.solve(factors, defects, tip), _error(problem, defects, tip)
-
-    def linearised(state: tuple[_Search, Any, Kept | None]) -> tuple[_Search, Any, Kept | None]:
-        search, count, kept = state
-        at = search.at
-        if kept is None:
-            old = jnp.array(False)
-            factors, dy, dxi, error = anew(at)
-        else:
-            old = kept.usable
-            factors, dy, dxi, error = jax.lax.cond(old, again, lambda _, at: anew(at), kept.factors, at)
-        at = at._replace(error=error)
-        size = size_of(dy)
-        usable = jnp.isfinite(size)
-        # a damping that this point itself asked for is kept; one left from a stale linearisation is not
-        damping = jnp.where(search.fresh, 1.0, jnp.maximum(search.damping, 0.25))
-        search = _Search(
-            at, dy, dxi, size, damping, search.corrections,
-            fresh=~old, go=usable & (at.error > options.tolerance), dead=~usable & ~old,
+            y=origin.y + step * direction[0], unknowns=origin.unknowns + step * direction[1],
+            before=origin, dy=direction[0], dxi=direction[1], size=jnp.where(accept, size, search.size),
+            damping=jnp.where(renew, 1.0, damping), renew=renew, first=jnp.array(False),
+            fresh=jnp.where(accept, first, search.fresh), old=search.old, done=good | dead,
+            corrections=search.corrections + (step > 0.0), linearisations=search.linearisations,
         )  # fmt: skip
-        search = jax.lax.while_loop(lambda s: s.go, lambda s: correct(factors, old, s), search)
-        # what an old linearisation did not solve says nothing of the damping that a new one needs
-        search = search._replace(fresh=search.fresh | old)
-        kept = None if kept is None else Kept(factors, jnp.array(False))
-        return search, jnp.where(old, count, count + 1), kept
 
-    def unsolved(state: tuple[_Search, Any, Kept | None]) -> Any:
-        search, count, _ = state
-        return (search.at.error > options.tolerance) & (count < options.max_linearisations) & ~search.dead
+    def linearised(state: tuple[_Search, Factors]) -> tuple[_Search, Factors]:
+        search, factors = state
+        renew = search.renew
 
+        def anew(at: tuple[Any, Any], old: Factors) -> Factors:
+            y, unknowns = at
+            y = jnp.concatenate([problem.base(unknowns)[None], y[1:]])
+            found = factors_of(problem, y, unknowns)
+            return found if batch is None else _where(renew, found, old)
+
+        # by the need of any robot, which is one number: by each one's, a batch would always do both
+        needed = renew if batch is None else jax.lax.psum(renew.astype(int), batch) > 0
+        at = search.y, search.unknowns
+        factors = jax.lax.cond(needed, anew, lambda _, old: old, at, factors)
+        search = search._replace(
+            size=jnp.where(renew, jnp.inf, search.size), old=search.old & ~renew, first=renew,
+            renew=jnp.array(False), linearisations=search.linearisations + renew,
+        )  # fmt: skip
+        going = functools.partial(jax.lax.while_loop, lambda s: unsolved(s) & ~s.renew)
+        return going(functools.partial(correct, factors), search), factors
+
+    def unsolved(search: _Search) -> Any:
+        return ~search.done & (search.linearisations + search.renew <= options.max_linearisations)
+
+    zero, no = jnp.array(0), jnp.array(False)
+    nowhere = Iterate(y, unknowns, jnp.zeros_like(y[1:]), jnp.zeros_like(unknowns), jnp.array(jnp.inf))
     first = _Search(
-        Iterate(_with_base(problem, y, unknowns), unknowns, jnp.array(jnp.inf)),
-        jnp.zeros_like(y), jnp.zeros_like(unknowns), size=jnp.array(0.0), damping=jnp.array(1.0),
-        corrections=jnp.array(0), fresh=jnp.array(True), go=jnp.array(True), dead=jnp.array(False),
+        y=y, unknowns=unknowns, before=nowhere, dy=jnp.zeros_like(y), dxi=jnp.zeros_like(unknowns),
+        size=jnp.array(jnp.inf), damping=jnp.array(1.0), renew=~kept.usable, first=no, fresh=no,
+        old=kept.usable, done=no, corrections=zero, linearisations=zero,
     )  # fmt: skip
-    search, count, kept = jax.lax.while_loop(unsolved, linearised, (first, jnp.array(0), kept))
-    if kept is not None:
-        kept = kept._replace(usable=search.at.error <= options.acceptable)
-    return Solution(search.at.y, search.at.unknowns, search.at.error, search.corrections, count), kept
+    search, factors = jax.lax.while_loop(lambda state: unsolved(state[0]), linearised, (first, kept.factors))
+    at = search.before
+    solution = Solution(at.y, at.unknowns, at.error, search.corrections, search.linearisations)
+    return solution, Kept(factors, (at.error <= options.acceptable) & ~search.renew)
+
+
+def _where(condition: Any, one: Any, other: Any) -> Any:
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), one, other)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -10,7 +11,9 @@ import numpy as np
 
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.simulate import simulate
+from knode_cosserat.solvers.guess import state_from_positions
+from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.simulate import refined, simulate
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.time import Static
 from knode_cosserat.trajectory import Trajectory
@@ -20,9 +23,11 @@ def equilibrium(
     robot: System | Sequence[System],
     control: Any,
     *,
-    space: str | SpaceScheme = "euler",
-    initial: Trajectory | None = None,
+    space: str | SpaceScheme = "lobatto2",
+    initial: Any = None,
     newton: NewtonOptions = NewtonOptions(),
+    position_tolerance: float | None = None,
+    recovery_budget: float | None = None,
     on_failure: Literal["raise", "return"] = "raise",
 ) -> Trajectory:
     """The shape a robot takes under a constant control, at rest.
@@ -30,15 +35,20 @@ def equilibrium(
     Args:
         robot: one system, or a sequence of systems that differ in their parameters only.
         control: (c,), or (B, c) for a batch; for a tendon robot the tensions in N.
-        space: "euler", "rk4", or a scheme.
-        initial: where to look for it first: a trajectory's last row, instead of the robot unloaded.
+        space: "lobatto2", "lobatto4", "euler", or a scheme.
+        initial: initial guess instead of the robot unloaded: a `Trajectory` (its last row), or measured
+            positions (M, 3) in m, evenly spaced along the rod from its base to its tip.
         newton: tolerances and limits of the solve.
+        position_tolerance: largest discretisation error (m) of positions, for which the nodes are chosen; by
+            default they are the robot's.
+        recovery_budget: seconds that recovery may take; see `simulate`.
         on_failure: "raise" a `SimulationError`, or "return" the trajectory with its row marked invalid.
 
     Returns:
         A `Trajectory` of one row, at time 0; it can be the `initial` of a simulation. If direct iteration
-        fails the load is applied in parts, and then the robot is let move, damped, until it rests; a robot
-        with several equilibria gives the one that this finds, stable or not: `kc.stability` tells.
+        fails, a rod between two held ends is started from a curve that hangs between them; then the load is
+        applied in parts, and then the robot moves, damped, until it rests. Of several equilibria this is one,
+        stable or not: see `kc.stability`.
 
     Raises:
         SimulationError: no equilibrium was found.
@@ -53,12 +63,40 @@ def equilibrium(
             raise ValueError(f"control is not numbers ({error}); allowed is (c,), or (B, c)") from None
     if not control.ndim:
         raise ValueError(f"control is one number, {control}; allowed is (c,), or (B, c) for a batch")
+    if position_tolerance is not None:
+        solve = functools.partial(
+            equilibrium, control=control, space=space, initial=initial, newton=newton,
+            recovery_budget=recovery_budget, on_failure=on_failure,
+        )  # fmt: skip
+        order = Settings.of("bdf2", space, "paper", newton).space.order
+        return refined(solve, robot, initial, position_tolerance, order)
+    if initial is not None and not isinstance(initial, Trajectory):
+        initial = _guess(robot, initial, control)
     found = simulate(
         robot, control[..., None, :], 1.0, time=Static(), space=space, initial=initial, newton=newton,
-        on_failure=on_failure,
+        recovery_budget=recovery_budget, on_failure=on_failure,
     )  # fmt: skip
     rows = (slice(None), slice(1, 2)) if found.y.ndim == 4 else slice(1, 2)
-    names = ("y", "z", "control", "result", "residual", "iterations")
+    names = ("y", "z", "control", "result", "residual", "iterations", "position_error")
     return dataclasses.replace(
         found, time=np.zeros(1), **{name: getattr(found, name)[rows] for name in names}
     )
+
+
+def _guess(robot: Any, positions: Any, control: Any) -> Trajectory:
+    """Return a trajectory of one row through measured positions."""
+    if not isinstance(robot, System):
+        raise ValueError("initial holds positions, which are of one robot; give a batch no initial")
+    try:
+        positions = np.asarray(positions, dtype=float)
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"initial is a {type(positions).__name__}; allowed is a Trajectory, or positions (M, 3) in m"
+        ) from None
+    record, ny = state_from_positions(robot, positions, np.asarray(control)), robot.y_layout.size
+    nothing = np.zeros(1)
+    return Trajectory(
+        system=robot, settings=None, time=nothing, y=record[None, :, :ny], z=record[None, :, ny:],
+        control=np.asarray(control)[None], result=nothing.astype(int), residual=nothing,
+        iterations=nothing.astype(int),
+    )  # fmt: skip

@@ -1,4 +1,4 @@
-"""The equations of one time step along the rod: what Newton's method (`boundary`) solves."""
+"""The equations of one time step along the rod: the problem that Newton's method (`boundary`) solves."""
 
 from __future__ import annotations
 
@@ -20,263 +20,383 @@ from knode_cosserat.rods.system import (
     unpacked_history,
 )
 from knode_cosserat.solvers.ahead import in_two
-from knode_cosserat.solvers.between import at_stages
-from knode_cosserat.solvers.crossing import Points, carried_on, points_of, spread, taken, within
-from knode_cosserat.solvers.space import VALUES, Along, SpaceScheme
-from knode_cosserat.solvers.time import TimeScheme
+from knode_cosserat.solvers.grid import Grid, grid_of, inside, taken
+from knode_cosserat.solvers.linear import Linearisation, Slopes, inverted, product
+from knode_cosserat.solvers.space import Formula, SpaceScheme
+
+#: corrections by which y at discontinuities between nodes is found from the nodes, for each on a segment
+FILLING = 5
 
 
-class Ahead(NamedTuple):
-    """What of the equations was evaluated before a step is solved (`ahead.InTwo`), and the rest of them."""
+class Hoisted(NamedTuple):
+    """Terms that do not change during Newton's iteration (`ahead.InTwo`), and the function of the rest."""
 
-    #: the rest: y_s and z from (what was evaluated, s, (y, packed record of history))
+    #: y_s and z from (hoisted terms, s, (y, packed record of history))
     then: Callable[[Any, Any, Any], Any]
-    #: at the stages of the pieces of all strands, and of the points
-    pieces: Any
-    points: Any
+    #: at all places of all strands
+    terms: Any
 
 
-def no_history(system: System, space: SpaceScheme) -> Float[Any, "stages points x"]:
-    """That of an equilibrium."""
+def no_history(system: System, space: SpaceScheme) -> Float[Any, "places x"]:
+    """Zero history, for statics."""
     ny, nz = system.y_layout.size, system.z_layout.size
-    count = len(points_of(system).segment) + 1
-    return jnp.zeros((len(space.parts), count, ny + nz + (ny if system.mixed else 0)))
-
-
-def keeps_stages(system: System, time: TimeScheme, space: SpaceScheme) -> bool:
-    """Whether the past is kept at the stages of the scheme along the rod, or interpolated between nodes.
-
-    What stages after the first find is of low order, and lets waves grow that no segment resolves. A scheme
-    in time without memory of rates damps what is so fast; others do not, and waves of strings, systems with
-    y_st, are slow.
-    """
-    return len(space.parts) == 1 or not (time.uses_rate or system.mixed)
+    return jnp.zeros((grid_of(system, space).count, ny + nz + (ny if system.mixed else 0)))
 
 
 def row_of(
-    system: System, y: Float[Any, "points y"], records: Float[Any, "stages points x"]
+    system: System, y: Float[Any, "points y"], records: Float[Any, "places x"]
 ) -> Float[Any, "nodes x"]:
-    """What is shown of a solved step: y at the nodes, on the near side of cuts, z and y_s on the far."""
-    nodes, ny = points_of(system).nodes, system.y_layout.size
-    return jnp.concatenate([taken(y, nodes), taken(records[0], nodes)[:, ny:]], axis=1)
+    """Output row of a solved step: y on the near side of discontinuities, z and y_s on the far side."""
+    nodes, ny = grid_of(system).nodes, system.y_layout.size
+    return jnp.concatenate([taken(y, nodes), taken(records, nodes)[:, ny:]], axis=1)
+
+
+class Stages(NamedTuple):
+    """Rates and strains of a state: at the ends of pieces, then at each stage between them."""
+
+    y: list[Any]
+    f: list[Any]
+    z: list[Any]
 
 
 class StepProblem(eqx.Module):
-    """One step: the system, its control, and what the time scheme remembers."""
+    """Boundary-value problem of one step: the system, its control, and the history."""
 
     system: System
     t: Float[Any, ""]
     control: Float[Any, " c"]
     c0: Float[Any, ""]
-    #: at the stages of each point: those of the piece that begins there, and at the tip of one without length
-    history: Float[Any, "stages points x"]
+    #: at every place where the equations are evaluated (`Grid`)
+    history: Float[Any, "places x"]
     space: SpaceScheme = eqx.field(static=True)
-    #: what the tip's conditions are to leave: zero, but on the way to a solution
+    #: right-hand side of the tip's conditions: zero, but during continuation
     tip_offset: Any = None
-    #: what was evaluated before: nothing, unless it is `ready`
-    ahead: Ahead | None = None
-    #: whether stages between nodes look back on themselves, or on what the nodes say (`keeps_stages`)
-    own_past: bool = eqx.field(static=True, default=True)
+    hoisted: Hoisted | None = None
 
     @classmethod
     def still(
         cls, system: System, space: SpaceScheme, control: Any, t: Any = 0.0, **options: Any
     ) -> StepProblem:
-        """That of an equilibrium: nothing moves, and nothing did."""
+        """Return the problem of an equilibrium: no rates, no history."""
         t, c0 = jnp.asarray(t, dtype=float), jnp.zeros(())
         return cls(system, t, jnp.asarray(control), c0, no_history(system, space), space, **options)
 
     def ready(self) -> StepProblem:
-        """The same with all evaluated that depends on neither y nor the past, for what is iterated on."""
-        strand, (places, stages) = self.system.strand, self._places
+        """Hoist the terms that depend on neither y nor the history."""
+        strand, places = self.system.strand, self.places
 
         def at_point(s: Any, state: tuple[Any, Any]) -> Any:
             return self.point_rates(s, *state)
 
-        record = self._past_by_strand(self.history[:1, :1])[0, 0]
+        record = self._history_by_strand(self.history[:1])[0]
         parts = in_two(at_point, places[0], (jnp.zeros(strand.y_layout.size), record))
-        # together, to be compiled once
-        found = [
-            jnp.stack([taken(each, stage) for stage in stages]) for each in jax.vmap(parts.first)(places)
-        ]
-        points = [self._each_strand(each, axis=1) for each in found]
-        pieces = [self._each_strand(each[:, :-1], axis=1) for each in found]
-        return dataclasses.replace(self, ahead=Ahead(parts.then, pieces, points))
+        return dataclasses.replace(self, hoisted=Hoisted(parts.then, jax.vmap(parts.first)(places)))
+
+    def with_history(self, history: Float[Any, "places x"]) -> StepProblem:
+        """Return the same problem with another history."""
+        return dataclasses.replace(self, history=history)
 
     def point_rates(self, s: Any, y: Float[Any, " y"], history: Float[Any, " x"]) -> Any:
-        """y_s and z at one point of a strand, from a packed record of its history."""
+        """Return y_s and z at one point of a strand, from a packed record of its history."""
         strand = self.system.strand
         return strand.derivatives(s, self.t, y, self.control, unpacked_history(strand, self.c0, history))
 
     def _unpack(self, history: Float[Any, " x"]) -> History:
         return unpacked_history(self.system, self.c0, history)
 
+    # the ends, and jumps
+
     def base(self, unknowns: Float[Any, " k"]) -> Float[Any, " y"]:
-        """y at the first node, for these unknowns."""
-        return self.system.base(self.t, self.control, unknowns, self._unpack(self.history[0, 0]))
+        """Return y at the first node, for these unknowns."""
+        return self.system.base(self.t, self.control, unknowns, self._unpack(self.history[0]))
 
     def tip_residual(self, y: Float[Any, " y"]) -> Float[Any, " k"]:
-        """What is left of the tip's conditions at this y of the last node."""
-        left = self.system.tip(self.t, self.control, y, self._unpack(self.history[0, -1]))
+        """Return the residual of the tip's conditions at this y of the last node."""
+        left = self.system.tip(self.t, self.control, y, self._unpack(self.history[self.grid.tip]))
         return left if self.tip_offset is None else left - self.tip_offset
 
     def crossed(self, acting: Any, y: Float[Any, " y"], history: Float[Any, " x"]) -> Float[Any, " y"]:
-        """y on the far side of the cuts that are acting."""
-        if not self.system.jumps:
-            return y
+        """Return y on the far side of the discontinuities that act."""
         return self.system.crossed(acting, self.t, y, self.control, self._unpack(history))
 
-    # where
+    def _far(self, y: Float[Any, "points y"]) -> Float[Any, "pieces y"]:
+        """Return y where pieces start, on the far side of their discontinuities."""
+        grid = self.grid
+        if not self.system.jumps:
+            return y[:-1]
+        return jax.vmap(self.crossed)(jnp.asarray(grid.acting), y[:-1], self.history[: grid.tip])
+
+    # places
 
     @property
-    def arclength(self) -> Float[Any, " nodes"]:
-        """s at the nodes (m)."""
-        return jnp.linspace(0.0, 1.0, self.system.nodes) * self.system.length
+    def grid(self) -> Grid:
+        """The points and places of the rod."""
+        return grid_of(self.system, self.space)
 
     @property
-    def points(self) -> Points:
-        """Where y is unknown: the nodes, and the cuts between them."""
-        return points_of(self.system)
-
-    @property
-    def _ends(self) -> tuple[Any, Any]:
-        """Where the pieces of all points begin and end (m); that of the tip has no length."""
+    def _bounds(self) -> tuple[Any, Any]:
+        """Arclength (m) of the start and the end of every piece."""
+        grid, ds = self.grid, self.system.length / (self.system.nodes - 1)
         if not self.system.cuts:
-            low = self.arclength
-            return low, jnp.concatenate([low[1:], low[-1:]])
-        ds = self.system.length / (self.system.nodes - 1)
-        low, high = (ds * (self.points.segment + self.points.bounds[:, k]) for k in (0, 1))
-        # on the near side of what may jump there
-        tip = within(high[-1:], low[-1:], high[-1:])
-        return jnp.concatenate([low, tip]), jnp.concatenate([high, tip])
+            s = jnp.linspace(0.0, 1.0, self.system.nodes) * self.system.length
+            return s[:-1], s[1:]
+        low, high = (ds * (grid.segment + grid.bounds[:, k]) for k in (0, 1))
+        return low, high
 
     @property
-    def _places(self) -> tuple[Any, np.ndarray]:
-        """Where the equations are evaluated (m), each place once, and which of them is each point's stage."""
-        (low, high), parts = self._ends, np.unique(self.space.parts)
-        count, which = len(self.points.segment) + 1, np.searchsorted(parts, self.space.parts)
-        stages = which[:, None] * count + np.arange(count)
-        places = [low + part * (high - low) for part in parts]
+    def places(self) -> Float[Any, " places"]:
+        """Arclength (m) where the equations are evaluated."""
+        grid, (low, high) = self.grid, self._bounds
+        first, last, near = low, high[-1:], high[grid.near - 1]
         if self.system.cuts:
-            places = [within(each, low, high) for each in places]
-        elif len(parts) > 1 and parts[-1] == 1.0:
-            # the end of a piece is where the next one begins
-            places.pop()
-            stages[which == which.max()] = np.minimum(np.arange(count) + 1, count - 1)
-        return jnp.concatenate(places), stages
-
-    @property
-    def stages(self) -> Float[Any, "stages points"]:
-        """Where the equations are evaluated (m)."""
-        places, stages = self._places
-        return places[stages]
+            first, last = inside(first, low, high), inside(last, low[-1:], high[-1:])
+            near = inside(near, low[grid.near - 1], near)
+        stages = [low + stage.place * (high - low) for stage in self.space.check.stages]
+        return jnp.concatenate([first, last, near, *stages])
 
     # along the rod
 
-    def filled(self, y: Float[Any, "nodes y"]) -> Float[Any, "points y"]:
-        """y at all points from that at the nodes: at a cut as carried there from the node before it."""
-        points, found = self.points, spread(self.points, y)
-        between = np.ones(len(points.segment), dtype=bool)
-        between[points.nodes[1:] - 1] = False
-        # one cut after the other, of all segments together
-        for _ in range(np.max(np.diff(points.nodes)) - 1):
-            found = found.at[1:].set(jnp.where(between[:, None], self.reached(found), found[1:]))
+    def _evaluated(self, lanes: slice, y: Float[Any, "n y"]) -> tuple[Any, Any]:
+        """Return f and z at these places, where y is given."""
+        f, z = self._side_by_side(self._at_point, lanes, y)
+        return self._joined(f), self._joined(z)
+
+    def _linearised(self, lanes: slice, y: Float[Any, "n y"]) -> tuple[Any, Slopes]:
+        """Return the rates at these places, and the slopes of rates and strains, places last."""
+        ny, nx = self.system.strand.y_layout.size, self._history_by_strand(self.history[:1]).shape[-1]
+        directions = jnp.eye(ny + nx)
+
+        def at_point(s: Any, y: Any, history: Any, terms: Any) -> Any:
+            def along(direction: Any) -> Any:
+                moved = direction[:ny], direction[ny:]
+                return jax.jvp(lambda y, past: self._at_point(s, y, past, terms), (y, history), moved)
+
+            return jax.vmap(along, in_axes=-1, out_axes=(None, -1))(directions)
+
+        (f, _), slopes = self._side_by_side(at_point, lanes, y)
+        return self._joined(f), Slopes(*slopes)
+
+    def _side_by_side(self, function: Any, lanes: slice, y: Any) -> Any:
+        """Apply a function of (s, y, history, hoisted terms) at places, which are last in what it returns."""
+        terms = None if self.hoisted is None else self.hoisted.terms
+        s, terms = jax.tree.map(lambda each: self._each_strand(each[lanes]), (self.places, terms))
+        history = self._history_by_strand(self.history[lanes])
+        # places last inside: XLA then vectorises over them
+        each = jax.vmap(function, in_axes=(0, -1, -1, 0), out_axes=-1)
+        return each(s, self._by_strand(y).T, history.T, terms)
+
+    def _at_point(self, s: Any, y: Any, history: Any, terms: Any) -> Any:
+        if self.hoisted is None:
+            return self.point_rates(s, y, history)
+        return self.hoisted.then(terms, s, (y, history))
+
+    def _ends(self, y: Float[Any, "points y"], every: bool) -> tuple[slice, Any]:
+        """Return the places at the ends of pieces that count, and y there."""
+        grid, far = self.grid, self._far(y)
+        if not (every or self.space.implicit):
+            return slice(0, grid.tip), far
+        return slice(0, grid.ends), jnp.concatenate([far, y[-1:], taken(y, grid.near)])
+
+    def lengths(self) -> Float[Any, "pieces 1"]:
+        """Return the lengths of all pieces (m)."""
+        low, high = self._bounds
+        return (high - low)[:, None]
+
+    def _at_ends(self, values: Any) -> tuple[Any, Any]:
+        """Values at the starts and at the ends of pieces, from those at the places of ends; 0 if unknown."""
+        grid = self.grid
+        end = taken(values, grid.end_of) if len(values) > grid.tip else jnp.zeros(())
+        return values[: grid.tip], end
+
+    def stages(self, y: Float[Any, "points y"], formula: Formula, known: Stages | None = None) -> Stages:
+        """Evaluate the stages of a formula, those after the ones that are known.
+
+        Without known stages only the ends of pieces that the scheme uses are evaluated (`ends` gives all).
+        """
+        found = self.ends(y, every=False) if known is None else Stages(*map(list, known))
+        rates = [*self._at_ends(found.f[0]), *found.f[1:]]
+        for k in range(len(found.f) - 1, len(formula.stages)):
+            between = self._between(formula.stages[k], found.y[0][: self.grid.tip], y[1:], rates)
+            f, z = self._evaluated(self.grid.stage(k), between)
+            rates.append(f)
+            for values, new in zip(found, (between, f, z), strict=True):
+                values.append(new)
         return found
 
+    def ends(self, y: Float[Any, "points y"], every: bool = True) -> Stages:
+        """Evaluate the equations at the ends of pieces."""
+        lanes, ends = self._ends(y, every)
+        f, z = self._evaluated(lanes, ends)
+        return Stages([ends], [f], [z])
+
+    def _between(self, stage: Any, start: Any, end: Any, rates: list[Any]) -> Any:
+        moved = sum(x * f for x, f in zip(stage.rates, rates, strict=False) if x)
+        return (1.0 - stage.end) * start + stage.end * end + self.lengths() * moved
+
+    def reached_by(self, formula: Formula, found: Stages) -> Float[Any, "pieces y"]:
+        """Return y at the ends of pieces by a formula, from its stages."""
+        rates = [*self._at_ends(found.f[0]), *found.f[1:]]
+        moved = sum(b * f for b, f in zip(formula.weights, rates, strict=False) if b)
+        return found.y[0][: self.grid.tip] + self.lengths() * moved
+
     def reached(self, y: Float[Any, "points y"]) -> Float[Any, "pieces y"]:
-        """y by the ends of all pieces."""
-        return self.pieces(VALUES, y).reshape(y[1:].shape)
+        """Return y at the ends of all pieces by the scheme."""
+        formula = self.space.formula
+        return self.reached_by(formula, self.stages(y, formula))
 
-    def pieces(self, along: Along, y: Float[Any, "points y"]) -> Any:
-        """What `along` makes of y at the points by the ends of all pieces of all strands, those inside."""
+    def residuals(self, y: Float[Any, "points y"]) -> tuple[Any, Any]:
+        """Return the defects of all pieces (the scheme's y at their ends less y there), and the tip's."""
+        return self.reached(y) - y[1:], self.tip_residual(y[-1])
 
-        def rates(s: Any, y: Any, known: Any) -> Any:
-            return self._at_point(s, y, *known)[0], None
+    def packed(self, found: Stages) -> Float[Any, "places x"]:
+        """Return stages as the records that following steps need: y, z and, if B is not zero, y_s."""
+        parts = [found.y, found.z, found.f] if self.system.mixed else [found.y, found.z]
+        return jnp.concatenate([jnp.concatenate(part) for part in parts], axis=-1)
 
-        def piece(advance: Callable[[Any], Any], y: Any) -> Any:
-            return along.on(lambda y: advance(y)[0], along.begin(y))
+    def records(self, y: Float[Any, "points y"]) -> Float[Any, "places x"]:
+        """Return the records of a state at every place."""
+        return self.packed(self.stages(y, self.space.check, self.ends(y)))
 
-        low, high = (each[:-1] for each in self._ends)
-        ahead = None if self.ahead is None else self.ahead.pieces
-        lanes = low, high, jnp.asarray(self.points.acting), y[:-1], self.history[:, :-1], ahead
-        return self._side_by_side(piece, rates, lanes, 0)
+    def linearise(self, y: Float[Any, "points y"], unknowns: Any) -> Linearisation:
+        """Return the exact derivatives of the residuals, all pieces side by side."""
+        grid, formula = self.grid, self.space.formula
+        lanes, ends = self._ends(y, every=False)
+        f, slopes = self._linearised(lanes, ends)
+        rates, found = [*self._at_ends(f)], [self._padded(slopes)]
+        ny = slopes.f.shape[0]
+        h, eye = self._each_strand(self.lengths()[:, 0]), jnp.eye(ny)[:, :, None]
+        start, end = self._slopes_at_ends(slopes.f[:, :ny])
+        by_start, by_end = [start, 0.0], [0.0, end]
+        for k, stage in enumerate(formula.stages):
+            between = self._between(stage, ends[: grid.tip], y[1:], rates)
+            f, slopes = self._linearised(grid.stage(k), between)
+            rates.append(f)
+            found.append(slopes)
+            for ways, part in ((by_start, 1.0 - stage.end), (by_end, stage.end)):
+                moved = sum(x * way for x, way in zip(stage.rates, ways, strict=False))
+                ways.append(product(slopes.f[:, :ny], part * eye + h * moved))
+        A, B = (
+            eye + sign * h * sum(b * way for b, way in zip(formula.weights, ways, strict=True))
+            for sign, ways in ((1.0, by_start), (-1.0, by_end))
+        )
+        G = None
+        if self.space.implicit:
+            # XLA would evaluate both again for each use of them
+            A, B = jax.lax.optimization_barrier((A, B))
+            G = inverted(B)
+            A = product(G, A)
+        F = self._jumped(self._blocks(A), y)
+        M, S = jax.jacfwd(self.tip_residual)(y[-1]), jax.jacfwd(self.base)(unknowns)
+        kept = Slopes(
+            *(jnp.moveaxis(jnp.concatenate(parts, axis=-1), -1, 0) for parts in zip(*found, strict=True))
+        )
+        return Linearisation(F, None if G is None else self._blocks(G), S, M, kept)
 
-    def records(self, y: Float[Any, "points y"]) -> Float[Any, "stages points x"]:
-        """What must be kept of a solved step at every stage: y, z and, if B is not zero, y_s."""
-        found = self._at_stages(y)
-        return found if self.own_past else at_stages(self.system, self.space, row_of(self.system, y, found))
+    def _padded(self, slopes: Slopes) -> Slopes:
+        """Slopes at all ends of pieces: the tip, and near sides, do not enter an explicit scheme."""
+        missing = self.grid.ends * self.system.strands - slopes.f.shape[-1]
+        return Slopes(*(jnp.pad(each, ((0, 0), (0, 0), (0, missing)), mode="edge") for each in slopes))
 
-    def _at_stages(self, y: Float[Any, "points y"]) -> Float[Any, "stages points x"]:
-        """y, z and, if B is not zero, y_s, as the stages have them."""
+    def _slopes_at_ends(self, J: Float[Any, "b b n_strands"]) -> tuple[Any, Any]:
+        """Slopes of rates at the starts and the ends of pieces."""
+        grid, strands = self.grid, self.system.strands
+        start = J[..., : grid.tip * strands]
+        if not self.space.implicit:
+            return start, 0.0
+        of_places = J.T.reshape(-1, strands, *J.shape[:2])
+        return start, taken(of_places, grid.end_of).reshape(-1, *J.shape[:2]).T
 
-        def rates(s: Any, y: Any, known: Any) -> Any:
-            y_s, z = self._at_point(s, y, *known)
-            return y_s, (y, z, y_s) if self.system.mixed else (y, z)
+    def _jumped(self, F: Any, y: Any) -> Any:
+        """F by y on the near side of what jumps at the starts of pieces."""
+        if not self.system.jumps:
+            return F
+        jump = jax.vmap(jax.jacfwd(self.crossed, 1))
+        D = jump(jnp.asarray(self.grid.acting), y[:-1], self.history[: self.grid.tip])
+        return jnp.sum(F[..., :, :, None] * D[..., None, :, :], axis=-2)
 
-        ahead = None if self.ahead is None else self.ahead.points
-        acting = np.concatenate([self.points.acting, np.zeros_like(self.points.acting[:1])])
-        lanes = *self._ends, jnp.asarray(acting), y, self.history, ahead
-        found = self._side_by_side(lambda advance, y: advance(y)[1], rates, lanes, 1)
-        shape = self.history.shape[:2]
-        return jnp.concatenate([each.reshape(*shape, -1) for each in found], axis=-1)
+    # errors
 
-    def records_between(self, y: Float[Any, "points y"]) -> Float[Any, "stages points x"]:
-        """As `records`, of equations that these y do not solve.
+    def moved_by(
+        self, slopes: Slopes, y: Float[Any, "points y"], unknowns: Any, d_history: Float[Any, "used x"]
+    ) -> tuple[Any, Any, Any]:
+        """Return the changes of defects, tip residuals and y at the base with the history, linearised."""
+        used = d_history.shape[0]
 
-        What is missing by a piece's end is added to y along it, and the rest is evaluated there.
-        """
-        ny = self.system.y_layout.size
-        gap = jnp.pad(y[1:] - self.reached(y), ((0, 1), (0, 0)))
-        parts = np.array(self.space.parts)[:, None, None]
-        own = self._at_stages(y)[..., :ny] + parts * gap
+        def ends(first: Any) -> Any:
+            own = self.with_history(jnp.concatenate([first, self.history[used:]]))
+            far = own._far(y) if self.system.jumps else None
+            return far, own.tip_residual(y[-1]), own.base(unknowns)
 
-        def at_stage(s: Any, y: Any, history: Any) -> Any:
-            rates = jax.vmap(self.point_rates)(self._each_strand(s), self._by_strand(y), history)
-            y_s, z = (each.reshape(len(s), -1) for each in rates)
-            return (y, z, y_s) if self.system.mixed else (y, z)
+        d_far, d_tip, d_base = jax.jvp(ends, (self.history[:used],), (d_history,))[1]
+        start = jnp.zeros((self.grid.tip, y.shape[1])) if d_far is None else d_far
+        moved = jnp.concatenate([start, jnp.zeros((self.grid.ends - self.grid.tip, y.shape[1]))])
+        at_ends = slice(0, self.grid.ends)
+        rates = [*self._at_ends(self._along(slopes.f, at_ends, moved, d_history[at_ends]))]
+        for k, stage in enumerate(self.space.formula.stages):
+            lanes = self.grid.stage(k)
+            moved = self._between(stage, start, jnp.zeros(()), rates)
+            rates.append(self._along(slopes.f, lanes, moved, d_history[lanes]))
+        weighed = sum(b * f for b, f in zip(self.space.formula.weights, rates, strict=True) if b)
+        return start + self.lengths() * weighed, d_tip, d_base
 
-        found = jax.vmap(at_stage)(self.stages, own, self._past_by_strand(self.history))
-        return jnp.concatenate(found, axis=-1)
+    def error_records(
+        self, slopes: Slopes, e: Float[Any, "points y"], d_history: Float[Any, "used x"]
+    ) -> Float[Any, "used x"]:
+        """Return the errors of y, z and y_s at the places of the scheme, from those of y at the points."""
+        stages = self.space.formula.stages
+        between = [(1.0 - each.end) * e[:-1] + each.end * e[1:] for each in stages]
+        dy = jnp.concatenate([e, e[self.grid.near], *between])
+        parts = [dy, self._along(slopes.z, slice(None), dy, d_history)]
+        if self.system.mixed:
+            along = (e[1:] - e[:-1]) / self.lengths()
+            parts.append(
+                jnp.concatenate([along, along[-1:], along[self.grid.near - 1], *[along] * len(stages)])
+            )
+        return jnp.concatenate(parts, axis=-1)
 
-    def _side_by_side(self, each: Any, rates: Any, lanes: tuple[Any, ...], out: int) -> Any:
-        """`each(advance, y)` of the pieces of all strands, `advance` by these rates; stacked along `out`."""
-        low, high, acting, y, history, ahead = lanes
+    def _along(self, slopes: Any, lanes: slice, dy: Any, d_history: Any) -> Float[Any, "n x"]:
+        """Apply slopes at places to changes of y and history there."""
+        strands = self.system.strands
+        own = slopes.reshape(-1, strands, *slopes.shape[1:])[lanes].reshape(-1, *slopes.shape[1:])
+        change = jnp.concatenate([self._by_strand(dy), self._history_by_strand(d_history)], axis=-1)
+        return jnp.sum(own * change[:, None, :], axis=-1).reshape(dy.shape[0], -1)
 
-        def piece(low: Any, high: Any, acting: Any, y: Any, history: Any, ahead: Any) -> Any:
-            known = history, ahead
+    def _blocks(self, matrices: Any) -> Any:
+        """Matrices (b, b, pieces and strands) as (pieces, b, b), or (pieces, strands, b, b)."""
+        found = jnp.moveaxis(matrices, -1, 0)
+        strands = self.system.strands
+        return found.reshape(-1, strands, *found.shape[1:]) if strands > 1 else found
 
-            def advance(y: Any) -> Any:
-                if not self.system.cuts:
-                    return self.space.advance(rates, low, high - low, y, known)
-                beyond = self.crossed(acting, y, history[0])
-                return carried_on(self.space, rates, (low, high), beyond, known)
+    def filled(self, y: Float[Any, "nodes y"]) -> Float[Any, "points y"]:
+        """Return y at all points from that at the nodes: at discontinuities between nodes by the scheme."""
+        grid = self.grid
+        found = grid.spread(y)
+        if not len(grid.between):
+            return found
+        most = int(np.max(np.diff(grid.nodes))) - 1
+        before = jnp.zeros(len(found), dtype=bool).at[grid.between].set(True)[1:, None]
 
-            return each(advance, y)
+        def corrected(_: Any, y: Any) -> Any:
+            defects = self.reached(y) - y[1:]
+            # of strands there are none with discontinuities
+            G = self.linearise(y, self.system.unknowns(y[0])).G
+            change = defects if G is None else jnp.sum(G * defects[:, None, :], axis=-1)
+            return y.at[1:].add(jnp.where(before, change, 0.0))
 
-        # nodes last inside: XLA then vectorises over them
-        side_by_side = jax.vmap(piece, in_axes=(0, 0, 0, -1, -1, 1), out_axes=out)
-        low, high, acting = map(self._each_strand, (low, high, acting))
-        past = jnp.moveaxis(self._past_by_strand(history), 1, -1)
-        return side_by_side(low, high, acting, self._by_strand(y).T, past, ahead)
+        return jax.lax.fori_loop(0, FILLING * most, corrected, found)
 
-    def _at_point(self, s: Any, y: Any, history: Any, ahead: Any) -> Any:
-        """`point_rates`, with what was evaluated before."""
-        if self.ahead is None:
-            return self.point_rates(s, y, history)
-        return self.ahead.then(ahead, s, (y, history))
+    # strands
 
-    def at_nodes(self, function: Callable[..., Any], y: Float[Any, "nodes y"], history: Any) -> Any:
-        """Apply `function(s, y, record of history)` to all nodes of all strands (strands inside)."""
-        past = self._past_by_strand(history[None])[0]
-        return jax.vmap(function)(self._each_strand(self.arclength), self._by_strand(y), past)
-
-    def _each_strand(self, values: Shaped[Any, "..."], axis: int = 0) -> Shaped[Any, "..."]:
-        return jnp.repeat(values, self.system.strands, axis=axis) if self.system.strands > 1 else values
+    def _each_strand(self, values: Shaped[Any, "n ..."]) -> Shaped[Any, "n_strands ..."]:
+        return jnp.repeat(values, self.system.strands, axis=0) if self.system.strands > 1 else values
 
     def _by_strand(self, rows: Float[Any, "n x"]) -> Float[Any, "n_strands x_of_strand"]:
         own = in_strands(self.system, rows)
         return own.reshape(-1, own.shape[-1])
 
-    def _past_by_strand(self, records: Float[Any, "stages n x"]) -> Float[Any, "stages n_strands own"]:
+    def _joined(self, values: Float[Any, "x_of_strand n_strands"]) -> Float[Any, "n x"]:
+        return values.T.reshape(values.shape[-1] // self.system.strands, -1)
+
+    def _history_by_strand(self, records: Float[Any, "n x"]) -> Float[Any, "n_strands own"]:
         own = records_in_strands(self.system, records)
-        return own.reshape(len(records), -1, own.shape[-1])
+        return own.reshape(-1, own.shape[-1])

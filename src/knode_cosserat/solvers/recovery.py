@@ -1,4 +1,4 @@
-"""What is tried when a step does not converge: a stable elimination, continuation, shorter steps, in order.
+"""Recovery of a failed step: other guesses, load continuation, easing, shorter steps, in this order.
 
 This runs outside the compiled loop, step by step in plain Python: it is rare, and its program is compiled
 only when it is first needed.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -17,13 +18,14 @@ import numpy as np
 
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import Solution, newton
-from knode_cosserat.solvers.linear import Decoupled
-from knode_cosserat.solvers.past import EXTRAPOLATIONS, Past, advanced, history_of, problem_of
-from knode_cosserat.solvers.problem import row_of
+from knode_cosserat.solvers.grid import grid_of
+from knode_cosserat.solvers.guess import hanging_curve, natural_reach, state_from_positions
+from knode_cosserat.solvers.history import EXTRAPOLATIONS, Past, history_of
+from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.stability import natural_time
 from knode_cosserat.solvers.time import BDF1, Static
+from knode_cosserat.solvers.time_loop import Rows, recorded
 
 #: the smallest part of a time step that it is divided into, and how many parts are tried
 LEAST_SUBSTEP, MOST_SUBSTEPS = 2.0**-14, 400
@@ -35,8 +37,39 @@ LEAST_PART = 1.0 / 512.0
 EASIEST = 1e-3
 #: forces in the control so many times EI/L² are taken for a wrong unit
 ABSURD = 1e4
-#: what part of the way a tip is brought in one step while a robot comes to rest
+#: part of the way that a tip is moved in one step while a robot comes to rest
 DRAWN = 0.05
+#: reaches of the curves between held ends from which an equilibrium is searched, in natural ones
+REACHES = (1.0, 0.3, 3.0)
+#: by default recovery may take so many times the run's own time, or so many seconds, whichever is more
+BUDGET_SHARE, BUDGET_LEAST = 20.0, 5.0
+
+
+class BudgetError(Exception):
+    """The time for recovery is used up."""
+
+
+class Budget:
+    """The time (s) that recovery may take in one run; compiling its program does not count."""
+
+    def __init__(self, seconds: float | None):
+        """`seconds` is fixed, or None: in proportion to the run's own time."""
+        self._fixed, self._own, self._used = seconds, 0.0, 0.0
+
+    @property
+    def seconds(self) -> float:
+        """Time (s) that recovery may take in all."""
+        return max(BUDGET_LEAST, BUDGET_SHARE * self._own) if self._fixed is None else self._fixed
+
+    def ran(self, seconds: float) -> None:
+        """Count time of the run itself."""
+        self._own += seconds
+
+    def spend(self, seconds: float) -> None:
+        """Count time of recovery; `BudgetError` once there is none left."""
+        self._used += seconds
+        if self._used > self.seconds:
+            raise BudgetError
 
 
 class Outcome(NamedTuple):
@@ -48,56 +81,86 @@ class Outcome(NamedTuple):
     unknowns: np.ndarray
     error: float
     corrections: int
-    size: float
+    position_error: float
     cause: str
+
+
+class Attempt(NamedTuple):
+    """A boundary-value problem that was tried."""
+
+    solution: Solution
+    after: Past
+    row: Rows
 
 
 @functools.partial(jax.jit, static_argnames="settings")
 def attempt(
-    system: System, settings: Settings, c0: Any, history: Any, control: Any, t: Any, y: Any, unknowns: Any,
+    system: System, settings: Settings, past: Past, coefficients: Any, control: Any, t: Any, y: Any,
+    unknowns: Any,
     part: Any, from_y: Any,
-) -> tuple[Solution, Any]:  # fmt: skip
-    """One boundary-value problem with the stable elimination and a long search.
+) -> Attempt:  # fmt: skip
+    """Solve one boundary-value problem with a long search.
 
-    The tip's conditions hold in `part`: of what they leave at `from_y` the rest is still left.
+    The tip's conditions hold in `part`: the rest of their residual at `from_y` stays.
     """
-    problem = problem_of(system, settings, t, control, c0, history).ready()
+    history = history_of(past.records, past.rate, coefficients, settings)
+    problem = StepProblem(system, t, control, coefficients[0], history, settings.space).ready()
     problem = dataclasses.replace(problem, tip_offset=(1.0 - part) * problem.tip_residual(from_y[-1]))
     patient = dataclasses.replace(settings.newton, max_linearisations=40)
-    solution = newton(problem, y, unknowns, Decoupled(), patient)
-    return solution, problem.records(solution.y)
+    solution, kept = newton(problem, y, unknowns, patient)
+    after, row = recorded(problem, settings, past, coefficients, solution, kept.factors)
+    return Attempt(solution, after._replace(weights=jnp.asarray(EXTRAPOLATIONS[0])), row)
+
+
+#: programs of `attempt` that there are: the first call of each compiles
+_COMPILED: set[Any] = set()
 
 
 class _Step:
-    """One time step as boundary-value problems, for one past and one set of coefficients."""
+    """One time step as boundary-value problems, for one history and one set of coefficients."""
 
-    def __init__(self, system: System, settings: Settings, past: Past, coefficients: Any, t: float):
+    def __init__(
+        self, system: System, settings: Settings, past: Past, coefficients: Any, t: float, budget: Budget
+    ):
         self.system, self.settings, self.past, self.t = system, settings, past, t
-        self.coefficients = np.asarray(coefficients, dtype=float)
-        self.history = history_of(past, self.coefficients, settings)
+        self.coefficients, self.budget = np.asarray(coefficients, dtype=float), budget
         self.corrections = 0
 
     def solve(
         self, control: Any, y: Any, unknowns: Any, part: float = 1.0, from_y: Any = None,
         system: System | None = None,
-    ) -> tuple[Solution, Any]:  # fmt: skip
-        solution, records = attempt(
-            system or self.system, self.settings, self.coefficients[0], self.history, control, self.t, y,
-            unknowns, part, y if from_y is None else from_y,
+    ) -> Attempt:  # fmt: skip
+        began, own = time.perf_counter(), system or self.system
+        found = attempt(
+            own, self.settings, self.past, self.coefficients, control, self.t, y, unknowns, part,
+            y if from_y is None else from_y,
         )  # fmt: skip
-        self.corrections += int(solution.corrections)
-        return solution, records
+        self.corrections += int(found.solution.corrections)
+        program = jax.tree.structure(own), self.settings, np.shape(y)
+        if program in _COMPILED:
+            self.budget.spend(time.perf_counter() - began)
+        _COMPILED.add(program)
+        return found
+
+    def hanging(self, control: Any) -> list[tuple[Any, Any]]:
+        """Guesses of an equilibrium between held ends: curves of the rod's length."""
+        found: list[tuple[Any, Any]] = []
+        if not isinstance(self.settings.time, Static):
+            return found
+        for reach in dict.fromkeys(min(1.0, part * natural_reach(self.system)) for part in REACHES):
+            points = hanging_curve(self.system, control, reach)
+            if points is not None:
+                record = state_from_positions(self.system, points, control)
+                y = grid_of(self.system).spread(jnp.asarray(record[:, : self.system.y_layout.size]))
+                found.append((y, self.system.unknowns(y[0])))
+        return found
 
     def guesses(self) -> list[tuple[Any, Any]]:
         guesses = [jnp.einsum("p,pny->ny", w, self.past.y) for w in EXTRAPOLATIONS[:2]]
         return [(y, self.system.unknowns(y[0])) for y in guesses]
 
-    def solved(self, solution: Solution) -> bool:
-        return bool(solution.error <= self.settings.newton.acceptable)
-
-    def after(self, solution: Solution, records: Any) -> Past:
-        rate = self.coefficients[0] * records + self.history
-        return advanced(self.past, records, rate, solution.y, jnp.asarray(EXTRAPOLATIONS[0]))
+    def solved(self, found: Attempt) -> bool:
+        return bool(found.row.error <= self.settings.newton.acceptable)
 
 
 def recover(
@@ -108,57 +171,65 @@ def recover(
     controls: tuple[Any, Any],
     t: float,
     dt: float,
+    budget: Budget,
 ) -> Outcome:
     """Solve the step that ends at t. `controls` are the previous step's and this one's."""
-    step = _Step(system, settings, past, coefficients, t)
-    best: tuple[Solution, Any] | None = None
-    for guess in step.guesses():
+    step = _Step(system, settings, past, coefficients, t, budget)
+    best: list[Attempt] = []
+    cause = ""
+    try:
+        found = _recovered(step, controls, dt, best)
+        if found is not None:
+            return _outcome(*found)
+    except BudgetError:
+        cause = f"Recovery was stopped after {budget.seconds:.3g} s (recovery_budget)."
+        step.budget = Budget(np.inf)
+    least = min(best, key=lambda each: float(each.solution.error)) if best else None
+    if least is None:
+        least = step.solve(controls[1], *step.guesses()[0])
+    result = Result.NO_CONVERGENCE if np.isfinite(least.solution.error) else Result.NOT_FINITE
+    outcome = _outcome(result, step, least, controls[1])._replace(past=past)
+    return outcome._replace(cause=f"{outcome.cause} {cause}".strip())
+
+
+def _recovered(
+    step: _Step, controls: tuple[Any, Any], dt: float, best: list[Attempt]
+) -> tuple[Result, _Step, Attempt] | None:
+    """Try everything in order; what is tried directly is added to `best`."""
+    for guess in (*step.hanging(controls[1]), *step.guesses()):
         found = step.solve(controls[1], *guess)
-        if step.solved(found[0]):
-            return _outcome(Result.RECOVERED_STABLE_ELIMINATION, step, found)
-        if best is None or found[0].error < best[0].error:
-            best = found
+        best.append(found)
+        if step.solved(found):
+            return Result.CONVERGED, step, found
     continued = _continue_load(step, *controls)
     if continued is not None:
-        return _outcome(Result.RECOVERED_LOAD_CONTINUATION, step, continued)
+        return Result.RECOVERED_LOAD_CONTINUATION, step, continued
     eased = _ease(step, controls[1])
     if eased is not None:
-        return _outcome(Result.RECOVERED_EASING, step, eased)
-    if isinstance(settings.time, Static):
+        return Result.RECOVERED_EASING, step, eased
+    if isinstance(step.settings.time, Static):
         relaxed = _relax(step, controls[1])
-        if relaxed is not None:
-            return _outcome(Result.RECOVERED_RELAXATION, step, relaxed)
-    else:
-        divided = _substeps(step, controls, dt)
-        if divided is not None:
-            return _outcome(Result.RECOVERED_STEP_HALVING, *divided)
-    assert best is not None
-    result = Result.NO_CONVERGENCE if np.isfinite(best[0].error) else Result.NOT_FINITE
-    return _outcome(result, step, best, controls[1])._replace(past=past)
+        return None if relaxed is None else (Result.RECOVERED_RELAXATION, step, relaxed)
+    divided = _substeps(step, controls, dt)
+    return None if divided is None else (Result.RECOVERED_STEP_HALVING, *divided)
 
 
-def _outcome(result: Result, step: _Step, found: tuple[Solution, Any], control: Any = None) -> Outcome:
-    solution, records = found
+def _outcome(result: Result, step: _Step, found: Attempt, control: Any = None) -> Outcome:
+    row = found.row
     return Outcome(
-        result,
-        step.after(solution, records),
-        np.asarray(row_of(step.system, solution.y, records)),
-        np.asarray(solution.unknowns),
-        float(solution.error),
-        step.corrections,
-        float(np.max(np.abs(solution.y) / np.asarray(step.system.scales().y))),
-        likely_cause(result, step, control),
-    )
+        result, found.after, np.asarray(row.records), np.asarray(row.unknowns), float(row.error),
+        step.corrections, float(row.position_error), likely_cause(result, step, control),
+    )  # fmt: skip
 
 
-def _continue_load(step: _Step, before: Any, now: Any) -> tuple[Solution, Any] | None:
+def _continue_load(step: _Step, before: Any, now: Any) -> Attempt | None:
     """From the previous control to this one in parts, each from the solution of the last."""
     before, now = np.asarray(before, dtype=float), np.asarray(now, dtype=float)
     if np.array_equal(before, now):
         return None
     for guess in step.guesses():
         found = step.solve(before, *guess)
-        if not step.solved(found[0]):
+        if not step.solved(found):
             continue
         whole = _in_parts(
             step, found, lambda part, at: step.solve(before + part * (now - before), at.y, at.unknowns)
@@ -168,17 +239,17 @@ def _continue_load(step: _Step, before: Any, now: Any) -> tuple[Solution, Any] |
     return None
 
 
-def _ease(step: _Step, control: Any) -> tuple[Solution, Any] | None:
+def _ease(step: _Step, control: Any) -> Attempt | None:
     """From friction and contact that set in gently to those that the system has."""
     system = step.system
     if system.eased(EASIEST) is system:
         return None
     for guess in step.guesses():
         found = step.solve(control, *guess, system=system.eased(EASIEST))
-        if not step.solved(found[0]):
+        if not step.solved(found):
             continue
 
-        def at_part(part: float, at: Solution) -> tuple[Solution, Any]:
+        def at_part(part: float, at: Solution) -> Attempt:
             easier = system.eased(EASIEST ** (1.0 - part)) if part < 1.0 else system
             return step.solve(control, at.y, at.unknowns, system=easier)
 
@@ -188,24 +259,20 @@ def _ease(step: _Step, control: Any) -> tuple[Solution, Any] | None:
     return None
 
 
-def _in_parts(
-    step: _Step, found: tuple[Solution, Any], solve: Callable[[float, Solution], tuple[Solution, Any]]
-) -> tuple[Solution, Any] | None:
+def _in_parts(step: _Step, found: Attempt, solve: Callable[[float, Solution], Attempt]) -> Attempt | None:
     """From a solution at part 0 to that at 1, each from the last, in steps as long as go well."""
     reached, part = 0.0, 0.25
     while reached < 1.0 and part >= LEAST_PART:
         target = min(1.0, reached + part)
-        following = solve(target, found[0])
-        if step.solved(following[0]):
+        following = solve(target, found.solution)
+        if step.solved(following):
             found, reached, part = following, target, 2.0 * part
         else:
             part /= 4.0
     return found if reached == 1.0 else None
 
 
-def _substeps(
-    whole: _Step, controls: tuple[Any, Any], dt: float
-) -> tuple[_Step, tuple[Solution, Any]] | None:
+def _substeps(whole: _Step, controls: tuple[Any, Any], dt: float) -> tuple[_Step, Attempt] | None:
     """The step in parts: the control as it is held throughout, or brought there bit by bit."""
     for before in (controls[1], controls[0]):
         found = _in_substeps(whole, before, controls[1], dt)
@@ -214,7 +281,7 @@ def _substeps(
     return None
 
 
-def _in_substeps(whole: _Step, before: Any, now: Any, dt: float) -> tuple[_Step, tuple[Solution, Any]] | None:
+def _in_substeps(whole: _Step, before: Any, now: Any, dt: float) -> tuple[_Step, Attempt] | None:
     """The step in time steps as long as go well, with coefficients for unequal ones."""
     settings, past = whole.settings, whole.past
     before, now = np.asarray(before, dtype=float), np.asarray(now, dtype=float)
@@ -223,7 +290,7 @@ def _in_substeps(whole: _Step, before: Any, now: Any, dt: float) -> tuple[_Step,
     for _ in range(MOST_SUBSTEPS):
         until = min(1.0, reached + part)
         coefficients = scheme.coefficients((until - reached) * dt, previous * dt)
-        step = _Step(whole.system, settings, past, coefficients, whole.t - (1.0 - until) * dt)
+        step = _Step(whole.system, settings, past, coefficients, whole.t - (1.0 - until) * dt, whole.budget)
         found = _one_substep(step, before + until * (now - before), ease=part < EASE_BELOW)
         if found is None:
             part /= 4.0
@@ -231,23 +298,28 @@ def _in_substeps(whole: _Step, before: Any, now: Any, dt: float) -> tuple[_Step,
                 return None
             continue
         if until == 1.0:
-            # the next whole step looks back on whole steps, not on the parts
-            step.past = whole.past
-            return step, found
-        past, previous, scheme = step.after(*found), until - reached, settings.time
+            # the history of the next step has whole steps, not their parts
+            before, after = whole.past, found.after
+            past = after._replace(
+                records=jnp.stack([after.records[0], before.records[0]]),
+                y=jnp.concatenate([after.y[:1], before.y[:-1]]),
+                error=jnp.stack([after.error[0], before.error[0], after.error[2]]),
+            )
+            return step, found._replace(after=past)
+        past, previous, scheme = found.after, until - reached, settings.time
         reached, part = until, 2.0 * previous
     return None
 
 
-def _one_substep(step: _Step, control: Any, ease: bool) -> tuple[Solution, Any] | None:
+def _one_substep(step: _Step, control: Any, ease: bool) -> Attempt | None:
     for guess in step.guesses():
         found = step.solve(control, *guess)
-        if step.solved(found[0]):
+        if step.solved(found):
             return found
     return _ease(step, control) if ease else None
 
 
-def _relax(step: _Step, control: Any) -> tuple[Solution, Any] | None:
+def _relax(step: _Step, control: Any) -> Attempt | None:
     """Implicit Euler with ever longer time steps, then the static solve: comes to rest in a stable shape.
 
     A tip that is held elsewhere than where it is, or loaded, is brought there in the first steps.
@@ -257,24 +329,24 @@ def _relax(step: _Step, control: Any) -> tuple[Solution, Any] | None:
     dt, longest = 0.1 * natural, 1e5 * natural
     at_first = step.guesses()[0][0]
     for _ in range(80):
-        moving = _Step(step.system, step.settings, now, BDF1().coefficients(dt, dt), 0.0)
+        moving = _Step(step.system, step.settings, now, BDF1().coefficients(dt, dt), 0.0, step.budget)
         target = min(1.0, part + DRAWN)
         found = moving.solve(control, *moving.guesses()[0], target, at_first)
-        if not moving.solved(found[0]):
+        if not moving.solved(found):
             dt /= 4.0
             continue
         # short steps until the tip is where it belongs
-        now, dt = moving.after(*found), 2.0 * dt if part == 1.0 else dt
+        now, dt = found.after, 2.0 * dt if part == 1.0 else dt
         part = target
         if dt > longest:
             break
     y = now.y[0]
     found = step.solve(control, y, step.system.unknowns(y[0]))
-    return found if step.solved(found[0]) else None
+    return found if step.solved(found) else None
 
 
 def likely_cause(result: Result, step: _Step, control: Any) -> str:
-    """A hint at what to change, from what can be seen."""
+    """Return a hint at the likely cause, and the fix."""
     if result.solved:
         return ""
     unit = other_unit(step.system, np.asarray(control))
@@ -297,7 +369,7 @@ def likely_cause(result: Result, step: _Step, control: Any) -> str:
 
 
 def other_unit(system: System, control: np.ndarray) -> str:
-    """Of a force in the control that is absurdly large: that it may be meant in another unit."""
+    """Return a hint at another unit if a force in the control is absurdly large."""
     if "n" not in system.y_layout.names:
         return ""
     natural = float(np.asarray(system.scales().y)[system.y_layout.slice("n")][0])
@@ -309,3 +381,12 @@ def other_unit(system: System, control: np.ndarray) -> str:
                 "this robot by its own length; is it meant in another unit?"
             )
     return ""
+
+
+def natural_time(system: System) -> float | None:
+    """Return the time (s) in which the system moves by its own length; None if its scales do not say."""
+    layout = system.strand.y_layout
+    if "p" not in layout.names or "q" not in layout.names:
+        return None
+    scale = np.asarray(system.strand.scales().y)
+    return float(np.min(scale[..., layout.slice("p")] / scale[..., layout.slice("q")]))

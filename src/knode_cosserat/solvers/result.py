@@ -1,4 +1,4 @@
-"""What came of each step, and the error that a failed one raises."""
+"""Result codes of steps, and the error that a failed step raises."""
 
 from __future__ import annotations
 
@@ -6,23 +6,24 @@ import enum
 
 
 class Result(enum.IntEnum):
-    """How a step ended. Zero and above: solved to tolerance. Below zero: not solved, the state is invalid."""
+    """How a step ended. Zero and above: solved to tolerance. Below zero: not solved, the state is invalid.
+
+    COARSE is solved, too, but its estimated discretisation error is more than 2 % of the length.
+    """
 
     CONVERGED = 0
-    RECOVERED_STABLE_ELIMINATION = 1
+    COARSE = 1
     RECOVERED_LOAD_CONTINUATION = 2
     RECOVERED_STEP_HALVING = 3
     RECOVERED_RELAXATION = 4
-    RECOVERED_FINER_SEGMENTS = 5
     RECOVERED_EASING = 6
     NO_CONVERGENCE = -1
     NOT_FINITE = -2
     NOT_REACHED = -3
-    UNSTABLE = -4
 
     @property
     def solved(self) -> bool:
-        """Whether the state is a solution."""
+        """True if the state is a solution of the equations on its grid."""
         return self >= 0
 
     @property
@@ -33,16 +34,21 @@ class Result(enum.IntEnum):
 
 _MESSAGES = {
     Result.CONVERGED: "converged",
-    Result.RECOVERED_STABLE_ELIMINATION: "converged with the stable elimination and a longer search",
+    Result.COARSE: "equations solved, but the grid is too coarse: use more nodes, or position_tolerance",
     Result.RECOVERED_LOAD_CONTINUATION: "converged by applying the change of control in smaller parts",
     Result.RECOVERED_STEP_HALVING: "converged by several smaller time steps",
     Result.RECOVERED_RELAXATION: "converged after a damped motion towards rest: it may have snapped",
-    Result.RECOVERED_FINER_SEGMENTS: "converged with every segment divided: they were too long",
-    Result.RECOVERED_EASING: "converged by way of friction or contact that set in more gently",
+    Result.RECOVERED_EASING: "converged by continuation from smoother friction or contact",
     Result.NO_CONVERGENCE: "no solution found",
     Result.NOT_FINITE: "the equations overflow or are undefined there",
-    Result.UNSTABLE: "the equations are solved, but their segments are too long for them to be the rod's",
     Result.NOT_REACHED: "not simulated: an earlier step failed",
+}
+
+#: results in files of earlier versions: solved with another elimination or on finer segments, or unstable
+EARLIER_RESULTS = {
+    "recovered_stable_elimination": Result.CONVERGED,
+    "recovered_finer_segments": Result.CONVERGED,
+    "unstable": Result.NO_CONVERGENCE,
 }
 
 

@@ -16,18 +16,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.boundary import linearise, residuals
-from knode_cosserat.solvers.linear import Condensed, carried
-from knode_cosserat.solvers.march import Rows, march_one
-from knode_cosserat.solvers.past import Past, advanced, history_of, problem_of
+from knode_cosserat.solvers.boundary import factors_of, pivots_of
+from knode_cosserat.solvers.history import Past, advanced, history_of
+from knode_cosserat.solvers.linear import solved
 from knode_cosserat.solvers.problem import StepProblem, row_of
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.task import Task
+from knode_cosserat.solvers.time_loop import Rows, loop_one
 
 
 @functools.lru_cache(maxsize=64)
 def rollout(task: Task) -> Callable[[System, Any, Past], Rows]:
-    """A differentiable function from (system, controls (T, c), past) to the rows of all steps.
+    """Return a differentiable function from (system, controls (T, c), past) to the rows of all steps.
 
     Kept between calls: JAX recognises by identity what it has traced and transposed before.
     """
@@ -35,14 +35,14 @@ def rollout(task: Task) -> Callable[[System, Any, Past], Rows]:
 
     @jax.custom_jvp
     def run(system: System, controls: Any, past: Past) -> Rows:
-        done, _, rows = march_one(system, settings, table, controls, dt, past, 0, steps)
+        done, _, rows = loop_one(system, settings, table, controls, dt, past, 0, steps)
         unsolved = jnp.arange(steps) >= done
         return Rows(
             jnp.where(unsolved[:, None, None], jnp.nan, rows.records),
             jnp.where(unsolved[:, None], jnp.nan, rows.unknowns),
             jnp.where(unsolved, jnp.inf, rows.error),
             rows.corrections,
-            rows.size,
+            rows.position_error,
         )
 
     @run.defjvp
@@ -55,7 +55,8 @@ def rollout(task: Task) -> Callable[[System, Any, Past], Rows]:
             d_past.records, d_past.rate,
         )  # fmt: skip
         still = np.zeros(steps, dtype=jax.dtypes.float0)
-        return rows, Rows(d_records, d_unknowns, jnp.zeros_like(rows.error), still, jnp.zeros_like(rows.size))
+        none = jnp.zeros_like(rows.error)
+        return rows, Rows(d_records, d_unknowns, none, still, none)
 
     return run
 
@@ -65,39 +66,31 @@ def tangent_march(
     settings: Settings, table: Any, dt: Any, rows: Any, unknowns: Any, system: System, controls: Any,
     past: Past, d_system: Any, d_controls: Any, d_records: Any, d_rate: Any,
 ) -> Any:  # fmt: skip
-    """Tangents of all rows and unknowns, linear in those of system, controls and past."""
-    ny = system.y_layout.size
-    y_scale = system.scales().y
+    """Return tangents of all rows and unknowns, linear in those of system, controls and past."""
+    ny, pivots = system.y_layout.size, pivots_of(system)
 
     def one(carry: Any, now: Any) -> Any:
         past, d_recent, d_rate = carry
         i, row, xi, control, d_control = now
         coefficients = jnp.where(i == 0, table[0], table[1])
         t = past.t0 + (i + 1) * dt
-        history = history_of(past, coefficients, settings)
-        d_history = coefficients[1] * d_recent[0] + coefficients[2] * d_recent[1]
-        if settings.time.uses_rate:
-            d_history = d_history + coefficients[3] * d_rate
+        history = history_of(past.records, past.rate, coefficients, settings)
+        d_history = history_of(d_recent, d_rate, coefficients, settings)
 
         def now_with(system: Any, control: Any, history: Any) -> StepProblem:
-            return problem_of(system, settings, t, control, coefficients[0], history)
+            return StepProblem(system, t, control, coefficients[0], history, settings.space)
 
         problem = now_with(system, control, history)
-        linear = Condensed()
         y = problem.filled(row[:, :ny])
-        linearisation = linearise(problem, y, xi)
-        factors, _, _ = linear.start(linearisation, y_scale)
+        factors = factors_of(problem, y, xi)
 
         def at_solution(system: Any, control: Any, history: Any) -> Any:
             problem = now_with(system, control, history)
-            return *residuals(problem, y), problem.base(xi)
+            return *problem.residuals(y), problem.base(xi)
 
         given, d_given = (system, control, history), (d_system, d_control, d_history)
         defects, tip, base = jax.jvp(at_solution, given, d_given)[1]
-        # a base that moves by itself enters through the first segment
-        defects = defects.at[0].add(carried(linearisation.F[0], base))
-        dy, dxi = linear.solve(factors, defects, tip)
-        dy = dy.at[0].add(base)
+        dy, dxi = solved(factors, pivots, defects, tip, base)
 
         def kept_of(system: Any, control: Any, history: Any, y: Any) -> Any:
             records = now_with(system, control, history).records(y)

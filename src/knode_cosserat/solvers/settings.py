@@ -1,4 +1,4 @@
-"""What the user may choose of the numerics, in one hashable value."""
+"""Numerical settings."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Any, Literal, Self
 from knode_cosserat.solvers import space as space_schemes
 from knode_cosserat.solvers import time as time_schemes
 from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.linear import ELIMINATIONS, Condensed, Decoupled, LinearSolver
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.time import TimeScheme
 
@@ -25,18 +24,13 @@ class Settings:
     """
 
     time: TimeScheme = time_schemes.BDF2()
-    space: SpaceScheme = space_schemes.Euler()
+    space: SpaceScheme = space_schemes.LOBATTO2
     start: Start = "paper"
     newton: NewtonOptions = NewtonOptions()
-    #: of a correction's linear equations; a run changes to the stable one by itself where it needs it
-    elimination: LinearSolver = Condensed()  # noqa: RUF009
 
     @classmethod
-    def of(
-        cls, time: str | TimeScheme, space: str | SpaceScheme, start: str, newton: NewtonOptions,
-        elimination: str | LinearSolver = "condensed",
-    ) -> Self:  # fmt: skip
-        """Settings from names or schemes. `ValueError` names what is allowed."""
+    def of(cls, time: str | TimeScheme, space: str | SpaceScheme, start: str, newton: NewtonOptions) -> Self:
+        """Return settings from names or schemes. `ValueError` names the accepted ones."""
         if not isinstance(newton, NewtonOptions):
             raise ValueError(f"newton is {newton!r}; allowed is a NewtonOptions")
         if start not in ("paper", "consistent"):
@@ -46,34 +40,38 @@ class Settings:
             _scheme("space", space, SpaceScheme, space_schemes.SCHEMES),
             start,  # type: ignore[arg-type]
             newton,
-            _scheme("elimination", elimination, LinearSolver, ELIMINATIONS),
         )
 
     def described(self) -> dict[str, Any]:
         """As plain data, for a file: schemes by their class's name and options."""
-        found: dict[str, Any] = {
+        return {
             "time": {"scheme": type(self.time).__name__, **dataclasses.asdict(self.time)},
             "space": {"scheme": type(self.space).__name__, **dataclasses.asdict(self.space)},
             "start": self.start,
             "newton": dataclasses.asdict(self.newton),
         }
-        if isinstance(self.elimination, Decoupled):
-            found["elimination"] = {"scheme": Decoupled.__name__, **dataclasses.asdict(self.elimination)}
-        return found
 
     @classmethod
     def from_description(cls, described: Any) -> Self:
-        """The settings that `described` gives; `KeyError`, `TypeError` or `ValueError` if it is not that."""
-        elimination = described.get("elimination", Condensed.__name__)
-        if isinstance(elimination, str):  # its name alone, as files had it at first
-            elimination = {"scheme": elimination}
+        """Return the settings described; `KeyError`, `TypeError` or `ValueError` if they are not that.
+
+        Descriptions of earlier versions are understood: RK4 becomes the scheme of the same order, and choices
+        that are no longer there are left out.
+        """
+        time = _named(TimeScheme, **described["time"])
+        space, newton = dict(described["space"]), dict(described["newton"])
+        space["scheme"] = _EARLIER_SCHEMES.get(space["scheme"], space["scheme"])
+        newton.pop("across_steps", None)
         return cls(
-            time=_named(TimeScheme, **described["time"]),
-            space=_named(SpaceScheme, **described["space"]),
+            time=time,
+            space=_named(SpaceScheme, **space),
             start=described["start"],
-            newton=NewtonOptions(**described["newton"]),
-            elimination=_named(LinearSolver, **elimination),
+            newton=NewtonOptions(**newton),
         )
+
+
+#: schemes along the rod of earlier versions, and those of the same order
+_EARLIER_SCHEMES = {"RK4": "Lobatto4"}
 
 
 def _scheme(what: str, given: Any, kind: Any, known: Any) -> Any:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Literal
 
 import jax
@@ -13,20 +13,21 @@ import numpy as np
 
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.solvers import sensitivity
-from knode_cosserat.solvers.begin import Beginning, Run, beginning
 from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.linear import LinearSolver
+from knode_cosserat.solvers.initial import Beginning, Run, beginning
+from knode_cosserat.solvers.recovery import natural_time
 from knode_cosserat.solvers.result import Result, SimulationError
-from knode_cosserat.solvers.run import as_ended, run_batch, run_one
+from knode_cosserat.solvers.run import mark_coarse, run_batch, run_one
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.solvers.stability import natural_time
+from knode_cosserat.solvers.space import Euler, SpaceScheme
 from knode_cosserat.solvers.task import Steps, Task
 from knode_cosserat.solvers.time import Static, TimeScheme
 from knode_cosserat.trajectory import Trajectory
 
 #: time steps from this (s), and so many times the rod's natural time, look like milliseconds
 LONG_STEP, LONG_STEPS = 1.0, 100.0
+#: segments that position_tolerance begins with, and at most
+FIRST_SEGMENTS, MOST_SEGMENTS = 8, 512
 #: of the largest tension: so much below zero may be noise of a measurement
 PUSHING = 0.02
 #: of its length: so much may a robot differ from the one whose motion it goes on with
@@ -39,11 +40,12 @@ def simulate(
     dt: float,
     *,
     time: str | TimeScheme = "bdf2",
-    space: str | SpaceScheme = "euler",
+    space: str | SpaceScheme = "lobatto2",
     start: Literal["paper", "consistent"] = "paper",
     initial: Trajectory | None = None,
     newton: NewtonOptions = NewtonOptions(),
-    elimination: str | LinearSolver | None = None,
+    position_tolerance: float | None = None,
+    recovery_budget: float | None = None,
     on_failure: Literal["raise", "return"] = "raise",
     progress: bool = False,
 ) -> Trajectory:
@@ -55,7 +57,7 @@ def simulate(
             from row i to row i + 1.
         dt: time step (s).
         time: "bdf1", "bdf2", "bdf-alpha", "trapezoidal", or a scheme.
-        space: "euler", "rk4", or a scheme.
+        space: "lobatto2" (order 2), "lobatto4" (order 4), "euler" (order 1, the paper's), or a scheme.
         start: how the first step is made from one state; see `Settings`.
         initial: start from this trajectory's last row instead of the robot's state at rest (where that is
             only a guess, such as of a platform on bent legs: the equilibrium under no control). If its time
@@ -63,14 +65,16 @@ def simulate(
             tell less: what lies between nodes is interpolated there, and a scheme that asks for their rates
             (BDF-α, the trapezoidal rule) may make its first step by BDF1.
         newton: tolerances and limits of the solve in each step.
-        elimination: of the linear equations: "condensed", or "decoupled" for rods along which much grows
-            (soft or long ones in short time steps), to which a run changes by itself where it needs it. None
-            begins with what `initial` ended with, or else with the first.
+        position_tolerance: largest discretisation error (m) of positions along the rod; the nodes are chosen
+            so that the estimate stays below it in every row. By default they are the robot's.
+        recovery_budget: seconds that recovery from failed steps may take; by default 20 times the run's own
+            time or 5 s, whichever is more.
         on_failure: "raise" a `SimulationError`, or "return" the trajectory with the rest marked invalid.
         progress: show a progress bar.
 
     Returns:
-        A `Trajectory` of T + 1 rows; row 0 is the initial state. Every row carries its result. Inside `jit`,
+        A `Trajectory` of T + 1 rows; row 0 is the initial state. Every row carries its result, and an
+        estimate of its discretisation error (`position_error`). Inside `jit`,
         `grad` or `vmap` nothing can be raised: rows that are not solved are NaN there.
 
     Raises:
@@ -79,36 +83,71 @@ def simulate(
     """
     if initial is not None and not isinstance(initial, Trajectory):
         raise ValueError(f"initial is a {type(initial).__name__}; allowed is a Trajectory, or None")
-    settings = settings_of(time, space, start, newton, elimination, initial)
+    settings = Settings.of(time, space, start, newton)
     if on_failure not in ("raise", "return"):
         raise ValueError(f'on_failure is {on_failure!r}; allowed is "raise" or "return"')
     dt = checked_dt(dt)
+    if position_tolerance is not None:
+        refine = functools.partial(
+            simulate, controls=controls, dt=dt, time=time, space=space, start=start, newton=newton,
+            recovery_budget=recovery_budget, on_failure=on_failure, progress=progress,
+        )  # fmt: skip
+        return refined(refine, robot, initial, position_tolerance, settings.space.order)
     system, batch = _stacked(robot)
     controls, batch = _checked_controls(system, controls, batch)
     if not isinstance(settings.time, Static):
         _warn_of_long_steps(system, dt)
     if initial is not None:
         check_initial(system, initial, batch)
-    run = Run(system, controls, initial, settings, dt, batch, isinstance(robot, Sequence))
+    run = Run(system, controls, initial, settings, dt, batch, isinstance(robot, Sequence), recovery_budget)
     if is_traced((system, controls, initial)):
-        return _traced(*run)
+        return _traced(*run[:7])
     if batch:
         return _batch(run, on_failure, progress)
     return _single(run, on_failure, progress)
 
 
+def refined(
+    solve: Callable[[System], Trajectory], robot: Any, initial: Any, tolerance: Any, order: int
+) -> Trajectory:
+    """Return the trajectory that `solve` gives with as many nodes as a position tolerance (m) needs."""
+    if not isinstance(robot, System) or np.ndim(robot.length):
+        raise ValueError(
+            "position_tolerance chooses the nodes of one robot; a batch has the nodes of its robots"
+        )
+    if isinstance(initial, Trajectory):
+        raise ValueError(
+            "position_tolerance chooses the nodes, and those of initial are given; leave one out"
+        )
+    if not isinstance(tolerance, int | float) or not 0.0 < tolerance < np.inf:
+        raise ValueError(f"position_tolerance is {tolerance!r}; allowed is a positive number of metres")
+    segments = FIRST_SEGMENTS
+    while True:
+        found = solve(robot.replace(nodes=segments + 1))
+        error = float(np.nanmax(found.position_error))
+        if error <= tolerance or not found.all_valid:
+            return found
+        if segments == MOST_SEGMENTS:
+            warnings.warn(
+                f"position_tolerance of {tolerance:g} m is not reached with {segments + 1} nodes, where the "
+                f'estimate is {error:.2g} m: use space="lobatto4", or a larger tolerance',
+                stacklevel=3,
+            )
+            return found
+        wanted = segments * max(1.2, 1.1 * (error / tolerance) ** (1.0 / order))
+        # few different numbers of nodes, so few programs to compile
+        segments = min(MOST_SEGMENTS, next(n for n in _ladder() if n >= min(wanted, MOST_SEGMENTS)))
+
+
+def _ladder() -> Iterator[int]:
+    """Numbers of segments, each about a quarter more than the one before."""
+    step = FIRST_SEGMENTS // 4
+    while True:
+        yield from (k * step for k in range(4, 8))
+        step *= 2
+
+
 # checking what was given
-
-
-def settings_of(
-    time: str | TimeScheme, space: str | SpaceScheme, start: str, newton: NewtonOptions,
-    elimination: str | LinearSolver | None, initial: Trajectory | None,
-) -> Settings:  # fmt: skip
-    """What was chosen; of the elimination, what `initial` ended with unless it is given."""
-    if elimination is None:
-        before = None if initial is None else initial.settings
-        elimination = "condensed" if before is None else before.elimination
-    return Settings.of(time, space, start, newton, elimination)
 
 
 def _stacked(robot: Any) -> tuple[System, int | None]:
@@ -219,24 +258,40 @@ def check_initial(system: System, initial: Trajectory, batch: int | None) -> Non
 
 
 def _single(run: Run, on_failure: str, progress: bool) -> Trajectory:
-    system, controls, _, settings, dt, _, _ = run
+    system, controls, settings, dt = run.system, run.controls, run.settings, run.dt
     begins = beginning(run)
-    task = Task(settings, dt, len(controls), begins.first)
+    task = Task(settings, dt, len(controls), begins.first, run.budget)
     steps, cause = run_one(task, system, controls, begins.start, progress)
     if on_failure == "raise" and steps.result.min() < 0:
         raise _failure(task, float(begins.t0), steps, cause, None)
-    return _trajectory(run._replace(settings=as_ended(settings, steps)), begins, steps)
+    _warn_of_coarse_grids(run, steps)
+    return _trajectory(run, begins, steps)
 
 
 def _batch(run: Run, on_failure: str, progress: bool) -> Trajectory:
-    system, controls, _, settings, dt, _, many = run
+    system, controls, settings, dt, many = run.system, run.controls, run.settings, run.dt, run.many
     begins = beginning(run)
-    task = Task(settings, dt, controls.shape[1])
+    task = Task(settings, dt, controls.shape[1], recovery_budget=run.budget)
     steps, causes = run_batch(task, system, many, controls, begins.start, progress)
     if on_failure == "raise" and causes:
         robot, cause = next(iter(causes.items()))
         raise _failure(task, 0.0, Steps(*(leaf[robot] for leaf in steps)), cause, robot)
+    _warn_of_coarse_grids(run, steps)
     return _trajectory(run, begins, steps)
+
+
+def _warn_of_coarse_grids(run: Run, steps: Steps) -> None:
+    """Warn of rows whose discretisation error is large; not of the paper's scheme, which is chosen for it."""
+    coarse = np.asarray(steps.result) == Result.COARSE
+    if np.any(coarse) and not isinstance(run.settings.space, Euler):
+        worst, length = float(np.max(steps.position_error[coarse])), float(np.max(run.system.length))
+        warnings.warn(
+            f"the grid is too coarse in {np.count_nonzero(coarse)} of {coarse.size} rows: positions are "
+            f"off by up to about {worst:.2g} m ({worst / length:.0%} of the length) with "
+            f"{run.system.nodes} nodes. "
+            "Use more nodes, or position_tolerance.",
+            stacklevel=4,
+        )
 
 
 def _failure(task: Task, t0: float, steps: Steps, cause: str, robot: int | None) -> SimulationError:
@@ -261,12 +316,12 @@ def _traced(system, controls, initial, settings, dt, batch, many):  # type: igno
     else:
         rows = one(system, controls, begins.start.past)
     result = jnp.where(rows.error <= settings.newton.acceptable, 0, int(Result.NO_CONVERGENCE))
-    return _trajectory(run, begins, Steps._make([*rows, result]))
+    return _trajectory(run, begins, mark_coarse(Steps._make([*rows, result]), system))
 
 
 def _trajectory(run: Run, begins: Beginning, steps: Steps) -> Trajectory:
     """Put the initial row before the steps, and NaN where there is no solution."""
-    system, controls, _, settings, dt, batch, _ = run
+    system, controls, settings, dt, batch = run.system, run.controls, run.settings, run.dt, run.batch
     numeric: Any = jnp if is_traced((begins.record, steps)) else np
     axis = 1 if batch else 0
     ny, nz = system.y_layout.size, system.z_layout.size
@@ -288,5 +343,6 @@ def _trajectory(run: Run, begins: Beginning, steps: Steps) -> Trajectory:
         result=joined(zero.astype(int), steps.result),
         residual=joined(zero, steps.error),
         iterations=joined(zero.astype(int), steps.corrections),
+        position_error=joined(zero, numeric.where(invalid, numeric.nan, steps.position_error)),
         begun=jax.tree.map(numeric.asarray, begins.begun),
     )

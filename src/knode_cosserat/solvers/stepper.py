@@ -7,24 +7,18 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.begin import Run, beginning
 from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.linear import LinearSolver
-from knode_cosserat.solvers.march import march_one
-from knode_cosserat.solvers.past import Begun, newest_row
+from knode_cosserat.solvers.history import Begun
+from knode_cosserat.solvers.initial import Run, beginning
+from knode_cosserat.solvers.recovery import Budget
 from knode_cosserat.solvers.result import Result, SimulationError
-from knode_cosserat.solvers.run import (
-    ENOUGH_RESCUES,
-    LEAST_CAPACITY,
-    rescue,
-    with_stable_elimination,
-)
-from knode_cosserat.solvers.simulate import check_initial, checked_dt, settings_of
+from knode_cosserat.solvers.run import COARSE_SHARE, LEAST_CAPACITY, rescue
+from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.simulate import check_initial, checked_dt
 from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.solvers.stability import SAFE_DECAY, decay_per_segment
 from knode_cosserat.solvers.task import Task
 from knode_cosserat.solvers.time import Static, TimeScheme
-from knode_cosserat.solvers.trust import trusted_size
+from knode_cosserat.solvers.time_loop import loop_one
 from knode_cosserat.trajectory import Trajectory
 
 
@@ -36,21 +30,20 @@ class _Solved(NamedTuple):
     result: int
     residual: float
     corrections: int
+    position_error: float
 
 
 class Stepper:
     """A robot that moves one step at a time, by the program of `simulate` and with its recovery.
 
-    As many calls of `step` give, bit for bit, the rows that one `simulate` gives. A call costs the step
-    itself and a fraction of a millisecond beside it; what `simulate` has compiled is not compiled again.
+    Calls of `step` give the rows of one `simulate`, to the tolerance of Newton's method. A call costs the
+    step itself and a fraction of a millisecond beside it; a program that `simulate` has compiled is not
+    compiled again.
 
         stepper = kc.Stepper(robot, dt=0.05)
         while True:
             row = stepper.step(tensions())
             row.tip_position[0], row.time[0]
-
-    There is one difference: where a motion grows as only an instability in space does, `simulate` begins
-    anew with divided segments. What has been handed out cannot be taken back, so that here this is an error.
     """
 
     def __init__(
@@ -59,11 +52,11 @@ class Stepper:
         dt: float,
         *,
         time: str | TimeScheme = "bdf2",
-        space: str | SpaceScheme = "euler",
+        space: str | SpaceScheme = "lobatto2",
         start: Literal["paper", "consistent"] = "paper",
         initial: Trajectory | None = None,
         newton: NewtonOptions = NewtonOptions(),
-        elimination: str | LinearSolver | None = None,
+        recovery_budget: float | None = None,
     ):
         """Begin at rest, or where `initial` ends. The arguments are those of `simulate`.
 
@@ -74,27 +67,22 @@ class Stepper:
         given: Any = robot
         if not isinstance(given, System) or np.ndim(given.length):
             raise ValueError(f"robot is {type(robot).__name__}; a stepper is of one robot, not of a batch")
-        settings = settings_of(time, space, start, newton, elimination, initial)
+        settings = Settings.of(time, space, start, newton)
         if isinstance(settings.time, Static):
             raise ValueError("time is Static; a stepper moves: see `equilibrium` for shapes at rest")
-        if settings.newton.across_steps:
-            raise ValueError("newton has across_steps; a stepper keeps nothing of one step's equations")
         self.robot, self.dt = robot, checked_dt(dt)
         if initial is not None:
             check_initial(robot, initial, None)
         count = robot.control_size
         begins = beginning(Run(robot, np.zeros((1, count)), initial, settings, self.dt, None, False))
         begun, t0 = begins.start, begins.t0
-        self._task = Task(settings, self.dt, 1, begins.first)
+        self._task = Task(settings, self.dt, 1, begins.first, recovery_budget)
         self._settings = settings
         self._past, self._t0, self._index, self._steps = begun.past, float(t0), 0, 0
         self._control = np.asarray(begun.control, dtype=float)
-        self._begun, self._trusted = begun, trusted_size(robot, begun)
-        self._decay: float | None = None
-        self._rescues = 0
         # as many as in a run of up to 128 steps, so that they share a program
         self._controls = np.zeros((LEAST_CAPACITY, count))
-        first = _Solved(begun.past, np.asarray(begins.record), 0, 0.0, 0)
+        first = _Solved(begun.past, np.asarray(begins.record), 0, 0.0, 0, 0.0)
         self._state = self._row(first, self._control, self.time, begins.begun)
 
     @property
@@ -119,18 +107,15 @@ class Stepper:
         solved = self._solve(control)
         self._past, self._control = solved.past, control
         self._steps, self._index = self._steps + 1, self._index + 1
-        self._rescues += solved.result == Result.RECOVERED_STABLE_ELIMINATION
-        if self._rescues >= ENOUGH_RESCUES:
-            self._settings = with_stable_elimination(self._task.settings)
         if self._index == LEAST_CAPACITY:
-            # the march counts from an earlier row on, but not from row 0, whose coefficients may differ
+            # the loop counts from an earlier row on, but not from row 0, whose coefficients may differ
             self._index = 1
             self._past = self._past._replace(t0=np.asarray(self.time - self.dt))
         self._state = self._row(solved, control, self.time, self._begun_after(solved))
         return self._state
 
     def preview(self, control: Any) -> Trajectory:
-        """What `step` would give, without going there. Raises what that would raise."""
+        """Return the row that `step` would give, without moving. Raises the same errors."""
         control = self._checked(control)
         solved = self._solve(control)
         return self._row(solved, control, self.time + self.dt, self._begun_after(solved))
@@ -157,48 +142,30 @@ class Stepper:
         i = self._index
         controls = self._controls.copy()  # the compiled march may still read the last one
         controls[i] = control
-        done, past, rows = march_one(
+        done, past, rows = loop_one(
             self.robot, self._settings, self._task.table, controls, self.dt, self._past, i, i + 1
         )
+        cause = ""
         if int(done) > i:
-            found = _Solved(
-                past, np.asarray(rows.records)[i], 0, float(rows.error[i]), int(rows.corrections[i])
-            )
-            size, cause = float(rows.size[i]), ""
+            record, error = np.asarray(rows.records)[i], float(rows.error[i])
+            found = _Solved(past, record, 0, error, int(rows.corrections[i]), float(rows.position_error[i]))
         else:
-            outcome = rescue(self._task, self.robot, self._past, (self._control, control), i)
+            budget = Budget(self._task.recovery_budget)
+            outcome = rescue(self._task, self.robot, self._past, (self._control, control), i, budget)
             found = _Solved(
-                outcome.past, outcome.record, int(outcome.result), outcome.error, outcome.corrections
-            )
-            size, cause = outcome.size, outcome.cause
-        self._require(found, control, size, cause)
-        return found
-
-    def _require(self, found: _Solved, control: np.ndarray, size: float, cause: str) -> None:
-        """That the step is solved, and a solution to be trusted."""
+                outcome.past, outcome.record, int(outcome.result), outcome.error, outcome.corrections,
+                outcome.position_error,
+            )  # fmt: skip
+            cause = outcome.cause
         result = Result(found.result)
-        if result.solved and not np.isfinite(found.record[-1, self.robot.y_layout.size :]).all():
-            result, cause = Result.NOT_FINITE, "At the tip strains are undefined."
-        if result.solved and size > self._trusted and self._may_be_unstable(control):
-            result = Result.UNSTABLE
-            cause = (
-                "Give the robot more nodes, or use longer time steps; `simulate` divides segments by itself."
-            )
         if not result.solved:
             number = self._steps + 1
             raise SimulationError(number, self.time + self.dt, found.residual, result, cause)
-
-    def _may_be_unstable(self, control: np.ndarray) -> bool:
-        """Whether its segments are long enough for that, as `simulate` judges it: by the first step."""
-        if self._decay is None:
-            record = newest_row(self.robot, self._begun.past)
-            self._decay = decay_per_segment(
-                self.robot, self._task.settings, self._task.table[1], record, control
-            )
-        return self._decay >= SAFE_DECAY / 4.0
+        coarse = not found.position_error <= COARSE_SHARE * float(self.robot.length)
+        return found._replace(result=int(Result.COARSE)) if coarse else found
 
     def _begun_after(self, solved: _Solved) -> Begun:
-        """What a motion that goes on from a step looks back on."""
+        """Return the initial history of a motion that continues from a step."""
         past = solved.past
         return Begun(*map(np.asarray, (past.records, past.rate, self._task.table[1], self.dt)))
 
@@ -215,5 +182,6 @@ class Stepper:
             result=np.array([solved.result]),
             residual=np.array([solved.residual]),
             iterations=np.array([solved.corrections]),
+            position_error=np.array([solved.position_error]),
             begun=begun,
         )

@@ -1,4 +1,4 @@
-"""What is to be run, where it begins, and what came of it: the nouns of `run`."""
+"""Types of a run: the task, its initial history, and its steps."""
 
 from __future__ import annotations
 
@@ -7,42 +7,42 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from knode_cosserat.solvers.past import Past, coefficient_table
+from knode_cosserat.solvers.history import Past, coefficient_table
 from knode_cosserat.solvers.settings import Settings
 
 FirstStep = Literal["start", "regular", "consistent", "still"]
 
 
 class Steps(NamedTuple):
-    """The steps of one robot (or, with a batch axis in front, of several), and what came of each."""
+    """The steps of one robot (or, with a batch axis in front, of several), with their result codes."""
 
     records: Any
     unknowns: Any
     error: Any
     corrections: Any
-    size: Any
+    position_error: Any
     result: Any
 
 
 class Start(NamedTuple):
-    """Where a run begins: the past, and the control before the first step."""
+    """Initial history of a run, and the control before the first step."""
 
     past: Past
     control: Any
-    #: whether it was found as an equilibrium, be it on a finer grid than its nodes
-    equilibrium: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """What is the same for every robot of a run."""
+    """Everything that is the same for every robot of a run."""
 
     settings: Settings
     dt: float
     steps: int
-    #: the first step: as the settings say, like any other (the past holds real states), or by BDF1; or every
-    #: step without rates, an equilibrium (by the program of a simulation with these settings)
+    #: the first step: as the settings say, like any other (the history holds real states), or by BDF1; or
+    #: every step without rates, an equilibrium (by the program of a simulation with these settings)
     first: FirstStep = "start"
+    #: seconds that recovery may take; None: 20 times the run's own time or 5 s, whichever is more
+    recovery_budget: float | None = None
 
     @property
     def table(self) -> np.ndarray:

@@ -139,4 +139,4 @@ def _predictors(imperfect: System, training: Sequence[Trajectory], settings: Any
 
 def _moved(system: System, control: str, rows: int, dt: float) -> Trajectory:
     """The first rows from rest on: the paper keeps as many as there are controls."""
-    return simulate(system, controls.parse(control, rows, dt), dt)[:rows]
+    return simulate(system, controls.parse(control, rows, dt), dt, space="euler")[:rows]

@@ -37,8 +37,8 @@ from knode_cosserat.studies.runner import Job, Product, StudyError
 ROBOT = "delrin-tendon-robot"
 #: time step of the comparison, and of the paper's models (s); the best model takes steps of a part of it
 DT, FINER = 0.05, 2
-#: and its scheme in arclength: by Euler's, the ends of long segments are turned too far for where they are
-SPACE = "rk4"
+#: schemes in arclength: of all models, and of the paper's
+SPACE, PAPER_SPACE = "lobatto2", "euler"
 #: what is learned from, if nothing else is said: the paper's two sines, and one random recording
 TRAIN = ("sine_1p0", "sine_3p0", "rand_0")
 #: recordings of steps are compared from their beginning; all others rest for as long (s) first
@@ -215,7 +215,7 @@ class Learned(NamedTuple):
     systems: dict[int, System | str]
     #: steps of the model in one of the comparison, and its scheme in arclength
     finer: int = 1
-    space: str = "euler"
+    space: str = SPACE
     loss: Mapping[str, list[float]] = {}
     #: what is told of the fit, a text
     told: str = ""
@@ -243,14 +243,10 @@ def _paper(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence
         str(model.about.facts["seed"]): np.asarray(model.about.facts["segments"]["loss"]).tolist()
         for model in models
     }
-    return Learned(dict(zip(seeds, models, strict=True)), loss=losses)
+    return Learned(dict(zip(seeds, models, strict=True)), space=PAPER_SPACE, loss=losses)
 
 
 def _best(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence[int]) -> Learned:
-    return _identified(knowledge, train, read, None, SPACE)
-
-
-def _by_euler(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence[int]) -> Learned:
     return _identified(knowledge, train, read, None)
 
 
@@ -269,15 +265,16 @@ def _identified(
     train: Sequence[str],
     read: _Read,
     names: tuple[str, ...] | None,
-    space: str = "euler",
 ) -> Learned:
-    return _found(lambda rows: identify(knowledge, rows, names, space=space), train, read, space)
+    return _found(lambda rows: identify(knowledge, rows, names, space=SPACE), train, read)
 
 
 def _calibrated(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence[int]) -> Learned:
     names = ("youngs_modulus", "density", "bending_damping", "drag", "gravity")
     return _found(
-        lambda rows: calibrate(knowledge, rows, names, by="rollouts", undetermined="keep"), train, read
+        lambda rows: calibrate(knowledge, rows, names, by="rollouts", undetermined="keep", space=SPACE),
+        train,
+        read,
     )
 
 
@@ -285,14 +282,13 @@ def _found(
     search: Callable[[list[Measurements]], Calibration],
     train: Sequence[str],
     read: _Read,
-    space: str = "euler",
 ) -> Learned:
-    """No chance in it: one seed."""
+    """Return the model of a search; there is no chance in it: one seed."""
     try:
         calibration = search([read.rows(name, FINER) for name in train])
     except CalibrationError as error:
         return Learned({0: str(error)}, FINER)
-    return Learned({0: calibration.robot}, FINER, space, told=str(calibration))
+    return Learned({0: calibration.robot}, FINER, told=str(calibration))
 
 
 #: those of the paper's Table II, and what of the best each part of it buys, which is without all later ones
@@ -305,7 +301,6 @@ METHODS: dict[str, Callable[[System, Sequence[str], _Read, Sequence[int]], Learn
     "calibrated": _calibrated,
     "no-memory": _no_memory,
     "no-vibration": _no_vibration,
-    "euler": _by_euler,
 }
 
 
@@ -346,8 +341,8 @@ class _Poses(NamedTuple):
     quaternion: Float[np.ndarray, "T M 4"]
 
 
-def _outcome(system: System | str, read: _Read, name: str, finer: int, space: str = "euler") -> _Outcome:
-    """The three figures over the rows in which everything was seen, or why there are none."""
+def _outcome(system: System | str, read: _Read, name: str, finer: int, space: str) -> _Outcome:
+    """Return the three figures over the rows in which everything was seen, or the cause of a failure."""
     none = {"tip_dtw": None, "pose_mse": None, "tip_rmse": None}
     if isinstance(system, str):
         return _Outcome({**none, "failed": system}, None)

@@ -151,4 +151,4 @@ def _outcome(system: System | str, truth: Trajectory, control: str, settings: An
 
 def _moved(system: System, control: str, rows: int, dt: float) -> Trajectory:
     """The first rows from rest on: the paper keeps as many as there are controls."""
-    return simulate(system, controls.parse(control, rows, dt), dt)[:rows]
+    return simulate(system, controls.parse(control, rows, dt), dt, space="euler")[:rows]

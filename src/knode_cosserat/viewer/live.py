@@ -42,7 +42,7 @@ def view_live(
     robot: System,
     *,
     dt: float | None = None,
-    space: str = "euler",
+    space: str = "lobatto2",
     title: str | None = None,
     port: int = 0,
     open_browser: bool = True,
@@ -54,7 +54,7 @@ def view_live(
         robot: a robot, or a model (`KNODE`).
         dt: time step (s), and how often the page gets a new shape; by default what a model learned at,
             or 0.05 s.
-        space: scheme along the rod, "euler" or "rk4".
+        space: scheme along the rod, "lobatto2", "lobatto4" or "euler".
         title: what stands above it; by default the robot's class.
         port: of the server, which only this machine reaches; 0 for any that is free.
         open_browser: whether to open the page; its address is printed in any case.

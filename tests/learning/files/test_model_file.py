@@ -96,7 +96,7 @@ def test_what_is_known_of_a_model_comes_back_the_same(facts):
 def test_settings_and_a_loss_history_come_back(tmp_path):
     loss = np.random.default_rng(0).random((5, 1000))
     chosen = kc.Settings(
-        time=kc.BDFAlpha(-1 / 3), space=kc.RK4(), newton=kc.NewtonOptions(tolerance=1e-9 / 3)
+        time=kc.BDFAlpha(-1 / 3), space=kc.Lobatto4(), newton=kc.NewtonOptions(tolerance=1e-9 / 3)
     )
     facts = {"loss": loss, "settings": chosen, "data": [{"sha256": "ab" * 32, "rows": (0, 30)}]}
     KNODE(ROBOT, network(), About(facts)).save(tmp_path / "model")

@@ -155,7 +155,9 @@ def moved(robot, control, rows):
 
 @pytest.mark.campaign
 def test_a_job_says_how_well_its_knowledge_does():
-    job = imperfections.jobs(["no drag"], [0], steps=20, method="baseline", controls={"sine": "sine:1.5"})[0]
+    job = imperfections.jobs(
+        ["no drag"], [0], steps=20, method="baseline", controls={"sine": "sine:1.5"}, space="lobatto2"
+    )[0]
     json.dumps(job.settings)
     truth = ROBOT.replace(drag=0.0)
     expected = moved(truth, "sine:1.5", 20)

@@ -140,18 +140,20 @@ def test_segments_that_are_not_one_euler_step():
     """A bar's y_s comes from splines, and what they give first is polished on the segments."""
     bar = BAR.replace(nodes=12, drag=0.0)
     wrong = bar.replace(density=1.5, stiffness=30.0)
-    data = [pulled(period, 20, bar, space="rk4") for period in (1.0, 0.7)]
+    data = [pulled(period, 20, bar, space="lobatto4") for period in (1.0, 0.7)]
     model = learned(wrong, data)
     unseen = 1.5 * np.cos(np.arange(1, 31) * 0.15)[:, None]
-    before, after, true = (kc.simulate(system, unseen, 0.1, space="rk4").y for system in (wrong, model, bar))
+    before, after, true = (
+        kc.simulate(system, unseen, 0.1, space="lobatto4").y for system in (wrong, model, bar)
+    )
     assert np.max(np.abs(after - true)) < 1e-6 * np.max(np.abs(before - true))
 
 
 @pytest.mark.campaign
 def test_segments_of_the_robot_that_are_not_one_euler_step(robot):
     knowledge = robot.replace(length=0.4, youngs_modulus=10e9)
-    model = learned(knowledge, recorded(robot, space="rk4"))
-    assert left(model, knowledge, robot, space="rk4") < 1e-7
+    model = learned(knowledge, recorded(robot, space="lobatto4"))
+    assert left(model, knowledge, robot, space="lobatto4") < 1e-7
 
 
 @pytest.mark.campaign
@@ -185,8 +187,8 @@ def test_a_system_of_ones_own_learns_too():
     def swung(system, period):
         t = np.arange(1, 61) * dt
         hand = np.stack([0.6 + 0.05 * np.sin(2 * np.pi * t / period), 0 * t], axis=1)
-        hanging = kc.equilibrium(system, rest, space="rk4")
-        return kc.simulate(system, hand, dt, space="rk4", initial=hanging)
+        hanging = kc.equilibrium(system, rest, space="lobatto4")
+        return kc.simulate(system, hand, dt, space="lobatto4", initial=hanging)
 
     model = learned(string, [swung(truth, 1.0)])
     true, base, ours = (np.asarray(swung(one, 0.7).part("p")) for one in (truth, string, model))

@@ -126,12 +126,12 @@ def test_what_no_weight_changes_is_found_once(robot, moved, bars, system):
     imperfect, known_of = (robot.replace(length=0.4), moved) if system == "robot" else (WRONG, bars)
     data = samples(imperfect, known_of)
     options = NetworkOptions(hidden=9, history="history" in system, convex=False, standardised=True)
-    net = program.standardised(network(imperfect, options, jax.random.key(1)), imperfect, data.segments)
+    net = program.standardised(network(imperfect, options, jax.random.key(1)), imperfect, data)
     size = imperfect.y_layout.size + imperfect.z_layout.size
     target = jnp.asarray(np.random.default_rng(0).normal(size=(size, len(data.segments.t))))
 
     def fast(net):
-        known = program.known(net, imperfect, data.segments)
+        known = program.known(net, imperfect, data.segments, data.space)
         return jnp.concatenate(program.corrected(net, known))
 
     def slow(net):
@@ -170,8 +170,8 @@ def _alone(system, data):
 def test_standardised_inputs_have_mean_zero_and_spread_one(bars):
     data = samples(WRONG, bars)
     net = network(WRONG, NetworkOptions(hidden=4, convex=False), jax.random.key(0))
-    scaled = program.standardised(net, WRONG, data.segments)
-    known = program.known(scaled, WRONG, data.segments)
+    scaled = program.standardised(net, WRONG, data)
+    known = program.known(scaled, WRONG, data.segments, kc.Euler())
     np.testing.assert_allclose(np.mean(known.inputs[:-1], axis=1), 0.0, atol=1e-12)
     np.testing.assert_allclose(np.std(known.inputs[:-1], axis=1), 1.0)
     # an output of one is as large as what the knowledge lacks: z is off by n (1/EA - 1/EA'), and damping
@@ -286,17 +286,17 @@ def test_cosine_goes_down_to_zero(bars):
 
 def test_it_learns(bars):
     data = samples(WRONG, bars)
-    net = program.standardised(small(), WRONG, data.segments)
+    net = program.standardised(small(), WRONG, data)
     _, losses, _ = trained(data, net, Training(epochs=400))
     assert losses[-1, 0] < 1e-2 * losses[0, 0]
 
 
-@pytest.mark.parametrize("space", ["rk4", "euler"])
+@pytest.mark.parametrize("space", ["lobatto4", "lobatto2"])
 def test_any_scheme_and_any_residual(bars, space):
     """Where a prediction is more than the knowledge's and something added, it is made anew in each epoch."""
-    settings = kc.Settings(space=kc.RK4() if space == "rk4" else kc.Euler())
-    data = samples(WRONG, [dataclasses.replace(bars[0], settings=settings)])
-    residual = small() if space == "rk4" else Softer(jnp.zeros(()))
+    swing = pulled(1.0, space=space) if space == "lobatto4" else bars[0]
+    data = samples(WRONG, [swing])
+    residual = small() if space == "lobatto4" else Softer(jnp.zeros(()))
     weights, losses, _ = trained(data, residual, Training(epochs=250, learning_rate=0.02))
     assert losses[-1, 0] < 0.1 * losses[0, 0]
     if isinstance(residual, Softer):
@@ -330,7 +330,7 @@ def test_a_seed_does_not_depend_on_those_beside_it(bars, noise):
 def test_noise_is_new_in_every_epoch_and_of_the_asked_size(bars):
     """With weights that stay (no rate to speak of) only the noise moves the loss."""
     data = samples(WRONG, bars)
-    net = program.standardised(small(), WRONG, data.segments)
+    net = program.standardised(small(), WRONG, data)
     losses = {}
     for noise in (0.0, 1e-4, 2e-4):
         training = Training(epochs=40, learning_rate=1e-300, schedule="constant", noise=noise)

@@ -102,7 +102,7 @@ def calibrate(
     by: Literal["segments", "rollouts"] = "segments",
     undetermined: Literal["stop", "keep"] | None = None,
     level: float = 0.95,
-    space: str | SpaceScheme = "euler",
+    space: str | SpaceScheme = "lobatto2",
 ) -> Calibration:
     """Find physical parameters of a robot from trajectories, by least squares.
 
@@ -115,8 +115,8 @@ def calibrate(
         by: "segments" compares one-segment predictions from the states in the data, all of which must be
             known. It takes a fraction of a second and finds its way from far off. Noise in the states enters
             its predictions too; what that does to the estimates is taken away, to leading order in its
-            variance. Between nodes, where RK4 looks back on more than a trajectory has, the past is that of
-            the robot that is found, in a few rounds. "rollouts" compares whole simulations with positions and
+            variance. Between nodes, where a trajectory has no rows, the history is that of the robot that is
+            found, in a few rounds. "rollouts" compares whole simulations with positions and
             orientations, and needs nothing else of trajectories that begin at rest. Its search begins where
             segments lead, if they do.
         undetermined: what to do about a parameter that the data do not determine: "stop" with an error, or

@@ -19,7 +19,7 @@ from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.places import places_at, positions_at
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.simulate import simulate
-from knode_cosserat.solvers.space import Euler, SpaceScheme
+from knode_cosserat.solvers.space import SpaceScheme
 
 #: what is found unless other names are given. Density and gravity stay: with tensions known in newtons, only
 #: the ratios of stiffness, tendon offset and weight can be told from poses
@@ -46,10 +46,10 @@ BEGIN_VIBRATION: dict[str, Any] = {"vibration_rate": 0.3, "vibration_softening":
 BEGINS = (0.35, 0.5, 0.65)
 #: vibration has to explain this part of what is left, on average, or it is not there
 WORTH = 0.02
-#: the sleeve's length, a part of the rod's; RK4 finds it itself: by Euler's scheme it would take up what
-#: positions lag behind orientations
+#: the sleeve's length at first, a part of the rod's. It is found last, but not with a scheme of order 1: it
+#: would make up for the lag of positions behind orientations
 SLEEVE = 0.11
-BY_RK4 = ("sleeve_length",)
+LAST = ("sleeve_length",)
 #: robots begin to vibrate somewhere between the least and the greatest tension of all tendons together, if
 #: these are further apart than this part of the greatest
 SPREAD = 0.2
@@ -65,7 +65,7 @@ def identify(
     measurements: Sequence[Measurements],
     names: Sequence[str] | None = None,
     *,
-    space: str | SpaceScheme = "euler",
+    space: str | SpaceScheme = "lobatto2",
 ) -> Calibration:
     """Find the model of a real robot from its recordings.
 
@@ -82,8 +82,8 @@ def identify(
             recordings determine. Where stiffness and tendon offset run off together, for a light rod's weight
             says little, the offset stays as it is known.
         space: the scheme in arclength that the model is for; simulate it with the same. With Euler's, the
-            positions of ten nodes lag behind their orientations by half a segment, and "rk4" takes three
-            times as long. It is searched from where Euler's scheme leads, and finds the sleeve's length too.
+            positions of ten nodes lag behind their orientations by half a segment, and the sleeve's length is
+            not found.
 
     Returns:
         The `Calibration`; its `robot` is the model.
@@ -94,35 +94,6 @@ def identify(
         ValueError: a scheme that does not exist.
     """
     scheme = Settings.of("bdf2", space, "paper", NewtonOptions()).space
-    rough = _by_euler(knowledge, measurements, names)
-    if isinstance(scheme, Euler):
-        return rough
-    every = tuple(rough.estimates)
-    fine = calibrate(rough.robot, measurements, every, by="rollouts", undetermined="keep", space=scheme)
-    if names is None:
-        fine = _freer(fine, measurements, every, scheme)
-    return dataclasses.replace(
-        fine,
-        before={name: rough.before.get(name, fine.before[name]) for name in fine.estimates},
-        undetermined=tuple(dict.fromkeys((*rough.undetermined, *fine.undetermined))),
-    )
-
-
-def _freer(
-    fine: Calibration, measurements: Sequence[Measurements], names: Sequence[str], space: SpaceScheme
-) -> Calibration:
-    """With what only a scheme without a lag can tell, from where all else is found; if it explains more."""
-    try:
-        more = (*names, *BY_RK4)
-        other = calibrate(fine.robot, measurements, more, by="rollouts", undetermined="keep", space=space)
-    except CalibrationError:
-        return fine
-    return other if _left(other) < _left(fine) else fine
-
-
-def _by_euler(
-    knowledge: System, measurements: Sequence[Measurements], names: Sequence[str] | None
-) -> Calibration:
     if not isinstance(knowledge, TendonRod):
         raise CalibrationError(
             f"knowledge is a {type(knowledge).__name__}; allowed is a tendon-driven robot (TendonRobot, "
@@ -131,43 +102,63 @@ def _by_euler(
     _check(measurements)
     start = _beginning(knowledge, NAMES if names is None else names)
     if names is not None:
-        return calibrate(start, measurements, names, by="rollouts")
-    still, names = _still(start, measurements, trusted=bool(knowledge.tendon_offset))
-    shaking = _vibrating(still.robot, measurements)
-    if shaking is None:
-        return still
+        return calibrate(start, measurements, names, by="rollouts", space=scheme)
+    still = _still(start, measurements, scheme, trusted=bool(knowledge.tendon_offset))
+    shaking = _vibrating(still.robot, measurements, scheme)
+    best = _better(still, shaking, measurements, VIBRATION, scheme, WORTH)
+    if scheme.order > 1:
+        best = _better(best, best.robot, measurements, LAST, scheme)
+    return best
+
+
+def _better(
+    before: Calibration,
+    start: System | None,
+    measurements: Sequence[Measurements],
+    more: Sequence[str],
+    space: SpaceScheme,
+    worth: float = 0.0,
+) -> Calibration:
+    """Return the calibration with more parameters, searched from a start, if it explains more."""
+    if start is None:
+        return before
+    # of the names that were not determined, the others may be with these parameters
+    fixed, free = (
+        [name for name in before.undetermined if (name == OFFSET) is kept] for kept in (True, False)
+    )
+    names = (*before.estimates, *free, *more)
     try:
-        every = (*names, *VIBRATION)
-        other = calibrate(shaking, measurements, every, by="rollouts", undetermined="keep")
-        other = dataclasses.replace(other, undetermined=(*_left_out(names), *other.undetermined))
+        other = calibrate(start, measurements, names, by="rollouts", undetermined="keep", space=space)
     except CalibrationError:
-        return still
-    return other if _left(other) < _left(still) - WORTH else still
+        return before
+    if _left(other) >= _left(before) - worth:
+        return before
+    return dataclasses.replace(
+        other,
+        before={name: before.before.get(name, value) for name, value in other.before.items()},
+        undetermined=(*fixed, *other.undetermined),
+    )
 
 
 def _still(
-    start: RoutedTendonRobot, measurements: Sequence[Measurements], trusted: bool
-) -> tuple[Calibration, tuple[str, ...]]:
-    """The robot without vibration, and the names that were searched.
+    start: RoutedTendonRobot, measurements: Sequence[Measurements], space: SpaceScheme, trusted: bool
+) -> Calibration:
+    """Return the robot without vibration.
 
     The weight of a light rod says so little that stiffness and tendon offset can run off together; then the
     offset is the one that is known (`trusted`: measured, and not a guess of ours).
     """
     try:
-        whole = calibrate(start, measurements, NAMES, by="rollouts", undetermined="keep")
+        whole = calibrate(start, measurements, NAMES, by="rollouts", undetermined="keep", space=space)
         assert isinstance(whole.robot, TendonRod)
         ratio = float(whole.robot.tendon_offset) / float(start.tendon_offset)
         if not trusted or 1.0 / FARTHEST <= ratio <= FARTHEST:
-            return whole, NAMES
+            return whole
     except CalibrationError:
         pass
     fewer = tuple(name for name in NAMES if name != OFFSET)
-    part = calibrate(start, measurements, fewer, by="rollouts", undetermined="keep")
-    return dataclasses.replace(part, undetermined=(*_left_out(fewer), *part.undetermined)), fewer
-
-
-def _left_out(names: Sequence[str]) -> tuple[str, ...]:
-    return tuple(name for name in NAMES if name not in names)
+    part = calibrate(start, measurements, fewer, by="rollouts", undetermined="keep", space=space)
+    return dataclasses.replace(part, undetermined=(OFFSET, *part.undetermined))
 
 
 def _check(measurements: object) -> None:
@@ -185,7 +176,7 @@ def _left(calibration: Calibration) -> float:
     return float(np.mean(np.log(list(calibration.remainder.values()))))
 
 
-def _vibrating(robot: System, measurements: Sequence[Measurements]) -> System | None:
+def _vibrating(robot: System, measurements: Sequence[Measurements], space: SpaceScheme) -> System | None:
     """The robot with some vibration, if that explains more as it is: a search that finds none takes long."""
     total = np.concatenate([each.tension.sum(axis=1) for each in measurements])
     least, greatest = float(total.min()), float(total.max())
@@ -195,16 +186,16 @@ def _vibrating(robot: System, measurements: Sequence[Measurements]) -> System | 
         robot.replace(**BEGIN_VIBRATION, vibration_tension=least + part * (greatest - least))
         for part in BEGINS
     ]
-    left = [_left_of(each, measurements) for each in tried]
+    left = [_left_of(each, measurements, space) for each in tried]
     best = int(np.argmin(left))
-    return tried[best] if left[best] < _left_of(robot, measurements) else None
+    return tried[best] if left[best] < _left_of(robot, measurements, space) else None
 
 
-def _left_of(robot: System, measurements: Sequence[Measurements]) -> float:
+def _left_of(robot: System, measurements: Sequence[Measurements], space: SpaceScheme) -> float:
     """As `_left`, of positions; infinite where the robot cannot be simulated."""
     found = 0.0
     for each in measurements:
-        y = np.asarray(simulate(robot, each.tension[:-1], each.dt, on_failure="return").y)
+        y = np.asarray(simulate(robot, each.tension[:-1], each.dt, space=space, on_failure="return").y)
         seen = positions_at(robot, y, places_at(each.fractions, robot.nodes))
         off = np.asarray(seen)[: len(each.time)] - each.position
         if not np.all(np.isfinite(y)):

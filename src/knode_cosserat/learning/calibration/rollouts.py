@@ -25,9 +25,9 @@ from knode_cosserat.learning.calibration.unknowns import Unknowns, found, with_c
 from knode_cosserat.learning.samples import DataError, samples
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.begin import Run, beginning
 from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.past import Past, initial_past, resting_past
+from knode_cosserat.solvers.history import Past, initial_past, resting_past
+from knode_cosserat.solvers.initial import Run, beginning
 from knode_cosserat.solvers.places import Places, places_at, positions_at, quaternions_at
 from knode_cosserat.solvers.run import run_one
 from knode_cosserat.solvers.sensitivity import tangent_march
@@ -154,7 +154,7 @@ class RolloutMisfit:
         given: Sequence[Trajectory] | Sequence[Measurements],
         unknowns: Unknowns,
         near: bool = False,
-        space: str | SpaceScheme = "euler",
+        space: str | SpaceScheme = "lobatto2",
     ):
         """`near`: a search begins where the robot is close to the real one; `space` is for measurements."""
         self.robot, self.unknowns, self.near = robot, unknowns, near

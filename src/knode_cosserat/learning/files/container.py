@@ -34,6 +34,11 @@ MOST_ARRAYS = 2**30
 #: objects in one file: each takes time to be traced
 MOST_OBJECTS = 5_000
 
+#: classes of earlier versions, and the class of the same order that replaced them
+EARLIER_CLASSES = {"RK4": "Lobatto4"}
+#: fields that classes had in earlier versions
+EARLIER_FIELDS = {"Settings": ("elimination",), "NewtonOptions": ("across_steps",)}
+
 _SIZES = {"b": (1,), "i": (1, 2, 4, 8), "u": (1, 2, 4, 8), "f": (2, 4, 8), "c": (8, 16)}
 #: what an array's numbers may be, in NumPy's notation
 _TYPES = {
@@ -294,11 +299,16 @@ class Reader:
 
     def _object(self, name: str, fields: dict[str, Any], where: str, classes: Classes) -> Any:
         if name not in classes:
+            name = EARLIER_CLASSES.get(name, name)
+        if name not in classes:
             raise UnknownClassError(f"{where} is of a class {name[:60]!r}, which is not known here", name)
         self._objects += 1
         if self._objects > MOST_OBJECTS:
             raise ContainerError(f"it has more than {MOST_OBJECTS} objects")
-        values = {key: self._value(part, f"{where}.{key}", classes) for key, part in fields.items()}
+        # not read: values of removed fields may be of classes that no longer exist
+        removed = set(EARLIER_FIELDS.get(name, ())) - set(_fields(classes[name]))
+        kept = {key: part for key, part in fields.items() if key not in removed}
+        values = {key: self._value(part, f"{where}.{key}", classes) for key, part in kept.items()}
         return _made(classes[name], values, where)
 
 

@@ -39,7 +39,7 @@ from knode_cosserat.learning.structured.expansion import Expansion, Term
 from knode_cosserat.learning.structured.residual import Load, Structured
 from knode_cosserat.rods import robot_file
 from knode_cosserat.rods.system import History, System, is_traced
-from knode_cosserat.solvers import linear, space, time
+from knode_cosserat.solvers import space, time
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.settings import Settings
 
@@ -80,8 +80,8 @@ def _add(classes: dict[str, type], cls: Any) -> None:
 
 
 for _known in (
-    Network, Structured, Load, Expansion, Term, Settings, NewtonOptions, space.Euler, space.RK4, time.BDF1,
-    time.BDF2, time.BDFAlpha, time.Trapezoidal, time.Static, linear.Condensed, linear.Decoupled,
+    Network, Structured, Load, Expansion, Term, Settings, NewtonOptions, space.Euler, space.Lobatto2,
+    space.Lobatto4, time.BDF1, time.BDF2, time.BDFAlpha, time.Trapezoidal, time.Static,
 ):  # fmt: skip
     register(_known)
 

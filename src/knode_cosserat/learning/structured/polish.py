@@ -1,7 +1,8 @@
 """The weights of a structured residual, polished on the segments themselves.
 
-Where a segment is more than one Euler step, what it reaches is not linear in the weights. Those that sparse
-regression chose are then moved, all at once, until what the segments reach fits best (Gauss-Newton).
+Where the scheme has stages, or a discontinuity is inside a segment, y at its end is not linear in the
+weights. The weights that sparse regression chose are then moved, all at once, until y at the segments' ends
+fits best (Gauss-Newton).
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 At the true states every part is linear in its weights. What the law of the strains leaves, at the true
 strains, gives the stress; the geometry of the samples gives the stretch; what the balance leaves gives the
-loads. Where a segment is not one Euler step, y_s comes from splines, and the weights found are then polished
-on the segments.
+loads. A scheme without stages (Euler's, the trapezoidal rule) is linear in the rates at a segment's ends, and
+so in the weights. For others y_s comes from splines, and the weights found are then polished on the segments.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.learning.config import StructuredOptions
-from knode_cosserat.learning.samples import Dataset, Samples, TipSamples, start_of
+from knode_cosserat.learning.samples import Dataset, Samples, TipSamples, end_of, start_of
 from knode_cosserat.learning.sides import whole
 from knode_cosserat.learning.structured.expansion import CURVED, DRAG, LINEAR, Expansion, expansion
 from knode_cosserat.learning.structured.polish import polished
@@ -35,11 +35,19 @@ from knode_cosserat.learning.structured.residual import (
     tip_observables,
 )
 from knode_cosserat.learning.structured.selection import folds
-from knode_cosserat.learning.structured.sums import Counting, Offer, Target, fitted_load, fitted_stress
+from knode_cosserat.learning.structured.sums import (
+    Counting,
+    Offer,
+    Target,
+    fitted_load,
+    fitted_stress,
+    mean_of_ends,
+)
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.system import System, unpacked_history
 from knode_cosserat.rotation import rotation_matrix
-from knode_cosserat.solvers.space import Euler
+from knode_cosserat.solvers.grid import ON_NODE
+from knode_cosserat.solvers.space import SpaceScheme
 
 #: of the natural size of what is balanced: less than this is the solver's tolerance, not a load
 LEAST = 1e-9
@@ -78,6 +86,13 @@ class _Seen:
         self.knowledge, self.data, self.options = knowledge, data, options
         #: what is learned along the rod is the law of a strand
         self.strand = knowledge.strand
+        self._along: _Along | None = None
+
+    def along(self, residual: Structured) -> _Along:
+        """Return the equations along the rod, with this residual's stress."""
+        if self._along is None or self.strand.cuts:
+            self._along = _Along(self, residual)
+        return self._along
 
     @functools.cached_property
     def law(self) -> tuple[list[Offer], list[Target]]:
@@ -85,19 +100,33 @@ class _Seen:
         return _law(self.strand, self.data.segments, self.options)
 
     @functools.cached_property
-    def views(self) -> _Views:
-        """Along the rod."""
-        return jax.tree.map(np.asarray, _views(self.strand, self.data.segments))
+    def linear(self) -> bool:
+        """True if y at the end of a segment is linear in the rates at its ends."""
+        return not self.data.space.formula.stages
 
     @functools.cached_property
-    def rates(self) -> Float[np.ndarray, "S y"]:
-        """The knowledge's y_s at the true strains."""
-        return np.asarray(_rates(self.strand, self.data.segments))
+    def moved(self) -> Float[np.ndarray, "S y"]:
+        """y_s of each segment: its mean if the scheme is linear in rates; otherwise that at its start."""
+        segments, strand = self.data.segments, self.strand
+        if not self.linear:
+            return np.asarray(segments.slope) / float(strand.length)
+        return (segments.y_next - segments.y) * ((strand.nodes - 1) / float(strand.length))
 
-    @functools.cached_property
-    def along(self) -> _Sides:
-        """What a load along the rod may be a sum of."""
-        return _sides(self.strand, loaded(self.strand), self.data.segments.y, self.views, self.options.curved)
+
+class _Along:
+    """The rod where the equations of a residual's loads are evaluated, and what a load may be a sum of.
+
+    `points` are the starts of all segments and, if the scheme uses them, then their ends. It depends on the
+    stress only where the rod has discontinuities.
+    """
+
+    def __init__(self, seen: _Seen, residual: Structured):
+        strand, data = seen.strand, seen.data
+        points = _points(strand, residual, data.segments, data.space)
+        self.views: _Views = jax.tree.map(np.asarray, _views(strand, points))
+        #: the knowledge's y_s at the true strains
+        self.rates = mean_of_ends(np.asarray(_rates(strand, points)), len(data.segments.t))
+        self.sides = _sides(strand, loaded(strand), points.y, self.views, seen.options.curved)
 
 
 class _Sides(NamedTuple):
@@ -187,56 +216,101 @@ class _Views(NamedTuple):
     matrix: Any
 
 
+class Points(NamedTuple):
+    """Points along the rod (P) where the equations are evaluated."""
+
+    s: Float[Any, " P"]
+    t: Float[Any, " P"]
+    c0: Float[Any, " P"]
+    y: Float[Any, "P y"]
+    z: Float[Any, "P z"]
+    control: Float[Any, "P c"]
+    history: Float[Any, "P x"]
+
+
+def starts_of(knowledge: System, data: Samples) -> Points:
+    """Return the starts of all segments."""
+    s = start_of(knowledge, data.place)
+    return Points(s, data.t, data.c0, data.y, data.z, data.control, data.history[:, 0])
+
+
+def _points(knowledge: System, residual: Structured, data: Samples, space: SpaceScheme) -> Points:
+    """Return the starts of all segments and, if the scheme uses them and has no stages, then their ends."""
+    starts = starts_of(knowledge, data)
+    if space.formula.stages or not space.implicit:
+        return starts
+    s, z = end_of(knowledge, data.place), data.z_next
+    if knowledge.cuts:
+        # z is known on the far side of a discontinuity; on the near side it is that of the corrected law
+        near = _near_strains(knowledge, residual, s, data)
+        nodes = knowledge.nodes - 1
+        on_cut = np.min(
+            np.abs(np.asarray(knowledge.cuts) * nodes - (data.place[:, None] * nodes + 1.0)), axis=1
+        )
+        z = np.where(on_cut[:, None] < ON_NODE, np.asarray(near), z)
+    ends = Points(s, data.t, data.c0, data.y_next, z, data.control, data.history[:, 1])
+    return Points(*(np.concatenate(each) for each in zip(starts, ends, strict=True)))
+
+
 @jax.jit
-def _views(knowledge: System, data: Samples) -> _Views:
-    def one(sample: Samples) -> Any:
-        s = start_of(knowledge, sample.place)
-        history = unpacked_history(knowledge, sample.c0, sample.history[0])
-        y_t, z_t = sample.c0 * sample.y + history.y, sample.c0 * sample.z + history.z
-        observables = knowledge.observables(s, sample.y, y_t, sample.z, z_t, sample.control)
+def _near_strains(knowledge: System, residual: Structured, s: Any, data: Samples) -> Any:
+    def one(s: Any, sample: Samples) -> Any:
+        history = unpacked_history(knowledge, sample.c0, sample.history[1])
+        return residual.strains(knowledge, s, sample.t, sample.y_next, sample.control, history)
+
+    return jax.vmap(one)(s, data)
+
+
+@jax.jit
+def _views(knowledge: System, points: Points) -> _Views:
+    def one(point: Points) -> Any:
+        history = unpacked_history(knowledge, point.c0, point.history)
+        y_t, z_t = point.c0 * point.y + history.y, point.c0 * point.z + history.z
+        observables = knowledge.observables(point.s, point.y, y_t, point.z, z_t, point.control)
         matrix = None
         if knowledge.mixed:
-            A, B, _ = knowledge.balance(s, sample.t, sample.y, y_t, sample.z, z_t, sample.control)
-            matrix = A + sample.c0 * B
-        ambient = ambient_inputs(knowledge, sample.control)
+            A, B, _ = knowledge.balance(point.s, point.t, point.y, y_t, point.z, z_t, point.control)
+            matrix = A + point.c0 * B
+        ambient = ambient_inputs(knowledge, point.control)
         return _Views(jnp.concatenate([observables, ambient]), ambient, matrix)
 
-    return jax.vmap(one)(data)
+    return jax.vmap(one)(points)
 
 
 @jax.jit
-def _rates(knowledge: System, data: Samples) -> Any:
+def _rates(knowledge: System, points: Points) -> Any:
     """The knowledge's y_s at the true strains."""
 
-    def one(sample: Samples) -> Any:
-        history = unpacked_history(knowledge, sample.c0, sample.history[0])
-        return knowledge.rates(
-            start_of(knowledge, sample.place), sample.t, sample.y, sample.z, sample.control, history
-        )
+    def one(point: Points) -> Any:
+        history = unpacked_history(knowledge, point.c0, point.history)
+        return knowledge.rates(point.s, point.t, point.y, point.z, point.control, history)
 
-    return jax.vmap(one)(data)
+    return jax.vmap(one)(points)
 
 
 def _with_loads(seen: _Seen, residual: Structured, counting: Counting) -> Structured:
     """The residual with its stretch and its loads."""
-    knowledge, data, rates = seen.strand, seen.data, seen.rates
-    length = float(knowledge.length)
-    if isinstance(data.space, Euler):
-        # only of a segment that is one step its ends tell the slope
+    knowledge, data, along = seen.strand, seen.data, seen.along(residual)
+    length, rates, moved = float(knowledge.length), along.rates, seen.moved
+    if seen.linear:
+        # y at the ends gives the mean rate only where no discontinuity is inside
         counts = counting.shares * whole(knowledge, data.segments.place)
-        counting = counting._replace(shares=counts / np.mean(counts))
-    moved, doubt = data.segments.slope / length, data.doubt / length
+        if np.any(counts):
+            counting = counting._replace(shares=counts / np.mean(counts))
     longer = _longer(knowledge, moved, rates, counting.shares)
     missing = moved / longer - rates
     if knowledge.mixed:
-        missing = np.einsum("sij,sj->si", seen.views.matrix, missing)
+        matrix = mean_of_ends(along.views.matrix, len(missing))
+        missing = np.einsum("sij,sj->si", matrix, missing)
     ds = length / (knowledge.nodes - 1)
     floors = _floors(knowledge.y_layout, np.abs(rates) + np.abs(moved))
     floors = np.maximum(floors, TOLERANCE * np.asarray(knowledge.scales().y) / ds)
-    where = knowledge.y_layout.indices(seen.along.layout.names)
-    load = _load(seen.along, missing[:, where], np.maximum(floors, doubt)[where], counting)
+    where = knowledge.y_layout.indices(along.sides.layout.names)
+    least = floors if seen.linear else np.maximum(floors, data.doubt / length)
+    load = _load(along.sides, missing[:, where], least[where], counting)
     residual = dataclasses.replace(residual, stretch=np.array(longer - 1.0), load=load)
-    if isinstance(data.space, Euler):
+    # of two ends: strains on the near side of discontinuities, and the mean of A + c0 B, are not exact
+    if seen.linear and not (data.space.implicit and (knowledge.cuts or knowledge.mixed)):
         return residual
     return polished(knowledge, data, residual, ds * floors, counting.shares)
 

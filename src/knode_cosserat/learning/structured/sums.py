@@ -32,7 +32,8 @@ WORTH = 0.8
 class Target(NamedTuple):
     """One field that is to be explained: its values, and below what nothing is meant.
 
-    `turn` has the rotation matrices from the material's frame to the values'; None if that is the same.
+    `turn` has the rotation matrices from the material's frame to the values', at every point; None if that is
+    the same. There may be several points to a sample, in blocks: a value is the mean of the load at them.
     """
 
     values: Float[Any, "S n"]
@@ -49,14 +50,19 @@ class Counting(NamedTuple):
     fold: Any
 
 
-class Offer:
-    """An expansion whose weights are to be found, and what it depends on, at every sample."""
+def mean_of_ends(values: Float[np.ndarray, "P ..."], count: int) -> Float[np.ndarray, "S ..."]:
+    """Return the mean over the points of each sample; of all samples the first points come first."""
+    return values if len(values) == count else values.reshape(-1, count, *values.shape[1:]).mean(axis=0)
 
-    def __init__(self, part: Expansion, inputs: Float[Any, "S x"]):
+
+class Offer:
+    """An expansion whose weights are to be found, and what it depends on, at every point."""
+
+    def __init__(self, part: Expansion, inputs: Float[Any, "P x"]):
         self.part, self.inputs = part, inputs
 
     @functools.cached_property
-    def features(self) -> Float[np.ndarray, "S k"]:
+    def features(self) -> Float[np.ndarray, "P k"]:
         """The values of its functions; the same however samples count, so that seeds share them."""
         return np.asarray(_features_of(self.part, self.inputs))
 
@@ -121,12 +127,13 @@ class _Problem:
             self.floors = np.array([target.floors.max()])
 
     def arranged(self, material: Any) -> Any:
-        """The columns, from the material's features (S, k)."""
+        """The columns, from the material's features (P, k)."""
+        count = len(self.target.values)
         if self.target.turn is None:
-            return np.concatenate([material, self.ambient[:, 1:]], axis=1)
+            return mean_of_ends(np.concatenate([material, self.ambient[:, 1:]], axis=1), count)
         turned = [self.target.turn[:, :, j, None] * material[:, None, :] for j in range(self.size)]
         still = [np.eye(self.size)[:, i, None] * self.ambient[:, None, :] for i in range(self.size)]
-        columns = np.concatenate([*turned, *still], axis=2)
+        columns = mean_of_ends(np.concatenate([*turned, *still], axis=2), count)
         return columns.reshape(-1, columns.shape[2])
 
     def spread(self, features: Any) -> Any:

@@ -1,7 +1,7 @@
 """Gradient training on one-segment samples: one compiled program for all epochs, and for several seeds.
 
-A network under Euler's scheme adds to what the knowledge alone predicts, and that does not depend on the
-weights: it is found once, and an epoch is then two matrix products and their derivatives. Everything else
+Under a scheme without stages a network adds to the prediction of the knowledge alone. This does not depend on
+the weights: it is found once, and an epoch is then two matrix products and their derivatives. Everything else
 (other schemes, other residuals) is predicted anew in every epoch, just as `samples.predict` has it.
 """
 
@@ -22,10 +22,10 @@ from jaxtyping import Float, Int, UInt32
 from knode_cosserat.learning.config import Training
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import Network, Residual, elu, input_layout
-from knode_cosserat.learning.samples import Dataset, Samples, predict, start_of
+from knode_cosserat.learning.samples import Dataset, Samples, end_of, predict
 from knode_cosserat.learning.training.losses import Loss, loss_for, sizes, spread
 from knode_cosserat.rods.system import System, unpacked_history
-from knode_cosserat.solvers.crossing import crossing_of
+from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.space import Euler, SpaceScheme
 
 #: the most epochs of one call of the program
@@ -59,32 +59,42 @@ def _is_weight(node: Any, path: Any, leaf: Any) -> bool:
 
 
 class Known(NamedTuple):
-    """What the knowledge alone predicts of each sample (S), and what a network sees there, scaled."""
+    """Prediction of each sample (S) by the knowledge alone, and a network's inputs, scaled."""
 
-    #: the last row is of ones: the biases' input
-    inputs: Float[Any, "inputs+1 S"]
+    #: at the starts of segments, then at their ends if the scheme uses these; the last row is of ones, for
+    #: the biases
+    inputs: Float[Any, "inputs+1 E*S"]
     y: Float[Any, "y S"]
     z: Float[Any, "z S"]
-    ds: Float[Any, ""]
+    #: length of a segment times the scheme's weights of the start and of the end
+    steps: Float[Any, "2"]
 
 
-def known(net: Network, knowledge: System, samples: Samples) -> Known:
-    """The part of Euler's prediction that does not depend on a network's weights."""
-    ds = knowledge.length / (knowledge.nodes - 1)
+def known(net: Network, knowledge: System, samples: Samples, space: SpaceScheme) -> Known:
+    """Evaluate what does not depend on a network's weights; for schemes without stages."""
+    steps = knowledge.length / (knowledge.nodes - 1) * jnp.asarray(space.formula.weights[:2])
+
+    def seen(sample: Samples, y: Any, z: Any, record: Any) -> Any:
+        inputs = net.inputs(knowledge, y, z, sample.control, unpacked_history(knowledge, sample.c0, record))
+        return (inputs - net.input_mean) / net.input_scale
 
     def one(sample: Samples) -> Any:
-        history = unpacked_history(knowledge, sample.c0, sample.history[0])
-        at = start_of(knowledge, sample.place), sample.t, sample.y, sample.control, history
-        y_s, z = knowledge.derivatives(*at)
-        inputs = net.inputs(knowledge, sample.y, z, sample.control, history)
-        return (inputs - net.input_mean) / net.input_scale, sample.y + ds * y_s, z
+        y, z = predict(knowledge, space, sample)
+        inputs = [seen(sample, sample.y, z, sample.history[0])]
+        if space.implicit:
+            history = unpacked_history(knowledge, sample.c0, sample.history[1])
+            at = end_of(knowledge, sample.place), sample.t, sample.y_next, sample.control, history
+            _, z_end = knowledge.derivatives(*at)
+            inputs.append(seen(sample, sample.y_next, z_end, sample.history[1]))
+        return inputs, y, z
 
     inputs, y, z = jax.vmap(one, out_axes=-1)(samples)
-    return Known(jnp.concatenate([inputs, jnp.ones_like(inputs[:1])]), y, z, jnp.asarray(ds))
+    joined = jnp.concatenate(inputs, axis=1)
+    return Known(jnp.concatenate([joined, jnp.ones_like(joined[:1])]), y, z, steps)
 
 
 def corrected(net: Network, known: Known) -> tuple[Float[Any, "y S"], Float[Any, "z S"]]:
-    """Prediction of all samples by knowledge and network, as `samples.predict` has it under Euler.
+    """Prediction of all samples by knowledge and network: that of `samples.predict`.
 
     Hidden units first and the biases as one more column: of the layouts tried the fastest (0.61 s for 1000
     epochs of the paper's preset on one core, 0.54 s with `_product`; samples first 0.69 to 1.0 s).
@@ -92,8 +102,11 @@ def corrected(net: Network, known: Known) -> tuple[Float[Any, "y S"], Float[Any,
     first = jnp.concatenate([net.input_weights, net.input_biases[:, None]], axis=1)
     second = _product(net.output_weights, elu(first @ known.inputs)) + net.output_biases[:, None]
     added = net.output_scale[:, None] * second
-    size = known.y.shape[0]
-    return known.y + known.ds * added[:size], known.z + added[size:]
+    size, count = known.y.shape
+    y = known.y + known.steps[0] * added[:size, :count]
+    if added.shape[1] > count:
+        y = y + known.steps[1] * added[:size, count:]
+    return y, known.z + added[size:, :count]
 
 
 @jax.custom_vjp
@@ -111,14 +124,17 @@ def _product_slope(given: Any, slope: Any) -> Any:
 _product.defvjp(lambda weights, units: (weights @ units, (weights, units)), _product_slope)
 
 
-def standardised(net: Network, knowledge: System, samples: Samples) -> Network:
-    """The network with its inputs shifted and scaled, and its outputs scaled, by what the data are like.
+def standardised(net: Network, knowledge: System, data: Dataset) -> Network:
+    """Return the network with its inputs shifted and scaled, and its outputs scaled, by the data's spread.
 
-    An output is scaled by the root mean square of what it would have to add under Euler's scheme.
+    An output is scaled by the root mean square of the correction that it would have to add along a segment.
     """
-    seen = _known(net, knowledge, samples)
+    samples = data.segments
+    seen = _known(net, knowledge, samples, Euler())
+    y, z = (seen.y, seen.z) if isinstance(data.space, Euler) else _predicted(knowledge, data.space, samples)
     inputs = np.asarray(seen.inputs)[:-1].T
-    lacking = [(samples.y_next.T - seen.y) / seen.ds, samples.z.T - seen.z]
+    ds = knowledge.length / (knowledge.nodes - 1)
+    lacking = [(samples.y_next.T - y) / ds, samples.z.T - z]
     scale = np.sqrt(np.mean(np.square(np.concatenate(lacking)), axis=1))
     return dataclasses.replace(
         net,
@@ -128,7 +144,12 @@ def standardised(net: Network, knowledge: System, samples: Samples) -> Network:
     )
 
 
-_known = jax.jit(known)
+_known = jax.jit(known, static_argnames="space")
+
+
+@functools.partial(jax.jit, static_argnames="space")
+def _predicted(system: System, space: SpaceScheme, samples: Samples) -> Any:
+    return jax.vmap(lambda one: predict(system, space, one), out_axes=-1)(samples)
 
 
 # the program
@@ -186,16 +207,15 @@ def _loss(weights: Any, recipe: Recipe, data: Data, noise: Any, key: Any) -> Any
     if recipe.noisy:
         samples = _noisy(samples, data, noise, key)
     if _adds(residual, recipe.space, data.knowledge):
-        return data.loss(*corrected(residual, known(residual, data.knowledge, samples)))
+        return data.loss(*corrected(residual, known(residual, data.knowledge, samples, recipe.space)))
     model = KNODE(data.knowledge, residual)
     return data.loss(*jax.vmap(lambda one: predict(model, recipe.space, one), out_axes=-1)(samples))
 
 
 def _adds(residual: Residual, space: SpaceScheme, knowledge: System) -> bool:
-    """Whether a prediction is what the knowledge alone predicts, and something added to that."""
-    crossing = crossing_of(knowledge)
-    parted = crossing is not None and crossing.acting.shape[1] > 1
-    return isinstance(residual, Network) and isinstance(space, Euler) and not parted
+    """True if a prediction is that of the knowledge alone, and a sum of the network's outputs."""
+    parted = grid_of(knowledge).parts.shape[1] > 1
+    return isinstance(residual, Network) and not space.formula.stages and not parted
 
 
 def _noisy(samples: Samples, data: Data, noise: Any, key: Any) -> Samples:
@@ -293,7 +313,7 @@ def prepared(
     _, rest = split(residual)
     given: Any = residual
     ready = (
-        _known(given, knowledge, segments)
+        _known(given, knowledge, segments, dataset.space)
         if _adds(residual, dataset.space, knowledge) and not recipe.noisy
         else None
     )

@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.rods.system import History, System
-from knode_cosserat.solvers.past import coefficient_table
+from knode_cosserat.solvers.history import coefficient_table
 from knode_cosserat.solvers.settings import Settings
 
 #: fields that a rod's state has to have here: known from poses, then from the balance; and of the strains

@@ -16,6 +16,7 @@ from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.space import Euler
 from knode_cosserat.trajectory import Trajectory
 
 Method = Literal["best", "paper"]
@@ -53,7 +54,8 @@ def estimate_states(
         end: the last row at most (s).
 
     Returns:
-        A `Trajectory` without settings; its time is the recording's. Row i has the control that
+        A `Trajectory` whose time is the recording's; without settings, or by the paper's method with those of
+        Euler's scheme, in whose segments its states are exact. Row i has the control that
         `simulate` would reach it with: the tension held from row i - 1 on (of row 0, its own).
 
     Raises:
@@ -124,9 +126,10 @@ def held_controls(part: Part) -> Float[np.ndarray, "T c"]:
 
 
 def _estimated(part: Part, robot: System, method: str) -> Trajectory:
-    control = held_controls(part)
+    control, settings = held_controls(part), None
     if method == "paper":
-        y, z = paper.states(part, robot, control, Settings())
+        settings = Settings(space=Euler())
+        y, z = paper.states(part, robot, control, settings)
     else:
         y, z = _best(part, robot, control)
     rows = len(part.rows.time)
@@ -134,7 +137,7 @@ def _estimated(part: Part, robot: System, method: str) -> Trajectory:
         raise RecordingError(f"{part.rows.source}: the robot's equations gave states that are not finite")
     return Trajectory(
         system=robot,
-        settings=None,
+        settings=settings,
         time=part.rows.time,
         y=y,
         z=z,

@@ -1,4 +1,4 @@
-"""Where a simulation begins: at rest, in an equilibrium to be found, or where another motion ends."""
+"""Initial state and history of a simulation: rest, an equilibrium, or the end of another motion."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.solvers import sensitivity
-from knode_cosserat.solvers.between import at_stages
-from knode_cosserat.solvers.crossing import points_of, spread
-from knode_cosserat.solvers.past import (
+from knode_cosserat.solvers.grid import at_places, grid_of
+from knode_cosserat.solvers.history import (
     Begun,
     Motion,
     Past,
@@ -26,7 +25,7 @@ from knode_cosserat.solvers.past import (
     past_of_one,
     rest_record,
     resting_past,
-    rows_tell,
+    rows_suffice,
 )
 from knode_cosserat.solvers.problem import no_history
 from knode_cosserat.solvers.result import Result, SimulationError
@@ -53,6 +52,8 @@ class Run(NamedTuple):
     dt: float
     batch: int | None
     many: bool
+    #: seconds that recovery may take, or None
+    budget: float | None = None
 
 
 class Beginning(NamedTuple):
@@ -71,7 +72,7 @@ class Beginning(NamedTuple):
 
 def beginning(run: Run) -> Beginning:
     """Where a run begins."""
-    system, controls, initial, settings, dt, batch, many = run
+    system, controls, initial, settings, dt, batch, many, _ = run
     if initial is not None:
         return _going_on(system, initial, settings, dt)
     record, past = (_all_at_rest if many else _at_rest)(system, _of_past(settings))
@@ -165,24 +166,16 @@ def _going_on(system: System, initial: Trajectory, settings: Settings, dt: float
     else:
         past, first = known
     begun = None if still else _begun(past, Task(settings, dt, 1, first).table[0], dt)
-    # of this robot: one of another is no more than where this one begins
-    found = rests and not is_traced((initial, system)) and _same(initial.system, system)
-    return Beginning(record, Start(past, control, found), t0, first, begun)
-
-
-def _same(one: System, other: System) -> bool:
-    """Whether two systems are the same in all their numbers."""
-    leaves, others = jax.tree.leaves(one), jax.tree.leaves(other)
-    alike: Any = jax.tree.structure(one), jax.tree.structure(other)
-    return bool(alike[0] == alike[1]) and all(map(np.array_equal, leaves, others))
+    return Beginning(record, Start(past, control), t0, first, begun)
 
 
 @functools.partial(jax.jit, static_argnames="space")
 def _shape(system: System, space: SpaceScheme, record: Any, t0: Any) -> Past:
-    """A past of a shape, where an equilibrium is looked for: what is between nodes is interpolated."""
+    """Return a history of one shape, from which an equilibrium is searched: interpolated between nodes."""
     more = no_history(system, space).shape[-1] - record.shape[-1]
-    y = spread(points_of(system), record[:, : system.y_layout.size])
-    return past_of_one(at_stages(system, space, jnp.pad(record, ((0, 0), (0, more)))), y, t0)
+    y = grid_of(system).spread(record[:, : system.y_layout.size])
+    records = at_places(system, space, jnp.pad(record, ((0, 0), (0, more))))
+    return past_of_one(system, space, records, y, t0)
 
 
 def _begun(past: Past, coefficients: Any, dt: Any) -> Begun:
@@ -204,7 +197,7 @@ def _known(
         system, made = initial.system, _of_past(made)
     else:
         made = _of_past(settings)
-    again = moved or rows_tell(system, settings)
+    again = moved or rows_suffice(system, settings.space)
     known = (_of_first_rows if again else _of_last_rows)(system, made, initial, rows, dt)
     if known is None:
         return None
@@ -215,11 +208,9 @@ def _known(
     if not is_traced((rows, controls)):
         packed = padded_rows(np.reshape(rows, (count, -1)))
         rows, controls = packed.reshape(-1, *np.shape(rows)[1:]), padded_rows(controls)
-    # what was found on finer segments does not solve the equations on these
-    solved = is_traced(initial.result) or not np.any(initial.result == Result.RECOVERED_FINER_SEGMENTS)
     motion = Motion(begun, regular, rows, controls, initial.time[row], count)
-    past, _ = _along(system, made, motion, solved=bool(solved))
-    alone = past_of_one(past.records[0], past.y[0], past.t0)
+    past, _ = _along(system, made, motion)
+    alone = past_of_one(system, made.space, past.records[0], past.y[0], past.t0)
     # of traced times nothing can be said but that a trajectory's rows are as far apart as it is to go on
     if not is_traced(begun.dt) and not np.isclose(begun.dt, dt):
         return alone, "start"
@@ -232,7 +223,7 @@ def _known(
 
 
 def _alike(one: System, other: System) -> bool:
-    """Whether stages are the same, and what is kept of them."""
+    """True if two systems have the same places and records."""
 
     def grid(system: System) -> Any:
         return system.cuts, system.nodes, system.strands, system.mixed
@@ -257,7 +248,7 @@ def _apart(times: Any, dt: float) -> float:
 def _of_first_rows(
     system: System, made: Settings, initial: Trajectory, rows: Any, dt: float
 ) -> _Known | None:
-    """What is known at a motion's first row, or its second."""
+    """Return the history at a motion's first row, or its second."""
     time, begun = initial.time, initial.begun
     if begun is not None and begun.rate.shape == no_history(system, made.space).shape:
         regular = coefficient_table(made, dt if is_traced(begun) else float(begun.dt))[1]
@@ -279,7 +270,7 @@ def _of_first_rows(
 
 
 def _of_last_rows(system: System, made: Settings, initial: Trajectory, rows: Any, dt: float) -> _Known | None:
-    """What is known at the last row of states that solve no equations of this system."""
+    """Return the history at the last row of states that solve no equations of this system."""
     time = initial.time
     if len(time) < 2:
         return None
@@ -287,7 +278,7 @@ def _of_last_rows(system: System, made: Settings, initial: Trajectory, rows: Any
 
 
 def _of_rows(system: System, made: Settings, two: Any, apart: float, row: int) -> _Known | None:
-    """What the nodes tell at the second of two rows; of y_st they do not."""
+    """Return the history at the second of two rows from their nodes; None with y_st."""
     if system.mixed:
         return None
     regular = coefficient_table(made, apart)[1]
@@ -297,12 +288,10 @@ def _of_rows(system: System, made: Settings, two: Any, apart: float, row: int) -
 _between = jax.jit(begun_between, static_argnames="space")
 
 
-_along = jax.jit(past_along, static_argnames=("settings", "solved"))
+_along = jax.jit(past_along, static_argnames="settings")
 
 
-def histories_along(
-    system: System, moved: Trajectory
-) -> tuple[int, Float[Any, "steps stages points x"]] | None:
+def histories_along(system: System, moved: Trajectory) -> tuple[int, Float[Any, "steps places x"]] | None:
     """What a simulation's steps looked back on at their stages, as a model of it has it, from which row on.
 
     None where rows tell too little.
@@ -315,4 +304,4 @@ def histories_along(
     row, count = known.row, len(rows) - known.row
     controls = jnp.asarray(moved.control[row:])
     motion = Motion(known.begun, known.regular, rows[row:], controls, moved.time[row], count)
-    return row + 1, _along(system, made, motion, solved=False)[1]
+    return row + 1, _along(system, made, motion)[1]

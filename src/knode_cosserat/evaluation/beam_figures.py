@@ -1,0 +1,56 @@
+"""The figure of a beam that is let go: how far its tip drops, measured and predicted."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.evaluation.drawing import new_figure
+from knode_cosserat.evaluation.study_figures import REFERENCE
+from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
+from knode_cosserat.recordings.beam import BeamRecording, tip_drop
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: how predictions are drawn, by method
+METHODS: dict[str, dict[str, Any]] = {
+    "nominal": {"color": PALETTE[1], "linewidth": 0.8},
+    "identified": {"color": PALETTE[0], "linewidth": 1.0},
+}
+#: the motion that is drawn large (s), from the release on
+SHOWN = 1.5
+
+
+def drops(
+    recordings: Sequence[BeamRecording],
+    predictions: Mapping[str, Mapping[str, Float[np.ndarray, "T 3 3"]]],
+    train: Collection[str],
+) -> Figure:
+    """Tip drop over time, a row for each recording: the first 1.5 s on the left, all on the right.
+
+    Raises:
+        ImportError: matplotlib is not installed.
+    """
+    with style():
+        figure = new_figure(TWO_COLUMNS, 1.7 * len(recordings) + 0.4)
+        grid = figure.subplots(len(recordings), 2, squeeze=False, width_ratios=(1.6, 1.0), sharey="row")
+        for row, each in zip(grid, recordings, strict=True):
+            time = each.time - each.crossing
+            for axes in row:
+                axes.plot(time, 1e3 * each.drop, label="measured", **REFERENCE)
+                for method, predicted in predictions[each.name].items():
+                    axes.plot(time, 1e3 * tip_drop(predicted), label=method, **METHODS[method])
+                axes.invert_yaxis()
+            use = "training" if each.name in train else "held out"
+            row[0].set(ylabel="tip drop [mm]", xlim=(-0.1, SHOWN))
+            row[0].set_title(f"load {1e3 * each.load:g} g, {use} ({each.name})")
+            row[1].set_xlim(-0.1, float(time[-1]))
+        for axes in grid[-1]:
+            axes.set_xlabel("time from the release [s]")
+        handles, labels = grid[0, 0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+    return figure

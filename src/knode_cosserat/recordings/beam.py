@@ -1,0 +1,147 @@
+"""Recordings of a clamped beam that is held by hand and let go: CSV files of motion-capture markers.
+
+The columns are `time_s` and `mK_x_m`, `mK_y_m`, `mK_z_m` of the markers 0 to 5: 0 to 2 are on the tip, 3 to
+5 on the base. x is vertical, upwards; z is along the beam. The file's name tells the load: `…load52…` for
+52 g at the tip, `…gravity…` for none.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.recordings.findings import RecordingError
+from knode_cosserat.recordings.table import read_csv
+
+#: markers on the tip, and on the base
+TIP, BASE = (0, 1, 2), (3, 4, 5)
+COLUMNS = ("time_s", *(f"m{k}_{axis}_m" for k in TIP + BASE for axis in "xyz"))
+#: a drop of the tip (m) by which recording and prediction are put on one clock; noise is below 0.1 mm, and
+#: so is the creep of the hand before it lets go
+THRESHOLD = 2e-3
+#: rows before the threshold that may belong to the fall already, or to a hand that is letting go
+MARGIN = 10
+#: the fewest rows of a held beam
+FEWEST_HELD = 5
+#: rows in which the tip has to stay below the threshold: a glitch of one row is no release
+LASTING = 4
+
+
+@dataclasses.dataclass(frozen=True)
+class BeamRecording:
+    """Markers of a beam over time, its load, and when it was let go."""
+
+    name: str
+    #: (T,) s
+    time: Float[np.ndarray, " T"]
+    #: (T, 3 markers, 3) m, from where they were while the beam was held; NaN where a marker is lost
+    tip: Float[np.ndarray, "T 3 3"]
+    #: (3 markers, 3) m, while the beam was held
+    held: Float[np.ndarray, "3 3"]
+    #: (3 markers, 3) m of the base, while the beam was held
+    base: Float[np.ndarray, "3 3"]
+    #: mass of the load (kg)
+    load: float
+    #: when the tip has dropped by `THRESHOLD` (s)
+    crossing: float
+
+    @property
+    def drop(self) -> Float[np.ndarray, " T"]:
+        """How far the tip is below where it was held (m), the mean of its markers."""
+        return tip_drop(self.tip)
+
+
+def tip_drop(moved: Float[np.ndarray, "T 3 3"]) -> Float[np.ndarray, " T"]:
+    """The mean drop (m) of markers by their displacements; NaN where one is lost."""
+    return -np.asarray(moved[:, :, 0].mean(axis=1))
+
+
+def load_of(name: str) -> float:
+    """Return the mass of the load (kg) that a file's name tells.
+
+    Raises:
+        RecordingError: the name tells none.
+    """
+    grams = re.search(r"load[_-]?(\d+(?:\.\d+)?)", name, re.IGNORECASE)
+    if grams:
+        return 1e-3 * float(grams.group(1))
+    if "gravity" in name.lower():
+        return 0.0
+    raise RecordingError(
+        f"{name}: the name tells no load; allowed is a name with load<grams>, such as beam_load52_a.csv, or "
+        "with gravity (no load); or give the load of each such file by --load NAME=GRAMS"
+    )
+
+
+def read_beam(path: Path, load: float | None = None) -> BeamRecording:
+    """Read a beam's recording.
+
+    Args:
+        path: the CSV file.
+        load: mass at the tip (kg), if not the one that the name tells.
+
+    Raises:
+        RecordingError: the file is not right, its load is not known, or the beam is never let go.
+    """
+    load = load_of(path.stem) if load is None else load
+    try:
+        _, table = read_csv(path.read_bytes(), str(path))
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
+    missing = [name for name in COLUMNS if name not in table.columns]
+    if missing:
+        raise RecordingError(
+            f"{path}: the column {missing[0]} is missing; needed are time_s and mK_x_m, mK_y_m, mK_z_m "
+            "of the markers 0 to 5"
+        )
+    values = table[list(COLUMNS)].to_numpy(dtype=float)
+    time, markers = values[:, 0], values[:, 1:].reshape(-1, len(TIP + BASE), 3)
+    if not np.all(np.diff(time) > 0.0):
+        raise RecordingError(f"{path}: time_s does not grow from row to row")
+    crossing, first = find_release(time, markers[:, TIP], str(path))
+    held = np.nanmedian(markers[:first], axis=0)
+    if not np.all(np.isfinite(held)):
+        lost = int(np.argwhere(~np.isfinite(held))[0, 0])
+        raise RecordingError(f"{path}: marker {lost} is lost all the time before the beam is let go")
+    tip = markers[:, TIP] - held[list(TIP)]
+    return BeamRecording(path.stem, time, tip, held[list(TIP)], held[list(BASE)], load, crossing)
+
+
+def find_release(
+    time: Float[np.ndarray, " T"], tip: Float[np.ndarray, "T 3 3"], source: str
+) -> tuple[float, int]:
+    """Return when the held tip has dropped by `THRESHOLD` (s), and the number of rows in which it is held.
+
+    The level that it is held at is the running median of the rows before: a slow creep of the hand is no
+    fall, and neither is a glitch.
+
+    Raises:
+        RecordingError: the tip never drops so far for good, or it is not held before.
+    """
+    # not the median of the markers: where one is lost that would jump
+    height = np.asarray(tip[:, :, 0].mean(axis=1))
+    for row in range(MARGIN + FEWEST_HELD, len(height) - LASTING):
+        level = (
+            np.nanmedian(height[: row - MARGIN]) if np.any(np.isfinite(height[: row - MARGIN])) else np.nan
+        )
+        lasting = level - height[row : row + LASTING]
+        if np.any(lasting > THRESHOLD) and not np.any(lasting <= THRESHOLD):
+            break
+    else:
+        raise RecordingError(
+            f"{source}: no release found: after at least {MARGIN + FEWEST_HELD} rows in which the beam is "
+            f"held, the markers m0 to m2 have to drop by more than {1e3 * THRESHOLD:g} mm along x"
+        )
+    held = row - MARGIN
+    drop = tip_drop(tip - np.nanmedian(tip[:held], axis=0))
+    # rows in which every marker is seen, on both sides of the threshold
+    seen = np.flatnonzero(np.isfinite(drop))
+    after = next((k for k in seen if k >= held and drop[k] > THRESHOLD), None)
+    before = seen[:0] if after is None else seen[seen < after]
+    if after is None or not len(before):
+        raise RecordingError(f"{source}: no release found: a marker of m0 to m2 is lost all the time")
+    return float(np.interp(THRESHOLD, drop[[before[-1], after]], time[[before[-1], after]])), held

@@ -1,0 +1,1 @@
+"""Cables held at both ends by robot arms: identified, learned and predicted from motion capture."""

@@ -1,0 +1,52 @@
+"""The rod that creeps: elastic at rest, stiffer in fast motion, a slender rod without its branch."""
+
+import numpy as np
+import pytest
+
+import knode_cosserat as kc
+from knode_cosserat.rods.viscoelastic_rod import ViscoelasticRod
+
+BODY = {
+    "length": 0.1, "radius": 0.015, "density": 1070.0, "youngs_modulus": 2.6e5, "nodes": 6,
+    "bending_damping": 1e-4, "loads": kc.loads.PointWrench(force=(1.0, 0.0, 0.0), controlled=True),
+    "gravity": (0.0, 0.0, 0.0),
+}  # fmt: skip
+
+
+def bent(rod, force=0.05):
+    return kc.equilibrium(rod, [force]).tip_position[0, 0]
+
+
+def test_at_rest_it_is_elastic():
+    elastic = bent(kc.SlenderRod(**BODY))
+    assert bent(ViscoelasticRod(**BODY, branch_stiffness=2.0)) == pytest.approx(elastic, rel=1e-9)
+
+
+def test_without_its_branch_it_is_a_slender_rod():
+    control = np.full((20, 1), 0.05)
+    plain = kc.simulate(kc.SlenderRod(**BODY), control, 5e-3)
+    rod = kc.simulate(ViscoelasticRod(**BODY, branch_stiffness=0.0), control, 5e-3)
+    np.testing.assert_allclose(rod.tip_position, plain.tip_position, atol=1e-9)
+
+
+def test_under_a_lasting_force_it_creeps_from_the_stiff_shape_to_that_at_rest():
+    rod = ViscoelasticRod(**BODY, branch_stiffness=1.0, relaxation_time=5.0)
+    stiff = bent(kc.SlenderRod(**{**BODY, "youngs_modulus": 2 * BODY["youngs_modulus"]}))
+    # the vibration has died out after a second; the branch is a fifth of the way
+    x = kc.simulate(rod, np.full((2000, 1), 0.05), 0.02).tip_position[:, 0]
+    assert stiff < x[50] < 1.2 * stiff
+    # creep of a standard linear solid: retardation time (1 + r) T
+    expected = bent(rod) * (1.0 - 0.5 * np.exp(-np.array([2.0, 10.0, 40.0]) / 10.0))
+    np.testing.assert_allclose(x[[100, 500, 2000]], expected, rtol=0.01)
+
+
+def test_both_ways_to_state_the_law_agree():
+    from knode_cosserat.rods.system import History
+
+    rod = ViscoelasticRod(**BODY, branch_stiffness=0.7, relaxation_time=0.3, shear_damping=0.2)
+    rng = np.random.default_rng(0)
+    y = np.asarray(rod.rest(0.05)[0]) + 0.01 * rng.normal(size=19)
+    history = History(100.0, rng.normal(size=19), rng.normal(size=12), np.zeros(19))
+    z = rod.strains(0.05, 0.0, y, np.zeros(1), history)
+    C, D, f2 = rod.constitutive(0.05, 0.0, y, np.zeros(19), np.zeros(1))
+    np.testing.assert_allclose(C @ z + D @ (history.c0 * z + history.z), f2, atol=1e-8 * np.abs(f2).max())
