@@ -6,6 +6,7 @@ import dataclasses
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 
@@ -71,6 +72,16 @@ class Layout:
         """Positions in the packed vector of the numbers of the named fields."""
         every = np.arange(self.size)
         return np.concatenate([every[self.slice(name)] for name in names])
+
+    def replaced(self, packed: Any, names: tuple[str, ...], values: Any) -> Any:
+        """Return a packed vector with other values of the named fields, given one after the other."""
+        given, at = {}, 0
+        for name in names:
+            where = self.slice(name)
+            given[name] = values[at : at + where.stop - where.start]
+            at += where.stop - where.start
+        # as a concatenation: XLA fuses it with what follows, unlike a scatter
+        return jnp.concatenate([given.get(each.name, self.get(packed, each.name)) for each in self.fields])
 
     def beyond(self, packed: Any) -> str:
         """What of some controls (…, size) is outside its field's limits, in words; empty if nothing is."""

@@ -274,7 +274,7 @@ class Rod(ElasticRod):
         """y at s = 0: held as its end has it, and moving as that moves."""
         held = self.base_end.pose(AT_ORIGIN, self._controls(control).base)
         y = jnp.concatenate([held.p, held.h, np.zeros(self.y_layout.size - 7)])
-        y = y.at[self.y_layout.indices(self.base_unknowns)].set(unknowns)
+        y = self.y_layout.replaced(y, self.base_unknowns, unknowns)
         if type(self.base_end) is Clamped:
             return y
         y_t = history.c0 * y + history.y

@@ -209,7 +209,7 @@ class System(Parametrised):
         `history` is that of the first node: a base that moves has its velocity from it.
         """
         fixed, _ = self.rest(jnp.zeros(()))
-        return jnp.asarray(fixed).at[self.y_layout.indices(self.base_unknowns)].set(unknowns)
+        return self.y_layout.replaced(jnp.asarray(fixed), self.base_unknowns, unknowns)
 
     def unknowns(self, y: Float[Any, " y"]) -> Float[Any, " k"]:
         """The unknowns in a given y at s = 0: the inverse of `base`."""

@@ -32,6 +32,8 @@ class InTwo(NamedTuple):
 
     first: Callable[[Any], list[Any]]
     then: Callable[[list[Any], Any, Any], Any]
+    #: the equations of `function`: of a place and the arrays of a state
+    traced: ClosedJaxpr
 
 
 def in_two(function: Callable[[Any, Any], Any], place: Any, state: Any) -> InTwo:
@@ -82,7 +84,7 @@ def in_two(function: Callable[[Any, Any], Any], place: Any, state: Any) -> InTwo
         found = evaluated(_On.STATE, inputs, jaxpr.outvars)
         return jax.tree.unflatten(jax.tree.structure(shape), found)
 
-    return InTwo(first, then)
+    return InTwo(first, then, closed)
 
 
 def _variables(*groups: Iterable[Any]) -> list[Var]:

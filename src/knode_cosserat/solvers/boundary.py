@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from knode_cosserat.rods.system import System
+from knode_cosserat.rods.system import Scales, System
 from knode_cosserat.solvers.linear import Factors, factored, solved
 from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.space import SpaceScheme
@@ -41,7 +41,7 @@ class NewtonOptions:
     acceptable: float = 1e-8
     max_linearisations: int = 12
     #: linearise again when the old linearisation is expected to need more corrections than this
-    patience: int = 8
+    patience: int = 6
     least_damping: float = 1e-3
 
     def __post_init__(self) -> None:
@@ -55,16 +55,6 @@ class NewtonOptions:
             given = getattr(self, name)
             if not isinstance(given, int | float) or not holds(given):
                 raise ValueError(f"NewtonOptions: {name} is {given!r}; allowed is {allowed}")
-
-
-class Iterate(NamedTuple):
-    """A point of the iteration and its residuals; `error` is the largest (natural units; inf for NaN)."""
-
-    y: Float[Any, "points y"]
-    unknowns: Float[Any, " k"]
-    defects: Float[Any, "pieces y"]
-    tip: Float[Any, " k"]
-    error: Float[Any, ""]
 
 
 class Solution(NamedTuple):
@@ -100,15 +90,13 @@ def none_kept(problem: StepProblem, y: Any, unknowns: Any) -> Kept:
     return Kept(jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), like), jnp.array(False))
 
 
-def _iterate(problem: StepProblem, y: Any, unknowns: Any) -> Iterate:
-    y = jnp.concatenate([problem.base(unknowns)[None], y[1:]])
-    defects, tip = problem.residuals(y)
-    return Iterate(y, unknowns, defects, tip, largest_residual(problem, defects, tip))
-
-
 def largest_residual(problem: StepProblem, defects: Any, tip: Any) -> Any:
     """Return the largest residual in natural units, infinite for a NaN."""
-    scales = problem.system.scales()
+    return largest_of(problem.system.scales(), defects, tip)
+
+
+def largest_of(scales: Scales, defects: Any, tip: Any) -> Any:
+    """Return the largest residual in these units, infinite for a NaN."""
     error = jnp.maximum(jnp.max(jnp.abs(defects) / scales.y), jnp.max(jnp.abs(tip) / scales.tip))
     return jnp.where(jnp.isnan(error), jnp.inf, error)
 
@@ -123,31 +111,46 @@ def static_error(system: System, space: SpaceScheme, record: Any, control: Any, 
     return jnp.maximum(error, jnp.max(jnp.abs(base) / system.scales().y))
 
 
-class _Search(NamedTuple):
-    """State of the iteration."""
+class _Progress(NamedTuple):
+    """Where the iteration stands; all are numbers, for they are kept in one vector."""
 
-    #: the next point
-    y: Float[Any, "points y"]
-    unknowns: Float[Any, " k"]
-    #: the last accepted point, and the correction from it
-    before: Iterate
-    dy: Float[Any, "points y"]
-    dxi: Float[Any, " k"]
-    #: its length, infinite if there is none by the same linearisation
-    size: Float[Any, ""]
-    damping: Float[Any, ""]
-    #: a new linearisation is needed at the next point
+    #: residual of the last accepted point
+    error: Any
+    #: length of the correction from it, infinite if there is none by the same linearisation
+    size: Any
+    #: part of the correction in which it is tried
+    damping: Any
+    #: a new linearisation is needed at the point
     renew: Any
-    #: the next correction is the first of its linearisation, at its point
+    #: no correction has been made by this linearisation
     first: Any
-    #: the last correction was made at the point of its linearisation
+    #: the direction is the first of its linearisation
     fresh: Any
     #: the linearisation is from an earlier step
     old: Any
     #: solved, or no further progress
     done: Any
-    corrections: Int[Any, ""]
-    linearisations: Int[Any, ""]
+    corrections: Any
+    linearisations: Any
+
+
+class _Search(NamedTuple):
+    """State of the iteration: few and long vectors, since every array costs the start of a kernel or two."""
+
+    #: the last accepted point, y and unknowns, and the correction from it
+    point: Float[Any, " n"]
+    direction: Float[Any, " n"]
+    #: `_Progress`
+    numbers: Float[Any, "10"]
+
+    @property
+    def progress(self) -> _Progress:
+        """The numbers by name."""
+        return _Progress(*(self.numbers[k] for k in range(len(_Progress._fields))))
+
+
+def _packed(progress: _Progress) -> Float[Any, "10"]:
+    return jnp.stack([jnp.asarray(each, dtype=float) for each in progress])
 
 
 def newton(
@@ -159,73 +162,93 @@ def newton(
     `batch` is the name of the axis of robots that are solved in lockstep: they are linearised together, if
     one of them needs it. Never fails: the `error` of the solution says whether it is one.
     """
-    y_scale, pivots = problem.system.scales().y, pivots_of(problem.system)
+    scales, pivots, shape = problem.system.scales(), pivots_of(problem.system), y.shape
     kept = none_kept(problem, y, unknowns) if kept is None else kept
 
+    def unpacked(point: Any) -> tuple[Any, Any]:
+        y, unknowns = point[:y_size].reshape(shape), point[y_size:]
+        return jnp.concatenate([problem.base(unknowns)[None], y[1:]]), unknowns
+
+    y_size = y.size
+
     def correct(factors: Factors, search: _Search) -> _Search:
-        first, damping = search.first, search.damping
-        at = _iterate(problem, search.y, search.unknowns)
-        dy, dxi = solved(factors, pivots, at.defects, at.tip)
-        size = jnp.max(jnp.abs(dy) / y_scale)
-        good = at.error <= options.tolerance
-        shorter = (size <= (1.0 - damping / 4.0) * search.size) & jnp.isfinite(size)
+        last = search.progress
+        first, fresh, old = last.first > 0.0, last.fresh > 0.0, last.old > 0.0
+        trial = search.point + last.damping * search.direction
+        y, _ = unpacked(trial)
+        defects, tip = problem.residuals(y)
+        error = largest_of(scales, defects, tip)
+        dy, dxi = solved(factors, pivots, defects, tip)
+        size = jnp.max(jnp.abs(dy) / scales.y)
+        good = error <= options.tolerance
+        shorter = (size <= (1.0 - last.damping / 4.0) * last.size) & jnp.isfinite(size)
         accept = good | shorter
         # corrections still to come at this rate
-        rate = jnp.log(jnp.maximum(search.size / size, 1.0 + 1e-6))
-        slow = jnp.log(at.error / options.tolerance) / rate > options.patience
-        slow = shorter & ~first & jnp.isfinite(search.size) & (slow | (damping < 1.0))
-        shorten = ~accept & search.fresh & ~first & (damping > options.least_damping)
-        rounding = ~accept & (search.before.error <= options.acceptable) & ~search.old & ~first
-        dead = rounding | (~accept & (first | search.fresh) & ~shorten)
-        # the next point: on from here, again from the one before but shorter, or a new linearisation there
-        origin = _where(accept, at, search.before)
-        direction = _where(accept, (dy, dxi), (search.dy, search.dxi))
-        damping = jnp.where(accept, jnp.where(first, 1.0, jnp.minimum(1.0, 4.0 * damping)), damping / 4.0)
+        rate = jnp.log(jnp.maximum(last.size / size, 1.0 + 1e-6))
+        slow = jnp.log(error / options.tolerance) / rate > options.patience
+        slow = shorter & ~first & jnp.isfinite(last.size) & (slow | (last.damping < 1.0))
+        shorten = ~accept & fresh & ~first & (last.damping > options.least_damping)
+        rounding = ~accept & (last.error <= options.acceptable) & ~old & ~first
+        dead = rounding | (~accept & (first | fresh) & ~shorten)
+        # on from here, again from the point before but shorter, or a new linearisation there
         renew = ~good & ~dead & (slow | (~accept & ~shorten))
-        step = jnp.where(good | dead | renew, 0.0, damping)
-        return _Search(
-            y=origin.y + step * direction[0], unknowns=origin.unknowns + step * direction[1],
-            before=origin, dy=direction[0], dxi=direction[1], size=jnp.where(accept, size, search.size),
-            damping=jnp.where(renew, 1.0, damping), renew=renew, first=jnp.array(False),
-            fresh=jnp.where(accept, first, search.fresh), old=search.old, done=good | dead,
-            corrections=search.corrections + (step > 0.0), linearisations=search.linearisations,
+        longer = jnp.where(first, 1.0, jnp.minimum(1.0, 4.0 * last.damping))
+        progress = _Progress(
+            error=jnp.where(accept, error, last.error), size=jnp.where(accept, size, last.size),
+            damping=jnp.where(accept, longer, last.damping / 4.0), renew=renew, first=False,
+            fresh=jnp.where(accept, first, fresh), old=old, done=good | dead,
+            corrections=last.corrections + ~(good | dead | renew), linearisations=last.linearisations,
         )  # fmt: skip
+        return _Search(
+            jnp.where(accept, trial, search.point),
+            jnp.where(accept, jnp.concatenate([dy.reshape(-1), dxi]), search.direction),
+            _packed(progress),
+        )
 
     def linearised(state: tuple[_Search, Factors]) -> tuple[_Search, Factors]:
         search, factors = state
-        renew = search.renew
+        last = search.progress
+        renew = last.renew > 0.0
 
-        def anew(at: tuple[Any, Any], old: Factors) -> Factors:
-            y, unknowns = at
-            y = jnp.concatenate([problem.base(unknowns)[None], y[1:]])
-            found = factors_of(problem, y, unknowns)
-            return found if batch is None else _where(renew, found, old)
+        def anew(state: tuple[Any, Factors]) -> tuple[Any, Factors]:
+            found = factors_of(problem, *unpacked(search.point))
+            return jnp.array(False), found if batch is None else _where(renew, found, state[1])
 
         # by the need of any robot, which is one number: by each one's, a batch would always do both
         needed = renew if batch is None else jax.lax.psum(renew.astype(int), batch) > 0
-        at = search.y, search.unknowns
-        factors = jax.lax.cond(needed, anew, lambda _, old: old, at, factors)
-        search = search._replace(
-            size=jnp.where(renew, jnp.inf, search.size), old=search.old & ~renew, first=renew,
-            renew=jnp.array(False), linearisations=search.linearisations + renew,
+        # a loop of one turn at most: `cond` would copy the factors that are kept
+        _, factors = jax.lax.while_loop(lambda state: state[0], anew, (needed, factors))
+        progress = last._replace(
+            damping=jnp.where(renew, 1.0, last.damping), size=jnp.where(renew, jnp.inf, last.size),
+            old=(last.old > 0.0) & ~renew, first=renew, renew=False,
+            linearisations=last.linearisations + renew,
         )  # fmt: skip
-        going = functools.partial(jax.lax.while_loop, lambda s: unsolved(s) & ~s.renew)
-        return going(functools.partial(correct, factors), search), factors
+        search = _Search(search.point, jnp.where(renew, 0.0, search.direction), _packed(progress))
+
+        def going(search: _Search) -> Any:
+            return unsolved(search) & ~(search.progress.renew > 0.0)
+
+        return jax.lax.while_loop(going, functools.partial(correct, factors), search), factors
 
     def unsolved(search: _Search) -> Any:
-        return ~search.done & (search.linearisations + search.renew <= options.max_linearisations)
+        now = search.progress
+        return ~(now.done > 0.0) & (now.linearisations + now.renew <= options.max_linearisations)
 
-    zero, no = jnp.array(0), jnp.array(False)
-    nowhere = Iterate(y, unknowns, jnp.zeros_like(y[1:]), jnp.zeros_like(unknowns), jnp.array(jnp.inf))
-    first = _Search(
-        y=y, unknowns=unknowns, before=nowhere, dy=jnp.zeros_like(y), dxi=jnp.zeros_like(unknowns),
-        size=jnp.array(jnp.inf), damping=jnp.array(1.0), renew=~kept.usable, first=no, fresh=no,
-        old=kept.usable, done=no, corrections=zero, linearisations=zero,
+    guess = jnp.concatenate([y.reshape(-1), unknowns])
+    begun = _Progress(
+        error=jnp.inf, size=jnp.inf, damping=1.0, renew=~kept.usable, first=False, fresh=False,
+        old=kept.usable, done=False, corrections=0, linearisations=0,
     )  # fmt: skip
-    search, factors = jax.lax.while_loop(lambda state: unsolved(state[0]), linearised, (first, kept.factors))
-    at = search.before
-    solution = Solution(at.y, at.unknowns, at.error, search.corrections, search.linearisations)
-    return solution, Kept(factors, (at.error <= options.acceptable) & ~search.renew)
+    search, factors = jax.lax.while_loop(
+        lambda state: unsolved(state[0]),
+        linearised,
+        (_Search(guess, jnp.zeros_like(guess), _packed(begun)), kept.factors),
+    )
+    end = search.progress
+    solution = Solution(
+        *unpacked(search.point), end.error, end.corrections.astype(int), end.linearisations.astype(int)
+    )
+    return solution, Kept(factors, (end.error <= options.acceptable) & ~(end.renew > 0.0))
 
 
 def _where(condition: Any, one: Any, other: Any) -> Any:

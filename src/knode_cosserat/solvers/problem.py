@@ -20,8 +20,9 @@ from knode_cosserat.rods.system import (
     unpacked_history,
 )
 from knode_cosserat.solvers.ahead import in_two
+from knode_cosserat.solvers.entering import entering
 from knode_cosserat.solvers.grid import Grid, grid_of, inside, taken
-from knode_cosserat.solvers.linear import Linearisation, Slopes, inverted, product
+from knode_cosserat.solvers.linear import Linearisation, filled_up, product, quotient
 from knode_cosserat.solvers.space import Formula, SpaceScheme
 
 #: corrections by which y at discontinuities between nodes is found from the nodes, for each on a segment
@@ -35,6 +36,8 @@ class Hoisted(NamedTuple):
     then: Callable[[Any, Any, Any], Any]
     #: at all places of all strands
     terms: Any
+    #: indices of a strand's y that enter its equations
+    entering: tuple[int, ...]
 
 
 def no_history(system: System, space: SpaceScheme) -> Float[Any, "places x"]:
@@ -90,7 +93,16 @@ class StepProblem(eqx.Module):
 
         record = self._history_by_strand(self.history[:1])[0]
         parts = in_two(at_point, places[0], (jnp.zeros(strand.y_layout.size), record))
-        return dataclasses.replace(self, hoisted=Hoisted(parts.then, jax.vmap(parts.first)(places)))
+        hoisted = Hoisted(
+            parts.then, jax.vmap(parts.first)(places), tuple(entering(parts.traced, 1).tolist())
+        )
+        return dataclasses.replace(self, hoisted=hoisted)
+
+    @property
+    def entering(self) -> np.ndarray:
+        """Indices of a strand's y that enter its equations (of a rod usually not p); all, if not `ready`."""
+        every = np.arange(self.system.strand.y_layout.size)
+        return every if self.hoisted is None else np.array(self.hoisted.entering, dtype=int)
 
     def with_history(self, history: Float[Any, "places x"]) -> StepProblem:
         """Return the same problem with another history."""
@@ -161,20 +173,18 @@ class StepProblem(eqx.Module):
         f, z = self._side_by_side(self._at_point, lanes, y)
         return self._joined(f), self._joined(z)
 
-    def _linearised(self, lanes: slice, y: Float[Any, "n y"]) -> tuple[Any, Slopes]:
-        """Return the rates at these places, and the slopes of rates and strains, places last."""
-        ny, nx = self.system.strand.y_layout.size, self._history_by_strand(self.history[:1]).shape[-1]
-        directions = jnp.eye(ny + nx)
+    def _linearised(self, lanes: slice, y: Float[Any, "n y"]) -> tuple[Any, Float[Any, "b used n_strands"]]:
+        """Return the rates at these places, and their slopes by the y that enter, places last."""
+        directions = jnp.eye(self.system.strand.y_layout.size)[:, self.entering]
 
         def at_point(s: Any, y: Any, history: Any, terms: Any) -> Any:
             def along(direction: Any) -> Any:
-                moved = direction[:ny], direction[ny:]
-                return jax.jvp(lambda y, past: self._at_point(s, y, past, terms), (y, history), moved)
+                return jax.jvp(lambda y: self._at_point(s, y, history, terms)[0], (y,), (direction,))
 
             return jax.vmap(along, in_axes=-1, out_axes=(None, -1))(directions)
 
-        (f, _), slopes = self._side_by_side(at_point, lanes, y)
-        return self._joined(f), Slopes(*slopes)
+        f, slopes = self._side_by_side(at_point, lanes, y)
+        return self._joined(f), slopes
 
     def _side_by_side(self, function: Any, lanes: slice, y: Any) -> Any:
         """Apply a function of (s, y, history, hoisted terms) at places, which are last in what it returns."""
@@ -259,22 +269,20 @@ class StepProblem(eqx.Module):
 
     def linearise(self, y: Float[Any, "points y"], unknowns: Any) -> Linearisation:
         """Return the exact derivatives of the residuals, all pieces side by side."""
-        grid, formula = self.grid, self.space.formula
+        grid, formula, used = self.grid, self.space.formula, self.entering
         lanes, ends = self._ends(y, every=False)
         f, slopes = self._linearised(lanes, ends)
-        rates, found = [*self._at_ends(f)], [self._padded(slopes)]
-        ny = slopes.f.shape[0]
-        h, eye = self._each_strand(self.lengths()[:, 0]), jnp.eye(ny)[:, :, None]
-        start, end = self._slopes_at_ends(slopes.f[:, :ny])
+        rates = [*self._at_ends(f)]
+        h, eye = self._each_strand(self.lengths()[:, 0]), jnp.eye(slopes.shape[0])[:, used, None]
+        start, end = self._slopes_at_ends(slopes)
         by_start, by_end = [start, 0.0], [0.0, end]
         for k, stage in enumerate(formula.stages):
             between = self._between(stage, ends[: grid.tip], y[1:], rates)
             f, slopes = self._linearised(grid.stage(k), between)
             rates.append(f)
-            found.append(slopes)
             for ways, part in ((by_start, 1.0 - stage.end), (by_end, stage.end)):
                 moved = sum(x * way for x, way in zip(stage.rates, ways, strict=False))
-                ways.append(product(slopes.f[:, :ny], part * eye + h * moved))
+                ways.append(product(slopes, taken(part * eye + h * moved, used)))
         A, B = (
             eye + sign * h * sum(b * way for b, way in zip(formula.weights, ways, strict=True))
             for sign, ways in ((1.0, by_start), (-1.0, by_end))
@@ -283,28 +291,19 @@ class StepProblem(eqx.Module):
         if self.space.implicit:
             # XLA would evaluate both again for each use of them
             A, B = jax.lax.optimization_barrier((A, B))
-            G = inverted(B)
-            A = product(G, A)
-        F = self._jumped(self._blocks(A), y)
+            A, G = quotient(A, B, used)
+        F = self._jumped(self._blocks(filled_up(A, used)), y)
         M, S = jax.jacfwd(self.tip_residual)(y[-1]), jax.jacfwd(self.base)(unknowns)
-        kept = Slopes(
-            *(jnp.moveaxis(jnp.concatenate(parts, axis=-1), -1, 0) for parts in zip(*found, strict=True))
-        )
-        return Linearisation(F, None if G is None else self._blocks(G), S, M, kept)
+        return Linearisation(F, None if G is None else self._blocks(filled_up(G, used)), S, M)
 
-    def _padded(self, slopes: Slopes) -> Slopes:
-        """Slopes at all ends of pieces: the tip, and near sides, do not enter an explicit scheme."""
-        missing = self.grid.ends * self.system.strands - slopes.f.shape[-1]
-        return Slopes(*(jnp.pad(each, ((0, 0), (0, 0), (0, missing)), mode="edge") for each in slopes))
-
-    def _slopes_at_ends(self, J: Float[Any, "b b n_strands"]) -> tuple[Any, Any]:
+    def _slopes_at_ends(self, J: Float[Any, "b used n_strands"]) -> tuple[Any, Any]:
         """Slopes of rates at the starts and the ends of pieces."""
         grid, strands = self.grid, self.system.strands
         start = J[..., : grid.tip * strands]
         if not self.space.implicit:
             return start, 0.0
-        of_places = J.T.reshape(-1, strands, *J.shape[:2])
-        return start, taken(of_places, grid.end_of).reshape(-1, *J.shape[:2]).T
+        of_places = J.T.reshape(-1, strands, *J.shape[1::-1])
+        return start, taken(of_places, grid.end_of).reshape(-1, *J.shape[1::-1]).T
 
     def _jumped(self, F: Any, y: Any) -> Any:
         """F by y on the near side of what jumps at the starts of pieces."""
@@ -313,53 +312,6 @@ class StepProblem(eqx.Module):
         jump = jax.vmap(jax.jacfwd(self.crossed, 1))
         D = jump(jnp.asarray(self.grid.acting), y[:-1], self.history[: self.grid.tip])
         return jnp.sum(F[..., :, :, None] * D[..., None, :, :], axis=-2)
-
-    # errors
-
-    def moved_by(
-        self, slopes: Slopes, y: Float[Any, "points y"], unknowns: Any, d_history: Float[Any, "used x"]
-    ) -> tuple[Any, Any, Any]:
-        """Return the changes of defects, tip residuals and y at the base with the history, linearised."""
-        used = d_history.shape[0]
-
-        def ends(first: Any) -> Any:
-            own = self.with_history(jnp.concatenate([first, self.history[used:]]))
-            far = own._far(y) if self.system.jumps else None
-            return far, own.tip_residual(y[-1]), own.base(unknowns)
-
-        d_far, d_tip, d_base = jax.jvp(ends, (self.history[:used],), (d_history,))[1]
-        start = jnp.zeros((self.grid.tip, y.shape[1])) if d_far is None else d_far
-        moved = jnp.concatenate([start, jnp.zeros((self.grid.ends - self.grid.tip, y.shape[1]))])
-        at_ends = slice(0, self.grid.ends)
-        rates = [*self._at_ends(self._along(slopes.f, at_ends, moved, d_history[at_ends]))]
-        for k, stage in enumerate(self.space.formula.stages):
-            lanes = self.grid.stage(k)
-            moved = self._between(stage, start, jnp.zeros(()), rates)
-            rates.append(self._along(slopes.f, lanes, moved, d_history[lanes]))
-        weighed = sum(b * f for b, f in zip(self.space.formula.weights, rates, strict=True) if b)
-        return start + self.lengths() * weighed, d_tip, d_base
-
-    def error_records(
-        self, slopes: Slopes, e: Float[Any, "points y"], d_history: Float[Any, "used x"]
-    ) -> Float[Any, "used x"]:
-        """Return the errors of y, z and y_s at the places of the scheme, from those of y at the points."""
-        stages = self.space.formula.stages
-        between = [(1.0 - each.end) * e[:-1] + each.end * e[1:] for each in stages]
-        dy = jnp.concatenate([e, e[self.grid.near], *between])
-        parts = [dy, self._along(slopes.z, slice(None), dy, d_history)]
-        if self.system.mixed:
-            along = (e[1:] - e[:-1]) / self.lengths()
-            parts.append(
-                jnp.concatenate([along, along[-1:], along[self.grid.near - 1], *[along] * len(stages)])
-            )
-        return jnp.concatenate(parts, axis=-1)
-
-    def _along(self, slopes: Any, lanes: slice, dy: Any, d_history: Any) -> Float[Any, "n x"]:
-        """Apply slopes at places to changes of y and history there."""
-        strands = self.system.strands
-        own = slopes.reshape(-1, strands, *slopes.shape[1:])[lanes].reshape(-1, *slopes.shape[1:])
-        change = jnp.concatenate([self._by_strand(dy), self._history_by_strand(d_history)], axis=-1)
-        return jnp.sum(own * change[:, None, :], axis=-1).reshape(dy.shape[0], -1)
 
     def _blocks(self, matrices: Any) -> Any:
         """Matrices (b, b, pieces and strands) as (pieces, b, b), or (pieces, strands, b, b)."""

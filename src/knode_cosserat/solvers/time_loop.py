@@ -13,7 +13,7 @@ from knode_cosserat.rods.system import System, in_strands
 from knode_cosserat.solvers.boundary import Kept, largest_residual, newton, none_kept, pivots_of
 from knode_cosserat.solvers.history import EXTRAPOLATIONS, Past, advanced, history_of
 from knode_cosserat.solvers.linear import Factors, solved
-from knode_cosserat.solvers.problem import StepProblem, row_of
+from knode_cosserat.solvers.problem import Stages, StepProblem, row_of
 from knode_cosserat.solvers.settings import Settings
 
 #: extrapolations are weighted by this power of their errors in the newest step: a lower one lets a bad one
@@ -64,18 +64,30 @@ def recorded(
     """
     system, space, y = problem.system, problem.space, solution.y
     d_history = history_of(past.error[:2], past.error[2], coefficients, settings)
-    moved = problem.moved_by(factors.slopes, y, solution.unknowns, d_history)
-    found = problem.stages(y, space.check, problem.ends(y))
-    defects = problem.reached_by(space.check, found) - y[1:]
-    e, _ = solved(factors, pivots_of(system), defects + moved[0], *moved[1:])
-    records, error = problem.packed(found), problem.error_records(factors.slopes, e, d_history)
+    used = d_history.shape[0]
+
+    def scheme(first: Any, y: Any) -> tuple[Stages, Any]:
+        own = problem.with_history(jnp.concatenate([first, problem.history[used:]]))
+        found = own.stages(y, space.formula, own.ends(y))
+        return found, (own.reached_by(space.formula, found), own.tip_residual(y[-1]))
+
+    def with_base(first: Any) -> Any:
+        own = problem.with_history(jnp.concatenate([first, problem.history[used:]]))
+        return scheme(first, y), own.base(solution.unknowns)
+
+    history = problem.history[:used]
+    ((found, (reached, tip)), _), ((_, (moved, d_tip)), d_base) = jax.jvp(with_base, (history,), (d_history,))
+    checked = problem.stages(y, space.check, found)
+    defects = problem.reached_by(space.check, checked) - y[1:]
+    e, _ = solved(factors, pivots_of(system), defects + moved, d_tip, d_base)
+    records = problem.packed(checked)
+    error = jax.jvp(lambda *at: problem.packed(scheme(*at)[0]), (history, y), (d_history, e))[1]
     if settings.time.uses_rate:
         rate, d_rate = coefficients[0] * records + problem.history, coefficients[0] * error + d_history
     else:
         rate, d_rate = past.rate, past.error[2]
     # of the state that is returned, evaluated apart from the iteration
-    left = problem.reached_by(space.formula, found) - y[1:], problem.tip_residual(y[-1])
-    residual = jnp.maximum(solution.error, largest_residual(problem, *left))
+    residual = jnp.maximum(solution.error, largest_residual(problem, reached - y[1:], tip))
     row = Rows(
         row_of(system, y, records), solution.unknowns, _finite_or_infinite(residual, records),
         solution.corrections, position_error(system, e),
