@@ -93,9 +93,9 @@ class StepProblem(eqx.Module):
 
         record = self._history_by_strand(self.history[:1])[0]
         parts = in_two(at_point, places[0], (jnp.zeros(strand.y_layout.size), record))
-        hoisted = Hoisted(
-            parts.then, jax.vmap(parts.first)(places), tuple(entering(parts.traced, 1).tolist())
-        )
+        # of equations that y does not enter, one column of zeros
+        columns = entering(parts.traced, 1).tolist() or [0]
+        hoisted = Hoisted(parts.then, jax.vmap(parts.first)(places), tuple(columns))
         return dataclasses.replace(self, hoisted=hoisted)
 
     @property

@@ -32,6 +32,8 @@ SCALE = 0.02
 DAMPING, TRIES = 1e-2, 4
 #: twists (rad) that the first stage begins with
 TWISTS = (0.0, 2.0, -2.0)
+#: part of the pieces that has to be simulated
+SIMULATED = 2 / 3
 #: relative gain at which a stage ends
 ENOUGH = 5e-3
 
@@ -118,9 +120,13 @@ def _twisted(start: CableParameters) -> list[CableParameters]:
 def _searched(
     rollouts: Rollouts, start: CableParameters, motions: Any, stage: Stage, seed: int, until: float
 ) -> CableParameters:
-    """Least squares by Levenberg-Marquardt with a robust loss."""
+    """Least squares by Levenberg-Marquardt with a robust loss.
+
+    A piece that cannot be simulated is left out, and losses are compared on the others.
+    """
     rollouts.forget()
     pieces = _pieces(motions, stage, seed)
+    least = SIMULATED * len(pieces)
     x, damping = coordinates(start), DAMPING
     chosen = np.array([NAMES.index(name) for name in stage.names])
     prior, moves = (
@@ -128,38 +134,48 @@ def _searched(
     )
     middle = x[chosen]
 
-    def at(x: Any) -> _Point:
-        both = in_threads(lambda one: rollouts.columns(x, one[1], one[0]), pieces)
+    def simulated(x: Any) -> list[Any]:
+        return in_threads(lambda one: rollouts.columns(x, one[1], one[0]), pieces)
+
+    def point(both: list[Any], x: Any) -> _Point:
         return _Point.of(both, chosen, stage.every, _weight(prior), x[chosen] - middle)
 
-    # a piece that cannot be simulated from the start is left out
-    first = in_threads(lambda one: rollouts.columns(x, one[1], one[0]), pieces)
-    pieces = [
-        piece for piece, each in zip(pieces, first, strict=True) if all(np.isfinite(v).all() for v in each)
-    ]
+    here = simulated(x)
+    pieces, here = _kept(_finite(here), pieces, here)
     if not pieces:
         raise ValueError("no piece of a motion can be simulated")
-    solved = [each for each in first if all(np.isfinite(v).all() for v in each)]
-    now = _Point.of(solved, chosen, stage.every, _weight(prior), np.zeros(len(chosen)))
     for _ in range(stage.corrections):
+        now = point(here, x)
         for _ in range(TRIES):
             matrix = now.square + damping * np.diag(np.diag(now.square))
             moved = x.copy()
             moved[chosen] += np.clip(-np.linalg.solve(matrix, now.gradient), -moves, moves)
-            after = at(moved)
-            if after.loss < now.loss:
+            there = simulated(moved)
+            solved = _finite(there)
+            before, after = (point(_kept(solved, each)[0], at) for each, at in ((here, x), (there, moved)))
+            if sum(solved) >= least and after.loss < before.loss:
                 break
             damping *= 6.0
             if time.process_time() > until:
                 return parameters_of(x)
         else:
             break
-        gain, x, damping = now.loss - after.loss, moved, max(damping / 5.0, 1e-4)
-        _LOG.info("%d frames: loss %.4f to %.4f", stage.frames, now.loss, after.loss)
-        if gain < ENOUGH * now.loss or time.process_time() > until:
+        gain, x, damping = before.loss - after.loss, moved, max(damping / 5.0, 1e-4)
+        pieces, here = _kept(solved, pieces, there)
+        _LOG.info("%d frames: loss %.4f to %.4f", stage.frames, before.loss, after.loss)
+        if gain < ENOUGH * before.loss or time.process_time() > until:
             break
-        now = after
     return parameters_of(x)
+
+
+def _finite(both: Sequence[Any]) -> list[bool]:
+    """True for each piece that was simulated."""
+    return [all(np.isfinite(part).all() for part in each) for each in both]
+
+
+def _kept(which: Sequence[bool], *lists: Sequence[Any]) -> list[list[Any]]:
+    """Return the items of lists for which `which` is true."""
+    return [[each for each, keep in zip(items, which, strict=True) if keep] for items in lists]
 
 
 class _Point(NamedTuple):
@@ -172,7 +188,7 @@ class _Point(NamedTuple):
     @classmethod
     def of(cls, both: Any, chosen: Any, every: int, weight: Any, off: Any) -> _Point:
         """Return these from differences and derivatives of pieces, with a prior about the start."""
-        if not all(np.isfinite(part).all() for each in both for part in each):
+        if not both:
             return cls(np.inf, np.zeros(len(chosen)), np.zeros((len(chosen), len(chosen))))
         values = np.concatenate([each[0][::every].ravel() for each in both])
         slopes = np.concatenate([each[1][chosen, ::every].reshape(len(chosen), -1) for each in both], axis=1)

@@ -62,6 +62,12 @@ def as_markdown(results: Sequence[CableResult]) -> str:
             for name, *errors in zip(names, *columns, strict=True)
         ]
         parts += [f"## {result.data.name}", markdown_table(["motion", *METHODS], each)]
+        estimates = [cell["position_error"] for cell in result.cells if "position_error" in cell]
+        if estimates:
+            parts.append(
+                "Discretisation error of positions by the solver's estimate, mean over a motion's frames: "
+                f"{1e3 * np.median(estimates):.1f} mm in the median, at most {1e3 * max(estimates):.1f} mm."
+            )
         failed = {cell["failed"] for cell in result.cells if "failed" in cell}
         parts += [f"Failed: {reason}." for reason in sorted(failed)]
         parts += ["Identified:", _parameters(result), "; ".join(result.notes) + "."]

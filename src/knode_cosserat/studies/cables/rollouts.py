@@ -109,13 +109,10 @@ class Rollouts:
         try:
             prepared, _ = self.model.prepared(p, markers)
             robot = self.model.robot(p, prepared.base, prepared.tip)
-            with warnings.catch_warnings():
-                # the error estimate is large for a few frames after fast jerks, and the report tells of it
-                warnings.filterwarnings("ignore", message="the grid is too coarse")
-                found = simulate(
-                    robot, prepared.controls, DT, initial=self.model.initial(robot, prepared),
-                    space=self.space, recovery_budget=RECOVERY, on_failure="return",
-                )  # fmt: skip
+            found = simulate(
+                robot, prepared.controls, DT, initial=self.model.initial(robot, prepared), space=self.space,
+                recovery_budget=RECOVERY, on_failure="return",
+            )  # fmt: skip
         except (ValueError, RuntimeError, ArithmeticError) as error:
             return Prediction(None, None, " ".join(str(error).split()))
         result = np.asarray(found.result)
@@ -129,7 +126,10 @@ class Rollouts:
 
     def predict_all(self, p: CableParameters, motions: Sequence[Any]) -> list[Prediction]:
         """Return the predictions of many motions, one thread a core."""
-        return in_threads(lambda markers: self.predict(p, markers), motions)
+        with warnings.catch_warnings():
+            # grids are too coarse for a few frames after jerks: the report gives the estimated errors
+            warnings.filterwarnings("ignore", message="the grid is too coarse")
+            return in_threads(lambda markers: self.predict(p, markers), motions)
 
     def columns(self, x: Float[np.ndarray, " n"], markers: Any, key: Any) -> tuple[Any, Any]:
         """Return predicted less measured markers (T, M, 3), and derivatives (n, T, M, 3) by all unknowns.

@@ -147,6 +147,7 @@ def _evaluated(
                 cell |= {"mean_abs_error": None, "failed": found.failure}
             else:
                 cell["mean_abs_error"] = mean_abs_error(found.markers, motion.markers)
+                cell["position_error"] = float(np.mean(found.trajectory.position_error))
                 predictions[method][motion.name] = found.markers
             cells.append(cell)
     return cells, predictions
