@@ -132,7 +132,7 @@ def first_call() -> dict[str, Any]:
     tensions = kc.controls.sine(1.5, STEPS, DT)
     call = seconds(lambda: kc.simulate(robot, tensions, DT))
     ribs = kc.load_robot("delrin-routed-tendon-robot")
-    family = seconds(lambda: kc.simulate(ribs, tensions, DT, space="lobatto4"))
+    family = seconds(lambda: kc.simulate(ribs, tensions, DT))
     return {"import": imported, "first_call": call, "ribs": family}
 
 

@@ -100,7 +100,7 @@ def table(found: dict[str, Any]) -> str:
         ),
         ("first call (nothing compiled yet)", f"{found['first_call']['first_call']:.1f} s", "<= 6 s"),
         (
-            "the same of the robot with ribs and real tendons, RK4",
+            "the same of the robot with ribs and real tendons",
             f"{found['first_call']['ribs']:.1f} s",
             "<= 6 s",
         ),

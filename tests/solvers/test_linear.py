@@ -166,7 +166,7 @@ def condensed(equations):
 
 @pytest.mark.parametrize(("growth", "first"), [(10.0, 1e-7), (1e2, 1e-4), (3e2, 1e-1)])
 def test_growth_along_the_rod_does_no_harm(growth, first):
-    """Rounding errors at the base grow by up to 1e90 to the tip; the problem is as well posed as ever.
+    """Rounding errors at the base grow by up to 1e74 to the tip; the problem is as well posed as ever.
 
     Within a group of pieces α is not changed, so that the first correction is inexact by what grows there.
     The next corrections by the same factors, as Newton's method makes them, leave rounding errors only.

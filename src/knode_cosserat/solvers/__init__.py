@@ -1,1 +1,1 @@
-"""How a system is stepped in time and solved along the rod. No physics: only the general class is seen."""
+"""Steps a system in time and solves it along the rod. No physics: only the general class is seen."""

@@ -96,7 +96,7 @@ def beginning(run: Run) -> Beginning:
 
 
 def _of_past(settings: Settings) -> Settings:
-    """What of the settings matters for the past: runs that differ in other things share its programs."""
+    """Return the settings that matter for the history; runs that differ in others share its programs."""
     return Settings(settings.time, settings.space, settings.start)
 
 
@@ -232,7 +232,7 @@ def _alike(one: System, other: System) -> bool:
 
 
 class _Known(NamedTuple):
-    """What is known of a motion at one of its rows, whether its rate is, and coefficients of its steps."""
+    """Known history of a motion at one of its rows, whether its rate is known, coefficients of its steps."""
 
     begun: Begun
     row: int

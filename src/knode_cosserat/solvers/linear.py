@@ -5,7 +5,7 @@
 From base to tip every solution is carried as δy_j = X_j α_j + w_j, where α_j are the values at node j of the
 fields that are unknown at the base (of a clamped rod: force and moment, so that X is the compliance of the
 rod behind the node). After every few pieces α changes to those of the node that is reached. Waves that grow
-along the rod, by whatever factor, are thereby kept apart, and rounding errors stay small: this is the
+along the rod are thereby kept apart, and rounding errors stay small: this is the
 Riccati form of the method of particular solutions (Ascher, Mattheij & Russell 1995, ch. 4).
 
 Strands (`System.strands`) meet at the ends only: F_j has a block for each, S and M are of all of them.

@@ -6,7 +6,7 @@ import enum
 
 
 class Result(enum.IntEnum):
-    """How a step ended. Zero and above: solved to tolerance. Below zero: not solved, the state is invalid.
+    """Outcome of a step. Zero and above: solved to tolerance. Below zero: not solved, the state is invalid.
 
     COARSE is solved, too, but its estimated discretisation error is more than 2 % of the length.
     """

@@ -212,7 +212,7 @@ def _checked_controls(system: System, controls: Any, batch: int | None) -> tuple
 
 
 def check_limits(system: System, controls: Any) -> None:
-    """That controls are within their fields' limits (`ValueError`); and warn of tendons that would push."""
+    """Check that controls are within their limits (`ValueError`); warn of tendons that would push."""
     if is_traced(controls):
         return
     layout = system.control_layout
@@ -230,7 +230,7 @@ def check_limits(system: System, controls: Any) -> None:
 
 
 def check_initial(system: System, initial: Trajectory, batch: int | None) -> None:
-    """That a trajectory is one robot's, fits the system, and is solved; `ValueError` otherwise."""
+    """Check that a trajectory is one robot's, fits the system and is solved; `ValueError` otherwise."""
     if batch or initial.y.ndim == 4:
         raise ValueError("initial is for one robot, not for a batch")
     if not len(initial.time):
