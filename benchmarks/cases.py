@@ -122,6 +122,47 @@ def gradient() -> dict[str, Any]:
     return {**times, "ratio": times["gradient"] / times["forward"], "first_call": first}
 
 
+def tangents(steps: int = 20, columns: int = 32) -> dict[str, Any]:
+    """Derivatives of a motion's tip with respect to 32 numbers: four tensions in eight blocks."""
+    one_core()
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    import knode_cosserat as kc
+
+    robot, tensions = kc.load_robot("delrin-tendon-robot"), kc.controls.sine(1.5, steps, DT)
+    block = np.eye(columns // 4)[np.arange(steps) * (columns // 4) // steps]
+
+    def tip(changes: Any) -> Any:
+        moved = tensions + block @ changes.reshape(-1, 4)
+        return kc.simulate(robot, moved, DT).tip_position
+
+    slopes, none = jax.jit(jax.jacfwd(tip)), jnp.zeros(columns)
+    taken = medians({"tangents": lambda: jax.block_until_ready(slopes(none))}, rounds=25)
+    return {"columns": columns, "steps": steps, "milliseconds": 1e3 * taken["tangents"]}
+
+
+def schemes() -> dict[str, Any]:
+    """A step by the default scheme against forward Euler: with as many nodes, and to the same accuracy."""
+    one_core()
+    import numpy as np
+
+    import knode_cosserat as kc
+
+    robot, tensions = kc.load_robot("delrin-tendon-robot"), kc.controls.sine(1.5, STEPS, DT)
+    finest = kc.simulate(robot.replace(nodes=97), tensions, DT, space="lobatto4").tip_position
+    cases = {"default": (10, "lobatto2"), "euler": (10, "euler"), "fine_euler": (400, "euler")}
+
+    def run(name: str) -> kc.Trajectory:
+        nodes, space = cases[name]
+        return kc.simulate(robot.replace(nodes=nodes), tensions, DT, space=space)
+
+    times = medians({name: functools.partial(run, name) for name in cases}, rounds=9, repeats=10)
+    off = {name: float(np.linalg.norm(run(name).tip_position - finest, axis=1).max()) for name in cases}
+    return {**times, "tip_error": off, "nodes": {name: nodes for name, (nodes, _) in cases.items()}}
+
+
 def first_call() -> dict[str, Any]:
     """Import and the first simulation, in this process."""
     begin = time.perf_counter()
@@ -164,9 +205,8 @@ def workspace_full() -> dict[str, Any]:
     return workspace(100_000)
 
 
-CASES = {
-    case.__name__: case for case in (steps, batch, gradient, first_call, memory, workspace, workspace_full)
-}
+ALL = (steps, batch, gradient, tangents, schemes, first_call, memory, workspace, workspace_full)
+CASES = {case.__name__: case for case in ALL}
 
 if __name__ == "__main__":
     print(json.dumps(CASES[sys.argv[1]]()))

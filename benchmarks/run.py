@@ -15,6 +15,8 @@ from pathlib import Path
 from typing import Any
 
 ROUNDS = 3
+#: cases that are run with compiled programs
+WARM = ("steps", "batch", "gradient", "tangents", "schemes", "memory", "workspace")
 
 
 def case(name: str | None, cache: str, of: str = "cases") -> dict[str, Any]:
@@ -64,7 +66,7 @@ def measure() -> dict[str, Any]:
                 cold.append(case("first_call", empty))
         command_seconds(cache)
         second = [command_seconds(cache) for _ in range(ROUNDS)]
-        found = {name: case(name, cache) for name in ("steps", "batch", "gradient", "memory", "workspace")}
+        found = {name: case(name, cache) for name in WARM}
         found["family"] = case(None, cache, "family")
         found |= {name: case(name, cache, "learning") for name in ("fits", "learned_steps")}
     with tempfile.TemporaryDirectory() as empty:
@@ -77,6 +79,11 @@ def measure() -> dict[str, Any]:
 def table(found: dict[str, Any]) -> str:
     """The figures as Markdown, with what is aimed at."""
     steps, nodes, gradient = found["steps"], found["steps"]["nodes"], found["gradient"]
+    schemes = found["schemes"]
+    default, euler = (
+        f"{schemes['nodes'][name]} nodes ({1e3 * schemes['tip_error'][name]:.1f} mm)"
+        for name in ("default", "fine_euler")
+    )
     rows = [
         *(
             (
@@ -106,6 +113,16 @@ def table(found: dict[str, Any]) -> str:
         ),
         ("second process, command to result", f"{found['second_process']['seconds']:.1f} s", "<= 3 s"),
         ("gradient of 100 steps against the steps", f"{gradient['ratio']:.1f}x", "<= 5x"),
+        (
+            f"{found['tangents']['columns']} tangents of {found['tangents']['steps']} steps",
+            f"{found['tangents']['milliseconds']:.1f} ms",
+            "<= 3 ms",
+        ),
+        (
+            f"tip within 1 mm: default, {default}, against forward Euler, {euler}",
+            f"{schemes['fine_euler'] / schemes['default']:.0f}x",
+            ">= 3x",
+        ),
         ("peak memory, 1,000 steps", f"{found['memory']['megabytes']:.0f} MB", "<= 700 MB"),
         *family_rows(found["family"]),
         *learning_rows(found),
