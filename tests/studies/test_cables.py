@@ -207,3 +207,28 @@ def test_the_study_writes_errors_of_all_methods(tmp_path, motions):
     assert (tmp_path / "out" / "A.html").stat().st_size > 1e5
     assert (tmp_path / "out" / "figures" / "cables.png").exists()
     assert told
+
+
+class OneBreaks:
+    """Rollouts off by the logarithm of the stiffness; one piece can be simulated at the start only."""
+
+    def __init__(self, start):
+        self.start = coordinates(start)
+
+    def forget(self):
+        pass
+
+    def columns(self, x, markers, key):
+        values, slopes = np.full((6, 1, 3), 0.01 * x[0]), np.zeros((len(NAMES), 6, 1, 3))
+        slopes[0] = 0.01
+        broken = key[0] == 0 and not np.array_equal(x, self.start)
+        return values * (np.nan if broken else 1.0), slopes
+
+
+def test_a_piece_that_cannot_be_simulated_does_not_stop_the_search():
+    start = CableParameters(bending=0.5)
+    motions = [np.zeros((8, 5, 3))] * 4
+    found = identify_cable(
+        OneBreaks(start), start, motions, lambda p: abs(np.log(p.bending)), [Stage(6, 4, ("bending",), 8, 1)]
+    )
+    assert found.parameters.bending == pytest.approx(1.0, abs=1e-3) and not found.notes
