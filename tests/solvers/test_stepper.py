@@ -105,6 +105,26 @@ def test_a_row_of_a_coarse_grid_says_so(robot):
     assert row.result[0] == kc.Result.COARSE and row.all_valid
 
 
+def test_rows_that_follow_a_coarse_one_are_coarse_too(robot):
+    """The estimate decays with the motion, and does not know where the right one would have gone."""
+    robot = robot.replace(nodes=3)
+    controls = np.full((60, 4), 5.0)
+    controls[:2, [0, 3]] = 60.0
+    stepper = kc.Stepper(robot, DT)
+    rows = [stepper.step(control) for control in controls]
+    with pytest.warns(UserWarning, match="too coarse in 60 of 60 rows"):
+        whole = kc.simulate(robot, controls, DT)
+    with pytest.warns(UserWarning, match="too coarse in 10 of 10 rows"):
+        after = kc.simulate(robot, controls[:10], DT, initial=whole)
+    small = whole.position_error < 0.01 * robot.length
+    assert np.count_nonzero(small) > 20
+    for found in (whole.result[1:], after.result[1:], [row.result[0] for row in rows]):
+        assert set(map(int, found)) == {kc.Result.COARSE}
+    # an equilibrium is none of a motion's rows
+    rests = kc.equilibrium(robot, controls[-1], initial=whole)
+    assert rests.result[0] == kc.Result.CONVERGED
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

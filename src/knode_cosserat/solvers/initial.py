@@ -29,7 +29,7 @@ from knode_cosserat.solvers.history import (
 )
 from knode_cosserat.solvers.problem import no_history
 from knode_cosserat.solvers.result import Result, SimulationError
-from knode_cosserat.solvers.run import run_one
+from knode_cosserat.solvers.run import is_coarse, run_one
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.task import FirstStep, Start, Task
@@ -77,19 +77,20 @@ def beginning(run: Run) -> Beginning:
         return _going_on(system, initial, settings, dt)
     record, past = (_all_at_rest if many else _at_rest)(system, _of_past(settings))
     still = isinstance(settings.time, Static)
+    coarse: Any = False
     if system.rest_is_guess and not still:
-        record, past = _settled(run, past)
+        record, past, coarse = _settled(run, past)
     begun = None if still else _begun(past, Task(settings, dt, 1).table[0], dt)
 
     def for_each(tree: Any) -> Any:
         return jax.tree.map(lambda x: jnp.broadcast_to(x, (batch, *jnp.shape(x))), tree)
 
     if batch and not many:
-        record, past, begun = for_each((record, past, begun))
+        record, past, begun, coarse = for_each((record, past, begun, coarse))
     elif batch and begun is not None:
         begun = begun._replace(coefficients=for_each(begun.coefficients), dt=for_each(begun.dt))
     none_yet = np.zeros((*np.shape(controls)[:-2], system.control_size))
-    return Beginning(record, Start(past, none_yet), 0.0, "start", begun)
+    return Beginning(record, Start(past, none_yet, coarse), 0.0, "start", begun)
 
 
 # at rest, or in equilibrium
@@ -110,30 +111,31 @@ def _all_at_rest(system: System, settings: Settings) -> Any:
     return jax.vmap(lambda each: _at_rest(each, settings))(system)
 
 
-def _settled(run: Run, past: Any) -> tuple[Any, Any]:
-    """The equilibrium under no control, looked for from rest: its record, and the past of it alone."""
+def _settled(run: Run, past: Any) -> tuple[Any, Any, Any]:
+    """Return the equilibrium under no control, its history, and whether its grid is too coarse."""
     system, many = run.system, run.many
     task = Task(run.settings, run.dt, 1, "still")
     none = np.zeros((1, system.control_size))
     if is_traced((system, past)):
         find = sensitivity.rollout(task)
         rows = jax.vmap(find, in_axes=(0, None, 0))(system, none, past) if many else find(system, none, past)
-        found = rows.records[..., 0, :, :]
+        found, coarse = rows.records[..., 0, :, :], is_coarse(rows.position_error, system)[..., 0]
     else:
         each = range(np.shape(past.t0)[0]) if many else [...]
-        found = np.stack([_settled_one(task, _part(system, i), none, _part(past, i), i) for i in each])
-        found = found if many else found[0]
+        both = [_settled_one(task, _part(system, i), none, _part(past, i), i) for i in each]
+        found, coarse = map(np.stack, zip(*both, strict=True)) if many else both[0]
     kept = found[..., : system.y_layout.size + system.z_layout.size]
-    return kept, (_all_pasts if many else _past)(system, _of_past(run.settings), kept, none[0], 0.0)
+    history = (_all_pasts if many else _past)(system, _of_past(run.settings), kept, none[0], 0.0)
+    return kept, history, coarse
 
 
-def _settled_one(task: Task, system: System, none: Any, past: Any, i: Any) -> Any:
-    """As `_settled`, of one robot; without an equilibrium there is nothing to begin with."""
+def _settled_one(task: Task, system: System, none: Any, past: Any, i: Any) -> tuple[Any, Any]:
+    """Return the equilibrium of one robot, and whether its grid is too coarse; an error if there is none."""
     steps, cause = run_one(task, system, none, Start(past, none[0]))
     if steps.result[0] < 0:
         robot = None if i is ... else i
         raise SimulationError(0, 0.0, float(steps.error[0]), Result(int(steps.result[0])), cause, robot)
-    return np.asarray(steps.records[0])
+    return np.asarray(steps.records[0]), steps.result[0] == Result.COARSE
 
 
 def _part(tree: Any, i: Any) -> Any:
@@ -166,7 +168,7 @@ def _going_on(system: System, initial: Trajectory, settings: Settings, dt: float
     else:
         past, first = known
     begun = None if still else _begun(past, Task(settings, dt, 1, first).table[0], dt)
-    return Beginning(record, Start(past, control), t0, first, begun)
+    return Beginning(record, Start(past, control, initial.result[-1] == Result.COARSE), t0, first, begun)
 
 
 @functools.partial(jax.jit, static_argnames="space")

@@ -66,7 +66,7 @@ def run_one(
             bar.update(reached - done)
             done = reached
     assert rows is not None
-    return mark_coarse(rows, system), cause
+    return mark_coarse(rows, system, task, start), cause
 
 
 def rescue(
@@ -80,12 +80,24 @@ def rescue(
     return recover(system, settings, past, task.table[min(i, 1)], controls, t, task.dt, budget)
 
 
-def mark_coarse(steps: Steps, system: System) -> Steps:
-    """Mark solved rows whose estimated position error is a stated share of the length."""
-    numeric: Any = jnp if is_traced((steps, system)) else np
-    length = numeric.asarray(system.length)
-    length = length[..., None] if length.ndim else length
-    coarse = (steps.result >= 0) & ~(steps.position_error <= COARSE_SHARE * length)
+def is_coarse(position_error: Any, system: System) -> Any:
+    """Return whether position errors are more than a stated share of the length; true for NaN."""
+    length = system.length
+    return ~(position_error <= COARSE_SHARE * (length[..., None] if np.ndim(length) else length))
+
+
+def mark_coarse(steps: Steps, system: System, task: Task, start: Start) -> Steps:
+    """Mark solved rows for which the grid is too coarse, and in a motion all that follow such a row.
+
+    The error is carried on by linear equations: they tell how an error decays in the motion that was found,
+    and not that the right motion would have gone elsewhere.
+    """
+    numeric: Any = jnp if is_traced((steps, system, start.coarse)) else np
+    coarse = is_coarse(steps.position_error, system)
+    if not task.still:
+        before = numeric.asarray(start.coarse)[..., None]
+        coarse = (numeric.cumsum(coarse, axis=-1) > 0) | before
+    coarse &= steps.result >= 0
     return steps._replace(result=numeric.where(coarse, int(Result.COARSE), steps.result))
 
 
@@ -127,10 +139,12 @@ def run_batch(
         with concurrent.futures.ThreadPoolExecutor(workers) as pool:
             chunks = first + list(pool.map(work, firsts[len(first) :]))
     done, *rows = (np.concatenate(parts) for parts in zip(*chunks, strict=True))
-    steps = mark_coarse(Steps._make([*rows, np.zeros((*done.shape, task.steps), dtype=int)]), system)
+    results = np.zeros((*done.shape, task.steps), dtype=int)
+    steps = mark_coarse(Steps._make([*rows, results]), system, task, start)
     causes = {}
+    coarse = np.broadcast_to(start.coarse, size)
     for i in np.flatnonzero(done < task.steps):
-        own = Start(jax.tree.map(lambda leaf, i=i: leaf[i], start.past), start.control[i])
+        own = Start(jax.tree.map(lambda leaf, i=i: leaf[i], start.past), start.control[i], coarse[i])
         alone, cause = run_one(task, robot(i), controls[i], own)
         for all_robots, one in zip(steps, alone, strict=True):
             all_robots[i] = one

@@ -310,13 +310,14 @@ def _traced(system, controls, initial, settings, dt, batch, many):  # type: igno
     """
     run = Run(system, controls, initial, settings, dt, batch, many)
     begins = beginning(run)
-    one = sensitivity.rollout(Task(settings, dt, np.shape(controls)[-2], begins.first))
+    task = Task(settings, dt, np.shape(controls)[-2], begins.first)
+    one = sensitivity.rollout(task)
     if batch:
         rows = jax.vmap(one, in_axes=(0 if many else None, 0, 0))(system, controls, begins.start.past)
     else:
         rows = one(system, controls, begins.start.past)
     result = jnp.where(rows.error <= settings.newton.acceptable, 0, int(Result.NO_CONVERGENCE))
-    return _trajectory(run, begins, mark_coarse(Steps._make([*rows, result]), system))
+    return _trajectory(run, begins, mark_coarse(Steps._make([*rows, result]), system, task, begins.start))
 
 
 def _trajectory(run: Run, begins: Beginning, steps: Steps) -> Trajectory:

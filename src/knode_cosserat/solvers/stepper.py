@@ -12,7 +12,7 @@ from knode_cosserat.solvers.history import Begun
 from knode_cosserat.solvers.initial import Run, beginning
 from knode_cosserat.solvers.recovery import Budget
 from knode_cosserat.solvers.result import Result, SimulationError
-from knode_cosserat.solvers.run import COARSE_SHARE, LEAST_CAPACITY, rescue
+from knode_cosserat.solvers.run import LEAST_CAPACITY, is_coarse, rescue
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.simulate import check_initial, checked_dt
 from knode_cosserat.solvers.space import SpaceScheme
@@ -79,6 +79,7 @@ class Stepper:
         self._task = Task(settings, self.dt, 1, begins.first, recovery_budget)
         self._settings = settings
         self._past, self._t0, self._index, self._steps = begun.past, float(t0), 0, 0
+        self._coarse = bool(begun.coarse)
         self._control = np.asarray(begun.control, dtype=float)
         # as many as in a run of up to 128 steps, so that they share a program
         self._controls = np.zeros((LEAST_CAPACITY, count))
@@ -106,6 +107,7 @@ class Stepper:
         control = self._checked(control)
         solved = self._solve(control)
         self._past, self._control = solved.past, control
+        self._coarse = solved.result == Result.COARSE
         self._steps, self._index = self._steps + 1, self._index + 1
         if self._index == LEAST_CAPACITY:
             # the loop counts from an earlier row on, but not from row 0, whose coefficients may differ
@@ -161,7 +163,8 @@ class Stepper:
         if not result.solved:
             number = self._steps + 1
             raise SimulationError(number, self.time + self.dt, found.residual, result, cause)
-        coarse = not found.position_error <= COARSE_SHARE * float(self.robot.length)
+        # as `mark_coarse`
+        coarse = self._coarse or is_coarse(np.asarray(found.position_error), self.robot)
         return found._replace(result=int(Result.COARSE)) if coarse else found
 
     def _begun_after(self, solved: _Solved) -> Begun:

@@ -9,6 +9,7 @@ import numpy as np
 
 from knode_cosserat.solvers.history import Past, coefficient_table
 from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.time import Static
 
 FirstStep = Literal["start", "regular", "consistent", "still"]
 
@@ -29,6 +30,8 @@ class Start(NamedTuple):
 
     past: Past
     control: Any
+    #: true if the grid was too coarse for the state before the first step
+    coarse: Any = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,6 +46,11 @@ class Task:
     first: FirstStep = "start"
     #: seconds that recovery may take; None: 20 times the run's own time or 5 s, whichever is more
     recovery_budget: float | None = None
+
+    @property
+    def still(self) -> bool:
+        """True if every step is an equilibrium, for itself."""
+        return self.first == "still" or isinstance(self.settings.time, Static)
 
     @property
     def table(self) -> np.ndarray:
