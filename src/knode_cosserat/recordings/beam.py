@@ -51,7 +51,7 @@ class BeamRecording:
 
     @property
     def drop(self) -> Float[np.ndarray, " T"]:
-        """How far the tip is below where it was held (m), the mean of its markers."""
+        """Drop of the tip from where it was held (m), the mean of its markers."""
         return tip_drop(self.tip)
 
 

@@ -162,14 +162,12 @@ def newton(
     `batch` is the name of the axis of robots that are solved in lockstep: they are linearised together, if
     one of them needs it. Never fails: the `error` of the solution says whether it is one.
     """
-    scales, pivots, shape = problem.system.scales(), pivots_of(problem.system), y.shape
+    scales, pivots, size_of_y, shape = problem.system.scales(), pivots_of(problem.system), y.size, y.shape
     kept = none_kept(problem, y, unknowns) if kept is None else kept
 
     def unpacked(point: Any) -> tuple[Any, Any]:
-        y, unknowns = point[:y_size].reshape(shape), point[y_size:]
+        y, unknowns = point[:size_of_y].reshape(shape), point[size_of_y:]
         return jnp.concatenate([problem.base(unknowns)[None], y[1:]]), unknowns
-
-    y_size = y.size
 
     def correct(factors: Factors, search: _Search) -> _Search:
         last = search.progress

@@ -149,11 +149,6 @@ def rows_suffice(system: System, space: SpaceScheme) -> bool:
     return not (system.mixed or space.formula.stages or system.cuts)
 
 
-def newest_row(system: System, past: Past) -> Float[Any, "nodes x"]:
-    """Return the newest state of a history as a row."""
-    return row_of(system, past.y[0], past.records[0])
-
-
 # rows of a trajectory
 
 

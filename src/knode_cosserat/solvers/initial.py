@@ -294,9 +294,9 @@ _along = jax.jit(past_along, static_argnames="settings")
 
 
 def histories_along(system: System, moved: Trajectory) -> tuple[int, Float[Any, "steps places x"]] | None:
-    """What a simulation's steps looked back on at their stages, as a model of it has it, from which row on.
+    """Return the first row whose step has a known history, with the histories of it and of all later steps.
 
-    None where rows tell too little.
+    None where the rows are not enough.
     """
     made = _of_past(moved.settings)
     rows = jnp.concatenate([moved.y, moved.z], axis=-1)

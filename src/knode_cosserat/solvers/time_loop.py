@@ -66,20 +66,17 @@ def recorded(
     d_history = history_of(past.error[:2], past.error[2], coefficients, settings)
     used = d_history.shape[0]
 
-    def scheme(first: Any, y: Any) -> tuple[Stages, Any]:
-        own = problem.with_history(jnp.concatenate([first, problem.history[used:]]))
+    def scheme(used_history: Any, y: Any) -> tuple[Stages, Any, Any, Any]:
+        own = problem.with_history(jnp.concatenate([used_history, problem.history[used:]]))
         found = own.stages(y, space.formula, own.ends(y))
-        return found, (own.reached_by(space.formula, found), own.tip_residual(y[-1]))
-
-    def with_base(first: Any) -> Any:
-        own = problem.with_history(jnp.concatenate([first, problem.history[used:]]))
-        return scheme(first, y), own.base(solution.unknowns)
+        reached = own.reached_by(space.formula, found)
+        return found, reached, own.tip_residual(y[-1]), own.base(solution.unknowns)
 
     history = problem.history[:used]
-    ((found, (reached, tip)), _), ((_, (moved, d_tip)), d_base) = jax.jvp(with_base, (history,), (d_history,))
+    (found, reached, tip, _), (_, *moved) = jax.jvp(lambda h: scheme(h, y), (history,), (d_history,))
     checked = problem.stages(y, space.check, found)
     defects = problem.reached_by(space.check, checked) - y[1:]
-    e, _ = solved(factors, pivots_of(system), defects + moved, d_tip, d_base)
+    e, _ = solved(factors, pivots_of(system), defects + moved[0], *moved[1:])
     records = problem.packed(checked)
     error = jax.jvp(lambda *at: problem.packed(scheme(*at)[0]), (history, y), (d_history, e))[1]
     if settings.time.uses_rate:
