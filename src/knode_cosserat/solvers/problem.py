@@ -20,10 +20,10 @@ from knode_cosserat.rods.system import (
     unpacked_history,
 )
 from knode_cosserat.solvers.ahead import in_two
-from knode_cosserat.solvers.entering import entering
 from knode_cosserat.solvers.grid import Grid, grid_of, inside, taken
 from knode_cosserat.solvers.linear import Linearisation, filled_up, product, quotient
 from knode_cosserat.solvers.space import Formula, SpaceScheme
+from knode_cosserat.solvers.sparsity import nonzero_columns
 
 #: corrections by which y at discontinuities between nodes is found from the nodes, for each on a segment
 FILLING = 5
@@ -36,8 +36,8 @@ class Hoisted(NamedTuple):
     then: Callable[[Any, Any, Any], Any]
     #: at all places of all strands
     terms: Any
-    #: indices of a strand's y that enter its equations
-    entering: tuple[int, ...]
+    #: columns of the Jacobian by a strand's y that may not be zero
+    columns: tuple[int, ...]
 
 
 def no_history(system: System, space: SpaceScheme) -> Float[Any, "places x"]:
@@ -94,15 +94,15 @@ class StepProblem(eqx.Module):
         record = self._history_by_strand(self.history[:1])[0]
         parts = in_two(at_point, places[0], (jnp.zeros(strand.y_layout.size), record))
         # of equations that y does not enter, one column of zeros
-        columns = entering(parts.traced, 1).tolist() or [0]
+        columns = nonzero_columns(parts.traced, 1).tolist() or [0]
         hoisted = Hoisted(parts.then, jax.vmap(parts.first)(places), tuple(columns))
         return dataclasses.replace(self, hoisted=hoisted)
 
     @property
-    def entering(self) -> np.ndarray:
-        """Indices of a strand's y that enter its equations (of a rod usually not p); all, if not `ready`."""
+    def columns(self) -> np.ndarray:
+        """Columns of the Jacobian by a strand's y that may not be zero; all of them, if not `ready`."""
         every = np.arange(self.system.strand.y_layout.size)
-        return every if self.hoisted is None else np.array(self.hoisted.entering, dtype=int)
+        return every if self.hoisted is None else np.array(self.hoisted.columns, dtype=int)
 
     def with_history(self, history: Float[Any, "places x"]) -> StepProblem:
         """Return the same problem with another history."""
@@ -175,7 +175,7 @@ class StepProblem(eqx.Module):
 
     def _linearised(self, lanes: slice, y: Float[Any, "n y"]) -> tuple[Any, Float[Any, "b used n_strands"]]:
         """Return the rates at these places, and their slopes by the y that enter, places last."""
-        directions = jnp.eye(self.system.strand.y_layout.size)[:, self.entering]
+        directions = jnp.eye(self.system.strand.y_layout.size)[:, self.columns]
 
         def at_point(s: Any, y: Any, history: Any, terms: Any) -> Any:
             def along(direction: Any) -> Any:
@@ -269,7 +269,7 @@ class StepProblem(eqx.Module):
 
     def linearise(self, y: Float[Any, "points y"], unknowns: Any) -> Linearisation:
         """Return the exact derivatives of the residuals, all pieces side by side."""
-        grid, formula, used = self.grid, self.space.formula, self.entering
+        grid, formula, used = self.grid, self.space.formula, self.columns
         lanes, ends = self._ends(y, every=False)
         f, slopes = self._linearised(lanes, ends)
         rates = [*self._at_ends(f)]

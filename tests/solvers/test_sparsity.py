@@ -7,15 +7,15 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.rods.system import unpacked_history
-from knode_cosserat.solvers.entering import entering
 from knode_cosserat.solvers.problem import no_history
 from knode_cosserat.solvers.space import LOBATTO2
+from knode_cosserat.solvers.sparsity import nonzero_columns
 
 SIZE = 7
 
 
 def found_in(function, *others):
-    return entering(jax.make_jaxpr(function)(jnp.ones(SIZE), *others), 0).tolist()
+    return nonzero_columns(jax.make_jaxpr(function)(jnp.ones(SIZE), *others), 0).tolist()
 
 
 @pytest.mark.parametrize(
@@ -63,7 +63,7 @@ class Tethered(kc.SlenderRod):
         return self.y_layout.replaced(y_s, ("n",), self.y_layout.get(y_s, "n") + self.y_layout.get(y, "p"))
 
 
-def entering_of(robot):
+def fields_that_enter(robot):
     """Names of the fields of y that enter."""
     layout = robot.y_layout
 
@@ -72,12 +72,12 @@ def entering_of(robot):
 
     x = jnp.zeros(no_history(robot, LOBATTO2).shape[1])
     closed = jax.make_jaxpr(equations)(robot.rest(0.1)[0], x, jnp.zeros(robot.control_size))
-    found = set(entering(closed, 0).tolist())
+    found = set(nonzero_columns(closed, 0).tolist())
     return {name for name in layout.names if found & set(layout.indices((name,)).tolist())}
 
 
 def test_of_a_rod_everything_enters_but_its_position():
     rod = {"length": 0.5, "radius": 1e-3, "density": 1e3, "youngs_modulus": 1e8}
-    assert entering_of(kc.SlenderRod(**rod)) == set("hnmqw")
-    assert entering_of(kc.load_robot("delrin-tendon-robot")) == set("hnmqw")
-    assert entering_of(Tethered(**rod)) == set("phnmqw")
+    assert fields_that_enter(kc.SlenderRod(**rod)) == set("hnmqw")
+    assert fields_that_enter(kc.load_robot("delrin-tendon-robot")) == set("hnmqw")
+    assert fields_that_enter(Tethered(**rod)) == set("phnmqw")

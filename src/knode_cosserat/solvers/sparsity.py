@@ -1,4 +1,4 @@
-"""Finds which elements of an input enter traced equations, element by element (Jacobian sparsity).
+"""Sparsity of Jacobians: columns that are zero whatever the values, found in traced equations.
 
 Every value carries, for each of its elements, the set of input elements that it may depend on. Operations
 that move elements or work on each alone keep them apart; all others mix what they are given. The result is
@@ -63,13 +63,13 @@ MOVES: dict[str, Callable[..., list[Sets]]] = {
 CALLS = frozenset(("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call", "remat"))
 
 
-def entering(closed: ClosedJaxpr, variable: int) -> Int[np.ndarray, " n"]:
+def nonzero_columns(closed: ClosedJaxpr, variable: int) -> Int[np.ndarray, " n"]:
     """Return the indices of the elements of an input, a vector, on which the outputs may depend."""
     inputs = closed.jaxpr.invars
     count = inputs[variable].aval.shape[0]
     given = [np.zeros((*each.aval.shape, count), dtype=bool) for each in inputs]
     given[variable] = np.eye(count, dtype=bool)
-    return np.flatnonzero(_any(_through(closed.jaxpr, given, count), count))
+    return np.flatnonzero(_any(_propagated(closed.jaxpr, given, count), count))
 
 
 def _any(sets: Sequence[Sets], count: int) -> Sets:
@@ -79,7 +79,7 @@ def _any(sets: Sequence[Sets], count: int) -> Sets:
     )
 
 
-def _through(jaxpr: Jaxpr, given: Sequence[Sets], count: int) -> list[Sets]:
+def _propagated(jaxpr: Jaxpr, given: Sequence[Sets], count: int) -> list[Sets]:
     """Return the sets of the outputs, from those of the inputs."""
     known = dict(zip(jaxpr.invars, given, strict=True))
 
@@ -99,7 +99,7 @@ def _of_step(step: Any, sets: list[Sets], count: int) -> list[Sets]:
     name, params = step.primitive.name, step.params
     inner = params.get("jaxpr", params.get("call_jaxpr"))
     if name in CALLS and inner is not None:
-        return _through(inner.jaxpr if isinstance(inner, ClosedJaxpr) else inner, sets, count)
+        return _propagated(inner.jaxpr if isinstance(inner, ClosedJaxpr) else inner, sets, count)
     if name in MOVES:
         return MOVES[name](*sets, **params)
     if name in ELEMENTWISE:
