@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.cases import one_core, seconds
+from knode_cosserat.rods.tendon_friction import TendonFriction
 
 STEPS, DT, ROUNDS = 128, 0.05, 15
 
@@ -27,7 +28,7 @@ def tendons() -> dict[str, Any]:
     robots = {
         "crude": crude,
         "straight": kc.RoutedTendonRobot.like(crude),
-        "friction": kc.RoutedTendonRobot.like(crude, friction_wobble=0.6, friction_curvature=0.1),
+        "friction": kc.RoutedTendonRobot.like(crude, friction=TendonFriction(wobble=0.6, curvature=0.1)),
         "helical": kc.RoutedTendonRobot.like(crude, routing=tuple(helix)),
         "ribs": kc.load_robot("delrin-routed-tendon-robot"),
     }
@@ -74,7 +75,7 @@ def reel() -> dict[str, Any]:
     hanging = kc.equilibrium(robot, np.zeros(1))
     moved = kc.simulate(robot, pulled - released, DT, initial=hanging)
     times = [seconds(lambda: kc.simulate(robot, pulled - released, DT, initial=hanging)) for _ in range(5)]
-    tension = np.asarray(moved.tension)[:, 0]
+    tension = np.asarray(moved.part("tension"))[:, 0, 0]
     return {
         "seconds": statistics.median(times),
         "slack_steps": int(np.sum(tension < 1e-3)),

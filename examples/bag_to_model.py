@@ -23,13 +23,13 @@ def main(out: str = "bag_to_model.png", seconds: float = 4.0) -> tuple[float, fl
             record_virtual(path, signal, seconds)
         config = kc.RecordingConfig.paper_robot()
         recordings = [kc.load_recording(path, config) for path in bags.values()]
-    seen, unseen = (recording.sampled(0.025, mean=True) for recording in recordings)
+    seen, unseen = (recording.sampled(0.0125, mean=True) for recording in recordings)
 
     # tendons as they are, which bend the rod; `kc.identify` finds their friction too, and takes longer
     knowledge = kc.RoutedTendonRobot.like(kc.load_robot("delrin-tendon-robot"))
     found = kc.calibrate(knowledge, [seen], NAMES, by="rollouts")
     print(found)
-    before, after = (kc.simulate(each, unseen.tension[:-1], 0.025) for each in (knowledge, found.robot))
+    before, after = (kc.simulate(each, unseen.held_tension[:-1], 0.0125) for each in (knowledge, found.robot))
     kc.figures.prediction_against_measurement(after, unseen).savefig(out)
     errors = tuple(
         float(((each.tip_position - unseen.tip_position) ** 2).sum(axis=1).mean() ** 0.5)

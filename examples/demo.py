@@ -36,7 +36,7 @@ def predict_a_recording(out: Path) -> None:
     measured = load_example().sampled(DT).between(1.0, 11.0)
     robot = kc.load_robot("delrin-tendon-robot")
     # row 0 is the state at rest, so that the last row's tension would lead beyond the last row
-    prediction = kc.simulate(robot, measured.tension[:-1], measured.dt)
+    prediction = kc.simulate(robot, measured.held_tension[:-1], measured.dt)
     figures.prediction_against_measurement(prediction, measured).savefig(out / "recording.png")
 
     predicted = np.asarray(prediction.tip_position)

@@ -20,10 +20,7 @@ from knode_cosserat.rods.virtual_robot import VirtualRobot
 
 HERE = Path(__file__).parent
 SIGNALS = {"sine-1": "sine:1", "sine-2": "sine:2", "random-0": "random:0", "unseen": "random:7"}
-DT, FINE, RESTING = 0.025, 0.005, 1.0
-#: what is not known: all that `identify` looks for but the tendons' offset, which was measured
-NAMES = ["youngs_modulus", "bending_damping", "sleeve_stiffening"]
-NAMES += ["friction_wobble", "friction_curvature", "friction_reach"]
+DT, FINE, RESTING = 0.0125, 0.005, 1.0
 
 
 def record(path: Path, signal: str, seconds: float) -> None:
@@ -62,12 +59,14 @@ def main(out: Path, seconds: float = 8.0) -> tuple[float, float]:
     unseen = recordings.pop("unseen").sampled(DT, mean=True)
     first = recordings["sine-1"]
     recording_figures.health(first, first.health()).savefig(out / "health.png", dpi=130)
-    found = kc.identify(knowledge, [each.sampled(DT, mean=True) for each in recordings.values()], NAMES)
-    print(found, *(f"left of the {name}: {size:.2g}" for name, size in found.remainder.items()), sep="\n")
+    found = kc.identify(knowledge, list(recordings.values()), progress=print)
+    print(found)
     kc.save_robot(found.robot, out / "found.yaml")
     errors = []
     for label, robot in (("before", knowledge), ("after", found.robot)):
-        prediction = kc.simulate(robot, unseen.tension[:-1], DT)
+        still = kc.equilibrium(robot, unseen.initial_tension)
+        tension = robot.undelayed(unseen.held_tension[:-1], DT)
+        prediction = kc.simulate(robot, tension, DT, initial=still)
         figures.prediction_against_measurement(prediction, unseen).savefig(out / f"{label}.png", dpi=130)
         errors.append(float(rms_distance(np.asarray(prediction.tip_position), unseen.tip_position)))
     print(f"tip RMSE on an unseen recording: {100 * errors[0]:.1f} cm before, {100 * errors[1]:.2f} cm after")

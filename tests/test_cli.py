@@ -74,7 +74,7 @@ def test_simulate_takes_controls_from_a_file_at_its_own_step(tmp_path):
     out = tmp_path / "a.nc"
     facts = told("simulate", ROBOT, "--controls", tmp_path / "tensions.csv", "--out", out)
     assert (facts["steps"], facts["dt"]) == (12, 0.025)
-    np.testing.assert_array_equal(kc.load_trajectory(out).tension[1:], tensions)
+    np.testing.assert_array_equal(kc.load_trajectory(out).held_tension[:-1], tensions)
 
 
 def test_simulate_draws(tmp_path):

@@ -58,7 +58,7 @@ WRONG = {
     "half a node": (lambda t: ROBOT.replace(nodes=10.5), "10.5", "whole number from 2"),
     "a fit of text": (lambda t: kc.fit("x", [t]), "str", "a robot or another System"),
     "a fit to one trajectory": (lambda t: kc.fit(ROBOT, t), "Trajectory", "list of trajectories"),
-    "a fit to arrays": (lambda t: kc.fit(ROBOT, [np.zeros(3)]), "ndarray", "a Trajectory"),
+    "a fit to arrays": (lambda t: kc.fit(ROBOT, [np.zeros(3)]), "ndarray", "load_recording.*a Trajectory"),
     "a fit to nothing": (lambda t: kc.fit(ROBOT, []), "no trajectories", "at least one"),
     "a config by its name": (lambda t: kc.fit(ROBOT, [t], "paper"), "str", "a FitConfig"),
     "a metric of text": (lambda t: kc.tip_dtw(t, "x"), "str", "a Trajectory"),

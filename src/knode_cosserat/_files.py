@@ -1,4 +1,4 @@
-"""Writing files whole, and which version of this package writes them."""
+"""Atomic writing of files, and the version of this package that writes them."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from pathlib import Path
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A name beside `path` to write to. What is there in the end takes the place of `path` in one go.
+    """Yield a temporary path beside `path`; the file written there replaces `path` atomically.
 
-    If anything fails, or the process is killed, the old file is still there as it was. A link goes on to lead
-    to what it led to, and what is no file, such as a pipe or /dev/null, is written to as it is.
+    If anything fails, or the process is killed, the old file is unchanged. A symbolic link keeps its target,
+    which is replaced. A path that is not a regular file, such as a pipe or /dev/null, is written directly.
     """
     if path.exists() and not path.is_file() and not path.is_dir():
         yield path
@@ -24,7 +24,7 @@ def replacing(path: Path) -> Iterator[Path]:
     temporary = path.parent / f".{path.name}.{secrets.token_hex(6)}.tmp"
     try:
         yield temporary
-        # on the disk before it has the name, or a power failure could leave the name with nothing behind it
+        # synchronise before the rename, or a power failure could leave the name with an empty file
         with temporary.open("r+b") as file:
             os.fsync(file.fileno())
         os.replace(temporary, path)
@@ -33,7 +33,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def package_version() -> str:
-    """The version of this package that is installed."""
+    """Return the installed version of this package."""
     try:
         return importlib.metadata.version("knode-cosserat")
     except importlib.metadata.PackageNotFoundError:

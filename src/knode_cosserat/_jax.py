@@ -1,4 +1,4 @@
-"""JAX as this package uses it: double precision; compiled programs kept on disk, and few in memory."""
+"""JAX configuration of this package: double precision, cache on disk, bounded programs in memory."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from knode_cosserat._programs import limit_programs
 
 
 def _machine() -> str:
-    """A short name of the CPU model: a program compiled for one may be illegal on another."""
+    """Return a short name of the CPU model: a program compiled for one may be illegal on another."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         described = "".join(sorted({line for line in lines if line.startswith(("model name", "flags"))}))
@@ -23,14 +23,14 @@ def _machine() -> str:
 
 
 def cache_directory() -> Path:
-    """Where compiled programs are kept: $KNODE_COSSERAT_CACHE, or the user's cache directory."""
+    """Return the directory of compiled programs: $KNODE_COSSERAT_CACHE, or the user's cache directory."""
     chosen = os.environ.get("KNODE_COSSERAT_CACHE")
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     return (Path(chosen) if chosen else home / "knode-cosserat") / _machine()
 
 
 def configure() -> None:
-    """Set JAX up, once, on import. A cache directory that the user chose for JAX is left alone."""
+    """Configure JAX once, on import. A cache directory that the user set for JAX is not changed."""
     jax.config.update("jax_enable_x64", True)
     if getattr(jax.config, "jax_compilation_cache_dir", None) is None:
         jax.config.update("jax_compilation_cache_dir", str(cache_directory()))

@@ -30,8 +30,8 @@ MAPS, MAPS_LIMIT = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
 DEFAULT_LIMIT = 65_530
 #: share of the limit at which programs are released
 SHARE = 0.5
-#: large programs at which all are released, for systems without memory maps and programs of few maps; a robot
-#: of another shape needs two (28 MB) for `simulate`
+#: large programs at which all are released, for systems without memory maps and programs of few maps;
+#: a robot of another shape needs two (28 MB) for `simulate`
 LARGE_PROGRAMS = 128
 #: compile times from this (s) belong to a large program; operations outside `jit` take 0.01 to 0.02 s
 LONG = 0.05
@@ -41,7 +41,7 @@ LARGE_MAPS, SMALL_MAPS = 2_000, 40
 
 
 def memory_maps() -> int:
-    """Return the number of memory maps of this process, or 0 where the system does not tell it."""
+    """Return the number of memory maps of this process, or 0 if the system does not report it."""
     try:
         return MAPS.read_bytes().count(b"\n")
     except OSError:
@@ -68,8 +68,8 @@ def default_maps() -> int:
 class ProgramBudget:
     """Releases all compiled programs when there are too many of them, or too many memory maps.
 
-    It listens to JAX's compile events, so that it sees every program: the package's, the user's, and those
-    compiled in threads. Calls of compiled programs cost nothing more. A program that runs in another thread
+    It listens to JAX's compile events and therefore sees every program: the package's, the user's, and those
+    compiled in threads. Calls of compiled programs have no extra cost. A program that runs in another thread
     stays alive until it returns.
     """
 
@@ -78,12 +78,12 @@ class ProgramBudget:
         self.releases = 0
         self._maps, self._programs, self._count = maps, programs, count
         self._threshold = maps
-        #: large programs since the last release; maps at the last count, and those that may have been added
+        #: large programs since the last release; maps at the last count, and maps that may have been added
         self._large = self._counted = self._added = 0
         self._lock = threading.Lock()
 
     def compiled(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
-        """Take note of a compile event, and release all programs if the budget is spent."""
+        """Record a compile event, and release all programs if the budget is spent."""
         # the lock is taken while another thread releases, and by finalizers that compile during a release
         if event != COMPILED or not self._lock.acquire(blocking=False):
             return

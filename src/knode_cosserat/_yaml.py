@@ -1,4 +1,4 @@
-"""YAML files of settings, read safely: the scalars of YAML 1.2, no key twice, and what is said of a value."""
+"""YAML files of settings, read safely: scalars of YAML 1.2, no duplicate keys; and error texts."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ import yaml
 
 
 class YAMLTextError(ValueError):
-    """A text that is not YAML, or not a mapping; the message says why and names no file."""
+    """A text is not YAML, or not a mapping; the message says why and names no file."""
 
 
 def mapping_of(text: str, keys: str) -> dict[Any, Any]:
-    """The outermost mapping of a text; `keys` names some of its keys, for the error.
+    """Return the outermost mapping of a text; `keys` names some of its keys, for the error.
 
     Raises:
-        YAMLTextError: the text is not YAML, or holds something else.
+        YAMLTextError: the text is not YAML, or is not a mapping.
     """
     try:
         content = yaml.load(text, _Loader)
@@ -36,14 +36,14 @@ def mapping_of(text: str, keys: str) -> dict[Any, Any]:
 
 
 def flow(value: Any) -> str:
-    """A value as YAML on one line."""
+    """Return a value as YAML on one line."""
     readable = not isinstance(value, str) or value.isprintable()
     listed = yaml.safe_dump([value], default_flow_style=True, width=float("inf"), allow_unicode=readable)
     return str(listed).strip()[1:-1]
 
 
 def shown(value: Any) -> str:
-    """A value in one line of bounded length: a file can hold what would print without end."""
+    """Return a value in one line of bounded length: a file can hold very long values."""
     short = reprlib.Repr()
     short.maxstring = short.maxother = 60
     short.maxlevel = 3
@@ -52,20 +52,20 @@ def shown(value: Any) -> str:
 
 
 def did_you_mean(given: Any, known: Any) -> str:
-    """The end of an error about an unknown name: the known one that is close to it, if one is."""
+    """Return the hint of an error about an unknown name: the closest known name, or an empty string."""
     close = difflib.get_close_matches(str(given), list(known), n=1)
     return f"; did you mean {close[0]}?" if close else ""
 
 
 class _Loader(yaml.SafeLoader):
-    """Safe, with the scalars of YAML 1.2 and no key twice."""
+    """Safe loader with the scalars of YAML 1.2 and no duplicate keys."""
 
     def construct_object(self, node: Any, deep: bool = False) -> Any:
         try:
             return super().construct_object(node, deep)
         except (yaml.YAMLError, RecursionError):
             raise
-        except Exception:  # PyYAML takes a scalar apart as its tag says without asking whether it can
+        except Exception:  # PyYAML converts a scalar by its tag without checking the text
             problem = f"{shown(node.value)} cannot be read as !!{node.tag.rpartition(':')[2]}"
             raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark) from None
 

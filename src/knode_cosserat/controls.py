@@ -1,8 +1,8 @@
 """Tendon tensions over time, as arrays (steps, tendons) in N: the studies' signals, and CSV files.
 
-Row i (from 0) is what `simulate` applies from time i dt to (i + 1) dt. The signals that are functions of time
-are evaluated at the end of that step, t = (i + 1) dt, as in the paper's studies. Tendons are numbered from 0
-in arguments, from 1 in files.
+`simulate` applies row i (from 0) from time i dt to (i + 1) dt. Signals that are functions of time are
+evaluated at the end of that step, t = (i + 1) dt, as in the paper's studies. Tendons are numbered from 0 in
+arguments, from 1 in files.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ TENSION_UNITS = {"N": 1.0, "gf": 9.81 / 1000.0}
 
 
 class ControlsError(ValueError):
-    """Controls that are not possible, or a file of them that cannot be read; the message is one line."""
+    """Controls are not possible, or a file of them cannot be read; the message is one line."""
 
 
 class Controls(NamedTuple):
@@ -43,10 +43,10 @@ class Controls(NamedTuple):
 
 
 def constant(tension: float, steps: int, *, tendons: int = 4) -> Tensions:
-    """One tension (N) in all tendons, all the time.
+    """Return one constant tension (N) in all tendons.
 
     Raises:
-        ControlsError: a number that is not possible, as from every function here.
+        ControlsError: an argument is not possible; likewise in every function here.
     """
     _require_numbers(tension=tension)
     _require_counts(steps=steps, tendons=tendons)
@@ -56,7 +56,7 @@ def constant(tension: float, steps: int, *, tendons: int = 4) -> Tensions:
 def sine(
     period: float, steps: int, dt: float, *, base: float = 6.0, amplitude: float = 1.0, tendons: int = 4
 ) -> Tensions:
-    """τ_k = base + amplitude sin(2πt/period + 2πk/tendons) in N, k = 0, 1, …; period in s."""
+    """Return τ_k = base + amplitude sin(2πt/period + 2πk/tendons) in N, k = 0, 1, …; period in s."""
     _require_numbers(base=base, amplitude=amplitude)
     _require_counts(tendons=tendons)
     phase = 2 * np.pi * np.arange(tendons) / tendons
@@ -69,7 +69,7 @@ def step(
     height: float, steps: int, dt: float, *, base: float = 5.0, at: float = 1.5,
     tendons: Sequence[int] = (0, 3), count: int = 4,
 ) -> Tensions:  # fmt: skip
-    """`base` (N) in `count` tendons; from t = at (s) on, base + height in the tendons named."""
+    """Return `base` (N) in `count` tendons, and base + height in the named tendons from t = at (s)."""
     _require_numbers(at=at)
     t = _times(steps, dt)
     return _raised("step", height, t >= at - SAME_TIME * dt, base, tendons, count)
@@ -79,9 +79,9 @@ def ramp(
     height: float, steps: int, dt: float, *, base: float = 5.0, start: float = 0.0, end: float | None = None,
     tendons: Sequence[int] = (0, 3), count: int = 4,
 ) -> Tensions:  # fmt: skip
-    """`base` (N) in `count` tendons; in those named it rises linearly by `height` (N) between two times (s).
+    """Return `base` (N) in `count` tendons, with a linear rise by `height` (N) in the named tendons.
 
-    It stays where it then is; the end is by default that of the last step.
+    The rise is from `start` to `end` (s), by default the end of the last step. The tension is constant after.
     """
     t = _times(steps, dt)
     end = float(t[-1]) if end is None else end
@@ -95,7 +95,7 @@ def ramp(
 def random(
     steps: int, *, low: float = 5.0, high: float = 10.0, seed: int = 0, tendons: int = 4, hold: int = 1
 ) -> Tensions:
-    """Uniform between `low` and `high` (N), every tendon by itself; a draw is held for `hold` steps."""
+    """Return independent uniform samples between `low` and `high` (N), each held for `hold` steps."""
     _require_counts(steps=steps, tendons=tendons, hold=hold)
     _require_counts(least=0, seed=seed)
     _require_numbers(low=low, high=high)
@@ -118,7 +118,7 @@ def _raised(
 
 
 def _times(steps: int, dt: float) -> np.ndarray:
-    """The ends of the steps (s)."""
+    """Return the ends of the steps (s)."""
     _require_counts(steps=steps)
     _require_positive("dt", dt)
     return np.arange(1, steps + 1) * dt
@@ -143,7 +143,7 @@ def _require_positive(name: str, value: Any) -> None:
 
 
 def _require_period(period: Any, last: float) -> None:
-    """A sine must have a phase at all times up to the last (s): 2πt/period must not be infinite."""
+    """Raise `ControlsError` if 2πt/period is not finite at all times up to the last (s)."""
     _require_positive("period", period)
     least = 8.0 * (last / np.finfo(float).max)
     if not period > least:
@@ -168,7 +168,7 @@ def _is_number(value: Any) -> bool:
 def save(path: str | Path, tensions: Any, dt: float) -> None:
     """Write tensions (steps, tendons) in N as CSV: the time (s) from which each row is held, then the row.
 
-    The file appears complete or not at all.
+    The file is written completely or not at all.
     """
     tensions = np.asarray(tensions, dtype=float)
     if tensions.ndim != 2 or 0 in tensions.shape:
@@ -180,7 +180,7 @@ def save(path: str | Path, tensions: Any, dt: float) -> None:
         with replacing(Path(path)) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
             writer = csv.writer(file, lineterminator="\n")
             writer.writerow(["time [s]", *names])
-            # a Python float prints all its digits, so that reading gives back the same number
+            # a Python float prints all its digits, so that it reads back equal
             writer.writerows([i * float(dt), *row] for i, row in enumerate(tensions.tolist()))
     except OSError as error:
         raise ControlsError(f"{path}: cannot be written: {error.strerror}") from None
@@ -190,12 +190,13 @@ def load(path: str | Path, dt: float | None = None) -> Controls:
     """Read a CSV file of tensions.
 
     Its header names the columns with their units: `time [s]`, and `tension_1 [N]`, `tension_2 [N]`, … or
-    `[gf]` (grams-force). Each row is held from its time until the next row's.
+    `[gf]` (grams-force). Each row is held from its time until the next row's. `held_tension_1 [N]`, as in
+    tables of simulations, is a synonym.
 
     Args:
         path: the file.
-        dt: time step (s) to sample at: row i of what is returned is what is held at the file's first time
-            + i dt, up to its last. None: the file's own step, which must then be the same everywhere.
+        dt: sampling step (s): row i of the result is held at the file's first time + i dt, up to its last
+            time. None: the file's own step, which must be constant.
 
     Raises:
         ControlsError: the file cannot be read; the message names the line and the column.
@@ -218,7 +219,7 @@ def _own_step(path: str | Path, time: np.ndarray) -> float:
     first = float(time[1] - time[0])
     mean = float(time[-1] - time[0]) / (len(time) - 1)
     if np.all(np.abs(time - time[0] - index * mean) <= 1e-3 * mean):
-        # what `save` wrote comes back to the last bit; rounded times are averaged
+        # a file written by `save` gives its exact step; rounded times are averaged
         exact = np.all(np.abs(time - time[0] - index * first) <= 1e-9 * (time[-1] - time[0]))
         return first if exact else mean
     steps = np.diff(time)
@@ -229,7 +230,7 @@ def _own_step(path: str | Path, time: np.ndarray) -> float:
 
 
 def _read(path: Path) -> tuple[np.ndarray, Tensions]:
-    """Times (rows,) in s and tensions (rows, tendons) in N."""
+    """Return times (rows,) in s and tensions (rows, tendons) in N."""
     try:
         time, tensions, _ = read_rows(path, _HEADER, _columns)
     except CSVTextError as error:
@@ -252,7 +253,7 @@ def _columns(where: str, titles: list[str]) -> list[Column]:
 
 
 def _column(where: str, title: str) -> Column:
-    match = re.fullmatch(r"(?:(time)|tension_([1-9]\d{0,5})) *(?:\[ *([^\[\]]*?) *\])?", title)
+    match = re.fullmatch(r"(?:(time)|(?:held_)?tension_([1-9]\d{0,5})) *(?:\[ *([^\[\]]*?) *\])?", title)
     if match is None:
         raise ControlsError(f"{where}: the column {title!r} is unknown; allowed is {_HEADER}")
     time, tendon, unit = match.groups()
@@ -273,9 +274,9 @@ def _column(where: str, title: str) -> Column:
 class _Signal(NamedTuple):
     make: Callable[..., Tensions]
     main: str
-    #: what else may be given by name, with how it is read
+    #: optional named arguments, each with its parser
     options: dict[str, Callable[[str], Any]]
-    #: what the function calls the number of tendons
+    #: name of the function's argument for the number of tendons
     tendon_count: str = "tendons"
 
 
@@ -293,25 +294,25 @@ _SIGNALS = {
     "constant": _Signal(constant, "tension", {}),
 }
 
-#: what `parse` takes, for help texts
+#: specifications that `parse` accepts, for help texts
 SPECIFICATIONS = ", ".join(f"{name}:{it.main.upper()}" for name, it in _SIGNALS.items()) + " or a CSV file"
 
 
 def parse(specification: str, steps: int | None, dt: float, *, tendons: int = 4) -> Tensions:
-    """Tensions from one word, as on the command line.
+    """Return tensions from one word, as on the command line.
 
     `sine:1.5`, `step:1.5`, `ramp:2`, `random:0`, `constant:5`: the signal and its first number (period in s,
-    height in N, height in N, seed, tension in N). What else it takes by name: `sine:1.5,base=8,amplitude=2`,
+    height in N, height in N, seed, tension in N). Other arguments have names: `sine:1.5,base=8,amplitude=2`,
     `step:1.5,at=2,tendons=1+4` (tendons numbered from 1). Anything else is a CSV file, sampled at dt.
 
     Args:
-        specification: as above.
-        steps: how many; None, of a file only: as many as it has.
+        specification: signal or file, as above.
+        steps: number of steps; None, for a file only: all steps of the file.
         dt: time step (s).
-        tendons: how many the robot has.
+        tendons: number of tendons of the robot.
 
     Raises:
-        ControlsError: the specification is not understood, or the file is not right or too short.
+        ControlsError: the specification is not understood, or the file is invalid or too short.
     """
     _require_positive("dt", dt)
     name, colon, rest = specification.partition(":")

@@ -1,4 +1,4 @@
-"""Whether this installation works: what it is made of, where it runs, and a short simulation."""
+"""Self-test of this installation: versions, hardware, and a short simulation."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from knode_cosserat.solvers.equilibrium import equilibrium
 from knode_cosserat.solvers.run import usable_cores
 from knode_cosserat.solvers.simulate import simulate
 
-#: what has to be there
+#: required packages
 NEEDED = ("jax", "jaxlib", "equinox", "numpy", "scipy")
-#: what extras bring, by extra
+#: optional packages, with the extra that installs each
 OPTIONAL = {
     "matplotlib": "viz", "rosbags": "ros", "pyarrow": "parquet", "tensorboardX": "tensorboard",
     "distributed": "dask", "pydmd": "bench",
 }  # fmt: skip
-#: how far the force at the base may be from the rod's weight, as a part of it
+#: largest relative error of the force at the base against the rod's weight
 WEIGHT_ERROR = 1e-9
 
 
 class Check(NamedTuple):
-    """One thing that was looked at: whether it is well, and what was seen."""
+    """One check: name, success, and observation."""
 
     name: str
     well: bool
@@ -40,9 +40,9 @@ class Check(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Diagnosis:
-    """What `doctor` found."""
+    """Result of `doctor`."""
 
-    #: by name: this package, Python, JAX, …; None for an extra that is not installed
+    #: versions by name: this package, Python, JAX, …; None for an extra that is not installed
     versions: dict[str, str | None]
     machine: str
     cores: int
@@ -53,16 +53,16 @@ class Diagnosis:
 
     @property
     def well(self) -> bool:
-        """Whether every check is."""
+        """True if every check passed."""
         return all(check.well for check in self.checks)
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON has it."""
+        """Return the diagnosis as a mapping for JSON."""
         own = dataclasses.asdict(self)
         return {**own, "checks": [check._asdict() for check in self.checks], "well": self.well}
 
     def __str__(self) -> str:
-        """A page of text."""
+        """Return a page of text."""
         there = [f"{name} {version}" for name, version in self.versions.items() if version]
         missing = [name for name, version in self.versions.items() if not version]
         extras = sorted({OPTIONAL[name] for name in missing if name in OPTIONAL})
@@ -82,9 +82,9 @@ class Diagnosis:
 
 
 def doctor() -> Diagnosis:
-    """Look at this installation, and simulate a little: a few seconds, less once it is compiled.
+    """Check this installation with a short simulation: a few seconds, less with compiled programs.
 
-    Nothing is raised for what is found wrong: the checks say so.
+    Failures are reported in the checks, not raised.
     """
     versions: dict[str, str | None] = {
         "knode-cosserat": package_version(),
@@ -114,7 +114,7 @@ def _precision() -> Check:
 
 
 def _cache(folder: Path) -> Check:
-    """Whether compiled programs can be kept, here or where it will be made."""
+    """Check that compiled programs can be stored in the folder, or in its parent if it does not exist."""
     place = folder
     while not place.exists() and place != place.parent:
         place = place.parent
@@ -137,7 +137,7 @@ def _simulated() -> list[Check]:
             moved = simulate(robot, tensions, 0.05)
             times.append(time.perf_counter() - began)
         carried = float(equilibrium(robot, np.zeros(4)).part("n")[0, 0, 2])
-    except Exception as error:  # whatever it is, it is what was asked for
+    except Exception as error:  # any failure is a result of the check
         return [Check("simulation", False, f"{type(error).__name__}: {' '.join(str(error).split())}")]
     solved = bool(moved.all_valid and np.max(moved.residual) <= 1e-8)
     weight = float(robot.density * np.pi * robot.radius**2 * robot.length * robot.gravity[2])

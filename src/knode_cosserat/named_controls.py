@@ -1,7 +1,7 @@
 """Controls of any robot, by the names of its control layout, such as `base_z`, `reel_1` or `load0_scale`.
 
-What `controls` is for tensions, for robots that are driven otherwise, or by more. Row i is what `simulate`
-applies from time i dt to (i + 1) dt, and signals are evaluated at that step's end.
+The counterpart of `controls`, which has tensions only, for robots with other controls. `simulate` applies
+row i from time i dt to (i + 1) dt, and signals are evaluated at that step's end.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Array = Float[np.ndarray, "steps c"]
 
 
 def labels(layout: Layout) -> list[str]:
-    """The name of every number of a control: its field's, numbered from 1 where that has several."""
+    """Return the name of every number of a control: its field's, numbered from 1 in a field of several."""
     return [
         field.name if field.size == 1 else f"{field.name}_{k + 1}"
         for field in layout.fields
@@ -34,26 +34,27 @@ def labels(layout: Layout) -> list[str]:
 
 
 def units(layout: Layout) -> list[str]:
-    """The unit of every number of a control."""
+    """Return the unit of every number of a control."""
     return [field.unit for field in layout.fields for _ in range(field.size)]
 
 
 def titles(layout: Layout) -> list[str]:
-    """The names with their units, as columns of a file have them: `reel_1 [m]`."""
+    """Return the names with their units, as the column titles of a file: `reel_1 [m]`."""
     return [f"{name} [{unit}]" for name, unit in zip(labels(layout), units(layout), strict=True)]
 
 
 def parse(robot: System, specification: str, steps: int | None, dt: float) -> Array:
-    """Controls (steps, c) of a robot from one word, as on the command line.
+    """Return controls (steps, c) of a robot from one word, as on the command line.
 
-    For a robot that has tensions only, as `controls.parse`. Otherwise signals by name, `base_z=ramp:0.1;
-    reel_1=sine:2,amplitude=0.01`, where the name of a field stands for all its numbers, each is given once
-    and what is not named is zero: `constant:VALUE`, `ramp:HEIGHT[,base=,start=,end=]`,
-    `step:HEIGHT[,base=,at=]`, `sine:PERIOD[,base=,amplitude=,phase=]`; or a CSV file with the columns
-    `time [s]` and any of these names with their units. `none` stands for zeros.
+    For a robot with tensions only, this is `controls.parse`. Otherwise the word has signals by name,
+    `base_z=ramp:0.1;reel_1=sine:2,amplitude=0.01`. The name of a field stands for all its numbers. Each
+    control is given at most once, and the others are zero. Signals are `constant:VALUE`,
+    `ramp:HEIGHT[,base=,start=,end=]`, `step:HEIGHT[,base=,at=]`, `sine:PERIOD[,base=,amplitude=,phase=]`. The
+    word may also be a CSV file with the columns `time [s]` and any of these names with their units. `none`
+    stands for zeros.
 
     Raises:
-        ControlsError: the specification is not understood, or the file is not right or too short.
+        ControlsError: the specification is not understood, or the file is invalid or too short.
     """
     layout = robot.control_layout
     if layout.names == ("tension",):
@@ -72,7 +73,7 @@ def parse(robot: System, specification: str, steps: int | None, dt: float) -> Ar
 
 
 def parse_signals(layout: Layout, words: list[str], t: Float[np.ndarray, " steps"]) -> Array:
-    """Controls (steps, c) at the times t (s) from words `NAME=SIGNAL`; see `parse`."""
+    """Return controls (steps, c) at the times t (s) from words `NAME=SIGNAL`; see `parse`."""
     found = np.zeros((len(t), layout.size))
     given: dict[int, str] = {}
     for entry in words:
@@ -82,7 +83,7 @@ def parse_signals(layout: Layout, words: list[str], t: Float[np.ndarray, " steps
                 f"controls {entry.strip()!r}: allowed is NAME=SIGNAL;…, `none` or a CSV file; "
                 f"names are {', '.join(labels(layout)) or 'none'}"
             )
-        # too short a period, say: what is not finite is refused here, so that nothing warns of it
+        # a very short period, for example, overflows: the check below refuses it without a NumPy warning
         with np.errstate(all="ignore"):
             values = _signal(word, t)
         if not np.all(np.isfinite(values)):
@@ -169,7 +170,7 @@ def _number(where: str, text: str) -> float:
 
 
 def _sampled(path: str, layout: Layout, steps: int | None, dt: float) -> Array:
-    """A file's columns, each row held until the next row's time."""
+    """Return a file's columns, each row held until the next row's time."""
     known = ["time [s]", *titles(layout)]
 
     def columns_of(where: str, found: list[str]) -> list[Column]:

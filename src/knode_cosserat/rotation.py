@@ -1,6 +1,6 @@
 """Quaternions (scalar first), rotation matrices, and products of small matrices.
 
-Everything here acts on a single point of the rod; the solvers map it over nodes, tangents and batches.
+Every function acts on a single point of the rod; the solvers map it over nodes, tangents and batches.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Float
 
-#: of angles whose square (rad²) is below this there are series
+#: squared angle (rad²) below which series are used
 SMALL = 1e-8
 
 # `lax` directly, because indexing by brackets takes ten times as long to trace, and these are traced often
@@ -27,10 +27,10 @@ def _columns(matrix: Any) -> list[Any]:
 
 
 def dot(matrix: Float[Any, "i j"], vector: Float[Any, " j"]) -> Float[Any, " i"]:
-    """Product of a small matrix and a vector, written as a sum of scaled columns.
+    """Return the product of a small matrix and a vector, written as a sum of scaled columns.
 
-    XLA fuses this form with the arithmetic around it. A `matrix @ vector` becomes a kernel of its own:
-    the linearisation of the rod's equations then takes three times as long.
+    XLA fuses this form with the arithmetic around it. A `matrix @ vector` becomes a separate kernel: the
+    linearisation of the rod's equations then takes three times as long.
     """
     columns, factors = _columns(matrix), _parts(vector)
     total = columns[0] * factors[0]
@@ -40,9 +40,9 @@ def dot(matrix: Float[Any, "i j"], vector: Float[Any, " j"]) -> Float[Any, " i"]
 
 
 def dot_by_rows(matrix: Float[Any, "i j"], vector: Float[Any, " j"]) -> Float[Any, " i"]:
-    """The same product, each of its numbers by itself.
+    """Return the same product, computed row by row.
 
-    Where one matrix meets many vectors, such as slopes in all directions, XLA then vectorises over these.
+    If one matrix multiplies many vectors, such as tangents in all directions, XLA vectorises over these.
     """
     factors = _parts(vector)
     return jnp.stack(
@@ -51,13 +51,13 @@ def dot_by_rows(matrix: Float[Any, "i j"], vector: Float[Any, " j"]) -> Float[An
 
 
 def cross(a: Float[Any, "3"], b: Float[Any, "3"]) -> Float[Any, "3"]:
-    """Cross product: the paper's hat operator applied, a × b = â b."""
+    """Return the cross product: the paper's hat operator applied, a × b = â b."""
     (ax, ay, az), (bx, by, bz) = _parts(a), _parts(b)
     return jnp.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
 def rotation_matrix(h: Float[Any, "4"]) -> Float[Any, "3 3"]:
-    """Rotation matrix of a quaternion of any length (scalar first), R = I + 2/(h·h) (…).
+    """Return the rotation matrix of a quaternion of any length (scalar first), R = I + 2/(h·h) (…).
 
     The division by h·h makes R orthogonal although the integration in s never normalises h.
     """
@@ -73,7 +73,7 @@ def rotation_matrix(h: Float[Any, "4"]) -> Float[Any, "3 3"]:
 
 
 def quaternion_rate(h: Float[Any, "4"], u: Float[Any, "3"]) -> Float[Any, "4"]:
-    """Derivative of h along s for the curvature u in the material frame: h_s = ½ h ∘ (0, u)."""
+    """Return the derivative of h along s for the curvature u in the material frame: h_s = ½ h ∘ (0, u)."""
     (w, x, y, z), (ux, uy, uz) = _parts(h), _parts(u)
     return 0.5 * jnp.stack(
         [
@@ -86,7 +86,7 @@ def quaternion_rate(h: Float[Any, "4"], u: Float[Any, "3"]) -> Float[Any, "4"]:
 
 
 def quaternion_product(a: Float[Any, "4"], b: Float[Any, "4"]) -> Float[Any, "4"]:
-    """The rotation b, then a: a ∘ b."""
+    """Return the rotation by b, then by a: a ∘ b."""
     (aw, ax, ay, az), (bw, bx, by, bz) = _parts(a), _parts(b)
     return jnp.stack(
         [
@@ -99,12 +99,12 @@ def quaternion_product(a: Float[Any, "4"], b: Float[Any, "4"]) -> Float[Any, "4"
 
 
 def conjugate(h: Float[Any, "4"]) -> Float[Any, "4"]:
-    """The rotation back, of a quaternion of length one."""
+    """Return the inverse rotation of a unit quaternion."""
     return h * np.array([1.0, -1.0, -1.0, -1.0])
 
 
 def _half(vector: Float[Any, "3"]) -> tuple[Any, Any, Any]:
-    """Of an angle, the vector's length: cos(angle / 2), sin(angle / 2) / angle, and its square."""
+    """Return cos(angle / 2), sin(angle / 2) / angle, and angle², with the vector's length as the angle."""
     square = jnp.sum(vector * vector)
     small = square < SMALL
     # the root of zero has no derivative
@@ -114,18 +114,18 @@ def _half(vector: Float[Any, "3"]) -> tuple[Any, Any, Any]:
 
 
 def quaternion_of(vector: Float[Any, "3"]) -> Float[Any, "4"]:
-    """The rotation about a vector by its length (rad)."""
+    """Return the quaternion of a rotation vector (rad)."""
     real, over, _ = _half(vector)
     return jnp.concatenate([real[None], over * vector])
 
 
 def turned(h: Float[Any, "4"], vector: Float[Any, "3"]) -> Float[Any, "3"]:
-    """A vector turned by a quaternion of any length."""
+    """Return a vector rotated by a quaternion of any length."""
     return dot(rotation_matrix(h), vector)
 
 
 def mean_turned(turn: Float[Any, "3"], vector: Float[Any, "3"]) -> Float[Any, "3"]:
-    """A vector's mean on the way from itself to where the rotation `turn` (rad) takes it, at even pace."""
+    """Return the mean of a vector over the rotation by `turn` (rad) at a constant rate."""
     real, over, square = _half(turn)
     small = square < SMALL
     # (1 - sin(angle) / angle) / angle²
@@ -135,10 +135,11 @@ def mean_turned(turn: Float[Any, "3"], vector: Float[Any, "3"]) -> Float[Any, "3
 
 
 def inverse(matrix: Float[Any, "3 3"]) -> Float[Any, "3 3"]:
-    """Inverse of a regular 3×3 matrix, by cofactors.
+    """Return the inverse of a regular 3×3 matrix, by cofactors.
 
-    Its rounding errors grow with the square of the condition at worst. Stiffness and damping are diagonal or
-    nearly so; by elimination, whose errors grow with the condition, real tendons took 3 % longer.
+    Its rounding errors grow with the square of the condition number at worst. Stiffness and damping are
+    diagonal or nearly so. Elimination, whose errors grow with the condition number, took 3 % longer for a
+    robot with real tendons.
     """
     columns = _columns(matrix)
     cofactors = jnp.stack(
@@ -148,9 +149,9 @@ def inverse(matrix: Float[Any, "3 3"]) -> Float[Any, "3 3"]:
 
 
 def small_inverse(matrix: Float[Any, "n n"]) -> Float[Any, "n n"]:
-    """Inverse of a small matrix; of 6×6, in blocks of 3×3, the upper left of which must be regular too.
+    """Return the inverse of a small matrix; a 6×6 matrix must have a regular upper left block of 3×3.
 
-    Written out because XLA fuses it: the library's factorisation takes several times as long at this size.
+    It is written out because XLA fuses it: at this size the library's factorisation is several times slower.
     """
     if matrix.shape[0] != 6:
         return jnp.linalg.inv(matrix)

@@ -1,30 +1,34 @@
-"""What a simulation gives: states over time, with what came of each step."""
+"""Result of a simulation: states over time, with the result of each step."""
 
 from __future__ import annotations
 
 from typing import Any, Self
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from knode_cosserat.rods.system import System
+from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.solvers.result import Result
 
 
 class Trajectory(eqx.Module):
-    """A system's states at T times and N nodes; every array may have a batch axis in front.
+    """A system's states at T times and N nodes; every array may have a leading batch axis.
 
-    Row 0 is the initial state; row i is the state after control i, which acted from row i - 1 on. Rows that
-    were not solved are NaN, and `result` says why. A pytree: it can be returned from a jitted function.
+    Row 0 is the initial state. Controls have one convention in this package: `held_control` and
+    `held_tension` of row k act from row k to row k + 1, here, in `Measurements` and in files. `control` is
+    the control in each row's own equations, which acted up to that row. Rows that were not solved are NaN;
+    `result` says why. A pytree: it can be returned from a jitted function.
     """
 
     system: System
-    #: what was chosen of the numerics (`solvers.settings.Settings`), or None for states that were measured
+    #: numerical settings (`solvers.settings.Settings`), or None for measured states
     settings: Any = eqx.field(static=True)
     time: Float[Any, " T"]
     y: Float[Any, "*batch T N y"]
     z: Float[Any, "*batch T N z"]
+    #: control in the row's equations: row i's acted from row i - 1 to i, row 0's before; see `held_control`
     control: Float[Any, "*batch T c"]
     result: Int[Any, "*batch T"]
     #: largest residual in natural units
@@ -32,8 +36,12 @@ class Trajectory(eqx.Module):
     iterations: Int[Any, "*batch T"]
     #: estimated discretisation error of positions along the rod (m), the largest over the nodes; NaN: unknown
     position_error: Any = None
-    #: initial history of a motion (`solvers.history.Begun`), if it is known
+    #: initial history of a motion (`solvers.history.Begun`); None if unknown
     begun: Any = None
+    #: True in rows outside the training range of a learned or identified model; None if unknown
+    extrapolated: Any = None
+    #: True if intermediate rows were left out: the controls held there are not known
+    thinned: bool = eqx.field(static=True, default=False)
 
     # named parts
 
@@ -58,16 +66,43 @@ class Trajectory(eqx.Module):
         return self.position[..., -1, :]
 
     @property
+    def held_control(self) -> Any:
+        """Controls (…, T, c), row k's held from row k to row k + 1, as for `simulate`.
+
+        The last row is NaN: the control after it is not known. Raises `ValueError` if intermediate rows were
+        left out.
+        """
+        if self.thinned:
+            raise ValueError(
+                "rows between were left out, and controls may have changed there; take held_control of the "
+                "whole trajectory"
+            )
+        numeric: Any = jnp if is_traced(self.control) else np
+        after = self.control[..., 1:, :]
+        return numeric.concatenate([after, numeric.full_like(self.control[..., :1, :], numeric.nan)], axis=-2)
+
+    @property
+    def held_tension(self) -> Any:
+        """Tensions (…, T, tendons) in N, row k's held from row k to row k + 1; NaN in the last row."""
+        layout = self.system.control_layout
+        if "tension" not in layout.names:
+            raise KeyError(
+                f"no field 'tension' among the controls; there are {', '.join(layout.names) or 'none'}; "
+                "tensions that are states are part('tension')"
+            )
+        return layout.get(self.held_control, "tension")
+
+    @property
     def tension(self) -> Any:
-        """Tendon tensions (…, T, tendons) in N, at the base; zero in row 0 of a robot that starts at rest."""
-        if "tension" in self.system.control_layout.names:
-            return self.system.control_layout.get(self.control, "tension")
-        tension = self.part("tension")
-        return tension[..., 0, :] if "tension" in self.system.y_layout.names else tension
+        """Not an attribute: a row has a tension that acted before it, and one that acts after it."""
+        raise AttributeError(
+            "a trajectory has no `tension`: held_tension[k] acts from row k to row k + 1, as in Measurements "
+            "and CSV files; part('tension')[k] is in row k's equations, and acted until row k"
+        )
 
     @property
     def arclength(self) -> Any:
-        """s of the nodes (N,) in m, or (B, N) in a batch of robots."""
+        """Arclength s of the nodes (N,) in m, or (B, N) in a batch of robots."""
         return np.linspace(0.0, 1.0, self.y.shape[-2]) * np.asarray(self.system.length)[..., None]
 
     @property
@@ -78,10 +113,10 @@ class Trajectory(eqx.Module):
         return float(self.time[1] - self.time[0])
 
     def part(self, name: str) -> Any:
-        """A field of y, z or the controls by its name: `n`, `m`, `v`, `u`, `tension` … (…, T, N, size).
+        """Return a field of y, z or the controls by name: `n`, `m`, `v`, `u`, `tension` … (…, T, N, size).
 
-        Of a robot of several rods, such as the legs of a platform, `n2` is the second one's and `n` that of
-        all of them, (…, T, N, rods, size).
+        For a robot of several rods, such as the legs of a platform, `n2` is the second rod's field and `n`
+        stacks all of them, (…, T, N, rods, size).
         """
         count, known = self.system.strands, []
         for layout, packed in self._layouts():
@@ -89,7 +124,7 @@ class Trajectory(eqx.Module):
                 return layout.get(packed, name)
             known += layout.names
             rods = tuple(f"{name}{k + 1}" for k in range(count))
-            # with no more of the name than there are rods, it is that of one field of each
+            # as many numbered fields as there are rods: one field of each rod
             if set(rods) <= set(layout.names) and f"{name}{count + 1}" not in layout.names:
                 every = packed[..., layout.indices(rods)]
                 return every.reshape(*every.shape[:-1], count, -1)
@@ -101,22 +136,22 @@ class Trajectory(eqx.Module):
 
     @property
     def force(self) -> Any:
-        """Internal force n (…, T, N, 3) in N, global frame; of several rods (…, T, N, rods, 3)."""
+        """Internal force n (…, T, N, 3) in N, global frame; with several rods (…, T, N, rods, 3)."""
         return self.part("n")
 
     @property
     def moment(self) -> Any:
-        """Internal moment m (…, T, N, 3) in N·m, global frame; of several rods (…, T, N, rods, 3)."""
+        """Internal moment m (…, T, N, 3) in N·m, global frame; with several rods (…, T, N, rods, 3)."""
         return self.part("m")
 
     @property
     def velocity(self) -> Any:
-        """Velocity q (…, T, N, 3) in m/s, material frame; of several rods (…, T, N, rods, 3)."""
+        """Velocity q (…, T, N, 3) in m/s, material frame; with several rods (…, T, N, rods, 3)."""
         return self.part("q")
 
     @property
     def angular_velocity(self) -> Any:
-        """Angular velocity ω (…, T, N, 3) in rad/s, material frame; of several rods (…, T, N, rods, 3)."""
+        """Angular velocity ω (…, T, N, 3) in rad/s, material frame; with several rods (…, T, N, rods, 3)."""
         return self.part("w")
 
     @property
@@ -128,16 +163,45 @@ class Trajectory(eqx.Module):
 
     @property
     def valid(self) -> Any:
-        """Which rows are solutions (…, T)."""
+        """True in rows that were solved (…, T)."""
         return self.result >= 0
 
     @property
+    def extrapolation(self) -> str:
+        """Message on the rows in which the model extrapolates; empty if there are none, or no known range."""
+        if self.extrapolated is None or not np.any(self.extrapolated):
+            return ""
+        rows = np.asarray(self.extrapolated)
+        first = float(np.asarray(self.time)[int(np.argmax(rows.reshape(-1, rows.shape[-1]).any(axis=0)))])
+        return (
+            f"{np.count_nonzero(rows)} of {rows.size} rows are outside the range that the model was trained "
+            f"in (controls, strains or strain rates), first at {first:g} s"
+        )
+
+    def __str__(self) -> str:
+        """Return rows, times, results, estimated error and extrapolation, in a few lines."""
+        codes, counts = np.unique(np.asarray(self.result), return_counts=True)
+        results = ", ".join(f"{n} {Result(int(code)).name}" for code, n in zip(codes, counts, strict=True))
+        batch = f"{len(self.y)} robots, " if np.ndim(self.y) == 4 else ""
+        times = f" from {float(self.time[0]):g} to {float(self.time[-1]):g} s" if len(self.time) else ""
+        lines = [
+            f"Trajectory of a {type(self.system).__name__}: {batch}{len(self.time)} rows{times}: {results}"
+        ]
+        if self.position_error is not None and np.any(np.isfinite(self.position_error)):
+            lines.append(
+                f"largest position error, by estimate: {1e3 * np.nanmax(self.position_error):.2g} mm"
+            )
+        if self.extrapolation:
+            lines.append(f"EXTRAPOLATION: {self.extrapolation}")
+        return "\n".join(lines)
+
+    @property
     def all_valid(self) -> bool:
-        """Whether every row is a solution."""
+        """True if every row was solved."""
         return bool(np.all(self.valid))
 
     def require_valid(self) -> None:
-        """Raise `ValueError`, naming the first row that is not a solution, if there is one."""
+        """Raise `ValueError`, naming the first row that was not solved, if there is one."""
         if not self.all_valid:
             first = np.argwhere(~np.asarray(self.valid))[0]
             result = Result(int(np.asarray(self.result)[tuple(first)]))
@@ -145,13 +209,15 @@ class Trajectory(eqx.Module):
             raise ValueError(f"the trajectory is not valid at {where}: {result.message}")
 
     def __getitem__(self, index: Any) -> Self:
-        """Rows of a trajectory (a slice), or one robot (an integer) or several (a slice) of a batch."""
+        """Return rows (a slice) of a trajectory, or one robot (an integer) or several (slice) of a batch."""
         if self.y.ndim == 3 and not isinstance(index, slice):
             raise TypeError(f"index a trajectory's rows by a slice, not by {index!r}")
         if self.y.ndim == 4 and not isinstance(index, slice | int | np.integer):
             raise TypeError(f"index a batch by a slice or a robot's number, not by {index!r}")
         fields: tuple[str, ...] = ("y", "z", "control", "result", "residual", "iterations")
-        fields += () if self.position_error is None else ("position_error",)
+        fields += tuple(
+            name for name in ("position_error", "extrapolated") if getattr(self, name) is not None
+        )
         picked: dict[str, Any] = {name: getattr(self, name)[index] for name in fields}
         time = self.time if self.y.ndim == 4 else self.time[index]
         system = self.system
@@ -161,8 +227,9 @@ class Trajectory(eqx.Module):
         if begun is not None and self.y.ndim == 4:
             begun = _picked(begun, index)
         elif isinstance(index, slice) and index.indices(len(self.time))[0::2] != (0, 1):
-            begun = None  # of rows that were left out, or lie further apart, it tells nothing
-        return type(self)(system, self.settings, time, **picked, begun=begun)
+            begun = None  # the initial history belongs to the first rows at the original step
+        thinned = self.thinned or (self.y.ndim == 3 and index.indices(len(self.time))[2] != 1)
+        return type(self)(system, self.settings, time, **picked, begun=begun, thinned=thinned)
 
     def save(self, path: Any) -> None:
         """Write a labelled netCDF file (see `trajectory_file.save`)."""

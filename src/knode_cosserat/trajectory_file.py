@@ -1,9 +1,9 @@
 """Trajectories as labelled netCDF files.
 
 Every field of y, z and the controls is a variable under its own name, with unit and meaning, over the
-dimensions (batch,) time, node and component. The robot is an attribute, as the text of a robot file, and so
-are the settings, as JSON; `trajectory_system` has what other systems are. Arrays come back bit for bit.
-Reading runs no code that a file brings.
+dimensions (batch,) time, node and component. The robot is an attribute, as the text of a robot file. The
+settings are an attribute too, as JSON. `trajectory_system` handles other systems. Arrays are stored exactly.
+Reading runs no code from the file.
 """
 
 from __future__ import annotations
@@ -40,17 +40,21 @@ if TYPE_CHECKING:
 FORMAT = "knode-cosserat trajectory"
 VERSION = 1
 
-#: one number in each row: name, unit and meaning
+#: variables with one number in each row: name, unit and meaning
 _ROWS = (
     ("result", "1", "how the step ended; below zero: not solved"),
     ("residual", "1", "largest residual, in natural units"),
     ("iterations", "1", "Newton corrections"),
 )
 _ERROR = ("position_error", "m", "estimated discretisation error of positions, the largest over the nodes")
-#: initial history of a motion: two states, newest first, and the newest one's rate, where the equations are
-#: evaluated along the rod; and c0, c1, c2, d1 and dt of the first step
+_OUTSIDE = ("extrapolated", "1", "1 in rows outside the range that the model was trained in")
+#: initial history of a motion: two states, newest first, and the newest one's rate, at the evaluation points
+#: along the rod; and c0, c1, c2, d1 and dt of the first step
 _BEGUN, _BEGUN_STEP = "initial_history", "initial_history_step"
 _BEGUN_ALONG = ("history_state", "history_place", "history_number")
+#: comment on each control about its interval; attribute for omitted intermediate rows
+_ACTED = "row i acted from row i - 1 to row i; row 0 before the motion"
+_THINNED = "rows_left_out"
 #: names in files of earlier versions, whose initial histories are ignored: they belong to other schemes
 _EARLIER = ("begun", "begun_step")
 
@@ -60,20 +64,20 @@ _EARLIER = ("begun", "begun_step")
 def save(trajectory: Trajectory, path: str | Path) -> None:
     """Write a trajectory as a labelled netCDF-4 file that `load_trajectory` reads back equal.
 
-    The file appears complete or not at all. A system that no file can describe does not stop it: all the
-    states are written, and `load_trajectory` asks for the system.
+    The file is written completely or not at all. For a system that no file can describe, the states are
+    still written, and `load_trajectory` needs the system as an argument.
 
     Raises:
         TrajectoryFileError: the arrays do not fit together, or the file cannot be written.
     """
     path = Path(path)
     data = _dataset(trajectory, str(path))
-    # xarray would declare NaN to mean "missing", but here it means what `result` says
+    # by default xarray declares NaN as "missing", but here `result` gives its meaning
     plain = {name: {"_FillValue": None} for name in data.variables}
     try:
         with replacing(path) as temporary:
             data.to_netcdf(temporary, engine="h5netcdf", encoding=plain)
-    except (OSError, RuntimeError) as error:  # HDF5 has either for a full disk
+    except (OSError, RuntimeError) as error:  # HDF5 raises either for a full disk
         number = error.errno if isinstance(error, OSError) else None
         reason = os.strerror(number) if number else first_line(error)
         raise TrajectoryFileError(f"{path}: cannot be written: {reason}") from None
@@ -97,12 +101,19 @@ def _dataset(trajectory: Trajectory, source: str) -> xarray.Dataset:
             component, names = _component(field, layout is system.control_layout)
             coordinates[component] = (component, names)
             values = layout.get(packed, field.name)
-            variables[field.name] = ((*rows, *along, component), values, labels(field.unit, field.meaning))
+            said = labels(field.unit, field.meaning)
+            if layout is system.control_layout:
+                said |= {"comment": _ACTED}
+            variables[field.name] = ((*rows, *along, component), values, said)
     for name, unit, meaning in _ROWS:
         variables[name] = (rows, np.asarray(getattr(trajectory, name)), labels(unit, meaning))
     if trajectory.position_error is not None:
         name, unit, meaning = _ERROR
         variables[name] = (rows, np.asarray(trajectory.position_error), labels(unit, meaning))
+    if trajectory.extrapolated is not None:
+        name, unit, meaning = _OUTSIDE
+        marks = np.asarray(trajectory.extrapolated).astype(np.int8)
+        variables[name] = (rows, marks, labels(unit, meaning))
     variables["result"][2].update(_flags(variables["result"][1].dtype))
     if trajectory.begun is not None:
         begun = Begun(*map(np.asarray, trajectory.begun))
@@ -128,7 +139,7 @@ def _dataset(trajectory: Trajectory, source: str) -> xarray.Dataset:
         ) from None
 
 
-#: the dimensions of y, z and the controls beside time
+#: dimensions of y, z and the controls besides time
 _ALONG: tuple[tuple[str, ...], ...] = (("node",), ("node",), ())
 
 
@@ -141,7 +152,7 @@ def _packed(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def _component(field: Field, control: bool) -> tuple[str, list[Any]]:
-    """The last dimension of a field's variable: its name, and what its places are called."""
+    """Return the last dimension of a field's variable: its name, and the labels of its components."""
     if field.name == "h" and field.size == 4:
         return "quaternion", ["w", "x", "y", "z"]
     if field.size == 3 and not control:
@@ -150,7 +161,7 @@ def _component(field: Field, control: bool) -> tuple[str, list[Any]]:
 
 
 def _flags(dtype: np.dtype) -> dict[str, Any]:
-    """The result codes, as the CF conventions have them."""
+    """Return the attributes of the result codes, by the CF conventions."""
     return {
         "flag_values": np.array([int(result) for result in Result], dtype=dtype),
         "flag_meanings": " ".join(result.name.lower() for result in Result),
@@ -158,10 +169,10 @@ def _flags(dtype: np.dtype) -> dict[str, Any]:
 
 
 def _require_names(system: System, source: str) -> None:
-    """A field's name must be free to be a variable's."""
+    """Raise `TrajectoryFileError` unless every field's name can be a variable's name."""
     names = [field.name for layout in _layouts(system) for field in layout.fields]
     taken = {"time", "node", "batch", "arclength", "axis", "quaternion", BYTES, SIZES}
-    taken |= {_BEGUN, _BEGUN_STEP, *_EARLIER, *(name for name, *_ in (*_ROWS, _ERROR))}
+    taken |= {_BEGUN, _BEGUN_STEP, *_EARLIER, *(name for name, *_ in (*_ROWS, _ERROR, _OUTSIDE))}
     for name in names:
         if name in taken or "/" in name or name.startswith(PARAMETER) or name.endswith("_index"):
             raise TrajectoryFileError(
@@ -176,6 +187,7 @@ def _attributes(trajectory: Trajectory, source: str) -> dict[str, Any]:
     return {
         "title": f"Trajectory of a {type(system).__name__}",
         "comment": "Row 0 is the initial state, row i the state after control i; NaN if not solved.",
+        _THINNED: int(trajectory.thinned),
         "format": FORMAT,
         "format_version": VERSION,
         "knode_cosserat_version": package_version(),
@@ -192,11 +204,11 @@ def load_trajectory(path: str | Path, *, system: System | None = None) -> Trajec
 
     Args:
         path: the file.
-        system: whose trajectory it is. Only needed for a system that no file can describe, such as one of a
-            class of yours.
+        system: the trajectory's system. Only needed for a system that no file can describe, such as one of a
+            user's class.
 
     Raises:
-        TrajectoryFileError: the file cannot be read, is something else, or does not hold what it should.
+        TrajectoryFileError: the file cannot be read, is not a trajectory, or has invalid contents.
     """
     path = Path(path)
     data = _read(path)
@@ -214,8 +226,11 @@ def load_trajectory(path: str | Path, *, system: System | None = None) -> Trajec
     numbers["result"] = _current_codes(numbers["result"], data["result"].attrs)
     if _ERROR[0] in data.variables:
         numbers[_ERROR[0]] = values_of(path, data, _ERROR[0], rows)
+    if _OUTSIDE[0] in data.variables:
+        numbers[_OUTSIDE[0]] = values_of(path, data, _OUTSIDE[0], rows).astype(bool)
     settings, begun = _settings(path, data), _begun(path, data)
-    return Trajectory(system, settings, time, y, z, control, **numbers, begun=begun)
+    thinned = bool(data.attrs.get(_THINNED, 0))
+    return Trajectory(system, settings, time, y, z, control, **numbers, begun=begun, thinned=thinned)
 
 
 def _current_codes(codes: np.ndarray, attributes: dict[Any, Any]) -> np.ndarray:
@@ -251,7 +266,7 @@ def _read(path: Path) -> xarray.Dataset:
             return data.load()
     except TrajectoryFileError:
         raise
-    except Exception as error:  # each of three libraries has its own for a damaged file
+    except Exception as error:  # each of three libraries has its own exceptions for a damaged file
         raise TrajectoryFileError(f"{path}: truncated or damaged: {first_line(error)}") from error
 
 

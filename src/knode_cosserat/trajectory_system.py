@@ -1,8 +1,8 @@
-"""Systems in files of trajectories: how one is described there, and made again.
+"""Systems in files of trajectories: their description, and their reconstruction.
 
-A robot is there as the text of a robot file, and the parameters of a batch as variables. A system that no
-robot file describes is there as the bytes of a file of its own, if there is a codec for its class. Making a
-system again runs no code that a file brings.
+A robot is stored as the text of a robot file, with the parameters of a batch as variables. A system without a
+robot file is stored as the bytes of another file, if there is a codec for its class. Reconstruction runs no
+code from the file.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from knode_cosserat.rods.system import System
 if TYPE_CHECKING:
     import xarray
 
-#: stands before a parameter's name where each robot of a batch has its own
+#: prefix of a parameter's name if each robot of a batch has its own value
 PARAMETER = "robot_"
-#: the bytes of a system that has a codec; of a batch, one system's after the other's, with their sizes
+#: the bytes of a system with a codec; for a batch, the systems' bytes in sequence, with their sizes
 BYTES, SIZES = "system_bytes", "system_sizes"
 
 
 class TrajectoryFileError(ValueError):
-    """A trajectory's file that cannot be read or written; the message is one line that says why."""
+    """A trajectory's file cannot be read or written; the message is one line with the reason."""
 
 
 class Codec(NamedTuple):
-    """How systems of a class become bytes and come back; the text is what errors call the file.
+    """Conversion of systems of a class to bytes and back; the text names the file in errors.
 
-    Both raise a `ValueError` of one line for what they cannot write or read.
+    Both functions raise a `ValueError` of one line on failure.
     """
 
     cls: type[System]
@@ -49,7 +49,7 @@ _codecs: dict[str, Codec] = {}
 def register_codec(
     cls: type[System], encode: Callable[[Any, str], bytes], decode: Callable[[bytes, str], System]
 ) -> None:
-    """Let files of trajectories hold systems of a class that no robot file can name (see `Codec`)."""
+    """Register a codec, so that files of trajectories can hold systems of a class without a robot file."""
     _codecs[cls.__name__] = Codec(cls, encode, decode)
 
 
@@ -57,13 +57,13 @@ def register_codec(
 
 
 def described(system: System) -> tuple[dict[str, str], dict[str, Any]]:
-    """Attributes and variables from which the system can be made again, if that is possible."""
+    """Return attributes and variables that reconstruct the system, if that is possible."""
     codec = _codecs.get(type(system).__name__)
     batch = np.ndim(system.length) > 0
     if type(system) in robot_file.KINDS.values():
         try:
             robot = {"robot": robot_file.format_robot(_robot(system, 0) if batch else system)}
-        except robot_file.RobotFileError as error:  # one of its parts is made of code
+        except robot_file.RobotFileError as error:  # one of its parts is a Python function
             return {"system_missing": first_line(error)}, {}
         return robot, _parameters(system) if batch else {}
     if codec is None or codec.cls is not type(system):
@@ -82,12 +82,12 @@ def described(system: System) -> tuple[dict[str, str], dict[str, Any]]:
 
 
 def _robot(system: System, index: int) -> System:
-    """One robot of a batch."""
+    """Return one robot of a batch."""
     return jax.tree.map(lambda leaf: leaf[index], system)
 
 
 def _parameters(system: System) -> dict[str, Any]:
-    """The parameters of a batch of robots, and of their parts, as variables."""
+    """Return the parameters of a batch of robots, and of their parts, as variables."""
     variables: dict[str, Any] = {}
     for name, parameter, values in _numbers(system):
         values = np.asarray(values)
@@ -97,9 +97,9 @@ def _parameters(system: System) -> dict[str, Any]:
 
 
 def _numbers(owner: Any, before: str = "") -> Iterator[tuple[str, Parameter, Any]]:
-    """Every parameter that is set, of a robot and its parts: its name as `System.replace` has it, and value.
+    """Yield every parameter that is set, of a robot and its parts: name for `System.replace`, and value.
 
-    Places are not among them: they are the same for all robots of a batch.
+    Places are left out: they are equal for all robots of a batch.
     """
     fixed = {field.name for field in dataclasses.fields(owner) if field.metadata.get("static")}
     for name, parameter in parameters_of(type(owner)).items():
@@ -114,7 +114,7 @@ def _numbers(owner: Any, before: str = "") -> Iterator[tuple[str, Parameter, Any
 
 
 def labels(unit: str, meaning: str) -> dict[str, Any]:
-    """A variable's attributes."""
+    """Return a variable's attributes."""
     return {"units": unit, "long_name": meaning}
 
 
@@ -122,7 +122,7 @@ def labels(unit: str, meaning: str) -> dict[str, Any]:
 
 
 def system_of(path: Path, data: xarray.Dataset) -> System:
-    """The robot, or the batch of robots, that the file describes."""
+    """Return the robot, or the batch of robots, described in the file."""
     text = data.attrs.get("robot")
     if text is None:
         return _from_bytes(path, data)
@@ -144,7 +144,7 @@ def system_of(path: Path, data: xarray.Dataset) -> System:
 
 
 def _from_bytes(path: Path, data: xarray.Dataset) -> System:
-    """The system, or the batch of systems, whose bytes the file holds."""
+    """Return the system, or the batch of systems, stored as bytes in the file."""
     name = str(data.attrs.get("system", "class unknown"))
     ask = "give it, load_trajectory(path, system=…)"
     if BYTES not in data.variables:
@@ -175,7 +175,7 @@ def _from_bytes(path: Path, data: xarray.Dataset) -> System:
 
 
 def values_of(path: Path, data: xarray.Dataset, name: str, shape: tuple[int, ...] | None) -> Any:
-    """The numbers of one variable; of any shape if none is given."""
+    """Return the numbers of one variable; any shape is allowed if `shape` is None."""
     if name not in data.variables:
         raise TrajectoryFileError(f"{path}: the variable {name!r} is missing")
     values = np.asarray(data[name].values)
@@ -191,6 +191,6 @@ def values_of(path: Path, data: xarray.Dataset, name: str, shape: tuple[int, ...
 
 
 def first_line(error: Exception) -> str:
-    """What an error says first, or what it is."""
+    """Return the first line of an error's message, or the name of its class."""
     lines = str(error).splitlines()
     return lines[0] if lines else type(error).__name__

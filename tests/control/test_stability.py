@@ -6,6 +6,7 @@ import pytest
 import knode_cosserat as kc
 from knode_cosserat.rods.ends import Clamped, Free, Pinned
 from knode_cosserat.rods.loads import PointWrench
+from knode_cosserat.rods.tendon_friction import TendonFriction, Vibration
 
 L, RADIUS, E = 0.5, 2e-3, 2e9
 EI, EA = E * np.pi * RADIUS**4 / 4, E * np.pi * RADIUS**2
@@ -274,7 +275,9 @@ def test_reels_are_refused():
 def test_friction_is_not_counted():
     """All tendons together push a column down, with or without friction in it."""
     robot = kc.RoutedTendonRobot.like(kc.load_robot("delrin-tendon-robot"), length=1.0)
-    rough = robot.replace(friction_wobble=0.5, friction_curvature=0.1, vibration_rate=0.0)
+    rough = robot.replace(
+        friction=TendonFriction(wobble=0.5, curvature=0.1), vibration=Vibration(tension=1e6, rate=0.0)
+    )
     for gravity in (-9.81, -60.0):
         found = [
             kc.stability(kc.equilibrium(each.replace(gravity=[0.0, 0.0, gravity]), np.full(4, 5.0)))

@@ -39,7 +39,7 @@ def recording(trajectory):
     tip = np.asarray(trajectory.tip_position) + rng.normal(0.0, 0.05, trajectory.tip_position.shape)
     return kc.Measurements(
         time=7.0 + np.asarray(trajectory.time),
-        tension=np.asarray(trajectory.tension),
+        tension=np.asarray(trajectory.held_tension),
         fractions=np.ones(1),
         position=tip[:, None],
         quaternion=np.full((len(tip), 1, 4), np.nan),
@@ -129,7 +129,7 @@ def test_tensions_are_held_from_row_to_row(trajectory):
     axes = figures.tensions(trajectory).axes[0]
     for k, patch in enumerate(axes.patches):
         values, edges, _ = patch.get_data()
-        np.testing.assert_array_equal(values, np.asarray(trajectory.tension)[1:, k])
+        np.testing.assert_array_equal(values, np.asarray(trajectory.held_tension)[:-1, k])
         np.testing.assert_array_equal(edges, trajectory.time)
     assert [text.get_text() for text in axes.get_legend().get_texts()] == [f"tendon {k}" for k in range(1, 5)]
 

@@ -43,7 +43,7 @@ def test_controls_are_drawn_one_below_the_other(truth, baseline):
         assert axes.get_title() == title
         assert (axes.get_xlabel(), axes.get_ylabel()) == ("time [s]", "tension [N]")
         for k, patch in enumerate(axes.patches):
-            np.testing.assert_array_equal(patch.get_data()[0], np.asarray(truth.tension)[1:, k])
+            np.testing.assert_array_equal(patch.get_data()[0], np.asarray(truth.held_tension)[:-1, k])
     assert labels(figure) == [f"tendon {k}" for k in range(1, 5)]
 
 

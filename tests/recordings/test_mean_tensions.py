@@ -1,4 +1,4 @@
-"""Mean tensions from row to row: what a simulation with a fine time step is driven by."""
+"""Mean tensions about the next row: what a simulation with an implicit time scheme is driven by."""
 
 import dataclasses
 
@@ -50,7 +50,7 @@ def lines(recording, time):
 
 def test_a_mean_is_that_of_the_lines_between_messages(uneven):
     given = uneven.sampled(0.05, start=0.2, mean=True)
-    fine = np.linspace(0.0, 0.05, 20001)
+    fine = np.linspace(0.025, 0.075, 20001)
     for row in (0, 1, 17, 40, len(given.time) - 3):
         values = lines(uneven, given.time[row] + fine)
         np.testing.assert_allclose(given.tension[row], np.trapezoid(values, fine, axis=0) / 0.05, rtol=1e-5)
@@ -65,30 +65,34 @@ def test_a_mean_is_that_of_the_lines_between_messages(uneven):
 def test_means_of_means_are_means(uneven, dt):
     """Whatever the time step, all rows together are the integral: no tension is lost or counted twice."""
     given = uneven.sampled(dt, start=0.2, end=3.0, mean=True)
-    breaks = np.unique(np.concatenate([[0.2, 3.0], TIMES[(TIMES > 0.2) & (TIMES < 3.0)]]))
+    first, last = 0.2 + 0.5 * dt, 3.0 + 0.5 * dt
+    breaks = np.unique(np.concatenate([[first, last], TIMES[(first < TIMES) & (last > TIMES)]]))
     integral = np.trapezoid(lines(uneven, breaks), breaks, axis=0)
     np.testing.assert_allclose(given.tension[:-1].sum(axis=0) * dt, integral, rtol=1e-12)
-    # the last row's goes on from there: it drives whatever comes after the rows
-    coarse = uneven.sampled(2 * dt, start=0.2, end=3.0, mean=True)
-    pairs = given.tension[: 2 * (len(coarse.time) - 1)].reshape(-1, 2, 2).mean(axis=1)
-    np.testing.assert_allclose(coarse.tension[:-1], pairs, rtol=1e-12)
+    # three rows from the second on lie about the same row as one of three times the time
+    coarse = uneven.sampled(3 * dt, start=0.2, end=3.0, mean=True)
+    rows = (len(given.time) - 2) // 3
+    triples = given.tension[1 : 1 + 3 * rows].reshape(-1, 3, 2).mean(axis=1)
+    np.testing.assert_allclose(coarse.tension[:rows], triples, rtol=1e-12)
 
 
-def test_a_constant_stays_and_a_line_is_taken_in_its_middle():
+def test_a_constant_stays_and_a_line_is_taken_at_the_next_row():
     time = np.round(np.arange(0.0, 4.0, 0.02), 6)
     constant = recorded(time, np.tile([5.0, 2.0], (len(time), 1))).sampled(0.05, mean=True)
     np.testing.assert_allclose(constant.tension, np.tile([5.0, 2.0], (len(constant.time), 1)), rtol=1e-12)
     rising = recorded(time, np.stack([time, 9.0 - 2 * time], axis=1)).sampled(0.05, end=3.9, mean=True)
-    middle = rising.time + 0.025
-    np.testing.assert_allclose(rising.tension, np.stack([middle, 9.0 - 2 * middle], axis=1), rtol=1e-12)
+    after = rising.time + 0.05
+    np.testing.assert_allclose(rising.tension, np.stack([after, 9.0 - 2 * after], axis=1), rtol=1e-12)
 
 
 def test_before_the_first_message_and_after_the_last_its_tension_holds():
     time, values = np.array([0.03, 0.1, 0.13]), np.array([[1.0, 1.0], [3.0, 1.0], [7.0, 1.0]])
     given = recorded(time, values, until=0.13).sampled(0.1, start=0.0, mean=True)
-    # 0.03 s at 1 N, then 0.07 s on the way to 3 N; 0.03 s on the way to 7 N, then 0.07 s there
+    # from 0.05 to 0.15 s: 0.05 s on the way from 1 to 3 N, 0.03 s on the way to 7 N, then 0.02 s there
     np.testing.assert_allclose(given.time, [0.0, 0.1])
-    np.testing.assert_allclose(given.tension[:, 0], [0.3 * 1 + 0.7 * 2, 0.3 * 5 + 0.7 * 7], rtol=1e-12)
+    np.testing.assert_allclose(
+        given.tension[:, 0], [0.5 * (11 / 7 + 3) / 2 + 0.3 * 5 + 0.2 * 7, 7.0], rtol=1e-12
+    )
     alone = recorded(np.array([0.05]), np.array([[4.0, 5.0]]), until=0.05).sampled(0.05, mean=True)
     np.testing.assert_allclose(alone.tension, [[4.0, 5.0], [4.0, 5.0]])
 
@@ -119,14 +123,14 @@ def test_a_pause_stays_unknown(uneven):
     times = paused.tension.time
     last, following = times[times < 1.0][-1], times[times > 2.0][0]
     unknown = ~np.isfinite(given.tension).all(axis=1)
-    end = given.time + 0.05
+    begin, end = given.time + 0.025, given.time + 0.075
     # a tension is believed for as long as a pause is bridged
-    np.testing.assert_array_equal(unknown, (end > last + 0.1) & (given.time < following))
+    np.testing.assert_array_equal(unknown, (end > last + 0.1) & (begin < following))
     plain = uneven.sampled(0.05, start=0.2, mean=True)
-    whole = (end < last) | (given.time > following)
+    whole = (end < last) | (begin > following)
     np.testing.assert_allclose(given.tension[whole], plain.tension[whole])
     # until then it is held, and no line leads to what was measured a second later
-    held = ~unknown & (given.time > last) & (given.time < following)
+    held = ~unknown & (begin > last) & (begin < following)
     assert held.any()
     np.testing.assert_allclose(given.tension[held], np.tile(lines(paused, np.array([last])), (held.sum(), 1)))
 

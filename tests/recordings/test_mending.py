@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 import knode_cosserat as kc
 from knode_cosserat.recordings import MarkerSource, RecordingConfig, TensionSource, cleaning
 from knode_cosserat.recordings.write import Poses, Pulls, write_recording
-from tests.recordings.made import PAPER, TURNED, changed, made, moved, write
+from tests.recordings.made import CLAMP, PAPER, TURNED, changed, made, moved, write
 
 TIP = "/vicon/continuum_3/pose"
 CUBE = Rotation.create_group("O")
@@ -289,11 +289,43 @@ def test_bodies_in_another_order_are_flagged(tmp_path, streams):
     assert finding.severity == "problem"
 
 
-def test_a_rod_that_does_not_point_up_at_rest_is_flagged(tmp_path, streams):
-    lying = dataclasses.replace(PAPER, rotation=(np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0))
-    write(tmp_path / "it.bag", streams)
-    recording = kc.load_recording(tmp_path / "it.bag", lying)
-    assert "degrees from straight above the clamped end" in said(recording, "at rest the last body").message
+@pytest.mark.parametrize("degrees", [30.0, 90.0])
+def test_a_straight_rod_that_does_not_point_along_its_axis_is_flagged(tmp_path, streams, degrees):
+    turn = Rotation.from_rotvec([np.radians(degrees), 0.0, 0.0])
+    poses = {name: each for name, each in streams[0].items() if name != "base"}
+    upright = dataclasses.replace(PAPER, base=None)
+    lying = dataclasses.replace(
+        upright, rotation=tuple(turn.as_quat(scalar_first=True)), origin=tuple(turn.apply(CLAMP))
+    )
+    write(tmp_path / "it.bag", (poses, *streams[1:]), upright)
+    finding = said(kc.load_recording(tmp_path / "it.bag", lying), "at rest the last body")
+    assert finding.severity == "problem"
+    assert (
+        f"{degrees:.0f} degrees from the axis of the clamped end, and the others as well" in finding.message
+    )
+
+
+@pytest.mark.parametrize(
+    ("degrees", "severity"), [(2.0, None), (11.0, "note"), (60.0, "note"), (85.0, "problem")]
+)
+def test_a_robot_that_sags_at_rest_is_no_problem(tmp_path, streams, degrees, severity):
+    """On an arc, as of a robot that lies, the chord leans by half of the bend; the length is the arc's."""
+    poses, tension, command = streams
+    bend = 2 * np.radians(degrees)
+    sagging = {}
+    for marker in PAPER.markers:
+        own = poses[marker.name]
+        s = marker.fraction
+        arc = 0.635 * np.array([(1 - np.cos(s * bend)) / bend, 0.0, np.sin(s * bend) / bend])
+        sagging[marker.name] = dataclasses.replace(own, position=own.position - own.position[0] + arc + CLAMP)
+    recording = read(tmp_path, ({**poses, **sagging}, tension, command))
+    about = [each for each in recording.findings if "at rest the last body" in each.message]
+    assert [each.severity for each in about] == ([] if severity is None else [severity])
+    if severity == "note":
+        assert f"is {degrees:.0f} degrees" in about[0].message
+        assert "sags, is bent or is pulled" in about[0].message
+    np.testing.assert_allclose(recording.health().rod_length, 0.635, rtol=5e-3)
+    assert not any("another order" in each.message for each in recording.findings)
 
 
 def test_a_simulated_robot_is_called_one(tmp_path, streams):

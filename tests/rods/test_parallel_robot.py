@@ -125,7 +125,7 @@ def test_a_trajectory_has_what_its_legs_have():
         np.testing.assert_array_equal(motion.part("u"), strains[pick][..., 3:])
         np.testing.assert_array_equal(motion.part("n6"), motion.force[..., 5, :])
         with pytest.raises(KeyError, match=r"no field 'tension'; there are p1, h1, .* displacement"):
-            _ = motion.tension
+            _ = motion.part("tension")
     assert jax.jit(lambda motion: motion.force)(motion).shape == (2, 3, 10, 6, 3)
 
 

@@ -22,6 +22,7 @@ from knode_cosserat.rods.robot_file import KINDS, RobotFileError, format_robot, 
 from knode_cosserat.rods.routing import FunctionRouting, Routing
 from knode_cosserat.rods.section import SectionChange
 from knode_cosserat.rods.surroundings import Obstacle, Sphere
+from knode_cosserat.rods.tendon_friction import TendonFriction
 from knode_cosserat.rods.virtual_robot import VirtualRobot
 
 BODY = {"length": 0.5, "radius": 0.005, "density": 1000.0, "youngs_modulus": 1e6}
@@ -83,7 +84,7 @@ TENDONS = {"tendon_offset": st.just(0.01), "tendon_angles": st.just([0.0, 2.0])}
 ROUTED = {
     **ROD, **TENDONS, "drive": st.sampled_from(["tension", "reel"]),
     "routing": st.none() | st.lists(parts(Routing), min_size=2, max_size=2).map(tuple),
-    "friction_wobble": st.none() | st.floats(0.0, 1.0), "tendon_compliance": st.floats(0.0, 1.0),
+    "friction": st.none() | parts(TendonFriction), "tendon_compliance": st.floats(0.0, 1.0),
 }  # fmt: skip
 FIELDS = {
     "slender-rod": ROD,

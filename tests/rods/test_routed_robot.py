@@ -1,5 +1,7 @@
 """Tendons beside the rod: closed forms, symmetry, friction as a memory, vibration, derivatives."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
@@ -7,12 +9,14 @@ from scipy.spatial.transform import Rotation
 
 import knode_cosserat as kc
 from knode_cosserat.rods.robot_file import format_robot, parse_robot
+from knode_cosserat.rods.section import Sleeve
+from knode_cosserat.rods.tendon_friction import TendonFriction, Vibration
 from knode_cosserat.solvers.result import Result
 
 KNOWLEDGE = kc.load_robot("delrin-tendon-robot")
 NO_LOADS = {"gravity": [0.0, 0.0, 0.0], "drag": 0.0}
 RUBBING = {
-    "friction_wobble": 0.6, "friction_curvature": 0.1, "friction_reach": 0.1, "bending_damping": 2e-3
+    "friction": TendonFriction(wobble=0.6, curvature=0.1, reach=0.1), "bending_damping": 2e-3
 }  # fmt: skip
 
 
@@ -64,7 +68,7 @@ def test_tendons_pull_the_rod_to_their_side_like_the_crude_model():
 
 
 def test_a_quarter_turn_of_the_tendons_is_a_quarter_turn_of_the_robot():
-    robot = kc.RoutedTendonRobot.like(KNOWLEDGE, **RUBBING, sleeve_stiffening=1.0)
+    robot = kc.RoutedTendonRobot.like(KNOWLEDGE, **RUBBING, sections=(Sleeve(stiffening=1.0),))
     control = kc.controls.parse("random:3", 60, 0.025)
     one, other = kc.simulate(robot, control, 0.025), kc.simulate(robot, np.roll(control, 1, axis=1), 0.025)
     turned = Rotation.from_euler("z", 90, degrees=True).apply(one.position.reshape(-1, 3))
@@ -111,7 +115,7 @@ def test_friction_stays_between_none_and_all_and_opposes_motion():
     way = np.zeros_like(rate)
     for k in range(1, len(rate)):
         way[k] = np.where(rate[k] * rate[k - 1] > 0.0, way[k - 1], 0.0) + rate[k]
-    sliding = np.abs(way) > 3 * float(robot.friction_reach)
+    sliding = np.abs(way) > 3 * float(robot.friction.reach)
     assert sliding.sum() > 200
     assert np.all(np.sign(f[1:][sliding]) == np.sign(rate[sliding]))
 
@@ -119,7 +123,7 @@ def test_friction_stays_between_none_and_all_and_opposes_motion():
 @pytest.mark.campaign
 def test_vibration_frees_the_tendons_and_stays_until_tension_falls():
     robot = kc.RoutedTendonRobot.like(
-        KNOWLEDGE, **RUBBING, vibration_tension=20.0, vibration_rate=1.0, vibration_softening=1e-3
+        KNOWLEDGE, **RUBBING, vibration=Vibration(tension=20.0, rate=1.0, softening=1e-3)
     )
     total = np.concatenate([np.full(20, 16.0), np.full(20, 24.0), np.full(20, 18.0)])
     along = kc.simulate(robot, np.repeat(total[:, None] / 4, 4, axis=1), 0.05)
@@ -130,11 +134,11 @@ def test_vibration_frees_the_tendons_and_stays_until_tension_falls():
 
 @pytest.mark.campaign
 def test_derivatives_are_those_of_the_solution():
-    robot = kc.RoutedTendonRobot.like(KNOWLEDGE, **RUBBING, sleeve_stiffening=1.0)
+    robot = kc.RoutedTendonRobot.like(KNOWLEDGE, **RUBBING, sections=(Sleeve(stiffening=1.0),))
     control = kc.controls.parse("sine:0.7", 30, 0.05)
 
     def tip(wobble, reach):
-        changed = robot.replace(friction_wobble=wobble, friction_reach=reach)
+        changed = robot.replace(friction=dataclasses.replace(robot.friction, wobble=wobble, reach=reach))
         return kc.simulate(changed, control, 0.05).position[-1, -1]
 
     slopes = jax.jacfwd(tip, argnums=(0, 1))(0.6, 0.1)
@@ -160,7 +164,7 @@ def test_the_batch_does_what_each_robot_does():
 @pytest.mark.campaign
 def test_strong_pulls_and_much_friction_are_solved_or_reported():
     robot = kc.RoutedTendonRobot.like(
-        KNOWLEDGE, friction_wobble=1.0, friction_reach=0.03, bending_damping=2e-3
+        KNOWLEDGE, friction=TendonFriction(wobble=1.0, reach=0.03), bending_damping=2e-3
     )
     for seed in range(4):
         control = 3.0 * kc.controls.parse(f"random:{seed}", 60, 0.05)

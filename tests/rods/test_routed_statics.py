@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 import knode_cosserat as kc
 from knode_cosserat.rods.routing import Helical, Polynomial, Straight, Tapered
+from knode_cosserat.rods.tendon_friction import TendonFriction
 from tests.rods import rucker_webster as oracle
 
 DELRIN = kc.load_robot("delrin-tendon-robot")
@@ -153,7 +154,7 @@ def test_a_batch_of_reeled_robots_is_each_by_itself():
 def helices(turn=0.0):
     routing = tuple(Helical(0.02, turn + k * np.pi / 2, 0.5) for k in range(4))
     return kc.RoutedTendonRobot.like(
-        DELRIN, routing=routing, friction_wobble=0.6, friction_curvature=0.3, friction_reach=0.02,
+        DELRIN, routing=routing, friction=TendonFriction(wobble=0.6, curvature=0.3, reach=0.02),
         gravity=[0.0, 0.0, 0.0],
     )  # fmt: skip
 

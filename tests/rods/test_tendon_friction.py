@@ -5,16 +5,22 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 
-from knode_cosserat.rods.tendon_friction import STRAIGHT, held, loss_rates, shaking
+from knode_cosserat.rods.tendon_friction import STRAIGHT, TendonFriction, Vibration
 
 REACH = 0.1
+FRICTION = TendonFriction(wobble=0.6, curvature=0.1, reach=REACH)
+VIBRATION = Vibration(tension=10.0, rate=0.4)
+#: a tendon that bends the rod about its first axis
+FIRST = np.array([[1.0, 0.0, 0.0]])
+STILL = np.zeros(3)
 PATHS = st.lists(st.floats(-0.5, 0.5), min_size=1, max_size=20)
 
 
 def remembered(changes, dt, f=0.0):
     """f after these changes of curvature (1/m), each within a step of BDF1."""
     for change in changes:
-        f = float(held(np.array([change / REACH / dt]), np.array([-f / dt]), 1.0 / dt)[0])
+        rate = np.array([change / dt, 0.0, 0.0])
+        f = float(FRICTION.held(FIRST, rate, STILL, np.array([-f / dt]), 1.0 / dt)[0])
     return f
 
 
@@ -48,26 +54,36 @@ def test_turning_round_takes_twice_the_reach():
 
 
 def test_at_rest_nothing_holds_and_vibration_has_grown_as_far_as_it_will():
-    np.testing.assert_array_equal(held(np.ones(2), np.ones(2), np.array(0.0)), 0.0)
-    grown = [float(shaking(np.array(rate), np.zeros(1), np.array(0.0))[0]) for rate in (-1.0, 0.0, 2.0)]
+    rest = np.array(0.0)
+    bent = np.array([0.5, 0.0, 0.0])
+    np.testing.assert_array_equal(FRICTION.held(FIRST, bent, bent, np.ones(1), rest), 0.0)
+    grown = [float(VIBRATION.shaken(total, np.zeros(1), rest)[0]) for total in (8.0, 10.0, 15.0)]
     assert grown == [0.0, 0.0, 1.0]
+
+
+@pytest.mark.parametrize(("part", "expected"), [(0.5, 0.25), (-0.5, -0.25), (1.0, 0.5)])
+def test_an_equilibrium_may_keep_a_part_of_the_friction(part, expected):
+    """Of what a motion from the unloaded rod to half the reach would have built up."""
+    friction = TendonFriction(wobble=0.6, reach=REACH, at_rest=part)
+    bent = np.array([0.5 * REACH, 0.0, 0.0])
+    assert float(friction.held(FIRST, STILL, bent, np.zeros(1), np.array(0.0))[0]) == pytest.approx(expected)
 
 
 def test_vibration_grows_at_its_rate_and_stays_between_none_and_all():
     x, c0 = 0.0, 1.0 / 0.1
     for step in range(1, 20):
-        x = float(shaking(np.array(0.8), np.array([-x * c0]), c0)[0])
+        x = float(VIBRATION.shaken(12.0, np.array([-x * c0]), c0)[0])
         assert x == pytest.approx(min(1.0, 0.8 * 0.1 * step), abs=1e-12)
     for _ in range(40):
-        x = float(shaking(np.array(-0.8), np.array([-x * c0]), c0)[0])
+        x = float(VIBRATION.shaken(8.0, np.array([-x * c0]), c0)[0])
     assert x == 0.0
 
 
 def test_an_arc_loses_what_a_capstan_does():
     """λ of an arc by μ times its angle, and by k times its length; the angle less what is nearly straight."""
     u, length = np.array([3.0, 4.0, 100.0]), 0.7
-    rates = loss_rates(u, np.array([1.0, -0.5]), 0.6, 0.1)
+    rates = FRICTION.loss_rates(u, np.array([1.0, -0.5]))
     np.testing.assert_allclose(length * rates, length * (0.6 + 0.1 * 5.0) * np.array([1.0, -0.5]), rtol=1e-3)
     straight = np.hypot(5.0, STRAIGHT) - STRAIGHT
     np.testing.assert_allclose(rates[0], 0.6 + 0.1 * straight, rtol=1e-14)
-    np.testing.assert_allclose(loss_rates(u, np.ones(1), None, 0.1), 0.1 * straight)
+    np.testing.assert_allclose(TendonFriction(curvature=0.1).loss_rates(u, np.ones(1)), 0.1 * straight)

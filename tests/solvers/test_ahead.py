@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
+from knode_cosserat.rods.tendon_friction import TendonFriction
 from knode_cosserat.solvers.ahead import in_two
 from knode_cosserat.solvers.grid import at_places
 from knode_cosserat.solvers.history import rest_record
@@ -20,9 +21,11 @@ ROBOTS = {
     "helical, one ends": lambda: kc.RoutedTendonRobot.like(
         kc.load_robot("delrin-tendon-robot"), routing=HELIX
     ),
-    "friction": lambda: kc.RoutedTendonRobot.like(kc.load_robot("delrin-tendon-robot"), friction_wobble=0.6),
+    "friction": lambda: kc.RoutedTendonRobot.like(
+        kc.load_robot("delrin-tendon-robot"), friction=TendonFriction(wobble=0.6)
+    ),
     "friction, one ends": lambda: kc.RoutedTendonRobot.like(
-        kc.load_robot("delrin-tendon-robot"), routing=HELIX, friction_curvature=0.1
+        kc.load_robot("delrin-tendon-robot"), routing=HELIX, friction=TendonFriction(curvature=0.1)
     ),
     "reel": lambda: kc.RoutedTendonRobot.like(
         kc.load_robot("delrin-tendon-robot"), drive="reel", tendon_compliance=1e-4

@@ -228,7 +228,7 @@ def test_derivatives_go_through_a_tendon_that_goes_slack():
     # slack in some rows and taut in others, and nothing recovered: what was would be NaN here
     motion = kc.simulate(robot, reels, 0.05)
     assert set(np.asarray(motion.result)) == {0}
-    assert np.min(motion.tension[1:, 0]) < 1e-5 and np.max(motion.tension[:, 0]) > 100.0
+    assert np.min(motion.part("tension")[1:, 0, 0]) < 1e-5 and np.max(motion.part("tension")[:, 0, 0]) > 100.0
 
     def tip(part):
         return kc.simulate(robot, part * reels, 0.05).tip_position[-1, 0]

@@ -17,6 +17,7 @@ from knode_cosserat.rods.ends import Clamped, Driven, Pinned
 from knode_cosserat.rods.loads import AttachedMass, DistributedWrench, PointWrench
 from knode_cosserat.rods.routing import Helical, Polynomial, Straight, Tapered
 from knode_cosserat.rods.surroundings import Cylinder, Plane, Sphere
+from knode_cosserat.rods.tendon_friction import TendonFriction
 from tests.solvers.test_random_cases import Case, worst_result
 
 STEPS = 40
@@ -160,7 +161,7 @@ def with_tendons(seed, drive="tension", hurry=QUICK):
         more = {"drive": "reel", "tendon_compliance": compliance}
     else:
         control = draws.signals(4, 0.0, 3.0 * EI / (L * r))
-        more = {"friction_wobble": draws.log(0.01, 1.0) / L, "friction_curvature": draws.log(0.01, 0.5)}
+        more = {"friction": TendonFriction(wobble=draws.log(0.01, 1.0) / L, curvature=draws.log(0.01, 0.5))}
     return Case(kc.RoutedTendonRobot(**parameters, routing=routing, **more), control, dt)
 
 

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 import knode_cosserat as kc
 from knode_cosserat.rods.surroundings import Plane
+from knode_cosserat.rods.tendon_friction import TendonFriction, Vibration
 from knode_cosserat.solvers.grid import at_places
 from knode_cosserat.solvers.history import EXTRAPOLATIONS, advanced, history_of, padded_rows, resting_past
 from knode_cosserat.solvers.problem import StepProblem
@@ -42,8 +43,8 @@ def truth(robot, sine):
 def test_rows_time_and_controls(robot, sine, truth):
     assert truth.y.shape == (101, 10, 19) and truth.z.shape == (101, 10, 6)
     np.testing.assert_allclose(truth.time, np.arange(101) * DT)
-    np.testing.assert_array_equal(truth.tension[1:], sine)
-    np.testing.assert_array_equal(truth.tension[0], 0.0)
+    np.testing.assert_array_equal(truth.held_tension[:-1], sine)
+    np.testing.assert_array_equal(truth.part("tension")[0], 0.0)
     np.testing.assert_allclose(truth.arclength, np.linspace(0.0, 0.635, 10))
     np.testing.assert_allclose(truth.position[0, :, 2], np.linspace(0.0, 0.635, 10))
     assert truth.all_valid and np.all(truth.result == kc.Result.CONVERGED)
@@ -156,6 +157,17 @@ def test_recovery_ends_within_its_budget(robot):
         assert caught.value.step == 2
 
 
+def test_without_a_budget_a_step_is_given_up_at_once(robot, monkeypatch):
+    """Nothing is tried, and so nothing compiled for it; solved rows stay."""
+    monkeypatch.setattr("knode_cosserat.solvers.recovery.attempt", None)
+    controls = np.array([np.zeros(4), HOPELESS, HOPELESS])
+    with pytest.raises(kc.SimulationError) as caught:
+        kc.simulate(robot, controls, DT, recovery_budget=0.0)
+    assert caught.value.step == 2
+    found = kc.simulate(robot, controls, DT, recovery_budget=0.0, on_failure="return")
+    assert found.result[1] >= 0 and found.result[2] < 0 and np.all(np.isnan(found.y[2:]))
+
+
 def test_time_of_recovery_is_in_proportion_to_that_of_the_run():
     budget = Budget(None)
     assert budget.seconds == 5.0
@@ -231,8 +243,8 @@ def test_easing_spreads_contact_and_friction_and_nothing_else(robot, part):
     assert float(easier.surroundings[0].smoothing) == pytest.approx(1e-4 / part)
     assert float(easier.surroundings[0].slip) == pytest.approx(2e-3 / part)
     assert float(easier.surroundings[0].friction) == 0.3 and float(easier.length) == 0.4
-    rubbing = kc.RoutedTendonRobot.like(robot, friction_curvature=0.2, friction_reach=0.05)
-    assert float(rubbing.eased(part).friction_reach) == pytest.approx(0.05 / part)
+    rubbing = kc.RoutedTendonRobot.like(robot, friction=TendonFriction(curvature=0.2, reach=0.05))
+    assert float(rubbing.eased(part).friction.reach) == pytest.approx(0.05 / part)
 
 
 # tension that makes boundary layers much shorter than a segment
@@ -399,7 +411,7 @@ def test_a_robot_with_more_to_remember_does_not_go_on(sine):
     robot = kc.RoutedTendonRobot.like(kc.load_robot("delrin-tendon-robot"))
     before = kc.simulate(robot, sine[:3], DT)
     with pytest.raises(ValueError, match="numbers in z"):
-        kc.simulate(robot.replace(vibration_tension=20.0, vibration_rate=1.0), sine, DT, initial=before)
+        kc.simulate(robot.replace(vibration=Vibration(tension=20.0, rate=1.0)), sine, DT, initial=before)
     with pytest.raises(ValueError, match="no rows"):
         kc.simulate(robot, sine, DT, initial=before[5:])
 

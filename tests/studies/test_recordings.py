@@ -9,8 +9,11 @@ from typer.testing import CliRunner
 
 import knode_cosserat as kc
 from knode_cosserat.cli import app
+from knode_cosserat.learning.residual import Nothing
 from knode_cosserat.recordings import RecordingConfig
 from knode_cosserat.recordings.write import Poses, Pulls, write_recording
+from knode_cosserat.rods.section import Sleeve
+from knode_cosserat.rods.tendon_friction import TendonFriction
 from knode_cosserat.studies import recordings as study
 from knode_cosserat.studies.recordings_report import repetitions, table_of
 from knode_cosserat.studies.runner import StudyError
@@ -20,10 +23,8 @@ DT = 0.01
 TRUE = kc.RoutedTendonRobot.like(
     kc.load_robot("delrin-tendon-robot"),
     bending_damping=5e-3,
-    friction_wobble=0.5,
-    friction_reach=0.15,
-    sleeve_stiffening=0.5,
-    sleeve_length=0.07,
+    friction=TendonFriction(wobble=0.5, reach=0.15),
+    sections=(Sleeve(stiffening=0.5, length=0.11),),
 )
 SECONDS = 4.0
 
@@ -87,7 +88,9 @@ def test_the_knowledge_alone(folder, tmp_path):
     )
     # the figures are those of the plain way, by hand
     seen = kc.load_recording(folder / "sine_2p0.bag").sampled(0.05, 1.0, 4.0)
-    moved = kc.simulate(kc.load_robot("delrin-tendon-robot"), seen.tension[:-1], 0.05)
+    robot = kc.load_robot("delrin-tendon-robot")
+    still = kc.equilibrium(robot, seen.initial_tension)
+    moved = kc.simulate(robot, seen.tension[:-1], 0.05, initial=still)
     off = np.asarray(moved.tip_position)[:60] - seen.tip_position[:60]
     assert cells[1]["tip_rmse"] == pytest.approx(np.sqrt(np.mean(np.sum(off**2, axis=1))), rel=1e-9)
     table = (tmp_path / "table2.md").read_text()
@@ -99,6 +102,30 @@ def test_the_knowledge_alone(folder, tmp_path):
     again = run(*given, "--simulated")
     assert again.exit_code == 0 and (tmp_path / "jobs" / "baseline.json").stat().st_mtime_ns == kept
     assert "of a simulated robot, not of a physical one" in (tmp_path / "table2.md").read_text()
+
+
+def test_a_folder_describes_its_robot_and_its_topics(folder, tmp_path):
+    """robot.yaml and recording.yaml beside the recordings are used, and named, unless others are given."""
+    own = tmp_path / "own"
+    own.mkdir()
+    for name in ("sine_1p0", "sine_2p0"):
+        (own / f"{name}.bag").symlink_to(folder / f"{name}.bag")
+    softer = kc.load_robot("delrin-tendon-robot").replace(youngs_modulus=2.0e9)
+    kc.save_robot(softer, own / "robot.yaml")
+    kc.RecordingConfig.paper_robot().replace(description="ours").save(own / "recording.yaml")
+    given = (own, "--train", "sine_1p0", "--methods", "baseline", "--seconds", 2)
+
+    def errors(name, *more):
+        done = run(*given, "--out", tmp_path / name, *more)
+        assert done.exit_code == 0, done.output
+        (cell,) = json.loads((tmp_path / name / "table2.json").read_text())
+        return cell["tip_rmse"], done.output
+
+    (found, told), (same, silent) = errors("a"), errors("b", "--robot", own / "robot.yaml")
+    assert found == same
+    assert f"taken from {own}: robot.yaml and recording.yaml" in told
+    assert f"taken from {own}: recording.yaml" in silent
+    assert errors("c", "--robot", "delrin-tendon-robot")[0] != pytest.approx(found, rel=0.1)
 
 
 def test_the_same_control_twice_is_seen(folder):
@@ -125,10 +152,34 @@ def test_the_whole_table(folder, tmp_path):
         base, best = by[name, "baseline", 0], by[name, "best", 0]
         for measure in ("tip_dtw", "pose_mse", "tip_rmse"):
             assert best[measure] < 0.1 * base[measure]
-    assert kc.load_robot(tmp_path / "models" / "best.yaml").friction_wobble > 0.0
+    assert kc.load_robot(tmp_path / "models" / "best.yaml").friction.wobble > 0.0
     assert isinstance(kc.load_model(tmp_path / "models" / "paper-a-1"), kc.KNODE)
     assert (tmp_path / "figures" / "loss.png").exists()
     assert "recordings are of a physical robot" in (tmp_path / "table2.md").read_text()
+
+
+@pytest.mark.parametrize("solved", [0, 3])
+def test_a_model_that_fails_is_reported_soon(folder, monkeypatch, solved):
+    """Nothing is tried to save one that fails everywhere, nor after recovery has not helped once."""
+    given = []
+
+    def failing(system, measured, *, recovery, **_):
+        given.append(recovery)
+        ends = len(given) <= solved
+        return study.Evaluation(0.0, 0.0, 0.0) if ends else study.Evaluation(failed="no solution")
+
+    def nothing_learned(knowledge, *_):
+        return study.Learned({0: kc.KNODE(knowledge, Nothing())})
+
+    monkeypatch.setattr(study, "evaluate", failing)
+    monkeypatch.setitem(study.METHODS, "baseline", nothing_learned)
+    paths = study.found(folder)
+    train, _ = study.chosen(list(paths), ["sine_1p0"])
+    jobs = study.jobs(paths, train, ["baseline"], study.Options(seconds=3.0))
+    product = study.predicted(next(each for each in jobs if each.key == "baseline").settings)
+    assert given == [0.0] * len(paths) + [study.RECOVERY] * (solved > 0)
+    failed = [cell for cell in product.facts["cells"] if "failed" in cell]
+    assert len(failed) == len(paths) - solved
 
 
 def test_what_is_nearly_all_is_not_all():

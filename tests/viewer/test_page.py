@@ -104,7 +104,7 @@ def test_any_state_of_any_node_is_plotted(page, truth):
     browser.run("document.getElementById('field').value = 'tension'")
     browser.run("document.getElementById('field').onchange()")
     lines = browser.run("viewer.statePlot.lines.map(({values}) => values)")
-    np.testing.assert_allclose(np.transpose(lines), truth.tension, rtol=1e-6)
+    np.testing.assert_allclose(np.transpose(lines), truth.part("tension"), rtol=1e-6)
 
 
 def test_tendons_run_at_their_places_and_have_the_colours_of_their_tensions(page, truth, robot):
@@ -121,7 +121,7 @@ def test_tendons_run_at_their_places_and_have_the_colours_of_their_tensions(page
         turned = r + 2.0 * np.cross(v, np.cross(v, r) + w[:, None] * r)
         np.testing.assert_allclose(points[k], truth.position[40] + turned, atol=2e-6)
     red = np.array(browser.run("viewer.robots[0].tendons.map((t) => t.colours[0])"))
-    assert list(np.argsort(red)) == list(np.argsort(truth.tension[40]))
+    assert list(np.argsort(red)) == list(np.argsort(truth.part("tension")[40]))
 
 
 def test_what_is_not_solved_is_not_drawn_as_solved(page, failed, truth):

@@ -28,6 +28,13 @@ FAMILIES = {
     "Obstacle": "Surroundings: `surroundings`",
     "SectionChange": "Sections: `sections`",
     "Routing": "Tendon routing: `routing`",
+    "LoadCells": "Load cells: `load_cells`",
+    "TendonFriction": "Friction of tendons: `friction`",
+    "Vibration": "Vibration: `vibration`",
+    "RibSpacing": "Rib spacing: `rib_spacing`",
+    "Reels": "Reels: `reels`",
+    "TrainedRange": "Trained range: `trained`",
+    "EarlyAnchors": "Early anchors: `anchors`",
 }
 
 

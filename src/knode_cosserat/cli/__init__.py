@@ -7,6 +7,7 @@ that finds no solution in status 1. Modules that take long to import are importe
 from knode_cosserat.cli.program import app, main
 
 # their commands, in the order in which the help has them
-from knode_cosserat.cli import robots, view, kinematics, learn, compare, inspect, record, study, health  # noqa: F401  isort: skip
+from knode_cosserat.cli import robots, view, kinematics, learn, identify  # noqa: F401  isort: skip
+from knode_cosserat.cli import compare, inspect, record, study, study_measured, health  # noqa: F401  isort: skip
 
 __all__ = ["app", "main"]

@@ -14,6 +14,7 @@ from knode_cosserat.cli.arguments import (
     Json,
     Picture,
     Progress,
+    Space,
     ensemble_of,
     figures,
     is_trajectory,
@@ -22,6 +23,7 @@ from knode_cosserat.cli.arguments import (
     trajectory_of,
     wanted,
 )
+from knode_cosserat.cli.identify import Config, Seconds, Start, Step, evaluate_on_recordings
 from knode_cosserat.cli.program import app, examples
 from knode_cosserat.cli.telling import table, tell
 
@@ -67,6 +69,8 @@ Columns = Annotated[
         "evaluate prediction.nc truth.nc",
         "evaluate model truth.nc",
         "evaluate delrin-tendon-robot truth.nc --set youngs_modulus=10e9 --rows 100",
+        "evaluate found.yaml unseen.bag --json",
+        "evaluate my-robot.yaml a.csv b.csv --config my-recording.yaml --start 1",
     )
 )
 def evaluate(
@@ -78,12 +82,20 @@ def evaluate(
             "which is simulated under each reference's controls.",
         ),
     ],
-    references: Annotated[list[Path], typer.Argument(metavar="REFERENCE", help="Trajectory files.")],
+    references: Annotated[
+        list[Path],
+        typer.Argument(metavar="REFERENCE", help="Trajectory files; or recordings: bags or tables."),
+    ],
     changes: Changes = None,
     rows: Annotated[
         int | None,
         typer.Option(metavar="N", min=1, help="Compare the first N rows only; the paper's tables: 100."),
     ] = None,
+    config: Config = None,
+    start: Start = None,
+    seconds: Seconds = None,
+    dt: Step = 0.0125,
+    space: Space = "lobatto2",
     progress: Progress = None,
     as_json: Json = False,
 ) -> None:
@@ -91,10 +103,14 @@ def evaluate(
 
     Tip DTW is the dynamic-time-warping distance between the tip paths in m, pose MSE the mean squared error
     of positions and Euler angles times 1000 (both as in the paper), tip RMSE the root mean square distance of
-    the tips in m.
+    the tips in m. Recordings are predicted by their measured tensions, from the equilibrium at their start;
+    rotations are those since then, and the options from --config to --space are theirs.
     """
     import knode_cosserat as kc
 
+    if config is not None or not any(is_trajectory(str(path)) for path in references):
+        system = system_of(prediction, changes)
+        return evaluate_on_recordings(system, references, config, start, seconds, dt, space, as_json)
     given: Trajectory | System | Ensemble
     if not is_trajectory(prediction):
         given = ensemble_of(prediction, changes) or system_of(prediction, changes)

@@ -33,8 +33,15 @@ def outcome(trajectory: Trajectory) -> dict[str, Any]:
         "first_failure": failure,
         "largest_residual": float(np.asarray(trajectory.residual)[valid].max()),
         "largest_position_error": _largest_error(trajectory),
+        "extrapolated": _extrapolated(trajectory),
         "tip_position": np.asarray(trajectory.tip_position)[valid][-1].tolist(),
     }
+
+
+def _extrapolated(trajectory: Trajectory) -> int | None:
+    """Return the number of rows outside the range of the training data; None if no range is known."""
+    rows = trajectory.extrapolated
+    return None if rows is None else int(np.count_nonzero(rows))
 
 
 def _largest_error(trajectory: Trajectory) -> float | None:
@@ -62,10 +69,13 @@ def at_rest(rest: Trajectory) -> dict[str, Any]:
         "tip_inclination": float(2 * np.arctan2(np.hypot(x, y), np.hypot(w, z))),
         "residual": float(rest.residual[0]),
         "position_error": _largest_error(rest),
+        "extrapolated": _extrapolated(rest),
         "result": Result(int(rest.result[0])).message,
     }
-    if "tension" in (*rest.system.control_layout.names, *rest.system.y_layout.names):
-        facts["tension"] = np.asarray(rest.tension)[0].tolist()
+    if "tension" in rest.system.control_layout.names:
+        facts["tension"] = rest.system.control_layout.get(np.asarray(rest.control)[0], "tension").tolist()
+    elif "tension" in rest.system.y_layout.names:
+        facts["tension"] = np.asarray(rest.part("tension"))[0, 0].tolist()
     if {"n", "m"} <= set(rest.system.y_layout.names):
         facts["base_force"] = np.asarray(rest.force)[0, 0].tolist()
         facts["base_moment"] = np.asarray(rest.moment)[0, 0].tolist()

@@ -117,6 +117,8 @@ def simulate(
     ]
     if kc.Result.COARSE in np.asarray(trajectory.result):
         lines.append(COARSE)
+    if trajectory.extrapolation:
+        lines.append(f"EXTRAPOLATION: {trajectory.extrapolation}")
     if came["first_failure"]:
         step, at, message = came["first_failure"].values()
         lines.append(f"NOT SOLVED from step {step} (t = {at:g} s) on: {message}")
@@ -159,6 +161,8 @@ def equilibrium(
         lines.append(f"internal moment at the base: {vector(facts['base_moment'])} N m")
     if facts["unstable"]:
         lines.append("UNSTABLE: the least push, and the robot leaves this shape")
+    if rest.extrapolation:
+        lines.append("EXTRAPOLATION: the model was not trained under such controls or strains")
     if rest.result[0] == kc.Result.COARSE:
         lines.append(COARSE)
     elif facts["result"] != "converged":

@@ -1,1 +1,1 @@
-"""What a robot can be asked to do: for now where it reaches, and how, at rest."""
+"""Static tasks of a robot: inverse kinematics, workspace, stability, compliance, equilibrium paths."""

@@ -1,4 +1,4 @@
-"""Checks of what is asked of a robot at rest; every error is one line."""
+"""Checks of the arguments of static tasks; every error is one line."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from knode_cosserat.solvers.time import Static
 
 
 def static_settings(space: str | SpaceScheme, newton: NewtonOptions) -> Settings:
-    """What `kc.equilibrium` solves with."""
+    """Return the settings of `kc.equilibrium`."""
     return Settings.of(Static(), space, "paper", newton)
 
 
 def checked_system(robot: Any) -> System:
-    """One system."""
+    """Return the robot, if it is one system; `ValueError` otherwise."""
     if not isinstance(robot, System):
         raise ValueError(f"robot is {type(robot).__name__}; allowed is one robot or model")
     return robot
 
 
 def checked_numbers(name: str, given: Any, size: int, allowed: str, most: int = 2) -> np.ndarray:
-    """Finite numbers (size,), or with `most` 2 also (B, size)."""
+    """Return finite numbers (size,), or with `most` 2 also (B, size)."""
     try:
         numbers = np.asarray(given, dtype=float)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name} is not numbers ({error}); allowed is {allowed}") from None
-    # no rows are nothing to answer; no numbers in a row are the control of a robot that nothing drives
+    # zero rows are refused; a row of size zero is the control of a robot without controls
     if not 1 <= numbers.ndim <= most or numbers.shape[-1] != size or 0 in numbers.shape[:-1]:
         raise ValueError(f"{name} has shape {numbers.shape}; allowed is {allowed}")
     if not np.all(np.isfinite(numbers)):
@@ -41,7 +41,7 @@ def checked_numbers(name: str, given: Any, size: int, allowed: str, most: int = 
 
 
 def checked_control(system: System, control: Any, name: str = "control") -> np.ndarray:
-    """One control (c,)."""
+    """Return one control (c,)."""
     size = system.control_size
     names = ", ".join(f"{field.name} ({field.unit})" for field in system.control_layout.fields)
     numbers = checked_numbers(name, control, size, f"({size},): {names or 'there are no controls'}", most=1)
@@ -49,7 +49,7 @@ def checked_control(system: System, control: Any, name: str = "control") -> np.n
 
 
 def within_limits(system: System, controls: np.ndarray, name: str) -> np.ndarray:
-    """Controls (…, c) that are within their fields' limits; `ValueError` otherwise."""
+    """Return controls (…, c), if they are within their fields' limits; `ValueError` otherwise."""
     beyond = system.control_layout.beyond(controls)
     if beyond:
         raise ValueError(f"{name}: {beyond}")
@@ -57,7 +57,7 @@ def within_limits(system: System, controls: np.ndarray, name: str) -> np.ndarray
 
 
 def checked_limits(system: System, low: Any, high: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Limits (c,) of the controls, from numbers or (c,)."""
+    """Return limits (c,) of the controls, from numbers or (c,)."""
     if not system.control_size:
         raise ValueError(f"a {type(system).__name__} without controls is given; allowed is one with controls")
     found = []

@@ -1,4 +1,4 @@
-"""What a robot does about one equilibrium: Jacobian, compliance, manipulability."""
+"""Linearisation of a robot about one equilibrium: Jacobian, compliance, manipulability."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.space import SpaceScheme
 
-#: of a compliance, in parts of its largest eigenvalue: what schemes along the rod may be off by
+#: error of the schemes along the rod in a compliance, as a fraction of its largest eigenvalue
 ASYMMETRY = 1e-4
 
 
 class Ellipsoid(NamedTuple):
-    """How far a unit of control moves something: a Jacobian's singular values, largest first."""
+    """Motion per unit of control: a Jacobian's singular values, largest first."""
 
     singular_values: np.ndarray
-    #: the directions that belong to them, in columns
+    #: the corresponding directions, in columns
     directions: np.ndarray
-    #: Yoshikawa's √det(J Jᵀ), or √det(Jᵀ J) with fewer controls than numbers: the singular values' product
+    #: Yoshikawa's √det(J Jᵀ), or √det(Jᵀ J) with fewer controls than rows: the singular values' product
     measure: float
-    #: largest by smallest singular value; infinite where a direction is lost
+    #: ratio of largest to smallest singular value; infinite if a direction is lost
     condition: float
 
 
 class Manipulability(NamedTuple):
-    """Yoshikawa's ellipsoids: of velocity (m per control), of turning (rad per control), of both together.
+    """Yoshikawa's ellipsoids: velocity (m per control), rotation (rad per control), and both combined.
 
-    Both together with lengths measured by the robot's own. `rotation` and `whole` are None without
+    The combined ellipsoid divides lengths by the robot's length. `rotation` and `whole` are None without
     orientation.
     """
 
@@ -43,16 +43,16 @@ class Manipulability(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Configuration:
-    """An equilibrium's pose and its slopes, all from one linearisation.
+    """Pose of an equilibrium and its derivatives, from one linearisation.
 
     Twists have the velocity of the pose's position first, then its angular velocity, both along the global
-    axes (the "hybrid" frame: at the pose's point, turned as the world is).
+    axes (the "hybrid" frame: origin at the pose's position, axes parallel to the global ones).
     """
 
     control: np.ndarray
     #: (3,) in m
     position: np.ndarray
-    #: (4,), scalar first, or None of a robot without orientation
+    #: (4,), scalar first; None for a robot without orientation
     quaternion: np.ndarray | None
     #: (6, c): twist per unit of each control, such as m/N and rad/N
     jacobian: np.ndarray
@@ -61,10 +61,11 @@ class Configuration:
 
     @property
     def compliance(self) -> np.ndarray:
-        """(6, 6): twist per force (N) and moment (N·m) that act at the tip, all along the global axes.
+        """(6, 6): twist per force (N) and moment (N·m) at the tip, all along the global axes.
 
-        Tensions are held. Symmetric and positive definite for a stable, conservative robot whose pose is
-        the tip's, up to the error of the scheme along the rod: use `space="lobatto4"` where that matters.
+        Controls are constant. The matrix is symmetric and positive definite for a stable, conservative robot
+        with the tip's pose, up to the error of the scheme along the rod. Use `space="lobatto4"` if that error
+        matters.
 
         Raises:
             ValueError: the robot's conditions at the tip are not forces and moments.
@@ -75,23 +76,22 @@ class Configuration:
 
     @property
     def unstable(self) -> bool:
-        """Whether the equilibrium is unstable, by a negative eigenvalue of the tip's compliance.
+        """True if the tip's compliance has a negative eigenvalue: the equilibrium is then unstable.
 
         The second variation of a conservative robot has as many negative eigenvalues as this compliance and
-        the robot with its tip held together (Haynsworth): what buckles with a free tip is seen,
-        what would buckle even between a clamped base and a held tip is not. For the
-        tip's own pose only.
+        the robot with its tip held together (Haynsworth). Buckling with a free tip is therefore detected.
+        Buckling between a clamped base and a held tip is not. Only valid for the tip's own pose.
         """
         C = self.compliance
         if C.shape[0] != C.shape[1]:
             raise ValueError(f"compliance has shape {C.shape}: the robot's pose and wrench do not match")
         values = np.linalg.eigvalsh((C + C.T) / 2)
-        # the stiffest directions are as small as the scheme's asymmetry
+        # eigenvalues of the stiffest directions are within the scheme's asymmetry
         return bool(values[0] < -ASYMMETRY * np.max(np.abs(values)))
 
     @property
     def manipulability(self) -> Manipulability:
-        """How far and in which directions the controls move the pose (Yoshikawa 1985)."""
+        """Size and directions of the pose's motion under the controls (Yoshikawa 1985)."""
         J, count = self.jacobian, len(self.position)
         if self.quaternion is None:
             return Manipulability(_ellipsoid(J), None, None)
@@ -102,7 +102,7 @@ class Configuration:
 def _ellipsoid(J: np.ndarray) -> Ellipsoid:
     directions, values, _ = np.linalg.svd(J, full_matrices=False)
     if not len(values):
-        # nothing drives it: √det(J Jᵀ) of what never moves
+        # no controls: √det(J Jᵀ) is zero
         return Ellipsoid(values, directions, 0.0, np.inf)
     lost = values[-1] <= np.finfo(float).eps * max(J.shape) * values[0]
     condition = np.inf if lost else float(values[0] / values[-1])
@@ -117,15 +117,15 @@ def configuration(
     newton: NewtonOptions = NewtonOptions(),
     pose: Pose = tip_pose,
 ) -> Configuration:
-    """The equilibrium of `kc.equilibrium` under a control (c,), and its slopes.
+    """Return the equilibrium of `kc.equilibrium` under a control (c,), and its derivatives.
 
     Args:
         robot: one robot or model.
-        control: (c,); for a tendon robot the tensions in N. Of a robot without controls `np.zeros(0)`.
+        control: (c,); for a tendon robot the tensions in N. For a robot without controls `np.zeros(0)`.
         space: "lobatto2", "lobatto4", "euler", or a scheme.
         newton: tolerances and limits of the solve.
-        pose: from the system and its last node's y to position (m) and quaternion (or None); the tip's by
-            default. A function that is kept, not a new one at each call: a program is compiled for each.
+        pose: function from the system and its last node's y to position (m) and quaternion (or None); the
+            tip's by default. Reuse one function object: a program is compiled for each.
 
     Raises:
         SimulationError: no equilibrium was found.
@@ -142,15 +142,15 @@ def configuration(
 
 
 def jacobian(robot: System, control: Any, **options: Any) -> np.ndarray:
-    """Twist of the tip per unit of each control (6, c); see `configuration` and `Configuration.jacobian`."""
+    """Return the twist of the tip per unit of each control (6, c); see `Configuration.jacobian`."""
     return configuration(robot, control, **options).jacobian
 
 
 def compliance(robot: System, control: Any, **options: Any) -> np.ndarray:
-    """Twist of the tip per wrench there (6, 6); see `configuration` and `Configuration.compliance`."""
+    """Return the twist of the tip per wrench there (6, 6); see `Configuration.compliance`."""
     return configuration(robot, control, **options).compliance
 
 
 def manipulability(robot: System, control: Any, **options: Any) -> Manipulability:
-    """How the controls move the tip; see `configuration` and `Manipulability`."""
+    """Return the manipulability of the tip; see `configuration` and `Manipulability`."""
     return configuration(robot, control, **options).manipulability

@@ -1,8 +1,8 @@
 """Paths of equilibria under a growing load, through limit points (pseudo-arclength continuation).
 
-A robot's equilibria G(y, ξ; control) = 0 form a curve as the control moves on a line. Followed by the load,
-the curve ends where the load has a maximum: the robot snaps. Followed by its own length it goes on (Keller
-1977).
+A robot's equilibria G(y, ξ; control) = 0 form a curve as the control moves on a line. Parametrised by the
+load, the curve ends at a maximum of the load: the robot snaps. Parametrised by its own arclength it continues
+beyond (Keller 1977).
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
 
-#: corrections of a point at most, and by which the next step is made longer or shorter
+#: largest number of corrections of a point; thresholds for a longer or a shorter next step
 MOST_CORRECTIONS, FEW, MANY = 12, 4, 7
-#: shortest and longest step along the path, in natural units
+#: shortest, longest and first step along the path, in natural units
 SHORTEST, LONGEST, FIRST = 1e-5, 0.2, 0.05
 
 
@@ -37,11 +37,11 @@ SHORTEST, LONGEST, FIRST = 1e-5, 0.2, 0.05
 class EquilibriumPath:
     """Equilibria along a path, in order."""
 
-    #: of each point, the part of the way from the first control to the last: it may turn back
+    #: fraction of the way from the first control to the last, for each point: it may turn back
     part: np.ndarray
     #: a row for each point; its time is the number of the point
     trajectory: Trajectory
-    #: number of independent ways in which the robot would leave each equilibrium; -1: not decided
+    #: number of unstable directions of each equilibrium; -1: not decided
     unstable_directions: np.ndarray
     #: True if the path reached the last control
     complete: bool
@@ -53,7 +53,7 @@ class EquilibriumPath:
 
     @property
     def limit_points(self) -> np.ndarray:
-        """Indices of the points at which the load turns back."""
+        """Indices of the points at which the load reverses."""
         steps = np.sign(np.diff(self.part))
         return np.flatnonzero(steps[1:] * steps[:-1] < 0.0) + 1
 
@@ -79,11 +79,12 @@ def equilibrium_path(
         initial: initial guess of the first equilibrium, as in `equilibrium`.
         space: "lobatto2", "lobatto4", "euler", or a scheme.
         newton: tolerances of the solve.
-        points: points at most.
-        with_stability: decide at every point whether it is stable (`stability`).
+        points: largest number of points.
+        with_stability: compute the stability of every point (`stability`).
 
     Returns:
-        An `EquilibriumPath`. It ends at `last`, or earlier where it runs out of points or cannot go on.
+        An `EquilibriumPath`. It ends at `last`, or earlier if `points` is reached or no further point is
+        found.
 
     Raises:
         SimulationError: there is no equilibrium at the first control.
@@ -111,7 +112,7 @@ def equilibrium_path(
 
 
 class _Walk:
-    """The points of a path so far."""
+    """The points of a path that have been computed."""
 
     def __init__(self, system: System, settings: Settings, ends: tuple[Any, Any], nodes: np.ndarray):
         self.system, self.settings, self.ends = system, settings, ends
@@ -122,13 +123,13 @@ class _Walk:
         self.tangent, self.step, self.complete = tangent, FIRST, False
 
     def advance(self) -> bool:
-        """Add a point; False if there is none."""
+        """Add a point; return False if none is found."""
         while self.step >= SHORTEST:
             y, part = self.y[-1], self.parts[-1]
             ty, tp = self.tangent
             guess = (y + self.step * ty, part + self.step * float(tp))
             if guess[1] >= 1.0 > part:
-                # the last point has the last control
+                # the last point is at the last control
                 share = (1.0 - part) / (guess[1] - part)
                 guess = (y + share * self.step * ty, 1.0)
                 found = _corrected(
@@ -160,7 +161,7 @@ def _filled(system, settings, control, y):  # type: ignore[no-untyped-def]
 
 @functools.partial(jax.jit, static_argnames="settings")
 def _corrected(system, settings, ends, start, tangent, plane):  # type: ignore[no-untyped-def]
-    """Newton's method in the plane across the tangent: y, part, error, corrections, and the new tangent."""
+    """Return y, part, error, corrections and the new tangent, by Newton's method across the tangent."""
     scale, pivots = system.scales().y, pivots_of(system)
     ty, tp = tangent
 
@@ -168,7 +169,7 @@ def _corrected(system, settings, ends, start, tangent, plane):  # type: ignore[n
         return jnp.mean(ty / scale * (y - plane[0]) / scale) + tp * (part - plane[1])
 
     def at(y: Any, part: Any) -> Any:
-        """Residuals, their error, and the changes of y that remove them or follow the load."""
+        """Return the error of the residuals, and the changes of y that remove them or follow the load."""
 
         def residuals(part: Any) -> Any:
             control = ends[0] + part * (ends[1] - ends[0])

@@ -1,4 +1,4 @@
-"""Inverse kinematics: the controls under which a robot at rest has a wanted pose."""
+"""Inverse kinematics: controls for a wanted pose of a robot at rest."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from knode_cosserat.solvers.result import Result, SimulationError
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
 
-#: of a trajectory, what its row has of its own
+#: fields of a trajectory with one entry per row
 OF_A_ROW = ("y", "z", "control", "result", "residual", "iterations")
-#: in natural units: what equilibria are solved to, at least. The search compares distances to rounding, and
-#: what Newton's method leaves at its own tolerance would hide from it that nothing is nearer
+#: tolerance of the equilibria, in natural units. The search compares distances to rounding; the residual at
+#: Newton's own tolerance would hide an optimum from it
 EXACT = 1e-13
-#: parts of the length, and rad: shapes that are nowhere further apart are the same
+#: tolerance for equal shapes: largest difference in fractions of the length, and in rad
 SAME_SHAPE = 1e-5
 
 
 class Reach(enum.IntEnum):
-    """What came of a wanted pose. Zero: reached. Below zero: not, and the pose is another."""
+    """Result of inverse kinematics. Zero: reached. Below zero: not reached; the pose is another."""
 
     REACHED = 0
     UNREACHABLE = -1
@@ -42,7 +42,7 @@ class Reach(enum.IntEnum):
 
     @property
     def message(self) -> str:
-        """The result in words."""
+        """Description of the result."""
         return {
             Reach.REACHED: "reached",
             Reach.UNREACHABLE: "not reachable from there: the nearest pose that was found",
@@ -53,35 +53,35 @@ class Reach(enum.IntEnum):
 
 @dataclasses.dataclass(frozen=True)
 class InverseKinematics:
-    """Controls that reach a pose, or come nearest; with several poses every array has their axis in front.
+    """Controls of a wanted pose, or of the nearest one; with several poses every array has a leading axis.
 
-    Only where `result` is `Reach.REACHED` (`converged`) is the pose the wanted one.
+    The pose is the wanted one only if `result` is `Reach.REACHED` (`converged`).
     """
 
     #: a `Reach`
     result: Any
     #: (c,)
     control: Any
-    #: where the pose is then: (3,) in m, and (4,) or None of a robot without orientation
+    #: resulting pose: (3,) in m, and (4,) or None for a robot without orientation
     position: Any
     quaternion: Any
-    #: how far that is from what was wanted (m), and how turned from it (rad); zero for what was not asked
+    #: distance to the wanted position (m), and angle to the wanted orientation (rad); zero if not wanted
     position_error: Any
     angle_error: Any
-    #: which controls are at their limits (c,)
+    #: True for controls at their limits (c,)
     at_low: Any
     at_high: Any
-    #: whether `kc.equilibrium`, which begins at the unloaded robot, finds the same shape; where it does not
-    #: the robot has several, and has to be led here
+    #: True if `kc.equilibrium`, which starts at the unloaded robot, finds the same shape; otherwise the robot
+    #: has several equilibria, and has to be moved to this one
     from_rest: Any
-    #: equilibria that were looked at
+    #: number of equilibria computed
     iterations: Any
-    #: the equilibrium itself, a `Trajectory` as of `kc.equilibrium`: for `kc.stability`, or to begin a motion
+    #: the equilibrium, a `Trajectory` as from `kc.equilibrium`: for `kc.stability`, or as an initial state
     equilibrium: Any
 
     @property
     def converged(self) -> Any:
-        """Whether the pose was reached."""
+        """True if the pose was reached."""
         return self.result == Reach.REACHED
 
 
@@ -100,28 +100,28 @@ def inverse_kinematics(
     newton: NewtonOptions = NewtonOptions(),
     pose: Pose = tip_pose,
 ) -> InverseKinematics:
-    """The controls under which a robot at rest has its tip at a position, in an orientation, or both.
+    """Return the controls under which the tip at rest has a wanted position, orientation, or both.
 
-    Of all controls that reach a pose those nearest to `low` are taken (least squares, in parts of the way
-    from `low` to `high`). A pose that cannot be reached gives the nearest that was found, by weights, and
-    says so. The search is local: it begins at `initial`, then, as long as the pose is not reached, at up to
-    `starts` other controls. Shapes are followed from there: of a robot with several equilibria the one found
-    may not be the one of `kc.equilibrium` (see `from_rest`).
+    If several controls reach a pose, the result is nearest to `low` (least squares, with each control as a
+    fraction of the way from `low` to `high`). For an unreachable pose the result is the nearest pose found,
+    by weights, and `result` says so. The search is local. It starts at `initial`; if the pose is not reached,
+    it restarts from other controls, up to `starts` in total. It follows shapes continuously: for a robot with
+    several equilibria the result may differ from that of `kc.equilibrium` (see `from_rest`).
 
     Args:
         robot: one robot or model.
-        position: wanted position (3,) in m, or (B, 3): a path, each pose looked for from the last.
+        position: wanted position (3,) in m, or (B, 3): a path; each search starts from the previous result.
         quaternion: wanted orientation (4,) or (B, 4), scalar first, of any length.
         low: lower limits of the controls, a number or (c,).
         high: upper limits.
-        initial: (c,), where to begin; by default half-way between the limits.
-        weights: of the errors of position, in parts of the robot's length, and of orientation (rad).
-        tolerance: a pose is reached when it is off by no more than this part of the robot's length, and
-            turned from it by no more than this (rad).
-        starts: how many beginnings are tried before a pose is called unreachable.
+        initial: initial controls (c,); by default half-way between the limits.
+        weights: weights of the position error, as a fraction of the robot's length, and of the angle (rad).
+        tolerance: largest position error, as a fraction of the robot's length, and largest angle (rad), of a
+            reached pose.
+        starts: number of initial controls to try before a pose counts as unreachable.
         space: "lobatto2", "lobatto4", "euler", or a scheme.
         newton: tolerances and limits of the solve.
-        pose: whose pose, as for `kc.configuration`.
+        pose: pose function, as for `kc.configuration`.
 
     Raises:
         ValueError: arguments of a wrong shape, not finite, or low above high.
@@ -161,7 +161,7 @@ def _whole(number: Any) -> bool:
 def _one(
     search: Search, wanted: Wanted, begin: np.ndarray, shape: Response | None, starts: int
 ) -> tuple[InverseKinematics, np.ndarray, Response | None]:
-    """One pose, from a beginning and the equilibrium there (None: from rest), then from others."""
+    """Solve for one pose, from `begin` and its equilibrium (None: from rest), then from other controls."""
     best: tuple[float, np.ndarray, Response, bool] | None = None
     search.trials = 0
     for u in (begin, *_others(len(begin), starts - 1, search.free)):
@@ -207,7 +207,7 @@ def _told(search: Search, wanted: Wanted, u: np.ndarray, found: Response, result
 
 
 def _from_rest(search: Search, control: np.ndarray, found: Response) -> bool:
-    """Whether the equilibrium that is found from the unloaded robot has the same shape."""
+    """True if the equilibrium found from the unloaded robot has the same shape."""
     try:
         cold = first_solved(search.system, search.settings, search.pose, control)
     except SimulationError:
@@ -217,16 +217,16 @@ def _from_rest(search: Search, control: np.ndarray, found: Response) -> bool:
 
 
 def _same_shape(system: System, one: np.ndarray, other: np.ndarray) -> bool:
-    """Whether positions and orientations agree at all points, of every rod.
+    """True if positions and orientations agree at all points, of every rod.
 
-    Forces are not asked: where reels or actuators hold lengths, what is left of a residual moves them by far
-    more than it moves the robot.
+    Forces are not compared: if reels or actuators prescribe lengths, a small residual changes the forces much
+    more than the shape.
     """
     states = [in_strands(system, y) for y in (one, other)]
     try:
         p, q = (np.asarray(system.strand.positions(y)) for y in states)
     except AttributeError:
-        # it does not say where it is: all that it has
+        # a system without positions: compare all of y
         return float(np.max(np.abs(one - other) / np.asarray(system.scales().y))) <= SAME_SHAPE
     off = float(np.max(np.abs(p - q))) / float(system.length)
     try:
@@ -234,7 +234,7 @@ def _same_shape(system: System, one: np.ndarray, other: np.ndarray) -> bool:
     except AttributeError:
         return off <= SAME_SHAPE
     g, h = (each / np.linalg.norm(each, axis=-1, keepdims=True) for each in (g, h))
-    # unit quaternions, of either sign, are half as far apart as one is turned from the other
+    # the distance of unit quaternions, up to sign, is half the angle between them
     turned = 2.0 * np.minimum(np.linalg.norm(g - h, axis=-1), np.linalg.norm(g + h, axis=-1))
     return max(off, float(np.max(turned))) <= SAME_SHAPE
 
@@ -263,7 +263,7 @@ def _rest(search: Search, control: np.ndarray, state: Any, result: Result, resid
 def _checked_wanted(
     system: System, pose: Pose, position: Any, quaternion: Any, measured_by: Any
 ) -> tuple[list[Wanted], bool]:
-    """The wanted poses, and whether one was given rather than several."""
+    """Return the wanted poses, and True if a single one was given."""
     here, turned = pose(system, system.rest(system.length)[0])
     given: dict[str, np.ndarray] = {}
     if position is not None:

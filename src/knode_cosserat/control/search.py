@@ -4,9 +4,9 @@ With u the controls between their limits (0 to 1) and r the pose's error in natu
 
     minimise |r(u)|² + ε² |u|²,     0 ≤ u ≤ 1
 
-by Levenberg's method, each of whose steps is a bounded linear least-squares problem, solved exactly. ε goes
-down in stages to 1e-7: of all controls that reach a pose it finds those nearest to the lower limits, and
-what is left of it in the pose is of the size ε². Slopes are exact, by the implicit function theorem.
+by Levenberg's method. Each step is a bounded linear least-squares problem, solved exactly. ε decreases in
+stages to 1e-7: among the controls that reach a pose the result is nearest to the lower limits, and the
+remaining pose error is of the size ε². Derivatives are exact, by the implicit function theorem.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ from knode_cosserat.control.statics import Pose, Response, respond
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.settings import Settings
 
-#: ε in turn: a strong one first, so that controls do not run off along what the pose hardly feels
+#: ε of the stages: large first, so that controls do not drift along directions with little effect on the pose
 STAGES = (3e-2, 1e-3, 1e-5, 1e-7)
-#: equilibria that one search looks at in a stage, at most
+#: largest number of equilibria in one stage
 MOST_TRIALS = 80
-#: in natural units: a residual beyond this may be so far that its own curvature counts
+#: residual in natural units beyond which the curvature of r may matter
 FAR = 1e-4
-#: part of the way between the limits by which curvature is differenced
+#: step of finite differences for the curvature, as a fraction of the way between the limits
 DIFFERENCE = 1e-4
-#: slope of the distance, in parts of what it could be, that counts as none
+#: gradient of the distance, relative to its bound, below which it counts as zero
 FLAT = 1e-6
-#: rounding, in parts of what is minimised
+#: relative rounding error of the objective
 ROUNDING = 1e-13
-#: of the way between the limits: what is nearer to one than this is at it
+#: distance from a limit, as a fraction of the way between the limits, below which a control is at it
 AT_LIMIT = 1e-12
 
 
 class Wanted(NamedTuple):
-    """A pose, with what its errors are divided by."""
+    """A wanted pose, with the scales and weights of its errors."""
 
     position: np.ndarray | None
     quaternion: np.ndarray | None
@@ -45,7 +45,7 @@ class Wanted(NamedTuple):
     tolerance: float
 
     def errors(self, found: Response) -> tuple[np.ndarray, np.ndarray]:
-        """Of position (m) and of orientation (a rotation vector, rad); empty for what is not wanted."""
+        """Return errors of position (m) and orientation (rotation vector, rad); empty if not wanted."""
         position = turned = np.zeros(0)
         if self.position is not None:
             position = np.asarray(found.position) - self.position
@@ -54,15 +54,15 @@ class Wanted(NamedTuple):
         return position, turned
 
     def residual(self, found: Response) -> np.ndarray:
-        """The errors in natural units, weighted: what is minimised."""
+        """Return the weighted errors in natural units, the residual of the least-squares problem."""
         position, turned = self.errors(found)
         return np.concatenate([position / self.length * self.weights[0], turned * self.weights[1]])
 
     def slope(self, found: Response) -> np.ndarray:
-        """∂residual/∂control.
+        """Return ∂residual/∂control.
 
-        Of a rotation vector θ the angular velocity stands for its rate: Jᵀθ, and so where the least is, is
-        exact; the rest is for small θ.
+        The rate of a rotation vector θ is approximated by the angular velocity. Jᵀθ, and therefore the
+        minimum, is exact; the rest holds for small θ.
         """
         J, count = np.asarray(found.jacobian), len(found.position)
         moved = J[:count] / self.length * self.weights[0] if self.position is not None else J[:0]
@@ -70,14 +70,14 @@ class Wanted(NamedTuple):
         return np.concatenate([moved, turned])
 
     def reached(self, found: Response) -> bool:
-        """Whether the pose is near enough."""
+        """True if the pose is within the tolerance."""
         position, turned = self.errors(found)
         off = np.linalg.norm(position) / self.length
         return bool(max(off, np.linalg.norm(turned)) <= self.tolerance)
 
 
 def rotation_between(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """The rotation vector (rad, global axes, at most π long) that turns `one` into `other`."""
+    """Return the rotation vector (rad, global axes, at most π long) from `one` to `other`."""
     (w, *v), (a, *b) = one / np.linalg.norm(one), other / np.linalg.norm(other)
     v, b = np.asarray(v), np.asarray(b)
     scalar, vector = a * w + b @ v, w * b - a * v - np.cross(b, v)
@@ -88,12 +88,12 @@ def rotation_between(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def at_limits(u: np.ndarray) -> np.ndarray:
-    """Controls between 0 and 1, at a limit where rounding alone keeps them away: u + (1 - u) may not be 1."""
+    """Return controls in [0, 1], moved to a limit that only rounding separates: u + (1 - u) may not be 1."""
     return np.where(u < AT_LIMIT, 0.0, np.where(u > 1.0 - AT_LIMIT, 1.0, u))
 
 
 class Search:
-    """Searches of one call: the robot, the limits, and the equilibria that were looked at."""
+    """State of the searches of one call: the robot, the limits, and the number of equilibria computed."""
 
     def __init__(self, system: System, settings: Settings, pose: Pose, low: np.ndarray, high: np.ndarray):
         self.system, self.settings, self.pose = system, settings, pose
@@ -102,23 +102,23 @@ class Search:
         self.trials = 0
 
     def control(self, u: np.ndarray) -> np.ndarray:
-        """Controls within their limits, and exactly at them for u = 0 and 1."""
+        """Return controls within their limits, and exactly at them for u = 0 and 1."""
         return np.where(u >= 1.0, self.high, np.minimum(self.low + u * self.span, self.high))
 
     def at(self, u: np.ndarray, guess: Response) -> Response | None:
-        """The equilibrium near another, or None."""
+        """Return the equilibrium near another, or None."""
         self.trials += 1
         found = respond(self.system, self.settings, self.pose, self.control(u), guess.y, guess.unknowns)
         return found if found.error <= self.settings.newton.acceptable else None
 
     def descend(self, wanted: Wanted, u: np.ndarray, found: Response) -> tuple[np.ndarray, Response, bool]:
-        """The nearest pose from there, and whether the search ended for that reason."""
+        """Return the locally nearest pose, and True if the search converged to it."""
         u = at_limits(u)
         for epsilon in STAGES:
             u, found = self._stage(wanted, u, found, epsilon)
         J, r = wanted.slope(found) * self.span, wanted.residual(found)
         slope = J.T @ r
-        # what points out of the limits is no way to go
+        # gradient components that point out of the limits do not count
         slope = np.where(((u <= 0.0) & (slope > 0.0)) | ((u >= 1.0) & (slope < 0.0)), 0.0, slope)
         steepest = np.linalg.norm(r) * np.max(np.linalg.norm(J, axis=0))
         return u, found, bool(np.max(np.abs(slope)) <= FLAT * steepest + 1e-12)
@@ -144,7 +144,7 @@ class Search:
                 + np.sum((bent @ step) ** 2)
                 + epsilon**2 * np.sum((u + step) ** 2)
             )
-            # what is minimised says no more, but steps still tell: as long as each is shorter than the last
+            # the objective is at rounding, but steps are informative while each is shorter than the last
             below_rounding = bool(merit - predicted <= ROUNDING * merit)
             if below_rounding and size > 0.9 * last:
                 return u, found
@@ -164,9 +164,9 @@ class Search:
         return u, found
 
     def _bending(self, wanted: Wanted, u: np.ndarray, found: Response, J: np.ndarray) -> np.ndarray:
-        """Rows B with BᵀB the part of Σ rᵢ ∇²rᵢ that is positive, by differences of Jᵀr.
+        """Return rows B with BᵀB the positive part of Σ rᵢ ∇²rᵢ, by differences of Jᵀr.
 
-        Far from what is wanted it outweighs JᵀJ, of which Gauss and Newton's method alone knows.
+        Far from the wanted pose it outweighs JᵀJ, the only term of the Gauss-Newton method.
         """
         gradient, columns = J.T @ wanted.residual(found), []
         for i in range(len(u)):
@@ -183,7 +183,7 @@ class Search:
         return np.sqrt(values[kept])[:, None] * directions[:, kept].T
 
     def _step(self, J: np.ndarray, r: np.ndarray, u: np.ndarray, quadratic: Any) -> Any:
-        """The change of u that is best by the slopes at hand, within the limits."""
+        """Return the change of u that minimises the quadratic model, within the limits."""
         # imported here: it would double this package's import time
         from scipy.optimize import lsq_linear
 

@@ -1,8 +1,8 @@
-"""Whether an equilibrium is stable: the second variation of its energy, by the stiffness of its segments.
+"""Stability of an equilibrium: the second variation of its energy, by the stiffness of its segments.
 
-Each segment is a finite element (`stiffness`). Summed up over the segments, and with what the two ends allow
-and ask, that is the second variation of the energy. An equilibrium is stable if it has no negative
-eigenvalue. Segments are divided until that no longer changes their number, and what gives way between two
+Each segment is a finite element (`stiffness`). The sum over the segments, restricted by the boundary
+conditions, is the second variation of the energy. An equilibrium is stable if this has no negative
+eigenvalue. Segments are divided until the number of negative eigenvalues is constant. Buckling between two
 nodes is counted too.
 """
 
@@ -34,61 +34,61 @@ from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.space import Lobatto4
 from knode_cosserat.trajectory import Trajectory
 
-#: in natural units: what is further than this from balance is no equilibrium
+#: largest residual of an equilibrium, in natural units
 BALANCED = 1e-6
-#: of the largest singular value: what counts as held
+#: singular value of an end's motion below which it counts as held, as a fraction of the largest
 HELD = 1e-9
-#: in natural units: what moves less than this by poses and stresses rests
+#: largest rate, in natural units, of a quantity that does not depend on poses and stresses
 RESTING = 1e-9
-#: by what segments are divided, until two in a row find the same
+#: divisions of segments, until two in a row give the same result
 DIVISIONS = (1, 2, 4, 8, 16)
-#: of all strands, as many as eigenvalues are computed of in seconds; by 2 segments are always divided
+#: number of points over all strands for which eigenvalues take seconds; division by 2 always runs
 POINTS = 400
-#: of the largest eigenvalue: what may be rounding, which may turn the sign of a soft one
+#: rounding as a fraction of the largest eigenvalue, which may change the sign of a small one
 ROUNDING = 1e-14
-#: in natural units: where rounding is beyond this a rod is not called stable for what is less than that
+#: if rounding exceeds this, in natural units, a least eigenvalue within rounding is not decided
 SEEN = 1e-3
-#: roots of the equations that are found from a root nearby
+#: results of a solve that converged to a nearby solution
 NEARBY = (Result.CONVERGED, Result.COARSE, Result.RECOVERED_LOAD_CONTINUATION)
 
 
 class Stability(NamedTuple):
     """The second variation of an equilibrium's energy."""
 
-    #: how many ways there are to leave it: negative eigenvalues, none of a stable one. Where segments would
-    #: buckle even in 16 parts it is a count of those that the nodes show
+    #: number of negative eigenvalues; zero for a stable equilibrium. If segments would buckle even in 16
+    #: parts, it is the count in the nodes' displacements only
     unstable_directions: int
-    #: the least eigenvalue, in natural units (EI/L): zero where the robot is about to buckle or snap
+    #: the smallest eigenvalue, in natural units (EI/L): zero at the onset of buckling or snapping
     least: float
-    #: (nodes, 3): how the line would move in the direction of the least, its largest displacement 1; of
+    #: (nodes, 3): displacement of the line in the direction of the smallest eigenvalue, with maximum 1; for
     #: several rods (nodes, rods, 3)
     mode: np.ndarray
-    #: how far the stiffness is from symmetric, as a part of its largest entry: what has a potential is
-    #: symmetric; follower loads are not
+    #: asymmetry of the stiffness, as a fraction of its largest entry: conservative loads give a symmetric
+    #: stiffness; follower loads do not
     asymmetry: float
 
     @property
     def stable(self) -> bool:
-        """Whether there is none."""
+        """True if the second variation has no negative eigenvalue."""
         return self.unstable_directions == 0
 
 
 def stability(equilibrium: Trajectory, row: int = -1) -> Stability:
-    """Whether a robot that rests stays where it is when it is pushed a little.
+    """Return the stability of a robot's equilibrium under small perturbations.
 
-    For whatever holds its ends: it finds what buckles between clamps, an arch that is about to snap, a column
-    that would fall. An equilibrium by another scheme along the rod is solved again by Lobatto4. Loads that
-    follow the rod have no potential: it finds their divergence, and not their flutter. Friction, which only
-    helps, is not counted.
+    It holds for any boundary conditions: buckling between clamps, an arch about to snap, a column about to
+    fall. An equilibrium from another scheme along the rod is solved again by Lobatto4. Follower loads have no
+    potential: their divergence is detected, their flutter is not. Friction is ignored, because it can only
+    stabilise.
 
     Args:
-        equilibrium: of one robot: what `kc.equilibrium` gives, or a trajectory that has come to rest.
-        row: which row of it.
+        equilibrium: result of `kc.equilibrium` for one robot, or a trajectory that has come to rest.
+        row: index of the row.
 
     Raises:
-        ValueError: no equilibrium, a system that is not rods with positions and orientations, or one with
-            more in y that moves with them (tendons on reels have an energy of their own). Or it cannot be
-            decided: the nodes are too few for the loads, or rounding is more than what holds the rod.
+        ValueError: the row is no equilibrium; the system is not made of rods with positions and orientations;
+            or its y has further energetic variables (such as tendons on reels). Or stability cannot be
+            decided: too few nodes for the loads, or rounding that exceeds the stiffness.
     """
     system, y, z, control = _checked(equilibrium, row)
     space = equilibrium.settings.space
@@ -136,7 +136,7 @@ def _checked(equilibrium: Any, row: Any) -> tuple[System, np.ndarray, np.ndarray
 
 
 def _require_rest(system: System, base: np.ndarray, moved: np.ndarray) -> None:
-    """That what y has beside poses and stresses, such as velocities, rests whatever those do."""
+    """Raise `ValueError` if other fields of y, such as velocities, depend on poses and stresses."""
     layout = system.strand.y_layout
     base = base.reshape(system.strands, layout.size, -1)
     for field in layout.fields:
@@ -152,14 +152,14 @@ def _require_rest(system: System, base: np.ndarray, moved: np.ndarray) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class _Variation:
-    """The second variation in what is free to move."""
+    """The second variation in the free coordinates."""
 
     energy: np.ndarray
-    #: poses of all points by that, strands inside (6 points strands, free)
+    #: poses of all points for each free coordinate, strands inside (6 points strands, free)
     free: np.ndarray
-    #: which part of the rod each point stands for, so that eigenvalues do not depend on the points
+    #: fraction of the rod that each point represents, so that eigenvalues do not depend on the points
     part: np.ndarray
-    #: which points are the nodes
+    #: indices of the nodes among the points
     nodes: np.ndarray
 
     @functools.cached_property
@@ -172,16 +172,16 @@ class _Variation:
 
     @property
     def rounding(self) -> float:
-        """That of the stiffest, which pulls, may turn the sign of a soft one."""
+        """Rounding error of the largest eigenvalue, which may change the sign of a small one."""
         return ROUNDING * float(np.max(np.abs(self.spectrum[0]), initial=0.0))
 
     @property
     def count(self) -> int:
-        """How many eigenvalues are negative."""
+        """Number of negative eigenvalues."""
         return int(np.sum(self.spectrum[0] < -self.rounding))
 
     def told(self, system: System, row: int) -> Stability:
-        """The result, unless rounding leaves it open."""
+        """Return the result; raise `ValueError` if rounding leaves it open."""
         values, ways = self.spectrum
         least = float(values[0])
         if self.rounding > SEEN and abs(least) <= self.rounding:
@@ -190,7 +190,7 @@ class _Variation:
                 f"rounding of the largest, {self.rounding:.2g} EI/L; allowed is a rod that is less slender"
             )
         moves = ways[:, 0].reshape(-1, system.strands, 6)[self.nodes, :, :3]
-        # what only twists does not move the line
+        # a mode of pure torsion does not move the line
         moves = moves / max(float(np.max(np.linalg.norm(moves, axis=-1))), np.finfo(float).tiny)
         mode = moves[:, 0] if system.strands == 1 else moves
         asymmetry = float(np.max(np.abs(self.energy - self.energy.T)) / np.max(np.abs(self.energy)))
@@ -198,14 +198,14 @@ class _Variation:
 
 
 def _decided(system: System, divisions: Iterator[Pieces], row: int) -> Stability:
-    """What two divisions in a row agree on; that it is unstable the last one may tell alone."""
+    """Return the result if two divisions in a row agree, or if the last ones are all unstable."""
     counts: list[int] = []
     sure, found = False, None
     for pieces in divisions:
         _require_rest(system, pieces.ends.base, pieces.moved)
         found = _variation(system, pieces)
         counts.append(found.count)
-        # a piece that would not stay by itself may hide some
+        # a piece that is unstable by itself may hide negative eigenvalues
         before, sure = sure, firm(pieces.stiffness)
         if before and sure and counts[-1] == counts[-2]:
             return found.told(system, row)
@@ -219,7 +219,7 @@ def _decided(system: System, divisions: Iterator[Pieces], row: int) -> Stability
 
 
 def _variation(system: System, pieces: Pieces) -> _Variation:
-    """The second variation by the nodes' poses; where those would hide a direction, by all pieces'."""
+    """Return the second variation in the nodes' poses, or in all pieces' if the nodes hide a direction."""
     elements, part = pieces.stiffness, pieces.part
     nodes = np.searchsorted(pieces.segment, np.arange(system.nodes))
     whole, hidden = joined(np.split(elements, nodes[1:-1]))
@@ -234,7 +234,7 @@ def _variation(system: System, pieces: Pieces) -> _Variation:
             K[np.ix_(spots, spots)] += own
     ends = pieces.ends
     base = _freedom(_at_end(system, ends.y[0], narrow, ends.base))
-    # what the tip's conditions leave free: as many ways as they have numbers
+    # null space of the tip's conditions: its dimension is the number of conditions
     left = np.linalg.svd(_at_end(system, ends.y[1], wide, ends.tip.T).T)[2][ends.tip.shape[0] :].T
     tip = _freedom(left)
     inner = np.eye(count * (points - 2))
@@ -248,7 +248,7 @@ def _variation(system: System, pieces: Pieces) -> _Variation:
 
 
 def _at_end(system: System, y: np.ndarray, way: Any, columns: np.ndarray) -> np.ndarray:
-    """Columns of y's numbers in poses and stresses, all poses first; or, by `wide`, of what asks of y."""
+    """Return columns of y in poses and stresses, all poses first; by `wide`, of linear forms on y."""
     strands, moved = system.strands, columns.reshape(system.strands, -1, columns.shape[1])
     own = np.stack([np.asarray(way(system.strand, jnp.asarray(each))) for each in in_strands(system, y)])
     if way is wide:
@@ -258,7 +258,7 @@ def _at_end(system: System, y: np.ndarray, way: Any, columns: np.ndarray) -> np.
 
 
 def _freedom(ways: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of the ways (δx over δf, in columns) in which an end can change: poses it can take, and δf of each."""
+    """Return an end's admissible poses, and δf of each, from its changes (δx over δf, in columns)."""
     x, f = np.split(ways, 2)
     U, size, V = np.linalg.svd(x)
     rank = int(np.sum(size > HELD * max(1.0, size.max(initial=0.0))))

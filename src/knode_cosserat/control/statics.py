@@ -1,7 +1,7 @@
-"""One equilibrium and everything that is linear about it, compiled: for inverse kinematics and the like.
+"""One equilibrium and its linearisation, compiled: for inverse kinematics and similar tasks.
 
-At an equilibrium G(y, ξ; control) = 0, and with a small wrench W at the tip G + e W = 0. The linearisation
-that found it gives, by the implicit function theorem, what the task's pose does for either.
+At an equilibrium G(y, ξ; control) = 0, and with a small wrench W at the tip G + e W = 0. The implicit
+function theorem gives the derivatives of the pose with respect to both, from the solver's linearisation.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from knode_cosserat.solvers.linear import solved
 from knode_cosserat.solvers.problem import StepProblem, row_of
 from knode_cosserat.solvers.settings import Settings
 
-#: position (d,) in m and orientation (quaternion, scalar first), or None, from a system and its last node's y
+#: function from a system and its last node's y to position (d,) in m and quaternion (scalar first) or None
 Pose = Callable[[System, Any], tuple[Any, Any]]
-#: the time at which `kc.equilibrium` solves
+#: time at which `kc.equilibrium` solves
 TIME = 1.0
 
 
 def tip_pose(system: System, y: Any) -> tuple[Any, Any]:
-    """Where the last node is and how it is turned; no orientation of a system that has none."""
+    """Return position and orientation of the last node; the orientation is None if the system has none."""
     try:
         turned = system.quaternions(y)
     except AttributeError:
@@ -38,10 +38,10 @@ def tip_pose(system: System, y: Any) -> tuple[Any, Any]:
 
 
 class Response(NamedTuple):
-    """An equilibrium (`error` above `acceptable`: none) and its pose's slopes.
+    """An equilibrium and its pose's derivatives; not converged if `error` is above `acceptable`.
 
-    Twists are of the pose: velocity of its position (m), then, of a pose that turns, its angular velocity
-    (rad), both along the global axes.
+    Twists belong to the pose: velocity of its position (m), then, if the pose has an orientation, its angular
+    velocity (rad), both along the global axes.
     """
 
     y: Any
@@ -52,17 +52,17 @@ class Response(NamedTuple):
     quaternion: Any
     #: twist per control (p, c)
     jacobian: Any
-    #: twist per force (N) and moment (N m) at the tip along the global axes (p, w); w is 0 where unknown
+    #: twist per force (N) and moment (N m) at the tip along the global axes (p, w); w is 0 if unavailable
     compliance: Any
 
 
 def static_problem(system: System, settings: Settings, control: Any) -> StepProblem:
-    """The boundary-value problem of `kc.equilibrium`."""
+    """Return the boundary-value problem of `kc.equilibrium`."""
     return StepProblem.still(system, settings.space, control, TIME)
 
 
 def at_rest(system: System) -> tuple[Any, Any]:
-    """The first guess of y at all points and of ξ: unloaded."""
+    """Return the unloaded initial guess of y at all points and of ξ."""
     y = grid_of(system).spread(rest_record(system)[:, : system.y_layout.size])
     return y, system.unknowns(y[0])
 
@@ -71,43 +71,43 @@ rest_guess = jax.jit(at_rest)
 
 
 def solve(system: System, settings: Settings, control: Any, y: Any, unknowns: Any) -> Solution:
-    """An equilibrium from a guess; its `error` says whether it is one."""
+    """Solve for an equilibrium from a guess; its `error` tells if it converged."""
     problem = static_problem(system, settings, control).ready()
     return newton(problem, y, unknowns, settings.newton)[0]
 
 
 @functools.partial(jax.jit, static_argnames="settings")
 def _filled(system, settings, control, y):  # type: ignore[no-untyped-def]
-    """y of an equilibrium at all points, from that at the nodes."""
+    """Return y of an equilibrium at all points, from y at the nodes."""
     return static_problem(system, settings, control).filled(y)
 
 
 @functools.partial(jax.jit, static_argnames="settings")
 def recorded(system, settings, control, y):  # type: ignore[no-untyped-def]
-    """y and z of an equilibrium at the nodes, from y at all points."""
+    """Return y and z of an equilibrium at the nodes, from y at all points."""
     record = row_of(system, y, static_problem(system, settings, control).records(y))
     ny = system.y_layout.size
     return record[:, :ny], record[:, ny : ny + system.z_layout.size]
 
 
 def wrench_fields(system: System) -> tuple[str, ...]:
-    """The tip's conditions to which a force and a moment at the tip are added."""
+    """Return the tip's conditions to which a force and a moment at the tip are added."""
     return tuple(name for name in ("n", "m") if name in system.tip_layout.names)
 
 
 def twist(system: System, pose: Pose, y: Any, dy: Any) -> Any:
-    """The pose's twist when the last node's y changes by dy."""
+    """Return the pose's twist for a change dy of the last node's y."""
     (_, h), (dp, dh) = jax.jvp(lambda y: pose(system, y), (y,), (dy,))
     if h is None:
         return dp
-    # ω = 2 (δh ∘ h⁻¹), whatever the length of h
+    # ω = 2 (δh ∘ h⁻¹), for any length of h
     w, v, dw, dv = h[0], h[1:], dh[0], dh[1:]
     return jnp.concatenate([dp, 2.0 * (w * dv - dw * v - jnp.cross(dv, v)) / jnp.sum(h * h)])
 
 
 @functools.partial(jax.jit, static_argnames=("settings", "pose"))
 def respond(system, settings, pose, control, y, unknowns):  # type: ignore[no-untyped-def]
-    """A `Response`: the equilibrium found from a guess, its pose, and the pose's slopes."""
+    """Return a `Response`: the equilibrium found from a guess, its pose, and the pose's derivatives."""
     found = solve(system, settings, control, y, unknowns)
     problem = static_problem(system, settings, control)
     factors, pivots = factors_of(problem, found.y, found.unknowns), pivots_of(system)
@@ -138,9 +138,9 @@ def respond(system, settings, pose, control, y, unknowns):  # type: ignore[no-un
 
 @functools.partial(jax.jit, static_argnames=("settings", "pose"))
 def poses_of(system, settings, pose, controls):  # type: ignore[no-untyped-def]
-    """Poses of many equilibria (B, c), each from rest, one after the other: nothing else is kept of them.
+    """Return the poses of many equilibria (B, c), each solved from rest in sequence; only poses are kept.
 
-    Position, quaternion, error, corrections, and the largest change of each strain's length from rest.
+    Position, quaternion, error, corrections, and the largest change from rest of each strain's magnitude.
     """
     begin = at_rest(system)
     ny = system.y_layout.size
@@ -157,7 +157,7 @@ def poses_of(system, settings, pose, controls):  # type: ignore[no-untyped-def]
 
 
 def first_solved(system: System, settings: Settings, pose: Pose, control: Any, guess: Any = None) -> Response:
-    """The response at a control: from the guess or rest, and if that fails by all that `equilibrium` tries.
+    """Return the response at a control: from the guess or rest, then by the recoveries of `equilibrium`.
 
     Raises `SimulationError` if there is no equilibrium.
     """

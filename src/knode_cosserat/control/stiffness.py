@@ -1,15 +1,15 @@
-"""Stiffness of the pieces of a rod in equilibrium: a finite element each, with no other unknowns.
+"""Stiffness of the pieces of a rod in equilibrium: each is a finite element in its end poses.
 
-Small changes of pose x and stress f along a rod follow a linear equation, which is Hamilton's where all loads
-have a potential. Over a piece it is integrated by Gauss's scheme, and solved for the stresses at both ends:
+Small changes of pose x and stress f along a rod follow a linear equation. It is Hamiltonian if all loads have
+a potential. Over a piece it is integrated by Gauss's scheme, and solved for the stresses at both ends:
 
     w′ = H w,  w = (x, f)        x⁺ = A x + B f        f⁺ = C x + D f
     -f = B⁻¹A x - B⁻¹x⁺          f⁺ = (C - DB⁻¹A) x + DB⁻¹x⁺
 
-Gauss's scheme leaves a Hamiltonian what it is: the stiffness is symmetric, that of the elastic energy at
-Gauss's points, and what is stiff remains so, however slender and bent a piece is. The derivative of a step of
-RK4 has an error of order h⁵κ²/EI. In a slender rod that is more than the flexibility h/EA of its axis, and
-turns the sign of its stiffness.
+Gauss's scheme preserves the Hamiltonian structure: the stiffness is symmetric, and that of the elastic energy
+at Gauss's points. It stays positive for stiff directions, for any slenderness and curvature of a piece. The
+derivative of a step of RK4 has an error of order h⁵κ²/EI. In a slender rod this exceeds the flexibility h/EA
+of its axis, and changes the sign of its stiffness.
 """
 
 from __future__ import annotations
@@ -27,55 +27,55 @@ from knode_cosserat.solvers.grid import grid_of, inside
 from knode_cosserat.solvers.problem import StepProblem, no_history
 from knode_cosserat.solvers.space import Lobatto4
 
-#: y of a strand that has a pose and a stress
+#: fields of y that a strand with pose and stress needs
 NEEDED = ("p", "h", "n", "m")
-#: Gauss's scheme of order 4: places, as parts of a piece, their weights (1/2 each), and those of its stages
+#: Gauss's scheme of order 4: places as fractions of a piece (weights 1/2), and coefficients of its stages
 _APART = np.sqrt(3.0) / 6.0
 PLACES = np.array([0.5 - _APART, 0.5 + _APART])
 STAGES = np.array([[0.25, 0.25 - _APART], [0.25 + _APART, 0.25]])
-#: from where to where y is carried: to each of them, and to the end
+#: intervals over which y is integrated: to each place, and to the end
 STEPS = np.array([[0.0, PLACES[0]], [PLACES[0], PLACES[1]], [PLACES[1], 1.0]])
-#: Newton's corrections of the equilibrium, while each is at most half the one before
+#: largest number of Newton corrections of the equilibrium; each must at most halve the error
 CORRECTIONS = 6
-#: in natural units: pieces that are less apart than this need none
+#: gap between pieces, in natural units, below which no correction is needed
 MET = 1e-11
-#: of the largest: what of an equilibrium costs less than this to change is left as it is
+#: relative cut-off of singular values: nearly neutral changes of an equilibrium are not made
 NEUTRAL = 1e-3
 
 
 class Ends(NamedTuple):
-    """The two ends, in equilibrium."""
+    """Linearised conditions at the two ends, in equilibrium."""
 
     #: y at the base and at the tip
     y: tuple[np.ndarray, np.ndarray]
-    #: the ways in which y can change at the base (y, ways)
+    #: admissible changes of y at the base (y, ways)
     base: np.ndarray
-    #: by what changes of y the tip's conditions change (conditions, y), and what is left of them
+    #: derivative of the tip's conditions with respect to y (conditions, y), and their residual
     tip: np.ndarray
     left: np.ndarray
 
 
 class Pieces(NamedTuple):
-    """Stiffnesses of pieces, one after the other along the rod."""
+    """Stiffness matrices of pieces in sequence along the rod."""
 
-    #: by poses at both ends, in natural units
+    #: matrices in the poses of both ends, natural units
     stiffness: Float[np.ndarray, "pieces strands 12 12"]
-    #: in which segment each is
+    #: index of the segment of each piece
     segment: np.ndarray
-    #: what part of the rod each is
+    #: fraction of the rod of each piece
     part: np.ndarray
-    #: how fast (per length of the rod) what y has beside poses and stresses changes by those, natural units
+    #: rates (per length of the rod) of the other fields of y under poses and stresses, natural units
     moved: Float[np.ndarray, " y"]
     ends: Ends
 
 
-# poses and stresses, and y
+# transformations between y and poses and stresses
 
 
 def wide(strand: System, y: Any) -> Float[Any, "y 12"]:
-    """δy of small changes of pose and stress (δp, θ, δn, μ), natural units; turns θ in the global frame.
+    """Return δy of small changes of pose and stress (δp, θ, δn, μ), natural units; θ in the global frame.
 
-    With μ = δm + ½ m × θ they are canonical: H is Hamiltonian also where there are moments.
+    With μ = δm + ½ m × θ they are canonical: H is Hamiltonian also with moments.
     """
     layout, scale = strand.y_layout, strand.scales().y
     p, h, n, m = (layout.slice(name) for name in NEEDED)
@@ -86,7 +86,7 @@ def wide(strand: System, y: Any) -> Float[Any, "y 12"]:
 
 
 def narrow(strand: System, y: Any) -> Float[Any, "12 y"]:
-    """The way back from δy."""
+    """Return the inverse of `wide`: pose and stress from δy."""
     layout, scale = strand.y_layout, strand.scales().y
     p, h, n, m = (layout.slice(name) for name in NEEDED)
     turn = 4.0 * _turned(y[h]).T / jnp.sum(y[h] * y[h])
@@ -97,7 +97,7 @@ def narrow(strand: System, y: Any) -> Float[Any, "12 y"]:
 
 
 def _turned(h: Any) -> Float[Any, "4 3"]:
-    """∂h/∂θ of a quaternion that is turned by small angles about the global axes."""
+    """Return ∂h/∂θ of a quaternion under small rotations about the global axes."""
     w, x, y, z = h
     return 0.5 * jnp.array([[-x, -y, -z], [w, z, -y], [-z, w, x], [y, -x, w]])
 
@@ -107,11 +107,11 @@ def _hat(v: Any) -> Float[Any, "3 3"]:
     return jnp.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
-# along the rod
+# integration along the rod
 
 
 def _carried(rates: Any, begin: Any, end: Any, y: Any) -> Any:
-    """Return y at the end of a short stretch, by the classical Runge-Kutta scheme, inside it."""
+    """Return y at the end of a short interval, by the classical Runge-Kutta scheme, evaluated inside it."""
     ds = end - begin
 
     def stage(reached: tuple[Any, Any], given: tuple[Any, Any]) -> Any:
@@ -127,7 +127,7 @@ def _carried(rates: Any, begin: Any, end: Any, y: Any) -> Any:
 
 @jax.jit
 def _filled(system: System, y: Any, control: Any, history: Any) -> Any:
-    """y at the nodes and at the cuts between them."""
+    """Return y at the nodes and at the cuts between them."""
     return StepProblem(system, jnp.zeros(()), control, jnp.zeros(()), history, Lobatto4()).filled(y)
 
 
@@ -142,7 +142,7 @@ def _ends(system: System, base: Any, tip: Any, control: Any, history: Any) -> tu
 def _along(
     system: System, y: Any, control: Any, low: Any, high: Any, acting: Any
 ) -> tuple[Any, Any, Any, Any]:
-    """Of all pieces: y at the end, the jump where they begin, H at Gauss's places, and what else moves."""
+    """Return for all pieces: y at the end, the jump at the beginning, H at Gauss's places, other rates."""
     strand = system.strand
     layout, scale = strand.y_layout, strand.scales().y
     rest = jnp.zeros(layout.size * (2 if strand.mixed else 1) + strand.z_layout.size)
@@ -169,7 +169,7 @@ def _along(
             moved = jnp.max(jnp.abs(ways_s), axis=1) * kept / scale
             return y, (narrow(strand, y) @ (ways_s - turning), moved)
 
-        # a loop, to be compiled once; at the end nothing is asked, but y
+        # a loop is compiled once; at the end only y is used
         y, (H, moved) = jax.lax.scan(on, y, STEPS)
         return y, jump, H[:-1], moved[:-1]
 
@@ -178,10 +178,10 @@ def _along(
 
 
 def divided(system: System, y: Any, control: Any, by: Sequence[int]) -> Iterator[Pieces]:
-    """The pieces, what lies between nodes and cuts divided by each of the numbers.
+    """Yield the pieces, with each interval between nodes and cuts divided by each of the numbers.
 
-    The equilibrium is made that of the pieces first, by Newton's method. By that of the nodes' scheme, a
-    little off, a rod that turns for nothing would seem to gain by it.
+    Newton's method first solves the equilibrium of the pieces. The equilibrium of the nodes' scheme differs a
+    little. With it a rod that rotates at no cost would seem to gain energy.
     """
     control, history = jnp.asarray(control), no_history(system, Lobatto4())
     points, length = grid_of(system), float(system.length)
@@ -193,7 +193,7 @@ def divided(system: System, y: Any, control: Any, by: Sequence[int]) -> Iterator
         return Ends((y[0], y[-1]), *map(np.asarray, asked))
 
     def integrated(y: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """F of the pieces, how y at the ends of what was divided is off, and what else moves."""
+        """Return F of the pieces, the gaps of y at the ends of the divided intervals, and other rates."""
         at, F, moved = in_strands(system, jnp.asarray(y[:-1])), [], []
         ds = (bounds[:, 1] - bounds[:, 0]) / count
         for k in range(count):
@@ -220,7 +220,7 @@ def divided(system: System, y: Any, control: Any, by: Sequence[int]) -> Iterator
 
 
 def _size(system: System, y: np.ndarray, off: np.ndarray) -> float:
-    """In natural units; a quaternion's length, which means nothing, is not looked at."""
+    """Return the size of gaps in natural units; a quaternion's length is meaningless and ignored."""
     return float(np.max(np.abs(_at_points(system, y, narrow)[1:] @ in_strands(system, off)[..., None])))
 
 
@@ -230,11 +230,11 @@ def _at_points(system: System, y: np.ndarray, way: Any) -> np.ndarray:
 
 
 def _correction(system: System, y: np.ndarray, F: np.ndarray, off: np.ndarray, ends: Ends) -> np.ndarray:
-    """By what y at all points has to change; the least of what would do."""
+    """Return the change of y at all points that closes the gaps; of several, the smallest."""
     strands, to, back = system.strands, _at_points(system, y, narrow), _at_points(system, y, wide)
     gaps = to[1:] @ in_strands(system, off)[..., None]
     ways = to[0] @ ends.base.reshape(strands, -1, ends.base.shape[1])
-    # what the gaps make of no change at the base, then what each way to change there makes
+    # first column: the gaps' effect with no change at the base; others: each admissible change at the base
     reached = [np.concatenate([np.zeros_like(ways[..., :1]), ways], axis=-1)]
     for pieces, gap in zip(F, gaps, strict=True):
         state = reached[-1]
@@ -250,7 +250,7 @@ def _correction(system: System, y: np.ndarray, F: np.ndarray, off: np.ndarray, e
 
 
 def _integrated(H: np.ndarray, ds: np.ndarray) -> np.ndarray:
-    """w at the ends of pieces by that where they begin, from H at Gauss's places."""
+    """Return the map of w from the beginning to the end of each piece, from H at Gauss's places."""
     lead, size = H.shape[:2], len(PLACES) * 12
     H = H * ds[:, None, None, None, None]
     among = np.einsum("ij,...jkl->...ikjl", STAGES, H).reshape(*lead, size, size)
@@ -265,19 +265,19 @@ def _stiffness(F: np.ndarray) -> np.ndarray:
     return np.block([[inverse @ A, -inverse], [C - D @ inverse @ A, D @ inverse]])
 
 
-# several pieces
+# assembly of several pieces
 
 
 def firm(stiffness: np.ndarray) -> bool:
-    """Whether each piece would stay as it is, held at one of its ends, whichever: then it hides nothing."""
+    """True if each piece is stable with either of its ends held: it then hides no negative eigenvalue."""
     ends = stiffness[..., :6, :6], stiffness[..., 6:, 6:]
     return all(bool(np.all(np.linalg.eigvalsh(symmetric(end)) > 0.0)) for end in ends)
 
 
 def joined(segments: Sequence[np.ndarray]) -> tuple[np.ndarray, int]:
-    """The stiffness of segments, made of pieces, by their ends, and how many negative directions that hides.
+    """Return the stiffness of segments of several pieces in their end poses, and the hidden negative count.
 
-    What lies between is eliminated; by Haynsworth's theorem the negative eigenvalues add up.
+    The inner poses are eliminated; by Haynsworth's theorem the numbers of negative eigenvalues add up.
     """
     found, hidden = [], 0
     for pieces in segments:
@@ -295,5 +295,5 @@ def joined(segments: Sequence[np.ndarray]) -> tuple[np.ndarray, int]:
 
 
 def symmetric(matrices: np.ndarray) -> np.ndarray:
-    """The symmetric part of each."""
+    """Return the symmetric part of each matrix."""
     return (matrices + np.swapaxes(matrices, -1, -2)) / 2.0

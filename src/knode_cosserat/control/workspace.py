@@ -1,4 +1,4 @@
-"""Where a robot reaches: poses of very many equilibria."""
+"""Workspace of a robot: poses of very many equilibria."""
 
 from __future__ import annotations
 
@@ -29,49 +29,49 @@ from knode_cosserat.solvers.run import usable_cores
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
 
-#: samples that one thread takes at a time; fewer are filled up to a power of two
+#: samples per task of a thread; fewer are padded to a power of two
 CHUNK = 1024
-#: how a workspace is written, by its file's ending
+#: endings of the files that a workspace can be written to
 FORMATS = (".nc", ".csv", ".npz")
 
 
 @dataclasses.dataclass(frozen=True)
 class Workspace:
-    """Poses of B equilibria. Where there is none (`result` < 0) the pose is NaN."""
+    """Poses of B equilibria. The pose of a sample without a solution (`result` < 0) is NaN."""
 
     system: System
     #: (B, c)
     controls: np.ndarray
     #: (B, 3) in m
     position: np.ndarray
-    #: (B, 4), scalar first, or None of a robot without orientation
+    #: (B, 4), scalar first; None for a robot without orientation
     quaternion: np.ndarray | None
     #: (B,), a `Result` each
     result: np.ndarray
     #: (B,), largest residual in natural units
     residual: np.ndarray
-    #: (B, fields): the length of each strain's largest change from rest along the rod, in z's own units
+    #: (B, fields): largest magnitude of each strain's change from rest along the rod, in z's own units
     strain: np.ndarray
 
     @property
     def valid(self) -> np.ndarray:
-        """Which samples are solutions (B,)."""
+        """True for samples that were solved (B,)."""
         return self.result >= 0
 
     @property
     def unsolved(self) -> int:
-        """How many are not."""
+        """Number of samples without a solution."""
         return int(np.sum(~self.valid))
 
     def peak(self, name: str) -> np.ndarray:
-        """(B,): the largest change from rest of a strain, such as `u` (1/m), anywhere along the rod."""
+        """Return (B,) the largest change from rest of a strain, such as `u` (1/m), anywhere along the rod."""
         names = self.system.z_layout.names
         if name not in names:
             raise ValueError(f"there is no strain {name!r}; there are {', '.join(names)}")
         return self.strain[:, names.index(name)]
 
     def within(self, **limits: float) -> np.ndarray:
-        """Which samples (B,) are solved with no strain above its limit, such as `u=4.0` (1/m)."""
+        """Return True for samples (B,) that are solved within the strain limits, such as `u=4.0` (1/m)."""
         inside = self.valid.copy()
         for name, limit in limits.items():
             with np.errstate(invalid="ignore"):
@@ -115,7 +115,7 @@ class Workspace:
         xarray.Dataset(variables).to_netcdf(path, engine="h5netcdf")
 
     def _table(self, path: Any, arrays: dict[str, np.ndarray]) -> None:
-        """Controls by their names and units, as files of controls have them; all else numbered from 0."""
+        """Write controls with names and units, as in files of controls; other columns numbered from 0."""
         names, columns = [], []
         for name, array in arrays.items():
             wide = array.reshape(len(array), -1)
@@ -136,7 +136,7 @@ def _numpy(path: Any, arrays: dict[str, np.ndarray]) -> None:
 
 
 def sample(low: np.ndarray, high: np.ndarray, count: int, seed: int = 0) -> np.ndarray:
-    """`count` controls (count, c) spread evenly between limits: the first of a scrambled Sobol sequence."""
+    """Return `count` controls (count, c) from a scrambled Sobol sequence between the limits."""
     from scipy.stats import qmc
 
     power = max(0, int(np.ceil(np.log2(count))))
@@ -157,26 +157,26 @@ def workspace(
     pose: Pose = tip_pose,
     progress: bool = False,
 ) -> Workspace:
-    """Where a robot reaches: its pose at rest under many controls.
+    """Return a robot's poses at rest under many controls.
 
-    Either `workspace(robot, controls)` or `workspace(robot, low, high, count)`, all of which may be named and
-    which spreads `count` controls evenly between limits (scrambled Sobol sequence with a seed).
+    Call `workspace(robot, controls)` or `workspace(robot, low, high, count)`. The latter, whose arguments may
+    be passed by name, spreads `count` controls evenly between limits (scrambled Sobol sequence with a seed).
 
-    Every equilibrium is looked for from the unloaded robot, as `kc.equilibrium` does, so a sample does not
-    depend on the others. A robot with several gives the one that is found from there; whether it is stable
-    is not looked at (`kc.configuration(…).unstable` says). What one iteration does not find goes through all
-    that `kc.equilibrium` tries. Only the poses are kept: memory does not grow with the nodes.
+    Every equilibrium is solved from the unloaded robot, as in `kc.equilibrium`, so a sample does not depend
+    on the others. A robot with several equilibria gives the one found from there. Its stability is not
+    computed (see `kc.configuration(…).unstable`). A sample that does not converge goes through the recoveries
+    of `kc.equilibrium`. Only the poses are kept: memory does not grow with the nodes.
 
     Args:
         robot: one robot or model.
         controls: (B, c); or the lower limits, numbers or (c,), with `high` and `count`.
         high: the upper limits.
-        count: how many samples.
+        count: number of samples.
         low: the lower limits by name, instead of `controls`.
-        seed: of the samples.
+        seed: seed of the samples.
         space: "lobatto2", "lobatto4", "euler", or a scheme.
         newton: tolerances and limits of the solve.
-        pose: what is looked at, as for `kc.configuration`.
+        pose: pose function, as for `kc.configuration`.
         progress: show a progress bar.
 
     Raises:
@@ -185,7 +185,7 @@ def workspace(
     system = checked_system(robot)
     settings = static_settings(space, newton)
     if low is None and high is not None:
-        # by their places
+        # positional limits
         low, controls = controls, None
     given = [argument is not None for argument in (controls, low, high, count)]
     if given not in ([True, False, False, False], [False, True, True, True]):
@@ -211,7 +211,7 @@ def _found(system: System, settings: Settings, pose: Pose, controls: np.ndarray,
     with tqdm(total=total, disable=not progress, unit="sample", leave=False) as bar:
 
         def work(first: int) -> Any:
-            # the last chunk is filled up with its last sample: one shape, one program
+            # the last chunk is padded with its last sample: one shape, one program
             index = np.minimum(np.arange(first, first + chunk), total - 1)
             found = poses_of(system, settings, pose, controls[index])
             count = min(chunk, total - first)
@@ -219,7 +219,7 @@ def _found(system: System, settings: Settings, pose: Pose, controls: np.ndarray,
             return [None if leaf is None else np.asarray(leaf)[:count] for leaf in found]
 
         firsts = range(0, total, chunk)
-        # the first alone: JAX may crash where one thread compiles what another does
+        # the first chunk alone: JAX may crash if two threads compile the same program
         chunks = [work(firsts[0])]
         with concurrent.futures.ThreadPoolExecutor(usable_cores()) as pool:
             chunks += pool.map(work, firsts[1:])
@@ -235,7 +235,7 @@ def _found(system: System, settings: Settings, pose: Pose, controls: np.ndarray,
 
 
 def _recovered(found: Workspace, i: int, settings: Settings, pose: Pose) -> None:
-    """Put in what `kc.equilibrium` finds of sample i with all that it tries, or that there is nothing."""
+    """Replace sample i by the result of `kc.equilibrium` with its recoveries, solved or not."""
     rest = equilibrium(
         found.system, found.controls[i], space=settings.space, newton=settings.newton, on_failure="return"
     )

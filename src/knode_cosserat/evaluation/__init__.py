@@ -1,1 +1,1 @@
-"""How well a prediction matches a reference."""
+"""Comparison of predictions with references: metrics, tables and figures."""

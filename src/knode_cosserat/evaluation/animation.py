@@ -1,6 +1,6 @@
-"""Motions as moving pictures: GIF by Pillow, which comes with matplotlib, MP4 by ffmpeg if there is one.
+"""Animations of motions: GIF by Pillow, which comes with matplotlib, or MP4 by ffmpeg if installed.
 
-What stands still is drawn once; for each frame the lines that move and the time are put onto a copy of it.
+The background is drawn once; each frame adds the moving lines and the time to a copy of it.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from knode_cosserat.trajectory import Trajectory
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-#: what motions can be written as
+#: file suffixes of the supported formats
 ENDINGS = (".gif", ".mp4")
-#: pictures a second: what eyes and the files' format can do with
+#: range of frame rates (1/s), limited by perception and by the file formats
 SLOWEST, FASTEST = 1.0, 50.0
-#: frames, at most: more would be a film, and fill the memory
+#: largest number of frames: more would fill the memory
 MOST_FRAMES = 5000
 
 
 class _Moved(NamedTuple):
-    """Lines of a robot (frames, points, d), the path of its tip, and how many of its rows each frame has."""
+    """Lines of a robot (frames, points, d), its tip path, and the number of path rows at each frame."""
 
     curves: list[NDArray[np.float64]]
     path: NDArray[np.float64]
@@ -51,27 +51,27 @@ def animate(
     columns: int = 1,
     dpi: int = 150,
 ) -> Path:
-    """Write a motion, or several over each other by their labels, as a GIF or MP4 in real time.
+    """Write an animation of one motion, or of several overlaid by label, as a GIF or MP4.
 
-    Between rows that are solved positions are interpolated linearly; where one is not the robot is not there.
+    Positions are interpolated linearly between solved rows; the robot is not drawn beside unsolved rows.
 
     Args:
-        trajectories: one trajectory, or a dict of several; the first is wide and pale if there are more.
+        trajectories: one trajectory, or a dict of several; the first of several is drawn wide and pale.
         path: a name that ends in .gif or .mp4.
-        fps: pictures a second, 1 to 50. A GIF counts in hundredths of a second: it takes the nearest rate.
-        speed: 1 is real time, 0.5 half as fast.
+        fps: frames per second, 1 to 50. A GIF is limited to delays of whole hundredths of a second.
+        speed: playback speed: 1 is real time, 0.5 half speed.
         view: "xyz" (in space), "xy", "xz" or "yz".
-        columns: as wide as one column of a paper (3.5 in) or as two (7.16 in).
-        dpi: dots in an inch.
+        columns: width in columns of a paper: 1 (3.5 in) or 2 (7.16 in).
+        dpi: resolution (dots per inch).
 
     Returns:
         The path.
 
     Raises:
         ImportError: matplotlib is not installed.
-        FileNotFoundError: an MP4 is wanted and there is no ffmpeg.
-        ValueError: a path with another ending, a number that is not possible, a batch, nothing that moves, or
-            trajectories of which some are in a plane and some in space.
+        FileNotFoundError: an MP4 is requested and ffmpeg is not installed.
+        ValueError: the path's suffix or a number is not allowed, the trajectory is a batch or has one row,
+            or planar and spatial trajectories are mixed.
     """
     path = Path(path)
     given = by_label(trajectories)
@@ -86,7 +86,7 @@ def animate(
 def _timing(
     given: Mapping[str, Trajectory], path: Path, fps: float, speed: float
 ) -> tuple[NDArray[np.float64], float]:
-    """At which times of the motion its pictures are, and how long each is shown (s)."""
+    """Return the times of the frames in the motion, and the display time of a frame (s)."""
     if path.suffix not in ENDINGS:
         raise ValueError(f"{path}: allowed for a motion is a name that ends in {', '.join(ENDINGS)}")
     for name, value, low, high in (("fps", fps, SLOWEST, FASTEST), ("speed", speed, 1e-3, 1e3)):
@@ -113,7 +113,7 @@ def _moved(trajectory: Trajectory, seconds: NDArray[np.float64]) -> _Moved:
     at = np.clip(seconds, time[0], time[-1])
     row = np.clip(np.searchsorted(time, at + 1e-9, side="right") - 1, 0, len(time) - 2)
     part = ((at - time[row]) / (time[row + 1] - time[row]))[:, None, None]
-    # at a row the next one is not needed, and need not be solved
+    # exactly at a row the next row is not needed and may be unsolved
     between = [
         np.where(part < 1e-6, curve[row], (1.0 - part) * curve[row] + part * curve[row + 1])
         for curve in curves
@@ -129,7 +129,7 @@ def _frames(
     width: float,
     dpi: int,
 ) -> Iterator[Image]:
-    """The pictures, one by one; what is wrong is said before the first."""
+    """Return an iterator of the frames; invalid input raises before the first frame."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -153,14 +153,14 @@ def _frames(
         legend_above(seen.axes)
     clock = figure.text(0.01, 0.99, "", ha="left", va="top", animated=True)
     canvas.draw()
-    # the layout is done; and once more, now that axes are where they stay
+    # draw again after the layout has fixed the axes
     figure.set_layout_engine("none")
     canvas.draw()
     return _drawn(canvas, seen, list(zip(lines, moved, strict=True)), clock, seconds)
 
 
 def _lines(seen: View, label: str, robot: _Moved, i: int, count: int) -> tuple[list[Any], Any]:
-    """The lines of a robot, and of the path of its tip."""
+    """Return the artists of a robot's lines, and of its tip path."""
     under = i == 0 and count > 1
     colour = "#AAAAAA" if under else PALETTE[max(0, i - 1) % len(PALETTE)]
     width = 4.0 if under else 1.8
@@ -202,7 +202,7 @@ def _write_gif(frames: Iterator[Image], path: Path, delay: float) -> None:
 
     first = next(frames)
     second = next(frames, None)
-    # colours of both ends of what can be seen; the same for all, so that nothing flickers
+    # one palette for all frames, so that nothing flickers
     palette = first.quantize(128)
     palette.putpalette([255 if value > 249 else value for value in palette.getpalette() or ()])
     rest = (each.quantize(palette=palette, dither=Dither.NONE) for each in frames)
@@ -222,7 +222,7 @@ def _write_mp4(frames: Iterator[Image], path: Path, delay: float) -> None:
     command = [
         program, "-loglevel", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24",
         "-s", f"{first.width}x{first.height}", "-r", f"{1.0 / delay:.6g}", "-i", "-",
-        # sides of an even number of dots, as the encoder wants them
+        # the encoder requires even numbers of pixels
         "-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-pix_fmt", "yuv420p", "-f", "mp4", str(path),
     ]  # fmt: skip
     with tempfile.TemporaryFile() as said:
@@ -233,7 +233,7 @@ def _write_mp4(frames: Iterator[Image], path: Path, delay: float) -> None:
             for frame in frames:
                 process.stdin.write(frame.tobytes())
         except BrokenPipeError:
-            pass  # its own words tell more
+            pass  # its error output is more specific
         finally:
             with contextlib.suppress(BrokenPipeError):
                 process.stdin.close()

@@ -1,4 +1,4 @@
-"""The figure of a beam that is let go: how far its tip drops, measured and predicted."""
+"""Figure of a released beam: measured and predicted tip drop."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from knode_cosserat.recordings.beam import BeamRecording, tip_drop
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: how predictions are drawn, by method
+#: line styles of predictions, by method
 METHODS: dict[str, dict[str, Any]] = {
     "nominal": {"color": PALETTE[1], "linewidth": 0.8},
     "identified": {"color": PALETTE[0], "linewidth": 1.0},
 }
-#: the motion that is drawn large (s), from the release on
+#: duration of the enlarged motion after the release (s)
 SHOWN = 1.5
 
 
@@ -30,7 +30,7 @@ def drops(
     predictions: Mapping[str, Mapping[str, Float[np.ndarray, "T 3 3"]]],
     train: Collection[str],
 ) -> Figure:
-    """Tip drop over time, a row for each recording: the first 1.5 s on the left, all on the right.
+    """Return a figure of the tip drop over time, a row per recording: first 1.5 s left, all right.
 
     Raises:
         ImportError: matplotlib is not installed.

@@ -1,4 +1,4 @@
-"""What the figures are made of: the parts that several of them draw. It needs matplotlib."""
+"""Drawing functions shared by the figures; they need matplotlib."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ AXES = ("x", "y", "z")
 
 
 class Tips(Protocol):
-    """What has tip positions over time: a trajectory, or a recording."""
+    """Protocol of data with tip positions over time: a trajectory, or a recording."""
 
     @property
     def time(self) -> ArrayLike:
-        """(T,) s."""
+        """Times (T,) in s."""
 
     @property
     def tip_position(self) -> ArrayLike:
-        """(T, 3) m."""
+        """Tip positions (T, 3) in m."""
 
 
 def equal_scales(axes: Any, points: NDArray[np.float64], zoom: float = 0.95) -> None:
-    """A metre is as long in every direction, and a thin box is still deep enough to see."""
+    """Set equal scales on all axes of a 3D plot, with a minimum depth of thin boxes."""
     from matplotlib.ticker import MaxNLocator
 
     low, high = points.min(axis=(0, 1)), points.max(axis=(0, 1))
@@ -44,7 +44,7 @@ def equal_scales(axes: Any, points: NDArray[np.float64], zoom: float = 0.95) -> 
     small = inches < 4.5
     steps = 3 if small else 4
     for axis, c, h in zip((axes.xaxis, axes.yaxis, axes.zaxis), centre, half, strict=True):
-        # not near the ends: where two axes meet, their labels would too; but two, or there is no scale
+        # no ticks near the ends, where labels of two axes collide; but at least two, for a scale
         for most in range(steps, steps + 4):
             ticks = [tick for tick in MaxNLocator(most).tick_values(c - h, c + h) if abs(tick - c) < 0.75 * h]
             if len(ticks) > 1:
@@ -58,7 +58,7 @@ def equal_scales(axes: Any, points: NDArray[np.float64], zoom: float = 0.95) -> 
 
 
 def draw_tips(axes: Any, paths: Mapping[str, tuple[ArrayLike, NDArray[np.float64]]]) -> None:
-    """x, y and z, one below the other, of paths given as times and positions."""
+    """Draw x, y and z of paths over time, one below the other; a path is times and positions."""
     for i, (label, (time, tip)) in enumerate(paths.items()):
         for axis, each in enumerate(axes):
             each.plot(time, tip[:, axis], label=label, **line(i, np.size(time)))
@@ -70,24 +70,24 @@ def draw_tips(axes: Any, paths: Mapping[str, tuple[ArrayLike, NDArray[np.float64
 
 
 def require_span(axes: Axes, span: float) -> None:
-    """Rounding errors are not to look like a motion."""
+    """Widen the y axis to a minimum span, so that rounding errors do not look like a motion."""
     low, high = axes.get_ylim()
     if high - low < span:
         axes.set_ylim((low + high - span) / 2, (low + high + span) / 2)
 
 
 def draw_tensions(axes: Axes, trajectory: Trajectory) -> None:
-    """The tension of every tendon, held from row to row; of a robot without tensions, its controls."""
+    """Draw the tension of every tendon, held from row to row, or the controls of other robots."""
     one, layout = one_of(trajectory), trajectory.system.control_layout
     if "tension" in layout.names:
-        values, names, label = np.asarray(one.tension), None, "tension [N]"
+        values, names, label = np.asarray(one.part("tension")), None, "tension [N]"
     else:
         values, names = np.asarray(one.control), labels(layout)
         units = {field.unit for field in layout.fields}
         label = f"control [{units.pop()}]" if len(units) == 1 else "control, in its units"
     time = np.asarray(trajectory.time)
     for k in range(values.shape[1]):
-        # thinner and thinner: where tensions are equal, all of them are still to be seen
+        # decreasing widths, so that equal tensions all remain visible
         width = max(0.7, 2.4 - 0.55 * k)
         style: dict[str, Any] = {
             "label": names[k] if names else f"tendon {k + 1}",
@@ -97,7 +97,7 @@ def draw_tensions(axes: Axes, trajectory: Trajectory) -> None:
         if len(time) == 1:
             axes.plot(time, values[:, k], "o", markersize=4.0 * width, **style)
         else:
-            # row i holds what acted from row i - 1 on
+            # row i has the control held from row i - 1 to row i
             axes.stairs(values[1:, k], time, baseline=None, **style)
     axes.set(xlabel="time [s]", ylabel=label)
     axes.margins(y=0.1)
@@ -106,13 +106,13 @@ def draw_tensions(axes: Axes, trajectory: Trajectory) -> None:
 
 
 def line(i: int, rows: int = 2) -> dict[str, Any]:
-    """How the i-th trajectory is drawn: as a line, or as a point if it has one row."""
+    """Return the style of the i-th trajectory: a line, or a point if it has one row."""
     kind = {"linestyle": DASHES[i % len(DASHES)]} if rows > 1 else {"linestyle": "none", "marker": "o"}
     return {"color": PALETTE[i % len(PALETTE)], **kind}
 
 
 def legend_above(axes: Axes) -> None:
-    """A legend above the axes, in as few lines as its words allow."""
+    """Add a legend above the axes; long labels get two columns, others four."""
     _, words = axes.get_legend_handles_labels()
     columns = 2 if len(words) > 4 and max(map(len, words)) > 10 else 4
     axes.legend(
@@ -121,14 +121,14 @@ def legend_above(axes: Axes) -> None:
 
 
 def tips_of(trajectory: Tips) -> NDArray[np.float64]:
-    """Positions of a tip (T, 3)."""
+    """Return the tip positions (T, 3)."""
     if isinstance(trajectory, Trajectory):
         one_of(trajectory)
     return np.asarray(trajectory.tip_position, dtype=float)
 
 
 def one_of(trajectory: Trajectory) -> Trajectory:
-    """The trajectory, if it is one, and of one robot."""
+    """Return the trajectory after checking that it is a trajectory of one robot."""
     if not isinstance(trajectory, Trajectory):
         raise TypeError(f"trajectory is a {type(trajectory).__name__}; allowed is a Trajectory")
     if np.ndim(trajectory.y) == 4:
@@ -142,7 +142,7 @@ def one_of(trajectory: Trajectory) -> Trajectory:
 
 
 def new_figure(width: float, height: float) -> Any:
-    """An empty figure of so many inches."""
+    """Return an empty figure of a given size (in)."""
     from knode_cosserat.evaluation.styled import StyledFigure
 
     return StyledFigure(figsize=(width, height), layout="constrained", dpi=150)

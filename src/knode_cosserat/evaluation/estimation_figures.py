@@ -1,4 +1,4 @@
-"""The figure of estimated states beside the true ones."""
+"""Figure of estimated and true states."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from knode_cosserat.trajectory import Trajectory
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: quantity, component, node, and what the axis says
+#: quantity, component, node and title of each panel
 _SHOWN = (
     ("q", 0, -1, "tip: q along x [m/s]"),
     ("w", 1, -1, "tip: ω about y [rad/s]"),
@@ -25,7 +25,7 @@ _SHOWN = (
 
 
 def states(truth: Trajectory, estimates: Mapping[str, Trajectory], span: tuple[float, float]) -> Figure:
-    """Velocities at the tip, force and moment at the base over a span of time (s), and the errors below each.
+    """Return a figure of tip velocities, base force and base moment over a time span (s), with their errors.
 
     Raises:
         ImportError: matplotlib is not installed.

@@ -1,14 +1,13 @@
-"""Figures of trajectories, all in one style, for a screen or a paper; they need matplotlib, the extra `viz`.
+"""Figures of trajectories in one style, for a screen or a paper; they need matplotlib, the extra `viz`.
 
-Every function returns a `matplotlib.figure.Figure` of its own: no window is opened, nothing global changes,
-and `figure.savefig("it.pdf")` (or .svg, .png) writes it with fonts that are part of the file. Colours are
-those of Okabe and Ito, every axis says its unit, and `columns` makes a figure as wide as one column of a
-paper (3.5 in) or as two (7.16 in). `trajectories` is one trajectory, or a dict of several by their labels,
-which are drawn over each other. Each is of one robot; rows that were not solved stay empty.
+Every function returns a new `matplotlib.figure.Figure`. No window is opened and no global setting changes.
+`figure.savefig("it.pdf")` (or .svg, .png) embeds the fonts. The colours are Okabe and Ito's, and every axis
+has its unit. `columns` sets the width: one column of a paper (3.5 in) or two (7.16 in). `trajectories` is one
+trajectory, or a dict of several by label, which are overlaid. Each is of one robot; unsolved rows stay empty.
 
 Raises, from every function here:
     ImportError: matplotlib is not installed.
-    ValueError: there is nothing to draw, or a batch is given where one robot can be drawn.
+    ValueError: there is nothing to draw, or a batch is given where one robot is required.
 """
 
 from __future__ import annotations
@@ -76,14 +75,14 @@ __all__ = [
     "workspace",
 ]
 
-#: what `states` draws if nothing else is asked for, as far as a system has it
+#: default fields of `states`, if the system has them
 FIELDS = ("q", "w", "n", "m", "v", "u")
 
 
 def shape(trajectory: Trajectory, *, count: int = 12, view: str | None = None, columns: int = 1) -> Figure:
-    """The robot at `count` times, evenly spread and coloured by time, and the path of its tip.
+    """Return a figure of the robot at `count` evenly spaced times, coloured by time, and its tip path.
 
-    Seen in space ("xyz"), or along an axis: "xy", "xz", "yz", where what surrounds the robot is drawn too.
+    The view is in space ("xyz"), or along an axis: "xy", "xz", "yz". Views along an axis show obstacles too.
     """
     curves = curves_of(one_of(trajectory))
     view = checked_view(view, curves[0].shape[-1])
@@ -130,9 +129,9 @@ def _draw_shape(figure: Any, trajectory: Trajectory, count: int, view: str) -> N
 def path(
     trajectories: Tips | Mapping[str, Tips | ArrayLike], *, view: str | None = None, columns: int = 1
 ) -> Figure:
-    """Where tips went, in space ("xyz") or along an axis ("xy", "xz", "yz"); also paths (points, 3) in m.
+    """Return a figure of tip paths in space ("xyz") or along an axis ("xy", "xz", "yz").
 
-    A label that begins with "wanted" is drawn as a wide, pale line under the others.
+    Paths may also be arrays (points, 3) in m. A path whose label begins with "wanted" is drawn wide and pale.
     """
     given = dict(trajectories) if isinstance(trajectories, Mapping) else {"": trajectories}
     if not given:
@@ -156,7 +155,7 @@ def path(
 
 
 def tips(trajectories: Tips | Mapping[str, Tips], *, columns: int = 1) -> Figure:
-    """x, y and z of the tips over time, of trajectories or of recordings."""
+    """Return a figure of x, y and z of the tips over time, of trajectories or recordings."""
     given = by_label(trajectories)
     paths = {label: (one.time, tips_of(one)) for label, one in given.items()}
     size = min(tip.shape[1] for _, tip in paths.values())
@@ -177,14 +176,14 @@ def states(
     node: int = -1,
     columns: int = 2,
 ) -> Figure:
-    """Fields of the state at one node over time: a panel for each, a colour for each component.
+    """Return a figure of the state's fields at one node over time: a panel per field, a colour per component.
 
     `fields` are names of y, z or the controls (`Trajectory.part`); by default velocities, loads and strains.
     Several trajectories differ by their dashes.
 
     Raises:
-        KeyError: a field that there is not.
-        ValueError: a node that there is not.
+        KeyError: a field does not exist.
+        ValueError: the node does not exist.
     """
     given = by_label(trajectories)
     first = one_of(next(iter(given.values())))
@@ -192,7 +191,7 @@ def states(
     known = {field.name: field for layout in layouts for field in layout.fields}
     names = [name for name in FIELDS if name in known] if fields is None else list(fields)
     names = names or list(known)
-    # `part` also has those of several rods together, which one panel cannot show
+    # `part` also accepts fields of several rods together, which one panel cannot show
     for name in set(names) - set(known):
         raise KeyError(f"no field {name!r}; there are {', '.join(known)}")
     if not -first.y.shape[1] <= node < first.y.shape[1]:
@@ -227,10 +226,10 @@ def states(
 
 
 def error(truth: Tips, predictions: Tips | Mapping[str, Tips], *, columns: int = 1) -> Figure:
-    """How far the tips of predictions are from the true one, over time, on a logarithmic scale.
+    """Return a figure of the distance of predicted tips from the true tip over time, on a log scale.
 
     Raises:
-        ValueError: a prediction has not the rows of the truth.
+        ValueError: a prediction's rows differ from the truth's.
     """
     given, true = by_label(predictions, "predictions"), tips_of(truth)
     with style():
@@ -244,7 +243,7 @@ def error(truth: Tips, predictions: Tips | Mapping[str, Tips], *, columns: int =
                     f"{len(true)}; both must have the same times"
                 )
             distance = np.linalg.norm(tip - true, axis=1)
-            # both begin at one place, and a logarithm has no zero
+            # the initial distance may be zero, which a logarithmic axis cannot show
             axes.plot(truth.time, np.where(distance > 0.0, distance, np.nan), label=label or None, **line(i))
         axes.set(xlabel="time [s]", ylabel="distance of the tips [m]", yscale="log")
         axes.margins(x=0.02)
@@ -254,7 +253,7 @@ def error(truth: Tips, predictions: Tips | Mapping[str, Tips], *, columns: int =
 
 
 def tensions(trajectory: Trajectory, *, columns: int = 1) -> Figure:
-    """The tension of every tendon over time, as it was held from row to row; or the controls."""
+    """Return a figure of every tendon's tension over time, held from row to row; or of the controls."""
     one_of(trajectory)
     with style():
         figure = new_figure(width_of(columns), 2.4)
@@ -263,7 +262,7 @@ def tensions(trajectory: Trajectory, *, columns: int = 1) -> Figure:
 
 
 def overview(trajectory: Trajectory, count: int = 12) -> Figure:
-    """Shapes, tip path and tensions of one trajectory in one picture, two columns wide."""
+    """Return one figure of shapes, tip path and tensions of a trajectory, two columns wide."""
     curves = curves_of(one_of(trajectory))
     with style():
         figure = new_figure(TWO_COLUMNS, 4.2)
@@ -279,10 +278,10 @@ def overview(trajectory: Trajectory, count: int = 12) -> Figure:
 
 
 def spread(batch: Trajectory, *, columns: int = 1) -> Figure:
-    """x, y and z of the tips of a batch over time: the median, where nine tenths are, and where all.
+    """Return a figure of a batch's tips over time: the median, the band of 90 % and the full range.
 
     Raises:
-        ValueError: a trajectory of one robot.
+        ValueError: the trajectory is not a batch.
     """
     if not isinstance(batch, Trajectory):
         raise TypeError(f"batch is a {type(batch).__name__}; allowed is a Trajectory of several robots")
@@ -317,10 +316,10 @@ def curves(
     marker: str = "",
     columns: int = 1,
 ) -> Figure:
-    """Any curves over x in the same style, by their labels; `log` names axes that are logarithmic, "xy" both.
+    """Return a figure of curves over x by label; `log` names the logarithmic axes ("", "x", "y" or "xy").
 
     Raises:
-        ValueError: a curve that has not as many values as x, or another `log`.
+        ValueError: a curve's number of values differs from x's, or `log` is not allowed.
     """
     if log not in ("", "x", "y", "xy"):
         raise ValueError(f"log is {log!r}; allowed is '', 'x', 'y' or 'xy'")

@@ -1,4 +1,4 @@
-"""Figures of what a model learned; they need matplotlib, the extra `viz`."""
+"""Figures of a model's learned residual; they need matplotlib, the extra `viz`."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ if TYPE_CHECKING:
 
 
 def residual(model: KNODE, trajectory: Trajectory) -> Figure:
-    """What the residual adds to strains and to the rates of what balances loads, at a trajectory's states.
+    """Return a figure of the residual's contribution to strains and load balances along a trajectory.
 
-    One row for each field of z, and for each field of y whose rate balances a load (all if the system does
-    not say): the largest over the rod's segments, over time, of the knowledge alone and of what is added.
+    There is one panel for each field of z, and for each field of y whose rate balances a load (all fields if
+    the system states none). It shows over time the maximum along the rod of the nominal model and of the
+    residual.
 
     Raises:
         DataError: the trajectory does not fit the model.
@@ -43,7 +44,7 @@ def residual(model: KNODE, trajectory: Trajectory) -> Figure:
                 size = np.linalg.norm(values, axis=-1).max(axis=1)
                 axis.plot(found.time, size, color=colour, label=name)
             axis.set_ylabel(label)
-            # a little below zero, for what adds nothing to be seen
+            # the axis begins below zero, so that a zero residual is visible
             axis.set_ylim(bottom=-0.04 * axis.get_ylim()[1])
         axes[-1].set_xlabel("time [s]")
         axes[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)

@@ -1,12 +1,12 @@
 """Distances between a predicted and a reference trajectory.
 
-Plain NumPy and SciPy on plain arrays: anything with positions and quaternions can be compared, whether it
-was simulated, predicted or recorded. The two figures of the paper's result tables are `tip_dtw` and
-`pose_mse`; the paper is Jiahao et al., "Knowledge-based Neural Ordinary Differential Equations for Cosserat
-Rod-based Soft Robots".
+The functions use NumPy and SciPy on plain arrays. They compare simulated, predicted or recorded data with
+positions and quaternions. The two metrics of the paper's result tables are `tip_dtw` and `pose_mse`; the
+paper is Jiahao et al., "Knowledge-based Neural Ordinary Differential Equations for Cosserat Rod-based Soft
+Robots".
 
-Every row counts, the first one too. The paper keeps T rows of a trajectory under T controls, the initial
-state and those after all but the last control; callers who want its figures slice before they compare.
+Every row counts, including the first. The paper keeps T rows of a trajectory under T controls: the initial
+state and the states after all but the last control. To reproduce its numbers, slice before comparing.
 """
 
 from typing import Any, Protocol
@@ -18,22 +18,22 @@ Array = NDArray[np.float64]
 
 
 class PoseHistory(Protocol):
-    """What the metrics read of a trajectory."""
+    """Protocol of a trajectory's data for the metrics."""
 
     @property
     def position(self) -> ArrayLike:
-        """(T, N, 3) m, global frame."""
+        """Positions (T, N, 3) in m, global frame."""
 
     @property
     def quaternion(self) -> ArrayLike:
-        """(T, N, 4), scalar first, material to global frame; any length but zero."""
+        """Quaternions (T, N, 4), scalar first, material to global frame; any nonzero norm."""
 
 
 def dtw_distance(a: ArrayLike, b: ArrayLike) -> float:
-    """Exact dynamic-time-warping distance between two paths, with the L1 ground distance.
+    """Return the exact dynamic-time-warping distance between two paths, with the L1 ground distance.
 
-    The smallest sum, over all monotone alignments that match both first points and both last points, of
-    |Δx| + |Δy| + |Δz| along the alignment. No window and no normalisation by the alignment's length. Time
+    The distance is the smallest sum of |Δx| + |Δy| + |Δz| over all monotone alignments that match both first
+    points and both last points. There is no window and no normalisation by the alignment's length. Time
     grows with T · S, memory with T + S.
 
     Args:
@@ -77,7 +77,7 @@ def dtw_distance(a: ArrayLike, b: ArrayLike) -> float:
 
 
 def tip_dtw(prediction: PoseHistory, reference: PoseHistory) -> float:
-    """`dtw_distance` between the paths of the two tips, the last nodes.
+    """Return `dtw_distance` between the paths of the two tips, the last nodes.
 
     The trajectories may differ in rows and in nodes.
 
@@ -95,11 +95,11 @@ def tip_dtw(prediction: PoseHistory, reference: PoseHistory) -> float:
 
 
 def pose_mse(prediction: PoseHistory, reference: PoseHistory) -> float:
-    """Mean squared error of positions and orientations, times 1000, as in the paper's tables.
+    """Return the mean squared error of positions and orientations, times 1000, as in the paper's tables.
 
     The mean runs over rows, nodes and six numbers: x, y, z in metres and three Euler angles in radians,
-    extrinsic in the order z, y, x. It adds m² to rad², and two angles either side of ±π count as almost 2π
-    apart; both are part of the published definition.
+    extrinsic in the order z, y, x. It adds m² to rad², and angles on opposite sides of ±π differ by almost
+    2π; both are part of the published definition.
 
     Returns:
         1000 times the mean, no unit.
@@ -116,7 +116,7 @@ def pose_mse(prediction: PoseHistory, reference: PoseHistory) -> float:
 
 
 def tip_rmse(prediction: PoseHistory, reference: PoseHistory) -> float:
-    """Root mean square, over rows, of the Euclidean distance between the two tips, the last nodes.
+    """Return the root mean square over rows of the Euclidean distance between the two tips, the last nodes.
 
     The trajectories may differ in nodes.
 
@@ -131,7 +131,7 @@ def tip_rmse(prediction: PoseHistory, reference: PoseHistory) -> float:
 
 
 def node_error(prediction: PoseHistory, reference: PoseHistory) -> Array:
-    """Root mean square, over rows, of the Euclidean distance between the positions of each node.
+    """Return the root mean square over rows of the Euclidean distance between positions, for each node.
 
     Returns:
         (N,) m, base first.
@@ -144,12 +144,12 @@ def node_error(prediction: PoseHistory, reference: PoseHistory) -> Array:
 
 
 def rms_distance(a: Array, b: Array) -> Array:
-    """Root mean square over time of the distances between points (T, ..., 3): (...), in their unit."""
+    """Return the root mean square over time (...) of the distances between points (T, ..., 3)."""
     return np.sqrt(np.mean(np.sum((a - b) ** 2, axis=-1), axis=0))
 
 
 def _euler_angles(quaternion: Array) -> Array:
-    # imported here: it takes a third of a second
+    # imported here, because the import takes a third of a second
     from scipy.spatial.transform import Rotation
 
     scalar_last = np.roll(quaternion, -1, axis=-1)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from knode_cosserat.recordings.measurements import Measurements
     from knode_cosserat.recordings.recording import Body, Recording
 
-#: how what happened at a time is marked: what the finding says, its colour and its name
+#: markers of events: text in the finding, colour and label
 _MARKS = (
     ("axes were swapped", PALETTE[1], "axes swapped"),
     ("clock", PALETTE[3], "clock jumped"),
@@ -34,7 +34,7 @@ _MARKS = (
 
 
 def health(recording: Recording, report: Health) -> Figure:
-    """What sensors saw over time, and how well: tensions, positions, frames that are missing, noise.
+    """Return a figure of a recording and its quality: tensions, positions, missing frames and noise.
 
     Raises:
         ImportError: matplotlib is not installed.
@@ -57,10 +57,9 @@ def health(recording: Recording, report: Health) -> Figure:
 
 
 def prediction_against_measurement(prediction: Tips, recording: Measurements) -> Figure:
-    """Two tip paths row by row: over the recording's time, seen from above, and how far apart they are.
+    """Return a figure of a predicted and a measured tip path: over time, from above, and their distance.
 
-    The title gives their DTW distance, and the root mean square of their distance in each row. A recording of
-    a simulated robot is named as one.
+    The title has the DTW distance and the RMSE. The label states if the robot was simulated.
 
     Raises:
         ValueError: the numbers of rows differ, or a position is not finite.
@@ -107,7 +106,7 @@ def _end(recording: Recording) -> float:
 
 
 def _draw_tensions(axes: Any, recording: Recording) -> None:
-    """Measured tensions as lines, commanded ones as dotted steps."""
+    """Draw measured tensions as lines and commanded ones as dotted steps."""
     end = _end(recording)
     if recording.command is not None:
         time = np.append(recording.command.time, max(end, recording.command.time[-1]))
@@ -130,7 +129,7 @@ def _draw_tensions(axes: Any, recording: Recording) -> None:
 
 
 def _draw_positions(axes: Any, recording: Recording) -> None:
-    """x, y and z of all bodies; lines break where a gap is too long to be bridged."""
+    """Draw x, y and z of all bodies; lines break at gaps too long to be bridged."""
     for k, body in enumerate(recording.bodies):
         time, position = _with_breaks(body, recording.config.longest_gap)
         for axis in range(3):
@@ -153,7 +152,7 @@ def _with_breaks(body: Body, longest: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _draw_frames(axes: Any, recording: Recording) -> None:
-    """A row for each stream: where frames are missing, and what happened."""
+    """Draw missing frames and events, a row per stream."""
     from knode_cosserat.recordings.recording import bridge, period
 
     streams = [(body.name, body.topic, body.time) for body in (*recording.bodies, recording.base) if body]
@@ -189,7 +188,7 @@ def _draw_frames(axes: Any, recording: Recording) -> None:
 
 
 def _draw_noise(axes: Any, report: Health) -> None:
-    """The noise of positions and, on a second axis, of orientations."""
+    """Draw the noise of positions and, on a second axis, of orientations."""
     bodies = [stream for stream in report.streams if stream.what not in ("measured tensions", "commands")]
     at = np.arange(len(bodies))
     axes.bar(at - 0.2, [1e3 * (each.noise or 0.0) for each in bodies], 0.38, color=PALETTE[0])
@@ -205,7 +204,7 @@ def _draw_noise(axes: Any, report: Health) -> None:
 
 
 def _draw_errors(axes: Any, recording: Recording, report: Health) -> None:
-    """Measured less commanded tension by tendon, or the measured ones' spread without commands."""
+    """Draw RMS and bias of measured minus commanded tension by tendon, or a note without commands."""
     if not report.tension_errors:
         axes.axis("off")
         axes.text(0.5, 0.5, "no commands to compare\nmeasured tensions with", ha="center", va="center")

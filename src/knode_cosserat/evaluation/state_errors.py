@@ -1,4 +1,4 @@
-"""How far estimated states are from true ones, quantity by quantity."""
+"""Errors of estimated states, quantity by quantity."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from jaxtyping import Float, Int
 
 from knode_cosserat.trajectory import Trajectory
 
-#: times that differ by less are the same (s), and places along the rod, as parts of its length
+#: tolerance of equal times (s) and of equal places along the rod (fraction of its length)
 _SAME = 1e-6
 
 
 class StateError(NamedTuple):
-    """One quantity: the root mean square, over rows and nodes, of the length of a vector.
+    """Error of one quantity: root mean square over rows and nodes of a vector's length.
 
     Attributes:
-        rms: of the error.
-        size: of the true quantity; of an orientation, of its turn from upright.
-        unit: of both.
+        rms: root mean square of the error.
+        size: root mean square of the true quantity; for an orientation, of its angle from upright.
+        unit: unit of both.
     """
 
     rms: float
@@ -31,11 +31,11 @@ class StateError(NamedTuple):
 def state_errors(
     estimate: Trajectory, truth: Trajectory, start: float | None = None
 ) -> dict[str, StateError]:
-    """The errors of p, h (an angle), n, m, q, w, v and u, and of whatever else both have in y and z.
+    """Return the errors of all fields that estimate and truth share in y and z; h's error is an angle.
 
     Args:
-        estimate: states of one robot.
-        truth: what they should be; it may have more rows and more nodes.
+        estimate: estimated states of one robot.
+        truth: true states; they may have more rows and more nodes.
         start: rows before this time are left out (s).
 
     Raises:
@@ -96,7 +96,7 @@ def _length(vectors: Float[np.ndarray, "T N size"]) -> Any:
 
 
 def _angle(a: Float[np.ndarray, "T N 4"], b: Float[np.ndarray, "T N 4"]) -> Any:
-    """The angle (rad) between orientations, exact also where it is small."""
+    """Return the angle (rad) between orientations, accurate also for small angles."""
     a, b = a / np.linalg.norm(a, axis=-1, keepdims=True), b / np.linalg.norm(b, axis=-1, keepdims=True)
     b = np.where(np.sum(a * b, axis=-1, keepdims=True) < 0.0, -b, b)
     return 4.0 * np.arcsin(np.clip(np.linalg.norm(a - b, axis=-1) / 2.0, 0.0, 1.0))

@@ -1,4 +1,4 @@
-"""The figures of a study: its controls, the robots' shapes and tips by each method, and how the loss fell."""
+"""Figures of a study: controls, shapes and tips by method, and the training loss."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from knode_cosserat.trajectory import Trajectory
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: how each is drawn, whatever others are there: the reference is wide and pale, so that what lies on it shows
+#: fixed line styles: the reference is wide and pale, so that a line on top of it remains visible
 REFERENCE: dict[str, Any] = {"color": "#AAAAAA", "linewidth": 3.0, "linestyle": "-"}
 METHODS: dict[str, dict[str, Any]] = {
     "baseline": {"color": PALETTE[1], "linestyle": "-", "linewidth": 1.0},
@@ -31,21 +31,21 @@ METHODS: dict[str, dict[str, Any]] = {
     "calibrated": {"color": PALETTE[3], "linestyle": (0, (1, 1.5)), "linewidth": 1.6},
     "best": {"color": PALETTE[6], "linestyle": (0, (4, 2)), "linewidth": 1.1},
 }
-#: others, by where they stand among all that are drawn
+#: styles of other labels, by their position in the figure
 _OTHERS = ("baseline", "best", "paper", "calibrated")
 
 
 def look_of(label: str, place: int) -> dict[str, Any]:
-    """How a prediction is drawn: a method of the studies as ever, anything else by its place."""
+    """Return the line style of a prediction: fixed for methods of the studies, otherwise by position."""
     return METHODS[label if label in METHODS else _OTHERS[place % len(_OTHERS)]]
 
 
 def controls(trajectories: Mapping[str, Trajectory]) -> Figure:
-    """The tensions of several trajectories, one below the other, by their titles.
+    """Return a figure of the tensions of several trajectories by title, one below the other.
 
     Raises:
         ImportError: matplotlib is not installed; from every function here.
-        ValueError: nothing is given to draw, or a batch of robots; from every function here.
+        ValueError: there is nothing to draw, or a batch is given; from every function here.
     """
     require_some(trajectories)
     with style():
@@ -60,7 +60,7 @@ def controls(trajectories: Mapping[str, Trajectory]) -> Figure:
 
 
 def shapes(reference: Trajectory, predictions: Mapping[str, Trajectory], count: int = 6) -> Figure:
-    """The robot at `count` times beside the reference and the paths of the tips, for each prediction."""
+    """Return a figure of shapes at `count` times and tip paths, a panel per prediction over the reference."""
     require_some(predictions)
     with style():
         columns = min(2, len(predictions))
@@ -78,7 +78,7 @@ def shapes(reference: Trajectory, predictions: Mapping[str, Trajectory], count: 
 
 
 def tips(cases: Mapping[str, tuple[Trajectory, Mapping[str, Trajectory]]]) -> Figure:
-    """x, y and z of the tips over time: a column for each case, given as its reference and predictions."""
+    """Return a figure of the tips over time: a column per case, given by its reference and predictions."""
     require_some(cases)
     with style():
         figure = new_figure(TWO_COLUMNS, 4.0)
@@ -92,7 +92,7 @@ def tips(cases: Mapping[str, tuple[Trajectory, Mapping[str, Trajectory]]]) -> Fi
 
 
 def comparison(reference: Trajectory, predictions: Mapping[str, Trajectory], count: int = 6) -> Figure:
-    """Shapes and tips of several predictions in one picture, each drawn over the reference."""
+    """Return one figure of the shapes and tips of several predictions, drawn over the reference."""
     require_some(predictions)
     with style():
         figure = new_figure(TWO_COLUMNS, 3.8)
@@ -139,7 +139,7 @@ def _draw_tips(column: Any, reference: Trajectory, predictions: Mapping[str, Tra
 
 
 def losses(runs: Mapping[str, Sequence[ArrayLike]]) -> Figure:
-    """The loss over epochs: for each label the median of its runs (seeds), and a band from least to most."""
+    """Return a figure of the loss over epochs: median and range of the runs (seeds) for each label."""
     require_some(runs)
     with style():
         figure = new_figure(TWO_COLUMNS, 3.2)
@@ -158,7 +158,7 @@ def losses(runs: Mapping[str, Sequence[ArrayLike]]) -> Figure:
 
 
 def legend_below(figure: Any, axes: Any) -> None:
-    """One legend for all axes, each label once."""
+    """Add one legend for all axes, each label once."""
     handles: dict[str, Any] = {}
     for each in axes:
         for handle, label in zip(*each.get_legend_handles_labels(), strict=True):
@@ -167,6 +167,6 @@ def legend_below(figure: Any, axes: Any) -> None:
 
 
 def require_some(given: Mapping[str, Any]) -> None:
-    """Raise `ValueError` if nothing is given to draw."""
+    """Raise `ValueError` if there is nothing to draw."""
     if not given:
         raise ValueError("there is nothing to draw; at least one is needed")

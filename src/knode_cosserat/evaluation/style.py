@@ -1,15 +1,15 @@
-"""The one style of all figures: colours, widths, fonts."""
+"""Style of all figures: colours, widths and fonts."""
 
 from __future__ import annotations
 
 from typing import Any
 
-#: Okabe and Ito's colours, which the colour-blind can tell apart, without the yellow that vanishes on paper
+#: Okabe and Ito's colour-blind safe palette, without yellow, which is hard to see on paper
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-#: the second trajectory and so on, which may lie on the first
+#: line styles by trajectory, so that overlapping lines remain distinguishable
 DASHES = ("-", "--", "-.", ":")
 TIME_COLOURS = "viridis"
-#: inches: the width of a figure in one column of a paper, and in both
+#: width of a figure in one column of a paper, and in two (in)
 ONE_COLUMN, TWO_COLUMNS = 3.5, 7.16
 STYLE: Any = {
     "font.size": 8,
@@ -31,10 +31,10 @@ STYLE: Any = {
     "lines.markersize": 4,
     "xtick.major.width": 0.6,
     "ytick.major.width": 0.6,
-    # TrueType: fonts are part of the file and its text can be searched; journals turn down Type 3
+    # TrueType: fonts are embedded and text is searchable; journals reject Type 3
     "pdf.fonttype": 42,
     "ps.fonttype": 42,
-    # letters as shapes: they look the same where the font is missing
+    # letters as paths, which do not depend on installed fonts
     "svg.fonttype": "path",
     "svg.hashsalt": "knode-cosserat",
     "savefig.dpi": 220,
@@ -42,7 +42,7 @@ STYLE: Any = {
 
 
 def require_matplotlib() -> None:
-    """Raise `ImportError`, saying how to install it, if matplotlib is not there."""
+    """Raise `ImportError` with the installation command if matplotlib is not installed."""
     try:
         import matplotlib.figure  # noqa: F401
     except ImportError:
@@ -50,7 +50,7 @@ def require_matplotlib() -> None:
 
 
 def style() -> Any:
-    """The context in which all figures are made."""
+    """Return the matplotlib context with the style of all figures."""
     require_matplotlib()
     import matplotlib
 
@@ -58,10 +58,10 @@ def style() -> Any:
 
 
 def width_of(columns: int) -> float:
-    """Inches of a figure that is as wide as one column of a paper, or as two.
+    """Return the width (in) of a figure in one or two columns of a paper.
 
     Raises:
-        ValueError: another number.
+        ValueError: the number of columns is not 1 or 2.
     """
     if columns not in (1, 2):
         raise ValueError(f"columns is {columns!r}; allowed is 1 or 2, the columns of a paper")

@@ -1,4 +1,4 @@
-"""A figure that is written in our style, whatever the user's own settings are. It needs matplotlib."""
+"""Figure that is saved in the package's style, independent of the user's settings. It needs matplotlib."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from knode_cosserat.evaluation.style import style
 
 
 class StyledFigure(Figure):
-    """Also fonts and resolution, which matplotlib takes from its settings only when it writes."""
+    """Figure with the package's fonts and resolution, which matplotlib reads only when it saves."""
 
     def savefig(self, *args: Any, **options: Any) -> None:
-        """As matplotlib's, in our style."""
+        """Save the figure as matplotlib does, in the package's style."""
         with style():
             super().savefig(*args, **options)
 
     def _repr_png_(self) -> bytes:
-        """What a notebook shows of the figure that a cell ends with."""
+        """Return the PNG that a notebook displays."""
         file = io.BytesIO()
         self.savefig(file, format="png", dpi=120)
         return file.getvalue()

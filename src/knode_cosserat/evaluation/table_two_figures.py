@@ -1,6 +1,6 @@
-"""The figures of the recordings' study: tensions, tips by each method, error over the horizon, repetitions.
+"""Figures of the recordings' study: tensions, tips by method, error over the horizon, and repetitions.
 
-What is drawn comes by the recordings' names. Rows that are not known are not numbers.
+Data are given by the recordings' names. Unknown rows are NaN.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: how each method is drawn
+#: line style of each method
 LINES: dict[str, dict[str, Any]] = {
     "baseline": METHODS["baseline"],
     "paper-a": {"color": PALETTE[5], "linestyle": "-", "linewidth": 1.1},
@@ -33,7 +33,7 @@ COLUMNS = 2
 
 
 class Predicted(NamedTuple):
-    """A recording: its tip as measured, and as each method predicts it from its first seed."""
+    """Recording with its measured tip, and each method's prediction with its first seed."""
 
     time: Float[np.ndarray, " T"]
     measured: Float[np.ndarray, "T 3"]
@@ -43,7 +43,7 @@ class Predicted(NamedTuple):
 
 
 def tensions(recordings: Mapping[str, Predicted]) -> Figure:
-    """Commanded tensions and measured ones, tendon by tendon.
+    """Return a figure of commanded and measured tensions by tendon.
 
     Raises:
         ImportError: matplotlib is not installed; from every function here.
@@ -65,10 +65,10 @@ def tensions(recordings: Mapping[str, Predicted]) -> Figure:
 
 
 def tip_x(recordings: Mapping[str, Predicted]) -> Figure:
-    """x of the tips over time."""
+    """Return a figure of x of the tips over time."""
     with style():
         figure, panels = _grid(recordings, 2.3)
-        # one scale: what hardly moves should look it; and a prediction that is far out goes off it
+        # one scale for all panels, so that motions are comparable; predictions far off leave the axes
         reach = 2.5 * max(float(np.nanmax(np.abs(it.measured[:, 0]))) for it in recordings.values())
         for axes, (name, it) in zip(panels, recordings.items(), strict=False):
             axes.plot(it.time, it.measured[:, 0], **MEASURED)
@@ -79,7 +79,7 @@ def tip_x(recordings: Mapping[str, Predicted]) -> Figure:
 
 
 def paths(recordings: Mapping[str, Predicted]) -> Figure:
-    """The paths of the tips in space."""
+    """Return a figure of the paths of the tips in space."""
     require_some(recordings)
     with style():
         columns = min(COLUMNS, len(recordings))
@@ -102,7 +102,7 @@ def paths(recordings: Mapping[str, Predicted]) -> Figure:
 
 
 def horizon(recordings: Mapping[str, Predicted]) -> Figure:
-    """How far the tips are off as time goes on: the root mean square over the recordings, and the worst."""
+    """Return a figure of the tip error over the horizon: RMS over the recordings, and their range."""
     require_some(recordings)
     with style():
         figure = new_figure(TWO_COLUMNS, 3.2)
@@ -118,7 +118,7 @@ def horizon(recordings: Mapping[str, Predicted]) -> Figure:
                 ]
             )
             time = several[0].time[:length] - several[0].time[0]
-            # of the last second: less ragged
+            # average over the last second, for smoother lines
             means = np.array(
                 [np.sqrt(np.nanmean(off[:, max(0, i - 20) : i + 1] ** 2)) for i in range(length)]
             )
@@ -138,7 +138,7 @@ def horizon(recordings: Mapping[str, Predicted]) -> Figure:
 
 
 def consistency(groups: Mapping[str, Sequence[Float[np.ndarray, "T 3"]]], dt: float) -> Figure:
-    """Recordings of one control on each other: how alike the robot does the same thing twice."""
+    """Return a figure of repeated recordings of one control, overlaid: the robot's repeatability."""
     with style():
         figure, panels = _grid(groups, 2.3)
         for axes, (name, several) in zip(panels, groups.items(), strict=False):

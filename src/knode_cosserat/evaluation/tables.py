@@ -1,7 +1,7 @@
-"""The paper's result table: two figures for each case and method over all seeds, and the paper's own.
+"""The paper's result table: two metrics for each case and method over all seeds, and the published values.
 
-A case is an imperfection under a control. A cell that could not be computed has no figures but a reason, and
-is shown with it.
+A case is an imperfection under a control. A cell that could not be computed has a reason in place of values,
+and is shown with it.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ import statistics
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple, NotRequired, TypedDict
 
-#: the two figures, as in a cell and as a title
+#: the two metrics: key in a cell, and title
 MEASURES = {"tip_dtw": "Tip DTW [m]", "pose_mse": "Pose MSE [1e-3]"}
 
 
 class Cell(TypedDict):
-    """The figures of one method, from one seed, in one case; None if there are none, and then the reason."""
+    """Metrics of one method with one seed in one case; if they are None, `failed` has the reason."""
 
     imperfection: str
     control: str
@@ -29,7 +29,7 @@ class Cell(TypedDict):
 
 
 class Published(NamedTuple):
-    """Tip DTW and pose MSE of a case as the paper has them, and as one rerun of its method has."""
+    """Published tip DTW and pose MSE of a case, and those of one rerun of the paper's method."""
 
     baseline: tuple[float, float]
     learned: tuple[float, float]
@@ -37,20 +37,20 @@ class Published(NamedTuple):
 
 
 class Spread(NamedTuple):
-    """One figure over the seeds of a method."""
+    """One metric over the seeds of a method."""
 
     values: tuple[float, ...]
-    #: why the others have none
+    #: reasons of the failed seeds
     failures: tuple[str, ...]
 
     @property
     def mean(self) -> float | None:
-        """The mean; None if there is no figure."""
+        """Mean over seeds; None without values."""
         return statistics.fmean(self.values) if self.values else None
 
     @property
     def deviation(self) -> float | None:
-        """The standard deviation between seeds; None of fewer than two."""
+        """Standard deviation between seeds; None for fewer than two."""
         return statistics.stdev(self.values) if len(self.values) > 1 else None
 
 
@@ -58,7 +58,7 @@ Case = tuple[str, str]
 
 
 def spreads(cells: Sequence[Cell], measure: str) -> dict[Case, dict[str, Spread]]:
-    """The figures named by `measure`, for each case and method, in the order in which they come."""
+    """Return the values of a metric by case and method, in the order of the cells."""
     found: dict[Case, dict[str, Spread]] = {}
     for cell in cells:
         methods = found.setdefault((cell["imperfection"], cell["control"]), {})
@@ -79,7 +79,7 @@ _COLUMNS = (
 
 
 def as_csv(cells: Sequence[Cell], published: Mapping[Case, Published]) -> str:
-    """A line for each case, method and measure: mean, deviation, the paper's figures, and the ratio to it."""
+    """Return CSV with a line per case, method and metric: mean, deviation, published values and ratio."""
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")
     writer.writerow(_COLUMNS)
@@ -98,7 +98,7 @@ def as_csv(cells: Sequence[Cell], published: Mapping[Case, Published]) -> str:
 
 
 def as_markdown(cells: Sequence[Cell], published: Mapping[Case, Published], notes: Sequence[str] = ()) -> str:
-    """One table for each measure, the paper's figures beside ours, and what failed below."""
+    """Return Markdown with one table per metric, with published values beside ours, and the failures."""
     parts = ["Mean and standard deviation over seeds. Ratios are to the paper's KNODE; less is better."]
     for k, (measure, title) in enumerate(MEASURES.items()):
         found = spreads(cells, measure)
@@ -129,7 +129,7 @@ def as_markdown(cells: Sequence[Cell], published: Mapping[Case, Published], note
 
 
 def in_words(spread: Spread) -> str:
-    """Mean and deviation, and how many failed: `0.0123 ± 0.0004`, `1.2 (2 of 5 failed)`."""
+    """Return mean, deviation and failures as text: `0.0123 ± 0.0004`, `1.2 (2 of 5 failed)`."""
     total = len(spread.values) + len(spread.failures)
     if total == 0:
         return ""
@@ -142,7 +142,7 @@ def in_words(spread: Spread) -> str:
 
 
 def ratio_in_words(value: float | None, published: float) -> str:
-    """How large a figure is beside the published one; nothing beside a published zero."""
+    """Return the ratio of a value to the published one as text; `-` for a published zero."""
     if value is None or published == 0.0:
         return "" if value is None else "-"
     ratio = value / published
@@ -152,7 +152,7 @@ def ratio_in_words(value: float | None, published: float) -> str:
 
 
 def markdown_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table in Markdown, its columns as wide as their widest cells."""
+    """Return a Markdown table with columns as wide as their widest cells."""
     widths = [max(map(len, column)) for column in zip(heads, *rows, strict=True)]
     lines = [
         "| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |"

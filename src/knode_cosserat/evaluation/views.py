@@ -1,4 +1,4 @@
-"""Where one looks from: robots in space or seen along an axis, several beside each other, and obstacles."""
+"""Views of robots in space or along an axis, with obstacles, and checks of the data to draw."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from knode_cosserat.evaluation.drawing import (
 )
 from knode_cosserat.trajectory import Trajectory
 
-#: in space, or two axes: across and up
+#: views: in space, or two axes (horizontal, vertical)
 VIEWS = ("xyz", "xy", "xz", "yz")
 OBSTACLE = "#C8C8C8"
-#: points across a view in which obstacles are looked for
+#: points along each axis of the grid that samples obstacles
 _GRID = 240
 
 
 class Points(NamedTuple):
-    """Tip positions without times: a path that was wanted, say."""
+    """Tip positions without times, such as a desired path."""
 
     tip_position: NDArray[np.float64]
 
 
 def by_label(given: Trajectory | Tips | Mapping[str, Any], what: str = "trajectories") -> dict[str, Any]:
-    """Trajectories by their labels, also if there is only one, without any.
+    """Return trajectories by label; a single trajectory gets an empty label.
 
     Raises:
         ValueError: there is none.
-        TypeError: something that has no tip.
+        TypeError: a value has no tip positions.
     """
     found = dict(given) if isinstance(given, Mapping) else {"": given}
     if not found:
@@ -49,7 +49,7 @@ def by_label(given: Trajectory | Tips | Mapping[str, Any], what: str = "trajecto
 
 
 def by_values(lines: Mapping[str, ArrayLike], count: int) -> dict[str, Any]:
-    """Curves by their labels, checked."""
+    """Return curves by label after checking their sizes."""
     found = {label: np.asarray(given, dtype=float) for label, given in lines.items()}
     if not found:
         raise ValueError("there are no curves to draw; at least one is needed")
@@ -60,7 +60,7 @@ def by_values(lines: Mapping[str, ArrayLike], count: int) -> dict[str, Any]:
 
 
 def path_of(one: Tips | ArrayLike) -> NDArray[np.float64]:
-    """Positions (T, d) of a tip, or those that are given as they are."""
+    """Return the tip positions (T, d) of a trajectory, or given points."""
     if hasattr(one, "tip_position"):
         tip: Any = one
         return tips_of(tip)
@@ -78,16 +78,16 @@ def path_of(one: Tips | ArrayLike) -> NDArray[np.float64]:
 
 
 def curves_of(trajectory: Trajectory) -> list[NDArray[np.float64]]:
-    """The lines (T, points, d) of a trajectory's robot."""
+    """Return the lines (T, points, d) of a trajectory's robot."""
     curves = trajectory.system.curves(one_of(trajectory).y)
     return [np.asarray(curve, dtype=float) for curve in curves]
 
 
 def valid_rows(curves: list[NDArray[np.float64]]) -> NDArray[np.intp]:
-    """Rows that are solved.
+    """Return the indices of the solved rows.
 
     Raises:
-        ValueError: none is.
+        ValueError: no row is solved.
     """
     solved = np.all([np.isfinite(curve).all(axis=(1, 2)) for curve in curves], axis=0)
     if not solved.any():
@@ -96,10 +96,10 @@ def valid_rows(curves: list[NDArray[np.float64]]) -> NDArray[np.intp]:
 
 
 def spread_rows(valid: NDArray[np.intp], count: int) -> NDArray[np.intp]:
-    """`count` rows of those that are valid, evenly spread.
+    """Return up to `count` evenly spaced rows of the valid ones.
 
     Raises:
-        ValueError: less than one is asked for.
+        ValueError: `count` is less than one.
     """
     if count < 1:
         raise ValueError(f"count is {count!r}; allowed is a number of shapes from 1 on")
@@ -107,7 +107,7 @@ def spread_rows(valid: NDArray[np.intp], count: int) -> NDArray[np.intp]:
 
 
 def checked_view(view: str | None, dimension: int) -> str:
-    """The view, or the one that shows most: all of space, or the plane of what lives in one."""
+    """Return the view after a check; the default is "xyz", or "xy" for a planar system."""
     if dimension == 2:
         if view not in (None, "xy"):
             raise ValueError(f'view is {view!r}; a system in a plane is seen from "xy" only')
@@ -119,7 +119,7 @@ def checked_view(view: str | None, dimension: int) -> str:
 
 
 class View:
-    """Axes that are seen from somewhere, and what of a point they show."""
+    """Axes of one view, and the projection of points onto them."""
 
     def __init__(self, figure: Any, place: Any, view: str) -> None:
         self.flat = len(view) == 2
@@ -128,11 +128,11 @@ class View:
         self.axes.set(**{f"{at}label": f"{name} [m]" for at, name in zip("xyz", view, strict=False)})
 
     def of(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """What is drawn of points (…, d): one array for each axis."""
+        """Return the drawn coordinates of points (…, d): one array per axis."""
         return np.moveaxis(points[..., self.index], -1, 0)
 
     def frame(self, points: NDArray[np.float64], zoom: float = 0.95) -> None:
-        """Limits around points (n, d), with a metre as long in every direction."""
+        """Set the limits around points (n, d), with equal scales on all axes."""
         points = points[np.isfinite(points).all(axis=1)]
         if not self.flat:
             equal_scales(self.axes, points[None], zoom)
@@ -147,7 +147,7 @@ class View:
             self.axes.locator_params(axis="y", nbins=3)
 
     def obstacles(self, trajectory: Trajectory, points: NDArray[np.float64]) -> None:
-        """What is around the robot, cut where it moves on average; nothing in space."""
+        """Draw obstacles cut at the robot's mean position; nothing is drawn in a 3D view."""
         around = getattr(trajectory.system, "surroundings", ())
         if not self.flat or not around:
             return
@@ -166,7 +166,7 @@ class View:
 
 
 def flat_height(points: NDArray[np.float64], view: str, width: float, beside: float) -> float:
-    """Inches that a flat picture needs, of so much width without what stands beside it."""
+    """Return the height (in) of a flat view, from its width less the width `beside` the axes (in)."""
     if len(view) == 3:
         return 0.8 * width
     span = np.nanmax(points, axis=0) - np.nanmin(points, axis=0)

@@ -1,4 +1,4 @@
-"""The figure of a workspace; it needs matplotlib, the extra `viz`."""
+"""Figure of a workspace; it needs matplotlib, the extra `viz`."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ if TYPE_CHECKING:
 
     from knode_cosserat.control.workspace import Workspace
 
-#: points that are drawn, at most: more only make the file large
+#: largest number of drawn points: more only make the file larger
 MOST_POINTS = 100_000
 
 
 def workspace_seen(found: Workspace) -> Figure:
-    """Tips from the side and from above, coloured by the sum of the controls.
+    """Return a figure of tips from the side and from above, coloured by the sum of the controls.
 
     Raises:
         ImportError: matplotlib is not installed.
-        ValueError: nothing was solved, or positions are not of three numbers.
+        ValueError: no sample is solved, or positions do not have three coordinates.
     """
     require_matplotlib()
     if not (hasattr(found, "position") and hasattr(found, "valid")):

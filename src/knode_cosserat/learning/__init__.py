@@ -1,1 +1,1 @@
-"""What the physics misses, learned: knowledge and a residual make a KNODE, which is again a system."""
+"""Learning of model errors: a nominal model and a residual form a KNODE, which is again a system."""

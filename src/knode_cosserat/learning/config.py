@@ -1,4 +1,4 @@
-"""What is learned and how: settings as data, checked when they are made, to JSON and back."""
+"""Settings of a fit: checked when they are made, and converted to JSON and back."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ import numpy as np
 
 
 class ConfigError(ValueError):
-    """Settings that are not possible: one line that says which, what was given and what is allowed."""
+    """Invalid setting. The message is one line: the setting, its value and the accepted values."""
 
 
-# what an option may be
+# accepted values
 
 
 @dataclasses.dataclass(frozen=True)
 class _Allowed:
-    """What an option may be: in words, and as a test that gives the value, or None if it is wrong."""
+    """Accepted values of an option: a description, and a test that returns the value, or None if invalid."""
 
     words: str
     test: Callable[[Any], Any]
@@ -71,13 +71,13 @@ def _several(words: str, test: Callable[[Any], bool]) -> _Allowed:
 
 
 def _option(default: Any, allowed: _Allowed, *, none: str = "") -> Any:
-    """A field with what it may be; `none` says what None means, where that is allowed."""
+    """Return a dataclass field with its accepted values; `none` is the meaning of None, if accepted."""
     return dataclasses.field(default=default, metadata={"allowed": allowed, "none": none})
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Settings of one kind. Raises `ConfigError` where a value is not allowed."""
+    """Settings of one kind. Raises `ConfigError` if a value is not accepted."""
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
@@ -90,13 +90,13 @@ class Options:
             object.__setattr__(self, field.name, allowed(f"{type(self).__name__}.{field.name}", value))
 
     def to_dict(self) -> dict[str, Any]:
-        """The settings as JSON can have them."""
+        """Return the settings as JSON values."""
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
     @classmethod
     def from_dict(cls, values: Any) -> Self:
-        """The settings that `to_dict` gave; what is not there is at its default. Raises `ConfigError`."""
+        """Return settings from `to_dict`'s result; missing options have defaults. Raises `ConfigError`."""
         names = [field.name for field in dataclasses.fields(cls)]
         return cls(**_checked_keys(cls.__name__, values, names))
 
@@ -112,7 +112,7 @@ def _checked_keys(what: str, values: Any, names: list[str]) -> dict[str, Any]:
     return dict(values)
 
 
-# what is learned
+# residuals
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,9 +121,9 @@ class StructuredOptions(Options):
 
     kind: ClassVar[str] = "structured"
 
-    #: whether curved functions (powers, saturating) are tried where the linear ones leave something
+    #: if true, nonlinear functions (powers, saturating) are tried where the linear ones leave a remainder
     curved: bool = _option(True, _flag())
-    #: whether the seed gives rows random weights (Bayesian bootstrap): seeds then differ as data would
+    #: if true, the seed draws random row weights (Bayesian bootstrap), so that seeds vary as new data would
     resample: bool = _option(False, _flag())
 
 
@@ -134,15 +134,28 @@ class NetworkOptions(Options):
     kind: ClassVar[str] = "network"
 
     hidden: int = _option(512, _whole(1, 100_000))
-    #: whether ʰy and ʰz are inputs too
+    #: if true, ʰy and ʰz are inputs too
     history: bool = _option(False, _flag())
-    #: whether the weights are kept from being negative
+    #: if true, the weights are kept nonnegative
     convex: bool = _option(True, _flag())
-    #: whether inputs and outputs are shifted and scaled by what the data are like
+    #: if true, inputs and outputs are standardised by the statistics of the data
     standardised: bool = _option(False, _flag())
 
 
-# how
+@dataclasses.dataclass(frozen=True)
+class PassiveOptions(Options):
+    """A passive residual, with a linear path and a network (`learning.passive`).
+
+    It is trained through rollouts, and only needs measured poses.
+    """
+
+    kind: ClassVar[str] = "passive"
+
+    #: units of each of its two networks
+    hidden: int = _option(8, _whole(1, 1000))
+
+
+# training
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,21 +164,21 @@ class Training(Options):
 
     epochs: int = _option(1000, _whole(1))
     learning_rate: float = _option(0.01, _number(0.0, 10.0, above=True))
-    #: "plateau": times `factor` after more than `patience` epochs in which the loss fell by less than 1e-4 of
-    #: itself; "cosine": down to zero over all epochs
+    #: "plateau": multiplied by `factor` after more than `patience` epochs in which the loss fell by less than
+    #: a fraction of 1e-4; "cosine": down to zero over all epochs
     schedule: Literal["plateau", "cosine", "constant"] = _option(
         "plateau", _choice("plateau", "cosine", "constant")
     )
     patience: int = _option(80, _whole(0))
     factor: float = _option(0.5, _number(0.0, 1.0, above=True))
-    #: "paper", or "standardised": every number by its own spread (also used where the paper's is not defined)
+    #: "paper", or "standardised": each error over its own spread (also used if the paper's is not defined)
     loss: Literal["paper", "standardised"] = _option("paper", _choice("paper", "standardised"))
-    #: decoupled (AdamW), of weights and not of biases
+    #: decoupled weight decay (AdamW), for weights but not for biases
     weight_decay: float = _option(0.0, _number(0.0, 10.0))
-    #: stabilisation: new noise in every epoch, as a part of how much each number varies in the data
+    #: stabilising noise, drawn anew in every epoch, relative to the standard deviation of each number
     noise: float = _option(0.0, _number(0.0, 10.0))
-    #: noise that is added once, before training, to all numbers of y and z in their own units, as the paper
-    #: does with recordings
+    #: noise added once, before training, to all numbers of y and z in their own units, as in the paper's
+    #: training on recordings
     data_noise: float = _option(0.0, _number(0.0, 10.0))
     #: nodes that are predicted
     nodes: tuple[int, ...] | None = _option(
@@ -181,7 +194,7 @@ class Training(Options):
 
 @dataclasses.dataclass(frozen=True)
 class RolloutTraining(Options):
-    """Fine-tuning through whole simulations: only what is compared has to be known of the trajectories."""
+    """Fine-tuning through whole simulations: only the compared fields of the trajectories must be known."""
 
     updates: int = _option(100, _whole(1))
     learning_rate: float = _option(1e-3, _number(0.0, 10.0, above=True))
@@ -192,13 +205,13 @@ class RolloutTraining(Options):
         _several("different names of fields of y", lambda x: isinstance(x, str)),
         none="position p and orientation h",
     )
-    #: how many rows are simulated
+    #: number of simulated rows
     horizon: int | None = _option(None, _whole(1), none="all rows")
-    #: the row to start from, with all that is known there
+    #: row to start from, with its full state
     first_row: int | None = _option(None, _whole(0), none="the model at rest, at time 0")
-    #: the largest norm of a gradient; a longer one is shortened
+    #: gradient clipping: largest norm of the gradient
     clip: float = _option(1.0, _number(0.0, 1e12, above=True))
-    #: how often in a row a step may be halved because the robot cannot be simulated after it
+    #: largest number of consecutive halvings of a step after which the simulation fails
     rejections: int = _option(8, _whole(1, 1000))
     #: updates without a better held-out rollout after which to stop; the best weights are kept
     stop_after: int | None = _option(None, _whole(1), none="never")
@@ -208,19 +221,19 @@ class RolloutTraining(Options):
 
 @dataclasses.dataclass(frozen=True)
 class FitConfig:
-    """What `fit` learns, and how. `FitConfig()` is the best preset.
+    """Settings of `fit`. `FitConfig()` is the best preset.
 
     Attributes:
-        residual: what is learned.
+        residual: kind of residual and its options.
         segments: gradient training on one-segment samples, or None.
-        rollouts: fine-tuning through whole simulations after that, or None.
-        seed: of the first weights and of the noise; several give as many models.
+        rollouts: subsequent fine-tuning through whole simulations, or None.
+        seed: seed of the initial weights and of the noise; several seeds give several models.
 
     Raises:
         ConfigError: a value is not allowed.
     """
 
-    residual: StructuredOptions | NetworkOptions = StructuredOptions()
+    residual: StructuredOptions | NetworkOptions | PassiveOptions = StructuredOptions()
     segments: Training | None = None
     rollouts: RolloutTraining | None = None
     seed: int | tuple[int, ...] = 0
@@ -234,10 +247,12 @@ class FitConfig:
         object.__setattr__(self, "seed", _checked_seed(self.seed))
         if isinstance(self.residual, NetworkOptions) and self.segments is None and self.rollouts is None:
             raise ConfigError("FitConfig has a network but neither segments nor rollouts to train it by")
+        if isinstance(self.residual, PassiveOptions) and self.rollouts is None:
+            raise ConfigError("FitConfig has a passive residual but no rollouts to train it by")
 
     @classmethod
     def paper(cls, seed: int | tuple[int, ...] = 0, history: bool = False) -> Self:
-        """The paper's training to the letter; with `history` inputs if they are asked for."""
+        """Return the paper's exact training settings, optionally with `history` inputs."""
         return cls(
             NetworkOptions(hidden=512, history=history, convex=True, standardised=False),
             Training(epochs=1000, learning_rate=0.01, schedule="plateau", patience=80, nodes=(3, 5, 7, 9)),
@@ -246,7 +261,7 @@ class FitConfig:
 
     @classmethod
     def paper_recordings(cls, seed: int | tuple[int, ...] = 0) -> Self:
-        """The paper's training on recordings: history inputs, weight decay 0.1, noise of 0.01 in the data."""
+        """Return the paper's settings for recordings: history inputs, weight decay 0.1, data noise 0.01."""
         same = cls.paper(seed, history=True)
         assert same.segments is not None
         training = dataclasses.replace(same.segments, weight_decay=0.1, data_noise=0.01)
@@ -263,7 +278,7 @@ class FitConfig:
         noise: float = 0.0,
         weight_decay: float = 0.3,
     ) -> Self:
-        """A network without the paper's constraint, on standardised inputs and outputs, at all nodes."""
+        """Return settings of an unconstrained network with standardised inputs and outputs, all nodes."""
         return cls(
             NetworkOptions(hidden=hidden, history=history, convex=False, standardised=True),
             Training(
@@ -273,13 +288,18 @@ class FitConfig:
             seed=seed,
         )  # fmt: skip
 
+    @classmethod
+    def network_recordings(cls, seed: int | tuple[int, ...] = 0, *, hidden: int = 8) -> Self:
+        """Return settings of a passive network, whose rollouts do not diverge, trained on measured poses."""
+        return cls(PassiveOptions(hidden), rollouts=RolloutTraining(learning_rate=0.02), seed=seed)
+
     @property
     def seeds(self) -> tuple[int, ...]:
-        """The seeds, also if it is one."""
+        """Seeds as a tuple, also for a single seed."""
         return self.seed if isinstance(self.seed, tuple) else (self.seed,)
 
     def to_dict(self) -> dict[str, Any]:
-        """The settings as JSON can have them."""
+        """Return the settings as JSON values."""
         return {
             "residual": {"kind": self.residual.kind, **self.residual.to_dict()},
             "segments": None if self.segments is None else self.segments.to_dict(),
@@ -289,7 +309,7 @@ class FitConfig:
 
     @classmethod
     def from_dict(cls, values: Any) -> Self:
-        """The settings that `to_dict` gave; what is not there is at its default. Raises `ConfigError`."""
+        """Return settings from `to_dict`'s result; missing options have defaults. Raises `ConfigError`."""
         parts = _checked_keys("FitConfig", values, [field.name for field in dataclasses.fields(cls)])
         if "residual" in parts:
             parts["residual"] = _residual(parts["residual"])
@@ -299,16 +319,16 @@ class FitConfig:
         return cls(**parts)
 
 
-#: what the parts of a `FitConfig` may be
+#: accepted types of the parts of a `FitConfig`
 _PARTS: dict[str, tuple[type, ...]] = {
-    "residual": (StructuredOptions, NetworkOptions),
+    "residual": (StructuredOptions, NetworkOptions, PassiveOptions),
     "segments": (Training,),
     "rollouts": (RolloutTraining,),
 }
 
 
 def _residual(values: Any) -> Any:
-    kinds = {kind.kind: kind for kind in (StructuredOptions, NetworkOptions)}
+    kinds = {kind.kind: kind for kind in (StructuredOptions, NetworkOptions, PassiveOptions)}
     kind = values.get("kind") if isinstance(values, dict) else None
     if kind not in kinds:
         raise ConfigError(

@@ -1,4 +1,4 @@
-"""Several models of the same robot as one: a mean, and a spread that says how far to trust it."""
+"""Ensembles: several models of the same robot, with mean prediction and spread."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, overload
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from knode_cosserat.learning.files.model_file import ModelFileError, load_model
 from knode_cosserat.learning.knode import KNODE
@@ -17,10 +17,10 @@ from knode_cosserat.trajectory import Trajectory
 
 
 class Ensemble(Sequence[KNODE]):
-    """Models that were fitted with several seeds; a sequence of them, and one model that predicts.
+    """Sequence of models that were fitted with several seeds, with a joint prediction.
 
     Raises:
-        ValueError: there is none, or one that is not a model.
+        ValueError: there are no members, or one is not a model.
     """
 
     def __init__(self, members: Iterable[KNODE]):
@@ -45,7 +45,7 @@ class Ensemble(Sequence[KNODE]):
         return iter(self.members)
 
     def predict(self, controls: Any, dt: float, **options: Any) -> Prediction:
-        """What every member makes of the controls (T, c).
+        """Simulate every member under the controls (T, c).
 
         Args:
             controls: as for `simulate`, for one robot.
@@ -53,8 +53,8 @@ class Ensemble(Sequence[KNODE]):
             options: further arguments of `simulate`.
 
         Raises:
-            SimulationError: a member has no solution, unless `on_failure="return"`: it is then left out from
-                the row on where it fails.
+            SimulationError: a member has no solution. With `on_failure="return"` it is instead left out from
+                the failed row on.
         """
         if len({jax.tree.structure(member) for member in self.members}) == 1 and "initial" not in options:
             batch = simulate(list(self.members), controls, dt, **options)
@@ -62,7 +62,7 @@ class Ensemble(Sequence[KNODE]):
         return Prediction([simulate(member, controls, dt, **options) for member in self.members])
 
     def save(self, folder: str | Path) -> None:
-        """Write every member to a folder of its own file; `load_ensemble` reads them back."""
+        """Write every member to its own file in a folder; `load_ensemble` reads them back."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         for old in folder.glob("member-*.model"):
@@ -72,7 +72,7 @@ class Ensemble(Sequence[KNODE]):
 
 
 def load_ensemble(folder: str | Path, **options: Any) -> Ensemble:
-    """The ensemble in a folder; `options` as for `load_model`. Raises `ModelFileError`."""
+    """Read the ensemble in a folder; `options` as for `load_model`. Raises `ModelFileError`."""
     files = sorted(Path(folder).glob("member-*.model"))
     if not files:
         raise ModelFileError(f"{folder}: there is no ensemble here (files member-000.model, …)")
@@ -80,10 +80,10 @@ def load_ensemble(folder: str | Path, **options: Any) -> Ensemble:
 
 
 class Prediction:
-    """What the members predict, their mean and their spread, row by row.
+    """Predictions of all members, with their mean and spread in every row.
 
-    It has `time`, `position`, `quaternion` and `tip_position` of the mean, and so can be compared and drawn
-    like a trajectory.
+    `time`, `position`, `quaternion` and `tip_position` are those of the mean, so that a prediction can be
+    compared and plotted like a trajectory.
     """
 
     def __init__(self, members: Sequence[Trajectory]):
@@ -91,8 +91,14 @@ class Prediction:
 
     @property
     def time(self) -> Float[np.ndarray, " T"]:
-        """(T,) s."""
+        """Times (T,) in s."""
         return np.asarray(self.members[0].time)
+
+    @property
+    def extrapolated(self) -> Bool[np.ndarray, " T"] | None:
+        """True in rows where a member is outside the range of its training data; None if unknown."""
+        known = [member.extrapolated for member in self.members if member.extrapolated is not None]
+        return np.any(known, axis=0) if known else None
 
     def _positions(self) -> Any:
         return np.stack([np.asarray(member.position) for member in self.members])
@@ -125,7 +131,7 @@ class Prediction:
         return np.sqrt(np.where(count > 1, square / np.maximum(count - 1, 1), np.nan))
 
     def interval(self, level: float = 0.9) -> tuple[Float[np.ndarray, "T N 3"], Float[np.ndarray, "T N 3"]]:
-        """Below and above: where one more member would be with this probability (Student's t)."""
+        """Return the lower and upper prediction limits of one more member, at this level (Student's t)."""
         if not 0.0 < level < 1.0:
             raise ValueError(f"level is {level!r}; allowed is a number between 0 and 1")
         from scipy.stats import t
@@ -135,10 +141,10 @@ class Prediction:
         return self.position - half, self.position + half
 
     def coverage(self, reference: Any, level: float = 0.9) -> float:
-        """Which part of the reference's positions lies within `interval`: of all rows, nodes and axes.
+        """Return the fraction of the reference's positions inside `interval`, over all rows, nodes and axes.
 
-        The spread can be trusted if this is near `level`. Far below it the members agree on something wrong:
-        they differ by the data and by chance, not by what none of them can express.
+        The spread is calibrated if the result is near `level`. If it is far below, the members share an
+        error: the spread covers data and chance, but not effects that no member can express.
 
         Raises:
             ValueError: rows or nodes differ, or there is one member only.
@@ -150,7 +156,7 @@ class Prediction:
         if true.shape != low.shape:
             raise ValueError(f"the reference's positions are {true.shape} and the prediction's {low.shape}")
         inside = (low <= true) & (true <= high)
-        # at the base, and in a first row at rest, there is nothing to predict
+        # the base and the initial row are not predicted
         return float(np.mean(inside[1:, 1:]))
 
 

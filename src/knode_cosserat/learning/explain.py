@@ -1,4 +1,4 @@
-"""What a structured residual learned, in words and units: what it adds to length, stress, loads and tip."""
+"""Readable terms of a structured residual, with units: corrections of length, stress, loads and tip."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from knode_cosserat.trajectory import Trajectory
 
 
 class Finding(NamedTuple):
-    """One term: where it is added, a function of what, with which coefficient, in which unit of the two."""
+    """One term: part, corrected field, function, coefficient, and the coefficient's unit."""
 
     part: str
     target: str
@@ -31,17 +31,17 @@ class Finding(NamedTuple):
 
 
 def explain(model: KNODE) -> list[Finding]:
-    """What the residual adds to the knowledge, the largest terms first within each part.
+    """Return the terms that the residual adds to the nominal model, the largest first within each part.
 
-    The parts are length, stress, load and tip; with a star what is fixed in the global frame, without what is
-    seen from the material.
+    The parts are length, stress, load and tip. A star marks terms in the global frame; all others are in the
+    material frame.
 
-    A coefficient stands before the function in SI units, with the plain vector in it, not the scaled one; of
-    a saturating function it is the slope where it begins. Stress is what the law of the strains misses,
-    C z + D z_t + stress = f2; loads are added to the rates of what they balance, or to the tip's conditions.
+    A coefficient multiplies the function in SI units, of the unscaled vector; for a saturating function it is
+    the initial slope. Stress is the missing term of the constitutive law, C z + D z_t + stress = f2. Loads
+    are added to the rates of the balanced fields, or to the tip's boundary conditions.
 
     Raises:
-        TypeError: it is no model, or its residual is not a structured one.
+        TypeError: not a model, or its residual is not structured.
     """
     if not isinstance(model, KNODE):
         raise TypeError(f"model is a {type(model).__name__}; allowed is a KNODE, which `fit` gives")
@@ -117,16 +117,16 @@ def _function(term: Term, axis: int, expansion: Expansion) -> str:
 
 
 class Added(NamedTuple):
-    """What a residual adds at the states of a trajectory, at every segment's start."""
+    """Derivatives without and with a residual at the states of a trajectory, at every segment's start."""
 
     time: Float[np.ndarray, " T"]
-    #: y_s and z of the knowledge alone, and of the model
+    #: y_s and z of the nominal model alone, and of the whole model
     knowledge: tuple[Float[np.ndarray, "T N y"], Float[np.ndarray, "T N z"]]
     model: tuple[Float[np.ndarray, "T N y"], Float[np.ndarray, "T N z"]]
 
 
 def added(model: KNODE, trajectory: Trajectory) -> Added:
-    """y_s and z at a trajectory's states, without the residual (of any kind) and with it.
+    """Return y_s and z at a trajectory's states, without the residual (of any kind) and with it.
 
     Raises:
         DataError: the trajectory does not fit the model.

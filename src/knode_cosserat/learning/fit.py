@@ -1,4 +1,4 @@
-"""Fitting: trajectories and an imperfect model in, a KNODE out."""
+"""Fit of a KNODE from trajectories and an imperfect nominal model."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ import jax
 import numpy as np
 
 from knode_cosserat._files import package_version
-from knode_cosserat.learning.config import FitConfig, NetworkOptions
+from knode_cosserat.learning.config import FitConfig, NetworkOptions, PassiveOptions
 from knode_cosserat.learning.ensemble import Ensemble
 from knode_cosserat.learning.knode import KNODE, About
+from knode_cosserat.learning.passive import passive
 from knode_cosserat.learning.residual import Residual, network
 from knode_cosserat.learning.samples import Dataset, of_strands, samples
 from knode_cosserat.learning.structured.solved import solved
@@ -28,14 +29,15 @@ from knode_cosserat.learning.training.runs import FitError, Run, run_all
 from knode_cosserat.learning.training.stages import RolloutRun, SegmentRun
 from knode_cosserat.learning.training.watch import Watch
 from knode_cosserat.rods.system import System, is_traced
+from knode_cosserat.rods.trained_range import TrainedRange
 from knode_cosserat.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
 
 #: the best preset
 BEST = FitConfig()
-#: hidden units times samples of all seeds up to which they share one vectorised program on a CPU; larger ones
-#: go side by side on all cores (measured, five of the paper's networks: 1.9 s on two cores instead of 4 s)
+#: hidden units times samples of all seeds up to which the seeds share one vectorised program on a CPU; larger
+#: fits run in parallel on all cores (measured, five of the paper's networks: 1.9 s on two cores, not 4 s)
 SHARED = 20_000
 
 
@@ -50,33 +52,32 @@ def fit(
     log_dir: str | Path | None = None,
     progress: bool = False,
 ) -> Any:
-    """Learn from trajectories what an imperfect model misses.
+    """Learn the model error of an imperfect nominal model from trajectories.
 
     Args:
-        knowledge: the imperfect model.
-        trajectories: what the robot really does, at the nodes of the knowledge; each counts one.
-        config: what is learned, and how.
-        held_out: trajectories from rest that are not learned from. What the model makes of them is reported,
-            and with `stop_after` in the config it decides when to stop.
-        checkpoint: a folder in which it is kept where the fit stands. The same call goes on from there, and
-            ends as if nothing had happened, bit for bit. What is not trained but solved for, in
-            milliseconds, is solved anew.
+        knowledge: the imperfect nominal model.
+        trajectories: motions of the real robot, at the nodes of the nominal model; all have equal weight.
+        config: settings of the fit.
+        held_out: held-out trajectories from rest. The model's error on them is reported; with `stop_after`
+            in the config it also decides when to stop.
+        checkpoint: folder for checkpoints. The same call resumes from them, and the result is the same, bit
+            for bit. Residuals that are solved in closed form, in milliseconds, are solved again.
         checkpoint_every: epochs (or updates) between two checkpoints.
-        log_dir: a folder for metrics as TensorBoard event files, one folder in it for each seed.
+        log_dir: folder for metrics as TensorBoard event files, with one subfolder for each seed.
         progress: show a progress bar with the loss and the time left.
 
     Returns:
-        A `KNODE`, or an `Ensemble` of one for each seed if `config.seed` is several. Its `about.facts` has
-        "config", "seed", "trajectories" and "held_out" (SHA-256 of the data, rows, time step), "versions",
-        "date" and "seconds"; of each stage of gradient training, "segments" and "rollouts", the "loss" before
-        every step, the "learning_rate", and the "held_out_error" (step, m) at every check; and the
-        "held_out_error" (m) of the model.
+        A `KNODE`, or an `Ensemble` with one member for each seed if `config.seed` holds several. Its
+        `about.facts` has "config", "seed", "trajectories" and "held_out" (SHA-256 of the data, rows, time
+        step), "versions", "date" and "seconds". Each stage of gradient training, "segments" and "rollouts",
+        has the "loss" before every step, the "learning_rate", and the "held_out_error" (step, m) at every
+        check. The final "held_out_error" (m) is that of the model.
 
     Raises:
         DataError: trajectories that do not fit the knowledge or each other, are too short or not finite.
-        FitError: training cannot begin or go on; the last good checkpoint is kept.
-        CheckpointError: there is a checkpoint of something else, or a damaged one.
-        WatchError: metrics are asked for and tensorboardX is not installed.
+        FitError: training cannot start or continue; the last good checkpoint is kept.
+        CheckpointError: a checkpoint belongs to another fit, or is damaged.
+        WatchError: metrics are requested and tensorboardX is not installed.
     """
     began = time.perf_counter()
     _check(knowledge, config, held_out, checkpoint_every)
@@ -98,14 +99,14 @@ def fit(
                 learned |= dict(zip(run.seeds, run.residuals(), strict=True))
                 for seed in run.seeds:
                     histories[seed][run.stage] = run.history(seed)
-    facts = _facts(config, trajectories, held_out)
+    facts, trained = _facts(config, trajectories, held_out), TrainedRange.of(trajectories)
     models = []
     for seed, residual in learned.items():
         own: dict[str, Any] = {**facts, "seed": seed, **histories[seed]}
         if given.held_out is not None:
             own["held_out_error"] = tip_error(KNODE(knowledge, residual), given.held_out)
         own["seconds"] = time.perf_counter() - began
-        models.append(KNODE(knowledge, residual, About(own)))
+        models.append(KNODE(knowledge, residual, About(own), trained))
         log.info("learned from %d trajectories in %.2f s, seed %s", len(trajectories), own["seconds"], seed)
     return Ensemble(models) if isinstance(config.seed, tuple) else models[0]
 
@@ -132,14 +133,14 @@ def _listed(name: str, given: Any) -> list[Trajectory]:
 
 
 class _First(NamedTuple):
-    """What training begins with: the samples, if they are needed, and a residual for each seed."""
+    """Initial data of training: the samples, if they are needed, and a residual for each seed."""
 
     dataset: Dataset | None
     residuals: list[Residual]
 
 
 class _Given(NamedTuple):
-    """What the stages of training have in common."""
+    """Data shared by the stages of training."""
 
     knowledge: System
     trajectories: Sequence[Trajectory]
@@ -160,11 +161,14 @@ def _first(knowledge: System, trajectories: Sequence[Trajectory], config: FitCon
         if options.standardised and dataset is not None:
             networks = [standardised(net, knowledge.strand, dataset) for net in networks]
         return _First(dataset, list(networks))
+    if isinstance(options, PassiveOptions):
+        controls = np.concatenate([np.asarray(each.control) for each in trajectories])
+        return _First(dataset, [passive(knowledge, controls, seed, options.hidden) for seed in config.seeds])
     return _First(dataset, list(solved(knowledge, trajectories, options, config.seeds)))
 
 
 def _noisy(trajectory: Trajectory, size: float, number: int) -> Trajectory:
-    """The same trajectory for all seeds, which then differ in their first weights only."""
+    """Return a trajectory with noise, the same for all seeds, which differ in initial weights."""
     if size == 0.0 or not isinstance(trajectory, Trajectory):
         return trajectory
     rng = np.random.default_rng(number)
@@ -186,7 +190,7 @@ def _segment_runs(given: _Given, learned: dict[int, Residual]) -> list[Run]:
 
 
 def _groups(config: FitConfig, count: int) -> list[tuple[int, ...]]:
-    """Which seeds share one vectorised program: all of them, unless each alone keeps a core busy."""
+    """Group the seeds that share one vectorised program: all seeds, unless each keeps a core busy."""
     if not isinstance(config.residual, NetworkOptions):
         return [(seed,) for seed in config.seeds]
     work = config.residual.hidden * count * len(config.seeds)

@@ -1,4 +1,4 @@
-"""A system made of a system and a residual: solvers cannot tell the difference."""
+"""KNODE: a nominal model with a learned residual, which is itself a system."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from jaxtyping import Float
 from knode_cosserat.learning.residual import Residual
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.system import History, Scales, System, of_strands
+from knode_cosserat.rods.trained_range import TrainedRange
 
 
 class About:
-    """What is known of a model beside its numbers: how it was fitted, on which data.
+    """Metadata of a model: settings and data of its fit.
 
-    It rides along with a model and is equal to any other, so that models of one structure share compiled
-    programs and can be stacked.
+    All instances compare equal, so that models of one structure share compiled programs and can be stacked.
     """
 
     def __init__(self, facts: dict[str, Any] | None = None):
@@ -32,86 +32,94 @@ class About:
 
 
 class KNODE(System):
-    """Knowledge and residual together (paper eq. 9), with the layouts and conditions of the knowledge."""
+    """Nominal model with a residual (paper eq. 9); layouts and base conditions are the nominal model's."""
 
     knowledge: System
     residual: Residual
     about: About = eqx.field(static=True)
+    #: range of the training trajectories; None if unknown
+    trained: TrainedRange | None = None
 
-    def __init__(self, knowledge: System, residual: Residual, about: About | None = None):
+    def __init__(
+        self, knowledge: System, residual: Residual, about: About | None = None,
+        trained: TrainedRange | None = None,
+    ):  # fmt: skip
         self.knowledge = knowledge
         self.residual = residual
         self.about = about or About()
+        self.trained = trained
         self.nodes = knowledge.nodes
 
     @property
     def adapted(self) -> System:
-        """The knowledge as the residual changes it."""
+        """Nominal model with the residual's parameter changes."""
         return self.residual.adapted(self.knowledge)
 
     @property
     def y_layout(self) -> Layout:  # type: ignore[override]
-        """The knowledge's."""
+        """Layout of y, from the nominal model."""
         return self.knowledge.y_layout
 
     @property
     def z_layout(self) -> Layout:  # type: ignore[override]
-        """The knowledge's."""
+        """Layout of z, from the nominal model."""
         return self.knowledge.z_layout
 
     @property
     def control_layout(self) -> Layout:  # type: ignore[override]
-        """The knowledge's."""
+        """Layout of the control, from the nominal model."""
         return self.knowledge.control_layout
 
     @property
     def base_unknowns(self) -> tuple[str, ...]:  # type: ignore[override]
-        """The knowledge's."""
+        """Fields of y that are unknown at the base, from the nominal model."""
         return self.knowledge.base_unknowns
 
     @property
     def mixed(self) -> bool:  # type: ignore[override]
-        """The knowledge's."""
+        """True if the nominal model has terms in y_st."""
         return self.knowledge.mixed
 
     @property
     def cuts(self) -> tuple[float, ...]:  # type: ignore[override]
-        """The knowledge's."""
+        """Discontinuities of the nominal model (parts of the length)."""
         return self.knowledge.cuts
 
     @property
     def jumps(self) -> bool:  # type: ignore[override]
-        """The knowledge's."""
+        """True if y jumps at discontinuities of the nominal model."""
         return self.knowledge.jumps
 
     @property
     def rest_is_guess(self) -> bool:  # type: ignore[override]
-        """The knowledge's."""
+        """True if the nominal model's state at rest is only a guess."""
         return self.knowledge.rest_is_guess
 
     @property
     def held(self) -> bool:  # type: ignore[override]
-        """The knowledge's."""
+        """True if the nominal model is held in place."""
         return self.knowledge.held
 
     @property
     def strands(self) -> int:
-        """The knowledge's."""
+        """Number of strands of the nominal model."""
         return self.knowledge.strands
 
     @property
     def strand(self) -> System:
-        """The knowledge's strand with the residual: what is learned along the rod holds for every strand."""
-        return self if self.strands == 1 else type(self)(self.knowledge.strand, self.residual, self.about)
+        """Strand of the nominal model with the residual; all strands share one residual."""
+        if self.strands == 1:
+            return self
+        return type(self)(self.knowledge.strand, self.residual, self.about, self.trained)
 
     @property
     def velocities(self) -> tuple[str, ...]:  # type: ignore[override]
-        """The knowledge's."""
+        """Names of the observables that are velocities, from the nominal model."""
         return self.knowledge.velocities
 
     @property  # type: ignore[misc]
     def length(self) -> Any:
-        """Length of the rod (m), as the residual corrects it; one each of a batch."""
+        """Length of the rod (m), corrected by the residual; one value each in a batch."""
         if np.ndim(self.knowledge.length):
             return jax.vmap(lambda model: model.adapted.length)(self)
         return self.adapted.length
@@ -119,7 +127,7 @@ class KNODE(System):
     def derivatives(
         self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-        """y_s and z of knowledge and residual together."""
+        """Return y_s and z of the nominal model with the residual."""
         if self.strands > 1:
             return of_strands(self, s, t, y, control, history)
         return self.residual.derivatives(self.adapted, s, t, y, control, history)
@@ -127,82 +135,94 @@ class KNODE(System):
     def crossed(
         self, acting: Float[Any, " cuts"], t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> Float[Any, " y"]:
-        """The knowledge's."""
+        """Return y on the far side of the active discontinuities, from the nominal model."""
         return self.adapted.crossed(acting, t, y, control, history)
 
     def rest(self, s: Any) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-        """The knowledge's, at its corrected length."""
+        """Return the state at rest of the nominal model, at its corrected length."""
         return self.adapted.rest(s)
 
     def base(self, t: Any, control: Any, unknowns: Float[Any, " k"], history: History) -> Float[Any, " y"]:
-        """The knowledge's."""
+        """Return y at the base, from the nominal model."""
         return self.adapted.base(t, control, unknowns, history)
 
     def unknowns(self, y: Float[Any, " y"]) -> Float[Any, " k"]:
-        """The knowledge's."""
+        """Return the unknowns in y at the base, from the nominal model."""
         return self.adapted.unknowns(y)
 
     def tip(self, t: Any, control: Any, y: Float[Any, " y"], history: History) -> Float[Any, " k"]:
-        """The tip's conditions of knowledge and residual together."""
+        """Return the residual of the tip's boundary conditions, with the learned residual."""
         return self.residual.tip(self.adapted, t, control, y, history)
 
     @property
     def tip_layout(self) -> Layout:
-        """The knowledge's."""
+        """Layout of the tip's boundary conditions, from the nominal model."""
         return self.knowledge.tip_layout
 
     def scales(self) -> Scales:
-        """The knowledge's."""
+        """Return the natural units of y and of the tip's residual, from the nominal model."""
         return self.adapted.scales()
 
     def actuation(self, control: Float[Any, " c"]) -> Float[Any, " a"]:
-        """The knowledge's."""
+        """Return the actuation of a control, from the nominal model."""
         return self.knowledge.actuation(control)
 
     @property
     def observable_layout(self) -> Layout:
-        """The knowledge's."""
+        """Layout of the observables, from the nominal model."""
         return self.knowledge.observable_layout
 
     def observables(self, s: Any, y: Any, y_t: Any, z: Any, z_t: Any, control: Any) -> Float[Any, " o"]:
-        """The knowledge's."""
+        """Return the observables, from the nominal model."""
         return self.adapted.observables(s, y, y_t, z, z_t, control)
 
     def end_poses(self, control: Any) -> tuple[Any, Any]:
-        """The knowledge's."""
+        """Return the poses of the held ends, from the nominal model."""
         return self.knowledge.end_poses(control)
 
     def positions(self, y: Any) -> Any:
-        """The knowledge's."""
+        """Return the positions in y, from the nominal model."""
         return self.knowledge.positions(y)
 
     def unstressed(self, s: Any, control: Any) -> Float[Any, " z"]:
-        """The knowledge's."""
+        """Return the strains without stress, from the nominal model."""
         return self.adapted.unstressed(s, control)
 
     def law_factors(self, s: Any, control: Any) -> tuple[Any, Any] | None:
-        """The knowledge's."""
+        """Return the factors of strain and rate in the law, from the nominal model."""
         return self.adapted.law_factors(s, control)
 
     def curves(self, y: Any) -> list[Any]:
-        """The knowledge's."""
+        """Return the centrelines in y, from the nominal model."""
         return self.knowledge.curves(y)
 
     def quaternions(self, y: Any) -> Any:
-        """The knowledge's."""
+        """Return the quaternions in y, from the nominal model."""
         return self.knowledge.quaternions(y)
 
     def eased(self, part: float) -> Self:
-        """With the knowledge's."""
+        """Return the model with eased friction and contact of the nominal model."""
         easier = self.knowledge.eased(part)
-        return self if easier is self.knowledge else type(self)(easier, self.residual, self.about)
+        if easier is self.knowledge:
+            return self
+        return type(self)(easier, self.residual, self.about, self.trained)
 
     def replace(self, **changes: Any) -> Self:
-        """A copy whose knowledge has other parameters (or nodes), by name."""
-        return type(self)(self.knowledge.replace(**changes), self.residual, self.about)
+        """Return a copy in which the nominal model has other parameters (or nodes), by name."""
+        return type(self)(self.knowledge.replace(**changes), self.residual, self.about, self.trained)
+
+    def undelayed(
+        self, measured: Float[np.ndarray, "T c"], dt: float, before: Float[np.ndarray, " c"] | None = None
+    ) -> Float[np.ndarray, "T c"]:
+        """Return the controls that act, without sensor delay, from the nominal model."""
+        return self.knowledge.undelayed(measured, dt, before)
+
+    def trained_range(self) -> TrainedRange | None:
+        """Return the model's own training range, else the nominal model's."""
+        return self.trained if self.trained is not None else self.knowledge.trained_range()
 
     def save(self, path: Any) -> None:
-        """Write a model's file (see `model_file.save`)."""
+        """Write the model to a file (see `model_file.save`)."""
         from knode_cosserat.learning.files import model_file
 
         model_file.save(self, path)

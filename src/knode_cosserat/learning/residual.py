@@ -1,4 +1,4 @@
-"""What a residual is, and the networks that add to the knowledge's [y_s; z] (paper eq. 9)."""
+"""Base class of residuals, and networks that add to the nominal model's [y_s; z] (paper eq. 9)."""
 
 from __future__ import annotations
 
@@ -17,35 +17,45 @@ from knode_cosserat.rods.system import History, System
 
 
 class Residual(eqx.Module):
-    """What is added to a knowledge, and where: it says what y_s, z and the tip's conditions become."""
+    """Correction of a nominal model: returns the corrected y_s, z and boundary conditions at the tip."""
 
-    #: attributes that are no weights: gradient training leaves them alone (modules inside may have their own)
+    #: attributes that gradient training does not change (nested modules may have their own)
     fixed: ClassVar[tuple[str, ...]] = ()
 
     def adapted(self, knowledge: System) -> System:
-        """The knowledge itself as this residual changes it: its length, say."""
+        """Return the nominal model with the residual's parameter changes, such as a corrected length."""
         return knowledge
 
     @abc.abstractmethod
     def derivatives(
         self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-        """y_s and z of the adapted knowledge and this residual together."""
+        """Return y_s and z of the adapted nominal model with this residual."""
 
     def tip(
         self, knowledge: System, t: Any, control: Any, y: Float[Any, " y"], history: History
     ) -> Float[Any, " k"]:
-        """The tip's conditions; the knowledge's own, unless a residual knows better."""
+        """Return the residual of the tip's boundary conditions; by default the nominal model's."""
         return knowledge.tip(t, control, y, history)
 
     def clamped(self) -> Self:
-        """The nearest residual with allowed weights: what training goes on from after every update."""
+        """Return the nearest residual with allowed weights; training calls it after every update."""
         return self
+
+
+class Nothing(Residual):
+    """No residual: the nominal model unchanged."""
+
+    def derivatives(
+        self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
+    ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
+        """Return y_s and z of the nominal model."""
+        return knowledge.derivatives(s, t, y, control, history)
 
 
 @jax.custom_jvp
 def elu(x: Any) -> Any:
-    """exp(x) - 1 below zero and x above: as `jax.nn.elu`, with one exponential for value and derivative."""
+    """Return exp(x) - 1 below zero and x above: `jax.nn.elu`, but its derivative uses no exponential."""
     return jnp.where(x > 0.0, x, jnp.exp(jnp.minimum(x, 0.0)) - 1.0)
 
 
@@ -58,10 +68,10 @@ def _elu_tangent(primals: Any, tangents: Any) -> Any:
 class Network(Residual):
     """One hidden layer of ELU units, f_θ, added to y_s and z: the paper's residual, and its variants.
 
-    Its inputs are y, the knowledge's z and the actuation; with `history`, ʰy and ʰz too. The corrected z is
-    an output only: it does not enter y_s. `convex` weights are never negative, so that every output is convex
-    and non-decreasing in every input; `clamped` keeps them so. Inputs are shifted and scaled, and outputs
-    scaled, by what is kept in the model.
+    Its inputs are y, the nominal model's z and the actuation; with `history`, ʰy and ʰz too. The corrected z
+    is an output only: it does not enter y_s. With `convex` the weights are nonnegative, so that every output
+    is convex and non-decreasing in every input; `clamped` enforces this. Inputs are shifted and scaled, and
+    outputs scaled, by constants stored in the model.
     """
 
     fixed: ClassVar[tuple[str, ...]] = ("input_mean", "input_scale", "output_scale")
@@ -81,27 +91,27 @@ class Network(Residual):
     def inputs(
         self, knowledge: System, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
     ) -> Float[Any, " inputs"]:
-        """What the network sees: y, z and the actuation; with history, y, ʰy, z, ʰz and the actuation."""
+        """Return the inputs: y, z and the actuation; with history, y, ʰy, z, ʰz and the actuation."""
         force = knowledge.actuation(control)
         if self.history:
             return jnp.concatenate([y, history.y, z, history.z, force])
         return jnp.concatenate([y, z, force])
 
     def correction(self, inputs: Float[Any, " inputs"]) -> Float[Any, " outputs"]:
-        """f_θ, what is added to [y_s; z]."""
+        """Return f_θ, the correction of [y_s; z]."""
         hidden = self.input_weights @ ((inputs - self.input_mean) / self.input_scale) + self.input_biases
         return self.output_scale * (self.output_weights @ elu(hidden) + self.output_biases)
 
     def derivatives(
         self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-        """The knowledge's y_s and z, and the correction added."""
+        """Return the nominal model's y_s and z plus the correction."""
         y_s, z = knowledge.derivatives(s, t, y, control, history)
         added = self.correction(self.inputs(knowledge, y, z, control, history))
         return y_s + added[: y.shape[0]], z + added[y.shape[0] :]
 
     def clamped(self) -> Self:
-        """A convex network with its negative weights at zero; any other unchanged."""
+        """Return a convex network with its negative weights set to zero; any other unchanged."""
         if not self.convex:
             return self
         weights = jnp.maximum(self.input_weights, 0.0), jnp.maximum(self.output_weights, 0.0)
@@ -109,10 +119,10 @@ class Network(Residual):
 
 
 def network(knowledge: System, options: NetworkOptions, key: Any) -> Network:
-    """A network with its first, random weights; inputs and outputs are not scaled.
+    """Return a network with random initial weights; inputs and outputs are not scaled.
 
-    A convex one starts as the paper's: weights |N(0.01, 0.01)|, biases N(0, 0.01). Any other starts with
-    N(0, 1/√inputs) and N(0, 0.1/√hidden), and so close to the knowledge alone.
+    A convex network starts like the paper's: weights |N(0.01, 0.01)|, biases N(0, 0.01). Any other starts
+    with N(0, 1/√inputs) and N(0, 0.1/√hidden), and is therefore close to the nominal model.
     """
     fields = input_layout(knowledge, options.history)
     inputs, outputs = fields.size, knowledge.y_layout.size + knowledge.z_layout.size
@@ -131,7 +141,7 @@ def network(knowledge: System, options: NetworkOptions, key: Any) -> Network:
 
 
 def input_layout(knowledge: System, history: bool) -> Layout:
-    """What a `Network` on this knowledge sees, in order."""
+    """Return the layout of a `Network`'s inputs, for this nominal model."""
     own = [[*layout.fields] for layout in (knowledge.y_layout, knowledge.z_layout)]
     past = [[Field(f"{f.name} past", f.size, f"{f.unit}/s", f"ʰ of {f.name}") for f in part] for part in own]
     size = jax.eval_shape(knowledge.actuation, np.zeros(knowledge.control_size)).shape[0]
@@ -140,5 +150,5 @@ def input_layout(knowledge: System, history: bool) -> Layout:
 
 
 def input_size(knowledge: System, history: bool) -> int:
-    """How many numbers a `Network` on this knowledge sees."""
+    """Return the number of inputs of a `Network`, for this nominal model."""
     return input_layout(knowledge, history).size

@@ -1,8 +1,8 @@
-"""Trajectories to one-segment samples: the true state of a node, and where the next one truly is.
+"""One-segment samples of trajectories: the true states at both ends of every segment.
 
 A sample is one segment of the rod at one time. From the true y at its start, with the true history, a model
-predicts y at its end and z at its start (paper eq. 12); nothing is integrated further than one segment, so
-that errors do not pile up and all samples are predicted side by side.
+predicts y at its end and z at its start (paper eq. 12). Integration spans one segment only, so that errors do
+not accumulate and all samples are predicted in parallel.
 """
 
 from __future__ import annotations
@@ -27,33 +27,33 @@ from knode_cosserat.trajectory import Trajectory
 
 
 class DataError(ValueError):
-    """Trajectories that nothing can be learned from; one line says which, where and why."""
+    """Unusable trajectories. The message is one line: the trajectory, the place and the reason."""
 
 
 class Samples(NamedTuple):
     """Segments (S) of all trajectories, in the order trajectory, row, segment."""
 
-    #: where the segment begins, as a part of the length
+    #: start of the segment, as a part of the length
     place: Float[Any, " S"]
     t: Float[Any, " S"]
     c0: Float[Any, " S"]
-    #: beyond what acts at the segment's start
+    #: y at the segment's start, on the far side of a discontinuity there
     y: Float[Any, "S y"]
     z: Float[Any, "S z"]
-    #: y at the segment's end, before what acts there
+    #: y at the segment's end, on the near side of a discontinuity there
     y_next: Float[Any, "S y"]
-    #: z at the segment's end, beyond what acts there
+    #: z at the segment's end, on the far side of a discontinuity there
     z_next: Float[Any, "S z"]
     #: y_s times the length at the segment's start, from the states alone
     slope: Float[Any, "S y"]
     control: Float[Any, "S c"]
     #: packed records of history at the places (start, end, stages between) of its first piece
     history: Float[Any, "S places x"]
-    #: the same of its other pieces, if the robot has segments with discontinuities inside
+    #: records of history of its other pieces, if the robot has discontinuities inside segments
     later: Float[Any, "S pieces-1 places x"]
-    #: one over how many samples the same trajectory gave
+    #: one over the number of samples of the same trajectory
     weight: Float[Any, " S"]
-    #: which trajectory, and which of its rows
+    #: indices of the trajectory and of its row
     origin: Any
 
 
@@ -76,9 +76,9 @@ class Dataset:
     segments: Samples
     tips: TipSamples
     space: SpaceScheme
-    #: segments of each row: all of them, or those that were chosen
+    #: number of segments used in each row
     per_row: int
-    #: by how much `Samples.slope` may be wrong (rms)
+    #: estimated error of `Samples.slope` (rms)
     doubt: Float[Any, " y"]
 
 
@@ -87,9 +87,9 @@ CORRECTIONS = 4
 
 
 def predict(system: System, space: SpaceScheme, sample: Samples) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-    """Return y at the end of one segment and z at its start, as the system predicts them.
+    """Predict y at the end of one segment and z at its start.
 
-    y at the end is that of the scheme's formula, whose stages use the true y at both ends.
+    y at the end follows the scheme's formula, with stages from the true y at both ends.
     """
 
     def derivatives(s: Any, y: Any, record: Any) -> Any:
@@ -136,7 +136,7 @@ def predict(system: System, space: SpaceScheme, sample: Samples) -> tuple[Float[
         inner = jax.lax.fori_loop(0, CORRECTIONS, corrected, y)
         last = jnp.asarray(grid.bounds)[own, 1] == 1.0
         found = reached((low, high), y, jnp.where(last, sample.y_next, inner), records)
-        # segments with fewer pieces have their last one repeated
+        # segments with fewer pieces repeat their last piece
         return jnp.where((k > 0) & (own == previous(k)), y, found), None
 
     segment = jnp.round(sample.place * (system.nodes - 1)).astype(int)
@@ -151,13 +151,13 @@ def predict(system: System, space: SpaceScheme, sample: Samples) -> tuple[Float[
 
 
 def start_of(system: System, place: Any) -> Any:
-    """Return the arclength (m) where a segment starts; a little inside it if the rod has discontinuities."""
+    """Return the arclength (m) of a segment's start; slightly inside if the rod has discontinuities."""
     s, ds = place * system.length, system.length / (system.nodes - 1)
     return inside(s, s, s + ds) if system.cuts else s
 
 
 def end_of(system: System, place: Any) -> Any:
-    """Return the arclength (m) where a segment ends; a little inside it if the rod has discontinuities."""
+    """Return the arclength (m) of a segment's end; slightly inside if the rod has discontinuities."""
     s, ds = place * system.length, system.length / (system.nodes - 1)
     return inside(s + ds, s, s + ds) if system.cuts else s + ds
 
@@ -166,10 +166,10 @@ def samples(
     knowledge: System, trajectories: Sequence[Trajectory], nodes: Sequence[int] | None = None,
     model: System | None = None,
 ) -> Dataset:  # fmt: skip
-    """One-segment samples of trajectories; `nodes` chooses the nodes that are predicted (1 to N - 1).
+    """Return one-segment samples of trajectories; `nodes` selects the predicted nodes (1 to N - 1).
 
-    Trajectories hold the nodes only. What the stages between them look back on is interpolated, or as a
-    `model` has it that is close to what moved.
+    Trajectories hold the nodes only. The history at stages between nodes is interpolated, or evaluated by a
+    `model` that is close to the real robot.
 
     Raises:
         DataError: a trajectory does not fit the knowledge or the others, is too short or not finite.
@@ -184,13 +184,13 @@ def samples(
 
 
 def told_by_rows(knowledge: System, trajectories: Sequence[Trajectory]) -> bool:
-    """Return True if rows hold every state that steps need, or come from no simulation."""
+    """True if the rows hold every state that steps need, or were not simulated."""
     made = [each.settings for each in trajectories]
     return all(settings is None or rows_suffice(knowledge, settings.space) for settings in made)
 
 
 def of_strands(knowledge: System, data: Dataset) -> Dataset:
-    """The same segments strand by strand, as samples of `knowledge.strand`; the tips stay as they are."""
+    """Return the segments strand by strand, as samples of `knowledge.strand`; the tips are unchanged."""
     count, segments = knowledge.strands, data.segments
     if count == 1:
         return data
@@ -212,7 +212,7 @@ def of_strands(knowledge: System, data: Dataset) -> Dataset:
 
 
 def settings_of(trajectory: Trajectory) -> Settings:
-    """Return the settings of a trajectory; the default ones if it was not simulated."""
+    """Return the settings of a trajectory; the defaults if it was not simulated."""
     return trajectory.settings or Settings()
 
 
@@ -228,7 +228,7 @@ def _of_one(
     beyond = far_side(knowledge, time, c0, y, control, history)
     if knowledge.cuts:
         slope, doubt = slopes_of(settings, y, beyond, knowledge.cuts)
-    # the rows before the first are its own if it is a start, and not known otherwise
+    # earlier rows equal the first row if that is the start of a motion, and are unknown otherwise
     first = 1 if time[0] == 0.0 else 2
     rows = np.arange(first, len(time))
     history, c0 = history[rows], c0[rows]
@@ -267,7 +267,7 @@ def _of_one(
 def _past_of_rows(
     knowledge: System, trajectory: Trajectory, rows: np.ndarray, history: np.ndarray, model: System | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`Samples.history` and `Samples.later` of all segments, row by row."""
+    """Return `Samples.history` and `Samples.later` of all segments, row by row."""
     space = settings_of(trajectory).space
     simulated = trajectory.settings is not None
     known = histories_along(model, trajectory) if model is not None and simulated else None
@@ -280,12 +280,12 @@ def _past_of_rows(
 
 
 def past_of_segments(knowledge: System, space: SpaceScheme, records: Float[Any, "nodes x"]) -> Any:
-    """`Samples.history` and `Samples.later` of all segments of one row, from its history at the nodes."""
+    """Return `Samples.history` and `Samples.later` of one row's segments, from its history at the nodes."""
     return in_segments(knowledge, space, at_places(knowledge, space, records))
 
 
 def in_segments(knowledge: System, space: SpaceScheme, records: Float[Any, "places x"]) -> Any:
-    """Records (segments, places, x) of first pieces, and (segments, pieces - 1, places, x) of others."""
+    """Return records (segments, places, x) of first pieces, (segments, pieces - 1, places, x) of others."""
     grid = grid_of(knowledge, space)
     parts = grid.parts
     found = records[grid.places_of(parts.ravel()).reshape(*parts.shape, -1)]
@@ -293,7 +293,7 @@ def in_segments(knowledge: System, space: SpaceScheme, records: Float[Any, "plac
 
 
 def histories(settings: Settings, dt: float, record: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """c0 (T,) and ʰ (T, N, x) of every row, by the scheme that made the trajectory; row 0 has none."""
+    """Return c0 (T,) and ʰ (T, N, x) of every row, by the trajectory's own scheme; zero in row 0."""
     table = coefficient_table(settings, dt)
     rate = np.zeros_like(record[0])
     c0, history = np.zeros(len(record)), np.zeros_like(record)
@@ -304,7 +304,7 @@ def histories(settings: Settings, dt: float, record: np.ndarray) -> tuple[np.nda
     return c0, history
 
 
-# checking
+# checks
 
 
 def _check(knowledge: System, trajectories: Sequence[Trajectory]) -> None:

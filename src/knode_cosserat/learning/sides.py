@@ -1,7 +1,7 @@
-"""Where something acts at a node: the state on its far side, and the slopes on either side of it.
+"""Discontinuities at nodes: the state on the far side, and the slopes on both sides.
 
-A trajectory holds y on the near side of a cut and z on the far side. What is predicted or regressed at a
-node is the segment that begins there, so that it needs y, and its slope, on the far side.
+A trajectory holds y on the near side of a discontinuity and z on the far side. Predictions and regressions
+use the segment that starts at a node, and therefore need y and its slope on the far side.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ def far_side(
     knowledge: System, t: Float[Any, " T"], c0: Float[Any, " T"], y: Float[Any, "T N y"],
     control: Float[Any, "T c"], history: Float[Any, "T N x"],
 ) -> Float[Any, "T N y"]:  # fmt: skip
-    """y at all nodes, beyond what the knowledge has acting there; the same y where nothing does."""
+    """Return y at all nodes, on the far side of the nominal model's discontinuities."""
     if not (knowledge.cuts and knowledge.jumps):
         return y
-    # of each segment, the cuts at its very start
+    # the discontinuities at the exact start of each segment
     grid = grid_of(knowledge)
     acting = grid.acting[grid.nodes[:-1]]
     jumping = np.flatnonzero(acting.any(axis=1))
@@ -52,11 +52,12 @@ def _crossed(knowledge, acting, t, c0, y, control, history):  # type: ignore[no-
 def slopes_of(
     settings: Settings, y: np.ndarray, beyond: np.ndarray | None = None, cuts: tuple[float, ...] = ()
 ) -> tuple[np.ndarray, np.ndarray]:
-    """y_s times the length (T, N, y), from the states alone, and by how much it may be wrong (y,).
+    """Return y_s times the length (T, N, y), from the states alone, and its estimated error (y,).
 
-    Exact where a segment is one Euler step; of splines otherwise, judged by those of the next lower order.
-    For the trapezoidal rule the slopes are near the splines', and their means are the changes over segments.
-    No spline goes over a cut: with `beyond`, y on the far side of the cuts, slopes at cuts are those there.
+    Exact if a segment is one Euler step. Otherwise from splines; the error estimate is the difference from
+    splines of the next lower order. For the trapezoidal rule the slopes are the nearest ones to the splines'
+    whose means equal the changes over segments. No spline spans a discontinuity: with `beyond` (y on the far
+    side), slopes at discontinuities are those on the far side.
     """
     last = y.shape[1] - 1
     beyond = y if beyond is None else beyond
@@ -71,7 +72,7 @@ def slopes_of(
         if settings.space.order == 2:
             own = _trapezoidal_slopes(values, own, last)
         slope[:, first : end + 1], wrong[:, first : end + 1] = own, doubt
-    # where a cut is between nodes there may be a node by itself: that of the segment must do, and is in doubt
+    # a node alone between discontinuities has no spline: use the slope of the segment, with a large error
     alone = [first for first, end in pieces(cuts, last + 1) if first == end]
     for node in alone:
         other = node if node < last else node - 1
@@ -81,7 +82,7 @@ def slopes_of(
 
 
 def whole(knowledge: System, place: Float[Any, " S"]) -> Float[np.ndarray, " S"]:
-    """1 for each segment, begun at that part of the length, that no cut parts; 0 for others."""
+    """Return 1 for each segment (by its start, a part of the length) without inner discontinuity, else 0."""
     if not knowledge.cuts:
         return np.ones(len(place))
     grid = grid_of(knowledge)
@@ -90,7 +91,7 @@ def whole(knowledge: System, place: Float[Any, " S"]) -> Float[np.ndarray, " S"]
 
 
 def pieces(cuts: tuple[float, ...], nodes: int) -> list[tuple[int, int]]:
-    """First and last node of each stretch of rod without a cut inside; neighbours share a node on a cut."""
+    """Return the first and last node of each smooth stretch; neighbours share a node on a discontinuity."""
     along = np.asarray(cuts) * (nodes - 1)
     nearest = np.round(along)
     is_node = np.abs(nearest - along) < ON_NODE * (nodes - 1)
@@ -109,19 +110,19 @@ def pieces(cuts: tuple[float, ...], nodes: int) -> list[tuple[int, int]]:
 
 
 def _trapezoidal_slopes(values: np.ndarray, near: np.ndarray, last: int) -> np.ndarray:
-    """Return the slopes nearest to others whose means over segments are the changes of values."""
+    """Return the slopes nearest to `near` whose means over segments equal the changes of values."""
     if values.shape[1] < 3:
         return near
     signs = (-1.0) ** np.arange(values.shape[1])[:, None]
     change = np.diff(values, axis=1) * last
     steps = np.cumsum(2.0 * change * signs[1:], axis=1)
     found = signs * np.concatenate([np.zeros_like(steps[:, :1]), steps], axis=1)
-    # what alternates is free
+    # the alternating component is free
     return found + signs * np.mean(signs * (near - found), axis=1, keepdims=True)
 
 
 def _spline_slopes(values: np.ndarray, last: int) -> tuple[np.ndarray, np.ndarray]:
-    """Slopes of one stretch between cuts, and the error of those of the next lower order."""
+    """Return spline slopes of one smooth stretch, and their difference from the next lower order."""
     # imported here: it takes a third of a second
     from scipy.interpolate import make_interp_spline
 

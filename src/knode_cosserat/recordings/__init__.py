@@ -1,10 +1,12 @@
-"""Recordings of robots: what was measured, on one clock and in the robot's frame."""
+"""Recordings of robots: measured data, on one clock and in the robot's frame."""
 
 from knode_cosserat.recordings.config import (
     BaseSource,
     CommandSource,
     MarkerSource,
+    MotorSource,
     RecordingConfig,
+    TableSource,
     TensionSource,
 )
 from knode_cosserat.recordings.findings import Finding, RecordingError
@@ -19,9 +21,11 @@ __all__ = [
     "Finding",
     "MarkerSource",
     "Measurements",
+    "MotorSource",
     "Recording",
     "RecordingConfig",
     "RecordingError",
+    "TableSource",
     "TensionSource",
     "Tensions",
     "load_example",

@@ -1,4 +1,4 @@
-"""From streams as they were read to a recording: one clock, cleaned, in the robot's frame."""
+"""Assembly of raw streams into a recording: one clock, cleaned, in the robot's frame."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from knode_cosserat.recordings.recording import Recording
 def assembled(
     path: str, name: str, config: RecordingConfig, found: dict[str, Stream], findings: list[Finding]
 ) -> Recording:
-    """The recording in streams as they were read.
+    """Return the recording assembled from raw streams.
 
     Args:
-        path: what errors call the file.
-        name: what the recording is called.
-        config: what it is read by.
-        found: by topic, what was read.
-        findings: what is known already.
+        path: the file's name in error messages.
+        name: name of the recording.
+        config: meaning of the topics or columns.
+        found: raw streams by topic.
+        findings: findings from reading the file.
 
     Raises:
-        RecordingError: nothing usable is in a stream that is needed.
+        RecordingError: a required stream has no usable data.
     """
     for stream in found.values():
         if stream.broken:
@@ -54,7 +54,7 @@ def assembled(
     assert all(body is not None for body in bodies)
     in_frame, base, rest, about_frame = placed([body for body in bodies if body is not None], base, config)
     findings += about_poses + about_tensions + about_frame
-    findings += units_doubted(in_frame, tension, command, rest)
+    findings += units_doubted(in_frame, None if config.motors else tension, command, rest)
     if config.simulated:
         findings.append(Finding("note", "", "the robot was itself a simulation, and not a physical one"))
     description = f"{name}: {config.description}" if config.description else name
@@ -75,7 +75,7 @@ def assembled(
 def _zero(
     config: RecordingConfig, times: dict[str, np.ndarray], rows: dict[str, np.ndarray]
 ) -> np.int64 | None:
-    """When the first pose or measured tension was (ns); commands can be long before."""
-    later = {config.command.topic} if config.command is not None and config.tension is not None else set()
+    """Return the time of the first pose or measured tension (ns); commands may start much earlier."""
+    later = {config.command.topic} if config.command is not None and config.measured is not None else set()
     first = [times[topic][kept[0]] for topic, kept in rows.items() if len(kept) and topic not in later]
     return np.int64(min(first)) if first else None

@@ -1,7 +1,7 @@
-"""Recordings of a clamped beam that is held by hand and let go: CSV files of motion-capture markers.
+"""Recordings of a clamped beam that is held by hand and released: CSV files of motion-capture markers.
 
-The columns are `time_s` and `mK_x_m`, `mK_y_m`, `mK_z_m` of the markers 0 to 5: 0 to 2 are on the tip, 3 to
-5 on the base. x is vertical, upwards; z is along the beam. The file's name tells the load: `…load52…` for
+The columns are `time_s` and `mK_x_m`, `mK_y_m`, `mK_z_m` for markers 0 to 5. Markers 0 to 2 are on the tip,
+3 to 5 on the base. x points up; z points along the beam. The file's name states the load: `…load52…` for
 52 g at the tip, `…gravity…` for none.
 """
 
@@ -20,51 +20,51 @@ from knode_cosserat.recordings.table import read_csv
 #: markers on the tip, and on the base
 TIP, BASE = (0, 1, 2), (3, 4, 5)
 COLUMNS = ("time_s", *(f"m{k}_{axis}_m" for k in TIP + BASE for axis in "xyz"))
-#: a drop of the tip (m) by which recording and prediction are put on one clock; noise is below 0.1 mm, and
-#: so is the creep of the hand before it lets go
+#: drop of the tip (m) that aligns the clocks of recording and prediction; the noise and the creep of the
+#: hand before the release are both below 0.1 mm
 THRESHOLD = 2e-3
-#: rows before the threshold that may belong to the fall already, or to a hand that is letting go
+#: rows before the threshold that may already belong to the fall or to the release by the hand
 MARGIN = 10
 #: the fewest rows of a held beam
 FEWEST_HELD = 5
-#: rows in which the tip has to stay below the threshold: a glitch of one row is no release
+#: rows in which the tip must stay below the threshold: a glitch of one row is not a release
 LASTING = 4
 
 
 @dataclasses.dataclass(frozen=True)
 class BeamRecording:
-    """Markers of a beam over time, its load, and when it was let go."""
+    """Marker trajectories of a beam, its load and its release time."""
 
     name: str
     #: (T,) s
     time: Float[np.ndarray, " T"]
-    #: (T, 3 markers, 3) m, from where they were while the beam was held; NaN where a marker is lost
+    #: (T, 3 markers, 3) displacements (m) from the held positions; NaN where a marker is lost
     tip: Float[np.ndarray, "T 3 3"]
-    #: (3 markers, 3) m, while the beam was held
+    #: (3 markers, 3) tip positions (m) while the beam was held
     held: Float[np.ndarray, "3 3"]
-    #: (3 markers, 3) m of the base, while the beam was held
+    #: (3 markers, 3) base positions (m) while the beam was held
     base: Float[np.ndarray, "3 3"]
     #: mass of the load (kg)
     load: float
-    #: when the tip has dropped by `THRESHOLD` (s)
+    #: time at which the tip has dropped by `THRESHOLD` (s)
     crossing: float
 
     @property
     def drop(self) -> Float[np.ndarray, " T"]:
-        """Drop of the tip from where it was held (m), the mean of its markers."""
+        """Drop of the tip from its held position (m), averaged over its markers."""
         return tip_drop(self.tip)
 
 
 def tip_drop(moved: Float[np.ndarray, "T 3 3"]) -> Float[np.ndarray, " T"]:
-    """The mean drop (m) of markers by their displacements; NaN where one is lost."""
+    """Return the mean drop (m) of markers from their displacements; NaN where a marker is lost."""
     return -np.asarray(moved[:, :, 0].mean(axis=1))
 
 
 def load_of(name: str) -> float:
-    """Return the mass of the load (kg) that a file's name tells.
+    """Return the mass of the load (kg) stated by a file's name.
 
     Raises:
-        RecordingError: the name tells none.
+        RecordingError: the name states no load.
     """
     grams = re.search(r"load[_-]?(\d+(?:\.\d+)?)", name, re.IGNORECASE)
     if grams:
@@ -82,10 +82,10 @@ def read_beam(path: Path, load: float | None = None) -> BeamRecording:
 
     Args:
         path: the CSV file.
-        load: mass at the tip (kg), if not the one that the name tells.
+        load: mass at the tip (kg); None: taken from the file's name.
 
     Raises:
-        RecordingError: the file is not right, its load is not known, or the beam is never let go.
+        RecordingError: the file is invalid, its load is unknown, or the beam is never released.
     """
     load = load_of(path.stem) if load is None else load
     try:
@@ -114,15 +114,15 @@ def read_beam(path: Path, load: float | None = None) -> BeamRecording:
 def find_release(
     time: Float[np.ndarray, " T"], tip: Float[np.ndarray, "T 3 3"], source: str
 ) -> tuple[float, int]:
-    """Return when the held tip has dropped by `THRESHOLD` (s), and the number of rows in which it is held.
+    """Return the time at which the tip has dropped by `THRESHOLD` (s), and the number of held rows.
 
-    The level that it is held at is the running median of the rows before: a slow creep of the hand is no
-    fall, and neither is a glitch.
+    The held level is the running median of the earlier rows. Slow creep of the hand and glitches are
+    therefore not detected as a fall.
 
     Raises:
-        RecordingError: the tip never drops so far for good, or it is not held before.
+        RecordingError: the tip never drops lastingly by the threshold, or it is not held before.
     """
-    # not the median of the markers: where one is lost that would jump
+    # the median of the markers would jump where one is lost
     height = np.asarray(tip[:, :, 0].mean(axis=1))
     for row in range(MARGIN + FEWEST_HELD, len(height) - LASTING):
         level = (

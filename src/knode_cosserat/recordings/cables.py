@@ -1,7 +1,7 @@
-"""Motions of cables held at both ends, seen by motion capture: folders as those of DEFORM (CoRL 2024).
+"""Motions of cables held at both ends, from motion capture: folders in the layout of DEFORM (CoRL 2024).
 
-A cable's folder has `train/*.pkl` and `eval/*.pkl`, a file for each motion: positions of N markers in T
-frames, as a NumPy array or a list of arrays. The same in one file is `NAME.npz` with arrays `train` and
+A cable's folder has `train/*.pkl` and `eval/*.pkl`, one file per motion: positions of N markers in T
+frames, as a NumPy array or a list of arrays. `NAME.npz` holds the same in one file, as arrays `train` and
 `eval` of shape (files, T, N, 3). Markers 0, 1, N - 2 and N - 1 are on the grippers.
 """
 
@@ -18,21 +18,21 @@ from jaxtyping import Float
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.pickles import LARGEST_FILE, read_pickled_array
 
-#: fewest frames, and fewest markers: four that are held and one that is free
+#: smallest number of frames, and of markers: four held ones and a free one
 FEWEST_FRAMES, FEWEST_MARKERS = 3, 5
-#: size of a cable's measurements (m), at most: anything larger is in another unit
+#: largest coordinate (m): larger values are in another unit
 FARTHEST = 100.0
 
 
 class CableMotion(NamedTuple):
-    """One motion: a name, and positions of the markers (m) in all frames."""
+    """Motion of a cable: its name and the marker positions (m) in all frames."""
 
     name: str
     markers: Float[np.ndarray, "T N 3"]
 
 
 class CableData(NamedTuple):
-    """The motions of one cable: to learn from, and to predict."""
+    """Motions of one cable: for training, and held-out."""
 
     name: str
     train: tuple[CableMotion, ...]
@@ -43,11 +43,11 @@ def load_cables(folder: str | Path) -> list[CableData]:
     """Return the cables of a folder, in the order of their names.
 
     Args:
-        folder: with folders `NAME/train/*.pkl` and `NAME/eval/*.pkl`, or files `NAME.npz`; or the folder of
-            one cable. Files are read without running code of theirs (see `pickles`).
+        folder: folder with `NAME/train/*.pkl` and `NAME/eval/*.pkl`, or with files `NAME.npz`; or the
+            folder of one cable. No code in the files is executed (see `pickles`).
 
     Raises:
-        RecordingError: there is no cable, or a file cannot be used; one line.
+        RecordingError: there is no cable, or a file cannot be used; the message is one line.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -102,7 +102,7 @@ def _from_npz(path: Path) -> CableData:
 
 
 def _checked(cable: CableData, source: str) -> CableData:
-    """The cable, if it has motions of both kinds with the same markers."""
+    """Return the cable after checking that both parts have motions, all with as many markers."""
     if not cable.train or not cable.held_out:
         raise RecordingError(
             f"{source}: {len(cable.train)} motions in train, {len(cable.held_out)} in eval; both are needed"
@@ -116,10 +116,10 @@ def _checked(cable: CableData, source: str) -> CableData:
 def as_markers(values: Any, source: str) -> Float[np.ndarray, "T N 3"]:
     """Return positions as (frames, markers, 3), from any order of these axes.
 
-    There are more frames than markers. Axes of length 1 in front, and rows of 3 N numbers, are accepted.
+    More frames than markers are assumed. Leading axes of length 1 and rows of 3 N numbers are accepted.
 
     Raises:
-        RecordingError: the shape, or a number, is not possible; `source` is named.
+        RecordingError: the shape or a number is invalid; the message names `source`.
     """
     try:
         array = np.asarray(values, dtype=float)
@@ -153,6 +153,6 @@ def as_markers(values: Any, source: str) -> Float[np.ndarray, "T N 3"]:
 
 
 def _in_order(name: str) -> list[tuple[int, int, str]]:
-    """A key by which `2` comes before `10`."""
+    """Return a sort key that puts `2` before `10`."""
     parts = re.split(r"(\d+)", name)
     return [(0, int(part), "") if part.isdigit() and part.isascii() else (1, 0, part) for part in parts]

@@ -1,4 +1,4 @@
-"""Streams of poses and tensions without what is wrong in them, and what that was."""
+"""Removal of errors from streams of poses and tensions, with findings on each removal."""
 
 from __future__ import annotations
 
@@ -9,20 +9,24 @@ from jaxtyping import Bool, Float
 
 from knode_cosserat.recordings import cleaning
 from knode_cosserat.recordings.config import (
+    MOTOR_UNITS,
     POSITION_UNITS,
     TENSION_UNITS,
+    MotorSource,
     RecordingConfig,
     TensionSource,
 )
 from knode_cosserat.recordings.findings import Finding, RecordingError, Severity
 from knode_cosserat.recordings.recording import Body, Tensions, bridge, period
 
-#: smaller jumps are left alone: m, rad, N
+#: smallest jumps that are removed (m, rad, N)
 SMALLEST_SHIFT, SMALLEST_TURN, SMALLEST_PULL = 5e-3, np.radians(8.0), 0.5
-#: load cells jump for a message or two; what takes longer can be a command (s)
+#: longest spike of a load cell (s): spikes last one or two messages, a longer change can be a command
 LONGEST_SPIKE = 0.04
-#: a body needs that many frames
+#: smallest number of frames of a body
 FEWEST_FRAMES = 2
+
+_UNITS = {**TENSION_UNITS, **MOTOR_UNITS}
 
 Seconds = Mapping[str, Float[np.ndarray, " n"]]
 Values = Mapping[str, Float[np.ndarray, "n size"]]
@@ -31,10 +35,12 @@ Values = Mapping[str, Float[np.ndarray, "n size"]]
 def cleaned_poses(
     config: RecordingConfig, seconds: Seconds, values: Values, path: str
 ) -> tuple[list[Body | None], list[Finding]]:
-    """The bodies in the order of the configuration, then the base, or None; in the recording's own frame.
+    """Return the bodies in the order of the configuration, then the base or None, and the findings.
+
+    Poses are in the recording's own frame.
 
     Raises:
-        RecordingError: a body was not seen in two frames.
+        RecordingError: a body has fewer than two usable frames.
     """
     bodies: list[Body | None] = []
     findings: list[Finding] = []
@@ -61,10 +67,14 @@ def _body(
     findings: list[Finding] = []
     good = _usable(pose)
     if pose.shape[1] == 7:
-        # a quaternion of zeros is how some drivers say that they see nothing
+        # some drivers send a zero quaternion while the body is not seen
         good[good] &= np.abs(np.linalg.norm(pose[good, 3:], axis=1) - 1.0) < 0.05
     _drop(findings, topic, time[~good], "pose is", "poses are", "not finite, or no rotation", "warning")
     time, pose = time[good], pose[good]
+    if config.repeats == "drop":
+        again = np.concatenate([[False], np.all(np.diff(pose, axis=0) == 0.0, axis=1)])[: len(time)]
+        _drop(findings, topic, time[again], "pose repeats", "poses repeat", "the one before", "note")
+        time, pose = time[~again], pose[~again]
     if len(time) < FEWEST_FRAMES:
         raise RecordingError(
             f"{path}: topic {topic}: {len(time)} usable poses of {name}; required is {FEWEST_FRAMES} or more"
@@ -77,7 +87,7 @@ def _body(
             what = f"its axes were swapped at {when:.3f} s, by {swap.angle:.0f} degrees about {swap.axis}"
             what += "; undone"
             findings.append(Finding("warning", topic, what, (when,)))
-    wrong = _jumping(time, pose, config)
+    wrong = np.zeros(len(time), dtype=bool) if config.static else _jumping(time, pose, config)
     if pose.shape[1] == 7:
         left = [row for row in unclear if not wrong[row - 1 : row + 1].any()]
         if left:
@@ -94,7 +104,7 @@ def _body(
 def _jumping(
     time: Float[np.ndarray, " n"], pose: Float[np.ndarray, "n size"], config: RecordingConfig
 ) -> Bool[np.ndarray, " n"]:
-    # as long as can be bridged, and not so many that they are most of what is looked at
+    # as many rows as can be bridged, but not most of the filter's window
     usual = float(np.median(np.diff(time))) or 1.0
     longest = int(np.clip(config.longest_gap / usual, 1, 4))
     floor = SMALLEST_SHIFT / POSITION_UNITS[config.position_unit]
@@ -109,14 +119,14 @@ def _jumping(
 def cleaned_tensions(
     config: RecordingConfig, seconds: Seconds, values: Values, path: str
 ) -> tuple[Tensions | None, Tensions | None, list[Finding]]:
-    """Measured and commanded tensions in N, tendon 1 first; None where there are none.
+    """Return measured and commanded tensions (N, tendon 1 first; None if absent), and the findings.
 
     Raises:
-        RecordingError: messages have another number of tendons, or none is usable and they are needed.
+        RecordingError: messages have another number of tendons, or required tensions have no usable row.
     """
     findings: list[Finding] = []
     both: list[Tensions | None] = []
-    for kind, source in (("measured", config.tension), ("commanded", config.command)):
+    for kind, source in (("measured", config.measured), ("commanded", config.command)):
         if source is None or source.topic not in seconds:
             both.append(None)
             continue
@@ -130,8 +140,9 @@ def cleaned_tensions(
 
 
 def _tensions(
-    source: TensionSource, time: np.ndarray, sent: np.ndarray, findings: list[Finding], path: str, kind: str
-) -> Tensions | None:
+    source: TensionSource | MotorSource, time: np.ndarray, sent: np.ndarray, findings: list[Finding],
+    path: str, kind: str,
+) -> Tensions | None:  # fmt: skip
     if len(sent) == 0:
         findings.append(Finding("warning", source.topic, f"there are no {kind} tensions"))
         return None
@@ -140,11 +151,12 @@ def _tensions(
             f"{path}: topic {source.topic}: a message has {sent.shape[1]} tensions; "
             f"the configuration's order has {len(source.order)} tendons"
         )
-    newtons = sent[:, np.argsort(source.order)] * TENSION_UNITS[source.unit]
+    newtons = sent[:, np.argsort(source.order)] * _UNITS[source.unit]
     good = _usable(newtons)
     _drop(findings, source.topic, time[~good], "tension is", "tensions are", "not finite", "warning")
     time, newtons = time[good], newtons[good]
-    if kind == "measured" and 0.0 < period(time) <= LONGEST_SPIKE:
+    measured = kind == "measured" and isinstance(source, TensionSource) and not source.held
+    if measured and 0.0 < period(time) <= LONGEST_SPIKE:
         spikes = np.zeros(len(time), dtype=bool)
         longest = min(2, int(LONGEST_SPIKE / period(time)))
         for tendon in newtons.T:
@@ -178,12 +190,12 @@ def _drop(
 
 
 def _usable(rows: Float[np.ndarray, "n size"]) -> Bool[np.ndarray, " n"]:
-    """Which rows are finite numbers of a size that something can have."""
+    """Return a mask of the rows with finite numbers of a plausible size."""
     return np.asarray(np.all(np.abs(np.nan_to_num(rows, nan=np.inf)) < 1e9, axis=1))
 
 
 def _pauses(topic: str, time: np.ndarray, longest: float) -> list[Finding]:
-    """What is said of pauses that are too long to be bridged."""
+    """Return findings on pauses that are too long to be bridged."""
     steps = np.diff(time)
     long = steps > bridge(time, longest)
     if not long.any():

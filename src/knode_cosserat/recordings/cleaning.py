@@ -1,4 +1,4 @@
-"""Single jumps out of a course, and swapped axes of bodies: found, and taken out or undone."""
+"""Detection of outliers in a signal, and detection and correction of swapped body axes."""
 
 from __future__ import annotations
 
@@ -10,34 +10,34 @@ import scipy.ndimage
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-#: a jump is larger than so many standard deviations of the steps around it
+#: threshold of a jump, in standard deviations of the steps around it
 SIGMAS = 12.0
-#: steps around one that say how much the motion itself varies, on each side: just there, and in general
+#: numbers of steps on each side that measure the variation of the motion: locally, and over a wider window
 _AROUND = (10, 50)
-#: the standard deviation of a normal distribution with this median of absolute values
+#: ratio of a normal distribution's standard deviation to its median absolute value
 _NORMAL = 1.4826
 
 
 def outliers(
     steps: Float[np.ndarray, "m size"], time: Float[np.ndarray, " n"], *, floor: float, longest: int
 ) -> Bool[np.ndarray, " n"]:
-    """Which rows jump out of a course, and back again after `longest` rows or fewer.
+    """Return a mask of rows that jump out of a signal and back again within `longest` rows.
 
-    A step that the steps around it do not explain is a jump; two that cancel have something wrong between
-    them. Motion, however fast, does not come back to where it would have been in one step.
+    A jump is a step that differs from the steps around it. The rows between two jumps that cancel are
+    outliers. Even fast motion does not return to its expected position in one step.
 
     Args:
-        steps: what changed from each row to the next (m = n - 1).
-        time: of the rows (s), rising.
-        floor: the smallest jump that counts.
-        longest: the most rows that are wrong in a row.
+        steps: change from each row to the next (m = n - 1).
+        time: times of the rows (s), increasing.
+        floor: smallest size of a jump.
+        longest: largest number of consecutive outliers.
     """
     found = np.zeros(len(time), dtype=bool)
     # no jump is larger than two steps
     if len(steps) < 5 or 2.0 * np.max(np.linalg.norm(steps, axis=1)) < floor:
         return found
     dt = np.diff(time)[:, None]
-    # by the rate, because some frames are missing
+    # filter the rate, because some frames are missing
     expected = scipy.ndimage.median_filter(steps / dt, size=(9, 1), mode="nearest") * dt
     jump = steps - expected
     size = np.linalg.norm(jump, axis=1)
@@ -56,12 +56,12 @@ def _running_median(values: Float[np.ndarray, " m"], around: int) -> Float[np.nd
 
 
 def position_steps(position: Float[np.ndarray, "n size"]) -> Float[np.ndarray, "m size"]:
-    """What changes from row to row."""
+    """Return the differences from row to row."""
     return np.diff(position, axis=0)
 
 
 def rotation_steps(quaternion: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "m 3"]:
-    """Rotation vectors from row to row (rad)."""
+    """Return the rotation vectors from row to row (rad)."""
     rotation = _rotation(quaternion)
     return (rotation[:-1].inv() * rotation[1:]).as_rotvec()
 
@@ -70,34 +70,34 @@ def rotation_steps(quaternion: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "m
 
 
 class Swap(NamedTuple):
-    """A body's axes became others, from a row on."""
+    """Swap of a body's axes at a row; it also applies to all later rows."""
 
     row: int
-    #: the turn by which they did (degrees), and about which of the body's axes
+    #: angle of the swap (degrees), and its rotation axis in the body's axes
     angle: float
     axis: tuple[int, ...]
 
 
-#: no motion between two frames turns a body further than this (rad): it would not be told from a swap
+#: largest rotation by motion between two frames (rad): a larger one cannot be distinguished from a swap
 _LARGEST_TURN = np.radians(45.0)
-#: how far from a multiple of 90 degrees a swap may look, at least, for what the body moved meanwhile (rad)
+#: smallest tolerance of a swap about a multiple of 90 degrees, for motion between the two frames (rad)
 _MOVED = np.radians(15.0)
-#: the rotations that take a cube to itself, the one that leaves it first
+#: rotation group of the cube, the identity first
 _CUBE = Rotation.create_group("O")
 
 
 def swaps_undone(
     time: Float[np.ndarray, " n"], quaternion: Float[np.ndarray, "n 4"]
 ) -> tuple[Float[np.ndarray, "n 4"], list[Swap], list[int]]:
-    """Orientations without swaps of the body's axes, the swaps, and rows of jumps that are no swaps.
+    """Return orientations without swapped axes, the swaps, and the rows of other large rotations.
 
-    Between two frames a swap turns a body by one of the 23 rotations of a cube, and by what it moved; the
-    turns around it say how much that can be. A turn that is large, but no multiple of 90 degrees or too fast
-    a motion to say, is left as it is.
+    Between two frames a swap rotates a body by one of the 23 rotations of a cube, plus its motion. The
+    neighbouring rotations bound that motion. A large rotation is left unchanged if it is not a multiple of
+    90 degrees, or if the motion is too fast to decide.
 
     Args:
-        time: of the rows (s), rising.
-        quaternion: of the body, scalar first.
+        time: times of the rows (s), increasing.
+        quaternion: orientation of the body, scalar first.
     """
     if len(time) < 2:
         return quaternion, [], []
@@ -112,7 +112,7 @@ def swaps_undone(
     unclear: list[int] = []
     begin = 0
     for step in large:
-        # what the body can have turned: the fastest of the turns nearby, for as long as nobody looked
+        # bound on the body's own rotation: the fastest rate nearby, over the time between the two frames
         moved = np.max(rate[max(0, step - 10) : step + 11], initial=0.0) * (time[step + 1] - time[step])
         left = np.asarray((_CUBE.inv() * turn[step]).magnitude())
         nearest = int(np.argmin(left))
@@ -122,7 +122,7 @@ def swaps_undone(
             continue
         undone.append(rotation[begin : step + 1] * undo)
         begin = int(step) + 1
-        # turns are seen in the swapped axes: back to the first ones, in the reverse order
+        # rotations are measured in the swapped axes: undo the swaps in reverse order
         undo = _CUBE[nearest].inv() * undo
         axis = np.sign(np.round(_CUBE[nearest].as_rotvec(), 6)).astype(int).tolist()
         swaps.append(Swap(begin, float(np.degrees(_CUBE[nearest].magnitude())), tuple(axis)))

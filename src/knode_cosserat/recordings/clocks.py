@@ -1,4 +1,4 @@
-"""From stamps to seconds on one clock: order, duplicates, jumps, and clocks that disagree."""
+"""Conversion of time stamps to one clock: order, duplicates, jumps, and clocks that disagree."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from jaxtyping import Bool, Float, Int
 from knode_cosserat.recordings.findings import Finding
 from knode_cosserat.recordings.messages import Stream
 
-#: clocks that disagree by more are not the same clock, and one that changes by more has jumped (s)
+#: largest disagreement of equal clocks, and smallest jump of a clock (s)
 DISAGREEMENT = 0.5
 JUMP = 0.1
-#: messages that are further from all others than this are not of this recording (s)
+#: messages separated from the largest group by a longer pause do not belong to the recording (s)
 FAR = 600.0
 
 
 def offsets(streams: Sequence[Stream]) -> dict[str, float]:
-    """By topic, how long after its stamp a message was recorded (s, the median); NaN without stamps."""
+    """Return the median delay from stamp to recording (s) by topic; NaN without stamps."""
     return {stream.topic: _offset(stream) for stream in streams}
 
 
@@ -30,7 +30,7 @@ def _offset(stream: Stream) -> float:
 
 
 def chosen(streams: Sequence[Stream], clock: str) -> tuple[dict[str, Int[np.ndarray, " n"]], list[Finding]]:
-    """By topic, when its messages were measured (ns), by the better of the two clocks."""
+    """Return the measurement times (ns) by topic, on the better of the two clocks, and the findings."""
     findings: list[Finding] = []
     late = offsets(streams)
     known = [delay for delay in late.values() if np.isfinite(delay)]
@@ -57,12 +57,12 @@ def chosen(streams: Sequence[Stream], clock: str) -> tuple[dict[str, Int[np.ndar
 
 
 def _without_jumps(stream: Stream) -> tuple[Int[np.ndarray, " n"], list[Finding]]:
-    """The stamps, or the times of recording less the usual delay if the stamps' clock was set meanwhile."""
+    """Return the stamps and findings; if the stamps' clock jumped, recording times less the median delay."""
     stamps, received = np.diff(stream.stamped) * 1e-9, np.diff(stream.received) * 1e-9
     usual = np.median(stamps) if len(stamps) else 0.0
-    # of the two, the clock that is further from the usual step is the one that jumped
+    # the clock whose step differs more from the usual step has jumped
     odd = (np.abs(stamps - received) > JUMP) & (np.abs(stamps - usual) > np.abs(received - usual))
-    # there and back: a message out of order, or one damaged stamp
+    # a jump and back: a message out of order, or a damaged stamp
     odd[1:] &= ~odd[:-1]
     drift = (stream.stamped - stream.received) * 1e-9
     stays = [row for row in np.flatnonzero(odd) if _stays(drift, int(row))]
@@ -77,13 +77,13 @@ def _without_jumps(stream: Stream) -> tuple[Int[np.ndarray, " n"], list[Finding]
 
 
 def _stays(drift: Float[np.ndarray, " n"], row: int) -> bool:
-    """Whether the stamps are as far from the times of recording for a while as right after a jump."""
+    """True if the offset between stamps and recording times stays changed for several rows after a jump."""
     before, after = drift[max(0, row - 4) : row + 1], drift[row + 1 : row + 6]
     return len(after) >= 3 and abs(float(np.median(after) - np.median(before))) > JUMP
 
 
 def ordered(topic: str, time: Int[np.ndarray, " n"]) -> tuple[Int[np.ndarray, " kept"], list[Finding]]:
-    """Which rows to take, in which order, so that times rise; with what was wrong with them."""
+    """Return the indices of the rows to keep, in order of increasing time, and the findings."""
     findings: list[Finding] = []
     order = np.argsort(time, kind="stable")
     backwards = int(np.sum(np.diff(time) < 0))
@@ -110,7 +110,7 @@ def ordered(topic: str, time: Int[np.ndarray, " n"]) -> tuple[Int[np.ndarray, " 
 
 
 def _together(time: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-    """Which of rising times are in the largest group without a long pause."""
+    """Return a mask of the (increasing) times in the largest group without a long pause."""
     if len(time) == 0:
         return np.ones(0, dtype=bool)
     group = np.concatenate([[0], np.cumsum(np.diff(time) > FAR * 1e9)])

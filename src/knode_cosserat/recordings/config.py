@@ -1,4 +1,4 @@
-"""What a recording's topics or columns mean: settings as data, checked when they are made, as YAML and back.
+"""Configuration of a recording's topics or columns: validated settings, read from and written to YAML.
 
     format: 1
     description: our robot, three tendons and one body at the tip
@@ -7,15 +7,16 @@
     markers:
       - {name: tip, topic: /mocap/tip/pose, fraction: 1}
 
-The same settings serve bags and tables. In a table a topic is what the columns' titles begin with: the topic
-`tip` has the columns `tip_x [m]`, `tip_y [m]`, `tip_z [m]` and, for its orientation, `tip_qw` to `tip_qz`;
-the topic `tension` has `tension_1 [N]`, `tension_2 [N]` and so on.
+The same settings serve bags and tables. In a table, a topic is the prefix of the columns' titles: the topic
+`tip` has the columns `tip_x [m]`, `tip_y [m]`, `tip_z [m]` and, for its orientation, `tip_qw` to `tip_qz`.
+The topic `tension` has `tension_1 [N]`, `tension_2 [N]` and so on. A robot with motor-driven tendons has
+`motors` in place of `tension`: the measured motor angles. `table` gives the column titles of other
+conventions, and the rate of a table without a time column.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import fractions
 import itertools
 import math
 from pathlib import Path
@@ -23,27 +24,38 @@ from typing import Any, Literal, Self
 
 from knode_cosserat._files import replacing
 from knode_cosserat._yaml import YAMLTextError, did_you_mean, flow, mapping_of, shown
+from knode_cosserat.recordings.config_values import (
+    PLACE,
+    Vector,
+    checked_choice,
+    checked_interval,
+    checked_number,
+    checked_numbers,
+    checked_order,
+    checked_quaternion,
+    checked_text,
+    checked_titles,
+)  # fmt: skip
 from knode_cosserat.recordings.findings import RecordingError
 
 FORMAT = 1
-#: how many of the SI unit one is
+#: conversion factors to SI units
 TENSION_UNITS = {"N": 1.0, "gf": 9.81 / 1000.0}
 POSITION_UNITS = {"m": 1.0, "mm": 1e-3}
-#: where the numbers stand in the text of a command
-PLACE = "{}"
-Vector = tuple[float, ...]
+#: units of motors: angles to rad, or wound-up lengths to m
+MOTOR_UNITS = {"rad": 1.0, "deg": math.pi / 180.0, "m": 1.0, "mm": 1e-3}
 
 
 @dataclasses.dataclass(frozen=True)
 class MarkerSource:
-    """A body that motion capture sees on the rod.
+    """Body on the rod, tracked by motion capture.
 
     Attributes:
-        name: what reports call it.
-        topic: where its poses are; a body without orientation may have positions only.
-        fraction: where it sits, as a fraction of the rod's length: 0 is the clamped end, 1 the tip.
-        rotation: the body's axes in the rod's frame there, as a quaternion, scalar first; None: they are
-            those seen at rest, when the rod points up.
+        name: name in reports.
+        topic: topic of its poses; a body without orientation may have positions only.
+        fraction: its place, as a fraction of the rod's length: 0 is the clamped end, 1 the tip.
+        rotation: the body's axes in the rod's local frame, as a quaternion, scalar first; None: the axes
+            are calibrated at rest, when the rod points up.
     """
 
     name: str
@@ -52,23 +64,23 @@ class MarkerSource:
     rotation: Vector | None = None
 
     def __post_init__(self) -> None:
-        _set(self, "name", _text(self.name, "name"))
-        _set(self, "topic", _text(self.topic, "topic"))
-        _set(self, "fraction", _number(self.fraction, "fraction", 0.0, 1.0))
+        _set(self, "name", checked_text(self.name, "name"))
+        _set(self, "topic", checked_text(self.topic, "topic"))
+        _set(self, "fraction", checked_number(self.fraction, "fraction", 0.0, 1.0))
         if self.rotation is not None:
-            _set(self, "rotation", _quaternion(self.rotation, "rotation"))
+            _set(self, "rotation", checked_quaternion(self.rotation, "rotation"))
 
 
 @dataclasses.dataclass(frozen=True)
 class BaseSource:
-    """A body that does not move with the rod, `height` (m) above the rod's clamped end."""
+    """Body fixed to the base, `height` (m) above the rod's clamped end."""
 
     topic: str
     height: float = 0.0
 
     def __post_init__(self) -> None:
-        _set(self, "topic", _text(self.topic, "topic"))
-        _set(self, "height", _number(self.height, "height", -10.0, 10.0, "m"))
+        _set(self, "topic", checked_text(self.topic, "topic"))
+        _set(self, "height", checked_number(self.height, "height", -10.0, 10.0, "m"))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,19 +88,24 @@ class TensionSource:
     """Measured tensions.
 
     Attributes:
-        topic: where they are.
-        order: which tendon each number of a message belongs to; tendons count from 1.
+        topic: topic of the tensions.
+        order: tendon of each number in a message; tendons count from 1.
         unit: "N" or "gf" (grams-force).
+        held: True if a tension acts unchanged until the next one, as commands do; otherwise it is a sample
+            at that instant, and tensions are interpolated linearly.
     """
 
     topic: str
     order: tuple[int, ...]
     unit: Literal["N", "gf"] = "N"
+    held: bool | None = None
 
     def __post_init__(self) -> None:
-        _set(self, "topic", _text(self.topic, "topic"))
-        _set(self, "order", _order(self.order))
-        _choice(self.unit, "unit", TENSION_UNITS)
+        _set(self, "topic", checked_text(self.topic, "topic"))
+        _set(self, "order", checked_order(self.order))
+        checked_choice(self.unit, "unit", TENSION_UNITS)
+        if self.held not in (None, True, False):
+            raise RecordingError(f"held is {shown(self.held)}; allowed is true or false")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,9 +113,9 @@ class CommandSource(TensionSource):
     """Commanded tensions, each held until the next.
 
     Attributes:
-        text: what a message of text says, with `{}` where the numbers stand (in a log, other lines are not
+        text: template of text messages, with `{}` in place of the numbers (other lines of a log are not
             commands); None for messages of numbers.
-        latency: how long after its stamp a command reaches the tendons (s).
+        latency: delay from a command's stamp until it reaches the tendons (s).
     """
 
     text: str | None = None
@@ -106,7 +123,9 @@ class CommandSource(TensionSource):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _set(self, "latency", _number(self.latency, "latency", 0.0, 10.0, "s"))
+        if self.held is False:
+            raise RecordingError("held is false; allowed of a command is true: it is held until the next")
+        _set(self, "latency", checked_number(self.latency, "latency", 0.0, 10.0, "s"))
         if self.text is not None and str(self.text).count(PLACE) != 1:
             raise RecordingError(
                 f"text is {shown(self.text)}; allowed is text with one {PLACE} where the numbers stand"
@@ -114,26 +133,81 @@ class CommandSource(TensionSource):
 
 
 @dataclasses.dataclass(frozen=True)
-class RecordingConfig:
-    """What the topics of a bag, or the columns of a table, mean.
+class MotorSource:
+    """Measured angles of motors that wind up tendons, or the wound-up lengths.
 
     Attributes:
-        markers: the bodies on the rod, from base to tip.
-        tension: measured tensions, or None if there are none.
+        topic: topic of the angles or lengths.
+        order: motor of each number in a message; motors count from 1.
+        unit: "rad" or "deg" for angles; "m" or "mm" for lengths.
+        latency: delay from an angle's stamp until it acts on the robot (s): the offset between the clocks
+            of motors and motion capture.
+    """
+
+    topic: str
+    order: tuple[int, ...]
+    unit: Literal["rad", "deg", "m", "mm"] = "rad"
+    latency: float = 0.0
+
+    def __post_init__(self) -> None:
+        _set(self, "topic", checked_text(self.topic, "topic"))
+        _set(self, "order", checked_order(self.order))
+        checked_choice(self.unit, "unit", MOTOR_UNITS)
+        _set(self, "latency", checked_number(self.latency, "latency", -10.0, 10.0, "s"))
+
+
+@dataclasses.dataclass(frozen=True)
+class TableSource:
+    """Titles of a table's columns, where they differ from this package's convention.
+
+    Attributes:
+        rate: rows per second (Hz), for a table without a time column; None: the column `time [s]` is used.
+        position: titles of a body's position, with `{}` in place of its topic.
+        quaternion: titles of its orientation, scalar first; a body without these columns has no orientation.
+        motor: title of a motor's angle, or of a tension, with `{}` in place of its number.
+    """
+
+    rate: float | None = None
+    position: tuple[str, ...] | None = None
+    quaternion: tuple[str, ...] | None = None
+    motor: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.rate is not None:
+            _set(self, "rate", checked_number(self.rate, "rate", 1e-6, 1e6, "Hz"))
+        for name, count in (("position", 3), ("quaternion", 4)):
+            if getattr(self, name) is not None:
+                _set(self, name, checked_titles(getattr(self, name), name, count))
+        if self.motor is not None:
+            _set(self, "motor", checked_titles([self.motor], "motor", 1)[0])
+
+
+@dataclasses.dataclass(frozen=True)
+class RecordingConfig:
+    """Configuration of the topics of a bag, or the columns of a table.
+
+    Attributes:
+        markers: bodies on the rod, from base to tip.
+        tension: measured tensions, or None.
+        motors: measured motor angles in place of tensions, or None.
         command: commanded tensions, or None.
-        base: the body that tells where the clamped end is, or None: then `origin` says it.
-        tensions: which of the two a robot is driven by, where nothing else is asked for.
+        base: body that locates the clamped end; None: `origin` locates it.
+        tensions: default choice of the tensions that drive the robot, "measured" or "commanded".
         position_unit: "m" or "mm".
-        origin: the clamped end in motion capture's frame (m), where there is no base.
-        rotation: turns motion capture's frame to the robot's, whose z points up the straight rod; a
-            quaternion, scalar first.
-        clock: "header": the stamps in messages' headers, when they were measured; "received": when they were
-            recorded.
-        longest_gap: the longest time without frames that is bridged (s); a stream's own period always is.
-        rest: from when to when the robot rests, straight up (s); None: found from the motion.
-        trim: from when to when the recording is used (s); None: from its start, to its end.
-        simulated: whether the robot was itself a simulation; None: not stated.
-        description: what was recorded, in one line.
+        origin: position of the clamped end in motion capture's frame (m), used without a base.
+        rotation: rotation from motion capture's frame to the robot's frame, whose z points up the straight
+            rod; a quaternion, scalar first.
+        clock: "header": measurement times from the messages' headers; "received": recording times.
+        table: titles of a table's columns; None: this package's convention.
+        static: True if each row is a separate equilibrium, not part of a motion.
+        repeats: "drop": a frame that repeats the previous pose exactly is not a measurement, because some
+            motion capture repeats the last pose of a lost body; "keep": every frame is a measurement.
+        longest_gap: longest gap between frames that is bridged (s); 1.5 periods of a stream always are.
+        rest: interval in which the robot rests, straight up (s); None: detected from the motion.
+        trim: interval of the recording that is used (s); None: no limit at that end.
+        initial_tension: tensions (N) before the first row, tendon 1 first; None: estimated from the rest.
+        simulated: True if the robot was itself a simulation; None: not stated.
+        description: one-line description of the recording.
 
     Raises:
         RecordingError: a value is not allowed.
@@ -141,18 +215,23 @@ class RecordingConfig:
 
     markers: tuple[MarkerSource, ...]
     tension: TensionSource | None = None
+    motors: MotorSource | None = None
     command: CommandSource | None = None
     base: BaseSource | None = None
+    table: TableSource | None = None
     tensions: Literal["measured", "commanded"] = "measured"
     position_unit: Literal["m", "mm"] = "m"
     origin: Vector = (0.0, 0.0, 0.0)
     rotation: Vector = (1.0, 0.0, 0.0, 0.0)
     clock: Literal["header", "received"] = "header"
+    static: bool = False
+    repeats: Literal["keep", "drop"] = "keep"
     longest_gap: float = 0.1
     rest: Vector | None = None
     trim: tuple[float | None, float | None] = (None, None)
     simulated: bool | None = None
     description: str = ""
+    initial_tension: Vector | None = None
 
     def __post_init__(self) -> None:
         _set(self, "markers", _markers(self.markers))
@@ -160,15 +239,18 @@ class RecordingConfig:
             value = getattr(self, name)
             if value is not None and type(value) is not kind:
                 raise RecordingError(f"{name} is {shown(value)}; allowed is a {kind.__name__}, or nothing")
-        _choice(self.tensions, "tensions", ("measured", "commanded"))
-        _choice(self.position_unit, "position_unit", POSITION_UNITS)
-        _choice(self.clock, "clock", ("header", "received"))
-        _set(self, "origin", _numbers(self.origin, "origin", 3, "three numbers (m)"))
-        _set(self, "rotation", _quaternion(self.rotation, "rotation"))
-        _set(self, "longest_gap", _number(self.longest_gap, "longest_gap", 0.0, 60.0, "s"))
+        checked_choice(self.tensions, "tensions", ("measured", "commanded"))
+        checked_choice(self.position_unit, "position_unit", POSITION_UNITS)
+        checked_choice(self.clock, "clock", ("header", "received"))
+        checked_choice(self.repeats, "repeats", ("keep", "drop"))
+        if not isinstance(self.static, bool):
+            raise RecordingError(f"static is {shown(self.static)}; allowed is true or false")
+        _set(self, "origin", checked_numbers(self.origin, "origin", 3, "three numbers (m)"))
+        _set(self, "rotation", checked_quaternion(self.rotation, "rotation"))
+        _set(self, "longest_gap", checked_number(self.longest_gap, "longest_gap", 0.0, 60.0, "s"))
         if self.rest is not None:
-            _set(self, "rest", _interval(self.rest, "rest", open_ended=False))
-        _set(self, "trim", _interval(self.trim, "trim", open_ended=True))
+            _set(self, "rest", checked_interval(self.rest, "rest", open_ended=False))
+        _set(self, "trim", checked_interval(self.trim, "trim", open_ended=True))
         if self.simulated is not None and not isinstance(self.simulated, bool):
             raise RecordingError(f"simulated is {shown(self.simulated)}; allowed is true or false")
         if not isinstance(self.description, str):
@@ -176,29 +258,44 @@ class RecordingConfig:
         self._check_together()
 
     def _check_together(self) -> None:
-        driver = "tension" if self.tensions == "measured" else "command"
-        if getattr(self, driver) is None:
-            raise RecordingError(f"{driver} is missing; required where tensions is {self.tensions}")
+        if self.tension and self.motors:
+            raise RecordingError("tension and motors are both there; allowed is one of them")
+        if self.measured is None and self.tensions == "measured":
+            raise RecordingError("tension is missing; required where tensions is measured, or motors")
+        if self.command is None and self.tensions == "commanded":
+            raise RecordingError("command is missing; required where tensions is commanded")
+        if self.motors and self.command:
+            raise RecordingError("motors and command are both there; allowed is one of them")
         if self.tension and self.command and len(self.tension.order) != len(self.command.order):
             raise RecordingError(
                 f"order has {len(self.tension.order)} tendons in tension and {len(self.command.order)} in "
                 "command; allowed is the same number"
             )
-        topics = [source.topic for source in (*self.markers, self.base, self.tension, self.command) if source]
+        if self.initial_tension is not None:
+            words = f"{self.tendons} numbers (N), one of each tendon"
+            given = checked_numbers(self.initial_tension, "initial_tension", self.tendons, words)
+            _set(self, "initial_tension", given)
+        sources = (*self.markers, self.base, self.measured, self.command)
+        topics = [source.topic for source in sources if source]
         twice = next((topic for topic in topics if topics.count(topic) > 1), None)
         if twice is not None:
             raise RecordingError(f"the topic {twice} is there twice; allowed is one use of each topic")
 
     @property
+    def measured(self) -> TensionSource | MotorSource | None:
+        """Measured tensions, or angles of motors."""
+        return self.tension or self.motors
+
+    @property
     def tendons(self) -> int:
-        """How many tendons there are."""
-        source = self.tension or self.command
+        """Number of tendons or motors."""
+        source = self.measured or self.command
         assert source is not None
         return len(source.order)
 
     @classmethod
     def paper_robot(cls) -> Self:
-        """The bags of the paper's robot: five bodies, tensions in grams-force, commands in the log."""
+        """Return the configuration of the paper's bags: five bodies, tensions in gf, commands in the log."""
         wire = (4, 1, 2, 3)
         return cls(
             markers=tuple(
@@ -211,8 +308,30 @@ class RecordingConfig:
             description="the paper's tendon robot, or one with the same topics",
         )
 
+    @classmethod
+    def asl_trunk(cls) -> Self:
+        """Return the configuration of the ASL trunk (Stanford): six motor angles (deg), three disks, 100 Hz.
+
+        Its frame has gravity along -y and the clamped end near (0.1, 0, 0.1) m. The robot's z axis points
+        down. The disks' orientations, present in
+        some files, are unreliable (axes flip) and are not read.
+        """
+        return cls(
+            markers=tuple(
+                MarkerSource(f"disk {k + 1}", f"{k + 1}", fraction)
+                for k, fraction in enumerate((0.338, 0.636, 1.0))
+            ),
+            motors=MotorSource("phi", (1, 2, 3, 4, 5, 6), "deg"),
+            table=TableSource(rate=100.0, position=("x{}", "y{}", "z{}"), motor="phi{}"),
+            origin=(0.1, 0.1, 0.0),
+            rotation=(math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0),
+            repeats="drop",
+            simulated=False,
+            description="ASL trunk of Stanford, StanfordASL/trunk-stack, MIT",
+        )
+
     def replace(self, **changes: Any) -> Self:
-        """The same settings with some of them changed. Raises `RecordingError`."""
+        """Return a copy with some settings changed. Raises `RecordingError`."""
         names = [field.name for field in dataclasses.fields(self)]
         for name in changes:
             _require_known(name, names)
@@ -223,7 +342,7 @@ class RecordingConfig:
         """Read settings from a YAML file.
 
         Raises:
-            RecordingError: the file cannot be read, or a key or value is not right; it names both.
+            RecordingError: the file cannot be read, or a key or value is invalid; the message names both.
         """
         try:
             text = Path(path).read_text(encoding="utf-8-sig")
@@ -238,7 +357,7 @@ class RecordingConfig:
             raise RecordingError(f"{path}: {error}") from None
 
     def save(self, path: str | Path) -> None:
-        """Write the settings as a YAML file that `load` reads back equal. Raises `RecordingError`."""
+        """Write the settings to a YAML file; `load` reads them back equal. Raises `RecordingError`."""
         lines = [f"format: {FORMAT}"]
         for name, value in self.to_dict().items():
             if name == "markers":
@@ -252,12 +371,16 @@ class RecordingConfig:
             raise RecordingError(f"{path}: cannot be written: {error.strerror}") from None
 
     def to_dict(self) -> dict[str, Any]:
-        """The settings as JSON and YAML can have them, without those that are not given."""
+        """Return the settings as plain values for JSON and YAML, without unset ones."""
         return {name: value for name, value in _plain(self).items() if value not in (None, [None, None], "")}
 
     @classmethod
     def from_dict(cls, values: dict[Any, Any]) -> Self:
-        """The settings that `to_dict` gave; what is not there is at its default. Raises `RecordingError`."""
+        """Return settings from the result of `to_dict`; missing keys get defaults.
+
+        Raises:
+            RecordingError: a key or value is invalid.
+        """
         values = dict(values)
         number = values.pop("format", FORMAT)
         if number != FORMAT or isinstance(number, bool):
@@ -273,7 +396,10 @@ class RecordingConfig:
         return _made(cls, values)
 
 
-_PARTS: dict[str, type] = {"tension": TensionSource, "command": CommandSource, "base": BaseSource}
+_PARTS: dict[str, type] = {
+    "tension": TensionSource, "motors": MotorSource, "command": CommandSource, "base": BaseSource,
+    "table": TableSource,
+}  # fmt: skip
 
 
 # mappings
@@ -321,77 +447,6 @@ def _plain(value: Any) -> Any:
 
 def _set(settings: Any, name: str, value: Any) -> None:
     object.__setattr__(settings, name, value)
-
-
-def _text(value: Any, name: str) -> str:
-    if not isinstance(value, str) or not value.strip() or not value.isprintable():
-        raise RecordingError(f"{name} is {shown(value)}; allowed is text on one line")
-    return value
-
-
-def _choice(value: Any, name: str, allowed: Any) -> None:
-    if not isinstance(value, str) or value not in allowed:
-        raise RecordingError(f"{name} is {shown(value)}; allowed is {' or '.join(allowed)}")
-
-
-def _number(value: Any, name: str, low: float, high: float, unit: str = "") -> float:
-    number = _fraction(value)
-    if number is None or not low <= number <= high:
-        words = f"a number from {low:g} to {high:g} {unit}".strip()
-        raise RecordingError(f"{name} is {shown(value)}; allowed is {words}")
-    return number
-
-
-def _fraction(value: Any) -> float | None:
-    """A finite number, also if it is written as 3/9; None of anything else."""
-    try:
-        if isinstance(value, str) and value.count("/") == 1 and len(value) < 40:
-            return float(fractions.Fraction(value.replace(" ", "")))
-        if isinstance(value, bool | str) or value is None:
-            return None
-        number = float(value)
-    except (TypeError, ValueError, OverflowError, ZeroDivisionError):
-        return None
-    return number if math.isfinite(number) else None
-
-
-def _numbers(value: Any, name: str, count: int, words: str) -> Vector:
-    numbers = [_fraction(each) for each in value] if isinstance(value, list | tuple) else []
-    if len(numbers) != count or None in numbers:
-        raise RecordingError(f"{name} is {shown(value)}; allowed is {words}")
-    return tuple(number for number in numbers if number is not None)
-
-
-def _quaternion(value: Any, name: str) -> Vector:
-    words = "a quaternion of length 1, scalar first"
-    numbers = _numbers(value, name, 4, words)
-    size = math.hypot(*numbers)
-    if abs(size - 1.0) > 1e-3:
-        raise RecordingError(f"{name} is {shown(value)}; allowed is {words}")
-    # what is written with few digits is not of length 1 to all of them
-    return numbers if abs(size - 1.0) < 1e-12 else tuple(number / size for number in numbers)
-
-
-def _order(value: Any) -> tuple[int, ...]:
-    given = tuple(value) if isinstance(value, list | tuple) else ()
-    whole = all(isinstance(each, int) and not isinstance(each, bool) for each in given)
-    if not given or not whole or sorted(given) != list(range(1, len(given) + 1)):
-        raise RecordingError(
-            f"order is {shown(value)}; allowed is the tendons 1, 2, 3, … in the order of the wire"
-        )
-    return given
-
-
-def _interval(value: Any, name: str, *, open_ended: bool) -> tuple[float | None, float | None]:
-    words = "[start, end] in s, start before end" + (", either of them null" if open_ended else "")
-    pair = list(value) if isinstance(value, list | tuple) else []
-    ends = [None if end is None and open_ended else _fraction(end) for end in pair]
-    wrong = [
-        end is None and not (given is None and open_ended) for given, end in zip(pair, ends, strict=True)
-    ]
-    if len(ends) != 2 or any(wrong) or (None not in ends and not ends[0] < ends[1]):  # type: ignore[operator]
-        raise RecordingError(f"{name} is {shown(value)}; allowed is {words}")
-    return ends[0], ends[1]
 
 
 def _markers(value: Any) -> tuple[MarkerSource, ...]:

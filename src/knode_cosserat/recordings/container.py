@@ -1,4 +1,4 @@
-"""What a bag's file holds before anybody asks what it means: raw messages by topic."""
+"""Raw messages of a bag's file by topic, before they are decoded."""
 
 from __future__ import annotations
 
@@ -7,49 +7,49 @@ import dataclasses
 
 @dataclasses.dataclass
 class Topic:
-    """Messages of one topic as they were recorded."""
+    """Raw messages of one topic."""
 
     name: str
-    #: as ROS 2 writes it: geometry_msgs/msg/PoseStamped
+    #: message type as ROS 2 writes it: geometry_msgs/msg/PoseStamped
     type: str
-    #: the hash of the type's definition, of ROS 1; empty if unknown
+    #: hash of the type's definition (ROS 1); empty if unknown
     digest: str = ""
-    #: when each message was recorded (ns)
+    #: recording time of each message (ns)
     received: list[int] = dataclasses.field(default_factory=list)
     raw: list[bytes | memoryview] = dataclasses.field(default_factory=list)
 
 
 @dataclasses.dataclass
 class Container:
-    """The topics of a bag, and how much of its file could not be read."""
+    """Topics of a bag, and the number of bytes that could not be read."""
 
-    #: 1 or 2: how messages are written
+    #: ROS version of the serialisation: 1 or 2
     ros: int
     topics: dict[str, Topic] = dataclasses.field(default_factory=dict)
-    #: how many bytes could not be read
+    #: number of bytes that could not be read
     lost: int = 0
-    #: what of the file is not as a recorder that was closed leaves it; empty: nothing
+    #: description of the damage to the file; empty: none
     damage: str = ""
 
     def topic(self, name: str, kind: str, digest: str = "") -> Topic | None:
-        """The topic of that name, made if it is new; None if it is there with another type."""
+        """Return the topic of that name, created if new; None if it exists with another type."""
         kind = kind if kind.count("/") != 1 else kind.replace("/", "/msg/")
         found = self.topics.setdefault(name, Topic(name, kind, digest))
         return found if found.type == kind else None
 
 
-#: no chunk that is larger than this is taken apart (bytes): its size is more likely an error than true
+#: largest decompressed size of a chunk (bytes): a larger stated size is more likely an error
 LARGEST_CHUNK = 1 << 30
 _PIECE = 1 << 14
 
 
 def decompressed(data: bytes | memoryview, compression: str, size: int) -> tuple[bytes, int]:
-    """A chunk's records, or as many as can be had if it is cut or damaged; and how many bytes they were.
+    """Return a chunk's records, as far as they are readable, and the number of compressed bytes used.
 
     Args:
-        data: what is packed; more may follow it.
-        compression: how.
-        size: of the records; zero if it is not known.
+        data: compressed bytes; other bytes may follow them.
+        compression: name of the compression: bz2, lz4 or zstd.
+        size: decompressed size (bytes); zero if unknown.
 
     Raises:
         ImportError: the library for this compression is not installed.
@@ -58,7 +58,7 @@ def decompressed(data: bytes | memoryview, compression: str, size: int) -> tuple
     decompressor = _decompressor(compression)
     parts: list[bytes] = []
     have = used = 0
-    # in pieces: what is before the damage then comes out
+    # in pieces, so that the data before a damaged byte are recovered
     while decompressor is not None and used < len(data) and have < size:
         piece = bytes(data[used : used + _PIECE])
         try:

@@ -1,4 +1,4 @@
-"""What is found out about a recording while it is read, and the error that ends the reading."""
+"""Findings on a recording, collected while it is read, and the error for an unusable recording."""
 
 from __future__ import annotations
 
@@ -6,27 +6,27 @@ import dataclasses
 from typing import Literal
 
 Severity = Literal["note", "warning", "problem"]
-#: the gravest first
+#: severities, the gravest first
 SEVERITIES: tuple[Severity, ...] = ("problem", "warning", "note")
 
 
 class RecordingError(ValueError):
-    """A recording that cannot be read or used; the message is one line that says why."""
+    """Error for a recording that cannot be read or used; the message is one line with the reason."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Finding:
-    """Something about a recording that whoever uses it should know.
+    """Finding on a recording that its user should know.
 
-    A `note` is as it should be or was mended without loss, a `warning` was mended at a cost or may be wrong,
-    a `problem` leaves out a part of the recording, or makes it doubtful.
+    A `note` is harmless or was repaired without loss. A `warning` was repaired at a cost or may be an error.
+    A `problem` means that a part of the recording is left out or doubtful.
     """
 
     severity: Severity
-    #: the topic (in a table, the columns) it is about; empty: the whole recording
+    #: topic concerned (in a table, the columns' prefix); empty: the whole recording
     topic: str
     message: str
-    #: when it was (s)
+    #: times of the events (s)
     times: tuple[float, ...] = ()
 
     def __str__(self) -> str:

@@ -1,4 +1,4 @@
-"""The robot's frame, from what is seen at rest: the clamped end, and the axes of bodies."""
+"""Transformation to the robot's frame: the clamped end, and the axes of bodies calibrated at rest."""
 
 from __future__ import annotations
 
@@ -13,18 +13,23 @@ from knode_cosserat.recordings.config import POSITION_UNITS, RecordingConfig
 from knode_cosserat.recordings.findings import Finding
 from knode_cosserat.recordings.recording import Body
 
-#: the shortest rest that tells how a body's axes are turned (s), and the fewest frames
+#: shortest rest for the calibration of a body's axes (s), and smallest number of frames
 SHORTEST_REST, FEWEST_FRAMES = 0.2, 5
-#: a body that stays so near to where it was rests (m), if it shakes no more than by its noise
+#: largest displacement of a resting body (m), beyond its noise
 STILL = 2e-3
-#: a straight rod that leans by more does not point up (rad)
+#: largest lean of a straight rod (rad); a rod with a larger lean sags or is bent at rest
 LEANING = np.radians(3.0)
-#: lengths of the rod by its bodies that differ by more are not of one rod, or not of this one
+#: largest plausible lean of the tip's chord (rad): beyond it the arc points back at its end
+BACK = np.radians(80.0)
+#: a rod clamped along z leans less near its base: at most by this fraction of the tip's lean. Checked for
+#: leans of the tip above the second number (rad), the largest misalignment of a mounted base
+ALIKE, ASKEW = 0.8, np.radians(15.0)
+#: largest relative spread of the rod's lengths estimated from its bodies
 UNEQUAL = 0.05
 
 
 def rest_of(bodies: Sequence[Body]) -> tuple[float, float] | None:
-    """From when to when, in the beginning, no body moves; None if that is too short."""
+    """Return the initial interval in which no body moves; None if it is too short."""
     start, end = max(body.time[0] for body in bodies), min(body.time[-1] for body in bodies)
     for body in bodies:
         first = body.position[body.time <= start + SHORTEST_REST + 1e-6]
@@ -41,9 +46,9 @@ def rest_of(bodies: Sequence[Body]) -> tuple[float, float] | None:
 def placed(
     bodies: Sequence[Body], base: Body | None, config: RecordingConfig
 ) -> tuple[list[Body], Body | None, tuple[float, float] | None, list[Finding]]:
-    """Bodies in the robot's frame, with orientations of the rod; the rest that told them; and findings.
+    """Return the bodies (with the rod's orientations) and the base in the robot's frame, rest and findings.
 
-    The bodies that are given have positions and orientations as they were recorded.
+    The input bodies have their recorded positions and orientations.
     """
     findings: list[Finding] = []
     turn = Rotation.from_quat(config.rotation, scalar_first=True)
@@ -80,7 +85,7 @@ def _turned(body: Body, turn: Rotation, scale: float) -> Body:
 def _of_the_rod(
     body: Body, rotation: Sequence[float] | None, rest: tuple[float, float] | None
 ) -> tuple[Body, list[Finding]]:
-    """The body with the orientation of the rod there in place of its own."""
+    """Return the body with the rod's local orientation in place of its own, and the findings."""
     if body.quaternion is None:
         return body, []
     own = Rotation.from_quat(body.quaternion, scalar_first=True)
@@ -101,14 +106,14 @@ def _of_the_rod(
 
 
 def at_rest(time: Float[np.ndarray, " n"], rest: tuple[float, float] | None) -> np.ndarray:
-    """Which rows are from the rest."""
+    """Return a mask of the rows within the rest."""
     return np.zeros(len(time), dtype=bool) if rest is None else (time >= rest[0] - 1e-6) & (time < rest[1])
 
 
 def rest_positions(
     bodies: Sequence[Body], rest: tuple[float, float] | None
 ) -> Float[np.ndarray, "M 3"] | None:
-    """Where the bodies are at rest (m), or None if one of them is not seen there."""
+    """Return the mean positions of the bodies at rest (m), or None if one of them is not seen at rest."""
     means = [body.position[at_rest(body.time, rest)] for body in bodies]
     if any(len(positions) == 0 for positions in means):
         return None
@@ -116,7 +121,7 @@ def rest_positions(
 
 
 def _judged(bodies: Sequence[Body], rest: tuple[float, float] | None) -> list[Finding]:
-    """Whether this is a rod that points up at rest, with bodies where the configuration has them."""
+    """Return findings on the rod's direction at rest and on the bodies' places on it."""
     if rest is None:
         what = f"no rest of {SHORTEST_REST:g} s in the beginning: how bodies are turned is not known from it"
         return [Finding("warning", "", what)]
@@ -124,14 +129,21 @@ def _judged(bodies: Sequence[Body], rest: tuple[float, float] | None) -> list[Fi
     if where is None:
         return []
     findings = []
-    tip = where[-1]
-    leans = np.arctan2(np.linalg.norm(tip[:2]), tip[2]) if np.linalg.norm(tip) > 0 else 0.0
-    if leans > LEANING:
-        what = (
-            f"at rest the last body is {np.degrees(leans):.0f} degrees from straight above the clamped end: "
-            "another rest, another frame or another robot than the configuration says?"
-        )
+    lean = leans_of(where)
+    leans = float(lean[-1])
+    inner = [k for k, body in enumerate(bodies) if 0.05 < body.fraction < 0.7]
+    straight = bool(inner) and lean[inner[0]] > ALIKE * leans
+    angle = f"at rest the last body is {np.degrees(leans):.0f} degrees from the axis of the clamped end"
+    if leans > BACK or (straight and leans > ASKEW):
+        why = "and the others as well" if straight else "and so points back"
+        what = f"{angle}, {why}: is `rotation`, `origin` or the base in the configuration right?"
         findings.append(Finding("problem", bodies[-1].topic, what))
+    elif leans > LEANING:
+        what = (
+            f"{angle}: the robot sags, is bent or is pulled there. Orientations of bodies are as if it were "
+            "straight, where the configuration does not state a marker's `rotation`"
+        )
+        findings.append(Finding("note", bodies[-1].topic, what))
     lengths = rod_lengths(bodies, where)
     if len(lengths) > 1 and np.ptp(lengths) > UNEQUAL * abs(np.median(lengths)):
         shown = ", ".join(f"{1e3 * length:.0f}" for length in lengths)
@@ -141,6 +153,17 @@ def _judged(bodies: Sequence[Body], rest: tuple[float, float] | None) -> list[Fi
 
 
 def rod_lengths(bodies: Sequence[Body], where: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, " some"]:
-    """The rod's length (m) by each body that is not at the clamped end, from where they are at rest."""
-    pairs = [(body.fraction, position[2]) for body, position in zip(bodies, where, strict=True)]
-    return np.array([height / fraction for fraction, height in pairs if fraction > 0.05])
+    """Return the rod's length (m) estimated from each body away from the clamped end, at rest.
+
+    The length is measured along a circular arc that leaves the clamped end along z and passes through the
+    body, because a robot may sag at rest.
+    """
+    lean = np.minimum(leans_of(where), np.pi / 2)
+    along = np.linalg.norm(where, axis=1) / np.sinc(lean / np.pi)
+    pairs = [(body.fraction, arc) for body, arc in zip(bodies, along, strict=True)]
+    return np.array([arc / fraction for fraction, arc in pairs if fraction > 0.05])
+
+
+def leans_of(where: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, " M"]:
+    """Return the angles (rad) between the z axis and the lines from the clamped end to the positions."""
+    return np.asarray(np.arctan2(np.linalg.norm(where[:, :2], axis=1), where[:, 2]))

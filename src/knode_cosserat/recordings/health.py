@@ -1,4 +1,4 @@
-"""How good a recording is: rates, gaps, noise, how late and how far from commands the tensions are."""
+"""Quality report of a recording: rates, gaps, noise, latency and errors of the tensions."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ from knode_cosserat.recordings.findings import Finding
 from knode_cosserat.recordings.frame import at_rest, rest_positions, rod_lengths
 from knode_cosserat.recordings.recording import Body, Recording, Tensions, period
 
-#: commands that change by less say nothing about how late they act (N)
+#: smallest standard deviation of commands for an estimate of their latency (N)
 QUIET = 0.05
-#: latencies are looked for up to this (s), on times this far apart
+#: range and resolution of the search for a latency (s)
 LONGEST_LATENCY, _FINE = 0.5, 0.002
-#: fewest rows at rest that tell the noise
+#: smallest number of rows for an estimate of the noise
 _ENOUGH = 20
-#: a latency that differs by more from the configuration's is said (s)
+#: smallest difference from the configuration's latency that is reported (s)
 _OFF = 0.03
 _NORMAL = 1.4826
 
 
 @dataclasses.dataclass(frozen=True)
 class StreamHealth:
-    """One topic.
+    """Quality of one topic.
 
     Attributes:
-        topic: its name.
+        topic: name of the topic.
         what: the body's name, or "measured tensions", or "commands".
-        rows: usable rows.
-        rate: usual rows a second (Hz); None for commands, which come when they come.
-        jitter: standard deviation of the time from row to row, without gaps (s); None as above.
-        missing: share of rows that should be there and are not; None as above.
-        gaps: how often rows are missing; None as above.
-        longest_gap: the longest time from row to row (s).
-        delay: how long after its stamp a message was recorded (s); None without stamps.
-        noise: standard deviation of a coordinate (m), or of a tension (N); None if it cannot be told.
-        turn_noise: standard deviation of orientation about an axis (rad); None if there is none.
+        rows: number of usable rows.
+        rate: usual rate of rows (Hz); None for commands, which are irregular.
+        jitter: standard deviation of the time from row to row, without gaps (s); None for commands.
+        missing: fraction of missing rows; None for commands.
+        gaps: number of gaps; None for commands.
+        longest_gap: longest time from row to row (s).
+        delay: median delay from stamp to recording (s); None without stamps.
+        noise: standard deviation of a coordinate (m), or of a tension (N); None if it cannot be estimated.
+        turn_noise: standard deviation of orientation about an axis (rad); None without orientations.
     """
 
     topic: str
@@ -59,12 +59,12 @@ class StreamHealth:
 
 @dataclasses.dataclass(frozen=True)
 class Latency:
-    """How late tensions follow commands.
+    """Latency of tensions after commands.
 
     Attributes:
-        shift: commands this much later are nearest to the measured tensions (s).
-        delay: until anything happens (s), if what then happens is a first-order lag.
-        lag: that lag's time constant (s).
+        shift: delay of commands that fits the measured tensions best (s).
+        delay: dead time of a fitted model with dead time and first-order lag (s).
+        lag: time constant of that lag (s).
     """
 
     shift: float
@@ -73,13 +73,13 @@ class Latency:
 
     @property
     def total(self) -> float:
-        """How late a change of commands has come through, on average (s)."""
+        """Mean delay of a change of commands: dead time plus lag (s)."""
         return self.delay + self.lag
 
 
 @dataclasses.dataclass(frozen=True)
 class TensionError:
-    """Measured less commanded tension of one tendon (N), commands taken as late as they act."""
+    """Measured minus commanded tension of one tendon (N), with commands delayed by their latency."""
 
     tendon: int
     bias: float
@@ -88,18 +88,18 @@ class TensionError:
 
 @dataclasses.dataclass(frozen=True)
 class Health:
-    """A recording's report.
+    """Quality report of a recording.
 
     Attributes:
-        source: what the recording is.
-        simulated: whether the robot was a simulation; None: not stated.
-        duration: how long everything is known (s).
-        rest: from when to when the robot rests (s), or None.
-        rod_length: by each body that is not at the clamped end (m), from the rest; empty without one.
-        streams: by topic.
-        latency: of tensions after commands, or None if that cannot be told.
-        tension_errors: by tendon; empty without both tensions.
-        findings: what was wrong or mended, the gravest first.
+        source: description of the recording.
+        simulated: True if the robot was a simulation; None: not stated.
+        duration: time from the start for which all poses and tensions are known (s).
+        rest: interval in which the robot rests (s), or None.
+        rod_length: estimates (m) from each body away from the clamped end, at rest; empty without a rest.
+        streams: quality of each topic.
+        latency: latency of tensions after commands, or None if it cannot be estimated.
+        tension_errors: errors of each tendon; empty without both tensions.
+        findings: errors and repairs, the gravest first.
     """
 
     source: str
@@ -113,12 +113,12 @@ class Health:
     findings: tuple[Finding, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """The report as JSON can have it."""
+        """Return the report as plain values for JSON."""
         return dataclasses.asdict(self)
 
 
 def health_of(recording: Recording) -> Health:
-    """The report on a recording."""
+    """Return the quality report of a recording."""
     streams = [_of_body(body, recording) for body in (*recording.bodies, recording.base) if body is not None]
     for what, tensions in (("measured tensions", recording.tension), ("commands", recording.command)):
         if tensions is not None:
@@ -146,7 +146,7 @@ def _of_body(body: Body, recording: Recording) -> StreamHealth:
     noise = _noise(body.time, body.position, recording.rest)
     turned = None
     if body.quaternion is not None:
-        # summed up from row to row: small turns, whose differences are those of angles
+        # cumulative sum of small rotations, whose differences are differences of angles
         turns = np.concatenate([np.zeros((1, 3)), np.cumsum(rotation_steps(body.quaternion), axis=0)])
         turned = _noise(body.time, turns, recording.rest)
     return _stream(body.topic, body.name, body.time, recording, noise, turned)
@@ -192,12 +192,12 @@ def _stream(
 def _noise(
     time: Float[np.ndarray, " n"], values: Float[np.ndarray, "n size"], rest: tuple[float, float] | None
 ) -> float | None:
-    """The standard deviation of one number, by what its neighbours do not explain; at rest, if it can be."""
+    """Return the noise's standard deviation from third differences, at rest if possible; None if unknown."""
     still = values[at_rest(time, rest)]
     known = still if len(still) >= _ENOUGH else values
     if len(known) < _ENOUGH:
         return None
-    # third differences leave nothing of a smooth motion; of noise they make √20 as much
+    # third differences remove smooth motion and multiply the noise by √20
     return float(_NORMAL * np.median(np.abs(np.diff(known, 3, axis=0))) / np.sqrt(20.0))
 
 
@@ -205,7 +205,7 @@ def _noise(
 
 
 def latency_of(recording: Recording) -> Latency | None:
-    """How late measured tensions follow commands; None if there are none, or they hardly change."""
+    """Return the latency of measured tensions after commands; None without both, or if they hardly change."""
     tension, command = recording.tension, recording.command
     if tension is None or command is None or len(tension.time) < _ENOUGH:
         return None
@@ -241,7 +241,7 @@ def latency_of(recording: Recording) -> Latency | None:
 
 
 def _followed(command: Tensions, time: Float[np.ndarray, " n"], delay: float, lag: float) -> np.ndarray:
-    """Commands held until the next, so much later, through a first-order lag."""
+    """Return commands, each held until the next, after a delay (s) and a first-order lag (s)."""
     last = np.searchsorted(command.time, time - delay + 1e-9, side="right") - 1
     held = command.tension[np.maximum(last, 0)]
     if lag < 1e-6:

@@ -1,11 +1,13 @@
 """Recordings from files: bags of ROS 1 and 2, CSV and Parquet tables.
 
-What takes long to import (pandas, scipy) is imported where it is used: this module comes with the package.
+Slow imports (pandas, scipy) are deferred, because this module is imported with the package.
 """
 
 from __future__ import annotations
 
+import gzip
 import importlib.resources
+import zlib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -19,23 +21,27 @@ from knode_cosserat.recordings.findings import Finding, RecordingError
 from knode_cosserat.recordings.messages import SIMULATED, Role, Stream, decoded
 from knode_cosserat.recordings.recording import Recording
 
-#: where the package's own recording is
+GZIP_MAGIC = b"\x1f\x8b"
+#: file name of the package's own recording
 EXAMPLE = "sine_1p0.csv"
 
 
 def load_recording(path: str | Path, config: RecordingConfig | None = None) -> Recording:
     """Read a recording: a bag of ROS 1 (.bag, also .bag.active) or ROS 2 (.mcap, .db3, a folder), or a table.
 
-    What the file holds decides, not its name. A bag that was cut, or whose recorder was killed, is read as
-    far as it goes. What was wrong or mended is in the recording's `findings`.
+    A CSV table may be compressed (.csv.gz).
+
+    The content of the file decides its format; the name does only if the first bytes are damaged. A bag
+    that was cut, or whose recorder was killed, is read as far as possible. Errors and repairs are reported
+    in the recording's `findings`.
 
     Args:
         path: the file or folder.
-        config: what its topics or columns mean; None: those of the paper's robot for bags; for tables what
-            their titles and comments say.
+        config: meaning of its topics or columns; None: the paper's robot for bags, and the titles and
+            comments of tables.
 
     Raises:
-        RecordingError: the file cannot be read, or a topic or column is missing or not usable; one line.
+        RecordingError: the file cannot be read, or a topic or column is missing or unusable; one line.
         ImportError: a library for this kind of file is not installed.
     """
     path = Path(path)
@@ -56,9 +62,9 @@ def load_recording(path: str | Path, config: RecordingConfig | None = None) -> R
 
 
 def load_example() -> Recording:
-    """The recording that comes with the package: tensions on sines of 1 s, 16 s long, 20 rows a second.
+    """Return the package's example: sinusoidal tensions of period 1 s, 16 s long, 20 rows per second.
 
-    The robot was a stand-in for the paper's, simulated with PyElastica, and not a physical one.
+    The robot was simulated with PyElastica as a stand-in for the paper's robot; it is not a physical one.
     """
     from knode_cosserat.recordings import table
 
@@ -80,13 +86,16 @@ def _beginning(path: Path) -> bytes:
 
 def _bytes(path: Path) -> bytes:
     try:
-        return path.read_bytes()
+        data = path.read_bytes()
+        return gzip.decompress(data) if data.startswith(GZIP_MAGIC) else data
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        raise RecordingError(f"{path}: cannot be decompressed: {error}") from None
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
 
 
 def _named_bag(path: Path) -> bool:
-    """A bag whose first bytes are damaged is still one."""
+    """True if the name is a bag's: a bag with damaged first bytes is recognised by it."""
     return path.suffix in (".bag", ".mcap", ".db3") or path.name.endswith(".bag.active")
 
 
@@ -98,7 +107,7 @@ def _from_bag(path: Path, begin: bytes, config: RecordingConfig) -> Recording:
 
     wanted = _roles(config)
     container = _container(path, begin, wanted)
-    unused = config.command if config.tensions == "measured" else config.tension
+    unused = config.command if config.tensions == "measured" else config.measured
     found: dict[str, Stream] = {}
     findings: list[Finding] = []
     for name, role in wanted.items():
@@ -110,7 +119,7 @@ def _from_bag(path: Path, begin: bytes, config: RecordingConfig) -> Recording:
             there = ", ".join(sorted(container.topics)) or "none"
             raise RecordingError(f"{path}: topic {name} ({role}) is missing; the bag has {there}")
         found[name] = decoded(topic, container.ros, role, config.command, str(path))
-        # text is in messages as it is
+        # messages contain text verbatim
         if config.simulated is None and any(SIMULATED.encode() in bytes(raw) for raw in topic.raw[:100]):
             config = config.replace(simulated=True)
     if container.damage:
@@ -122,8 +131,8 @@ def _roles(config: RecordingConfig) -> dict[str, Role]:
     roles: dict[str, Role] = {marker.topic: "pose" for marker in config.markers}
     if config.base is not None:
         roles[config.base.topic] = "pose"
-    if config.tension is not None:
-        roles[config.tension.topic] = "tension"
+    if config.measured is not None:
+        roles[config.measured.topic] = "tension"
     if config.command is not None:
         roles[config.command.topic] = "command"
     return roles

@@ -1,40 +1,77 @@
-"""What was measured, row by row at the same times: what models are compared with and learn from."""
+"""Measurements on a common time grid, for training and comparison of models."""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Self
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from knode_cosserat.recordings.findings import RecordingError
 
+if TYPE_CHECKING:
+    from knode_cosserat.trajectory import Trajectory
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Measurements:
-    """Tensions and poses of M bodies at T evenly spaced times.
+    """Tensions or motor angles, and poses of M bodies, at T evenly spaced times.
 
-    In the robot's frame: z up, origin at the clamped end. Where motion capture saw nothing for longer than
-    can be bridged, rows are NaN; `parts` gives the pieces without such rows.
+    Positions are in the robot's frame: z up, origin at the clamped end. Rows in a gap of motion capture that
+    is too long to be bridged are NaN; `parts` returns the pieces without such rows.
     """
 
     #: s, from the recording's start
     time: Float[np.ndarray, " T"]
-    #: N, each row held until the next: row i drives the robot from row i to row i + 1
+    #: tensions (N), held: row i drives the robot from row i to row i + 1 (`held_tension`). For a robot with
+    #: motor-driven tendons: the motor angles (rad) or the wound-up lengths (m)
     tension: Float[np.ndarray, "T tendons"]
-    #: where the bodies sit on the rod, as fractions of its length, from base to tip
+    #: places of the bodies, as fractions of the rod's length, from base to tip
     fractions: Float[np.ndarray, " M"]
-    #: m
+    #: positions of the bodies (m)
     position: Float[np.ndarray, "T M 3"]
-    #: of the rod's frame there, scalar first; NaN for bodies without orientation
+    #: orientation of the rod's local frame, scalar first; NaN for bodies without orientation
     quaternion: Float[np.ndarray, "T M 4"]
-    #: False where a pose is bridged from what was seen before and after
+    #: False where a pose is interpolated across a gap
     measured: Bool[np.ndarray, "T M"]
-    #: whether the robot was itself a simulation; None: not stated
+    #: True if the robot was itself a simulation; None: not stated
     simulated: bool | None
-    #: what the recording is and where it comes from
+    #: description and origin of the recording
     source: str
+    #: tensions before the first row (N): the mean over the preceding rest, if there is one; None: unknown
+    initial_tension: Float[np.ndarray, " tendons"] | None = None
+    #: True if each row is a separate equilibrium under its tensions, not part of a motion
+    static: bool = False
+
+    @classmethod
+    def of(cls, trajectory: Trajectory, fractions: Sequence[float] = (1.0,)) -> Self:
+        """Return noise-free measurements of a trajectory of one robot.
+
+        Args:
+            trajectory: a whole trajectory, or consecutive rows; the robot is driven by tensions.
+            fractions: places of the bodies, as fractions of the rod's length, from base to tip.
+
+        Raises:
+            KeyError: the robot is not driven by tensions.
+            ValueError: the trajectory is a batch, or its rows are further apart than the time steps.
+        """
+        from knode_cosserat.recordings.exchange import measured
+
+        return cls(**measured(trajectory, fractions))
+
+    def save(self, path: str | Path) -> None:
+        """Write a table (.csv, .parquet) for `load_recording`; see `exchange.save`."""
+        from knode_cosserat.recordings import exchange
+
+        exchange.save(self, path)
+
+    @property
+    def held_tension(self) -> Float[np.ndarray, "T tendons"]:
+        """`tension` (N), held from row i to row i + 1, as `Trajectory.held_tension`."""
+        return self.tension
 
     @property
     def tip_position(self) -> Float[np.ndarray, "T 3"]:
@@ -43,7 +80,7 @@ class Measurements:
 
     @property
     def dt(self) -> float:
-        """Time from row to row (s). Raises `RecordingError` if there is but one row."""
+        """Time from row to row (s). Raises `RecordingError` if there are fewer than two rows."""
         if len(self.time) < 2:
             raise RecordingError(f"{self.source}: one row has no time step")
         dt = float(self.time[-1] - self.time[0]) / (len(self.time) - 1)
@@ -51,12 +88,12 @@ class Measurements:
 
     @property
     def complete(self) -> Bool[np.ndarray, " T"]:
-        """Which rows have tensions and the positions of all bodies."""
+        """Mask of the rows with tensions and the positions of all bodies."""
         known = np.isfinite(self.tension).all(axis=1) & np.isfinite(self.position).all(axis=(1, 2))
         return np.asarray(known)
 
     def between(self, start: float, end: float) -> Self:
-        """The rows from time `start` (s) on, before time `end`. Raises `RecordingError` if there are none."""
+        """Return the rows from time `start` (s) to before time `end`. Raises `RecordingError` if none."""
         first, last = np.searchsorted(self.time, np.array([start, end]) - 1e-9)
         if first >= last:
             there = f"from {self.time[0]:g} to {self.time[-1]:g} s" if len(self.time) else "none at all"
@@ -66,15 +103,18 @@ class Measurements:
         return self.rows(int(first), int(last))
 
     def rows(self, first: int, last: int) -> Self:
-        """The rows from number `first` on, before number `last`."""
+        """Return the rows from index `first` to before index `last`."""
         names = ("time", "tension", "position", "quaternion", "measured")
-        return dataclasses.replace(self, **{name: getattr(self, name)[first:last] for name in names})
+        changes: dict[str, Any] = {name: getattr(self, name)[first:last] for name in names}
+        if first:
+            changes["initial_tension"] = None
+        return dataclasses.replace(self, **changes)
 
     def parts(self, shortest: float = 0.0) -> list[Self]:
-        """The longest pieces without a row that is not complete.
+        """Return the longest pieces with complete rows only.
 
         Args:
-            shortest: pieces that take less time are left out (s); a piece has two rows at least.
+            shortest: shorter pieces are left out (s); a piece has at least two rows.
         """
         known = np.concatenate([[False], self.complete, [False]])
         ends = np.flatnonzero(known[1:] != known[:-1]).reshape(-1, 2)

@@ -1,7 +1,7 @@
-"""Messages of ROS to numbers, and back: which types can hold poses, tensions and commands, and where.
+"""Conversion of ROS messages to numbers: the types for poses, tensions and commands, and their fields.
 
-Messages are understood by the definitions that come with rosbags. Those in a bag are not used: rosbags turns
-definitions into Python code.
+Messages are decoded with the definitions of rosbags. Definitions in a bag are not used, because rosbags
+turns definitions into Python code.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from knode_cosserat.recordings.config import PLACE, CommandSource
+from knode_cosserat.recordings.config import CommandSource
+from knode_cosserat.recordings.config_values import PLACE
 from knode_cosserat.recordings.container import Topic
 from knode_cosserat.recordings.findings import RecordingError
 
@@ -23,16 +24,16 @@ Role = Literal["pose", "tension", "command"]
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Stream:
-    """Numbers of one topic as they were recorded, in the units and the order of its messages."""
+    """Numbers of one topic, in the units and the order of its messages."""
 
     topic: str
-    #: when each was measured, by its header (ns); -1 where none says so
+    #: measurement times from the headers (ns); -1 without a stamp
     stamped: Int[np.ndarray, " n"]
-    #: when each was recorded (ns)
+    #: recording times (ns)
     received: Int[np.ndarray, " n"]
-    #: poses: position and, if known, quaternion, scalar first; tensions
+    #: poses (position and, if known, quaternion, scalar first) or tensions
     values: Float[np.ndarray, "n size"]
-    #: messages that could not be understood
+    #: number of messages that could not be decoded
     broken: int = 0
 
 
@@ -48,13 +49,13 @@ def _transform(m: Any) -> tuple[float, ...]:
     return *_xyz(m.transform.translation), *_wxyz(m.transform.rotation)
 
 
-#: by message type, a pose in it
+#: reader of a pose, by message type
 POSES: dict[str, Callable[[Any], Any]] = {
     "geometry_msgs/msg/PoseStamped": lambda m: (*_xyz(m.pose.position), *_wxyz(m.pose.orientation)),
     "geometry_msgs/msg/TransformStamped": _transform,
     "geometry_msgs/msg/PointStamped": lambda m: _xyz(m.point),
 }
-#: by message type, the numbers in it in the order of its fields
+#: reader of the numbers in the order of the fields, by message type
 NUMBERS: dict[str, Callable[[Any], Any]] = {
     "geometry_msgs/msg/QuaternionStamped": lambda m: (*_xyz(m.quaternion), m.quaternion.w),
     "geometry_msgs/msg/Vector3Stamped": lambda m: _xyz(m.vector),
@@ -62,9 +63,9 @@ NUMBERS: dict[str, Callable[[Any], Any]] = {
     "std_msgs/msg/Float32MultiArray": lambda m: m.data,
     "sensor_msgs/msg/JointState": lambda m: m.effort,
 }
-#: what a line of a log says where the robot of a recording was itself simulated
+#: line of a log that marks a recording of a simulated robot
 SIMULATED = "Simulated: the robot of this recording is a simulation, and not a physical one"
-#: by message type, the text in it
+#: reader of the text, by message type
 TEXTS: dict[str, Callable[[Any], str]] = {
     "rosgraph_msgs/msg/Log": lambda m: m.msg,
     "rcl_interfaces/msg/Log": lambda m: m.msg,
@@ -74,7 +75,7 @@ TEXTS: dict[str, Callable[[Any], str]] = {
 
 @functools.cache
 def typestore(ros: int) -> Any:
-    """The standard message types of ROS 1 or 2. Raises `ImportError`, saying how to install rosbags."""
+    """Return the standard message types of ROS 1 or 2. Raises `ImportError` without rosbags."""
     try:
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
@@ -83,10 +84,10 @@ def typestore(ros: int) -> Any:
 
 
 def decoded(topic: Topic, ros: int, role: Role, command: CommandSource | None, source: str) -> Stream:
-    """The numbers in a topic's messages; messages that cannot be understood are left out and counted.
+    """Return the numbers in a topic's messages; messages that cannot be decoded are left out and counted.
 
     Raises:
-        RecordingError: the type of its messages is not one for this role.
+        RecordingError: the topic's message type is not allowed for this role.
     """
     text = command.text if role == "command" and command is not None else None
     readers = _readers(role, text)
@@ -105,7 +106,7 @@ def decoded(topic: Topic, ros: int, role: Role, command: CommandSource | None, s
     rows: list[tuple[int, int, Any]] = []
     broken = 0
     for received, raw in zip(topic.received, topic.raw, strict=True):
-        # rosbags meets damaged bytes with whatever error they lead to
+        # rosbags raises various errors on damaged bytes
         try:
             message = deserialize(raw, topic.type)
             found = read(message)
@@ -126,7 +127,7 @@ def _readers(role: Role, text: str | None) -> dict[str, Callable[[Any], Any]]:
 
 
 def _spoken(read: Callable[[Any], str], text: str, message: Any) -> tuple[float, ...] | None:
-    """The numbers in a message of text; None if it says something else."""
+    """Return the numbers in a text message; None if the text does not match the template."""
     before, after = text.split(PLACE)
     said = read(message).strip()
     before, after = before.strip(), after.strip()
@@ -136,7 +137,7 @@ def _spoken(read: Callable[[Any], str], text: str, message: Any) -> tuple[float,
 
 
 def _stream(topic: str, rows: list[tuple[int, int, Any]], broken: int) -> Stream:
-    """Rows as arrays; those with another count of numbers than most are broken too."""
+    """Return rows as arrays; rows whose size differs from most are counted as broken."""
     counts = [len(values) for _, _, values in rows]
     size = max(set(counts), key=counts.count) if counts else 0
     kept = [row for row in rows if len(row[2]) == size]

@@ -1,13 +1,12 @@
 """NumPy arrays from a pickle, read without running any code of the file.
 
-A pickle is a program for a small machine, and it may call any function that it can name. Three measures keep
-it to data:
+A pickle is a program that may call any function by name. Three measures restrict it to data:
 
-- Names are looked up in a table of this module. It has NumPy's constructors of arrays and nothing else. Its
-  entries are stand-ins: they take the arguments that NumPy's own functions would get, and check them.
-- The program is scanned before it runs (`pickletools`): its pieces must lie within the file, and it may not
-  ask for more memory than the file has bytes.
-- An array's bytes must be as many as its shape and number format say. Objects, records, texts and scalars of
+- Names are looked up in a table of this module. The table has NumPy's constructors of arrays only. Its
+  entries are stand-ins that take the arguments of NumPy's own functions and check them.
+- The program is scanned before it runs (`pickletools`): its pieces must lie within the file, and its memory
+  must not exceed the file's size by more than a fixed allowance.
+- The size of an array's data must match its shape and number format. Objects, records, texts and scalars of
   NumPy are refused.
 
 The result is an array of float64, made from arrays and nested lists or tuples of them.
@@ -26,18 +25,18 @@ from jaxtyping import Float
 
 from knode_cosserat.recordings.findings import RecordingError
 
-#: largest file (bytes), and numbers in it
+#: largest size of a file (bytes), and largest count of numbers in it
 LARGEST_FILE, MOST_NUMBERS = 1 << 28, 1 << 27
-#: lists within lists, at most
+#: largest depth of nested lists
 DEEPEST = 6
 #: number formats of arrays, as NumPy's pickles name them
 FORMATS = ("f2", "f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")
-#: memory that a short pickle may ask for beyond its own size (places of its memory)
+#: memory slots that a pickle may use beyond its own size
 SPARE_PLACES = 1 << 16
 
 
 class _RefusedError(Exception):
-    """Content that is not an array of numbers."""
+    """Error for content that is not an array of numbers."""
 
 
 class _Format:
@@ -57,12 +56,12 @@ class _Format:
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """The format itself."""
+        """Number format as a NumPy dtype."""
         return np.dtype(self.order.replace("|", "<") + self.code)
 
 
 class _ArrayClass:
-    """Stand-in for the class `numpy.ndarray`, which pickles name but do not call."""
+    """Stand-in for the class `numpy.ndarray`; pickles name it but do not call it."""
 
     def __init__(self, *_: Any):
         raise _RefusedError("an array made by its class")
@@ -72,7 +71,7 @@ class _ArrayClass:
 
 
 class _Array:
-    """Stand-in for `numpy.core.multiarray._reconstruct`: an array that is filled by its state."""
+    """Stand-in for `numpy.core.multiarray._reconstruct`: an array filled by its state."""
 
     values: np.ndarray[Any, Any] | None = None
 
@@ -98,7 +97,7 @@ class _Buffer:
 
 
 class _Encoded(bytes):
-    """Stand-in for `_codecs.encode`, by which old protocols write bytes as a text."""
+    """Stand-in for `_codecs.encode`: old protocols write bytes as text."""
 
     def __new__(cls, text: Any, encoding: Any = "latin1") -> _Encoded:
         if not isinstance(text, str) or encoding != "latin1":
@@ -119,7 +118,7 @@ _NAMES: dict[tuple[str, str], type] = {
 
 
 class _Reader(pickle.Unpickler):
-    """An unpickler that knows the names of the table only."""
+    """Unpickler restricted to the names in the table."""
 
     def find_class(self, module: str, name: str) -> Any:
         found = _NAMES.get((module, name))
@@ -131,11 +130,11 @@ class _Reader(pickle.Unpickler):
 def read_pickled_array(path: str | Path) -> Float[np.ndarray, "..."]:
     """Return the numbers of a pickle as one array, without running any code of the file.
 
-    Accepted are arrays of real numbers, and lists or tuples (nested up to 6 deep) of arrays or numbers that
+    Arrays of real numbers are accepted, and lists or tuples (nested up to 6 deep) of arrays or numbers that
     form one array, in any protocol.
 
     Raises:
-        RecordingError: the file is no pickle of that; one line with the reason.
+        RecordingError: the file is not such a pickle; the message is one line with the reason.
         OSError: the file cannot be read.
     """
     path = Path(path)
@@ -150,7 +149,7 @@ def read_pickled_array(path: str | Path) -> Float[np.ndarray, "..."]:
         return np.asarray(values, dtype=float)
     except _RefusedError as error:
         raise RecordingError(f"{path}: the pickle holds {error}; {accepted}") from None
-    # the machine of pickles fails in many ways on a damaged program
+    # the unpickler raises various errors on a damaged program
     except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise RecordingError(f"{path}: not a pickle of arrays ({reason[:120]}); {accepted}") from None
@@ -167,7 +166,7 @@ def _scan(data: bytes) -> None:
 
 
 def _filled(raw: Any, kind: Any, shape: Any, order: Any) -> np.ndarray[Any, Any]:
-    """An array from its bytes, if they are as many as shape and format say."""
+    """Return an array from its bytes after checking their number against shape and format."""
     if not isinstance(raw, bytes | bytearray) or not isinstance(kind, _Format):
         raise _RefusedError("an array of objects")
     if isinstance(shape, int):
@@ -183,7 +182,7 @@ def _filled(raw: Any, kind: Any, shape: Any, order: Any) -> np.ndarray[Any, Any]
 
 
 def _numbers(given: Any, left: list[int], depth: int) -> Any:
-    """Arrays and numbers in nested lists; `left` counts down the numbers that are still accepted."""
+    """Return arrays and numbers in nested lists; `left` counts down the remaining allowance of numbers."""
     values: np.ndarray[Any, Any] | None = None
     if isinstance(given, _Array | _Buffer):
         values = given.values

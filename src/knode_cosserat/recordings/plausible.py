@@ -1,4 +1,4 @@
-"""Whether tensions and positions can be in the units that the configuration says."""
+"""Plausibility check of the units of tensions and positions."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from knode_cosserat.recordings.findings import Finding
 from knode_cosserat.recordings.frame import rest_positions
 from knode_cosserat.recordings.recording import Body, Tensions
 
-#: tensions of a tendon robot are between these (N)
+#: plausible range of a tendon robot's tensions (N)
 SLACK, STRONG = 0.12, 120.0
-#: rods are between these (m)
+#: plausible range of a rod's length (m)
 SHORT, LONG = 0.02, 20.0
-#: measured and commanded tensions that differ by such a factor are not in the same unit
+#: largest plausible ratio of measured to commanded tensions, or the inverse
 FACTOR = 20.0
 
 
@@ -24,7 +24,7 @@ def units_doubted(
     command: Tensions | None,
     rest: tuple[float, float] | None,
 ) -> list[Finding]:
-    """What is doubtful about the units, with the unit that is the likely one."""
+    """Return findings on implausible units, with the likely error."""
     findings = []
     sizes = []
     for stream in (tension, command):

@@ -1,4 +1,4 @@
-"""Recordings: what sensors saw, each at its own rate, cleaned, in SI units and in the robot's frame."""
+"""Recordings: cleaned sensor data, each stream at its own rate, in SI units and in the robot's frame."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from knode_cosserat.recordings.measurements import Measurements
 if TYPE_CHECKING:
     from knode_cosserat.recordings.health import Health
 
-#: more rows than this are a mistake, and not a recording
+#: largest number of rows of a grid: more rows are a mistake
 MOST_ROWS = 10_000_000
-#: stamps are exact to a microsecond at best
+#: tolerance of stamps (s)
 _SAME = 1e-6
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Body:
-    """Poses of a body that motion capture saw, at the times of its frames.
+    """Poses of a body from motion capture, at the times of its frames.
 
     Attributes:
-        name: what reports call it.
-        topic: where it was recorded.
-        fraction: where it sits on the rod; NaN for the base.
-        time: from the recording's start, rising (s).
-        position: in the robot's frame (m).
-        quaternion: of the rod's frame there, scalar first; None if it is not known.
+        name: name in reports.
+        topic: topic of its poses.
+        fraction: its place on the rod, as a fraction of the length; NaN for the base.
+        time: times from the recording's start, increasing (s).
+        position: positions in the robot's frame (m).
+        quaternion: orientations of the rod's local frame, scalar first; None if unknown.
     """
 
     name: str
@@ -47,7 +47,7 @@ class Body:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Tensions:
-    """Tensions of all tendons (N), tendon 1 first, at the times of their messages (s)."""
+    """Tensions of all tendons (N), or angles (rad) or lengths (m) of all motors, in order, at their times."""
 
     topic: str
     time: Float[np.ndarray, " n"]
@@ -56,22 +56,22 @@ class Tensions:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Recording:
-    """A recording as `load_recording` reads it.
+    """Recording of a robot, as read by `load_recording`.
 
-    Times are seconds from the first pose or tension on. Positions are in the robot's frame: z up, origin at
-    the clamped end. Frames that were lost are not there; `sampled` bridges them.
+    Times are seconds from the first pose or tension. Positions are in the robot's frame: z up, origin at
+    the clamped end. Lost frames are absent; `sampled` bridges them.
 
     Attributes:
-        source: what the recording is and where it comes from.
-        config: what it was read by.
-        bodies: on the rod, from base to tip.
-        base: the body that tells where the clamped end is, or None.
-        tension: as measured, or None.
-        command: as commanded, or None.
-        rest: from when to when the robot rests (s), or None if it never does.
-        simulated: whether the robot was itself a simulation; None: not stated.
-        findings: what was wrong or mended, the gravest first.
-        delays: by topic, how long after its stamp a message was recorded (s, the median); NaN without stamps.
+        source: description and origin of the recording.
+        config: configuration of its topics or columns.
+        bodies: bodies on the rod, from base to tip.
+        base: body that locates the clamped end, or None.
+        tension: measured tensions, or None.
+        command: commanded tensions, or None.
+        rest: interval in which the robot rests (s), or None.
+        simulated: True if the robot was itself a simulation; None: not stated.
+        findings: errors and repairs, the gravest first.
+        delays: median delay from stamp to recording (s) by topic; NaN without stamps.
     """
 
     source: str
@@ -87,16 +87,22 @@ class Recording:
 
     @property
     def tendons(self) -> int:
-        """How many tendons there are."""
+        """Number of tendons."""
         return self.config.tendons
 
     @property
     def end(self) -> float:
-        """When the first of the poses and tensions ends, and so everything is known (s)."""
+        """End of the first stream to end (s): until then all poses and tensions are known."""
         driver = self._driver(self.config.tensions)
         ends = [body.time[-1] for body in self.bodies]
+        if driver is self.tension:
+            ends.append(driver.time[-1] + (period(driver.time) if self._is_held(driver) else 0.0))
         # a command holds until the next
-        return float(min([*ends, driver.time[-1]] if driver is self.tension else ends))
+        return float(min(ends))
+
+    def _is_held(self, driver: Tensions) -> bool:
+        """True if each tension acts unchanged until the next one."""
+        return driver is self.command or bool(self.config.tension and self.config.tension.held)
 
     def sampled(
         self,
@@ -107,39 +113,45 @@ class Recording:
         *,
         mean: bool = False,
     ) -> Measurements:
-        """The measurements at the times `start`, `start + dt` and so on, up to `end` (s).
+        """Return the measurements at the times `start`, `start + dt` and so on, up to `end` (s).
 
-        Tensions are the last ones at or before a row's time (zero-order hold), commanded ones as of their
-        latency before. Poses are interpolated: positions by cubic splines, orientations on the shortest way.
-        A pause between frames is bridged up to the configuration's `longest_gap`, or to one and a half of the
-        stream's usual period if that is longer; rows in a longer one are NaN.
+        Tensions are the last ones at or before a row's time (zero-order hold); commands and motor angles are
+        delayed by their latency. Positions are interpolated by cubic splines, orientations by spherical
+        linear interpolation. A gap between frames is bridged up to the configuration's `longest_gap`, or up
+        to 1.5 usual periods of the stream if that is longer; rows in a longer gap are NaN.
 
         Args:
-            dt: from row to row (s).
-            start: the first row; None: where the configuration's `trim` begins, or the recording.
-            end: the last row at most; None: where the `trim` or the first stream ends.
-            tensions: which ones; None: what the configuration says.
-            mean: tensions are means from each row to the next instead, of measured ones on the lines between
-                messages: what a simulation with a fine time step should be driven by. Rows that reach into a
-                pause that is not bridged are NaN.
+            dt: time from row to row (s); a recording of equilibria keeps its own rows.
+            start: time of the first row (s); None: start of the configuration's `trim` or of the recording.
+            end: latest time of the last row (s); None: end of the `trim` or of the first stream to end.
+            tensions: "measured" or "commanded"; None: the configuration's choice.
+            mean: True to average the tensions over dt. Held tensions are averaged from each row to the
+                next. Other tensions are interpolated linearly and averaged about the next row, because
+                an implicit time step is driven by the tension at its end. Rows that reach into a gap too
+                long to be bridged are NaN.
 
         Raises:
             RecordingError: there are no such tensions or no such rows.
         """
         driver = self._driver(tensions or self.config.tensions)
-        time = self._grid(dt, start, end)
+        time = self._own_rows(driver, start, end) if self.config.static else self._grid(dt, start, end)
         bridged = self.config.longest_gap
         latency = 0.0
         if driver is self.command and self.config.command is not None:
             latency = self.config.command.latency
+        elif driver is self.tension and self.config.motors is not None:
+            latency = self.config.motors.latency
         longest = bridged if driver is self.tension else math.inf
         held = _held(driver, time - latency, longest)
-        if mean:
-            straight = bridge(driver.time, bridged) if driver is self.tension else 0.0
-            # the last row's goes on for as long as the last message holds
-            until = _held(driver, np.minimum(time - latency + dt, max(driver.time[-1], time[-1])), longest)
-            known = np.isfinite(held) & np.isfinite(until)
-            held = np.where(known, _averaged(driver, time - latency, dt, straight), np.nan)
+        if mean and not self.config.static:
+            is_held = self._is_held(driver)
+            straight = 0.0 if is_held else bridge(driver.time, bridged)
+            begin = time - latency + (0.0 if is_held else 0.5 * dt)
+            # the last row's interval is limited to the duration of the last message
+            until = _held(driver, np.minimum(begin + dt, max(driver.time[-1], time[-1])), longest)
+            known = np.isfinite(_held(driver, np.minimum(begin, max(driver.time[-1], time[-1])), longest))
+            known &= np.isfinite(until)
+            held = np.where(known, _averaged(driver, begin, dt, straight), np.nan)
         poses = [_interpolated(body, time, bridged) for body in self.bodies]
         return Measurements(
             time=time,
@@ -150,10 +162,23 @@ class Recording:
             measured=np.stack([measured for _, _, measured in poses], axis=1),
             simulated=self.simulated,
             source=self.source,
+            initial_tension=self._initial_tension(driver, float(time[0]) - latency, longest),
+            static=self.config.static,
         )
 
+    def _initial_tension(self, driver: Tensions, at: float, longest: float) -> Float[np.ndarray, " c"] | None:
+        """Return the tension (N) before a time: the stated one, the mean over the rest, or the held one."""
+        if self.config.initial_tension is not None and at <= driver.time[0] + _SAME:
+            return np.array(self.config.initial_tension)
+        if self.rest is not None and self.rest[0] <= at <= self.rest[1]:
+            resting = (driver.time >= self.rest[0] - _SAME) & (driver.time <= at + _SAME)
+            if resting.any():
+                return np.asarray(driver.tension[resting].mean(axis=0))
+        held = _held(driver, np.array([at]), longest)[0]
+        return held if np.all(np.isfinite(held)) else None
+
     def health(self) -> Health:
-        """The report on this recording: rates, gaps, noise, latency, tension errors and findings."""
+        """Return the quality report: rates, gaps, noise, latency, tension errors and findings."""
         from knode_cosserat.recordings.health import health_of
 
         return health_of(self)
@@ -166,11 +191,19 @@ class Recording:
             raise RecordingError(f"{self.source}: there are no {kind} tensions")
         return driver
 
+    def _own_rows(self, driver: Tensions, start: float | None, end: float | None) -> Float[np.ndarray, " T"]:
+        """Return the times of the rows of equilibria (s)."""
+        low, high = -math.inf if start is None else start, math.inf if end is None else end
+        time = driver.time[(driver.time >= low - _SAME) & (driver.time <= high + _SAME)]
+        if not len(time):
+            raise RecordingError(f"{self.source}: no rows from {start} to {end} s")
+        return time
+
     def _grid(self, dt: float, start: float | None, end: float | None) -> Float[np.ndarray, " T"]:
         trim = self.config.trim
         start = start if start is not None else trim[0]
         if start is None:
-            # a frame that was lost in the beginning is no reason to begin later
+            # a lost frame at the beginning does not delay the first row
             first = max(body.time[0] for body in self.bodies) - self.config.longest_gap
             start = max(0.0, math.ceil(first / dt - _SAME) * dt) if dt > 0 else 0.0
         last = min([self.end, *(limit for limit in (end, trim[1]) if limit is not None)])
@@ -188,18 +221,18 @@ class Recording:
 
 
 def bridge(time: Float[np.ndarray, " n"], longest: float) -> float:
-    """The longest pause between rows of a stream that is bridged (s)."""
+    """Return the longest gap between rows of a stream that is bridged (s)."""
     return max(longest, 1.5 * period(time)) + _SAME
 
 
 def period(time: Float[np.ndarray, " n"]) -> float:
-    """The usual time from row to row (s); zero for fewer than two rows."""
+    """Return the median time from row to row (s); zero for fewer than two rows."""
     return float(np.median(np.diff(time))) if len(time) > 1 else 0.0
 
 
 def _held(driver: Tensions, time: Float[np.ndarray, " T"], longest: float) -> Float[np.ndarray, "T tendons"]:
     last = np.searchsorted(driver.time, time + _SAME, side="right") - 1
-    # before the first, that one, if it is near
+    # before the first message its tension is used, if it is near
     age = time - driver.time[np.maximum(last, 0)]
     old = np.abs(age) > bridge(driver.time, longest)
     return np.where(old[:, None], np.nan, driver.tension[np.maximum(last, 0)])
@@ -208,7 +241,10 @@ def _held(driver: Tensions, time: Float[np.ndarray, " T"], longest: float) -> Fl
 def _averaged(
     driver: Tensions, time: Float[np.ndarray, " T"], dt: float, straight: float
 ) -> Float[np.ndarray, "T tendons"]:
-    """Means from each time to `dt` later: on lines between messages up to `straight` (s) apart, else held."""
+    """Return means from each time to `dt` later.
+
+    Tensions are interpolated linearly between messages up to `straight` (s) apart, otherwise held.
+    """
     known, values = driver.time, driver.tension
     steps = np.diff(known)[:, None]
     rises = np.where(steps <= straight, np.diff(values, axis=0) / np.maximum(steps, _SAME), 0.0)
@@ -221,7 +257,7 @@ def _averaged(
         since = (inside - known[last])[:, None]
         rise = rises[last] if len(known) > 1 else 0.0
         whole = integral[last] + since * (values[last] + 0.5 * since * rise)
-        # before the first and after the last, those
+        # constant before the first and after the last message
         return np.asarray(
             whole + (at - inside)[:, None] * np.where(at[:, None] < known[0], values[0], values[-1])
         )
@@ -232,13 +268,13 @@ def _averaged(
 def _interpolated(
     body: Body, time: Float[np.ndarray, " T"], longest: float
 ) -> tuple[Float[np.ndarray, "T 3"], Float[np.ndarray, "T 4"], Bool[np.ndarray, " T"]]:
-    """Positions, orientations, and which of them are not bridged."""
+    """Return positions, orientations, and a mask of the rows that are not bridged."""
     seen = body.time
     position, quaternion = np.full((len(time), 3), np.nan), np.full((len(time), 4), np.nan)
     limit = bridge(seen, longest)
     for first, last in _runs(seen, limit):
         reach = limit if first == 0 else _SAME
-        # before the first frame of all: as in that one
+        # before the very first frame its pose is used
         inside = (time >= seen[first] - reach) & (time <= seen[last - 1] + _SAME)
         at = np.clip(time[inside], seen[first], seen[last - 1])
         position[inside] = _curve(seen[first:last], body.position[first:last], at)
@@ -252,7 +288,7 @@ def _interpolated(
 
 
 def _runs(time: Float[np.ndarray, " n"], limit: float) -> list[tuple[int, int]]:
-    """First and last (exclusive) rows of the pieces without a longer pause."""
+    """Return the first and last (exclusive) rows of the pieces without a gap longer than `limit`."""
     breaks = np.flatnonzero(np.diff(time) > limit) + 1
     ends = [0, *breaks.tolist(), len(time)]
     return [(first, last) for first, last in itertools.pairwise(ends) if last > first]
@@ -276,7 +312,7 @@ def _turned(
     if len(time) == 1 or len(at) == 0:
         return np.broadcast_to(quaternion[0], (len(at), 4))
     turned = Slerp(time, Rotation.from_quat(quaternion, scalar_first=True))(at).as_quat(scalar_first=True)
-    # of the two quaternions of a rotation, the one that goes on from row to row
+    # q and -q are the same rotation: choose the sign that is continuous from row to row
     flips = np.cumprod(np.where(np.sum(turned[1:] * turned[:-1], axis=1) < 0.0, -1.0, 1.0))
     sign = 1.0 if turned[0, 0] >= 0.0 else -1.0
     return np.asarray(turned * sign * np.concatenate([[1.0], flips])[:, None])

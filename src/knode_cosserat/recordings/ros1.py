@@ -1,7 +1,7 @@
-"""Bags of ROS 1, record by record (bag format 2.0), as far as they go.
+"""Reader of ROS 1 bags (bag format 2.0), record by record, as far as they are readable.
 
-The index at a bag's end is not used: a recorder that was killed has not written it. Records are taken one
-after the other, those in chunks without compression too; where none can be read, the next one is searched.
+The index at a bag's end is not used: a recorder that was killed has not written it. Records are read one
+after the other, also those in uncompressed chunks. After an unreadable byte the next record is searched.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from knode_cosserat.recordings.findings import RecordingError
 
 MAGIC = b"#ROSBAG V"
 VERSION = b"#ROSBAG V2.0\n"
-#: the kinds of records
+#: record types
 MESSAGE, BAG, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07
 KINDS = (MESSAGE, BAG, INDEX, CHUNK, CHUNK_INFO, CONNECTION)
-#: a header field that every record has, up to its value
+#: start of the header field `op`, which every record has
 _KIND_FIELD = b"\x04\x00\x00\x00op="
-#: no header is longer; a number that says so is an error
+#: largest length of a header (bytes): a larger stated length is an error
 _LONGEST_HEADER = 1 << 16
 _length = struct.Struct("<I").unpack_from
 _stamp = struct.Struct("<II").unpack
@@ -29,16 +29,16 @@ _stamp = struct.Struct("<II").unpack
 class _Record(NamedTuple):
     kind: int
     fields: dict[bytes, bytes]
-    #: where its data begin, and where they should end
+    #: start and expected end of its data
     begin: int
     end: int
 
 
 def read_ros1(data: bytes, wanted: Collection[str], source: str) -> Container:
-    """The messages of the wanted topics, and the names and types of all.
+    """Return the messages of the wanted topics, and the names and types of all topics.
 
     Raises:
-        RecordingError: it is a bag of another version, or nothing in it can be read.
+        RecordingError: the bag has another version, or nothing in it can be read.
     """
     if data.startswith(MAGIC) and not data.startswith(VERSION):
         version = data[len(MAGIC) :].split(b"\n", 1)[0][:20]
@@ -55,7 +55,7 @@ def read_ros1(data: bytes, wanted: Collection[str], source: str) -> Container:
 
 
 class _Bag:
-    """What has been read so far: messages by their connection, whose topic may be known only later."""
+    """Messages read so far, by connection; a connection's topic may be known only later."""
 
     def __init__(self, data: bytes, wanted: Collection[str]) -> None:
         self.size = len(data)
@@ -106,14 +106,14 @@ class _Bag:
         texts = (
             part.decode("utf-8", "replace") for part in (topic, fields[b"type"], fields.get(b"md5sum", b""))
         )
-        # the first that can be read: the same one comes again in the index
+        # keep the first readable one: the index repeats it
         self.connections.setdefault(int.from_bytes(number, "little"), tuple(texts))  # type: ignore[arg-type]
 
     def _chunk(self, view: memoryview, record: _Record) -> int:
-        """Take what is in a chunk; where the next record is."""
+        """Read a chunk and return the position of the next record."""
         compression = record.fields.get(b"compression", b"").decode("ascii", "replace")
         if compression == "none":
-            # its records come next; its length is not trusted
+            # its records follow directly; its stated length is not trusted
             return record.begin
         # a recorder that was killed has not yet written how long its last chunk is
         known = record.begin < record.end <= len(view)
@@ -146,7 +146,7 @@ class _Bag:
 
 
 def _record(data: bytes, position: int) -> _Record | None:
-    """The record that begins at a position, or None if there is none."""
+    """Return the record at a position, or None if there is none."""
     if position + 4 > len(data):
         return None
     (length,) = _length(data, position)
@@ -161,14 +161,14 @@ def _record(data: bytes, position: int) -> _Record | None:
         return None
     (size,) = _length(data, begin)
     end = begin + 4 + size
-    # only a chunk is read in part
+    # only a chunk may be read partly
     if end > len(data) and kind[0] != CHUNK:
         return None
     return _Record(kind[0], fields, begin + 4, end)
 
 
 def _fields(data: bytes, position: int, end: int) -> dict[bytes, bytes] | None:
-    """The named fields from a position on that fill the bytes up to `end`, or None if they do not."""
+    """Return the named fields between `position` and `end`, or None if they do not fill these bytes."""
     fields: dict[bytes, bytes] = {}
     while position + 4 <= end:
         (length,) = _length(data, position)
@@ -184,10 +184,10 @@ def _fields(data: bytes, position: int, end: int) -> dict[bytes, bytes] | None:
 
 
 def _next_record(data: bytes, position: int) -> int:
-    """Where the next record begins, from a position on; the end of the data if there is none."""
+    """Return the start of the next record from a position on; the end of the data if there is none."""
     mark = data.find(_KIND_FIELD, position)
     while mark >= 0:
-        # fields may stand before the kind: how many is not known, but their lengths have to fit
+        # an unknown number of fields may precede the type, but their lengths must fit
         for begin in range(max(position, mark - 80), mark - 3):
             (length,) = _length(data, begin)
             if mark - begin <= length <= 4096 and _record(data, begin) is not None:

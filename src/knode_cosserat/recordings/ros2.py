@@ -1,4 +1,4 @@
-"""Bags of ROS 2: MCAP files, SQLite files (.db3) and the folders that hold them, as far as they go.
+"""Reader of ROS 2 bags: MCAP files, SQLite files (.db3) and folders of these, as far as they are readable.
 
 Neither the summary at an MCAP file's end nor a folder's metadata.yaml is needed: a recorder that was killed
 has not written them.
@@ -17,16 +17,16 @@ from knode_cosserat.recordings.findings import RecordingError
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 SQLITE_MAGIC = b"SQLite format 3\x00"
-#: the kinds of MCAP's records
+#: record types of MCAP
 SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 0x03, 0x04, 0x05, 0x06, 0x0F
 _KINDS = range(0x01, 0x10)
 
 
 def storage_files(folder: Path) -> list[Path]:
-    """The files of a bag that is a folder, in the order of recording.
+    """Return the files of a bag's folder, in the order of recording.
 
     Raises:
-        RecordingError: it holds none, or compressed ones.
+        RecordingError: the folder holds no files of a bag, or compressed ones.
     """
     files = [path for path in folder.iterdir() if path.suffix in (".mcap", ".db3")]
     packed = next((path for path in folder.iterdir() if path.suffix == ".zstd"), None)
@@ -39,7 +39,7 @@ def storage_files(folder: Path) -> list[Path]:
 
 
 def merged(containers: list[Container]) -> Container:
-    """The files of one bag, one after the other."""
+    """Return the files of one bag joined into one container."""
     whole = containers[0]
     for each in containers[1:]:
         whole.lost += each.lost
@@ -56,7 +56,7 @@ def merged(containers: list[Container]) -> Container:
 
 
 def read_mcap(data: bytes, wanted: Collection[str], source: str) -> Container:
-    """The messages of the wanted topics, and the names and types of all. Raises `RecordingError`."""
+    """Return the wanted topics' messages, and all topics' names and types. Raises `RecordingError`."""
     file = _Mcap(wanted)
     file.scan(memoryview(data), len(MCAP_MAGIC))
     if not file.finished:
@@ -67,7 +67,7 @@ def read_mcap(data: bytes, wanted: Collection[str], source: str) -> Container:
 
 
 class _Mcap:
-    """What has been read of an MCAP file so far."""
+    """Content of an MCAP file read so far."""
 
     def __init__(self, wanted: Collection[str]) -> None:
         self.container = Container(ros=2)
@@ -92,7 +92,7 @@ class _Mcap:
                 break
             yield kind, view[begin : begin + size]
             position = begin + size
-            # what follows the data repeats them
+            # the records after the data only repeat them
             if kind == DATA_END:
                 self.finished = True
                 return
@@ -126,7 +126,7 @@ class _Mcap:
 
 
 def _string(record: memoryview, position: int) -> tuple[str, int]:
-    """Text with its length before it, and where it ends."""
+    """Return a length-prefixed text and the position of its end."""
     (length,) = struct.unpack_from("<I", record, position)
     end = position + 4 + length
     if end > len(record):
@@ -138,7 +138,7 @@ def _string(record: memoryview, position: int) -> tuple[str, int]:
 
 
 def read_sqlite(path: Path, wanted: Collection[str], source: str) -> Container:
-    """The messages of the wanted topics, and the names and types of all. Raises `RecordingError`."""
+    """Return the wanted topics' messages, and all topics' names and types. Raises `RecordingError`."""
     container = Container(ros=2)
     # without a journal beside it the file is only read; with one, SQLite has to look into both
     journal = path.with_name(path.name + "-wal").exists()
@@ -160,9 +160,9 @@ def read_sqlite(path: Path, wanted: Collection[str], source: str) -> Container:
 
 
 def _tables(connection: sqlite3.Connection, container: Container, wanted: Collection[str]) -> None:
-    # without it SQLite does not open a file that is shorter than its first page says
+    # without this SQLite does not open a file that is shorter than its first page states
     connection.execute("PRAGMA writable_schema = ON")
-    # not views: reading a file is not to run what somebody wrote into it
+    # views are refused: reading a file must not run queries stored in it
     query = "SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name IN ('topics', 'messages')"
     if connection.execute(query).fetchone()[0] != 2:
         return
@@ -170,7 +170,7 @@ def _tables(connection: sqlite3.Connection, container: Container, wanted: Collec
     for number, name, kind in connection.execute("SELECT id, name, type FROM topics"):
         if isinstance(name, str) and isinstance(kind, str):
             topics[number] = container.topic(name, kind)
-    # in the order in which they were written: what is read before the damage is then the beginning
+    # in the order of writing, so that the messages before a damaged page are the beginning
     for number, received, raw in connection.execute(
         "SELECT topic_id, timestamp, data FROM messages ORDER BY id"
     ):

@@ -1,6 +1,6 @@
-"""Recordings as tables, CSV or Parquet: columns with names and units, and what is said of all of them.
+"""Recordings as tables, CSV or Parquet: columns with names and units, and metadata.
 
-A CSV file, UTF-8, with comments before its header; a Parquet file has the same as metadata of its schema:
+A CSV file (UTF-8) has the metadata as comments before its header, a Parquet file in its schema:
 
     # source: what the recording is and where it comes from
     # simulated: true
@@ -9,10 +9,12 @@ A CSV file, UTF-8, with comments before its header; a Parquet file has the same 
     # latency: 0.06
     time [s],tension_1 [N],tension_2 [N],…,command_1 [N],…,rib_x [m],rib_y [m],rib_z [m],rib_qw,…,tip_x [m],…
 
-`simulated` says whether the robot was itself a simulation; without it nothing is claimed. A body alone is at
-the tip, others need their `fraction` of the rod's length. Without a configuration positions are in the
-robot's frame and orientations (quaternions, scalar first) those of the rod. A row has what was measured at
-its time: where other sensors are faster, cells stay empty.
+`tension_k` was measured at the row's time. A tension that is held from its row to the next, such as in a
+simulation, is named `held_tension_k`; a command is always held. `initial tension: 5 5 5 5` gives the tensions
+before the first row (N). `simulated` is true if the robot was itself a simulation; without it this is not
+stated. A single body is at the tip by default; several bodies need their `fraction` of the rod's length.
+Without a configuration, positions are in the robot's frame and quaternions (scalar first) are the rod's
+orientation. A row has the measurements at its time: cells of slower sensors stay empty.
 """
 
 from __future__ import annotations
@@ -27,25 +29,35 @@ import pandas as pd  # type: ignore[import-untyped]
 from jaxtyping import Float
 
 from knode_cosserat._yaml import shown
-from knode_cosserat.recordings.config import CommandSource, MarkerSource, RecordingConfig, TensionSource
+from knode_cosserat.recordings.config import (
+    CommandSource,
+    MarkerSource,
+    RecordingConfig,
+    TableSource,
+    TensionSource,
+)
+from knode_cosserat.recordings.config_values import PLACE
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.messages import Stream
 
 TIME = "time [s]"
-#: what columns of tensions begin with where no configuration says otherwise
-TENSION, COMMAND = "tension", "command"
+#: default prefixes of the columns of tensions
+TENSION, HELD, COMMAND = "tension", "held_tension", "command"
+#: metadata key of the tensions before the first row
+INITIAL = "initial tension"
 ALLOWED = (
     f"{TIME}, tension_1 [N], tension_2 [N], …, NAME_x [m], NAME_y [m], NAME_z [m] for each body, and, if "
-    "they were measured, NAME_qw, NAME_qx, NAME_qy, NAME_qz, and command_1 [N], …"
+    "they were measured, NAME_qw, NAME_qx, NAME_qy, NAME_qz, and command_1 [N], …; tensions that are held "
+    "from a row to the next are held_tension_1 [N], … instead"
 )
 PARQUET_MAGIC = b"PAR1"
 _QUATERNION = ("qw", "qx", "qy", "qz")
-#: larger numbers of seconds cannot be a time
+#: largest plausible time (s)
 _LATEST = 9e9
 
 
 def read_csv(data: bytes, path: str) -> tuple[dict[str, str], pd.DataFrame]:
-    """What a CSV file's comments say, and its columns of numbers. Raises `RecordingError`."""
+    """Return a CSV file's metadata and its columns of numbers. Raises `RecordingError`."""
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -54,7 +66,7 @@ def read_csv(data: bytes, path: str) -> tuple[dict[str, str], pd.DataFrame]:
 
 
 def read_parquet(path: Path) -> tuple[dict[str, str], pd.DataFrame]:
-    """What a Parquet file's metadata say, and its columns of numbers.
+    """Return a Parquet file's metadata and its columns of numbers.
 
     Raises:
         RecordingError: the file cannot be read, or a column has no numbers.
@@ -74,7 +86,7 @@ def read_parquet(path: Path) -> tuple[dict[str, str], pd.DataFrame]:
 
 
 def write_parquet(path: Path, table: pd.DataFrame, said: Mapping[str, str]) -> None:
-    """Write columns and what is said of them. Raises `ImportError` if pyarrow is not installed."""
+    """Write columns and metadata as Parquet. Raises `ImportError` if pyarrow is not installed."""
     pyarrow = _pyarrow()
     written = pyarrow.Table.from_pandas(table, preserve_index=False)
     pyarrow.parquet.write_table(written.replace_schema_metadata(dict(said)), path)
@@ -90,7 +102,7 @@ def _pyarrow() -> Any:
 
 
 def _comments(text: str) -> dict[str, str]:
-    """What the lines `# key: value` before the header say."""
+    """Return the metadata from the lines `# key: value` before the header."""
     said = {}
     for line in text.splitlines():
         if not line.startswith("#"):
@@ -102,7 +114,7 @@ def _comments(text: str) -> dict[str, str]:
 
 
 def _cells(text: str, path: str) -> pd.DataFrame:
-    """The cells as text, under the header's titles."""
+    """Return the cells as text, with the header's titles."""
     try:
         cells = pd.read_csv(io.StringIO(text), comment="#", header=None, dtype=str, skipinitialspace=True)
     except pd.errors.EmptyDataError:
@@ -117,14 +129,14 @@ def _cells(text: str, path: str) -> pd.DataFrame:
 
 
 def _numbers(table: pd.DataFrame, path: str) -> pd.DataFrame:
-    """All cells as numbers, NaN where they are empty."""
+    """Return all cells as numbers, NaN where they are empty."""
     numbers = table.apply(pd.to_numeric, errors="coerce")
     values = numbers.to_numpy(dtype=float, na_value=np.nan)
     said = ~table.isna().to_numpy()
     wrong = said & ~np.isfinite(values)
     for row, column in np.argwhere(wrong):
         given = table.iat[row, column]
-        # how programs write that there is no number
+        # common spellings of a missing number
         if str(given).strip().lower() not in ("nan", "none", "null", "na", "n/a", "-nan", ""):
             raise RecordingError(
                 f"{path}: row {row + 1}: {table.columns[column]} is {shown(given)}; "
@@ -133,13 +145,20 @@ def _numbers(table: pd.DataFrame, path: str) -> pd.DataFrame:
     return pd.DataFrame(values, columns=list(map(str, table.columns)))
 
 
-# what the columns are
+# meaning of the columns
 
 
 def configured(said: Mapping[str, str], columns: list[str], path: str) -> RecordingConfig:
-    """The configuration of a table that comes without one. Raises `RecordingError`."""
+    """Return the configuration derived from a table's titles and metadata. Raises `RecordingError`."""
     others = [name for name in columns if name != TIME]
-    tendons = {name: sum(each.startswith(f"{name}_") for each in others) for name in (TENSION, COMMAND)}
+    titles = (TENSION, HELD, COMMAND)
+    tendons = {name: sum(each.startswith(f"{name}_") for each in others) for name in titles}
+    if tendons[TENSION] and tendons[HELD]:
+        raise RecordingError(
+            f"{path}: there are {TENSION}_1 (at the row's time) and {HELD}_1 (from its row to the next); "
+            "allowed is one of them"
+        )
+    measured = HELD if tendons[HELD] else TENSION
     bodies = [name.removesuffix("_x [m]") for name in others if name.endswith("_x [m]")]
     known = [f"{name}_{k + 1} [N]" for name, count in tendons.items() for k in range(count)]
     for body in bodies:
@@ -154,16 +173,18 @@ def configured(said: Mapping[str, str], columns: list[str], path: str) -> Record
         for body in bodies
     ]
     order = {name: tuple(range(1, count + 1)) for name, count in tendons.items()}
+    latency, before = _said_number("latency", said, 0.0, path), _said_tensions(said, path)
     try:
         return RecordingConfig(
             markers=tuple(sorted(markers, key=lambda marker: marker.fraction)),
-            tension=TensionSource(TENSION, order[TENSION]) if order[TENSION] else None,
-            command=(
-                CommandSource(COMMAND, order[COMMAND], latency=_said_number("latency", said, 0.0, path))
-                if order[COMMAND]
+            tension=(
+                TensionSource(measured, order[measured], held=True if measured == HELD else None)
+                if order[measured]
                 else None
             ),
-            tensions="measured" if order[TENSION] else "commanded",
+            command=(CommandSource(COMMAND, order[COMMAND], latency=latency) if order[COMMAND] else None),
+            tensions="measured" if order[measured] else "commanded",
+            initial_tension=before,
         )
     except RecordingError as error:
         raise RecordingError(f"{path}: {error}") from None
@@ -186,8 +207,18 @@ def _said_number(key: str, said: Mapping[str, str], otherwise: float, path: str)
         raise RecordingError(f"{path}: {key} is {shown(said[key])}; allowed is a number") from None
 
 
+def _said_tensions(said: Mapping[str, str], path: str) -> tuple[float, ...] | None:
+    """Return the tensions before the first row (N), or None if the table does not state them."""
+    if INITIAL not in said:
+        return None
+    try:
+        return tuple(float(word) for word in said[INITIAL].replace(",", " ").split())
+    except ValueError:
+        raise RecordingError(f"{path}: {INITIAL} is {shown(said[INITIAL])}; allowed is numbers (N)") from None
+
+
 def said_simulated(said: Mapping[str, str], path: str) -> bool | None:
-    """Whether a table says that the robot was a simulation; None if it does not. Raises `RecordingError`."""
+    """True if a table states that the robot was a simulation; None if not stated. Raises `RecordingError`."""
     given = said.get("simulated")
     if given not in (None, "true", "false"):
         raise RecordingError(f"{path}: simulated is {shown(given)}; allowed is true or false")
@@ -195,40 +226,47 @@ def said_simulated(said: Mapping[str, str], path: str) -> bool | None:
 
 
 def position_titles(body: str, unit: str) -> list[str]:
-    """The titles of a body's position."""
+    """Return the titles of a body's position."""
     return [f"{body}_{axis} [{unit}]" for axis in "xyz"]
 
 
 def quaternion_titles(body: str) -> list[str]:
-    """The titles of a body's orientation."""
+    """Return the titles of a body's orientation."""
     return [f"{body}_{part}" for part in _QUATERNION]
 
 
 def tension_titles(topic: str, unit: str, count: int) -> list[str]:
-    """The titles of tensions, or commands, in the order of a message."""
+    """Return the titles of tensions or commands, in the order of a message."""
     return [f"{topic}_{k + 1} [{unit}]" for k in range(count)]
 
 
 def streams(table: pd.DataFrame, config: RecordingConfig, path: str) -> dict[str, Stream]:
-    """By topic, the rows in which it was measured. Raises `RecordingError` if a column is missing."""
-    columns = list(table.columns)
-    if columns.count(TIME) != 1:
+    """Return the measured rows of each topic. Raises `RecordingError` if a column is missing."""
+    columns, called = list(table.columns), config.table or TableSource()
+    if called.rate is not None:
+        time = np.arange(len(table)) / called.rate
+    elif columns.count(TIME) != 1:
         raise RecordingError(f"{path}: the columns are {', '.join(columns)}; required is {TIME}, once")
-    time = table[TIME].to_numpy()
+    else:
+        time = table[TIME].to_numpy()
     if np.any(np.abs(time) > _LATEST):
         row = int(np.argmax(np.abs(time) > _LATEST))
         raise RecordingError(f"{path}: row {row + 1}: {TIME} is {time[row]:g}; allowed is up to {_LATEST:g}")
     wanted: dict[str, list[str]] = {}
     for source in (*config.markers, config.base):
         if source is not None:
-            titles, turned = (
-                position_titles(source.topic, config.position_unit),
-                quaternion_titles(source.topic),
+            titles = _called(called.position, source.topic) or position_titles(
+                source.topic, config.position_unit
             )
+            turned = _called(called.quaternion, source.topic) or quaternion_titles(source.topic)
             wanted[source.topic] = titles + (turned if turned[0] in columns else [])
-    for tendons in (config.tension, config.command):
+    for tendons in (config.measured, config.command):
         if tendons is not None:
-            wanted[tendons.topic] = tension_titles(tendons.topic, tendons.unit, len(tendons.order))
+            count = len(tendons.order)
+            titles = tension_titles(tendons.topic, tendons.unit, count)
+            if called.motor is not None:
+                titles = [called.motor.replace(PLACE, str(k + 1)) for k in range(count)]
+            wanted[tendons.topic] = titles
     optional = _optional(config)
     found = {}
     for topic, titles in wanted.items():
@@ -244,26 +282,31 @@ def streams(table: pd.DataFrame, config: RecordingConfig, path: str) -> dict[str
     return found
 
 
+def _called(titles: tuple[str, ...] | None, topic: str) -> list[str]:
+    """Return a body's titles from the configuration's templates; empty without templates."""
+    return [title.replace(PLACE, topic) for title in titles or ()]
+
+
 def _optional(config: RecordingConfig) -> set[str]:
-    """The tensions that nobody needs."""
-    unused = config.command if config.tensions == "measured" else config.tension
+    """Return the topic of the tensions that do not drive the robot; its columns may be missing."""
+    unused = config.command if config.tensions == "measured" else config.measured
     return {unused.topic} if unused is not None else set()
 
 
 def _stream(topic: str, time: Float[np.ndarray, " n"], values: Float[np.ndarray, "n size"]) -> Stream:
     there = np.isfinite(time) & np.isfinite(values).any(axis=1)
     stamps = np.round(time[there] * 1e9).astype(np.int64)
-    # tables may begin before zero, and a stamp below zero would be none
+    # received times may be negative, because a table may begin before zero
     return Stream(topic, stamps, stamps, values[there])
 
 
 def frame_of(columns: Mapping[str, Any]) -> pd.DataFrame:
-    """A table of columns that each have their own times: a row for each time at which something was measured.
+    """Return a table from columns with different times: a row for each time in any of them.
 
     Args:
-        columns: by title, times (s) and numbers.
+        columns: times (s) and numbers by title.
     """
     parts = {title: pd.Series(values, index=time) for title, (time, values) in columns.items()}
-    # together, because one by one each would be sorted into all others
+    # one concatenation, because repeated merges would sort the rows each time
     table = pd.concat(parts, axis=1).sort_index()
     return table.rename_axis(TIME).reset_index()

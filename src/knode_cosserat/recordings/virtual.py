@@ -1,8 +1,8 @@
-"""Recordings of a virtual robot, in the paper's format: the whole path from bags to models without a robot.
+"""Recordings of a virtual robot in the paper's format, to test the whole pipeline without a robot.
 
 Commands, in whole grams-force, reach the tendons through motors with a lag. The robot (`VirtualRobot`) is
-simulated with finer steps and more nodes than models have. Motion capture sees bodies with axes of their own,
-loses frames and is noisy; load cells are noisy and count in steps. Every bag says that it is simulated.
+simulated with finer steps and more nodes than models have. Motion capture tracks bodies with arbitrary axes,
+loses frames and is noisy. Load cells are noisy and quantised. Every file states that it is simulated.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from knode_cosserat import controls
 from knode_cosserat.recordings.config import TENSION_UNITS, RecordingConfig
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.write import FORMATS, Poses, Pulls, write_recording
+from knode_cosserat.rods.tendon_rod import TendonRod
 from knode_cosserat.rods.virtual_robot import VirtualRobot
 from knode_cosserat.solvers.equilibrium import equilibrium
 from knode_cosserat.solvers.simulate import simulate
@@ -26,29 +27,29 @@ from knode_cosserat.trajectory import Trajectory
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
-#: newtons of a gram-force
+#: one gram-force (N)
 GRAM = TENSION_UNITS["gf"]
-#: the paper's signals: rest, and what is added to it (gf); how long it rests, also before a step (s)
+#: the paper's signals: rest tension, amplitude of sines, range of random ones (gf); rest durations (s)
 REST, SWING, HIGHEST, RESTING, BEFORE_STEP = 500.0, 300.0, 700.0, 1.0, 2.0
-#: how far apart commands are (s), and how long a random one is held
+#: period of commands, and hold time of random ones (s)
 COMMANDED, HELD = 0.05, 0.4
-#: the plant's time step (s) and nodes, and how far apart rows of its states are kept (s)
+#: the plant's time step (s) and number of nodes, and the time between its stored rows (s)
 PLANT_STEP, PLANT_NODES, KEPT = 0.005, 28, 0.01
 LONGEST = 300.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Sensors:
-    """What measuring does to what is measured.
+    """Sensor errors and the motors' lag.
 
     Attributes:
         position_noise: standard deviation of a coordinate (m).
-        turn_noise: of an orientation about an axis (rad).
-        lost: share of frames that motion capture loses.
-        swap: when the third rib's body swaps its axes by a quarter turn (s), or None.
+        turn_noise: standard deviation of an orientation about an axis (rad).
+        lost: fraction of frames that motion capture loses.
+        swap: time at which the axes of the third rib's body are swapped by a quarter turn (s), or None.
         tension_noise: standard deviation of a load cell (N).
-        tension_step: what it counts in (N).
-        tension_period: from one tension to the next (s).
+        tension_step: quantisation step of a load cell (N).
+        tension_period: sampling period of the load cells (s).
         lag: time constant of the motors (s).
     """
 
@@ -63,7 +64,7 @@ class Sensors:
 
 
 def virtual_robot(nodes: int = PLANT_NODES) -> VirtualRobot:
-    """The robot of virtual recordings: as long as the paper's, softer, with ribs and tendons in them."""
+    """Return the robot of virtual recordings: the paper's length, but softer, with tendons guided by ribs."""
     return VirtualRobot(
         length=0.635,
         radius=0.003175,
@@ -82,25 +83,26 @@ def record_virtual(
     seconds: float = 16.0,
     seed: int = 0,
     sensors: Sensors = Sensors(),
+    robot: TendonRod | None = None,
 ) -> Trajectory:
-    """Record a virtual robot: write what its sensors saw, return what it truly did.
+    """Record a virtual robot: write its sensor data and return its true motion.
 
     Args:
-        path: a bag (.bag, .mcap, .db3) or table (.csv, .parquet) that the paper's configuration reads.
-        signal: `sine:PERIOD` (s), `step:HEIGHT` (N, tendons 3 and 4 after 2 s) or `random:SEED`, each about
-            the paper's rest tension and as large as the paper's; or anything that `controls.parse` takes,
-            after 1 s of rest.
-        seconds: how long.
-        seed: of the noise, and of how the bodies' axes are turned.
+        path: a bag (.bag, .mcap, .db3) or table (.csv, .parquet) for the paper's configuration.
+        signal: `sine:PERIOD` (s), `step:HEIGHT` (N, tendons 3 and 4 after 2 s) or `random:SEED`, with the
+            paper's rest tension and amplitudes; or any signal of `controls.parse`, after 1 s of rest.
+        seconds: duration (s).
+        seed: seed of the noise and of the rotations of the bodies' axes.
         sensors: noise and lag.
+        robot: a robot with four tendons in the role of the real one; None: `virtual_robot()`.
 
     Returns:
-        The plant's `Trajectory`, a row every 10 ms, from its equilibrium at the rest tension on.
+        The plant's `Trajectory`, a row every 10 ms, starting in equilibrium at the first command.
 
     Raises:
-        RecordingError: the path or a number is not possible.
-        ControlsError: the signal is not understood.
-        SimulationError: the tensions are more than the robot can stand.
+        RecordingError: the path, a number or the robot is not allowed.
+        ControlsError: the signal cannot be parsed.
+        SimulationError: the simulation fails, for example at too large tensions.
     """
     path = Path(path)
     if path.suffix not in FORMATS:
@@ -109,8 +111,10 @@ def record_virtual(
         raise RecordingError(f"seconds is {seconds:g}; allowed is 1.5 to {LONGEST:g} s")
     if not 0 <= seed < 2**32:
         raise RecordingError(f"seed is {seed}; allowed is a whole number from 0 to {2**32 - 1}")
+    if robot is not None and robot.control_size != 4:
+        raise RecordingError(f"the robot has {robot.control_size} controls; allowed is one with four tendons")
     sent = commands(signal, seconds)
-    truth = driven(sent, sensors.lag)
+    truth = driven(sent, sensors.lag, virtual_robot() if robot is None else robot)
     poses, tension = measured(truth, sent, seed, sensors)
     config = RecordingConfig.paper_robot().replace(
         simulated=True, description=f"a virtual robot, simulated: {signal}"
@@ -123,7 +127,7 @@ def record_virtual(
 
 
 def commands(signal: str, seconds: float) -> Pulls:
-    """The commands of a signal (see `record_virtual`): whole grams-force in N, every 50 ms."""
+    """Return the commands of a signal (see `record_virtual`): whole grams-force, in N, every 50 ms."""
     time = np.round(np.arange(0.0, seconds - 1e-9, COMMANDED), 9)
     grams = np.full((len(time), 4), REST)
     name, _, number = signal.partition(":")
@@ -158,14 +162,14 @@ def _plain_number(text: str) -> float | None:
 
 
 def lagged(sent: Pulls, time: Float[np.ndarray, " n"], lag: float) -> Float[np.ndarray, "n 4"]:
-    """Tensions (N) at even times (s): the commands, each held until the next, through a first-order lag.
+    """Return tensions (N) at evenly spaced times (s): the held commands after a first-order lag.
 
-    Exact where commands come at some of these times.
+    The result is exact if each command's time is one of these times.
     """
     if lag <= 0.0:
         return sent.tension[np.searchsorted(sent.time, time + 1e-9, side="right") - 1]
     stays = np.exp(-(time[1] - time[0]) / lag)
-    # between two times acts the command that came last before them
+    # the last command before an interval acts during it
     held = sent.tension[np.searchsorted(sent.time, time - 1e-9, side="right").clip(1) - 1]
     followed = [held[0]]
     for target in held[1:]:
@@ -173,9 +177,9 @@ def lagged(sent: Pulls, time: Float[np.ndarray, " n"], lag: float) -> Float[np.n
     return np.array(followed)
 
 
-def driven(sent: Pulls, lag: float) -> Trajectory:
-    """What the virtual robot does under commands, in rows 10 ms apart."""
-    robot = virtual_robot()
+def driven(sent: Pulls, lag: float, robot: TendonRod) -> Trajectory:
+    """Return the motion of a robot under commands, in rows 10 ms apart."""
+    robot = robot.replace(nodes=PLANT_NODES)
     time = np.arange(round((sent.time[-1] + COMMANDED) / PLANT_STEP) + 1) * PLANT_STEP
     tension = lagged(sent, time, lag)
     still = equilibrium(robot, tension[0], space="lobatto4")
@@ -188,7 +192,7 @@ def driven(sent: Pulls, lag: float) -> Trajectory:
 
 
 def measured(truth: Trajectory, sent: Pulls, seed: int, sensors: Sensors) -> tuple[dict[str, Poses], Pulls]:
-    """What motion capture and load cells give of a robot's states; poses by the names in the paper's bags."""
+    """Return simulated motion capture (poses by the paper's marker names) and load cells of a motion."""
     random = np.random.default_rng(seed)
     time = np.round(np.asarray(truth.time), 9)
     config = RecordingConfig.paper_robot()
@@ -221,7 +225,7 @@ def _seen(
     random: np.random.Generator,
     sensors: Sensors,
 ) -> Poses:
-    """Poses of a body whose axes are turned somehow, in the frames that it was seen in."""
+    """Return noisy poses of a body with randomly rotated axes, without its lost frames."""
     from scipy.spatial.transform import Rotation
 
     axes: Rotation = Rotation.from_quat(random.normal(size=4))

@@ -1,7 +1,7 @@
-"""Writing recordings, as sensors give them: bags of ROS 1 and 2, and tables, by the same configuration.
+"""Writer of recordings: bags of ROS 1 and 2, and tables, from the same configuration.
 
-What is written with a configuration is read back with it. The name's ending says the format: .bag (ROS 1),
-.mcap or .db3 (ROS 2), .csv, .parquet.
+A file is read back with the configuration that it was written with. The name's suffix selects the format:
+.bag (ROS 1), .mcap or .db3 (ROS 2), .csv, .parquet.
 """
 
 from __future__ import annotations
@@ -18,24 +18,24 @@ from jaxtyping import Float
 
 from knode_cosserat._files import replacing
 from knode_cosserat.recordings.config import (
-    PLACE,
     POSITION_UNITS,
     TENSION_UNITS,
     CommandSource,
     RecordingConfig,
     TensionSource,
 )
+from knode_cosserat.recordings.config_values import PLACE
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.messages import SIMULATED, typestore
 
 BAGS = (".bag", ".mcap", ".db3")
 FORMATS = (*BAGS, ".csv", ".parquet")
-#: what time zero is on the clock of a bag, unless it is said (s since 1970)
+#: default of time zero on the clock of a bag (s since 1970)
 START = 1_720_000_000
-#: the message type for so many numbers; for others, arrays, which have no stamps
+#: message type by count of numbers; other counts are sent as arrays, which have no stamps
 _NUMBERS = {3: "geometry_msgs/msg/Vector3Stamped", 4: "geometry_msgs/msg/QuaternionStamped"}
 _ARRAY = "std_msgs/msg/Float64MultiArray"
-#: what messages are made of
+#: types of the parts of messages
 _PARTS = (
     "builtin_interfaces/msg/Time",
     "geometry_msgs/msg/Point",
@@ -49,12 +49,12 @@ _PARTS = (
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Poses:
-    """Poses of a body as motion capture gives them, in its own frame and with the body's own axes.
+    """Poses of a body from motion capture, in motion capture's frame and with the body's own axes.
 
     Attributes:
-        time: s, rising.
-        position: m.
-        quaternion: scalar first; None if only positions are seen.
+        time: times (s), increasing.
+        position: positions (m).
+        quaternion: orientations, scalar first; None if only positions are known.
     """
 
     time: Float[np.ndarray, " n"]
@@ -64,7 +64,7 @@ class Poses:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Pulls:
-    """Tensions (N), tendon 1 first, and when they were measured or commanded (s)."""
+    """Tensions (N), tendon 1 first, and the times of their measurement or command (s)."""
 
     time: Float[np.ndarray, " n"]
     tension: Float[np.ndarray, "n tendons"]
@@ -80,22 +80,22 @@ def write_recording(
     start: int = START,
     delays: Mapping[str, float] | None = None,
 ) -> None:
-    """Write a recording that `load_recording(path, config)` reads.
+    """Write a recording for `load_recording(path, config)`.
 
-    Where commands are text and the configuration says that the robot is simulated, the log says so too.
+    In a bag of a simulated robot with text commands, the first message of the log states the simulation.
 
     Args:
-        path: the file; one that is there is replaced.
-        config: topics, order, units; what is on the wire is made by it. Commands in text are whole numbers
-            in grams-force, as the paper's robot sends them.
-        poses: by the markers' names, and the base's under "base".
-        tension: as measured.
-        command: as commanded.
-        start: what time zero is on the bag's clock (s since 1970); tables begin at zero.
-        delays: by topic, how long after its stamp a message is recorded (s); zero where it is not said.
+        path: the file; an existing one is replaced.
+        config: topics, order and units of the messages. Text commands in grams-force are rounded to whole
+            numbers, as the paper's robot sends them.
+        poses: poses by the markers' names; the base's under "base".
+        tension: measured tensions.
+        command: commanded tensions.
+        start: time zero on the bag's clock (s since 1970); tables begin at zero.
+        delays: delay from stamp to recording (s) by topic; zero by default.
 
     Raises:
-        RecordingError: the format is not known, something is missing, or the file cannot be written.
+        RecordingError: the format is unknown, data are missing, or the file cannot be written.
         ImportError: the library for this format is not installed.
     """
     path = Path(path)
@@ -115,7 +115,7 @@ def write_recording(
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Stream:
-    """Numbers in the units and the order of the wire."""
+    """Numbers in the units and the order of the messages."""
 
     topic: str
     role: str
@@ -158,7 +158,7 @@ def _on_the_wire(
 
 
 def _saying_so(stream: _Stream) -> _Stream:
-    """The stream; if it is a log, with a row of nothing in front: a line about the recording itself."""
+    """Return the stream; a log gets a first row of NaN, which stands for the line on the simulation."""
     if not isinstance(stream.source, CommandSource) or stream.source.text is None or len(stream.time) == 0:
         return stream
     nothing = np.full((1, np.shape(stream.values)[1]), np.nan)
@@ -192,7 +192,7 @@ def _write_ros2(path: Path, streams: list[_Stream], start: int, delays: Mapping[
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     plugin = StoragePlugin.MCAP if path.suffix == ".mcap" else StoragePlugin.SQLITE3
-    # rosbags writes a folder with a description; the file says all that is in it
+    # rosbags writes a folder with a description; the data file alone is complete
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
         bag = Path(folder) / "bag"
         with Writer(bag, version=9, storage_plugin=plugin) as writer:
@@ -208,7 +208,7 @@ def _write_ros2(path: Path, streams: list[_Stream], start: int, delays: Mapping[
 def _messages(
     streams: list[_Stream], ros: int, start: int, delays: Mapping[str, float]
 ) -> Iterator[tuple[str, str, int, Any]]:
-    """Topic, type, when it was recorded (ns) and message, in the order of recording."""
+    """Yield topic, type, recording time (ns) and message, in the order of recording."""
 
     def of(stream: _Stream) -> Iterator[tuple[int, int, str, str, Any]]:
         kind, make = _type(stream, ros), _maker(stream, ros)
@@ -231,7 +231,7 @@ def _type(stream: _Stream, ros: int) -> str:
 
 
 def _maker(stream: _Stream, ros: int) -> Callable[[int, int, Any], Any]:
-    """What makes a message of a stamp, a row's number and its values."""
+    """Return a function that makes a message from a stamp (ns), a row's index and its values."""
     types, kind = typestore(ros).types, _type(stream, ros)
     made = {name.rsplit("/", 1)[1]: types[name] for name in _PARTS}
     frame = "world" if stream.role == "pose" else ""
@@ -252,7 +252,7 @@ def _maker(stream: _Stream, ros: int) -> Callable[[int, int, Any], Any]:
         return types[kind](header=header(stamp, row), pose=placed)
 
     def spoken(stamp: int, row: int, values: Any) -> Any:
-        # a row of nothing is what is said of the recording itself
+        # a row of NaN stands for the line on the simulation
         numbers = " ".join(f"{value:.10g}" for value in values if np.isfinite(value))
         said = stream.source.text.replace(PLACE, numbers) if numbers else SIMULATED
         head = header(stamp, row)
@@ -297,6 +297,8 @@ def _write_table(path: Path, config: RecordingConfig, streams: list[_Stream]) ->
         said["source"] = " ".join(config.description.split())
     if config.simulated is not None:
         said["simulated"] = "true" if config.simulated else "false"
+    if config.initial_tension is not None:
+        said[table.INITIAL] = " ".join(map(repr, config.initial_tension))
     if config.command is not None and config.command.latency:
         said["latency"] = repr(config.command.latency)
     frame = table.frame_of(columns)

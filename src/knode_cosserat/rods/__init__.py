@@ -1,1 +1,1 @@
-"""What a robot is: continuous equations of rods. No grid, no time step, no solver."""
+"""Robot models: continuous equations of rods. No grid, no time step, no solver."""

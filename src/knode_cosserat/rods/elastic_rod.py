@@ -1,6 +1,6 @@
-"""What a rod is made of: its section and material, anywhere along it, and the law of its strains.
+"""Elastic rod: section and material along the rod, and the law of its strains.
 
-`rod` adds what loads it, holds it and touches it. Symbols follow the paper's table of notations:
+`rod` adds loads, boundary conditions and contact. Symbols follow the paper's table of notations:
 
     p  position (m)            h  orientation, quaternion, scalar first     R  its rotation matrix
     n  internal force (N)      m  internal moment (N·m), both in the global frame
@@ -33,7 +33,7 @@ from knode_cosserat.rotation import dot, inverse, rotation_matrix
 
 
 class ElasticRod(System):
-    """A round rod with stiffness and damping, which may differ along it, and the paper's law (eq. 15)."""
+    """A round rod with stiffness and damping, which may vary along it, and the paper's law (eq. 15)."""
 
     y_layout: ClassVar[Layout] = Layout(
         ("p", 3, "m", "position, global frame"),
@@ -73,13 +73,13 @@ class ElasticRod(System):
 
     @abc.abstractmethod
     def section_controls(self, control: Any) -> list[Any]:
-        """What of the control is each section's own."""
+        """Return the control of each section."""
 
-    # what follows from the parameters
+    # derived quantities
 
     @property
     def section(self) -> CircularSection:
-        """The rod's cross-section, where nothing is said of another."""
+        """The rod's cross-section outside `sections`."""
         return CircularSection(self.radius)
 
     @property
@@ -89,19 +89,19 @@ class ElasticRod(System):
 
     @property
     def G(self) -> Any:
-        """Shear modulus (Pa): as given, or from Young's."""
+        """Shear modulus (Pa): the parameter, or by default from Young's modulus."""
         return shear_modulus(self.youngs_modulus) if self.shear_modulus is None else self.shear_modulus
 
     @property
     def Kse(self) -> Float[Any, "3 3"]:
-        """Stiffness of shear and extension (N): as given, or from moduli and section."""
+        """Stiffness of shear and extension (N): the parameter, or by default from moduli and section."""
         if self.shear_stiffness is not None:
             return self.shear_stiffness
         return self.section.shear_stiffness(self.youngs_modulus, self.G)
 
     @property
     def Kbt(self) -> Float[Any, "3 3"]:
-        """Stiffness of bending and twisting (N·m²): as given, or from moduli and section."""
+        """Stiffness of bending and twisting (N·m²): the parameter, or by default from moduli and section."""
         if self.bending_stiffness is not None:
             return self.bending_stiffness
         return self.section.bending_stiffness(self.youngs_modulus, self.G)
@@ -113,11 +113,11 @@ class ElasticRod(System):
 
     @property
     def u_star(self) -> np.ndarray:
-        """u of the unloaded rod (1/m), where no section says otherwise: straight."""
+        """u of the unloaded rod (1/m) outside `sections`: straight."""
         return np.zeros(3)
 
     def material(self, s: Any, control: Any) -> Material:
-        """Section and material at arclength s (m)."""
+        """Return section and material at arclength s (m)."""
         plain = Material(
             self.Kse, self.shear_damping, self.Kbt, self.bending_damping, self.u_star,
             self.mass_per_length, self.density * self.section.inertia, self.radius,
@@ -135,15 +135,15 @@ class ElasticRod(System):
     def _differences(self, s: Any, control: Any) -> Differences:
         return differences_at(self.sections, s / self.length, self.section_controls(control))
 
-    # what learning looks at
+    # observables for learning
 
     def unstressed(self, s: Any, control: Any) -> Float[Any, " z"]:
-        """As the sections are curved there, by themselves and by control."""
+        """Return z of the unstressed rod at s: with the sections' curvature, intrinsic and controlled."""
         _, z = self.rest(s)
         return z.at[3:6].set(self.material(s, control).u_star) if self.sections else z
 
     def law_factors(self, s: Any, control: Any) -> tuple[Any, Any] | None:
-        """Those of the sections on stiffness and damping."""
+        """Return the sections' factors on stiffness and damping; None without sections."""
         if not self.sections:
             return None
         found = self._differences(s, control)
@@ -154,14 +154,14 @@ class ElasticRod(System):
     # the law of the strains
 
     def stresses(self, y: Float[Any, " y"]) -> tuple[Float[Any, "3"], Float[Any, "3"]]:
-        """Rᵀn (N) and Rᵀm (N·m)."""
+        """Return Rᵀn (N) and Rᵀm (N·m)."""
         R = rotation_matrix(self.y_layout.get(y, "h"))
         return dot(R.T, self.y_layout.get(y, "n")), dot(R.T, self.y_layout.get(y, "m"))
 
     def strains(
         self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> Float[Any, " z"]:
-        """v and u of the linear law (paper eq. 15)."""
+        """Return v and u of the linear law (paper eq. 15)."""
         c0, material = history.c0, self.material(s, control)
         n, m = self.stresses(y)
         hv, hu = self.z_layout.get(history.z, "v"), self.z_layout.get(history.z, "u")
@@ -172,7 +172,7 @@ class ElasticRod(System):
         return jnp.concatenate([v, u])
 
     def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
-        """C, D, f2 of the same law, K (z - z*) + B z_t = Rᵀ (n, m)."""
+        """Return C, D, f2 of the same law, K (z - z*) + B z_t = Rᵀ (n, m)."""
         material = self.material(s, control)
         n, m = self.stresses(y)
         zero = jnp.zeros((3, 3))

@@ -1,9 +1,8 @@
-"""What holds a rod at its two ends.
+"""Boundary conditions at the two ends of a rod.
 
-At its base an end says what y is there, given what it leaves unknown; at its tip, what is left of its
-conditions. An end that is held has a pose: at the base (0, 0, 0) and upright unless it is given, at the tip
-by default the one that the rod has there while it is straight. A robot whose tip is held starts at its
-equilibrium.
+At the base, an end determines y from its unknowns. At the tip, an end returns the residual of its conditions.
+An end that is held has a pose. By default the pose at the base is (0, 0, 0) and upright, and the pose at the
+tip is that of the straight rod. A robot with a constrained tip starts at its equilibrium.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from knode_cosserat.rods.parameters import choice, parameter
 from knode_cosserat.rods.parts import Part
 from knode_cosserat.rotation import conjugate, dot, quaternion_of, quaternion_product, rotation_matrix
 
-#: where an end may be moved by control: along a global axis, or about one
+#: motions of an end that a control may drive: along a global axis, or about one
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 _POSITION = ("p", 3, "m", "position at the tip, global frame")
@@ -37,15 +36,15 @@ class Pose(NamedTuple):
 
 
 class End(Part):
-    """An end of a rod, of its base or of its tip."""
+    """An end of a rod: its base or its tip."""
 
-    #: what of p, h, n, m is unknown where this end is the rod's base; the rest is given
+    #: unknown fields among p, h, n, m where this end is the rod's base; the others are prescribed
     unknowns: ClassVar[tuple[str, ...]]
-    #: whether anything holds it in its place
+    #: True if the end is constrained
     held: ClassVar[bool] = True
-    #: whether it can be a rod's base as well as its tip
+    #: True if the end can be a rod's base as well as its tip
     anywhere: ClassVar[bool] = True
-    #: of the tip's conditions: names, sizes, units
+    #: the tip's conditions: names, sizes, units
     conditions: ClassVar[tuple[tuple[Any, ...], ...]]
 
     position: Any = parameter(
@@ -56,18 +55,18 @@ class End(Part):
     )
 
     def pose(self, rest: Pose, control: Any) -> Pose:
-        """Where the end is held; as at rest where nothing else is given."""
+        """Return the pose in which the end is held; by default the pose at rest."""
         p = rest.p if self.position is None else self.position
         h = rest.h if self.orientation is None else self.orientation
         return Pose(jnp.asarray(p), jnp.asarray(h) / jnp.sqrt(jnp.sum(jnp.asarray(h) ** 2)))
 
     @abc.abstractmethod
     def left(self, held: Pose, y: Pose, n: Any, m: Any) -> Float[Any, " k"]:
-        """What is left of the tip's conditions: poses, and n and m less what loads the tip there."""
+        """Return the residual of the tip's conditions, from poses, and n and m less the loads at the tip."""
 
 
 class Free(End):
-    """An end that nothing holds."""
+    """An unconstrained end."""
 
     kind: ClassVar[str] = "free"
     unknowns: ClassVar[tuple[str, ...]] = ("p", "h")
@@ -75,38 +74,38 @@ class Free(End):
     conditions: ClassVar[tuple[tuple[Any, ...], ...]] = (_FORCE, _MOMENT)
 
     def left(self, held: Pose, y: Pose, n: Any, m: Any) -> Float[Any, " k"]:
-        """No force and no moment."""
+        """Return the residual of zero force and zero moment."""
         return jnp.concatenate([-n, -m])
 
 
 class Clamped(End):
-    """An end whose position and orientation are held."""
+    """An end with prescribed position and orientation."""
 
     kind: ClassVar[str] = "clamped"
     unknowns: ClassVar[tuple[str, ...]] = ("n", "m")
     conditions: ClassVar[tuple[tuple[Any, ...], ...]] = (_POSITION, _TURN)
 
     def left(self, held: Pose, y: Pose, n: Any, m: Any) -> Float[Any, " k"]:
-        """Position, and twice the vector part of the rotation that is left."""
+        """Return the position error, and twice the vector part of the rotation error."""
         turned = quaternion_product(conjugate(held.h), y.h)
         turned = turned * jnp.where(turned[0] < 0.0, -1.0, 1.0) / jnp.sqrt(jnp.sum(turned * turned))
         return jnp.concatenate([y.p - held.p, 2.0 * turned[1:]])
 
 
 class Pinned(End):
-    """An end whose position is held, and that turns without resistance: a ball joint."""
+    """An end with a prescribed position that rotates without resistance: a ball joint."""
 
     kind: ClassVar[str] = "pinned"
     unknowns: ClassVar[tuple[str, ...]] = ("h", "n")
     conditions: ClassVar[tuple[tuple[Any, ...], ...]] = (_POSITION, _MOMENT)
 
     def left(self, held: Pose, y: Pose, n: Any, m: Any) -> Float[Any, " k"]:
-        """Position, and no moment."""
+        """Return the position error, and the residual of zero moment."""
         return jnp.concatenate([y.p - held.p, -m])
 
 
 class Driven(Clamped):
-    """A clamped end that the control moves: along global axes (m), and about them (rad)."""
+    """A clamped end moved by the control: along global axes (m), and about them (rad)."""
 
     kind: ClassVar[str] = "driven"
 
@@ -114,7 +113,7 @@ class Driven(Clamped):
 
     @property
     def control_fields(self) -> tuple[Field, ...]:
-        """One number for each axis."""
+        """One control for each driven axis."""
         return tuple(
             Field(axis, 1, "rad", f"rotation about {axis[1]}")
             if axis.startswith("r")
@@ -123,7 +122,7 @@ class Driven(Clamped):
         )
 
     def pose(self, rest: Pose, control: Any) -> Pose:
-        """Moved from where it would be held: rotated by the vector (rx, ry, rz), displaced by (x, y, z)."""
+        """Return the clamped pose, rotated by the vector (rx, ry, rz) and displaced by (x, y, z)."""
         held = super().pose(rest, control)
         places = np.zeros((6, len(self.axes)))
         places[[AXES.index(axis) for axis in self.axes], np.arange(len(self.axes))] = 1.0
@@ -132,7 +131,7 @@ class Driven(Clamped):
 
 
 class Sliding(Driven):
-    """A driven end at the tip that slides freely along a global axis, under whatever pulls it there."""
+    """A driven end at the tip that slides freely along a global axis, under the loads at the tip."""
 
     kind: ClassVar[str] = "sliding"
     anywhere: ClassVar[bool] = False
@@ -145,14 +144,14 @@ class Sliding(Driven):
     along: str = choice("the global axis that it slides along", AXES[:3], "z")
 
     def left(self, held: Pose, y: Pose, n: Any, m: Any) -> Float[Any, " k"]:
-        """As clamped, but with no force along the axis instead of a place on it."""
+        """Return the clamped residual, with zero force along the axis instead of the position along it."""
         left, k = super().left(held, y, n, m), AXES.index(self.along)
         across = [i for i in range(3) if i != k]
         return jnp.concatenate([jnp.stack([left[i] for i in across]), -n[k : k + 1], left[3:]])
 
 
 def velocities(pose: Pose, pose_t: Pose) -> tuple[Any, Any]:
-    """q and ω (material frame) of what is at a pose, whose rates are p_t and h_t."""
+    """Return q and ω (material frame) of a pose whose rates are p_t and h_t."""
     h, h_t = pose.h, pose_t.h
     turning = quaternion_product(conjugate(h), h_t) / jnp.sum(h * h)
     return dot(rotation_matrix(h).T, pose_t.p), 2.0 * turning[1:]

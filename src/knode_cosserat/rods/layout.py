@@ -1,4 +1,4 @@
-"""What the numbers of a packed vector are: y, z, a control, the tip's conditions."""
+"""Layouts of packed vectors: y, z, a control, the tip's conditions."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ import numpy as np
 class Field(NamedTuple):
     """A named part of y or z: its size, unit and meaning.
 
-    `frame` names the orientation (a quaternion in y) by whose rotation a vector of the global frame is seen
-    from the material; none for what is not turned. `load` is the unit of the load that the field's rate along
-    s balances, such as N/m of an internal force, none for a field whose rate is geometry; of a strain, the
-    unit of its stress. `low` and `high` are what a control has to stay between.
+    `frame` names the orientation (a quaternion in y) whose rotation takes a vector of the global frame to the
+    material frame; it is empty for a field that is not rotated. `load` is the unit of the load that balances
+    the field's rate along s, such as N/m for an internal force. It is empty for a field whose rate is
+    geometry. For a strain, it is the unit of its stress. `low` and `high` are a control's limits.
     """
 
     name: str
@@ -40,7 +40,7 @@ class Layout:
 
     @property
     def size(self) -> int:
-        """How many numbers a packed vector has."""
+        """Size of a packed vector."""
         return sum(field.size for field in self.fields)
 
     @property
@@ -49,7 +49,7 @@ class Layout:
         return tuple(field.name for field in self.fields)
 
     def slice(self, name: str) -> slice:
-        """Where a field stands in a packed vector. `KeyError` if there is no such field."""
+        """Return the slice of a field in a packed vector. `KeyError` if there is no such field."""
         start = 0
         for field in self.fields:
             if field.name == name:
@@ -58,33 +58,33 @@ class Layout:
         raise KeyError(f"no field {name!r}; there are {', '.join(self.names)}")
 
     def get(self, packed: Any, name: str) -> Any:
-        """One field of a packed vector (or of an array of them: the last axis is packed)."""
+        """Return one field of a packed vector (or of an array of them: the last axis is packed)."""
         where = self.slice(name)
         if isinstance(packed, jax.core.Tracer):  # brackets take ten times as long to trace
             return jax.lax.slice_in_dim(packed, where.start, where.stop, axis=-1)
         return packed[..., where]
 
     def split(self, packed: Any) -> tuple[Any, ...]:
-        """All fields of a packed vector, in order."""
+        """Return all fields of a packed vector, in order."""
         return tuple(self.get(packed, field.name) for field in self.fields)
 
     def indices(self, names: tuple[str, ...]) -> np.ndarray:
-        """Positions in the packed vector of the numbers of the named fields."""
+        """Return the indices of the named fields in the packed vector."""
         every = np.arange(self.size)
         return np.concatenate([every[self.slice(name)] for name in names])
 
     def replaced(self, packed: Any, names: tuple[str, ...], values: Any) -> Any:
-        """Return a packed vector with other values of the named fields, given one after the other."""
+        """Return a packed vector with other values of the named fields; `values` is their concatenation."""
         given, at = {}, 0
         for name in names:
             where = self.slice(name)
             given[name] = values[at : at + where.stop - where.start]
             at += where.stop - where.start
-        # as a concatenation: XLA fuses it with what follows, unlike a scatter
+        # as a concatenation: XLA fuses it with later operations, unlike a scatter
         return jnp.concatenate([given.get(each.name, self.get(packed, each.name)) for each in self.fields])
 
     def beyond(self, packed: Any) -> str:
-        """What of some controls (…, size) is outside its field's limits, in words; empty if nothing is."""
+        """Describe the first control (…, size) outside its field's limits; empty if all are within."""
         for field in self.fields:
             values = np.asarray(self.get(packed, field.name))
             wrong = (values < field.low) | (values > field.high)

@@ -1,4 +1,4 @@
-"""Loads of a rod: what pulls at it along its length, and what sits or pulls at one place of it.
+"""Loads of a rod: distributed along its length, or at one place.
 
 A load at a place makes n and m jump there: n(s⁺) = n(s⁻) - F, m(s⁺) = m(s⁻) - M. At the tip it is part of the
 tip's conditions instead.
@@ -20,12 +20,12 @@ from knode_cosserat.rotation import cross, dot, rotation_matrix
 
 
 def square_law_drag(C: Float[Any, "3 3"], q: Float[Any, "3"]) -> Float[Any, "3"]:
-    """Drag C q ⊙ |q| against the velocity q, both in the material frame (N/m); C in kg/m²."""
+    """Return the drag C q ⊙ |q| against the velocity q, both in the material frame (N/m); C in kg/m²."""
     return dot(C, q * jnp.abs(q))
 
 
 class Motion(NamedTuple):
-    """How a point of the rod is placed and moves: p, R in the global frame, the rest in the material's."""
+    """Pose and motion of a point of the rod: p, R in the global frame, the rest in the material frame."""
 
     p: Float[Any, "3"]
     R: Float[Any, "3 3"]
@@ -36,7 +36,7 @@ class Motion(NamedTuple):
 
     @classmethod
     def of(cls, layout: Any, y: Any, y_t: Any) -> Motion:
-        """From a packed y and its rate."""
+        """Return the motion from a packed y and its rate."""
         p, h, q, w = (layout.get(y, name) for name in ("p", "h", "q", "w"))
         return cls(p, rotation_matrix(h), q, w, layout.get(y_t, "q"), layout.get(y_t, "w"))
 
@@ -54,18 +54,18 @@ class Wrench(NamedTuple):
 class Body(NamedTuple):
     """A rigid body by its moments about a point of the rod, material frame; bodies at one point add up.
 
-    None where there is none: what only has a mass, as most ribs, goes without their equations.
+    A moment that is zero is None: a body with only a mass, such as most ribs, needs no equations of rotation.
     """
 
     mass: Any
-    #: mass times its centre's place (kg·m)
+    #: mass times the position of its centre (kg·m)
     first: Float[Any, "3"] | None
     #: moments of inertia about the point (kg·m²)
     inertia: Float[Any, "3 3"] | None
 
     @classmethod
     def of(cls, bodies: list[tuple[Body, Any]]) -> Body:
-        """Bodies as one, each times its weight."""
+        """Return the weighted sum of several bodies."""
         found = []
         for moments in zip(*(body for body, _ in bodies), strict=True):
             weighed = zip(moments, (weight for _, weight in bodies), strict=True)
@@ -74,7 +74,7 @@ class Body(NamedTuple):
         return cls(*found)
 
     def wrench(self, motion: Motion, gravity: Any) -> Wrench:
-        """Weight less what its motion takes: F = m a - ω_t × S - ω × (ω × S), M = S × a - (J ω_t + ω × J ω).
+        """Return weight less inertia: F = m a - ω_t × S - ω × (ω × S), M = S × a - (J ω_t + ω × J ω).
 
         S and J are the moments, and a the gravity less the acceleration of the point.
         """
@@ -91,22 +91,22 @@ class Body(NamedTuple):
 
 
 class Load(Part):
-    """Anything that loads a rod beside gravity and drag, which every rod has."""
+    """Base class of loads. Gravity and drag are parameters of every rod instead."""
 
 
 class PointLoad(Load):
-    """A load at one place, `at`, as a part of the rod's length."""
+    """A load at one place, `at`, as a fraction of the rod's length."""
 
     at: float = place("where it acts", default=1.0)
 
     @property
     def body(self) -> Body | None:
-        """What it is as a rigid body about the rod's axis, if it is one: those at one place are summed up."""
+        """The load as a rigid body about the rod's axis, or None. Bodies at one place are summed."""
         return None
 
     @abc.abstractmethod
     def wrench(self, motion: Motion, gravity: Any, control: Any) -> Wrench:
-        """What it does to the rod (N, N·m)."""
+        """Return the load on the rod (N, N·m)."""
 
 
 class SpreadLoad(Load):
@@ -121,7 +121,7 @@ class SpreadLoad(Load):
 
     @abc.abstractmethod
     def wrench(self, motion: Motion, control: Any) -> Wrench:
-        """What it does to the rod, per length (N/m, N)."""
+        """Return the load on the rod per length (N/m, N)."""
 
 
 _FOLLOWS = "whether it turns with the rod"
@@ -129,7 +129,7 @@ _CONTROLLED = "whether a control multiplies it"
 
 
 class PointWrench(PointLoad):
-    """A force and a moment at a place: dead, in the global frame, or following, in the material's."""
+    """A force and a moment at a place: constant in the global frame, or following the material frame."""
 
     kind: ClassVar[str] = "point-wrench"
 
@@ -140,16 +140,16 @@ class PointWrench(PointLoad):
 
     @property
     def control_fields(self) -> tuple[Field, ...]:
-        """The multiple of it that acts, if it is controlled."""
+        """The factor on the load, if it is controlled."""
         return (Field("scale", 1, "1", "multiple of the load that acts"),) if self.controlled else ()
 
     def wrench(self, motion: Motion, gravity: Any, control: Any) -> Wrench:
-        """As given, turned with the rod if it follows."""
+        """Return the force and the moment, rotated with the rod if they follow it."""
         return _given(self, motion, control)
 
 
 class DistributedWrench(SpreadLoad):
-    """A force and a moment per length: dead, in the global frame, or following, in the material's."""
+    """A force and a moment per length: constant in the global frame, or following the material frame."""
 
     kind: ClassVar[str] = "distributed-wrench"
 
@@ -164,11 +164,11 @@ class DistributedWrench(SpreadLoad):
 
     @property
     def control_fields(self) -> tuple[Field, ...]:
-        """The multiple of it that acts, if it is controlled."""
+        """The factor on the load, if it is controlled."""
         return (Field("scale", 1, "1", "multiple of the load that acts"),) if self.controlled else ()
 
     def wrench(self, motion: Motion, control: Any) -> Wrench:
-        """As given, turned with the rod if it follows."""
+        """Return the force and the moment, rotated with the rod if they follow it."""
         return _given(self, motion, control)
 
 
@@ -181,7 +181,7 @@ def _given(load: Any, motion: Motion, control: Any) -> Wrench:
 class AttachedMass(PointLoad):
     """A rigid body on the rod: a rib, a gripper, a payload. At the tip it is the robot's rigid end.
 
-    Its moments of inertia are about its own centre of mass and the axes of the material's frame.
+    Its moments of inertia are about its own centre of mass, along the axes of the material frame.
     """
 
     kind: ClassVar[str] = "attached-mass"
@@ -197,7 +197,7 @@ class AttachedMass(PointLoad):
 
     @property
     def body(self) -> Body:
-        """About the rod's axis, the material's axes."""
+        """The rigid body about the rod's axis, in the material frame."""
         J = None if self.inertia is None else np.eye(3) * jnp.asarray(self.inertia)
         if self.offset is None:
             return Body(self.mass, None, J)
@@ -206,12 +206,12 @@ class AttachedMass(PointLoad):
         return Body(self.mass, self.mass * r, off_axis if J is None else J + off_axis)
 
     def wrench(self, motion: Motion, gravity: Any, control: Any) -> Wrench:
-        """Weight less what its motion takes."""
+        """Return weight less inertial forces."""
         return self.body.wrench(motion, gravity)
 
 
 def point_wrench(acting: list[tuple[Any, Any, Any]], motion: Motion, gravity: Any) -> Wrench:
-    """What loads at one place do together: each with its weight (0 where it is not there) and control."""
+    """Return the sum of the loads at one place: each with its weight (0 if it acts elsewhere) and control."""
     total, bodies = Wrench(jnp.zeros(3), jnp.zeros(3)), []
     for load, weight, control in acting:
         body = load.body
@@ -221,6 +221,6 @@ def point_wrench(acting: list[tuple[Any, Any, Any]], motion: Motion, gravity: An
         own = load.wrench(motion, gravity, control)
         total = total + Wrench(weight * own.force, weight * own.moment)
     if bodies:
-        # as one: their equations are compiled once, however many there are
+        # summed before the wrench: their equations are compiled once for any number of bodies
         total = total + Body.of(bodies).wrench(motion, gravity)
     return total

@@ -1,7 +1,7 @@
 """A parallel continuum robot: elastic legs from linear actuators to one rigid platform.
 
-The layout is that of Stewart and Gough where there are six legs in pairs (Black, Till & Rucker 2018; Till,
-Aloi & Rucker 2019). Symbols as in `elastic_rod`, for each leg.
+With six legs in pairs the layout is that of Stewart and Gough (Black, Till & Rucker 2018; Till, Aloi & Rucker
+2019). Symbols as in `elastic_rod`, for each leg.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from knode_cosserat.rods.strands import Bundle
 from knode_cosserat.rods.system import History, Scales, System, in_strands, is_traced
 from knode_cosserat.rotation import cross, dot, rotation_matrix
 
-#: what a leg has of a rod's parameters
+#: rod parameters that a leg takes from the robot
 LEG = (
     "length", "radius", "density", "youngs_modulus", "shear_modulus", "shear_damping", "bending_damping",
     "drag", "linear_drag", "gravity", "shear_stiffness", "bending_stiffness",
 )  # fmt: skip
-#: numbers of y of one leg, before which of them a field begins: p, h, n, m, q, w
+#: indices in a leg's y at which the fields after p begin: h, n, m, q, w
 FIELDS = (3, 7, 10, 13, 16)
 
 
 class Leg(Rod):
-    """The rod between base and platform. Its control is the whole robot's."""
+    """The rod between base and platform. Its control is the control of the whole robot."""
 
     base_unknowns: ClassVar[tuple[str, ...]] = ("n", "m")
 
@@ -40,17 +40,17 @@ class Leg(Rod):
 
     @property
     def control_layout(self) -> Layout:  # type: ignore[override]
-        """The robot's."""
+        """Layout of the robot's control."""
         return displacements(self.legs)
 
 
 def displacements(count: int) -> Layout:
-    """The control of a robot with so many legs."""
+    """Return the control layout of a robot with `count` legs."""
     return Layout(("displacement", count, "m", "displacement of each leg's base along z"))
 
 
 def _of_rod(name: str) -> Any:
-    """A rod's parameter, as it is stated there."""
+    """Return a field that states a parameter as `Leg` does."""
     stated = Leg.__dataclass_fields__[name]
     given = {} if stated.default is dataclasses.MISSING else {"default": stated.default}
     return dataclasses.field(metadata=stated.metadata, **given)
@@ -59,21 +59,21 @@ def _of_rod(name: str) -> Any:
 class ParallelRobot(Bundle):
     """Legs clamped in actuators that move along z, and clamped again in a rigid platform.
 
-    The base of leg i stands at the angle base_angles[i] on the base's circle, at the height that control i
-    says. On the platform it is at platform_angles[i], with the platform's orientation: legs that are not
-    bent stand straight along z, and the platform lies at height `length`, not turned. The platform is a
-    rigid body whose centre of mass is the centre of its circle of joints.
+    The base of leg i is at the angle base_angles[i] on the base's circle, at the height of control i. Its end
+    is at platform_angles[i] on the platform, with the platform's orientation. Unbent legs are straight along
+    z, with the platform at height `length` and not rotated. The platform is a rigid body whose centre of mass
+    is the centre of its circle of joints.
 
-    `positions` and `quaternions` are those of one line, the robot's axis, which ends in the platform's
-    centre: at every node the mean of where its legs would hold the platform. `leg_positions` has the legs.
+    `positions` and `quaternions` describe one line, the robot's axis, which ends in the platform's centre. At
+    every node it is the mean of the platform poses that the legs imply. `leg_positions` has the legs.
 
-    Where the angles or radii of base and platform differ the legs are bent at rest, and `rest` is a guess by
-    the theory of slender beams; a simulation therefore begins in the equilibrium under no control.
+    If the angles or radii of base and platform differ, the legs are bent at rest, and `rest` is a guess from
+    the theory of slender beams. A simulation therefore starts at the equilibrium under zero control.
     """
 
     strand_class: ClassVar[type[System]] = Leg
     rest_is_guess: ClassVar[bool] = True
-    #: observables of the platform; those of the legs are the strand's
+    #: observables of the platform; the legs' observables belong to the strand
     velocities: ClassVar[tuple[str, ...]] = ("q", "w")
 
     length: Any = _of_rod("length")
@@ -118,16 +118,16 @@ class ParallelRobot(Bundle):
                 "allowed is one of each for every leg"
             )
 
-    # what follows from the parameters
+    # derived quantities
 
     @property
     def strands(self) -> int:
-        """How many legs there are."""
+        """Number of legs."""
         return np.shape(self.base_angles)[-1]
 
     @property
     def strand(self) -> Leg:
-        """The equations along every leg."""
+        """Equations along a leg; the legs share them."""
         return Leg(**{name: getattr(self, name) for name in LEG}, legs=self.strands, nodes=self.nodes)
 
     @property
@@ -144,37 +144,37 @@ class ParallelRobot(Bundle):
 
     @property
     def joints(self) -> Float[Any, "legs 3"]:
-        """Where the legs end, from the platform's centre and in its frame (m)."""
+        """Positions of the legs' ends relative to the platform's centre, in its frame (m)."""
         return _on_circle(self.platform_radius, self.platform_angles)
 
     # the state of each leg
 
     def legs(self, y: Float[Any, "*n y"]) -> list[Any]:
-        """p, h, n, m, q and w (…, legs, size) of states y."""
+        """Return p, h, n, m, q and w (…, legs, size) of states y."""
         return _split(in_strands(self, y))
 
     def leg_positions(self, y: Any) -> Any:
-        """Positions (…, legs, 3) of the legs' points, in m, of states y (…, y)."""
+        """Return the positions (…, legs, 3) in m of the legs' points, from states y (…, y)."""
         return self.legs(y)[0]
 
     def curves(self, y: Any) -> list[Any]:
-        """Every leg, and the platform: the polygon of its joints."""
+        """Return every leg's curve, and the polygon of the platform's joints."""
         legs = np.moveaxis(np.asarray(self.leg_positions(y)), -2, 0)
         order = np.argsort(np.asarray(self.platform_angles) % (2.0 * np.pi))
         joints = np.moveaxis(legs[np.append(order, order[0]), ..., -1, :], 0, -2)
         return [*legs, joints]
 
     def leg_quaternions(self, y: Any) -> Any:
-        """Orientations (…, legs, 4) of the legs' points, scalar first, of states y (…, y)."""
+        """Return the orientations (…, legs, 4) of the legs' points, scalar first, from states y (…, y)."""
         return self.legs(y)[1]
 
     def positions(self, y: Any) -> Any:
-        """The robot's axis (…, 3) in m, of states y (…, y); at the tip, the platform's centre."""
+        """Return the robot's axis (…, 3) in m, from states y (…, y); at the tip, the platform's centre."""
         numeric: Any = jnp if is_traced((self, y)) else np
         p, h, *_ = self.legs(y)
         w, x = h[..., :1], h[..., 1:]
         joints = numeric.asarray(self.joints)
-        # each robot of a batch has its own
+        # each robot of a batch has its own joints
         lead = joints.shape[:-2] + (1,) * (p.ndim - joints.ndim)
         joints = numeric.broadcast_to(joints.reshape(*lead, *joints.shape[-2:]), p.shape)
         across = numeric.cross(x, joints)
@@ -183,7 +183,7 @@ class ParallelRobot(Bundle):
         return numeric.mean(p - arms, axis=-2)
 
     def quaternions(self, y: Any) -> Any:
-        """Mean orientations of the legs (…, 4), scalar first, of states y. At the tip, the platform's."""
+        """Return the legs' mean orientations (…, 4), scalar first; at the tip, the platform's."""
         numeric: Any = jnp if is_traced((self, y)) else np
         h = self.legs(y)[1]
         h = h / numeric.sqrt(numeric.sum(h * h, axis=-1, keepdims=True))
@@ -192,21 +192,21 @@ class ParallelRobot(Bundle):
         return total / numeric.sqrt(numeric.sum(total * total, axis=-1, keepdims=True))
 
     def platform_position(self, y: Any) -> Any:
-        """The platform's centre (…, 3) in m, of the robot's states y (…, nodes, y)."""
+        """Return the platform's centre (…, 3) in m, from the robot's states y (…, nodes, y)."""
         return self.positions(y[..., -1, :])
 
     def platform_orientation(self, y: Any) -> Any:
-        """The platform's orientation (…, 4), scalar first, of the robot's states y (…, nodes, y)."""
+        """Return the platform's orientation (…, 4), scalar first, from the robot's states y (…, nodes, y)."""
         return self.quaternions(y[..., -1, :])
 
     # the two ends, and rest
 
     def rest(self, s: Any) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-        """Where the joints face each other, straight and unloaded; else about as slender beams would bend."""
+        """Return straight unloaded legs if the joints face each other, else an estimate by slender beams."""
         L, EI, count = self.length, self.strand.Kbt[0, 0], self.strands
         begin, end = _on_circle(self.base_radius, self.base_angles), self.joints
         facing, off = jnp.sum(begin * end), jnp.sum(begin[:, 1] * end[:, 0] - begin[:, 0] * end[:, 1])
-        # the turn of the platform that brings its joints nearest to the base's, where there is one
+        # rotation of the platform that brings its joints nearest to the base's, if it is defined
         known = facing**2 + off**2 > 0.0
         turn = jnp.where(known, jnp.arctan2(off, jnp.where(known, facing, 1.0)), 0.0)
         x, y = end[:, 0], end[:, 1]
@@ -229,7 +229,7 @@ class ParallelRobot(Bundle):
         return state.reshape(-1), jnp.concatenate([v, m / EI], axis=1).reshape(-1)
 
     def base(self, t: Any, control: Any, unknowns: Float[Any, " k"], history: History) -> Float[Any, " y"]:
-        """The actuators' places and velocities along z."""
+        """Return y at the base: the actuators' positions and velocities along z."""
         count = self.strands
         height = jnp.asarray(control)
         speed = history.c0 * height + self.legs(history.y)[0][:, 2]
@@ -241,7 +241,7 @@ class ParallelRobot(Bundle):
         return jnp.concatenate([p, h, own, q, jnp.zeros((count, 3))], axis=1).reshape(-1)
 
     def tip(self, t: Any, control: Any, y: Float[Any, " y"], history: History) -> Float[Any, " k"]:
-        """The platform's equations of motion, and that all legs hold it in the first one's pose."""
+        """Return the residuals of the platform's motion and of the joints with the legs' tips."""
         p, h, n, m, _, _ = self.legs(y)
         R, M = rotation_matrix(h[0]), self.platform_mass
         arms = jax.vmap(lambda joint: dot(R, joint))(self.joints)
@@ -255,9 +255,9 @@ class ParallelRobot(Bundle):
         return jnp.concatenate([force, moment, jnp.concatenate([gaps, turns], axis=1).reshape(-1)])
 
     def _inertial(self, y: Any, y_t: Any) -> tuple[Any, Any]:
-        """Acceleration of the platform's centre and rate of its spin's momentum, both in its frame.
+        """Acceleration of the platform's centre and rate of its angular momentum, both in its frame.
 
-        Of the mean of the legs' velocities: on a coarse grid these differ a little, and none counts more.
+        Computed from the mean of the legs' velocities, which differ a little on a coarse grid.
         """
         q, w = self._velocity(y)
         q_t, w_t = self._velocity(y_t)
@@ -272,7 +272,7 @@ class ParallelRobot(Bundle):
 
     @property
     def tip_layout(self) -> Layout:
-        """Force and moment on the platform, and how far the legs' tips are from where the first has them."""
+        """Force and moment on the platform, and the other legs' tip errors relative to the first leg."""
         gaps = [
             field
             for k in range(2, self.strands + 1)
@@ -288,17 +288,17 @@ class ParallelRobot(Bundle):
         )
 
     def scales(self) -> Scales:
-        """A leg's, for each; of the conditions a leg's force and moment, its length, and one radian."""
+        """Return a leg's scales for every leg; a gap's scale is the leg's length, a turn's one radian."""
         leg = self.strand.scales()
         gaps = jnp.concatenate([jnp.full(3, self.length), jnp.ones(3)])
         rest = jnp.tile(gaps, self.strands - 1)
         return Scales(jnp.tile(leg.y, self.strands), jnp.concatenate([leg.tip, rest]))
 
-    # what learning looks at
+    # observables for learning
 
     @property
     def observable_layout(self) -> Layout:
-        """The platform's motion, in its frame; the legs' own observables are the strand's."""
+        """The platform's motion, in its frame; the legs' own observables belong to the strand."""
         return Layout(
             ("acceleration", 3, "m/s2", "acceleration of the platform"),
             ("spin", 3, "1/s2", "rate of the platform's angular velocity, as a rigid body's"),
@@ -307,14 +307,14 @@ class ParallelRobot(Bundle):
         )
 
     def observables(self, s: Any, y: Any, y_t: Any, z: Any, z_t: Any, control: Any) -> Float[Any, " o"]:
-        """See `observable_layout`."""
+        """Return the platform's acceleration, spin, q and w; see `observable_layout`."""
         q, w = self._velocity(y)
         q_t, w_t = self._velocity(y_t)
         return jnp.concatenate([q_t + cross(w, q), w_t, q, w])
 
 
 def _split(own: Any) -> list[Any]:
-    """p, h, n, m, q and w of states (…, legs, 19)."""
+    """Return p, h, n, m, q and w of states (…, legs, 19)."""
     numeric: Any = jnp if is_traced(own) else np
     return numeric.split(own, FIELDS, axis=-1)
 
@@ -327,7 +327,7 @@ def _on_circle(radius: Any, angles: Any) -> Float[Any, "legs 3"]:
 
 
 def _turn(one: Float[Any, "4"], other: Float[Any, "4"]) -> Float[Any, "3"]:
-    """Twice the sine of half the angle from one orientation to the other, times its axis (seen from one)."""
+    """Return twice the sine of half the angle between two orientations times its axis, in one's frame."""
     a, b = one[0], other[0]
     vector = a * other[1:] - b * one[1:] - cross(one[1:], other[1:])
     return 2.0 * vector / jnp.sqrt(jnp.sum(one * one) * jnp.sum(other * other))

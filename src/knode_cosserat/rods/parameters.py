@@ -1,7 +1,7 @@
 """Physical parameters: units, meaning and allowed range, stated once beside each parameter.
 
-The same statement serves `System.replace`, robot files and `knode-cosserat info`. Beside numbers a robot may
-state choices (words), and parts: tendons' routings, loads, ends, obstacles, each with parameters of its own.
+`System.replace`, robot files and `knode-cosserat info` use the same statement. A robot may also have choices
+(words), and parts: tendons' routings, loads, ends, obstacles, each with its own parameters.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ import numpy as np
 
 from knode_cosserat._yaml import did_you_mean
 
-#: what is only a direction, such as a quaternion, is longer: its square is lost if it is much shorter
+#: smallest length of a direction or quaternion: the square of a much smaller length underflows
 SHORTEST = 1e-9
 
 
 class ParameterError(ValueError):
-    """A parameter's name or value is not allowed; the message says what was given and what is."""
+    """A parameter's name or value is not allowed; the message gives the value and the allowed range."""
 
 
 Shape = Literal["scalar", "vector", "direction", "quaternion", "matrix", "list"]
 
-#: of the length: what is nearer to an end of the rod than this is at it
+#: fraction of the rod's length: a place nearer to an end than this is at the end
 AT_END = 1e-9
 
 
 @dataclasses.dataclass(frozen=True)
 class Parameter:
-    """What is known of one parameter. `low` and `high` bound each number (eigenvalue, of a matrix)."""
+    """Specification of one parameter. `low` and `high` bound each number (of a matrix, each eigenvalue)."""
 
     unit: str
     meaning: str
@@ -45,7 +45,7 @@ class Parameter:
 
     @property
     def allowed(self) -> str:
-        """The allowed values, in words."""
+        """Description of the allowed values."""
         bounds = f"{self.low:g} to {self.high:g}" + (f" {self.unit}" if self.unit else "")
         kind = {
             "scalar": "a number",
@@ -67,7 +67,7 @@ def parameter(
     high: float,
     default: Any = dataclasses.MISSING,
 ) -> Any:
-    """A dataclass field that holds a physical parameter (see `Parameter`); a default of None: optional."""
+    """Return a dataclass field for a physical parameter (see `Parameter`); default None makes it optional."""
     stated = Parameter(unit, meaning, shape, low, high, optional=default is None)
     extra = {} if default is dataclasses.MISSING else {"default": default}
     return eqx.field(converter=_converter(stated), metadata={"parameter": stated}, **extra)
@@ -76,7 +76,7 @@ def parameter(
 def place(
     meaning: str, *, low: float = 0.0, default: Any = dataclasses.MISSING, kw_only: bool = False
 ) -> Any:
-    """A field that holds a place on the rod, as a part of its length. It is part of a program, not data."""
+    """Return a field for a place on the rod, as a fraction of its length. It is static, not traced."""
     stated = Parameter("", f"{meaning}, as a part of the length", "scalar", low, 1.0, optional=False)
     extra: dict[str, Any] = {} if default is dataclasses.MISSING else {"default": default}
     return eqx.field(
@@ -86,18 +86,18 @@ def place(
 
 @dataclasses.dataclass(frozen=True)
 class Choice:
-    """What is known of a field that holds one of some words, or several of them."""
+    """Specification of a field that holds one or several of a set of words."""
 
     meaning: str
     allowed: tuple[Any, ...]
     many: bool
 
     def allows(self, value: Any) -> bool:
-        """Whether a value is one of them, or several different ones."""
+        """True if a value is one of the allowed words, or a collection of different ones."""
         if self.many and not isinstance(value, tuple | list):
             return False
         several = list(value) if self.many else [value]
-        # of the same class too: 1 is not True
+        # also compare the class: 1 is not True
         known = all(
             any(type(each) is type(word) and each == word for word in self.allowed) for each in several
         )
@@ -105,13 +105,13 @@ class Choice:
 
     @property
     def words(self) -> str:
-        """The allowed values, in words."""
+        """Description of the allowed values."""
         listed = ", ".join(str(value).lower() for value in self.allowed)
         return f"a list of different ones of {listed}" if self.many else listed
 
 
 def choice(meaning: str, allowed: tuple[Any, ...], default: Any) -> Any:
-    """A dataclass field with one of the allowed words, or several where the default is a tuple."""
+    """Return a dataclass field with one of the allowed words, or several if the default is a tuple."""
     stated = Choice(meaning, allowed, isinstance(default, tuple))
     convert = (lambda given: tuple(given) if isinstance(given, list) else given) if stated.many else None
     extra: dict[str, Any] = {} if convert is None else {"converter": convert}
@@ -120,7 +120,7 @@ def choice(meaning: str, allowed: tuple[Any, ...], default: Any) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class Slot:
-    """What is known of a field that holds a part, or (`many`) a tuple of parts, of a family of classes."""
+    """Specification of a field that holds a part, or (`many`) a tuple of parts, of a family of classes."""
 
     meaning: str
     family: type
@@ -129,7 +129,7 @@ class Slot:
 
 
 def part(meaning: str, family: type, *, many: bool = False, default: Any) -> Any:
-    """A dataclass field that holds a part, or parts (see `parts.Part`); a default of None: optional."""
+    """Return a dataclass field for a part, or parts (see `parts.Part`); default None makes it optional."""
     stated = Slot(meaning, family, many, optional=default is None)
 
     def several(given: Any) -> Any:
@@ -143,12 +143,12 @@ def part(meaning: str, family: type, *, many: bool = False, default: Any) -> Any
 
 
 class Parametrised(eqx.Module):
-    """What systems and their parts have in common: parameters, stated in the class, given by name."""
+    """Base of systems and their parts: parameters, stated in the class and passed by name."""
 
     def __new__(cls, *args: Any, **given: Any) -> Self:
-        """Say which names there are, before Python says no more than that one is not among them."""
+        """Raise `ParameterError` that lists the known names; Python's own message would not."""
         for name in given.keys() - {field.name for field in dataclasses.fields(cls)}:
-            # a class may have a constructor of its own
+            # a class may define its own constructor
             stated = inspect.signature(cls.__init__).parameters
             if name in stated or any(each.kind is each.VAR_KEYWORD for each in stated.values()):
                 continue
@@ -157,12 +157,12 @@ class Parametrised(eqx.Module):
 
     @classmethod
     def parameters(cls) -> dict[str, Parameter]:
-        """The physical parameters by name, with unit, meaning and allowed range."""
+        """Return the physical parameters by name, with unit, meaning and allowed range."""
         return parameters_of(cls)
 
 
 def unknown_parameter(cls: type, name: Any, known: Iterable[str]) -> str:
-    """What to say of a name that is not a parameter's."""
+    """Return the error message for an unknown parameter name."""
     known = list(known)
     return (
         f"{cls.__name__} has no parameter {name!r}{did_you_mean(name, known)}; there are {', '.join(known)}"
@@ -170,12 +170,12 @@ def unknown_parameter(cls: type, name: Any, known: Iterable[str]) -> str:
 
 
 def choices_of(cls: type) -> dict[str, Choice]:
-    """The choices of a class, by name."""
+    """Return the choices of a class, by name."""
     return _stated(cls, "choice")
 
 
 def slots_of(cls: type) -> dict[str, Slot]:
-    """The slots for parts of a class, by name."""
+    """Return the slots for parts of a class, by name."""
     return _stated(cls, "part")
 
 
@@ -199,7 +199,7 @@ def check_fields(owner: Any) -> None:
 
 
 def parameters_of(cls: type) -> dict[str, Parameter]:
-    """The parameters of a class, by name."""
+    """Return the parameters of a class, by name."""
     return _stated(cls, "parameter")
 
 
@@ -209,7 +209,7 @@ def _stated(cls: type, what: str) -> dict[str, Any]:
 
 
 def checked(name: str, value: Any, parameter: Parameter) -> None:
-    """Raise `ParameterError` unless the value is allowed. Tracers cannot be looked at, and pass."""
+    """Raise `ParameterError` unless the value is allowed. Tracers have no values and are not checked."""
     if value is None and parameter.optional:
         return
     if isinstance(value, jax.core.Tracer):
@@ -255,21 +255,21 @@ def _converter(parameter: Parameter) -> Callable[[Any], Any]:
 
 
 def _plain_number(value: Any) -> Any:
-    """A number as Python's own, so that it can be compared and hashed; anything else is for `checked`."""
+    """Return a number as a Python float, which can be compared and hashed; `checked` judges anything else."""
     return (
         float(value) if isinstance(value, int | float | np.number) and not isinstance(value, bool) else value
     )
 
 
 def _place_number(value: Any) -> Any:
-    """The same, and at an end of the rod if only rounding keeps it away: a tip load is at 1, not beside."""
+    """Return a place as a Python float, rounded to an end of the rod if it is within `AT_END` of it."""
     number = _plain_number(value)
     near = [end for end in (0.0, 1.0) if isinstance(number, float) and abs(number - end) < AT_END]
     return near[0] if near else number
 
 
 def _as_matrix(value: Any) -> Any:
-    """One number or three become a diagonal matrix; anything else stays, for `checked` to judge."""
+    """Return one number or three as a diagonal matrix; `checked` judges anything else."""
     numeric = np if isinstance(value, np.ndarray) else jax.numpy
     if value.shape == ():
         return value * np.eye(3)

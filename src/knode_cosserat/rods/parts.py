@@ -1,7 +1,7 @@
 """Parts of a robot: routings of tendons, loads, ends, obstacles, sections. Each is a small class of a family.
 
-A family is an abstract class; what can stand in a robot's file is its subclasses with a `kind`. A part has
-parameters of its own, and may be driven by numbers of the robot's control.
+A family is an abstract class. Its subclasses with a `kind` can be named in a robot's file. A part has its own
+parameters, and may be driven by entries of the robot's control.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from knode_cosserat.rods.parameters import ParameterError, Parametrised, check_f
 
 
 class Part(Parametrised):
-    """What all parts have in common."""
+    """Base class of parts."""
 
-    #: how robot files call it; none: it cannot be written to one
+    #: name in robot files; empty if the part cannot be written to one
     kind: ClassVar[str] = ""
 
     @property
     def control_fields(self) -> tuple[Field, ...]:
-        """What of the robot's control is this part's own; the robot puts its place before the names."""
+        """Fields of the robot's control that drive this part; the robot prefixes their names."""
         return ()
 
     def __check_init__(self) -> None:
@@ -32,29 +32,30 @@ class Part(Parametrised):
 
 
 def require_stretch(begin: Any, end: Any, who: str) -> None:
-    """Raise `ParameterError` unless a stretch of the rod ends beyond where it begins."""
+    """Raise `ParameterError` unless a section of the rod ends beyond its beginning."""
     if not end > begin:
         raise ParameterError(f"{who}: end is {end:g}; allowed is a place beyond begin, {begin:g}")
 
 
 def kinds_of(family: type) -> dict[str, type[Part]]:
-    """The classes of a family that robot files can name."""
+    """Return the classes of a family that robot files can name: the family and its subclasses."""
     found: dict[str, type[Part]] = {}
-    cls: Any
-    for cls in family.__subclasses__():
-        found |= kinds_of(cls)
-        if getattr(cls, "kind", "") and not inspect.isabstract(cls):
-            found[cls.kind] = cls
+    cls: Any = family
+    each: Any
+    if getattr(cls, "kind", "") and not inspect.isabstract(cls):
+        found[cls.kind] = cls
+    for each in family.__subclasses__():
+        found |= kinds_of(each)
     return dict(sorted(found.items()))
 
 
 def placed(fields: tuple[Field, ...], prefix: str) -> tuple[Field, ...]:
-    """Fields with the place of their part before their names."""
+    """Return fields with their part's prefix before their names."""
     return tuple(field._replace(name=f"{prefix}_{field.name}") for field in fields)
 
 
 def shares(parts: tuple[Any, ...], first: int) -> list[slice]:
-    """Where the control of each part stands in the robot's, the first one's at `first`."""
+    """Return each part's slice of the robot's control; the first begins at `first`."""
     found = []
     for each in parts:
         last = first + sum(field.size for field in each.control_fields)

@@ -1,14 +1,14 @@
-"""Robots as YAML files, and the robots that come with the package.
+"""Robots as YAML files, and the catalog of robots in the package.
 
     format: 1
     kind: tendon-robot
-    description: what it is, in one line
+    description: one line of text
     parameters:
       length: 0.635  # m
       …
 
-Names, units and allowed values are those that the kind's class states (`System.parameters`). Reading runs no
-code, and numbers are read as YAML 1.2 has it: `2.7e9` is a number and `1:30` is not.
+The kind's class states names, units and allowed values (`System.parameters`). Reading runs no code. Numbers
+follow YAML 1.2: `2.7e9` is a number and `1:30` is not.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ import numpy as np
 
 from knode_cosserat._files import replacing
 from knode_cosserat._yaml import YAMLTextError, did_you_mean, flow, mapping_of, shown
+from knode_cosserat.rods.old_keys import upgraded
 from knode_cosserat.rods.parallel_robot import ParallelRobot
 from knode_cosserat.rods.parameters import (
     Parameter,
@@ -44,10 +45,10 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.rods.tendon_robot import TendonRobot
 from knode_cosserat.rods.virtual_robot import VirtualRobot
 
-#: what files say is their format. The first had numbers only; a robot that needs no more is still written so
+#: formats of files. The first had numbers only; a robot without choices and parts is still written in it
 FORMATS = (1, 2)
 
-#: the classes that a file can name as its kind
+#: classes that a file can name as its kind
 KINDS: dict[str, type[System]] = {
     "tendon-robot": TendonRobot,
     "routed-tendon-robot": RoutedTendonRobot,
@@ -58,24 +59,24 @@ KINDS: dict[str, type[System]] = {
 
 
 class RobotFileError(ValueError):
-    """A robot file that is not right: one line that names file, key, value and what is allowed."""
+    """A robot file is invalid: one line that names file, key, value and the allowed values."""
 
 
 def load_robot(name_or_path: str | Path) -> System:
-    """A robot from the catalog, by name, or from a file, by path. The catalog's names come first.
+    """Return a robot from the catalog, by name, or from a file, by path. The catalog has priority.
 
     Raises:
-        RobotFileError: there is no such robot, or its file is not right.
+        RobotFileError: there is no such robot, or its file is invalid.
     """
     file = _catalog_files().get(str(name_or_path)) or _existing(Path(name_or_path))
     return parse_robot(_text(file, str(name_or_path)), str(name_or_path))
 
 
 def save_robot(robot: System, path: str | Path, *, description: str = "") -> None:
-    """Write a robot as a file that `load_robot` reads back equal. It appears complete or not at all.
+    """Write a robot to a file that `load_robot` reads back equal. The file is complete or not written.
 
     Raises:
-        RobotFileError: it is of a class that no file can name, a batch, or the file cannot be written.
+        RobotFileError: the robot's class has no kind, it is a batch, or the file cannot be written.
     """
     text = format_robot(robot, description)
     try:
@@ -86,7 +87,7 @@ def save_robot(robot: System, path: str | Path, *, description: str = "") -> Non
 
 
 def catalog() -> dict[str, str]:
-    """The robots that come with the package: their names, each with a description in one line."""
+    """Return the names of the catalog's robots, each with a description in one line."""
     files = sorted(_catalog_files().items())
     described = {name: _mapping(_text(file, name), name).get("description", "") for name, file in files}
     return {name: " ".join(description.split()) for name, description in described.items()}
@@ -121,7 +122,7 @@ def _text(file: Traversable, source: str) -> str:
 
 
 def parse_robot(text: str, source: str) -> System:
-    """A robot from a file's text; `source` is what errors call the file. Raises `RobotFileError`."""
+    """Return the robot of a file's text; `source` names the file in errors. Raises `RobotFileError`."""
     file = _mapping(text, source)
     number = file.get("format", FORMATS[0])
     if isinstance(number, bool) or number not in FORMATS:
@@ -143,7 +144,7 @@ def parse_robot(text: str, source: str) -> System:
         raise RobotFileError(
             f"{source}: parameters is {shown(values)}; allowed is a mapping from names to values"
         )
-    return _robot(KINDS[kind], values, source)
+    return _robot(KINDS[kind], upgraded(kind, values), source)
 
 
 def _robot(cls: type[System], values: dict[Any, Any], source: str) -> System:
@@ -153,9 +154,9 @@ def _robot(cls: type[System], values: dict[Any, Any], source: str) -> System:
 
 
 def _made(cls: type, values: dict[Any, Any], source: str, where: str, more: tuple[str, ...] = ()) -> Any:
-    """An object of a class that states its parameters, choices and parts, from a mapping of them."""
+    """Return an object of a class from a mapping of its parameters, choices and parts."""
     numbers, words, parts = parameters_of(cls), choices_of(cls), slots_of(cls)
-    # an empty optional value is as good as none
+    # an empty optional value counts as absent
     optional = {name for name, each in (numbers | parts).items() if each.optional}
     values = {key: value for key, value in values.items() if value is not None or key not in optional}
     fields = {field.name: field for field in dataclasses.fields(cls)}
@@ -180,7 +181,7 @@ def _made(cls: type, values: dict[Any, Any], source: str, where: str, more: tupl
 
 
 def _parts(value: Any, slot: Slot, source: str, where: str) -> Any:
-    """A part from a mapping with its kind, or parts from a list of such."""
+    """Return a part from a mapping with its kind, or parts from a list of such mappings."""
     known = kinds_of(slot.family)
     names = ", ".join(known)
     if slot.many:
@@ -235,7 +236,7 @@ def _require_allowed(key: str, value: Any, parameter: Parameter, source: str) ->
 
 
 def _array(value: Any) -> np.ndarray | None:
-    """A number, a list of numbers or a list of lists of them as an array; None of anything else."""
+    """Return a number, a list of numbers or a list of lists as an array; None for anything else."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         try:
             return np.asarray(float(value))
@@ -243,7 +244,7 @@ def _array(value: Any) -> np.ndarray | None:
             return np.asarray(np.inf)
     if not isinstance(value, list) or not value:
         return None
-    # nothing allowed is deeper than a list of lists: a file may nest without end
+    # no allowed value is deeper than a list of lists; a file could nest without end
     if any(isinstance(inner, list) for row in value if isinstance(row, list) for inner in row):
         return None
     rows = [_array(row) for row in value]
@@ -258,7 +259,7 @@ def _asymmetric(array: np.ndarray | None, parameter: Parameter) -> bool:
     return bool(np.all(np.isfinite(array))) and not np.allclose(array, array.T, rtol=1e-9, atol=0.0)
 
 
-#: by unit: what numbers are typical, and the other units that people write, the likeliest first
+#: by unit: the typical range, and other common units, the likeliest first
 _OTHER_UNITS: dict[str, tuple[float, float, dict[str, float]]] = {
     "m": (1e-5, 10.0, {"mm": 1e-3, "um": 1e-6}),
     "Pa": (1e5, 4e11, {"GPa": 1e9, "MPa": 1e6, "kPa": 1e3}),
@@ -269,7 +270,7 @@ _OTHER_UNITS: dict[str, tuple[float, float, dict[str, float]]] = {
 
 
 def _unit_hint(value: Any, array: np.ndarray | None, parameter: Parameter) -> str:
-    """The same number in another unit, if that would have been typical."""
+    """Return a hint with the same number in another unit, if that value would be typical."""
     if array is None or parameter.unit not in _OTHER_UNITS or parameter.shape == "matrix":
         return ""
     low, high, others = _OTHER_UNITS[parameter.unit]
@@ -286,7 +287,7 @@ def _unit_hint(value: Any, array: np.ndarray | None, parameter: Parameter) -> st
 
 
 def format_robot(robot: System, description: str = "") -> str:
-    """A robot as the text of a file, with the unit beside each value; see `save_robot` for the errors."""
+    """Return the text of a robot's file, with the unit beside each value; see `save_robot` for the errors."""
     kind = next((name for name, cls in KINDS.items() if type(robot) is cls), None)
     if kind is None:
         raise RobotFileError(
@@ -310,7 +311,7 @@ def format_robot(robot: System, description: str = "") -> str:
 
 
 def more_of(robot: System) -> list[str]:
-    """Lines for the choices and parts of a robot that are not as they are by default."""
+    """Return lines for the choices and parts of a robot that differ from their defaults."""
     lines = []
     defaults = {field.name: field.default for field in dataclasses.fields(robot)}
     for name, choice in choices_of(type(robot)).items():
@@ -330,7 +331,7 @@ def more_of(robot: System) -> list[str]:
 
 
 def _part_text(each: Any) -> str:
-    """A part on one line."""
+    """Return a part's text on one line."""
     if not each.kind:
         raise RobotFileError(
             f"a {type(each).__name__} cannot be written to a robot file: it is made of code, not of numbers"
@@ -354,7 +355,7 @@ def _word(value: Any) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Numbers in the shortest form that reads back equal: a multiple of the identity as one, say."""
+    """Return numbers in the shortest form that reads back equal: one for a multiple of the identity."""
     array = np.asarray(value, dtype=float)
     if array.shape == (3, 3) and np.array_equal(array, np.diag(np.diag(array))):
         array = np.diag(array)
@@ -366,7 +367,7 @@ def _plain(value: Any) -> Any:
 
 
 def _mapping(text: str, source: str) -> dict[Any, Any]:
-    """The file's outermost mapping."""
+    """Return the file's outermost mapping."""
     try:
         return mapping_of(text, "format, kind and parameters")
     except YAMLTextError as error:

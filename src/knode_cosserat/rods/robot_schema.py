@@ -1,8 +1,8 @@
-"""What a robot file may hold, as a JSON Schema: an editor then completes names and marks what is not allowed.
+"""JSON Schema of robot files, for completion of names and marking of errors in an editor.
 
-It is made of the same statements that the loader checks (`parameters`, `parts`). The loader knows more, such
-as the eigenvalues of a matrix, or how many angles a platform has; what the schema refuses it
-refuses too.
+It is built from the same statements that the loader checks (`parameters`, `parts`). The schema is weaker than
+the loader: it does not check the eigenvalues of a matrix, for example. The loader refuses every file that the
+schema refuses.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ NODES = {
     "default": 10,
     "description": "nodes along the rod, base and tip included",
 }
-#: of an array
+#: constraint on an array
 NOT_ALL_ZERO = {"contains": {"not": {"const": 0}}}
 
 
 def robot_schema() -> dict[str, Any]:
-    """The JSON Schema (draft 2020-12) of robot files, as a mapping that `json.dumps` writes.
+    """Return the JSON Schema (draft 2020-12) of robot files, as a mapping that `json.dumps` writes.
 
     `knode-cosserat schema` prints it. A robot file names it in a comment for the editor:
     `# yaml-language-server: $schema=robot.schema.json`.
@@ -58,14 +58,14 @@ def robot_schema() -> dict[str, Any]:
 
 
 def _mapping(cls: type, parts: dict[str, Any], **more: Any) -> dict[str, Any]:
-    """What a mapping for this class may hold; the families of its parts are added to `parts`."""
+    """Return the schema of a class's mapping; the families of its parts are added to `parts`."""
     fields = {field.name: field.default for field in dataclasses.fields(cls)}
     numbers = parameters_of(cls)
     known = {name: _number(each, fields[name]) for name, each in numbers.items()}
     known |= {name: _word(each, fields[name]) for name, each in choices_of(cls).items()}
     known |= {name: _slot(each, parts) for name, each in slots_of(cls).items()}
     if {"begin", "end"} <= known.keys():
-        # neither has a place for the other there
+        # begin < end leaves no room for these values
         known["begin"]["exclusiveMaximum"], known["end"]["exclusiveMinimum"] = 1.0, 0.0
     if "base_end" in known:
         ends: Any = kinds_of(End)
@@ -102,7 +102,7 @@ def _array(one: Any, count: int) -> dict[str, Any]:
 
 
 def _square(one: Any, high: float) -> dict[str, Any]:
-    """A 3x3 matrix: the diagonal keeps to the eigenvalues' bounds, and no entry exceeds the upper one."""
+    """Schema of a 3x3 matrix: diagonal within the eigenvalues' bounds, entries within the upper one."""
     other = {"type": "number", "minimum": -high, "maximum": high}
     rows = [[one if row == column else other for column in range(3)] for row in range(3)]
     whole = [{"type": "array", "prefixItems": row, "minItems": 3, "maxItems": 3} for row in rows]
@@ -135,7 +135,7 @@ def _slot(slot: Slot, parts: dict[str, Any]) -> dict[str, Any]:
     one = {"$ref": f"#/$defs/{family}"}
     shape: dict[str, Any] = {"type": "array", "items": one} if slot.many else one
     if slot.many and slot.optional:
-        # that there are none is said by leaving it out
+        # an absent key means none, so an empty list is refused
         shape["minItems"] = 1
     return {**_or_null(shape, slot.optional), "description": slot.meaning}
 

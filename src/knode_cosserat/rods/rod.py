@@ -1,7 +1,7 @@
-"""A Cosserat rod with everything that may load it, hold it and touch it: what all robots of one rod share.
+"""A Cosserat rod with loads, boundary conditions and contact: the base of all single-rod robots.
 
-`elastic_rod` is what it is made of, and has the symbols; `slender_rod` is a rod by itself; `tendon_robot` and
-`routed_robot` add what tendons do.
+`elastic_rod` has the material and the symbols. `slender_rod` is a rod without actuators. `tendon_robot` and
+`routed_robot` add tendons.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from knode_cosserat.rods.surroundings import Obstacle
 from knode_cosserat.rods.system import History, Scales
 from knode_cosserat.rotation import cross, dot, quaternion_rate, rotation_matrix
 
-#: where ends are placed from
+#: default pose of the base
 AT_ORIGIN = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 
 
 class PartControls(NamedTuple):
-    """The controls of a rod's parts, those of sections and loads in their order."""
+    """Controls of a rod's parts; sections and loads in their order."""
 
     base: Any
     tip: Any
@@ -47,8 +47,8 @@ class PartControls(NamedTuple):
 class Rod(ElasticRod):
     """A round rod with gravity, drag, loads, ends and surroundings (paper eqs. 13 and 14).
 
-    A subclass says what its actuators do: by a law of its own, `strains`, which then has no `constitutive`,
-    or by what they load the rod with, `actuator_force`.
+    A subclass defines its actuators by its own law of strains, `strains` (it then has no `constitutive`), or
+    by their load on the rod, `actuator_force`.
     """
 
     mixed: ClassVar[bool] = False
@@ -75,62 +75,62 @@ class Rod(ElasticRod):
         if not self.base_end.anywhere:
             raise ParameterError(f"base_end is {self.base_end.kind}; that is allowed as tip_end only")
 
-    # what follows from the parameters
+    # derived quantities
 
     @property
     def base_unknowns(self) -> tuple[str, ...]:  # type: ignore[override]
-        """What the end at the base leaves unknown."""
+        """Unknown fields of y at the base."""
         return self.base_end.unknowns
 
     @property
     def actuator_layout(self) -> Layout:
-        """The controls of the actuators: none, unless a robot has some."""
+        """Layout of the actuators' controls; empty by default."""
         return Layout()
 
     @property
     def control_layout(self) -> Layout:  # type: ignore[override]
-        """The actuators' controls, then those of ends, sections and loads."""
+        """Layout of the actuators' controls, then the controls of ends, sections and loads."""
         driven = [field for prefix, each in self._driven for field in placed(each.control_fields, prefix)]
         return Layout(*self.actuator_layout.fields, *driven)
 
     @property
     def _driven(self) -> list[tuple[str, Any]]:
-        """Everything that may have controls of its own, with how its controls are called."""
+        """Parts that may have controls, each with the prefix of its controls' names."""
         ends = [("base", self.base_end), ("tip", self.tip_end)]
         sections = [(f"section{k}", each) for k, each in enumerate(self.sections)]
         return [*ends, *sections, *((f"load{k}", each) for k, each in enumerate(self.loads))]
 
     def _controls(self, control: Any) -> PartControls:
-        """What of the control is each part's own."""
+        """Return the control of each part."""
         spots = shares(tuple(each for _, each in self._driven), self.actuator_layout.size)
         base, tip, *others = (control[spot] for spot in spots)
         return PartControls(base, tip, others[: len(self.sections)], others[len(self.sections) :])
 
     def section_controls(self, control: Any) -> list[Any]:
-        """What of the control is each section's own."""
+        """Return the control of each section."""
         return self._controls(control).sections
 
     @property
     def rest_is_guess(self) -> bool:  # type: ignore[override]
-        """Where its tip is held, which the rod as it is by itself need not meet."""
+        """True if the tip is constrained: the unloaded rod need not meet that constraint."""
         return self.tip_end.held
 
     @property
     def held(self) -> bool:  # type: ignore[override]
-        """Whether an end is held, or there is something on which it may lie."""
+        """True if an end is constrained, or there is an obstacle on which the rod may lie."""
         return self.base_end.held or self.tip_end.held or bool(self.surroundings)
 
     def eased(self, part: float) -> Self:
-        """With softer obstacles, on which the rod slides more easily."""
+        """Return the rod with smoothed contact and friction on its obstacles."""
         if not self.surroundings:
             return self
         return self.replace(surroundings=tuple(each.eased(part) for each in self.surroundings))
 
-    # what learning looks at
+    # observables for learning
 
     @property
     def observable_layout(self) -> Layout:
-        """Motion and bending, as seen from the material."""
+        """Motion and bending, in the material frame."""
         return Layout(
             ("acceleration", 3, "m/s2", "acceleration of the centreline"),
             ("spin", 3, "1/s2", "rate of the angular momentum over ρI"),
@@ -141,7 +141,7 @@ class Rod(ElasticRod):
         )
 
     def observables(self, s: Any, y: Any, y_t: Any, z: Any, z_t: Any, control: Any) -> Float[Any, " o"]:
-        """See `observable_layout`."""
+        """Return acceleration, spin, q, w, curvature and its rate; see `observable_layout`."""
         q, w = self.y_layout.get(y, "q"), self.y_layout.get(y, "w")
         q_t, w_t = self.y_layout.get(y_t, "q"), self.y_layout.get(y_t, "w")
         u, u_t = self.z_layout.get(z, "u"), self.z_layout.get(z_t, "u")
@@ -150,21 +150,21 @@ class Rod(ElasticRod):
         bent = u - self.material(s, control).u_star
         return jnp.concatenate([acceleration, spin, q, w, bent, u_t])
 
-    # the equations, as the paper gives them
+    # the paper's equations
 
     def actuator_force(self, control: Float[Any, " c"]) -> Float[Any, "3"] | None:
-        """What actuators add to the load per length (N/m), global frame; none, unless a robot says so."""
+        """Return the actuators' load per length (N/m), global frame; None by default."""
         return None
 
     def rates(
         self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
     ) -> Float[Any, " y"]:
-        """y_s (paper eqs. 13 and 14)."""
+        """Return y_s (paper eqs. 13 and 14)."""
         y_t, z_t = history.c0 * y + history.y, history.c0 * z + history.z
         return self.spatial_rates(s, y, y_t, z, z_t, control)
 
     def spatial_rates(self, s, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
-        """The right-hand side of paper eq. 13, once y_t, z and z_t are known."""
+        """Return the right-hand side of paper eq. 13, from y_t, z and z_t."""
         h, n = self.y_layout.get(y, "h"), self.y_layout.get(y, "n")
         motion = Motion.of(self.y_layout, y, y_t)
         _, R, q, w, q_t, w_t = motion
@@ -189,7 +189,7 @@ class Rod(ElasticRod):
         return jnp.concatenate([p_s, h_s, n_s, m_s, q_s, w_s])
 
     def _distributed(self, s: Any, motion: Motion, radius: Any, control: Any) -> list[Wrench]:
-        """What loads and surroundings do, per length."""
+        """Return the wrenches of loads and surroundings, per length."""
         found = [obstacle.wrench(motion, radius) for obstacle in self.surroundings]
         for load, own in zip(self.loads, self._controls(control).loads, strict=True):
             if not isinstance(load, SpreadLoad):
@@ -201,11 +201,11 @@ class Rod(ElasticRod):
             found.append(wrench)
         return found
 
-    # places where something begins, ends or pulls
+    # discontinuities: places where something begins, ends or pulls
 
     @property
     def cuts(self) -> tuple[float, ...]:  # type: ignore[override]
-        """Where loads and sections begin or end, and where loads act at one place."""
+        """Places where loads and sections begin or end, and where point loads act."""
         stretches: list[Any] = [
             *self.sections,
             *(load for load in self.loads if isinstance(load, SpreadLoad)),
@@ -217,13 +217,13 @@ class Rod(ElasticRod):
 
     @property
     def jumps(self) -> bool:  # type: ignore[override]
-        """Whether a load acts at one place."""
+        """True if a point load acts before the tip."""
         return any(isinstance(load, PointLoad) and load.at < 1.0 for load in self.loads)
 
     def crossed(
         self, acting: Float[Any, " cuts"], t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> Float[Any, " y"]:
-        """y on the far side of the cuts that are acting: n and m less what pulls there."""
+        """Return y on the far side of the acting cuts: n and m less the point loads there."""
         places = {cut: k for k, cut in enumerate(self.cuts)}
         weights = {k: acting[places[load.at]] for k, load in self._points() if load.at in places}
         wrench = self._point_wrench(weights, y, control, history)
@@ -234,7 +234,7 @@ class Rod(ElasticRod):
         return [(k, load) for k, load in enumerate(self.loads) if isinstance(load, PointLoad)]
 
     def _point_wrench(self, weights: Any, y: Any, control: Any, history: History) -> Wrench:
-        """The sum of the loads at places, each times its weight."""
+        """Return the sum of the point loads, each times its weight."""
         controls = self._controls(control).loads
         motion = Motion.of(self.y_layout, y, history.c0 * y + history.y)
         acting = [(self.loads[k], weight, controls[k]) for k, weight in weights.items()]
@@ -243,14 +243,14 @@ class Rod(ElasticRod):
     # the two ends, and rest
 
     def rest(self, s: Any) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-        """Unloaded, at rest, from the base on: straight, or as it is curved there."""
+        """Return y and z of the unloaded rod at rest: straight, or with the sections' curvature."""
         s = jnp.asarray(s, dtype=float)
         p, h, u = self._rest_shape(self.base_end.pose(AT_ORIGIN, self._no_control(0)), s)
         y = jnp.concatenate([p, h, np.zeros(self.y_layout.size - 7)])
         return y, jnp.concatenate([self.v_star, u])
 
     def _no_control(self, k: int) -> np.ndarray:
-        """The control of the k-th driven part while nothing is controlled."""
+        """Return the zero control of the k-th driven part."""
         return np.zeros(sum(field.size for field in self._driven[k][1].control_fields))
 
     def _rest_shape(self, base: Pose, s: Any) -> tuple[Any, Any, Any]:
@@ -264,14 +264,14 @@ class Rod(ElasticRod):
 
         ends = {place for each in self.sections for place in (each.begin, each.end)}
         edges = self.length * np.array(sorted({0.0, *ends, 1.0}))
-        # z at a node is that on its far side, and where two sections meet is both; less than by what places
-        # are moved away from that side
+        # z at a node is the far-side value, and where two sections meet both curvatures act; the margin is
+        # less than the distance that moves places away from that side
         margin = 0.2 * INWARD * self.length / (self.nodes - 1)
         beyond = jnp.minimum(s + margin, self.length - margin)
         return *shape_at_rest(base.p, base.h, s, curvature, edges), curvature(beyond)
 
     def base(self, t: Any, control: Any, unknowns: Float[Any, " k"], history: History) -> Float[Any, " y"]:
-        """y at s = 0: held as its end has it, and moving as that moves."""
+        """Return y at s = 0: the pose and velocity of the base's end, with the unknowns."""
         held = self.base_end.pose(AT_ORIGIN, self._controls(control).base)
         y = jnp.concatenate([held.p, held.h, np.zeros(self.y_layout.size - 7)])
         y = self.y_layout.replaced(y, self.base_unknowns, unknowns)
@@ -282,7 +282,7 @@ class Rod(ElasticRod):
         return jnp.concatenate([y[:13], q, w, y[19:]])
 
     def end_poses(self, control: Any) -> tuple[Pose | None, Pose | None]:
-        """Return the poses in which the ends are clamped under a control; None for an end that is not."""
+        """Return the clamped poses of the two ends under a control; None for an end that is not clamped."""
         controls, rest = self._controls(control), self._pose(self.rest(self.length)[0])
         ends = (self.base_end, AT_ORIGIN, controls.base), (self.tip_end, rest, controls.tip)
         base, tip = (end.pose(at, own) if isinstance(end, Clamped) else None for end, at, own in ends)
@@ -292,7 +292,7 @@ class Rod(ElasticRod):
         return Pose(self.y_layout.get(y, "p"), self.y_layout.get(y, "h"))
 
     def tip(self, t: Any, control: Any, y: Float[Any, " y"], history: History) -> Float[Any, " k"]:
-        """What is left of the end's conditions, with the loads there, and of the quaternion's length."""
+        """Return the residual of the tip's conditions with the loads there, and of the quaternion's norm."""
         n, m = self.y_layout.get(y, "n"), self.y_layout.get(y, "m")
         at_tip = {k: 1.0 for k, load in self._points() if load.at == 1.0}
         if at_tip:
@@ -311,14 +311,14 @@ class Rod(ElasticRod):
 
     @property
     def tip_layout(self) -> Layout:
-        """Of the end at the tip: force and moment, or where it is held."""
+        """Layout of the tip's conditions: force and moment, or the constrained pose."""
         fields = self.tip_end.conditions
         if "h" in self.base_unknowns:
             fields = (*fields, ("norm", 1, "1", "square of the length of the quaternion, less one"))
         return Layout(*fields)
 
     def scales(self) -> Scales:
-        """Of a beam: length L, force EI/L², moment EI/L, time L² √(ρA/EI)."""
+        """Return the scales of a beam: length L, force EI/L², moment EI/L, time L² √(ρA/EI)."""
         L, EI = self.length, self.Kbt[0, 0]
         T = L * L * jnp.sqrt(self.mass_per_length / EI)
         sizes = {
@@ -332,5 +332,5 @@ class Rod(ElasticRod):
         return Scales(of(self.y_layout), of(self.tip_layout))
 
     def scale_of(self, name: str, sizes: dict[str, Any]) -> Any:
-        """The natural size of a field of y or of the tip's conditions; those of a beam are given."""
+        """Return the natural size of a field of y or of the tip's conditions; `sizes` are those of a beam."""
         return sizes[name]

@@ -1,19 +1,21 @@
-"""A robot whose tendons run through holes in its ribs: they bend it, and rub. Symbols as in `elastic_rod`.
+"""A robot with tendons routed through holes in its ribs, with friction. Symbols as in `elastic_rod`.
 
-n and m carry rod and tendons together, so that their balance has no tendon in it, and where a tendon is
-anchored nothing of theirs jumps. What the tendons take of them stands in the material's law (Till 2019,
-after Rucker & Webster 2011; `tendon_law`), with tendon i at rᵢ(s) and ṗᵢ = v + u × rᵢ + rᵢ′:
+n and m include rod and tendons, so the balance equations contain no tendon forces. n and m do not jump where
+a tendon is anchored. The tendons' part is in the material's law (Till 2019, after Rucker & Webster 2011;
+`tendon_law`), with tendon i at rᵢ(s) and ṗᵢ = v + u × rᵢ + rᵢ′:
 
     Rᵀn = Kse (v - v*) + Bse v_t + Σ τᵢ ṗᵢ/|ṗᵢ|        Rᵀm = Kbt (u - u*) + Bbt u_t + Σ τᵢ rᵢ × ṗᵢ/|ṗᵢ|
 
 Drive. Tendons are pulled with a tension, or by a reel. A reel that has taken in dᵢ leaves a tendon the
-length ℓᵢ* - dᵢ + C Tᵢ, with its length ℓᵢ* in the robot unloaded and the compliance C; the way through the
-robot is ℓᵢ = ∫|ṗᵢ| ds. Either the tendon is taut and they are equal, or it is slack and Tᵢ = 0:
+length ℓᵢ* - dᵢ + C Tᵢ, with its length ℓᵢ* in the unloaded robot and the compliance C. The path length
+through the robot is ℓᵢ = ∫|ṗᵢ| ds. Either the tendon is taut and they are equal, or it is slack and Tᵢ = 0:
 
     0 ≤ Tᵢ  ⊥  ℓᵢ* - dᵢ + C Tᵢ - ℓᵢ ≥ 0
 
-Friction and vibration are memories (`tendon_friction` has them): a tendon loses tension on its way, τᵢ =
-Tᵢ exp(-λᵢ). λ is a part of y; how much of the friction holds, f, and how much is shaken loose, x, of z.
+Parts. Friction and vibration (`tendon_friction`) are internal variables: a tendon loses tension along its
+path, τᵢ = Tᵢ exp(-λᵢ). λ is a part of y. The mobilised part f of the friction and the part x that vibration
+removes are parts of z. `rib_spacing` softens the rod, `anchors` end tendons early, `load_cells` correct
+measured tensions.
 """
 
 from __future__ import annotations
@@ -26,29 +28,38 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.rods.anchors import EarlyAnchors
 from knode_cosserat.rods.layout import Layout
+from knode_cosserat.rods.load_cells import LoadCells
 from knode_cosserat.rods.parameters import ParameterError, choice, parameter, part
+from knode_cosserat.rods.reels import Reels
+from knode_cosserat.rods.rib_spacing import RibSpacing
 from knode_cosserat.rods.rod import Rod
 from knode_cosserat.rods.routing import Routing, Straight, ends, routes
-from knode_cosserat.rods.section import Material
 from knode_cosserat.rods.system import History, System
-from knode_cosserat.rods.tendon_friction import held, loss_rates, shaking
-from knode_cosserat.rods.tendon_law import stretches, tendon_balance, tendon_strains, unbent_flexibility
+from knode_cosserat.rods.tendon_friction import TendonFriction, Vibration
+from knode_cosserat.rods.tendon_law import (
+    stretches,
+    tendon_balance,
+    tendon_strains,
+    unbent_flexibility,
+)
 from knode_cosserat.rods.tendon_rod import TendonRod
+from knode_cosserat.rods.trained_range import TrainedRange
 from knode_cosserat.rotation import dot
 
-#: of the rod's length: how far slack and taut are blended, so that Newton's method has a slope between them
+#: fraction of the rod's length over which slack and taut are blended, so that Newton's method has a slope
 BLEND = 1e-7
-#: points of Gauss's rule for the length of a tendon in the unloaded robot
+#: points of Gauss quadrature for the length of a tendon in the unloaded robot
 GAUSS = 24
 
 
 class RoutedTendonRobot(TendonRod):
-    """A round rod with tendons that run beside it, anywhere, and bend it, with friction where they run.
+    """A round rod with routed tendons beside it that bend it, with friction along them.
 
-    Without friction and vibration (the defaults) it has no memory beyond that of its damping. The heads of
-    this module and of `tendon_friction` have the equations. Tendons are at `tendon_offset` and
-    `tendon_angles`, or where `routing` has them.
+    Without friction and vibration (the defaults) damping is its only internal variable. The docstrings of
+    this module, of `tendon_friction` and of `rib_spacing` have the equations. Tendons are at `tendon_offset`
+    and `tendon_angles`, or follow `routing`.
     """
 
     routing: tuple[Routing, ...] | None = part(
@@ -65,40 +76,50 @@ class RoutedTendonRobot(TendonRod):
         high=1.0,
         default=0.0,
     )
-    sleeve_stiffening: Any = parameter(
-        "", "how much stiffer against bending the rod is at its base, as a part", low=0.0, high=1e4,
+    reels: Reels | None = part(
+        "motors whose angles, or lengths, are the controls of the reels; none: one length for each tendon",
+        Reels, default=None,
+    )  # fmt: skip
+    friction: TendonFriction | None = part(
+        "friction of the tendons; none: they slide freely", TendonFriction, default=None
+    )
+    vibration: Vibration | None = part(
+        "loss of friction where high tensions make the robot shake; none: it does not",
+        Vibration,
+        default=None,
+    )
+    rib_spacing: RibSpacing | None = part(
+        "softening by tendons that are straight between ribs; none: they are bent as the rod is", RibSpacing,
         default=None,
     )  # fmt: skip
-    sleeve_length: Any = parameter(
-        "m", "where that ends: exp(-(s / length)^4) of it are left at s", low=1e-4, high=20.0, default=0.05
-    )
-    friction_wobble: Any = parameter(
-        "1/m", "k, friction of the tendons by the way they run", low=0.0, high=100.0, default=None
-    )
-    friction_curvature: Any = parameter(
-        "1/rad", "μ, friction of the tendons by the angle they turn", low=0.0, high=10.0, default=None
-    )
-    friction_reach: Any = parameter(
-        "1/m", "κ₀, change of curvature that builds friction up", low=1e-4, high=100.0, default=0.1
-    )
-    vibration_tension: Any = parameter(
-        "N", "T_v, tension of all tendons together above which vibration grows", low=0.0, high=1e6,
-        default=1e6,
+    anchors: EarlyAnchors | None = part(
+        "where tendons are anchored before the tip; none: at the tip, or where `routing` ends", EarlyAnchors,
+        default=None,
     )  # fmt: skip
-    vibration_rate: Any = parameter(
-        "1/(N s)", "k_v, how fast it grows; none at 0", low=0.0, high=1e3, default=None
+    load_cells: LoadCells | None = part(
+        "what measured tensions have to be corrected by; none: controls are tensions", LoadCells, default=None
     )
-    vibration_softening: Any = parameter(
-        "m2", "c, loss of bending stiffness by vibration, by tension", low=0.0, high=1.0, default=0.0
-    )
+
+    trained: TrainedRange | None = part(
+        "range of the recordings that it was identified from; outside it extrapolates", TrainedRange,
+        default=None,
+    )  # fmt: skip
 
     def __check_init__(self) -> None:
         if isinstance(self.routing, tuple) and not self.routing:
             raise ParameterError("routing is []; allowed is one or more, one for each tendon")
+        if self.reels is None:
+            return
+        if self.drive != "reel":
+            raise ParameterError(f"reels are given, and drive is {self.drive}; allowed is reel")
+        if self.reels.tendon_count != self.tendon_count:
+            raise ParameterError(
+                f"reels have {self.reels.tendon_count} tendons; the robot has {self.tendon_count}"
+            )
 
     @classmethod
     def like(cls, robot: TendonRod, **changes: Any) -> Self:
-        """A robot with the rod of another, and with tendons at the same places.
+        """Return a robot with the rod of another, and with tendons at the same places.
 
         Raises:
             ParameterError: a change that is not allowed.
@@ -109,27 +130,24 @@ class RoutedTendonRobot(TendonRod):
         return cls(**same).replace(**changes)
 
     def eased(self, part: float) -> Self:
-        """With friction that builds up over a longer reach."""
+        """Return the robot with smoothed contact, and friction that builds up over more curvature."""
         found = super().eased(part)
-        if not self.rubs:
-            return found
-        return found.replace(friction_reach=np.minimum(self.friction_reach / part, 100.0))
+        return found if self.friction is None else found.replace(friction=self.friction.eased(part))
 
-    # what its tendons have: which states there are
+    def undelayed(
+        self, measured: Float[np.ndarray, "T c"], dt: float, before: Float[np.ndarray, " c"] | None = None
+    ) -> Float[np.ndarray, "T c"]:
+        """Return the acting tensions, from the load cells' readings."""
+        cells = self.load_cells
+        return measured if cells is None else cells.undelayed(measured, dt, before)
 
-    @property
-    def rubs(self) -> bool:
-        """Whether there is friction, or could be: a coefficient of it is given."""
-        return self.friction_wobble is not None or self.friction_curvature is not None
-
-    @property
-    def vibrates(self) -> bool:
-        """Whether vibration is a state: its rate is given."""
-        return self.vibration_rate is not None
+    def trained_range(self) -> TrainedRange | None:
+        """Return the range of the recordings used to identify it; None if it has none."""
+        return self.trained
 
     @property
     def routings(self) -> tuple[Routing, ...]:
-        """Where the tendons run."""
+        """Routings of the tendons."""
         if self.routing is not None:
             return self.routing
         angles = jnp.asarray(self.tendon_angles)
@@ -138,21 +156,24 @@ class RoutedTendonRobot(TendonRod):
 
     @property
     def tendon_count(self) -> int:
-        """How many tendons there are."""
+        """Number of tendons."""
         return len(self.routing) if self.routing is not None else int(np.shape(self.tendon_angles)[-1])
 
     @property
     def actuator_layout(self) -> Layout:
-        """One tension per tendon, or what its reel has taken in."""
-        if self.drive == "reel":
-            return Layout(("reel", self.tendon_count, "m", "length of tendon that the reel has taken in"))
-        return Layout(("tension", self.tendon_count, "N", "tendon tension"))
+        """Layout of the tendons' tensions, or of the lengths taken in by reels, or of the motors' angles."""
+        if self.drive != "reel":
+            return Layout(("tension", self.tendon_count, "N", "tendon tension"))
+        count = self.tendon_count if self.reels is None else self.reels.motor_count(self.tendon_count)
+        if self.reels is not None and self.reels.radius is not None:
+            return Layout(("motor", count, "rad", "angle of the motor"))
+        return Layout(("reel", count, "m", "length of tendon that the reel has taken in"))
 
     @property
     def y_layout(self) -> Layout:  # type: ignore[override]
-        """The rod's, the loss of tension by friction, and of reels the tension and the tendons' ways."""
+        """Layout of y: the rod, the loss of tension by friction, and for reels tension and path length."""
         count, more = self.tendon_count, []
-        if self.rubs:
+        if self.friction is not None:
             more.append(("loss", count, "1", "logarithm of tension lost by friction"))
         if self.drive == "reel":
             more.append(("tension", count, "N", "tendon tension at the base"))
@@ -161,51 +182,70 @@ class RoutedTendonRobot(TendonRod):
 
     @property
     def z_layout(self) -> Layout:  # type: ignore[override]
-        """Strains, friction of each tendon, and vibration."""
+        """Layout of z: strains, friction of each tendon, and vibration."""
         more = []
-        if self.rubs:
+        if self.friction is not None:
             more.append(
                 ("f", self.tendon_count, "1", "part of the friction that holds a tendon, and which way")
             )
-        if self.vibrates:
+        if self.vibration is not None:
             more.append(("x", 1, "1", "part of the friction that vibration has taken away"))
         return Rod.z_layout + Layout(*more)
 
     @property
     def base_unknowns(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Those of the rod, and the tension that comes of a reel's position."""
+        """Unknown fields of y at the base: those of the rod, and with reels the tension."""
         return (*self.base_end.unknowns, "tension") if self.drive == "reel" else self.base_end.unknowns
 
     @property
     def cuts(self) -> tuple[float, ...]:  # type: ignore[override]
-        """Those of the rod, and where tendons are anchored."""
-        return tuple(sorted({*super().cuts, *(end for end in self._ends if end < 1.0)}))
+        """Places of discontinuity: those of the rod, and the tendons' anchors."""
+        early = () if self.anchors is None else (self.anchors.at,)
+        return tuple(sorted({*super().cuts, *(end for end in (*self._ends, *early) if end < 1.0)}))
 
     @property
     def _ends(self) -> tuple[float, ...]:
         return (1.0,) if self.routing is None else tuple(float(end) for end in ends(self.routing))
 
-    # what the tendons do
+    # action of the tendons
 
     def base_tension(self, y: Float[Any, " y"], control: Float[Any, " c"]) -> Float[Any, " c"]:
-        """T (N) at the base."""
-        return self.y_layout.get(y, "tension") if self.drive == "reel" else control[: self.tendon_count]
+        """Return the tensions T (N) at the base."""
+        return self.y_layout.get(y, "tension") if self.drive == "reel" else self._pulled(control)
+
+    def taken_in(self, control: Float[Any, " c"]) -> Float[Any, " tendons"]:
+        """Return dᵢ (m), the length of each tendon that the reels have taken in."""
+        given = control[: self.actuator_layout.size]
+        return given if self.reels is None else self.reels.lengths(given)
+
+    @property
+    def _compliance(self) -> Any:
+        """C (m/N) of each tendon, including its spring."""
+        springs = None if self.reels is None else self.reels.compliance
+        return self.tendon_compliance if springs is None else self.tendon_compliance + jnp.asarray(springs)
+
+    def _pulled(self, control: Float[Any, " c"]) -> Float[Any, " c"]:
+        """Return the tensions (N) at the base: the control, corrected by load cells if there are any."""
+        given = control[: self.tendon_count]
+        return given if self.load_cells is None else self.load_cells.tension(given)
 
     def tension_at(self, s: Any, y: Float[Any, " y"], control: Float[Any, " c"]) -> Float[Any, " c"]:
-        """τ (N) at s: less by friction, and none of a tendon that has ended."""
+        """Return τ (N) at s: reduced by friction, and zero beyond a tendon's end."""
         T = self.base_tension(y, control)
-        if self.rubs:
+        if self.friction is not None:
             T = T * jnp.exp(-self.y_layout.get(y, "loss"))
         return self._where_it_runs(s, T)
 
     def _where_it_runs(self, s: Any, values: Float[Any, " c"]) -> Float[Any, " c"]:
-        """Values of the tendons, and zero for those that have ended before s."""
+        """Return the tendons' values, with zero for tendons that end before s."""
+        if self.anchors is not None:
+            values = values * jnp.where(s < self.anchors.at * self.length, 1.0, self.anchors.share)
         if min(self._ends) >= 1.0:
             return values
         return jnp.where(s < np.array(self._ends) * self.length, values, 0.0)
 
     def routes_at(self, s: Any) -> tuple[Float[Any, "c 3"], Float[Any, "c 3"]]:
-        """r and r′ of the tendons at s."""
+        """Return r and r′ of the tendons at s."""
         if self.routing is not None:
             return routes(self.routing, s / self.length, self.length)
         angles = jnp.asarray(self.tendon_angles)
@@ -213,7 +253,7 @@ class RoutedTendonRobot(TendonRod):
         return self.tendon_offset * around, np.zeros(around.shape)
 
     def bending_directions(self, s: Any) -> Float[Any, "c 3"]:
-        """eᵢ: the direction of u in which each tendon bends the rod at s, material frame."""
+        """Return eᵢ: the direction of u in which each tendon bends the rod at s, material frame."""
         if self.routing is None:
             angles = jnp.asarray(self.tendon_angles)
             return jnp.stack([-jnp.sin(angles), jnp.cos(angles), jnp.zeros_like(angles)], axis=-1)
@@ -222,41 +262,29 @@ class RoutedTendonRobot(TendonRod):
         return across / jnp.sqrt(jnp.sum(across * across, axis=1, keepdims=True) + 1e-24)
 
     def actuation(self, control: Float[Any, " c"]) -> Float[Any, " a"]:
-        """Σ Tᵢ d₃ × rᵢ of straight tendons (N·m), material frame; of all others the control."""
+        """Return Σ Tᵢ d₃ × rᵢ of straight tendons (N·m), material frame; otherwise the control."""
         if self.routing is not None or self.drive == "reel" or self.control_size > self.tendon_count:
             return control
-        return self.tendon_offset * dot(self.bending_directions(0.0).T, control)
-
-    def material(self, s: Any, control: Any) -> Material:
-        """The rod's, stiffer against bending within the sleeve."""
-        found = super().material(s, control)
-        if self.sleeve_stiffening is None:
-            return found
-        return found._replace(Kbt=found.Kbt * self._sleeve(s))
-
-    def _sleeve(self, s: Any) -> Any:
-        return 1.0 + self.sleeve_stiffening * jnp.exp(-((s / self.sleeve_length) ** 4))
+        return self.tendon_offset * dot(self.bending_directions(0.0).T, self._pulled(control))
 
     def law_factors(self, s: Any, control: Any) -> tuple[Any, Any] | None:
-        """Those of the rod's sections, and the sleeve's on its stiffness."""
+        """Return the sections' factors on stiffness and damping, with 1 for the other rows of the law."""
         found = super().law_factors(s, control)
-        if found is None and self.sleeve_stiffening is None:
+        if found is None:
             return None
-        stiffness, damping = (jnp.ones(6), jnp.ones(6)) if found is None else found
-        if self.sleeve_stiffening is not None:
-            stiffness = stiffness * jnp.concatenate([jnp.ones(3), jnp.full(3, self._sleeve(s))])
+        stiffness, damping = found
         others = jnp.ones(self.z_layout.size - 6)
         return jnp.concatenate([stiffness, others]), jnp.concatenate([damping, others])
 
     def rest(self, s: Any) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-        """That of the rod; no tension, and no friction."""
+        """Return the rod's state at rest, with zero tension and zero friction."""
         y, z = super().rest(s)
         if self.drive == "reel":
             y = y.at[self.y_layout.slice("path")].set(self._ways(s))
         return y, jnp.concatenate([z, np.zeros(self.z_layout.size - 6)])
 
     def _ways(self, s: Any) -> Float[Any, " c"]:
-        """Lengths of the tendons through the unloaded robot from the base to s, by Gauss's rule."""
+        """Return the tendons' lengths in the unloaded robot from the base to s, by Gauss quadrature."""
         nodes, weights = np.polynomial.legendre.leggauss(GAUSS)
         ways = []
         for k, routing in enumerate(self.routings):
@@ -275,100 +303,100 @@ class RoutedTendonRobot(TendonRod):
 
     # the equations
 
-    # not of the form C z + D z_t = f2
+    # the law is not of the form C z + D z_t = f2
     constitutive = System.constitutive
 
     def strains(
         self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> Float[Any, " z"]:
-        """v and u by the material's law, f and x by their own."""
+        """Return v and u by the material's law, and f and x by their own laws."""
         given, more = self._law_at(s, y, control, history)
         v, u = tendon_strains(*given, flexibility=self._unbent_flexibility(s, y, control, history.c0))
-        if self.rubs:
-            more.insert(0, self._friction(s, history.c0 * u + self.z_layout.get(history.z, "u"), history))
+        if self.friction is not None:
+            more.insert(0, self._held(self.friction, s, u, control, history))
         return jnp.concatenate([v, u, *more])
 
     linear_law = False
 
     def left_of_law(self, s, t, y, z, control, history):  # type: ignore[no-untyped-def]
-        """Rod and tendons together less n and m; of friction and vibration, what they differ by."""
+        """Return the law's residual: rod and tendons less n and m; for f and x, their error."""
         given, more = self._law_at(s, y, control, history)
         v, u = self.z_layout.get(z, "v"), self.z_layout.get(z, "u")
-        if self.rubs:
-            more.insert(0, self._friction(s, history.c0 * u + self.z_layout.get(history.z, "u"), history))
+        if self.friction is not None:
+            more.insert(0, self._held(self.friction, s, u, control, history))
         left = tendon_balance(v, u, *given)
         return jnp.concatenate([left, z[6:] - jnp.concatenate(more)]) if more else left
 
     def _law_at(self, s: Any, y: Any, control: Any, history: History) -> tuple[tuple[Any, ...], list[Any]]:
-        """K_v, K_u, a, b, r, r′ and T of the law (see `tendon_law`), and x if there is vibration."""
+        """Return K_v, K_u, a, b, r, r′ and T of the law (see `tendon_law`), and x if there is vibration."""
         c0, material = history.c0, self.material(s, control)
         n, m = self.stresses(y)
         hv, hu = self.z_layout.get(history.z, "v"), self.z_layout.get(history.z, "u")
         Kse, Bse, Kbt, Bbt = material[:4]
         more = []
-        if self.vibrates:
-            x = self._vibration(y, control, history)
-            more.append(x)
+        if self.vibration is not None:
             total = jnp.sum(self.base_tension(y, control))
-            Kbt = Kbt - self.vibration_softening * x[0] * total * np.diag([1.0, 1.0, 0.0])
+            x = self.vibration.shaken(total, self.z_layout.get(history.z, "x"), c0)
+            more.append(x)
+            Kbt = Kbt - self.vibration.softening * x[0] * total * np.diag([1.0, 1.0, 0.0])
+        tension = self.tension_at(s, y, control)
         a = n + dot(Kse, self.v_star) - dot(Bse, hv)
         b = m - dot(Bbt, hu) if not self.sections else m + dot(Kbt, material.u_star) - dot(Bbt, hu)
-        tension = self.tension_at(s, y, control)
+        if self.rib_spacing is not None:
+            # tendons press on the bent rod, including its intrinsic curvature
+            Kbt = self.rib_spacing.softened(Kbt, jnp.sum(tension))
         return (Kse + c0 * Bse, Kbt + c0 * Bbt, a, b, *self.routes_at(s), tension), more
 
     def _unbent_flexibility(self, s: Any, y: Any, control: Any, c0: Any) -> Float[Any, "6 6"]:
-        """What the law is solved by: of what is known before y, where tensions are given."""
+        """Return the approximate inverse for solving the law, known before y where tensions are controls."""
         Kse, Bse, Kbt, Bbt = self.material(s, control)[:4]
         tension = self._where_it_runs(s, self.base_tension(y, control))
         return unbent_flexibility(Kse + c0 * Bse, Kbt + c0 * Bbt, *self.routes_at(s), tension)
 
-    def _vibration(self, y: Any, control: Any, history: History) -> Float[Any, " 1"]:
-        total = jnp.sum(self.base_tension(y, control))
-        growth = self.vibration_rate * (total - self.vibration_tension)
-        return shaking(growth, self.z_layout.get(history.z, "x"), history.c0)
-
-    def _friction(self, s: Any, u_t: Float[Any, "3"], history: History) -> Float[Any, " c"]:
-        bending = dot(self.bending_directions(s), u_t) / self.friction_reach
-        return held(bending, self.z_layout.get(history.z, "f"), history.c0)
+    def _held(self, friction: TendonFriction, s: Any, u: Any, control: Any, history: History) -> Any:
+        u_t = history.c0 * u + self.z_layout.get(history.z, "u")
+        bent = u - self.material(s, control).u_star
+        past = self.z_layout.get(history.z, "f")
+        return friction.held(self.bending_directions(s), u_t, bent, past, history.c0)
 
     def spatial_rates(self, s, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
-        """Those of the rod, of the tension, and of the tendons' way."""
+        """Return y_s of the rod, of the tension, and of the tendons' path lengths."""
         rates = [super().spatial_rates(s, y, y_t, z, z_t, control)]
         v, u = self.z_layout.get(z, "v"), self.z_layout.get(z, "u")
-        if self.rubs:
+        if self.friction is not None:
             f = self.z_layout.get(z, "f")
-            if self.vibrates:
+            if self.vibration is not None:
                 f = f * (1.0 - self.z_layout.get(z, "x"))
-            rates.append(loss_rates(u, f, self.friction_wobble, self.friction_curvature))
+            rates.append(self.friction.loss_rates(u, f))
         if self.drive == "reel":
             way = stretches(v, u, *map(jnp.asarray, self.routes_at(s)))
             rates += [jnp.zeros(self.tendon_count), self._where_it_runs(s, way)]
         return jnp.concatenate(rates)
 
     def tip(self, t: Any, control: Any, y: Float[Any, " y"], history: History) -> Float[Any, " k"]:
-        """That of the rod; of reels, that tension or slack is zero (Fischer & Burmeister, blended)."""
+        """Return the rod's residual; for reels also that tension or slack is zero (Fischer-Burmeister)."""
         left = super().tip(t, control, y, history)
         if self.drive != "reel":
             return left
         T, way = self.y_layout.get(y, "tension"), self.y_layout.get(y, "path")
-        given = self._ways(self.length) - control[: self.tendon_count] + self.tendon_compliance * T
+        given = self._ways(self.length) - self.taken_in(control) + self._compliance * T
         slack, pulled = given - way, self._give * T
         blend = BLEND * self.length
         return jnp.concatenate([left, slack + pulled - jnp.sqrt(slack**2 + pulled**2 + 2.0 * blend**2)])
 
     @property
     def _give(self) -> Any:
-        """Metres per newton by which tension and slack are compared: the tendon's own, and the rod's."""
-        return self.tendon_compliance + 1e-3 * self.length**3 / self.Kbt[0, 0]
+        """Scale (m/N) for comparing tension and slack: the tendon's compliance plus a part of the rod's."""
+        return self._compliance + 1e-3 * self.length**3 / self.Kbt[0, 0]
 
     @property
     def tip_layout(self) -> Layout:
-        """That of the rod, and of reels."""
+        """Layout of the tip's conditions: those of the rod, and of reels."""
         if self.drive != "reel":
             return super().tip_layout
         return super().tip_layout + Layout(("slack", self.tendon_count, "m", "slack or tension"))
 
     def scale_of(self, name: str, sizes: dict[str, Any]) -> Any:
-        """Tension of a rod's own force, ways of its length."""
+        """Return the natural size of a field: a tension's is the rod's force, a path's its length."""
         more = {"loss": 1.0, "tension": sizes["n"], "path": sizes["p"], "slack": sizes["p"]}
         return more[name] if name in more else super().scale_of(name, sizes)

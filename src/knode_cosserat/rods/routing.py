@@ -1,7 +1,8 @@
-"""Where tendons run in the rod, from the base to where they are anchored.
+"""Routing of tendons in the rod, from the base to their anchors.
 
-A routing says where its tendon crosses the section at σ = s/L: (x, y) in metres in the material frame, whose
-third axis is along the rod. σ runs from 0 to 1 over the whole rod, also for a tendon that ends before.
+A routing gives the point where its tendon crosses the section at σ = s/L: (x, y) in metres in the material
+frame, whose third axis is along the rod. σ runs from 0 to 1 over the whole rod, also for a tendon that is
+anchored before the tip.
 """
 
 from __future__ import annotations
@@ -21,23 +22,23 @@ from knode_cosserat.rods.parts import Part
 
 
 class Routing(Part):
-    """The way of one tendon. `end` is the part of the length at which it is anchored."""
+    """The path of one tendon. `end` is the fraction of the length at which it is anchored."""
 
     end: float = place("where the tendon is anchored", low=1e-3, default=1.0, kw_only=True)
 
     @abc.abstractmethod
     def at(self, sigma: Any) -> tuple[Any, Any]:
-        """x and y (m) at σ. JAX-traceable."""
+        """Return x and y (m) at σ. JAX-traceable."""
 
     def rate(self, sigma: Any) -> tuple[Any, Any]:
-        """Derivatives of x and y with respect to σ (m)."""
+        """Return the derivatives of x and y with respect to σ (m)."""
         sigma = jnp.asarray(sigma, dtype=float)
         x_s, y_s = jax.jvp(self.at, (sigma,), (jnp.ones_like(sigma),))[1]
         return x_s, y_s
 
 
 class Straight(Routing):
-    """Beside the rod, always at the same place of the section."""
+    """A straight routing beside the rod, at a constant place of the section."""
 
     kind: ClassVar[str] = "straight"
 
@@ -45,16 +46,16 @@ class Straight(Routing):
     y: Any = parameter("m", "place in the section", low=-1.0, high=1.0)
 
     def at(self, sigma: Any) -> tuple[Any, Any]:
-        """The same at every σ."""
+        """Return the constant place."""
         return self.x, self.y
 
     def rate(self, sigma: Any) -> tuple[Any, Any]:
-        """None."""
+        """Return zero."""
         return np.zeros(()), np.zeros(())
 
 
 class Tapered(Routing):
-    """At one angle about the rod, with a distance from the axis that changes evenly down to its end."""
+    """A routing at a constant angle, with a distance from the axis that changes linearly down to its end."""
 
     kind: ClassVar[str] = "tapered"
 
@@ -63,18 +64,18 @@ class Tapered(Routing):
     angle: Any = parameter("rad", "angle about the rod, from x to y", low=-10.0, high=10.0, default=0.0)
 
     def at(self, sigma: Any) -> tuple[Any, Any]:
-        """A straight line in σ, from the base to `end`."""
+        """Return the point on a straight line in σ, from the base to `end`."""
         offset = self.base_offset + (self.end_offset - self.base_offset) * (sigma / self.end)
         return offset * jnp.cos(self.angle), offset * jnp.sin(self.angle)
 
     def rate(self, sigma: Any) -> tuple[Any, Any]:
-        """The same at every σ."""
+        """Return the constant slope."""
         slope = (self.end_offset - self.base_offset) / self.end
         return slope * jnp.cos(self.angle), slope * jnp.sin(self.angle)
 
 
 class Helical(Routing):
-    """Around the rod, always at the same distance from the axis."""
+    """A helix around the rod, at a constant distance from the axis."""
 
     kind: ClassVar[str] = "helical"
 
@@ -85,19 +86,19 @@ class Helical(Routing):
     )
 
     def at(self, sigma: Any) -> tuple[Any, Any]:
-        """On a circle about the axis."""
+        """Return the point on a circle about the axis."""
         angle = self.phase + 2.0 * np.pi * self.turns * sigma
         return self.radius * jnp.cos(angle), self.radius * jnp.sin(angle)
 
     def rate(self, sigma: Any) -> tuple[Any, Any]:
-        """Along that circle."""
+        """Return the tangent of that circle."""
         x, y = self.at(sigma)
         speed = 2.0 * np.pi * self.turns
         return -speed * y, speed * x
 
 
 class Polynomial(Routing):
-    """x and y are polynomials of σ: the coefficients of 1, σ, σ², … each, as many as one likes."""
+    """A routing with polynomials x and y of σ: any number of coefficients, from 1, σ, σ² on."""
 
     kind: ClassVar[str] = "polynomial"
 
@@ -105,21 +106,21 @@ class Polynomial(Routing):
     y: Any = parameter("m", "coefficients of y, from the constant on", shape="list", low=-1e3, high=1e3)
 
     def at(self, sigma: Any) -> tuple[Any, Any]:
-        """By Horner's rule."""
+        """Return the polynomials' values, by Horner's rule."""
         return _horner(self.x, sigma), _horner(self.y, sigma)
 
     def rate(self, sigma: Any) -> tuple[Any, Any]:
-        """The polynomials' derivatives."""
+        """Return the polynomials' derivatives."""
         return _horner(_derived(self.x), sigma), _horner(_derived(self.y), sigma)
 
 
 class FunctionRouting(Routing):
-    """Any function of σ that gives x and y (m), written with `jax.numpy`. Robot files cannot hold it."""
+    """Any function of σ that returns x and y (m), written with `jax.numpy`. Robot files cannot hold it."""
 
     function: Callable[[Any], tuple[Any, Any]] = eqx.field(static=True)  # type: ignore[misc]
 
     def at(self, sigma: Any) -> tuple[Any, Any]:
-        """What the function says."""
+        """Return the function's value."""
         x, y = self.function(sigma)
         return x, y
 
@@ -143,9 +144,9 @@ class FunctionRouting(Routing):
 def routes(
     routings: Sequence[Routing], sigma: Any, length: Any
 ) -> tuple[Float[Any, "c 3"], Float[Any, "c 3"]]:
-    """r (m) of all tendons at σ, and r′, its derivative with respect to s.
+    """Return r (m) of all tendons at σ, and r′, its derivative with respect to s.
 
-    Where no routing depends on σ neither does the result: it is the same array for all nodes.
+    If no routing depends on σ, the result is one constant array for all nodes.
     """
     r = _vectors([routing.at(sigma) for routing in routings])
     if all(isinstance(routing, Straight) for routing in routings):
@@ -154,7 +155,7 @@ def routes(
 
 
 def ends(routings: Sequence[Routing]) -> np.ndarray:
-    """The parts of the length (c,) at which the tendons are anchored."""
+    """Return the fractions of the length (c,) at which the tendons are anchored."""
     return np.array([routing.end for routing in routings], dtype=float)
 
 

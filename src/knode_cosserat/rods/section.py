@@ -1,4 +1,4 @@
-"""Cross-sections and the stiffness and inertia that follow from them."""
+"""Cross-sections, with their stiffness and inertia."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from knode_cosserat.rotation import cross, mean_turned, quaternion_of, quaternio
 
 #: d₃: along the rod
 ALONG = np.array([0.0, 0.0, 1.0])
-#: even steps in which the shape of a rod that is curved at rest is integrated; its edges part them further
+#: equal steps for integrating the shape of a rod that is curved at rest; section edges split them further
 REST_STEPS = 50
-#: by this part of a stretch points are moved into it, so that what is smooth within is seen up to its ends
+#: points are moved into an interval by this fraction of it, so that one-sided values are used at its ends
 INWARD = 1e-9
-#: The paper's G = E / (2 (1 + 0.3)), for a robot that gives no shear modulus.
+#: the paper's G = E / (2 (1 + 0.3)), for a robot without a shear modulus
 POISSON_RATIO = 0.3
 
 
@@ -48,16 +48,16 @@ class CircularSection(NamedTuple):
         return self.second_moment * np.diag([1.0, 1.0, 2.0])
 
     def shear_stiffness(self, youngs_modulus: Any, shear_modulus: Any) -> Float[Any, "3 3"]:
-        """Kse = diag(GA, GA, EA): shear and extension (N)."""
+        """Return Kse = diag(GA, GA, EA): shear and extension (N)."""
         return self.area * jnp.diag(jnp.stack([shear_modulus, shear_modulus, youngs_modulus]))
 
     def bending_stiffness(self, youngs_modulus: Any, shear_modulus: Any) -> Float[Any, "3 3"]:
-        """Kbt = diag(EI, EI, 2GI): bending and twisting (N·m²)."""
+        """Return Kbt = diag(EI, EI, 2GI): bending and twisting (N·m²)."""
         return self.second_moment * jnp.diag(jnp.stack([youngs_modulus, youngs_modulus, 2.0 * shear_modulus]))
 
 
 def shear_modulus(youngs_modulus: Any) -> Any:
-    """Shear modulus G = E / (2 (1 + ν)) of an isotropic material (Pa)."""
+    """Return the shear modulus G = E / (2 (1 + ν)) of an isotropic material (Pa)."""
     return youngs_modulus / (2.0 * (1.0 + POISSON_RATIO))
 
 
@@ -77,7 +77,7 @@ class Material(NamedTuple):
 
 
 class Differences(NamedTuple):
-    """How a place of the rod differs: factors of radius and stiffness, and curvature (1/m) added at rest."""
+    """Local changes of the rod: factors of radius and stiffness, and curvature (1/m) added at rest."""
 
     radius: Any = 1.0
     stiffness: Any = 1.0
@@ -85,7 +85,7 @@ class Differences(NamedTuple):
 
 
 class SectionChange(Part):
-    """Where, and how, a rod's cross-section is not what its parameters say."""
+    """A section of the rod with a cross-section that differs from the rod's parameters."""
 
     begin: float = place("where it begins", default=0.0)
     end: float = place("where it ends", default=1.0)
@@ -96,15 +96,15 @@ class SectionChange(Part):
 
     @abc.abstractmethod
     def differences(self, part: Any, control: Any) -> Differences:
-        """How the rod differs at a part of the way, 0 to 1, from `begin` to `end`."""
+        """Return the changes at a fraction, 0 to 1, of the way from `begin` to `end`."""
 
 
 class Stretch(SectionChange):
-    """A stretch of rod whose radius, stiffness or curvature at rest differs, along it and by control.
+    """A section of the rod with another radius, stiffness or curvature at rest, along it and by control.
 
-    With ξ from 0 to 1 along the stretch, the radius is multiplied by a + b ξ + c ξ² … with the coefficients
-    given, and so is the stiffness. A control c, if there is one, multiplies the stiffness by another 1 +
-    gain·c and adds gain·c to the curvature.
+    With ξ from 0 to 1 along the section, the radius is multiplied by a + b ξ + c ξ² … with the given
+    coefficients. The stiffness is multiplied by a polynomial in the same way. A control c, if there is one,
+    multiplies the stiffness by another 1 + gain·c and adds gain·c to the curvature.
     """
 
     kind: ClassVar[str] = "stretch"
@@ -152,23 +152,23 @@ class Stretch(SectionChange):
 
     @property
     def control_fields(self) -> tuple[Field, ...]:
-        """One number, if it is controlled; as large as leaves some stiffness."""
+        """One control, if the section is controlled; its limit leaves some stiffness."""
         input = Field("input", 1, "1", "what acts on the section")._replace(**self._range)
         return (input,) if self.controlled else ()
 
     @property
     def _range(self) -> dict[str, Any]:
-        """Limits of the control, where the gain is one number that is known."""
+        """Limits of the control, if the stiffness gain is one known number."""
         gain = self.stiffness_gain
         if isinstance(gain, jax.core.Tracer) or np.ndim(gain) or gain == 0.0:
             return {}
         none_left = float(-1.0 / gain)
-        # the limit itself leaves nothing
+        # at the limit itself the stiffness is zero
         name, inside = ("low", np.inf) if gain > 0.0 else ("high", -np.inf)
         return {name: float(np.nextafter(none_left, inside))}
 
     def differences(self, part: Any, control: Any) -> Differences:
-        """See the class."""
+        """Return the polynomial factors, with the control's changes."""
         input = control[0] if self.controlled else 0.0
         stiffness = _polynomial(self.stiffness, part) * (1.0 + self.stiffness_gain * input)
         curvature = (
@@ -179,11 +179,35 @@ class Stretch(SectionChange):
         return Differences(_polynomial(self.radius, part), stiffness, curvature)
 
 
-class FunctionSection(SectionChange):
-    """A section that is any function of the part of the way along it, for use from Python.
+class Sleeve(SectionChange):
+    """A sleeve at the beginning of a section: it multiplies the stiffness by 1 + a exp(-(ξ / ℓ)⁴).
 
-    `function` maps the part of the way, 0 to 1, and the robot's control of it to `Differences`; with
-    `inputs` it has as many numbers of the control. It must be traceable by JAX, and no file can hold it.
+    ξ runs from 0 to 1 along the section.
+    """
+
+    kind: ClassVar[str] = "sleeve"
+
+    stiffening: Any = parameter(
+        "",
+        "a, how much stiffer the rod is where the stretch begins, as a part",
+        low=0.0,
+        high=1e4,
+        default=0.0,
+    )
+    length: Any = parameter(
+        "", "ℓ, where the sleeve ends, as a part of the stretch", low=1e-3, high=10.0, default=0.1
+    )
+
+    def differences(self, part: Any, control: Any) -> Differences:
+        """Return the sleeve's factor of the stiffness."""
+        return Differences(stiffness=1.0 + self.stiffening * jnp.exp(-((part / self.length) ** 4)))
+
+
+class FunctionSection(SectionChange):
+    """A section with any function of the fraction of the way along it, for use from Python.
+
+    `function` maps the fraction of the way, 0 to 1, and the section's control to `Differences`. `inputs` is
+    the size of that control. The function must be traceable by JAX, and no file can hold it.
     """
 
     function: Callable[[Any, Any], Differences] = eqx.field(
@@ -193,16 +217,16 @@ class FunctionSection(SectionChange):
 
     @property
     def control_fields(self) -> tuple[Field, ...]:
-        """As many numbers as were asked for."""
+        """One field of `inputs` numbers."""
         return (Field("input", self.inputs, "1", "what acts on the section"),) if self.inputs else ()
 
     def differences(self, part: Any, control: Any) -> Differences:
-        """What the function says."""
+        """Return the function's value."""
         return self.function(part, control)
 
 
 def _least(coefficients: Float[np.ndarray, " k"]) -> tuple[float, float]:
-    """The least value of a polynomial between 0 and 1, and where it is."""
+    """Return the minimum of a polynomial on [0, 1], and its place."""
     polynomial = np.polynomial.Polynomial(coefficients)
     turns = np.asarray(polynomial.deriv().roots(), dtype=complex)
     at = np.concatenate([[0.0, 1.0], np.clip(turns[turns.imag == 0.0].real, 0.0, 1.0)])
@@ -218,7 +242,7 @@ def _polynomial(coefficients: Any, at: Any) -> Any:
 
 
 def differences_at(changes: tuple[SectionChange, ...], part: Any, controls: list[Any]) -> Differences:
-    """How the rod differs at a part of its length: factors multiplied, curvatures added."""
+    """Return the changes at a fraction of the rod's length: factors multiplied, curvatures added."""
     found = Differences(1.0, 1.0, jnp.zeros(3))
     for change, control in zip(changes, controls, strict=True):
         own = change.differences((part - change.begin) / (change.end - change.begin), control)
@@ -238,15 +262,15 @@ def shape_at_rest(
     curvature: Callable[[Any], Any],
     edges: Float[Any, " edges"],
 ) -> tuple[Float[Any, "3"], Float[Any, "4"]]:
-    """Position (m) and orientation at s of a rod without strain, from those at its base and its curvature.
+    """Return position (m) and orientation at s of a rod without strain, from its base pose and its curvature.
 
-    `edges` are the places (m), from 0 on to the rod's length, between which the curvature (1/m) is smooth. By
-    Magnus' series to order 4, of poses: even curvature gives its helix whatever the steps.
+    `edges` are places (m), from 0 to the rod's length, with a smooth curvature (1/m) between them. The
+    integration is Magnus' series of order 4 on poses: a constant curvature gives an exact helix for any step.
     """
     even = edges[-1] * (np.arange(1, REST_STEPS) / REST_STEPS)
     between = jnp.sort(jnp.concatenate([even, edges[1:-1]]))
     bounds = jnp.concatenate([edges[:1], between, edges[-1:]])
-    # all steps beyond s are of length 0
+    # all steps beyond s have zero length
     passed = jnp.concatenate([edges[:1], jnp.minimum(between, s), jnp.reshape(s, 1)])
     ds = jnp.diff(passed)
     at = passed[:-1] + (0.5 + np.array([[-1.0], [1.0]]) / np.sqrt(12.0)) * ds

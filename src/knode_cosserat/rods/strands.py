@@ -1,4 +1,4 @@
-"""Systems of several rods alike that are joined at their ends only."""
+"""Systems of several identical rods that are joined at their ends only."""
 
 from __future__ import annotations
 
@@ -13,63 +13,63 @@ from knode_cosserat.rods.system import History, System, of_strands
 
 
 class Bundle(System):
-    """Rods alike, side by side: y, z and the unknowns hold those of the first rod, then of the next.
+    """Identical rods in parallel: y, z and the unknowns hold the values of the first rod, then of the next.
 
-    A subclass gives `strand` (the equations along every rod), `strands`, `rest`, `base`, `tip` and what else
-    is its own. Fields are named as the strand's with the rod's number behind: `p1`, `n6`.
+    A subclass defines `strand` (the equations along a rod), `strands`, `rest`, `base`, `tip` and its other
+    particulars. A field's name is the strand's with the rod's number appended: `p1`, `n6`.
     """
 
-    #: the strand's class: of a batch of robots only this can be asked
+    #: the strand's class: a batch of robots has only this, no `strand`
     strand_class: ClassVar[type[System]]
 
     @property
     @abc.abstractmethod
     def strand(self) -> System:
-        """The equations along every rod."""
+        """Equations along a rod; all rods share them."""
 
     @property
     def y_layout(self) -> Layout:  # type: ignore[override]
-        """The strand's, numbered."""
+        """The strand's layout of y, numbered for each rod."""
         return numbered(self.strand_class.y_layout, self.strands)
 
     @property
     def z_layout(self) -> Layout:  # type: ignore[override]
-        """The strand's, numbered."""
+        """The strand's layout of z, numbered for each rod."""
         return numbered(self.strand_class.z_layout, self.strands)
 
     @property
     def base_unknowns(self) -> tuple[str, ...]:  # type: ignore[override]
-        """The strand's, numbered."""
+        """The strand's unknown fields at the base, numbered for each rod."""
         names = self.strand_class.base_unknowns
         return tuple(f"{name}{k + 1}" for k in range(self.strands) for name in names)
 
     @property
     def mixed(self) -> bool:  # type: ignore[override]
-        """The strand's."""
+        """True if B of the strand is not zero."""
         return self.strand_class.mixed
 
     def derivatives(
         self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-        """y_s and z of all rods at one arclength."""
+        """Return y_s and z of all rods at one arclength."""
         return of_strands(self, s, t, y, control, history)
 
     def rates(
         self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
     ) -> Float[Any, " y"]:
-        """y_s of all rods, for the strains that follow from their law: z is not looked at."""
+        """Return y_s of all rods, for the strains of their law; z is ignored."""
         return self.derivatives(s, t, y, control, history)[0]
 
     def strains(
         self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> Float[Any, " z"]:
-        """z of all rods."""
+        """Return z of all rods."""
         return self.derivatives(s, t, y, control, history)[1]
 
 
 @functools.lru_cache(maxsize=64)
 def numbered(layout: Layout, count: int) -> Layout:
-    """The fields of `count` strands of this layout."""
+    """Return the fields of `count` strands with this layout."""
 
     def field(given: Field, k: int) -> Field:
         frame = f"{given.frame}{k}" if given.frame else ""

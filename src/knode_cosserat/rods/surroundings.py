@@ -1,14 +1,14 @@
-"""What a rod may touch: planes, spheres and cylinders, fixed in the global frame.
+"""Obstacles for contact with a rod: planes, spheres and cylinders, fixed in the global frame.
 
 The contact is smooth. With the gap g from the rod's surface to the obstacle's and the smoothing δ, an
 obstacle pushes with the force per length
 
     f = k δ log(1 + exp(-g/δ)),
 
-which is a spring of stiffness k where the rod is pressed in by more than δ, and fades within δ before it is
-touched. Friction is Coulomb's with its jump smoothed over slow sliding: -μ f v/√(|v|² + ε²), v the velocity
-of the rod's surface along the obstacle's. It therefore creeps where it should stick, at a speed below ε; an
-equilibrium, with all velocities zero, has no friction.
+This is a spring of stiffness k where the rod is pressed in by more than δ; the force decays over δ outside
+the obstacle. Friction is Coulomb's with its jump smoothed over slow sliding: -μ f v/√(|v|² + ε²), v the
+velocity of the rod's surface along the obstacle's. It therefore creeps instead of sticking, at a speed below
+ε. An equilibrium, with all velocities zero, has no friction.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from knode_cosserat.rotation import cross, dot
 
 
 class Obstacle(Part):
-    """Something that a rod touches and does not pass through."""
+    """An obstacle that a rod touches and does not penetrate."""
 
     stiffness: Any = parameter(
         "N/m2", "k, contact force per length and depth", low=0.0, high=1e12, default=1e4
@@ -46,10 +46,10 @@ class Obstacle(Part):
 
     @abc.abstractmethod
     def distance(self, p: Float[Any, "3"]) -> tuple[Any, Float[Any, "3"]]:
-        """Distance (m) from the obstacle's surface, negative within, and the unit vector away from it."""
+        """Return the distance (m) to the obstacle's surface, negative inside, and the outward unit vector."""
 
     def wrench(self, motion: Motion, radius: Any) -> Wrench:
-        """What it does to a rod of this radius (m) at a point, per length (N/m, N), global frame."""
+        """Return the load on a rod of this radius (m) at a point, per length (N/m, N), global frame."""
         distance, normal = self.distance(motion.p)
         arm = -radius * normal
         velocity = dot(motion.R, motion.q) + cross(dot(motion.R, motion.w), arm)
@@ -62,20 +62,20 @@ class Obstacle(Part):
         return Wrench(force, cross(arm, force))
 
     def eased(self, part: float) -> Self:
-        """The same with contact and sliding that set in over 1/part of the depth and the speed."""
+        """Return the obstacle with contact and sliding smoothed over 1/part of the depth and the speed."""
         return dataclasses.replace(
             self, smoothing=np.minimum(self.smoothing / part, 1.0), slip=np.minimum(self.slip / part, 1e3)
         )
 
 
 def _unit(vector: Any) -> Any:
-    """A direction, of length one."""
+    """Return a direction as a unit vector."""
     vector = jnp.asarray(vector)
     return vector / jnp.sqrt(jnp.sum(vector * vector))
 
 
 def _length(vector: Any) -> Any:
-    """Length, never zero, so that it has a slope at the centre of a sphere too."""
+    """Return the length, regularised so that it has a derivative at zero, such as at a sphere's centre."""
     return jnp.sqrt(jnp.sum(vector * vector) + 1e-24)
 
 
@@ -93,13 +93,13 @@ class Plane(Obstacle):
     )
 
     def distance(self, p: Float[Any, "3"]) -> tuple[Any, Float[Any, "3"]]:
-        """See `Obstacle.distance`."""
+        """Return distance and unit vector; see `Obstacle.distance`."""
         normal = _unit(self.normal)
         return jnp.sum((p - self.point) * normal), normal
 
 
 class Sphere(Obstacle):
-    """A ball, or with `inside` a hollow one."""
+    """A ball, or with `inside` a hollow sphere."""
 
     kind: ClassVar[str] = "sphere"
 
@@ -108,13 +108,13 @@ class Sphere(Obstacle):
     inside: bool = choice(_INSIDE, (False, True), False)
 
     def distance(self, p: Float[Any, "3"]) -> tuple[Any, Float[Any, "3"]]:
-        """See `Obstacle.distance`."""
+        """Return distance and unit vector; see `Obstacle.distance`."""
         away = p - self.center
         return _round(away, self.radius, self.inside)
 
 
 class Cylinder(Obstacle):
-    """An endless round bar, or with `inside` a pipe."""
+    """An infinite round bar, or with `inside` a pipe."""
 
     kind: ClassVar[str] = "cylinder"
 
@@ -129,7 +129,7 @@ class Cylinder(Obstacle):
     inside: bool = choice(_INSIDE, (False, True), False)
 
     def distance(self, p: Float[Any, "3"]) -> tuple[Any, Float[Any, "3"]]:
-        """See `Obstacle.distance`."""
+        """Return distance and unit vector; see `Obstacle.distance`."""
         axis = _unit(self.axis)
         away = p - self.point
         return _round(away - jnp.sum(away * axis) * axis, self.radius, self.inside)

@@ -7,8 +7,8 @@ An implicit time scheme, y_t = c0 y + ʰy, turns it into an ordinary differentia
     z   = (C + c0 D)⁻¹ (f2 - D ʰz)
     y_s = (A + c0 B)⁻¹ (f1 - B ʰy_s)
 
-A system says which numbers y and z hold, gives these terms (or z and y_s directly), what holds at the base
-and at the tip, and what is unknown at the base. It knows nothing of nodes in between, time steps or solvers.
+A system defines the layouts of y and z, these terms (or z and y_s directly), the boundary conditions at base
+and tip, and the unknowns at the base. It does not depend on the nodes in between, time steps or solvers.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ from knode_cosserat.rods.parameters import (
 )
 from knode_cosserat.rotation import dot, rotation_matrix
 
-#: how many nodes a rod may be divided into
+#: smallest and largest number of nodes of a rod
 FEWEST_NODES, MOST_NODES = 2, 10_000
 
 
 class History(NamedTuple):
-    """What an implicit time scheme knows of the past at one point of the rod.
+    """History terms of an implicit time scheme at one point of the rod.
 
-    With it, y_t = c0 y + ʰy, z_t = c0 z + ʰz and y_st = c0 y_s + ʰy_s. At rest c0 and all three are zero.
+    The scheme is y_t = c0 y + ʰy, z_t = c0 z + ʰz, y_st = c0 y_s + ʰy_s. At rest c0 and all three are zero.
     """
 
     c0: Float[Any, ""]
@@ -50,19 +50,19 @@ class History(NamedTuple):
 
 
 def unpacked_history(system: System, c0: Any, record: Float[Any, " x"]) -> History:
-    """The history at one point from a packed record of it: y, z and, if B is not zero, y_s."""
+    """Return the history at one point from its packed record: y, z and, if B is not zero, y_s."""
     ny, nz = system.y_layout.size, system.z_layout.size
     y_s = record[ny + nz :] if system.mixed else jnp.zeros(ny)
     return History(c0, record[:ny], record[ny : ny + nz], y_s)
 
 
 def in_strands(system: System, packed: Any) -> Any:
-    """Numbers (…, y), or z or the unknowns, strand by strand: (…, strands, those of one)."""
+    """Return a packed y, z or vector of unknowns (…, n) split by strand: (…, strands, n / strands)."""
     return packed.reshape(*packed.shape[:-1], system.strands, packed.shape[-1] // system.strands)
 
 
 def records_in_strands(system: System, records: Any) -> Any:
-    """Packed records of history (…, x), strand by strand: (…, strands, x of one)."""
+    """Return packed records of history (…, x) split by strand: (…, strands, x of one)."""
     if system.strands == 1:
         return in_strands(system, records)
     ny, nz = system.y_layout.size, system.z_layout.size
@@ -73,7 +73,7 @@ def records_in_strands(system: System, records: Any) -> Any:
 def of_strands(
     system: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
 ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-    """y_s and z of a system at one place, from the equations of its strands."""
+    """Return y_s and z of a system at one place, from the equations of its strands."""
     strand = system.strand
     own = [in_strands(system, part) for part in (y, history.y, history.z, history.y_s)]
 
@@ -85,7 +85,7 @@ def of_strands(
 
 
 class Scales(NamedTuple):
-    """Natural sizes of the numbers in y (y,) and of the tip's residuals (k,): what "small" is measured by."""
+    """Natural sizes of the numbers in y (y,) and of the tip's residuals (k,), for scaled tolerances."""
 
     y: Float[Any, " y"]
     tip: Float[Any, " k"]
@@ -94,71 +94,71 @@ class Scales(NamedTuple):
 class System(Parametrised):
     """A rod robot of the general class.
 
-    A subclass states the layouts below, `rest`, `base`, `tip`, and either `constitutive` and `balance`
+    A subclass defines the layouts below, `rest`, `base`, `tip`, and either `constitutive` and `balance`
     (the general form) or `strains` and `rates` (z and y_s directly). Its numeric parameters are leaves of a
-    JAX pytree, so that one compiled program serves every value of them, batches, and their derivatives.
+    JAX pytree: one compiled program serves all their values, batches, and derivatives.
     """
 
     y_layout: ClassVar[Layout]
     z_layout: ClassVar[Layout]
     control_layout: ClassVar[Layout]
-    #: fields of y that are unknown at the base; the tip has as many conditions
+    #: unknown fields of y at the base; the number of tip conditions is equal
     base_unknowns: ClassVar[tuple[str, ...]]
-    #: whether B is not zero: the history of y_s is then kept
+    #: True if B is not zero: the history of y_s is then stored
     mixed: ClassVar[bool] = True
 
-    #: whether the state at rest is a guess: a simulation then begins in the equilibrium under no control
+    #: True if the state at rest is a guess: a simulation then starts at the equilibrium under zero control
     rest_is_guess: ClassVar[bool] = False
 
-    #: whether anything holds it in its place: it has no equilibrium else, unless what loads it cancels out
+    #: True if the system is constrained; without constraints an equilibrium needs loads that cancel
     held: ClassVar[bool] = True
 
-    #: whether `left_of_law` is linear in the strains
+    #: True if `left_of_law` is linear in the strains
     linear_law: ClassVar[bool] = True
 
-    #: observables that are velocities, on which drag and friction depend; none: the system does not say
+    #: velocities among the observables, on which drag and friction depend; empty: not specified
     velocities: ClassVar[tuple[str, ...]] = ()
 
-    #: places, as parts of the length between 0 and 1, where the right-hand side or y jumps
+    #: places of discontinuity of the right-hand side or of y, as fractions of the length between 0 and 1
     cuts: ClassVar[tuple[float, ...]] = ()
-    #: whether y jumps at some of them
+    #: True if y jumps at some of them
     jumps: ClassVar[bool] = False
 
     if TYPE_CHECKING:  # every system has a length (m) among its own parameters
         length: Any
-    #: how many nodes the rod is divided into, both ends counted
+    #: number of nodes of the rod, both ends included
     nodes: int = eqx.field(static=True, default=10, kw_only=True)
 
     # strands: rods that touch each other at their ends only, such as the legs of a platform
 
     @property
     def strands(self) -> int:
-        """Of how many rods alike, joined at their ends only, it is made: y and z are theirs in turn."""
+        """Number of identical rods, joined at their ends only: y and z hold them in turn."""
         return 1
 
     @property
     def strand(self) -> System:
-        """The equations that all strands have in common: a system with y and z of one of them.
+        """The system of one strand; all strands share its equations.
 
-        Solvers and learning use its equations along the rod, and nothing of its ends. It is given the whole
-        control.
+        Solvers and learning use its equations along the rod, but not its boundary conditions. It receives the
+        whole control.
         """
         return self
 
     # the equations
 
     def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
-        """C (z, z), D (z, z) and f2 (z,) of C z + D z_t = f2, at arclength s (m) and time t (s)."""
+        """Return C (z, z), D (z, z) and f2 (z,) of C z + D z_t = f2, at arclength s (m) and time t (s)."""
         raise NotImplementedError(f"{type(self).__name__} gives neither `strains` nor `constitutive`")
 
     def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
-        """A (y, y), B (y, y) and f1 (y,) of A y_s + B y_st = f1, at arclength s (m) and time t (s)."""
+        """Return A (y, y), B (y, y) and f1 (y,) of A y_s + B y_st = f1, at arclength s (m) and time t (s)."""
         raise NotImplementedError(f"{type(self).__name__} gives neither `rates` nor `balance`")
 
     def strains(
         self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> Float[Any, " z"]:
-        """z at one point, semi-discretised in time (paper eq. 4, second line)."""
+        """Return z at one point, semi-discretised in time (paper eq. 4, second line)."""
         c0 = history.c0
         C, D, f2 = self.constitutive(s, t, y, c0 * y + history.y, control)
         return jnp.linalg.solve(C + c0 * D, f2 - D @ history.z)
@@ -166,9 +166,9 @@ class System(Parametrised):
     def left_of_law(
         self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
     ) -> Float[Any, " z"]:
-        """What the law of the strains leaves at z, zero at `strains`: C z + D z_t - f2, or z less those.
+        """Return the residual of the strains' law at z: C z + D z_t - f2, or z less `strains`.
 
-        A system whose law is one of stresses, but not linear, states it here, and says so (`linear_law`).
+        A system with a nonlinear law of stresses defines it here, and sets `linear_law` to False.
         """
         c0 = history.c0
         if type(self).constitutive is System.constitutive:
@@ -179,7 +179,7 @@ class System(Parametrised):
     def rates(
         self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
     ) -> Float[Any, " y"]:
-        """y_s at one point where the strains are z, semi-discretised in time (paper eq. 4, first line)."""
+        """Return y_s at one point with strains z, semi-discretised in time (paper eq. 4, first line)."""
         c0 = history.c0
         A, B, f1 = self.balance(s, t, y, c0 * y + history.y, z, c0 * z + history.z, control)
         return jnp.linalg.solve(A + c0 * B, f1 - B @ history.y_s)
@@ -187,75 +187,75 @@ class System(Parametrised):
     def derivatives(
         self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-        """y_s and z at one point: what the solvers integrate."""
+        """Return y_s and z at one point, for integration by the solvers."""
         z = self.strains(s, t, y, control, history)
         return self.rates(s, t, y, z, control, history), z
 
     def crossed(
         self, acting: Float[Any, " cuts"], t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> Float[Any, " y"]:
-        """y on the far side of the cuts that act (ones; zeros elsewhere), from that on the near side."""
+        """Return y on the far side of the acting cuts (ones; zeros elsewhere), from y on the near side."""
         raise NotImplementedError(f"{type(self).__name__} has `jumps`, but gives no `crossed`")
 
     # the two ends, and rest
 
     @abc.abstractmethod
     def rest(self, s: Any) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-        """y and z at arclength s (m) of the unloaded robot at rest: where a simulation starts by default."""
+        """Return y and z at arclength s (m) of the unloaded robot at rest: the default initial state."""
 
     def base(self, t: Any, control: Any, unknowns: Float[Any, " k"], history: History) -> Float[Any, " y"]:
-        """y at s = 0: the values at rest, with the unknowns in their places.
+        """Return y at s = 0: the values at rest, with the unknowns in their places.
 
-        `history` is that of the first node: a base that moves has its velocity from it.
+        `history` is the history of the first node; it determines the velocity of a moving base.
         """
         fixed, _ = self.rest(jnp.zeros(()))
         return self.y_layout.replaced(jnp.asarray(fixed), self.base_unknowns, unknowns)
 
     def unknowns(self, y: Float[Any, " y"]) -> Float[Any, " k"]:
-        """The unknowns in a given y at s = 0: the inverse of `base`."""
+        """Return the unknowns of y at s = 0: the inverse of `base`."""
         return y[..., self.y_layout.indices(self.base_unknowns)]
 
     @abc.abstractmethod
     def tip(self, t: Any, control: Any, y: Float[Any, " y"], history: History) -> Float[Any, " k"]:
-        """Residuals of the conditions at s = length: zero when they hold."""
+        """Return the residuals of the boundary conditions at s = length."""
 
     def end_poses(self, control: Any) -> tuple[Any, Any]:
-        """Return the poses in which base and tip are held under a control; None for an end that is not."""
+        """Return the constrained poses of base and tip under a control; None for a free end."""
         return None, None
 
     @property
     def tip_layout(self) -> Layout:
-        """What the tip's residuals are; one nameless field unless a system says more."""
+        """Layout of the tip's residuals; one generic field by default."""
         return Layout(("tip", self.unknown_count, "", "conditions at the tip"))
 
     def scales(self) -> Scales:
-        """Natural sizes of y and of the tip's residuals; ones unless a system knows better."""
+        """Return the natural sizes of y and of the tip's residuals; ones by default."""
         return Scales(jnp.ones(self.y_layout.size), jnp.ones(self.unknown_count))
 
     def eased(self, part: float) -> Self:
-        """The same system, with what is nearly a jump (friction, contact) spread over 1/part of its width.
+        """Return the system with near-discontinuities (friction, contact) spread over 1/part of their width.
 
-        Solvers go by way of it where they find no other. By default nothing is, and it is the system itself.
+        Solvers use it as an intermediate problem when the direct solution fails. By default it is the system.
         """
         return self
 
-    # what learning looks at
+    # observables for learning
 
     def actuation(self, control: Float[Any, " c"]) -> Float[Any, " a"]:
-        """What of the control enters the equations; the control itself unless a system knows better."""
+        """Return the part of the control that enters the equations; the whole control by default."""
         return control
 
     def unstressed(self, s: Any, control: Any) -> Float[Any, " z"]:
-        """z at s that the material has without stress, under this control; by default that of rest."""
+        """Return z at s of the unstressed material under this control; by default z at rest."""
         return self.rest(s)[1]
 
     def law_factors(self, s: Any, control: Any) -> tuple[Any, Any] | None:
-        """By what C and D of the strains' law differ at s from elsewhere, by number of z; None: not."""
+        """Return factors on C and D of the strains' law at s, for each number of z; None if uniform."""
         return None
 
     @property
     def observable_layout(self) -> Layout:
-        """What `observables` gives: by default y, its rate, the strains from rest, and their rate."""
+        """Layout of `observables`: by default y, its rate, the strains relative to rest, and their rate."""
         state, strain = self.y_layout.fields, self.z_layout.fields
         return Layout(
             *state,
@@ -267,12 +267,12 @@ class System(Parametrised):
     def observables(
         self, s: Any, y: Float[Any, " y"], y_t: Any, z: Float[Any, " z"], z_t: Any, control: Any
     ) -> Float[Any, " o"]:
-        """What a load that the equations miss may depend on beside the control, as seen from the material."""
+        """Return the possible arguments of an unmodelled load, beside the control, in the material frame."""
         bent = z - self.unstressed(s, control)
         return jnp.concatenate([self.turned(y, y), self.turned(y, y_t), bent, z_t])
 
     def turned(self, y: Float[Any, " y"], vectors: Float[Any, " y"]) -> Float[Any, " y"]:
-        """Numbers laid out like y with those of the global frame turned into the material's."""
+        """Return numbers with the layout of y, with vectors of the global frame in the material frame."""
         parts = []
         for field in self.y_layout.fields:
             part = self.y_layout.get(vectors, field.name)
@@ -281,28 +281,41 @@ class System(Parametrised):
             parts.append(part)
         return jnp.concatenate(parts)
 
-    # what every system can be asked
+    # queries that every system answers
 
     @property
     def unknown_count(self) -> int:
-        """How many numbers are unknown at the base."""
+        """Number of unknowns at the base."""
         return len(self.y_layout.indices(self.base_unknowns))
+
+    def undelayed(
+        self, measured: Float[np.ndarray, "T c"], dt: float, before: Float[np.ndarray, " c"] | None = None
+    ) -> Float[np.ndarray, "T c"]:
+        """Return the acting controls, from measured ones that are held for `dt` (s) each.
+
+        They are equal unless the robot's sensors have a delay. `before` acted before the first row.
+        """
+        return measured
+
+    def trained_range(self) -> Any:
+        """Return the `TrainedRange` of a model that was learned or identified; None if there is none."""
+        return None
 
     @property
     def control_size(self) -> int:
-        """How many numbers a control has."""
+        """Size of a control."""
         return self.control_layout.size
 
     def positions(self, y: Any) -> Any:
-        """Positions (…, 3) in metres of states y (…, y)."""
+        """Return positions (…, 3) in metres of states y (…, y)."""
         return self._named(y, "p", "position")
 
     def curves(self, y: Any) -> list[Any]:
-        """What is drawn of the states y (…, N, y) of one robot: lines (…, points, 3) in m."""
+        """Return lines (…, points, 3) in m for drawing the states y (…, N, y) of one robot."""
         return [np.asarray(self.positions(y))]
 
     def quaternions(self, y: Any) -> Any:
-        """Orientations (…, 4), scalar first, of states y (…, y)."""
+        """Return orientations (…, 4), scalar first, of states y (…, y)."""
         return self._named(y, "h", "orientation")
 
     def _named(self, y: Any, name: str, meaning: str) -> Any:
@@ -314,13 +327,13 @@ class System(Parametrised):
         return self.y_layout.get(y, name)
 
     def replace(self, **changes: Any) -> Self:
-        """A copy with other parameters, by name; what depends on them follows.
+        """Return a copy with other parameters, by name; derived quantities follow.
 
-        Those of parts have names with dots, and numbers where there are several: `base_end.position`,
-        `loads.0.mass`; they are given as `replace(**{"loads.0.mass": 0.1})`.
+        Parameters of parts have names with dots, and indices if there are several parts:
+        `base_end.position`, `loads.0.mass`. They are passed as `replace(**{"loads.0.mass": 0.1})`.
 
         Raises `ParameterError` for a name that does not exist or a value that is not allowed. Values may be
-        JAX tracers, so that derivatives with respect to a parameter go through here.
+        JAX tracers: `replace` is differentiable with respect to a parameter.
         """
         for name in [name for name in changes if "." in name]:
             first, _, rest = name.partition(".")
@@ -343,7 +356,7 @@ class System(Parametrised):
 
 
 def with_value(owner: Any, path: str, value: Any, name: str) -> Any:
-    """A part, or a tuple of parts, with another value at a path such as `0.mass`."""
+    """Return a part, or a tuple of parts, with another value at a path such as `0.mass`."""
     first, _, rest = path.partition(".")
     several = isinstance(owner, tuple)
     stated = dataclasses.fields(owner) if dataclasses.is_dataclass(owner) else ()
@@ -360,5 +373,5 @@ def with_value(owner: Any, path: str, value: Any, name: str) -> Any:
 
 
 def is_traced(tree: Any) -> bool:
-    """Whether any leaf is a JAX tracer: inside `jit`, `grad` or `vmap` values cannot be looked at."""
+    """True if any leaf is a JAX tracer: inside `jit`, `grad` or `vmap` values are not available."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))

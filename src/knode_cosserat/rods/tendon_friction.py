@@ -1,56 +1,107 @@
-"""What holds tendons in their holes, and what shakes them loose: two memories of a robot.
+"""Hysteretic friction of tendons, and its loss by vibration: two internal variables.
 
-Friction. A tendon that slides loses tension on its way, as a rope on a capstan: τᵢ = Tᵢ exp(-λᵢ) with λᵢ_s
-= fᵢ (k + μ |u|), the wobble coefficient k and the curvature friction coefficient μ. fᵢ, from -1 to 1, is
-how much of the friction holds the tendon and which way. It is a memory, the part of z that remembers where
-the robot has come from: it grows as the rod bends in the tendon's direction eᵢ, up to where the tendon
-slides (an elastic, perfectly plastic element: Prandtl 1928)
+Friction. A sliding tendon loses tension along its path, like a rope on a capstan: τᵢ = Tᵢ exp(-λᵢ) with λᵢ_s
+= fᵢ (k + μ |u|), the wobble coefficient k and the curvature friction coefficient μ. fᵢ, from -1 to 1, is the
+mobilised fraction of the friction, with its direction. It is a part of z and causes the hysteresis. It grows
+as the rod bends in the tendon's direction eᵢ, until the tendon slides (an elastic, perfectly plastic element:
+Prandtl 1928)
 
     fᵢ_t = eᵢ·u_t / κ₀    while |fᵢ| < 1
 
-so that a robot that is held stays where it is, whatever noise its tensions have. (Dahl's smooth law lets it
-creep: with it a step of 10 s was predicted with three times the error.) An equilibrium, with all rates
-zero, is the one without friction.
+A robot at rest therefore stays at rest under noisy tensions. (Dahl's smooth law lets it creep: with that law
+the prediction of a step of 10 s had three times the error.) An equilibrium, with all rates zero, has no
+friction, except for the part `at_rest` of the friction that the motion from the unloaded rod would have built
+up.
 
-Vibration. Above some tension of all tendons together robots begin to shake, and what shakes does not stick:
-x, from 0 to 1, is the part of the friction that is gone. It is a memory too, x_t = k_v (Σ Tᵢ - T_v), and
-takes a part c x Σ Tᵢ of the rod's stiffness with it.
+Vibration. Above some total tension of all tendons robots begin to shake, and vibration removes friction: x,
+from 0 to 1, is the removed part. It is an internal variable too, x_t = k_v (Σ Tᵢ - T_v), and reduces the
+rod's bending stiffness by c x Σ Tᵢ.
 
-Rates are c0 times the value plus what the time scheme has of its past (`past`); c0 is 0 at rest.
+Rates are c0 times the value plus the time scheme's history (`past`); c0 is 0 at rest.
 """
 
 from __future__ import annotations
 
-from typing import Any
+import dataclasses
+from typing import Any, ClassVar, Self
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float
 
-#: turns (1/m) below this hardly count in friction, so that it has a slope everywhere
+from knode_cosserat.rods.parameters import parameter
+from knode_cosserat.rods.parts import Part
+from knode_cosserat.rotation import dot
+
+#: curvature (1/m) of the regularisation of |u| in friction, so that it has a derivative everywhere
 STRAIGHT = 1e-2
 
 
-def held(bending: Float[Any, " c"], past: Float[Any, " c"], c0: Any) -> Float[Any, " c"]:
-    """fᵢ from eᵢ·u_t / κ₀ (1/s): none at rest."""
-    return jnp.clip(_grown(bending, past, c0, at_rest=0.0), -1.0, 1.0)
+class TendonFriction(Part):
+    """Capstan friction of the tendons, by their length and by the angle they turn, with hysteresis."""
+
+    kind: ClassVar[str] = "tendon-friction"
+
+    wobble: Any = parameter(
+        "1/m", "k, friction by the length of a tendon in the robot", low=0.0, high=100.0, default=0.0
+    )
+    curvature: Any = parameter(
+        "1/rad", "μ, friction by the angle that a tendon turns", low=0.0, high=10.0, default=0.0
+    )
+    reach: Any = parameter(
+        "1/m", "κ₀, change of curvature that builds friction up", low=1e-4, high=100.0, default=0.1
+    )
+    at_rest: Any = parameter(
+        "", "part of the friction of a motion from the unloaded rod that acts in an equilibrium", low=-1.0,
+        high=1.0, default=0.0,
+    )  # fmt: skip
+
+    def held(
+        self, directions: Float[Any, "c 3"], u_t: Float[Any, "3"], bent: Float[Any, "3"],
+        past: Float[Any, " c"], c0: Any,
+    ) -> Float[Any, " c"]:  # fmt: skip
+        """Return fᵢ of tendons that bend the rod in these directions.
+
+        Args:
+            directions: eᵢ.
+            u_t: rate of the curvature (1/(m s)).
+            bent: curvature relative to the unloaded rod (1/m), for an equilibrium.
+            past: history of fᵢ.
+            c0: coefficient of the time scheme (1/s).
+        """
+        along = directions / self.reach
+        return jnp.clip(_grown(dot(along, u_t), past, c0, self.at_rest * dot(along, bent)), -1.0, 1.0)
+
+    def loss_rates(self, u: Float[Any, "3"], f: Float[Any, " c"]) -> Float[Any, " c"]:
+        """Return λᵢ_s (1/m) at the curvature u (1/m), with the mobilised fraction f of the friction."""
+        turn = jnp.sqrt(u[0] * u[0] + u[1] * u[1] + STRAIGHT**2) - STRAIGHT
+        return (self.wobble + self.curvature * turn) * f
+
+    def eased(self, part: float) -> Self:
+        """Return friction that builds up over a longer change of curvature."""
+        return dataclasses.replace(self, reach=np.minimum(self.reach / part, 100.0))
 
 
-def loss_rates(u: Float[Any, "3"], f: Float[Any, " c"], wobble: Any, curvature: Any) -> Float[Any, " c"]:
-    """λᵢ_s (1/m) where the curvature is u (1/m) and f of the friction holds; k and μ may be None."""
-    turn = jnp.sqrt(u[0] * u[0] + u[1] * u[1] + STRAIGHT**2) - STRAIGHT
-    return (_or_zero(wobble) + _or_zero(curvature) * turn) * f
+class Vibration(Part):
+    """Loss of friction and of bending stiffness by vibration under high tensions."""
 
+    kind: ClassVar[str] = "vibration"
 
-def shaking(growth: Any, past: Float[Any, " 1"], c0: Any) -> Float[Any, " 1"]:
-    """x from its rate k_v (Σ Tᵢ - T_v) (1/s): at rest it has grown as far as it will."""
-    return jnp.clip(_grown(growth, past, c0, at_rest=jnp.sign(growth)), 0.0, 1.0)
+    tension: Any = parameter(
+        "N", "T_v, tension of all tendons together above which vibration grows", low=0.0, high=1e6
+    )
+    rate: Any = parameter("1/(N s)", "k_v, how fast it grows", low=0.0, high=1e3)
+    softening: Any = parameter(
+        "m2", "c, loss of bending stiffness by vibration, by tension", low=0.0, high=1.0, default=0.0
+    )
+
+    def shaken(self, total: Any, past: Float[Any, " 1"], c0: Any) -> Float[Any, " 1"]:
+        """Return x under a total tension (N) of all tendons: at rest it is 0 or 1."""
+        growth = self.rate * (total - self.tension)
+        return jnp.clip(_grown(growth, past, c0, at_rest=jnp.sign(growth)), 0.0, 1.0)
 
 
 def _grown(rate: Any, past: Any, c0: Any, at_rest: Any) -> Any:
-    """What a memory is by its rate, were there no bounds."""
+    """Return an internal variable before clipping."""
     moving = c0 > 0.0
     return jnp.where(moving, (rate - past) / jnp.where(moving, c0, 1.0), at_rest)
-
-
-def _or_zero(value: Any) -> Any:
-    return 0.0 if value is None else value

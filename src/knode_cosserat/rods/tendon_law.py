@@ -1,4 +1,4 @@
-"""The material's law of a rod together with its tendons: v and u where n and m carry both.
+"""The material's law of a rod together with its tendons: v and u if n and m include both.
 
 At one point of the rod, in the material frame, with tendon i at rᵢ(s) = (x, y, 0) under the tension Tᵢ,
 
@@ -6,15 +6,15 @@ At one point of the rod, in the material frame, with tendon i at rᵢ(s) = (x, y
 
 K_v = Kse + c0 Bse and K_u = Kbt + c0 Bbt; a and b come from n, m and history (Rucker & Webster 2011, in the
 form that keeps the paper's y and z). For K positive definite and Tᵢ ≥ 0 there is exactly one solution: the
-least of the strictly convex energy ½ vᵀK_v v + ½ uᵀK_u u + Σ Tᵢ |ṗᵢ| - aᵀv - bᵀu. Its second derivative is
+minimum of the strictly convex energy ½ vᵀK_v v + ½ uᵀK_u u + Σ Tᵢ |ṗᵢ| - aᵀv - bᵀu. Its second derivative is
 
     J = diag(K_v, K_u) + Σ Tᵢ/|ṗᵢ| (WᵢᵀWᵢ - gᵢgᵢᵀ),     Wᵢ = [I, -r̂ᵢ],     gᵢ = Wᵢᵀtᵢ = (tᵢ, rᵢ × tᵢ)
 
-Tendons hardly turn against a rod, and so J hardly changes: most often the law is solved by three or four
-corrections with J where rod and tendons are not bent, `unbent_flexibility`. That depends on nothing that
-solvers iterate on, and they evaluate it once for a step (`solvers/ahead.py`). Where tendons turn so far that
-this converges slowly Newton's method goes on from there, damped. The measure of it all is by how much, as a
-part, a correction changes ṗᵢ.
+Tendons rotate little relative to the rod, so J is nearly constant. Three or four corrections with J of the
+unbent rod and tendons, `unbent_flexibility`, usually solve the law. This J does not change during the
+solvers' iterations, and is evaluated once for a step (`solvers/ahead.py`). If this converges slowly because
+tendons rotate far, a damped Newton's method continues from the last iterate. Errors are measured by the
+relative change of ṗᵢ in a correction.
 """
 
 from __future__ import annotations
@@ -29,29 +29,29 @@ from jaxtyping import Float
 
 from knode_cosserat.rotation import dot, dot_by_rows, inverse, small_inverse
 
-#: corrections of Newton's method at most
+#: largest number of Newton corrections
 ROUNDS = 50
-#: by what part each correction with one J must be less than the one before it
+#: largest ratio of successive corrections with a constant J
 LESS = 0.1
-#: a tendon's turn up to which a correction is not damped
+#: rotation of a tendon below which a correction is not damped
 SMALL = 0.05
-#: what may be missing of a tendon's tangent
+#: tolerance of a tendon's tangent
 MISSING = 1e-14
-#: v and u of a rod that is not bent
+#: v and u of an unbent rod
 UNBENT = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 
 
 def path_rates(
     v: Float[Any, "3"], u: Float[Any, "3"], r: Float[Any, "c 3"], r_s: Float[Any, "c 3"]
 ) -> Float[Any, "c 3"]:
-    """ṗᵢ = v + u × rᵢ + rᵢ′, along the tendons per metre of rod, material frame."""
+    """Return ṗᵢ = v + u × rᵢ + rᵢ′, along the tendons per metre of rod, material frame."""
     return jnp.stack(_rates(jnp.concatenate([v, u]), r, r_s), axis=1)
 
 
 def stretches(
     v: Float[Any, "3"], u: Float[Any, "3"], r: Float[Any, "c 3"], r_s: Float[Any, "c 3"]
 ) -> Float[Any, " c"]:
-    """|ṗᵢ|: metres of tendon per metre of rod; its integral is the length of the tendon in the rod."""
+    """Return |ṗᵢ|: metres of tendon per metre of rod; its integral is the tendon's length in the rod."""
     x, y, z = _rates(jnp.concatenate([v, u]), r, r_s)
     return jnp.sqrt(x * x + y * y + z * z)
 
@@ -59,14 +59,14 @@ def stretches(
 def tangents(
     v: Float[Any, "3"], u: Float[Any, "3"], r: Float[Any, "c 3"], r_s: Float[Any, "c 3"]
 ) -> Float[Any, "c 3"]:
-    """tᵢ, unit tangents of the tendons, material frame."""
+    """Return tᵢ, unit tangents of the tendons, material frame."""
     return _units(jnp.concatenate([v, u]), r, r_s)[0].T
 
 
 def tendon_wrench(
     v: Float[Any, "3"], u: Float[Any, "3"], r: Float[Any, "c 3"], r_s: Float[Any, "c 3"], tension: Any
 ) -> tuple[Float[Any, "3"], Float[Any, "3"]]:
-    """Σ Tᵢ tᵢ (N) and Σ Tᵢ rᵢ × tᵢ (N·m), material frame: what tendons take of Rᵀn and Rᵀm."""
+    """Return Σ Tᵢ tᵢ (N) and Σ Tᵢ rᵢ × tᵢ (N·m), material frame: the tendons' part of Rᵀn and Rᵀm."""
     loads = dot(_levers(jnp.concatenate([v, u]), r, r_s)[0], tension)
     return loads[:3], loads[3:]
 
@@ -78,7 +78,7 @@ def unbent_flexibility(
     r_s: Float[Any, "c 3"],
     tension: Float[Any, " c"],
 ) -> Float[Any, "6 6"]:
-    """J⁻¹ where rod and tendons are not bent; arguments as those of `tendon_strains`."""
+    """Return J⁻¹ of the unbent rod and tendons; arguments as in `tendon_strains`."""
     return _flexibility(*_levers(UNBENT, r, r_s), K_v, K_u, r, tension)
 
 
@@ -93,22 +93,22 @@ def tendon_strains(
     *,
     flexibility: Float[Any, "6 6"] | None = None,
 ) -> tuple[Float[Any, "3"], Float[Any, "3"]]:
-    """v and u (1/m) that fulfil the law: see the module's head.
+    """Return the v and u (1/m) that satisfy the law in the module's docstring.
 
     Args:
         K_v: stiffness of shear and extension (N), symmetric and positive definite.
-        K_u: the same of bending and twisting (N·m²).
-        a: what v has to balance (N).
-        b: what u has to balance (N·m).
-        r: where the tendons run (m); its third numbers are not used.
-        r_s: derivative of r along the rod; its third numbers are not used.
-        tension: T (N), not negative; 0 of a tendon that has ended.
-        flexibility: `unbent_flexibility` of these, or about. It decides how fast the solution is found, not
-            which, as long as it is not zero.
+        K_u: stiffness of bending and twisting (N·m²), likewise.
+        a: load on v (N).
+        b: load on u (N·m).
+        r: the tendons' places (m); the third components are not used.
+        r_s: derivative of r along the rod; the third components are not used.
+        tension: T (N), not negative; 0 for a tendon that has ended.
+        flexibility: `unbent_flexibility` of these arguments, or an approximation that is not zero. It affects
+            the speed of convergence, not the solution.
 
     Returns:
-        v and u, solved to rounding; NaN where Newton's method did not find them. Derivatives of any order
-        and mode are those of the solution.
+        v and u, solved to rounding; NaN if Newton's method did not converge. Derivatives of any order and
+        mode are those of the solution.
     """
     if flexibility is None:
         flexibility = unbent_flexibility(K_v, K_u, r, r_s, tension)
@@ -128,12 +128,12 @@ def tendon_balance(
     r_s: Float[Any, "c 3"],
     tension: Float[Any, " c"],
 ) -> Float[Any, "6"]:
-    """What the law leaves at any v and u (N, N·m): zero at those of `tendon_strains`."""
+    """Return the law's residual at any v and u (N, N·m): zero at the result of `tendon_strains`."""
     x = jnp.concatenate([v, u])
     return _left(x, _levers(x, r, r_s)[0], K_v, K_u, jnp.concatenate([a, b]), tension)
 
 
-# x is v and u together
+# x is the concatenation of v and u
 
 
 def _columns(vectors: Float[Any, "c 3"]) -> tuple[Any, Any]:
@@ -141,7 +141,7 @@ def _columns(vectors: Float[Any, "c 3"]) -> tuple[Any, Any]:
 
 
 def _turned(x: Float[Any, "6"], r: Float[Any, "c 3"]) -> tuple[Any, Any, Any]:
-    """Wᵢ x = v + u × rᵢ, in parts (c,)."""
+    """Return the components (c,) of Wᵢ x = v + u × rᵢ."""
     vx, vy, vz, ux, uy, uz = (jax.lax.index_in_dim(x, k, 0, keepdims=False) for k in range(6))
     rx, ry = _columns(r)
     return vx - uz * ry, vy + uz * rx, vz + ux * ry - uy * rx
@@ -153,30 +153,30 @@ def _rates(x: Float[Any, "6"], r: Float[Any, "c 3"], r_s: Float[Any, "c 3"]) -> 
 
 
 def _units(x: Float[Any, "6"], r: Float[Any, "c 3"], r_s: Float[Any, "c 3"]) -> tuple[Any, Any]:
-    """Tangents (3, c) and 1/|ṗᵢ| (c,)."""
+    """Return tangents (3, c) and 1/|ṗᵢ| (c,)."""
     rates = jnp.stack(_rates(x, r, r_s))
     shorter = 1.0 / jnp.sqrt(jnp.sum(rates * rates, axis=0))
     return rates * shorter, shorter
 
 
 def _levers(x: Float[Any, "6"], r: Float[Any, "c 3"], r_s: Float[Any, "c 3"]) -> tuple[Any, Any]:
-    """gᵢ = (tᵢ, rᵢ × tᵢ), (6, c), and 1/|ṗᵢ|."""
+    """Return gᵢ = (tᵢ, rᵢ × tᵢ), (6, c), and 1/|ṗᵢ|."""
     (tx, ty, tz), shorter = _units(x, r, r_s)
     rx, ry = _columns(r)
     return jnp.stack([tx, ty, tz, ry * tz, -rx * tz, rx * ty - ry * tx]), shorter
 
 
 def _left(x: Any, g: Any, K_v: Any, K_u: Any, ab: Any, tension: Any) -> Float[Any, "6"]:
-    """What is left of the law at x."""
+    """Return the law's residual at x."""
     elastic = jnp.concatenate([dot(K_v, x[:3]), dot(K_u, x[3:])])
     return elastic + dot(g, tension) - ab
 
 
 def _stiffness(g: Any, shorter: Any, K_v: Any, K_u: Any, r: Any, tension: Any) -> Float[Any, "6 6"]:
-    """J."""
+    """Return J."""
     rx, ry = _columns(r)
     o, one = jnp.zeros_like(rx), jnp.ones_like(rx)
-    # rows of Wᵢ: apart from x, and so constants where r is
+    # rows of Wᵢ: independent of x, and so constant if r is
     W = [jnp.stack(row) for row in ((one, o, o, o, o, -ry), (o, one, o, o, o, rx), (o, o, one, ry, -rx, o))]
     spread = sum(row[:, None] * row[None, :] for row in W)
     stiffer = jnp.sum(tension * shorter * (spread - g[:, None] * g[None, :]), axis=2)
@@ -186,37 +186,37 @@ def _stiffness(g: Any, shorter: Any, K_v: Any, K_u: Any, r: Any, tension: Any) -
 
 
 def _flexibility(g: Any, shorter: Any, K_v: Any, K_u: Any, r: Any, tension: Any) -> Float[Any, "6 6"]:
-    """J⁻¹."""
+    """Return J⁻¹."""
     return small_inverse(_stiffness(g, shorter, K_v, K_u, r, tension))
 
 
 def _solved_by_cholesky(J: Any, right: Any) -> Float[Any, "6"]:
-    """J⁻¹ times a vector by the library: slower than an inverse that is written out, but quick to compile."""
+    """Return J⁻¹ times a vector by the library: slower than a written-out inverse, but quick to compile."""
     return jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(J), True), right)
 
 
-#: what is computed is used as it is: XLA would otherwise do what is early again for all that is late
+#: optimisation barrier: without it XLA would recompute early results at each later use
 _in_turn = jax.lax.optimization_barrier
 
 
 def _turn(dx: Any, shorter: Any, r: Any) -> Any:
-    """By how much dx turns a tendon: the largest |Wᵢ dx|/|ṗᵢ|."""
+    """Return the rotation of a tendon by dx: the largest |Wᵢ dx|/|ṗᵢ|."""
     turned = jnp.stack(_turned(dx, r)) * shorter
     return jnp.sqrt(jnp.max(jnp.sum(turned * turned, axis=0)))
 
 
 def _unturned(K_v: Any, K_u: Any, ab: Any, r: Any, r_s: Any, tension: Any) -> Float[Any, "6"]:
-    """Where the rod would be if its tendons had not turned: from far away a better beginning."""
+    """Return the solution with unrotated tendons: a better initial guess far from the unbent rod."""
     free = -_left(np.zeros(6), _levers(UNBENT, r, r_s)[0], K_v, K_u, ab, tension)
     return jnp.concatenate([dot(inverse(K_v), free[:3]), dot(inverse(K_u), free[3:])])
 
 
 def _solved(flexibility: Any, K_v: Any, K_u: Any, ab: Any, r: Any, r_s: Any, tension: Any) -> Float[Any, "6"]:
-    """The law's solution, from where rod and tendons are not bent."""
+    """Return the law's solution, starting from the unbent rod and tendons."""
     law = flexibility, K_v, K_u, ab, r, r_s, tension
 
     def correction(x: Any, law: Any) -> tuple[Any, Any]:
-        """Minus the flexibility times what is left at x, and by how much that turns a tendon."""
+        """Return minus the flexibility times the residual at x, and the rotation of a tendon by it."""
         flexibility, K_v, K_u, ab, r, r_s, tension = law
         g, shorter = _levers(x, r, r_s)
         dx = -jnp.sum(flexibility * _left(x, g, K_v, K_u, ab, tension), axis=1)
@@ -227,23 +227,23 @@ def _solved(flexibility: Any, K_v: Any, K_u: Any, ab: Any, r: Any, r_s: Any, ten
         return (count < ROUNDS) & ~(missing <= MISSING)
 
     def corrected(reached: Any) -> Any:
-        """One step of Newton's method, damped."""
+        """Return the next iterate of Newton's method, damped."""
         (count, x, _), (_, K_v, K_u, ab, r, r_s, tension) = _in_turn((reached, law))
         x = jnp.where(count == 0, _unturned(K_v, K_u, ab, r, r_s, tension), x)
         g, shorter = _levers(x, r, r_s)
         J = _stiffness(g, shorter, K_v, K_u, r, tension)
         dx = -_solved_by_cholesky(J, _left(x, g, K_v, K_u, ab, tension))
         turned = _turn(dx, shorter, r)
-        # the damping that keeps a convex function with |f‴| ≤ 3 f″ going down (Sun & Tran-Dinh 2019)
+        # damping that guarantees descent for a convex function with |f‴| ≤ 3 f″ (Sun & Tran-Dinh 2019)
         near = turned < SMALL
         x = x + jnp.where(near, 1.0, jnp.log1p(3.0 * turned) / jnp.maximum(3.0 * turned, 1e-300)) * dx
-        # the next correction would be about this one times how much J has changed since (|t″| ≤ 3)
+        # estimate of the next correction: this one times the change of J (|t″| ≤ 3)
         return count + 1, x, jnp.where(near, 3.0 * turned * turned, jnp.inf)
 
     def left_over(turned: Any, before: Any) -> Any:
-        """What is missing after a correction: with one J each is the same part of the one before it."""
+        """Return the chord iteration's error estimate: corrections shrink by a constant ratio."""
         less = turned * (turned / jnp.maximum(before, 1e-300))
-        # where nothing is missing both are rounding errors
+        # after convergence both are rounding errors
         return jnp.where(turned <= jnp.maximum(LESS * before, MISSING), jnp.minimum(less, turned), jnp.inf)
 
     def converges(reached: Any) -> Any:
@@ -251,19 +251,19 @@ def _solved(flexibility: Any, K_v: Any, K_u: Any, ab: Any, r: Any, r_s: Any, ten
         return (missing > MISSING) & (missing < jnp.inf)
 
     def once_more(reached: Any) -> Any:
-        # with the law in turn: what a loop may never need XLA would otherwise evaluate before it
+        # the barrier includes the law: XLA would otherwise evaluate it before a loop that may not need it
         (x, before, _), own = _in_turn((reached, law))
         dx, turned = correction(x, own)
         return x + dx, turned, left_over(turned, before)
 
-    # those that do most often are written out: a loop's bookkeeping takes as long as a correction
+    # the usual first corrections are written out: a loop's bookkeeping takes as long as a correction
     x = _in_turn(UNBENT + correction(UNBENT, law)[0])
     dx, first = correction(x, law)
     x, first = _in_turn((x + dx, first))
     dx, turned = correction(x, law)
     x, turned = _in_turn((x + dx, turned))
     x, turned, missing = jax.lax.while_loop(converges, once_more, (x, turned, left_over(turned, first)))
-    # near enough to go on from there
+    # continue from x if it is close to the solution
     begun = jnp.where(turned < SMALL, 1, 0)
     _, x, missing = jax.lax.while_loop(unsolved, corrected, (begun, x, missing))
     return jnp.where(missing <= MISSING, x, jnp.nan)
@@ -273,9 +273,9 @@ _solution = jax.custom_jvp(_solved)
 
 
 def _slope(primals: Any, tangents: Any) -> tuple[Any, Any]:
-    """J dx = -d(law) at the solution, for those arguments that have slopes (most often a and b only)."""
+    """Return the solution's derivative, J dx = -d(law), for the arguments with tangents (mostly a and b)."""
     x = _solution(*primals)
-    # how it was solved does not matter
+    # the derivative does not depend on the initial flexibility
     primals, tangents = primals[1:], tangents[1:]
     moves = [not isinstance(tangent, SymbolicZero) for tangent in tangents]
 

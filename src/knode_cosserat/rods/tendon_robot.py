@@ -14,21 +14,21 @@ from knode_cosserat.rods.tendons import transverse_force
 class TendonRobot(TendonRod):
     """A round rod with tendons, gravity, drag and material damping, as in the paper (eqs. 13-15).
 
-    The tendons load the rod as in the paper (`tendons.transverse_force`): a force across it, no moment. For
-    tendons as they are, see `RoutedTendonRobot`.
+    The tendons load the rod as in the paper (`tendons.transverse_force`): a force across it, no moment. See
+    `RoutedTendonRobot` for realistic tendons.
     """
 
     def actuation(self, control: Float[Any, " c"]) -> Float[Any, " a"]:
-        """The resultant of the tendons' forces per length (N/m), global frame: the paper's τ·φ."""
+        """Return the resultant of the tendons' forces per length (N/m), global frame: the paper's τ·φ."""
         force = self.actuator_force(control)
         count = self.actuator_layout.size
         return force if count == self.control_size else jnp.concatenate([force, control[count:]])
 
     def actuator_force(self, control: Float[Any, " c"]) -> Float[Any, "3"]:
-        """The resultant of the tendons' forces per length (N/m), global frame: all that these tendons do."""
+        """Return the resultant of the tendons' forces per length (N/m), global frame: their only load."""
         return transverse_force(control[: self.actuator_layout.size], self.tendon_angles)
 
     def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
-        """A = I, B = 0, and f1 the right-hand side of paper eq. 13."""
+        """Return A = I, B = 0, and f1, the right-hand side of paper eq. 13."""
         size = self.y_layout.size
         return jnp.eye(size), jnp.zeros((size, size)), self.spatial_rates(s, y, y_t, z, z_t, control)

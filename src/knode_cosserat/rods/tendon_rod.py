@@ -1,4 +1,4 @@
-"""A rod that tendons bend: what all models of its tendons have in common. Symbols as in `elastic_rod`."""
+"""A rod bent by tendons: the base of all tendon models. Symbols as in `elastic_rod`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FOUR_TENDONS = tuple(np.pi / 4 + i * np.pi / 2 for i in range(4))
 
 
 class TendonRod(Rod):
-    """A rod with straight tendons around it. A subclass says what they do."""
+    """A rod with straight tendons around it. A subclass defines the tendons' action on the rod."""
 
     tendon_offset: Any = parameter(
         "m", "distance of the tendons from the rod's axis; of no use to the crude model", low=0.0, high=1.0,

@@ -1,4 +1,4 @@
-"""What tendons do to a rod."""
+"""The paper's model of the load of tendons on a rod."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from jaxtyping import Float
 
 
 def transverse_force(tension: Float[Any, " tendons"], angles: Float[Any, " tendons"]) -> Float[Any, "3"]:
-    """The paper's crude model: f = Σ τᵢ dᵢ per metre of rod (N/m), in the global frame.
+    """Return the load of the paper's crude model: f = Σ τᵢ dᵢ per metre of rod (N/m), in the global frame.
 
-    dᵢ is the unit vector at the tendon's angle (rad) in the global x-y plane. The force does not turn with
-    the rod and there is no moment: what the paper writes as τ·φ. Tension in N.
+    dᵢ is the unit vector at the tendon's angle (rad) in the global x-y plane. The force does not rotate with
+    the rod and there is no moment: the paper's τ·φ. Tension in N.
     """
     return jnp.stack([jnp.sum(tension * jnp.cos(angles)), jnp.sum(tension * jnp.sin(angles)), jnp.zeros(())])

@@ -1,7 +1,7 @@
-"""A robot that differs from the paper's model as real ones do: it plays the real one in virtual recordings.
+"""A virtual robot that differs from the paper's model like real ones, for virtual recordings.
 
-Tendons run at a distance from the axis and bend the rod by their moment, rubbing in the holes of its ribs;
-ribs have masses; a sleeve stiffens the rod at the base.
+Tendons run at a distance from the axis and bend the rod by their moment, with friction in the holes of its
+ribs. Ribs have masses. A sleeve stiffens the rod at the base.
 """
 
 from __future__ import annotations
@@ -18,26 +18,26 @@ from knode_cosserat.rods.system import History, System
 from knode_cosserat.rods.tendon_rod import TendonRod
 from knode_cosserat.rotation import cross, dot, inverse, rotation_matrix
 
-#: Newton corrections of the material's law with friction, which bends it little
+#: Newton corrections of the material's law with friction, which is weakly nonlinear
 CORRECTIONS = 12
-#: standard deviation of how a rib's mass is spread along the rod (m)
+#: standard deviation of the distribution of a rib's mass along the rod (m)
 RIB_WIDTH = 0.02
 #: the nine ribs, as fractions of the length
 RIBS = tuple((k + 1) / 9 for k in range(9))
 
 
 class VirtualRobot(TendonRod):
-    """A rod with tendons in ribs: n and m carry rod and tendons together.
+    """A rod with tendons in ribs: n and m include rod and tendons.
 
     With the tendons at r_i, and d₃ the third axis of the material frame,
 
         Rᵀn = Kse (v - v*) + Σ T_i d₃            Rᵀm = Kbt (u - u*) + Bbt u_t + Σ T_i r_i × d₃
         T_i(s) = τ_i (1 - μ s/L tanh(ρ_i/ρ₀)),    ρ_i = d₃ · (r_i × u_t)
 
-    where ρ_i is the rate at which the tendon is pulled in per metre of rod, so that a tendon that is
-    pulled in loses tension towards the tip and one that is let out gains. Near the base Kbt is
-    multiplied; ribs are masses, each spread over a part of the length. The balance of n and m is that of a
-    rod without tendons, for these act within the section; at the tip, where they end, n and m are zero.
+    where ρ_i is the rate at which the tendon is pulled in per metre of rod. A tendon that is pulled in loses
+    tension towards the tip, and a tendon that is let out gains tension. Near the base Kbt is multiplied. Ribs
+    are masses, each distributed over a part of the length. The balance of n and m is that of a rod without
+    tendons, because the tendons act within the section. At the tip, where they end, n and m are zero.
     """
 
     friction: Any = parameter(
@@ -51,32 +51,32 @@ class VirtualRobot(TendonRod):
     rib_mass: Any = parameter("kg", "mass of one of the nine ribs", low=0.0, high=1.0, default=0.0015)
 
     def actuation(self, control: Float[Any, " c"]) -> Float[Any, "3"]:
-        """Tension in all, and its moment about the axis (N, N·m, N·m)."""
+        """Return the total tension, and its moment about the axis (N, N·m, N·m)."""
         moment = self.tendon_offset * jnp.stack(
             [jnp.sum(control * jnp.sin(self.tendon_angles)), -jnp.sum(control * jnp.cos(self.tendon_angles))]
         )
         return jnp.concatenate([jnp.sum(control)[None], moment])
 
     def stiffness(self, s: Any) -> Float[Any, "3 3"]:
-        """Kbt at s (N·m²): more of it within the sleeve."""
+        """Return Kbt at s (N·m²), increased within the sleeve."""
         inside = jnp.exp(-((s / self.sleeve_length) ** 2))
         return self.Kbt * (1.0 + (self.sleeve_factor - 1.0) * inside)
 
     def tendon_moment(self, s: Any, u_t: Float[Any, "3"], control: Any) -> Float[Any, "3"]:
-        """Σ T_i r_i × d₃ (N·m) at s, material frame, while the curvature changes at u_t."""
+        """Return Σ T_i r_i × d₃ (N·m) at s, material frame, at the rate of curvature u_t."""
         x, y = jnp.cos(self.tendon_angles), jnp.sin(self.tendon_angles)
         pulled_in = self.tendon_offset * (x * u_t[1] - y * u_t[0])
         loss = self.friction * s / self.length * jnp.tanh(pulled_in / self.sliding)
         T = jnp.asarray(control) * (1.0 - loss)
         return self.tendon_offset * jnp.stack([jnp.sum(T * y), -jnp.sum(T * x), jnp.zeros(())])
 
-    # not of the form C z + D z_t = f2
+    # the law is not of the form C z + D z_t = f2
     constitutive = System.constitutive
 
     def strains(
         self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> Float[Any, " z"]:
-        """v and u; that of u by a few corrections of Newton's method."""
+        """Return v and u; u by a few Newton corrections."""
         R = rotation_matrix(self.y_layout.get(y, "h"))
         n, m = self.y_layout.get(y, "n"), self.y_layout.get(y, "m")
         hv, hu = self.z_layout.split(history.z)
@@ -97,9 +97,9 @@ class VirtualRobot(TendonRod):
             return u - dot(inverse(jax.jacfwd(left)(u, held)), left(u, held))
 
         held = (K, B, hu, dot(R.T, m), jnp.asarray(control))
-        # the search itself is not differentiated: one more correction has the implicit function's derivatives
+        # the iteration is not differentiated: one more correction has the implicit function's derivatives
         still = jax.lax.stop_gradient(held)
-        # from where nothing slides Newton's method does not overshoot; at rest the law is linear
+        # starting without sliding, Newton's method does not overshoot; at rest the law is linear
         begin = -still[2] / jnp.where(c0 > 0.0, c0, 1.0)
         u = jax.lax.fori_loop(0, CORRECTIONS, lambda _, u: corrected(u, still), begin)
         u = corrected(jax.lax.stop_gradient(u), held)
@@ -108,9 +108,9 @@ class VirtualRobot(TendonRod):
     def rates(
         self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
     ) -> Float[Any, " y"]:
-        """Those of a rod without tendons, and of the rib there."""
+        """Return y_s of a rod without tendons, with the ribs' masses."""
         away = (s / self.length - np.array(RIBS)) * self.length / RIB_WIDTH
-        # a smooth lump, half of the last one beyond the tip
+        # a Gaussian, with half of the last one beyond the tip
         lump = jnp.exp(-0.5 * away**2) / (RIB_WIDTH * np.sqrt(2.0 * np.pi))
         mass = self.rib_mass * jnp.sum(lump)
         y_t = history.c0 * y + history.y

@@ -1,11 +1,11 @@
-"""A rod of rubber: it creeps, and is stiffer in fast motion than at rest (the standard linear solid).
+"""A viscoelastic rod, such as rubber: it creeps, and is stiffer in fast motion (standard linear solid).
 
-Beside the elastic law of `elastic_rod` a Maxwell branch acts in parallel: a spring of stiffness r K in series
+A Maxwell branch acts in parallel with the elastic law of `elastic_rod`: a spring of stiffness r K in series
 with a dashpot. Its dashpot has the strain z_i,
 
     K (z - z*) + B z_t + r K (z - z_i) = Rᵀ (n, m),      T z_i,t = z - z_i,
 
-with the relaxation time T. Fast motion feels the stiffness (1 + r) K, rest K alone.
+with the relaxation time T. The stiffness is (1 + r) K in fast motion, and K at rest.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from knode_cosserat.rotation import dot, inverse
 
 
 class ViscoelasticRod(SlenderRod):
-    """A slender rod whose material relaxes: with `branch_stiffness` 0 it is a `SlenderRod`."""
+    """A slender rod with a relaxing material; with `branch_stiffness` 0 it is a `SlenderRod`."""
 
     z_layout: ClassVar[Layout] = ElasticRod.z_layout + Layout(
         ("v_branch", 3, "1", "v of the dashpot of the Maxwell branch"),
@@ -37,19 +37,19 @@ class ViscoelasticRod(SlenderRod):
     relaxation_time: Any = parameter("s", "relaxation time of that branch", low=1e-6, high=1e6, default=1.0)
 
     def rest(self, s: Any) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-        """Unloaded, at rest; the branch is relaxed."""
+        """Return the unloaded state at rest, with a relaxed branch."""
         y, z = super().rest(s)
         return y, jnp.concatenate([z, z])
 
     def unstressed(self, s: Any, control: Any) -> Float[Any, " z"]:
-        """Strains without stress; the branch is relaxed."""
+        """Return the strains without stress, with a relaxed branch."""
         z = super().unstressed(s, control)[:6]
         return jnp.concatenate([z, z])
 
     def strains(
         self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> Float[Any, " z"]:
-        """v, u and the strains of the dashpot, which are eliminated first."""
+        """Return v, u and the strains of the dashpot, which are eliminated first."""
         c0, (Kse, Bse, Kbt, Bbt, u_star, *_) = history.c0, self.material(s, control)
         hv, hu, hv_branch, hu_branch = self.z_layout.split(history.z)
         n, m = self.stresses(y)
@@ -67,7 +67,7 @@ class ViscoelasticRod(SlenderRod):
         return jnp.concatenate([z, (z - T * h_branch) / (1.0 + c0 * T)])
 
     def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
-        """C, D, f2 of the same law."""
+        """Return C, D, f2 of the same law."""
         C, D, f2 = super().constitutive(s, t, y, y_t, control)
         K, one, zero = self.branch_stiffness * C, jnp.eye(6), jnp.zeros((6, 6))
         return (

@@ -1,1 +1,1 @@
-"""Steps a system in time and solves it along the rod. No physics: only the general class is seen."""
+"""Solvers in time and along the rod. They contain no physics and use only the class `System`."""

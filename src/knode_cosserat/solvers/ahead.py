@@ -1,8 +1,8 @@
-"""Hoists terms that do not change during Newton's iteration: they are evaluated once, before.
+"""Hoists terms that do not change during Newton's iteration.
 
-A step evaluates the equations many times at the same places, under the same control. What depends on neither
-y nor the past (where tendons run, how stiff a section is, by which matrix a law is solved) is the same every
-time. It is found in the traced equations: no system has to say what that is, and none can say it wrong.
+A step evaluates the equations many times at the same places, under the same control. Terms that depend on
+neither y nor the history (tendon routing, section stiffness, the matrix of a law) are evaluated once, before
+the iteration. They are found in the traced equations, so no system has to declare them.
 """
 
 from __future__ import annotations
@@ -25,29 +25,29 @@ class _On(enum.IntEnum):
 
 
 class InTwo(NamedTuple):
-    """`function(place, state)` in two: `then(first(place), place, state)` is the same.
+    """`function(place, state)` in two parts: `then(first(place), place, state)` gives the same result.
 
-    What depends on neither is evaluated once, when it is parted.
+    Terms that depend on neither argument are evaluated once, when the function is split.
     """
 
     first: Callable[[Any], list[Any]]
     then: Callable[[list[Any], Any, Any], Any]
-    #: the equations of `function`: of a place and the arrays of a state
+    #: the traced equations of `function`; inputs are a place and the arrays of a state
     traced: ClosedJaxpr
 
 
 def in_two(function: Callable[[Any, Any], Any], place: Any, state: Any) -> InTwo:
-    """A function parted into what follows from its first argument, and the rest.
+    """Split a function into a part that depends only on its first argument, and the rest.
 
     Args:
         function: of a place (an array) and a state (a pytree); JAX-traceable.
-        place: one like those it will be given.
-        state: the same.
+        place: an example of the first argument.
+        state: an example of the second argument.
     """
     closed, shape = jax.make_jaxpr(function, return_shape=True)(place, state)
     jaxpr = closed.jaxpr
     at_place, given = jaxpr.invars[:1], jaxpr.invars[1:]
-    # what depends on nothing at all stays where it is used: XLA makes more of a constant it can see
+    # equations without any input stay where they are used: XLA optimises constants that it can see
     depends: dict[Var, _On] = dict.fromkeys(jaxpr.constvars, _On.PARAMETERS)
     depends |= {at_place[0]: _On.PLACE, **dict.fromkeys(given, _On.STATE)}
     steps: dict[_On, list[JaxprEqn]] = {on: [] for on in _On}
@@ -88,5 +88,5 @@ def in_two(function: Callable[[Any, Any], Any], place: Any, state: Any) -> InTwo
 
 
 def _variables(*groups: Iterable[Any]) -> list[Var]:
-    """Each variable once, in the order in which they come."""
+    """Return each variable once, in order of first appearance."""
     return list(dict.fromkeys(each for group in groups for each in group if not isinstance(each, Literal)))

@@ -31,7 +31,7 @@ from knode_cosserat.solvers.space import SpaceScheme
 
 @dataclasses.dataclass(frozen=True)
 class NewtonOptions:
-    """When a step counts as solved, and how long to try.
+    """Tolerances and limits of Newton's method.
 
     Residuals are measured in the system's natural units (`System.scales`). A step is solved when the largest
     is below `tolerance`, or below `acceptable` where rounding allows no further progress.
@@ -112,13 +112,13 @@ def static_error(system: System, space: SpaceScheme, record: Any, control: Any, 
 
 
 class _Progress(NamedTuple):
-    """Where the iteration stands; all are numbers, for they are kept in one vector."""
+    """Progress of the iteration; all entries are numbers because they are stored in one vector."""
 
     #: residual of the last accepted point
     error: Any
     #: length of the correction from it, infinite if there is none by the same linearisation
     size: Any
-    #: part of the correction in which it is tried
+    #: damping factor of the next correction
     damping: Any
     #: a new linearisation is needed at the point
     renew: Any
@@ -135,7 +135,7 @@ class _Progress(NamedTuple):
 
 
 class _Search(NamedTuple):
-    """State of the iteration: few and long vectors, since every array costs the start of a kernel or two."""
+    """State of the iteration, in few and long vectors: every array costs one or two kernel launches."""
 
     #: the last accepted point, y and unknowns, and the correction from it
     point: Float[Any, " n"]
@@ -159,8 +159,8 @@ def newton(
 ) -> tuple[Solution, Kept]:  # fmt: skip
     """Solve one step from a first guess, beginning with kept factors if they are usable.
 
-    `batch` is the name of the axis of robots that are solved in lockstep: they are linearised together, if
-    one of them needs it. Never fails: the `error` of the solution says whether it is one.
+    `batch` is the name of the axis of robots that are solved in lockstep. They are linearised together if one
+    of them needs it. Never fails: the `error` of the solution tells if it is solved.
     """
     scales, pivots, size_of_y, shape = problem.system.scales(), pivots_of(problem.system), y.size, y.shape
     kept = none_kept(problem, y, unknowns) if kept is None else kept
@@ -188,7 +188,7 @@ def newton(
         shorten = ~accept & fresh & ~first & (last.damping > options.least_damping)
         rounding = ~accept & (last.error <= options.acceptable) & ~old & ~first
         dead = rounding | (~accept & (first | fresh) & ~shorten)
-        # on from here, again from the point before but shorter, or a new linearisation there
+        # continue from here, retry a shorter step from the previous point, or linearise anew there
         renew = ~good & ~dead & (slow | (~accept & ~shorten))
         longer = jnp.where(first, 1.0, jnp.minimum(1.0, 4.0 * last.damping))
         progress = _Progress(
@@ -212,7 +212,7 @@ def newton(
             found = factors_of(problem, *unpacked(search.point))
             return jnp.array(False), found if batch is None else _where(renew, found, state[1])
 
-        # by the need of any robot, which is one number: by each one's, a batch would always do both
+        # one flag for the whole batch: with one flag a robot, a batch would always evaluate both branches
         needed = renew if batch is None else jax.lax.psum(renew.astype(int), batch) > 0
         # a loop of one turn at most: `cond` would copy the factors that are kept
         _, factors = jax.lax.while_loop(lambda state: state[0], anew, (needed, factors))

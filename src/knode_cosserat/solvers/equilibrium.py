@@ -30,25 +30,25 @@ def equilibrium(
     recovery_budget: float | None = None,
     on_failure: Literal["raise", "return"] = "raise",
 ) -> Trajectory:
-    """The shape a robot takes under a constant control, at rest.
+    """Return the static equilibrium under a constant control.
 
     Args:
         robot: one system, or a sequence of systems that differ in their parameters only.
         control: (c,), or (B, c) for a batch; for a tendon robot the tensions in N.
         space: "lobatto2", "lobatto4", "euler", or a scheme.
-        initial: initial guess instead of the robot unloaded: a `Trajectory` (its last row), or measured
+        initial: initial guess, by default the unloaded robot: a `Trajectory` (its last row), or measured
             positions (M, 3) in m, evenly spaced along the rod from its base to its tip.
         newton: tolerances and limits of the solve.
-        position_tolerance: largest discretisation error (m) of positions, for which the nodes are chosen; by
-            default they are the robot's.
+        position_tolerance: largest discretisation error (m) of positions. The number of nodes is chosen for
+            it; by default it is the robot's.
         recovery_budget: seconds that recovery may take; see `simulate`.
         on_failure: "raise" a `SimulationError`, or "return" the trajectory with its row marked invalid.
 
     Returns:
         A `Trajectory` of one row, at time 0; it can be the `initial` of a simulation. If direct iteration
-        fails, a rod between two held ends is started from a curve that hangs between them; then the load is
-        applied in parts, and then the robot moves, damped, until it rests. Of several equilibria this is one,
-        stable or not: see `kc.stability`.
+        fails, three methods follow: a rod between two held ends starts from a hanging curve, the load is
+        applied in parts, and a damped motion is simulated until the robot rests. If there are several
+        equilibria, this is one of them, stable or unstable: see `kc.stability`.
 
     Raises:
         SimulationError: no equilibrium was found.
@@ -77,7 +77,8 @@ def equilibrium(
         recovery_budget=recovery_budget, on_failure=on_failure,
     )  # fmt: skip
     rows = (slice(None), slice(1, 2)) if found.y.ndim == 4 else slice(1, 2)
-    names = ("y", "z", "control", "result", "residual", "iterations", "position_error")
+    names = ["y", "z", "control", "result", "residual", "iterations", "position_error"]
+    names += [] if found.extrapolated is None else ["extrapolated"]
     return dataclasses.replace(
         found, time=np.zeros(1), **{name: getattr(found, name)[rows] for name in names}
     )

@@ -2,12 +2,12 @@
 
 A scheme in arclength keeps its order only where the right-hand side is smooth. A segment is therefore
 divided into pieces at every discontinuity of the system (`System.cuts`), and y jumps there if the system
-says so. Within the tolerance `ON_NODE` a discontinuity lies on a node. y at a node is that on its near side,
-z that on its far side.
+says so. Within the tolerance `ON_NODE` a discontinuity lies on a node. At a node, y
+is the value on the near side and z the value on the far side.
 
-Points are where y is unknown: the nodes and the discontinuities between them. Places are where the equations
-are evaluated: at the points (on the far side of discontinuities), on the near side of those that have one,
-and at the stages of the scheme within every piece.
+y is unknown at the points: the nodes and the discontinuities between them. The equations are evaluated at the
+places: at the points (on the far side of discontinuities), at the near sides of discontinuities, and at the
+stages of the scheme within every piece.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from knode_cosserat.rods.section import INWARD
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.space import LOBATTO2, SpaceScheme
 
-#: discontinuities closer to a node than this part of a segment lie on it
+#: a discontinuity closer to a node than this part of a segment is placed on the node
 ON_NODE = 0.1 * INWARD
-#: nodes of a smooth stretch that interpolation uses, if it has as many: order 4
+#: largest number of nodes of a smooth stretch that interpolation uses: order 4
 NEAREST = 4
 
 
@@ -37,17 +37,17 @@ class Stencil(NamedTuple):
 
 
 class Grid:
-    """The points and places of a rod with these discontinuities (parts of its length) and nodes."""
+    """Points and places of a rod, from its discontinuities (parts of its length) and its number of nodes."""
 
     def __init__(self, cuts: tuple[float, ...], nodes: int, stages: tuple[float, ...]):
         along = np.asarray(cuts, dtype=float) * (nodes - 1)
         nearest = np.round(along)
         along = np.where(np.abs(along - nearest) < ON_NODE, nearest, along)
         starts = np.unique(np.concatenate([np.arange(nodes - 1.0), along[along < nodes - 1]]))
-        #: in which segment each piece is
+        #: segment index of each piece
         self.segment = np.minimum(np.floor(starts).astype(int), nodes - 2)
         ends = np.append(starts[1:], nodes - 1.0)
-        #: from where to where in it, as parts of the segment
+        #: start and end of each piece, as parts of its segment
         self.bounds = np.stack([starts, ends], axis=1) - self.segment[:, None]
         #: the discontinuities at each piece's start (pieces, cuts)
         self.acting = (starts[:, None] == along[None]).astype(float)
@@ -55,7 +55,7 @@ class Grid:
         whole = starts == np.floor(starts)
         self.nodes = np.append(np.flatnonzero(whole), len(starts))
         self.between = np.flatnonzero(~whole)
-        #: index of the tip among the points, which is the number of pieces
+        #: index of the tip among the points; equals the number of pieces
         self.tip = len(starts)
         #: points that have a near side
         self.near = np.flatnonzero(self.acting.any(axis=1) & (starts > 0.0))
@@ -92,7 +92,7 @@ class Grid:
 
     @functools.cached_property
     def stencils(self) -> tuple[Stencil, Stencil]:
-        """Interpolation from nodes to places: of y, which is continuous, and of what jumps."""
+        """Interpolation stencils from nodes to places: for y, and for values that jump (z and y_s)."""
         points = np.append(self.segment + self.bounds[:, 0], self.nodes.size - 1.0)
         starts, ends = points[:-1], points[1:]
         along = [
@@ -114,7 +114,7 @@ class Grid:
             low, high = points[k], points[k + 1]
             first, end = edges[edges <= low].max(), edges[edges >= high].min()
             stretch = np.arange(np.ceil(first), np.floor(end) + 1.0)
-            # at a discontinuity on a node the value that jumps is known on the far side
+            # a value that jumps at a node is known on the far side only
             jumping = stretch if end == last else stretch[stretch < end]
             nearby = np.array([self.segment[k], self.segment[k] + 1.0])
             for stencil, own in ((on, stretch), (over, jumping)):
@@ -142,7 +142,7 @@ def grid_of(system: System, space: SpaceScheme = LOBATTO2) -> Grid:
 
 
 def at_places(system: System, space: SpaceScheme, records: Float[Any, "nodes x"]) -> Float[Any, "places x"]:
-    """Interpolate packed records at the nodes to all places, over no discontinuity."""
+    """Interpolate packed records at the nodes to all places; no stencil spans a discontinuity."""
     ny = system.y_layout.size
     found = [
         jnp.sum(stencil.weights[..., None] * own[stencil.nodes], axis=1)

@@ -13,7 +13,7 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.rotation import turned
 from knode_cosserat.solvers.history import rest_record
 
-#: fewest positions that say something of a curve, and those along a curve between held ends
+#: fewest positions that define a curve, and number of positions along a curve between held ends
 FEWEST, POINTS = 2, 65
 
 
@@ -22,13 +22,13 @@ def state_from_positions(
 ) -> Float[np.ndarray, "nodes x"]:
     """Return y and z at the nodes of a rod whose centreline goes through these positions.
 
-    They are taken as evenly spaced along the rod, from its base to its tip, and joined by a spline. Frames
-    are carried along it from the base's without twist; a twist that a held tip asks for is spread evenly.
-    Moments and strains are those of the material's law; forces are zero.
-    Accepts systems of one rod with positions p, orientations h and curvatures u.
+    The positions are assumed evenly spaced along the rod, from base to tip, and are joined by a spline. The
+    base frame is transported along it without twist; the twist of a held tip is spread evenly. Moments
+    follow from the material's law; forces are zero. Accepts systems of one rod with positions p,
+    orientations h and curvatures u.
 
     Raises:
-        ValueError: the positions are no curve, or the system is none of these.
+        ValueError: the positions are no curve, or the system is not accepted.
     """
     positions = np.asarray(positions, dtype=float)
     y_layout, z_layout = system.y_layout, system.z_layout
@@ -61,7 +61,7 @@ def state_from_positions(
 
 
 def _curve(positions: Any, s: Any) -> tuple[Any, Any]:
-    """Positions and unit tangents of a spline at parts of the length."""
+    """Return positions and unit tangents of a spline at parts of the length."""
     from scipy.interpolate import make_interp_spline
 
     spline = make_interp_spline(
@@ -72,7 +72,7 @@ def _curve(positions: Any, s: Any) -> tuple[Any, Any]:
 
 
 def _carried(base: Any, tangents: Any) -> Any:
-    """Orientations (quaternions, scalar first) along tangents, from the base's on without twist."""
+    """Return twist-free orientations (quaternions, scalar first) along tangents, starting at the base's."""
     from scipy.spatial.transform import Rotation
 
     frame = Rotation.from_quat(np.roll(base, -1))
@@ -81,7 +81,7 @@ def _carried(base: Any, tangents: Any) -> Any:
         axis = frame.apply([0.0, 0.0, 1.0])
         across, along = np.cross(axis, tangent), float(np.dot(axis, tangent))
         size = float(np.linalg.norm(across))
-        if size < 1e-12 and along < 0.0:  # turned back: about any axis across
+        if size < 1e-12 and along < 0.0:  # tangent reversed: rotate about any perpendicular axis
             across, size = frame.apply([1.0, 0.0, 0.0]), 1.0
             turn = np.pi * across
         else:
@@ -89,13 +89,13 @@ def _carried(base: Any, tangents: Any) -> Any:
         frame = Rotation.from_rotvec(turn) * frame
         found.append(np.roll(frame.as_quat(), 1))
     h = np.array(found)
-    for k in range(1, len(h)):  # of the two quaternions the nearer
+    for k in range(1, len(h)):  # choose the sign nearest to the previous quaternion
         h[k] *= 1.0 if np.dot(h[k], h[k - 1]) >= 0.0 else -1.0
     return h
 
 
 def _twisted(h: Any, tip: Any) -> Any:
-    """Orientations twisted evenly about their tangents, so that the last is nearest to the tip's."""
+    """Return orientations twisted evenly about their tangents; the last one is nearest to the tip's."""
     from scipy.spatial.transform import Rotation
 
     frames = Rotation.from_quat(np.roll(h, -1, axis=1))
@@ -111,9 +111,9 @@ def _twisted(h: Any, tip: Any) -> Any:
 
 
 def natural_reach(system: System) -> float:
-    """Return how far an end of the rod holds its direction, as a part of the length.
+    """Return the distance over which an end of the rod keeps its direction, as a part of the length.
 
-    Twice the gravity-bending length (EI/ρAg)^⅓, at most the whole: of a stiff rod, or without gravity.
+    It is twice the gravity-bending length (EI/ρAg)^⅓, at most 1: for a stiff rod, or without gravity.
     """
     gravity = float(np.linalg.norm(np.asarray(getattr(system, "gravity", 0.0))))
     if gravity == 0.0 or not (hasattr(system, "Kbt") and hasattr(system, "mass_per_length")):
@@ -124,11 +124,11 @@ def natural_reach(system: System) -> float:
 
 
 def hanging_curve(system: System, control: Any, reach: float) -> Float[np.ndarray, "M 3"] | None:
-    """Return positions along a smooth curve of the rod's length between its held ends; None if they are not.
+    """Return positions on a smooth curve of the rod's length between its held ends; None if an end is free.
 
-    It sags along gravity, and leaves both ends along their tangents, further for a larger `reach` (parts of
-    the length): a stiff rod far, a floppy one hardly. Ends farther apart than the length are joined by a
-    curve that is longer.
+    It sags along gravity. It leaves both ends along their tangents, further for a larger `reach` (parts of
+    the length): far for a stiff rod, hardly for a floppy one. If the ends are farther apart than the
+    length, the curve is longer than the rod.
     """
     base, tip = system.end_poses(np.asarray(control))
     if base is None or tip is None:
@@ -157,7 +157,7 @@ def hanging_curve(system: System, control: Any, reach: float) -> Float[np.ndarra
 
 
 def _sagging(system: System, chord: Any, tangent: Any) -> Any:
-    """The unit vector across the chord along gravity; without one, along the first tangent, or anywhere."""
+    """Return a unit vector normal to the chord: along gravity, else along the first tangent, else any."""
     for way in (getattr(system, "gravity", np.zeros(3)), tangent, np.eye(3)[0], np.eye(3)[1]):
         way = np.asarray(way, dtype=float)
         across = way - chord * np.dot(way, chord) / max(np.dot(chord, chord), 1e-300)
@@ -167,7 +167,7 @@ def _sagging(system: System, chord: Any, tangent: Any) -> Any:
 
 
 def _root(growing: Any, high: float) -> float:
-    """Return where a function changes sign between 0 and high, by bisection; an end if nowhere."""
+    """Return the sign change of a function between 0 and high, by bisection; an end if there is none."""
     low, rises = 0.0, growing(high) > 0.0
     for _ in range(60):
         middle = 0.5 * (low + high)
@@ -176,14 +176,14 @@ def _root(growing: Any, high: float) -> float:
 
 
 def _evenly(points: Any) -> Any:
-    """Points at even distances along a polygon."""
+    """Return points at even distances along a polygon."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     at = np.linspace(0.0, along[-1], len(points))
     return np.stack([np.interp(at, along, column) for column in points.T], axis=1)
 
 
 def _curvatures(h: Any, ds: float) -> Any:
-    """Curvatures (1/m), material frame, from orientations at the nodes."""
+    """Return curvatures (1/m), in the material frame, from orientations at the nodes."""
     from scipy.spatial.transform import Rotation
 
     frames = Rotation.from_quat(np.roll(h, -1, axis=1))

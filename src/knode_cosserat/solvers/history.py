@@ -1,8 +1,8 @@
-"""History of a motion: the states that a step needs of those before it.
+"""History of a motion: the earlier states that a time step needs.
 
-An implicit scheme in time needs y, z and y_s of earlier steps wherever a step evaluates the equations
-(`grid.Grid`). They are kept there. A trajectory holds the nodes only; the rest of its states is evaluated
-again, row by row, for a motion that continues from it.
+An implicit scheme in time needs y, z and y_s of earlier steps at all places where a step evaluates the
+equations (`grid.Grid`). The history stores them there. A trajectory holds the nodes only. A motion that
+continues from it evaluates the other places again, row by row.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.time import BDF1
 
-#: number of earlier states in the first guess of a step, and the extrapolations it is a mean of: constant,
-#: linear, quadratic in time
+#: number of earlier states in the first guess of a step, and the extrapolations in time (constant, linear,
+#: quadratic) of which the guess is the weighted mean
 PAST = 3
 EXTRAPOLATIONS = np.array([[1.0, 0.0, 0.0], [2.0, -1.0, 0.0], [3.0, -3.0, 1.0]])
-#: a row is taken for an equilibrium of its grid if its residuals are at most this (natural units): more than
-#: the solver's `acceptable`
+#: a row counts as an equilibrium of its grid if its residuals are at most this (natural units); it is larger
+#: than the solver's `acceptable`
 SOLVED = 2e-8
 
 
@@ -37,7 +37,7 @@ class Past(NamedTuple):
     rate: Float[Any, "places x"]
     #: for the first guess
     y: Float[Any, "past points y"]
-    #: of each state in the first guess
+    #: weight of each state in the first guess
     weights: Float[Any, " past"]
     #: time of row 0 (s): step i ends at t0 + (i + 1) dt
     t0: Float[Any, ""]
@@ -50,21 +50,21 @@ class Begun(NamedTuple):
 
     records: Float[Any, "2 places x"]
     rate: Float[Any, "places x"]
-    #: of that step: c0, c1, c2 (1/s) and d1
+    #: coefficients of the first step: c0, c1, c2 (1/s) and d1
     coefficients: Float[Any, "4"]
     #: time step (s) between the two states
     dt: Float[Any, ""]
 
 
 def coefficient_table(settings: Settings, dt: float) -> np.ndarray:
-    """Return the coefficients (2, 4) of the first step and of every other."""
+    """Return the coefficients (2, 4) of the first step and of all later steps."""
     regular = settings.time.coefficients(dt, dt)
     first = BDF1().coefficients(dt, dt) if settings.start == "consistent" else regular
     return np.array([first, regular])
 
 
 def history_of(states: Any, rate: Any, coefficients: Any, settings: Settings) -> Any:
-    """Return ʰ = c1 (newest) + c2 (the one before) + d1 (its rate), for y, z and y_s alike."""
+    """Return the history terms ʰ = c1 (newest) + c2 (second newest) + d1 (newest rate), of y, z and y_s."""
     _, c1, c2, d1 = coefficients
     history = c1 * states[0] + c2 * states[1]
     return history + d1 * rate if settings.time.uses_rate else history
@@ -80,7 +80,7 @@ def advanced(past: Past, records: Any, rate: Any, y: Any, weights: Any) -> Past:
     )
 
 
-# one state, and no other before it
+# histories of one state
 
 
 def rest_record(system: System) -> Float[Any, "nodes x"]:
@@ -91,7 +91,7 @@ def rest_record(system: System) -> Float[Any, "nodes x"]:
 
 
 def resting_past(system: System, settings: Settings) -> Past:
-    """Return a history of rest under no control, at time 0."""
+    """Return the history of the robot at rest under zero control, at time 0."""
     none = jnp.zeros(system.control_size)
     if system.mixed:
         return initial_past(system, settings, rest_record(system), none)
@@ -101,9 +101,10 @@ def resting_past(system: System, settings: Settings) -> Past:
 
 
 def initial_past(system: System, settings: Settings, row: Any, control: Any, t0: Any = 0.0) -> Past:
-    """Return a history of one state, y and z of it at the nodes: every state before the first is the first.
+    """Return a history in which all earlier states equal one state, given by y and z at the nodes.
 
-    Between nodes an equilibrium under this control is that of its solution, any other state is interpolated.
+    Between nodes, an equilibrium under this control is evaluated from its equations; any other state is
+    interpolated.
     """
     still = StepProblem.still(system, settings.space, control, t0)
     y = still.filled(row[:, : system.y_layout.size])
@@ -113,7 +114,7 @@ def initial_past(system: System, settings: Settings, row: Any, control: Any, t0:
 def past_of_one(
     system: System, space: SpaceScheme, records: Float[Any, "places x"], y: Float[Any, "points y"], t0: Any
 ) -> Past:
-    """Return a history of one state only."""
+    """Return a history in which all earlier states equal one state."""
     used = used_places(system, space)
     return Past(
         jnp.stack([records] * 2),
@@ -126,20 +127,20 @@ def past_of_one(
 
 
 def used_places(system: System, space: SpaceScheme) -> int:
-    """Return the number of places that the scheme itself uses, without those of its check."""
+    """Return the number of places that the scheme itself uses, without the extra stages of its check."""
     grid = grid_of(system, space)
     return grid.ends + len(space.formula.stages) * grid.tip
 
 
 def still_records(still: StepProblem, row: Any, y: Any) -> Float[Any, "places x"]:
-    """Return records of one row at all places: of its equilibrium if it is one, interpolated if not."""
+    """Return records of one row at all places: evaluated if the row is an equilibrium, else interpolated."""
     system, ny = still.system, still.system.y_layout.size
     solved = still.records(y)
     own = row_of(system, y, solved)
     nodes = jnp.concatenate([row, own[:, row.shape[1] :]], axis=1)
     scales = system.scales()
     off = jnp.max(jnp.abs(still.reached(y) - y[1:]) / scales.y)
-    # strains that are not those of the equilibrium: the state moves
+    # the strains must also equal the equilibrium's: otherwise the state moves
     bent = jnp.max(jnp.abs(nodes - own)[:, ny:]) <= SOLVED * (1.0 + jnp.max(jnp.abs(own[:, ny:])))
     return jnp.where((off <= SOLVED) & bent, solved, at_places(system, still.space, nodes))
 
@@ -153,7 +154,7 @@ def rows_suffice(system: System, space: SpaceScheme) -> bool:
 
 
 def padded_rows(rows: Any, least: int = 1) -> np.ndarray:
-    """Rows (…, T, n) filled up to a power of two, so that a few more need no new program."""
+    """Return rows (…, T, n) padded to a power of two, so that a few more rows need no new program."""
     rows = np.asarray(rows)
     count = rows.shape[-2]
     width = [(0, 0)] * rows.ndim
@@ -169,11 +170,11 @@ class Motion(NamedTuple):
     regular: Float[Any, "4"]
     #: y and z of the nodes
     rows: Float[Any, "rows nodes x"]
-    #: of each row; that of the first is not used
+    #: control of each row; the first is not used
     controls: Float[Any, "rows c"]
     #: time of the first row (s)
     t0: Any
-    #: number of rows; the rest is filling
+    #: number of rows; the rest is padding
     count: Any
 
 
@@ -184,10 +185,10 @@ def begun_between(system: System, space: SpaceScheme, rows: Any, coefficients: A
 
 
 def past_along(system: System, settings: Settings, motion: Motion) -> tuple[Past, Any]:
-    """Return the history after a motion's last row, and that (rows - 1, places, x) of each step.
+    """Return the history after a motion's last row, and the history terms (rows - 1, places, x) of each step.
 
-    The equations are evaluated again at every place of each step. A difference from them at the nodes (none,
-    unless a row was changed since) is carried over to the places between.
+    The equations are evaluated again at every place of each step. If a row was changed after it was solved,
+    its difference from the equations at the nodes is interpolated to the other places.
     """
     begun, regular, rows, controls, t0, count = motion
     ny, dt, space = system.y_layout.size, begun.dt, settings.space

@@ -36,14 +36,14 @@ from knode_cosserat.solvers.task import FirstStep, Start, Task
 from knode_cosserat.solvers.time import Static
 from knode_cosserat.trajectory import Trajectory
 
-#: a rate that was not known counts less than this after so many steps as are looked at
+#: an unknown initial rate is ignored if its weight has decayed below this after all available steps
 FORGOTTEN = 1e-9
-#: row 0 is that of rest if it is off by less than this (natural units)
+#: row 0 is the state at rest if it differs by less than this (natural units)
 AT_REST = 1e-12
 
 
 class Run(NamedTuple):
-    """The checked arguments of one call; `many` says that the systems themselves are batched."""
+    """The checked arguments of one call; `many` is true if the systems themselves are batched."""
 
     system: System
     controls: Any
@@ -57,21 +57,21 @@ class Run(NamedTuple):
 
 
 class Beginning(NamedTuple):
-    """Where a run begins."""
+    """Initial state and history of a run."""
 
     #: y and z at the nodes
     record: Any
     start: Start
-    #: time of that (s)
+    #: time of the initial state (s)
     t0: Any
-    #: how the first step is made (`Task.first`)
+    #: kind of the first step (`Task.first`)
     first: FirstStep
-    #: of a motion: what its first step looks back on
+    #: initial history of a motion; None for statics
     begun: Begun | None
 
 
 def beginning(run: Run) -> Beginning:
-    """Where a run begins."""
+    """Return the initial state and history of a run."""
     system, controls, initial, settings, dt, batch, many, _ = run
     if initial is not None:
         return _going_on(system, initial, settings, dt)
@@ -97,7 +97,7 @@ def beginning(run: Run) -> Beginning:
 
 
 def _of_past(settings: Settings) -> Settings:
-    """Return the settings that matter for the history; runs that differ in others share its programs."""
+    """Return only the settings that affect the history; runs that differ in others share programs."""
     return Settings(settings.time, settings.space, settings.start)
 
 
@@ -112,7 +112,7 @@ def _all_at_rest(system: System, settings: Settings) -> Any:
 
 
 def _settled(run: Run, past: Any) -> tuple[Any, Any, Any]:
-    """Return the equilibrium under no control, its history, and whether its grid is too coarse."""
+    """Return the equilibrium under zero control, its history, and a flag: true if its grid is too coarse."""
     system, many = run.system, run.many
     task = Task(run.settings, run.dt, 1, "still")
     none = np.zeros((1, system.control_size))
@@ -130,7 +130,7 @@ def _settled(run: Run, past: Any) -> tuple[Any, Any, Any]:
 
 
 def _settled_one(task: Task, system: System, none: Any, past: Any, i: Any) -> tuple[Any, Any]:
-    """Return the equilibrium of one robot, and whether its grid is too coarse; an error if there is none."""
+    """Return the equilibrium of one robot, and a flag for a too coarse grid; raise if there is none."""
     steps, cause = run_one(task, system, none, Start(past, none[0]))
     if steps.result[0] < 0:
         robot = None if i is ... else i
@@ -150,7 +150,7 @@ def _all_pasts(system: System, settings: Settings, rows: Any, control: Any, t0: 
     return jax.vmap(lambda each, row: initial_past(each, settings, row, control, t0))(system, rows)
 
 
-# where another motion ends
+# continuation of another motion
 
 
 def _going_on(system: System, initial: Trajectory, settings: Settings, dt: float) -> Beginning:
@@ -173,7 +173,7 @@ def _going_on(system: System, initial: Trajectory, settings: Settings, dt: float
 
 @functools.partial(jax.jit, static_argnames="space")
 def _shape(system: System, space: SpaceScheme, record: Any, t0: Any) -> Past:
-    """Return a history of one shape, from which an equilibrium is searched: interpolated between nodes."""
+    """Return a history of one shape, the start of a search for an equilibrium; interpolated between nodes."""
     more = no_history(system, space).shape[-1] - record.shape[-1]
     y = grid_of(system).spread(record[:, : system.y_layout.size])
     records = at_places(system, space, jnp.pad(record, ((0, 0), (0, more))))
@@ -187,10 +187,10 @@ def _begun(past: Past, coefficients: Any, dt: Any) -> Begun:
 def _known(
     system: System, initial: Trajectory, settings: Settings, dt: float
 ) -> tuple[Past, FirstStep] | None:
-    """The past that a motion's rows tell of, and how the first step after it is made; None: of one state.
+    """Return the history from a motion's rows, and the kind of the next step; None if one state is all.
 
-    What was simulated on the same points and stages is looked at as it moved, and other states as they are
-    between nodes.
+    A motion that was simulated on the same points and stages is evaluated again by its own equations. Other
+    states are interpolated between nodes.
     """
     rows: Any = jnp.concatenate([initial.y, initial.z], axis=-1)
     made = initial.settings
@@ -213,11 +213,11 @@ def _known(
     motion = Motion(begun, regular, rows, controls, initial.time[row], count)
     past, _ = _along(system, made, motion)
     alone = past_of_one(system, made.space, past.records[0], past.y[0], past.t0)
-    # of traced times nothing can be said but that a trajectory's rows are as far apart as it is to go on
+    # traced times cannot be compared: the rows are assumed to have the same time step as the continuation
     if not is_traced(begun.dt) and not np.isclose(begun.dt, dt):
         return alone, "start"
     if settings.time.uses_rate and not rate_known:
-        # the rate at the first row is not known if that was in motion; long enough after, most schemes forget
+        # the rate at a first row in motion is unknown; its effect decays over the steps in most schemes
         forgotten = float(abs(made.time.coefficients(dt, dt).d1)) ** (count - 1)
         if forgotten >= FORGOTTEN:
             return alone, "consistent"
@@ -234,7 +234,7 @@ def _alike(one: System, other: System) -> bool:
 
 
 class _Known(NamedTuple):
-    """Known history of a motion at one of its rows, whether its rate is known, coefficients of its steps."""
+    """Known history of a motion at one of its rows, a flag for a known rate, and the steps' coefficients."""
 
     begun: Begun
     row: int
@@ -243,7 +243,7 @@ class _Known(NamedTuple):
 
 
 def _apart(times: Any, dt: float) -> float:
-    """By what the last two of these times differ; of traced ones that is not known, but what it is to be."""
+    """Return the difference of the last two times; if they are traced, the given time step."""
     return dt if is_traced(times) else float(times[-1] - times[-2])
 
 
@@ -254,8 +254,7 @@ def _of_first_rows(
     time, begun = initial.time, initial.begun
     if begun is not None and begun.rate.shape == no_history(system, made.space).shape:
         regular = coefficient_table(made, dt if is_traced(begun) else float(begun.dt))[1]
-        # of one row alone that was the first of a motion nothing before it is known; of a traced one it is
-        # not known whether it was
+        # a single row that was the first of a motion has no earlier state; a traced row cannot be tested
         if len(time) > 1 or is_traced(begun) or np.any(begun.records[0] != begun.records[1]):
             return _Known(begun, 0, made.time.uses_rate, regular)
     if len(time) < 2:
@@ -265,7 +264,7 @@ def _of_first_rows(
     apart = _apart(time[:2], dt)
     record, past = _at_rest(system, made)
     if not is_traced((record, rows)) and not np.allclose(record, rows[0], rtol=0.0, atol=AT_REST):
-        # as files had them that did not say how a motion began
+        # files of earlier versions do not hold the initial history
         past = _past(system, made, rows[0], initial.control[0], 0.0)
     first, regular = coefficient_table(made, apart)
     return _Known(_begun(past, first, apart), 0, True, regular)
@@ -294,9 +293,9 @@ _along = jax.jit(past_along, static_argnames="settings")
 
 
 def histories_along(system: System, moved: Trajectory) -> tuple[int, Float[Any, "steps places x"]] | None:
-    """Return the first row whose step has a known history, with the histories of it and of all later steps.
+    """Return the first row whose step has a known history, and the history terms of that and all later steps.
 
-    None where the rows are not enough.
+    None if the rows do not suffice.
     """
     made = _of_past(moved.settings)
     rows = jnp.concatenate([moved.y, moved.z], axis=-1)

@@ -2,14 +2,14 @@
 
     δy_0 = S δξ,     δy_{j+1} = F_j δy_j + G_j r_j,     M δy_N = -tip
 
-From base to tip every solution is carried as δy_j = X_j α_j + w_j, where α_j are the values at node j of the
-fields that are unknown at the base (of a clamped rod: force and moment, so that X is the compliance of the
-rod behind the node). After every few pieces α changes to those of the node that is reached. Waves that grow
-along the rod are thereby kept apart, and rounding errors stay small: this is the
-Riccati form of the method of particular solutions (Ascher, Mattheij & Russell 1995, ch. 4).
+From base to tip every solution is written as δy_j = X_j α_j + w_j. α_j are the values at node j of the fields
+that are unknown at the base. For a clamped rod these are force and moment, and X is the compliance of the rod
+behind the node. After every few pieces α changes to the values at the node that is reached. Waves that grow
+along the rod are thereby kept apart, and rounding errors stay small. This is the Riccati form of the method
+of particular solutions (Ascher, Mattheij & Russell 1995, ch. 4).
 
-Strands (`System.strands`) meet at the ends only: F_j has a block for each, S and M are of all of them.
-A single rod's F has no axis of strands: with one of length one a step takes 1.3 times as long.
+Strands (`System.strands`) meet at the ends only: F_j has a block for each strand, S and M cover all strands.
+A single rod's F has no axis of strands: with an axis of length one a step takes 1.3 times longer.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Linearisation(NamedTuple):
     """Derivatives of the residuals: of each piece, of the base and of the tip."""
 
     F: Float[Any, "pieces *strands b b"]
-    #: None of an explicit scheme, where it is the identity
+    #: None for an explicit scheme, where it is the identity
     G: Any
     base: Float[Any, "y k"]
     tip: Float[Any, "k y"]
@@ -46,7 +46,7 @@ class Factors(NamedTuple):
     #: Fᵀ and Gᵀ
     Ft: Float[Any, "groups each *strands b b"]
     Gt: Any
-    #: X after each piece, of the α at its group's start; at the end of a group by those that follow
+    #: X after each piece, for the α at its group's start; at a group's end, for the next group's α
     X: Float[Any, "groups each y k"]
     #: α at a group's start is T (α at its end - β), β the values of these fields in w
     T: Float[Any, "groups k k"]
@@ -55,8 +55,8 @@ class Factors(NamedTuple):
     inverse: Float[Any, "k k"]
 
 
-# As sums of products: for sizes this small the library's products are twice as slow. From Fᵀ XLA vectorises
-# over the rows of F, which are neighbours then.
+# Sums of products: for sizes this small the library's products are twice as slow. With Fᵀ the rows of F are
+# contiguous, and XLA vectorises over them.
 
 
 def _product(Ft: Any, X: Any) -> Any:
@@ -76,7 +76,7 @@ def _apply(F: Any, x: Any) -> Any:
 def product(A: Float[Any, "a b n"], B: Float[Any, "b c n"]) -> Float[Any, "a c n"]:
     """Return the products of n pairs of small matrices, which are last.
 
-    Square ones of 19 rows take the library's product a quarter of the time of a sum of products.
+    For square matrices of 19 rows the library's product takes a quarter of the time of a sum of products.
     """
     return jnp.moveaxis(jnp.moveaxis(A, -1, 0) @ jnp.moveaxis(B, -1, 0), 0, -1)
 
@@ -84,8 +84,9 @@ def product(A: Float[Any, "a b n"], B: Float[Any, "b c n"]) -> Float[Any, "a c n
 def inverted(matrices: Float[Any, "b b n"]) -> Float[Any, "b b n"]:
     """Return the inverses of n small matrices, which are last, without pivoting.
 
-    Matrices I - h J of a scheme need no pivoting. Large ones are halved, the rest is by Gauss and Jordan. For
-    9 and 39 matrices of 16 rows this took a fifth of the time of the library's factorisation.
+    Matrices I - h J of a scheme need no pivoting. Large ones are inverted by blocks, small ones by
+    Gauss-Jordan elimination. For 9 and 39 matrices of 16 rows this took a fifth of the time of the library's
+    factorisation.
     """
     size = matrices.shape[0]
     if size <= HALVED:
@@ -101,7 +102,7 @@ def inverted(matrices: Float[Any, "b b n"]) -> Float[Any, "b b n"]:
 
 
 def _by_turns(matrices: Float[Any, "b b n"]) -> Float[Any, "b b n"]:
-    """Return inverses by Gauss and Jordan. In each turn the first row and column become the last."""
+    """Return inverses by Gauss-Jordan elimination. In each turn the first row and column become the last."""
     ones = jnp.ones((1, matrices.shape[-1]))
 
     def turn(A: Any, _: None) -> tuple[Any, None]:
@@ -112,11 +113,11 @@ def _by_turns(matrices: Float[Any, "b b n"]) -> Float[Any, "b b n"]:
     return jax.lax.scan(turn, matrices, None, length=matrices.shape[0])[0]
 
 
-# Matrices of which only the columns `used` differ from those of the identity are given by these columns.
+# A matrix that differs from the identity in the columns `used` only is given by these columns.
 
 
 def filled_up(columns: Float[Any, "b used n"], used: np.ndarray) -> Float[Any, "b b n"]:
-    """Return whole matrices from the columns that differ from the identity's."""
+    """Return full matrices from the columns that differ from the identity's."""
     size, count = columns.shape[0], columns.shape[-1]
     others = np.setdiff1d(np.arange(size), used)
     if not len(others):
@@ -129,7 +130,7 @@ def filled_up(columns: Float[Any, "b used n"], used: np.ndarray) -> Float[Any, "
 def quotient(
     A: Float[Any, "b used n"], B: Float[Any, "b used n"], used: np.ndarray
 ) -> tuple[Float[Any, "b used n"], Float[Any, "b used n"]]:
-    """Return B⁻¹ A and B⁻¹, of matrices that are the identity's but in the columns `used`."""
+    """Return B⁻¹ A and B⁻¹ of matrices that differ from the identity in the columns `used` only."""
     size = A.shape[0]
     others = np.setdiff1d(np.arange(size), used)
     order = np.argsort(np.concatenate([used, others]))
@@ -145,12 +146,12 @@ def quotient(
 
 def _each(pieces: int) -> int:
     """Return the number of pieces in a group."""
-    # a change of α takes the time of some two pieces
+    # a change of α costs about two pieces
     return min(GROUPS, key=lambda each: -(-pieces // each) * (each + 2))
 
 
 def _in_groups(values: Any, each: int, filling: Any) -> Any:
-    """(pieces, …) as (groups, each, …), filled up."""
+    """Reshape (pieces, …) to (groups, each, …), padded."""
     missing = -values.shape[0] % each
     filled = jnp.broadcast_to(filling, (missing, *values.shape[1:]))
     values = jnp.concatenate([values, filled]) if missing else values
@@ -183,7 +184,7 @@ def factored(linearisation: Linearisation, pivots: Any) -> Factors:
 def solved(
     factors: Factors, pivots: Any, defects: Float[Any, "pieces y"], tip: Float[Any, " k"], base: Any = None
 ) -> tuple[Float[Any, "points y"], Float[Any, " k"]]:
-    """Return the correction (δy, δξ); `base` is added to δy_0, of a base that moves by itself."""
+    """Return the correction (δy, δξ); `base` is added to δy_0, for a base that moves by itself."""
     Ft, Gt, X, T, S, M, inverse = factors
     each, of_strands = Ft.shape[1], Ft.shape[2:-1]
     r = _in_groups(defects, each, 0.0)
@@ -191,7 +192,7 @@ def solved(
 
     def along(w: Any, group: Any) -> Any:
         Ft, Gt, r, X = group
-        # within the loop: before it, XLA would evaluate the defects again for each use of them
+        # inside the loop: outside, XLA would evaluate the defects again for each use
         r = r if Gt is None else _times(Gt, r)
         found = []
         for k in range(each):

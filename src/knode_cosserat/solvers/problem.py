@@ -25,18 +25,18 @@ from knode_cosserat.solvers.linear import Linearisation, filled_up, product, quo
 from knode_cosserat.solvers.space import Formula, SpaceScheme
 from knode_cosserat.solvers.sparsity import nonzero_columns
 
-#: corrections by which y at discontinuities between nodes is found from the nodes, for each on a segment
+#: Newton corrections of y at discontinuities inside a segment, for each discontinuity of the segment
 FILLING = 5
 
 
 class Hoisted(NamedTuple):
     """Terms that do not change during Newton's iteration (`ahead.InTwo`), and the function of the rest."""
 
-    #: y_s and z from (hoisted terms, s, (y, packed record of history))
+    #: function of (hoisted terms, s, (y, packed record of history)) that returns y_s and z
     then: Callable[[Any, Any, Any], Any]
-    #: at all places of all strands
+    #: hoisted terms at all places of all strands
     terms: Any
-    #: columns of the Jacobian by a strand's y that may not be zero
+    #: columns of the Jacobian with respect to a strand's y that may be nonzero
     columns: tuple[int, ...]
 
 
@@ -69,10 +69,10 @@ class StepProblem(eqx.Module):
     t: Float[Any, ""]
     control: Float[Any, " c"]
     c0: Float[Any, ""]
-    #: at every place where the equations are evaluated (`Grid`)
+    #: history terms at every place where the equations are evaluated (`Grid`)
     history: Float[Any, "places x"]
     space: SpaceScheme = eqx.field(static=True)
-    #: right-hand side of the tip's conditions: zero, but during continuation
+    #: right-hand side of the tip's boundary conditions: zero, except during continuation
     tip_offset: Any = None
     hoisted: Hoisted | None = None
 
@@ -93,14 +93,14 @@ class StepProblem(eqx.Module):
 
         record = self._history_by_strand(self.history[:1])[0]
         parts = in_two(at_point, places[0], (jnp.zeros(strand.y_layout.size), record))
-        # of equations that y does not enter, one column of zeros
+        # if y does not enter the equations: one column of zeros
         columns = nonzero_columns(parts.traced, 1).tolist() or [0]
         hoisted = Hoisted(parts.then, jax.vmap(parts.first)(places), tuple(columns))
         return dataclasses.replace(self, hoisted=hoisted)
 
     @property
     def columns(self) -> np.ndarray:
-        """Columns of the Jacobian by a strand's y that may not be zero; all of them, if not `ready`."""
+        """Columns of the Jacobian with respect to a strand's y that may be nonzero; all if not `ready`."""
         every = np.arange(self.system.strand.y_layout.size)
         return every if self.hoisted is None else np.array(self.hoisted.columns, dtype=int)
 
@@ -123,12 +123,12 @@ class StepProblem(eqx.Module):
         return self.system.base(self.t, self.control, unknowns, self._unpack(self.history[0]))
 
     def tip_residual(self, y: Float[Any, " y"]) -> Float[Any, " k"]:
-        """Return the residual of the tip's conditions at this y of the last node."""
+        """Return the residual of the tip's boundary conditions, from y of the last node."""
         left = self.system.tip(self.t, self.control, y, self._unpack(self.history[self.grid.tip]))
         return left if self.tip_offset is None else left - self.tip_offset
 
     def crossed(self, acting: Any, y: Float[Any, " y"], history: Float[Any, " x"]) -> Float[Any, " y"]:
-        """Return y on the far side of the discontinuities that act."""
+        """Return y on the far side of the active discontinuities."""
         return self.system.crossed(acting, self.t, y, self.control, self._unpack(history))
 
     def _far(self, y: Float[Any, "points y"]) -> Float[Any, "pieces y"]:
@@ -169,12 +169,12 @@ class StepProblem(eqx.Module):
     # along the rod
 
     def _evaluated(self, lanes: slice, y: Float[Any, "n y"]) -> tuple[Any, Any]:
-        """Return f and z at these places, where y is given."""
+        """Return f and z at places, from y there."""
         f, z = self._side_by_side(self._at_point, lanes, y)
         return self._joined(f), self._joined(z)
 
     def _linearised(self, lanes: slice, y: Float[Any, "n y"]) -> tuple[Any, Float[Any, "b used n_strands"]]:
-        """Return the rates at these places, and their slopes by the y that enter, places last."""
+        """Return the rates at places, and their derivatives with respect to the used columns of y."""
         directions = jnp.eye(self.system.strand.y_layout.size)[:, self.columns]
 
         def at_point(s: Any, y: Any, history: Any, terms: Any) -> Any:
@@ -187,7 +187,7 @@ class StepProblem(eqx.Module):
         return self._joined(f), slopes
 
     def _side_by_side(self, function: Any, lanes: slice, y: Any) -> Any:
-        """Apply a function of (s, y, history, hoisted terms) at places, which are last in what it returns."""
+        """Apply a function of (s, y, history, hoisted terms) at places (last axis of the result)."""
         terms = None if self.hoisted is None else self.hoisted.terms
         s, terms = jax.tree.map(lambda each: self._each_strand(each[lanes]), (self.places, terms))
         history = self._history_by_strand(self.history[lanes])
@@ -201,7 +201,7 @@ class StepProblem(eqx.Module):
         return self.hoisted.then(terms, s, (y, history))
 
     def _ends(self, y: Float[Any, "points y"], every: bool) -> tuple[slice, Any]:
-        """Return the places at the ends of pieces that count, and y there."""
+        """Return the places at the ends of pieces that the scheme uses (all if `every`), and y there."""
         grid, far = self.grid, self._far(y)
         if not (every or self.space.implicit):
             return slice(0, grid.tip), far
@@ -213,15 +213,15 @@ class StepProblem(eqx.Module):
         return (high - low)[:, None]
 
     def _at_ends(self, values: Any) -> tuple[Any, Any]:
-        """Values at the starts and at the ends of pieces, from those at the places of ends; 0 if unknown."""
+        """Return values at the starts and at the ends of pieces; 0 at the ends if they were not evaluated."""
         grid = self.grid
         end = taken(values, grid.end_of) if len(values) > grid.tip else jnp.zeros(())
         return values[: grid.tip], end
 
     def stages(self, y: Float[Any, "points y"], formula: Formula, known: Stages | None = None) -> Stages:
-        """Evaluate the stages of a formula, those after the ones that are known.
+        """Evaluate the stages of a formula that are not known yet.
 
-        Without known stages only the ends of pieces that the scheme uses are evaluated (`ends` gives all).
+        Without known stages, only those ends of pieces are evaluated that the scheme uses (`ends` gives all).
         """
         found = self.ends(y, every=False) if known is None else Stages(*map(list, known))
         rates = [*self._at_ends(found.f[0]), *found.f[1:]]
@@ -255,11 +255,11 @@ class StepProblem(eqx.Module):
         return self.reached_by(formula, self.stages(y, formula))
 
     def residuals(self, y: Float[Any, "points y"]) -> tuple[Any, Any]:
-        """Return the defects of all pieces (the scheme's y at their ends less y there), and the tip's."""
+        """Return the defects of all pieces (y at the end by the scheme, minus y), and the tip's residual."""
         return self.reached(y) - y[1:], self.tip_residual(y[-1])
 
     def packed(self, found: Stages) -> Float[Any, "places x"]:
-        """Return stages as the records that following steps need: y, z and, if B is not zero, y_s."""
+        """Pack stages into the records that later steps need: y, z and, if B is not zero, y_s."""
         parts = [found.y, found.z, found.f] if self.system.mixed else [found.y, found.z]
         return jnp.concatenate([jnp.concatenate(part) for part in parts], axis=-1)
 
@@ -289,7 +289,7 @@ class StepProblem(eqx.Module):
         )
         G = None
         if self.space.implicit:
-            # XLA would evaluate both again for each use of them
+            # otherwise XLA evaluates both again for each use
             A, B = jax.lax.optimization_barrier((A, B))
             A, G = quotient(A, B, used)
         F = self._jumped(self._blocks(filled_up(A, used)), y)
@@ -297,7 +297,7 @@ class StepProblem(eqx.Module):
         return Linearisation(F, None if G is None else self._blocks(filled_up(G, used)), S, M)
 
     def _slopes_at_ends(self, J: Float[Any, "b used n_strands"]) -> tuple[Any, Any]:
-        """Slopes of rates at the starts and the ends of pieces."""
+        """Return the derivatives of the rates at the starts and the ends of pieces."""
         grid, strands = self.grid, self.system.strands
         start = J[..., : grid.tip * strands]
         if not self.space.implicit:
@@ -306,7 +306,7 @@ class StepProblem(eqx.Module):
         return start, taken(of_places, grid.end_of).reshape(-1, *J.shape[1::-1]).T
 
     def _jumped(self, F: Any, y: Any) -> Any:
-        """F by y on the near side of what jumps at the starts of pieces."""
+        """Return F with respect to y on the near side of jumps at the starts of pieces."""
         if not self.system.jumps:
             return F
         jump = jax.vmap(jax.jacfwd(self.crossed, 1))
@@ -314,13 +314,13 @@ class StepProblem(eqx.Module):
         return jnp.sum(F[..., :, :, None] * D[..., None, :, :], axis=-2)
 
     def _blocks(self, matrices: Any) -> Any:
-        """Matrices (b, b, pieces and strands) as (pieces, b, b), or (pieces, strands, b, b)."""
+        """Reshape matrices (b, b, pieces and strands) to (pieces, b, b), or (pieces, strands, b, b)."""
         found = jnp.moveaxis(matrices, -1, 0)
         strands = self.system.strands
         return found.reshape(-1, strands, *found.shape[1:]) if strands > 1 else found
 
     def filled(self, y: Float[Any, "nodes y"]) -> Float[Any, "points y"]:
-        """Return y at all points from that at the nodes: at discontinuities between nodes by the scheme."""
+        """Return y at all points from y at the nodes; at other discontinuities by the scheme."""
         grid = self.grid
         found = grid.spread(y)
         if not len(grid.between):
@@ -330,7 +330,7 @@ class StepProblem(eqx.Module):
 
         def corrected(_: Any, y: Any) -> Any:
             defects = self.reached(y) - y[1:]
-            # of strands there are none with discontinuities
+            # systems with several strands have no discontinuities
             G = self.linearise(y, self.system.unknowns(y[0])).G
             change = defects if G is None else jnp.sum(G * defects[:, None, :], axis=-1)
             return y.at[1:].add(jnp.where(before, change, 0.0))

@@ -1,7 +1,7 @@
 """Recovery of a failed step: other guesses, load continuation, easing, shorter steps, in this order.
 
-This runs outside the compiled loop, step by step in plain Python: it is rare, and its program is compiled
-only when it is first needed.
+It runs outside the compiled loop, step by step in plain Python. It is rare, and its program is compiled only
+when it is first needed.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.time import BDF1, Static
 from knode_cosserat.solvers.time_loop import Rows, recorded
 
-#: the smallest part of a time step that it is divided into, and how many parts are tried
+#: smallest substep as a part of a time step, and largest number of substeps tried
 LEAST_SUBSTEP, MOST_SUBSTEPS = 2.0**-14, 400
-#: friction and contact are eased only in parts of a step below this: smaller parts alone mostly do
+#: friction and contact are eased only in substeps below this part of a step: smaller substeps mostly suffice
 EASE_BELOW = 1.0 / 16.0
-#: the smallest part of a change of control that continuation goes down to
+#: smallest load step of continuation, as a part of the change of control
 LEAST_PART = 1.0 / 512.0
-#: how much gentler friction and contact are, where continuation in them begins
+#: initial factor by which continuation eases friction and contact
 EASIEST = 1e-3
-#: forces in the control so many times EI/L² are taken for a wrong unit
+#: forces in the control above this multiple of EI/L² suggest a wrong unit
 ABSURD = 1e4
-#: part of the way that a tip is moved in one step while a robot comes to rest
+#: part of the distance that a tip is moved in one step of relaxation
 DRAWN = 0.05
-#: reaches of the curves between held ends from which an equilibrium is searched, in natural ones
+#: reaches of the initial curves between held ends, as multiples of the natural reach
 REACHES = (1.0, 0.3, 3.0)
-#: by default recovery may take so many times the run's own time, or so many seconds, whichever is more
+#: default recovery budget: this multiple of the run's own time, or this many seconds, whichever is more
 BUDGET_SHARE, BUDGET_LEAST = 20.0, 5.0
 
 
@@ -53,12 +53,12 @@ class Budget:
     """The time (s) that recovery may take in one run; compiling its program does not count."""
 
     def __init__(self, seconds: float | None):
-        """`seconds` is fixed, or None: in proportion to the run's own time."""
+        """Set a fixed budget in seconds; None: in proportion to the run's own time."""
         self._fixed, self._own, self._used = seconds, 0.0, 0.0
 
     @property
     def seconds(self) -> float:
-        """Time (s) that recovery may take in all."""
+        """Total time (s) that recovery may take."""
         return max(BUDGET_LEAST, BUDGET_SHARE * self._own) if self._fixed is None else self._fixed
 
     def ran(self, seconds: float) -> None:
@@ -66,14 +66,14 @@ class Budget:
         self._own += seconds
 
     def spend(self, seconds: float) -> None:
-        """Count time of recovery; `BudgetError` once there is none left."""
+        """Count time of recovery. Raises `BudgetError` if the budget is used up."""
         self._used += seconds
         if self._used > self.seconds:
             raise BudgetError
 
 
 class Outcome(NamedTuple):
-    """A recovered step, or the best that was reached (`result` < 0)."""
+    """A recovered step, or the best attempt (`result` < 0)."""
 
     result: Result
     past: Past
@@ -86,7 +86,7 @@ class Outcome(NamedTuple):
 
 
 class Attempt(NamedTuple):
-    """A boundary-value problem that was tried."""
+    """Result of one boundary-value problem."""
 
     solution: Solution
     after: Past
@@ -101,7 +101,7 @@ def attempt(
 ) -> Attempt:  # fmt: skip
     """Solve one boundary-value problem with a long search.
 
-    The tip's conditions hold in `part`: the rest of their residual at `from_y` stays.
+    The tip's boundary conditions are enforced in `part`: the rest of their residual at `from_y` remains.
     """
     history = history_of(past.records, past.rate, coefficients, settings)
     problem = StepProblem(system, t, control, coefficients[0], history, settings.space).ready()
@@ -112,7 +112,7 @@ def attempt(
     return Attempt(solution, after._replace(weights=jnp.asarray(EXTRAPOLATIONS[0])), row)
 
 
-#: programs of `attempt` that there are: the first call of each compiles
+#: compiled programs of `attempt`: the first call of each compiles and does not count
 _COMPILED: set[Any] = set()
 
 
@@ -143,7 +143,7 @@ class _Step:
         return found
 
     def hanging(self, control: Any) -> list[tuple[Any, Any]]:
-        """Guesses of an equilibrium between held ends: curves of the rod's length."""
+        """Return initial guesses of an equilibrium between held ends: curves of the rod's length."""
         found: list[tuple[Any, Any]] = []
         if not isinstance(self.settings.time, Static):
             return found
@@ -175,6 +175,8 @@ def recover(
 ) -> Outcome:
     """Solve the step that ends at t. `controls` are the previous step's and this one's."""
     step = _Step(system, settings, past, coefficients, t, budget)
+    if budget.seconds <= 0.0:
+        return _given_up(step, controls[1])
     best: list[Attempt] = []
     cause = ""
     try:
@@ -192,10 +194,19 @@ def recover(
     return outcome._replace(cause=f"{outcome.cause} {cause}".strip())
 
 
+def _given_up(step: _Step, control: Any) -> Outcome:
+    """Return the outcome of a failed step without recovery; nothing is compiled."""
+    past, system = step.past, step.system
+    record = np.full((system.nodes, past.records.shape[-1]), np.nan)
+    cause = likely_cause(Result.NO_CONVERGENCE, step, control)
+    unknowns = np.full(system.unknown_count, np.nan)
+    return Outcome(Result.NO_CONVERGENCE, past, record, unknowns, np.inf, 0, np.nan, cause)
+
+
 def _recovered(
     step: _Step, controls: tuple[Any, Any], dt: float, best: list[Attempt]
 ) -> tuple[Result, _Step, Attempt] | None:
-    """Try everything in order; what is tried directly is added to `best`."""
+    """Try all methods in order; attempts from direct guesses are added to `best`."""
     for guess in (*step.hanging(controls[1]), *step.guesses()):
         found = step.solve(controls[1], *guess)
         best.append(found)
@@ -223,7 +234,7 @@ def _outcome(result: Result, step: _Step, found: Attempt, control: Any = None) -
 
 
 def _continue_load(step: _Step, before: Any, now: Any) -> Attempt | None:
-    """From the previous control to this one in parts, each from the solution of the last."""
+    """Continue from the previous control to this one in load steps, each from the last solution."""
     before, now = np.asarray(before, dtype=float), np.asarray(now, dtype=float)
     if np.array_equal(before, now):
         return None
@@ -240,7 +251,7 @@ def _continue_load(step: _Step, before: Any, now: Any) -> Attempt | None:
 
 
 def _ease(step: _Step, control: Any) -> Attempt | None:
-    """From friction and contact that set in gently to those that the system has."""
+    """Continue from eased friction and contact to the system's own."""
     system = step.system
     if system.eased(EASIEST) is system:
         return None
@@ -260,7 +271,7 @@ def _ease(step: _Step, control: Any) -> Attempt | None:
 
 
 def _in_parts(step: _Step, found: Attempt, solve: Callable[[float, Solution], Attempt]) -> Attempt | None:
-    """From a solution at part 0 to that at 1, each from the last, in steps as long as go well."""
+    """Continue from a solution at part 0 to part 1, with adaptive steps, each from the last solution."""
     reached, part = 0.0, 0.25
     while reached < 1.0 and part >= LEAST_PART:
         target = min(1.0, reached + part)
@@ -273,7 +284,7 @@ def _in_parts(step: _Step, found: Attempt, solve: Callable[[float, Solution], At
 
 
 def _substeps(whole: _Step, controls: tuple[Any, Any], dt: float) -> tuple[_Step, Attempt] | None:
-    """The step in parts: the control as it is held throughout, or brought there bit by bit."""
+    """Divide the step into substeps: with a constant control first, then with a ramp."""
     for before in (controls[1], controls[0]):
         found = _in_substeps(whole, before, controls[1], dt)
         if found is not None:
@@ -282,7 +293,7 @@ def _substeps(whole: _Step, controls: tuple[Any, Any], dt: float) -> tuple[_Step
 
 
 def _in_substeps(whole: _Step, before: Any, now: Any, dt: float) -> tuple[_Step, Attempt] | None:
-    """The step in time steps as long as go well, with coefficients for unequal ones."""
+    """Solve the step by adaptive substeps, with coefficients for unequal time steps."""
     settings, past = whole.settings, whole.past
     before, now = np.asarray(before, dtype=float), np.asarray(now, dtype=float)
     reached, part, previous = 0.0, 0.5, 1.0
@@ -298,7 +309,7 @@ def _in_substeps(whole: _Step, before: Any, now: Any, dt: float) -> tuple[_Step,
                 return None
             continue
         if until == 1.0:
-            # the history of the next step has whole steps, not their parts
+            # the history of the next step holds whole steps, not substeps
             before, after = whole.past, found.after
             past = after._replace(
                 records=jnp.stack([after.records[0], before.records[0]]),
@@ -320,9 +331,9 @@ def _one_substep(step: _Step, control: Any, ease: bool) -> Attempt | None:
 
 
 def _relax(step: _Step, control: Any) -> Attempt | None:
-    """Implicit Euler with ever longer time steps, then the static solve: comes to rest in a stable shape.
+    """Relax by implicit Euler with growing time steps, then solve the static problem; ends in a stable shape.
 
-    A tip that is held elsewhere than where it is, or loaded, is brought there in the first steps.
+    The tip's boundary conditions are applied gradually in the first steps.
     """
     now, part = step.past, 0.0
     natural = natural_time(step.system) or 0.1
@@ -335,7 +346,7 @@ def _relax(step: _Step, control: Any) -> Attempt | None:
         if not moving.solved(found):
             dt /= 4.0
             continue
-        # short steps until the tip is where it belongs
+        # short steps until the tip's boundary conditions hold
         now, dt = found.after, 2.0 * dt if part == 1.0 else dt
         part = target
         if dt > longest:
@@ -346,7 +357,7 @@ def _relax(step: _Step, control: Any) -> Attempt | None:
 
 
 def likely_cause(result: Result, step: _Step, control: Any) -> str:
-    """Return a hint at the likely cause, and the fix."""
+    """Return a hint at the likely cause and the fix."""
     if result.solved:
         return ""
     unit = other_unit(step.system, np.asarray(control))
@@ -384,7 +395,7 @@ def other_unit(system: System, control: np.ndarray) -> str:
 
 
 def natural_time(system: System) -> float | None:
-    """Return the time (s) in which the system moves by its own length; None if its scales do not say."""
+    """Return the time (s) in which the system moves by its own length; None if its scales do not give it."""
     layout = system.strand.y_layout
     if "p" not in layout.names or "q" not in layout.names:
         return None

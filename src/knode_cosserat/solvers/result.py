@@ -8,7 +8,7 @@ import enum
 class Result(enum.IntEnum):
     """Outcome of a step. Zero and above: solved to tolerance. Below zero: not solved, the state is invalid.
 
-    COARSE is solved, too, but its estimated discretisation error is more than 2 % of the length.
+    COARSE is also solved, but its estimated discretisation error is more than 2 % of the length.
     """
 
     CONVERGED = 0
@@ -44,7 +44,7 @@ _MESSAGES = {
     Result.NOT_REACHED: "not simulated: an earlier step failed",
 }
 
-#: results in files of earlier versions: solved with another elimination or on finer segments, or unstable
+#: result names in files of earlier versions, and their present equivalents
 EARLIER_RESULTS = {
     "recovered_stable_elimination": Result.CONVERGED,
     "recovered_finer_segments": Result.CONVERGED,
@@ -55,7 +55,7 @@ EARLIER_RESULTS = {
 class SimulationError(RuntimeError):
     """A step could not be solved.
 
-    `step`, `time` (s), `residual` (natural units), `result`, `cause` and `robot` (of a batch) say more.
+    Attributes: `step`, `time` (s), `residual` (natural units), `result`, `cause` and `robot` (of a batch).
     """
 
     def __init__(

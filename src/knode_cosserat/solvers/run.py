@@ -1,4 +1,4 @@
-"""Running compiled time loops: one robot with recovery, or a batch on all cores."""
+"""Execution of compiled time loops: one robot with recovery, or a batch on all cores."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ from knode_cosserat.solvers.time_loop import Rows, loop_many, loop_one
 
 log = logging.getLogger(__name__)
 
-#: robots that one thread takes at a time
+#: number of robots that one thread solves at a time
 CHUNK = 16
-#: steps for which every run of one robot has room: short ones, and equilibria, then share a program
+#: smallest number of steps for which a run of one robot is compiled, so that short runs share a program
 LEAST_CAPACITY = 128
-#: seconds between two looks at signals, and steps before the first
+#: seconds between two checks for signals, and number of steps before the first check
 RESPONSE, FIRST_STEPS = 0.2, 128
-#: of the length: a row with a larger position error is COARSE
+#: a row whose position error is above this part of the length is COARSE
 COARSE_SHARE = 0.02
 
 
 def run_one(
     task: Task, system: System, controls: np.ndarray, start: Start, progress: bool = False
 ) -> tuple[Steps, str]:
-    """Return all steps of one robot, and the likely cause if one (`result` < 0) could not be solved."""
+    """Return all steps of one robot, and the likely cause if a step failed (`result` < 0)."""
     past, total, piece = start.past, task.steps, FIRST_STEPS
     padded = padded_rows(controls, least=LEAST_CAPACITY)
     budget = Budget(task.recovery_budget)
@@ -53,7 +53,7 @@ def run_one(
             reached = int(reached)
             elapsed = time.perf_counter() - began
             budget.ran(elapsed)
-            # short enough for an interruption, long enough to cost nothing
+            # short enough to respond to an interruption, long enough to cost nothing
             piece = max(piece, int((reached - done) * RESPONSE / max(elapsed, 1e-6)))
             rows = _merged(rows, new, done, reached, total)
             if reached < stop:
@@ -72,7 +72,7 @@ def run_one(
 def rescue(
     task: Task, system: System, past: Past, controls: tuple[Any, Any], i: int, budget: Budget
 ) -> Outcome:
-    """Recover step i, where the compiled loop fails; `controls` are the previous step's and its own."""
+    """Recover step i after the compiled loop failed; `controls` are the previous step's and its own."""
     settings = task.settings
     if task.first == "still":
         settings = dataclasses.replace(settings, time=Static())
@@ -81,16 +81,16 @@ def rescue(
 
 
 def is_coarse(position_error: Any, system: System) -> Any:
-    """Return whether position errors are more than a stated share of the length; true for NaN."""
+    """Return true where a position error is above `COARSE_SHARE` of the length, or NaN."""
     length = system.length
     return ~(position_error <= COARSE_SHARE * (length[..., None] if np.ndim(length) else length))
 
 
 def mark_coarse(steps: Steps, system: System, task: Task, start: Start) -> Steps:
-    """Mark solved rows for which the grid is too coarse, and in a motion all that follow such a row.
+    """Mark solved rows for which the grid is too coarse, and in a motion all rows after such a row.
 
-    The error is carried on by linear equations: they tell how an error decays in the motion that was found,
-    and not that the right motion would have gone elsewhere.
+    The error is propagated by linearised equations. They give its decay along the computed motion, but cannot
+    show that the exact motion diverges from it.
     """
     numeric: Any = jnp if is_traced((steps, system, start.coarse)) else np
     coarse = is_coarse(steps.position_error, system)
@@ -104,9 +104,9 @@ def mark_coarse(steps: Steps, system: System, task: Task, start: Start) -> Steps
 def run_batch(
     task: Task, system: System, batched: bool, controls: np.ndarray, start: Start, progress: bool
 ) -> tuple[Steps, dict[int, str]]:
-    """Return the steps of all robots, and the likely cause for each that could not be solved.
+    """Return the steps of all robots, and the likely cause for each robot that failed.
 
-    They are solved in chunks, one thread a core. A robot with a step that fails is then run by itself, with
+    Robots are solved in chunks, one thread a core. A robot with a failed step is then run by itself, with
     recovery.
     """
     size = controls.shape[0]
@@ -121,7 +121,7 @@ def run_batch(
     with tqdm(total=size, disable=not progress, unit="robot", leave=False) as bar:
 
         def work(first: int) -> Any:
-            # the last chunk is filled up with its last robot: one shape, one program
+            # the last chunk is padded with its last robot: one shape, one program
             index = np.minimum(np.arange(first, first + chunk), size - 1)
             past = jax.tree.map(lambda leaf: leaf[index], start.past)
             done, rows = loop_many(
@@ -153,13 +153,13 @@ def run_batch(
     return steps, causes
 
 
-#: programs of `run_batch` that there are already. JAX may crash where one thread writes a program to the
-#: disk's cache while another compiles the same, so the first chunk of a new one goes alone.
+#: compiled programs of `run_batch`. JAX may crash if one thread writes a program to the disk's cache while
+#: another compiles the same program, so the first chunk of a new program runs alone.
 _COMPILED: set[Any] = set()
 
 
 def _program(system: System, past: Any, controls: np.ndarray, *static: Any) -> Any:
-    """Structures and shapes for which JAX compiles anew."""
+    """Return the structures and shapes that determine a compiled program."""
     leaves, structure = jax.tree.flatten((system, past))
     return structure, tuple(np.shape(leaf) for leaf in leaves), controls.shape, static
 
@@ -172,7 +172,7 @@ def usable_cores() -> int:
 
 
 def _merged(rows: Steps | None, new: Rows, first: int, last: int, total: int) -> Steps:
-    """Add the rows `first` to `last` of a time loop to those there already."""
+    """Add the rows `first` to `last` of a time loop to the existing rows."""
     if rows is None:
         leaves = [np.asarray(leaf)[:total] for leaf in new]
         if last == total:

@@ -1,8 +1,8 @@
 """Derivatives of a simulation, by the implicit function theorem in each step.
 
-A solved step satisfies G(y, ξ; history, control, parameters) = 0 exactly, so its tangent solves the linear
-equations that Newton's method solves anyway, with the tangents of history, control and parameters on the
-right. Nothing of the iteration is differentiated, and reverse mode is the transpose of the same recursion.
+A solved step satisfies G(y, ξ; history, control, parameters) = 0. Its tangent therefore solves the linear
+equations of Newton's method, with the tangents of history, control and parameters on the right-hand side.
+The iteration is not differentiated, and reverse mode is the transpose of the same recursion.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from knode_cosserat.solvers.time_loop import Rows, loop_one
 def rollout(task: Task) -> Callable[[System, Any, Past], Rows]:
     """Return a differentiable function from (system, controls (T, c), past) to the rows of all steps.
 
-    Kept between calls: JAX recognises by identity what it has traced and transposed before.
+    Cached between calls: JAX recognises functions that it has already traced by identity.
     """
     settings, table, dt, steps = task.settings, task.table, task.dt, task.steps
 
@@ -66,7 +66,17 @@ def tangent_march(
     settings: Settings, table: Any, dt: Any, rows: Any, unknowns: Any, system: System, controls: Any,
     past: Past, d_system: Any, d_controls: Any, d_records: Any, d_rate: Any,
 ) -> Any:  # fmt: skip
-    """Return tangents of all rows and unknowns, linear in those of system, controls and past."""
+    """Return tangents of all rows and unknowns, linear in the tangents of system, controls and history."""
+    return tangent_piece(
+        settings, table, dt, rows, unknowns, system, controls, past, d_system, d_controls, d_records, d_rate
+    )[1]
+
+
+def tangent_piece(
+    settings: Settings, table: Any, dt: Any, rows: Any, unknowns: Any, system: System, controls: Any,
+    past: Past, d_system: Any, d_controls: Any, d_records: Any, d_rate: Any,
+) -> Any:  # fmt: skip
+    """Return the history after the last row with its tangents, and the result of `tangent_march`."""
     ny, pivots = system.y_layout.size, pivots_of(system)
 
     def one(carry: Any, now: Any) -> Any:
@@ -103,5 +113,8 @@ def tangent_march(
         return (past, jnp.stack([d_records, d_recent[0]]), d_rate), (d_row, dxi)
 
     steps = jnp.arange(rows.shape[0])
-    _, tangents = jax.lax.scan(one, (past, d_records, d_rate), (steps, rows, unknowns, controls, d_controls))
-    return tangents
+    begun = past, d_records, d_rate
+    (past, d_records, d_rate), tangents = jax.lax.scan(
+        one, begun, (steps, rows, unknowns, controls, d_controls)
+    )
+    return (past, d_records, d_rate), tangents

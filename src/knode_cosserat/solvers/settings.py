@@ -19,8 +19,8 @@ Start = Literal["paper", "consistent"]
 class Settings:
     """Schemes in time and space, the first step, and Newton's options.
 
-    `start` says how a scheme that needs two past states makes its first step from one: "paper" takes the
-    state before the first to be the first, "consistent" makes the first step by BDF1 (keeps order 2).
+    `start` selects the first step of a scheme that needs two earlier states. "paper" sets the state before
+    the first equal to the first; "consistent" makes the first step by BDF1 (keeps order 2).
     """
 
     time: TimeScheme = time_schemes.BDF2()
@@ -30,7 +30,7 @@ class Settings:
 
     @classmethod
     def of(cls, time: str | TimeScheme, space: str | SpaceScheme, start: str, newton: NewtonOptions) -> Self:
-        """Return settings from names or schemes. `ValueError` names the accepted ones."""
+        """Return settings from names or schemes. Raises `ValueError` with the accepted names."""
         if not isinstance(newton, NewtonOptions):
             raise ValueError(f"newton is {newton!r}; allowed is a NewtonOptions")
         if start not in ("paper", "consistent"):
@@ -43,7 +43,7 @@ class Settings:
         )
 
     def described(self) -> dict[str, Any]:
-        """As plain data, for a file: schemes by their class's name and options."""
+        """Return the settings as plain data, for a file: schemes by class name and options."""
         return {
             "time": {"scheme": type(self.time).__name__, **dataclasses.asdict(self.time)},
             "space": {"scheme": type(self.space).__name__, **dataclasses.asdict(self.space)},
@@ -53,10 +53,10 @@ class Settings:
 
     @classmethod
     def from_description(cls, described: Any) -> Self:
-        """Return the settings described; `KeyError`, `TypeError` or `ValueError` if they are not that.
+        """Return settings from plain data. Raises `KeyError`, `TypeError` or `ValueError` if it is not valid.
 
-        Descriptions of earlier versions are understood: RK4 becomes the scheme of the same order, and choices
-        that are no longer there are left out.
+        Data of earlier versions is accepted: RK4 becomes the scheme of the same order, and removed options
+        are ignored.
         """
         time = _named(TimeScheme, **described["time"])
         space, newton = dict(described["space"]), dict(described["newton"])
@@ -70,7 +70,7 @@ class Settings:
         )
 
 
-#: schemes along the rod of earlier versions, and those of the same order
+#: schemes along the rod of earlier versions, and present schemes of the same order
 _EARLIER_SCHEMES = {"RK4": "Lobatto4"}
 
 
@@ -84,7 +84,7 @@ def _scheme(what: str, given: Any, kind: Any, known: Any) -> Any:
 
 
 def _named(base: type, *, scheme: str, **options: Any) -> Any:
-    """A scheme of a class that exists already: the package's, or one that the user has defined by now."""
+    """Return a scheme by its class name, from the package or defined by the user."""
     ours_last = sorted(_subclasses(base), key=lambda cls: cls.__module__.startswith("knode_cosserat."))
     known = {cls.__name__: cls for cls in ours_last}
     if scheme not in known:

@@ -1,7 +1,8 @@
-"""From a system and its controls to a trajectory: one robot, or a batch."""
+"""Simulation of a system under given controls: one robot, or a batch."""
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -12,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from knode_cosserat.rods.system import System, is_traced
+from knode_cosserat.rods.trained_range import without_range
 from knode_cosserat.solvers import sensitivity
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.initial import Beginning, Run, beginning
@@ -24,13 +26,13 @@ from knode_cosserat.solvers.task import Steps, Task
 from knode_cosserat.solvers.time import Static, TimeScheme
 from knode_cosserat.trajectory import Trajectory
 
-#: time steps from this (s), and so many times the rod's natural time, look like milliseconds
+#: time steps above this (s), and above this multiple of the rod's natural time, suggest milliseconds
 LONG_STEP, LONG_STEPS = 1.0, 100.0
-#: segments that position_tolerance begins with, and at most
+#: first and largest number of segments for position_tolerance
 FIRST_SEGMENTS, MOST_SEGMENTS = 8, 512
-#: of the largest tension: so much below zero may be noise of a measurement
+#: negative tensions up to this part of the largest tension may be measurement noise
 PUSHING = 0.02
-#: of its length: so much may a robot differ from the one whose motion it goes on with
+#: largest relative difference in length between a robot and the one whose motion it continues
 OTHER_LENGTH = 1e-3
 
 
@@ -59,26 +61,27 @@ def simulate(
         time: "bdf1", "bdf2", "bdf-alpha", "trapezoidal", or a scheme.
         space: "lobatto2" (order 2), "lobatto4" (order 4), "euler" (order 1, the paper's), or a scheme.
         start: how the first step is made from one state; see `Settings`.
-        initial: start from this trajectory's last row instead of the robot's state at rest (where that is
-            only a guess, such as of a platform on bent legs: the equilibrium under no control). If its time
-            step is the same the motion goes on exactly. Rows from the middle of a motion, and measured ones,
-            tell less: what lies between nodes is interpolated there, and a scheme that asks for their rates
-            (BDF-α, the trapezoidal rule) may make its first step by BDF1.
+        initial: start from this trajectory's last row. By default the simulation starts from the robot's
+            state at rest, or from the equilibrium under zero control if that state is only a guess (such as
+            for a platform on bent legs). With the same time step the motion continues exactly. For rows from
+            the middle of a motion, and for measured rows, states between nodes are interpolated, and a scheme
+            that needs rates (BDF-α, the trapezoidal rule) may make its first step by BDF1.
         newton: tolerances and limits of the solve in each step.
-        position_tolerance: largest discretisation error (m) of positions along the rod; the nodes are chosen
-            so that the estimate stays below it in every row. By default they are the robot's.
-        recovery_budget: seconds that recovery from failed steps may take; by default 20 times the run's own
-            time or 5 s, whichever is more.
-        on_failure: "raise" a `SimulationError`, or "return" the trajectory with the rest marked invalid.
+        position_tolerance: largest discretisation error (m) of positions along the rod. The number of nodes
+            is chosen so that the estimate stays below it in every row; by default it is the robot's.
+        recovery_budget: seconds that recovery from failed steps may take, 0 for none; by default 20 times
+            the run's own time or 5 s, whichever is more.
+        on_failure: "raise" a `SimulationError`, or "return" the trajectory with the remaining rows invalid.
         progress: show a progress bar.
 
     Returns:
         A `Trajectory` of T + 1 rows; row 0 is the initial state. Every row carries its result, and an
-        estimate of its discretisation error (`position_error`). Inside `jit`,
-        `grad` or `vmap` nothing can be raised: rows that are not solved are NaN there.
+        estimate of its discretisation error (`position_error`). Rows in which a learned or identified model
+        is outside the range of its training data are marked (`extrapolated`). Inside `jit`, `grad` or `vmap`
+        no error can be raised: unsolved rows are NaN there.
 
     Raises:
-        SimulationError: a step has no solution, and nothing that was tried helped.
+        SimulationError: a step was not solved, and recovery failed.
         ValueError: arguments of a wrong shape or name.
     """
     if initial is not None and not isinstance(initial, Trajectory):
@@ -99,18 +102,43 @@ def simulate(
         _warn_of_long_steps(system, dt)
     if initial is not None:
         check_initial(system, initial, batch)
-    run = Run(system, controls, initial, settings, dt, batch, isinstance(robot, Sequence), recovery_budget)
+    # ranges are not part of the equations: programs are compiled for systems without them
+    bare, begins = without_range(system), without_range(_unmarked(initial))
+    run = Run(bare, controls, begins, settings, dt, batch, isinstance(robot, Sequence), recovery_budget)
     if is_traced((system, controls, initial)):
-        return _traced(*run[:7])
-    if batch:
-        return _batch(run, on_failure, progress)
-    return _single(run, on_failure, progress)
+        found = _traced(*run[:7])
+    elif batch:
+        found = _batch(run, on_failure, progress)
+    else:
+        found = _single(run, on_failure, progress)
+    return marked(dataclasses.replace(found, system=system), initial)
+
+
+def _unmarked(initial: Trajectory | None) -> Trajectory | None:
+    return None if initial is None else dataclasses.replace(initial, extrapolated=None)
+
+
+def marked(trajectory: Trajectory, initial: Trajectory | None) -> Trajectory:
+    """Return a trajectory with `extrapolated` marked where its system extrapolates.
+
+    The first row takes the mark of the last row of the trajectory that it continues.
+    """
+    system = trajectory.system
+    trained = system.trained_range()
+    if trained is None:
+        return trajectory
+    outside = trained.outside(system, trajectory.time, trajectory.control, trajectory.z)
+    if initial is not None and initial.extrapolated is not None:
+        numeric: Any = jnp if is_traced(outside) else np
+        first = numeric.arange(outside.shape[-1]) == 0
+        outside = numeric.where(first, initial.extrapolated[-1], outside)
+    return dataclasses.replace(trajectory, extrapolated=outside)
 
 
 def refined(
     solve: Callable[[System], Trajectory], robot: Any, initial: Any, tolerance: Any, order: int
 ) -> Trajectory:
-    """Return the trajectory that `solve` gives with as many nodes as a position tolerance (m) needs."""
+    """Return the trajectory of `solve` with enough nodes for a position tolerance (m)."""
     if not isinstance(robot, System) or np.ndim(robot.length):
         raise ValueError(
             "position_tolerance chooses the nodes of one robot; a batch has the nodes of its robots"
@@ -140,14 +168,14 @@ def refined(
 
 
 def _ladder() -> Iterator[int]:
-    """Numbers of segments, each about a quarter more than the one before."""
+    """Yield increasing numbers of segments, in steps of about a quarter or less."""
     step = FIRST_SEGMENTS // 4
     while True:
         yield from (k * step for k in range(4, 8))
         step *= 2
 
 
-# checking what was given
+# checks of the arguments
 
 
 def _stacked(robot: Any) -> tuple[System, int | None]:
@@ -162,14 +190,14 @@ def _stacked(robot: Any) -> tuple[System, int | None]:
 
 
 def checked_dt(dt: Any) -> float:
-    """A time step (s); `ValueError` for what is none."""
+    """Return a valid time step (s). Raises `ValueError` otherwise."""
     if not isinstance(dt, int | float | np.number) or not 0.0 < dt < np.inf:
         raise ValueError(f"dt is {dt!r}; allowed is a positive number of seconds")
     return float(dt)
 
 
 def _warn_of_long_steps(system: System, dt: float) -> None:
-    """Say so where a time step looks like milliseconds: seconds long, and far beyond what the rod does."""
+    """Warn if a time step looks like milliseconds: seconds long, and far above the rod's natural time."""
     if dt < LONG_STEP or is_traced(system):
         return
     natural = natural_time(system)
@@ -221,7 +249,7 @@ def check_limits(system: System, controls: Any) -> None:
         raise ValueError(f"controls: {beyond}")
     if "tension" in layout.names:
         tension = np.asarray(layout.get(controls, "tension"))
-        # of what was measured some may be a little less than nothing
+        # measured tensions may be slightly negative
         if np.min(tension) < -PUSHING * np.max(np.abs(tension)):
             warnings.warn(
                 f"a tension is {np.min(tension):g} N: a tendon only pulls, but is computed as if it pushed",
@@ -230,7 +258,7 @@ def check_limits(system: System, controls: Any) -> None:
 
 
 def check_initial(system: System, initial: Trajectory, batch: int | None) -> None:
-    """Check that a trajectory is one robot's, fits the system and is solved; `ValueError` otherwise."""
+    """Check that a trajectory is of one robot, fits the system and is solved. Raises `ValueError`."""
     if batch or initial.y.ndim == 4:
         raise ValueError("initial is for one robot, not for a batch")
     if not len(initial.time):
@@ -281,7 +309,7 @@ def _batch(run: Run, on_failure: str, progress: bool) -> Trajectory:
 
 
 def _warn_of_coarse_grids(run: Run, steps: Steps) -> None:
-    """Warn of rows whose discretisation error is large; not of the paper's scheme, which is chosen for it."""
+    """Warn of rows with a large discretisation error; not for Euler, which only reproduces the paper."""
     coarse = np.asarray(steps.result) == Result.COARSE
     if np.any(coarse) and not isinstance(run.settings.space, Euler):
         worst, length = float(np.max(steps.position_error[coarse])), float(np.max(run.system.length))
@@ -304,9 +332,9 @@ def _failure(task: Task, t0: float, steps: Steps, cause: str, robot: int | None)
 
 @functools.partial(jax.jit, static_argnums=(3, 4, 5, 6))
 def _traced(system, controls, initial, settings, dt, batch, many):  # type: ignore[no-untyped-def]
-    """As seen by JAX's transformations: nothing is recovered, rows that are not solved become NaN.
+    """Simulate inside JAX's transformations: without recovery; unsolved rows become NaN.
 
-    One jitted call, so that a transformation traces it once and not at every call.
+    A single jitted function, so that a transformation traces it once and not at every call.
     """
     run = Run(system, controls, initial, settings, dt, batch, many)
     begins = beginning(run)
@@ -321,7 +349,7 @@ def _traced(system, controls, initial, settings, dt, batch, many):  # type: igno
 
 
 def _trajectory(run: Run, begins: Beginning, steps: Steps) -> Trajectory:
-    """Put the initial row before the steps, and NaN where there is no solution."""
+    """Return the trajectory: the initial row, then the steps, with NaN in unsolved rows."""
     system, controls, settings, dt, batch = run.system, run.controls, run.settings, run.dt, run.batch
     numeric: Any = jnp if is_traced((begins.record, steps)) else np
     axis = 1 if batch else 0

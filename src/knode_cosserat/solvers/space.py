@@ -4,9 +4,9 @@ Over a piece of length h from y_a to y_b a scheme has stages i at s_a + cᵢ h,
 
     Yᵢ = (1 - vᵢ) y_a + vᵢ y_b + h Σ_{k<i} xᵢₖ f(Yₖ),     y_b = y_a + h Σ bᵢ f(Yᵢ)
 
-(Cash & Singhal 1982). Stages are explicit in both ends, so that y at the ends is all that is unknown.
-Lobatto's formulas are symmetric and A-stable: an exponential that grows or decays within a piece, however
-steep, is never turned into the other. Forward Euler is neither; it is kept to reproduce the paper.
+(Cash & Singhal 1982). Stages are explicit in y at both ends, so only y at the ends is unknown. Lobatto's
+formulas are symmetric and A-stable: they never turn a growing exponential into a decaying one, or the
+reverse, at any step length. Forward Euler is neither; it is kept to reproduce the paper.
 
 Every scheme names a second formula of higher order, `check`. Its defect estimates the discretisation error.
 """
@@ -21,7 +21,7 @@ from typing import ClassVar, NamedTuple
 class Stage(NamedTuple):
     """A stage between the ends of a piece: its place c, v, and the weights of earlier rates.
 
-    `rates` weighs f at the start, f at the end, then f of the stages before, each times h.
+    `rates` are the weights of f at the start, f at the end, then f of earlier stages, each multiplied by h.
     """
 
     place: float
@@ -44,8 +44,8 @@ def _hermite(place: float) -> Stage:
 
 _MIDDLE = _hermite(0.5)
 _SIMPSON = Formula((_MIDDLE,), (1 / 6, 1 / 6, 2 / 3))
-#: order 6 (Cash & Singhal 1982, Boole's rule). The middle is evaluated again: by the cubic it is off by h⁴,
-#: and weights of any order would then leave an error of the size that is to be estimated
+#: order 6 (Cash & Singhal 1982, Boole's rule). The middle is evaluated again: the cubic's value has an error
+#: of h⁴, which would leave an error of the same size as the one to be estimated
 _BOOLE = Formula(
     (_MIDDLE, _hermite(0.25), _hermite(0.75), Stage(0.5, 0.5, (-5 / 24, 5 / 24, 0.0, 2 / 3, -2 / 3))),
     (7 / 90, 7 / 90, 0.0, 16 / 45, 16 / 45, 2 / 15),
@@ -96,7 +96,7 @@ class Lobatto2(SpaceScheme):
 class Lobatto4(SpaceScheme):
     """Lobatto IIIA of order 4 (Hermite-Simpson): the accurate scheme.
 
-    Two evaluations a node. Use it where the tip has to be right to better than a thousandth of the length.
+    Two evaluations a node. Use it if the tip error must be below a thousandth of the length.
     """
 
     order = 4

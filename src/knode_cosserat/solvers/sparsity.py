@@ -1,8 +1,8 @@
-"""Sparsity of Jacobians: columns that are zero whatever the values, found in traced equations.
+"""Sparsity of Jacobians: structurally zero columns, found in traced equations.
 
-Every value carries, for each of its elements, the set of input elements that it may depend on. Operations
-that move elements or work on each alone keep them apart; all others mix what they are given. The result is
-therefore never too small.
+Every value carries, for each of its elements, the set of input elements that it may depend on. Elementwise
+operations, and operations that move elements, keep these sets separate. All other operations merge the sets
+of their inputs. The result is therefore never too small.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 from jaxtyping import Bool, Int
 
-#: operations on each element alone
+#: elementwise operations
 ELEMENTWISE = frozenset((
     "abs", "acos", "acosh", "add", "and", "asin", "asinh", "atan", "atan2", "cbrt", "ceil", "clamp",
     "convert_element_type", "copy", "cos", "cosh", "div", "eq", "erf", "erfc", "exp", "exp2", "expm1",
@@ -24,7 +24,7 @@ ELEMENTWISE = frozenset((
     "select_n", "sign", "sin", "sinh", "sqrt", "square", "stop_gradient", "sub", "tan", "tanh", "xor",
 ))  # fmt: skip
 
-#: the sets of input elements, of each element of a value
+#: sets of input elements, for each element of a value
 Sets = Bool[np.ndarray, "*shape inputs"]
 
 
@@ -64,7 +64,7 @@ CALLS = frozenset(("jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_
 
 
 def nonzero_columns(closed: ClosedJaxpr, variable: int) -> Int[np.ndarray, " n"]:
-    """Return the indices of the elements of an input, a vector, on which the outputs may depend."""
+    """Return the indices of those elements of an input vector that the outputs may depend on."""
     inputs = closed.jaxpr.invars
     count = inputs[variable].aval.shape[0]
     given = [np.zeros((*each.aval.shape, count), dtype=bool) for each in inputs]
@@ -73,14 +73,14 @@ def nonzero_columns(closed: ClosedJaxpr, variable: int) -> Int[np.ndarray, " n"]
 
 
 def _any(sets: Sequence[Sets], count: int) -> Sets:
-    """Return the elements in any of the sets."""
+    """Return the union of all sets."""
     return np.any(
         [np.zeros(count, dtype=bool), *(each.reshape(-1, count).any(axis=0) for each in sets)], axis=0
     )
 
 
 def _propagated(jaxpr: Jaxpr, given: Sequence[Sets], count: int) -> list[Sets]:
-    """Return the sets of the outputs, from those of the inputs."""
+    """Return the sets of the outputs from the sets of the inputs."""
     known = dict(zip(jaxpr.invars, given, strict=True))
 
     def of(each: Any) -> Sets:
@@ -95,7 +95,7 @@ def _propagated(jaxpr: Jaxpr, given: Sequence[Sets], count: int) -> list[Sets]:
 
 
 def _of_step(step: Any, sets: list[Sets], count: int) -> list[Sets]:
-    """Return the sets of what one operation gives."""
+    """Return the sets of the outputs of one operation."""
     name, params = step.primitive.name, step.params
     inner = params.get("jaxpr", params.get("call_jaxpr"))
     if name in CALLS and inner is not None:

@@ -1,4 +1,4 @@
-"""One robot, step by step: for what decides on each control only when it has seen the step before."""
+"""Step-by-step simulation of one robot, for controllers that choose each control from the previous state."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from knode_cosserat.solvers.recovery import Budget
 from knode_cosserat.solvers.result import Result, SimulationError
 from knode_cosserat.solvers.run import LEAST_CAPACITY, is_coarse, rescue
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.simulate import check_initial, checked_dt
+from knode_cosserat.solvers.simulate import check_initial, checked_dt, marked
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.task import Task
 from knode_cosserat.solvers.time import Static, TimeScheme
@@ -23,7 +23,7 @@ from knode_cosserat.trajectory import Trajectory
 
 
 class _Solved(NamedTuple):
-    """A step that was solved: the past of the next one, and what its row is made of."""
+    """A solved step: the history of the next step, and the data of its row."""
 
     past: Any
     record: np.ndarray
@@ -36,9 +36,8 @@ class _Solved(NamedTuple):
 class Stepper:
     """A robot that moves one step at a time, by the program of `simulate` and with its recovery.
 
-    Calls of `step` give the rows of one `simulate`, to the tolerance of Newton's method. A call costs the
-    step itself and a fraction of a millisecond beside it; a program that `simulate` has compiled is not
-    compiled again.
+    Calls of `step` return the rows of one `simulate`, to the tolerance of Newton's method. A call takes the
+    time of the step and a fraction of a millisecond in addition. Programs are shared with `simulate`.
 
         stepper = kc.Stepper(robot, dt=0.05)
         while True:
@@ -58,10 +57,10 @@ class Stepper:
         newton: NewtonOptions = NewtonOptions(),
         recovery_budget: float | None = None,
     ):
-        """Begin at rest, or where `initial` ends. The arguments are those of `simulate`.
+        """Start at rest, or at the last row of `initial`. The arguments are the same as in `simulate`.
 
         Raises:
-            SimulationError: where rest is an equilibrium to be found, there is none.
+            SimulationError: the initial equilibrium was not found.
             ValueError: arguments of a wrong shape or name.
         """
         given: Any = robot
@@ -81,27 +80,27 @@ class Stepper:
         self._past, self._t0, self._index, self._steps = begun.past, float(t0), 0, 0
         self._coarse = bool(begun.coarse)
         self._control = np.asarray(begun.control, dtype=float)
-        # as many as in a run of up to 128 steps, so that they share a program
+        # same capacity as in a run of up to 128 steps, so that they share a program
         self._controls = np.zeros((LEAST_CAPACITY, count))
         first = _Solved(begun.past, np.asarray(begins.record), 0, 0.0, 0, 0.0)
         self._state = self._row(first, self._control, self.time, begins.begun)
 
     @property
     def time(self) -> float:
-        """Time of the state that has been reached (s)."""
+        """Time of the current state (s)."""
         return self._t0 + self._steps * self.dt
 
     @property
     def state(self) -> Trajectory:
-        """The state that has been reached: a trajectory of one row."""
+        """Current state, a trajectory of one row."""
         return self._state
 
     def step(self, control: Any) -> Trajectory:
-        """Go on by one time step under a control (c,): the new state, a trajectory of one row.
+        """Advance by one time step under a control (c,) and return the new state, a trajectory of one row.
 
         Raises:
-            SimulationError: the step has no solution, or none to be trusted. The robot then stays where it
-                is, and may be stepped with another control.
+            SimulationError: the step was not solved. The state is then unchanged, and another control may be
+                tried.
             ValueError: a control of a wrong shape, or one that is not finite.
         """
         control = self._checked(control)
@@ -110,14 +109,14 @@ class Stepper:
         self._coarse = solved.result == Result.COARSE
         self._steps, self._index = self._steps + 1, self._index + 1
         if self._index == LEAST_CAPACITY:
-            # the loop counts from an earlier row on, but not from row 0, whose coefficients may differ
+            # restart the count at row 1, not at row 0, because the coefficients of row 0 may differ
             self._index = 1
             self._past = self._past._replace(t0=np.asarray(self.time - self.dt))
         self._state = self._row(solved, control, self.time, self._begun_after(solved))
         return self._state
 
     def preview(self, control: Any) -> Trajectory:
-        """Return the row that `step` would give, without moving. Raises the same errors."""
+        """Return the row that `step` would return, without changing the state. Raises the same errors."""
         control = self._checked(control)
         solved = self._solve(control)
         return self._row(solved, control, self.time + self.dt, self._begun_after(solved))
@@ -142,7 +141,7 @@ class Stepper:
 
     def _solve(self, control: np.ndarray) -> _Solved:
         i = self._index
-        controls = self._controls.copy()  # the compiled march may still read the last one
+        controls = self._controls.copy()  # the compiled loop may still read the previous array
         controls[i] = control
         done, past, rows = loop_one(
             self.robot, self._settings, self._task.table, controls, self.dt, self._past, i, i + 1
@@ -163,7 +162,7 @@ class Stepper:
         if not result.solved:
             number = self._steps + 1
             raise SimulationError(number, self.time + self.dt, found.residual, result, cause)
-        # as `mark_coarse`
+        # same rule as `mark_coarse`
         coarse = self._coarse or is_coarse(np.asarray(found.position_error), self.robot)
         return found._replace(result=int(Result.COARSE)) if coarse else found
 
@@ -175,7 +174,7 @@ class Stepper:
     def _row(self, solved: _Solved, control: np.ndarray, time: float, begun: Begun | None) -> Trajectory:
         ny, nz = self.robot.y_layout.size, self.robot.z_layout.size
         record = solved.record[None, :, : ny + nz]
-        return Trajectory(
+        row = Trajectory(
             system=self.robot,
             settings=self._settings,
             time=np.array([time]),
@@ -188,3 +187,4 @@ class Stepper:
             position_error=np.array([solved.position_error]),
             begun=begun,
         )
+        return marked(row, None)

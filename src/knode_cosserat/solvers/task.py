@@ -36,25 +36,25 @@ class Start(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """Everything that is the same for every robot of a run."""
+    """Settings and sizes shared by every robot of a run."""
 
     settings: Settings
     dt: float
     steps: int
-    #: the first step: as the settings say, like any other (the history holds real states), or by BDF1; or
-    #: every step without rates, an equilibrium (by the program of a simulation with these settings)
+    #: kind of the first step: "start" by the settings, "regular" like any other (the history holds real
+    #: states), "consistent" by BDF1; "still": every step is an equilibrium, with the same compiled program
     first: FirstStep = "start"
     #: seconds that recovery may take; None: 20 times the run's own time or 5 s, whichever is more
     recovery_budget: float | None = None
 
     @property
     def still(self) -> bool:
-        """True if every step is an equilibrium, for itself."""
+        """True if every step is an independent equilibrium."""
         return self.first == "still" or isinstance(self.settings.time, Static)
 
     @property
     def table(self) -> np.ndarray:
-        """Coefficients of the first step and of every other."""
+        """Coefficients (2, 4) of the first step and of all later steps."""
         if self.first == "still":
             return np.zeros((2, 4))
         if self.first == "consistent":

@@ -1,8 +1,8 @@
-"""Implicit time schemes: y_t at the new time as c0 y plus what the past contributes.
+"""Implicit time schemes: y_t at the new time is c0 y plus a history term.
 
     y_t,n = c0 y_n + ʰy,     ʰy = c1 y_{n-1} + c2 y_{n-2} + d1 y_t,{n-1}
 
-Every scheme is its coefficients for a step that may differ from the one before, so that a step can be halved.
+A scheme is defined by its coefficients. Consecutive steps may differ in length, so that a step can be halved.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Coefficients(NamedTuple):
 class TimeScheme(abc.ABC):
     """An implicit scheme in time."""
 
-    #: whether y_t of the previous step enters, and so must be kept; if not, what is too fast dies out
+    #: true if y_t of the previous step enters, and so must be stored; if false, unresolved modes are damped
     uses_rate = False
 
     @property
@@ -35,17 +35,17 @@ class TimeScheme(abc.ABC):
 
     @abc.abstractmethod
     def coefficients(self, dt: float, previous_dt: float) -> Coefficients:
-        """Coefficients for a step of dt (s) after one of previous_dt (s)."""
+        """Return the coefficients for a step of dt (s) after one of previous_dt (s)."""
 
 
 @dataclasses.dataclass(frozen=True)
 class BDF1(TimeScheme):
-    """Implicit Euler. Order 1, damps every vibration; it needs one past state only."""
+    """Implicit Euler. Order 1, damps every vibration; it needs one earlier state only."""
 
     order = 1
 
     def coefficients(self, dt: float, previous_dt: float) -> Coefficients:
-        """Coefficients for a step of dt (s); the step before does not matter."""
+        """Return the coefficients for a step of dt (s); the previous step does not matter."""
         return Coefficients(1.0 / dt, -1.0 / dt, 0.0, 0.0)
 
 
@@ -53,9 +53,9 @@ class BDF1(TimeScheme):
 class BDFAlpha(TimeScheme):
     """The family of Till, Aloi & Rucker (2019): α = 0 is BDF2, α = -1/2 the trapezoidal rule.
 
-    Order 2. The closer α to -1/2, the less numerical damping; at -1/2 there is none, and what is stiff rings.
-    With r = dt/previous_dt, BDF2 for unequal steps plus α times the second difference that stands for
-    y_t,n - y_t,{n-1}.
+    Order 2. Numerical damping decreases as α approaches -1/2; at -1/2 there is none, and stiff modes ring.
+    The scheme is BDF2 for unequal steps (r = dt/previous_dt) plus α times the second difference that
+    approximates y_t,n - y_t,{n-1}.
     """
 
     alpha: float = -0.2
@@ -68,11 +68,11 @@ class BDFAlpha(TimeScheme):
 
     @property
     def uses_rate(self) -> bool:  # type: ignore[override]
-        """BDF2 itself needs no y_t of the past."""
+        """True unless α is zero: BDF2 needs no y_t of the previous step."""
         return self.alpha != 0.0
 
     def coefficients(self, dt: float, previous_dt: float) -> Coefficients:
-        """Coefficients for a step of dt (s) after one of previous_dt (s)."""
+        """Return the coefficients for a step of dt (s) after one of previous_dt (s)."""
         a, r = self.alpha, dt / previous_dt
         scale = 1.0 / (dt * (1.0 + a))
         return Coefficients(
@@ -99,12 +99,12 @@ class Trapezoidal(BDFAlpha):
 
 @dataclasses.dataclass(frozen=True)
 class Static(TimeScheme):
-    """Every rate is zero: a step of this scheme is a static equilibrium."""
+    """All rates are zero: a step of this scheme is a static equilibrium."""
 
     order = 0
 
     def coefficients(self, dt: float, previous_dt: float) -> Coefficients:
-        """Zeros, whatever the step."""
+        """Return zeros."""
         return Coefficients(0.0, 0.0, 0.0, 0.0)
 
 

@@ -1,4 +1,4 @@
-"""The loop over time, compiled: steps until all are done or one fails."""
+"""Compiled time loop: runs until all steps are done or one fails."""
 
 from __future__ import annotations
 
@@ -16,10 +16,9 @@ from knode_cosserat.solvers.linear import Factors, solved
 from knode_cosserat.solvers.problem import Stages, StepProblem, row_of
 from knode_cosserat.solvers.settings import Settings
 
-#: extrapolations are weighted by this power of their errors in the newest step: a lower one lets a bad one
-#: in, a higher one trusts chance
+#: extrapolations are weighted by this power of their errors in the newest step
 TRUST = -3
-#: name of the axis of robots that are solved in lockstep
+#: axis name of robots that are solved in lockstep
 BATCH = "robots"
 #: misfits below this are rounding errors (natural units)
 ROUNDING = 1e-12
@@ -44,7 +43,7 @@ def step(
     """Solve one time step: return the next history, the step's row, and the kept factors."""
     history = history_of(past.records, past.rate, coefficients, settings)
     problem = StepProblem(system, t, control, coefficients[0], history, settings.space).ready()
-    # as sums of products, not as matrix products: XLA fuses these with what follows
+    # sum of products instead of a matrix product: XLA fuses it with the next operations
     guess = jnp.sum(past.weights[:, None, None] * past.y, axis=0)
     solution, kept = newton(problem, guess, system.unknowns(guess[0]), settings.newton, kept, batch)
     after, row = recorded(problem, settings, past, coefficients, solution, kept.factors)
@@ -59,8 +58,8 @@ def recorded(
 ) -> tuple[Past, Rows]:
     """Return the history after a solved step, and its row, with the discretisation error.
 
-    The error e of a step solves the step's linear equations. Their right-hand side is the defect of the
-    formula that checks the scheme, and the effect of the errors of the steps before, through the history.
+    The error e of a step solves the step's linear equations. Their right-hand side is the defect of the check
+    formula, plus the effect of earlier steps' errors through the history.
     """
     system, space, y = problem.system, problem.space, solution.y
     d_history = history_of(past.error[:2], past.error[2], coefficients, settings)
@@ -83,7 +82,7 @@ def recorded(
         rate, d_rate = coefficients[0] * records + problem.history, coefficients[0] * error + d_history
     else:
         rate, d_rate = past.rate, past.error[2]
-    # of the state that is returned, evaluated apart from the iteration
+    # residual of the returned state, evaluated independently of the iteration
     residual = jnp.maximum(solution.error, largest_residual(problem, reached - y[1:], tip))
     row = Rows(
         row_of(system, y, records), solution.unknowns, _finite_or_infinite(residual, records),
@@ -94,7 +93,7 @@ def recorded(
 
 
 def position_error(system: System, e: Float[Any, "points y"]) -> Float[Any, ""]:
-    """Return the largest error of a position (m); without positions, of y in parts of its scale."""
+    """Return the largest position error (m); without positions, that of y over its scale times the length."""
     strand = system.strand
     if "p" not in strand.y_layout.names:
         return jnp.max(jnp.abs(e) / system.scales().y) * system.length
@@ -103,12 +102,12 @@ def position_error(system: System, e: Float[Any, "points y"]) -> Float[Any, ""]:
 
 
 def _finite_or_infinite(error: Any, records: Any) -> Any:
-    """Residual of a step, infinite if a state is undefined (at the tip nothing else uses it)."""
+    """Return the residual of a step; infinite if a record is not finite (no residual has the tip's z)."""
     return jnp.where(jnp.all(jnp.isfinite(records)), error, jnp.inf)
 
 
 def weights_by(misfit: Float[Any, " extrapolations"]) -> Float[Any, " past"]:
-    """Return the weights of earlier states in the mean of the extrapolations, by the errors of these."""
+    """Return the weights of earlier states in the first guess, from the errors of the extrapolations."""
     trust = jnp.maximum(misfit / jnp.maximum(jnp.min(misfit), ROUNDING), 1.0) ** TRUST
     return jnp.sum((trust / jnp.sum(trust))[:, None] * EXTRAPOLATIONS, axis=0)
 
@@ -121,7 +120,7 @@ def no_factors(system: System, settings: Settings, past: Past, control: Any) -> 
 
 
 def _no_rows(system: System, shape: tuple[int, ...], past: Past) -> Rows:
-    """Rows of zeros, (steps,) or (robots, steps)."""
+    """Return rows of zeros, (steps,) or (robots, steps)."""
     return Rows(
         jnp.zeros((*shape, system.nodes, past.records.shape[-1])),
         jnp.zeros((*shape, system.unknown_count)),
@@ -135,7 +134,7 @@ def _attempt(
     system: System, settings: Settings, table: Any, past: Past, control: Any, i: Any, dt: Any, kept: Kept,
     batch: str | None = None,
 ) -> tuple[Any, Past, Rows, Kept]:  # fmt: skip
-    """Step i: whether it failed, the history of the next step (or its own, if it failed), row, factors."""
+    """Try step i: return a failure flag, the next history (unchanged on failure), row and factors."""
     coefficients = jnp.where(i == 0, table[0], table[1])
     t = past.t0 + (i + 1) * dt
     after, row, kept = step(system, settings, past, coefficients, control, t, kept, batch)
@@ -153,8 +152,8 @@ def time_loop(
 ) -> tuple[Any, Past, Rows]:  # fmt: skip
     """Solve the steps `start` to `stop` (exclusive; step i uses controls[i] and ends at t0 + (i + 1) dt).
 
-    Ends early at a step that does not converge. Returns the number of steps done, the history of the next
-    step, and the rows of all steps that were tried; the rest of the rows are zero.
+    Stops at a step that does not converge. Returns the number of steps done, the history of the next step,
+    and the rows of all steps tried; the remaining rows are zero.
     """
 
     def going(state: Any) -> Any:
@@ -183,9 +182,9 @@ def loop_in_turn(
     stop: Any,
     batched: Any,
 ) -> tuple[Any, Rows]:
-    """Solve all steps of one robot after the other: return the numbers of steps done, and all rows.
+    """Solve all steps, one robot after the other; return the numbers of steps done, and all rows.
 
-    One loop over robots and steps, not a loop in a loop: XLA copies all rows at every turn of an inner loop.
+    It is a single loop over robots and steps: XLA would copy all rows at every turn of an inner loop.
     """
     size = controls.shape[0]
 
@@ -220,16 +219,16 @@ def loop_in_turn(
 
 @functools.partial(jax.jit, static_argnames="settings")
 def loop_one(system, settings, table, controls, dt, past, start, stop):  # type: ignore[no-untyped-def]
-    """`time_loop`, compiled."""
+    """Run `time_loop` as a compiled program."""
     return time_loop(system, settings, table, controls, dt, past, start, stop)
 
 
 @functools.partial(jax.jit, static_argnames=("settings", "batched", "lockstep"))
 def loop_many(system, settings, table, controls, dt, pasts, stop, batched, lockstep):  # type: ignore[no-untyped-def]
-    """A batch, compiled once: controls (B, T, c), and a batch of systems if `batched`.
+    """Simulate a batch as one compiled program: controls (B, T, c), and a batch of systems if `batched`.
 
-    On a CPU the robots are solved one after the other, each with its own number of corrections; in lockstep
-    they would wait for the slowest, which measured a third as fast. On a GPU lockstep wins.
+    On a CPU the robots are solved one after the other, each with its own number of corrections; lockstep was
+    measured at a third of the speed, because all robots wait for the slowest. On a GPU lockstep is faster.
     """
     if not lockstep:
         return loop_in_turn(system, settings, table, controls, dt, pasts, stop, batched)

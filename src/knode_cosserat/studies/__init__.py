@@ -1,1 +1,1 @@
-"""The paper's studies: settings as data, and one runner for their jobs."""
+"""Studies of the paper and further ones: settings as data, and one runner for all jobs."""

@@ -1,4 +1,4 @@
-"""The study of a real beam of silicone: identified from some recordings, the others predicted."""
+"""Study of a real silicone beam: identified from training recordings, tested on held-out ones."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ def read_folder(folder: Path, loads: Mapping[str, float] | None = None) -> list[
 
     Args:
         folder: has `beam_*.csv`.
-        loads: masses (kg) by names of files without endings, where the names do not tell them.
+        loads: masses (kg) by file name without suffix, for names that do not state the load.
 
     Raises:
-        RecordingError: there is none, or one is not right.
+        RecordingError: there is no recording, or one is invalid.
     """
     loads = loads or {}
     paths = sorted(folder.glob(PATTERN)) if folder.is_dir() else []
@@ -75,15 +75,15 @@ def rerun(
     """Identify the beam from the training recordings, predict all, and write errors, a table and a figure.
 
     Args:
-        out: the folder that is written to.
-        folder: has the recordings.
-        train: names of those to learn from, without endings; None: `training_names`.
-        loads: masses (kg) by name, where the names do not tell them.
+        out: the output folder.
+        folder: the folder of recordings.
+        train: names of the training recordings, without suffixes; None: `training_names`.
+        loads: masses (kg) by name, for names that do not state the load.
         numerics: nodes and time step of every rollout.
-        progress: is called with a line for each iteration.
+        progress: callback that receives a line for each iteration.
 
     Raises:
-        RecordingError: a recording is not right, or does not exist.
+        RecordingError: a recording is invalid, or does not exist.
     """
     recordings = read_folder(folder, loads)
     by_name = {each.name: each for each in recordings}
@@ -114,7 +114,7 @@ def _no_such(folder: Path, option: str, name: str, known: Sequence[str]) -> str:
 def _cells(
     recordings: Sequence[BeamRecording], train: Sequence[str], predictions: Predictions
 ) -> list[dict[str, Any]]:
-    """A cell for each recording and method."""
+    """Return a cell for each recording and method."""
     cells: list[dict[str, Any]] = []
     for each in recordings:
         for method, predicted in predictions[each.name].items():
@@ -129,7 +129,7 @@ def _cells(
 
 
 def as_markdown(cells: Sequence[Mapping[str, Any]], beam: Beam) -> str:
-    """The errors of every recording, and the numbers that were identified."""
+    """Return Markdown with the errors of every recording and the identified parameters."""
     methods = list(dict.fromkeys(cell["method"] for cell in cells))
     rows = []
     for name in dict.fromkeys(cell["file"] for cell in cells):

@@ -1,4 +1,4 @@
-"""Identification of the beam: its numbers by least squares through rollouts of training recordings."""
+"""Identification of the beam: parameters by least squares through rollouts of training recordings."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from jaxtyping import Float
 from knode_cosserat.recordings.beam import BeamRecording
 from knode_cosserat.studies.beam_model import DEFAULT, Beam, Numerics, predict, tip_height
 
-#: Young's modulus by those who made the recordings (Pa); the other numbers are where the search begins
+#: Young's modulus published with the recordings (Pa); the other parameters are initial values
 NOMINAL = Beam(youngs_modulus=263_824.0, damping_time=5e-3)
 #: from a branch of 0.1 and 0.1 s the search stops in a flat valley, with 0.697 mm on the training recordings
 #: instead of 0.685
@@ -35,7 +35,7 @@ STEP, TOLERANCE = 1e-3, 3e-3
 
 
 class Identified(NamedTuple):
-    """A beam that was identified, with its effort."""
+    """Identified beam, and the number of evaluations."""
 
     beam: Beam
     #: predictions of all training recordings for one set of numbers
@@ -43,13 +43,13 @@ class Identified(NamedTuple):
 
 
 def errors(predicted: Float[np.ndarray, "T 3 3"], recording: BeamRecording) -> Float[np.ndarray, "T 3"]:
-    """Distances (m) between predicted and measured tip markers from the release on, row by row."""
+    """Return the distances (m) between predicted and measured tip markers after the release, row by row."""
     released = np.isfinite(predicted).all(axis=(1, 2))
     return np.asarray(np.linalg.norm((predicted - recording.tip)[released], axis=2))
 
 
 def marker_rmse(predicted: Float[np.ndarray, "T 3 3"], recording: BeamRecording) -> float:
-    """Root mean square (m) of the distances over all rows after the release and all tip markers."""
+    """Return the root mean square (m) of the distances over rows after the release and tip markers."""
     return float(np.sqrt(np.nanmean(errors(predicted, recording) ** 2)))
 
 
@@ -59,9 +59,9 @@ def identify_beam(
     numerics: Numerics = DEFAULT,
     progress: Callable[[str], None] = lambda line: None,
 ) -> Identified:
-    """Find the numbers of the beam that explain the training recordings best.
+    """Return the beam whose parameters fit the training recordings best.
 
-    Each recording counts alike, whatever its number of rows.
+    Each recording has the same weight, independent of its number of rows.
     """
     start = dataclasses.replace(START, level=float(np.mean([tip_height(each) for each in recordings])))
     names = (*POSITIVE, *FREE)
@@ -86,7 +86,7 @@ def identify_beam(
 
 
 def _moved(start: Beam, x: Float[np.ndarray, " k"]) -> Beam:
-    """The beam at a point of the search, which begins at zero."""
+    """Return the beam at a point of the search, which begins at zero."""
     changes: dict[str, float] = dict(zip((*POSITIVE, *FREE), x.tolist(), strict=True))
     values = {name: getattr(start, name) * math.exp(changes[name]) for name in POSITIVE}
     values |= {name: getattr(start, name) + unit * changes[name] for name, (unit, _) in FREE.items()}
@@ -96,7 +96,7 @@ def _moved(start: Beam, x: Float[np.ndarray, " k"]) -> Beam:
 def _residual(
     beam: Beam, recording: BeamRecording, steps: int, numerics: Numerics
 ) -> Float[np.ndarray, " r"]:
-    """Differences of all rows from the threshold's crossing on, in mm; their squares sum up to the MSE."""
+    """Return the scaled residuals (mm) of rows from the threshold on; their squares sum to the MSE."""
     rows = recording.time >= recording.crossing
     left = 1e3 * (predict(beam, recording, steps, numerics) - recording.tip)[rows]
     seen = np.isfinite(recording.tip[rows])

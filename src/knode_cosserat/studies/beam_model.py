@@ -1,8 +1,8 @@
-"""A clamped beam of silicone that is let go: its rod, its numbers, and the motion of its markers.
+"""Model of a released clamped silicone beam: its rod, its parameters, and the motion of its markers.
 
-The frame is that of the recordings (`recordings.beam`): x upwards, z along the beam. The held beam is the
-equilibrium under a vertical force of the hand at the tip, as large as brings the tip to the height where it
-was measured. At the release this force vanishes.
+The frame is the recordings' (`recordings.beam`): x upwards, z along the beam. The held beam is the
+equilibrium under a vertical force of the hand at the tip that reproduces the measured height of the tip. At
+the release this force vanishes.
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ class Numerics(NamedTuple):
     dt: float = 2.5e-3
 
 
-#: what studies use
+#: settings of the studies
 DEFAULT = Numerics()
 
 
 @dataclasses.dataclass(frozen=True)
 class Beam:
-    """The numbers of the beam and of its rig that are identified."""
+    """Parameters of the beam and of its rig; the identification fits them."""
 
     #: Young's modulus at rest (Pa)
     youngs_modulus: float
@@ -66,7 +66,7 @@ class Beam:
 
 
 def shear_factor(poisson: float = POISSON) -> float:
-    """Shear correction factor of a rectangular section, 10 (1 + ν) / (12 + 11 ν) (Cowper 1966)."""
+    """Return the shear correction factor of a rectangle, 10 (1 + ν) / (12 + 11 ν) (Cowper 1966)."""
     return 10.0 * (1.0 + poisson) / (12.0 + 11.0 * poisson)
 
 
@@ -137,7 +137,7 @@ def step_count(recordings: list[BeamRecording], dt: float) -> int:
 
 
 def markers_of(motion: Trajectory) -> Float[np.ndarray, "T 3 3"]:
-    """Displacements (m) of the markers from the first row."""
+    """Return the displacements (m) of the markers from the first row."""
     p, h = np.asarray(motion.tip_position), np.asarray(motion.quaternion)[:, -1]
     positions = p[:, None] + np.einsum("tij,kj->tki", _matrices(h), MARKERS)
     return positions - positions[0]

@@ -1,4 +1,4 @@
-"""What a learned model is compared with: learning without knowledge, and linear prediction in time."""
+"""Baselines for learned models: learning without a nominal model, and linear prediction in time."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from knode_cosserat.trajectory import Trajectory
 
 
 class NoKnowledge(System):
-    """A system that knows what its numbers are and what holds at its ends, and nothing else: y_s = 0, z = 0.
+    """System without physics between its ends: y_s = 0, z = 0.
 
-    With a residual on it everything is learned. Layouts, ends and rest are those of another system.
+    A residual on it learns everything. Layouts, boundary conditions and rest come from another system.
     """
 
     model: System
@@ -31,93 +31,93 @@ class NoKnowledge(System):
 
     @property
     def y_layout(self) -> Layout:  # type: ignore[override]
-        """The model's."""
+        """Layout of the model's y."""
         return self.model.y_layout
 
     @property
     def z_layout(self) -> Layout:  # type: ignore[override]
-        """The model's."""
+        """Layout of the model's z."""
         return self.model.z_layout
 
     @property
     def control_layout(self) -> Layout:  # type: ignore[override]
-        """The model's."""
+        """Layout of the model's controls."""
         return self.model.control_layout
 
     @property
     def base_unknowns(self) -> tuple[str, ...]:  # type: ignore[override]
-        """The model's."""
+        """Unknowns at the model's base."""
         return self.model.base_unknowns
 
     @property
     def mixed(self) -> bool:  # type: ignore[override]
-        """Whatever the model's is: B is not known."""
+        """False for every model: B is unknown."""
         return False
 
     @property  # type: ignore[misc]
     def length(self) -> Any:
-        """The model's (m)."""
+        """Length of the model (m)."""
         return self.model.length
 
     def derivatives(
         self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-        """Zeros."""
+        """Return zeros for y_s and z."""
         return jnp.zeros(self.y_layout.size), jnp.zeros(self.z_layout.size)
 
     def rest(self, s: Any) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-        """The model's: where a simulation begins is no physics."""
+        """Return the model's rest state: an initial state is not physics."""
         return self.model.rest(s)
 
     def base(self, t: Any, control: Any, unknowns: Float[Any, " k"], history: History) -> Float[Any, " y"]:
-        """The model's."""
+        """Return the model's y at the base."""
         return self.model.base(t, control, unknowns, history)
 
     def unknowns(self, y: Float[Any, " y"]) -> Float[Any, " k"]:
-        """The model's."""
+        """Return the model's unknowns at the base from y."""
         return self.model.unknowns(y)
 
     def tip(self, t: Any, control: Any, y: Float[Any, " y"], history: History) -> Float[Any, " k"]:
-        """The model's."""
+        """Return the residual of the model's boundary conditions at the tip."""
         return self.model.tip(t, control, y, history)
 
     @property
     def tip_layout(self) -> Layout:
-        """The model's."""
+        """Layout of the residual at the model's tip."""
         return self.model.tip_layout
 
     def scales(self) -> Scales:
-        """The model's."""
+        """Return the model's scales."""
         return self.model.scales()
 
     def actuation(self, control: Float[Any, " c"]) -> Float[Any, " a"]:
-        """The model's, so that the network sees what it sees beside a knowledge."""
+        """Return the model's actuation, so that the network has the same input as with a nominal model."""
         return self.model.actuation(control)
 
     def positions(self, y: Any) -> Any:
-        """The model's."""
+        """Return the model's positions."""
         return self.model.positions(y)
 
     def quaternions(self, y: Any) -> Any:
-        """The model's."""
+        """Return the model's quaternions."""
         return self.model.quaternions(y)
 
     def replace(self, **changes: Any) -> Self:
-        """A copy of which the model has other parameters (or nodes), by name."""
+        """Return a copy with changed parameters (or nodes) of the model."""
         return type(self)(self.model.replace(**changes))
 
 
 class Poses(NamedTuple):
-    """What the metrics compare: positions (T, N, 3) in m and quaternions (T, N, 4)."""
+    """Poses for the metrics: positions (T, N, 3) in m and quaternions (T, N, 4)."""
 
     position: np.ndarray
     quaternion: np.ndarray
 
 
 def compared(prediction: PoseHistory | str, reference: PoseHistory | str) -> dict[str, Any]:
-    """Both figures of a cell; None and the reason, if there is none of the two trajectories but a reason.
+    """Return both metrics of a cell; None and the reason if a trajectory is replaced by a reason.
 
-    The same if a prediction has grown beyond all numbers.
+    A prediction that is not finite counts as failed too.
     """
     failed = next((each for each in (reference, prediction) if isinstance(each, str)), None)
     if failed is None and not np.all(np.isfinite(np.asarray(prediction.position))):  # type: ignore[union-attr]
@@ -129,10 +129,10 @@ def compared(prediction: PoseHistory | str, reference: PoseHistory | str) -> dic
 
 
 class LinearPredictor(NamedTuple):
-    """x' = A x + B f, from one row to the next: x is how far a state is from rest, f the actuation.
+    """Linear predictor x' = A x + B f from row to row: x is the deviation from rest, f the actuation.
 
-    A and B are found by dynamic mode decomposition with control (Proctor, Brunton & Kutz, SIAM J. Applied
-    Dynamical Systems 15, 2016) of the numbers of all nodes, each field in its own unit of size.
+    A and B come from dynamic mode decomposition with control (Proctor, Brunton & Kutz, SIAM J. Applied
+    Dynamical Systems 15, 2016) of the states of all nodes, with each field scaled by its size.
     """
 
     system: System
@@ -144,11 +144,11 @@ class LinearPredictor(NamedTuple):
 
     @property
     def growth(self) -> float:
-        """By what the fastest of its motions grows from row to row, if left alone."""
+        """Spectral radius of A: the largest growth factor from row to row without actuation."""
         return float(np.max(np.abs(np.linalg.eigvals(self.A))))
 
     def __call__(self, tensions: Float[Any, "T c"]) -> Poses:
-        """T rows from rest on under these controls, as the paper counts; they may grow beyond all numbers."""
+        """Return T rows from rest under these controls, as the paper counts; they may overflow."""
         x = np.zeros_like(self.rest)
         rows = [x]
         with np.errstate(over="ignore", invalid="ignore"):
@@ -159,22 +159,22 @@ class LinearPredictor(NamedTuple):
         return Poses(np.asarray(self.system.positions(y)), np.asarray(self.system.quaternions(y)))
 
 
-#: ranks that are tried
+#: candidate ranks
 RANKS = (1, 2, 3, 4, 6, 8, 10, 12, 16, 20, 24)
 #: a row: e in a hundred
 GROWTH = 1.01
 
 
 def linear_predictor(system: System, trajectories: Sequence[Trajectory]) -> LinearPredictor:
-    """The linear predictor of the rank that goes on best where it has not seen how.
+    """Return the linear predictor of the rank with the best extrapolation.
 
-    For each of `RANKS` it is fitted to the first two thirds of every trajectory, to be rolled out over all of
-    it; the best is then fitted to everything. One that grows faster than `GROWTH` is taken only for want of
-    another.
+    For each of `RANKS` a predictor is fitted to the first two thirds of every trajectory and rolled out over
+    the whole. The best rank is then fitted to all data. A predictor that grows faster than `GROWTH` is used
+    only if there is no other.
 
     Args:
-        system: the robot, for its layout and its actuation only.
-        trajectories: each from rest on, of 4 rows at least.
+        system: the robot; only its layout and actuation are used.
+        trajectories: trajectories that begin at rest, with at least 4 rows each.
 
     Raises:
         ImportError: PyDMD is not installed, the extra `bench`.
@@ -190,7 +190,7 @@ def linear_predictor(system: System, trajectories: Sequence[Trajectory]) -> Line
 
 
 def _fitted(system: System, trajectories: Sequence[Trajectory], rank: int) -> LinearPredictor | None:
-    """The predictor of one rank; None if there are too few rows for it."""
+    """Return the predictor of one rank; None if there are too few rows for it."""
     states = [np.asarray(trajectory.y) for trajectory in trajectories]
     rest, scale = states[0][0], np.ones_like(states[0][0])
     for field in system.y_layout.fields:
@@ -200,9 +200,9 @@ def _fitted(system: System, trajectories: Sequence[Trajectory], rank: int) -> Li
     scaled = [((each - rest) / scale).reshape(len(each), -1) for each in states]
     before = np.concatenate([each[:-1] for each in scaled]).T
     after = np.concatenate([each[1:] for each in scaled]).T
-    # what acts between two rows is the second one's
+    # the second row of a pair has the control that acts between both
     inputs = np.concatenate([_forces(system, each.control)[1:] for each in trajectories]).T
-    # directions in which nothing ever pulls have no weight to be found
+    # directions without actuation have no identifiable weight
     pulled = np.abs(inputs).max(axis=1) > 0.0
     if rank + pulled.sum() > before.shape[1] and rank > 1:
         return None
@@ -217,7 +217,7 @@ def _forces(system: System, tensions: Any) -> np.ndarray:
 
 
 def _misses(predictor: LinearPredictor, trajectory: Trajectory) -> float:
-    """Mean square of the positions that a rollout misses; infinite if it grows beyond all numbers."""
+    """Return the mean squared position error of a rollout; infinite if it overflows."""
     tensions = np.asarray(trajectory.control)
     predicted = predictor(np.concatenate([tensions[1:], tensions[-1:]])).position
     with np.errstate(over="ignore", invalid="ignore"):
@@ -226,7 +226,7 @@ def _misses(predictor: LinearPredictor, trajectory: Trajectory) -> float:
 
 
 def _decomposed(before: Any, after: Any, inputs: Any, rank: int) -> tuple[np.ndarray, np.ndarray]:
-    """A and B of one rank, from pairs of states (x, pairs) and what acted between them (a, pairs)."""
+    """Return A and B of one rank, from pairs of states (x, pairs) and the actuation of each (a, pairs)."""
     try:
         dmdc = importlib.import_module("pydmd.dmdc")
     except ImportError:

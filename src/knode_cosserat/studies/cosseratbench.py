@@ -1,13 +1,13 @@
 """This package as a solver of `cosseratbench`, an independent suite of rod scenarios.
 
-A scenario says physics only; here it becomes a `SlenderRod` for each of its rods, and the rod's states become
-the frames that are asked for. What is chosen of the numerics:
+A scenario states physics only. Here each of its rods becomes a `SlenderRod`, whose states become the
+requested frames. The numerical settings are:
 
 - Arclength: Lobatto's formula of order 4. It is stable on any grid; for its accuracy each element has enough
   segments to keep exponentials along the rod (bending under tension, waves within a time step, twist) below
   e^0.3 in each.
-- A quasi-static scenario in which nothing is driven has one equilibrium, and that is what is solved for: the
-  first frame is the shape given, every other the equilibrium.
+- A quasi-static scenario without driven ends has one equilibrium. The first frame is the given shape, every
+  other frame the equilibrium.
 - A quasi-static scenario with a driven end is a motion, under a drag that would damp its slowest vibration
   critically.
 - Any other scenario is a motion without damping.
@@ -39,16 +39,16 @@ from knode_cosserat.studies.shapes import resting
 CHUNK = 128
 #: error of the period of the slowest vibration that the time step may make
 PERIOD_ERROR = 2e-5
-#: almost the trapezoidal rule: what it damps of a slow vibration is far below its error in time
+#: almost the trapezoidal rule: its damping of a slow vibration is far below its error in time
 SCHEME = kc.BDFAlpha(-0.45)
-#: growth of what grows along the rod, as an exponent, that one segment may have
+#: largest exponent of growth along the rod within one segment
 STEEPEST = 0.3
 #: points for each segment at which the tangent and the curvature of the given shape are taken
 FINER = 10
 
 
 class KnodeCosserat:
-    """The solver that the suite finds; `time_step_scale` multiplies the time step it would choose."""
+    """Solver for the suite; `time_step_scale` multiplies the time step that it chooses."""
 
     name = "knode-cosserat"
     capabilities: ClassVar[frozenset[Capability]] = frozenset({Capability.STRETCH, Capability.SHEAR})
@@ -58,7 +58,7 @@ class KnodeCosserat:
         self.time_step_scale = time_step_scale
 
     def settings(self, scenario: Scenario, *, n_elements: int, n_frames: int) -> dict[str, Any]:
-        """The numerics chosen for a run, to be shown beside its result."""
+        """Return the numerical settings of a run, to be shown with its result."""
         dt = self._time_step(scenario, scenario.duration / (n_frames - 1))
         segments = max(_segments(rod, scenario, n_elements, dt) for rod in scenario.rods)
         chosen: dict[str, Any] = {"space": "lobatto4", "segments_per_element": segments}
@@ -68,11 +68,11 @@ class KnodeCosserat:
         return chosen | {"time": f"bdf-alpha({SCHEME.alpha})", "time_step": dt, "drag_rate": drag}
 
     def run(self, scenario: Scenario, *, n_elements: int, n_frames: int) -> Trajectory:
-        """Positions (n_frames, n_elements + 1, 3) and directors of every rod; see the module.
+        """Return positions (n_frames, n_elements + 1, 3) and directors of every rod; see the module.
 
         Raises:
             Diverged: a step has no solution.
-            NotImplementedError: of the scenario something is outside the model.
+            NotImplementedError: the model does not support a part of the scenario.
         """
         times = np.linspace(0.0, scenario.duration, n_frames)
         dt = self._time_step(scenario, times[1])
@@ -80,7 +80,10 @@ class KnodeCosserat:
         return Trajectory(times, *(tuple(each) for each in zip(*shapes, strict=True)))
 
     def _time_step(self, scenario: Scenario, interval: float) -> float | None:
-        """A part of the interval between frames, or none at rest; the period is off by (ω dt)² / 12."""
+        """Return a fraction of the interval between frames, or None for an equilibrium.
+
+        The relative error of the period is (ω dt)² / 12.
+        """
         if scenario.quasi_static and not any(rod.motion(end) for rod in scenario.rods for end in End):
             return None
         dt = self.time_step_scale * _usual_time_step(scenario)
@@ -88,12 +91,12 @@ class KnodeCosserat:
 
 
 def _usual_time_step(scenario: Scenario) -> float:
-    """That which gives the period of the slowest vibration the error that it may have."""
+    """Return the time step (s) at which the period of the slowest vibration has the allowed error."""
     return math.sqrt(12.0 * PERIOD_ERROR) / scenario.slowest_frequency()
 
 
 class Shape(NamedTuple):
-    """The shape that a rod starts in, at the nodes: p, h, and the strains v and u that belong to it."""
+    """Initial shape of a rod at its nodes: p, h, and the strains v and u."""
 
     p: np.ndarray
     h: np.ndarray
@@ -102,7 +105,7 @@ class Shape(NamedTuple):
 
     @classmethod
     def of(cls, rod: Rod, segments: int) -> Shape:
-        """From the scenario's polyline; the rod starts without shear and, as the suite wants it, twist."""
+        """Return the shape of the scenario's polyline, without shear and, as the suite requires, twist."""
         points = np.asarray(rod.centerline, dtype=float)
         along = rod.rest_arc_length
         if along is None:
@@ -127,7 +130,7 @@ class Shape(NamedTuple):
 
 
 def _frames(rod: Rod, scenario: Scenario, times: np.ndarray, dt: float | None, n_elements: int) -> Any:
-    """Positions and directors of one rod at these times, in steps of dt or at rest."""
+    """Return positions and directors of one rod at these times, in steps of dt or at rest."""
     segments, newton = _segments(rod, scenario, n_elements, dt), _newton(rod, scenario)
     shape = Shape.of(rod, segments * n_elements)
     system = _system(rod, scenario, shape)
@@ -147,7 +150,7 @@ def _frames(rod: Rod, scenario: Scenario, times: np.ndarray, dt: float | None, n
 
 
 def _segments(rod: Rod, scenario: Scenario, n_elements: int, dt: float | None) -> int:
-    """Number of segments in an element, by the steepest exponential along the rod."""
+    """Return the number of segments in an element, from the steepest exponential along the rod."""
     EI = rod.material.youngs_modulus * rod.second_moment_of_area
     mass = rod.material.density * rod.area
     rate = math.sqrt(_pull(rod, scenario)) / rod.length
@@ -163,7 +166,7 @@ def _segments(rod: Rod, scenario: Scenario, n_elements: int, dt: float | None) -
 
 
 def _pull(rod: Rod, scenario: Scenario) -> float:
-    """The largest tension that its loads can give the rod, in EI / L²."""
+    """Return an upper bound of the tension in the rod by its loads, in EI / L²."""
     EI = rod.material.youngs_modulus * rod.second_moment_of_area
     weight = rod.material.density * rod.area * rod.length * np.linalg.norm(scenario.gravity)
     pull = weight + sum(np.linalg.norm(load.force) for load in rod.loads)
@@ -171,13 +174,13 @@ def _pull(rod: Rod, scenario: Scenario) -> float:
 
 
 def _newton(rod: Rod, scenario: Scenario) -> kc.NewtonOptions:
-    """Residuals as small beside the loads of a cable as they are, by default, beside EI / L²."""
+    """Return Newton's options with tolerances scaled by the loads if these exceed EI / L²."""
     usual, size = kc.NewtonOptions(), max(1.0, _pull(rod, scenario))
     return kc.NewtonOptions(tolerance=size * usual.tolerance, acceptable=size * usual.acceptable)
 
 
 def _drag_rate(scenario: Scenario) -> float:
-    """Drag over mass (1/s): that which damps the slowest vibration critically, or none."""
+    """Return drag over mass (1/s) for critical damping of the slowest vibration; zero in dynamics."""
     return 2.0 * scenario.slowest_frequency() if scenario.quasi_static else 0.0
 
 
@@ -185,7 +188,7 @@ def _drag_rate(scenario: Scenario) -> float:
 
 
 def _system(rod: Rod, scenario: Scenario, shape: Shape) -> kc.SlenderRod:
-    """The rod, unloaded straight along its first tangent."""
+    """Return the rod; unloaded, it is straight along its first tangent."""
     if rod.start is EndCondition.FREE and any(load.at is End.START for load in rod.loads):
         raise NotImplementedError("a load at a free start")
     force = np.sum([load.force for load in rod.loads if load.at is End.END] or np.zeros((1, 3)), axis=0)
@@ -206,7 +209,7 @@ def _system(rod: Rod, scenario: Scenario, shape: Shape) -> kc.SlenderRod:
 
 
 def _end(rod: Rod, which: End, p: np.ndarray, h: np.ndarray) -> Any:
-    """What holds the rod there."""
+    """Return the boundary condition at an end of the rod."""
     condition, motion = rod.condition(which), rod.motion(which)
     if condition is EndCondition.FREE:
         return kc.ends.Free()
@@ -222,7 +225,7 @@ def _end(rod: Rod, which: End, p: np.ndarray, h: np.ndarray) -> Any:
 
 
 def _axis(motion: Motion) -> str:
-    """The global axis that an end slides along."""
+    """Return the name of the global axis along which an end slides."""
     along = np.abs(motion.axis)
     if along.max() < 1.0 - 1e-12:
         raise NotImplementedError(f"an end that slides along {motion.slides_along}, no axis of the world")
@@ -232,7 +235,7 @@ def _axis(motion: Motion) -> str:
 def _motion(
     start: kc.Trajectory, rod: Rod, times: np.ndarray, dt: float, newton: kc.NewtonOptions
 ) -> np.ndarray:
-    """States at these times, in steps of dt."""
+    """Return the states at these times, in steps of dt."""
     steps = round(times[1] / dt)
     controls = _controls(rod, dt * (1.0 + np.arange(steps * (len(times) - 1))))
     states, going = [np.asarray(start.y)], start
@@ -246,7 +249,7 @@ def _motion(
 
 
 def _controls(rod: Rod, times: np.ndarray) -> np.ndarray:
-    """Displacement and rotation vector of each driven end at these times."""
+    """Return displacement and rotation vector of each driven end at these times."""
     found = [np.zeros((len(times), 0))]
     for end in End:
         motion = rod.motion(end)
@@ -259,7 +262,7 @@ def _controls(rod: Rod, times: np.ndarray) -> np.ndarray:
 
 
 def _directors(system: kc.SlenderRod, states: np.ndarray) -> np.ndarray:
-    """The material's first direction of each element: of its two nodes', what is across the element."""
+    """Return the first director of each element: the mean of its two nodes', normal to the element."""
     chord = np.diff(np.asarray(system.positions(states)), axis=1)
     chord /= np.linalg.norm(chord, axis=2, keepdims=True)
     h = np.asarray(system.quaternions(states))

@@ -1,7 +1,7 @@
-"""How much data learning needs: the cells of the paper's table from 5 to 30 rows, of one sine and of two.
+"""Study of data efficiency: the cells of the paper's table from 5 to 30 rows, of one sine and of two.
 
-With a knowledge, by the best preset and by the paper's; without any, by networks of the same size and by
-linear prediction. What has no knowledge does not see the imperfection: it has the same figures for every one.
+Methods with a nominal model are the best preset and the paper's. Methods without one are networks of the same
+size and linear prediction. The latter do not depend on the imperfection and have the same result for each.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from knode_cosserat.studies.methods import METHODS, Learned
 from knode_cosserat.studies.runner import Job, Product
 from knode_cosserat.trajectory import Trajectory
 
-#: rows of each sine that are learned from, the state at rest among them
+#: training rows of each sine, including the state at rest
 ROWS = (5, 10, 20, 30)
 #: the first sine alone, and both
 SINES = (1, 2)
@@ -31,12 +31,12 @@ SEEDS = 3
 
 
 def paper_alone(imperfect: System, training: Sequence[Trajectory], seeds: Sequence[int]) -> Learned:
-    """The paper's network and training, on a system that knows nothing."""
+    """Return the paper's network, trained on a system without physics."""
     return _without_knowledge(imperfect, training, FitConfig.paper(seed=tuple(seeds)))
 
 
 def network_alone(imperfect: System, training: Sequence[Trajectory], seeds: Sequence[int]) -> Learned:
-    """A network of that size without the paper's constraint, standardised, on a system that knows nothing."""
+    """Return a standardised, unconstrained network of the paper's size, on a system without physics."""
     return _without_knowledge(imperfect, training, FitConfig.network(seed=tuple(seeds), hidden=512))
 
 
@@ -52,22 +52,22 @@ Method = Callable[[System, Sequence[Trajectory], Sequence[int]], Learned]
 INFORMED: dict[str, Method] = {name: METHODS[name] for name in ("baseline", "paper", "best")}
 ALONE: dict[str, Method] = {"paper, no knowledge": paper_alone, "network, no knowledge": network_alone}
 LINEAR = "linear (DMDc)"
-#: by their names, in the order of the tables
+#: all methods by name, in the order of the tables
 ALL = (*INFORMED, *ALONE, LINEAR)
-#: what stands for all imperfections, of a method that sees none
+#: name for all imperfections, in cells of methods without a nominal model
 ANY = "any"
 
 
 def jobs(seeds: Sequence[int], rows: Sequence[int] = ROWS, methods: Sequence[str] | None = None) -> list[Job]:
-    """One job for each method, amount of data and, with a knowledge, imperfection.
+    """Return one job for each method, amount of data and, with a nominal model, imperfection.
 
     Args:
-        seeds: of the fits; the baseline and the linear prediction need none.
-        rows: of each sine.
-        methods: some of `ALL`, and all by default.
+        seeds: seeds of the fits; the baseline and the linear prediction need none.
+        rows: training rows of each sine.
+        methods: some of `ALL`; all by default.
 
     Raises:
-        ValueError: a method is not known.
+        ValueError: a method is unknown.
     """
     made = []
     for method in methods or ALL:
@@ -98,7 +98,7 @@ def _job(method: str, imperfection: str, changes: Any, amount: tuple[int, int], 
 
 
 def predict(settings: Any) -> Product:
-    """The cells of one method, imperfection and amount of data, under every control."""
+    """Return the cells of one method, imperfection and amount of data, under every control."""
     robot, dt, steps = load_robot(settings["robot"]), settings["dt"], settings["steps"]
     amount = {"sines": len(settings["training"]), "rows": settings["rows"]}
     training = [_moved(robot, control, settings["rows"], dt) for control in settings["training"]]
@@ -116,7 +116,7 @@ Predictor = Callable[[str], Any]
 
 
 def _predictors(imperfect: System, training: Sequence[Trajectory], settings: Any) -> dict[int, Predictor]:
-    """For each seed, what gives a prediction under a control, or why there is none."""
+    """Return for each seed a predictor under a control, or the reason why there is none."""
     dt, steps, method = settings["dt"], settings["steps"], settings["method"]
     if method == LINEAR:
         linear = linear_predictor(imperfect, training)
@@ -138,5 +138,5 @@ def _predictors(imperfect: System, training: Sequence[Trajectory], settings: Any
 
 
 def _moved(system: System, control: str, rows: int, dt: float) -> Trajectory:
-    """The first rows from rest on: the paper keeps as many as there are controls."""
+    """Return the first rows of a simulation from rest: as many as controls, as in the paper."""
     return simulate(system, controls.parse(control, rows, dt), dt, space="euler")[:rows]

@@ -1,4 +1,4 @@
-"""What is written of the study of data efficiency: tables, JSON and a figure of errors over rows."""
+"""Report of the study of data efficiency: tables, JSON and a figure of errors over rows."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from knode_cosserat.studies.report import Report, as_json, write_figures, write_
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: how each method is drawn: the number of its colour
+#: index of each method's colour
 COLOURS = {"best": 6, "paper": 0, "network, no knowledge": 3, "paper, no knowledge": 4, LINEAR: 2}
 #: without data: the baseline
 NONE = (0, 0)
@@ -32,10 +32,10 @@ def rerun(
     dask: str | None = None,
     progress: bool = False,
 ) -> Report:
-    """Run the study, or what is left of it, and write `data.md`, `data.json` and figures into the folder.
+    """Run the study's pending jobs and write `data.md`, `data.json` and figures into the folder.
 
     Args:
-        out: the folder; an earlier run on it is gone on with.
+        out: the folder; an earlier run in it is continued.
         seeds: whole numbers.
         rows: of each sine.
         methods: some of `data_efficiency.ALL`; all by default.
@@ -56,7 +56,7 @@ def rerun(
 
 
 def as_markdown(cells: Sequence[Any]) -> str:
-    """One table for each measure: a line for each case and method, a column for each amount of data."""
+    """Return one table per metric: a line per case and method, a column per amount of data."""
     amounts = sorted({(cell["sines"], cell["rows"]) for cell in cells} - {NONE})
     lines = dict.fromkeys((cell["imperfection"], cell["control"], cell["method"]) for cell in cells)
     parts = []
@@ -82,10 +82,10 @@ def as_markdown(cells: Sequence[Any]) -> str:
 
 
 def figure(cells: Sequence[Any], measure: str = "tip_dtw") -> Figure:
-    """Error over rows, a panel for each imperfection and control: one sine dashed, two in full.
+    """Return a figure of error over rows, a panel per imperfection and control: one sine dashed, two solid.
 
-    The line is the median over seeds, the band reaches from the least to the most. A cross at the upper edge
-    says that there no seed could be simulated. The baseline, which needs no data, is the grey line.
+    The line is the median over seeds, the band their range. A cross at the upper edge marks cases in which no
+    seed could be simulated. The baseline, which needs no data, is the grey line.
 
     Raises:
         ImportError: matplotlib is not installed.

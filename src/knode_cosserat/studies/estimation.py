@@ -1,4 +1,4 @@
-"""The study of state estimation: both methods on recordings of the virtual robot, whose states are known."""
+"""Study of state estimation: both methods on recordings of the virtual robot, whose states are known."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.studies.report import Report, as_json, write_figures, write_texts
 from knode_cosserat.trajectory import Trajectory
 
-#: what is recorded, by the names of the files
+#: recorded signals, by the names of the files
 SIGNALS = {"sine": "sine:1.0", "random": "random:0", "step": "step:4.4"}
 SECONDS, NODES = 12.0, 10
 METHODS: tuple[Method, ...] = ("paper", "best")
-#: whose balance and law n, m, v follow
+#: names of the robots whose balance and constitutive law give n, m and v
 TRUE, CRUDE = "the robot's own", "the paper's knowledge"
-#: what a table says of each quantity: title, factor, unit
+#: title, factor and unit of each quantity in a table
 QUANTITIES = {
     "p": ("position", 1e3, "mm"),
     "h": ("orientation", 1e3, "mrad"),
@@ -74,7 +74,7 @@ def rerun(out: Path, signals: Mapping[str, str] = SIGNALS, seed: int = 0) -> Rep
 
 
 def as_markdown(cells: Sequence[Mapping[str, Any]]) -> str:
-    """The errors: a table for each recording with the robot's own balance, and one with the knowledge's."""
+    """Return a table of errors for each recording with the true robot's balance, and the nominal model's."""
     noise = dataclasses.asdict(Sensors())
     known = {"p": np.sqrt(3) * noise["position_noise"], "h": np.sqrt(3) * noise["turn_noise"]}
     parts = [

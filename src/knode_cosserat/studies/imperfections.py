@@ -1,8 +1,8 @@
-"""Imperfections beyond the paper's four: truths that a wrong parameter does not explain, learned as blindly.
+"""Study of imperfections beyond the paper's four: true robots that no wrong parameter explains.
 
-As in the paper's study two short sines are all that is learned from, and no method is told what is wrong.
-What is predicted is half a minute of controls that were not seen, and two at twice the tension: far outside
-the data a model need not be better than the knowledge, but must not be worse.
+As in the paper's study the training data are two short sines, and no method gets the imperfection as input.
+The predictions are 30 s under held-out controls, and two controls at twice the tension. Far outside the
+training data a model need not be better than the nominal model, but must not be worse.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from knode_cosserat.trajectory import Trajectory
 ROBOT = "delrin-tendon-robot"
 #: time step (s)
 DT = 0.05
-#: steps that are predicted: 30 s
+#: predicted steps (30 s)
 STEPS = 600
 TRAINING = ("sine:0.5", "sine:1.0")
 TRAINING_ROWS = 30
@@ -41,7 +41,7 @@ CONTROLS = {
 }
 #: twice the tension of the training, and of the random control
 FAR = {"double sine": "sine:1.0,base=12,amplitude=2", "double random": "random:0,low=10,high=20"}
-#: the part of the baseline's error that may be left
+#: largest allowed ratio to the baseline's error
 LEFT = 0.05
 KINDS: dict[str, type[TendonRobot]] = {
     kind.__name__: kind
@@ -54,7 +54,7 @@ KINDS: dict[str, type[TendonRobot]] = {
 
 
 def _is(kind: str = "TendonRobot", **truth: Any) -> dict[str, Any]:
-    """The true robot: its class, and how its parameters differ from the knowledge's."""
+    """Return the true robot's settings: its class, and its parameters that differ from the nominal ones."""
     return {"kind": kind, "truth": truth}
 
 
@@ -109,11 +109,11 @@ IMPERFECTIONS = {**NAMED, **OTHERS}
 
 
 def jobs(names: Sequence[str], seeds: Sequence[int], **changes: Any) -> list[Job]:
-    """One job for each imperfection: the baseline and the best method under all controls.
+    """Return one job for each imperfection: the baseline and the best method under all controls.
 
     Args:
-        names: of `IMPERFECTIONS`.
-        seeds: of the fits.
+        names: some of `IMPERFECTIONS`.
+        seeds: seeds of the fits.
         changes: other settings than those of the study; see `settings`.
     """
     return [
@@ -123,14 +123,14 @@ def jobs(names: Sequence[str], seeds: Sequence[int], **changes: Any) -> list[Job
 
 
 def settings(name: str, seeds: Sequence[int], **changes: Any) -> dict[str, Any]:
-    """What a job is told; these may be changed.
+    """Return the settings of a job; these may be changed.
 
-    method               the name of one of `METHODS`
-    training, rows       controls that are learned from, and how many rows of each
+    method               name of one of `METHODS`
+    training, rows       training controls, and the number of rows of each
     training_dt, dt      time steps (s) of the training and of the predictions
-    steps, controls      of the predictions
-    space, nodes         scheme along the rod, and nodes
-    noise                on all that is learned from, as a part of how much each number varies
+    steps, controls      steps and controls of the predictions
+    space, nodes         scheme along the rod, and number of nodes
+    noise                noise on the training data, as a fraction of each value's variation
     """
     if name not in IMPERFECTIONS:
         raise ValueError(f"imperfection {name!r} is unknown; allowed is some of {', '.join(IMPERFECTIONS)}")
@@ -152,7 +152,7 @@ def settings(name: str, seeds: Sequence[int], **changes: Any) -> dict[str, Any]:
 
 
 def assess(settings: Any) -> Product:
-    """The cells of one imperfection: the knowledge alone and what was learned, under every control."""
+    """Return the cells of one imperfection: the nominal and the learned model, under every control."""
     knowledge: Any = load_robot(settings["robot"]).replace(nodes=settings["nodes"])
     truth = truths.extended(KINDS[settings["kind"]], knowledge, **settings["truth"])
     training, references = _truths(truth, settings)
@@ -168,7 +168,7 @@ def assess(settings: Any) -> Product:
 
 
 def _truths(truth: System, settings: Any) -> tuple[list[Trajectory], list[Trajectory | str]]:
-    """Trajectories to learn from, and those to be predicted."""
+    """Return the training trajectories and the reference trajectories."""
     training, asked = settings["training"], list(settings["controls"].values())
     if settings["training_dt"] == settings["dt"]:
         # one batch, so that one program is compiled
@@ -186,7 +186,7 @@ def _truths(truth: System, settings: Any) -> tuple[list[Trajectory], list[Trajec
 
 
 def with_noise(trajectory: Trajectory, level: float, seed: int) -> Trajectory:
-    """A trajectory with normal noise on y and z: a part of how much each number varies along rod and time."""
+    """Return a trajectory with normal noise on y and z, relative to each value's variation."""
     if level == 0.0:
         return trajectory
     draw = np.random.default_rng(seed)
@@ -197,7 +197,7 @@ def with_noise(trajectory: Trajectory, level: float, seed: int) -> Trajectory:
 
 
 def _moved(system: System, asked: Sequence[str], steps: int, dt: float, space: str) -> list[Trajectory | str]:
-    """Trajectories of as many rows as steps, or why there is none."""
+    """Return trajectories of as many rows as steps, or the reasons of failure."""
     tensions = np.stack([controls.parse(control, steps, dt) for control in asked])
     batch = simulate(system, tensions, dt, space=space, on_failure="return")
     return [

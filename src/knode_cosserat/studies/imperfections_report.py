@@ -1,4 +1,4 @@
-"""The study of further imperfections from its jobs to what is written: tables, JSON and a figure."""
+"""Report of the study of further imperfections: tables, JSON and a figure."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ def rerun(
     dask: str | None = None,
     progress: bool = False,
 ) -> Report:
-    """Run the study, or what is left of it, and write its tables and figure into the folder.
+    """Run the study's pending jobs and write its tables and figure into the folder.
 
     Args:
-        out: the folder; an earlier run on it is gone on with.
+        out: the folder; an earlier run in it is continued.
         seeds: whole numbers.
         names: some of `IMPERFECTIONS`; all by default.
         workers: see `runner.run`.
@@ -50,10 +50,10 @@ def rerun(
 
 
 def ratios(cells: Sequence[Mapping[str, Any]], measure: str) -> dict[tuple[str, str], float | None]:
-    """What of the baseline's error the worst seed leaves, by imperfection and control.
+    """Return the worst seed's error relative to the baseline's, by imperfection and control.
 
-    None where a seed could not be simulated. Where the baseline could not, but every seed could, it is zero;
-    where the truth could not, there is nothing.
+    The ratio is None if a seed could not be simulated. It is zero if only the baseline could not be
+    simulated. Cases whose true robot could not be simulated are left out.
     """
     of: dict[tuple[str, str], dict[bool, list[Any]]] = {}
     for cell in cells:
@@ -71,10 +71,10 @@ def ratios(cells: Sequence[Mapping[str, Any]], measure: str) -> dict[tuple[str, 
 
 
 def missed(cells: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
-    """The imperfections and controls under which the learned model is not as good as it should be.
+    """Return the imperfections and controls in which the learned model misses its target.
 
-    Under the study's controls `LEFT` of the baseline's error may be left, in both measures; at twice the
-    tension all of it.
+    The target is an error of at most `LEFT` times the baseline's in both metrics; at twice the tension it is
+    at most the baseline's error.
     """
     found = {measure: ratios(cells, measure) for measure in MEASURES}
     wrong = []
@@ -87,7 +87,7 @@ def missed(cells: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
 
 
 def as_markdown(cells: Sequence[Mapping[str, Any]]) -> str:
-    """One table for each measure, a line for each imperfection, and what is not as good as it should be."""
+    """Return one table per metric with a line per imperfection, and the missed targets."""
     names = list(dict.fromkeys(cell["imperfection"] for cell in cells))
     controls = list(dict.fromkeys(cell["control"] for cell in cells))
     wrong = missed(cells)
@@ -135,9 +135,9 @@ def _words(ratio: float | str | None, baseline: float | None) -> str:
 
 
 def figure(cells: Sequence[Mapping[str, Any]]) -> Figure:
-    """What is left of the baseline's error: a line for each imperfection, a point for each control.
+    """Return a figure of errors relative to the baseline's: a line per imperfection, a point per control.
 
-    A failure is a cross at the right edge; the dotted line is what is allowed.
+    A cross at the right edge is a failure; the dotted line is the target.
 
     Raises:
         ImportError: matplotlib is not installed.

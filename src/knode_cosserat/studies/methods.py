@@ -1,4 +1,4 @@
-"""What a study does with an imperfect model and a few trajectories: nothing, calibration, or learning."""
+"""Methods of the studies for an imperfect model and trajectories: none, calibration, or learning."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Trajectories = Sequence[Trajectory]
 
 @dataclasses.dataclass(frozen=True)
 class Learned:
-    """A system for each seed, or why there is none; and what it says of its fit (plain JSON values)."""
+    """System for each seed, or the reason of its failure, and facts on the fit (plain JSON values)."""
 
     systems: dict[int, System | str]
     #: the loss of every epoch, where there are epochs
@@ -29,12 +29,12 @@ class Learned:
 
 
 def baseline(imperfect: System, training: Trajectories, seeds: Sequence[int]) -> Learned:
-    """The imperfect model as it is."""
+    """Return the imperfect model unchanged."""
     return Learned({0: imperfect})
 
 
 def calibrated(imperfect: System, training: Trajectories, seeds: Sequence[int]) -> Learned:
-    """The imperfect model with all its parameters that the data determine; no residual."""
+    """Return the imperfect model with calibrated parameters, without a residual."""
     try:
         result = calibrate(imperfect, training)
     except CalibrationError as error:
@@ -49,12 +49,12 @@ def calibrated(imperfect: System, training: Trajectories, seeds: Sequence[int]) 
 
 
 def paper(imperfect: System, training: Trajectories, seeds: Sequence[int]) -> Learned:
-    """The paper's network and training."""
+    """Return the paper's network after the paper's training."""
     return _fitted(imperfect, training, FitConfig.paper(seed=tuple(seeds)))
 
 
 def best(imperfect: System, training: Trajectories, seeds: Sequence[int]) -> Learned:
-    """The best preset; seeds are random weights of the data's rows, for it has no chance of its own."""
+    """Return the best preset's model; seeds resample the data's rows, because the fit is deterministic."""
     return _fitted(imperfect, training, FitConfig(StructuredOptions(resample=True), seed=tuple(seeds)))
 
 
@@ -69,5 +69,5 @@ def _fitted(imperfect: System, training: Trajectories, config: FitConfig) -> Lea
 
 
 Method = Callable[[System, Trajectories, Sequence[int]], Learned]
-#: by their names, in the order of the table
+#: methods by name, in the order of the table
 METHODS: dict[str, Method] = {method.__name__: method for method in (baseline, paper, calibrated, best)}

@@ -1,7 +1,7 @@
-"""The paper's study of a real robot: what its recordings teach, and how well it is predicted then.
+"""The paper's study of a real robot: learning from recordings, and prediction of held-out ones.
 
-Some recordings are learned from; every other one in the folder is predicted from rest by its tensions alone,
-and compared with what motion capture saw. Everything that is chosen goes into the jobs as plain values.
+Every held-out recording in the folder is predicted from rest by its tensions alone, and compared with motion
+capture. All settings are passed to the jobs as plain values.
 """
 
 from __future__ import annotations
@@ -12,15 +12,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
-from knode_cosserat.evaluation.metrics import dtw_distance, pose_mse
-from knode_cosserat.learning.calibration.calibrate import Calibration, CalibrationError, calibrate
-from knode_cosserat.learning.calibration.identify import NAMES, identify
+from knode_cosserat.identification.evaluate import Evaluation, evaluate
+from knode_cosserat.identification.fit import fit as learn
+from knode_cosserat.identification.identify import IdentificationError, identify
+from knode_cosserat.learning.calibration.calibrate import CalibrationError, calibrate
 from knode_cosserat.learning.config import FitConfig
 from knode_cosserat.learning.files.model_file import encoded
 from knode_cosserat.learning.fit import fit
 from knode_cosserat.learning.knode import KNODE
+from knode_cosserat.learning.samples import DataError
 from knode_cosserat.learning.training.runs import FitError
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.estimation.estimate import estimate_states
@@ -29,27 +30,28 @@ from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
 from knode_cosserat.rods.robot_file import format_robot, load_robot, parse_robot
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.places import places_at, positions_at, quaternions_at
-from knode_cosserat.solvers.result import SimulationError
-from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.studies.runner import Job, Product, StudyError
 
 ROBOT = "delrin-tendon-robot"
+#: files in a folder of recordings that describe the robot, and its topics or columns
+OWN_ROBOT, OWN_CONFIG = "robot.yaml", "recording.yaml"
 #: time step of the comparison, and of the paper's models (s); the best model takes steps of a part of it
-DT, FINER = 0.05, 2
+DT, FINER = 0.05, 4
 #: schemes in arclength: of all models, and of the paper's
 SPACE, PAPER_SPACE = "lobatto2", "euler"
-#: what is learned from, if nothing else is said: the paper's two sines, and one random recording
+#: default training recordings: the paper's two sines, and one random recording
 TRAIN = ("sine_1p0", "sine_3p0", "rand_0")
 #: recordings of steps are compared from their beginning; all others rest for as long (s) first
 REST, STEPS = 1.0, "step"
+#: seconds that recovery may take in a prediction, where a model needs any
+RECOVERY = 2.0
 #: recordings whose names begin so are only in Dataset B
 RANDOM = "rand"
 ENDINGS = (".bag", ".mcap", ".db3", ".csv", ".parquet")
 
 
 class Window(NamedTuple):
-    """A recording, and the part of it that is looked at (s)."""
+    """Recording, and the part of it that is compared (s)."""
 
     path: str
     start: float
@@ -60,7 +62,7 @@ class Window(NamedTuple):
 
 
 def found(folder: Path) -> dict[str, Path]:
-    """The recordings in a folder by their names: bags and tables, and folders that are ROS 2 bags.
+    """Return the recordings in a folder by name: bags, tables, and folders of ROS 2 bags.
 
     Raises:
         StudyError: there are none, or two have the same name.
@@ -82,11 +84,17 @@ def found(folder: Path) -> dict[str, Path]:
     return by_name
 
 
+def described_in(folder: Path) -> dict[str, Path]:
+    """Return the files in a folder that describe its recordings: "robot" and "config", if there."""
+    usual = {"robot": folder / OWN_ROBOT, "config": folder / OWN_CONFIG}
+    return {what: path for what, path in usual.items() if path.is_file()}
+
+
 def chosen(names: Sequence[str], train: Sequence[str] | None) -> tuple[list[str], list[str]]:
-    """Which recordings are learned from, and which are predicted.
+    """Return the names of the training recordings and of the held-out ones.
 
     Raises:
-        StudyError: a name is not there, or nothing is left to predict.
+        StudyError: a name does not exist, or no held-out recording is left.
     """
     wanted = list(TRAIN if train is None else train)
     missing = [name for name in wanted if name not in names]
@@ -102,11 +110,11 @@ def chosen(names: Sequence[str], train: Sequence[str] | None) -> tuple[list[str]
 
 
 class Options(NamedTuple):
-    """What a study of recordings can be asked for."""
+    """Options of a study of recordings."""
 
     robot: str = ROBOT
     config: str | None = None
-    #: where the comparison begins (s); None: at `REST`, and at 0 for steps
+    #: start of the comparison (s); None: `REST`, and 0 for steps
     start: float | None = None
     seconds: float = 10.0
     seeds: int = 5
@@ -115,7 +123,7 @@ class Options(NamedTuple):
 def jobs(
     paths: Mapping[str, Path], train: Sequence[str], methods: Sequence[str], options: Options
 ) -> list[Job]:
-    """One job for each method, with all seeds and recordings, and one for what was measured."""
+    """Return one job for each method, with all seeds and recordings, and one for the measurements."""
     windows = {
         name: {
             "path": str(path.resolve()),
@@ -148,11 +156,11 @@ def _checksum(path: Path) -> str:
     return digest.hexdigest()
 
 
-# what was measured
+# measurements
 
 
 class _Read:
-    """The recordings of a job, each read once and only if it is needed."""
+    """Recordings of a job, each read once and only if needed."""
 
     def __init__(self, settings: Any):
         self._settings = settings
@@ -170,13 +178,13 @@ class _Read:
         return Window(it["path"], it["start"], it["seconds"])
 
     def rows(self, name: str, finer: int = 1) -> Measurements:
-        """The rows of a window: as many as the paper keeps, and the one after them. Finer ones with means."""
+        """Return the rows of a window: the paper's rows and one more. Finer rows have mean tensions."""
         _, start, seconds = self.window(name)
         return self[name].sampled(DT / finer, start, start + seconds, mean=finer > 1)
 
 
 def measured(settings: Any) -> Product:
-    """What was measured: paths of the tips, tensions, and where the robot came from."""
+    """Return the measurements: tip paths, tensions, and the origin of the recordings."""
     read = _Read(settings)
     facts: dict[str, Any] = {}
     for name in settings["recordings"]:
@@ -195,12 +203,12 @@ def measured(settings: Any) -> Product:
 
 
 def _compared(rows: Measurements, seconds: float) -> Measurements:
-    """The paper keeps the state at rest and those after all controls but the last."""
+    """Return the rows that the paper keeps: rest, and the states after all controls but the last."""
     return rows.rows(0, round(seconds / DT))
 
 
 def _plain(values: Any, digits: int) -> Any:
-    """As JSON has it; None for what is not known."""
+    """Return rounded values for JSON; None for values that are not finite."""
     plain = np.round(np.asarray(values, dtype=float), digits).astype(object)
     plain[~np.isfinite(np.asarray(values, dtype=float))] = None
     return plain.tolist()
@@ -210,14 +218,14 @@ def _plain(values: Any, digits: int) -> Any:
 
 
 class Learned(NamedTuple):
-    """A system for each seed, or why there is none."""
+    """System for each seed, or the reason of its failure."""
 
     systems: dict[int, System | str]
     #: steps of the model in one of the comparison, and its scheme in arclength
     finer: int = 1
     space: str = SPACE
     loss: Mapping[str, list[float]] = {}
-    #: what is told of the fit, a text
+    #: report of the fit, a text
     told: str = ""
 
 
@@ -247,48 +255,42 @@ def _paper(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence
 
 
 def _best(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence[int]) -> Learned:
-    return _identified(knowledge, train, read, None)
-
-
-def _no_vibration(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence[int]) -> Learned:
-    return _identified(knowledge, train, read, NAMES)
-
-
-def _no_memory(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence[int]) -> Learned:
-    return _identified(
-        knowledge, train, read, tuple(name for name in NAMES if not name.startswith("friction"))
-    )
-
-
-def _identified(
-    knowledge: System,
-    train: Sequence[str],
-    read: _Read,
-    names: tuple[str, ...] | None,
-) -> Learned:
-    return _found(lambda rows: identify(knowledge, rows, names, space=SPACE), train, read)
+    """Return the identified robot; identification is deterministic, so there is one seed."""
+    try:
+        found = identify(knowledge, [read.rows(name, FINER) for name in train], space=SPACE)
+    except IdentificationError as error:
+        return Learned({0: str(error)}, FINER)
+    return Learned({0: found.robot}, FINER, told=str(found))
 
 
 def _calibrated(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence[int]) -> Learned:
     names = ("youngs_modulus", "density", "bending_damping", "drag", "gravity")
-    return _found(
-        lambda rows: calibrate(knowledge, rows, names, by="rollouts", undetermined="keep", space=SPACE),
-        train,
-        read,
-    )
-
-
-def _found(
-    search: Callable[[list[Measurements]], Calibration],
-    train: Sequence[str],
-    read: _Read,
-) -> Learned:
-    """Return the model of a search; there is no chance in it: one seed."""
+    rows = [read.rows(name, FINER) for name in train]
     try:
-        calibration = search([read.rows(name, FINER) for name in train])
+        found = calibrate(knowledge, rows, names, by="rollouts", undetermined="keep", space=SPACE)
     except CalibrationError as error:
         return Learned({0: str(error)}, FINER)
-    return Learned({0: calibration.robot}, FINER, told=str(calibration))
+    return Learned({0: found.robot}, FINER, told=str(found))
+
+
+def _network(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence[int]) -> Learned:
+    """Return a passive network on the nominal model; its training is deterministic too."""
+    try:
+        model = learn(
+            knowledge, [read.rows(name, FINER) for name in train], FitConfig.network_recordings(), space=SPACE
+        )
+    except (FitError, DataError) as error:
+        return Learned({0: str(error)}, FINER)
+    return Learned({0: model}, FINER)
+
+
+def _residual(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence[int]) -> Learned:
+    """Return the identified robot, with a passive residual if this improves held-out recordings."""
+    try:
+        model = learn(knowledge, [read.rows(name, FINER) for name in train], space=SPACE)
+    except (IdentificationError, FitError, DataError) as error:
+        return Learned({0: str(error)}, FINER)
+    return Learned({0: model}, FINER, told="\n".join(f"- {step}" for step in model.about.facts["steps"]))
 
 
 #: those of the paper's Table II, and what of the best each part of it buys, which is without all later ones
@@ -297,10 +299,10 @@ METHODS: dict[str, Callable[[System, Sequence[str], _Read, Sequence[int]], Learn
     "baseline": _baseline,
     "paper-a": _paper_a,
     "paper-b": _paper,
+    "network": _network,
     "best": _best,
+    "residual": _residual,
     "calibrated": _calibrated,
-    "no-memory": _no_memory,
-    "no-vibration": _no_vibration,
 }
 
 
@@ -308,16 +310,20 @@ METHODS: dict[str, Callable[[System, Sequence[str], _Read, Sequence[int]], Learn
 
 
 def predicted(settings: Any) -> Product:
-    """A method's figures for every recording, from every seed."""
+    """Return a method's metrics for every recording and seed."""
     read, knowledge = _Read(settings), parse_robot(settings["robot"], "the robot")
     method = settings["method"]
     learned = METHODS[method](knowledge, settings["train"], read, settings["seeds"])
     cells: list[dict[str, Any]] = []
     tips: dict[str, Any] = {}
+    outcomes = {
+        seed: _outcomes(system, read, settings["recordings"], learned)
+        for seed, system in learned.systems.items()
+    }
     for name in settings["recordings"]:
-        for seed, system in learned.systems.items():
-            outcome = _outcome(system, read, name, learned.finer, learned.space)
-            cells.append({"recording": name, "method": method, "seed": seed, **outcome.figures})
+        for seed in learned.systems:
+            outcome = outcomes[seed][name]
+            cells.append({"recording": name, "method": method, "seed": seed, **outcome.to_dict()})
             if outcome.tip is not None:
                 tips.setdefault(name, _plain(outcome.tip, 6))
     files = {}
@@ -331,41 +337,33 @@ def predicted(settings: Any) -> Product:
     return Product(facts, files)
 
 
-class _Outcome(NamedTuple):
-    figures: dict[str, Any]
-    tip: Float[np.ndarray, "T 3"] | None
+def _outcomes(
+    system: System | str, read: _Read, names: Sequence[str], learned: Learned
+) -> dict[str, Evaluation]:
+    """Return a model's metrics for all recordings.
+
+    The first attempt has no recovery from failed steps, because its compilation is slow. Failed recordings
+    are repeated with recovery. A learned model is not repeated if it fails on all recordings, or once
+    recovery has not helped.
+    """
+    found = {name: _outcome(system, read, name, learned, 0.0) for name in names}
+    failed = [name for name in names if found[name].failed is not None]
+    impatient = isinstance(system, str | KNODE)
+    if impatient and len(failed) == len(found):
+        return found
+    for name in failed:
+        found[name] = _outcome(system, read, name, learned, RECOVERY)
+        if impatient and found[name].failed is not None:
+            break
+    return found
 
 
-class _Poses(NamedTuple):
-    position: Float[np.ndarray, "T M 3"]
-    quaternion: Float[np.ndarray, "T M 4"]
-
-
-def _outcome(system: System | str, read: _Read, name: str, finer: int, space: str) -> _Outcome:
-    """Return the three figures over the rows in which everything was seen, or the cause of a failure."""
-    none = {"tip_dtw": None, "pose_mse": None, "tip_rmse": None}
+def _outcome(system: System | str, read: _Read, name: str, learned: Learned, recovery: float) -> Evaluation:
+    """Return a model's metrics for a recording, or the cause of a failure."""
     if isinstance(system, str):
-        return _Outcome({**none, "failed": system}, None)
-    driven = read.rows(name, finer)
-    rows = _compared(read.rows(name), read.window(name).seconds)
-    try:
-        trajectory = simulate(system, driven.tension[:-1], driven.dt, space=space)
-    except SimulationError as error:
-        return _Outcome({**none, "failed": str(error)}, None)
-    y = np.asarray(trajectory.y)[::finer][: len(rows.time)]
-    places = places_at(rows.fractions, system.nodes)
-    position, quaternion = (np.asarray(part(system, y, places)) for part in (positions_at, quaternions_at))
-    known = rows.complete
-    off = position[known, -1] - rows.position[known, -1]
-    figures: dict[str, Any] = {
-        "tip_dtw": dtw_distance(position[known, -1], rows.position[known, -1]),
-        "pose_mse": None,
-        "tip_rmse": float(np.sqrt(np.mean(np.sum(off**2, axis=1)))),
-    }
-    turned = np.isfinite(rows.quaternion).all(axis=(1, 2)) & known
-    if turned.any():
-        figures["pose_mse"] = pose_mse(
-            _Poses(position[turned], quaternion[turned]),
-            _Poses(rows.position[turned], rows.quaternion[turned]),
-        )
-    return _Outcome(figures, position[:, -1])
+        return Evaluation(failed=system)
+    rows = round(read.window(name).seconds / DT)
+    return evaluate(
+        system, read.rows(name, learned.finer), every=learned.finer, last=rows, space=learned.space,
+        recovery=recovery,
+    )  # fmt: skip

@@ -1,4 +1,4 @@
-"""The recordings' study from its jobs to what is written: Table II, and figures."""
+"""Report of the recordings' study: Table II and figures."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from knode_cosserat.studies.report import Report, as_json, write_figures, write_
 Facts = Mapping[str, Mapping[str, Any]]
 Cells = Sequence[Mapping[str, Any]]
 
-#: the figures, as in a cell and as a title, and by what a cell's is multiplied
+#: the metrics: key in a cell, title, and factor of the cell's value
 MEASURES = {
     "tip_dtw": ("Tip DTW [m]", 1.0),
     "pose_mse": ("Pose MSE [1e-3]", 1.0),
@@ -46,12 +46,12 @@ def rerun(
     """Learn from some recordings of a folder, predict the others, and write Table II and its figures.
 
     Args:
-        out: where to; an earlier run on it is gone on with.
-        folder: bags and tables.
-        train: names (without endings) of those that are learned from; None: the paper's.
-        methods: some of those in `recordings.METHODS`.
+        out: the output folder; an earlier run in it is continued.
+        folder: the folder of bags and tables.
+        train: names (without suffixes) of the training recordings; None: the paper's.
+        methods: some of `recordings.METHODS`.
         options: see `recordings.Options`.
-        simulated: whether the robot was simulated; None: what the recordings say.
+        simulated: True if the robot was simulated; None: as stated by the recordings.
         workers: see `runner.run`.
         dask: see `runner.run`.
         progress: show a progress bar.
@@ -78,7 +78,7 @@ def rerun(
 
 
 def _said(measured: Mapping[str, Any], simulated: bool | None) -> str:
-    """Where the recordings come from, plainly."""
+    """Return a sentence that states if the recordings are of a simulated or a physical robot."""
     said = {it["simulated"] for it in measured.values()} if simulated is None else {simulated}
     if said == {True}:
         return "**These recordings are of a simulated robot, not of a physical one.**"
@@ -96,7 +96,7 @@ def _said(measured: Mapping[str, Any], simulated: bool | None) -> str:
 
 
 def as_markdown(cells: Cells, seen: Cells, facts: Facts, methods: Sequence[str], said: str) -> str:
-    """A table for each figure, improvements below, and what was found."""
+    """Return a table for each metric, the improvements, and the reports of the fits."""
     trained = ", ".join(dict.fromkeys(cell["recording"] for cell in seen))
     parts = [
         "# Table II: recordings that were not learned from",
@@ -133,7 +133,7 @@ def _spread(cells: Cells, recording: str, method: str, measure: str, factor: flo
 
 
 def table_of(cells: Cells, measure: str, factor: float, methods: Sequence[str]) -> str:
-    """One figure of all recordings by all methods, in Markdown."""
+    """Return a Markdown table of one metric for all recordings and methods."""
     rows = []
     for name in dict.fromkeys(cell["recording"] for cell in cells):
         base = _spread(cells, name, "baseline", measure, factor).mean
@@ -149,12 +149,12 @@ def table_of(cells: Cells, measure: str, factor: float, methods: Sequence[str]) 
 
 
 def _in_percent(part: float) -> str:
-    """Whole percents, but where these would say that nothing is left."""
+    """Return a fraction as text in whole percent, with one decimal above 99.5 %."""
     return f"{100.0 * part:.0f} %" if part < 0.995 else f"{100.0 * part:.1f} %"
 
 
 def _gains(cells: Cells, methods: Sequence[str]) -> dict[str, float]:
-    """By method the mean over recordings and both figures; a method that failed somewhere has none."""
+    """Return each method's mean improvement over recordings and both metrics; failed methods have none."""
     found: dict[str, float] = {}
     names = list(dict.fromkeys(cell["recording"] for cell in cells))
     for method in methods:
@@ -185,7 +185,7 @@ def _mended(facts: Facts) -> list[str]:
 
 
 def draw(facts: Facts, methods: Sequence[str], names: Sequence[str], out: Path) -> list[Path]:
-    """Tensions, paths, x of the tips, error over the horizon; losses and repetitions if there are any."""
+    """Write figures of tensions, paths, tip x, error over the horizon, and losses and repetitions if any."""
     seen = {name: _predicted(facts, methods, name) for name in names}
     drawn = {
         "tensions": table_two_figures.tensions(seen),
@@ -215,7 +215,7 @@ def _predicted(facts: Facts, methods: Sequence[str], name: str) -> Predicted:
 
 
 def repetitions(recordings: Mapping[str, Predicted]) -> dict[str, list[np.ndarray]]:
-    """Tips of the recordings whose commands are the same, by the first one's name."""
+    """Return the tips of recordings with equal commands, by the first recording's name."""
     groups: list[list[str]] = []
     for name, it in recordings.items():
         for group in groups:

@@ -1,4 +1,4 @@
-"""What every study writes: a table as text, its cells as JSON, figures."""
+"""Output of every study: a table as text, its cells as JSON, and figures."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class Report(NamedTuple):
-    """What a study found, and the files that tell it; the first table is in Markdown."""
+    """Results of a study and its files; the first table is in Markdown."""
 
     cells: Sequence[Mapping[str, Any]]
     tables: list[Path]
@@ -22,12 +22,12 @@ class Report(NamedTuple):
 
 
 def as_json(cells: Sequence[Mapping[str, Any]]) -> str:
-    """A list with one cell a line."""
+    """Return a JSON list with one cell per line."""
     return "[\n" + ",\n".join(json.dumps(cell, allow_nan=False) for cell in cells) + "\n]\n"
 
 
 def write_texts(out: Path, texts: Mapping[str, str]) -> list[Path]:
-    """Files of these names, each whole or not at all."""
+    """Write texts to files by name, each atomically, and return their paths."""
     for name, text in texts.items():
         with replacing(out / name) as temporary:
             temporary.write_text(text, encoding="utf-8")
@@ -35,7 +35,7 @@ def write_texts(out: Path, texts: Mapping[str, str]) -> list[Path]:
 
 
 def write_figures(out: Path, figures: Mapping[str, Figure]) -> list[Path]:
-    """OUT/figures/NAME.png for each."""
+    """Write each figure to OUT/figures/NAME.png and return the paths."""
     (out / "figures").mkdir(exist_ok=True)
     paths = [out / "figures" / f"{name}.png" for name in figures]
     for path, figure in zip(paths, figures.values(), strict=True):

@@ -1,8 +1,8 @@
-"""Jobs that may be interrupted: what each gives is kept as soon as it is there, and not computed again.
+"""Runner of interruptible jobs: each result is stored when it is complete, and not computed again.
 
-A job is a function of plain settings. What it gives is written under its key to OUT/jobs, whole or not at
-all, with a mark of everything that it depends on: the job, its settings, and the code and packages that ran.
-Another run on the same folder takes what has the right mark and does the rest, here or on a Dask cluster.
+A job is a function of plain settings. Its result is written atomically under its key to OUT/jobs, with a mark
+of everything that it depends on: the job, its settings, and the versions of code and packages. Another run in
+the same folder reuses results with the right mark and computes the others, here or on a Dask cluster.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ PATIENCE = 60
 
 
 class StudyError(ValueError):
-    """A study cannot be run as asked, or went wrong in a way that running it again may cure; one line."""
+    """Error for a study that cannot be run, or that may succeed when run again; the message is one line."""
 
 
 class Product(NamedTuple):
-    """What a job gives: facts (plain JSON values), and files by their paths within the study's folder."""
+    """Result of a job: facts (plain JSON values), and files by their paths within the study's folder."""
 
     facts: dict[str, Any]
     files: dict[str, bytes]
@@ -48,7 +48,7 @@ class Product(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """A key that can be a file's name, a function of a module, and its settings (plain JSON values)."""
+    """Job: a key that is a valid file name, a function of a module, and its settings (plain JSON values)."""
 
     key: str
     work: Callable[[Any], Product]
@@ -63,11 +63,11 @@ def run(
     dask: str | None = None,
     progress: bool = False,
 ) -> dict[str, dict[str, Any]]:
-    """The facts of all jobs by their keys, in their order; those already in the folder are not run again.
+    """Run all jobs without a stored result and return the facts of all jobs by key, in their order.
 
     Args:
-        jobs: any order; none may need another's result.
-        out: the study's folder; it is made if it is not there.
+        jobs: independent jobs in any order.
+        out: the study's folder; it is created if missing.
         workers: processes on this machine; 1: this one. By default one for every four cores: each has to
             compile its own programs, and a job keeps more than one core busy.
         dask: the address of a scheduler, to run the jobs on its workers instead.
@@ -93,12 +93,12 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-# what is kept
+# stored results
 
 
 @functools.cache
 def made_by() -> dict[str, str]:
-    """What runs here: versions of packages, and a checksum of this package's files."""
+    """Return the versions of packages and a checksum of this package's files."""
     folder = Path(knode_cosserat.__file__).parent
     digest = hashlib.sha256()
     for file in sorted(folder.rglob("*")):
@@ -116,7 +116,7 @@ def _mark(job: Job) -> str:
 
 
 def _kept(job: Job, out: Path) -> dict[str, Any] | None:
-    """What an earlier run kept of a job, if it is whole and still what the job would give."""
+    """Return the stored result of a job if it is complete and its mark is current, else None."""
     try:
         record = json.loads((out / "jobs" / f"{job.key}.json").read_text(encoding="utf-8"))
         if record["mark"] != _mark(job):
@@ -126,7 +126,7 @@ def _kept(job: Job, out: Path) -> dict[str, Any] | None:
                 return None
         return dict(record["facts"])
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return None  # not there, or not what a run of this writes
+        return None  # missing, or not written by this runner
 
 
 def _keep(job: Job, done: _Done, out: Path) -> dict[str, Any]:
@@ -179,7 +179,7 @@ def _require_same_code(other: dict[str, str]) -> None:
 
 
 def _ran(jobs: Sequence[Job], workers: int, dask: str | None) -> Iterator[tuple[Job, _Done]]:
-    """The jobs as they end."""
+    """Return an iterator of the jobs in order of completion."""
     if not jobs:
         return iter(())
     if dask is not None:
@@ -209,7 +209,7 @@ def _in_processes(jobs: Sequence[Job], workers: int) -> Iterator[tuple[Job, _Don
 
 
 def _end_with_parent() -> None:
-    """Who is waiting for jobs would not notice that nobody is there any more to give one."""
+    """End this worker with its parent: a worker that waits for jobs does not notice the parent's end."""
     parent = multiprocessing.parent_process()
 
     def watch() -> None:

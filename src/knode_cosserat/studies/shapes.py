@@ -1,4 +1,4 @@
-"""States of a rod that rests in a given shape, to start from."""
+"""Initial states of a rod at rest in a given shape."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def resting(
     v: Float[np.ndarray, "nodes 3"],
     u: Float[np.ndarray, "nodes 3"],
 ) -> Trajectory:
-    """A trajectory of one row, to be the `initial` of a simulation or of an equilibrium.
+    """Return a trajectory of one row, for the `initial` of a simulation or of an equilibrium.
 
     Args:
         system: the rod, whose material law gives n and m; its sections are taken to be all alike.

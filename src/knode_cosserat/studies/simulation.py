@@ -1,8 +1,8 @@
-"""The paper's simulation study: a robot, four imperfect models of it, and what learning makes of them.
+"""The paper's simulation study: a robot, four imperfect models of it, and learned corrections.
 
-Everything that is chosen stands here as data, and goes into the jobs as plain values. Each imperfect model
+All settings are data in this module, and are passed to the jobs as plain values. Each imperfect model
 learns from two short sines of the true robot, by each method, from several seeds at once; no method is told
-which imperfection it faces. It then predicts a sine and a step that it has not seen.
+which imperfection it faces. It then predicts a held-out sine and a held-out step.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ IMPERFECTIONS: dict[str, dict[str, Any]] = {
 }
 SEEDS = 5
 
-#: Table I of the paper, and what one seed of the same method gives when it is rerun (tip DTW, then pose MSE).
+#: Table I of the paper, and a rerun of the same method with one seed (tip DTW, then pose MSE).
 #: The baseline of self-weight under the step was published from a solve that had not converged; see NOTES.
 PUBLISHED = {
     ("self-weight", "sine"): Published((1.75, 0.09), (0.00, 0.00), (0.00, 0.00)),
@@ -82,7 +82,7 @@ def jobs(seeds: Sequence[int], methods: Sequence[str]) -> list[Job]:
 
 
 def reference(settings: Any) -> Product:
-    """The true robot under the controls of the evaluation."""
+    """Return the true robot's motions under the controls of the evaluation."""
     kept = _Kept()
     robot = load_robot(settings["robot"])
     for name, control in settings["controls"].items():
@@ -91,7 +91,7 @@ def reference(settings: Any) -> Product:
 
 
 def predict(settings: Any) -> Product:
-    """The cells of one imperfection and method: fitted from every seed, under every control."""
+    """Return the cells of one imperfection and method: every seed under every control."""
     robot, dt = load_robot(settings["robot"]), settings["dt"]
     imperfection, method = settings["imperfection"], settings["method"]
     training = [_moved(robot, control, settings["training_rows"], dt) for control in settings["training"]]
@@ -114,7 +114,7 @@ def predict(settings: Any) -> Product:
 
 
 class _Kept:
-    """The files of a job, and which trajectories are among them, by their controls."""
+    """Files of a job, and the names of its trajectories by control."""
 
     def __init__(self) -> None:
         self.files: dict[str, bytes] = {}
@@ -137,7 +137,7 @@ class _Outcome(NamedTuple):
 
 
 def _outcome(system: System | str, truth: Trajectory, control: str, settings: Any) -> _Outcome:
-    """The two figures, or why there are none."""
+    """Return the two metrics, or the reason of a failure."""
     if isinstance(system, str):
         return _Outcome({"tip_dtw": None, "pose_mse": None, "failed": system}, None)
     try:
@@ -150,5 +150,5 @@ def _outcome(system: System | str, truth: Trajectory, control: str, settings: An
 
 
 def _moved(system: System, control: str, rows: int, dt: float) -> Trajectory:
-    """The first rows from rest on: the paper keeps as many as there are controls."""
+    """Return the first rows of a simulation from rest: as many as controls, as in the paper."""
     return simulate(system, controls.parse(control, rows, dt), dt, space="euler")[:rows]

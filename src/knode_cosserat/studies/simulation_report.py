@@ -1,4 +1,4 @@
-"""The simulation study from its jobs to what is written: the table as Markdown, CSV and JSON, and figures."""
+"""Report of the simulation study: the table as Markdown, CSV and JSON, and figures."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ def rerun(
     dask: str | None = None,
     progress: bool = False,
 ) -> Report:
-    """Run the study, or what is left of it, and write its table and figures into the folder.
+    """Run the study's pending jobs and write its table and figures into the folder.
 
     Args:
-        out: the folder; an earlier run on it is gone on with.
+        out: the folder; an earlier run in it is continued.
         seeds: whole numbers.
         methods: some of those in `methods.METHODS`.
         workers: see `runner.run`.
@@ -45,7 +45,7 @@ def rerun(
 
 
 def cells_of(facts: Facts) -> list[Cell]:
-    """All cells of the jobs in the order of the paper's table: control, imperfection, method, seed."""
+    """Return all cells of the jobs in the order of the paper's table: control, imperfection, method, seed."""
     cells = [cell for each in facts.values() for cell in each["cells"]]
     controls, imperfections = list(simulation.CONTROLS), list(simulation.IMPERFECTIONS)
     return sorted(
@@ -54,7 +54,7 @@ def cells_of(facts: Facts) -> list[Cell]:
 
 
 def write_table(cells: Sequence[Cell], out: Path) -> list[Path]:
-    """`table1.md`, `table1.csv` and `table1.json`."""
+    """Write `table1.md`, `table1.csv` and `table1.json`."""
     return write_texts(
         out,
         {
@@ -66,7 +66,7 @@ def write_table(cells: Sequence[Cell], out: Path) -> list[Path]:
 
 
 def draw(facts: Facts, methods: Sequence[str], out: Path) -> list[Path]:
-    """The figures, in OUT/figures: controls, shapes and tips of the first seed, losses of all."""
+    """Write figures to OUT/figures: controls, shapes and tips of the first seed, losses of all."""
     truths = _trajectories(facts[simulation.REFERENCE], out)
     drawn = {"controls": study_figures.controls(truths)}
     for imperfection in simulation.IMPERFECTIONS:

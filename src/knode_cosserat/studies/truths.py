@@ -1,7 +1,7 @@
-"""Robots with physics that the package's own robot does not have: what a model of it may be wrong about.
+"""Robots with physics beyond the nominal robot: the true robots of the study of imperfections.
 
-Each is the paper's robot (`TendonRobot`) with one thing more. They play the truth in the study of
-imperfections: a residual on a `TendonRobot` has to learn what is more here from trajectories alone.
+Each is the paper's robot (`TendonRobot`) with one additional effect. A residual on a `TendonRobot` has to
+learn this effect from trajectories alone.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Robot = TypeVar("Robot", bound=TendonRobot)
 
 
 def extended(kind: type[Robot], robot: TendonRobot, **more: Any) -> Robot:
-    """A robot of the given class with another's parameters, and those that only the class has."""
+    """Return a robot of the given class with another robot's parameters and the class's own ones."""
     own = {name: getattr(robot, name) for name in robot.parameters() if name in kind.parameters()}
     return kind(**{**own, "nodes": robot.nodes, **more})
 
@@ -50,7 +50,7 @@ class CurvedMaterial(TendonRobot):
     def strains(
         self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> Float[Any, " z"]:
-        """v of the linear law, and u of this one; NaN if that could not be solved."""
+        """Return v of the linear law and u of this law; NaN if Newton's method fails."""
         z = super().strains(s, t, y, control, history)
         v, u_linear = self.z_layout.split(z)
         hu = self.z_layout.get(history.z, "u")
@@ -59,12 +59,12 @@ class CurvedMaterial(TendonRobot):
         u = _solved(jax.lax.stop_gradient(given))
         return jnp.concatenate([v, u + _correction(given, u)])
 
-    # what is not linear in z has no general form
+    # a law that is not linear in z has no general form
     constitutive = System.constitutive
 
 
 def _left(given: Any, u: Any) -> Any:
-    """What the two sides of the law for u differ by (N·m)."""
+    """Return the residual of the constitutive law for u (N·m)."""
     robot, c0, u_linear, hu = given
     K = robot.Kbt + c0 * robot.bending_damping
     return dot(K, u - u_linear) + robot.extra_moment(u, c0 * u + hu)
@@ -75,7 +75,7 @@ def _correction(given: Any, u: Any) -> Any:
 
 
 def _solved(given: Any) -> Any:
-    """u by Newton's method, each correction as much as helps most; NaN if that does not solve it."""
+    """Return u by Newton's method with a line search; NaN if it does not converge."""
     robot, c0, u_linear, hu = given
     own = jnp.abs(dot(robot.Kbt, u_linear)) + c0 * jnp.abs(dot(robot.bending_damping, u_linear))
     size = jnp.max(own + jnp.abs(dot(robot.bending_damping, hu)))
@@ -114,7 +114,7 @@ class Stiffening(CurvedMaterial):
     law: Stiffness = eqx.field(static=True, default="square")
 
     def extra_moment(self, u: Float[Any, "3"], u_t: Float[Any, "3"]) -> Float[Any, "3"]:
-        """What is above Kbt u."""
+        """Return the moment in excess of Kbt u (N·m)."""
         x = u / self.curvature
         square = jnp.sum(x * x)
         # the square root of zero has no derivative
@@ -132,7 +132,7 @@ class Stiffening(CurvedMaterial):
 
 
 class Precurved(CurvedMaterial):
-    """A rod that would like to be bent, and is not at the start: a constant moment in the material."""
+    """Rod with an intrinsic curvature but a straight initial state: a constant moment in the material."""
 
     rest_curvature: Any = parameter(
         "1/m", "curvature of the unloaded rod", shape="vector", low=-1e3, high=1e3, default=(0.2, -0.1, 0.0)
@@ -157,11 +157,11 @@ class Tapered(TendonRobot):
     def strains(
         self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> Float[Any, " z"]:
-        """Those of a rod with the modulus at s."""
+        """Return the strains of a rod with the modulus at s."""
         return self._there(s).strains(s, t, y, control, history)
 
     def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
-        """That of a rod with the modulus at s."""
+        """Return the constitutive law of a rod with the modulus at s."""
         return self._there(s).constitutive(s, t, y, y_t, control)
 
 
@@ -171,10 +171,10 @@ Rubbing = Literal["each axis", "isotropic", "stribeck"]
 
 
 def rubbing(law: Rubbing, rate: Float[Any, "3"], least: Any) -> Float[Any, "3"]:
-    """The direction and, of about one, the size of what friction opposes to a rate.
+    """Return the normalised friction against a rate.
 
-    "each axis" is tanh of every number over `least`; "isotropic" points along the rate and levels off where
-    that is beyond `least`; "stribeck" is that, and half as much again while it moves slowly.
+    "each axis" is tanh of every component over `least`. "isotropic" points along the rate and saturates
+    beyond `least`. "stribeck" is "isotropic", increased by half at slow rates.
     """
     if law == "each axis":
         return jnp.tanh(rate / least)
@@ -193,7 +193,7 @@ class InternalFriction(CurvedMaterial):
     law: Rubbing = eqx.field(static=True, default="each axis")
 
     def extra_moment(self, u: Float[Any, "3"], u_t: Float[Any, "3"]) -> Float[Any, "3"]:
-        """Against the rate of the curvature."""
+        """Return the friction's moment, which opposes the rate of the curvature (N·m)."""
         return self.friction * rubbing(self.law, u_t, self.least)
 
 
@@ -205,7 +205,7 @@ class ExternalFriction(TendonRobot):
     law: Rubbing = eqx.field(static=True, default="each axis")
 
     def spatial_rates(self, s, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
-        """With what this robot has beside."""
+        """Return the rates with this robot's additional effect."""
         y_s = super().spatial_rates(s, y, y_t, z, z_t, control)
         R = rotation_matrix(self.y_layout.get(y, "h"))
         moment = self.friction * rubbing(self.law, self.y_layout.get(y, "w"), self.least)
@@ -224,7 +224,7 @@ class Wind(TendonRobot):
     )  # fmt: skip
 
     def spatial_rates(self, s, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
-        """With what this robot has beside."""
+        """Return the rates with this robot's additional effect."""
         y_s = super().spatial_rates(s, y, y_t, z, z_t, control)
         R, q = rotation_matrix(self.y_layout.get(y, "h")), self.y_layout.get(y, "q")
         relative = q - dot(R.T, jnp.asarray(self.wind))
@@ -238,7 +238,7 @@ class TurningTendons(TendonRobot):
     turning: Any = parameter("", "part of the tendons' force that turns", low=0.0, high=1.0, default=1.0)
 
     def spatial_rates(self, s, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
-        """With what this robot has beside."""
+        """Return the rates with this robot's additional effect."""
         y_s = super().spatial_rates(s, y, y_t, z, z_t, control)
         f = self.actuation(control)
         turned = dot(rotation_matrix(self.y_layout.get(y, "h")), f)
@@ -253,11 +253,11 @@ class FadingTendons(TendonRobot):
     def rates(
         self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
     ) -> Float[Any, " y"]:
-        """Those of the tension that is left at s."""
+        """Return the rates under the tension remaining at s."""
         return super().rates(s, t, y, z, jnp.asarray(control) * jnp.exp(-self.loss * s), history)
 
     def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
-        """That of the tension that is left at s."""
+        """Return the balance under the tension remaining at s."""
         return super().balance(s, t, y, y_t, z, z_t, jnp.asarray(control) * jnp.exp(-self.loss * s))
 
 
@@ -272,7 +272,7 @@ class LoadedTip(TendonRobot):
         """Force (N) and moment (N·m) on the tip, in the global frame; R turns the material's into it."""
 
     def tip(self, t: Any, control: Any, y: Float[Any, " y"], history: History) -> Float[Any, " k"]:
-        """n and m at the tip are the load there."""
+        """Return the boundary condition's residual: n and m at the tip equal the load."""
         R = rotation_matrix(self.y_layout.get(y, "h"))
         load = self.load_at_tip(R, y, history.c0 * y + history.y)
         return super().tip(t, control, y, history) + jnp.concatenate(load)
@@ -291,7 +291,7 @@ class TipMass(LoadedTip):
     )  # fmt: skip
 
     def load_at_tip(self, R: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> tuple[Any, Any]:
-        """What moves the body, with the sign turned, and its weight."""
+        """Return the body's weight minus its inertia force, and the moment about the tip."""
         part = self.y_layout.get
         q, w, q_t, w_t = part(y, "q"), part(y, "w"), part(y_t, "q"), part(y_t, "w")
         offset, J = jnp.asarray(self.tip_offset), jnp.asarray(self.tip_inertia)
@@ -312,18 +312,18 @@ class FollowerLoad(LoadedTip):
     )
 
     def load_at_tip(self, R: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> tuple[Any, Any]:
-        """Both, turned."""
+        """Return force and moment, rotated to the global frame."""
         return dot(R, jnp.asarray(self.tip_force)), dot(R, jnp.asarray(self.tip_moment))
 
 
 class TipFriction(LoadedTip):
-    """A force against the tip's velocity and a moment against its turning."""
+    """Robot with a friction force against the tip's velocity."""
 
     tip_friction: Any = parameter("N", "force of the friction", low=0.0, high=1e3, default=0.05)
     least: Any = parameter("m/s", "velocity from which it is full", low=1e-9, high=1e6, default=0.1)
     law: Rubbing = eqx.field(static=True, default="each axis")
 
     def load_at_tip(self, R: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> tuple[Any, Any]:
-        """The force alone: a point has no moment."""
+        """Return the friction force and a zero moment."""
         force = -self.tip_friction * rubbing(self.law, self.y_layout.get(y, "q"), self.least)
         return dot(R, force), np.zeros(3)

@@ -21,7 +21,7 @@ MODULES = {
         for name in ("app", "data", "live", "plots", "robot", "stage", "tube")
     },
 }
-#: what the page may do: nothing over the network, but for the live mode to its own server
+#: security policy of the page: no network access, except to its own server in the live mode
 _POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' data:; style-src 'unsafe-inline'; img-src data:; "
     "base-uri 'none'; form-action 'none'; connect-src "

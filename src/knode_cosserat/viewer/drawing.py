@@ -1,4 +1,4 @@
-"""What of a system is drawn beside its states: radii, tendons, ribs, obstacles, and its fields."""
+"""Drawing data of a system beside its states: radii, tendons, ribs, obstacles, and its fields."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from knode_cosserat.rods.surroundings import Cylinder, Obstacle, Plane, Sphere
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.tendon_rod import TendonRod
 
-#: the radius of what has none, as a part of its length
+#: default radius, as a fraction of the length
 SLIM = 0.006
-#: how far tendons that have no place are drawn from the axis, in radii of the rod
+#: distance from the axis at which tendons without a route are drawn, in radii of the rod
 BESIDE = 2.5
-#: how much wider ribs are than the circle of their tendons
+#: ratio of the ribs' radius to that of the tendons' circle
 RIM = 1.3
-#: about which the paper pulls its tendons (N)
+#: mean tension in the paper (N)
 MEAN_TENSION = 6.0
 #: where sliders may end, between powers of ten
 NICE = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
 
 
 def physics_of(system: System) -> Any:
-    """The robot itself: of a model its knowledge, as what it learned corrects it."""
+    """Return the robot itself; for a model, its adapted nominal model."""
     return system.adapted if isinstance(system, KNODE) else system
 
 
 def drawing(system: System, nodes: np.ndarray) -> dict[str, Any]:
-    """What the page needs to know of a system to draw its states at these of its nodes."""
+    """Return the page's data for drawing a system's states at the given nodes."""
     robot = physics_of(system)
     s = nodes / max(1, system.nodes - 1) * float(system.length)
     radii = _radii(robot, s)
@@ -53,7 +53,7 @@ def drawing(system: System, nodes: np.ndarray) -> dict[str, Any]:
 
 
 def _short(values: Any) -> Any:
-    """Numbers as they are written, no longer than a drawing needs."""
+    """Return numbers rounded to the precision of a drawing."""
     return np.round(np.asarray(values, dtype=float), 7).tolist()
 
 
@@ -68,14 +68,14 @@ def _radii(robot: Any, s: np.ndarray) -> np.ndarray:
 
 
 def _up(robot: Any) -> list[float]:
-    """The direction against gravity; z where there is none. Positions of two numbers are drawn in x and z."""
+    """Return the direction against gravity; z without gravity. Planar positions are drawn in x and z."""
     gravity = np.asarray(getattr(robot, "gravity", np.zeros(3)), dtype=float)
     size = np.linalg.norm(gravity) if gravity.shape == (3,) else 0.0
     return _short(-gravity / size) if size > 0.0 else [0.0, 0.0, 1.0]
 
 
 def _tendons(robot: Any, s: np.ndarray, radii: np.ndarray) -> dict[str, Any] | None:
-    """Where the tendons run (c, nodes, 3) in the material frame, where they end, and their tension."""
+    """Return the tendons' routes (c, nodes, 3) in the material frame, their ends, and their tension."""
     if not isinstance(robot, TendonRod):
         return None
     if isinstance(robot, RoutedTendonRobot):
@@ -99,7 +99,7 @@ def _tendons(robot: Any, s: np.ndarray, radii: np.ndarray) -> dict[str, Any] | N
 
 
 def _ribs(robot: Any, nodes: int, tendons: dict[str, Any] | None, radius: float) -> list[dict[str, Any]]:
-    """Discs that hold tendons, and masses: at the robot's masses, or else at its nodes."""
+    """Return discs that guide tendons, and masses: at the robot's masses, or else at its nodes."""
     masses = [load for load in getattr(robot, "loads", ()) if isinstance(load, AttachedMass)]
     if tendons is None:
         return [{"at": float(load.at), "shape": "ball", "radius": 2.5 * radius} for load in masses]
@@ -117,13 +117,13 @@ def _obstacle(obstacle: Obstacle) -> dict[str, Any]:
         more = {"shape": "sphere", "point": _short(obstacle.center)}
     elif isinstance(obstacle, Cylinder):
         more = {"shape": "cylinder", "point": _short(obstacle.point), "axis": _short(obstacle.axis)}
-    else:  # one of the user's own, of which nothing is known but its distance
+    else:  # a user-defined obstacle: only its distance is known
         return {"shape": "unknown", "name": type(obstacle).__name__}
     return {**more, "radius": float(obstacle.radius), "inside": bool(obstacle.inside)}
 
 
 def fields(system: System) -> list[dict[str, Any]]:
-    """What can be plotted: every field of y, z and the control, with its components' names."""
+    """Return the fields that can be plotted: every field of y, z and the control, with component names."""
     layouts = (("y", system.y_layout), ("z", system.z_layout), ("control", system.control_layout))
     return [
         {
@@ -136,7 +136,7 @@ def fields(system: System) -> list[dict[str, Any]]:
 
 
 def _components(field: Field, control: bool) -> list[str]:
-    """As in a trajectory's file."""
+    """Return the names of a field's components, as in a trajectory's file."""
     if field.size == 1:
         return [""]
     if field.size == 4 and field.name.rstrip("0123456789") == "h":
@@ -147,7 +147,7 @@ def _components(field: Field, control: bool) -> list[str]:
 
 
 def sliders(system: System) -> list[dict[str, Any]]:
-    """A slider for each number of the control: its name and unit, a sensible range, where it begins."""
+    """Return a slider for each component of the control: name, unit, range and initial value."""
     found = []
     for field in system.control_layout.fields:
         low, high, start = _range(system, field)
@@ -185,16 +185,16 @@ def _range(system: System, field: Field) -> tuple[float, float, float]:
 
 
 def _nice(value: float) -> float:
-    """A round number, not below the given one."""
+    """Return a round number, not below the given one."""
     power = 10.0 ** np.floor(np.log10(value))
     return float(next(step * power for step in NICE if step * power >= value * (1.0 - 1e-9)))
 
 
 def positions_of(system: System, y: np.ndarray) -> np.ndarray:
-    """Positions (T, N, 3) of states, those of two numbers in x and z.
+    """Return the positions (T, N, 3) of states; planar positions are put into x and z.
 
     Raises:
-        ValueError: the system does not say where its nodes are.
+        ValueError: the system does not define positions.
     """
     try:
         found = np.asarray(system.positions(y), dtype=float)
@@ -211,7 +211,7 @@ def positions_of(system: System, y: np.ndarray) -> np.ndarray:
 
 
 def quaternions_of(system: System, y: np.ndarray) -> np.ndarray | None:
-    """Orientations (T, N, 4), scalar first, if the system has any."""
+    """Return the orientations (T, N, 4), scalar first, or None if the system has none."""
     try:
         return np.asarray(system.quaternions(y), dtype=float)
     except AttributeError:
@@ -229,7 +229,7 @@ def curves_of(system: System, y: np.ndarray, positions: np.ndarray) -> list[dict
 
 
 def offset_of(layout: Layout, packed: np.ndarray, values: np.ndarray) -> int | None:
-    """Where in packed numbers these values stand as they are, so that they need not be sent again."""
+    """Return the offset of equal values in packed numbers, to avoid sending them twice; None if absent."""
     start = 0
     for field in layout.fields:
         stop = start + field.size

@@ -1,9 +1,8 @@
 """A robot or model that follows sliders in the browser in real time.
 
-The shape that is drawn is the one at the end of the time step in progress, under the control as it is now:
-a moved slider solves that step again at once, and does not wait for the next. When the step's time is over it
-is gone (`Stepper.step`), and the next one is in progress. What cannot be solved is said, and the last
-shape stays.
+The drawn shape is the solution at the end of the current time step under the current control. A moved slider
+solves this step again at once, without waiting for the next one. When the step's time is over, the step is
+taken (`Stepper.step`) and the next one becomes current. Failures are reported, and the last shape stays.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ from knode_cosserat.viewer.serve import HOST, announce, checked_port
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
 
-#: time step (s) of what does not say better
+#: default time step (s)
 USUAL = 0.05
 #: time over which the pace is averaged (s)
 PACE = 1.0
@@ -73,7 +72,7 @@ def view_live(
 
 
 def usual_step(robot: System) -> float:
-    """The time step (s) of the trajectories that a model learned from, or else 0.05 s."""
+    """Return the time step (s) of a model's training trajectories, or else 0.05 s."""
     learned = robot.about.facts.get("trajectories") if isinstance(robot, KNODE) else None
     try:
         return float(learned[0]["dt"]) if learned else USUAL
@@ -90,7 +89,7 @@ def require_websockets() -> None:
 
 
 def live_page(robot: System, dt: float, space: str, title: str | None = None) -> bytes:
-    """The page of a robot in motion; on the way its program is compiled."""
+    """Return the page of a robot in motion; this also compiles its program."""
     stepper = Stepper(robot, dt, space=space)
     if not robot.control_size:
         raise ValueError(f"a {type(robot).__name__} has no controls, so that there is nothing to be moved")
@@ -148,7 +147,7 @@ async def _serve(
 
 
 class Session:
-    """One page and its robot: what it wants, and the clock."""
+    """Session of one page: its robot, its control and commands, and the clock."""
 
     def __init__(self, robot: System, dt: float, space: str, connection: Any):
         self.robot, self.dt, self.space, self.connection = robot, dt, space, connection
@@ -160,7 +159,7 @@ class Session:
         self.pace, self.spent = 1.0, 0.0
 
     async def run(self) -> None:
-        """Until the page is closed."""
+        """Run until the page is closed."""
         reading = asyncio.create_task(self._read())
         moving = asyncio.create_task(self._move())
         try:
@@ -179,7 +178,7 @@ class Session:
                 await self.connection.send(json.dumps({"error": " ".join(str(error).split())}))
 
     def understand(self, message: Any) -> None:
-        """What the page says: a control, or a command. `ValueError` for anything else."""
+        """Process a message of the page: a control, or a command. `ValueError` for anything else."""
         command = message.get("command")
         if command is None:
             control = np.array(message["control"], dtype=float)
@@ -219,7 +218,7 @@ class Session:
                     self.pace += weight * (
                         min(1.0, self.dt / (self.dt + max(0.0, late - self.dt))) - self.pace
                     )
-                    # what is too slow is slower than real time, and does not hurry afterwards
+                    # a slow solution delays the clock; later steps do not catch up
                     end = end + self.dt if late < self.dt else loop.time() + self.dt
                 elif stuck or self.paused:
                     end = loop.time() + self.dt
@@ -228,7 +227,7 @@ class Session:
         return Stepper(self.robot, self.dt, space=self.space)
 
     def solve(self, control: np.ndarray, sequence: int, over: bool) -> tuple[bytes | str, bool]:
-        """Go on if the step is over, solve the one in progress; a message, and whether it failed."""
+        """Take the step if it is over, solve the current one; return a message, and True if it failed."""
         began = perf_counter()
         try:
             if over:
@@ -243,7 +242,7 @@ class Session:
         return self.frame(ahead, sequence), False
 
     def frame(self, ahead: Trajectory, sequence: int) -> bytes:
-        """A shape for the page: what it answers, time, result, pace, computing time (ms), then the row."""
+        """Return a shape for the page: sequence, time, result, pace, computing time (ms), then the row."""
         head = [sequence, ahead.time[0], ahead.result[0], self.pace, self.spent]
         row = row_of(self.robot, ahead, self.names)
         return np.concatenate([np.array(head, dtype=np.float32), row]).tobytes()

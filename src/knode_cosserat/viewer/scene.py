@@ -1,4 +1,4 @@
-"""What the page is given: trajectories as compact arrays, with what it needs to draw and to plot them.
+"""Scene of the page: trajectories as compact arrays, with the data to draw and to plot them.
 
 Arrays are float32, their bytes sorted by significance and compressed, in base64: 500 steps of the paper's
 robot take 0.5 MB at most. What is longer is thinned: at most 41 nodes of a rod are kept, and of the rows so
@@ -28,19 +28,19 @@ from knode_cosserat.viewer.drawing import (
     quaternions_of,
 )
 
-#: how many trajectories a view has room for
+#: largest number of trajectories in a view
 MOST = 12
-#: what is kept of long trajectories: nodes, numbers of all rows, and rows at least
+#: limits for long trajectories: most nodes, most numbers in all rows, and least rows
 MOST_NODES, MOST_NUMBERS, LEAST_ROWS = 41, 500_000, 200
 
 Given = Trajectory | Sequence[Trajectory] | Mapping[str, Trajectory]
 
 
 def named(trajectories: Given) -> dict[str, Trajectory]:
-    """Trajectories of one robot each, by name; those of a batch one by one.
+    """Return trajectories of one robot each, by name; a batch is split.
 
     Raises:
-        ValueError: something else than trajectories, none, or too many.
+        ValueError: a value is not a trajectory, or there are none or too many.
     """
     if isinstance(trajectories, Trajectory):
         trajectories = {"trajectory": trajectories}
@@ -69,7 +69,7 @@ def _one(batch: Trajectory, k: int) -> Trajectory:
 
 
 def scene(trajectories: Given, title: str | None = None) -> dict[str, Any]:
-    """What the page shows, ready for JSON.
+    """Return the page's scene as plain values for JSON.
 
     Raises:
         ValueError: no trajectory, too many, or one that has nothing to be drawn.
@@ -85,7 +85,7 @@ def scene(trajectories: Given, title: str | None = None) -> dict[str, Any]:
 
 
 def track(trajectory: Trajectory, name: str) -> dict[str, Any]:
-    """One trajectory for the page."""
+    """Return the page's data of one trajectory."""
     if not np.any(trajectory.valid):
         raise ValueError("no row is solved; there is nothing to draw")
     system = trajectory.system
@@ -106,7 +106,7 @@ def track(trajectory: Trajectory, name: str) -> dict[str, Any]:
 
 
 def kept(shape: Sequence[int], strains: int) -> tuple[np.ndarray, np.ndarray]:
-    """Which nodes and rows of a trajectory with y of this shape (T, N, y) are kept; see the module's head."""
+    """Return the kept nodes and rows of a trajectory with y of this shape (T, N, y); see the module."""
     rows, nodes, size = shape
     few = np.unique(np.linspace(0, nodes - 1, min(nodes, MOST_NODES)).round().astype(int))
     most = max(LEAST_ROWS, MOST_NUMBERS // (len(few) * (size + strains)))
@@ -152,7 +152,7 @@ def arrays_of(
 
 
 def row_of(system: System, trajectory: Trajectory, names: Sequence[str]) -> np.ndarray:
-    """The numbers of a trajectory's last row, array after array, as the live page takes them."""
+    """Return the values of a trajectory's last row, array after array, for the live page."""
     nodes, _ = kept(np.shape(trajectory.y), system.z_layout.size)
     y = np.asarray(trajectory.y)[-1:]
     curves = list(system.curves(y)) if any(name.startswith("curve") for name in names) else []
@@ -172,7 +172,7 @@ def row_of(system: System, trajectory: Trajectory, names: Sequence[str]) -> np.n
 
 
 def _failure(trajectory: Trajectory, unsolved: np.ndarray) -> dict[str, Any] | None:
-    """From when on nothing is solved, and why."""
+    """Return the time and the reason of the first unsolved row, or None."""
     if len(unsolved) == 0:
         return None
     first = int(unsolved[0])

@@ -58,14 +58,14 @@ def view(
 
 
 def checked_port(port: int) -> int:
-    """A port, or 0 for any; `ValueError` for what is none."""
+    """Return a valid port, or 0 for any free one; `ValueError` otherwise."""
     if not 0 <= port <= 65535:
         raise ValueError(f"port is {port!r}; allowed is 0 (any that is free) to 65535")
     return port
 
 
 def announce(address: str, open_browser: bool, ready: Callable[[str], None] | None) -> None:
-    """Say where the page is, and open it if wanted."""
+    """Report the address of the page, and open it if requested."""
     if ready is not None:
         ready(address)
     else:

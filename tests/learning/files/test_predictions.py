@@ -42,7 +42,7 @@ def test_a_prediction_comes_back_with_its_model(prediction):
     assert_same_states(found, trajectory)
     assert_same(found.system, trajectory.system)
     assert found.system.about.facts["loss"].tolist() == [0.0, 1.0, 2.0]
-    again = kc.simulate(found.system, found.tension[1:], found.dt)
+    again = kc.simulate(found.system, found.held_tension[:-1], found.dt)
     assert np.array_equal(again.y, trajectory.y)
 
 

@@ -1,1 +1,1 @@
-"""The physical parameters themselves, from the same trajectories."""
+"""Calibration of physical parameters from trajectories."""

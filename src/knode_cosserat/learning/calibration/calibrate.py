@@ -1,4 +1,4 @@
-"""The physical parameters themselves, found from trajectories, with intervals that say how well."""
+"""Calibration of physical parameters from trajectories, with confidence intervals."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
 
-#: noise may move an estimate by this part of it, on average, and be corrected for
+#: largest relative bias of an estimate by noise that is corrected
 MOST_SHIFT = 0.3
-#: how often the search is made again with the past between nodes that the robot has which it found
+#: largest number of repeated searches with the history between nodes from the calibrated robot
 MOST_ROUNDS = 8
 
 
 @dataclasses.dataclass(frozen=True)
 class Calibration:
-    """Parameters that were found from trajectories; `print` shows them as a table.
+    """Result of a calibration; `print` shows it as a table.
 
-    What is by parameter is a float, or an array for what has several numbers: the components of a vector, the
-    diagonal of a matrix. A matrix that is a multiple of the identity counts as one number.
+    Values by parameter are floats, or arrays for parameters with several numbers: the components of a vector,
+    the diagonal of a matrix. A matrix that is a multiple of the identity counts as one number.
     """
 
     #: the robot with the estimates
@@ -55,18 +55,18 @@ class Calibration:
     estimates: Mapping[str, Any]
     standard_errors: Mapping[str, Any]
     intervals: Mapping[str, Any]
-    #: how probable it is that an interval holds the truth, if what is left is noise
+    #: confidence level of the intervals, if the remainder is noise
     level: float
-    #: the numbers in the order of `correlation`, and their units
+    #: names of the numbers in the order of `correlation`, and their units
     labels: tuple[str, ...]
     units: tuple[str, ...]
     #: correlation of the numbers' errors
     correlation: Float[np.ndarray, "n n"]
-    #: parameters that were left as they were, because the data do not determine them
+    #: parameters that were not changed, because the data do not determine them
     undetermined: tuple[str, ...]
-    #: root mean square of what is left between prediction and data, by field
+    #: root mean square of the remaining differences between prediction and data, by field
     remainder: Mapping[str, float]
-    #: fields in which that is not noise: another parameter is wrong, or the equations miss something
+    #: fields whose remainder is not noise: another parameter is wrong, or the equations lack an effect
     unexplained: tuple[str, ...]
 
     def __str__(self) -> str:
@@ -107,26 +107,25 @@ def calibrate(
     """Find physical parameters of a robot from trajectories, by least squares.
 
     Args:
-        robot: where the search begins; what is not named stays as it is.
-        trajectories: what the real robot did; or measurements from rest on (`Recording.sampled`), which only
-            "rollouts" can use.
+        robot: initial robot of the search; parameters that are not named stay unchanged.
+        trajectories: full states of the real robot; or measurements that start at rest (`Recording.sampled`),
+            which only "rollouts" can use.
         names: parameters by name (`System.parameters`); by default all that have a value and that the data
             determine.
-        by: "segments" compares one-segment predictions from the states in the data, all of which must be
-            known. It takes a fraction of a second and finds its way from far off. Noise in the states enters
-            its predictions too; what that does to the estimates is taken away, to leading order in its
-            variance. Between nodes, where a trajectory has no rows, the history is that of the robot that is
-            found, in a few rounds. "rollouts" compares whole simulations with positions and
-            orientations, and needs nothing else of trajectories that begin at rest. Its search begins where
-            segments lead, if they do.
-        undetermined: what to do about a parameter that the data do not determine: "stop" with an error, or
-            "keep" it as it was, which `Calibration.undetermined` says. None: stop if it was named.
-        level: how probable it is that an interval holds the truth.
-        space: the scheme in arclength by which measurements are simulated, as in `simulate`: what is found is
-            a robot for that scheme. Trajectories bring their own.
+        by: "segments" compares one-segment predictions from the full states in the data. It takes a fraction
+            of a second and converges from a distant start. Noise in the states also enters the predictions;
+            the resulting bias is corrected to leading order in the variance. The history between nodes is
+            evaluated by the calibrated robot, in a few rounds. "rollouts" compares whole simulations with
+            positions and orientations, and needs no other data of trajectories that start at rest. Its search
+            starts at the result of "segments", if there is one.
+        undetermined: action for a parameter that the data do not determine: "stop" with an error, or "keep"
+            its value, listed in `Calibration.undetermined`. None: stop if `names` was given, else keep.
+        level: confidence level of the intervals.
+        space: scheme in arclength for the simulation of measurements, as in `simulate`; the calibrated robot
+            is for that scheme. Trajectories have their own scheme.
 
     Returns:
-        The estimates, their intervals and the robot that has them. Intervals take what is left for white
+        The estimates, their intervals and the calibrated robot. Intervals assume that the remainder is white
         noise; `unexplained` names the fields where it is not.
 
     Raises:
@@ -150,7 +149,7 @@ def calibrate(
 def _misfit(
     robot: System, given: Any, unknowns: Unknowns, by: str, space: str | SpaceScheme
 ) -> tuple[Misfit, np.ndarray]:
-    """What is to become small, and where the search begins."""
+    """Return the misfit to be minimised, and the initial coordinates of the search."""
     start = searched(unknowns, values(robot, unknowns))
     if by == "segments":
         return SegmentMisfit(robot, given, unknowns), start
@@ -179,7 +178,7 @@ def _check(robot: Any, trajectories: Any, by: Any, level: Any) -> None:
 
 
 def _by_segments(robot: System, trajectories: Sequence[Trajectory], unknowns: Unknowns) -> np.ndarray | None:
-    """Where segments lead, if they lead anywhere and all that they need was measured."""
+    """Return the coordinates from a calibration by segments; None if it fails or the data do not suffice."""
     try:
         misfit = SegmentMisfit(robot, trajectories, unknowns)
         return search.fit(misfit, searched(unknowns, values(robot, unknowns)), may_leave_out=True).coordinates
@@ -188,7 +187,7 @@ def _by_segments(robot: System, trajectories: Sequence[Trajectory], unknowns: Un
 
 
 def _ended(misfit: Misfit, start: np.ndarray, may_leave_out: bool) -> tuple[Fit, Errors]:
-    """Where the search ends, and with which errors: little enough for the estimates to mean something."""
+    """Return the result of the search and its errors; undetermined parameters are left out or raise."""
     left_out: tuple[str, ...] = ()
     while True:
         ended = search.fit(misfit, start, may_leave_out, left_out)
@@ -214,7 +213,7 @@ def _ended(misfit: Misfit, start: np.ndarray, may_leave_out: bool) -> tuple[Fit,
 def _with_its_own_past(
     misfit: SegmentMisfit, ended: Fit, errors: Errors, may_leave_out: bool
 ) -> tuple[SegmentMisfit, Fit, Errors]:
-    """The search again, as the robot it ended with has the past between nodes, while that explains more."""
+    """Repeat the search with the history between nodes from the calibrated robot, while the fit improves."""
     for _ in range(MOST_ROUNDS):
         numbers = found(misfit.unknowns, ended.coordinates)
         again = misfit.looking_back_on(with_numbers(misfit.robot, misfit.unknowns, numbers))
@@ -259,7 +258,7 @@ def _calibration(misfit: Misfit, ended: Fit, errors: Errors, level: float) -> Ca
 
 
 def _by_parameter(unknowns: Unknowns, numbers: np.ndarray) -> dict[str, Any]:
-    """Numbers (n,), or pairs of them (n, 2), by parameter."""
+    """Return numbers (n,), or pairs of them (n, 2), by parameter."""
     result, first = {}, 0
     for unknown in unknowns:
         own = numbers[first : first + unknown.size]
@@ -270,7 +269,7 @@ def _by_parameter(unknowns: Unknowns, numbers: np.ndarray) -> dict[str, Any]:
 
 
 def _as_precise_as(value: float, error: float) -> str:
-    """A number to two digits of its error, at most twelve."""
+    """Format a number to two digits of its error, with at most twelve digits."""
     if not 0.0 < error < np.inf or value == 0.0:
         return f"{value:.6g}"
     digits = int(np.floor(np.log10(abs(value)))) - int(np.floor(np.log10(error))) + 2

@@ -1,7 +1,7 @@
-"""How far one-segment predictions with given parameters are from trajectories, and the slopes of that.
+"""Misfit of one-segment predictions with given parameters, and its derivatives.
 
-Differences (M,) come in groups, a field of the state a group, with their exact derivatives (M, n) by the
-coordinates of the search.
+Differences (M,) are in groups, one for each field of the state. Their exact derivatives (M, n) are with
+respect to the coordinates of the search.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ from knode_cosserat.learning.samples import Dataset, Samples, TipSamples, predic
 from knode_cosserat.rods.system import System, unpacked_history
 from knode_cosserat.trajectory import Trajectory
 
-#: ten times the solver's tolerance, of natural sizes: what is less is its error, and not even white
+#: ten times the solver's tolerance, in natural units: smaller differences are solver errors
 LEAST = 1e-9
-#: what a sample holds of states
+#: fields of a sample that depend on measured states
 SEEN = ("y", "z", "y_next", "history", "later")
-#: draws of noise; what is found with both signs of each hardly depends on how many there are
+#: number of draws of noise; with both signs of each draw, results hardly depend on it
 DRAWS = 6
 
 
 def by_group(squares: Any, groups: np.ndarray) -> Float[np.ndarray, " G"]:
-    """The mean of numbers in each group; not a number where a group is empty."""
+    """Return the mean of numbers in each group; NaN for an empty group."""
     return np.bincount(groups, weights=squares) / np.bincount(groups)
 
 
 class Differences(NamedTuple):
-    """What is predicted minus what is there, and its derivatives by the coordinates of the search."""
+    """Predictions minus data, and their derivatives with respect to the coordinates of the search."""
 
     values: Float[np.ndarray, " M"]
     slopes: Float[np.ndarray, "M n"]
@@ -45,11 +45,11 @@ class Differences(NamedTuple):
 
 
 def _differences(robot, coordinates, data, length, unknowns, space):  # type: ignore[no-untyped-def]
-    """All differences (M,) of the samples' segments and tips, in one vector."""
+    """Return all differences (M,) of the samples' segments and tips, in one vector."""
     system = with_coordinates(robot, unknowns, coordinates)
 
     def scaled(record: Any) -> Any:
-        # rates along the rod were taken at the length that the robot had
+        # rates along the rod were computed with the robot's initial length
         if not system.mixed:
             return record
         ny = system.y_layout.size
@@ -79,7 +79,7 @@ def _differences_and_slopes(robot, coordinates, data, length, unknowns, space): 
 
 @functools.partial(jax.jit, static_argnames=("unknowns", "space"))
 def _pulled_back(robot, coordinates, data, length, unknowns, space, factors):  # type: ignore[no-untyped-def]
-    """Derivatives of factors (k, M) times differences by the states and histories in the samples."""
+    """Return derivatives of factors (k, M) times differences by the samples' states and history."""
     segments, tips = data
 
     def of(measured: Any) -> Any:
@@ -96,9 +96,9 @@ def _pulled_back(robot, coordinates, data, length, unknowns, space, factors):  #
 
 
 class SegmentMisfit:
-    """One-segment predictions: y at the segment's end, z at its start, and the tip's conditions."""
+    """Misfit of one-segment predictions: y at the segment's end, z at its start, and tip conditions."""
 
-    #: whether a search must not go far at once
+    #: true if the first step of a search must be limited
     cautious = False
 
     def __init__(
@@ -116,7 +116,7 @@ class SegmentMisfit:
         sizes = [field.size for layout in (y, z, tip) for field in layout.fields]
         numbers = np.repeat(np.arange(len(sizes)), sizes)
         own = y.size + z.size
-        #: which of `fields` each number of a sample, and each difference, belongs to
+        #: index in `fields` of each number of a sample; `groups` has the same for each difference
         self.state_groups = numbers[:own]
         segments, tips = self.data.segments, self.data.tips
         self.groups = np.concatenate(
@@ -127,7 +127,7 @@ class SegmentMisfit:
     def __call__(
         self, coordinates: np.ndarray, moved: tuple[Samples, TipSamples] | None = None
     ) -> Differences:
-        """Differences at the samples, or at others like them."""
+        """Return differences at the samples, or at `moved` samples of the same shape."""
         data = self._on_device if moved is None else moved
         slopes, values = _differences_and_slopes(
             self.robot, coordinates, data, self.length, self.unknowns, self.data.space
@@ -135,13 +135,13 @@ class SegmentMisfit:
         return Differences(np.asarray(values), np.asarray(slopes))
 
     def looking_back_on(self, model: System) -> SegmentMisfit | None:
-        """The same with the past between nodes as a model has it; None if the nodes tell all of it."""
+        """Return a copy with the history between nodes from a model; None if the nodes hold all of it."""
         if told_by_rows(self.robot, self.trajectories):
             return None
         return SegmentMisfit(self.robot, self.trajectories, self.unknowns, model)
 
     def blocks(self, values: Float[np.ndarray, " M"]) -> list[tuple[np.ndarray, np.ndarray]]:
-        """The field (n,) of the differences of a row, and these by row (R, n), of each trajectory."""
+        """Return for each trajectory the field (n,) of a row's differences, and the differences (R, n)."""
         segments, tips = self.data.segments.origin, self.data.tips.origin
         cut = len(segments) * len(self.state_groups)
         parts = []
@@ -154,7 +154,7 @@ class SegmentMisfit:
         return parts
 
     def pulled_back(self, coordinates: np.ndarray, factors: Float[np.ndarray, "k M"]) -> Any:
-        """Derivatives of factors times differences by ((y, z, y_next, history), (tip y, tip history))."""
+        """Return derivatives of factors times differences by the `SEEN` fields and (tip y, tip history)."""
         space = self.data.space
         pulled = _pulled_back(
             self.robot, coordinates, self._on_device, self.length, self.unknowns, space, factors
@@ -162,11 +162,11 @@ class SegmentMisfit:
         return jax.tree.map(np.asarray, pulled)
 
     def beginnings(self) -> list[Float[np.ndarray, " M"]]:
-        """Which differences count in searches that lead to where that of all begins: there are none."""
+        """Return masks of differences for preliminary searches: none."""
         return []
 
     def first_sizes(self) -> Float[np.ndarray, " G"]:
-        """Sizes of the differences, by field, before anything is known: how much the data vary there."""
+        """Return initial sizes of the differences, by field: the variation of the data."""
         segments = self.data.segments
         change, strain = segments.y_next - segments.y, segments.z - np.mean(segments.z, axis=0)
         squares = np.mean(np.square(np.concatenate([change, strain], axis=1)), axis=0)
@@ -179,9 +179,9 @@ class SegmentMisfit:
         return np.concatenate([np.where(own > 0.0, own, 1.0), tips])
 
     def least_sizes(self, coordinates: np.ndarray) -> Float[np.ndarray, " G"]:
-        """What noise of the size of the solver's tolerance makes of the differences, by field.
+        """Return the differences caused by noise of the size of the solver's tolerance, by field.
 
-        z follows from y without an error of its own.
+        Noise is added to y only; z follows from y without an additional error.
         """
         system = with_numbers(self.robot, self.unknowns, found(self.unknowns, coordinates))
         natural = LEAST * np.asarray(system.scales().y)
@@ -191,7 +191,7 @@ class SegmentMisfit:
 
     @functools.cached_property
     def draws(self) -> list[tuple[Samples, TipSamples]]:
-        """What white noise of size one in all of y and z adds to the samples, which are linear in it."""
+        """Changes of the samples by white noise of size one in y and z; the samples are linear in it."""
         rng = np.random.default_rng(0)
         return [self._unit_noise(rng) for _ in range(DRAWS)]
 
@@ -208,7 +208,7 @@ class SegmentMisfit:
     def moved(
         self, noise: tuple[Samples, TipSamples], sizes: Float[np.ndarray, " x"]
     ) -> tuple[Samples, TipSamples]:
-        """The samples with noise of given sizes, in the numbers of y and z, added."""
+        """Return the samples with added noise of given sizes, for each number of y and z."""
         ny = self.robot.y_layout.size
         in_y, in_z, record = sizes[:ny], sizes[ny:], np.concatenate([sizes, sizes[:ny]])
         (segments, tips), (own, own_tips) = noise, (self.data.segments, self.data.tips)

@@ -1,10 +1,10 @@
-"""What noise in the data does to parameters that were found from them.
+"""Effect of data noise on calibrated parameters: covariance and bias.
 
-In rollouts noise is only in what they are compared with. In one-segment predictions, a state is in a
-segment's start, in what another's end is compared with and, multiplied by 1/dt, in the history of the rows
-after it. So the differences of neighbouring segments and rows are correlated, and noise moves the estimates
-on average, not only by chance. Both follow from how large the noise is in each field of y and z, which the
-differences tell: white noise is assumed, independent from node to node and from row to row.
+In rollouts noise is only in the targets. In one-segment predictions, a state is the start of one segment, the
+target of another and, multiplied by 1/dt, part of the history of later rows. The differences of neighbouring
+segments and rows are therefore correlated, and noise also causes a bias. Both follow from the size of the
+noise in each field of y and z, which is estimated from the differences. White noise is assumed, independent
+between nodes and rows.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from knode_cosserat.learning.samples import histories, past_of_segments, setting
 from knode_cosserat.learning.sides import slopes_of
 from knode_cosserat.trajectory import Trajectory
 
-#: numbers of states are not known better than to this part
+#: relative accuracy of the numbers of states
 ROUNDING = 1e-14
-#: draws from which it is taken how large differences become by noise in each field
+#: number of draws for the effect of noise in each field on the differences
 PROBES = 3
 
 
 class Errors(NamedTuple):
-    """Errors of the coordinates that were searched: their covariance, and what they are on average."""
+    """Errors of the searched coordinates: covariance and bias."""
 
     covariance: Float[np.ndarray, "n n"]
     shift: Float[np.ndarray, " n"]
@@ -40,7 +40,7 @@ class Errors(NamedTuple):
 
 
 def errors_of(misfit: Misfit, ended: Fit) -> Errors:
-    """Errors where a search ended, as noise of the size of the differences makes them."""
+    """Return the errors of a search's result, from noise of the size of the differences."""
     weights = ended.weights(misfit)
     slopes = misfit(ended.coordinates).slopes[:, ended.free] * weights[:, None]
     lengths = np.linalg.norm(slopes, axis=0)
@@ -50,7 +50,7 @@ def errors_of(misfit: Misfit, ended: Fit) -> Errors:
         return Errors(inverse * len(slopes) / freedom, np.zeros(len(inverse)))
     sizes = noise_sizes(misfit, ended)
     covariance = np.zeros_like(inverse)
-    # of what was left out too, which is zero: one compiled program whatever is left out
+    # includes zeros for left-out coordinates, so that one compiled program serves all cases
     moves = np.zeros((len(ended.free), len(weights)))
     moves[ended.free] = inverse @ slopes.T * weights
     for effects in by_states(misfit, ended.coordinates, moves):
@@ -60,10 +60,10 @@ def errors_of(misfit: Misfit, ended: Fit) -> Errors:
 
 
 def hidden_by_rounding(misfit: Misfit, ended: Fit) -> np.ndarray:
-    """Which coordinates the data tell of by their last digits only: (n,), true or false.
+    """Return true for coordinates (n,) whose effect on the data is at the level of rounding errors.
 
-    Noise as small as rounding then changes their slopes by more than a little: what multiplies a rate that is
-    zero, say, in a robot that is at rest.
+    Noise of the size of rounding errors then changes their derivatives noticeably. An example is a
+    coefficient of a rate in a robot at rest, where the rate is zero.
     """
     hidden = np.zeros(len(ended.free), dtype=bool)
     if not isinstance(misfit, SegmentMisfit):
@@ -75,14 +75,14 @@ def hidden_by_rounding(misfit: Misfit, ended: Fit) -> np.ndarray:
 
 
 def typical_sizes(misfit: SegmentMisfit) -> Float[np.ndarray, " fields"]:
-    """How large the numbers of each field of y and z are (rms)."""
+    """Return the rms size of each field of y and z."""
     segments = misfit.data.segments
     squares = np.mean(np.square(np.hstack([segments.y, segments.z])), axis=0)
     return np.sqrt(by_group(squares, misfit.state_groups))
 
 
 def noise_sizes(misfit: SegmentMisfit, ended: Fit) -> Float[np.ndarray, " x"]:
-    """Standard deviations of white noise in y and z that explain how large the differences are."""
+    """Return standard deviations of white noise in y and z that explain the differences."""
     # imported here: it takes a third of a second
     from scipy.optimize import nnls
 
@@ -103,11 +103,11 @@ def noise_sizes(misfit: SegmentMisfit, ended: Fit) -> Float[np.ndarray, " x"]:
 
 
 def _shift(misfit: SegmentMisfit, ended: Fit, sizes: Float[np.ndarray, " x"]) -> Float[np.ndarray, " n"]:
-    """By how much noise of these sizes moves the estimates on average, to leading order.
+    """Return the bias of the estimates by noise of these sizes, to leading order.
 
-    Noise is added once more, with both signs, and each time one step of the search is made. This is linear in
-    the variance, so what a second helping adds on average the first has added too (simulation-extrapolation:
-    Cook & Stefanski, J. Am. Stat. Assoc. 89, 1994).
+    Noise is added once more, with both signs, and each time one step of the search is made. It is linear
+    in the variance, so the additional noise adds the same bias as the original noise
+    (simulation-extrapolation: Cook & Stefanski, J. Am. Stat. Assoc. 89, 1994).
     """
     weights, free = ended.weights(misfit), ended.free
     moved = [misfit.moved(draw, sign * sizes) for draw in misfit.draws for sign in (1.0, -1.0)]
@@ -116,7 +116,7 @@ def _shift(misfit: SegmentMisfit, ended: Fit, sizes: Float[np.ndarray, " x"]) ->
 
 
 def _step(there: Differences, weights: Float[np.ndarray, " M"], free: np.ndarray) -> Float[np.ndarray, " n"]:
-    """One step of Gauss and Newton towards the least weighted squares."""
+    """Return one Gauss-Newton step of the weighted least squares."""
     weighted = there.slopes[:, free] * weights[:, None]
     lengths = np.linalg.norm(weighted, axis=0)
     scaled, *_ = np.linalg.lstsq(weighted / lengths, -there.values * weights)
@@ -126,7 +126,7 @@ def _step(there: Differences, weights: Float[np.ndarray, " M"], free: np.ndarray
 def by_states(
     misfit: SegmentMisfit, coordinates: np.ndarray, factors: Float[np.ndarray, "n M"]
 ) -> list[Float[np.ndarray, "n T N x"]]:
-    """Derivatives of factors times differences by y and z of each trajectory, all rows and nodes."""
+    """Return derivatives of factors times differences by y and z of each trajectory, at all nodes."""
     pulled = misfit.pulled_back(coordinates, factors)
     return [_by_states(misfit, pulled, k, each) for k, each in enumerate(misfit.trajectories)]
 
@@ -134,9 +134,9 @@ def by_states(
 def _by_states(
     misfit: SegmentMisfit, pulled: Any, k: int, trajectory: Trajectory
 ) -> Float[np.ndarray, "n T N x"]:
-    """Derivatives by y and z of trajectory k, from those by what its samples hold.
+    """Return derivatives by y and z of trajectory k, from derivatives by its samples.
 
-    The way of `samples.samples` backwards: it is linear in the states.
+    This is the transpose of `samples.samples`, which is linear in the states.
     """
     segments, (tip_y, tip_history) = pulled
     data, settings, robot = misfit.data, settings_of(trajectory), misfit.robot

@@ -1,8 +1,8 @@
-"""How far simulations with given parameters are from what was measured, and the slopes of that.
+"""Misfit of simulations with given parameters to measured poses, and its derivatives.
 
-Only positions and orientations are compared, at all nodes of trajectories or where bodies of a recording sit:
-no velocity, force or strain has to be known. The derivatives are those of each solved step, by the implicit
-function theorem.
+Only positions and orientations are compared, at all nodes of trajectories or at the bodies of a recording. No
+velocity, force or strain has to be known. Every solved step is differentiated by the implicit function
+theorem.
 """
 
 from __future__ import annotations
@@ -36,35 +36,35 @@ from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.task import Task
 from knode_cosserat.trajectory import Trajectory
 
-#: a far start is brought near on the first two rows, then on this many times as many, and so on
+#: growth factor of the number of rows in preliminary searches
 GROWTH = 2
 
-#: how many rows are looked at first
+#: numbers of rows in preliminary searches
 FIRST_ROWS = (2, 5, 10, 20, 50, 100)
 
 
 #: coefficients of a step without rates
 STILL = np.zeros((2, 4))
-#: rollouts at a time: each keeps one core busy
+#: number of parallel rollouts: each keeps one core busy
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class _Rollout(NamedTuple):
-    """One trajectory or recording to be simulated again."""
+    """One trajectory or recording to be simulated."""
 
     settings: Settings
     dt: float
-    #: the rows that it begins from, or none: it begins from the robot's own state at rest
+    #: the initial rows, or None: it starts from the robot's own state at rest
     initial: Trajectory | None
     control: Float[np.ndarray, "T c"]
-    #: what is compared
+    #: places that are compared
     places: Places
-    #: position and, if that is compared, quaternion of length one; not a number where nothing was seen
+    #: position and, if compared, unit quaternion; NaN where nothing was measured
     target: Float[np.ndarray, "T M k"]
 
 
 def _seen(robot: System, oriented: bool, y: Any, places: Places) -> Any:
-    """Positions and, if the robot has any, quaternions of length one."""
+    """Return positions and, if the robot has orientations, unit quaternions."""
     seen = [positions_at(robot, y, places)]
     if oriented:
         seen.append(quaternions_at(robot, y, places))
@@ -72,14 +72,14 @@ def _seen(robot: System, oriented: bool, y: Any, places: Places) -> Any:
 
 
 class _Rows(NamedTuple):
-    """The solved rows of a rollout, what they began from, and what was measured."""
+    """Solved rows of a rollout, their initial state and history, and the measurements."""
 
     records: Float[Any, "T N x"]
     unknowns: Float[Any, "T k"]
     past: Past
-    #: the last row and control of the rows that it began from, if there are any
+    #: last row and control of the initial rows, if there are any
     before: Any
-    #: y and z at the nodes where it began
+    #: y and z of the initial state at the nodes
     first: Float[Any, "N x"]
     control: Float[Any, "T c"]
     places: Places
@@ -88,7 +88,7 @@ class _Rows(NamedTuple):
 
 @functools.partial(jax.jit, static_argnames=("unknowns", "settings", "oriented", "one_state"))
 def _differences(robot, coordinates, rows, table, dt, unknowns, settings, oriented, one_state):  # type: ignore[no-untyped-def]
-    """Differences (M,) of solved rows from what was measured, and their derivatives (M, n)."""
+    """Return differences (M,) of solved rows from measurements, and their derivatives (M, n)."""
     ny = robot.y_layout.size
 
     def start(x: Any) -> Any:
@@ -111,7 +111,7 @@ def _differences(robot, coordinates, rows, table, dt, unknowns, settings, orient
         return jnp.where(jnp.isnan(rows.target), 0.0, seen - target).ravel()
 
     def settled(system: Any, d_system: Any) -> Any:
-        """The past where it began if that is an equilibrium which had to be found, and its tangent."""
+        """Return the initial history and its tangent, if the initial state is a solved equilibrium."""
         none, guess = jnp.zeros(system.control_size), resting_past(system, settings)
         d_none, d_guess = jax.tree.map(jnp.zeros_like, (none[None], guess))
         d_first, _ = tangent_march(
@@ -139,13 +139,13 @@ def _differences(robot, coordinates, rows, table, dt, unknowns, settings, orient
 
 
 class RolloutMisfit:
-    """Whole simulations against the measured positions and orientations, from the same beginning.
+    """Misfit of whole simulations to measured positions and orientations, from the same initial state.
 
-    A trajectory that begins at t = 0 under no control begins from the robot's own state at rest, and so do
-    measurements; any other trajectory from its own first rows, which then have to be states without noise.
+    Measurements, and trajectories from t = 0 under zero control, start from the robot's own state at rest.
+    Any other trajectory starts from its own first rows, which must then be states without noise.
     """
 
-    #: whether a search must not go far at once: simulations of a robot that is far off lead astray
+    #: true if the first step of a search must be limited: distant robots mislead the search
     cautious = True
 
     def __init__(
@@ -156,7 +156,7 @@ class RolloutMisfit:
         near: bool = False,
         space: str | SpaceScheme = "lobatto2",
     ):
-        """`near`: a search begins where the robot is close to the real one; `space` is for measurements."""
+        """Set up the rollouts; `near` is true if the initial robot is close to the real one."""
         self.robot, self.unknowns, self.near = robot, unknowns, near
         y = np.asarray(robot.rest(0.0)[0])
         try:
@@ -169,7 +169,7 @@ class RolloutMisfit:
         trajectories = [each for each in given if isinstance(each, Trajectory)]
         if trajectories:
             samples(robot, [_without_unused(robot, each) for each in trajectories])  # checks them
-        #: whether the data are a real robot's: no model of it is exact, and none is searched as if it were
+        #: true if the data are measurements: no model of a real robot is exact, so the search stops earlier
         self.rough = not trajectories
         self.rollouts = [
             _of_trajectory(robot, self.oriented, each)
@@ -182,17 +182,17 @@ class RolloutMisfit:
         self._begun = False
         self._kept: dict[bytes, Differences] = {}
         self._known = [np.isfinite(one.target).ravel() for one in self.rollouts]
-        #: what is compared; each recording by itself, for a model may do better on one than on another
+        #: compared fields; separate for each recording, because the model's error may differ between them
         self.fields, self._natural, self._groups = self._fields_of(given, sizes)
-        #: which of `fields` each difference belongs to
+        #: index in `fields` of each difference
         self.groups = np.concatenate(
             [each[known] for each, known in zip(self._groups, self._known, strict=True)]
         )
 
     def _fields_of(self, given: Sequence[Any], sizes: list[int]) -> tuple[tuple[str, ...], Any, Any]:
-        """The fields in which something was seen, their natural sizes, and the field of each difference.
+        """Return the measured fields, their natural sizes, and the field of each difference.
 
-        The differences are by rollout, also of what was not seen; that which is never seen is in field -1.
+        The differences are listed by rollout and include unmeasured ones; never measured ones have field -1.
         """
         apart = self.rough and len(self.rollouts) > 1
         what = ("position", "orientation")[: len(sizes)]
@@ -216,7 +216,7 @@ class RolloutMisfit:
         )
 
     def __call__(self, coordinates: np.ndarray) -> Differences:
-        """Differences of all rollouts; infinite if one of them has no solution. The last ones are kept."""
+        """Return differences of all rollouts; infinite if a rollout has no solution. The last are cached."""
         key = np.asarray(coordinates).tobytes()
         if key not in self._kept:
             self._kept = {key: self._computed(coordinates)}
@@ -261,7 +261,7 @@ class RolloutMisfit:
         return Differences(np.asarray(values), np.asarray(slopes))
 
     def blocks(self, values: Float[np.ndarray, " M"]) -> list[tuple[np.ndarray, np.ndarray]]:
-        """The field (n,) of the differences of a row, and these by row (R, n), of each trajectory."""
+        """Return for each trajectory the field (n,) of a row's differences, and the differences (R, n)."""
         ends = np.cumsum([known.sum() for known in self._known])[:-1]
         found = []
         for mine, known, groups, one in zip(
@@ -275,10 +275,10 @@ class RolloutMisfit:
         return found
 
     def beginnings(self) -> list[Float[np.ndarray, " M"]]:
-        """Which differences count in searches that lead to where that of all begins: more rows each time.
+        """Return masks of differences for preliminary searches, with more rows each time.
 
-        A robot that is far from the real one is soon anywhere, and all rows together lead to a limp robot
-        that hangs in the middle. The first rows tell the way.
+        Simulations of a distant robot soon diverge from the data, and a search on all rows ends at a robot
+        that is too soft. A search on the first rows converges.
         """
         if self.near:
             return []
@@ -291,11 +291,11 @@ class RolloutMisfit:
         return [(rows < last).astype(float) for last in FIRST_ROWS if last <= rows.max()]
 
     def first_sizes(self) -> Float[np.ndarray, " G"]:
-        """Sizes of the differences, by field, before anything is known: of positions, the length."""
+        """Return initial sizes of the differences, by field; for positions, the length."""
         return self._natural
 
     def least_sizes(self, coordinates: np.ndarray) -> Float[np.ndarray, " G"]:
-        """The solver's tolerance, by field."""
+        """Return the solver's tolerance, by field."""
         return LEAST * self.first_sizes()
 
 
@@ -304,17 +304,17 @@ def _of_trajectory(robot: System, oriented: bool, trajectory: Trajectory) -> _Ro
     control, y = (np.asarray(values, dtype=float)[begins:] for values in (trajectory.control, trajectory.y))
     initial = None if _from_rest(trajectory) else trajectory[:begins]
     settings = trajectory.settings or Settings()
-    # the base is left out: it is where the model puts it
+    # the base is left out: its pose is given
     places = Places(np.arange(robot.nodes - 1), np.ones(robot.nodes - 1))
     target = np.asarray(_seen(robot, oriented, y, places))
     return _Rollout(settings, trajectory.dt, initial, control, places, target)
 
 
 def _of_measurements(robot: System, oriented: bool, given: Any, space: str | SpaceScheme) -> _Rollout:
-    """Measurements, with row 0 where the robot rests.
+    """Return the rollout of measurements, with the robot at rest in row 0.
 
     Raises:
-        DataError: they are not of this robot, too short, or tensions are not known in all rows.
+        DataError: the measurements are not of this robot, too short, or lack tensions in some rows.
     """
     if not isinstance(given, Measurements):
         raise DataError(f"a {type(given).__name__} is no trajectory and no measurements")
@@ -341,7 +341,7 @@ def _of_measurements(robot: System, oriented: bool, given: Any, space: str | Spa
 
 
 def _names(given: Sequence[Measurements]) -> list[str]:
-    """A name for each recording: how its source begins, or all of it; numbered where they are still alike."""
+    """Return a name for each recording: the start of its source, or all of it; numbered if equal."""
     names = [each.source.partition(":")[0] for each in given]
     if len(set(names)) < len(names):
         names = [each.source for each in given]
@@ -349,7 +349,7 @@ def _names(given: Sequence[Measurements]) -> list[str]:
 
 
 def _first_row(trajectory: Trajectory) -> int:
-    """The first row that is compared: one that has all the rows before it that its scheme looks at."""
+    """Return the first compared row: the first one with the full history of its scheme."""
     return 1 if trajectory.time[0] == 0.0 else 3
 
 
@@ -358,7 +358,7 @@ def _from_rest(trajectory: Trajectory) -> bool:
 
 
 def _without_unused(robot: System, given: Any) -> Any:
-    """A trajectory whose numbers that are not looked at are finite: they need not have been measured."""
+    """Return a trajectory in which unused numbers are finite: they need not have been measured."""
     if not isinstance(given, Trajectory) or given.y.ndim != 3 or not _from_rest(given):
         return given
     if given.y.shape[-1] != robot.y_layout.size:

@@ -1,4 +1,4 @@
-"""The search for parameters by least squares: weights, convergence, and what the data do not determine."""
+"""Least-squares search for parameters: weights, convergence, and undetermined parameters."""
 
 from __future__ import annotations
 
@@ -21,86 +21,86 @@ from knode_cosserat.learning.calibration.unknowns import (
 
 Misfit = SegmentMisfit | RolloutMisfit
 
-#: how often the weights of the fields are set anew
+#: largest number of updates of the fields' weights
 PASSES = 5
-#: and the part by which they may still change
+#: relative change of the weights at convergence
 SETTLED = 0.02
-#: ways by which a search from far off is tried, if what the first one leaves is not noise
+#: largest number of paths of a search from a distant start, tried if the first remainder is not noise
 MOST_WAYS = 3
-#: evaluations of one search
+#: largest number of evaluations of one search
 MOST_EVALUATIONS = 100
 
 
 class End(NamedTuple):
-    """When a search ends: at a step so small, in natural sizes, or a fall of the squares by such a part."""
+    """Stopping tolerances of a search: step, in natural sizes, and relative decrease of the squares."""
 
     step: float
     fall: float
 
 
-#: the last search, one that only leads to its start, and one for a real robot, of which no model is exact
+#: tolerances of the final search, of preliminary ones, and of the final one for a real robot
 FINE, ROUGH, PLAIN = End(1e-12, 1e-15), End(1e-3, 1e-6), End(1e-3, 1e-3)
-#: a combination of parameters is not determined if it does less than this part of what each does alone
+#: a combination of parameters is undetermined if its relative effect is below this
 FLAT = 1e-8
-#: nor is a positive parameter if the standard error of its logarithm is above this
+#: a positive parameter is undetermined if the standard error of its logarithm is above this
 VAGUE = 1.0
-#: nor any other if its standard error is this many times what it was before and is now; and of those that
-#: nobody asked for
+#: any other parameter is undetermined if its standard error is above this multiple of its size (before or
+#: after); the second limit is for parameters that were not named
 HOPELESS, POOR = 10.0, 1.0
-#: rows apart, beyond the memory of BDF2, and a correlation there that noise does not have
+#: lags in rows, beyond the memory of BDF2, and the correlation above which a remainder is not noise
 LAGS = range(3, 11)
 ALIKE = 0.3
-#: what takes part in a combination: more than this part of what takes part most
+#: a parameter belongs to a combination if its share is above this part of the largest share
 PART = 0.1
 
 
 class CalibrationError(ValueError):
-    """The parameters cannot be found; one line says which and why."""
+    """Parameters that cannot be found. The message is one line: the parameters and the reason."""
 
 
 class Fit(NamedTuple):
-    """Where the search ended."""
+    """Result of a search."""
 
     coordinates: Float[np.ndarray, " n"]
-    #: which of the coordinates were searched
+    #: true for the coordinates that were searched
     free: np.ndarray
-    #: parameters that were not, because the data do not determine them
+    #: parameters that were not searched, because the data do not determine them
     left_out: tuple[str, ...]
-    #: sizes of the differences by field, never less than what the solver's tolerance makes of them
+    #: sizes of the differences by field, at least those caused by the solver's tolerance
     sizes: Float[np.ndarray, " G"]
-    #: which of them are that little
+    #: true for fields whose size is that lower bound
     exact: np.ndarray
 
     def weights(self, misfit: Misfit) -> Float[np.ndarray, " M"]:
-        """One over the size of each difference; zero where a field tells nothing."""
+        """Return one over the size of each difference; zero if the size is zero."""
         return _inverse(self.sizes)[misfit.groups]
 
 
 class Gap(NamedTuple):
-    """Parameters that the data do not determine together, and why, in words."""
+    """Parameters that the data do not determine together, and the reason in words."""
 
     names: tuple[str, ...]
     reason: str
-    #: whether all of them have to be left out, or one
+    #: true if all of them must be left out, false if one suffices
     every: bool
 
 
 def fit(
     misfit: Misfit, start: Float[np.ndarray, " n"], may_leave_out: bool, left_out: tuple[str, ...] = ()
 ) -> Fit:
-    """Search from a start, with weights that follow from the differences that are left.
+    """Search from a start, with weights from the remaining differences.
 
-    What is left out already stays so; `may_leave_out` allows for more.
+    Parameters in `left_out` are not searched; `may_leave_out` allows further ones to be left out.
 
     Raises:
-        CalibrationError: no convergence, or something is not determined that may not be left out.
+        CalibrationError: no convergence, or an undetermined parameter that may not be left out.
     """
     unknowns = misfit.unknowns
     while True:
         free = np.array([name not in left_out for name in labels_of(unknowns)])
         if not free.any():
             raise CalibrationError(f"these data determine none of {', '.join(left_out)}")
-        # a symmetry that hides something is exact where the search begins, and not quite where noise leads it
+        # checked at the start: there a symmetry that hides a parameter is exact, later noise breaks it
         gap = _gap(misfit, Fit(start, free, (), misfit.first_sizes(), np.zeros(0)), np.inf)
         if gap is None:
             converged, ended = _search(misfit, start, free)
@@ -119,14 +119,14 @@ def fit(
 
 
 def labels_of(unknowns: Unknowns) -> tuple[str, ...]:
-    """The parameter that each number belongs to."""
+    """Return the parameter name of each number."""
     return tuple(unknown.name for unknown in unknowns for _ in range(unknown.size))
 
 
 def _search(misfit: Misfit, start: np.ndarray, free: np.ndarray) -> tuple[bool, Fit]:
-    """The search by the first way whose end leaves nothing but noise, else the best of all ways.
+    """Return the result of the first path that leaves only noise, else the best of all paths.
 
-    With noise the first rows of a rollout may point the wrong way, and another number of them the right one.
+    With noise the first rows of a rollout may mislead the search, while another number of rows does not.
     """
     beginnings = misfit.beginnings()
     best: tuple[bool, Fit] | None = None
@@ -136,17 +136,17 @@ def _search(misfit: Misfit, start: np.ndarray, free: np.ndarray) -> tuple[bool, 
             best = converged, ended
         if converged and not systematic(misfit, ended):
             break
-    assert best is not None  # the loop has one way at least
+    assert best is not None  # the loop has one path at least
     return best
 
 
 def remainder(ended: Fit) -> float:
-    """How much is left, of all fields together: smaller is better."""
+    """Return the total log size of the remaining differences over all fields; smaller is better."""
     return float(np.sum(np.log(np.maximum(ended.sizes, 1e-300))))
 
 
 def _one_way(misfit: Misfit, start: np.ndarray, free: np.ndarray, beginnings: Any) -> tuple[bool, Fit]:
-    """Searches one after the other, each with the sizes of what the last one left as weights."""
+    """Run searches in sequence, each weighted by the remaining differences of the last one."""
     sizes, least = misfit.first_sizes(), np.zeros(len(misfit.fields))
     coordinates, converged, left = start, True, sizes
     for mask in beginnings:
@@ -171,7 +171,7 @@ def _least_squares(
     mask: Any = 1.0,
     end: End = FINE,
 ) -> tuple[bool, np.ndarray]:
-    """Whether the search converged, and where it ended; `mask` says which differences count."""
+    """Run one least-squares search: return a convergence flag and the coordinates."""
     # imported here: it takes a third of a second
     from scipy.optimize import least_squares
 
@@ -187,7 +187,7 @@ def _least_squares(
         return full
 
     def reduced(x: np.ndarray) -> np.ndarray:
-        """Slopes and values, of thousands of rows, turned into as many rows as columns: the same squares."""
+        """Return slopes and values reduced to a square matrix by QR, with the same sums of squares."""
         if x.tobytes() not in last:
             there = misfit(whole(x))
             columns = np.column_stack([there.slopes[:, free] * reach, there.values]) * weights[:, None]
@@ -208,8 +208,8 @@ def _least_squares(
     if not np.all(np.isfinite(first)):
         raise CalibrationError("the robot that the search begins from has no solution under these controls")
     if misfit.cautious:
-        # the search's first step is as long as one: a factor of e, a number's own size or, if that is zero,
-        # what the number would do by itself
+        # the first step of the search has length one: a factor of e, a number's own size or, if that is zero,
+        # its own one-dimensional Gauss-Newton step
         alone = np.linalg.norm(first[:, -1]) * _inverse(np.linalg.norm(first[:, :-1], axis=0))
         own = np.where(begin != 0.0, np.abs(begin), np.where(alone > 0.0, alone, 1.0))
         origin, reach = begin, np.where(logarithmic(misfit.unknowns)[free], 1.0, own)
@@ -223,7 +223,7 @@ def _least_squares(
 
 
 def _gap(misfit: Misfit, ended: Fit, worst: float) -> Gap | None:
-    """What the data do not determine, if anything: at all, or with errors up to `worst` times the value."""
+    """Return the undetermined parameters, if any; `worst` limits errors relative to the values."""
     unknowns, free = misfit.unknowns, ended.free
     names = np.array(labels_of(unknowns))[free]
     weighted = misfit(ended.coordinates).slopes[:, free] * ended.weights(misfit)[:, None]
@@ -247,7 +247,7 @@ def _gap(misfit: Misfit, ended: Fit, worst: float) -> Gap | None:
 
 
 def _magnitudes(misfit: Misfit, ended: Fit) -> Float[np.ndarray, " n"]:
-    """For each number the largest of its parameter, before or now; the allowed range where all are zero."""
+    """Return the largest size of each number's parameter, before or after; its range if all are zero."""
     unknowns = misfit.unknowns
     names = np.array(labels_of(unknowns))
     largest = np.maximum(np.abs(values(misfit.robot, unknowns)), np.abs(found(unknowns, ended.coordinates)))
@@ -265,7 +265,7 @@ def _together(names: np.ndarray, parts: np.ndarray) -> Gap:
 
 
 def _check_range(misfit: Misfit, ended: Fit) -> None:
-    """Raise if a number ended where its allowed range does; zero is a value like others."""
+    """Raise if a number ended at a limit of its allowed range; a limit of zero is accepted."""
     unknowns = misfit.unknowns
     low, high = limits(misfit.robot, unknowns)
     numbers = found(unknowns, ended.coordinates)
@@ -282,7 +282,7 @@ def _inverse(sizes: np.ndarray) -> np.ndarray:
 
 
 def systematic(misfit: Misfit, ended: Fit) -> tuple[str, ...]:
-    """Fields in which what is left is not noise: rows are alike that lie further apart than noise reaches."""
+    """Return the fields whose remainder is not noise: its rows are correlated at large lags."""
     blocks = misfit.blocks(misfit(ended.coordinates).values)
     which = np.zeros(len(misfit.fields), dtype=bool)
     for lag in LAGS:

@@ -1,4 +1,4 @@
-"""Physical parameters as the numbers that a search moves: which, from where, within which bounds."""
+"""Physical parameters as unknowns of a search: names, initial values and bounds."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from knode_cosserat.rods.system import System
 
 
 class Unknown(NamedTuple):
-    """One parameter to be found: how its value is made of the numbers that are searched.
+    """One unknown parameter, and the composition of its value from the searched numbers.
 
-    "number": a scalar. "multiple": one number times the identity matrix. "diagonal": a matrix's three.
-    "components": those of a vector or a list. What cannot be zero or less is searched by its logarithm.
+    "number": a scalar. "multiple": one number times the identity matrix. "diagonal": the three diagonal
+    numbers of a matrix. "components": the components of a vector or a list. Positive parameters are searched
+    by their logarithm.
     """
 
     name: str
@@ -28,13 +29,13 @@ class Unknown(NamedTuple):
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """A name for each number."""
+        """Names of the numbers."""
         if self.kind in ("number", "multiple"):
             return (self.name,)
         return tuple(f"{self.name}[{i}]" for i in range(self.size))
 
     def value(self, numbers: Any) -> Any:
-        """The parameter's value from its numbers."""
+        """Return the parameter's value from its numbers."""
         if self.kind == "number":
             return numbers[0]
         if self.kind == "multiple":
@@ -46,12 +47,12 @@ Unknowns = tuple[Unknown, ...]
 
 
 def owner_of(robot: System) -> System:
-    """The system whose parameters they are: of a model, its knowledge."""
+    """Return the system that owns the parameters; for a KNODE, its nominal model."""
     return owner_of(robot.knowledge) if isinstance(robot, KNODE) else robot
 
 
 def unknowns_of(robot: System, names: Sequence[str] | None) -> Unknowns:
-    """The named parameters of a robot, or all that have a value and can be searched.
+    """Return the named parameters of a robot, or all that have a value and can be searched.
 
     Raises:
         ParameterError: a name that does not exist or is given twice, a parameter without a value, or a
@@ -81,7 +82,7 @@ def unknowns_of(robot: System, names: Sequence[str] | None) -> Unknowns:
 
 
 def _unknown(owner: System, name: str, parameter: Parameter) -> Unknown | str:
-    """How a parameter is searched, or why it cannot be."""
+    """Return the unknown of a parameter, or the reason why it cannot be searched."""
     given = getattr(owner, name)
     if given is None:
         return f"{name} has no value: it follows from other parameters; give it one first, or calibrate those"
@@ -99,12 +100,12 @@ def _unknown(owner: System, name: str, parameter: Parameter) -> Unknown | str:
 
 
 def labels(unknowns: Unknowns) -> tuple[str, ...]:
-    """A name for each number that is searched."""
+    """Return a name for each searched number."""
     return tuple(label for unknown in unknowns for label in unknown.labels)
 
 
 def values(robot: System, unknowns: Unknowns) -> Float[np.ndarray, " n"]:
-    """The numbers as the robot has them."""
+    """Return the robot's values of the numbers."""
     owner = owner_of(robot)
     parts = []
     for unknown in unknowns:
@@ -114,7 +115,7 @@ def values(robot: System, unknowns: Unknowns) -> Float[np.ndarray, " n"]:
 
 
 def limits(robot: System, unknowns: Unknowns) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """The lowest and the highest allowed value of each number."""
+    """Return the lowest and the highest allowed value of each number."""
     known = owner_of(robot).parameters()
     low, high = (
         [getattr(known[u.name], end) for u in unknowns for _ in range(u.size)] for end in ("low", "high")
@@ -123,30 +124,30 @@ def limits(robot: System, unknowns: Unknowns) -> tuple[Float[np.ndarray, " n"], 
 
 
 def units(robot: System, unknowns: Unknowns) -> tuple[str, ...]:
-    """The unit of each number."""
+    """Return the unit of each number."""
     known = owner_of(robot).parameters()
     return tuple(known[unknown.name].unit for unknown in unknowns for _ in range(unknown.size))
 
 
 def logarithmic(unknowns: Unknowns) -> np.ndarray:
-    """Which numbers are searched by their logarithm."""
+    """Return true for numbers that are searched by their logarithm."""
     return np.array([unknown.logarithmic for unknown in unknowns for _ in range(unknown.size)])
 
 
 def searched(unknowns: Unknowns, numbers: np.ndarray) -> np.ndarray:
-    """Coordinates of the search from the numbers."""
+    """Return coordinates of the search from the numbers."""
     which = logarithmic(unknowns)
     return np.where(which, np.log(np.where(which, numbers, 1.0)), numbers)
 
 
 def found(unknowns: Unknowns, coordinates: np.ndarray) -> np.ndarray:
-    """The numbers from the coordinates of the search."""
+    """Return the numbers from the coordinates of the search."""
     which = logarithmic(unknowns)
     return np.where(which, np.exp(np.where(which, coordinates, 0.0)), coordinates)
 
 
 def with_coordinates(robot: System, unknowns: Unknowns, coordinates: Any) -> System:
-    """The robot with the parameters that the coordinates stand for; they may be JAX tracers."""
+    """Return the robot with the parameters at these coordinates, which may be JAX tracers."""
     changes, first = {}, 0
     for unknown in unknowns:
         numbers = coordinates[first : first + unknown.size]
@@ -156,7 +157,7 @@ def with_coordinates(robot: System, unknowns: Unknowns, coordinates: Any) -> Sys
 
 
 def with_numbers(robot: System, unknowns: Unknowns, numbers: np.ndarray) -> System:
-    """The robot with these numbers, each within what is allowed."""
+    """Return the robot with these numbers, each clipped to its allowed range."""
     within = np.clip(numbers, *limits(robot, unknowns))
     changes, first = {}, 0
     for unknown in unknowns:

@@ -1,1 +1,1 @@
-"""Models in files whose loading runs no code."""
+"""Model files, whose loading runs no code."""

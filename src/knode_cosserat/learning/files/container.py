@@ -1,14 +1,15 @@
-"""Arrays, plain values and objects of known classes as the bytes of one file, with a checksum.
+"""File format for arrays, plain values and objects of known classes, with a checksum.
 
     knode-cosserat model, format 1, package 0.1.0
     <sha256, hex> <size of the header> <size of the arrays>
     {"arrays": [["<f8", [512, 28]], …], …}                            the header: JSON, ASCII
     the arrays, one after the other, in C order
 
-The checksum is of everything but itself. Values that JSON does not have stand in the header as an object with
-one key: {"$array": 3} is array number 3, {"$scalar": 3} the NumPy scalar in it, {"$tuple": […]} a tuple,
-{"$class": "Name", "fields": {…}} an object, {"$dict": [[key, value], …]} a dictionary that looks like one of
-these. Nothing in a file is ever run or imported: its names are looked up among the classes that are given.
+The checksum covers everything but itself. Values that JSON does not support are stored in the header as an
+object with one key: {"$array": 3} is array number 3, {"$scalar": 3} the NumPy scalar in it, {"$tuple": […]} a
+tuple, {"$class": "Name", "fields": {…}} an object, {"$dict": [[key, value], …]} a dictionary with keys that
+begin with "$". No content of a file is ever executed or imported: class names are looked up among the given
+classes.
 """
 
 from __future__ import annotations
@@ -28,10 +29,10 @@ import numpy as np
 
 from knode_cosserat._files import package_version, replacing
 
-#: bytes of a header, and of the arrays: what a hostile file can ask for ends there
+#: largest number of bytes of the header and of the arrays, as a limit for hostile files
 MOST_HEADER = 4 * 2**20
 MOST_ARRAYS = 2**30
-#: objects in one file: each takes time to be traced
+#: largest number of objects in one file, because each takes time to be traced
 MOST_OBJECTS = 5_000
 
 #: classes of earlier versions, and the class of the same order that replaced them
@@ -40,7 +41,7 @@ EARLIER_CLASSES = {"RK4": "Lobatto4"}
 EARLIER_FIELDS = {"Settings": ("elimination",), "NewtonOptions": ("across_steps",)}
 
 _SIZES = {"b": (1,), "i": (1, 2, 4, 8), "u": (1, 2, 4, 8), "f": (2, 4, 8), "c": (8, 16)}
-#: what an array's numbers may be, in NumPy's notation
+#: accepted array types, in NumPy's notation
 _TYPES = {
     np.dtype(f"{order}{kind}{size}").str for kind, sizes in _SIZES.items() for size in sizes for order in "<>"
 }
@@ -50,16 +51,16 @@ _ALLOWED = "numbers, text, None, arrays of numbers, and lists, tuples and dictio
 
 
 class ContainerError(ValueError):
-    """What cannot be packed or unpacked, in one line that does not name the file."""
+    """A value that cannot be packed or unpacked. The message is one line that does not name the file."""
 
     def __init__(self, message: str):
-        # a file's own words may have line ends and worse in them
+        # text from a file may contain line ends and control characters
         line = "".join(letter if letter.isprintable() else " " for letter in message)
         super().__init__(line if len(line) <= 600 else line[:600] + "…")
 
 
 class UnknownClassError(ContainerError):
-    """A file has an object of a class that is not among those given; `name` is what the class is called."""
+    """A file has an object of an unknown class; `name` is the name of the class."""
 
     def __init__(self, message: str, name: str):
         super().__init__(message)
@@ -67,7 +68,7 @@ class UnknownClassError(ContainerError):
 
 
 class Title(NamedTuple):
-    """What a file says that it is: its kind, and the version of that kind's format."""
+    """Kind of a file, and version of its format."""
 
     name: str
     version: int
@@ -80,23 +81,23 @@ Classes = Mapping[str, type]
 
 
 class Writer:
-    """Collects the arrays of values, and gives the values in the form in which a header has them."""
+    """Collects the arrays of values, and converts values to the form of the header."""
 
     def __init__(self) -> None:
         self._arrays: list[np.ndarray] = []
         self._objects = 0
 
     def value(self, value: Any, where: str, classes: Classes, *, others: bool = False) -> Any:
-        """A value for the header.
+        """Return a value in the form of the header.
 
         Args:
             value: it may contain arrays, and objects of dataclasses and named tuples.
-            where: what messages call it.
+            where: name of the value in messages.
             classes: the known classes, by name.
-            others: whether other classes are allowed; whoever reads the file has to know them.
+            others: true to allow other classes; the reader of the file must know them.
 
         Raises:
-            ContainerError: there is something in it that cannot be kept.
+            ContainerError: the value contains something that cannot be stored.
         """
         try:
             return self._value(value, where, classes, others)
@@ -165,7 +166,7 @@ class Writer:
         return parts
 
     def file(self, title: Title, header: dict[str, Any]) -> bytes:
-        """The bytes of a file whose header has these entries, made of what `value` gave."""
+        """Return the bytes of a file whose header has these entries, which were made by `value`."""
         arrays = [[array.dtype.str, list(array.shape)] for array in self._arrays]
         try:
             text = json.dumps({**header, "arrays": arrays}, separators=(",", ":")).encode("ascii")
@@ -189,7 +190,7 @@ class Writer:
 
 
 def write(path: Path, data: bytes) -> None:
-    """Write a file that appears complete or not at all. Raises `ContainerError`."""
+    """Write a file atomically. Raises `ContainerError`."""
     try:
         with replacing(path) as temporary:
             temporary.write_bytes(data)
@@ -198,12 +199,12 @@ def write(path: Path, data: bytes) -> None:
 
 
 def same_class(one: type, other: type) -> bool:
-    """Whether two classes are one, or one is the other defined again, as happens in a notebook."""
+    """True if two classes are identical, or have the same module and name (redefined in a notebook)."""
     return one is other or (one.__module__, one.__qualname__) == (other.__module__, other.__qualname__)
 
 
 def has_fields(cls: type) -> bool:
-    """Whether a class is a dataclass (an Equinox module is one) or a named tuple."""
+    """True if a class is a dataclass (such as an Equinox module) or a named tuple."""
     return dataclasses.is_dataclass(cls) or (issubclass(cls, tuple) and hasattr(cls, "_fields"))
 
 
@@ -224,9 +225,9 @@ def _checksum(first: bytes, sizes: bytes, body: bytes) -> bytes:
 
 
 def read(path: Path) -> bytes:
-    """The bytes of a file, if it is one and not too large. Raises `ContainerError`."""
+    """Return the bytes of a regular file that is not too large. Raises `ContainerError`."""
     try:
-        # asked first: opening a pipe would wait for somebody to write
+        # checked first: opening a pipe would block until somebody writes
         if not path.is_file():
             what = "this is a folder; allowed is a file" if path.is_dir() else "no such file"
             raise ContainerError(what if path.is_dir() or not path.exists() else "not a file")
@@ -242,7 +243,7 @@ class Reader:
     """A file's header, and its values with the arrays and objects in their places.
 
     Raises:
-        ContainerError: the bytes are of something else, of another version, truncated, or damaged.
+        ContainerError: the bytes are of another kind or version, truncated, or damaged.
     """
 
     def __init__(self, data: bytes, title: Title) -> None:
@@ -258,14 +259,14 @@ class Reader:
         self._objects = 0
 
     def entry(self, name: str, kind: type, mapping: Any = None) -> Any:
-        """An entry of the header, or of a mapping in it, of the kind that it should be."""
+        """Return an entry of the header, or of a mapping in it, checked for its type."""
         mapping = self.header if mapping is None else mapping
         if type(mapping.get(name)) is not kind:
             raise ContainerError(f"{name!r} is missing in its header, or not a {kind.__name__}")
         return mapping[name]
 
     def value(self, value: Any, where: str, classes: Classes) -> Any:
-        """What `Writer.value` made of a value, turned back. Objects are made of the given classes only."""
+        """Return a value from the result of `Writer.value`. Objects are of the given classes only."""
         try:
             return self._value(value, where, classes)
         except RecursionError:
@@ -313,7 +314,7 @@ class Reader:
 
 
 def _parts(data: bytes, title: Title) -> tuple[bytes, bytes]:
-    """Header and arrays, checked."""
+    """Return the bytes of header and arrays, checked."""
     name = title.name.encode("ascii")
     if not data.startswith(name[: len(data)] if data else name):
         raise ContainerError(f"not a file of the kind {title.name!r}")
@@ -344,7 +345,7 @@ def _parts(data: bytes, title: Title) -> tuple[bytes, bytes]:
 
 
 def _unpacked(described: list[Any], data: bytes) -> list[np.ndarray]:
-    """The arrays, each a copy of its own. Nothing is allocated that the data do not fill."""
+    """Return the arrays as separate copies. No more memory is allocated than the data fill."""
     arrays, offset = [], 0
     for number, entry in enumerate(described):
         if not _is_array(entry):
@@ -364,7 +365,7 @@ def _unpacked(described: list[Any], data: bytes) -> list[np.ndarray]:
 
 
 def _is_array(entry: Any) -> bool:
-    """A known type, and a shape that NumPy could have even where the array is empty."""
+    """True for an accepted type, and a shape that NumPy accepts even if the array is empty."""
     if not (isinstance(entry, list) and len(entry) == 2 and isinstance(entry[1], list)):
         return False
     kind, shape = entry
@@ -379,7 +380,7 @@ def _is_item(part: Any) -> bool:
 
 
 def _made(cls: Any, values: dict[str, Any], where: str) -> Any:
-    """An object of a class from its fields; those that the file does not have are at their defaults."""
+    """Return an object of a class from its fields; missing fields have their defaults."""
     values = {**_defaults(cls), **values}
     expected = _fields(cls)
     for name in (*expected, *values):
@@ -393,14 +394,14 @@ def _made(cls: Any, values: dict[str, Any], where: str) -> Any:
     try:
         if not issubclass(cls, eqx.Module):
             return cls(**{field.name: values[field.name] for field in dataclasses.fields(cls) if field.init})
-        # as JAX does it: a constructor may take something else than the fields
+        # like JAX's unflattening: the constructor's arguments may differ from the fields
         made = object.__new__(cls)
         for name in expected:
             object.__setattr__(made, name, values[name])
         for base in cls.__mro__:
             if "__check_init__" in vars(base):
                 vars(base)["__check_init__"](made)
-    except Exception as error:  # a class may find fault in any way
+    except Exception as error:  # validation in a class may raise any error
         raise ContainerError(f"{where}, a {cls.__name__}, is not possible: {_first_line(error)}") from None
     return made
 

@@ -1,16 +1,16 @@
-"""Models as files: the weights, what is known of them, and the knowledge as the text of a robot file.
+"""Model files: the weights, the metadata of the fit, and the nominal model as the text of a robot file.
 
-A file is a `container`: its header describes the knowledge, the residual and what `about` tells of the fit,
-with the names of their classes, and the arrays come back bit for bit. Loading runs no code that a file
-brings: an object is made only of a class that is known by its name, and only its fields are set. The
-package's own residuals are known. One of yours has to be told, at loading or once and for all:
+A file is a `container`: its header describes the nominal model, the residual and the metadata in `about`,
+with the names of their classes. Arrays are restored bit for bit. Loading runs no code from a file: objects
+are made only of known classes, and only their fields are set. The package's own residuals are known. A
+user's residual class must be given at loading, or registered once:
 
     model = load_model("model", residuals=[MyResidual])
     register(MyResidual)        # also for trajectories of such models
 
-The fields of a residual may hold arrays, numbers, text, None, other Equinox modules whose classes are told
-too, and lists, tuples and dictionaries of these; its constructor is not called. The checksum in a file finds
-what happened to it by accident, and tampering by somebody who does not care to make a new one.
+The fields of a residual may hold arrays, numbers, text, None, other Equinox modules of known classes, and
+lists, tuples and dictionaries of these; its constructor is not called. The checksum detects accidental
+damage. It is no protection against deliberate changes, because it can be recomputed.
 """
 
 from __future__ import annotations
@@ -34,11 +34,13 @@ from knode_cosserat.learning.files.container import (
     Writer,
 )
 from knode_cosserat.learning.knode import KNODE, About
-from knode_cosserat.learning.residual import Network, Residual
+from knode_cosserat.learning.passive import Passive, Sizes
+from knode_cosserat.learning.residual import Network, Nothing, Residual
 from knode_cosserat.learning.structured.expansion import Expansion, Term
 from knode_cosserat.learning.structured.residual import Load, Structured
 from knode_cosserat.rods import robot_file
 from knode_cosserat.rods.system import History, System, is_traced
+from knode_cosserat.rods.trained_range import TrainedRange
 from knode_cosserat.solvers import space, time
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.settings import Settings
@@ -53,14 +55,14 @@ _Class = TypeVar("_Class", bound=type)
 
 
 class ModelFileError(ValueError):
-    """A model's file that cannot be read or written; the message is one line that says why."""
+    """A model file that cannot be read or written. The message is one line with the reason."""
 
 
 def register(cls: _Class) -> _Class:
-    """Let files name a class: a residual, a module inside one, or a dataclass or named tuple in `about`.
+    """Register a class for files: a residual, a module inside one, or a dataclass or named tuple in `about`.
 
     Raises:
-        ModelFileError: another class has this name already, or it has no fields that could be kept.
+        ModelFileError: another class has this name already, or the class has no fields.
     """
     _add(_classes, cls)
     return cls
@@ -80,20 +82,21 @@ def _add(classes: dict[str, type], cls: Any) -> None:
 
 
 for _known in (
-    Network, Structured, Load, Expansion, Term, Settings, NewtonOptions, space.Euler, space.Lobatto2,
-    space.Lobatto4, time.BDF1, time.BDF2, time.BDFAlpha, time.Trapezoidal, time.Static,
+    Network, Nothing, Passive, Sizes, Structured, Load, Expansion, Term, Settings, NewtonOptions, space.Euler,
+    space.Lobatto2, space.Lobatto4, time.BDF1, time.BDF2, time.BDFAlpha, time.Trapezoidal, time.Static,
+    TrainedRange,
 ):  # fmt: skip
     register(_known)
 
 
 def save(model: KNODE, path: str | Path) -> None:
-    """Write a model as a file that `load_model` reads back equal, at exactly this path.
+    """Write a model to a file at exactly this path; `load_model` reads an equal model.
 
-    The file appears complete or not at all. A knowledge of a class that no robot file can name does not stop
-    it: its class, layouts and parameters are written, and `load_model` asks for it.
+    The file is written atomically. If no robot file can describe the nominal model, its class name, layouts
+    and parameters are written, and `load_model` needs the nominal model as an argument.
 
     Raises:
-        ModelFileError: there is something in the model that cannot be kept, it is a batch, or the file cannot
+        ModelFileError: the model contains something that cannot be stored, it is a batch, or the file cannot
             be written.
     """
     data = encoded(model, str(path))
@@ -104,17 +107,17 @@ def save(model: KNODE, path: str | Path) -> None:
 
 
 def load_model(path: str | Path, *, knowledge: System | None = None, residuals: Iterable[type] = ()) -> KNODE:
-    """Read a model that `save` wrote.
+    """Read a model from a file of `save`.
 
     Args:
         path: the file.
-        knowledge: the knowledge of the model. Only needed for one that no robot file can describe, such as
-            one of a class of yours; it has to be the one that the model was saved with.
-        residuals: classes that the model's residual needs beside those of the package.
+        knowledge: the nominal model. Needed only if no robot file can describe it, such as for a user's
+            class; it must equal the one that the model was saved with.
+        residuals: classes of the model's residual that are not in the package.
 
     Raises:
-        ModelFileError: the file cannot be read, is something else, of another version, truncated or damaged,
-            or what is in it does not fit together.
+        ModelFileError: the file cannot be read, is of another kind or version, truncated or damaged, or its
+            parts do not fit together.
     """
     try:
         data = container.read(Path(path))
@@ -127,7 +130,7 @@ def load_model(path: str | Path, *, knowledge: System | None = None, residuals: 
 
 
 def encoded(model: KNODE, source: str) -> bytes:
-    """The bytes of a model's file; `source` is what errors call it. Raises `ModelFileError`."""
+    """Return the bytes of a model's file; `source` is its name in errors. Raises `ModelFileError`."""
     try:
         if type(model) is not KNODE:
             raise ContainerError(f"a {type(model).__name__} is not a model; allowed is a KNODE")
@@ -147,12 +150,13 @@ def _header(writer: Writer, model: KNODE) -> dict[str, Any]:
     return {
         "knowledge": _described(writer, model.knowledge),
         "residual": writer.value(model.residual, "residual", _classes, others=True),
+        "trained": writer.value(model.trained, "trained", _classes),
         "about": writer.value(model.about.facts, "about", _classes),
     }
 
 
 def _described(writer: Writer, knowledge: System) -> dict[str, Any]:
-    """A model again, a robot file's text, or what can be said of a system that no robot file can name."""
+    """Return a nominal model for the header: a nested model, the text of a robot file, or its traits."""
     name = {"class": type(knowledge).__name__}
     if type(knowledge) is KNODE:
         return {**name, "model": _header(writer, knowledge)}
@@ -165,7 +169,7 @@ def _described(writer: Writer, knowledge: System) -> dict[str, Any]:
 
 
 def _traits(system: System) -> dict[str, Any]:
-    """What a knowledge that is given again must have in common with the one that was there."""
+    """Return the traits that a given nominal model must share with the saved one."""
     layouts = {"y": system.y_layout, "z": system.z_layout, "controls": system.control_layout}
     parameters = {name: getattr(system, name) for name in system.parameters()}
     return {
@@ -183,7 +187,7 @@ def _traits(system: System) -> dict[str, Any]:
 def decoded(
     data: bytes, source: str, *, knowledge: System | None = None, residuals: Iterable[type] = ()
 ) -> KNODE:
-    """The model in a file's bytes; see `load_model`."""
+    """Return the model in a file's bytes; see `load_model`."""
     classes = dict(_classes)
     for cls in residuals:
         _add(classes, cls)
@@ -209,7 +213,13 @@ def _model(reader: Reader, header: Any, classes: Classes, given: System | None) 
     facts = reader.value(reader.entry("about", dict, header), "about", classes)
     if type(facts) is not dict:
         raise ContainerError(f"its 'about' is a {type(facts).__name__}; allowed is a mapping")
-    return KNODE(knowledge, residual, About(facts))
+    # files of earlier versions have no range
+    trained = reader.value(header.get("trained"), "trained", classes)
+    if not isinstance(trained, TrainedRange | None):
+        raise ContainerError(
+            f"its range is a {type(trained).__name__}; allowed is a TrainedRange, or nothing"
+        )
+    return KNODE(knowledge, residual, About(facts), trained)
 
 
 def _knowledge(reader: Reader, described: dict[str, Any], classes: Classes, given: System | None) -> System:
@@ -264,18 +274,18 @@ def _short(value: Any) -> str:
     return text if len(text) <= 100 else text[:100] + "…"
 
 
-# what fits together
+# consistency of nominal model and residual
 
 
 def _require_fit(model: KNODE) -> None:
-    """Raise `ContainerError` unless the equations can be traced, and give what the layouts say."""
+    """Raise `ContainerError` unless the equations can be traced, with results as in the layouts."""
     ny, nz = model.y_layout.size, model.z_layout.size
     history = History(np.zeros(()), np.zeros(ny), np.zeros(nz), np.zeros(ny))
     try:
         length = np.asarray(model.length)
         found = jax.eval_shape(_equations, model, np.zeros(ny), np.zeros(model.control_size), history)
         shapes = [part.shape for part in found]
-    except Exception as error:  # a residual may stumble in any way over arrays that do not fit
+    except Exception as error:  # a residual may raise any error if arrays do not fit
         line = (str(error).splitlines() or [type(error).__name__])[0]
         reason = re.sub(r"<function \w+ at 0x[0-9a-f]+>", "the equations", line[:300])
         raise ContainerError(f"residual and knowledge do not fit together: {reason}") from None

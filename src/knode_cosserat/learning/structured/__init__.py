@@ -1,1 +1,1 @@
-"""The structured residual: terms in the places that mechanics leaves open, solved for in closed form."""
+"""Structured residual: correction terms of length, stress and loads, solved in closed form."""

@@ -1,10 +1,9 @@
-"""Sparse linear regression that finds its own regularisation: automatic relevance determination.
+"""Sparse linear regression with automatic relevance determination.
 
-Every weight has a prior of its own, w_i ~ N(0, 1/α_i), and the noise a precision β; all are set to what
-makes the data likeliest (MacKay, "Bayesian interpolation", 1992; Tipping, "Sparse Bayesian learning", 2001).
-Weights that the data do not ask for go to zero and are taken out. Worked on the triangular factor of the
-features, not on their normal equations: data of simulations are exact to ten digits, and squaring would lose
-half of them.
+Every weight has its own prior, w_i ~ N(0, 1/α_i), and the noise has a precision β. All are set by maximising
+the evidence (MacKay, "Bayesian interpolation", 1992; Tipping, "Sparse Bayesian learning", 2001). Irrelevant
+weights go to zero and are removed. The algorithm uses the triangular factor of the features, not their normal
+equations: simulated data are exact to ten digits, and normal equations would lose half of them.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-#: a weight is taken out when it moves the prediction by less than this part of the noise, over all samples
+#: a weight is removed if its effect on the prediction, over all samples, is below this part of the noise
 RELEVANCE = 0.3
 MOST_SWEEPS = 100
 #: a weight stays if it is this many times its standard error
@@ -22,7 +21,7 @@ SIGNIFICANCE = 5.0
 
 
 class Weights(NamedTuple):
-    """Weights (k,), zero where not needed, their standard errors, and the size of what is left (rms)."""
+    """Weights (k,), zero if irrelevant, their standard errors, and the rms remainder."""
 
     values: Float[Any, " k"]
     errors: Float[Any, " k"]
@@ -37,13 +36,13 @@ def relevant(
     floors: Float[Any, " n"],
     weight: Float[Any, " S"] | None = None,
 ) -> list[Weights]:
-    """The few weights with which features explain each target.
+    """Return sparse weights of the features for each target.
 
     Args:
         features: (S, k).
-        targets: (S, n), each on its own.
-        floors: what of each target (rms) is known to be noise at least, such as the solver's tolerance.
-        weight: how much each sample counts, on average one.
+        targets: (S, n), each with its own regression.
+        floors: lower bounds of the noise (rms) in each target, such as the solver's tolerance.
+        weight: sample weights, on average one.
     """
     if weight is not None:
         root = np.sqrt(weight)[:, None]
@@ -58,7 +57,7 @@ def relevant(
     units = np.concatenate([sizes[live], np.where(spreads > 0.0, spreads, 1.0)])
     factor: Any = np.linalg.qr(np.column_stack([features[:, live], targets]) / units, mode="r")
     X, along = factor[: len(live), : len(live)], factor[:, len(live) :]
-    # beside the features' directions only the length of a target counts
+    # orthogonal to the features only the length of a target matters
     beside = np.linalg.norm(along[len(live) :], axis=0)
     y = np.vstack([along[: len(live)], beside])
     X = np.vstack([X, np.zeros((len(y) - len(X), len(live)))])
@@ -86,7 +85,7 @@ def _nothing(count: int, size: int, spread: float, floor: float) -> Weights:
 
 
 def _of_one(X: Any, y: Any, count: int, least: float) -> tuple[Any, Any, Any, float] | None:
-    """The active weights of one target, their values and errors, and the squares left; None if none is."""
+    """Return the active weights of one target, values, errors and remaining squares; None if all are zero."""
     active = np.arange(X.shape[1])
     alpha, beta = np.full(X.shape[1], 1e-2), 1e6
     for sweep in range(MOST_SWEEPS):
@@ -105,7 +104,7 @@ def _of_one(X: Any, y: Any, count: int, least: float) -> tuple[Any, Any, Any, fl
         certain = np.abs(w) > SIGNIFICANCE * np.sqrt(variance)
         if certain.all():
             break
-        # the least certain half of the doubtful at a time: what one explains another may take over
+        # remove the less certain half of the insignificant ones at a time: others may take over their effect
         doubt = np.abs(w) / np.sqrt(variance)
         active = active[doubt >= min(SIGNIFICANCE, np.median(doubt[~certain]) * (1.0 + 1e-9))]
         if not len(active):
@@ -117,7 +116,7 @@ def _of_one(X: Any, y: Any, count: int, least: float) -> tuple[Any, Any, Any, fl
 
 
 def _posterior(X: Any, y: Any, alpha: Any, beta: float) -> tuple[Any, Any, float]:
-    """Mean and variance of the weights, and the sum of squares that they leave."""
+    """Return mean and variance of the weights, and the remaining sum of squares."""
     k = len(alpha)
     stacked = np.vstack([np.sqrt(beta) * X, np.diag(np.sqrt(alpha))])
     Q, R = np.linalg.qr(stacked)

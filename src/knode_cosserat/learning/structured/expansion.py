@@ -3,13 +3,13 @@
 The functions of a vector x with the natural size σ, with k a learned slope:
 
     linear       x/σ
-    square       |xᵢ| xᵢ/σ², cube   xᵢ³/σ³, each number by itself (drag)
-    square_norm  |x| x/σ², cube_norm   |x|² x/σ³ (what stiffens or softens, in any direction)
-    saturating   tanh(k xᵢ/σ)/k, for several k (friction): a hidden layer whose units look along the axes
+    square       |xᵢ| xᵢ/σ², cube   xᵢ³/σ³, for each component (drag)
+    square_norm  |x| x/σ², cube_norm   |x|² x/σ³ (stiffening or softening, in any direction)
+    saturating   tanh(k xᵢ/σ)/k, for several k (friction): a hidden layer with units along the axes
     saturating_norm   x/σ / √(1 + k²|x|²/σ²), the same in any direction
 
-With the constant they are the linear path and the network of a structured residual: few enough to be found
-by least squares, and each can be read.
+With the constant they are the linear path and the network of a structured residual. They are few enough for
+least squares, and each can be interpreted.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from jaxtyping import Float
 from knode_cosserat.rods.layout import Layout
 
 LINEAR = ("linear",)
-#: what a velocity may do: drag is linear or quadratic
+#: functions of velocities: drag is linear or quadratic
 DRAG = ("linear", "square")
 CURVED = ("linear", "square", "cube", "square_norm", "cube_norm", "saturating", "saturating_norm")
-#: where the slopes of the saturating functions start
+#: initial slopes of the saturating functions
 SLOPES = (0.5, 1.0, 2.0, 4.0)
 
 
 class Term(NamedTuple):
-    """One function of one vector: where the vector stands, and which of the sizes and slopes is its own."""
+    """One function of one vector: the vector's position, and the indices of its scale and slope."""
 
     name: str
     start: int
@@ -44,14 +44,14 @@ class Term(NamedTuple):
 
     @property
     def size(self) -> int:
-        """How many numbers it gives."""
+        """Number of values of the function."""
         return self.stop - self.start
 
 
 class Expansion(eqx.Module):
-    """What some functions of a packed vector (x,) add up to: (outputs,)."""
+    """Weighted sum (outputs,) of functions of a packed vector (x,)."""
 
-    #: what gradient training leaves alone
+    #: attributes that gradient training does not change
     fixed: ClassVar[tuple[str, ...]] = ("scales",)
 
     #: (outputs, 1 + features), the constant first
@@ -61,7 +61,7 @@ class Expansion(eqx.Module):
     terms: tuple[Term, ...] = eqx.field(static=True)
 
     def features(self, x: Float[Any, " x"]) -> Float[Any, " features"]:
-        """The functions' values, the constant first."""
+        """Return the functions' values, the constant first."""
         values = [
             _value(term, x[term.start : term.stop] / self.scales[term.scale], self.slopes)
             for term in self.terms
@@ -69,7 +69,7 @@ class Expansion(eqx.Module):
         return jnp.concatenate([jnp.ones(1), *values])
 
     def __call__(self, x: Float[Any, " x"]) -> Float[Any, " outputs"]:
-        """The weighted sum."""
+        """Return the weighted sum."""
         if all(term.form == "linear" for term in self.terms):
             # one small product of numbers that do not change along the rod
             sizes = jnp.concatenate(
@@ -84,11 +84,11 @@ class Expansion(eqx.Module):
 
     @property
     def curved(self) -> bool:
-        """Whether anything but the linear functions is there."""
+        """True if there are nonlinear functions."""
         return any(term.form != "linear" for term in self.terms)
 
     def labels(self) -> list[str]:
-        """A name for every feature, the constant first."""
+        """Return a name for every feature, the constant first."""
         names = ["1"]
         for term in self.terms:
             axes = "xyz" if term.size == 3 else [str(i + 1) for i in range(term.size)]
@@ -97,19 +97,19 @@ class Expansion(eqx.Module):
         return names
 
     def columns(self) -> list[tuple[Term, range]]:
-        """Each term with the features that are its own."""
+        """Return each term with the indices of its features."""
         starts = np.cumsum([1, *(term.size for term in self.terms)])
         return [
             (term, range(start, start + term.size)) for term, start in zip(self.terms, starts, strict=False)
         ]
 
     def columns_of(self, other: Self) -> list[int]:
-        """Where the features of an expansion with some of these terms stand among these."""
+        """Return the indices here of another expansion's features; its terms must be a subset."""
         own = {(term.name, term.form, term.slope): where for term, where in self.columns()}
         return [0, *(k for term in other.terms for k in own[term.name, term.form, term.slope])]
 
     def owned(self) -> Any:
-        """Which features each slope belongs to: (slopes, features), true or false."""
+        """Return true where a feature depends on a slope (slopes, features)."""
         owned = np.zeros((len(self.slopes), self.weights.shape[1]), dtype=bool)
         for term, where in self.columns():
             if term.slope >= 0:
@@ -117,12 +117,12 @@ class Expansion(eqx.Module):
         return owned
 
     def kinds(self) -> list[tuple[str, str]]:
-        """The vector and the form that each slope belongs to."""
+        """Return the vector and the form of each slope."""
         found = {term.slope: (term.name, term.form) for term in self.terms if term.slope >= 0}
         return [found.get(k, ("", "")) for k in range(len(self.slopes))]
 
     def pruned(self) -> Self | None:
-        """Without the terms that have no weight; None if nothing has any."""
+        """Return a copy without terms of zero weight; None if all weights are zero."""
         used = np.any(np.asarray(self.weights) != 0.0, axis=0)
         if not used.any():
             return None
@@ -152,7 +152,7 @@ def _value(term: Term, x: Any, slopes: Any) -> Any:
 def expansion(
     layout: Layout, values: Float[Any, "S x"], forms: dict[str, Sequence[str]], outputs: int
 ) -> Expansion:
-    """An expansion with zero weights, sized by the values that each vector takes in the data."""
+    """Return an expansion with zero weights, scaled by the vectors' rms values in the data."""
     terms: list[Term] = []
     scales: list[float] = []
     slopes: list[float] = []

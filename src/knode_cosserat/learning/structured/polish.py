@@ -1,8 +1,7 @@
-"""The weights of a structured residual, polished on the segments themselves.
+"""Gauss-Newton refinement of the weights of a structured residual, on the segments.
 
-Where the scheme has stages, or a discontinuity is inside a segment, y at its end is not linear in the
-weights. The weights that sparse regression chose are then moved, all at once, until y at the segments' ends
-fits best (Gauss-Newton).
+If the scheme has stages, or a discontinuity is inside a segment, y at its end is not linear in the weights.
+The nonzero weights from sparse regression are then refined together, to fit y at the segments' ends.
 """
 
 from __future__ import annotations
@@ -29,9 +28,9 @@ MOST_ROUNDS = 8
 def polished(
     knowledge: System, data: Dataset, residual: Structured, sizes: Float[Any, " y"], shares: Float[Any, " S"]
 ) -> Structured:
-    """The residual with its stretch and the weights of its loads moved to where y at the segments' ends fits.
+    """Return the residual with stretch and load weights refined to fit y at the segments' ends.
 
-    `sizes` (y,) is what each number's misfit is measured by.
+    `sizes` (y,) are the scales of the misfit.
     """
     weights, _ = ravel_pytree(_movable(residual))
     free = np.flatnonzero(np.asarray(weights))
@@ -77,7 +76,7 @@ def _moved(residual: Structured, free: Any, move: Any) -> Structured:
 def _linearised(
     knowledge: System, residual: Structured, space: SpaceScheme, data: Samples, free: Any
 ) -> tuple[Any, Any]:
-    """What the segments miss (S, y), and how that changes with each free weight (w, S, y)."""
+    """Return the misfit of the segments (S, y), and the derivatives of y by each free weight (w, S, y)."""
 
     def reached(move: Any) -> Any:
         model = KNODE(knowledge, _moved(residual, free, move))

@@ -1,9 +1,10 @@
 """The structured residual from samples, by least squares: material, stretch, loads and tip.
 
-At the true states every part is linear in its weights. What the law of the strains leaves, at the true
-strains, gives the stress; the geometry of the samples gives the stretch; what the balance leaves gives the
-loads. A scheme without stages (Euler's, the trapezoidal rule) is linear in the rates at a segment's ends, and
-so in the weights. For others y_s comes from splines, and the weights found are then polished on the segments.
+At the true states every part is linear in its weights. The residual of the constitutive law at the true
+strains gives the stress, the geometry of the samples gives the stretch, and the residual of the balance
+gives the loads. A scheme without stages (Euler's, the trapezoidal rule) is linear in the rates at a segment's
+ends, and so in the weights. For others y_s comes from splines, and the weights are then refined on the
+segments.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ from knode_cosserat.rotation import rotation_matrix
 from knode_cosserat.solvers.grid import ON_NODE
 from knode_cosserat.solvers.space import SpaceScheme
 
-#: of the natural size of what is balanced: less than this is the solver's tolerance, not a load
+#: smaller relative values are the solver's tolerance, not a load
 LEAST = 1e-9
 #: the solver's tolerance, in natural units, with some room
 TOLERANCE = 3e-10
@@ -58,10 +59,9 @@ TOLERANCE = 3e-10
 def solve(
     knowledge: System, data: Dataset, options: StructuredOptions, seeds: Sequence[int]
 ) -> list[Structured]:
-    """The structured residuals that explain the samples, one for each seed.
+    """Return the structured residuals that explain the samples, one for each seed.
 
-    A seed says how rows count if they are resampled, and nothing else: what they have to explain, and with
-    what, is found once.
+    A seed only determines the row weights if rows are resampled. Targets and features are shared.
     """
     seen = _Seen(knowledge, data, options)
     found: list[Structured] = []
@@ -77,14 +77,14 @@ def solve(
 
 
 class _Seen:
-    """What has to be explained, and what may explain it: the same however samples count.
+    """Targets and features of the regressions, which do not depend on sample weights.
 
-    Its segments are those of strands.
+    Segments are those of single strands.
     """
 
     def __init__(self, knowledge: System, data: Dataset, options: StructuredOptions):
         self.knowledge, self.data, self.options = knowledge, data, options
-        #: what is learned along the rod is the law of a strand
+        #: the strand, whose law is learned along the rod
         self.strand = knowledge.strand
         self._along: _Along | None = None
 
@@ -96,7 +96,7 @@ class _Seen:
 
     @functools.cached_property
     def law(self) -> tuple[list[Offer], list[Target]]:
-        """Of the law of the strains."""
+        """Features and targets of the constitutive law."""
         return _law(self.strand, self.data.segments, self.options)
 
     @functools.cached_property
@@ -106,7 +106,7 @@ class _Seen:
 
     @functools.cached_property
     def moved(self) -> Float[np.ndarray, "S y"]:
-        """y_s of each segment: its mean if the scheme is linear in rates; otherwise that at its start."""
+        """y_s of each segment: its mean if the scheme is linear in rates; otherwise its initial value."""
         segments, strand = self.data.segments, self.strand
         if not self.linear:
             return np.asarray(segments.slope) / float(strand.length)
@@ -114,7 +114,7 @@ class _Seen:
 
 
 class _Along:
-    """The rod where the equations of a residual's loads are evaluated, and what a load may be a sum of.
+    """Points along the rod for the regression of loads, with the features there.
 
     `points` are the starts of all segments and, if the scheme uses them, then their ends. It depends on the
     stress only where the rod has discontinuities.
@@ -124,13 +124,13 @@ class _Along:
         strand, data = seen.strand, seen.data
         points = _points(strand, residual, data.segments, data.space)
         self.views: _Views = jax.tree.map(np.asarray, _views(strand, points))
-        #: the knowledge's y_s at the true strains
+        #: y_s of the nominal model at the true strains
         self.rates = mean_of_ends(np.asarray(_rates(strand, points)), len(data.segments.t))
         self.sides = _sides(strand, loaded(strand), points.y, self.views, seen.options.curved)
 
 
 class _Sides(NamedTuple):
-    """A load's layout, what it may be a sum of, and the rotations (S, 3, 3) of its fields."""
+    """Layout of a load, its features, and the rotations (S, 3, 3) of its fields."""
 
     layout: Layout
     material: list[Offer]
@@ -139,7 +139,7 @@ class _Sides(NamedTuple):
 
 
 def _sides(system: System, layout: Layout, y: Any, views: _Views, curved: bool) -> _Sides:
-    """What a load of this layout may be a sum of, of the material and ambient, and its frames."""
+    """Return the material and ambient features of a load of this layout, and its frames."""
     material = _candidates(system, material_layout(system), layout, views, curved)
     ambient = expansion(ambient_layout(system), views.ambient, {}, layout.size)
     offers = [Offer(part, views.material) for part in material]
@@ -147,7 +147,7 @@ def _sides(system: System, layout: Layout, y: Any, views: _Views, curved: bool) 
 
 
 def _counting(data: Samples | TipSamples, options: StructuredOptions, seed: int) -> Counting:
-    """How much each sample counts, on average one; resampled, rows count at random (Bayesian bootstrap)."""
+    """Return sample weights (on average one) and folds; resampled rows have random weights (bootstrap)."""
     shares = data.weight
     if options.resample:
         rows, which = np.unique(data.origin, axis=0, return_inverse=True)
@@ -156,7 +156,7 @@ def _counting(data: Samples | TipSamples, options: StructuredOptions, seed: int)
 
 
 def _floors(layout: Layout, values: Float[Any, "S n"]) -> Float[Any, " n"]:
-    """For each number, the part of its field's natural size below which nothing is meant."""
+    """Return the noise floor of each number, a small part of its field's rms."""
     floors = np.zeros(layout.size)
     for field in layout.fields:
         where = layout.slice(field.name)
@@ -169,7 +169,7 @@ def _floors(layout: Layout, values: Float[Any, "S n"]) -> Float[Any, " n"]:
 
 @jax.jit
 def _left_of_law(knowledge: System, data: Samples) -> tuple[Any, Any, Any]:
-    """What the law leaves at the true strains, its natural size, and what stress may depend on."""
+    """Return the residual of the law at the true strains, its natural size, and the inputs of stress."""
 
     def one(sample: Samples) -> Any:
         s = start_of(knowledge, sample.place)
@@ -180,7 +180,7 @@ def _left_of_law(knowledge: System, data: Samples) -> tuple[Any, Any, Any]:
         def law(z: Any) -> Any:
             return knowledge.left_of_law(s, sample.t, sample.y, z, sample.control, history)
 
-        # its slope along z sums up what the law's terms are made of
+        # the derivative along z gives the size of the law's terms
         left, size = jax.jvp(law, (z,), (z,))
         return -left, size, inputs
 
@@ -197,7 +197,7 @@ def _law(knowledge: System, data: Samples, options: StructuredOptions) -> tuple[
     ]
     floors = _floors(knowledge.z_layout, size)
     spots = [knowledge.z_layout.slice(field.name) for field in fields]
-    # curved in the strain itself and its rate only: what the others do is no more than a linear coupling
+    # nonlinear in the strain itself and its rate only; other strains have a linear coupling
     targets = [
         Target(left[:, spot], None, floors[spot], (field.name, f"{field.name}_t"))
         for field, spot in zip(fields, spots, strict=True)
@@ -209,7 +209,7 @@ def _law(knowledge: System, data: Samples, options: StructuredOptions) -> tuple[
 
 
 class _Views(NamedTuple):
-    """What loads may depend on, at every sample, and A + c0 B if B is not zero."""
+    """Inputs of loads at every sample, and A + c0 B if B is not zero."""
 
     material: Float[Any, "S o"]
     ambient: Float[Any, "S a"]
@@ -279,7 +279,7 @@ def _views(knowledge: System, points: Points) -> _Views:
 
 @jax.jit
 def _rates(knowledge: System, points: Points) -> Any:
-    """The knowledge's y_s at the true strains."""
+    """Return y_s of the nominal model at the true strains."""
 
     def one(point: Points) -> Any:
         history = unpacked_history(knowledge, point.c0, point.history)
@@ -289,7 +289,7 @@ def _rates(knowledge: System, points: Points) -> Any:
 
 
 def _with_loads(seen: _Seen, residual: Structured, counting: Counting) -> Structured:
-    """The residual with its stretch and its loads."""
+    """Return the residual with its stretch and its loads."""
     knowledge, data, along = seen.strand, seen.data, seen.along(residual)
     length, rates, moved = float(knowledge.length), along.rates, seen.moved
     if seen.linear:
@@ -309,14 +309,14 @@ def _with_loads(seen: _Seen, residual: Structured, counting: Counting) -> Struct
     least = floors if seen.linear else np.maximum(floors, data.doubt / length)
     load = _load(along.sides, missing[:, where], least[where], counting)
     residual = dataclasses.replace(residual, stretch=np.array(longer - 1.0), load=load)
-    # of two ends: strains on the near side of discontinuities, and the mean of A + c0 B, are not exact
+    # with two ends: strains on the near side of discontinuities, and the mean of A + c0 B, are not exact
     if seen.linear and not (data.space.implicit and (knowledge.cuts or knowledge.mixed)):
         return residual
     return polished(knowledge, data, residual, ds * floors, counting.shares)
 
 
 def _longer(knowledge: System, moved: Any, rates: Any, shares: Any) -> float:
-    """How much longer the rod is than the knowledge has it, from the rates that are geometry."""
+    """Return the ratio of the rod's length to the nominal length, from the geometric rates."""
     ratios, precisions = [], []
     for name in geometric(knowledge):
         where = knowledge.y_layout.slice(name)
@@ -336,7 +336,7 @@ def _longer(knowledge: System, moved: Any, rates: Any, shares: Any) -> float:
 def _candidates(
     knowledge: System, inputs: Layout, layout: Layout, views: _Views, curved: bool
 ) -> list[Expansion]:
-    """What a load may be a sum of: at first, and if that is not enough."""
+    """Return the candidate expansions of a load: a simple one, and a nonlinear one if `curved`."""
     stated = knowledge.velocities or knowledge.observable_layout.names
     simple: dict[str, Sequence[str]] = dict.fromkeys(knowledge.velocities, DRAG)
     rich: dict[str, Sequence[str]] = dict.fromkeys(stated, CURVED)
@@ -347,7 +347,7 @@ def _candidates(
 
 
 def _load(sides: _Sides, missing: Any, floors: Any, counting: Counting) -> Load | None:
-    """The load that explains what is missing (S, l)."""
+    """Return the load that explains the missing loads (S, l)."""
     targets = [
         Target(missing[:, spot], sides.frames.get(name), floors[spot])
         for name in sides.layout.names
@@ -362,7 +362,7 @@ def _turns() -> Callable[[Any], Any]:
 
 
 def _frames(knowledge: System, layout: Layout, y: Any) -> dict[str, Any]:
-    """The rotation matrices (S, 3, 3) of each field that is turned."""
+    """Return the rotation matrices (S, 3, 3) of each field in a rotated frame."""
     found = {
         name: np.asarray(_turns()(knowledge.y_layout.get(y, name)))
         for name in {field.frame for field in layout.fields if field.frame}
@@ -375,7 +375,7 @@ def _frames(knowledge: System, layout: Layout, y: Any) -> dict[str, Any]:
 
 @jax.jit
 def _at_tip(adapted: System, data: TipSamples) -> tuple[Any, _Views]:
-    """What is left of the conditions at the true tip, and what a load there may depend on."""
+    """Return the residual of the conditions at the true tip, and the inputs of a load there."""
 
     def one(sample: TipSamples) -> Any:
         history = unpacked_history(adapted, sample.c0, sample.history)

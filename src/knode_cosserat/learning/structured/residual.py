@@ -1,13 +1,13 @@
-"""The structured residual: it corrects what a mechanician would, where the equations have it.
+"""Structured residual: mechanical corrections of length, constitutive law, loads and tip.
 
     length      L (1 + γ)
     material    C z + D z_t + σ(z - z*, z_t) = f2: the strains are corrected before the kinematics use them
-    loads       + R f(what is seen from the material) + g(control): on what balances loads, nothing else
-    tip         + the same two at the tip: a mass, a weight, a force that the knowledge does not have
+    loads       + R f(material-frame observables) + g(control): on the balance equations only
+    tip         + the same two at the tip: a mass, a weight, a force that the nominal model lacks
 
 The geometry (p_s, h_s, q_s, ω_s of a rod) stays exact, and the laws do not depend on the time step. Each of
-σ, f and g is an `Expansion`. A system says by its layouts what is a load and what is turned (`Field.frame`,
-`Field.load`); in one that does not say, every rate may be corrected.
+σ, f and g is an `Expansion`. A system's layouts mark loads and rotated fields (`Field.frame`,
+`Field.load`); without such marks every rate may be corrected.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from knode_cosserat.rods.layout import Field, Layout
 from knode_cosserat.rods.system import History, System
 from knode_cosserat.rotation import dot, rotation_matrix, small_inverse
 
-#: Newton corrections of a material's law that is not linear, at most, and the parts of each that are tried
+#: largest number of Newton corrections of a nonlinear law, and the damping factors tried for each
 MOST_CORRECTIONS = 40
 PARTS = np.array([1.0, 0.5, 0.2, 0.05])
-#: a law is solved when what is left of it is this part of its terms
+#: a law is solved when its residual is this part of its terms
 SOLVED = 1e-12
 
 
 class Load(eqx.Module):
-    """A load as seen from the material, of observables and control, and a global one, of the control."""
+    """A load in the material frame, of observables and control, and a global load, of the control."""
 
     material: Expansion | None
     ambient: Expansion | None
@@ -42,7 +42,7 @@ class Load(eqx.Module):
     def __call__(
         self, layout: Layout, frames: Layout, y: Float[Any, " y"], observables: Any, control: Any
     ) -> Float[Any, " l"]:
-        """The load, laid out by `layout`, in the frames in which the equations have it."""
+        """Return the load, laid out by `layout`, in the frames of the equations."""
         total = jnp.zeros(layout.size)
         if self.material is not None:
             total = turned_back(layout, frames, y, self.material(jnp.concatenate([observables, control])))
@@ -52,23 +52,23 @@ class Load(eqx.Module):
 
 
 class _Law(NamedTuple):
-    """The knowledge's law and σ(z - z*, c0 z + ʰz) together, for the strains z at one point."""
+    """Sum of the nominal law and σ(z - z*, c0 z + ʰz), for the strains z at one point."""
 
     stress: Expansion
-    #: of the knowledge's law at z0: all of it if it is linear
+    #: derivative of the nominal law at z0; the whole law if it is linear
     M: Float[Any, "z z"]
     c0: Any
     z_rest: Float[Any, " z"]
     z0: Float[Any, " z"]
     hz: Float[Any, " z"]
 
-    #: by what strain and rate count there (see `law_inputs`); None: by one
+    #: factors of strain and rate at the point (see `law_inputs`); None: one
     factors: Any = None
-    #: the knowledge and its arguments, if its law is not linear
+    #: the nominal model and its arguments, if its law is nonlinear
     point: Any = None
 
     def left(self, z: Float[Any, " z"]) -> Float[Any, " z"]:
-        """What is left of the law."""
+        """Return the residual of the law."""
         strain, rate = z - self.z_rest, self.c0 * z + self.hz
         if self.factors is not None:
             strain, rate = strain * self.factors[0], rate * self.factors[1]
@@ -82,13 +82,13 @@ class _Law(NamedTuple):
 
 
 def solved(law: _Law) -> Float[Any, " z"]:
-    """The strains of a law that is not linear, by Newton's method from z0, damped; NaN where it finds none.
+    """Return the strains of a nonlinear law, by damped Newton's method from z0; NaN if it fails.
 
-    Each correction is taken in that part, of several, which leaves least: friction makes laws so steep that
-    whole corrections overshoot for ever.
+    Each correction uses the damping factor with the least residual: with friction, laws are so steep that
+    full corrections always overshoot.
     """
     n = law.z0.shape[0]
-    # natural size of what the law sums up, number by number
+    # natural size of the law's terms, for each number
     enough = SOLVED * jnp.sum(jnp.abs(law.M) * (jnp.abs(law.z0) + jnp.abs(law.z_rest) + 1e-3), axis=1)
 
     def size(left: Any) -> Any:
@@ -111,7 +111,7 @@ def solved(law: _Law) -> Float[Any, " z"]:
 
 
 class Structured(Residual):
-    """See the module. Parts that are not needed are None, and cost nothing."""
+    """Structured residual (see the module). Unused parts are None, and cost nothing."""
 
     stretch: Float[Any, ""]
     stress: Expansion | None
@@ -119,13 +119,13 @@ class Structured(Residual):
     tip_load: Load | None
 
     def adapted(self, knowledge: System) -> System:
-        """The knowledge with its length corrected."""
+        """Return the nominal model with corrected length."""
         return knowledge.replace(length=knowledge.length * (1.0 + self.stretch))
 
     def derivatives(
         self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-        """y_s and z: the strains corrected first, then the loads added to what they balance."""
+        """Return y_s and z: strains are corrected first, then loads are added to the balance equations."""
         z = self.strains(knowledge, s, t, y, control, history)
         y_s = knowledge.rates(s, t, y, z, control, history)
         if self.load is None:
@@ -143,7 +143,7 @@ class Structured(Residual):
     def strains(
         self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> Float[Any, " z"]:
-        """z of the corrected law, the knowledge's plus σ(z - z*, c0 z + ʰz), from the knowledge's z0."""
+        """Return z of the corrected law, the nominal one plus σ(z - z*, c0 z + ʰz), from the nominal z0."""
         z0 = knowledge.strains(s, t, y, control, history)
         if self.stress is None:
             return z0
@@ -165,7 +165,7 @@ class Structured(Residual):
     def tip(
         self, knowledge: System, t: Any, control: Any, y: Float[Any, " y"], history: History
     ) -> Float[Any, " k"]:
-        """The knowledge's conditions, and the load that it misses there."""
+        """Return the nominal model's conditions at the tip plus the learned tip load."""
         conditions = knowledge.tip(t, control, y, history)
         if self.tip_load is None:
             return conditions
@@ -184,18 +184,18 @@ class Structured(Residual):
 
 
 def factors_at(knowledge: System, s: Any, control: Any) -> tuple[Any, Any] | None:
-    """By what the law differs at s, of a law that is one of stresses; one of strains is alike everywhere."""
+    """Return the local factors of a law of stresses at s; None for a law of strains."""
     return None if _in_strains(knowledge) else knowledge.law_factors(s, control)
 
 
 def _in_strains(knowledge: System) -> bool:
-    """Whether a system gives its strains directly, and states no law of stresses."""
+    """True if a system gives its strains directly, without a law of stresses."""
     kind = type(knowledge)
     return kind.left_of_law is System.left_of_law and kind.constitutive is System.constitutive
 
 
 def law_inputs(knowledge: System, s: Any, control: Any, z: Any, z_t: Any) -> Float[Any, " 2z"]:
-    """What stress may depend on: strain and rate, as much of them as the section there makes of it."""
+    """Return the inputs of stress: strain and rate, scaled by the local factors of the section."""
     strain, factors = z - knowledge.unstressed(s, control), factors_at(knowledge, s, control)
     if factors is None:
         return jnp.concatenate([strain, z_t])
@@ -203,31 +203,31 @@ def law_inputs(knowledge: System, s: Any, control: Any, z: Any, z_t: Any) -> Flo
 
 
 def tip_observables(knowledge: System, y: Float[Any, " y"], control: Any, history: History) -> Any:
-    """What a load at the tip may depend on: not on the strains there, which it determines itself."""
+    """Return the observables for a tip load, without the strains there, which it determines itself."""
     s = knowledge.length
     _, z = knowledge.rest(s)
     return knowledge.observables(s, y, history.c0 * y + history.y, z, jnp.zeros_like(z), control)
 
 
 def loaded(knowledge: System) -> Layout:
-    """The fields of y whose rates balance loads; all of them if the system does not say."""
+    """Return the fields of y whose rates balance loads; all fields if none is marked."""
     stated = tuple(field for field in knowledge.y_layout.fields if field.load)
     return Layout(*stated) if stated else knowledge.y_layout
 
 
 def geometric(knowledge: System) -> tuple[str, ...]:
-    """The fields of y whose rates are geometry; none if the system does not say."""
+    """Return the fields of y with geometric rates; none if no loads are marked."""
     names = knowledge.y_layout.names
     return tuple(name for name in names if name not in loaded(knowledge).names)
 
 
 def material_layout(knowledge: System) -> Layout:
-    """What a load as seen from the material may depend on: the observables, and what an ambient one may."""
+    """Return the input layout of a material-frame load: the observables, and the ambient inputs."""
     return knowledge.observable_layout + ambient_layout(knowledge)
 
 
 def ambient_layout(knowledge: System) -> Layout:
-    """What an ambient load may depend on: the control, and its actuation if that differs."""
+    """Return the input layout of an ambient load: the control, and its actuation if that differs."""
     if type(knowledge).actuation is System.actuation:
         return knowledge.control_layout
     size = jax.eval_shape(knowledge.actuation, np.zeros(knowledge.control_size)).shape[0]
@@ -236,7 +236,7 @@ def ambient_layout(knowledge: System) -> Layout:
 
 
 def ambient_inputs(knowledge: System, control: Any) -> Any:
-    """The numbers laid out by `ambient_layout`."""
+    """Return the numbers laid out by `ambient_layout`."""
     if type(knowledge).actuation is System.actuation:
         return control
     return jnp.concatenate([control, knowledge.actuation(control)])
@@ -245,7 +245,7 @@ def ambient_inputs(knowledge: System, control: Any) -> Any:
 def strain_matrix(
     knowledge: System, s: Any, t: Any, y: Any, z: Any, control: Any, history: History
 ) -> Float[Any, "z z"]:
-    """The derivative of the law of the strains: C + c0 D; the identity where a system gives them directly."""
+    """Return the derivative of the law, C + c0 D; the identity if a system gives its strains directly."""
     if _in_strains(knowledge):
         return jnp.eye(knowledge.z_layout.size)
     if not knowledge.linear_law:
@@ -255,7 +255,7 @@ def strain_matrix(
 
 
 def turned_back(layout: Layout, frames: Layout, y: Any, load: Any) -> Any:
-    """A load as seen from the material, in the frames in which the equations have it."""
+    """Return a material-frame load in the frames of the equations."""
     parts = []
     for field in layout.fields:
         part = layout.get(load, field.name)

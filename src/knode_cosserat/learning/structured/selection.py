@@ -1,8 +1,8 @@
-"""Which terms to take where no few of them explain everything: forward selection by held-out error.
+"""Forward selection of terms by held-out error.
 
-What a wrong set of functions leaves is not noise, and evidence would take term after term to chase it;
-such sums fit the data and fail elsewhere. So the terms are added one by one, each the one that lowers the
-error most on data that were held out (whole trajectories, or parts of the only one), until none does.
+The remainder of an incomplete set of functions is not noise. Selection by evidence would then add many terms,
+which overfit. Instead, terms are added one by one, each time the one that lowers the error on held-out data
+most (whole trajectories, or parts of a single one), until none lowers it enough.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from jaxtyping import Float
 #: a term stays if it lowers the held-out squared error by this part
 GAIN = 0.05
 MOST_TERMS = 12
-#: into how many parts the rows of a single trajectory are held out
+#: number of folds of the rows of a single trajectory
 PARTS = 3
 
 
@@ -29,7 +29,7 @@ class Moments(NamedTuple):
 
 
 def folds(origin: Any) -> Any:
-    """Which fold each sample (trajectory, row) belongs to: its trajectory, or a part of the only one."""
+    """Return the fold of each sample (trajectory, row): its trajectory, or a part of a single one."""
     trajectories = np.unique(origin[:, 0])
     if len(trajectories) > 1:
         return np.searchsorted(trajectories, origin[:, 0])
@@ -38,13 +38,13 @@ def folds(origin: Any) -> Any:
 
 
 def moments(features: Float[Any, "S k"], values: Float[Any, "S n"], fold: Any) -> list[Moments]:
-    """The moments of every fold."""
+    """Return the moments of every fold."""
     parts = [(features[fold == k], values[fold == k]) for k in np.unique(fold)]
     return [Moments(X.T @ X, X.T @ y, np.sum(y * y, axis=0)) for X, y in parts]
 
 
 def held_out_error(parts: Sequence[Moments], columns: Any) -> float:
-    """Sum of squares that the folds' values keep when each is predicted from the others."""
+    """Return the cross-validated sum of squared errors: each fold is predicted from the others."""
     total = Moments(*(sum(each) for each in zip(*parts, strict=True)))
     error = 0.0
     for part in parts:
@@ -58,7 +58,7 @@ def held_out_error(parts: Sequence[Moments], columns: Any) -> float:
 
 
 def selected(parts: Sequence[Moments], groups: Sequence[Any], floor: float) -> tuple[list[int], float]:
-    """The groups of columns to take, and the held-out error with them; `floor` is the least that is meant."""
+    """Return the selected groups of columns, and their held-out error; stops at the error `floor`."""
     taken: list[int] = []
     columns = np.zeros(0, dtype=int)
     error = held_out_error(parts, columns)
@@ -75,7 +75,7 @@ def selected(parts: Sequence[Moments], groups: Sequence[Any], floor: float) -> t
 
 
 def _solution(G: Any, b: Any) -> Any:
-    """Least squares from moments, in units in which every feature has size one."""
+    """Solve least squares from moments, in units in which every feature has size one."""
     size = np.sqrt(np.maximum(np.diag(G), 1e-300))
     scaled = G / size[:, None] / size[None, :] + 1e-11 * np.eye(len(G))
     return np.linalg.solve(scaled, b / size[:, None]) / size[:, None]

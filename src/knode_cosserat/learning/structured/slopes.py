@@ -1,6 +1,6 @@
-"""The slopes of saturating functions, refined together with their weights.
+"""Refinement of the slopes of saturating functions together with their weights.
 
-Where the true law saturates, the fixed slopes of an expansion only surround the right one. The weights are
+If the true law saturates, its slope lies between the fixed slopes of an expansion. The weights are
 solved for inside (variable projection, Golub & Pereyra 1973), so that the search is over the slopes alone.
 """
 
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-#: how far a slope may go, either way
+#: largest factor by which a slope may change, in both directions
 FURTHEST = 30.0
 
 
@@ -24,15 +24,15 @@ def refined(
     owned: Float[Any, "slopes k"],
     kinds: Sequence[Any],
 ) -> Float[Any, " slopes"]:
-    """Slopes with which the features in use explain the target best.
+    """Return the slopes with which the used features explain the target best.
 
     Args:
         build: features (S, k) from slopes.
         target: (S,).
-        used: which features have a weight.
-        slopes: where to start.
-        owned: which features each slope belongs to.
-        kinds: of each slope; those of a kind stay apart, because two that meet are no better than one.
+        used: true for features with a weight.
+        slopes: initial slopes.
+        owned: true where a feature depends on a slope.
+        kinds: kind of each slope; slopes of one kind are kept apart, because two equal ones are redundant.
     """
     # imported here: it takes a third of a second
     from scipy.optimize import least_squares
@@ -61,7 +61,7 @@ def refined(
 
 
 def _bounds(start: Any, kinds: Sequence[Any]) -> tuple[Any, Any]:
-    """How far each logarithm may go: a long way, but only near the middle to the next of its kind."""
+    """Return bounds of each logarithm; they stay below the middle to the next slope of the same kind."""
     low, high = start - np.log(FURTHEST), start + np.log(FURTHEST)
     for i, kind in enumerate(kinds):
         for other, same in zip(start, kinds, strict=True):

@@ -1,7 +1,7 @@
-"""The structured residual from trajectories: solved for, and again with the past that it says itself.
+"""Structured residual from trajectories, solved in closed form, in a few rounds.
 
-Trajectories hold the nodes. A scheme with stages between them looks back on more: by interpolation at first,
-and then, where the trajectories were simulated, as the model that was found says.
+Trajectories hold the nodes only. A scheme with stages between nodes also needs the history there. It is
+interpolated at first. If the trajectories were simulated, it is then evaluated by the fitted model.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from knode_cosserat.learning.structured.residual import Structured
 from knode_cosserat.rods.system import System
 from knode_cosserat.trajectory import Trajectory
 
-#: how often it is solved for again: each time leaves a hundredth of the error
+#: number of repeated solves: each reduces the error to a hundredth
 ROUNDS = 2
 
 
 def solved(
     knowledge: System, trajectories: Sequence[Trajectory], options: StructuredOptions, seeds: Sequence[int]
 ) -> list[Structured]:
-    """The structured residuals that explain the trajectories, one for each seed.
+    """Return the structured residuals that explain the trajectories, one for each seed.
 
     Raises:
         DataError: a trajectory does not fit the knowledge or the others, is too short or not finite.

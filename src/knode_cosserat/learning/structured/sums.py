@@ -1,8 +1,8 @@
-"""Which functions a load or a stress is a sum of, and their weights, by sparse regression.
+"""Selection of the functions of a load or a stress, and their weights, by sparse regression.
 
-The simple functions first. A field that they leave unexplained may take curved ones too, those few that
-explain data held out (`selection`). Every field of vectors is one regression: what is turned (a load seen
-from the material) and what is not (an ambient load) are found together.
+Simple functions come first. A field that they do not explain may also take nonlinear ones, selected by
+held-out error (`selection`). Every vector field is one regression: loads in the material frame and ambient
+loads in the global frame are found together.
 """
 
 from __future__ import annotations
@@ -25,56 +25,56 @@ from knode_cosserat.learning.structured.slopes import refined
 
 #: a remainder below this part of the target is explained well enough by the simple functions
 WELL = 1e-6
-#: what part of the simple functions' held-out squared error the curved ones may leave, to be taken
+#: nonlinear functions are taken if their held-out squared error is below this part of the simple ones'
 WORTH = 0.8
 
 
 class Target(NamedTuple):
-    """One field that is to be explained: its values, and below what nothing is meant.
+    """One target field of a regression: its values, and the floors below which they are noise.
 
-    `turn` has the rotation matrices from the material's frame to the values', at every point; None if that is
-    the same. There may be several points to a sample, in blocks: a value is the mean of the load at them.
+    `turn` has the rotation matrices from the material frame to the values' frame, at every point; None if
+    the frames are the same. A sample may have several points, in blocks: a value is the mean load over them.
     """
 
     values: Float[Any, "S n"]
     turn: Any
     floors: Float[Any, " n"]
-    #: names of the vectors of which curved functions are allowed; None: of all
+    #: names of the vectors with nonlinear functions; None: all
     curved: tuple[str, ...] | None = None
 
 
 class Counting(NamedTuple):
-    """How samples count: the share of each, on average one, and the fold that each is held out with."""
+    """Sample weights (on average one) and cross-validation folds."""
 
     shares: Float[Any, " S"]
     fold: Any
 
 
 def mean_of_ends(values: Float[np.ndarray, "P ..."], count: int) -> Float[np.ndarray, "S ..."]:
-    """Return the mean over the points of each sample; of all samples the first points come first."""
+    """Return the mean over the points of each sample; the first points of all samples come first."""
     return values if len(values) == count else values.reshape(-1, count, *values.shape[1:]).mean(axis=0)
 
 
 class Offer:
-    """An expansion whose weights are to be found, and what it depends on, at every point."""
+    """An expansion with unknown weights, and its inputs at every point."""
 
     def __init__(self, part: Expansion, inputs: Float[Any, "P x"]):
         self.part, self.inputs = part, inputs
 
     @functools.cached_property
     def features(self) -> Float[np.ndarray, "P k"]:
-        """The values of its functions; the same however samples count, so that seeds share them."""
+        """Values of the functions; independent of sample weights, so that seeds share them."""
         return np.asarray(_features_of(self.part, self.inputs))
 
     def with_slopes(self, slopes: Any) -> Offer:
-        """The same with other slopes."""
+        """Return a copy with other slopes."""
         return Offer(dataclasses.replace(self.part, slopes=slopes), self.inputs)
 
 
 def fitted_load(
     material: Sequence[Offer], ambient: Offer, targets: Sequence[Target], counting: Counting
 ) -> Load | None:
-    """The load that explains the targets: of observables, simple or curved, and of inputs."""
+    """Return the load that explains the targets, from observables (simple or nonlinear) and inputs."""
     own, beside = _best(material, ambient.features, targets, counting)
     outer = dataclasses.replace(ambient.part, weights=np.concatenate(beside)).pruned()
     return None if own is None and outer is None else Load(own, outer)
@@ -83,7 +83,7 @@ def fitted_load(
 def fitted_stress(
     candidates: Sequence[Offer], targets: Sequence[Target], counting: Counting
 ) -> Expansion | None:
-    """The stress that explains the targets, with the simple expansion or the curved."""
+    """Return the stress that explains the targets, by the simple or the nonlinear expansion."""
     return _best(candidates, np.ones((len(counting.shares), 1)), targets, counting)[0]
 
 
@@ -93,22 +93,22 @@ def _features_of(part: Expansion, inputs: Any) -> Any:
 
 
 class _Fit(NamedTuple):
-    """Weights on the material's and the ambient features (n, k), and how much they leave."""
+    """Weights of the material and the ambient features (n, k), and the remainder."""
 
     material: Float[Any, "n k"]
     ambient: Float[Any, "n a"]
-    #: what is left of each regression (rms)
+    #: remainder of each regression (rms)
     left: list[float]
-    #: which columns of the problem have a weight
+    #: true for columns of the problem with a weight
     used: Any
 
 
 class _Problem:
-    """A target with its features as the columns of one regression of all its numbers, or one of each.
+    """A target with its features as the columns of one regression of all its numbers, or one for each.
 
-    Where nothing is turned every number (n,) has a regression of its own on the same columns: the material's
-    features and the ambient ones but for the constant, which would be the material's. Where the load is
-    turned there is one regression; a column is a feature of one of the material's numbers, or an ambient one.
+    Without rotation every number (n,) has its own regression on the same columns: the material features, and
+    the ambient features without the constant, which is already a material feature. With rotation there is one
+    regression; a column is a feature of one of the material's numbers, or an ambient one.
     """
 
     def __init__(self, target: Target, material: Any, ambient: Any, counting: Counting):
@@ -127,7 +127,7 @@ class _Problem:
             self.floors = np.array([target.floors.max()])
 
     def arranged(self, material: Any) -> Any:
-        """The columns, from the material's features (P, k)."""
+        """Return the columns, from the material features (P, k)."""
         count = len(self.target.values)
         if self.target.turn is None:
             return mean_of_ends(np.concatenate([material, self.ambient[:, 1:]], axis=1), count)
@@ -137,14 +137,14 @@ class _Problem:
         return columns.reshape(-1, columns.shape[2])
 
     def spread(self, features: Any) -> Any:
-        """Something of each of the material's features (…, k), for each column; zero for ambient ones."""
+        """Expand values of the material features (…, k) to all columns; zero for ambient ones."""
         copies = 1 if self.target.turn is None else self.size
         rest = self.columns.shape[1] - copies * self.counts[0]
         none = np.zeros((*features.shape[:-1], rest), dtype=features.dtype)
         return np.concatenate([features] * copies + [none], axis=-1)
 
     def solved(self, among: Any = None) -> _Fit:
-        """The fit with these columns (all, by default)."""
+        """Return the fit with these columns (by default all)."""
         among = np.ones(self.columns.shape[1], dtype=bool) if among is None else among
         weights = np.zeros((len(self.floors), len(among)))
         found = relevant(self.columns[:, among], self.values, self.floors, self.shares)
@@ -159,13 +159,13 @@ class _Problem:
         return _Fit(material, ambient, left, np.any(weights != 0.0, axis=0))
 
     def unexplained(self, fit: _Fit) -> float:
-        """What is left as a part of the target; zero at the floor."""
+        """Return the remainder relative to the target; zero at the floor."""
         if max(fit.left) <= 3.0 * self.floors.max():
             return 0.0
         return max(fit.left) / float(np.sqrt(np.mean(self.values**2)))
 
     def groups(self, part: Expansion) -> list[Any]:
-        """The columns that are taken or left together: of each allowed term, and each ambient one."""
+        """Return groups of columns that are selected together: each allowed term, and each ambient one."""
         allowed = self.target.curved
         terms = [
             where for term, where in part.columns()
@@ -181,7 +181,7 @@ class _Problem:
         return [*material, *(rest.reshape(-1, max(len(rest), 1)) + first if len(rest) else [])]
 
     def picked(self, part: Expansion, simple: _Fit) -> Any:
-        """The columns that explain most of what is held out, or none; None if the simple fit is as good."""
+        """Return the columns with the least held-out error; None if the simple fit is nearly as good."""
         root = np.sqrt(self.shares)[:, None]
         parts = moments(self.columns * root, self.values * root, self.fold)
         groups = self.groups(part)
@@ -198,7 +198,7 @@ class _Problem:
 def _best(
     candidates: Sequence[Offer], ambient: Any, targets: Sequence[Target], counting: Counting
 ) -> tuple[Expansion | None, list[Any]]:
-    """The expansion of the fields' best fits, and their ambient weights."""
+    """Return the expansion of the fields' best fits, and their ambient weights."""
     simple, *richer = candidates
     problems = [_Problem(target, simple.features, ambient, counting) for target in targets]
     fits = [problem.solved() for problem in problems]
@@ -239,7 +239,7 @@ def _best(
 def _with_slopes(
     rich: Offer, ambient: Any, targets: dict[int, Target], picks: dict[int, Any], counting: Counting
 ) -> Offer:
-    """The slopes of the saturating functions refined, on the field that they serve worst."""
+    """Return `rich` with refined slopes of the saturating functions, fitted on the worst explained field."""
     part = rich.part
     if not part.slopes.size:
         return rich

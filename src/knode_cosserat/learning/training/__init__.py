@@ -1,1 +1,1 @@
-"""Training by gradients: losses, epochs, many seeds at once, checkpoints."""
+"""Gradient training: losses, epochs, several seeds in parallel, checkpoints."""

@@ -1,7 +1,7 @@
-"""Where a fit stands, kept in files: interrupted at any moment, it goes on from the last of them.
+"""Checkpoints of a fit: after an interruption at any time it resumes from the last one.
 
-A checkpoint says which fit it is of: settings, data and knowledge. That of another one is refused, and so is
-one that is truncated or damaged. Files are `container`s: they appear complete or not at all, and reading one
+A checkpoint identifies its fit by settings, data and nominal model. A checkpoint of another fit is refused,
+and so is a truncated or damaged one. Files are `container`s: they are written atomically, and reading one
 runs no code.
 """
 
@@ -30,12 +30,12 @@ SUFFIX = ".checkpoint"
 
 
 class CheckpointError(ValueError):
-    """A checkpoint that cannot be used or written: one line that says which and why."""
+    """A checkpoint that cannot be used or written. The message is one line: the file and the reason."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Identity:
-    """What makes two fits the same, but for the seed: that stands in a checkpoint's name."""
+    """Identity of a fit, without its seed, which is in the checkpoint's name."""
 
     config: dict[str, Any]
     knowledge: str
@@ -50,13 +50,13 @@ class Identity:
         held_out: Sequence[Trajectory],
         config: FitConfig,
     ) -> Self:
-        """Of the arguments of `fit`."""
+        """Return the identity of a fit from the arguments of `fit`."""
         settings = {name: value for name, value in config.to_dict().items() if name != "seed"}
         hashes = (tuple(map(data_hash, several)) for several in (trajectories, held_out))
         return cls(settings, _knowledge_hash(knowledge), *hashes)
 
     def difference(self, other: dict[str, Any]) -> str:
-        """In which way a file is of another fit; empty if it is of this one."""
+        """Return the difference from the fit of a file, in words; empty if it is the same fit."""
         changed = _first_change(self.config, other.get("config"))
         if changed:
             return f"of other settings: {changed}"
@@ -71,7 +71,7 @@ class Identity:
 
 
 def data_hash(trajectory: Trajectory) -> str:
-    """SHA-256 of a trajectory's times, states, strains and controls: what is learned from."""
+    """Return the SHA-256 of a trajectory's times, states, strains and controls."""
     return _hash([np.asarray(getattr(trajectory, name)) for name in ("time", "y", "z", "control")])
 
 
@@ -104,10 +104,10 @@ def _first_change(own: Any, other: Any, where: str = "") -> str:
 
 
 class Checkpoints:
-    """The checkpoints of one fit, in a folder: one file for each part that runs by itself.
+    """Checkpoints of one fit in a folder: one file for each independent part.
 
     Raises:
-        CheckpointError: the folder cannot be made.
+        CheckpointError: the folder cannot be created.
     """
 
     def __init__(self, folder: str | Path, identity: Identity):
@@ -120,11 +120,11 @@ class Checkpoints:
             raise CheckpointError(f"{folder}: cannot be made a folder: {reason}") from None
 
     def path(self, name: str) -> Path:
-        """The file of a part."""
+        """Return the file of a part."""
         return self.folder / f"{name}{SUFFIX}"
 
     def save(self, name: str, snapshot: dict[str, Any]) -> None:
-        """Write where a part stands, in place of what was there. Raises `CheckpointError`."""
+        """Write the state of a part; replaces its earlier file. Raises `CheckpointError`."""
         writer = Writer()
         try:
             header = {
@@ -137,7 +137,7 @@ class Checkpoints:
             raise CheckpointError(f"{self.path(name)}: {error}") from None
 
     def load(self, name: str) -> dict[str, Any] | None:
-        """Where a part stood, or None if it has not been kept yet. Raises `CheckpointError`."""
+        """Read the state of a part; None if there is no checkpoint yet. Raises `CheckpointError`."""
         path = self.path(name)
         for left_over in self.folder.glob(f".{path.name}.*.tmp"):
             with contextlib.suppress(OSError):
@@ -160,12 +160,12 @@ class Checkpoints:
 
 
 def packed(tree: Any) -> list[np.ndarray]:
-    """The arrays of a pytree, for a snapshot."""
+    """Return the arrays of a pytree, for a snapshot."""
     return [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
 
 
 def unpacked(arrays: Any, like: Any) -> Any:
-    """A pytree like another one with the arrays of a snapshot. Raises `CheckpointError`."""
+    """Return a pytree of the same structure with the arrays of a snapshot. Raises `CheckpointError`."""
     leaves, structure = jax.tree.flatten(like)
     described = [(np.shape(leaf), np.asarray(leaf).dtype) for leaf in leaves]
     if not isinstance(arrays, list) or not all(isinstance(array, np.ndarray) for array in arrays):

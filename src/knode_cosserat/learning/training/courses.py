@@ -1,7 +1,7 @@
-"""Whole simulations against trajectories: the loss that fine-tuning goes down, and the held-out error.
+"""Whole simulations compared with trajectories: the loss of fine-tuning, and the held-out error.
 
-Only what is compared has to be known of a trajectory. Derivatives go through every solved step by the
-implicit function theorem (`solvers.sensitivity`), so that any residual can be trained in this way.
+Only the compared fields of a trajectory must be known. Every solved step is differentiable by the implicit
+function theorem (`solvers.sensitivity`), so that any residual can be trained in this way.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.trajectory import Trajectory
 
-#: what is compared if nothing else is asked for, as far as a system has it
+#: fields compared by default, if the system has them
 POSE = ("p", "h")
 
 
 class Past(NamedTuple):
-    """The rows of some trajectories (B) up to the one that simulations start from."""
+    """Rows of trajectories (B) up to the initial row of the simulations."""
 
     time: Float[Any, "B rows"]
     y: Float[Any, "B rows nodes y"]
@@ -40,17 +40,17 @@ class Past(NamedTuple):
 
 
 class Course(NamedTuple):
-    """Trajectories (B) of one length: what is done, and what should come of it."""
+    """Trajectories (B) of one length: controls and target states."""
 
     past: Past | None
     control: Float[Any, "B T c"]
-    #: row 0 is where simulations start
+    #: row 0 is the initial state of the simulations
     y: Float[Any, "B T+1 nodes y"]
 
 
 @dataclasses.dataclass(frozen=True)
 class Courses:
-    """All trajectories, those of one length together, and how they are simulated."""
+    """All trajectories, grouped by length, with the settings of their simulation."""
 
     parts: tuple[Course, ...]
     compared: tuple[str, ...]
@@ -61,11 +61,11 @@ class Courses:
 def courses(
     knowledge: System, trajectories: Sequence[Trajectory], options: RolloutTraining, what: str = ""
 ) -> Courses:
-    """Trajectories as they are simulated and compared; `what` comes before their number in messages.
+    """Return trajectories prepared for simulation and comparison; `what` precedes their number in messages.
 
     Raises:
-        DataError: one does not fit the knowledge or the others, is too short, begins in motion, or is not
-            finite where it matters.
+        DataError: a trajectory does not fit the nominal model or the others, is too short, begins in motion,
+            or is not finite where it is used.
     """
     compared = _checked_names(knowledge, options.compared)
     first = options.first_row
@@ -114,7 +114,7 @@ def _checked_names(knowledge: System, given: tuple[str, ...] | None) -> tuple[st
 
 
 def _relevant(knowledge: System, trajectory: Any, names: tuple[str, ...], first: int | None) -> Any:
-    """A trajectory with zeros for all that is neither compared nor started from: it may be unknown."""
+    """Return a trajectory with zeros in all unused values, which may be unknown."""
     if not isinstance(trajectory, Trajectory) or np.ndim(trajectory.y) != 3:
         return trajectory
     y, z = np.array(trajectory.y, dtype=float), np.array(trajectory.z, dtype=float)
@@ -131,7 +131,7 @@ def _relevant(knowledge: System, trajectory: Any, names: tuple[str, ...], first:
 
 
 def rolled(model: System, course: Course, settings: Settings, dt: float) -> Float[Any, "B T+1 nodes y"]:
-    """y of all trajectories as the model has them, one after the other; NaN where a step is not solved."""
+    """Return y of all trajectories simulated by the model, one after the other; NaN in unsolved steps."""
 
     def one(given: Any) -> Any:
         past, control = given
@@ -160,10 +160,10 @@ def _tip_errors(model: System, parts: tuple[Course, ...], settings: Settings, dt
 
 
 def held_out_courses(knowledge: System, trajectories: Sequence[Trajectory]) -> Courses | None:
-    """Trajectories to be simulated from rest and compared at the tip; None if there are none.
+    """Return trajectories to simulate from rest and compare at the tip; None if there are none.
 
     Raises:
-        DataError: as `courses`; or the system has no positions.
+        DataError: as for `courses`, or the system has no positions.
     """
     if not trajectories:
         return None
@@ -175,7 +175,7 @@ def held_out_courses(knowledge: System, trajectories: Sequence[Trajectory]) -> C
 
 
 def tip_error(model: System, courses: Courses) -> float:
-    """The root mean square distance (m) of the tips, a mean over trajectories; infinite if not solved."""
+    """Return the rms tip error (m), averaged over trajectories; infinite if a step is not solved."""
     errors = np.asarray(_tip_errors(model, courses.parts, courses.settings, courses.dt))
     return float(np.mean(errors)) if np.all(np.isfinite(errors)) else float("inf")
 
@@ -184,7 +184,7 @@ def tip_error(model: System, courses: Courses) -> float:
 
 
 def scales(courses: Courses, layout: Layout) -> tuple[float, ...]:
-    """By what the errors of each compared field are measured: how much it moves, the root mean square."""
+    """Return the scale of each compared field's errors: the rms of its motion."""
     found = []
     for name in courses.compared:
         values = [layout.get(part.y, name) for part in courses.parts]
@@ -195,7 +195,7 @@ def scales(courses: Courses, layout: Layout) -> tuple[float, ...]:
 
 
 class Aim(NamedTuple):
-    """What the loss is measured against, and by what."""
+    """Targets and scales of the loss."""
 
     knowledge: System
     rest: Any
@@ -207,10 +207,10 @@ class Aim(NamedTuple):
 def loss_and_slope(
     weights: Any, aim: Aim, compared: tuple[str, ...], settings: Settings, dt: float
 ) -> tuple[Float[Any, ""], Any]:
-    """The rollout loss of a residual's weights and its gradient; NaN if a step is not solved.
+    """Return the rollout loss of a residual's weights and its gradient; NaN if a step is not solved.
 
-    A mean over trajectories, rows but the first, nodes and numbers of squared errors, each over the scale of
-    its field; then over fields. A quaternion is compared at length one, and up to its sign.
+    The loss is the mean of squared errors, each over its field's scale, over trajectories, rows (without the
+    first), nodes and numbers, then over fields. Quaternions are normalised, and compared up to their sign.
     """
 
     def loss(weights: Any) -> Any:

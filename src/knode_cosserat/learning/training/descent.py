@@ -1,8 +1,8 @@
 """Gradient training on one-segment samples: one compiled program for all epochs, and for several seeds.
 
-Under a scheme without stages a network adds to the prediction of the knowledge alone. This does not depend on
-the weights: it is found once, and an epoch is then two matrix products and their derivatives. Everything else
-(other schemes, other residuals) is predicted anew in every epoch, just as `samples.predict` has it.
+With a scheme without stages, a network adds to the prediction of the nominal model. That prediction does not
+depend on the weights and is evaluated once; an epoch is then two matrix products and their derivatives. Other
+schemes and residuals are predicted in every epoch by `samples.predict`.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from knode_cosserat.rods.system import System, unpacked_history
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.space import Euler, SpaceScheme
 
-#: the most epochs of one call of the program
+#: largest number of epochs in one call of the program
 PIECE = 50
-#: by which part of itself the best loss must fall to count as better, as in PyTorch's ReduceLROnPlateau
+#: relative decrease of the best loss that counts as an improvement, as in PyTorch's ReduceLROnPlateau
 LEAST_GAIN = 1e-4
 
 ADAM = optax.scale_by_adam(b1=0.9, b2=0.999, eps=1e-8)
@@ -40,7 +40,7 @@ ADAM = optax.scale_by_adam(b1=0.9, b2=0.999, eps=1e-8)
 
 
 def split(residual: Residual) -> tuple[Any, Any]:
-    """The weights of a residual, and the residual without them: `equinox.combine` puts them together."""
+    """Split a residual into its weights and the rest; `equinox.combine` joins them."""
     mask = jax.tree_util.tree_map_with_path(lambda path, leaf: _is_weight(residual, path, leaf), residual)
     return eqx.partition(residual, mask)
 
@@ -55,14 +55,14 @@ def _is_weight(node: Any, path: Any, leaf: Any) -> bool:
     return bool(np.issubdtype(jnp.result_type(leaf), np.floating))
 
 
-# what a network adds to
+# predictions of the nominal model
 
 
 class Known(NamedTuple):
-    """Prediction of each sample (S) by the knowledge alone, and a network's inputs, scaled."""
+    """Predictions of the samples (S) by the nominal model alone, and a network's scaled inputs."""
 
-    #: at the starts of segments, then at their ends if the scheme uses these; the last row is of ones, for
-    #: the biases
+    #: at the starts of segments, then at their ends if the scheme uses them; the last row is ones, for the
+    #: biases
     inputs: Float[Any, "inputs+1 E*S"]
     y: Float[Any, "y S"]
     z: Float[Any, "z S"]
@@ -71,7 +71,7 @@ class Known(NamedTuple):
 
 
 def known(net: Network, knowledge: System, samples: Samples, space: SpaceScheme) -> Known:
-    """Evaluate what does not depend on a network's weights; for schemes without stages."""
+    """Evaluate the terms that do not depend on a network's weights; for schemes without stages."""
     steps = knowledge.length / (knowledge.nodes - 1) * jnp.asarray(space.formula.weights[:2])
 
     def seen(sample: Samples, y: Any, z: Any, record: Any) -> Any:
@@ -94,9 +94,9 @@ def known(net: Network, knowledge: System, samples: Samples, space: SpaceScheme)
 
 
 def corrected(net: Network, known: Known) -> tuple[Float[Any, "y S"], Float[Any, "z S"]]:
-    """Prediction of all samples by knowledge and network: that of `samples.predict`.
+    """Return the predictions of all samples by nominal model and network, equal to `samples.predict`.
 
-    Hidden units first and the biases as one more column: of the layouts tried the fastest (0.61 s for 1000
+    Hidden units first and the biases as an additional column was the fastest layout tried (0.61 s for 1000
     epochs of the paper's preset on one core, 0.54 s with `_product`; samples first 0.69 to 1.0 s).
     """
     first = jnp.concatenate([net.input_weights, net.input_biases[:, None]], axis=1)
@@ -116,7 +116,7 @@ def _product(weights: Float[Any, "outputs hidden"], units: Float[Any, "hidden S"
 
 def _product_slope(given: Any, slope: Any) -> Any:
     weights, units = given
-    # a copy that XLA may not see through: a product with a transposed matrix takes it twice as long
+    # the barrier forces a copy: XLA's product with a transposed matrix takes twice the time
     turned = jax.lax.optimization_barrier(weights.T)
     return slope @ units.T, turned @ slope
 
@@ -125,9 +125,9 @@ _product.defvjp(lambda weights, units: (weights @ units, (weights, units)), _pro
 
 
 def standardised(net: Network, knowledge: System, data: Dataset) -> Network:
-    """Return the network with its inputs shifted and scaled, and its outputs scaled, by the data's spread.
+    """Return the network with standardised inputs and scaled outputs.
 
-    An output is scaled by the root mean square of the correction that it would have to add along a segment.
+    An output is scaled by the root mean square of the correction that is needed along a segment.
     """
     samples = data.segments
     seen = _known(net, knowledge, samples, Euler())
@@ -156,7 +156,7 @@ def _predicted(system: System, space: SpaceScheme, samples: Samples) -> Any:
 
 
 class Numbers(NamedTuple):
-    """The settings that are numbers: other values need no new program."""
+    """Numerical settings, which do not change the compiled program."""
 
     learning_rate: Any
     patience: Any
@@ -175,7 +175,7 @@ class Recipe(NamedTuple):
 
 
 class Data(NamedTuple):
-    """What an epoch needs beside the weights: `known` where that does not change, `samples` elsewhere."""
+    """Inputs of an epoch besides the weights: `known` if predictions are fixed, otherwise `samples`."""
 
     knowledge: System
     rest: Any
@@ -187,12 +187,12 @@ class Data(NamedTuple):
 
 
 class State(NamedTuple):
-    """Where training stands; all but `epoch` have the seeds (G) as first axis."""
+    """State of the training; all fields but `epoch` have the seeds (G) as first axis."""
 
     epoch: Int[Any, ""]
     weights: Any
     adam: Any
-    #: of the "plateau" schedule: the rate, the best loss, and how long ago that was
+    #: for the "plateau" schedule: the rate, the best loss, and the number of epochs since then
     rate: Float[Any, " G"]
     best: Float[Any, " G"]
     waited: Int[Any, " G"]
@@ -213,16 +213,16 @@ def _loss(weights: Any, recipe: Recipe, data: Data, noise: Any, key: Any) -> Any
 
 
 def _adds(residual: Residual, space: SpaceScheme, knowledge: System) -> bool:
-    """True if a prediction is that of the knowledge alone, and a sum of the network's outputs."""
+    """True if a prediction is the nominal model's plus a linear combination of the network's outputs."""
     parted = grid_of(knowledge).parts.shape[1] > 1
     return isinstance(residual, Network) and not space.formula.stages and not parted
 
 
 def _noisy(samples: Samples, data: Data, noise: Any, key: Any) -> Samples:
-    """Other states and histories at the segments' starts; where they end is still the truth."""
+    """Return samples with noise in states and histories at the segments' starts; targets are unchanged."""
     for_y, for_history = jax.random.split(key)
     y = samples.y + noise * data.y_spread * jax.random.normal(for_y, samples.y.shape)
-    # the same along the segment: as if the whole past were a little different
+    # the same along the segment: a perturbation of the whole history
     shift = noise * data.history_spread * jax.random.normal(for_history, samples.history[:, 0].shape)
     later = samples.later + shift[:, None, None]
     return samples._replace(y=y, history=samples.history + shift[:, None], later=later)
@@ -235,7 +235,7 @@ def _rate(recipe: Recipe, numbers: Numbers, epoch: Any, rate: Any) -> Any:
 
 
 def plateau(numbers: Numbers, loss: Any, rate: Any, best: Any, waited: Any) -> tuple[Any, Any, Any]:
-    """Rate, best loss and epochs since then, after an epoch: PyTorch's ReduceLROnPlateau."""
+    """Return rate, best loss and epochs since then, after an epoch, as PyTorch's ReduceLROnPlateau."""
     better = loss < best * (1.0 - LEAST_GAIN)
     waited = jnp.where(better, 0, waited + 1)
     enough = waited > numbers.patience
@@ -247,7 +247,7 @@ def plateau(numbers: Numbers, loss: Any, rate: Any, best: Any, waited: Any) -> t
 
 
 def _epoch(recipe: Recipe, numbers: Numbers, data: Data, epoch: Any, of_seed: Any) -> Any:
-    """One update of one seed's weights: what it becomes, the loss before, and the rate."""
+    """Run one update of one seed: return its new state, the loss before, and the rate."""
     weights, adam, rate, best, waited, key = of_seed
     fresh = jax.random.fold_in(key, epoch) if recipe.noisy else None
     loss, slope = jax.value_and_grad(_loss)(weights, recipe, data, numbers.noise, fresh)
@@ -269,10 +269,10 @@ def _epoch(recipe: Recipe, numbers: Numbers, data: Data, epoch: Any, of_seed: An
 def run_epochs(
     recipe: Recipe, numbers: Numbers, data: Data, state: State, stop: Any
 ) -> tuple[State, Float[Any, "PIECE G"], Float[Any, "PIECE G"]]:
-    """Epochs up to `stop`, at most `PIECE` of them: the state then, their losses, and their rates.
+    """Run epochs up to `stop`, at most `PIECE`: return the new state, the losses and the rates.
 
-    How many is a number, not a shape: one program serves every piece, so that where training is interrupted
-    changes nothing.
+    The number of epochs is a value, not a shape. One program serves every piece, so that an interruption does
+    not change the result.
     """
     first = state.epoch
 
@@ -290,7 +290,7 @@ def run_epochs(
 
 
 def _side_by_side(update: Any, of_seeds: Any) -> Any:
-    """`update` of all seeds; a batch of one would cost a third more than the one."""
+    """Apply `update` to all seeds; without a batch axis for one seed, which would cost a third more."""
     if jax.tree.leaves(of_seeds)[0].shape[0] > 1:
         return jax.vmap(update)(of_seeds)
     alone = update(jax.tree.map(lambda leaf: leaf[0], of_seeds))
@@ -303,7 +303,7 @@ def _side_by_side(update: Any, of_seeds: Any) -> Any:
 def prepared(
     knowledge: System, residual: Residual, dataset: Dataset, training: Training
 ) -> tuple[Recipe, Numbers, Data]:
-    """What the program needs beside its state."""
+    """Return the program's inputs besides its state."""
     segments = dataset.segments
     recipe = Recipe(dataset.space, training.schedule, training.noise > 0.0)
     numbers = Numbers(
@@ -328,7 +328,7 @@ def prepared(
 
 
 def started(residuals: Sequence[Residual], training: Training, seeds: Sequence[int]) -> State:
-    """The state before the first epoch, of one residual a seed."""
+    """Return the state before the first epoch, with one residual for each seed."""
     every = [split(residual)[0] for residual in residuals]
     weights = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(x, dtype=float) for x in leaves]), *every)
     count = len(residuals)

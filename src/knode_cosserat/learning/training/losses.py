@@ -1,6 +1,6 @@
-"""How far one-segment predictions are from the data.
+"""Losses of one-segment predictions.
 
-Everything here has numbers first and samples last, (numbers, S): that is how a network gives them.
+Arrays have numbers first and samples last, (numbers, S), like the outputs of a network.
 """
 
 from __future__ import annotations
@@ -20,27 +20,27 @@ from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.system import System
 from knode_cosserat.rotation import rotation_matrix
 
-#: the fields of y that the paper's loss speaks of
+#: fields of y in the paper's loss
 PAPER_FIELDS = ("p", "h", "n", "m", "q", "w")
-#: a number that varies by less than this part of what its whole field does is measured by the field
+#: a number whose spread is below this part of its field's largest is scaled by the field's spread
 LEAST_PART = 1e-3
-#: what varies by less, as a part of its size, is taken to be constant
+#: relative variation below which a field is constant
 ROUNDING = 1e-12
 
 
 class Loss(eqx.Module):
-    """Compares predictions with the data that it keeps; every trajectory counts one."""
+    """Loss of predictions relative to stored data; all trajectories have equal weight."""
 
     @abc.abstractmethod
     def __call__(self, y: Float[Any, "y S"], z: Float[Any, "z S"]) -> Float[Any, ""]:
-        """The loss of y at the ends of all segments and z at their starts."""
+        """Return the loss of y at the ends of all segments and z at their starts."""
 
 
 class PaperLoss(Loss):
-    """The paper's: the sum of four mean squares, with orientations as Euler angles.
+    """The paper's loss: the sum of four mean squares, with orientations as Euler angles.
 
-    Positions, Euler angles, strains z, and all of n, m, q and ω together, in SI units; the mean over the
-    numbers of a step and over steps, the sum over trajectories.
+    The four are positions, Euler angles, strains z, and n, m, q and ω together, all in SI units. Means are
+    over the numbers of a step and over steps, sums over trajectories.
     """
 
     y: Float[Any, "y S"]
@@ -50,7 +50,7 @@ class PaperLoss(Loss):
     layout: Layout = eqx.field(static=True)
 
     def __call__(self, y: Float[Any, "y S"], z: Float[Any, "z S"]) -> Float[Any, ""]:
-        """The loss, no unit that would make sense."""
+        """Return the loss, in mixed units."""
         p, h, *rest = (y[self.layout.slice(name)] for name in PAPER_FIELDS)
         p_true, _, *rest_true = (self.y[self.layout.slice(name)] for name in PAPER_FIELDS)
         squares = (
@@ -63,9 +63,9 @@ class PaperLoss(Loss):
 
 
 class StandardisedLoss(Loss):
-    """The mean square of all numbers' errors, each over its own spread: for any system.
+    """Mean square of all errors, each over its own spread, for any system.
 
-    The spread of y is that of its increments over a segment, the spread of z its own.
+    Errors of y are scaled by the spread of its increments over a segment, errors of z by the spread of z.
     """
 
     y: Float[Any, "y S"]
@@ -75,13 +75,13 @@ class StandardisedLoss(Loss):
     weight: Float[Any, " S"]
 
     def __call__(self, y: Float[Any, "y S"], z: Float[Any, "z S"]) -> Float[Any, ""]:
-        """The loss, no unit."""
+        """Return the loss (dimensionless)."""
         errors = [(y - self.y) / self.y_spread[:, None], (z - self.z) / self.z_spread[:, None]]
         return jnp.sum(self.weight * _mean_square(jnp.concatenate(errors)))
 
 
 def loss_for(name: str, knowledge: System, segments: Samples) -> Loss:
-    """The "paper" loss, where y has the fields that it needs, or the "standardised" one."""
+    """Return the "paper" loss if y has the fields for it, otherwise the "standardised" loss."""
     y, z = segments.y_next.T, segments.z.T
     if name == "paper" and set(PAPER_FIELDS) <= set(knowledge.y_layout.names):
         angles = np.asarray(_angles(y[knowledge.y_layout.slice("h")]))
@@ -94,9 +94,9 @@ def loss_for(name: str, knowledge: System, segments: Samples) -> Loss:
 
 
 def euler_angles(h: Float[Any, "4 S"]) -> Float[Any, "3 S"]:
-    """Angles (rad) of quaternions (scalar first, any length) about the fixed z, then y, then x axis.
+    """Return angles (rad) of quaternions (scalar first, any length) about the fixed z, then y, then x axis.
 
-    The order that SciPy calls "zyx". At ±π/2 of the second one they are not unique, and have no derivative.
+    The order is SciPy's "zyx". If the second angle is ±π/2 they are not unique, and have no derivative.
     """
     R = jax.vmap(rotation_matrix, in_axes=-1, out_axes=-1)(h)
     return jnp.stack(
@@ -112,17 +112,17 @@ _angles = jax.jit(euler_angles)
 
 
 def sizes(layout: Layout) -> list[int]:
-    """How many numbers each field has."""
+    """Return the size of each field."""
     return [field.size for field in layout.fields]
 
 
 def spread(values: Float[Any, "S x"], fields: Sequence[int]) -> Float[np.ndarray, " x"]:
-    """The standard deviation of every number, never zero: what errors, noise and inputs are measured by.
+    """Return the standard deviation of every number, never zero, as a scale of errors, noise and inputs.
 
     Args:
         values: one row a sample.
-        fields: how many numbers each field has, in order. A number that hardly varies, such as a force
-            across the plane of motion, is measured by its field; a field that does not vary at all by one.
+        fields: size of each field, in order. A number that hardly varies, such as a force normal to the plane
+            of motion, gets a part of its field's largest; the numbers of a constant field get one.
     """
     found = []
     for part in np.split(np.asarray(values), np.cumsum(fields)[:-1], axis=1):

@@ -1,4 +1,4 @@
-"""Running the parts of a fit: side by side on all cores, each with its own checkpoint."""
+"""Execution of the parts of a fit: in parallel on all cores, each with its own checkpoint."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from knode_cosserat.learning.training.watch import Watch
 
 
 class FitError(ValueError):
-    """A fit that cannot begin or go on: one line that says why, and what is kept."""
+    """A fit that cannot start or continue. The message is one line: the reason, and the kept state."""
 
 
 class Run(abc.ABC):
-    """A part of a fit that runs by itself: some seeds, through so many steps.
+    """Independent part of a fit: some seeds, for a number of steps.
 
     Attributes:
-        name: of its checkpoint.
-        stage: what its steps are, for progress and metrics.
-        seeds: whose weights it trains.
-        steps: how many there are.
-        done: how many of them are done.
+        name: name of its checkpoint.
+        stage: kind of its steps, for progress and metrics.
+        seeds: seeds that it trains.
+        steps: total number of steps.
+        done: number of steps done.
     """
 
     name: str
@@ -42,19 +42,19 @@ class Run(abc.ABC):
     @property
     @abc.abstractmethod
     def finished(self) -> bool:
-        """Whether there is nothing left to do."""
+        """True if no steps are left."""
 
     @abc.abstractmethod
     def compile(self) -> None:
-        """Compile what `advance` runs: threads would each do it."""
+        """Compile the program of `advance` before threads would each compile it."""
 
     @abc.abstractmethod
     def advance(self, stop: int, watch: Watch) -> None:
-        """Some steps, to number `stop` at most. Raises `FitError`, and then is as it was before or worse."""
+        """Run some steps, up to number `stop` at most. Raises `FitError`."""
 
     @abc.abstractmethod
     def snapshot(self) -> dict[str, Any]:
-        """Where it stands: plain values, arrays, and lists of arrays."""
+        """Return the state as plain values, arrays, and lists of arrays."""
 
     @abc.abstractmethod
     def restore(self, snapshot: dict[str, Any]) -> None:
@@ -62,29 +62,29 @@ class Run(abc.ABC):
 
     @abc.abstractmethod
     def residuals(self) -> list[Residual]:
-        """What came of it, one for every seed."""
+        """Return the trained residuals, one for every seed."""
 
     @abc.abstractmethod
     def history(self, seed: int) -> dict[str, Any]:
-        """Loss, rate and held-out errors of one seed over the steps."""
+        """Return loss, rate and held-out errors of one seed over the steps."""
 
 
 class Best:
-    """The best weights of each of some seeds by the error of held-out rollouts, and when to stop."""
+    """Best weights of each seed by held-out error, and early stopping."""
 
     def __init__(self, weights: Any, stop_after: int | None):
         count = jax.tree.leaves(weights)[0].shape[0]
         self.stop_after = stop_after
         self.errors = np.full(count, np.inf)
         self.steps = np.zeros(count, dtype=int)
-        #: after which step each seed stopped; -1 for one that goes on
+        #: step after which each seed stopped; -1 if it is still running
         self.stopped = np.full(count, -1)
         self.weights = jax.tree.map(lambda leaf: np.array(leaf), weights)
         #: step, and the error of each seed
         self.seen: list[list[float]] = []
 
     def offer(self, step: int, errors: Sequence[float], weights: Any) -> None:
-        """The errors and weights (seeds first) after a step."""
+        """Record the held-out errors and weights (seeds first) after a step."""
         self.seen.append([float(step), *errors])
         for k in map(int, np.flatnonzero(self.stopped < 0)):
             if errors[k] < self.errors[k]:
@@ -95,17 +95,17 @@ class Best:
                 self.stopped[k] = step
 
     def chosen(self, k: int, last: Any) -> Any:
-        """The weights of a seed: the best if it may stop early, and the last otherwise."""
+        """Return the weights of a seed: the best if it may stop early, otherwise the last."""
         kept = self.stop_after is not None and np.isfinite(self.errors[k])
         return jax.tree.map(lambda leaf: jax.numpy.asarray(leaf[k]), self.weights if kept else last)
 
     def history(self, k: int) -> np.ndarray:
-        """Steps and errors (checks, 2) of a seed, as far as it went."""
+        """Return steps and errors (checks, 2) of a seed, until it stopped."""
         seen = np.array(self.seen).reshape(len(self.seen), 1 + len(self.errors))[:, [0, 1 + k]]
         return seen if self.stopped[k] < 0 else seen[seen[:, 0] <= self.stopped[k]]
 
     def snapshot(self) -> dict[str, Any]:
-        """What `restore` takes."""
+        """Return the state for `restore`."""
         return {
             "errors": self.errors, "steps": self.steps, "stopped": self.stopped,
             "weights": packed(self.weights), "seen": np.array(self.seen),
@@ -121,10 +121,10 @@ class Best:
 
 
 def run_all(runs: Sequence[Run], checkpoints: Checkpoints | None, every: int, watch: Watch) -> None:
-    """All runs to their end, from their checkpoints if there are any, with one every so many steps.
+    """Complete all runs, from their checkpoints if there are any, with a checkpoint every `every` steps.
 
     Raises:
-        FitError: one of them cannot go on; the others have stopped too.
+        FitError: a run cannot continue; the others have stopped too.
         CheckpointError: a checkpoint cannot be used, or not be written.
     """
     for run in runs if checkpoints else ():
@@ -166,9 +166,9 @@ def _kept(checkpoints: Checkpoints | None, run: Run) -> str:
 
 
 def _side_by_side(runs: Sequence[Run], work: Callable[[Run], None]) -> None:
-    """Every run in turn, a piece at a time, by as many threads as there are cores.
+    """Work on all runs in turn, a piece at a time, with one thread for each core.
 
-    Not one thread a run: five runs on two cores would take as long as six.
+    With one thread for each run, five runs on two cores would take the time of six.
     """
     waiting = collections.deque(runs)
     stop = threading.Event()

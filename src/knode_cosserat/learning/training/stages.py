@@ -1,4 +1,4 @@
-"""The two stages of gradient training as runs: one-segment samples first, whole rollouts after."""
+"""The two stages of gradient training: one-segment samples first, then whole rollouts."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from knode_cosserat.learning.training.runs import Best, FitError, Run
 from knode_cosserat.learning.training.watch import Watch
 from knode_cosserat.rods.system import System
 
-#: a loss so many times what it began with has diverged; one that began with next to nothing may come to one
+#: a loss above this multiple of its initial value has diverged; the initial value counts as at least NOTHING
 DIVERGED = 1e6
 NOTHING = 1e-6
 
@@ -31,7 +31,7 @@ def _finite(tree: Any) -> bool:
 
 
 class SegmentRun(Run):
-    """Epochs on one-segment samples, of one seed or of several in one program."""
+    """Epochs on one-segment samples, for one seed or several in one program."""
 
     stage = "segments"
 
@@ -50,17 +50,17 @@ class SegmentRun(Run):
 
     @property
     def finished(self) -> bool:
-        """All epochs are done, or all seeds have stopped."""
+        """True if all epochs are done, or all seeds have stopped."""
         return self.done >= self.steps or bool(np.all(self._best.stopped >= 0))
 
     def compile(self) -> None:
-        """No epoch, and one held-out rollout."""
+        """Compile the epochs' program without running one, and run one held-out rollout."""
         run_epochs(*self._given, self._state, self.done)
         if self._held_out:
             tip_error(KNODE(self._knowledge, self._last()[0]), self._held_out)
 
     def advance(self, stop: int, watch: Watch) -> None:
-        """Epochs up to the next check, or `PIECE` of them."""
+        """Run epochs up to the next check, at most `PIECE`."""
         every = self._training.check_every
         stop = min(stop, self.done + PIECE, self.steps)
         if self._held_out:
@@ -104,12 +104,12 @@ class SegmentRun(Run):
         return [self._residual(jax.tree.map(lambda x, k=k: x[k], weights)) for k in range(len(self.seeds))]
 
     def residuals(self) -> list[Residual]:
-        """The last weights, or the best if training may stop early."""
+        """Return residuals with the last weights, or the best if training may stop early."""
         weights = self._state.weights
         return [self._residual(self._best.chosen(k, weights)) for k in range(len(self.seeds))]
 
     def history(self, seed: int) -> dict[str, Any]:
-        """Loss before every update, rate, and held-out errors."""
+        """Return the loss before every update, the learning rate, and held-out errors."""
         k = self.seeds.index(seed)
         stopped = self._best.stopped[k]
         rows = slice(0, stopped if stopped >= 0 else None)
@@ -117,7 +117,7 @@ class SegmentRun(Run):
         return found | ({"held_out_error": self._best.history(k)} if self._held_out else {})
 
     def snapshot(self) -> dict[str, Any]:
-        """State, histories and best weights."""
+        """Return state, histories and best weights."""
         return {
             "state": packed(self._state), "losses": self._losses, "rates": self._rates,
             "best": self._best.snapshot(),
@@ -145,8 +145,8 @@ def _proposal(weights: Any, rest: Any, adam: Any, slope: Any, rate: Any, clip: A
 class RolloutRun(Run):
     """Fine-tuning of one seed's residual through whole simulations.
 
-    A step after which the robot cannot be simulated, or the loss has exploded, is not made: it is halved, and
-    so are all that follow.
+    A step after which the simulation fails or the loss diverges is rejected: it is halved, and so are all
+    later steps.
     """
 
     stage = "rollouts"
@@ -163,7 +163,7 @@ class RolloutRun(Run):
         measured = np.array(scales(courses, knowledge.y_layout))
         self._aim = Aim(knowledge, self._rest, courses.parts, measured)
         self._adam = ADAM.init(self._weights)
-        #: what the step is multiplied by, after halvings
+        #: factor on the step after halvings
         self._scale = 1.0
         self._losses = np.zeros(0)
         self._rates = np.zeros(0)
@@ -177,11 +177,11 @@ class RolloutRun(Run):
 
     @property
     def finished(self) -> bool:
-        """All updates are done, or held-out rollouts have got no better for long enough."""
+        """True if all updates are done, or the held-out error has not improved for `stop_after` updates."""
         return self.done >= self.steps or bool(self._best.stopped[0] >= 0)
 
     def compile(self) -> None:
-        """One evaluation, and one held-out rollout."""
+        """Compile by one evaluation and one held-out rollout."""
         self._evaluated(self._weights)
         if self._held_out:
             tip_error(self._model(), self._held_out)
@@ -192,7 +192,7 @@ class RolloutRun(Run):
         return float(loss), slope
 
     def begin(self, watch: Watch) -> None:
-        """The loss before the first update."""
+        """Evaluate the loss before the first update. Raises `FitError` if the simulation fails."""
         loss, self._slope = self._evaluated(self._weights)
         if not np.isfinite(loss) or not _finite(self._slope):
             raise FitError(
@@ -203,7 +203,7 @@ class RolloutRun(Run):
         self._check(watch)
 
     def advance(self, stop: int, watch: Watch) -> None:
-        """One update."""
+        """Run one update."""
         if len(self._losses) == 0:
             self.begin(watch)
         options = self._options
@@ -241,11 +241,11 @@ class RolloutRun(Run):
         watch.error(self.stage, self.seeds[0], self.done, error)
 
     def residuals(self) -> list[Residual]:
-        """The weights with the lowest loss, or the best held-out ones if fine-tuning may stop early."""
+        """Return the weights with the lowest loss, or the lowest held-out error if it may stop early."""
         return [eqx.combine(self._best.chosen(0, self._one(self._lowest)), self._rest)]
 
     def history(self, seed: int) -> dict[str, Any]:
-        """Loss before every update and after the last, step size, and held-out errors."""
+        """Return the loss before every update and after the last, step size, and held-out errors."""
         found = {"loss": self._losses, "learning_rate": self._rates}
         return found | ({"held_out_error": self._best.history(0)} if self._held_out else {})
 
@@ -253,7 +253,7 @@ class RolloutRun(Run):
         return self._weights, self._adam, self._slope, self._lowest, np.array(self._scale)
 
     def snapshot(self) -> dict[str, Any]:
-        """Weights, optimiser, slope, histories and best weights."""
+        """Return weights, optimiser state, gradient, histories and best weights."""
         return {
             "state": packed(self._state()), "losses": self._losses, "rates": self._rates,
             "best": self._best.snapshot(),

@@ -1,4 +1,4 @@
-"""What a fit tells while it runs: a progress bar, and metrics as TensorBoard event files."""
+"""Progress of a running fit: a progress bar, and metrics as TensorBoard event files."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from tqdm import tqdm
 
 
 class WatchError(ValueError):
-    """Metrics cannot be written: one line that says why."""
+    """Metrics cannot be written. The message is one line with the reason."""
 
 
 class Watch:
-    """Told by all parts of a fit, from any thread. Use as a context."""
+    """Receiver of progress from all parts of a fit, from any thread. Use as a context manager."""
 
     def __init__(self, progress: bool, log_dir: str | Path | None):
         self._lock = threading.Lock()
@@ -36,7 +36,7 @@ class Watch:
             self._bar.close()
 
     def begin(self, what: str, total: int, done: int) -> None:
-        """A new stage of so many steps in all, of which some may be done already."""
+        """Start a stage with a total number of steps; some may be done already."""
         if self._bar is not None:
             self._bar.close()
         self._bar = tqdm(total=total, initial=done, desc=what, unit="step", disable=not self._progress)
@@ -44,7 +44,7 @@ class Watch:
     def steps(
         self, what: str, seeds: Sequence[int], first: int, losses: np.ndarray, rates: np.ndarray
     ) -> None:
-        """The losses and rates (steps, seeds) of some steps of some seeds, the first being number `first`."""
+        """Record the losses and rates (steps, seeds) of consecutive steps; the first has number `first`."""
         with self._lock:
             self._bar.set_postfix_str(f"loss {np.mean(losses[-1]):.3g}", refresh=False)
             self._bar.update(losses.size)
@@ -53,7 +53,7 @@ class Watch:
                 self._write(seed, first, f"{what}/learning_rate", rates[:, k])
 
     def error(self, what: str, seed: int, step: int, error: float) -> None:
-        """The held-out error (m) after so many steps."""
+        """Record the held-out error (m) after a step."""
         with self._lock:
             self._write(seed, step, f"{what}/held_out_error", [error])
 
@@ -63,7 +63,7 @@ class Watch:
         if seed not in self._writers:
             folder = self._folder / f"seed-{seed}"
             try:
-                # what an interrupted run wrote after its last checkpoint is written again: it counts once
+                # purge metrics that an interrupted run wrote after its last checkpoint: they come again
                 self._writers[seed] = self._writer_class(str(folder), purge_step=first, flush_secs=5)
             except OSError as error:
                 raise WatchError(f"{folder}: metrics cannot be written: {error.strerror}") from None

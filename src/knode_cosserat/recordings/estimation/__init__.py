@@ -1,1 +1,1 @@
-"""State estimation: full states on the nodes of a model, from what was recorded."""
+"""State estimation: full states on the nodes of a model, from a recording."""

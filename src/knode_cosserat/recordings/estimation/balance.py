@@ -1,7 +1,7 @@
-"""Internal force and moment from a robot's own balance, and strains from its own law, where motion is known.
+"""Internal force and moment of a known motion from a robot's balance, and strains from its constitutive law.
 
-A system gives y_s of all of y. Where p, h, q, ω and their rates are known, those of n and m are a linear
-differential equation along the rod, which is integrated from the tip, where the system says what holds.
+A system gives y_s for all of y. With p, h, q, ω and their rates known, n and m satisfy a linear differential
+equation along the rod. It is integrated from the tip, where the system gives the boundary conditions.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from knode_cosserat.rods.system import History, System
 from knode_cosserat.solvers.history import coefficient_table
 from knode_cosserat.solvers.settings import Settings
 
-#: fields that a rod's state has to have here: known from poses, then from the balance; and of the strains
+#: required fields of a rod's state: known from poses, known from the balance, and the strains
 KNOWN, LOADS, STRAINS = ("p", "h", "q", "w"), ("n", "m"), ("v", "u")
-#: corrections of the tip's conditions, and of a segment that is implicit; both are linear or nearly so
+#: Newton steps at the tip and in an implicit segment; both problems are linear or nearly so
 _CORRECTIONS = 3
-#: compiled programs are for a multiple of so many rows
+#: rows are padded to a multiple of this, so that few programs are compiled
 BLOCK = 128
 
 
 def require_rod(robot: System) -> None:
-    """Raise `RecordingError` unless the robot's state is that of a rod, free or loaded at its tip."""
+    """Raise `RecordingError` unless the robot has the state of a clamped rod, free or loaded at its tip."""
     has = (*robot.y_layout.names, *robot.z_layout.names)
     missing = [name for name in (*KNOWN, *LOADS, *STRAINS) if name not in has]
     if missing:
@@ -43,7 +43,7 @@ def require_rod(robot: System) -> None:
 
 
 class Rows(NamedTuple):
-    """What is known at T rows and P points: y without n and m (zero there), its rate, z and its rate."""
+    """Known values at T rows and P points: y with n and m set to zero, its rate, z and its rate."""
 
     t: Float[Any, " T"]
     control: Float[Any, "T c"]
@@ -54,7 +54,7 @@ class Rows(NamedTuple):
 
 
 def loads_of(robot: System, s: Float[Any, " P"], rows: Rows) -> Float[np.ndarray, "T P y"]:
-    """y with n and m, at points that alternate between ends and middles of segments; order 4 in them."""
+    """Return y with n and m. Points alternate between ends and middles of segments; the order is 4."""
     return np.asarray(_loads(robot, s, _padded(rows)))[: len(rows.t)]
 
 
@@ -64,7 +64,7 @@ def _loads(robot: System, s: Float[Any, " P"], rows: Rows) -> Float[Any, "T P y"
 
     def one(t: Any, control: Any, y: Any, y_t: Any, z: Any, z_t: Any) -> Any:
         def slope(j: Any, loads: Any) -> Any:
-            # the rates are given and not made of c0 and the past
+            # the rates are known, not computed from c0 and the history
             history = History(jnp.zeros(()), y_t[j], z_t[j], jnp.zeros_like(y_t[j]))
             return robot.rates(s[j], t, y[j].at[where].set(loads), z[j], control, history)[where]
 
@@ -90,7 +90,7 @@ def _loads(robot: System, s: Float[Any, " P"], rows: Rows) -> Float[Any, "T P y"
 
 
 def _at_tip(robot: System, t: Any, control: Any, y: Any, history: History) -> Any:
-    """n and m with which the tip's conditions hold."""
+    """Return n and m that satisfy the boundary conditions at the tip."""
     where = robot.y_layout.indices(LOADS)
 
     def left(loads: Any) -> Any:
@@ -103,9 +103,9 @@ def _at_tip(robot: System, t: Any, control: Any, y: Any, history: History) -> An
 
 
 def strains_of(robot: System, rows: Rows, settings: Settings, dt: float) -> Float[np.ndarray, "T N z"]:
-    """z by the robot's own law at its nodes, row by row; z_t by the time scheme from the rows before.
+    """Return z at the nodes from the robot's constitutive law; z_t comes from the time scheme.
 
-    `rows.y` is complete here, and `rows.z` not looked at. The first row is taken to be at rest.
+    `rows.y` must be complete; `rows.z` is ignored. The first row is assumed to be at rest.
     """
     coefficients = coefficient_table(settings, dt)[1]
     return np.asarray(_strains(robot, _padded(rows), coefficients))[: len(rows.t)]
@@ -141,9 +141,10 @@ def _strains(robot: System, rows: Rows, coefficients: Float[Any, "4"]) -> Float[
 def semi_discretised(
     robot: System, t: Any, control: Any, known: Float[Any, "T N y"], settings: Settings, dt: float
 ) -> tuple[Float[np.ndarray, "T N y"], Float[np.ndarray, "T N z"]]:
-    """y and z at the nodes by the equations as a simulation has them, one Euler segment after the other.
+    """Return y and z at the nodes from the discrete equations of a simulation with Euler segments.
 
-    Rates are the time scheme's, from the rows before; before the first row is the first (paper, section 3).
+    Rates come from the time scheme and earlier rows. The history of the first row is constant (paper,
+    section 3).
     """
     coefficients = coefficient_table(settings, dt)[1]
     records = np.asarray(_semi_discretised(robot, *_padded((t, control, known)), coefficients))[: len(t)]
@@ -188,7 +189,7 @@ def _semi_discretised(
 
     _, z_rest = jax.vmap(robot.rest)(s)
     begin = jnp.concatenate([known[0], z_rest], axis=1)
-    # the first row is before itself: n, m and z of it are found from a guess of them
+    # the first row is its own history: fixed-point iteration for its n, m and z
     begin = jax.lax.fori_loop(
         0, 2, lambda _, begin: solved(t[0], control[0], known[0], (c1 + c2) * begin), begin
     )
@@ -197,7 +198,7 @@ def _semi_discretised(
 
 
 def _padded(rows: Any) -> Any:
-    """Rows, the last one repeated, in whole blocks: one compiled program serves many lengths."""
+    """Return rows padded with the last one to whole blocks: one compiled program serves many lengths."""
     count = -(-len(rows[0]) // BLOCK) * BLOCK
 
     def longer(values: Any) -> Any:
@@ -207,7 +208,7 @@ def _padded(rows: Any) -> Any:
 
 
 def packed(robot: System, part: str, **fields: Float[np.ndarray, "... size"]) -> Float[np.ndarray, "... y"]:
-    """Fields of y (or z: `part`) in their places, zero elsewhere."""
+    """Return a vector y (or z, by `part`) with the given fields, zero elsewhere."""
     layout = robot.y_layout if part == "y" else robot.z_layout
     shape = next(iter(fields.values())).shape[:-1]
     values = np.zeros((*shape, layout.size))

@@ -1,9 +1,8 @@
-"""The most likely curvature of a rod, over arclength and time, given what motion capture saw.
+"""Maximum a posteriori curvature of a rod, over arclength and time, from motion capture.
 
 The curvature's coefficients are curves in time (`smoothing`), the bodies' poses follow from them
-(`kinematics`), and Gauss-Newton's method finds the curves. How smooth they are, and how large the noise is,
-is chosen by what makes the poses likeliest: MacKay's fixed point of the evidence. Modes that the bodies tell
-little of are then held by the prior.
+(`kinematics`), and Gauss-Newton's method finds the curves. The smoothness and the noise level maximise the
+evidence of the poses by MacKay's fixed point. The prior determines modes that are poorly observed.
 """
 
 from __future__ import annotations
@@ -17,37 +16,37 @@ from knode_cosserat.recordings.estimation import kinematics
 from knode_cosserat.recordings.estimation.kinematics import MODES, Rod, Sensitivity, Shape
 from knode_cosserat.recordings.estimation.smoothing import ORDER, Banded, Splines
 
-#: knots no further apart (s); with frames that are rarer, as far as those
+#: largest spacing of knots (s); the frame period if that is longer
 SPACING = 0.04
-#: Gauss-Newton's corrections, of which each takes a new choice of smoothness; and choices after the last
+#: minimum number of Gauss-Newton iterations, and further iterations at most
 CORRECTIONS, CHOICES = 5, 3
-#: converged when no coefficient of the curvature changes by more (1/m)
+#: tolerance on the change of the curvature's coefficients (1/m)
 CLOSE = 1e-6
-#: markers are not better than this (m, rad)
+#: lower bounds of the noise (m, rad)
 LEAST_NOISE = (1e-6, 1e-5)
-#: what is known of the curvature beforehand, beside its smoothness: it is below this (1/m)
+#: standard deviation of a weak prior on the curvature's coefficients (1/m)
 LARGEST = 30.0
-#: where the search for the smoothness begins: motion up to this frequency (Hz)
+#: initial bandwidth of the motion in the search for the smoothness (Hz)
 BEGIN = 6.0
-#: the prior's precision grows with the cosines' order by this power or more; at first, by the other
+#: smallest exponent of the growth of the prior's precision with the cosines' order; its initial value
 DECAY, BEGIN_DECAY = 2.0, 4.0
-#: how far the prior's precision follows the jerk: where nothing moves it is (1 + 1/QUIET) times as large
+#: regularisation of the precision's profile: at zero jerk the precision is (1 + 1/QUIET) times as large
 QUIET = 0.05
-#: over how many of the points that the prior looks at the jerk is averaged: 3 in the time from knot to knot
+#: width of the jerk's Gaussian average, in points of the prior: 3 points per knot interval
 WIDTH = 2.0
 _PROBES = 4
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Poses:
-    """Poses of all bodies at F times; what was not seen is marked, and has any finite value.
+    """Poses of all bodies at F times; masked values are arbitrary but finite.
 
     Attributes:
-        time: s, rising.
-        position: m.
-        quaternion: scalar first.
-        placed: which positions were seen.
-        turned: which orientations were.
+        time: times (s), increasing.
+        position: positions (m).
+        quaternion: orientations, scalar first.
+        placed: True where a position was seen.
+        turned: True where an orientation was seen.
     """
 
     time: Float[np.ndarray, " F"]
@@ -59,12 +58,12 @@ class Poses:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Fit:
-    """What was found.
+    """Fitted curvature.
 
     Attributes:
-        splines: in time.
+        splines: splines in time.
         curves: coefficients of the splines.
-        stretch: how much longer the rod is than its model says, as a factor.
+        stretch: ratio of the rod's length to its model's length.
         noise: standard deviations of a coordinate (m) and of an angle (rad).
     """
 
@@ -74,12 +73,12 @@ class Fit:
     noise: tuple[float, float]
 
     def at(self, time: Float[np.ndarray, " T"]) -> Float[np.ndarray, "3 T K"]:
-        """The curvature's coefficients and their first two rates at some times (s)."""
+        """Return the curvature's coefficients and their first two rates at given times (s)."""
         return np.stack([np.asarray(self.splines.design(time, order) @ self.curves) for order in range(3)])
 
 
 def fitted(rod: Rod, poses: Poses, stretch: float, noise: tuple[float, float]) -> Fit:
-    """The most likely curvature over time; `noise` and `stretch` are where the search begins."""
+    """Return the most likely curvature over time; `noise` and `stretch` are initial values."""
     usual = float(np.median(np.diff(poses.time)))
     splines = Splines.of(poses.time[0], poses.time[-1], max(SPACING, usual))
     design = splines.design(poses.time)
@@ -102,7 +101,7 @@ def fitted(rod: Rod, poses: Poses, stretch: float, noise: tuple[float, float]) -
         system.factorise(precision, ridge)
         new = system.curve()
         if correction >= 2:
-            # beyond the first corrections the poses are explained, and what is left is noise
+            # after the first iterations the residual is noise
             precision, effective = _likelier(system, new, precision, groups)
             profile = _profile(splines, new, precision)
             after = _after(moves, left, poses, np.asarray(design @ new) - a)
@@ -116,14 +115,14 @@ def fitted(rod: Rod, poses: Poses, stretch: float, noise: tuple[float, float]) -
 
 
 def _left(rod: Rod, it: Shape, poses: Poses) -> tuple[np.ndarray, np.ndarray]:
-    """What poses differ by from the shape: turns (rad) and shifts (m), zero where nothing was seen."""
+    """Return the residuals of poses: rotations (rad) and shifts (m), zero where nothing was seen."""
     turns = kinematics.turn_between(poses.quaternion, it.h[:, rod.bodies])
     shifts = poses.position - it.p[:, rod.bodies]
     return turns * poses.turned[..., None], shifts * poses.placed[..., None]
 
 
 def _stretching(rod: Rod, it: Shape, shifts: Float[np.ndarray, "F M 3"]) -> float:
-    """What more of stretch brings the bodies nearer: along the rod, where curvature cannot move them."""
+    """Return the least-squares correction of the stretch from the residual shifts along the position."""
     along = it.p[:, rod.bodies] - rod.origin
     return float(np.sum(along * shifts) / np.sum(along**2))
 
@@ -135,7 +134,7 @@ def _normal(
     noise: tuple[float, float],
     a: Float[np.ndarray, "F K"],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """H and g of every frame, as `smoothing` has them."""
+    """Return H and g of every frame, as defined in `smoothing`."""
     F, _, _, K = moves.turn.shape
     rows = np.concatenate(
         [
@@ -157,10 +156,11 @@ def _shared(values: Float[np.ndarray, " K"], groups: np.ndarray) -> Float[np.nda
 def _likelier(
     system: Banded, curves: Float[np.ndarray, "n K"], precision: Float[np.ndarray, " K"], groups: np.ndarray
 ) -> tuple[Float[np.ndarray, " K"], float]:
-    """A likelier τ for every group, and how many numbers the poses determine in all.
+    """Return an updated τ for every mode, and the effective number of parameters.
 
-    MacKay's fixed point: τ = γ / ∫ (c''')² dt, where γ counts how many of the jerk's numbers the poses
-    determine rather than the prior. The trace in it is estimated by random probes, the same every time.
+    MacKay's fixed point: τ = γ / ∫ (c''')² dt, where γ is the number of parameters of the jerk that are
+    determined by the poses rather than by the prior. Its trace is estimated by random probes with a fixed
+    seed.
     """
     roots = system.roots
     n, K = curves.shape
@@ -179,13 +179,13 @@ def _likelier(
     determined = np.clip(dimensions - tau * traces, 1e-3 * dimensions, dimensions)
     jerk = np.bincount(groups, np.sum(np.square(roots @ curves), axis=0))
     new = determined / np.maximum(jerk, 1e-300)
-    # one choice at a time, and not a leap
+    # limit the change of one update
     new = np.clip(new, tau / 1e3, tau * 1e3)
     return _decaying(new, DECAY)[groups], float(determined.sum())
 
 
 def _decaying(precision: Float[np.ndarray, " groups"], power: float) -> Float[np.ndarray, " groups"]:
-    """Precisions that rise with the order: what the bodies hardly tell would have any, by the evidence."""
+    """Return precisions that grow with the order: the evidence hardly determines poorly observed modes."""
     first = 0
     for size in (max(MODES[:2]), MODES[2]):
         for k in range(1, size):
@@ -198,7 +198,7 @@ def _decaying(precision: Float[np.ndarray, " groups"], power: float) -> Float[np
 def _profile(
     splines: Splines, curves: Float[np.ndarray, "n K"], precision: Float[np.ndarray, " K"]
 ) -> Float[np.ndarray, " points"]:
-    """The prior's precision over time: lower where the jerk is large, as after a step of a tension."""
+    """Return the prior's relative precision over time: lower where the jerk is large, as after a step."""
     from scipy.ndimage import gaussian_filter1d
 
     jerk = splines.roots[: splines.points] @ curves
@@ -210,7 +210,7 @@ def _profile(
 def _after(
     moves: Sensitivity, left: tuple[np.ndarray, np.ndarray], poses: Poses, change: Float[np.ndarray, "F K"]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What is left of turns (rad) and shifts (m) after a change of the coefficients."""
+    """Return the residual rotations (rad) and shifts (m) after a change of the coefficients."""
     by = change[:, None, :, None]
     turns = left[0] - (moves.turn @ by)[..., 0] * poses.turned[..., None]
     return turns, left[1] - (moves.shift @ by)[..., 0] * poses.placed[..., None]
@@ -219,7 +219,7 @@ def _after(
 def _noise(
     after: tuple[np.ndarray, np.ndarray], poses: Poses, effective: float, noise: tuple[float, float]
 ) -> tuple[float, float]:
-    """Standard deviations of a coordinate and of an angle, by what the curves leave."""
+    """Return the standard deviations of a coordinate and of an angle, from the residuals."""
     counts = 3.0 * np.array([poses.placed.sum(), poses.turned.sum()])
     kept = max(0.2, 1.0 - effective / counts.sum())
     sums = np.array([np.sum(after[1] ** 2), np.sum(after[0] ** 2)])

@@ -1,4 +1,4 @@
-"""From a recording to full states on a model's nodes: what learning needs of a real robot."""
+"""Estimation of full states on a model's nodes from a recording, for learning from a real robot."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from knode_cosserat.solvers.space import Euler
 from knode_cosserat.trajectory import Trajectory
 
 Method = Literal["best", "paper"]
-#: where the search for the noise begins (m, rad)
+#: initial noise (m, rad)
 NOISE = (3e-4, 3e-3)
-#: lengths of robot and recording that differ by more are not of the same robot
+#: largest ratio between the lengths of robot and recording, or its inverse
 UNLIKE = 2.0
 
 
@@ -34,33 +34,33 @@ def estimate_states(
     start: float | None = None,
     end: float | None = None,
 ) -> Trajectory:
-    """The full states that a recording shows: y and z on the robot's nodes, ready to be learned from.
+    """Estimate full states from a recording: y and z on the robot's nodes, as data for learning.
 
-    `method="best"` finds the rod's curvature over arclength and time that explains the poses best
-    (`curvature`), at motion capture's own rate; positions, orientations, velocities and accelerations are
+    `method="best"` finds the rod's curvature over arclength and time that fits the poses best
+    (`curvature`), at motion capture's own rate. Positions, orientations, velocities and accelerations are
     integrals of it. n and m follow from the robot's balance, integrated from the tip, and v from its
-    law. u is the curvature that was seen, not what the law makes of m: where the robot given is wrong, it
-    shows that. `method="paper"` is the paper's recipe (`paper`).
+    constitutive law. u is the measured curvature, not the law's result for m, so that errors of the robot's
+    model remain visible. `method="paper"` is the paper's method (`paper`).
 
-    Positions, orientations, velocities and u come from the recording alone. n, m and v are those of the
-    robot that is given, and so as right as its masses and loads are.
+    Positions, orientations, velocities and u come from the recording alone. n, m and v depend on the
+    robot's masses and loads and are as accurate as these.
 
     Args:
-        recording: as read, or its measurements on a grid; the former is better.
-        robot: whose nodes, balance and law are used; its length is that of its model.
-        method: as above.
-        dt: from row to row (s).
-        start: the first row (s); None: as in `Recording.sampled`.
-        end: the last row at most (s).
+        recording: a recording, or its measurements on a grid; a recording gives better results.
+        robot: the robot whose nodes, balance and constitutive law are used.
+        method: "best" or "paper".
+        dt: time from row to row (s).
+        start: time of the first row (s); None: as in `Recording.sampled`.
+        end: latest time of the last row (s).
 
     Returns:
-        A `Trajectory` whose time is the recording's; without settings, or by the paper's method with those of
-        Euler's scheme, in whose segments its states are exact. Row i has the control that
-        `simulate` would reach it with: the tension held from row i - 1 on (of row 0, its own).
+        A `Trajectory` with the recording's times. It has no settings, except by the paper's method: there it
+        has those of Euler's scheme, and the states satisfy its discrete equations. Row i has the control
+        with which `simulate` reaches it: the tension held from row i - 1 on (row 0 has its own tension).
 
     Raises:
-        RecordingError: the recording is in parts (then use `estimate_parts`), does not fit the robot, has too
-            few bodies or no orientations; the method or a time is not possible.
+        RecordingError: the recording is in parts (then use `estimate_parts`), does not fit the robot, or has
+            too few bodies or no orientations; or the method or a time is not allowed.
     """
     found = _parts(recording, robot, method, dt, start, end)
     if len(found) > 1:
@@ -80,10 +80,10 @@ def estimate_parts(
     start: float | None = None,
     end: float | None = None,
 ) -> list[Trajectory]:
-    """As `estimate_states`, of every part between pauses that are too long to be bridged.
+    """Estimate full states, as `estimate_states`, of every part between gaps too long to be bridged.
 
     Raises:
-        RecordingError: as in `estimate_states`, but for the parts.
+        RecordingError: as in `estimate_states`, except that several parts are allowed.
     """
     return [_estimated(part, robot, method) for part in _parts(recording, robot, method, dt, start, end)]
 
@@ -113,20 +113,20 @@ def _parts(
 
 
 def _stretch(part: Part, robot: System) -> float:
-    """How much longer the rod is than its model: by the straightest row, which is at rest if there is one."""
+    """Return the ratio of the rod's length to its model's, from the straightest row."""
     places = part.fractions * float(robot.length)
     reach = np.linalg.norm(part.rows.position[:, part.rows.fractions > 0.0], axis=2)
     return float(np.nanmax(reach @ places / (places @ places)))
 
 
-def held_controls(part: Part) -> Float[np.ndarray, "T c"]:
-    """For each row the tension that was held up to it; of the first, its own."""
+def applied_controls(part: Part) -> Float[np.ndarray, "T c"]:
+    """Return for each row the tension held from the row before; for the first, its own."""
     tension = part.rows.tension
     return np.concatenate([tension[:1], tension[:-1]])
 
 
 def _estimated(part: Part, robot: System, method: str) -> Trajectory:
-    control, settings = held_controls(part), None
+    control, settings = applied_controls(part), None
     if method == "paper":
         settings = Settings(space=Euler())
         y, z = paper.states(part, robot, control, settings)
@@ -149,7 +149,7 @@ def _estimated(part: Part, robot: System, method: str) -> Trajectory:
 
 
 def rod_of(part: Part, robot: System) -> kinematics.Rod:
-    """The grid for a robot and the bodies of a recording."""
+    """Return the grid for a robot and the bodies of a recording."""
     y0 = np.asarray(robot.rest(jnp.zeros(()))[0], dtype=float)
     h = y0[robot.y_layout.slice("h")]
     return kinematics.Rod.of(
@@ -175,7 +175,7 @@ def completed(
     time: Float[np.ndarray, " T"],
     control: Float[np.ndarray, "T c"],
 ) -> tuple[Float[np.ndarray, "T N y"], Float[np.ndarray, "T N z"]]:
-    """y and z at the nodes: the motion, with n and m by the robot's balance and v by its law."""
+    """Return y and z at the nodes: the motion, n and m from the robot's balance, and v from its law."""
     spin = np.concatenate([np.zeros_like(it.w[..., :1]), it.w], axis=-1)
     h_t = 0.5 * kinematics.hamilton(it.shape.h, spin)
     p_t = (it.shape.R @ it.q[..., None])[..., 0]

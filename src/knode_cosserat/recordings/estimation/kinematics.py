@@ -4,13 +4,13 @@ With u(s, t) in the material frame and a constant stretch λ of the centreline,
 
     R_s = R û,    p_s = λ R e₃,
 
-and in the global frame, with θ a small turn, everything that moves is an integral from the base:
+and in the global frame, with θ a small rotation, variations and velocities are integrals from the base:
 
     δθ(s) = ∫ R δu dσ                        δp(s) = ∫ δθ × p_s dσ
     ω = ∫ R u_t dσ                           p_t  = ∫ ω × p_s dσ
     ω_t = ∫ R u_tt + ω × R u_t dσ            p_tt = ∫ ω_t × p_s + ω × (ω × p_s) dσ
 
-The curvature about every axis is a sum of cosines, cos(kπ s/L). All arrays have frames in front.
+The curvature about every axis is a sum of cosines, cos(kπ s/L). The first axis of all arrays is the frame.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-#: cosines for the curvature about x, about y, and for the twist
+#: numbers of cosines for the curvature about x, about y, and for the twist
 MODES = (9, 9, 3)
 #: the longest segment of the grid, as a fraction of the length
 FINEST = 1.0 / 27.0
@@ -31,17 +31,17 @@ _GAUSS = 0.5 / np.sqrt(3.0)
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Rod:
-    """A grid along a rod, on which its nodes and the bodies on it are points, and the curvature's basis.
+    """Grid along a rod that contains its nodes and bodies, and the curvature's basis.
 
     Points alternate between ends and middles of segments, from base to tip.
 
     Attributes:
-        length: m.
+        length: length (m).
         s: arclength of the points (m).
-        nodes: which points are the model's nodes.
-        bodies: which points the bodies sit at.
-        basis: of the curvature at the points, modes of all axes one after the other; zero for other axes.
-        gauss: the same at the two Gauss points of every half of a segment.
+        nodes: indices of the points at the model's nodes.
+        bodies: indices of the points at the bodies.
+        basis: the curvature's basis at the points, modes of all axes in sequence; zero for other axes.
+        gauss: the basis at the two Gauss points of every half segment.
         base: orientation at the base, scalar first.
         origin: position of the base (m).
     """
@@ -57,7 +57,7 @@ class Rod:
 
     @property
     def modes(self) -> int:
-        """How many numbers describe the curvature at one time."""
+        """Number of coefficients of the curvature at one time."""
         return self.basis.shape[-1]
 
     @classmethod
@@ -69,7 +69,7 @@ class Rod:
         base: Float[np.ndarray, " 4"],
         origin: Float[np.ndarray, " 3"],
     ) -> Rod:
-        """The grid of a rod of this length (m) with so many nodes and bodies at these fractions."""
+        """Return the grid of a rod from its length (m), its number of nodes and its bodies' fractions."""
         fixed = np.unique(np.round(np.concatenate([np.linspace(0.0, 1.0, nodes), fractions]), 9))
         ends = [np.zeros(1)]
         for first, last in itertools.pairwise(fixed):
@@ -97,7 +97,7 @@ class Rod:
 
 
 def mode_groups() -> Int[np.ndarray, " K"]:
-    """Which modes share their smoothness: x and y of one k, so that a turn about z changes nothing."""
+    """Return the group of each mode: x and y of one k share their smoothness (invariance about z)."""
     return np.concatenate([np.arange(MODES[0]), np.arange(MODES[1]), MODES[0] + np.arange(MODES[2])])
 
 
@@ -112,7 +112,7 @@ def _basis(places: Float[np.ndarray, "..."]) -> Float[np.ndarray, "... 3 K"]:
 
 
 class Shape(NamedTuple):
-    """A rod at F times: at the points, curvature (1/m), orientation (also as a matrix), position (m)."""
+    """Shape of a rod at F times: curvature (1/m), orientation (also as a matrix) and position (m)."""
 
     u: Float[np.ndarray, "F P 3"]
     h: Float[np.ndarray, "F P 4"]
@@ -121,10 +121,10 @@ class Shape(NamedTuple):
 
 
 def shape(rod: Rod, a: Float[np.ndarray, "F K"], stretch: float) -> Shape:
-    """The shape of a rod whose curvature has the coefficients a (1/m); order 4 in the segments."""
+    """Return the shape of a rod from the curvature's coefficients a (1/m); order 4 in the segments."""
     half = np.diff(rod.s)
     u1, u2 = (np.einsum("hck,fk->fhc", rod.gauss[:, i], a, optimize=True) for i in (0, 1))
-    # Magnus' expansion to order 4: the turn of a half segment as a rotation vector
+    # Magnus' expansion to order 4: the rotation vector of a half segment
     turn = half[:, None] / 2 * (u1 + u2) + np.sqrt(3.0) / 12 * half[:, None] ** 2 * np.cross(u1, u2)
     angle = np.linalg.norm(turn, axis=-1, keepdims=True)
     # sin(x/2)/x, also where x is zero
@@ -139,14 +139,14 @@ def shape(rod: Rod, a: Float[np.ndarray, "F K"], stretch: float) -> Shape:
 
 
 class Sensitivity(NamedTuple):
-    """How poses of the bodies change: turns in the global frame (rad) and shifts (m), per coefficient."""
+    """Derivatives of the bodies' poses by the coefficients: rotations (global frame, rad) and shifts (m)."""
 
     turn: Float[np.ndarray, "F M 3 K"]
     shift: Float[np.ndarray, "F M 3 K"]
 
 
 def sensitivity(rod: Rod, it: Shape) -> Sensitivity:
-    """The derivatives of the bodies' poses by the coefficients; one integral each, no recursion."""
+    """Return the derivatives of the bodies' poses by the coefficients, as integrals without recursion."""
     weights = _weights(rod)  # (M, P)
     F, P = it.p.shape[:2]
     moment = np.cross(it.R, it.p[..., None], axisa=-2, axisb=-2, axisc=-2)  # columns of R, times p
@@ -169,7 +169,7 @@ def sensitivity(rod: Rod, it: Shape) -> Sensitivity:
 
 
 class Motion(NamedTuple):
-    """A rod in motion at F times, at the points; q, w and their rates in the material frame, SI units."""
+    """Motion of a rod at F times; q, w and their rates are in the material frame, in SI units."""
 
     shape: Shape
     q: Float[np.ndarray, "F P 3"]
@@ -180,7 +180,7 @@ class Motion(NamedTuple):
 
 
 def motion(rod: Rod, a: Float[np.ndarray, "3 F K"], stretch: float) -> Motion:
-    """Shape, velocities and accelerations from the coefficients and their first two rates."""
+    """Return shape, velocities and accelerations from the coefficients and their first two rates."""
     it = shape(rod, a[0], stretch)
     u_t, u_tt = (np.einsum("pck,fk->fpc", rod.basis, each, optimize=True) for each in a[1:])
     p_s = stretch * it.R[..., 2]
@@ -191,7 +191,7 @@ def motion(rod: Rod, a: Float[np.ndarray, "3 F K"], stretch: float) -> Motion:
     p_tt = cumulative(rod, np.cross(w_t, p_s) + np.cross(w, np.cross(w, p_s)))
     back = np.swapaxes(it.R, -1, -2)
     q_local, w_local = _turned(back, p_t), _turned(back, w)
-    # seen from a frame that turns: of ω the two terms cancel
+    # rates in a rotating frame; for ω the extra term vanishes
     q_t = _turned(back, p_tt) - np.cross(w_local, q_local)
     return Motion(it, q_local, w_local, q_t, _turned(back, w_t), u_t)
 
@@ -200,7 +200,7 @@ def motion(rod: Rod, a: Float[np.ndarray, "3 F K"], stretch: float) -> Motion:
 
 
 def cumulative(rod: Rod, values: Float[np.ndarray, "F P 3"]) -> Float[np.ndarray, "F P 3"]:
-    """Integrals from the base to every point, of parabolas through each segment's three points (Simpson)."""
+    """Return the integrals from the base to every point, by Simpson's rule in each segment."""
     ds = (rod.s[2::2] - rod.s[:-2:2])[:, None]
     first, middle, last = values[:, :-2:2], values[:, 1::2], values[:, 2::2]
     total = np.zeros_like(values)
@@ -210,7 +210,7 @@ def cumulative(rod: Rod, values: Float[np.ndarray, "F P 3"]) -> Float[np.ndarray
 
 
 def _weights(rod: Rod) -> Float[np.ndarray, "M P"]:
-    """Simpson's weights of the integrals from the base to the bodies."""
+    """Return Simpson's weights of the integrals from the base to the bodies."""
     ds = rod.s[2::2] - rod.s[:-2:2]
     weights = np.zeros((len(rod.bodies), len(rod.s)))
     for row, end in zip(weights, rod.bodies, strict=True):
@@ -227,7 +227,7 @@ def _weights(rod: Rod) -> Float[np.ndarray, "M P"]:
 def hamilton(
     left: Float[np.ndarray, "... 4"], right: Float[np.ndarray, "... 4"]
 ) -> Float[np.ndarray, "... 4"]:
-    """Product of quaternions, scalar first."""
+    """Return the product of quaternions, scalar first."""
     a, b, c, d = np.moveaxis(left, -1, 0)
     w, x, y, z = np.moveaxis(right, -1, 0)
     return np.stack(
@@ -242,7 +242,7 @@ def hamilton(
 
 
 def matrices(h: Float[np.ndarray, "... 4"]) -> Float[np.ndarray, "... 3 3"]:
-    """Rotation matrices of unit quaternions, scalar first."""
+    """Return the rotation matrices of unit quaternions, scalar first."""
     w, x, y, z = np.moveaxis(h, -1, 0)
     rows = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
@@ -255,7 +255,7 @@ def matrices(h: Float[np.ndarray, "... 4"]) -> Float[np.ndarray, "... 3 3"]:
 def turn_between(
     to: Float[np.ndarray, "... 4"], start: Float[np.ndarray, "... 4"]
 ) -> Float[np.ndarray, "... 3"]:
-    """Rotation vectors (rad), global frame, that turn orientations `start` into `to`."""
+    """Return the rotation vectors (rad, global frame) from orientations `start` to `to`."""
     inverse = start * np.array([1.0, -1.0, -1.0, -1.0])
     turn = hamilton(to, inverse)
     turn = np.where(turn[..., :1] < 0.0, -turn, turn)

@@ -1,4 +1,4 @@
-"""What of a recording the estimation uses: unbroken parts, their poses at full rate, and rows to estimate."""
+"""Input of the estimation: unbroken parts of a recording, their poses at full rate, and rows to estimate."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Body, Recording
 from knode_cosserat.rods.system import System
 
-#: poses this much before the first row and after the last are looked at too (s)
+#: margin of poses used before the first row and after the last (s)
 AROUND = 0.5
-#: stamps nearer than this are of one frame (s)
+#: tolerance of stamps of one frame (s)
 _SAME = 1e-4
-#: fewest bodies away from the clamped end, and fewest rows
+#: smallest number of bodies away from the clamped end, and of rows
 FEWEST_BODIES, FEWEST_ROWS = 2, 4
 
 
@@ -27,8 +27,8 @@ class Part:
 
     Attributes:
         rows: measurements at the times to estimate.
-        poses: of the bodies that are not at the clamped end, at the full rate.
-        fractions: where those bodies sit.
+        poses: poses of the bodies away from the clamped end, at the full rate.
+        fractions: places of these bodies, as fractions of the rod's length.
     """
 
     rows: Measurements
@@ -39,10 +39,10 @@ class Part:
 def parts_of(
     recording: Recording | Measurements, robot: System, dt: float, start: float | None, end: float | None
 ) -> list[Part]:
-    """The parts that can be estimated, each with enough rows.
+    """Return the parts with enough rows for an estimation.
 
     Raises:
-        RecordingError: the recording does not fit the robot, or does not say enough.
+        RecordingError: the recording does not fit the robot, or has too few data.
     """
     if isinstance(recording, Recording):
         rows = recording.sampled(dt, start, end)
@@ -101,13 +101,13 @@ def _of_rows(rows: Measurements, used: np.ndarray) -> Poses:
     position, quaternion = rows.position[:, used], rows.quaternion[:, used]
     turned = np.isfinite(quaternion).all(axis=2)
     filled = np.where(turned[..., None], quaternion, [1.0, 0.0, 0.0, 0.0])
-    # what is bridged was not seen
+    # bridged poses are not observations
     seen = rows.measured[:, used]
     return Poses(rows.time, position, filled, seen, turned & seen)
 
 
 def _frames(bodies: list[Body], time: Float[np.ndarray, " T"]) -> Poses:
-    """Poses of all bodies, those of one frame together."""
+    """Return the poses of all bodies, grouped by frame."""
     first, last = time[0] - AROUND, time[-1] + AROUND
     inside = [body.time[(body.time >= first) & (body.time <= last)] for body in bodies]
     stamps = np.unique(np.concatenate(inside))

@@ -1,9 +1,9 @@
-"""The paper's way from poses to states: splines along the rod, differences in time, the discrete equations.
+"""The paper's state estimation: splines along the rod, differences in time, and the discrete equations.
 
-Positions are cubic splines over arclength through base and bodies, orientations go on the shortest way
-between them; both at the model's nodes, row by row. Velocities are central differences in time, seen from the
-material frame (the paper's own scripts leave q in the global one). n and m are integrated from the free tip
-with the equations as a simulation has them, and v and u are those of the robot's law.
+Positions are cubic splines over arclength through base and bodies; orientations are interpolated spherically.
+Both are evaluated at the model's nodes, row by row. Velocities are central differences in time, in the
+material frame (the paper's own scripts leave q in the global one). n and m are integrated from the tip with
+the discrete equations of a simulation. v and u follow from the robot's constitutive law.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from knode_cosserat.solvers.settings import Settings
 def states(
     part: Part, robot: System, control: Float[np.ndarray, "T c"], settings: Settings
 ) -> tuple[Float[np.ndarray, "T N y"], Float[np.ndarray, "T N z"]]:
-    """y and z of the rows. Raises `RecordingError` if a body has no orientation."""
+    """Return y and z of the rows. Raises `RecordingError` if a body has no orientation."""
     rows = part.rows
     used = rows.fractions > 0.0
     if not np.isfinite(rows.quaternion[:, used]).all():
@@ -53,7 +53,7 @@ def _along(
     quaternion: Float[np.ndarray, "T B 4"],
     nodes: Float[np.ndarray, " N"],
 ) -> tuple[Float[np.ndarray, "T N 3"], Float[np.ndarray, "T N 4"]]:
-    """Positions and orientations at the nodes of every row."""
+    """Return positions and orientations at the nodes for every row."""
     from scipy.interpolate import CubicSpline
 
     p = np.asarray(CubicSpline(places, position, axis=1)(nodes))
@@ -64,7 +64,7 @@ def _along(
     angle = np.linalg.norm(turn, axis=-1, keepdims=True)
     step = np.concatenate([np.cos(angle / 2), np.sinc(angle / (2 * np.pi)) / 2 * turn], axis=-1)
     h = kinematics.hamilton(step, start)
-    # of the two quaternions of a rotation, the one that goes on from row to row: they are differentiated
+    # q and -q are the same rotation: choose the continuous sign, because rows are differentiated in time
     flips = np.cumprod(np.where(np.sum(h[1:] * h[:-1], axis=-1) < 0.0, -1.0, 1.0), axis=0)
     h[1:] *= flips[..., None]
     return p, np.where(h[:1, :, :1] < 0.0, -h, h)

@@ -1,12 +1,12 @@
-"""Curves in time: splines of several coefficients at once, fitted to what frames say of them.
+"""Curves in time: splines of several coefficients, fitted to frames.
 
-A curve is c(t) = Σ_l B_l(t) c_l with B-splines B_l and K numbers in each c_l. Frame i says
-½ aᵀ H_i a - g_iᵀ a of the curve's value a = c(t_i), and the prior is, with ''' the third derivative,
+A curve is c(t) = Σ_l B_l(t) c_l with B-splines B_l and K numbers in each c_l. Frame i contributes
+½ aᵀ H_i a - g_iᵀ a with the curve's value a = c(t_i). The prior is, with ''' the third derivative,
 
-    ½ Σ_k τ_k ∫ (c_k''')² + Ω⁶ c_k² dt:
+    ½ Σ_k τ_k ∫ (c_k''')² + Ω⁶ c_k² dt.
 
-that of a motion whose jerk is white noise of the intensity 1/τ_k above the frequency Ω, and which below it
-is as large as there: what hardly moves is not far from zero either. Both together are a banded system.
+Above the frequency Ω it is the prior of a motion with white-noise jerk of the intensity 1/τ_k. Below Ω the
+spectrum is flat, so that slow motion stays near zero. Data and prior form a banded system.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-#: degree of the splines: smooth in the accelerations' rate
+#: degree of the splines: the rate of the accelerations is smooth
 DEGREE = 5
-#: which derivative the prior holds small, and below which frequency the value itself (Hz)
+#: derivative penalised by the prior, and frequency below which the value itself is penalised (Hz)
 ORDER, CORNER = 3, 0.6
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Splines:
-    """B-splines on even knots.
+    """B-splines on evenly spaced knots.
 
     Attributes:
-        knots: s.
-        count: how many splines there are.
-        roots: of the prior's matrix at τ = 1, which is `rootsᵀ roots`: first those of the jerk, then those of
-            the value, both at points that follow each other in time.
+        knots: times of the knots (s).
+        count: number of splines.
+        roots: factor of the prior's matrix at τ = 1, which is `rootsᵀ roots`: first the rows of the jerk,
+            then those of the value, each in order of time.
     """
 
     knots: Float[np.ndarray, " n"]
@@ -40,7 +40,7 @@ class Splines:
 
     @classmethod
     def of(cls, start: float, end: float, spacing: float) -> Splines:
-        """Splines from `start` to `end`, knots as far apart as `spacing` or less (s)."""
+        """Return splines from `start` to `end` with a spacing of knots up to `spacing` (s)."""
         import scipy.sparse
 
         pieces = max(1, int(np.ceil((end - start) / spacing - 1e-9)))
@@ -55,17 +55,17 @@ class Splines:
         return dataclasses.replace(made, roots=scipy.sparse.vstack(parts).tocsr())
 
     def roots_of(self, profile: Float[np.ndarray, " points"]) -> Any:
-        """The prior's roots where the jerk is by a profile's factor (1 on average) more precisely zero."""
+        """Return the prior's roots with the jerk's precision scaled by a profile (1 on average)."""
         scale = np.concatenate([np.sqrt(profile), np.ones(len(profile))])
         return self.roots.multiply(scale[:, None]).tocsr()
 
     @property
     def points(self) -> int:
-        """At how many points in time the prior looks at the jerk."""
+        """Number of points in time at which the prior evaluates the jerk."""
         return self.roots.shape[0] // 2
 
     def design(self, time: Float[np.ndarray, " F"], derivative: int = 0) -> Any:
-        """Values (F, count), sparse, of a derivative of the splines at some times (s)."""
+        """Return the sparse values (F, count) of a derivative of the splines at given times (s)."""
         import scipy.sparse
         from scipy.interpolate import BSpline
 
@@ -82,7 +82,7 @@ class Splines:
 
 
 class Banded:
-    """The system of a curve: data of the frames in a band, to which the prior is added."""
+    """Banded linear system of a curve: data of the frames plus the prior."""
 
     def __init__(
         self,
@@ -109,7 +109,7 @@ class Banded:
         self.factor: np.ndarray | None = None
 
     def factorise(self, precision: Float[np.ndarray, " K"], ridge: Float[np.ndarray, " K"]) -> None:
-        """Factorise with these τ and a weak hold on every coefficient."""
+        """Factorise with the precisions τ of the prior and a ridge on every coefficient."""
         from scipy.linalg import cholesky_banded
 
         K, n = self.modes, self.splines.count
@@ -121,19 +121,19 @@ class Banded:
         self.factor = cholesky_banded(band, lower=True, overwrite_ab=True, check_finite=False)
 
     def solve(self, right: Float[np.ndarray, "nK ..."]) -> Float[np.ndarray, "nK ..."]:
-        """The solution for one right-hand side or several."""
+        """Return the solution for one right-hand side or several."""
         from scipy.linalg import cho_solve_banded
 
         assert self.factor is not None
         return np.asarray(cho_solve_banded((self.factor, True), right, check_finite=False))
 
     def curve(self) -> Float[np.ndarray, "n K"]:
-        """The most likely coefficients."""
+        """Return the most likely coefficients."""
         return self.solve(self.right).reshape(self.splines.count, self.modes)
 
 
 def _put(band: np.ndarray, blocks: Float[np.ndarray, "n K K"], ahead: int, K: int) -> None:
-    """Blocks (row of the later spline, column of the earlier one) into a lower band."""
+    """Write blocks (row of the later spline, column of the earlier one) into a lower band."""
     columns = band.reshape(band.shape[0], -1, K)
     for j in range(K):
         for i in range(j if ahead == 0 else 0, K):

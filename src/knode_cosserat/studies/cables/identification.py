@@ -68,7 +68,7 @@ STAGES = (
 
 
 class Identified(NamedTuple):
-    """The best parameters, and what each stage left on motions that were not used (m)."""
+    """Best parameters, and the error of each stage on held-out motions (m)."""
 
     parameters: CableParameters
     errors: tuple[float, ...]

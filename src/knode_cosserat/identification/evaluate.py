@@ -1,0 +1,169 @@
+"""Prediction of a recording by its measured tensions, compared with what was measured."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.evaluation.metrics import dtw_distance, pose_mse
+from knode_cosserat.identification.misfit import since_first, turned_from
+from knode_cosserat.recordings.measurements import Measurements
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.equilibrium import equilibrium
+from knode_cosserat.solvers.places import places_at, positions_at, quaternions_at
+from knode_cosserat.solvers.result import SimulationError
+from knode_cosserat.solvers.simulate import simulate
+from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.solvers.time import Static
+from knode_cosserat.trajectory import Trajectory
+
+#: seconds that recovery may take before a prediction has failed
+RECOVERY = 5.0
+
+
+class Poses(NamedTuple):
+    """Positions (m) and orientations of bodies."""
+
+    position: Float[np.ndarray, "T M 3"]
+    quaternion: Float[np.ndarray, "T M 4"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluation:
+    """A prediction against its recording.
+
+    Attributes:
+        tip_dtw: dynamic-time-warping distance of the tip (m), or None.
+        tip_rmse: root mean square distance of the tip (m), or None.
+        pose_mse: mean square error of positions and quaternions of all bodies, or None.
+        failed: why there is no prediction, or None.
+        tip: predicted positions of the last body (m), or None.
+        extrapolated: part of the rows outside the range that the robot was identified in; None: not known.
+    """
+
+    tip_dtw: float | None = None
+    tip_rmse: float | None = None
+    pose_mse: float | None = None
+    failed: str | None = None
+    tip: Float[np.ndarray, "T 3"] | None = None
+    extrapolated: float | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the figures, or the reason for there being none, as JSON has them."""
+        figures: dict[str, Any] = {
+            "tip_dtw": self.tip_dtw, "pose_mse": self.pose_mse, "tip_rmse": self.tip_rmse,
+        }  # fmt: skip
+        if self.extrapolated is not None:
+            figures["extrapolated"] = self.extrapolated
+        return figures if self.failed is None else {**figures, "failed": self.failed}
+
+    def __str__(self) -> str:
+        if self.failed is not None:
+            return f"no prediction: {self.failed}"
+        assert self.tip_rmse is not None
+        turned = "" if self.pose_mse is None else f", pose MSE {self.pose_mse:.3g}"
+        outside = f", {self.extrapolated:.0%} of the rows extrapolated" if self.extrapolated else ""
+        return f"tip RMSE {1e3 * self.tip_rmse:.2f} mm{turned}{outside}"
+
+
+def coverage(
+    members: Iterable[System], measured: Measurements, level: float = 0.9, *,
+    space: str | SpaceScheme = "lobatto2",
+) -> float:  # fmt: skip
+    """Return which part of the measured positions lies where several models' spread says.
+
+    Each begins in its own equilibrium under the initial tensions. The interval is that of one more model with
+    the given probability (Student's t), as `Prediction.interval` has it; the first row is not counted.
+
+    Args:
+        members: at least two models, such as an `Ensemble`.
+        measured: rows as far apart as steps of the simulation.
+        level: probability.
+        space: the scheme along the rod.
+
+    Raises:
+        SimulationError: a member has no solution.
+        ValueError: there are fewer than two members.
+    """
+    predicted = []
+    for robot in members:
+        moved = _moved(robot, measured, space, RECOVERY)
+        places = places_at(measured.fractions, robot.nodes)
+        predicted.append(np.asarray(positions_at(robot, np.asarray(moved.y), places)))
+    count = len(predicted)
+    if count < 2:
+        raise ValueError("fewer than two members have no spread")
+    from scipy.stats import t
+
+    half = (
+        t.ppf(0.5 + level / 2.0, count - 1) * np.sqrt(1.0 + 1.0 / count) * np.std(predicted, axis=0, ddof=1)
+    )
+    off = np.abs(measured.position - np.mean(predicted, axis=0))[1:]
+    return float(np.mean((off <= half[1:])[np.isfinite(off)]))
+
+
+def _moved(robot: System, measured: Measurements, space: str | SpaceScheme, recovery: float) -> Trajectory:
+    """Return rows under the measured controls: a motion from the equilibrium before it, or equilibria."""
+    initial, first = None, measured.tension[0] if measured.static else measured.initial_tension
+    if first is not None:
+        initial = equilibrium(robot, first, space=space, recovery_budget=recovery)
+    time: Static | str = "bdf2"
+    if measured.static:
+        tension, dt, time = measured.tension, 1.0, Static()
+    else:
+        tension = robot.undelayed(measured.tension[:-1], measured.dt, measured.initial_tension)
+        dt = measured.dt
+    moved = simulate(robot, tension, dt, time=time, space=space, initial=initial, recovery_budget=recovery)
+    # the first row of equilibria is where the search began
+    return moved[1:] if measured.static else moved
+
+
+def evaluate(
+    robot: System, measured: Measurements, *, every: int = 1, last: int | None = None,
+    space: str | SpaceScheme = "lobatto2", recovery: float = RECOVERY,
+) -> Evaluation:  # fmt: skip
+    """Predict a recording from the equilibrium under its initial tensions, and compare.
+
+    Rows of equilibria (`measured.static`) are each predicted by itself.
+
+    Args:
+        robot: any robot or model.
+        measured: rows as far apart as steps of the simulation.
+        every: rows that are compared: each, every second, and so on.
+        last: how many of these are compared at most.
+        space: the scheme along the rod.
+        recovery: seconds that recovery from failed steps may take.
+
+    Returns:
+        The `Evaluation` over the rows in which all bodies were seen; with `failed` if a step has no solution.
+    """
+    try:
+        moved = _moved(robot, measured, space, recovery)
+    except SimulationError as error:
+        return Evaluation(failed=str(error))
+    rows = np.arange(len(measured.time))[::every][:last]
+    y, z = np.asarray(moved.y)[rows], np.asarray(moved.z)[rows]
+    places = places_at(measured.fractions, robot.nodes)
+    position = np.asarray(positions_at(robot, y, places, z))
+    quaternion = np.asarray(quaternions_at(robot, y, places))
+    seen, known = measured.position[rows], measured.complete[rows]
+    off = position[known, -1] - seen[known, -1]
+    # how bodies are mounted is not known: rotations are those since the first row, in which the robot rests
+    turned = turned_from(quaternion[0], since_first(measured.quaternion[rows]))
+    oriented = np.isfinite(turned).all(axis=(1, 2)) & known
+    mse = None
+    if oriented.any():
+        mse = pose_mse(
+            Poses(position[oriented], quaternion[oriented]), Poses(seen[oriented], turned[oriented])
+        )
+    return Evaluation(
+        tip_dtw=dtw_distance(position[known, -1], seen[known, -1]),
+        tip_rmse=float(np.sqrt(np.mean(np.sum(off**2, axis=1)))),
+        pose_mse=mse,
+        tip=position[:, -1],
+        extrapolated=None if moved.extrapolated is None else float(np.mean(moved.extrapolated[rows])),
+    )

@@ -1,0 +1,237 @@
+"""Fitting from whatever was recorded: full states, or measured poses."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from knode_cosserat.identification.evaluate import evaluate
+from knode_cosserat.identification.given import DT, measurements_of, names_of, padded, poses_of
+from knode_cosserat.identification.identify import identify
+from knode_cosserat.identification.misfit import Data, Misfit, data_of
+from knode_cosserat.identification.model import Model
+from knode_cosserat.identification.residual import Learned, learn_residual
+from knode_cosserat.identification.residual_model import Known, ResidualModel
+from knode_cosserat.identification.result import Identified
+from knode_cosserat.identification.search import Search, SearchError
+from knode_cosserat.learning import fit as learning
+from knode_cosserat.learning.config import FitConfig, PassiveOptions, StructuredOptions
+from knode_cosserat.learning.ensemble import Ensemble
+from knode_cosserat.learning.knode import KNODE, About
+from knode_cosserat.learning.passive import PARTS, Passive, passive
+from knode_cosserat.learning.residual import Nothing
+from knode_cosserat.learning.samples import DataError
+from knode_cosserat.learning.training.runs import FitError
+from knode_cosserat.recordings.measurements import Measurements
+from knode_cosserat.recordings.recording import Recording
+from knode_cosserat.rods.elastic_rod import ElasticRod
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.trajectory import Trajectory
+
+log = logging.getLogger(__name__)
+
+#: of a network's residual: widths of its priors, wide enough for what crude knowledge misses
+WIDE = {"stiffness": 0.5, "levers": 3.0, "energy": 0.5, "damping": 3.0, "dissipation": 3.0}
+
+
+def fit(
+    knowledge: System,
+    data: Sequence[Trajectory | Recording | Measurements],
+    config: FitConfig = learning.BEST,
+    *,
+    held_out: Sequence[Any] = (),
+    space: str | SpaceScheme = "lobatto2",
+    progress: bool = False,
+    **options: Any,
+) -> Any:
+    """Learn from trajectories of full states, or from recordings of poses, what an imperfect model misses.
+
+    From recordings (or their `Measurements`, or a mixture with trajectories) the robot is identified
+    (`identify`), then a residual is learned on top, through rollouts and from measured poses alone. It is
+    passive: it cannot feed energy in. It is kept only if recordings that were left out are predicted better
+    with it. `FitConfig.network_recordings` learns a passive network on the knowledge itself, without
+    identification.
+
+    Args:
+        knowledge: the imperfect model.
+        data: trajectories of full states at the nodes of the knowledge, or recordings that begin at rest;
+            several, for what is kept is decided by those left out.
+        config: what is learned, and how.
+        held_out: what is not learned from; what the model makes of it is reported.
+        space: the scheme along the rod, for recordings.
+        progress: show how it goes on.
+        options: for trajectories only: `checkpoint`, `checkpoint_every` and `log_dir` of `learning.fit.fit`.
+
+    Returns:
+        A `KNODE`, or an `Ensemble` of one for each seed if `config.seed` is several: from recordings, robots
+        drawn from what these leave possible, with a spread as wide as held-out recordings ask for. From
+        recordings `about.facts` has "given" (what was done with each), "steps" (in words), "identified" (see
+        `Identified.to_dict`), "residual" (whether it was kept) and "held_out_error" (m) by recording.
+
+    Raises:
+        DataError: recordings or trajectories that cannot be used.
+        FitError: there is nothing to be learned from, or a config that needs full states.
+        IdentificationError: the robot cannot be identified.
+    """
+    listed: Any = data
+    several = isinstance(listed, Iterable) and not isinstance(listed, str | Trajectory)
+    listed = list(listed) if several else listed
+    if not several or all(isinstance(each, Trajectory) for each in listed):
+        return learning.fit(knowledge, listed, config, held_out=held_out, progress=progress, **options)
+    if options:
+        raise FitError(f"{next(iter(options))} is for trajectories; from recordings there are no checkpoints")
+    if not isinstance(getattr(config, "residual", None), StructuredOptions | PassiveOptions):
+        raise FitError(
+            "this config needs full states, and recordings have none: estimate them first "
+            "(kc.estimate_states), or use FitConfig() or FitConfig.network_recordings()"
+        )
+    tell = _teller(progress)
+    measured, given = _measured(listed)
+    for line in given:
+        tell(line)
+    others, _ = _measured(held_out) if held_out else ([], [])
+    if isinstance(config.residual, PassiveOptions):
+        return _network(knowledge, measured, others, config, given, space, tell)
+    if len(measured) == 1 and isinstance(config.seed, tuple):
+        raise FitError("there is one recording; an ensemble needs two at least, for its spread is held out")
+    return _identified(knowledge, measured, others, config, given, space, tell)
+
+
+def _identified(
+    knowledge: System, measured: Sequence[Measurements], others: Sequence[Measurements], config: FitConfig,
+    given: list[str], space: str | SpaceScheme, tell: Callable[[str], None],
+) -> Any:  # fmt: skip
+    """Return the identified robot, with a residual if that is kept."""
+    found = identify(knowledge, measured, space=space, progress=tell)
+    facts: dict[str, Any] = {"given": given, "identified": found.to_dict(), "residual": False}
+    if len(measured) == 1:
+        facts["steps"] = [*found.steps, "no residual: there is one recording, and none to hold out"]
+        return _named(found.robot, config, {**facts, **_unseen(found.robot, others, space)})
+    learned = with_residual(knowledge, measured, found, space=space, progress=tell)
+    errors = {name: {"identified": own.tip, **_with(learned, name)} for name, own in learned.without.items()}
+    facts |= {
+        "steps": [*found.steps, *learned.steps], "residual": learned.kept, "held_out_error": errors,
+    }  # fmt: skip
+    return _models(learned, config, facts, others, space)
+
+
+def with_residual(
+    nominal: System, recordings: Sequence[Recording | Measurements], found: Identified, *,
+    space: str | SpaceScheme = "lobatto2", progress: Callable[[str], None] | None = None, hidden: int = 4,
+    seed: int = 0,
+) -> Learned:  # fmt: skip
+    """Learn a passive residual on an identified robot from the recordings that it was identified from.
+
+    Args:
+        nominal: the robot that the identification began from.
+        recordings: the recordings; at least two, for one is left out in turn.
+        found: the identification.
+        space: the scheme along the rod.
+        progress: called with a line for each step.
+        hidden: units of the residual's networks.
+        seed: of the networks' fixed weights.
+
+    Raises:
+        DataError: there is one recording only, or they cannot be used.
+    """
+    measured = measurements_of(recordings)
+    if len(measured) < 2:
+        raise DataError("there is one recording; a residual needs two at least, for one is left out in turn")
+    tension = np.concatenate([each.tension for each in measured])
+    model = Model(nominal, tension)  # type: ignore[arg-type]
+    x = coordinates(model, found)
+    robot = model.reduced(x, found.effects)
+    both = ResidualModel(model, found.effects, passive(robot, tension, seed, hidden))
+    return learn_residual(both, x, _data(measured, model), space, progress or log.info)
+
+
+def coordinates(model: Model, found: Identified) -> np.ndarray:
+    """Return the coordinates of an identified robot, by its estimates."""
+    x = np.zeros(model.size)
+    for name in found.effects:
+        values = [each.value for each in found.estimates if each.effect == name]
+        for k, value in zip(range(*model.slice(name).indices(model.size)), values, strict=True):
+            x[k] = model.numbers[k].coordinate(value)
+    return x
+
+
+def _teller(progress: bool) -> Callable[[str], None]:
+    return (lambda line: print(line, file=sys.stderr, flush=True)) if progress else log.info
+
+
+def _data(measured: Sequence[Measurements], model: Any) -> list[Data]:
+    named = zip(measured, names_of(measured), strict=True)
+    return padded([data_of(each, model, name) for each, name in named])
+
+
+def _measured(given: Sequence[Any]) -> tuple[list[Measurements], list[str]]:
+    """Return the poses in everything that is given, and what was done with each, in words."""
+    found, words = [], []
+    for k, each in enumerate(given):
+        if isinstance(each, Trajectory):
+            found.append(poses_of(each, f"trajectory {k}"))
+            words.append(f"trajectory {k}: poses of its {len(each.time)} rows, not its other states")
+            continue
+        (rows,) = measurements_of([each])
+        found.append(rows)
+        how = f"a recording, rows of {DT:g} s with mean tensions" if isinstance(each, Recording) else "rows"
+        words.append(f"{names_of([rows])[0]}: {how}, {len(rows.time)} of them, poses and tensions")
+    return measurements_of(found), words
+
+
+def _with(learned: Learned, name: str) -> dict[str, float]:
+    return {"residual": learned.with_residual[name].tip} if name in learned.with_residual else {}
+
+
+def _models(
+    learned: Learned, config: FitConfig, facts: dict[str, Any], others: Sequence[Measurements],
+    space: str | SpaceScheme,
+) -> Any:  # fmt: skip
+    """Return the learned model, or one drawn for each of several seeds."""
+    if isinstance(config.seed, tuple):
+        return Ensemble(_named(learned.member(seed), config, {**facts, "seed": seed}) for seed in config.seed)
+    told = _unseen(learned.robot, others, space)
+    return _named(learned.robot, config, {**facts, "seed": config.seed, **told})
+
+
+def _unseen(robot: System, others: Sequence[Measurements], space: str | SpaceScheme) -> dict[str, Any]:
+    """Return errors of what was not learned from, if there is any."""
+    errors = [evaluate(robot, each, space=space).tip_rmse for each in others]
+    return {"unseen_error": dict(zip(names_of(others), errors, strict=True))} if others else {}
+
+
+def _named(system: System, config: FitConfig, facts: dict[str, Any]) -> KNODE:
+    """Return a model with what is known of it, and without parts of its residual that do nothing."""
+    about = About({**facts, "config": config.to_dict()})
+    if not isinstance(system, KNODE):
+        return KNODE(system, Nothing(), about)
+    residual = system.residual
+    return KNODE(system.knowledge, residual.pruned() if isinstance(residual, Passive) else residual, about)
+
+
+def _network(
+    knowledge: System, measured: Sequence[Measurements], others: Sequence[Measurements], config: FitConfig,
+    given: list[str], space: str | SpaceScheme, tell: Callable[[str], None],
+) -> Any:  # fmt: skip
+    """Return the knowledge with a passive network, searched from zero over horizons that grow."""
+    if not isinstance(knowledge, ElasticRod):
+        raise FitError(f"knowledge is a {type(knowledge).__name__}; allowed is a rod with bending stiffness")
+    tension = np.concatenate([each.tension for each in measured])
+    options = config.residual
+    assert isinstance(options, PassiveOptions)
+    model = ResidualModel(Known(knowledge), (), passive(knowledge, tension, 0, options.hidden), WIDE)
+    # it offers what a Model does
+    misfit = Misfit(model, _data(measured, model), space)  # type: ignore[arg-type]
+    search = Search(misfit, tell)
+    try:
+        point = search.from_far(model.mask(PARTS))
+    except SearchError as error:
+        raise FitError(f"{error}: the knowledge is too far from the robot") from None
+    robot = model.robot(point.x)
+    learned = Learned(robot, True, {}, {}, (), point.x, point.covariance(), model)
+    return _models(learned, config, {"given": given, "residual": True}, others, space)

@@ -1,0 +1,74 @@
+"""Robots that differ from their data sheet by random effects, for tests of identification."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.identification.model import Model
+from knode_cosserat.rods.parameters import ParameterError
+from knode_cosserat.rods.routed_robot import RoutedTendonRobot
+from knode_cosserat.rods.tendon_rod import TendonRod
+
+#: probability that a robot has an effect
+SHARE = 1.0 / 3.0
+#: sizes of an effect's numbers, in standard deviations of their priors
+SIZES = (0.5, 1.5)
+
+
+@dataclasses.dataclass(frozen=True)
+class Imperfect:
+    """A robot with random imperfections.
+
+    Attributes:
+        robot: the robot.
+        effects: the effects that it has.
+        values: their numbers by label.
+        model: all effects and their priors.
+        x: coordinates (n,) of the robot.
+    """
+
+    robot: RoutedTendonRobot
+    effects: tuple[str, ...]
+    values: Mapping[str, float]
+    model: Model
+    x: Float[np.ndarray, " n"]
+
+
+def imperfect_robot(nominal: TendonRod, tension: Float[np.ndarray, "T c"], seed: int) -> Imperfect:
+    """Return a robot with imperfections drawn from the library of effects.
+
+    Basic effects (stiffness, damping) are always drawn, every other one with probability 1/3; numbers lie 0.5
+    to 1.5 standard deviations of their priors from their nominal values.
+
+    Args:
+        nominal: the robot as its data sheet has it.
+        tension: tensions (N) that it will be pulled with: some effects' sizes depend on them.
+        seed: a whole number from 0 to 2**32 - 1.
+
+    Raises:
+        ParameterError: a seed out of range.
+    """
+    if not 0 <= seed < 2**32:
+        raise ParameterError(f"seed is {seed}; allowed is a whole number from 0 to {2**32 - 1}")
+    model, random = Model(nominal, tension), np.random.default_rng(seed)
+    names: list[str] = []
+    own = [effect for effect in model.effects if not effect.of_recordings]
+    for effect in own:
+        present = bool(random.uniform() < SHARE) or effect.basic
+        if present and set(effect.needs) <= set(names):
+            names.append(effect.name)
+    count = sum(len(effect.numbers) for effect in own)
+    drawn = random.uniform(*SIZES, count) * random.choice([-1.0, 1.0], count)
+    sizes = np.concatenate([drawn, np.zeros(model.size - count)])
+    low, high = model.bounds
+    # numbers that are not negative, say, and nominally zero
+    sizes = np.where((low >= 0.0) | (high <= 0.0), np.abs(sizes) * np.where(high <= 0.0, -1.0, 1.0), sizes)
+    x = np.where(model.mask(names), np.clip(sizes, low, high), 0.0)
+    values = dict(zip((each.label for each in model.numbers), model.values(x), strict=True))
+    mask = model.mask(names)
+    kept = {each.label: values[each.label] for each, on in zip(model.numbers, mask, strict=True) if on}
+    return Imperfect(model.reduced(x, names), tuple(names), kept, model, x)

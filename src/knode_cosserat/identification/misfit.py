@@ -1,0 +1,310 @@
+"""Simulated against measured poses of whole recordings, and derivatives by all coordinates."""
+
+from __future__ import annotations
+
+import concurrent.futures
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.identification.model import Model, Parametrised
+from knode_cosserat.learning.samples import DataError
+from knode_cosserat.recordings.measurements import Measurements
+from knode_cosserat.rods.load_cells import LoadCells
+from knode_cosserat.rotation import conjugate, quaternion_product
+from knode_cosserat.solvers.boundary import NewtonOptions
+from knode_cosserat.solvers.history import initial_past, resting_past
+from knode_cosserat.solvers.places import Places, places_at, positions_at, quaternions_at
+from knode_cosserat.solvers.run import run_one, usable_cores
+from knode_cosserat.solvers.sensitivity import tangent_piece
+from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.solvers.task import FirstStep, Start, Task
+
+#: rows of one compiled program with derivatives
+PIECE = 40
+#: seconds that recovery of one simulation may take
+RECOVERY = 0.5
+#: a rotation counts as the displacement at this part of the length
+ARM = 0.2
+#: coefficients of steps without rates
+STILL = np.zeros((2, 4))
+
+
+class Data(NamedTuple):
+    """One recording, ready to be compared with."""
+
+    name: str
+    dt: float
+    #: tension before row 0 (c,), and held from each row to the next (T, c), in N
+    initial_tension: Float[np.ndarray, " c"]
+    tension: Float[np.ndarray, "T c"]
+    places: Places
+    #: positions (T + 1, M, 3) in m, and rotations since row 0 (T + 1, M, 4); NaN where nothing was seen
+    position: Float[np.ndarray, "rows M 3"]
+    rotation: Float[np.ndarray, "rows M 4"]
+    #: the first row in motion
+    moves: int
+    #: whether each row is an equilibrium of its own
+    static: bool = False
+
+
+def data_of(given: Measurements, model: Model, name: str) -> Data:
+    """Return a recording's data.
+
+    Raises:
+        DataError: too short, unknown tensions, or another number of tendons than the robot has.
+    """
+    if len(given.time) < 3:
+        raise DataError(f"{name}: {len(given.time)} rows; at least 3 are needed")
+    if given.tension.shape[1] != model.nominal.control_size:
+        raise DataError(
+            f"{name}: {given.tension.shape[1]} tensions in a row; the robot has {model.nominal.control_size}"
+        )
+    if given.static:
+        given = _as_steps(given)
+    if not np.all(np.isfinite(given.tension[:-1])):
+        row = int(np.flatnonzero(~np.isfinite(given.tension).all(axis=1))[0])
+        raise DataError(
+            f"{name}: no tension is known at {given.time[row]:g} s; use the part before (`parts`)"
+        )
+    if not np.any(np.isfinite(given.position[1:])):
+        raise DataError(f"{name}: no position was seen after the first row")
+    tension = given.tension[:-1]
+    initial = tension[0] if given.initial_tension is None else given.initial_tension
+    swing = np.max(np.abs(tension - initial), axis=1)
+    moving = np.flatnonzero(swing > 0.05 * max(np.max(swing), 1e-12))
+    return Data(
+        name, given.dt, np.asarray(initial), tension, places_at(given.fractions, model.nominal.nodes),
+        given.position, since_first(given.quaternion),
+        int(moving[0]) if len(moving) and not given.static else 0, given.static,
+    )  # fmt: skip
+
+
+def _as_steps(given: Measurements) -> Measurements:
+    """Return equilibria as rows of a motion: each row's own tension leads to it, the first one not seen."""
+
+    def late(rows: np.ndarray) -> np.ndarray:
+        return np.concatenate([np.full_like(rows[:1], np.nan), rows])
+
+    return dataclasses.replace(
+        given,
+        tension=np.concatenate([given.tension, given.tension[-1:]]),
+        position=late(given.position),
+        quaternion=late(given.quaternion),
+        initial_tension=given.tension[0],
+    )
+
+
+def since_first(quaternion: Float[np.ndarray, "T M 4"]) -> Float[np.ndarray, "T M 4"]:
+    """Return rotations, in the global frame, since the first row; NaN where either is not known."""
+    first = np.broadcast_to(np.array(quaternion[:1]), quaternion.shape)
+    both = jax.vmap(jax.vmap(lambda h, first: quaternion_product(h, conjugate(first))))
+    return np.asarray(both(jnp.asarray(quaternion), jnp.asarray(first)))
+
+
+def turned_from(
+    first: Float[np.ndarray, "M 4"], rotation: Float[np.ndarray, "T M 4"]
+) -> Float[np.ndarray, "T M 4"]:
+    """Return orientations from those in the first row, and rotations since then."""
+    begun = jnp.broadcast_to(jnp.asarray(first), rotation.shape)
+    return np.asarray(jax.vmap(jax.vmap(quaternion_product))(jnp.asarray(rotation), begun))
+
+
+class Rollout(NamedTuple):
+    """A simulated recording: differences of positions and rotations (rows, M, 6) in m, or none if it failed.
+
+    NaN where nothing was measured. `derivatives` are by the coordinates (n, rows, M, 6).
+    """
+
+    values: Float[np.ndarray, "rows M 6"]
+    derivatives: Float[np.ndarray, "n rows M 6"] | None
+
+
+class Misfit:
+    """Differences of simulations from recordings, by the coordinates of a model."""
+
+    def __init__(self, model: Model, data: Sequence[Data], space: str | SpaceScheme):
+        self.model, self.data = model, tuple(data)
+        self.settings = Settings.of("bdf2", space, "paper", NewtonOptions())
+        self._first = True
+
+    def differences(
+        self, x: Float[np.ndarray, " n"], rows: int | None = None, which: Sequence[int] | None = None,
+        derivatives: bool = True,
+    ) -> list[Rollout | None]:  # fmt: skip
+        """Return the rollouts of all recordings, or of those with the given numbers; None if one failed.
+
+        Args:
+            x: coordinates.
+            rows: rows after the first in motion that are simulated; None: all.
+            which: numbers of recordings.
+            derivatives: compute them too.
+        """
+        chosen = [self.data[k] for k in (range(len(self.data)) if which is None else which)]
+
+        def work(data: Data) -> Rollout | None:
+            return self._of_one(x, data, rows, derivatives)
+
+        if self._first:  # programs are compiled one by one
+            self._first = False
+            return [work(data) for data in chosen]
+        with concurrent.futures.ThreadPoolExecutor(usable_cores()) as pool:
+            return list(pool.map(work, chosen))
+
+    def _of_one(self, x: Any, data: Data, rows: int | None, derivatives: bool) -> Rollout | None:
+        x = np.asarray(x, dtype=float)
+        steps = len(data.tension) if rows is None else min(len(data.tension), data.moves + rows)
+        system, settings = _system(self.model.robot, x), self.settings
+        acting, slope = _acting(system, data)
+        past = _resting(system, settings)
+        # controls have room for a motion: one program for equilibrium and motion
+        still = np.broadcast_to(data.initial_tension, data.tension.shape)
+        first, _ = run_one(
+            Task(settings, data.dt, 1, "still", RECOVERY), system, still, Start(past, still[0])
+        )
+        if first.result[0] < 0:
+            return None
+        count = system.y_layout.size + system.z_layout.size
+        begun = (
+            past
+            if data.static
+            else _initial(system, settings, first.records[0][:, :count], data.initial_tension)
+        )
+        kind: FirstStep = "still" if data.static else "start"
+        task = Task(settings, data.dt, max(steps, 1), kind, recovery_budget=RECOVERY)
+        found, _ = run_one(task, system, acting, Start(begun, data.initial_tension))
+        if found.result.min() < 0:
+            return None
+        ny = system.y_layout.size
+        y = np.concatenate([first.records[:1, :, :ny], found.records[:steps, :, :ny]])
+        if not derivatives:
+            return Rollout(np.asarray(_compared(system, y, *self._target(data, steps))), None)
+        d_first, d_begun = self._of_start(x, data, past, first)
+        if data.static:
+            # an equilibrium depends on no history
+            d_begun = tuple(np.zeros_like(each) for each in d_begun)
+        parts, carry = [d_first[:, None, :, :ny]], (begun, *d_begun)
+        for k in range(0, steps, PIECE):
+            size = min(PIECE, steps - k)
+            parts_of = (found.records, found.unknowns, acting, slope)
+            rows_, xi, tension, by_latency = (_filled(each[k : k + size], PIECE) for each in parts_of)
+            table = task.table if k == 0 else task.table[[1, 1]]
+            carry, d_rows = _piece(
+                self.model.robot, x, settings, table, data.dt, rows_, xi, tension, by_latency, carry
+            )
+            parts.append(np.asarray(d_rows)[:, :size, :, :ny])
+        d_y = np.concatenate(parts, axis=1)
+        values, slopes = _with_slopes(system, y, d_y, *self._target(data, steps))
+        return Rollout(np.asarray(values), np.asarray(slopes))
+
+    def _target(self, data: Data, steps: int) -> tuple[Any, ...]:
+        return data.places, data.position[: steps + 1], data.rotation[: steps + 1]
+
+    def _of_start(self, x: Any, data: Data, past: Any, first: Any) -> tuple[Any, Any]:
+        """Derivatives of the equilibrium, and of the history that a motion begins with.
+
+        An equilibrium depends on no history: derivatives of that are zero, and those after it are of a motion
+        that rests.
+        """
+        rows, xi = (_filled(each[:1], PIECE) for each in (first.records, first.unknowns))
+        tension = np.broadcast_to(data.initial_tension, (PIECE, len(data.initial_tension)))
+        none = (np.zeros((self.model.size, *np.shape(each))) for each in (past.records, past.rate))
+        after, d_rows = _piece(
+            self.model.robot,
+            x,
+            self.settings,
+            STILL,
+            data.dt,
+            rows,
+            xi,
+            tension,
+            np.zeros_like(tension),
+            (past, *none),
+        )
+        return np.asarray(d_rows)[:, 0], after[1:]
+
+
+def _cells(system: Any) -> LoadCells | None:
+    """Return the load cells of a robot, also of one with a residual."""
+    return getattr(getattr(system, "knowledge", system), "load_cells", None)
+
+
+def _acting(system: Any, data: Data) -> tuple[np.ndarray, np.ndarray]:
+    """Return the tensions (T, c) that act by the load cells' latency, and their derivative by it (N/s).
+
+    The derivative is over one row: between rows it jumps, and at no latency it is of both sides.
+    """
+    cells, half = _cells(system), 0.5 * data.dt
+    if cells is None:
+        return data.tension, np.zeros_like(data.tension)
+    late, early, acting = (
+        dataclasses.replace(cells, latency=np.asarray(cells.latency) + shift).undelayed(
+            data.tension, data.dt, data.initial_tension
+        )
+        for shift in (half, -half, 0.0)
+    )
+    return acting, (late - early) / data.dt
+
+
+def _filled(rows: Any, count: int) -> np.ndarray:
+    """Exactly so many rows: the last one again and again."""
+    return np.asarray(rows)[np.minimum(np.arange(count), len(rows) - 1)]
+
+
+@jax.jit
+def _system(robot: Parametrised, x: Any) -> Any:
+    return robot(x)
+
+
+_resting = jax.jit(resting_past, static_argnames="settings")
+_initial = jax.jit(initial_past, static_argnames="settings")
+
+
+@functools.partial(jax.jit, static_argnames="settings")
+def _piece(
+    robot: Parametrised, x: Any, settings: Settings, table: Any, dt: Any, rows: Any, xi: Any, controls: Any,
+    by_latency: Any, carry: Any,
+) -> Any:  # fmt: skip
+    """Derivatives of a piece's rows, and the history after it; `by_latency` are those of the controls."""
+    past, d_records, d_rate = carry
+
+    def one(direction: Any, d_records: Any, d_rate: Any) -> Any:
+        system, d_system = jax.jvp(robot, (x,), (direction,))
+        cells = _cells(d_system)
+        d_controls = jnp.zeros_like(controls) if cells is None else by_latency * cells.latency
+        return tangent_piece(
+            settings, table, dt, rows, xi, system, controls, past, d_system, d_controls, d_records, d_rate
+        )
+
+    axes = ((None, 0, 0), (0, 0))
+    (past, d_records, d_rate), (d_rows, _) = jax.vmap(one, out_axes=axes)(jnp.eye(len(x)), d_records, d_rate)
+    return (past._replace(t0=past.t0 + PIECE * dt), d_records, d_rate), d_rows
+
+
+@jax.jit
+def _compared(system: Any, y: Any, places: Places, position: Any, rotation: Any) -> Any:
+    """Differences of positions (m), and of rotations since row 0 times an arm (m)."""
+    seen = positions_at(system, y, places) - position
+    h = quaternions_at(system, y, places)
+    product = jax.vmap(jax.vmap(quaternion_product))
+    inverse = jax.vmap(jax.vmap(conjugate))
+    since = product(h, inverse(jnp.broadcast_to(h[:1], h.shape)))
+    left = product(since, inverse(jnp.where(jnp.isnan(rotation), 1.0, rotation)))
+    left = left * jnp.where(left[..., :1] < 0.0, -1.0, 1.0)
+    turned = jnp.where(jnp.isnan(rotation[..., :1]), jnp.nan, 2.0 * ARM * system.length * left[..., 1:])
+    return jnp.concatenate([seen, turned], axis=-1)
+
+
+@jax.jit
+def _with_slopes(system: Any, y: Any, d_y: Any, places: Places, position: Any, rotation: Any) -> Any:
+    def compared(y: Any) -> Any:
+        return _compared(system, y, places, position, rotation)
+
+    return compared(y), jax.vmap(lambda d: jax.jvp(compared, (y,), (d,))[1])(d_y)

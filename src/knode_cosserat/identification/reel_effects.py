@@ -1,0 +1,176 @@
+"""Effects of robots whose tendons are wound up by reels: geometry, springs, and what reels take in.
+
+Angles and poses alone leave the scale of all forces open: stiffness, springs and masses can grow together.
+It is the weights that are given (density, masses) that set it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from knode_cosserat.identification.effects import Effect, Number, effects_of
+from knode_cosserat.rods.routed_robot import RoutedTendonRobot
+from knode_cosserat.rods.routing import Straight
+
+#: of the length: uncertainty of what reels have taken in, and of angles about which tendons lie (rad)
+TAKEN_IN, TURN = 0.01, 0.1
+
+
+#: effects of measured tensions, which a robot with reels does not have
+OF_TENSIONS = ("load cell gains", "load cell offsets", "early anchors", "vibration", "latency")
+#: effects of tendons that are given by their offset and angles, and of friction
+OF_ANGLES, OF_FRICTION = ("tendon offset", "tendon angles"), ("friction", "friction by curvature")
+#: of the length: uncertainty of the clamped end's position
+PLACED = 0.03
+
+
+def all_effects(nominal: RoutedTendonRobot, tensions: float, highest: float) -> list[Effect]:
+    """Return the effects that a robot may have, by what drives its tendons; see `effects_of`."""
+    if nominal.drive != "reel":
+        return effects_of(nominal, tensions, highest)
+    gone = {*OF_TENSIONS}
+    gone |= set() if nominal.routing is None else {*OF_ANGLES}
+    # what costs time in each step is searched for where the nominal robot states it
+    gone |= set() if nominal.friction is not None else {*OF_FRICTION}
+    gone |= set() if nominal.rib_spacing is not None else {"rib spacing"}
+    known = effects_of(nominal, tensions, highest, placed=PLACED)
+    return [*(each for each in known if each.name not in gone), *reel_effects(nominal)]
+
+
+def reel_effects(nominal: RoutedTendonRobot) -> list[Effect]:
+    """Return the effects of a robot with reels, beside those that all tendon robots have."""
+    reels = nominal.reels
+    assert reels is not None
+    L, tendons = float(nominal.length), nominal.tendon_count
+    levels = _levels(nominal)
+    effects = [
+        Effect(
+            "length",
+            "length of the rod",
+            (Number("length", "m", L, 0.05, 1e-3, 20.0, True),),
+            lambda robot, v: robot.replace(length=v[0]),
+        ),
+        Effect(
+            "axial stiffness",
+            "stiffness against extension and shear over that of the section",
+            (Number("shear_stiffness", "", 1.0, 1.0, 1e-6, 1e6, True),),
+            lambda robot, v: robot.replace(shear_stiffness=robot.Kse * v[0]),
+        ),
+        Effect(
+            "motor zeros",
+            "angle of each motor at which its reel has taken in nothing",
+            tuple(
+                Number(f"reels.zero[{k}]", "rad" if reels.radius is not None else "m", float(at), width)
+                for k, (at, width) in enumerate(zip(reels.zero, _zero_widths(nominal), strict=True))
+            ),
+            lambda robot, v: _reels(robot, zero=jnp.stack(v)),
+        ),
+        Effect(
+            "taken in",
+            "length of tendons that is taken in at the motors' zeros, by where they end",
+            tuple(
+                Number(f"taken_in to {end:g} L", "m", float(np.mean(reels.taken_in[group])), TAKEN_IN * L)
+                for end, group in levels
+            ),
+            lambda robot, v: _reels(robot, taken_in=_by_level(v, levels, tendons)),
+        ),
+        Effect(
+            "springs",
+            "compliance of the springs in series with tendons, by where these end",
+            tuple(_spring(end, float(np.mean(reels.compliance[group])), nominal) for end, group in levels),
+            lambda robot, v: _reels(robot, compliance=_by_level(v, levels, tendons)),
+        ),
+    ]
+    if reels.radius is not None:
+        radii = np.asarray(reels.radius, dtype=float)
+        effects += [
+            Effect(
+                "reel radius",
+                "radius of all reels over what is known of it",
+                (Number("reels.radius", "", 1.0, 0.2, 0.01, 100.0, True),),
+                lambda robot, v: _reels(robot, radius=robot.reels.radius * v[0]),
+            ),
+            Effect(
+                "reel radii",
+                "radius of each reel",
+                tuple(
+                    Number(f"reels.radius[{k}]", "m", float(at), 0.05, 1e-6, 1.0, True)
+                    for k, at in enumerate(radii)
+                ),
+                lambda robot, v: _reels(robot, radius=jnp.stack(v) * (robot.reels.radius / radii)),
+            ),
+        ]
+    if nominal.routing is not None and all(isinstance(each, Straight) for each in nominal.routing):
+        effects += _routing_effects(nominal)
+    return effects
+
+
+def _routing_effects(nominal: RoutedTendonRobot) -> list[Effect]:
+    """Return effects that move straight tendons about the rod."""
+    routing = nominal.routing
+    assert routing is not None
+    motors = np.abs(np.asarray(nominal.reels.motors)).astype(int)  # type: ignore[union-attr]
+
+    def turned(robot: Any, scale: Any, angles: list[Any]) -> Any:
+        found = []
+        for each, angle in zip(robot.routing, angles, strict=True):
+            c, s = scale * jnp.cos(angle), scale * jnp.sin(angle)
+            found.append(dataclasses.replace(each, x=c * each.x - s * each.y, y=s * each.x + c * each.y))
+        return robot.replace(routing=tuple(found))
+
+    return [
+        Effect(
+            "routing",
+            "distance of all tendons from the axis over what is known of it, and their rotation about it",
+            (
+                Number("routing.offset", "", 1.0, 0.1, 0.01, 100.0, True),
+                Number("routing.turn", "rad", 0.0, TURN),
+            ),
+            lambda robot, v: turned(robot, v[0], [v[1]] * len(routing)),
+        ),
+        Effect(
+            "routing by motor",
+            "rotation of each motor's tendons about the axis",
+            tuple(Number(f"routing.turn[{k}]", "rad", 0.0, 0.5 * TURN) for k in range(motors.max())),
+            lambda robot, v: turned(robot, 1.0, [v[k - 1] for k in motors]),
+        ),
+    ]
+
+
+def _reels(robot: Any, **changes: Any) -> Any:
+    return robot.replace(reels=dataclasses.replace(robot.reels, **changes))
+
+
+def _levels(robot: RoutedTendonRobot) -> list[tuple[float, np.ndarray]]:
+    """Return where tendons end, and which do there."""
+    ends = np.array([each.end for each in robot.routings])
+    return [(float(end), np.flatnonzero(ends == end)) for end in np.unique(ends)]
+
+
+def _by_level(values: list[Any], levels: list[tuple[float, np.ndarray]], count: int) -> Any:
+    found = [jnp.zeros(())] * count
+    for value, (_, group) in zip(values, levels, strict=True):
+        for k in group:
+            found[k] = value
+    return jnp.stack(found)
+
+
+def _spring(end: float, given: float, robot: RoutedTendonRobot) -> Number:
+    """Return the compliance of springs: none is none, and beside a usual one the rod bends as much."""
+    label = f"compliance to {end:g} L"
+    if given:
+        return Number(label, "m/N", given, 0.7, 0.0, 1.0, True)
+    offset = float(np.mean([np.linalg.norm([float(at) for at in each.at(0.0)]) for each in robot.routings]))
+    usual = offset**2 * float(robot.length) / float(robot.Kbt[0, 0])
+    return Number(label, "m/N", 0.0, usual, 0.0, 1.0, begin=0.3)
+
+
+def _zero_widths(robot: RoutedTendonRobot) -> np.ndarray:
+    reels = robot.reels
+    assert reels is not None and reels.zero is not None
+    width = np.full(len(reels.zero), TAKEN_IN * float(robot.length))
+    return width if reels.radius is None else width / np.asarray(reels.radius)

@@ -1,0 +1,258 @@
+"""Robust least squares with priors, over horizons that grow."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import logging
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from knode_cosserat.identification.misfit import Misfit, Rollout
+
+log = logging.getLogger(__name__)
+
+#: horizons (s) after the first motion; from a nominal robot that is far off all rows at once lead astray
+HORIZONS = (0.0, 0.2, 0.4, 0.7, 1.1, 1.7, 2.5, 4.0)
+#: differences are correlated in time: as many seconds of them count as one
+CORRELATED = 0.25
+#: and more bodies than this count as so many
+BODIES = 2.0
+#: differences beyond so many scales count by their size, not by its square (Huber)
+ROBUST = 3.0
+#: scale of the differences: never less than this part of the length
+LEAST_SCALE = 5e-4
+#: largest change of a coordinate in one correction
+LARGEST_MOVE = 1.0
+#: a recording that is alone is left out in so many pieces
+FOLDS = 5
+#: pieces of a recording (s) over which the scatter of what an effect is worth is taken, two at least
+BLOCK = 1.0
+#: corrections of a search at one horizon, and of the last one; parts by which the cost falls at their end
+ROUGH, FINE = (6, 2e-2), (25, 1e-3)
+#: failed tries of one correction
+TRIES = 7
+
+
+class Problem(NamedTuple):
+    """Normal equations at a point: robust cost, gradient and Gauss-Newton matrix of each recording."""
+
+    cost: Float[np.ndarray, " R"]
+    #: number of independent differences
+    amount: Float[np.ndarray, " R"]
+    gradient: Float[np.ndarray, "R n"]
+    matrix: Float[np.ndarray, "R n n"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Point:
+    """End of a search: coordinates, scales of the differences (m), and the normal equations there."""
+
+    x: Float[np.ndarray, " n"]
+    scale: Float[np.ndarray, " R"]
+    #: of each part that is left out together, and of the blocks of each (as many of all), one after the other
+    problem: Problem
+    blocks: Problem
+    free: Bool[np.ndarray, " n"]
+    #: precision of each coordinate's prior
+    prior: Float[np.ndarray, " n"]
+
+    @property
+    def cost(self) -> float:
+        """Robust cost with the prior."""
+        return float(self.problem.cost.sum() + np.sum(self.prior * self.x**2))
+
+    def covariance(self) -> Float[np.ndarray, "n n"]:
+        """Return the covariance of the coordinates, of the prior where nothing is known or searched."""
+        free, full = self.free, np.diag(1.0 / self.prior)
+        matrix = self.problem.matrix.sum(axis=0)[np.ix_(free, free)] + np.diag(self.prior[free])
+        full[np.ix_(free, free)] = np.linalg.inv(matrix)
+        return full
+
+
+def huber(values: Float[np.ndarray, " m"]) -> tuple[np.ndarray, np.ndarray]:
+    """Return Huber's cost of scaled differences, and their weights."""
+    size = np.abs(values)
+    weights = np.where(size <= ROBUST, 1.0, ROBUST / np.maximum(size, ROBUST))
+    return np.where(size <= ROBUST, values**2, 2.0 * ROBUST * size - ROBUST**2), weights
+
+
+def normal_equations(
+    rollouts: Sequence[Rollout], scales: Float[np.ndarray, " R"], thinned: float,
+    folds: Sequence[Any] = (slice(None),),
+) -> Problem:  # fmt: skip
+    """Return the normal equations, of each fold of each recording; a difference counts 1 / `thinned`."""
+    parts = []
+    pieces = [
+        (_rows(rollout, fold), scale)
+        for rollout, scale in zip(rollouts, scales, strict=True)
+        for fold in folds
+    ]
+    for rollout, scale in pieces:
+        known = np.isfinite(rollout.values)
+        values = rollout.values[known] / scale
+        cost, weights = huber(values)
+        n = 0 if rollout.derivatives is None else len(rollout.derivatives)
+        gradient, matrix = np.zeros(n), np.zeros((n, n))
+        if rollout.derivatives is not None:
+            slopes = rollout.derivatives[:, known] / scale
+            weighted = slopes * weights
+            gradient, matrix = weighted @ values, weighted @ slopes.T
+        parts.append((cost.sum() / thinned, known.sum() / thinned, gradient / thinned, matrix / thinned))
+    return Problem(*(np.array(part) for part in zip(*parts, strict=True)))
+
+
+def _rows(rollout: Rollout, fold: Any) -> Rollout:
+    slopes = rollout.derivatives
+    return Rollout(rollout.values[fold], None if slopes is None else slopes[:, fold])
+
+
+def scales_of(rollouts: Sequence[Rollout], length: float) -> Float[np.ndarray, " R"]:
+    """Return the usual size of the differences of each recording (m).
+
+    Each recording counts by what the model leaves of it: one that cannot be explained does not spoil others.
+    """
+    known = [rollout.values[np.isfinite(rollout.values)] for rollout in rollouts]
+    return np.array([max(1.4826 * float(np.median(np.abs(v))), LEAST_SCALE * length) for v in known])
+
+
+class Search:
+    """Searches coordinates of a model from recordings.
+
+    Args:
+        misfit: the recordings and the model.
+        tell: called with a line of progress.
+        prior: precision of each coordinate's prior, about zero; by default 1.
+    """
+
+    def __init__(
+        self, misfit: Misfit, tell: Callable[[str], None] = lambda line: None,
+        prior: Float[np.ndarray, " n"] | None = None,
+    ):  # fmt: skip
+        self.misfit, self.tell = misfit, tell
+        self.prior = np.ones(misfit.model.size) if prior is None else prior
+        self.length = float(misfit.model.nominal.length)
+        self.low, self.high = misfit.model.bounds
+
+    @property
+    def folds(self) -> list[slice]:
+        """Rows that are left out together: of a recording that is alone, one piece after the other."""
+        first = self.misfit.data[0]
+        if len(self.misfit.data) > 1:
+            return [slice(None)]
+        if first.static:
+            return [slice(k, None, FOLDS) for k in range(FOLDS)]
+        edges = np.linspace(0, len(first.tension) + 1, FOLDS + 1).astype(int)
+        return [slice(low, high) for low, high in itertools.pairwise(edges)]
+
+    def blocks(self, count: int) -> list[Int[np.ndarray, " m"]]:
+        """Return which of so many rows are in the blocks of each fold, one fold after the other."""
+        first = self.misfit.data[0]
+        rows = [np.arange(count)[fold] for fold in self.folds]
+        pieces = FOLDS if first.static else max(2, round(min(map(len, rows)) * first.dt / BLOCK))
+        return [block for each in rows for block in np.array_split(each, pieces)]
+
+    def thinned(self) -> float:
+        """Return how many differences count as one: they are correlated in time, and between bodies."""
+        data = self.misfit.data[0]
+        bodies = max(1.0, data.position.shape[1] / BODIES)
+        return max(1.0, CORRELATED / data.dt) * bodies
+
+    def from_far(self, free: Bool[np.ndarray, " n"]) -> Point:
+        """Return the end of a search from the nominal robot, over horizons that grow.
+
+        Raises:
+            SearchError: the nominal robot cannot be simulated, not even at rest.
+        """
+        x = np.where(free, self.misfit.model.begin, 0.0)
+        data = self.misfit.data
+        longest = max(len(each.tension) - each.moves for each in data) * data[0].dt
+        if data[0].static or self.misfit.model.nominal.drive == "reel":
+            # no row depends on those before; and what reels have taken in leads no robot far astray
+            longest = 0.0
+        for horizon in [h for h in HORIZONS if h < 0.8 * longest]:
+            rows = round(horizon / data[0].dt)
+            x = self.run(x, free, rows, *ROUGH).x
+        return self.run(x, free, None, *FINE)
+
+    def run(
+        self, x: Float[np.ndarray, " n"], free: Bool[np.ndarray, " n"], rows: int | None = None,
+        most: int = FINE[0], fall: float = FINE[1], which: Sequence[int] | None = None,
+        scale: Float[np.ndarray, " R"] | None = None,
+    ) -> Point:  # fmt: skip
+        """Return the end of a search (Levenberg-Marquardt) from a point, by some recordings and rows."""
+        now = self._solved(x, rows, which)
+        if now is None:
+            raise SearchError("the robot that the search begins from cannot be simulated")
+        fixed = scale
+        damping = 1e-3
+        for k in range(most):
+            scale = scales_of(now, self.length) if fixed is None else fixed
+            problem = normal_equations(now, scale, self.thinned())
+            cost = problem.cost.sum() + np.sum(self.prior * x**2)
+            step = self._correction(x, free, problem, cost, scale, damping, rows, which)
+            if step is None:
+                break
+            there, damping, lower = step
+            again = self._solved(there, rows, which)
+            if again is None:  # recovery has its time, and a busy machine gets less done in it
+                break
+            x, now = there, again
+            sizes = ", ".join(f"{1e3 * size:.2f}" for size in scales_of(now, self.length))
+            self.tell(f"{'all rows' if rows is None else f'{rows} rows'}, correction {k + 1}: {sizes} mm")
+            if cost - lower < fall * cost:
+                break
+        scale = scales_of(now, self.length) if fixed is None else fixed
+        blocks = normal_equations(now, scale, self.thinned(), self.blocks(len(now[0].values)))
+        parts = len(now) * len(self.folds)
+        problem = Problem(*(each.reshape(parts, -1, *each.shape[1:]).sum(axis=1) for each in blocks))
+        return Point(x, scale, problem, blocks, free, self.prior)
+
+    def _solved(self, x: np.ndarray, rows: int | None, which: Sequence[int] | None) -> list[Rollout] | None:
+        found = self.misfit.differences(x, rows, which)
+        return None if any(each is None for each in found) else found  # type: ignore[return-value]
+
+    def _correction(
+        self, x: np.ndarray, free: np.ndarray, problem: Problem, cost: float, scale: np.ndarray,
+        damping: float, rows: int | None, which: Sequence[int] | None,
+    ) -> tuple[np.ndarray, float, float] | None:  # fmt: skip
+        """Return a better point, the next damping and its cost; None if none was found."""
+        gradient = problem.gradient.sum(axis=0) + self.prior * x
+        matrix = problem.matrix.sum(axis=0) + np.diag(self.prior)
+        for _ in range(TRIES):
+            there = self._proposed(x, free, gradient, matrix, damping)
+            tried = self.misfit.differences(there, rows, which, derivatives=False)
+            if all(each is not None for each in tried):
+                found = [each for each in tried if each is not None]
+                lower = normal_equations(found, scale, self.thinned()).cost.sum()
+                lower = lower + np.sum(self.prior * there**2)
+                if lower < cost:
+                    return there, max(damping / 10.0, 1e-6), float(lower)
+            damping = max(damping, 1e-4) * 8.0
+        return None
+
+    def _proposed(
+        self, x: np.ndarray, free: np.ndarray, gradient: np.ndarray, matrix: np.ndarray, damping: float
+    ) -> np.ndarray:
+        """Return the point of a damped correction, within bounds: what meets one stays there."""
+        active = free.copy()
+        move = np.zeros(len(x))
+        for _ in range(len(x)):
+            where = np.ix_(active, active)
+            damped = matrix[where] + damping * np.diag(np.diag(matrix)[active])
+            move = np.zeros(len(x))
+            move[active] = -np.linalg.solve(damped, gradient[active])
+            out = active & (((x <= self.low) & (move < 0.0)) | ((x >= self.high) & (move > 0.0)))
+            if not out.any():
+                break
+            active &= ~out
+        longest = np.max(np.abs(move))
+        move = move / max(1.0, longest / LARGEST_MOVE)
+        return np.clip(x + move, self.low, self.high)
+
+
+class SearchError(RuntimeError):
+    """A search cannot go on; one line says why."""

@@ -1,0 +1,282 @@
+"""Selection of effects by recordings that were not searched: cross-validation, smallest model first."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import NamedTuple, Self
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from knode_cosserat.identification.model import Model
+from knode_cosserat.identification.search import Point, Problem, Search, SearchError
+
+#: an effect is worth its place if it lowers the held-out cost by this much for each of its numbers
+WORTH = 4.0
+#: and by so many standard errors of that
+ERRORS = 2.0
+#: part of the cost that linear equations leave at least
+LEAST_LEFT = 1e-3
+#: few effects leave much more than all if it is so many times as much, on average
+MUCH_MORE = 1.3
+#: absent effects that are tried at a time
+MOST_TRIES = 3
+
+
+class Chosen(NamedTuple):
+    """Selected effects, where their search ended, and what was tried on the way, in words."""
+
+    names: tuple[str, ...]
+    point: Point
+    steps: tuple[str, ...]
+
+
+def held_out(
+    problem: Problem, x: Float[np.ndarray, " n"], free: Bool[np.ndarray, " n"], model: Model
+) -> float:
+    """Return the cost of recordings that were each left out of a search, linearised about a point.
+
+    It is -2 times the logarithm of the likelihood of differences whose size is not known, by recording. All
+    numbers that are not free are nominal. Of a recording that is alone its pieces are left out.
+    """
+    total = 0.0
+    for k, move in enumerate(_moves(problem, x, free, model)):
+        left = problem.cost[k] + 2.0 * problem.gradient[k] @ move + move @ problem.matrix[k] @ move
+        total += problem.amount[k] * np.log(max(left, LEAST_LEFT * problem.cost[k]) / problem.amount[k])
+    return float(total)
+
+
+def _moves(
+    problem: Problem, x: Float[np.ndarray, " n"], free: Bool[np.ndarray, " n"], model: Model
+) -> list[Float[np.ndarray, " n"]]:
+    """Return the moves of searches that leave out one part each, linearised about a point."""
+    low, high = model.bounds
+    count = len(problem.cost)
+    found = []
+    for k in range(count):
+        others = [j for j in range(count) if j != k] or [k]
+        gradient, matrix = problem.gradient[others].sum(axis=0), problem.matrix[others].sum(axis=0)
+        found.append(_linear(x, free, gradient, matrix, low, high))
+    return found
+
+
+class Left(NamedTuple):
+    """Robust costs (m²) of the blocks of parts that were each left out of a search."""
+
+    cost: Float[np.ndarray, "parts blocks"]
+    #: independent differences of each part
+    amount: Float[np.ndarray, " parts"]
+
+    @classmethod
+    def of(cls, point: Point, names: Iterable[str], model: Model) -> Self:
+        """Return what the named effects leave, linearised about the end of a search."""
+        free, blocks, count = model.mask(names), point.blocks, len(point.problem.cost)
+        each = [part.reshape(count, -1, *part.shape[1:]) for part in blocks]
+        scale = np.repeat(point.scale, count // len(point.scale)) ** 2
+        costs = []
+        for k, move in enumerate(_moves(point.problem, point.x, free, model)):
+            now, gradient, matrix = each[0][k], each[2][k], each[3][k]
+            left = now + 2.0 * gradient @ move + np.einsum("i,bij,j->b", move, matrix, move)
+            # linear equations may promise more than there is
+            costs.append(scale[k] * np.maximum(left, LEAST_LEFT * now.sum() / len(now)))
+        return cls(np.array(costs), point.problem.amount)
+
+    def worth(self, more: Left) -> tuple[float, float]:
+        """Return by how much more effects lower the cost of held-out parts, and the standard error of that.
+
+        The cost is -2 times the logarithm of the likelihood of differences whose size is not known, by part.
+        The error is from the scatter of the blocks' shares, for what a model misses is not random.
+        """
+        without, with_them = self.cost.sum(axis=1), more.cost.sum(axis=1)
+        fall = np.log(without / with_them)
+        even = np.abs(fall) < 1e-9
+        mean = np.where(even, without, (without - with_them) / np.where(even, 1.0, fall))
+        shares = self.amount[:, None] * (self.cost - more.cost) / mean[:, None]
+        scatter = np.sum((shares - shares.mean(axis=1, keepdims=True)) ** 2)
+        return float(shares.sum()), float(np.sqrt(scatter))
+
+    def promise(self, more: Left, count: int) -> float:
+        """Return what so many more numbers are worth over what they have to be."""
+        worth, error = self.worth(more)
+        return worth / max(WORTH * count, ERRORS * error)
+
+
+def _linear(
+    x: np.ndarray,
+    free: np.ndarray,
+    gradient: np.ndarray,
+    matrix: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+) -> np.ndarray:
+    """Return the move to the least cost, with the prior, of the free numbers within their bounds."""
+    fixed = np.where(free, 0.0, -x)
+    active = free.copy()
+    for _ in range(len(x)):
+        where = np.ix_(active, active)
+        right = gradient[active] + (matrix @ fixed)[active] + x[active]
+        move = fixed.copy()
+        move[active] = -np.linalg.solve(matrix[where] + np.eye(int(active.sum())), right)
+        beyond = active & ((x + move < low - 1e-9) | (x + move > high + 1e-9))
+        if not beyond.any():
+            return move
+        fixed = np.where(beyond, np.clip(x + move, low, high) - x, fixed)
+        active &= ~beyond
+    return fixed
+
+
+def _with_needs(names: Iterable[str], model: Model) -> tuple[str, ...]:
+    """Return the effects that have all that they need, in the model's order."""
+    found = set(names)
+    while True:
+        kept = {name for name in found if set(model.effect(name).needs) <= found}
+        if kept == found:
+            return tuple(name for name in model.names if name in found)
+        found = kept
+
+
+def selected(search: Search, tell: Callable[[str], None]) -> Chosen:
+    """Return the effects that are worth their place, searched together.
+
+    Searches from the nominal robot begin with few effects and with all of them. With few a search finds its
+    way better; it is only if these leave much more than all that the selection goes on from all. Then effects
+    that are not worth their place go, one after the other, and absent ones are added that promise most for
+    recordings that are left out; each stays or goes as the next search shows.
+    """
+    model = search.misfit.model
+    usual = tuple(effect.name for effect in model.effects if effect.basic or effect.usual)
+    names, point = _better(search, usual, model.names, tell)
+    steps = [f"from {len(names)} effects: {sizes(point)}"]
+    refused: set[str] = set()
+    while True:
+        names, point, gone = without_idle(search, names, point, refused)
+        if gone:
+            steps.append(f"without {', '.join(gone)}: {sizes(point)}")
+            tell(steps[-1])
+        found = _with_another(search, names, point, {*refused, *gone})
+        if found is None:
+            return Chosen(names, point, tuple(steps))
+        added = [name for name in found[0] if name not in names]
+        names, point = found
+        refused |= {*gone, *added}
+        steps.append(f"with {', '.join(added)}: {sizes(point)}")
+        tell(steps[-1])
+
+
+def _better(
+    search: Search, few: tuple[str, ...], many: tuple[str, ...], tell: Callable[[str], None]
+) -> tuple[tuple[str, ...], Point]:
+    """Return few effects and the end of their search, or many if few leave much more."""
+    ends: dict[tuple[str, ...], Point] = {}
+    for names in (few, many):
+        try:
+            ends[names] = search.from_far(search.misfit.model.mask(names))
+        except SearchError as error:
+            tell(f"{len(names)} effects: {error}")
+            continue
+        tell(f"{len(names)} effects: {sizes(ends[names])}")
+    if not ends:
+        raise SearchError("the robot that the search begins from cannot be simulated")
+    much_more = len(ends) == 2 and np.mean(np.log(ends[few].scale / ends[many].scale)) > np.log(MUCH_MORE)
+    names = many if much_more or few not in ends else few
+    return names, ends[names]
+
+
+def sizes(point: Point) -> str:
+    """Return the usual differences of each recording, in words."""
+    return ", ".join(f"{1e3 * size:.1f}" for size in point.scale) + " mm"
+
+
+def _with_another(
+    search: Search, names: tuple[str, ...], point: Point, refused: set[str]
+) -> tuple[tuple[str, ...], Point] | None:
+    """Return the effects with the most promising one that keeps its promise; None if there is none."""
+    model = search.misfit.model
+    left = Left.of(point, names, model)
+    for promise, name, more in _promises(point, names, left, model)[:MOST_TRIES]:
+        if promise <= 1.0 or name in refused:
+            continue
+        there = _searched(search, point, more)
+        count = _count(model, set(more) - set(names))
+        if there is not None and left.promise(Left.of(there, more, model), count) >= 1.0:
+            return more, there
+    return None
+
+
+def _count(model: Model, names: Iterable[str]) -> int:
+    return sum(len(model.effect(name).numbers) for name in names)
+
+
+def _promises(
+    point: Point, names: tuple[str, ...], left: Left, model: Model
+) -> list[tuple[float, str, tuple[str, ...]]]:
+    """Return absent effects by what they promise, over what they have to be worth, the most first."""
+    found = []
+    for name in model.names:
+        if name in names:
+            continue
+        more = _with_needs([*names, name, *model.effect(name).needs], model)
+        count = _count(model, set(more) - set(names))
+        found.append((left.promise(Left.of(point, more, model), count), name, more))
+    return sorted(found, reverse=True)
+
+
+def _searched(search: Search, point: Point, names: tuple[str, ...]) -> Point | None:
+    """Return the end of a search with these effects, from where new ones begin; None if there is none."""
+    model = search.misfit.model
+    free = model.mask(names)
+    for begin in (model.begin, 0.1 * model.begin):
+        x = np.where(free, np.where(point.free, point.x, begin), 0.0)
+        try:
+            return search.run(x, free)
+        except SearchError:
+            continue
+    return None
+
+
+def without_idle(
+    search: Search, names: tuple[str, ...], point: Point, kept: Iterable[str] = ()
+) -> tuple[tuple[str, ...], Point, list[str]]:
+    """Return the effects without those that are not worth their place, and those; `kept` ones stay.
+
+    All of them go at once, by the equations linear about the point; a search without them shows whether that
+    holds. If it does not, half as many go.
+    """
+    model = search.misfit.model
+    gone: list[str] = []
+    stay = set(kept)
+    most = len(names)
+    while True:
+        fewer = _without_least(point, names, stay, model, most)
+        dropped = [name for name in names if name not in fewer]
+        if not dropped:
+            return names, point, gone
+        there = _searched(search, point, fewer)
+        left, count = Left.of(point, names, model), _count(model, dropped)
+        if there is not None and Left.of(there, fewer, model).promise(left, count) < 1.0:
+            gone += dropped
+            names, point = fewer, there
+        elif most > 1:
+            most = max(1, min(most, len(dropped)) // 2)
+        else:
+            stay |= set(dropped)
+
+
+def _without_least(
+    point: Point, names: tuple[str, ...], stay: set[str], model: Model, most: int
+) -> tuple[str, ...]:
+    """Return the effects without at most so many that are not worth their place, the least one first."""
+    for _ in range(most):
+        left = Left.of(point, names, model)
+        options = []
+        for name in names:
+            if name in stay or model.effect(name).basic:
+                continue
+            fewer = _with_needs([each for each in names if each != name], model)
+            count = _count(model, set(names) - set(fewer))
+            if not stay & (set(names) - set(fewer)):
+                options.append((Left.of(point, fewer, model).promise(left, count), name, fewer))
+        if not options or min(options)[0] >= 1.0:
+            break
+        names = min(options)[2]
+    return names

@@ -1,0 +1,109 @@
+"""Trials that an identified robot has to pass before it is accepted."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.identification.misfit import Data
+from knode_cosserat.rods.system import System
+from knode_cosserat.rods.trained_range import TrainedRange
+from knode_cosserat.solvers.equilibrium import equilibrium
+from knode_cosserat.solvers.result import Result, SimulationError
+from knode_cosserat.solvers.simulate import simulate
+from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.solvers.time import Static
+from knode_cosserat.trajectory import Trajectory
+
+#: amplitudes of the recordings' tensions about their initial ones
+AMPLITUDES = (1.0, 1.5)
+#: random tensions: seconds, and for how long each is held
+SECONDS, HELD = 5.0, 0.4
+#: share of rows whose grid may be too coarse
+FEW = 0.01
+#: seconds that recovery may take in a trial: a robot that needs more is not accepted
+RECOVERY = 2.0
+
+
+def failed_trial(robot: System, data: Sequence[Data], space: str | SpaceScheme) -> str | None:
+    """Return why a robot is not accepted, or None if it passes all trials.
+
+    It has to follow the tensions of every recording, the same with 1.5 times the amplitude, and random
+    tensions within the recordings' range, without a step that cannot be solved.
+    """
+    pulls = robot.control_layout.names[0] == "tension"
+    for each in data:
+        for amplitude in AMPLITUDES:
+            tension = each.initial_tension + amplitude * (each.tension - each.initial_tension)
+            # a tendon does not push; a motor turns either way
+            tension = np.maximum(tension, 0.0) if pulls else tension
+            reason = _failure(robot, tension, each.initial_tension, each.dt, space, each.static)
+            if reason:
+                return f"tensions of {each.name} at {amplitude:g} times their amplitude: {reason}"
+    first = data[0]
+    reason = _failure(robot, _random(data), first.initial_tension, first.dt, space, first.static)
+    return f"random tensions: {reason}" if reason else None
+
+
+def is_coarse(robot: System, data: Sequence[Data], space: str | SpaceScheme) -> bool:
+    """Return whether the grid is too coarse in more than a few rows of the recordings.
+
+    A robot that cannot follow them is not said to be: `failed_trial` tells why.
+    """
+    for each in data:
+        try:
+            _, found = _moved(robot, each.tension, each.initial_tension, each.dt, space, each.static)
+        except SimulationError:
+            return False
+        if np.mean(np.asarray(found.result) == Result.COARSE) > FEW:
+            return True
+    return False
+
+
+def trained_range(robot: System, data: Sequence[Data], space: str | SpaceScheme) -> TrainedRange | None:
+    """Return the range of controls, strains and strain rates of the robot in its recordings."""
+    return TrainedRange.of(
+        part
+        for each in data
+        for part in _moved(robot, each.tension, each.initial_tension, each.dt, space, each.static)
+    )
+
+
+def _random(data: Sequence[Data]) -> Float[np.ndarray, "T c"]:
+    low = np.min([each.tension.min(axis=0) for each in data], axis=0)
+    high = np.max([each.tension.max(axis=0) for each in data], axis=0)
+    dt = data[0].dt
+    count, hold = max(round(SECONDS / dt), 1), max(round(HELD / dt), 1)
+    drawn = np.random.default_rng(0).uniform(low, high, (-(-count // hold), len(low)))
+    return np.repeat(drawn, hold, axis=0)[:count]
+
+
+def _failure(
+    robot: System, tension: Float[np.ndarray, "T c"], initial: Float[np.ndarray, " c"], dt: float,
+    space: str | SpaceScheme, static: bool,
+) -> str | None:  # fmt: skip
+    try:
+        _, found = _moved(robot, tension, initial, dt, space, static)
+    except SimulationError as error:
+        return str(error)
+    if not np.all(np.isfinite(np.asarray(found.y))):
+        return "a state is not finite"
+    return None
+
+
+def _moved(
+    robot: System, tension: Float[np.ndarray, "T c"], initial: Float[np.ndarray, " c"], dt: float,
+    space: str | SpaceScheme, static: bool,
+) -> tuple[Trajectory, Trajectory]:  # fmt: skip
+    """Return the equilibrium under the initial tensions, and the motion, or the equilibria, from there."""
+    time: Static | str = Static() if static else "bdf2"
+    with warnings.catch_warnings():
+        # whether steps can be solved is the question here, not how exact they are
+        warnings.filterwarnings("ignore", message="the grid is too coarse")
+        still = equilibrium(robot, initial, space=space, recovery_budget=RECOVERY)
+        tension = robot.undelayed(tension, dt, initial)
+        found = simulate(robot, tension, dt, time=time, initial=still, space=space, recovery_budget=RECOVERY)
+        return still, found

@@ -1,0 +1,81 @@
+"""Conversion of trajectories to measurements and of measurements to tables, with held tensions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from knode_cosserat.recordings.config import MarkerSource, RecordingConfig, TensionSource
+from knode_cosserat.recordings.findings import RecordingError
+from knode_cosserat.recordings.table import HELD
+from knode_cosserat.recordings.write import Poses, Pulls, write_recording
+from knode_cosserat.solvers.places import places_at, positions_at, quaternions_at
+
+if TYPE_CHECKING:
+    from knode_cosserat.recordings.measurements import Measurements
+    from knode_cosserat.trajectory import Trajectory
+
+TABLES = (".csv", ".parquet")
+
+
+def measured(trajectory: Trajectory, fractions: Sequence[float]) -> dict[str, Any]:
+    """Return the fields of `Measurements` for a trajectory; see `Measurements.of`."""
+    y, system = np.asarray(trajectory.y), trajectory.system
+    if y.ndim == 4:
+        raise ValueError("a batch of trajectories; allowed is one, such as `batch[0]`")
+    held = np.array(trajectory.held_tension)
+    before = np.asarray(system.control_layout.get(np.asarray(trajectory.control), "tension"))[0]
+    # the last row has no following tension; without a value it would not count as complete
+    held[-1] = held[-2] if len(held) > 1 else before
+    along = np.array(fractions, dtype=float)
+    places = places_at(along, system.nodes)
+    position = np.asarray(positions_at(system, y, places, np.asarray(trajectory.z)))
+    return {
+        "time": np.asarray(trajectory.time, dtype=float),
+        "tension": held,
+        "fractions": along,
+        "position": position,
+        "quaternion": np.asarray(quaternions_at(system, y, places)),
+        "measured": np.isfinite(position).all(axis=-1),
+        "simulated": True,
+        "source": f"simulated {type(system).__name__}",
+        "initial_tension": before,
+    }
+
+
+def save(measurements: Measurements, path: str | Path) -> None:
+    """Write measurements as a table with tensions held from each row to the next, as its titles state.
+
+    `load_recording(path).sampled(measurements.dt)` gives the same rows. Bridged poses are not written.
+    Bodies are named `tip` and `body_1`, `body_2` and so on.
+
+    Raises:
+        RecordingError: the name does not end in .csv or .parquet, or the file cannot be written.
+        ImportError: pyarrow is needed for .parquet, and not installed.
+    """
+    path = Path(path)
+    if path.suffix not in TABLES:
+        raise RecordingError(f"{path}: allowed is a name that ends in {' or '.join(TABLES)}")
+    it = measurements
+    names = ["tip" if at == 1.0 else f"body_{k + 1}" for k, at in enumerate(it.fractions)]
+    poses = {}
+    for k, name in enumerate(names):
+        rows = it.measured[:, k]
+        oriented = bool(np.isfinite(it.quaternion[rows, k]).any())
+        quaternion = it.quaternion[rows, k] if oriented else None
+        poses[name] = Poses(it.time[rows], it.position[rows, k], quaternion)
+    before = it.initial_tension
+    config = RecordingConfig(
+        markers=tuple(
+            MarkerSource(name, name, float(at), rotation=(1.0, 0.0, 0.0, 0.0))
+            for name, at in zip(names, it.fractions, strict=True)
+        ),
+        tension=TensionSource(HELD, tuple(range(1, it.tension.shape[1] + 1)), held=True),
+        simulated=it.simulated,
+        description=it.source,
+        initial_tension=None if before is None else tuple(before.tolist()),
+    )
+    write_recording(path, config, poses, Pulls(it.time, it.tension))

@@ -1,0 +1,53 @@
+"""Loss of bending stiffness by tendons that are straight between ribs.
+
+The tendons press on a bent rod between two ribs, a distance d apart, with the sum P of their tensions. The
+rotation from rib to rib is that of a beam-column (Timoshenko & Gere 1961), with the effective bending
+stiffness EI x cot x, x = d/2 √(P/EI). The loss is P d²/12 to leading order; the stiffness is zero where the
+rod between two ribs buckles.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.rods.parameters import parameter
+from knode_cosserat.rods.parts import Part
+
+#: below this the series of √w cot √w is exact to rounding
+SMALL_PRESSURE = 1e-3
+#: argument of `pressed` at which a beam-column buckles
+BUCKLED = 0.25 * np.pi**2
+
+
+class RibSpacing(Part):
+    """Loss of bending stiffness under tension, because tendons are straight between ribs."""
+
+    kind: ClassVar[str] = "rib-spacing"
+
+    softening: Any = parameter(
+        "m2",
+        "loss of bending stiffness by small tensions; d²/12 for ribs at a distance d",
+        low=0.0,
+        high=1e4,
+    )
+
+    def softened(self, Kbt: Float[Any, "3 3"], total: Any) -> Float[Any, "3 3"]:
+        """Return the stiffness (N m²) under the sum (N) of all tensions."""
+        stiffness = 0.5 * (Kbt[0, 0] + Kbt[1, 1])
+        lost = 1.0 - pressed(3.0 * self.softening * total / stiffness)
+        return Kbt - lost * stiffness * np.diag([1.0, 1.0, 0.0])
+
+
+def pressed(w: Any) -> Any:
+    """Return √w cot √w for w ≥ 0: the remaining fraction of a beam-column's stiffness under pressure.
+
+    Beyond π²/4, where it buckles, the fraction continues below zero along the tangent.
+    """
+    small, buckled = w < SMALL_PRESSURE, w > BUCKLED
+    root = jnp.sqrt(jnp.where(small | buckled, 1.0, w))
+    series = 1.0 - w / 3.0 - w * w / 45.0 - 2.0 * w**3 / 945.0
+    return jnp.where(small, series, jnp.where(buckled, 0.5 * (BUCKLED - w), root / jnp.tan(root)))

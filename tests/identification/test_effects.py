@@ -1,0 +1,136 @@
+"""Effects: nominal numbers change nothing, and each component does what its closed form says."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import knode_cosserat as kc
+from knode_cosserat.identification.effects import Number
+from knode_cosserat.identification.model import Model
+from knode_cosserat.rods.anchors import EarlyAnchors
+from knode_cosserat.rods.load_cells import LoadCells
+from knode_cosserat.rods.rib_spacing import RibSpacing, pressed
+from knode_cosserat.rods.routing import Straight
+from knode_cosserat.rods.section import Sleeve
+from knode_cosserat.rods.tendon_friction import TendonFriction
+
+NOMINAL = kc.load_robot("delrin-tendon-robot").replace(tendon_offset=0.02)
+ROUTED = kc.RoutedTendonRobot.like(NOMINAL)
+TENSION = np.array([7.0, 5.0, 3.0, 5.0])
+
+
+@pytest.fixture(scope="module")
+def model():
+    return Model(NOMINAL, np.tile(TENSION, (4, 1)))
+
+
+def shape(robot, tension=TENSION, **more):
+    return np.asarray(kc.equilibrium(robot, tension, **more).position[-1])
+
+
+def test_nominal_numbers_change_nothing(model):
+    """The robot with all effects at zero is the nominal one, and so is the one without their parts."""
+    x = np.zeros(model.size)
+    basic = x.copy()
+    # damping has no nominal value of its own: it is that of a usual damping ratio
+    expected = shape(ROUTED)
+    assert np.allclose(shape(model.robot(basic)), expected, rtol=0.0, atol=1e-9)
+    reduced = model.reduced(x, ("stiffness", "damping"))
+    assert reduced.sections == () and reduced.loads == () and reduced.load_cells is None
+    assert np.allclose(shape(reduced), expected, rtol=0.0, atol=1e-9)
+
+
+def test_reduced_robots_stand_as_those_with_all_parts(model):
+    """What is left out of a robot does nothing there."""
+    x = 0.3 * np.ones(model.size)
+    names = ("stiffness", "damping", "rest curvature", "sleeve", "load cell gains", "base rotation")
+    whole = model.robot(np.where(model.mask(names), x, 0.0))
+    assert np.allclose(shape(whole), shape(model.reduced(x, names)), rtol=0.0, atol=1e-9)
+
+
+@given(
+    st.floats(-3.0, 3.0), st.booleans(), st.floats(0.1, 10.0), st.floats(0.01, 2.0)
+)  # fmt: skip
+@settings(deadline=None, max_examples=50)
+def test_numbers_and_their_coordinates(x, logarithmic, nominal, width):
+    number = Number("a", "m", nominal, width, 0.0, 1e6, logarithmic)
+    value = float(number.value(np.asarray(x)))
+    expected = nominal * np.exp(width * x) if logarithmic else nominal + width * x
+    assert value == pytest.approx(expected, rel=1e-12)
+    low, _ = number.bounds
+    at_low = 0.0 if np.isinf(low) else float(number.value(np.asarray(low)))
+    assert at_low == pytest.approx(0.0, abs=1e-9)
+
+
+def test_pressed_is_smooth_and_that_of_a_beam_column():
+    w = np.array([1e-12, 9.99e-4, 1.001e-3, 0.5, 1.0, 2.0])
+    assert np.asarray(pressed(w)) == pytest.approx(np.sqrt(w) / np.tan(np.sqrt(w)), rel=1e-13)
+    assert float(pressed(np.asarray(0.0))) == 1.0
+    # a rod between two ribs that buckles has no stiffness
+    assert float(pressed(np.asarray(np.pi**2 / 4.0))) == pytest.approx(0.0, abs=1e-12)
+    beyond = np.asarray(pressed(np.pi**2 / 4.0 + np.array([1e-7, 5.0, 50.0])))
+    assert np.all(np.diff(beyond) < 0.0) and beyond == pytest.approx([-5e-8, -2.5, -25.0])
+
+
+def test_softening_by_tension_is_that_of_stiffness():
+    """Without gravity a tendon bends the rod to a circle; softer by the factor of a beam-column."""
+    robot = ROUTED.replace(gravity=(0.0, 0.0, 0.0), shear_stiffness=1e6)
+    tension, c = np.array([2.0, 0.0, 0.0, 0.0]), 1e-3
+    EI = float(robot.Kbt[0, 0])
+    left = float(pressed(np.asarray(3.0 * c * tension.sum() / EI)))
+    soft = robot.replace(rib_spacing=RibSpacing(softening=c))
+    softer = robot.replace(bending_stiffness=np.diag([EI * left, EI * left, float(robot.Kbt[2, 2])]))
+    assert np.allclose(shape(soft, tension), shape(softer, tension), rtol=0.0, atol=1e-9)
+
+
+def test_load_cells_correct_tensions():
+    gain, offset = np.array([1.1, 0.9, 1.0, 1.0]), np.array([0.2, 0.0, -0.1, -9.0])
+    cells = LoadCells(gain=gain, offset=offset)
+    true = np.maximum(gain * TENSION + offset, 0.0)
+    assert true[-1] == 0.0
+    found = shape(ROUTED.replace(load_cells=cells))
+    assert np.allclose(found, shape(ROUTED, true), rtol=0.0, atol=1e-9)
+
+
+def test_early_anchors_are_ends_of_routings():
+    at = 6.0 / 9.0
+    early = ROUTED.replace(anchors=EarlyAnchors(at=at, share=(0.0, 1.0, 1.0, 1.0)))
+    routing = tuple(
+        Straight(0.02 * np.cos(angle), 0.02 * np.sin(angle), end=at if k == 0 else 1.0)
+        for k, angle in enumerate(np.asarray(NOMINAL.tendon_angles))
+    )
+    assert np.allclose(shape(early), shape(ROUTED.replace(routing=routing)), rtol=0.0, atol=1e-8)
+
+
+def test_a_sleeve_is_stiffness_along_the_rod():
+    s = np.linspace(0.0, 1.0, 7) * float(ROUTED.length)
+    robot = ROUTED.replace(sections=(Sleeve(stiffening=2.0, length=0.3),))
+    found = [float(robot.material(each, np.zeros(4)).Kbt[0, 0] / ROUTED.Kbt[0, 0]) for each in s]
+    assert found == pytest.approx(1.0 + 2.0 * np.exp(-((s / (0.3 * float(ROUTED.length))) ** 4)), rel=1e-12)
+
+
+def test_friction_at_rest_holds_the_robot_back():
+    """A part of the friction of the way from the unloaded rod: it is bent less, and more by the opposite."""
+    robot = ROUTED.replace(friction=TendonFriction(wobble=0.5, reach=0.1))
+    bent = {}
+    for part in (-1.0, 0.0, 1.0):
+        friction = dataclasses.replace(robot.friction, at_rest=part)
+        bent[part] = np.linalg.norm(shape(robot.replace(friction=friction))[-1, :2])
+    assert bent[1.0] < bent[0.0] < bent[-1.0]
+    assert bent[0.0] == pytest.approx(np.linalg.norm(shape(ROUTED)[-1, :2]), rel=1e-9)
+
+
+def test_its_parts_come_back_from_a_file(model, tmp_path):
+    x = 0.3 * np.ones(model.size)
+    robot = model.reduced(x, model.names)
+    kc.save_robot(robot, tmp_path / "found.yaml")
+    again = kc.load_robot(tmp_path / "found.yaml")
+    assert again.load_cells.kind == "load-cells" and again.anchors.kind == "early-anchors"
+    assert again.sections[-1].kind == "sleeve"
+    tension = TENSION[None]
+    assert np.allclose(again.load_cells.tension(tension[0]), robot.load_cells.tension(tension[0]), rtol=1e-12)
+    assert np.allclose(again.anchors.share, robot.anchors.share, rtol=1e-12)
+    assert float(again.friction.at_rest) == pytest.approx(float(robot.friction.at_rest), rel=1e-12)

@@ -1,0 +1,93 @@
+"""Identification of robots with reels: nominal numbers change nothing, and equilibria tell the truth."""
+
+import numpy as np
+import pytest
+
+import knode_cosserat as kc
+from knode_cosserat.identification.evaluate import evaluate
+from knode_cosserat.identification.model import Model
+from knode_cosserat.rods.reels import Reels
+from knode_cosserat.rods.routing import Straight
+from knode_cosserat.rods.section import Stretch
+
+#: three cables in a soft rod that hangs; a control of 1 takes in 0.1 mm
+CABLES = kc.RoutedTendonRobot(
+    length=0.12, radius=0.004, density=1100.0, youngs_modulus=3e5, gravity=(0.0, 0.0, 9.81), nodes=6,
+    tendon_offset=0.004, tendon_angles=(0.0, 2.0944, 4.1888), drive="reel",
+    reels=Reels(motors=(1, 2, 3), radius=(1e-4, 1e-4, 1e-4)),
+)  # fmt: skip
+PAIR = CABLES.replace(
+    routing=(Straight(0.02, 0.0), Straight(-0.02, 0.0), Straight(0.0, 0.02, end=0.5)),
+    reels=Reels(motors=(1, -1, 2), radius=(0.03, 0.03), taken_in=(1e-3, 1e-3, 0.0), compliance=(1e-3,) * 3),
+)
+
+
+@pytest.mark.parametrize("robot", [CABLES, PAIR])
+def test_nominal_numbers_change_nothing(robot):
+    model = Model(robot, np.ones((4, robot.control_size)))
+    assert not {"load cell gains", "early anchors", "vibration", "friction"} & set(model.names)
+    assert ("tendon angles" in model.names) == (robot.routing is None)
+    same = model.robot(np.zeros(model.size))
+    control = np.linspace(0.5, 1.0, robot.control_size)
+    for s in (0.0, 0.3, 1.0):
+        for each, nominal in zip(same.routes_at(s), robot.routes_at(s), strict=True):
+            np.testing.assert_allclose(each, nominal, rtol=0.0, atol=1e-15)
+        found, expected = same.material(s * 0.12, control), robot.material(s * 0.12, control)
+        np.testing.assert_allclose(found.Kse, expected.Kse, rtol=1e-12)
+        np.testing.assert_allclose(found.Kbt, expected.Kbt, rtol=1e-12)
+    np.testing.assert_allclose(same.taken_in(control), robot.taken_in(control), rtol=0.0, atol=1e-15)
+    np.testing.assert_allclose(same._compliance, robot._compliance * np.ones(3), rtol=1e-12)
+    reduced = model.reduced(np.zeros(model.size), ("stiffness", "damping"))
+    assert reduced.sections == () and reduced.loads == () and reduced.shear_stiffness is None
+    for name in ("zero", "taken_in", "compliance"):
+        assert (getattr(reduced.reels, name) is None) == (getattr(robot.reels, name) is None)
+
+
+def test_what_effects_do():
+    model = Model(PAIR, np.ones((4, 2)))
+    x = np.zeros(model.size)
+    x[model.slice("taken in")] = [1.0, 2.0]
+    x[model.slice("motor zeros")] = [0.5, 0.0]
+    x[model.slice("axial stiffness")] = 1.0
+    x[model.slice("routing")] = [1.0, 2.0]
+    robot = model.robot(x)
+    # by where they end: first those to half of the length; angles by 1 % of the length over the radius
+    zero = 0.5 * 0.01 * 0.12 / 0.03
+    expected = [1e-3 + 2.4e-3 - 0.03 * zero, 1e-3 + 2.4e-3 + 0.03 * zero, 1.2e-3]
+    assert np.asarray(robot.taken_in(np.zeros(2))) == pytest.approx(expected, abs=1e-12)
+    assert np.asarray(robot.Kse) == pytest.approx(np.e * np.asarray(PAIR.Kse), rel=1e-12)
+    r = 0.02 * np.exp(0.1)
+    assert robot.routes_at(0.0)[0][0] == pytest.approx([r * np.cos(0.2), r * np.sin(0.2), 0.0], rel=1e-12)
+
+
+def equilibria(robot, control, noise=5e-5):
+    still = kc.equilibrium(robot, control)
+    position = np.asarray(still.position)[:, :, -1]
+    position = position + noise * np.random.default_rng(0).normal(size=position.shape)
+    count = len(control)
+    return kc.Measurements(
+        time=np.arange(float(count)), tension=control, fractions=np.ones(1), position=position,
+        quaternion=np.full((count, 1, 4), np.nan), measured=np.ones((count, 1), dtype=bool), simulated=True,
+        source="equilibria", static=True,
+    )  # fmt: skip
+
+
+@pytest.mark.campaign
+def test_a_robot_is_found_from_equilibria():
+    """Slack cables among them; each row is predicted by itself, and in any order."""
+    true = CABLES.replace(
+        length=0.125, tendon_offset=0.0043, sections=(Stretch(curvature=(1.0, -0.5, 0.0)),),
+        shear_stiffness=0.7 * np.asarray(CABLES.Kse),
+    )  # fmt: skip
+    rng = np.random.default_rng(1)
+    control = 80.0 * rng.uniform(size=(40, 3))
+    control[np.arange(40), rng.integers(0, 3, size=40)] = 0.0
+    seen = equilibria(true, control)
+    assert evaluate(true, seen).tip_rmse < 1e-4
+    learned, unseen = seen.rows(0, 20), seen.rows(20, 40)
+    effects = ["length", "axial stiffness", "tendon offset", "rest curvature"]
+    found = kc.identify(CABLES, [learned], effects)
+    before, after = (evaluate(robot, unseen).tip_rmse for robot in (CABLES, found.robot))
+    assert before > 2e-3 and after < 2e-4
+    by_label = {each.label: each.value for each in found.estimates}
+    assert by_label["length"] == pytest.approx(0.125, rel=0.01)

@@ -1,0 +1,163 @@
+"""Rows outside the range that a model was trained in are marked, wherever trajectories go."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+import knode_cosserat as kc
+from knode_cosserat.learning.config import FitConfig
+from knode_cosserat.learning.knode import KNODE
+from knode_cosserat.rods.parameters import ParameterError
+from knode_cosserat.rods.trained_range import MARGIN, TrainedRange, without_range
+from knode_cosserat.solvers import time_loop
+from tests.learning.bar import BAR, WRONG, pulled
+
+SMALL = FitConfig.network(hidden=5, epochs=300)
+
+
+@pytest.fixture(scope="module")
+def seen():
+    return [pulled(1.0), pulled(0.7)]
+
+
+@pytest.fixture(scope="module")
+def ensemble(seen):
+    return kc.fit(WRONG, seen, dataclasses.replace(SMALL, seed=(0, 1)))
+
+
+@pytest.fixture(scope="module")
+def model(ensemble):
+    return ensemble[0]
+
+
+@pytest.fixture(scope="module")
+def beyond():
+    """More pull than in training, at first within its range."""
+    pull = 2.0 * np.sin(2 * np.pi * np.arange(1, 21) * 0.1) * np.linspace(0.2, 1.6, 20)
+    return kc.simulate(BAR, pull[:, None], 0.1)
+
+
+@pytest.fixture(scope="module")
+def predicted(model, beyond):
+    return kc.simulate(model, beyond.held_control[:-1], beyond.dt)
+
+
+def test_the_range_is_that_of_the_trajectories(model, seen):
+    trained = model.trained_range()
+    for low, high, values in (
+        (trained.strain_low, trained.strain_high, np.concatenate([each.z for each in seen]).reshape(-1, 1)),
+        (trained.control_low, trained.control_high, np.concatenate([each.control[1:] for each in seen])),
+        (
+            trained.rate_low, trained.rate_high,
+            np.concatenate([np.diff(each.z, axis=0) / each.dt for each in seen]).reshape(-1, 1),
+        ),
+    ):  # fmt: skip
+        np.testing.assert_allclose(low, values.min(axis=0), atol=1e-12)
+        np.testing.assert_allclose(high, values.max(axis=0), atol=1e-12)
+
+
+def test_nothing_is_marked_in_what_it_learned_from(model, seen):
+    for each in seen:
+        again = kc.simulate(model, each.held_control[:-1], each.dt)
+        assert again.extrapolated.shape == (len(each.time),) and not again.extrapolated.any()
+        assert "EXTRAPOLATION" not in str(again) and again.extrapolation == ""
+    # the knowledge alone was not trained
+    assert kc.simulate(WRONG, seen[0].held_control[:-1], seen[0].dt).extrapolated is None
+
+
+def test_rows_beyond_are_marked_and_said(model, seen, predicted):
+    trained = model.trained_range()
+    slack = MARGIN * (trained.control_high - trained.control_low).max()
+    driven = (predicted.control > trained.control_high + slack).any(axis=1)
+    driven |= (predicted.control < trained.control_low - slack).any(axis=1)
+    assert driven.any() and not driven.all()
+    # wherever the control is beyond, and where strains or rates are
+    assert np.all(predicted.extrapolated[1:][driven[1:]]) and not predicted.extrapolated.all()
+    count = int(predicted.extrapolated.sum())
+    assert f"EXTRAPOLATION: {count} of {len(predicted.time)} rows" in str(predicted)
+    first = predicted.time[np.argmax(predicted.extrapolated)]
+    assert f"first at {first:g} s" in predicted.extrapolation
+
+
+def test_marks_survive_slices_files_continuing_batches_and_equilibria(
+    model, ensemble, beyond, predicted, tmp_path
+):
+    marks, controls = predicted.extrapolated, beyond.held_control[:-1]
+    np.testing.assert_array_equal(predicted[3:9].extrapolated, marks[3:9])
+    predicted.save(tmp_path / "predicted.nc")
+    loaded = kc.load_trajectory(tmp_path / "predicted.nc", system=model)
+    assert loaded.extrapolated.dtype == bool
+    np.testing.assert_array_equal(loaded.extrapolated, marks)
+    assert loaded.system.trained_range() is not None
+    half = len(controls) // 2
+    first = kc.simulate(model, controls[:half], beyond.dt)
+    second = kc.simulate(model, controls[half:], beyond.dt, initial=first)
+    np.testing.assert_array_equal(np.concatenate([first.extrapolated, second.extrapolated[1:]]), marks)
+    assert second.extrapolated[0] == first.extrapolated[-1]
+    both = kc.simulate(model, np.stack([controls, 0.2 * controls]), beyond.dt)
+    np.testing.assert_array_equal(both.extrapolated[0], marks)
+    assert not both[1].extrapolated[1:].all() and "2 robots" in str(both)
+    prediction = ensemble.predict(controls, beyond.dt)
+    np.testing.assert_array_equal(
+        prediction.extrapolated, prediction.members[0].extrapolated | prediction.members[1].extrapolated
+    )
+    top = 2.0 * np.asarray(model.trained_range().control_high)
+    rest = kc.equilibrium(model, top)
+    assert rest.extrapolated.shape == (1,) and rest.extrapolated[0]
+    traced = jax.jit(lambda part: kc.simulate(model, part * controls, beyond.dt).extrapolated)(1.0)
+    np.testing.assert_array_equal(traced, marks)
+
+
+def test_a_range_needs_no_program_of_its_own(model, beyond):
+    bare = KNODE(model.knowledge, model.residual, model.about)
+    assert jax.tree.structure(without_range(model)) == jax.tree.structure(bare)
+    kc.simulate(bare, beyond.held_control[:-1], beyond.dt)
+    programs = time_loop.loop_one._cache_size()
+    kc.simulate(model, beyond.held_control[:-1], beyond.dt)
+    assert time_loop.loop_one._cache_size() == programs
+
+
+def test_files_keep_the_range(model, tmp_path):
+    model.save(tmp_path / "model")
+    again = kc.load_model(tmp_path / "model", knowledge=WRONG)
+    assert jax.tree.all(jax.tree.map(np.array_equal, again.trained, model.trained))
+    trained = TrainedRange(
+        np.array([-1e-5, -1e-5, 0.999, -3.0, -2.0, -0.1]), np.array([1e-5, 1e-5, 1.0, 3.0, 2.0, 0.1]),
+        -np.ones(6), np.ones(6), np.zeros(4), np.full(4, 9.5),
+    )  # fmt: skip
+    robot = kc.load_robot("delrin-routed-tendon-robot").replace(trained=trained)
+    kc.save_robot(robot, tmp_path / "robot.yaml")
+    found = kc.load_robot(tmp_path / "robot.yaml")
+    assert jax.tree.all(jax.tree.map(np.array_equal, found.trained, trained))
+    # a model of an identified robot has that robot's range until it is trained itself
+    assert KNODE(robot, model.residual).trained_range() is robot.trained
+
+
+def test_each_kind_of_number_is_judged_with_a_margin():
+    robot = kc.load_robot("delrin-routed-tendon-robot")
+    zero, one = np.zeros(6), np.ones(6)
+    trained = TrainedRange(-one, one, -one, one, np.zeros(4), np.full(4, 10.0))
+    time, control, z = np.arange(4.0) / 100, np.zeros((4, 4)), np.zeros((4, 3, 6))
+
+    def rows(**changes):
+        given = {"time": time, "control": control, "z": z} | changes
+        return trained.outside(robot, **given).tolist()
+
+    assert rows() == [False] * 4
+    strained = z.copy()
+    strained[2:, 1, 4] = 1.0 + 2.0 * MARGIN + 1e-6  # and so fast: row 2 for both, row 3 for the strain
+    assert rows(z=strained, time=100 * time) == [False, False, True, True]
+    strained[2:, 1, 4] = 1.0 + 2.0 * MARGIN - 1e-6
+    assert rows(z=strained, time=1e4 * time) == [False] * 4
+    assert rows(z=strained) == [False, False, True, False]
+    pulling = control.copy()
+    pulling[[0, 2], 3] = 10.0 + 10.0 * MARGIN + 1e-6
+    # the first row's control acted before
+    assert rows(control=pulling) == [False, False, True, False]
+    assert rows(z=np.full((4, 3, 6), np.nan)) == [False] * 4
+    with pytest.raises(ParameterError, match="strain_low is above strain_high"):
+        TrainedRange(one, zero, -one, one)
+    with pytest.raises(ParameterError, match="allowed is one number for each component"):
+        TrainedRange(one, one, -one, one, np.zeros(4))

@@ -1,0 +1,76 @@
+"""The files of the real robots: they load, fit together, and predict measurements that were not used."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import knode_cosserat as kc
+from knode_cosserat.identification.evaluate import evaluate
+from knode_cosserat.recordings import RecordingConfig
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+TRUNK, CABLES = EXAMPLES / "asl_trunk", EXAMPLES / "three_cables"
+
+
+def trunk(name="identified_11"):
+    return kc.load_robot(TRUNK / f"{name}.yaml")
+
+
+def extract():
+    """Ten seconds that the robot was not identified from, 20 rows a second."""
+    config = RecordingConfig.load(TRUNK / "recording.yaml")
+    table = dataclasses.replace(config.table, rate=20.0)
+    return kc.load_recording(TRUNK / "extract_11.csv", config.replace(table=table, longest_gap=0.2))
+
+
+def test_the_trunks_files_fit_together():
+    assert RecordingConfig.load(TRUNK / "recording.yaml") == RecordingConfig.asl_trunk()
+    for name in ("nominal", "identified_1", "identified_11"):
+        robot = trunk(name)
+        assert robot.control_layout.names == ("motor",) and robot.control_size == 6
+        # two tendons of each motor, at opposite sides, that end at one disk; on a reel it is in or out
+        taken_in = np.asarray(robot.taken_in(np.ones(6)) - robot.taken_in(np.zeros(6)))
+        for k in range(6):
+            one, other = robot.routing[2 * k], robot.routing[2 * k + 1]
+            assert one.end == other.end and np.hypot(one.x + other.x, one.y + other.y) < 1e-6
+            assert taken_in[2 * k] == pytest.approx(-taken_in[2 * k + 1])
+    seen = extract().sampled(0.05)
+    assert seen.tension.shape[1] == 6 and np.abs(seen.tension).max() < np.radians(90.0)
+    # it hangs, and z goes down
+    assert np.nanmax(seen.position[:, -1, 2]) > 0.3
+
+
+@pytest.mark.campaign
+def test_the_trunk_is_predicted():
+    seen = extract().sampled(0.05, mean=True)
+    found = evaluate(trunk(), seen)
+    assert found.failed is None
+    error = (found.tip - seen.tip_position)[seen.complete, :2]
+    swing = np.nanstd(seen.tip_position[:, :2], axis=0)
+    assert np.all(np.sqrt(np.mean(error**2, axis=0)) < 0.25 * swing)
+
+
+def cables(name):
+    config = RecordingConfig.load(CABLES / "recording.yaml")
+    return kc.load_recording(CABLES / name, config).sampled()
+
+
+def test_three_cables_are_read():
+    used, unused = cables("identify.csv"), cables("held_out.csv")
+    assert (len(used.time), len(unused.time)) == (50, 250) and used.static
+    assert not {*map(tuple, used.tension)} >= {*map(tuple, unused.tension)}
+    # one cable is always slack, and the tip hangs below the clamped end
+    assert np.all(unused.tension.min(axis=1) == 0.0) and np.all(unused.position[:, 0, 2] > 0.05)
+
+
+def test_three_cables_are_predicted():
+    unused = cables("held_out.csv")
+    robots = [kc.load_robot(CABLES / f"{name}.yaml") for name in ("nominal", "identified")]
+    nominal, found = (evaluate(robot, unused).tip_rmse for robot in robots)
+    assert found < LIMIT and found < 0.5 * nominal
+
+
+#: m, the figure of docs/real-robots.md and a little
+LIMIT = 2.3e-3
