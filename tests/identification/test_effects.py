@@ -13,7 +13,7 @@ from knode_cosserat.identification.model import Model
 from knode_cosserat.rods.anchors import EarlyAnchors
 from knode_cosserat.rods.load_cells import LoadCells
 from knode_cosserat.rods.rib_spacing import RibSpacing, pressed
-from knode_cosserat.rods.routing import Straight
+from knode_cosserat.rods.routing import Helical, Straight
 from knode_cosserat.rods.section import Sleeve
 from knode_cosserat.rods.tendon_friction import TendonFriction
 
@@ -103,6 +103,31 @@ def test_early_anchors_are_ends_of_routings():
         for k, angle in enumerate(np.asarray(NOMINAL.tendon_angles))
     )
     assert np.allclose(shape(early), shape(ROUTED.replace(routing=routing)), rtol=0.0, atol=1e-8)
+
+
+def test_twisted_tendons_are_helices():
+    twist = 0.7
+    routing = tuple(
+        Helical(0.02, phase=angle, turns=twist / (2.0 * np.pi)) for angle in np.asarray(NOMINAL.tendon_angles)
+    )
+    twisted = ROUTED.replace(tendon_twist=twist)
+    assert not np.allclose(shape(twisted), shape(ROUTED), atol=1e-3)
+    assert np.allclose(shape(twisted), shape(ROUTED.replace(routing=routing)), rtol=0.0, atol=1e-9)
+
+
+def test_tendons_whose_routing_is_stated_are_moved_by_effects_of_that():
+    """Angles of tendons mean nothing there; those of the routing turn each tendon."""
+    routing = tuple(
+        Straight(0.02 * np.cos(angle), 0.02 * np.sin(angle)) for angle in np.asarray(NOMINAL.tendon_angles)
+    )
+    model = Model(ROUTED.replace(routing=routing), np.tile(TENSION, (4, 1)))
+    assert not {"tendon offset", "tendon angles", "tendon twist"} & set(model.names)
+    x = np.zeros(model.size)
+    x[model.slice("routing by motor")] = [1.0, 0.0, 0.0, 0.0]
+    turn = model.numbers[model.slice("routing by motor").start].width
+    angles = np.asarray(NOMINAL.tendon_angles) + np.array([turn, 0.0, 0.0, 0.0])
+    found = shape(model.reduced(x, ("stiffness", "damping", "routing by motor")))
+    assert np.allclose(found, shape(ROUTED.replace(tendon_angles=angles)), rtol=0.0, atol=1e-9)
 
 
 def test_a_sleeve_is_stiffness_along_the_rod():

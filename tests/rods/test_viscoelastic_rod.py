@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
+from knode_cosserat.rods.relaxation import Relaxation
 from knode_cosserat.rods.viscoelastic_rod import ViscoelasticRod
 
 BODY = {
@@ -50,3 +51,20 @@ def test_both_ways_to_state_the_law_agree():
     z = rod.strains(0.05, 0.0, y, np.zeros(1), history)
     C, D, f2 = rod.constitutive(0.05, 0.0, y, np.zeros(19), np.zeros(1))
     np.testing.assert_allclose(C @ z + D @ (history.c0 * z + history.z), f2, atol=1e-8 * np.abs(f2).max())
+
+
+def test_relaxation_of_a_tendon_robot_is_that_of_the_rod():
+    """A robot whose tendons pull with nothing moves under its weight as a rod of the same material."""
+    body = {name: value for name, value in BODY.items() if name != "loads"} | {"gravity": (9.81, 0.0, 0.0)}
+    stiff = 1e9 * np.eye(3)
+    rod = ViscoelasticRod(**body, shear_stiffness=stiff, branch_stiffness=1.5, relaxation_time=0.2)
+    robot = kc.RoutedTendonRobot(
+        **body, shear_stiffness=stiff, tendon_offset=0.01, relaxation=Relaxation(stiffness=1.5, time=0.2)
+    )
+    none, slack = np.zeros((40, 0)), np.zeros((40, 4))
+    expected = kc.simulate(rod, none, 0.01, initial=kc.equilibrium(rod.replace(gravity=(0.0, 0.0, 0.0)), []))
+    found = kc.simulate(
+        robot, slack, 0.01, initial=kc.equilibrium(robot.replace(gravity=(0.0, 0.0, 0.0)), np.zeros(4))
+    )
+    assert np.ptp(expected.tip_position[:, 0]) > 5e-3
+    np.testing.assert_allclose(found.tip_position, expected.tip_position, atol=1e-7)

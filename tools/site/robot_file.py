@@ -32,6 +32,7 @@ FAMILIES = {
     "TendonFriction": "Friction of tendons: `friction`",
     "Vibration": "Vibration: `vibration`",
     "RibSpacing": "Rib spacing: `rib_spacing`",
+    "Relaxation": "Relaxation of the material: `relaxation`",
     "Reels": "Reels: `reels`",
     "TrainedRange": "Trained range: `trained`",
     "EarlyAnchors": "Early anchors: `anchors`",

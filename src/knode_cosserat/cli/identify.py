@@ -66,6 +66,10 @@ def identify(
             show_default="those worth their place",
         ),
     ] = None,
+    checkpoint: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Keep finished searches here; an interrupted run resumes."),
+    ] = None,
     space: Space = "lobatto2",
     changes: Changes = None,
     progress: Progress = None,
@@ -87,7 +91,7 @@ def identify(
     ]
     began = perf_counter()
     say = _on_stderr if wanted(progress) else None
-    found = find(nominal, given, effects or None, space=space, progress=say)
+    found = find(nominal, given, effects or None, space=space, progress=say, checkpoint=checkpoint)
     kc.save_robot(found.robot, out)
     facts = found.to_dict() | {"computing_time": round(perf_counter() - began, 1)}
     tell(as_json, facts, str(found).splitlines(), out=out)

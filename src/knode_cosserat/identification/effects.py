@@ -185,6 +185,12 @@ def effects_of(
             _with_angles,
         ),
         Effect(
+            "tendon twist",
+            "angle by which ribs, and the tendons in them, turn about the rod from base to tip",
+            (Number("tendon_twist", "rad", float(nominal.tendon_twist or 0.0), 0.06),),
+            Replace(("tendon_twist",)),
+        ),
+        Effect(
             "load cell gains",
             "tension of each tendon over what its load cell measures",
             tuple(Number(f"load_cells.gain[{k}]", "", 1.0, 0.05, 0.1, 10.0, True) for k in range(count)),
@@ -235,6 +241,15 @@ def effects_of(
                 Number("anisotropy_turned", "", 0.0, 0.1, -0.9, 0.9),
             ),
             _with_axes,
+        ),
+        Effect(
+            "creep",
+            "relaxation of the material: a Maxwell branch beside its stiffness",
+            (
+                Number("relaxation.stiffness", "", 0.0, 0.2, 0.0, 100.0, begin=0.3),
+                Number("relaxation.time", "s", 1.0, 1.0, 0.02, 100.0, True),
+            ),
+            ReplaceInPart("relaxation", ("stiffness", "time")),
         ),
         Effect(
             "linear drag",

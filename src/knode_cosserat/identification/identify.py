@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 
 from knode_cosserat._yaml import did_you_mean
 from knode_cosserat.identification.given import SELECTED_DT, coarser, measurements_of, names_of, padded
 from knode_cosserat.identification.intervals import estimates_of
+from knode_cosserat.identification.journal import Journal
 from knode_cosserat.identification.misfit import Data, Misfit, data_of
 from knode_cosserat.identification.model import Model
 from knode_cosserat.identification.result import Estimate, Identified
@@ -42,6 +44,7 @@ def identify(
     *,
     space: str | SpaceScheme = "lobatto2",
     progress: Callable[[str], None] | None = None,
+    checkpoint: str | Path | None = None,
 ) -> Identified:
     """Identify a tendon robot from recordings: find which effects it has, and their numbers.
 
@@ -63,6 +66,8 @@ def identify(
         effects: effects by name (`effects_of`), all of which are identified; None: those worth their place.
         space: the scheme along the rod that the result is for.
         progress: called with a line for each step.
+        checkpoint: folder in which finished searches are kept; an interrupted run with the same arguments
+            resumes from there.
 
     Returns:
         The `Identified` robot, with estimates, intervals, and errors of held-out recordings.
@@ -79,10 +84,13 @@ def identify(
             "RoutedTendonRobot)"
         )
     measured = measurements_of(recordings)
-    search = _search(robot, measured, space, tell)
+    journal = None if checkpoint is None else Journal(checkpoint)
+    search = _search(robot, measured, space, tell, journal)
     model, data = search.misfit.model, search.misfit.data
     is_fine = data[0].dt < SELECTED_DT and not data[0].static
-    far = Search(Misfit(model, [coarser(each) for each in data], space), tell) if is_fine else search
+    far = search
+    if is_fine:
+        far = Search(Misfit(model, [coarser(each) for each in data], space), tell, journal=journal)
     steps: list[str] = []
     try:
         if effects is not None:
@@ -105,11 +113,12 @@ def identify(
 
 
 def _search(
-    robot: TendonRod, measured: Sequence[Measurements], space: str | SpaceScheme, tell: Callable[[str], None]
-) -> Search:
+    robot: TendonRod, measured: Sequence[Measurements], space: str | SpaceScheme,
+    tell: Callable[[str], None], journal: Journal | None,
+) -> Search:  # fmt: skip
     model = Model(robot, np.concatenate([each.tension for each in measured]))
     data = [data_of(each, model, name) for each, name in zip(measured, names_of(measured), strict=True)]
-    return Search(Misfit(model, padded(data), space), tell)
+    return Search(Misfit(model, padded(data), space), tell, journal=journal)
 
 
 def _refined(
@@ -123,7 +132,7 @@ def _refined(
             break
         nodes = 2 * model.nominal.nodes
         tell(f"the grid of {model.nominal.nodes} nodes is too coarse: {nodes} nodes")
-        search = _search(model.nominal.replace(nodes=nodes), measured, space, tell)
+        search = _search(model.nominal.replace(nodes=nodes), measured, space, tell, search.journal)
         point = search.run(point.x, search.misfit.model.mask(names))
         steps.append(f"with {nodes} nodes, for the grid was too coarse: {sizes(point)}")
     return search, point

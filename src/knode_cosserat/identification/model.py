@@ -19,6 +19,7 @@ from knode_cosserat.rods.ends import Clamped
 from knode_cosserat.rods.load_cells import LoadCells
 from knode_cosserat.rods.loads import AttachedMass
 from knode_cosserat.rods.reels import Reels
+from knode_cosserat.rods.relaxation import Relaxation
 from knode_cosserat.rods.rib_spacing import RibSpacing
 from knode_cosserat.rods.routed_robot import RoutedTendonRobot
 from knode_cosserat.rods.section import Sleeve, Stretch
@@ -58,7 +59,10 @@ def extended(robot: RoutedTendonRobot) -> RoutedTendonRobot:
         sections=(*robot.sections, Stretch(stiffness=(1.0, 0.0)), Sleeve()),
         loads=(*robot.loads, AttachedMass(at=1.0, mass=0.0)),
         linear_drag=np.zeros((3, 3)) if robot.linear_drag is None else robot.linear_drag,
+        relaxation=robot.relaxation or Relaxation(stiffness=0.0),
     )
+    if robot.routing is None and robot.tendon_twist is None:
+        robot = robot.replace(tendon_twist=0.0)
     return _with_reels(robot) if robot.drive == "reel" else _with_load_cells(robot)
 
 
@@ -233,7 +237,8 @@ class Model:
         changes: dict[str, Any] = {"sections": tuple(sections), "loads": tuple(loads)}
         gone = {
             "friction": "friction", "vibration": "vibration", "rib spacing": "rib_spacing",
-            "early anchors": "anchors", "linear drag": "linear_drag",
+            "early anchors": "anchors", "linear drag": "linear_drag", "creep": "relaxation",
+            "tendon twist": "tendon_twist",
         }  # fmt: skip
         changes |= {part: getattr(nominal, part) for effect, part in gone.items() if effect not in names}
         if not {"load cell gains", "load cell offsets", "latency"} & set(names):

@@ -6,11 +6,12 @@ import dataclasses
 import itertools
 import logging
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from knode_cosserat.identification.journal import Journal, hashed, identity
 from knode_cosserat.identification.misfit import Misfit, Rollout
 
 log = logging.getLogger(__name__)
@@ -59,6 +60,22 @@ class Point:
     free: Bool[np.ndarray, " n"]
     #: precision of each coordinate's prior
     prior: Float[np.ndarray, " n"]
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return its arrays by name, for a file."""
+        found = {name: getattr(self, name) for name in ("x", "scale", "free", "prior")}
+        for name in ("problem", "blocks"):
+            found |= {f"{name}.{part}": array for part, array in getattr(self, name)._asdict().items()}
+        return found
+
+    @classmethod
+    def of(cls, arrays: dict[str, np.ndarray]) -> Self:
+        """Return the point of these arrays: the inverse of `arrays`."""
+        problem, blocks = (
+            Problem(**{part: arrays[f"{name}.{part}"] for part in Problem._fields})
+            for name in ("problem", "blocks")
+        )
+        return cls(arrays["x"], arrays["scale"], problem, blocks, arrays["free"], arrays["prior"])
 
     @property
     def cost(self) -> float:
@@ -126,14 +143,16 @@ class Search:
         misfit: the recordings and the model.
         tell: called with a line of progress.
         prior: precision of each coordinate's prior, about zero; by default 1.
+        journal: where the ends of finished searches are kept, and looked up.
     """
 
     def __init__(
         self, misfit: Misfit, tell: Callable[[str], None] = lambda line: None,
-        prior: Float[np.ndarray, " n"] | None = None,
+        prior: Float[np.ndarray, " n"] | None = None, journal: Journal | None = None,
     ):  # fmt: skip
-        self.misfit, self.tell = misfit, tell
+        self.misfit, self.tell, self.journal = misfit, tell, journal
         self.prior = np.ones(misfit.model.size) if prior is None else prior
+        self._identity = "" if journal is None else identity(misfit, self.prior)
         self.length = float(misfit.model.nominal.length)
         self.low, self.high = misfit.model.bounds
 
@@ -183,7 +202,30 @@ class Search:
         most: int = FINE[0], fall: float = FINE[1], which: Sequence[int] | None = None,
         scale: Float[np.ndarray, " R"] | None = None,
     ) -> Point:  # fmt: skip
-        """Return the end of a search (Levenberg-Marquardt) from a point, by some recordings and rows."""
+        """Return the end of a search (Levenberg-Marquardt) from a point, by some recordings and rows.
+
+        Raises:
+            SearchError: the robot at that point cannot be simulated.
+        """
+        if self.journal is None:
+            return self._searched(x, free, rows, most, fall, which, scale)
+        given = repr((rows, most, fall, None if which is None else tuple(which), scale is None))
+        key = hashed(self._identity, given, x, free, np.zeros(0) if scale is None else scale)
+        kept = self.journal.load(key)
+        if kept is None:
+            try:
+                kept = self._searched(x, free, rows, most, fall, which, scale).arrays()
+            except SearchError as error:
+                kept = {"failed": np.array(str(error))}
+            self.journal.save(key, kept)
+        if "failed" in kept:
+            raise SearchError(str(kept["failed"]))
+        return Point.of(kept)
+
+    def _searched(
+        self, x: Float[np.ndarray, " n"], free: Bool[np.ndarray, " n"], rows: int | None, most: int,
+        fall: float, which: Sequence[int] | None, scale: Float[np.ndarray, " R"] | None,
+    ) -> Point:  # fmt: skip
         now = self._solved(x, rows, which)
         if now is None:
             raise SearchError("the robot that the search begins from cannot be simulated")
