@@ -82,8 +82,13 @@ def test_softening_by_tension_is_that_of_stiffness():
     EI = float(robot.Kbt[0, 0])
     left = float(pressed(np.asarray(3.0 * c * tension.sum() / EI)))
     soft = robot.replace(rib_spacing=RibSpacing(softening=c))
+    # of ribs whose places are known
+    spans = robot.replace(
+        rib_spacing=RibSpacing(at=(0.25, 0.5, 0.75, 1.0), share=c / (0.25 * robot.length) ** 2 * 12.0)
+    )
     softer = robot.replace(bending_stiffness=np.diag([EI * left, EI * left, float(robot.Kbt[2, 2])]))
     assert np.allclose(shape(soft, tension), shape(softer, tension), rtol=0.0, atol=1e-9)
+    assert np.allclose(shape(spans, tension), shape(softer, tension), rtol=0.0, atol=1e-8)
 
 
 def test_load_cells_correct_tensions():

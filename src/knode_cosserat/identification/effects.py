@@ -153,6 +153,8 @@ def effects_of(
     frequency = FIRST_MODE * (EI * L / carried) ** 0.5 / L**2
     damping = 2.0 * DAMPING_RATIO * EI / frequency
     drag = 2.0 * DAMPING_RATIO * frequency * carried / L
+    ribbed = nominal.rib_spacing
+    spacing = (0.0, 0.0) if ribbed is None else (float(ribbed.softening), float(ribbed.share))
     effects = [
         Effect(
             "stiffness",
@@ -291,8 +293,15 @@ def effects_of(
         Effect(
             "rib spacing",
             "softer bending under tension, for tendons are straight between ribs",
-            (Number("rib_spacing.softening", "m2", 0.0, (0.2 * L) ** 2 / 12.0, 0.0, L**2, begin=0.3),),
+            (Number("rib_spacing.softening", "m2", spacing[0], (0.2 * L) ** 2 / 12.0, 0.0, L**2, begin=0.3),),
             ReplaceInPart("rib_spacing", ("softening",)),
+        ),
+        Effect(
+            "rib spans",
+            "softer bending under tension between the ribs, or bodies, whose places are known",
+            (Number("rib_spacing.share", "", spacing[1], 0.5, 0.0, 10.0, begin=0.5),),
+            ReplaceInPart("rib_spacing", ("share",)),
+            usual=True,
         ),
         Effect(
             "friction",

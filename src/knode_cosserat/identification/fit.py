@@ -143,7 +143,7 @@ def with_residual(
     if len(measured) < 2:
         raise DataError("there is one recording; a residual needs two at least, for one is left out in turn")
     tension = np.concatenate([each.tension for each in measured])
-    model = Model(nominal, tension)  # type: ignore[arg-type]
+    model = Model(nominal, tension, measured[0].fractions)  # type: ignore[arg-type]
     x = coordinates(model, found)
     robot = model.reduced(x, found.effects)
     both = ResidualModel(model, found.effects, passive(robot, tension, seed, hidden))

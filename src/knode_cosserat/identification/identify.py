@@ -116,7 +116,8 @@ def _search(
     robot: TendonRod, measured: Sequence[Measurements], space: str | SpaceScheme,
     tell: Callable[[str], None], journal: Journal | None,
 ) -> Search:  # fmt: skip
-    model = Model(robot, np.concatenate([each.tension for each in measured]))
+    tension = np.concatenate([each.tension for each in measured])
+    model = Model(robot, tension, measured[0].fractions)
     data = [data_of(each, model, name) for each, name in zip(measured, names_of(measured), strict=True)]
     return Search(Misfit(model, padded(data), space), tell, journal=journal)
 

@@ -32,6 +32,8 @@ PLACED = 0.03
 def all_effects(nominal: RoutedTendonRobot, tensions: float, highest: float) -> list[Effect]:
     """Return the effects that a robot may have, by what drives its tendons; see `effects_of`."""
     gone = set() if nominal.routing is None else {*OF_ANGLES}
+    if nominal.rib_spacing is None or nominal.rib_spacing.at is None:
+        gone |= {"rib spans"}
     if nominal.drive != "reel":
         known = [each for each in effects_of(nominal, tensions, highest) if each.name not in gone]
         return [*known, *routing_effects(nominal)]

@@ -84,6 +84,12 @@ def place(
     )
 
 
+def places(meaning: str) -> Any:
+    """Return an optional field for several places on the rod, as fractions of its length; static."""
+    stated = Parameter("", f"{meaning}, as parts of the length", "list", 0.0, 1.0, optional=True)
+    return eqx.field(static=True, default=None, converter=_place_numbers, metadata={"parameter": stated})
+
+
 @dataclasses.dataclass(frozen=True)
 class Choice:
     """Specification of a field that holds one or several of a set of words."""
@@ -266,6 +272,12 @@ def _place_number(value: Any) -> Any:
     number = _plain_number(value)
     near = [end for end in (0.0, 1.0) if isinstance(number, float) and abs(number - end) < AT_END]
     return near[0] if near else number
+
+
+def _place_numbers(value: Any) -> Any:
+    """Return places as a tuple, which can be compared and hashed; `checked` judges anything else."""
+    several = isinstance(value, tuple | list | np.ndarray)
+    return tuple(_place_number(each) for each in value) if several else value
 
 
 def _as_matrix(value: Any) -> Any:

@@ -212,9 +212,10 @@ class RoutedTendonRobot(TendonRod):
 
     @property
     def cuts(self) -> tuple[float, ...]:  # type: ignore[override]
-        """Places of discontinuity: those of the rod, and the tendons' anchors."""
+        """Places of discontinuity: those of the rod, the tendons' anchors, and ribs."""
         early = () if self.anchors is None else (self.anchors.at,)
-        return tuple(sorted({*super().cuts, *(end for end in (*self._ends, *early) if end < 1.0)}))
+        ribs = () if self.rib_spacing is None else self.rib_spacing.at or ()
+        return tuple(sorted({*super().cuts, *(at for at in (*self._ends, *early, *ribs) if at < 1.0)}))
 
     @property
     def _ends(self) -> tuple[float, ...]:
@@ -381,7 +382,7 @@ class RoutedTendonRobot(TendonRod):
         b = m - dot(Bbt, hu) if not self.sections else m + dot(Kbt, material.u_star) - dot(Bbt, hu)
         if self.rib_spacing is not None:
             # tendons press on the bent rod, including its intrinsic curvature
-            Kbt = self.rib_spacing.softened(Kbt, jnp.sum(tension))
+            Kbt = self.rib_spacing.softened(s / self.length, self.length, Kbt, jnp.sum(tension))
         if self.relaxation is not None:
             branch = self.relaxation.damping(material.Kbt, c0)
             b = b - dot(branch, self.z_layout.get(history.z, "u_branch"))
