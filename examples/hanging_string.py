@@ -1,6 +1,6 @@
 """A system of your own: an elastic string in the vertical plane, hung between a nail and a moving hand.
 
-Of the general class (paper eqs. 1-4): p_s = (1 + T/EA) n/T, n_s = ρ q_t + c q - ρ g, q_s = p_st, T = |n|.
+Of the general class (paper eq. 1): p_s = (1 + T/EA) n/T, n_s = ρ q_t + c q - ρ g, q_s = p_st, T = |n|.
 """
 
 from typing import Any, ClassVar
