@@ -23,7 +23,7 @@ FIRST_MODE = 3.516
 DAMPING_RATIO = 0.02
 
 
-#: what an effect does to a robot, by the values of its numbers; equal for any robot of the same parts
+#: change of a robot by the values of an effect's parameters; equal for all robots of the same parts
 Change = Callable[[Any, list[Any]], Any]
 
 

@@ -35,7 +35,7 @@ from knode_cosserat.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
 
-#: of a network's residual: widths of its priors, wide enough for what crude knowledge misses
+#: widths of the priors of a network's residual, wide enough for the errors of a crude nominal model
 WIDE = {"stiffness": 0.5, "levers": 3.0, "energy": 0.5, "damping": 3.0, "dissipation": 3.0}
 
 

@@ -1,4 +1,4 @@
-"""What is given to identify a robot from: recordings, their rows, or trajectories."""
+"""Input of an identification: recordings, their rows, or trajectories."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from knode_cosserat.identification.model import Model
 from knode_cosserat.identification.result import Estimate
 from knode_cosserat.identification.search import Point
 
-#: of a normal distribution, for 95 %
+#: quantile of the normal distribution for 95 %
 SIGMAS = 1.96
 #: a number whose uncertainty is more than this part of its prior's is held by the prior
 HELD = 0.8

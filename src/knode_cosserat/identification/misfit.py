@@ -51,7 +51,7 @@ class Data(NamedTuple):
     rotation: Float[np.ndarray, "rows M 4"]
     #: the first row in motion
     moves: int
-    #: whether each row is an equilibrium of its own
+    #: true if each row is a separate equilibrium
     static: bool = False
 
 

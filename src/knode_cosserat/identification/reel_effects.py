@@ -16,7 +16,7 @@ from knode_cosserat.identification.effects import Effect, Number, effects_of
 from knode_cosserat.rods.routed_robot import RoutedTendonRobot
 from knode_cosserat.rods.routing import Straight
 
-#: of the length: uncertainty of what reels have taken in, and of angles about which tendons lie (rad)
+#: uncertainty of the wound-up length, as a fraction of the rod's length, and of tendon angles (rad)
 TAKEN_IN, TURN = 0.01, 0.1
 
 
@@ -24,7 +24,7 @@ TAKEN_IN, TURN = 0.01, 0.1
 OF_TENSIONS = ("load cell gains", "load cell offsets", "early anchors", "vibration", "latency")
 #: effects of tendons that are given by their offset and angles, and of friction
 OF_ANGLES, OF_FRICTION = ("tendon offset", "tendon angles"), ("friction", "friction by curvature")
-#: of the length: uncertainty of the clamped end's position
+#: uncertainty of the clamped end's position, as a fraction of the length
 PLACED = 0.03
 
 

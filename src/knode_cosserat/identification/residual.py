@@ -58,7 +58,7 @@ class Errors(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Learned:
-    """What came of a residual.
+    """Result of the search for a residual.
 
     Attributes:
         robot: the identified robot with the residual, or alone if that is not kept.
@@ -162,7 +162,7 @@ def _solved(misfit: Misfit, x: np.ndarray) -> list[Rollout]:
 
 
 class _Scaled(NamedTuple):
-    """What `held_out` asks a model for."""
+    """Members of a model that `held_out` uses."""
 
     bounds: tuple[np.ndarray, np.ndarray]
 

@@ -53,7 +53,7 @@ class Point:
 
     x: Float[np.ndarray, " n"]
     scale: Float[np.ndarray, " R"]
-    #: of each part that is left out together, and of the blocks of each (as many of all), one after the other
+    #: rows of each part that is left out together, and of the blocks of each part (equally many), in order
     problem: Problem
     blocks: Problem
     free: Bool[np.ndarray, " n"]
