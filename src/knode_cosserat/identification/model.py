@@ -44,7 +44,7 @@ def routed(nominal: TendonRod) -> RoutedTendonRobot:
 def extended(robot: RoutedTendonRobot) -> RoutedTendonRobot:
     """Return the same robot with every part that effects change: a stretch, a sleeve, a tip mass and so on.
 
-    Base and load cells stay as they are if they are given; all others do nothing.
+    A base and load cells that the robot already has are unchanged; all added parts have no effect.
     """
     held = robot.base_end
     if isinstance(held, Clamped):
@@ -118,8 +118,8 @@ class Parametrised(eqx.Module):
         robot: the nominal robot with every part.
         nominal: nominal values (n,) of all numbers.
         width: widths (n,) of their priors.
-        logarithmic: which of them are logarithmic.
-        changes: for each effect, what it does to a robot, and how many numbers it has.
+        logarithmic: true for logarithmic parameters.
+        changes: for each effect, its change of a robot, and the number of its parameters.
     """
 
     robot: RoutedTendonRobot

@@ -1,7 +1,7 @@
-"""Effects of robots whose tendons are wound up by reels: geometry, springs, and what reels take in.
+"""Effects of robots whose tendons are wound up by reels: geometry, springs, and wound-up lengths.
 
-Angles and poses alone leave the scale of all forces open: stiffness, springs and masses can grow together.
-It is the weights that are given (density, masses) that set it.
+Angles and poses alone do not determine the scale of forces: stiffness, springs and masses can grow together.
+The specified weights (density, masses) determine it.
 """
 
 from __future__ import annotations

@@ -94,7 +94,7 @@ def chosen(names: Sequence[str], train: Sequence[str] | None) -> tuple[list[str]
     """Return the names of the training recordings and of the held-out ones.
 
     Raises:
-        StudyError: a name does not exist, or no held-out recording is left.
+        StudyError: a name does not exist, or there is no held-out recording.
     """
     wanted = list(TRAIN if train is None else train)
     missing = [name for name in wanted if name not in names]
