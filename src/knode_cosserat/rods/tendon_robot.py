@@ -29,6 +29,6 @@ class TendonRobot(TendonRod):
         return transverse_force(control[: self.actuator_layout.size], self.tendon_angles)
 
     def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
-        """Return A = I, B = 0, and f1, the spatial derivatives of the rod (`spatial_rates`)."""
+        """Return A = I, B = 0, and f1 = `spatial_rates`."""
         size = self.y_layout.size
         return jnp.eye(size), jnp.zeros((size, size)), self.spatial_rates(s, y, y_t, z, z_t, control)

@@ -64,7 +64,7 @@ def coefficient_table(settings: Settings, dt: float) -> np.ndarray:
 
 
 def history_of(states: Any, rate: Any, coefficients: Any, settings: Settings) -> Any:
-    """Return ʰ of y, z and y_s (paper eq. 3, history terms).
+    """Return ʰ of y, z and y_s (paper eq. 3, lumped history terms).
 
     ʰ = c1 (newest) + c2 (second newest) + d1 (newest rate)
     """
