@@ -60,7 +60,7 @@ def _case(name: str, motion: Callable[[], tuple[Any, np.ndarray, float]]) -> Cas
 
 
 MOTIONS = {
-    "alike": _case("a rod that is alike all along", _falling()),
+    "alike": _case("a uniform rod", _falling()),
     "section": _case("its section changes at 0.317 of its length", _falling(0.317)),
     "tendon ends": _case("one of two helical tendons ends at 0.63", functools.partial(_pulled, "ends")),
     "ribs": _case("`delrin-routed-tendon-robot`: sleeve and ribs", functools.partial(_pulled, "ribs")),

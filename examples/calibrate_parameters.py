@@ -1,6 +1,6 @@
-"""Find stiffness and damping of a robot from one noisy motion, with intervals that say how sure they are.
+"""Calibrate stiffness and damping of a robot from one noisy motion, with confidence intervals.
 
-Where the equations are right and only numbers are wrong, calibration is the shortest way: least squares on
+If the equations are right and only parameters are wrong, calibration is the shortest way. Least squares on
 whole simulations needs positions and orientations only.
 """
 

@@ -1,8 +1,8 @@
-"""Trust, but check: a cantilever that a moment bends into a half circle, against the closed form.
+"""Validation: a cantilever that a moment bends into a half circle, compared with the closed form.
 
-The rod takes constant curvature M/EI, so that its tip is known exactly however far it is bent. The error
-falls with the first power of the segments' length by Euler's scheme, and with the second and the fourth by
-Lobatto's.
+The rod has constant curvature M/EI, so its tip position is known exactly for any bending. The error falls
+with the first power of the segment length for Euler's scheme, and with the second and the fourth for the
+Lobatto schemes.
 """
 
 import numpy as np
@@ -12,7 +12,7 @@ import knode_cosserat as kc
 
 
 def main(out: str = "closed_form.png", most_nodes: int = 21) -> tuple[list[int], dict[str, list[float]]]:
-    """Nodes, and the tip's error (m) by each scheme."""
+    """Return the numbers of nodes, and the tip's error (m) for each scheme."""
     length, radius, E = 0.5, 0.005, 1e7
     EI = E * np.pi * radius**4 / 4
     curvature = np.pi / length  # 1/m: half a circle

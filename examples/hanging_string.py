@@ -1,6 +1,6 @@
 """A system of your own: an elastic string in the vertical plane, hung between a nail and a moving hand.
 
-Of the general class (paper eqs. 1-4): p_s = (1 + T/EA) n/T, n_s = ρ q_t + c q - ρ g, q_s = p_st, T = |n|.
+In the general class (paper eq. 1): p_s = (1 + T/EA) n/T, n_s = ρ q_t + c q - ρ g, q_s = p_st, T = |n|.
 """
 
 from typing import Any, ClassVar
@@ -13,7 +13,7 @@ import knode_cosserat as kc
 
 
 class HangingString(kc.System):
-    """Pinned at the origin; the control is where the hand holds the other end."""
+    """A string pinned at the origin; the control is the position of the other end."""
 
     y_layout: ClassVar = kc.Layout(("p", 2, "m", "place"), ("n", 2, "N", "force"), ("q", 2, "m/s", "speed"))
     z_layout: ClassVar = kc.Layout(("T", 1, "N", "tension"))

@@ -322,14 +322,19 @@ def test_the_demonstration_runs_and_says_what_it_shows(tmp_path):
     done = python(demo, "--out", "pictures", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     written = {path.name for path in (tmp_path / "pictures").iterdir()}
-    assert written == {"truth.nc", "overview.png", "recording.png", "model", "learning.png", "scene.html"}
-    assert "tip DTW 61." in done.stdout
-    assert "simulated stand-in robot" in done.stdout.replace("\n   ", " ")
+    assert written == {
+        "truth.nc", "overview.png", "model", "learning.png", "scene.html", "calibrated.yaml", "recording.png",
+    }  # fmt: skip
     rows = {line[3:33].strip(): line[33:].split() for line in done.stdout.splitlines()}
     before, published, ours = (
         [float(word) for word in rows[label]]
-        for label in ("the model, before", "the paper's KNODE, published", "this package's")
+        for label in ("imperfect model", "paper's network, published", "learned model")
     )
     assert before == pytest.approx([42.70, 34.57, 23.13, 21.44], rel=5e-3)
     assert published == pytest.approx([5.07, 10.95, 1.31, 5.94], rel=5e-3)
     assert all(own < 0.01 * paper for own, paper in zip(ours, published, strict=True))
+    # the last table: a held-out recording is predicted after calibration
+    title, nominal, calibrated = done.stdout.rstrip().splitlines()[-3:]
+    assert "held-out recording (simulated)" in title
+    assert "nominal model" in nominal and float(nominal.split()[-1]) > 15.0
+    assert "calibrated model" in calibrated and float(calibrated.split()[-1]) < 5.0

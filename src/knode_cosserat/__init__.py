@@ -1,7 +1,7 @@
 """Simulate Cosserat-rod robots, learn what the physics misses, predict real robots.
 
-Everything public is here; see `simulate`, `load_robot` and `Trajectory` first. What goes on inside is told
-to the logger "knode_cosserat", which is quiet unless a handler is added.
+All public names are here; see `simulate`, `load_robot` and `Trajectory` first. Events are logged to the
+logger "knode_cosserat", which is quiet unless a handler is added.
 """
 
 import logging

@@ -10,6 +10,24 @@ from typing import Any
 import knode_cosserat as kc
 
 PACKAGE = "knode_cosserat"
+#: functions that most readers look for: first on their pages, in this order
+MAIN = (
+    "load_robot",
+    "simulate",
+    "equilibrium",
+    "fit",
+    "calibrate",
+    "load_recording",
+    "estimate_states",
+    "identify",
+    "tip_rmse",
+    "pose_mse",
+    "inverse_kinematics",
+    "workspace",
+    "stability",
+    "view",
+    "view_live",
+)
 
 
 def rooms() -> dict[str, list[str]]:
@@ -26,13 +44,19 @@ def where(thing: Any) -> str:
 
 
 def page(*named: str) -> str:
-    """What is public in some rooms: classes and functions, and modules of them with all that they hold."""
+    """Return the public names of some rooms: main functions first, modules with all their members last."""
     known = rooms()
     names = [name for room in named for name in known[room]]
-    things = {name: getattr(kc, name) for name in sorted(names, key=str.lower)}
-    # modules last: they are longest
-    ordered = sorted(things, key=lambda name: isinstance(things[name], types.ModuleType))
+    things = {name: getattr(kc, name) for name in names}
+    ordered = sorted(names, key=lambda name: (_rank(name, things[name]), name.lower()))
     return "\n\n".join(f"::: {_path(things[name])}" for name in ordered)
+
+
+def _rank(name: str, thing: Any) -> int:
+    """Return the place of a name: main functions, then functions, then classes, then modules."""
+    if name in MAIN:
+        return MAIN.index(name)
+    return len(MAIN) + (2 if isinstance(thing, types.ModuleType) else isinstance(thing, type))
 
 
 def _path(thing: Any) -> str:

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from knode_cosserat.rods.system import System
     from knode_cosserat.trajectory import Trajectory
 
-#: what figures can be written as
+#: file formats of figures
 FORMATS = (".png", ".pdf", ".svg")
-#: how netCDF-4 files begin, and the files of models
+#: first bytes of netCDF-4 files, and of model files
 TRAJECTORY_MARK, MODEL_MARK = b"\x89HDF", b"knode-cosserat model,"
 
 ROBOT = "A robot of the catalog (`knode-cosserat info` lists them), a YAML file, or a model that was fitted."
@@ -128,7 +128,7 @@ def _number(value: Any) -> Any:
 
 
 def is_trajectory(name: str) -> bool:
-    """Whether a name stands for a trajectory: by its content, or its ending if there is no such file."""
+    """True if a path is a trajectory: by its content, or by its suffix if there is no such file."""
     return Path(name).suffix == ".nc" or _begins(name, TRAJECTORY_MARK)
 
 
@@ -181,7 +181,7 @@ def _try_to_write(path: Path, *, folder: bool, replaced: bool) -> None:
 
 
 def wanted(progress: bool | None) -> bool:
-    """Whether to show progress: as told, or if somebody is looking."""
+    """True if progress is shown: as requested, or else on a terminal."""
     return sys.stderr.isatty() if progress is None else progress
 
 

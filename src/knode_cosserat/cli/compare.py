@@ -220,7 +220,7 @@ def _by_stem(paths: list[Path]) -> dict[str, Trajectory]:
 
 
 def _seen(trajectory: Trajectory, view: Seen) -> str | None:
-    """What was asked for; the only view of a system in a plane."""
+    """Return the requested view; for a planar system, its only view."""
     return None if np.shape(trajectory.position)[-1] == 2 and view is Seen.xyz else view.value
 
 

@@ -1,4 +1,4 @@
-"""What the commands tell: facts of trajectories and systems, ready for JSON."""
+"""Output of the commands: facts of trajectories and systems, ready for JSON."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ if TYPE_CHECKING:
     from knode_cosserat.trajectory import Trajectory
 
 
-#: how many terms of a residual are told in words
+#: largest number of a residual's terms in the text output
 MOST_FINDINGS = 24
 
 
 def outcome(trajectory: Trajectory) -> dict[str, Any]:
-    """What came of the steps, and where the tip was after the last that was solved."""
+    """Return the results of the steps, and the final tip position."""
     codes = np.asarray(trajectory.result)
     valid = codes >= 0
     failure = None
@@ -91,7 +91,7 @@ def parameters(system: System) -> dict[str, dict[str, Any]]:
 
 
 def derived(system: System) -> dict[str, dict[str, Any]]:
-    """What follows from the parameters, in the same form."""
+    """Return the derived quantities, in the same form as the parameters."""
     from knode_cosserat.rods.loads import AttachedMass
     from knode_cosserat.rods.rod import Rod
 
@@ -139,7 +139,7 @@ def _quantity(value: Any, unit: str, meaning: str) -> dict[str, Any]:
 
 
 def learned(system: System) -> tuple[dict[str, Any], list[str]]:
-    """What a model learned, as facts and in words; nothing of a system that is not a model."""
+    """Return the learned terms of a model, as facts and in words; nothing for other systems."""
     from knode_cosserat.learning.explain import explain
     from knode_cosserat.learning.knode import KNODE
     from knode_cosserat.learning.structured.residual import Structured
@@ -163,7 +163,7 @@ def learned(system: System) -> tuple[dict[str, Any], list[str]]:
 
 
 def _knowledge(system: System) -> System:
-    """What a model was made of; any other system itself."""
+    """Return the nominal model of a learned model; any other system itself."""
     from knode_cosserat.learning.knode import KNODE
 
     return _knowledge(system.knowledge) if isinstance(system, KNODE) else system

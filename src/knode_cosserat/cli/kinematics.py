@@ -206,7 +206,7 @@ def _held(system: System, control: list[float]) -> str:
 
 
 def _unstable(found: InverseKinematics) -> bool | None:
-    """Whether the pose is that of an unstable equilibrium; None where `kc.stability` cannot tell."""
+    """True if the pose is an unstable equilibrium; None where `kc.stability` cannot decide."""
     import knode_cosserat as kc
 
     try:

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 class Preset(enum.StrEnum):
-    """What is learned, and how."""
+    """Presets of a fit."""
 
     best = "best"
     paper = "paper"
@@ -147,7 +147,7 @@ def fit(
 
 
 def _draw(model: KNODE, states: Trajectory, path: Path) -> None:
-    """What the model adds to its knowledge, at the states of a trajectory."""
+    """Draw the correction of the nominal model, at the states of a trajectory."""
     from knode_cosserat.evaluation.learning_figures import residual
 
     residual(model, states).savefig(path)
@@ -187,7 +187,7 @@ def _loaded(path: Path, rows: int | None) -> Trajectory:
 
 
 def _named(message: str, paths: list[Path]) -> str:
-    """What is said of trajectory 0, 1, … said of its file."""
+    """Return a message with the names of files in place of "trajectory 0", "trajectory 1", …."""
 
     def path(found: re.Match[str]) -> str:
         number = int(found[1])

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 PROGRAM = "knode-cosserat"
-#: what the user can do something about; anything else is a mistake of ours, and shows where it is
+#: errors that the user can fix; any other is a bug, and keeps its traceback
 _EXPECTED = (SimulationError, ValueError, OSError, ImportError, MemoryError, OverflowError)
 
 

@@ -224,7 +224,7 @@ def schema(
 
 
 def _unstable(rest: Any, space: str) -> bool | None:
-    """Whether an equilibrium is unstable: by its energy, or else the tip's compliance, or else None."""
+    """True if an equilibrium is unstable, by its energy or else the tip's compliance; None if unknown."""
     import knode_cosserat as kc
 
     try:
@@ -237,7 +237,7 @@ def _unstable(rest: Any, space: str) -> bool | None:
 
 
 def _control(system: System, tension: str | None, control: str | None) -> Any:
-    """What is held: tensions, or controls by name."""
+    """Return the constant control: tensions, or controls by name."""
     from knode_cosserat import named_controls
 
     tensions = [field.size for field in system.control_layout.fields if field.name == "tension"]

@@ -98,7 +98,7 @@ def data(
     progress: Progress = None,
     as_json: Json = False,
 ) -> None:
-    """How much data learning needs: errors from 5 to 30 rows of one sine and of two.
+    """Study how much data learning needs: errors from 5 to 30 rows of one sine and of two.
 
     With the paper's imperfect models, and without any knowledge: networks of the same size, and a linear
     predictor (needs the extra `bench`). Writes data.md, .json and figures; goes on where an earlier run on
@@ -117,7 +117,7 @@ def data(
 
 @studies.command(epilog=examples("study estimation --out results"))
 def estimation(out: Out, as_json: Json = False) -> None:
-    """How well full states are estimated from recordings: the paper's method, and the best.
+    """Study the accuracy of states estimated from recordings: the paper's method, and the best.
 
     Records the virtual robot (simulated: its states are known) and writes the errors of every quantity
     (estimation.md, .json) and a figure; the bags stay in the folder.

@@ -40,7 +40,7 @@ def prepare(out: Path, workers: int | None, dask: str | None) -> None:
 
 
 def chosen_of(option: str, given: str | None, known: Iterable[str]) -> list[str]:
-    """Those asked for, in the order of the table. A known name may itself have a comma in it."""
+    """Return the requested names, in the order of the table. A known name may contain a comma."""
     if given is None:
         return list(known)
     rest = f"{given},"

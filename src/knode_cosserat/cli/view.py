@@ -24,7 +24,7 @@ from knode_cosserat.cli.telling import tell
 if TYPE_CHECKING:
     from knode_cosserat.trajectory import Trajectory
 
-#: what moves if no robot is named
+#: default robot of the live view
 EXAMPLE = "delrin-tendon-robot"
 
 

@@ -1,4 +1,4 @@
-"""Fitting from whatever was recorded: full states, or measured poses."""
+"""Fitting from full states or from measured poses."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from knode_cosserat.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
 
-#: of a network's residual: widths of its priors, wide enough for what crude knowledge misses
+#: widths of the priors of a network's residual, wide enough for the errors of a crude nominal model
 WIDE = {"stiffness": 0.5, "levers": 3.0, "energy": 0.5, "damping": 3.0, "dissipation": 3.0}
 
 
@@ -49,29 +49,28 @@ def fit(
     progress: bool = False,
     **options: Any,
 ) -> Any:
-    """Learn from trajectories of full states, or from recordings of poses, what an imperfect model misses.
+    """Learn the errors of an imperfect model from trajectories of full states, or from recordings of poses.
 
     From recordings (or their `Measurements`, or a mixture with trajectories) the robot is identified
     (`identify`), then a residual is learned on top, through rollouts and from measured poses alone. It is
-    passive: it cannot feed energy in. It is kept only if recordings that were left out are predicted better
-    with it. `FitConfig.network_recordings` learns a passive network on the knowledge itself, without
-    identification.
+    passive: it cannot add energy. It is kept only if it improves the prediction of held-out recordings.
+    `FitConfig.network_recordings` learns a passive network on the nominal model, without identification.
 
     Args:
-        knowledge: the imperfect model.
-        data: trajectories of full states at the nodes of the knowledge, or recordings that begin at rest;
-            several, for what is kept is decided by those left out.
-        config: what is learned, and how.
-        held_out: what is not learned from; what the model makes of it is reported.
+        knowledge: the imperfect (nominal) model.
+        data: trajectories of full states at the nodes of the nominal model, or recordings that begin at rest;
+            several recordings, because held-out ones decide if the residual is kept.
+        config: settings of the fit.
+        held_out: data that are not used for learning; the model's error on them is reported.
         space: the scheme along the rod, for recordings.
-        progress: show how it goes on.
+        progress: show progress.
         options: for trajectories only: `checkpoint`, `checkpoint_every` and `log_dir` of `learning.fit.fit`.
 
     Returns:
-        A `KNODE`, or an `Ensemble` of one for each seed if `config.seed` is several: from recordings, robots
-        drawn from what these leave possible, with a spread as wide as held-out recordings ask for. From
-        recordings `about.facts` has "given" (what was done with each), "steps" (in words), "identified" (see
-        `Identified.to_dict`), "residual" (whether it was kept) and "held_out_error" (m) by recording.
+        A `KNODE`, or an `Ensemble` of one for each seed if `config.seed` is several: from recordings, random
+        samples of the robots that agree with them, with a spread that covers held-out recordings. From
+        recordings, `about.facts` has "given" (the use of each), "steps" (in words), "identified" (see
+        `Identified.to_dict`), "residual" (true if it was kept) and "held_out_error" (m) by recording.
 
     Raises:
         DataError: recordings or trajectories that cannot be used.
@@ -129,7 +128,7 @@ def with_residual(
 
     Args:
         nominal: the robot that the identification began from.
-        recordings: the recordings; at least two, for one is left out in turn.
+        recordings: at least two recordings, because each is held out in turn.
         found: the identification.
         space: the scheme along the rod.
         progress: called with a line for each step.
@@ -170,7 +169,7 @@ def _data(measured: Sequence[Measurements], model: Any) -> list[Data]:
 
 
 def _measured(given: Sequence[Any]) -> tuple[list[Measurements], list[str]]:
-    """Return the poses in everything that is given, and what was done with each, in words."""
+    """Return the poses in all data, and the use of each, in words."""
     found, words = [], []
     for k, each in enumerate(given):
         if isinstance(each, Trajectory):
@@ -200,13 +199,13 @@ def _models(
 
 
 def _unseen(robot: System, others: Sequence[Measurements], space: str | SpaceScheme) -> dict[str, Any]:
-    """Return errors of what was not learned from, if there is any."""
+    """Return errors of held-out data, if there are any."""
     errors = [evaluate(robot, each, space=space).tip_rmse for each in others]
     return {"unseen_error": dict(zip(names_of(others), errors, strict=True))} if others else {}
 
 
 def _named(system: System, config: FitConfig, facts: dict[str, Any]) -> KNODE:
-    """Return a model with what is known of it, and without parts of its residual that do nothing."""
+    """Return a model with its metadata, and without parts of its residual that have no effect."""
     about = About({**facts, "config": config.to_dict()})
     if not isinstance(system, KNODE):
         return KNODE(system, Nothing(), about)
@@ -225,7 +224,7 @@ def _network(
     options = config.residual
     assert isinstance(options, PassiveOptions)
     model = ResidualModel(Known(knowledge), (), passive(knowledge, tension, 0, options.hidden), WIDE)
-    # it offers what a Model does
+    # it has the members of a Model
     misfit = Misfit(model, _data(measured, model), space)  # type: ignore[arg-type]
     search = Search(misfit, tell)
     try:

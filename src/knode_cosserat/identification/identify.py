@@ -1,4 +1,4 @@
-"""Identification of a robot from its recordings: which effects it has, and their numbers."""
+"""Identification of a robot from recordings: its physical effects, and their parameters."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 
 #: nodes are doubled so often at most
 REFINEMENTS = 2
-#: corrections of a search that leaves a recording out
+#: most corrections of a search without one recording
 FOLD = (8, 5e-3)
 
 
@@ -46,25 +46,24 @@ def identify(
     progress: Callable[[str], None] | None = None,
     checkpoint: str | Path | None = None,
 ) -> Identified:
-    """Identify a tendon robot from recordings: find which effects it has, and their numbers.
+    """Identify a tendon robot from recordings: find its physical effects and their parameters.
 
-    Whole simulations, each from the equilibrium under the recording's initial tensions, are compared with
-    the measured positions and with the rotations since the first row; no velocity, force or strain has to
-    be known. Numbers are those of least (robust) squares with a prior about the data sheet's. An effect is
-    kept only if it lowers the error of recordings that were left out of the search, by more than two standard
-    errors of that. The result has to pass
-    trials with larger and random tensions; otherwise an effect is given up until it does.
+    Whole simulations start in the equilibrium under the recording's initial tensions. They are compared with
+    the measured positions and with the rotations since the first row; velocities, forces and strains need not
+    be known. Parameters minimise robust squares, with a prior about the data sheet. An effect is kept only if
+    it lowers the error of held-out recordings by more than two standard errors of the improvement. The result
+    has to pass trials with larger and random tensions; effects are removed until it does.
 
-    Where rows are closer than 0.02 s effects are selected with time steps twice as long; numbers and errors
-    are those of steps from row to row. If the grid is too coarse for the robot that was found, its nodes are
+    If rows are closer than 0.02 s, effects are selected with time steps twice as long; parameters and errors
+    are those of steps from row to row. If the grid is too coarse for the identified robot, its nodes are
     doubled and the last search is repeated: the result may have more nodes than the nominal robot.
 
     Args:
         robot: the nominal robot, from ruler, scale and data sheet; a robot with tendons.
         recordings: recordings, or their `Measurements` with mean tensions (`recording.sampled(0.0125,
-            mean=True)`), each from rest on; at least two for effects to be selected by held-out error.
-        effects: effects by name (`effects_of`), all of which are identified; None: those worth their place.
-        space: the scheme along the rod that the result is for.
+            mean=True)`), each starting at rest; at least two, to select effects by held-out error.
+        effects: names of effects (`effects_of`) that are all identified; None: select effects.
+        space: the scheme along the rod for which the result is valid.
         progress: called with a line for each step.
         checkpoint: folder in which finished searches are kept; an interrupted run with the same arguments
             resumes from there.

@@ -45,8 +45,8 @@ def routed(nominal: TendonRod) -> RoutedTendonRobot:
 def extended(robot: RoutedTendonRobot, ribs: Sequence[float] = ()) -> RoutedTendonRobot:
     """Return the same robot with every part that effects change: a stretch, a sleeve, a tip mass and so on.
 
-    Base and load cells stay as they are if they are given; all others do nothing. Ribs may be where the
-    robot has masses, or at the places given if it has none.
+    A base and load cells that the robot already has are unchanged; all added parts have no effect. Ribs may be
+    where the robot has masses, or at the given places if it has none.
     """
     held = robot.base_end
     if isinstance(held, Clamped):
@@ -130,8 +130,8 @@ class Parametrised(eqx.Module):
         robot: the nominal robot with every part.
         nominal: nominal values (n,) of all numbers.
         width: widths (n,) of their priors.
-        logarithmic: which of them are logarithmic.
-        changes: for each effect, what it does to a robot, and how many numbers it has.
+        logarithmic: true for logarithmic parameters.
+        changes: for each effect, its change of a robot, and the number of its parameters.
     """
 
     robot: RoutedTendonRobot

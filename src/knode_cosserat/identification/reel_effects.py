@@ -1,7 +1,7 @@
 """Effects of robots with reels or stated routing: geometry, springs, and the lengths that reels take in.
 
-Angles and poses alone leave the scale of all forces open: stiffness, springs and masses can grow together.
-It is the weights that are given (density, masses) that set it.
+Angles and poses alone do not determine the scale of forces: stiffness, springs and masses can grow together.
+The specified weights (density, masses) determine it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from knode_cosserat.identification.effects import Effect, Number, effects_of
 from knode_cosserat.rods.routed_robot import RoutedTendonRobot
 from knode_cosserat.rods.routing import Straight
 
-#: of the length: uncertainty of what reels have taken in, and of angles about which tendons lie (rad)
+#: uncertainty of the wound-up length, as a fraction of the rod's length, and of tendon angles (rad)
 TAKEN_IN, TURN = 0.01, 0.1
 
 
@@ -25,7 +25,7 @@ OF_TENSIONS = ("load cell gains", "load cell offsets", "early anchors", "vibrati
 #: effects of tendons that are given by their offset and angles, and of friction
 OF_ANGLES = ("tendon offset", "tendon angles", "tendon twist")
 OF_FRICTION = ("friction", "friction by curvature")
-#: of the length: uncertainty of the clamped end's position
+#: uncertainty of the clamped end's position, as a fraction of the length
 PLACED = 0.03
 
 

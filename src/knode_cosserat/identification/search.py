@@ -16,21 +16,21 @@ from knode_cosserat.identification.misfit import Misfit, Rollout
 
 log = logging.getLogger(__name__)
 
-#: horizons (s) after the first motion; from a nominal robot that is far off all rows at once lead astray
+#: horizons (s) after the first motion; with all rows at once, a search from a poor nominal robot may fail
 HORIZONS = (0.0, 0.2, 0.4, 0.7, 1.1, 1.7, 2.5, 4.0)
-#: differences are correlated in time: as many seconds of them count as one
+#: correlation time of differences (s): rows within it count as one
 CORRELATED = 0.25
-#: and more bodies than this count as so many
+#: largest number of independent bodies
 BODIES = 2.0
-#: differences beyond so many scales count by their size, not by its square (Huber)
+#: threshold of the Huber loss, in units of the scale
 ROBUST = 3.0
-#: scale of the differences: never less than this part of the length
+#: smallest scale of the differences, as a fraction of the length
 LEAST_SCALE = 5e-4
 #: largest change of a coordinate in one correction
 LARGEST_MOVE = 1.0
-#: a recording that is alone is left out in so many pieces
+#: number of held-out pieces of a single recording
 FOLDS = 5
-#: pieces of a recording (s) over which the scatter of what an effect is worth is taken, two at least
+#: duration of the blocks (s) for the scatter of an effect's improvement; at least two blocks
 BLOCK = 1.0
 #: corrections of a search at one horizon, and of the last one; parts by which the cost falls at their end
 ROUGH, FINE = (6, 2e-2), (25, 1e-3)
@@ -54,7 +54,7 @@ class Point:
 
     x: Float[np.ndarray, " n"]
     scale: Float[np.ndarray, " R"]
-    #: of each part that is left out together, and of the blocks of each (as many of all), one after the other
+    #: rows of each part that is left out together, and of the blocks of each part (equally many), in order
     problem: Problem
     blocks: Problem
     free: Bool[np.ndarray, " n"]
@@ -130,7 +130,7 @@ def _rows(rollout: Rollout, fold: Any) -> Rollout:
 def scales_of(rollouts: Sequence[Rollout], length: float) -> Float[np.ndarray, " R"]:
     """Return the usual size of the differences of each recording (m).
 
-    Each recording counts by what the model leaves of it: one that cannot be explained does not spoil others.
+    Each recording is weighted by its residual, so one that cannot be explained does not spoil the others.
     """
     known = [rollout.values[np.isfinite(rollout.values)] for rollout in rollouts]
     return np.array([max(1.4826 * float(np.median(np.abs(v))), LEAST_SCALE * length) for v in known])
@@ -190,7 +190,7 @@ class Search:
         data = self.misfit.data
         longest = max(len(each.tension) - each.moves for each in data) * data[0].dt
         if data[0].static or self.misfit.model.nominal.drive == "reel":
-            # no row depends on those before; and what reels have taken in leads no robot far astray
+            # rows are independent of each other, and wound-up lengths keep the search near the solution
             longest = 0.0
         for horizon in [h for h in HORIZONS if h < 0.8 * longest]:
             rows = round(horizon / data[0].dt)
@@ -279,7 +279,7 @@ class Search:
     def _proposed(
         self, x: np.ndarray, free: np.ndarray, gradient: np.ndarray, matrix: np.ndarray, damping: float
     ) -> np.ndarray:
-        """Return the point of a damped correction, within bounds: what meets one stays there."""
+        """Return the point of a damped correction; coordinates that meet a bound stay there."""
         active = free.copy()
         move = np.zeros(len(x))
         for _ in range(len(x)):

@@ -32,7 +32,7 @@ class About:
 
 
 class KNODE(System):
-    """Nominal model with a residual (paper eq. 9); layouts and base conditions are the nominal model's."""
+    """Nominal model with a residual; layouts and base conditions are the nominal model's."""
 
     knowledge: System
     residual: Residual
@@ -127,7 +127,7 @@ class KNODE(System):
     def derivatives(
         self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-        """Return y_s and z of the nominal model with the residual."""
+        """Return y_s and z of the nominal model with the residual (paper eq. 7, KNODE model)."""
         if self.strands > 1:
             return of_strands(self, s, t, y, control, history)
         return self.residual.derivatives(self.adapted, s, t, y, control, history)

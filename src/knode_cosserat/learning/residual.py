@@ -1,4 +1,4 @@
-"""Base class of residuals, and networks that add to the nominal model's [y_s; z] (paper eq. 9)."""
+"""Base class of residuals, and networks that add to the nominal model's [y_s; z]."""
 
 from __future__ import annotations
 
@@ -30,7 +30,10 @@ class Residual(eqx.Module):
     def derivatives(
         self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-        """Return y_s and z of the adapted nominal model with this residual."""
+        """Return y_s and z of the nominal model plus Δ (paper eq. 6, true dynamics).
+
+        `knowledge` is the adapted nominal model.
+        """
 
     def tip(
         self, knowledge: System, t: Any, control: Any, y: Float[Any, " y"], history: History

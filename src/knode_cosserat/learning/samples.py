@@ -1,7 +1,7 @@
 """One-segment samples of trajectories: the true states at both ends of every segment.
 
 A sample is one segment of the rod at one time. From the true y at its start, with the true history, a model
-predicts y at its end and z at its start (paper eq. 12). Integration spans one segment only, so that errors do
+predicts y at its end and z at its start (`predict`). Integration spans one segment only, so that errors do
 not accumulate and all samples are predicted in parallel.
 """
 
@@ -87,7 +87,7 @@ CORRECTIONS = 4
 
 
 def predict(system: System, space: SpaceScheme, sample: Samples) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-    """Predict y at the end of one segment and z at its start.
+    """Predict y at the end of one segment and z at its start (paper eq. 9, integration over one segment).
 
     y at the end follows the scheme's formula, with stages from the true y at both ends.
     """

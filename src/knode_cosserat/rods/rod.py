@@ -45,7 +45,7 @@ class PartControls(NamedTuple):
 
 
 class Rod(ElasticRod):
-    """A round rod with gravity, drag, loads, ends and surroundings (paper eqs. 13 and 14).
+    """A round rod with gravity, drag, loads, ends and surroundings.
 
     A subclass defines its actuators by its own law of strains, `strains` (it then has no `constitutive`), or
     by their load on the rod, `actuator_force`.
@@ -159,12 +159,12 @@ class Rod(ElasticRod):
     def rates(
         self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
     ) -> Float[Any, " y"]:
-        """Return y_s (paper eqs. 13 and 14)."""
+        """Return y_s from y_t = c0 y + ʰy and z_t = c0 z + ʰz (paper eq. 11, rates in time of the rod)."""
         y_t, z_t = history.c0 * y + history.y, history.c0 * z + history.z
         return self.spatial_rates(s, y, y_t, z, z_t, control)
 
     def spatial_rates(self, s, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
-        """Return the right-hand side of paper eq. 13, from y_t, z and z_t."""
+        """Return y_s (paper eq. 10, spatial derivatives of the rod), from y_t, z and z_t."""
         h, n = self.y_layout.get(y, "h"), self.y_layout.get(y, "n")
         motion = Motion.of(self.y_layout, y, y_t)
         _, R, q, w, q_t, w_t = motion

@@ -31,7 +31,7 @@ from knode_cosserat._files import package_version, replacing
 PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "equinox", "optax")
 #: cores for each process, if it is not said how many; measured on two cores: 44 s in one process, 68 s in two
 CORES = 4
-#: how long a Dask cluster may take to answer, and to have a worker (s)
+#: time limits for a Dask cluster to answer, and to have a worker (s)
 PATIENCE = 60
 
 

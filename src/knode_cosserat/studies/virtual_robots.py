@@ -43,7 +43,7 @@ def jobs(seeds: Sequence[int]) -> list[Job]:
 
 
 def rerun(out: Path, seeds: Sequence[int], **how: Any) -> Report:
-    """Run the study on these seeds, and write virtual_robots.md and .json; interrupted runs go on.
+    """Run the study on these seeds, and write virtual_robots.md and .json; interrupted runs are continued.
 
     Args:
         out: the folder.

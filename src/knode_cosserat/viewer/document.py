@@ -1,4 +1,4 @@
-"""The page as one text: its files, the libraries and the scene, so that it opens from anywhere by itself."""
+"""The page as one self-contained text: its files, the libraries and the scene."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ def export_scene(trajectories: Given, path: str | Path, *, title: str | None = N
     """Write trajectories as one HTML file that any browser opens, without a server or a network.
 
     Args:
-        trajectories: a `Trajectory`, several, or several by name; those of a batch are shown one by one.
+        trajectories: a `Trajectory`, several, or several by name; a batch is shown as separate trajectories.
         path: the file to write.
-        title: what stands above it; by default the names.
+        title: title of the page; by default the names.
 
     Raises:
         ValueError: no trajectory, more than 12, or one that has nothing to be drawn.
@@ -58,7 +58,7 @@ def document(shown: dict[str, Any], connects: str = "'none'") -> str:
         "SCENE": for_script(shown),
     }
     page = _text("page/index.html")
-    # one after the other between marks, so that what stands in a scene is never taken for a mark
+    # replaced one after the other between marks, so that text in a scene is never taken for a mark
     pieces = page.split("@@")
     return "".join(parts[piece] if k % 2 else piece for k, piece in enumerate(pieces))
 

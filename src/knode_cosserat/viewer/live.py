@@ -54,9 +54,9 @@ def view_live(
         dt: time step (s), and how often the page gets a new shape; by default what a model learned at,
             or 0.05 s.
         space: scheme along the rod, "lobatto2", "lobatto4" or "euler".
-        title: what stands above it; by default the robot's class.
+        title: title of the page; by default the robot's class.
         port: of the server, which only this machine reaches; 0 for any that is free.
-        open_browser: whether to open the page; its address is printed in any case.
+        open_browser: open the page; its address is always printed.
         ready: called with the address, instead of printing it.
 
     Raises:
@@ -196,7 +196,7 @@ class Session:
     async def _move(self) -> None:
         """A step ends every dt, and the one in progress is solved again when the control changes."""
         loop = asyncio.get_running_loop()
-        # of its own, so that the page is heard while a step is looked for
+        # a separate thread, so that messages of the page are read during a solve
         with concurrent.futures.ThreadPoolExecutor(1) as worker:
             end, stuck = loop.time() + self.dt, False
             while True:

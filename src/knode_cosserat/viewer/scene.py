@@ -1,9 +1,9 @@
 """Scene of the page: trajectories as compact arrays, with the data to draw and to plot them.
 
 Arrays are float32, their bytes sorted by significance and compressed, in base64: 500 steps of the paper's
-robot take 0.5 MB at most. What is longer is thinned: at most 41 nodes of a rod are kept, and of the rows so
-many (evenly, the last one among them) that a trajectory takes 2 MB before compression, at least 200. The
-page says so. Nothing that is not a number or a text leaves here, and texts are shown as texts only.
+robot take 0.5 MB at most. Longer trajectories are thinned: at most 41 nodes of a rod are kept, and rows are
+evenly selected (with the last one) so that a trajectory takes 2 MB before compression, but at least 200. The
+page reports it. A scene contains only numbers and texts, and texts are never interpreted as markup.
 """
 
 from __future__ import annotations

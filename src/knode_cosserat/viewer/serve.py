@@ -1,4 +1,4 @@
-"""A page on a small server of this machine, for this machine only."""
+"""Local server of the page, reachable from this machine only."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ def view(
     """Show trajectories in the browser until interrupted (Ctrl-C).
 
     Args:
-        trajectories: a `Trajectory`, several, or several by name; those of a batch are shown one by one.
-        title: what stands above it; by default the names.
+        trajectories: a `Trajectory`, several, or several by name; a batch is shown as separate trajectories.
+        title: title of the page; by default the names.
         port: of the server, which only this machine reaches; 0 for any that is free.
-        open_browser: whether to open the page; its address is printed in any case.
+        open_browser: open the page; its address is always printed.
         ready: called with the address, instead of printing it.
 
     Raises:

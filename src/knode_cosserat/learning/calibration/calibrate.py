@@ -168,7 +168,10 @@ def _check(robot: Any, trajectories: Any, by: Any, level: Any) -> None:
         raise CalibrationError(f'by is {by!r}; allowed is "segments" or "rollouts"')
     measured = [isinstance(each, Measurements) for each in trajectories]
     if any(measured) and by != "rollouts":
-        raise DataError('measurements are no states: calibrate(…, by="rollouts") compares poses only')
+        raise DataError(
+            'calibrate needs full states (got Measurements); use calibrate(…, by="rollouts"), identify, '
+            "or estimate_states first"
+        )
     if any(measured) and not all(measured):
         raise DataError("trajectories and measurements are mixed; allowed is a list of one kind")
     if isinstance(level, bool) or not isinstance(level, int | float) or not 0.0 < level < 1.0:
