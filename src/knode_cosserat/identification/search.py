@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.identification.misfit import Misfit, Rollout
 
 log = logging.getLogger(__name__)
@@ -254,5 +255,7 @@ class Search:
         return np.clip(x + move, self.low, self.high)
 
 
-class SearchError(RuntimeError):
+class SearchError(KnodeCosseratError, RuntimeError):
     """A search cannot go on; one line says why."""
+
+    code = "search"

@@ -17,13 +17,16 @@ import jax
 import numpy as np
 
 from knode_cosserat._yaml import did_you_mean
+from knode_cosserat.errors import KnodeCosseratError
 
 #: smallest length of a direction or quaternion: the square of a much smaller length underflows
 SHORTEST = 1e-9
 
 
-class ParameterError(ValueError):
+class ParameterError(KnodeCosseratError, ValueError):
     """A parameter's name or value is not allowed; the message gives the value and the allowed range."""
+
+    code = "parameter"
 
 
 Shape = Literal["scalar", "vector", "direction", "quaternion", "matrix", "list"]

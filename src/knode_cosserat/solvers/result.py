@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import enum
 
+from knode_cosserat.errors import KnodeCosseratError
+
 
 class Result(enum.IntEnum):
     """Outcome of a step. Zero and above: solved to tolerance. Below zero: not solved, the state is invalid.
@@ -52,11 +54,13 @@ EARLIER_RESULTS = {
 }
 
 
-class SimulationError(RuntimeError):
+class SimulationError(KnodeCosseratError, RuntimeError):
     """A step could not be solved.
 
     Attributes: `step`, `time` (s), `residual` (natural units), `result`, `cause` and `robot` (of a batch).
     """
+
+    code = "simulation"
 
     def __init__(
         self, step: int, time: float, residual: float, result: Result, cause: str, robot: int | None = None

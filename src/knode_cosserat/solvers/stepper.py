@@ -39,7 +39,7 @@ class Stepper:
     Calls of `step` return the rows of one `simulate`, to the tolerance of Newton's method. A call takes the
     time of the step and a fraction of a millisecond in addition. Programs are shared with `simulate`.
 
-        stepper = kc.Stepper(robot, dt=0.05)
+        stepper = kc.solvers.Stepper(robot, dt=0.05)
         while True:
             row = stepper.step(tensions())
             row.tip_position[0], row.time[0]

@@ -17,7 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import block_diag
 
-from knode_cosserat.control.stiffness import (
+from knode_cosserat.rods.system import System, in_strands
+from knode_cosserat.solvers.boundary import static_error
+from knode_cosserat.solvers.equilibrium import equilibrium as rests
+from knode_cosserat.solvers.result import Result
+from knode_cosserat.solvers.space import Lobatto4
+from knode_cosserat.statics.stiffness import (
     NEEDED,
     Pieces,
     divided,
@@ -27,11 +32,6 @@ from knode_cosserat.control.stiffness import (
     symmetric,
     wide,
 )
-from knode_cosserat.rods.system import System, in_strands
-from knode_cosserat.solvers.boundary import static_error
-from knode_cosserat.solvers.equilibrium import equilibrium as rests
-from knode_cosserat.solvers.result import Result
-from knode_cosserat.solvers.space import Lobatto4
 from knode_cosserat.trajectory import Trajectory
 
 #: largest residual of an equilibrium, in natural units

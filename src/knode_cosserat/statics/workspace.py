@@ -13,14 +13,6 @@ from tqdm import tqdm
 
 from knode_cosserat import named_controls
 from knode_cosserat._files import replacing
-from knode_cosserat.control.asked import (
-    checked_limits,
-    checked_numbers,
-    checked_system,
-    static_settings,
-    within_limits,
-)
-from knode_cosserat.control.statics import Pose, poses_of, tip_pose
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.equilibrium import equilibrium
@@ -28,6 +20,14 @@ from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.run import usable_cores
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.statics.asked import (
+    checked_limits,
+    checked_numbers,
+    checked_system,
+    static_settings,
+    within_limits,
+)
+from knode_cosserat.statics.response import Pose, poses_of, tip_pose
 
 #: samples per task of a thread; fewer are padded to a power of two
 CHUNK = 1024
@@ -164,8 +164,8 @@ def workspace(
 
     Every equilibrium is solved from the unloaded robot, as in `kc.equilibrium`, so a sample does not depend
     on the others. A robot with several equilibria gives the one found from there. Its stability is not
-    computed (see `kc.configuration(…).unstable`). A sample that does not converge goes through the recoveries
-    of `kc.equilibrium`. Only the poses are kept: memory does not grow with the nodes.
+    computed (see `kc.statics.configuration(…).unstable`). A sample that does not converge goes through the
+    recoveries of `kc.equilibrium`. Only the poses are kept: memory does not grow with the nodes.
 
     Args:
         robot: one robot or model.
@@ -176,7 +176,7 @@ def workspace(
         seed: seed of the samples.
         space: "lobatto2", "lobatto4", "euler", or a scheme.
         newton: tolerances and limits of the solve.
-        pose: pose function, as for `kc.configuration`.
+        pose: pose function, as for `kc.statics.configuration`.
         progress: show a progress bar.
 
     Raises:

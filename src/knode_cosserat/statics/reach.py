@@ -8,19 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from knode_cosserat.control.asked import (
+from knode_cosserat.rods.system import System, in_strands
+from knode_cosserat.solvers.boundary import NewtonOptions
+from knode_cosserat.solvers.result import Result, SimulationError
+from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.statics.asked import (
     checked_control,
     checked_limits,
     checked_numbers,
     checked_system,
     static_settings,
 )
-from knode_cosserat.control.search import Search, Wanted
-from knode_cosserat.control.statics import Pose, Response, first_solved, recorded, tip_pose
-from knode_cosserat.rods.system import System, in_strands
-from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.result import Result, SimulationError
-from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.statics.response import Pose, Response, first_solved, recorded, tip_pose
+from knode_cosserat.statics.search import Search, Wanted
 from knode_cosserat.trajectory import Trajectory
 
 #: fields of a trajectory with one entry per row
@@ -76,7 +76,8 @@ class InverseKinematics:
     from_rest: Any
     #: number of equilibria computed
     iterations: Any
-    #: the equilibrium, a `Trajectory` as from `kc.equilibrium`: for `kc.stability`, or as an initial state
+    #: the equilibrium, a `Trajectory` as from `kc.equilibrium`: for `kc.statics.stability`, or as an initial
+    #: state
     equilibrium: Any
 
     @property
@@ -121,7 +122,7 @@ def inverse_kinematics(
         starts: number of initial controls to try before a pose counts as unreachable.
         space: "lobatto2", "lobatto4", "euler", or a scheme.
         newton: tolerances and limits of the solve.
-        pose: pose function, as for `kc.configuration`.
+        pose: pose function, as for `kc.statics.configuration`.
 
     Raises:
         ValueError: arguments of a wrong shape, not finite, or low above high.
@@ -187,7 +188,7 @@ def _one(
 
 
 def _others(size: int, count: int, free: np.ndarray) -> np.ndarray:
-    from knode_cosserat.control.workspace import sample
+    from knode_cosserat.statics.workspace import sample
 
     return np.where(free, sample(np.zeros(size), np.ones(size), max(count, 1))[:count], 0.0)
 
