@@ -21,6 +21,7 @@ from jaxtyping import Float
 
 from knode_cosserat._csv import SAME_TIME, Column, CSVTextError, held_rows, read_rows
 from knode_cosserat._files import replacing
+from knode_cosserat._reprs import count_of
 from knode_cosserat.errors import KnodeCosseratError
 
 Tensions = Float[np.ndarray, "steps tendons"]
@@ -40,6 +41,11 @@ class Controls(NamedTuple):
 
     tensions: Tensions
     dt: float
+
+    def __repr__(self) -> str:
+        rows, tendons = self.tensions.shape
+        span = f"{self.tensions.min():.4g} to {self.tensions.max():.4g} N" if rows else "none"
+        return f"Controls: {rows} steps of {self.dt:g} s; {count_of(tendons, 'tendon')}, {span}"
 
 
 # signals

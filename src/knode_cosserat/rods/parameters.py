@@ -16,6 +16,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from knode_cosserat._reprs import object_text
 from knode_cosserat._yaml import did_you_mean
 from knode_cosserat.errors import KnodeCosseratError
 
@@ -162,6 +163,10 @@ class Parametrised(eqx.Module):
     def parameters(cls) -> dict[str, Parameter]:
         """Return the physical parameters by name, with unit, meaning and allowed range."""
         return parameters_of(cls)
+
+    def __repr__(self) -> str:
+        units = {name: parameter.unit for name, parameter in parameters_of(type(self)).items()}
+        return object_text(self, units, always=("nodes", "length"))
 
 
 def unknown_parameter(cls: type, name: Any, known: Iterable[str]) -> str:

@@ -13,10 +13,11 @@ from tqdm import tqdm
 
 from knode_cosserat import named_controls
 from knode_cosserat._files import replacing
+from knode_cosserat._reprs import quantity, robot_text, wrapped
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.equilibrium import equilibrium
-from knode_cosserat.solvers.result import Result
+from knode_cosserat.solvers.result import Result, ResultCodes
 from knode_cosserat.solvers.run import usable_cores
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
@@ -52,6 +53,17 @@ class Workspace:
     residual: np.ndarray
     #: (B, fields): largest magnitude of each strain's change from rest along the rod, in z's own units
     strain: np.ndarray
+
+    def __repr__(self) -> str:
+        solved = self.position[self.valid]
+        spans = [
+            f"{axis} {quantity([low, high], 'm')}"
+            for axis, low, high in zip("xyz", solved.min(axis=0), solved.max(axis=0), strict=False)
+        ] if len(solved) else []  # fmt: skip
+        return wrapped(
+            f"Workspace of a {robot_text(self.system)}: {len(self.result)} samples, "
+            f"{self.unsolved} without a solution; {', '.join(spans)}"
+        )
 
     @property
     def valid(self) -> np.ndarray:
@@ -227,7 +239,7 @@ def _found(system: System, settings: Settings, pose: Pose, controls: np.ndarray,
         None if parts[0] is None else np.concatenate(parts) for parts in zip(*chunks, strict=True)
     ]
     position, quaternion, residual, _, strain = joined
-    result = np.full(total, int(Result.CONVERGED))
+    result = ResultCodes.of(np.full(total, int(Result.CONVERGED)))
     found = Workspace(system, controls, position, quaternion, result, residual, strain)
     for i in np.flatnonzero(~(residual <= settings.newton.acceptable)):
         _recovered(found, int(i), settings, pose)
