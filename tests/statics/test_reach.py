@@ -128,6 +128,7 @@ def test_a_path_is_followed():
     path = np.array([tip(ROBOT, pull)[0] for pull in pulls.T])
     found = kc.inverse_kinematics(ROBOT, path, low=0.0, high=HIGH)
     assert np.all(found.converged) and found.control.shape == (9, 4)
+    assert str(found.result).count("REACHED") == 9 and "9 REACHED" in repr(found)
     np.testing.assert_allclose(found.position, path, atol=1e-8)
     np.testing.assert_allclose(found.control[0], found.control[-1], atol=1e-5)
 
