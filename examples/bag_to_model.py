@@ -21,12 +21,12 @@ def main(out: str = "bag_to_model.png", seconds: float = 4.0) -> tuple[float, fl
         bags = {"sine:1.5": Path(folder) / "seen.bag", "sine:1.0": Path(folder) / "unseen.bag"}
         for signal, path in bags.items():
             record_virtual(path, signal, seconds)
-        config = kc.RecordingConfig.paper_robot()
+        config = kc.recordings.RecordingConfig.paper_robot()
         recordings = [kc.load_recording(path, config) for path in bags.values()]
     seen, unseen = (recording.sampled(0.0125, mean=True) for recording in recordings)
 
     # realistic tendons, which bend the rod; `kc.identify` finds their friction too, and takes longer
-    knowledge = kc.RoutedTendonRobot.like(kc.load_robot("delrin-tendon-robot"))
+    knowledge = kc.robots.RoutedTendonRobot.like(kc.load_robot("delrin-tendon-robot"))
     found = kc.calibrate(knowledge, [seen], NAMES, by="rollouts")
     print(found)
     before, after = (kc.simulate(each, unseen.held_tension[:-1], 0.0125) for each in (knowledge, found.robot))

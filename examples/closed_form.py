@@ -16,12 +16,12 @@ def main(out: str = "closed_form.png", most_nodes: int = 21) -> tuple[list[int],
     length, radius, E = 0.5, 0.005, 1e7
     EI = E * np.pi * radius**4 / 4
     curvature = np.pi / length  # 1/m: half a circle
-    load = kc.loads.PointWrench(moment=(0.0, EI * curvature, 0.0), at=1.0)
+    load = kc.robots.loads.PointWrench(moment=(0.0, EI * curvature, 0.0), at=1.0)
     exact = np.array([2.0, 0.0, 0.0]) / curvature
     nodes = [n for n in (6, 11, 21, 41, 81) if n <= most_nodes]
     errors: dict[str, list[float]] = {"euler": [], "lobatto2": [], "lobatto4": []}
     for n in nodes:
-        rod = kc.SlenderRod(
+        rod = kc.robots.SlenderRod(
             length=length, radius=radius, density=1000.0, youngs_modulus=E, gravity=(0.0, 0.0, 0.0),
             loads=(load,), nodes=n,
         )  # fmt: skip

@@ -26,10 +26,10 @@ def known_frequency() -> float:
 
 def main(out: str = "cut_the_thread.png", steps: int = 128, nodes: int = 11) -> tuple[float, float]:
     """Return the frequencies (Hz): simulated, and from beam theory."""
-    thread = kc.loads.PointWrench(force=(0.05, 0.0, 0.0), at=1.0, controlled=True)
-    robot = kc.SlenderRod(
+    thread = kc.robots.loads.PointWrench(force=(0.05, 0.0, 0.0), at=1.0, controlled=True)
+    robot = kc.robots.SlenderRod(
         length=LENGTH, radius=RADIUS, density=DENSITY, youngs_modulus=E, gravity=(0.0, 0.0, 0.0),
-        loads=(kc.loads.AttachedMass(mass=MASS), thread), nodes=nodes,
+        loads=(kc.robots.loads.AttachedMass(mass=MASS), thread), nodes=nodes,
     )  # fmt: skip
     held = kc.equilibrium(robot, np.ones(1), space="lobatto4")
     known = known_frequency()

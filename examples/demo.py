@@ -54,12 +54,12 @@ def learn_what_a_model_misses(out: Path) -> None:
     }
     sines = {label: prediction["sine"] for label, prediction in predictions.items()}
     study_figures.comparison(truth["sine"], sines).savefig(out / "learning.png")
-    kc.export_scene({"robot": truth["sine"], **sines}, out / "scene.html", title="What the model missed")
+    kc.viewer.export_scene({"robot": truth["sine"], **sines}, out / "scene.html", title="What the model missed")
 
     errors = {
         label: [
             measure(prediction[name], truth[name])
-            for measure in (kc.tip_dtw, kc.pose_mse)
+            for measure in (kc.metrics.tip_dtw, kc.metrics.pose_mse)
             for name in CONTROLS
         ]
         for label, prediction in predictions.items()

@@ -10,7 +10,7 @@ import typer
 import knode_cosserat as kc
 
 
-def main(out: str = "follow_a_path.png", points: int = 60) -> kc.InverseKinematics:
+def main(out: str = "follow_a_path.png", points: int = 60) -> kc.statics.InverseKinematics:
     """Return the tensions (points, 4) in N that follow the eight, and the error of each point."""
     robot = kc.load_robot("delrin-tendon-robot")
     turn = np.linspace(0.0, 2.0 * np.pi, points)

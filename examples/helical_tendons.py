@@ -10,12 +10,12 @@ import typer
 import knode_cosserat as kc
 
 
-def wound(turns: float) -> kc.RoutedTendonRobot:
+def wound(turns: float) -> kc.robots.RoutedTendonRobot:
     """Return a soft rod of 30 cm with one tendon, 8 mm from its axis."""
-    return kc.RoutedTendonRobot(
+    return kc.robots.RoutedTendonRobot(
         length=0.3, radius=0.004, density=1100.0, youngs_modulus=5e7, bending_damping=1e-3, nodes=21,
         gravity=(0.0, 0.0, 0.0), tendon_offset=0.008, tendon_angles=(0.0,),
-        routing=(kc.routing.Helical(radius=0.008, phase=0.0, turns=turns),),
+        routing=(kc.robots.routing.Helical(radius=0.008, phase=0.0, turns=turns),),
     )  # fmt: skip
 
 

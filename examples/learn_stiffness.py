@@ -22,7 +22,7 @@ def main(out: str = "learn_stiffness.png", steps: int = 100) -> tuple[float, flo
     unseen = kc.controls.random(steps, seed=3, hold=10)
     truth, before, after = (kc.simulate(each, unseen, DT) for each in (robot, model, learned))
     kc.figures.compare(truth, {"before": before, "after": after}).savefig(out)
-    errors = kc.tip_rmse(before, truth), kc.tip_rmse(after, truth)
+    errors = kc.metrics.tip_rmse(before, truth), kc.metrics.tip_rmse(after, truth)
     print(f"tip RMSE on tensions it has not seen: {errors[0]:.2g} m before, {errors[1]:.2g} m after")
     return errors
 

@@ -12,7 +12,7 @@ import knode_cosserat as kc
 
 def main(
     out: str = "platform_on_a_circle.png", points: int = 40, radius: float = 0.03
-) -> tuple[kc.InverseKinematics, kc.Trajectory]:
+) -> tuple[kc.statics.InverseKinematics, kc.Trajectory]:
     """Return actuator displacements (points, 6) in m for a circle of this radius (m), and the motion."""
     robot = kc.load_robot("six-legged-robot")
     still = kc.equilibrium(robot, np.zeros(6))

@@ -10,7 +10,7 @@ import typer
 import knode_cosserat as kc
 
 
-def main(out: str = "where_it_reaches.png", count: int = 5000) -> kc.Workspace:
+def main(out: str = "where_it_reaches.png", count: int = 5000) -> kc.statics.Workspace:
     """Return the workspace for tensions from 0 to 10 N."""
     robot = kc.load_robot("delrin-tendon-robot")
     found = kc.workspace(robot, 0.0, 10.0, count)

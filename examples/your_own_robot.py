@@ -40,7 +40,7 @@ def record(path: Path, signal: str, seconds: float) -> None:
     still = kc.equilibrium(real, tension[0], space="lobatto4")
     moved = kc.simulate(real, tension[1:], FINE, space="lobatto4", initial=still)[::2]
     rng = np.random.default_rng(list(signal.encode()))
-    config = kc.RecordingConfig.load(HERE / "your_own_recording.yaml")
+    config = kc.recordings.RecordingConfig.load(HERE / "your_own_recording.yaml")
     config = config.replace(simulated=True, description=f"{path.stem}: a virtual robot")
     seen = np.asarray(moved.tip_position) + config.origin + rng.normal(0.0, 2e-4, (len(moved.time), 3))
     turned = np.asarray(moved.quaternion)[:, -1] + rng.normal(0.0, 1e-3, (len(moved.time), 4))
@@ -52,7 +52,7 @@ def main(out: Path, seconds: float = 8.0) -> tuple[float, float]:
     """Record, identify, and predict a held-out recording; return the tip's errors (m) before and after."""
     out.mkdir(parents=True, exist_ok=True)
     knowledge = kc.load_robot(HERE / "your_own_robot.yaml")
-    config = kc.RecordingConfig.load(HERE / "your_own_recording.yaml")
+    config = kc.recordings.RecordingConfig.load(HERE / "your_own_recording.yaml")
     for name, signal in SIGNALS.items():
         record(out / f"{name}.csv", signal, seconds)
     recordings = {name: kc.load_recording(out / f"{name}.csv", config) for name in SIGNALS}

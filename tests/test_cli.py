@@ -52,7 +52,7 @@ def test_simulate_takes_schemes_and_parameters(tmp_path):
         "--set", "youngs_modulus=10e9", "--set", "gravity=[0, 0, -1e0]", "--set", "drag=0",
     )  # fmt: skip
     made = kc.load_trajectory(tmp_path / "a.nc")
-    assert (type(made.settings.time), type(made.settings.space)) == (kc.BDF1, kc.Lobatto4)
+    assert (type(made.settings.time), type(made.settings.space)) == (kc.solvers.BDF1, kc.solvers.Lobatto4)
     assert made.system.youngs_modulus == 10e9
     np.testing.assert_array_equal(made.system.gravity, [0, 0, -1])
     np.testing.assert_array_equal(made.system.drag, np.zeros((3, 3)))
@@ -260,7 +260,7 @@ def test_fit_trains_an_ensemble_of_networks_at_once(data, tmp_path):
     assert one["steps"] == other["steps"] == 20
     assert one["loss"] != other["loss"]
     assert any((tmp_path / "kept").iterdir()) and any((tmp_path / "log").iterdir())
-    members = kc.load_ensemble(out)
+    members = kc.learning.load_ensemble(out)
     assert [member.about.facts["segments"]["loss"][-1] for member in members] == [one["loss"], other["loss"]]
     (row,) = told("evaluate", out, data / "a.nc", "--rows", 5)["references"]
     reference = kc.load_trajectory(data / "a.nc")

@@ -167,7 +167,7 @@ def test_what_cannot_be_saved(tmp_path):
     with fails("the trajectory's arrays do not fit together", "time"):
         dataclasses.replace(trajectory, residual=np.zeros(3)).save(tmp_path / "a.nc")
     with fails("the settings cannot be written"):
-        synthetic(settings=kc.Settings(time=Leapfrog(object()))).save(tmp_path / "a.nc")
+        synthetic(settings=kc.solvers.Settings(time=Leapfrog(object()))).save(tmp_path / "a.nc")
     assert os.listdir(tmp_path) == ["folder.nc"]
 
 
@@ -175,7 +175,9 @@ def test_what_cannot_be_saved(tmp_path):
     "name", ["time", "result", "a/b", "force", "robot_length", "force_index", "system_bytes", "system_sizes"]
 )
 def test_fields_whose_names_are_taken(tmp_path, monkeypatch, name):
-    layout = kc.Layout(("angle", 1, "rad", "angle"), ("force", 3, "N", "force"), (name, 1, "1", "taken"))
+    layout = kc.robots.Layout(
+        ("angle", 1, "rad", "angle"), ("force", 3, "N", "force"), (name, 1, "1", "taken")
+    )
     monkeypatch.setattr(Pendulum, "y_layout", layout)
     with fails(f"a Pendulum has a field '{name}'", "taken"):
         synthetic(robot=Pendulum(0.5)).save(tmp_path / "a.nc")

@@ -17,7 +17,7 @@ def blocks(language):
 
 def test_the_file_on_the_page_loads():
     robot = parse_robot(blocks("yaml")[0], "docs/robots.md")
-    assert isinstance(robot, kc.SlenderRod) and robot.control_layout.names == ("base_z", "base_ry")
+    assert isinstance(robot, kc.robots.SlenderRod) and robot.control_layout.names == ("base_z", "base_ry")
 
 
 def test_the_file_with_two_sections_is_that_of_its_page():

@@ -7,9 +7,9 @@ import knode_cosserat as kc
 from knode_cosserat import named_controls
 from tests.test_controls import DT, fails, written
 
-ROD = kc.SlenderRod(
+ROD = kc.robots.SlenderRod(
     length=0.5, radius=0.005, density=1000.0, youngs_modulus=2e7,
-    base_end=kc.ends.Driven(axes=("x", "z", "ry")),
+    base_end=kc.robots.ends.Driven(axes=("x", "z", "ry")),
 )  # fmt: skip
 NAMED = "time [s],base_z [m],base_ry [rad]\n"
 

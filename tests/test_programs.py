@@ -132,7 +132,7 @@ def test_results_are_the_same_after_a_release(listening):
     robot = kc.load_robot("delrin-tendon-robot").replace(nodes=4)
     controls = np.full((3, 4), [1.0, 0.0, 0.0, 0.0])
     before = kc.simulate(robot, controls, 0.05)
-    steppers = [kc.Stepper(robot, 0.05) for _ in range(2)]
+    steppers = [kc.solvers.Stepper(robot, 0.05) for _ in range(2)]
     stepped = [steppers[0].step(control).y for control in controls]
     steppers[1].step(controls[0])
     budget = listening(ProgramBudget(10**6, programs=1))

@@ -44,7 +44,7 @@ unseen = kc.controls.random(steps, low=4.0, high=9.0, seed=1, hold=8)
 truth, before, after = (kc.simulate(each, unseen, DT) for each in (robot, knowledge, model))
 for label, found in (("before", before), ("after", after)):
     print(
-        f"{label:7} tip RMSE {kc.tip_rmse(found, truth):.1e} m, pose MSE {kc.pose_mse(found, truth):.1e}e-3"
+        f"{label:7} tip RMSE {kc.metrics.tip_rmse(found, truth):.1e} m, pose MSE {kc.metrics.pose_mse(found, truth):.1e}e-3"
     )
 
 # %%

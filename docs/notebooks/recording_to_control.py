@@ -23,7 +23,7 @@ truths = {signal: record_virtual(f"{signal[5:]}.bag", signal, seconds) for signa
 # Poses and tensions have different rates, noise and lost frames; `sampled` resamples them on one time grid.
 
 # %%
-config = kc.RecordingConfig.paper_robot()
+config = kc.recordings.RecordingConfig.paper_robot()
 recording = kc.load_recording("1.5.bag", config)
 unseen = kc.load_recording("1.0.bag", config).sampled(0.025, mean=True)
 print("bodies:", ", ".join(body.name for body in recording.bodies), "| simulated:", recording.simulated)
@@ -46,7 +46,7 @@ kc.figures.states({"truth": truths["sine:1.5"], "estimated": states}, ("q", "w")
 # tests the result. (`kc.identify` finds friction as well, and takes longer.)
 
 # %%
-knowledge = kc.RoutedTendonRobot.like(crude)
+knowledge = kc.robots.RoutedTendonRobot.like(crude)
 measured = recording.sampled(0.025, mean=True)
 found = kc.calibrate(knowledge, [measured], ["youngs_modulus", "bending_damping"], by="rollouts")
 print(found)

@@ -21,6 +21,8 @@ from jaxtyping import Float
 
 from knode_cosserat._csv import SAME_TIME, Column, CSVTextError, held_rows, read_rows
 from knode_cosserat._files import replacing
+from knode_cosserat._reprs import count_of
+from knode_cosserat.errors import KnodeCosseratError
 
 Tensions = Float[np.ndarray, "steps tendons"]
 
@@ -28,8 +30,10 @@ Tensions = Float[np.ndarray, "steps tendons"]
 TENSION_UNITS = {"N": 1.0, "gf": 9.81 / 1000.0}
 
 
-class ControlsError(ValueError):
+class ControlsError(KnodeCosseratError, ValueError):
     """Controls are not possible, or a file of them cannot be read; the message is one line."""
+
+    code = "controls"
 
 
 class Controls(NamedTuple):
@@ -37,6 +41,11 @@ class Controls(NamedTuple):
 
     tensions: Tensions
     dt: float
+
+    def __repr__(self) -> str:
+        rows, tendons = self.tensions.shape
+        span = f"{self.tensions.min():.4g} to {self.tensions.max():.4g} N" if rows else "none"
+        return f"Controls: {rows} steps of {self.dt:g} s; {count_of(tendons, 'tendon')}, {span}"
 
 
 # signals

@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from knode_cosserat._files import package_version
+from knode_cosserat._reprs import count_of
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.solvers.equilibrium import equilibrium
 from knode_cosserat.solvers.run import usable_cores
@@ -60,6 +61,12 @@ class Diagnosis:
         """Return the diagnosis as a mapping for JSON."""
         own = dataclasses.asdict(self)
         return {**own, "checks": [check._asdict() for check in self.checks], "well": self.well}
+
+    def __repr__(self) -> str:
+        wrong = [check.name for check in self.checks if not check.well]
+        return f"Diagnosis: {count_of(len(self.checks), 'check')}, " + (
+            f"wrong: {', '.join(wrong)}" if wrong else "all is well"
+        )
 
     def __str__(self) -> str:
         """Return a page of text."""

@@ -18,7 +18,7 @@ from knode_cosserat.rods.section import Sleeve
 from knode_cosserat.rods.tendon_friction import TendonFriction
 
 NOMINAL = kc.load_robot("delrin-tendon-robot").replace(tendon_offset=0.02)
-ROUTED = kc.RoutedTendonRobot.like(NOMINAL)
+ROUTED = kc.robots.RoutedTendonRobot.like(NOMINAL)
 TENSION = np.array([7.0, 5.0, 3.0, 5.0])
 
 

@@ -48,34 +48,36 @@ def test_matrices_in_three_ways(robot, given):
     ],
 )
 def test_what_is_refused(robot, change, message):
-    with pytest.raises(kc.ParameterError, match=message) as caught:
+    with pytest.raises(kc.robots.ParameterError, match=message) as caught:
         robot.replace(**change)
     assert "\n" not in str(caught.value)
 
 
 def test_a_misspelt_name_of_a_constructor_is_answered_with_the_names():
     with pytest.raises(
-        kc.ParameterError, match=r"^TendonRobot has no parameter 'yongs_modulus'; did you mean"
+        kc.robots.ParameterError, match=r"^TendonRobot has no parameter 'yongs_modulus'; did you mean"
     ):
-        kc.TendonRobot(length=1.0, radius=0.01, density=1e3, yongs_modulus=1e9)
+        kc.robots.TendonRobot(length=1.0, radius=0.01, density=1e3, yongs_modulus=1e9)
     with pytest.raises(
-        kc.ParameterError, match=r"'trns'; did you mean turns\?; there are radius, phase, turns"
+        kc.robots.ParameterError, match=r"'trns'; did you mean turns\?; there are radius, phase, turns"
     ):
-        kc.routing.Helical(0.02, 0.0, trns=1.0)
+        kc.robots.routing.Helical(0.02, 0.0, trns=1.0)
 
 
 def test_a_class_may_have_a_constructor_of_its_own():
-    class Wire(kc.SlenderRod):
+    class Wire(kc.robots.SlenderRod):
         def __init__(self, gauge):
             super().__init__(length=1.0, radius=1e-3 / gauge, density=8e3, youngs_modulus=2e11)
 
     assert Wire(gauge=2.0).radius == 5e-4
-    with pytest.raises(kc.ParameterError, match=r"^Wire has no parameter 'gage'; did you mean gauge"):
+    with pytest.raises(kc.robots.ParameterError, match=r"^Wire has no parameter 'gage'; did you mean gauge"):
         Wire(gage=2.0)
 
 
 @pytest.mark.parametrize("short", [[1e-200, 0, 0, 0], [0, 0, 1e-9, 0], [0, 0, 0, 0]])
 def test_a_quaternion_has_a_length(short):
-    kc.ends.Clamped(orientation=[1e-8, 0, 0, 0])
-    with pytest.raises(kc.ParameterError, match=r"^Clamped: orientation is \[.* \(length above 1e-09\)"):
-        kc.ends.Clamped(orientation=short)
+    kc.robots.ends.Clamped(orientation=[1e-8, 0, 0, 0])
+    with pytest.raises(
+        kc.robots.ParameterError, match=r"^Clamped: orientation is \[.* \(length above 1e-09\)"
+    ):
+        kc.robots.ends.Clamped(orientation=short)

@@ -201,10 +201,10 @@ def test_errors_name_file_place_value_and_what_is_allowed(more, words):
 
 
 def test_code_cannot_be_saved(tmp_path):
-    rod = kc.SlenderRod(**BODY, sections=(kc.FunctionSection(),))
+    rod = kc.robots.SlenderRod(**BODY, sections=(kc.robots.FunctionSection(),))
     with pytest.raises(RobotFileError, match=r"^a FunctionSection cannot be written .* made of code"):
         kc.save_robot(rod, tmp_path / "rod.yaml")
-    routed = kc.RoutedTendonRobot(
+    routed = kc.robots.RoutedTendonRobot(
         **BODY,
         tendon_offset=0.01,
         tendon_angles=[0.0],
@@ -217,10 +217,11 @@ def test_code_cannot_be_saved(tmp_path):
 
 # parameters of parts by name
 
-LADEN = kc.SlenderRod(
+LADEN = kc.robots.SlenderRod(
     **BODY, nodes=6, base_end=Driven(axes=("x", "ry")),
     loads=(AttachedMass(mass=0.1, at=0.4), PointWrench(controlled=True), DistributedWrench(begin=0.3)),
-    surroundings=(Sphere(center=[0.0, 0.0, -1.0]),), sections=(kc.Stretch(end=0.4, stiffness=[1.0, 2.0]),),
+    surroundings=(Sphere(center=[0.0, 0.0, -1.0]),),
+    sections=(kc.robots.Stretch(end=0.4, stiffness=[1.0, 2.0]),),
 )  # fmt: skip
 
 
@@ -252,7 +253,7 @@ def test_parameters_of_parts_by_name():
     ],
 )
 def test_wrong_names_of_parts(name, value, words):
-    with pytest.raises(kc.ParameterError, match=words) as caught:
+    with pytest.raises(kc.robots.ParameterError, match=words) as caught:
         LADEN.replace(**{name: value})
     assert "\n" not in str(caught.value)
 

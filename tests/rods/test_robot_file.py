@@ -343,9 +343,9 @@ def test_files_that_cannot_be_read(tmp_path):
 class Pendulum(kc.System):
     """A class that no file can name."""
 
-    y_layout: ClassVar[kc.Layout] = kc.Layout(("x", 1, "m", "somewhere"))
-    z_layout: ClassVar[kc.Layout] = kc.Layout()
-    control_layout: ClassVar[kc.Layout] = kc.Layout()
+    y_layout: ClassVar[kc.robots.Layout] = kc.robots.Layout(("x", 1, "m", "somewhere"))
+    z_layout: ClassVar[kc.robots.Layout] = kc.robots.Layout()
+    control_layout: ClassVar[kc.robots.Layout] = kc.robots.Layout()
     base_unknowns: ClassVar[tuple[str, ...]] = ()
     length: Any = parameter("m", "length", low=0.0, high=1.0)
 

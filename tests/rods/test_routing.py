@@ -90,6 +90,6 @@ def test_kinds_are_named_once_each():
     ],
 )
 def test_what_is_refused(wrong, message):
-    with pytest.raises(kc.ParameterError, match=message) as caught:
+    with pytest.raises(kc.robots.ParameterError, match=message) as caught:
         wrong()
     assert "\n" not in str(caught.value)

@@ -45,7 +45,7 @@ def numbers(message):
 
 def test_a_frame_is_the_step_in_progress_under_the_newest_control(session, robot):
     first, then = np.array([7.0, 5.0, 5.0, 7.0]), np.array([5.0, 7.0, 7.0, 5.0])
-    stepper = kc.Stepper(robot, DT)
+    stepper = kc.solvers.Stepper(robot, DT)
     # both of the same step, until it is over
     for sequence, control in ((1, first), (2, then)):
         message, stuck = session.solve(control, sequence, over=False)

@@ -154,9 +154,9 @@ def test_the_page_may_not_reach_any_network(truth, tmp_path):
 class Flat(kc.System):
     """A system that says of its nodes where they are, in two numbers, and no more."""
 
-    y_layout = kc.Layout(("place", 2, "m", "place"), ("n", 1, "N", "force"))
-    z_layout = kc.Layout()
-    control_layout = kc.Layout(("pull", 1, "N", "pull"))
+    y_layout = kc.robots.Layout(("place", 2, "m", "place"), ("n", 1, "N", "force"))
+    z_layout = kc.robots.Layout()
+    control_layout = kc.robots.Layout(("pull", 1, "N", "pull"))
     base_unknowns = ("n",)
 
     length: float = 2.0
@@ -214,8 +214,8 @@ def test_every_robot_has_a_drawing_and_a_slider_for_each_control(name):
 
 
 def test_tendons_are_drawn_where_their_routing_has_them():
-    helix = kc.routing.Helical(radius=0.01, phase=0.3, turns=1.5)
-    short = kc.routing.Straight(x=0.008, y=0.0, end=0.5)
+    helix = kc.robots.routing.Helical(radius=0.01, phase=0.3, turns=1.5)
+    short = kc.robots.routing.Straight(x=0.008, y=0.0, end=0.5)
     robot = kc.load_robot("delrin-routed-tendon-robot").replace(routing=(helix, short))
     tendons = drawing(robot, np.arange(10))["tendons"]
     angle = 0.3 + 2.0 * np.pi * 1.5 * np.linspace(0.0, 1.0, 10)

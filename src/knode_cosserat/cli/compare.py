@@ -227,7 +227,7 @@ def _seen(trajectory: Trajectory, view: Seen) -> str | None:
 def _measures() -> tuple[Any, ...]:
     import knode_cosserat as kc
 
-    return kc.tip_dtw, kc.pose_mse, kc.tip_rmse
+    return kc.metrics.tip_dtw, kc.metrics.pose_mse, kc.metrics.tip_rmse
 
 
 def _driven(system: System | Ensemble, reference: Trajectory, rows: int | None, progress: bool) -> Any:
@@ -237,7 +237,7 @@ def _driven(system: System | Ensemble, reference: Trajectory, rows: int | None, 
 
     if np.ndim(reference.y) != 3 or len(reference.time) < 2:
         raise ValueError("allowed is a trajectory of one robot, of two rows or more")
-    it = reference.settings or kc.Settings()
+    it = reference.settings or kc.solvers.Settings()
     options: Any = {
         "time": it.time, "space": it.space, "start": it.start, "newton": it.newton, "progress": progress,
     }  # fmt: skip

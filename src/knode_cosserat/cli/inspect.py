@@ -50,7 +50,7 @@ def inspect(
         figures()
     import knode_cosserat as kc
 
-    read = kc.load_recording(recording, kc.RecordingConfig.load(config) if config else None)
+    read = kc.load_recording(recording, kc.recordings.RecordingConfig.load(config) if config else None)
     report = read.health()
     if plot:
         from knode_cosserat.evaluation import recording_figures

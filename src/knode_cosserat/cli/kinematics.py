@@ -26,9 +26,9 @@ from knode_cosserat.cli.program import app, examples
 from knode_cosserat.cli.telling import tell, vector
 
 if TYPE_CHECKING:
-    from knode_cosserat.control.reach import InverseKinematics
-    from knode_cosserat.control.workspace import Workspace
     from knode_cosserat.rods.system import System
+    from knode_cosserat.statics.reach import InverseKinematics
+    from knode_cosserat.statics.workspace import Workspace
 
 Low = Annotated[
     str,
@@ -147,7 +147,7 @@ def workspace(
     as_json: Json = False,
 ) -> None:
     """Find where a robot's tip can be at rest: poses under controls spread evenly between limits."""
-    from knode_cosserat.control.workspace import FORMATS
+    from knode_cosserat.statics.workspace import FORMATS
 
     require_writable(out, picture)
     if out.suffix not in FORMATS:
@@ -206,11 +206,11 @@ def _held(system: System, control: list[float]) -> str:
 
 
 def _unstable(found: InverseKinematics) -> bool | None:
-    """True if the pose is an unstable equilibrium; None where `kc.stability` cannot decide."""
+    """True if the pose is an unstable equilibrium; None where `kc.statics.stability` cannot decide."""
     import knode_cosserat as kc
 
     try:
-        return not kc.stability(found.equilibrium).stable
+        return not kc.statics.stability(found.equilibrium).stable
     except ValueError:
         return None
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.solvers.result import SimulationError
 
 if TYPE_CHECKING:
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 
 PROGRAM = "knode-cosserat"
 #: errors that the user can fix; any other is a bug, and keeps its traceback
-_EXPECTED = (SimulationError, ValueError, OSError, ImportError, MemoryError, OverflowError)
+_EXPECTED = (KnodeCosseratError, ValueError, OSError, ImportError, MemoryError, OverflowError)
 
 
 class _Program(TyperGroup):

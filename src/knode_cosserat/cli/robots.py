@@ -220,7 +220,7 @@ def schema(
 
     import knode_cosserat as kc
 
-    typer.echo(json.dumps(kc.robot_schema(), indent=None if as_json else 2, ensure_ascii=False))
+    typer.echo(json.dumps(kc.robots.robot_schema(), indent=None if as_json else 2, ensure_ascii=False))
 
 
 def _unstable(rest: Any, space: str) -> bool | None:
@@ -228,12 +228,12 @@ def _unstable(rest: Any, space: str) -> bool | None:
     import knode_cosserat as kc
 
     try:
-        return not kc.stability(rest).stable
+        return not kc.statics.stability(rest).stable
     except ValueError:
         # on reels, or no rod
         if not {"n", "m"} <= set(rest.system.tip_layout.names):
             return None
-        return bool(kc.configuration(rest.system, rest.control[0], space=space).unstable)
+        return bool(kc.statics.configuration(rest.system, rest.control[0], space=space).unstable)
 
 
 def _control(system: System, tension: str | None, control: str | None) -> Any:

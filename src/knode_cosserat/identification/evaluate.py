@@ -61,6 +61,9 @@ class Evaluation:
             figures["extrapolated"] = self.extrapolated
         return figures if self.failed is None else {**figures, "failed": self.failed}
 
+    def __repr__(self) -> str:
+        return f"Evaluation: {self}"
+
     def __str__(self) -> str:
         if self.failed is not None:
             return f"no prediction: {self.failed}"

@@ -18,9 +18,10 @@ from knode_cosserat.identification.residual import Learned, learn_residual
 from knode_cosserat.identification.residual_model import Known, ResidualModel
 from knode_cosserat.identification.result import Identified
 from knode_cosserat.identification.search import Search, SearchError
-from knode_cosserat.learning import fit as learning
 from knode_cosserat.learning.config import FitConfig, PassiveOptions, StructuredOptions
 from knode_cosserat.learning.ensemble import Ensemble
+from knode_cosserat.learning.fit import BEST
+from knode_cosserat.learning.fit import fit as fit_states
 from knode_cosserat.learning.knode import KNODE, About
 from knode_cosserat.learning.passive import PARTS, Passive, passive
 from knode_cosserat.learning.residual import Nothing
@@ -42,7 +43,7 @@ WIDE = {"stiffness": 0.5, "levers": 3.0, "energy": 0.5, "damping": 3.0, "dissipa
 def fit(
     knowledge: System,
     data: Sequence[Trajectory | Recording | Measurements],
-    config: FitConfig = learning.BEST,
+    config: FitConfig = BEST,
     *,
     held_out: Sequence[Any] = (),
     space: str | SpaceScheme = "lobatto2",
@@ -81,7 +82,7 @@ def fit(
     several = isinstance(listed, Iterable) and not isinstance(listed, str | Trajectory)
     listed = list(listed) if several else listed
     if not several or all(isinstance(each, Trajectory) for each in listed):
-        return learning.fit(knowledge, listed, config, held_out=held_out, progress=progress, **options)
+        return fit_states(knowledge, listed, config, held_out=held_out, progress=progress, **options)
     if options:
         raise FitError(f"{next(iter(options))} is for trajectories; from recordings there are no checkpoints")
     if not isinstance(getattr(config, "residual", None), StructuredOptions | PassiveOptions):

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from knode_cosserat._yaml import did_you_mean
+from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.identification.given import SELECTED_DT, coarser, measurements_of, names_of, padded
 from knode_cosserat.identification.intervals import estimates_of
 from knode_cosserat.identification.journal import Journal
@@ -33,8 +34,10 @@ REFINEMENTS = 2
 FOLD = (8, 5e-3)
 
 
-class IdentificationError(ValueError):
+class IdentificationError(KnodeCosseratError, ValueError):
     """A robot cannot be identified; one line says why."""
+
+    code = "identification"
 
 
 def identify(

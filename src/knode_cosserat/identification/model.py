@@ -45,8 +45,8 @@ def routed(nominal: TendonRod) -> RoutedTendonRobot:
 def extended(robot: RoutedTendonRobot, ribs: Sequence[float] = ()) -> RoutedTendonRobot:
     """Return the same robot with every part that effects change: a stretch, a sleeve, a tip mass and so on.
 
-    A base and load cells that the robot already has are unchanged; all added parts have no effect. Ribs may be
-    where the robot has masses, or at the given places if it has none.
+    A base and load cells that the robot already has are unchanged; all added parts have no effect. Ribs may
+    be where the robot has masses, or at the given places if it has none.
     """
     held = robot.base_end
     if isinstance(held, Clamped):

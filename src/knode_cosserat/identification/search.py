@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.identification.journal import Journal, hashed, identity
 from knode_cosserat.identification.misfit import Misfit, Rollout
 
@@ -296,5 +297,7 @@ class Search:
         return np.clip(x + move, self.low, self.high)
 
 
-class SearchError(RuntimeError):
+class SearchError(KnodeCosseratError, RuntimeError):
     """A search cannot go on; one line says why."""
+
+    code = "search"

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat._reprs import count_of, quantity, robot_text, wrapped
 from knode_cosserat.learning.residual import Residual
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.system import History, Scales, System, of_strands
@@ -49,6 +50,15 @@ class KNODE(System):
         self.about = about or About()
         self.trained = trained
         self.nodes = knowledge.nodes
+
+    def __repr__(self) -> str:
+        facts = self.about.facts
+        parts = [f"KNODE of a {robot_text(self.knowledge)}", f"residual {self.residual!r}"]
+        if "trajectories" in facts:
+            parts.append(f"fitted to {count_of(len(facts['trajectories']), 'trajectory', 'trajectories')}")
+        if isinstance(facts.get("held_out_error"), float):
+            parts.append(f"held-out tip error {quantity(1e3 * facts['held_out_error'], 'mm')}")
+        return wrapped("; ".join(parts))
 
     @property
     def adapted(self) -> System:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat._reprs import count_of
 from knode_cosserat.learning.config import NetworkOptions
 from knode_cosserat.rods.layout import Field, Layout
 from knode_cosserat.rods.system import History, System
@@ -21,6 +22,10 @@ class Residual(eqx.Module):
 
     #: attributes that gradient training does not change (nested modules may have their own)
     fixed: ClassVar[tuple[str, ...]] = ()
+
+    def __repr__(self) -> str:
+        numbers = sum(int(np.size(leaf)) for leaf in jax.tree.leaves(self) if eqx.is_array(leaf))
+        return f"{type(self).__name__} with {count_of(numbers, 'number')}"
 
     def adapted(self, knowledge: System) -> System:
         """Return the nominal model with the residual's parameter changes, such as a corrected length."""

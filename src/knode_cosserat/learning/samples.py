@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.learning.sides import far_side, slopes_of
 from knode_cosserat.rods.system import System, in_strands, records_in_strands, unpacked_history
 from knode_cosserat.solvers.grid import at_places, grid_of, inside
@@ -26,8 +27,10 @@ from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
 
 
-class DataError(ValueError):
+class DataError(KnodeCosseratError, ValueError):
     """Unusable trajectories. The message is one line: the trajectory, the place and the reason."""
+
+    code = "training-data"
 
 
 class Samples(NamedTuple):

@@ -9,6 +9,7 @@ from knode_cosserat.recordings.config import (
     TableSource,
     TensionSource,
 )
+from knode_cosserat.recordings.estimation.estimate import estimate_parts, estimate_states
 from knode_cosserat.recordings.findings import Finding, RecordingError
 from knode_cosserat.recordings.load import load_example, load_recording
 from knode_cosserat.recordings.measurements import Measurements
@@ -28,6 +29,8 @@ __all__ = [
     "TableSource",
     "TensionSource",
     "Tensions",
+    "estimate_parts",
+    "estimate_states",
     "load_example",
     "load_recording",
 ]

@@ -16,14 +16,18 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from knode_cosserat._reprs import object_text
 from knode_cosserat._yaml import did_you_mean
+from knode_cosserat.errors import KnodeCosseratError
 
 #: smallest length of a direction or quaternion: the square of a much smaller length underflows
 SHORTEST = 1e-9
 
 
-class ParameterError(ValueError):
+class ParameterError(KnodeCosseratError, ValueError):
     """A parameter's name or value is not allowed; the message gives the value and the allowed range."""
+
+    code = "parameter"
 
 
 Shape = Literal["scalar", "vector", "direction", "quaternion", "matrix", "list"]
@@ -165,6 +169,10 @@ class Parametrised(eqx.Module):
     def parameters(cls) -> dict[str, Parameter]:
         """Return the physical parameters by name, with unit, meaning and allowed range."""
         return parameters_of(cls)
+
+    def __repr__(self) -> str:
+        units = {name: parameter.unit for name, parameter in parameters_of(type(self)).items()}
+        return object_text(self, units, always=("nodes", "length"))
 
 
 def unknown_parameter(cls: type, name: Any, known: Iterable[str]) -> str:

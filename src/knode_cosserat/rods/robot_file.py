@@ -27,6 +27,7 @@ import numpy as np
 
 from knode_cosserat._files import replacing
 from knode_cosserat._yaml import YAMLTextError, did_you_mean, flow, mapping_of, shown
+from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.rods.old_keys import upgraded
 from knode_cosserat.rods.parallel_robot import ParallelRobot
 from knode_cosserat.rods.parameters import (
@@ -58,8 +59,10 @@ KINDS: dict[str, type[System]] = {
 }
 
 
-class RobotFileError(ValueError):
+class RobotFileError(KnodeCosseratError, ValueError):
     """A robot file is invalid: one line that names file, key, value and the allowed values."""
+
+    code = "robot-file"
 
 
 def load_robot(name_or_path: str | Path) -> System:

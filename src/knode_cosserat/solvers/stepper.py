@@ -6,6 +6,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from knode_cosserat._reprs import robot_text
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.history import Begun
@@ -39,7 +40,7 @@ class Stepper:
     Calls of `step` return the rows of one `simulate`, to the tolerance of Newton's method. A call takes the
     time of the step and a fraction of a millisecond in addition. Programs are shared with `simulate`.
 
-        stepper = kc.Stepper(robot, dt=0.05)
+        stepper = kc.solvers.Stepper(robot, dt=0.05)
         while True:
             row = stepper.step(tensions())
             row.tip_position[0], row.time[0]
@@ -84,6 +85,9 @@ class Stepper:
         self._controls = np.zeros((LEAST_CAPACITY, count))
         first = _Solved(begun.past, np.asarray(begins.record), 0, 0.0, 0, 0.0)
         self._state = self._row(first, self._control, self.time, begins.begun)
+
+    def __repr__(self) -> str:
+        return f"Stepper of a {robot_text(self.robot)}: t = {self.time:g} s, dt = {self.dt:g} s"
 
     @property
     def time(self) -> float:

@@ -26,6 +26,7 @@ from tqdm import tqdm
 
 import knode_cosserat
 from knode_cosserat._files import package_version, replacing
+from knode_cosserat.errors import KnodeCosseratError
 
 #: packages whose versions may change a figure
 PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "equinox", "optax")
@@ -35,8 +36,10 @@ CORES = 4
 PATIENCE = 60
 
 
-class StudyError(ValueError):
+class StudyError(KnodeCosseratError, ValueError):
     """Error for a study that cannot be run, or that may succeed when run again; the message is one line."""
+
+    code = "study"
 
 
 class Product(NamedTuple):
