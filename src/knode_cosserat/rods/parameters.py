@@ -32,6 +32,36 @@ Shape = Literal["scalar", "vector", "direction", "quaternion", "matrix", "list"]
 AT_END = 1e-9
 
 
+#: by unit: the typical range
+TYPICAL: dict[str, tuple[float, float]] = {
+    "m": (1e-5, 10.0),
+    "Pa": (1e5, 4e11),
+    "kg/m3": (100.0, 23e3),
+    "m/s2": (-30.0, 30.0),
+    "rad": (-2 * np.pi, 2 * np.pi),
+}
+#: by unit: the size of other common units, the likeliest first
+_OTHER_UNITS: dict[str, dict[str, float]] = {
+    "m": {"mm": 1e-3, "um": 1e-6},
+    "Pa": {"GPa": 1e9, "MPa": 1e6, "kPa": 1e3},
+    "kg/m3": {"g/cm3": 1e3, "g/m3": 1e-3},
+    "m/s2": {"mm/s2": 1e-3},
+    "rad": {"degrees": np.pi / 180.0},
+}
+
+
+def in_other_unit(value: Any, unit: str, low: float, high: float) -> tuple[str, Any] | None:
+    """Return the unit in which numbers were likely meant, and their values in `unit`.
+
+    The first common unit is taken that brings all numbers between `low` and `high`. None if there is none.
+    """
+    for other, factor in _OTHER_UNITS.get(unit, {}).items():
+        scaled = np.asarray(value, dtype=float) * factor
+        if np.all((low <= scaled) & (scaled <= high)):
+            return other, np.vectorize(lambda number: float(f"{number:.12g}"))(scaled).tolist()
+    return None
+
+
 @dataclasses.dataclass(frozen=True)
 class Parameter:
     """Specification of one parameter. `low` and `high` bound each number (of a matrix, each eigenvalue)."""
@@ -44,9 +74,13 @@ class Parameter:
     optional: bool
 
     @property
+    def bounds(self) -> str:
+        """Description of the allowed range, with the unit."""
+        return f"between {self.low:g} and {self.high:g}" + (f" {self.unit}" if self.unit else "")
+
+    @property
     def allowed(self) -> str:
         """Description of the allowed values."""
-        bounds = f"{self.low:g} to {self.high:g}" + (f" {self.unit}" if self.unit else "")
         kind = {
             "scalar": "a number",
             "vector": "three numbers, each",
@@ -55,7 +89,31 @@ class Parameter:
             "matrix": "one number, three (a diagonal) or a symmetric 3x3 matrix, with eigenvalues",
             "list": "a list of numbers, each",
         }[self.shape]
-        return f"{kind} {bounds}"
+        return f"{kind} {self.bounds}"
+
+    def refusal(self, name: str, shown: str, value: Any = None) -> str:
+        """Return the error message for a value: the allowed ones, the given one, and the likely value.
+
+        Args:
+            name: the parameter's name.
+            shown: the given value as text.
+            value: the given numbers (an array), if there are any.
+        """
+        size = np.shape(value)
+        if self.shape == "matrix" and size == (3, 3) and not _is_symmetric(value):
+            shown = f"{shown}, not symmetric"
+        scalar = value is not None and self.shape == "scalar" and size == ()
+        message = f"{name} must be {self.bounds if scalar else self.allowed} (got {shown})"
+        if value is None or self.shape == "matrix" or (size == ()) != (self.shape == "scalar"):
+            return message
+        beyond = np.any((value < self.low) | (value > self.high))
+        meant = self._in_other_unit(value) if beyond else None
+        return f"{message}. Did you mean {meant[1]} ({shown} {meant[0]})?" if meant else message
+
+    def _in_other_unit(self, value: Any) -> tuple[str, Any] | None:
+        """Return the likely unit of a value and its conversion; None if no conversion would be typical."""
+        low, high = TYPICAL.get(self.unit, (np.inf, -np.inf))
+        return in_other_unit(value, self.unit, max(low, self.low), min(high, self.high))
 
 
 def parameter(
@@ -222,20 +280,28 @@ def checked(name: str, value: Any, parameter: Parameter) -> None:
     except (TypeError, ValueError):
         array = np.array("ragged")
     if array.dtype.kind not in "fiu":
-        raise ParameterError(f"{name} is {value!r}; allowed is {parameter.allowed}")
+        raise ParameterError(parameter.refusal(name, repr(value)))
     if (array.ndim != 1 or array.size == 0) if expected is None else array.shape != expected:
-        raise ParameterError(f"{name} has shape {array.shape}; allowed is {parameter.allowed}")
+        raise ParameterError(parameter.refusal(name, f"{array.tolist()}, of shape {array.shape}"))
+    if not _is_within(array, parameter):
+        raise ParameterError(parameter.refusal(name, str(array.tolist()), array))
+
+
+def _is_symmetric(array: np.ndarray) -> bool:
+    return np.allclose(array, array.T, rtol=1e-9, atol=0.0)
+
+
+def _is_within(array: np.ndarray, parameter: Parameter) -> bool:
+    """True if numbers of the right shape are allowed."""
     if not np.all(np.isfinite(array)):
-        raise ParameterError(f"{name} is {array.tolist()}; allowed is {parameter.allowed}")
+        return False
     if parameter.shape in ("direction", "quaternion") and not math.hypot(*array) > SHORTEST:
-        raise ParameterError(f"{name} is {array.tolist()}; allowed is {parameter.allowed}")
+        return False
     if parameter.shape == "matrix":
-        if not np.allclose(array, array.T, rtol=1e-9, atol=0.0):
-            raise ParameterError(f"{name} is not symmetric: {array.tolist()}; allowed is {parameter.allowed}")
+        if not _is_symmetric(array):
+            return False
         array = np.linalg.eigvalsh(array)
-    if np.any(array < parameter.low) or np.any(array > parameter.high):
-        shown = np.asarray(value).tolist()
-        raise ParameterError(f"{name} is {shown}; allowed is {parameter.allowed}")
+    return bool(np.all((parameter.low <= array) & (array <= parameter.high)))
 
 
 def _converter(parameter: Parameter) -> Callable[[Any], Any]:
