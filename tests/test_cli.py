@@ -155,7 +155,7 @@ def test_equilibrium_tells_the_shape_and_what_holds_it(tmp_path):
     assert facts["position_error"] == pytest.approx(error, rel=0.3)
     words = succeeded("equilibrium", ROBOT, "--tension", "7,5,5,7")
     assert "tip: (0.244533, 0, 0.57779) m" in words
-    assert "largest position error, by estimate: 0.66 mm (0.1 % of the length)" in words
+    assert "largest estimated position error: 0.66 mm (0.1 % of the length)" in words
     paper = succeeded("equilibrium", ROBOT, "--tension", "7,5,5,7", "--space", "euler")
     assert "tip: (0.28029, 0, 0.551513) m" in paper and "COARSE GRID: " in paper
 
@@ -243,7 +243,7 @@ def test_fit_tells_what_it_did(data, tmp_path):
     text = succeeded(
         "fit", ROBOT, data / "a.nc", "--set", "length=0.4", "--rows", 12, "--out", tmp_path / "m"
     )
-    assert f"learned what {ROBOT} misses from 1 trajectories of 12 rows in all: preset best" in text
+    assert f"learned a residual model of {ROBOT} from 1 trajectory (12 rows): preset best" in text
     assert "+0.5875 of the knowledge's length" in text
     assert text.endswith(f"wrote {tmp_path / 'm'}\n")
 

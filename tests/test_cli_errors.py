@@ -90,7 +90,7 @@ def bad_inputs():
         (("evaluate", ROBOT), "REFERENCE"),
         (("plot", "nowhere.nc", "--out", "a.png"), "nowhere.nc: no such file"),
         (("plot", "broken.nc", "--out", "a.png"), "broken.nc: not a netCDF-4 file"),
-        (("plot", "broken.nc", "--out", "a"), "ends in .png"),
+        (("plot", "broken.nc", "--out", "a"), "end in .png"),
         (("plot", "broken.nc", "--out", "a.png", "--kind", "cake"), "--kind"),
     ]
 

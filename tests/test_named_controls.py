@@ -96,3 +96,14 @@ def test_all_numbers_of_a_field_and_one_of_them_are_given_twice():
     for words in ("reel=ramp:0.01;reel_2=constant:0", "reel_2=constant:0;reel=ramp:0.01"):
         with fails("reel_2 is given already, by"):
             named_controls.parse(robot, words, 5, DT)
+
+
+def test_a_signal_without_effect_during_the_run_is_refused():
+    with fails("base_z=step:1,at=2", "the step starts at 2 s, after the end of the run", "use 40 steps"):
+        named_controls.parse(ROD, "base_z=step:1,at=2", 10, DT)
+    with fails("ramp: start is 2.0 s", "before the end of the last step"):
+        named_controls.parse(ROD, "base_z=ramp:1,start=2", 10, DT)
+    with fails("base_z=sine:0.1", "the sine has the same value at every time step"):
+        named_controls.parse(ROD, "base_z=sine:0.1", 10, DT)
+    assert named_controls.parse(ROD, "base_z=step:1,at=2", 40, DT)[-1, 1] == 1.0
+    assert np.all(named_controls.parse(ROD, "base_z=step:1", 10, DT)[:, 1] == 1.0)

@@ -17,6 +17,7 @@ from jaxtyping import Float
 
 from knode_cosserat import controls
 from knode_cosserat._csv import SAME_TIME, Column, CSVTextError, held_rows, read_rows
+from knode_cosserat._signals import require_effect
 from knode_cosserat.controls import ControlsError
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.system import System
@@ -50,8 +51,8 @@ def parse(robot: System, specification: str, steps: int | None, dt: float) -> Ar
     `base_z=ramp:0.1;reel_1=sine:2,amplitude=0.01`. The name of a field stands for all its numbers. Each
     control is given at most once, and the others are zero. Signals are `constant:VALUE`,
     `ramp:HEIGHT[,base=,start=,end=]`, `step:HEIGHT[,base=,at=]`, `sine:PERIOD[,base=,amplitude=,phase=]`. The
-    word may also be a CSV file with the columns `time [s]` and any of these names with their units. `none`
-    stands for zeros.
+    word may also be a CSV file with the columns `time [s]` and any of these names with their units, or the
+    numbers of a constant control in the layout's order. `none` stands for zeros.
 
     Raises:
         ControlsError: the specification is not understood, or the file is invalid or too short.
@@ -67,7 +68,12 @@ def parse(robot: System, specification: str, steps: int | None, dt: float) -> Ar
     if os.path.isfile(specification):
         return _sampled(specification, layout, steps, dt)
     if steps is None:
-        raise ControlsError(f"controls {specification!r}: the number of steps is not given")
+        raise ControlsError(
+            f"controls {specification!r}: the number of steps is not given; only a file states its own"
+        )
+    held = controls.constant_control(specification, layout.size)
+    if held is not None:
+        return np.tile(held, (steps, 1))
     words = [] if specification.strip() == "none" else specification.split(";")
     return parse_signals(layout, words, np.arange(1, steps + 1) * dt)
 
@@ -84,8 +90,11 @@ def parse_signals(layout: Layout, words: list[str], t: Float[np.ndarray, " steps
                 f"names are {', '.join(labels(layout)) or 'none'}"
             )
         # a very short period, for example, overflows: the check below refuses it without a NumPy warning
-        with np.errstate(all="ignore"):
-            values = _signal(word, t)
+        try:
+            with np.errstate(all="ignore"):
+                values = _signal(word, t)
+        except ControlsError as error:
+            raise ControlsError(f"controls {entry.strip()!r}: {error}") from None
         if not np.all(np.isfinite(values)):
             raise ControlsError(
                 f"controls {entry.strip()!r}: a value is {values[~np.isfinite(values)][0]}; "
@@ -116,6 +125,10 @@ def _columns(layout: Layout, name: str) -> list[int]:
 
 def _ramp(t: Any, height: float, *, base: float = 0.0, start: float = 0.0, end: float | None = None) -> Any:
     last = float(t[-1]) if end is None else end
+    if last <= start and end is None:
+        raise ControlsError(
+            f"ramp: start is {start!r} s; allowed is a time before the end of the last step, {last:g} s"
+        )
     if last <= start:
         raise ControlsError(f"ramp: end is {last!r} s; allowed is a time after its start, {start!r} s")
     return base + height * np.clip((t - start) / (last - start), 0.0, 1.0)
@@ -156,7 +169,13 @@ def _signal(word: str, t: Float[np.ndarray, " steps"]) -> Float[np.ndarray, " st
             allowed = ", ".join(f"{option}=…" for option in options) or "nothing"
             raise ControlsError(f"{name}: {other!r} is not understood; allowed is {allowed}")
         given[key] = _number(name, text)
-    return np.asarray(function(t, _number(name, first), **given))
+    value = _number(name, first)
+    found = np.asarray(function(t, value, **given))
+    if len(t) > 1 and name != "constant" and np.all(np.isfinite(found)):
+        main = "period" if name == "sine" else "height"
+        known = function.__kwdefaults__ or {}
+        require_effect(name, {**known, main: value, **given}, found, len(t), float(t[0]))
+    return found
 
 
 def _number(where: str, text: str) -> float:

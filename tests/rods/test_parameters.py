@@ -40,7 +40,10 @@ def test_matrices_in_three_ways(robot, given):
         ({"nodes": 1}, "nodes is 1; allowed is a whole number"),
         ({"nodes": 10.0}, "nodes is 10.0"),
         ({"gravity": [0.0, 1.0]}, r"gravity must be three numbers, .* of shape \(2,\)\)$"),
-        ({"bending_stiffness": [[1.0, 0.5, 0], [0, 1, 0], [0, 0, 1]]}, r"bending_stiffness must be .*, not symmetric\)$"),
+        (
+            {"bending_stiffness": [[1.0, 0.5, 0], [0, 1, 0], [0, 0, 1]]},
+            r"bending_stiffness must be .*, not symmetric\)$",
+        ),
         ({"bending_stiffness": [-1.0, 1.0, 1.0]}, "bending_stiffness must be one number, three"),
         ({"drag": ["1", "2", "3"]}, "drag must be"),
         ({"drag": [True, True, False]}, "drag must be"),
