@@ -311,7 +311,7 @@ def test_a_file_as_specification(tmp_path):
     assert np.array_equal(controls.parse(str(path), None, DT), tensions)
     assert np.array_equal(controls.parse(str(path), 5, DT), tensions[:5])
     assert np.array_equal(controls.parse(str(path), None, 2 * DT), tensions[::2])
-    with fails("there are 20 steps of 0.05 s; 21 are asked for"):
+    with fails("there are 20 steps of 0.05 s; 21 are requested; allowed is up to 20"):
         controls.parse(str(path), 21, DT)
     with fails("there are 4 tendons; the robot has 3"):
         controls.parse(str(path), 5, DT, tendons=3)
@@ -323,7 +323,7 @@ def test_a_file_as_specification(tmp_path):
         ("sin:1.5", ["'sin:1.5'", "no such signal or file", "sine:PERIOD", "did you mean sine:PERIOD?"]),
         ("nothing.csv", ["'nothing.csv'", "no such signal or file", "CSV file"]),
         ("", ["''", "no such signal or file"]),
-        ("sine", ["'sine'", "period is ''", "a number"]),
+        ("sine", ["'sine'", "period is missing", "such as sine:1.5"]),
         ("sine:fast", ["period is 'fast'", "a number"]),
         ("sine:0", ["'sine:0'", "period is 0.0", "above 0"]),
         ("sine:1.5,speed=2", ["'speed=2' is not understood", "base=…, amplitude=…"]),

@@ -20,7 +20,7 @@ def test_a_file_of_named_controls(tmp_path):
     assert found.tolist() == [[0, 1, 5], [0, 2, 6], [0, 3, 7]]
     assert np.array_equal(named_controls.parse(ROD, str(path), 2, 0.1), found[:2])
     assert named_controls.parse(ROD, str(path), 4, 0.05)[:, 1].tolist() == [1, 1, 2, 2]
-    with fails("there are 3 steps of 0.1 s; 4 are asked for"):
+    with fails("there are 3 steps of 0.1 s; 4 are requested; allowed is up to 3"):
         named_controls.parse(ROD, str(path), 4, 0.1)
     path = written(tmp_path, "time [s]\n0\n0.1\n")
     assert named_controls.parse(ROD, str(path), None, 0.1).tolist() == [[0, 0, 0]] * 2

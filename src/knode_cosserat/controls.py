@@ -231,6 +231,8 @@ def parse(specification: str, steps: int | None, dt: float, *, tendons: int = 4)
     if name not in _SIGNALS:
         close = difflib.get_close_matches(name, _SIGNALS, n=1)
         hint = f"; did you mean {close[0]}:{_SIGNALS[close[0]].main.upper()}?" if close else ""
+        if "=" in name:
+            hint = "; NAME=SIGNAL is for robots with controls other than tensions"
         raise ControlsError(
             f"controls {specification!r}: no such signal or file; allowed is {SPECIFICATIONS}{hint}"
         )
@@ -281,13 +283,20 @@ def _from_file(path: str, steps: int | None, dt: float, tendons: int) -> Tension
         return tensions
     require_counts(steps=steps)
     if len(tensions) < steps:
-        raise ControlsError(f"{path}: there are {len(tensions)} steps of {dt:g} s; {steps} are asked for")
+        raise ControlsError(
+            f"{path}: there are {len(tensions)} steps of {dt:g} s; {steps} are requested; "
+            f"allowed is up to {len(tensions)}"
+        )
     return tensions[:steps]
 
 
 def _from_signal(name: str, text: str, steps: int, dt: float, tendons: int) -> Tensions:
     signal = _SIGNALS[name]
     first, *others = text.split(",")
+    if not first.strip():
+        examples = {"period": "1.5", "height": "1.5", "seed": "0", "tension": "5"}
+        example = f"{name}:{examples[signal.main]}"
+        raise ControlsError(f"{signal.main} is missing; allowed is {name}:NUMBER, such as {example}")
     arguments = {signal.main: _read_as(int if signal.main == "seed" else float, signal.main, first)}
     for other in others:
         key, _, value = (part.strip() for part in other.partition("="))

@@ -6,7 +6,6 @@ row i from time i dt to (i + 1) dt, and signals are evaluated at that step's end
 
 from __future__ import annotations
 
-import difflib
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +17,7 @@ from jaxtyping import Float
 from knode_cosserat import controls
 from knode_cosserat._csv import SAME_TIME, Column, CSVTextError, held_rows, read_rows
 from knode_cosserat._signals import require_effect
+from knode_cosserat._yaml import did_you_mean
 from knode_cosserat.controls import ControlsError
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.system import System
@@ -85,9 +85,12 @@ def parse_signals(layout: Layout, words: list[str], t: Float[np.ndarray, " steps
     for entry in words:
         name, equals, word = (part.strip() for part in entry.partition("="))
         if not equals:
+            known = labels(layout)
+            meant = known and name.partition(":")[0] in _SIGNALS
             raise ControlsError(
-                f"controls {entry.strip()!r}: allowed is NAME=SIGNAL;…, `none` or a CSV file; "
-                f"names are {', '.join(labels(layout)) or 'none'}"
+                f"controls {entry.strip()!r}: allowed is NAME=SIGNAL;…, one number for each control, `none` "
+                f"or a CSV file; names are {', '.join(known) or 'none'}"
+                + (f"; did you mean {known[0]}={name}?" if meant else "")
             )
         # a very short period, for example, overflows: the check below refuses it without a NumPy warning
         try:
@@ -118,9 +121,9 @@ def _columns(layout: Layout, name: str) -> list[int]:
         return list(range(*layout.slice(name).indices(layout.size)))
     if name in known:
         return [known.index(name)]
-    close = difflib.get_close_matches(name, known, n=1)
-    hint = f"; did you mean {close[0]}?" if close else ""
-    raise ControlsError(f"the control {name!r} is unknown; there are {', '.join(known) or 'none'}{hint}")
+    raise ControlsError(
+        f"the control {name!r} is unknown; there are {', '.join(known) or 'none'}{did_you_mean(name, known)}"
+    )
 
 
 def _ramp(t: Any, height: float, *, base: float = 0.0, start: float = 0.0, end: float | None = None) -> Any:
@@ -159,7 +162,9 @@ _SIGNALS: dict[str, tuple[Callable[..., Any], tuple[str, ...]]] = {
 def _signal(word: str, t: Float[np.ndarray, " steps"]) -> Float[np.ndarray, " steps"]:
     name, _, rest = word.partition(":")
     if name not in _SIGNALS:
-        raise ControlsError(f"the signal {word!r} is unknown; allowed is {', '.join(_SIGNALS)}")
+        raise ControlsError(
+            f"the signal {word!r} is unknown; allowed is {', '.join(_SIGNALS)}{did_you_mean(name, _SIGNALS)}"
+        )
     function, options = _SIGNALS[name]
     first, *others = rest.split(",")
     given = {}
@@ -206,7 +211,10 @@ def _sampled(path: str, layout: Layout, steps: int | None, dt: float) -> Array:
     except CSVTextError as error:
         raise ControlsError(str(error)) from None
     if steps is not None and steps > len(rows):
-        raise ControlsError(f"{path}: there are {len(rows)} steps of {dt:g} s; {steps} are asked for")
+        raise ControlsError(
+            f"{path}: there are {len(rows)} steps of {dt:g} s; {steps} are requested; "
+            f"allowed is up to {len(rows)}"
+        )
     found = np.zeros((len(rows), layout.size))
     found[:, [place - 1 for place in places]] = values[rows]
     return found[:steps]

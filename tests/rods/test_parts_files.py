@@ -245,7 +245,7 @@ def test_parameters_of_parts_by_name():
             1.0,
             r"no parameter 'loads.0.weight': no 'weight' among at, mass, inertia, offset",
         ),
-        ("loads.0.mass", -1.0, r"AttachedMass: mass must be between 0 and 10000 kg \(got -1.0\)"),
+        ("loads.0.mass", -1.0, r"AttachedMass: mass must be between 0 and 10000 kg \(got -1\)"),
         ("cargo.0.mass", 1.0, r"no parameter 'cargo"),
         ("loads.0", 3.0, r"loads holds a float; allowed is a load"),
         ("length.0", 3.0, r"no parameter 'length.0': no '0' among nothing"),

@@ -160,7 +160,7 @@ def test_defaults():
 )
 def test_numbers_as_people_write_them(number):
     if "_" in number:
-        with fails("youngs_modulus is '20_0e7'"):
+        with fails("youngs_modulus must be a number", "(got '20_0e7')"):
             parse_robot(text(youngs_modulus=number), "here")
     else:
         assert parse_robot(text(youngs_modulus=number), "here").youngs_modulus == 2e9
@@ -261,18 +261,18 @@ def test_matrices(matrix):
         ({"radius": "3175"}, ["radius must be", "(got 3175", "Did you mean 0.003175 (3175 um)?"]),
         (
             {"youngs_modulus": "2.757903"},
-            ["youngs_modulus must be", "(got 2.757903", "Did you mean 2757903000.0 (2.757903 GPa)?"],
+            ["youngs_modulus must be", "(got 2.757903", "Did you mean 2757903000 (2.757903 GPa)?"],
         ),
-        ({"youngs_modulus": "700"}, ["Did you mean 700000000.0 (700 MPa)?"]),
+        ({"youngs_modulus": "700"}, ["Did you mean 700000000 (700 MPa)?"]),
         (
             {"shear_modulus": "1.06"},
-            ["shear_modulus must be", "(got 1.06", "Did you mean 1060000000.0 (1.06 GPa)?"],
+            ["shear_modulus must be", "(got 1.06", "Did you mean 1060000000 (1.06 GPa)?"],
         ),
-        ({"density": "1400000"}, ["density must be", "(got 1400000", "Did you mean 1400.0 (1400000 g/m3)?"]),
-        ({"gravity": "[0, 0, -9810]"}, ["Did you mean [0.0, 0.0, -9.81] ([0, 0, -9810] mm/s2)?"]),
+        ({"density": "1400000"}, ["density must be", "(got 1400000", "Did you mean 1400 (1400000 g/m3)?"]),
+        ({"gravity": "[0, 0, -9810]"}, ["Did you mean [0, 0, -9.81] ([0, 0, -9810] mm/s2)?"]),
         (
             {"tendon_angles": "[0, 90, 180, 270]"},
-            ["each between -10 and 10 rad", "Did you mean [0.0, 1.570796", "([0, 90, 180, 270] degrees)?"],
+            ["each between -10 and 10 rad", "Did you mean [0, 1.570796", "([0, 90, 180, 270] degrees)?"],
         ),
     ],
 )
@@ -350,7 +350,7 @@ def test_what_would_print_without_end(key):
 
 @pytest.mark.parametrize("key", ["length", "gravity", "drag", "tendon_angles", "nodes"])
 def test_parameters_that_would_print_without_end(key):
-    with fails(f"{key} is [[1, 1, 1,"):
+    with fails("(got [[1, 1, 1," if key != "nodes" else "nodes is [[1, 1, 1,"):
         parse_robot(text(**{key: without_end()}), "here")
 
 

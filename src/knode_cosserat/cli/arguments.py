@@ -16,6 +16,7 @@ from knode_cosserat._numbers import numbers_in
 
 if TYPE_CHECKING:
     from knode_cosserat.learning.ensemble import Ensemble
+    from knode_cosserat.recordings.recording import Recording
     from knode_cosserat.rods.system import System
     from knode_cosserat.trajectory import Trajectory
 
@@ -239,6 +240,30 @@ def _try_to_write(path: Path, *, folder: bool, replaced: bool) -> None:
     except OSError as error:
         where = "" if over or at == path else f" in {at}"
         raise ValueError(f"{path}: nothing can be written{where}: {error.strerror}") from None
+
+
+def load_recordings(paths: Sequence[Path], config: Path | None) -> list[Recording]:
+    """Return the recordings in files, read by a configuration file if there is one."""
+    from knode_cosserat.recordings.config import RecordingConfig
+    from knode_cosserat.recordings.findings import RecordingError
+    from knode_cosserat.recordings.load import load_recording
+
+    meaning = None if config is None else RecordingConfig.load(config)
+    recordings = []
+    for path in paths:
+        if is_trajectory(str(path)):
+            raise ValueError(
+                f"{path}: this is a trajectory; allowed is a recording (.bag, .mcap, .db3, .csv, .parquet). "
+                f"To draw a trajectory, type: {command_line('plot', path, '--out', path.stem + '.png')}. "
+                f"To learn a model from it, type: {command_line('fit', 'ROBOT', path, '--out', 'model')}"
+            )
+        try:
+            recordings.append(load_recording(path, meaning))
+        except RecordingError as error:
+            columns = config is None and ("the columns are" in str(error) or "is missing" in str(error))
+            hint = "; or describe its own names in a YAML file with --config" if columns else ""
+            raise ValueError(f"{error}{hint}") from None
+    return recordings
 
 
 def shows_progress(progress: bool | None) -> bool:

@@ -15,6 +15,7 @@ from knode_cosserat.cli.arguments import (
     Progress,
     Robot,
     Space,
+    load_recordings,
     load_system,
     require_writable,
     shows_progress,
@@ -23,8 +24,6 @@ from knode_cosserat.cli.output import write_output
 from knode_cosserat.cli.program import app, examples
 
 if TYPE_CHECKING:
-    from knode_cosserat.recordings.config import RecordingConfig
-    from knode_cosserat.recordings.recording import Recording
     from knode_cosserat.rods.system import System
 
 Recordings = Annotated[
@@ -93,7 +92,7 @@ def identify(
     nominal = load_system(str(robot), changes)
     samples = [
         each.sampled(dt, start, None if seconds is None else (start or 0.0) + seconds, mean=True)
-        for each in _read(recordings, config)
+        for each in load_recordings(recordings, config)
     ]
     began = perf_counter()
     report = _print_on_stderr if shows_progress(progress) else None
@@ -116,21 +115,13 @@ def evaluate_on_recordings(
 
     facts: dict[str, Any] = {}
     lines = []
-    for path, recording in zip(recordings, _read(recordings, config), strict=True):
+    for path, recording in zip(recordings, load_recordings(recordings, config), strict=True):
         end = None if seconds is None else (start or 0.0) + seconds
         rows = recording.sampled(dt, start, end, mean=True)
         evaluation = compare(system, rows, space=space)
         facts[str(path)] = evaluation.to_dict()
         lines.append(f"{path}: {evaluation}")
     write_output(as_json, {"recordings": facts}, lines)
-
-
-def _read(paths: list[Path], config: Path | None) -> list[Recording]:
-    from knode_cosserat.recordings.config import RecordingConfig
-    from knode_cosserat.recordings.load import load_recording
-
-    chosen: RecordingConfig | None = None if config is None else RecordingConfig.load(config)
-    return [load_recording(path, chosen) for path in paths]
 
 
 def _print_on_stderr(line: str) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from knode_cosserat.cli.arguments import Json, Picture, command_line, figures, is_trajectory, require_writable
+from knode_cosserat.cli.arguments import Json, Picture, figures, load_recordings, require_writable
 from knode_cosserat.cli.output import table, write_output
 from knode_cosserat.cli.program import app, examples
 
@@ -48,19 +48,12 @@ def inspect(
     require_writable(figure=plot)
     if plot:
         figures()
-    if is_trajectory(str(recording)):
-        raise ValueError(
-            f"{recording}: this is a trajectory; allowed is a recording. To draw a trajectory, "
-            f"type: {command_line('plot', recording, '--out', recording.with_suffix('.png').name)}"
-        )
-    import knode_cosserat as kc
-
-    read = kc.load_recording(recording, kc.RecordingConfig.load(config) if config else None)
-    report = read.health()
+    (loaded,) = load_recordings([recording], config)
+    report = loaded.health()
     if plot:
         from knode_cosserat.evaluation import recording_figures
 
-        recording_figures.health(read, report).savefig(plot)
+        recording_figures.health(loaded, report).savefig(plot)
     written = {"plot": plot} if plot or as_json else {}
     write_output(as_json, {"recording": str(recording), **report.to_dict()}, _lines(report), **written)
 

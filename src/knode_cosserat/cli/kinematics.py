@@ -204,7 +204,7 @@ def _target(text: str, length: float) -> list[float]:
             unit, values = meant
             raise ValueError(
                 f"--position must be in metres (got {text} for a robot of {length:g} m length). "
-                f"Did you mean {' '.join(f'{x:g}' for x in values)} ({unit})?"
+                f"Did you mean {' '.join(f'{x:g}' for x in values)} ({text} {unit})?"
             )
     return target
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import warnings
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
+from knode_cosserat._numbers import numbers_in
 from knode_cosserat.cli.arguments import (
     ROBOT,
     Changes,
@@ -102,10 +104,13 @@ def simulate(
         dt = kc.controls.load(controls).dt if os.path.isfile(controls) and tensions_only else 0.05
     sequence = kc.named_controls.parse(system, controls, steps, dt)
     began = perf_counter()
-    trajectory = kc.simulate(
-        system, sequence, dt, time=time, space=space, progress=shows_progress(progress),
-        on_failure="return" if allow_failure else "raise",
-    )  # fmt: skip
+    with warnings.catch_warnings():
+        # a line of the output says it
+        warnings.filterwarnings("ignore", message="the grid is too coarse")
+        trajectory = kc.simulate(
+            system, sequence, dt, time=time, space=space, progress=shows_progress(progress),
+            on_failure="return" if allow_failure else "raise",
+        )  # fmt: skip
     seconds = perf_counter() - began
     trajectory.save(out)
     if drawing:
@@ -279,7 +284,12 @@ def _control(system: System, tension: str | None, control: str | None) -> Any:
 def _control_words(control: str, names: list[str]) -> list[str]:
     """Return the signals `NAME=constant:VALUE` of a control given by numbers in order, or by names."""
     if "=" not in control:
-        values = parse_numbers("--control", control, len(names), "7,5,5,7 or NAME=VALUE,…")
+        values = numbers_in(control)
+        if values is None or len(values) != len(names):
+            raise ValueError(
+                f"--control must be {len(names)} numbers, in the order {', '.join(names)}, or NAME=VALUE,…, "
+                f"such as {names[0] if names else 'NAME'}=0.1 (got {control!r})"
+            )
         return [f"{name}=constant:{value!r}" for name, value in zip(names, values, strict=True)]
     words = []
     # separated by commas, semicolons or spaces, but not by spaces around an equals sign

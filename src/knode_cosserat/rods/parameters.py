@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import math
+import re
 from collections.abc import Callable, Iterable
 from typing import Any, Literal, Self
 
@@ -16,7 +17,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from knode_cosserat._yaml import did_you_mean
+from knode_cosserat._yaml import did_you_mean, shown
 
 #: smallest length of a direction or quaternion: the square of a much smaller length underflows
 SHORTEST = 1e-9
@@ -32,6 +33,8 @@ Shape = Literal["scalar", "vector", "direction", "quaternion", "matrix", "list"]
 AT_END = 1e-9
 
 
+#: largest number of elements of a list in an error message
+MOST_SHOWN = 12
 #: by unit: the typical range
 TYPICAL: dict[str, tuple[float, float]] = {
     "m": (1e-5, 10.0),
@@ -48,6 +51,14 @@ _OTHER_UNITS: dict[str, dict[str, float]] = {
     "m/s2": {"mm/s2": 1e-3},
     "rad": {"degrees": np.pi / 180.0},
 }
+
+
+def numbers_text(value: Any) -> str:
+    """Return a number or (nested) list of numbers as text of bounded length, without needless digits."""
+    if isinstance(value, list):
+        more = ", …" if len(value) > MOST_SHOWN else ""
+        return "[" + ", ".join(map(numbers_text, value[:MOST_SHOWN])) + more + "]"
+    return f"{value:.12g}"
 
 
 def in_other_unit(value: Any, unit: str, low: float, high: float) -> tuple[str, Any] | None:
@@ -91,24 +102,33 @@ class Parameter:
         }[self.shape]
         return f"{kind} {self.bounds}"
 
-    def refusal(self, name: str, shown: str, value: Any = None) -> str:
+    def refusal(self, name: str, given: str, value: Any = None) -> str:
         """Return the error message for a value: the allowed ones, the given one, and the likely value.
 
         Args:
             name: the parameter's name.
-            shown: the given value as text.
+            given: the given value as text.
             value: the given numbers (an array), if there are any.
         """
         size = np.shape(value)
         if self.shape == "matrix" and size == (3, 3) and not _is_symmetric(value):
-            shown = f"{shown}, not symmetric"
+            given = f"{given}, not symmetric"
         scalar = value is not None and self.shape == "scalar" and size == ()
-        message = f"{name} must be {self.bounds if scalar else self.allowed} (got {shown})"
+        message = f"{name} must be {self.bounds if scalar else self.allowed} (got {given})"
         if value is None or self.shape == "matrix" or (size == ()) != (self.shape == "scalar"):
             return message
         beyond = np.any((value < self.low) | (value > self.high))
         meant = self._in_other_unit(value) if beyond else None
-        return f"{message}. Did you mean {meant[1]} ({shown} {meant[0]})?" if meant else message
+        return f"{message}. Did you mean {numbers_text(meant[1])} ({given} {meant[0]})?" if meant else message
+
+    def refusal_of_text(self, name: str, text: str) -> str:
+        """Return the error message for a text, such as a number with its unit."""
+        message = f"{name} must be {self.allowed} (got {shown(text)})"
+        found = re.fullmatch(r"([-+.\deE]*\d\.?) *([a-zA-Z][\w/]*)", text.strip())
+        factor = {self.unit: 1.0, **_OTHER_UNITS.get(self.unit, {})}.get(found[2]) if found else None
+        if found is None or factor is None or self.shape != "scalar":
+            return message
+        return f"{message}. Did you mean {numbers_text(float(found[1]) * factor)}?"
 
     def _in_other_unit(self, value: Any) -> tuple[str, Any] | None:
         """Return the likely unit of a value and its conversion; None if no conversion would be typical."""
@@ -223,7 +243,7 @@ def unknown_parameter(cls: type, name: Any, known: Iterable[str]) -> str:
     """Return the error message for an unknown parameter name."""
     known = list(known)
     return (
-        f"{cls.__name__} has no parameter {name!r}{did_you_mean(name, known)}; there are {', '.join(known)}"
+        f"{cls.__name__} has no parameter {name!r}; there are {', '.join(known)}{did_you_mean(name, known)}"
     )
 
 
@@ -280,11 +300,13 @@ def checked(name: str, value: Any, parameter: Parameter) -> None:
     except (TypeError, ValueError):
         array = np.array("ragged")
     if array.dtype.kind not in "fiu":
-        raise ParameterError(parameter.refusal(name, repr(value)))
+        if isinstance(value, str):
+            raise ParameterError(parameter.refusal_of_text(name, value))
+        raise ParameterError(parameter.refusal(name, shown(value)))
     if (array.ndim != 1 or array.size == 0) if expected is None else array.shape != expected:
-        raise ParameterError(parameter.refusal(name, f"{array.tolist()}, of shape {array.shape}"))
+        raise ParameterError(parameter.refusal(name, numbers_text(array.tolist())))
     if not _is_within(array, parameter):
-        raise ParameterError(parameter.refusal(name, str(array.tolist()), array))
+        raise ParameterError(parameter.refusal(name, numbers_text(array.tolist()), array))
 
 
 def _is_symmetric(array: np.ndarray) -> bool:

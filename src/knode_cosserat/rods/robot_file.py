@@ -207,9 +207,11 @@ def _parts(value: Any, slot: Slot, source: str, where: str) -> Any:
 def _require_keys(mapping: dict[Any, Any], source: str, *, known: Any, required: Any) -> None:
     for key in mapping:
         if key not in known:
+            hint = did_you_mean(key, known)
+            if "parameters" in known and any(key in parameters_of(kind) for kind in KINDS.values()):
+                hint = "; a robot's parameters belong under the key parameters"
             raise RobotFileError(
-                f"{source}: the key {shown(key)} is unknown; allowed is {', '.join(known)}"
-                f"{did_you_mean(key, known)}"
+                f"{source}: the key {shown(key)} is unknown; allowed is {', '.join(known)}{hint}"
             )
     missing = [key for key in required if key not in mapping]
     if missing:
@@ -228,7 +230,11 @@ def _require_allowed(key: str, value: Any, parameter: Parameter, source: str) ->
     try:
         checked(key, np.asarray(None) if array is None else array, parameter)
     except ParameterError:
-        raise RobotFileError(f"{source}: {parameter.refusal(key, shown(value), array)}") from None
+        text = isinstance(value, str)
+        message = (
+            parameter.refusal_of_text(key, value) if text else parameter.refusal(key, shown(value), array)
+        )
+        raise RobotFileError(f"{source}: {message}") from None
 
 
 def _array(value: Any) -> np.ndarray | None:
