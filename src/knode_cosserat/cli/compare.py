@@ -209,7 +209,7 @@ def animate(
     columns: Columns = 1,
     as_json: Json = False,
 ) -> None:
-    """Write an animation of one trajectory, or of several overlaid.
+    """Animate one trajectory, or several overlaid.
 
     A GIF needs matplotlib; an MP4 also needs the program ffmpeg.
     """

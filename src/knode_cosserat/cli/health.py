@@ -11,9 +11,9 @@ from knode_cosserat.cli.program import app, examples
 
 @app.command(epilog=examples("doctor", "doctor --json"))
 def doctor(as_json: Json = False) -> None:
-    """Check the installation: versions, devices, cache, precision, and a short simulation.
+    """Check the installation with a short simulation.
 
-    The exit status is 1 if a check fails.
+    Prints versions, devices, cache and precision. The exit status is 1 if a check fails.
     """
     import knode_cosserat as kc
 

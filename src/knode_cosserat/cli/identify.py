@@ -79,7 +79,7 @@ def identify(
     progress: Progress = None,
     as_json: Json = False,
 ) -> None:
-    """Identify a tendon robot from recordings: its physical effects and their parameters.
+    """Identify a tendon robot's parameters from recordings.
 
     ROBOT is the nominal robot, from measured dimensions, masses and data sheets. An effect is kept if it
     lowers the error on recordings left out of the search. The result must pass trial simulations with larger

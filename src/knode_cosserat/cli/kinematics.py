@@ -52,7 +52,7 @@ High = Annotated[
 
 @app.command(
     epilog=examples(
-        "reach delrin-tendon-robot --position 0.2063 0.1032 0.58 --high 10",
+        "reach delrin-tendon-robot --position 0.17404 0.0838 0.60002 --high 10",
         "reach delrin-tendon-robot --quaternion 0.98 -0.1 0.17 0 --low 1 --high 8,8,10,10 --tolerance 1e-2",
     )
 )
@@ -79,7 +79,7 @@ def reach(
     nodes: Nodes = None,
     as_json: Json = False,
 ) -> None:
-    """Compute the tensions, or other controls, that move the tip to a pose at rest.
+    """Compute controls that move the tip to a pose at rest.
 
     Among several solutions it returns the one with the smallest controls above the lower limits. If the pose
     cannot be reached, it returns the nearest pose and says so.
@@ -159,7 +159,10 @@ def workspace(
     progress: Progress = None,
     as_json: Json = False,
 ) -> None:
-    """Sample the workspace: tip poses at rest under controls distributed evenly between limits."""
+    """Sample the tip poses that a robot reaches at rest.
+
+    Controls are distributed evenly between their limits.
+    """
     from knode_cosserat.control.workspace import FORMATS
 
     require_writable(out, picture)

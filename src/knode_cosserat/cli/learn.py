@@ -99,10 +99,11 @@ def fit(
     progress: Progress = None,
     as_json: Json = False,
 ) -> None:
-    """Learn a residual model: the difference between a robot's physics and trajectories.
+    """Learn a residual model from trajectories.
 
-    Trajectories have full states, from a simulation or from state estimation; use `identify` for recordings.
-    The resulting model is accepted wherever a robot is.
+    The residual is the difference between the robot's physics and the trajectories. Trajectories have full
+    states, from a simulation or from state estimation; use `identify` for recordings. The resulting model is
+    accepted wherever a robot is.
     """
     _refuse_recordings(robot, trajectories, out)
     numbers = _seeds(seed, seeds)

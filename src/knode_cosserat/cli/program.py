@@ -117,9 +117,7 @@ def _app(**options: Any) -> typer.Typer:
 
 app = _app(cls=_Program, add_completion=True)
 #: the commands under `study`
-studies = _app(
-    help="Repeat a study of the paper, or identify a robot, a beam or cables from a folder of recordings."
-)
+studies = _app(help="Repeat a study of the paper, or of a folder of recordings.")
 
 
 def main() -> None:
@@ -161,7 +159,7 @@ def program(
 ) -> None:
     """Simulate Cosserat-rod robots, learn residual models and identify parameters.
 
-    Units are SI: m, s, kg, N, Pa, rad. Vectors are written as 7,5,5,7 or "7 5 5 7" or 7 5 5 7.
+    Units are SI: m, s, kg, N, Pa, rad. Vectors are numbers separated by commas or spaces: 7,5,5,7.
     """
     if verbose:
         handler = logging.StreamHandler()

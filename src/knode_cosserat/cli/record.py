@@ -64,11 +64,11 @@ def record_virtual(
     states: Annotated[Path | None, NetCDF] = None,
     as_json: Json = False,
 ) -> None:
-    """Record a simulated robot: write a bag in the format of the paper's robot.
+    """Record a simulated robot as a bag or table.
 
-    The simulation includes effects that models do not have: tendon friction, ribs with masses, a sleeve,
-    motor lag and sensor noise. --states writes the true states. With --imperfections the robot is the paper's
-    with random effects that `identify` can find.
+    The recording has the format of the paper's robot. The simulation includes effects that models do not
+    have: tendon friction, ribs with masses, a sleeve, motor lag and sensor noise. --states writes the true
+    states. With --imperfections the robot is the paper's with random effects that `identify` can find.
     """
     for path in (out, states, truth):
         require_writable(path)

@@ -93,7 +93,7 @@ def simulate(
     progress: Progress = None,
     as_json: Json = False,
 ) -> None:
-    """Simulate the motion of a robot under tendon tensions or other controls."""
+    """Simulate a robot under tensions or other controls."""
     require_writable(out, figure)
     drawing = figures() if figure else None
     import knode_cosserat as kc
@@ -198,7 +198,10 @@ def info(
     nodes: Nodes = None,
     as_json: Json = False,
 ) -> None:
-    """Show parameters and controls of a robot, and the residual of a model; or list the catalog."""
+    """Show a robot's parameters and controls, or the catalog.
+
+    For a model, show the residual as well.
+    """
     import knode_cosserat as kc
 
     robots = kc.catalog()
@@ -235,7 +238,10 @@ def info(
 def schema(
     as_json: Annotated[bool, typer.Option("--json", help="Print the schema on one line.")] = False,
 ) -> None:
-    """Print the JSON Schema of robot files, for completion and checks in editors."""
+    """Print the JSON Schema of robot files.
+
+    Editors use it to complete and check them.
+    """
     import json
 
     import knode_cosserat as kc

@@ -33,10 +33,11 @@ def simulation(
     progress: Progress = None,
     as_json: Json = False,
 ) -> None:
-    """Repeat the paper's simulation study (Table I): four imperfect models, each trained on two short sines.
+    """Repeat the paper's simulation study, Table I.
 
-    Writes Table I with the paper's published values (table1.md, .csv, .json), figures, trajectories and
-    models. Resumes an earlier run in the same folder.
+    Four imperfect models are each trained on two short sines. Writes Table I with the paper's published
+    values (table1.md, .csv, .json), figures, trajectories and models. Resumes an earlier run in the same
+    folder.
     """
     prepare(out, workers, dask)
     from knode_cosserat.studies.methods import METHODS
@@ -64,10 +65,11 @@ def imperfections(
     progress: Progress = None,
     as_json: Json = False,
 ) -> None:
-    """Measure the error of the preset best for robots that differ structurally from the model.
+    """Measure errors for robots that differ from the model.
 
-    Each model is trained on two sines of 30 rows. It predicts 30 s of held-out controls, and of controls with
-    twice the tension. Writes imperfections.md, .json and a figure. Resumes an earlier run in the same folder.
+    The robots differ by more than a parameter. Each model is learned with the preset best. It is trained on
+    two sines of 30 rows. It predicts 30 s of held-out controls, and of controls with twice the tension.
+    Writes imperfections.md, .json and a figure. Resumes an earlier run in the same folder.
     """
     prepare(out, workers, dask)
     from knode_cosserat.studies.imperfections import IMPERFECTIONS
@@ -98,11 +100,11 @@ def data(
     progress: Progress = None,
     as_json: Json = False,
 ) -> None:
-    """Measure data efficiency: errors after training on 5 to 30 rows of one sine, and of two.
+    """Measure errors against the amount of training data.
 
-    Compares the paper's imperfect models with predictors without a physical model: networks of the same size
-    and a linear predictor (needs the extra `bench`). Writes data.md, .json and figures. Resumes an earlier
-    run in the same folder.
+    Trains on 5 to 30 rows of one sine, and of two. Compares the paper's imperfect models with predictors
+    without a physical model: networks of the same size and a linear predictor (needs the extra `bench`).
+    Writes data.md, .json and figures. Resumes an earlier run in the same folder.
     """
     prepare(out, workers, dask)
     from knode_cosserat.studies.data_efficiency import ALL
@@ -117,10 +119,10 @@ def data(
 
 @studies.command(epilog=examples("study estimation --out results"))
 def estimation(out: Out, as_json: Json = False) -> None:
-    """Measure the error of state estimation from recordings: the paper's method and the best one.
+    """Measure the error of state estimation.
 
-    Records the virtual robot (simulated, so its true states are known). Writes the errors of all quantities
-    (estimation.md, .json), a figure, and the bags.
+    Compares the paper's method and the best one. Records the virtual robot (simulated, so its true states are
+    known). Writes the errors of all quantities (estimation.md, .json), a figure, and the bags.
     """
     prepare(out, None, None)
     from knode_cosserat.studies.estimation import rerun

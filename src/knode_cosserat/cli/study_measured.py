@@ -80,12 +80,12 @@ def recordings(
     progress: Progress = None,
     as_json: Json = False,
 ) -> None:
-    """Learn a robot from some recordings and predict the others, as in the paper's Table II.
+    """Learn a robot from recordings, as in the paper's Table II.
 
-    Estimates states, trains the paper's model without (A) and with (B) the recordings named rand*, and
-    identifies the best model from measured poses alone. Files robot.yaml and recording.yaml in BAGDIR are the
-    defaults of --robot and --config. Writes table2.md, .json, figures and models. Resumes an earlier run in
-    the same folder.
+    Predicts the recordings that are not used for training. Estimates states, trains the paper's model without
+    (A) and with (B) the recordings named rand*, and identifies the best model from measured poses alone.
+    Files robot.yaml and recording.yaml in BAGDIR are the defaults of --robot and --config. Writes table2.md,
+    .json, figures and models. Resumes an earlier run in the same folder.
     """
     prepare(out, workers, dask)
     from knode_cosserat.studies.recordings import METHODS, ROBOT, Options, described_in
@@ -143,11 +143,11 @@ def beam(
     progress: Progress = None,
     as_json: Json = False,
 ) -> None:
-    """Identify a real silicone beam that is released by hand, and predict its other recordings.
+    """Identify a silicone beam from recordings.
 
-    Detects the release in each recording, and identifies stiffness, damping and creep by least squares over
-    whole rollouts of the training recordings. Writes the errors of the tip markers (beam.md, .json) and a
-    figure.
+    The beam is real and released by hand; recordings not used for training are predicted. Detects the release
+    in each recording, and identifies stiffness, damping and creep by least squares over whole rollouts of the
+    training recordings. Writes the errors of the tip markers (beam.md, .json) and a figure.
     """
     prepare(out, None, None)
     from knode_cosserat.studies.beam import rerun
@@ -184,11 +184,11 @@ def cables(
     ] = 400.0,
     as_json: Json = False,
 ) -> None:
-    """Identify cables held by two grippers, and predict the motions in `eval` open loop.
+    """Identify cables held by two grippers.
 
-    Reads marker positions at 100 Hz in the format of the DEFORM data set; pickle files are read without
-    running code from them. Writes cables.json, cables.md, a figure, and a 3-D scene of prediction and
-    measurement for each cable.
+    Predicts the motions in `eval` open loop. Reads marker positions at 100 Hz in the format of the DEFORM
+    data set; pickle files are read without running code from them. Writes cables.json, cables.md, a figure,
+    and a 3-D scene of prediction and measurement for each cable.
     """
     prepare(out, None, None)
     from knode_cosserat.studies.cables.study import CableOptions, rerun

@@ -72,7 +72,10 @@ def view(
     nodes: Nodes = None,
     as_json: Json = False,
 ) -> None:
-    """Show trajectories in 3-D in the browser, or control a robot by sliders."""
+    """Show trajectories in 3-D, or control a robot by sliders.
+
+    The scene opens in the browser.
+    """
     from knode_cosserat import viewer
 
     names = files or []
