@@ -332,7 +332,7 @@ def test_a_file_as_specification(tmp_path):
         ("random:1.5", ["seed is '1.5'", "a whole number"]),
         ("random:1,hold=x", ["hold is 'x'", "a whole number"]),
         ("step:1,tendons=a", ["tendons is 'a'", "tendons like 1+4"]),
-        ("step:1,tendons=5", ["tendons is (4,)", "0 to 3"]),
+        ("step:1,tendons=5", ["tendons is 5", "numbers from 1 to 4"]),
         ("constant:-1", ["'constant:-1'", "a tension is -1 N"]),
         ("constant:nan", ["tension is nan"]),
         ("x" * 5000, ["no such signal or file"]),

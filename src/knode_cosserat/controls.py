@@ -306,6 +306,11 @@ def _from_signal(name: str, text: str, steps: int, dt: float, tendons: int) -> T
         arguments[key] = _read_as(signal.options[key], key, value)
     if "dt" in inspect.signature(signal.make).parameters:
         arguments["dt"] = dt
+    if not set(arguments.get("tendons", ())) <= set(range(tendons)):
+        given = "+".join(str(k + 1) for k in arguments["tendons"])
+        raise ControlsError(
+            f"tendons is {given}; allowed is numbers from 1 to {tendons}, such as 1+{tendons}"
+        )
     tensions = signal.make(steps=steps, **arguments, **{signal.tendon_count: tendons})
     if name in ("sine", "step", "ramp") and steps > 1:
         stated = {**_defaults(signal.make), **arguments}

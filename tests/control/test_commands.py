@@ -98,7 +98,7 @@ def test_workspace_writes_and_draws(tmp_path):
         (("reach", ROBOT), "neither position nor quaternion"),
         (
             ("reach", ROBOT, "--position", 0, 0, 1, "--low", "a"),
-            "--low must be numbers, such as 10, or 8,8,10,10 for each control (got 'a')",
+            "--low must be one number for all controls, or 4, one for each (got 'a')",
         ),
         (("workspace", ROBOT, "--out", "w.txt"), "w.txt: the name must end in"),
         (("workspace", ROBOT, "--out", "w.nc", "--low", 3, "--high", 1), "low is 3 and high 1"),

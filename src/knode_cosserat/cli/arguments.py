@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shlex
 import sys
 import tempfile
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -85,9 +87,13 @@ def parse_numbers(option: str, text: str, count: int | None = None, example: str
     return numbers
 
 
-def parse_limits(option: str, text: str) -> float | list[float]:
-    """Return the limits of controls: one number for all, or one for each."""
-    numbers = parse_numbers(option, text, example="10, or 8,8,10,10 for each control")
+def parse_limits(option: str, text: str, count: int) -> float | list[float]:
+    """Return the limits of `count` controls: one number for all, or one for each."""
+    numbers = numbers_in(text)
+    if numbers is None or len(numbers) not in (1, count):
+        raise ValueError(
+            f"{option} must be one number for all controls, or {count}, one for each (got {text!r})"
+        )
     return numbers[0] if len(numbers) == 1 else numbers
 
 
@@ -177,8 +183,8 @@ def is_trajectory(name: str) -> bool:
 
 
 def is_recording(name: str) -> bool:
-    """True if a file is a bag or a table by its ending."""
-    return name.lower().endswith(RECORDINGS)
+    """True if a file is a bag or a table by its ending, and not a trajectory by its content."""
+    return name.lower().endswith(RECORDINGS) and not _begins(name, TRAJECTORY_MARK)
 
 
 def command_line(*words: str | Path) -> str:
@@ -240,6 +246,22 @@ def _try_to_write(path: Path, *, folder: bool, replaced: bool) -> None:
     except OSError as error:
         where = "" if over or at == path else f" in {at}"
         raise ValueError(f"{path}: nothing can be written{where}: {error.strerror}") from None
+
+
+def require_trajectory_name(path: Path | None) -> None:
+    """Raise `ValueError` if the name of a netCDF output has the ending of another type of file."""
+    if path and path.name.lower().endswith((*RECORDINGS, *FORMATS, ".yaml", ".yml", ".json", ".npz")):
+        raise ValueError(
+            f"{path}: the name of a trajectory must end in .nc. Did you mean {path.with_suffix('.nc')}?"
+        )
+
+
+@contextlib.contextmanager
+def coarse_grid_in_output() -> Iterator[None]:
+    """Suppress the warning of a coarse grid, for commands whose output states it."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="the grid is too coarse")
+        yield
 
 
 def load_recordings(paths: Sequence[Path], config: Path | None) -> list[Recording]:

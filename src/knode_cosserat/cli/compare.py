@@ -253,6 +253,12 @@ def _require_one_kind(prediction: str, references: list[Path], config: Path | No
             f"{recordings[0]}: this is a recording; only a robot or model is compared with it, not the "
             f"trajectory {prediction}. Type: {typed}"
         )
+    robots = [name for name in others if not is_trajectory(name)]
+    if is_trajectory(prediction) and robots:
+        raise ValueError(
+            f"{robots[0]}: a reference must be a trajectory or a recording; a robot or model comes "
+            f"first. Type: {command_line('evaluate', robots[0], prediction)}"
+        )
     trajectories = [name for name in others if is_trajectory(name)]
     if recordings and trajectories:
         typed = command_line("evaluate", prediction, *recordings, *(read or ["--config", "recording.yaml"]))

@@ -88,13 +88,14 @@ def reach(
     from knode_cosserat import named_controls
 
     system = load_system(robot, changes, nodes)
+    size = system.control_size
     target = None if position is None else _target(position, float(system.length))
     orientation = (
         None if quaternion is None else parse_numbers("--quaternion", quaternion, 4, "0.98,-0.1,0.17,0")
     )
     found = kc.inverse_kinematics(
-        system, target, orientation, low=parse_limits("--low", low), high=parse_limits("--high", high),
-        tolerance=tolerance, space=space,
+        system, target, orientation,
+        low=parse_limits("--low", low, size), high=parse_limits("--high", high, size), tolerance=tolerance, space=space,
     )  # fmt: skip
     facts: dict[str, Any] = {
         "robot": robot,
@@ -173,10 +174,11 @@ def workspace(
     import knode_cosserat as kc
 
     system = load_system(robot, changes, nodes)
+    size = system.control_size
     began = perf_counter()
     found = kc.workspace(
-        system, parse_limits("--low", low), parse_limits("--high", high), count, seed=seed, space=space,
-        progress=shows_progress(progress),
+        system, parse_limits("--low", low, size), parse_limits("--high", high, size), count,
+        seed=seed, space=space, progress=shows_progress(progress),
     )  # fmt: skip
     seconds = perf_counter() - began
     found.save(out)

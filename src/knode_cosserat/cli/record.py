@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from knode_cosserat.cli.arguments import Json, NetCDF, require_writable
+from knode_cosserat.cli.arguments import Json, NetCDF, require_trajectory_name, require_writable
 from knode_cosserat.cli.output import write_output
 from knode_cosserat.cli.program import app, examples
 
@@ -70,6 +70,7 @@ def record_virtual(
     have: tendon friction, ribs with masses, a sleeve, motor lag and sensor noise. --states writes the true
     states. With --imperfections the robot is the paper's with random effects that `identify` can find.
     """
+    require_trajectory_name(states)
     for path in (out, states, truth):
         require_writable(path)
     if truth and imperfections is None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import warnings
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Annotated, Any
@@ -23,9 +22,11 @@ from knode_cosserat.cli.arguments import (
     Progress,
     Robot,
     Space,
+    coarse_grid_in_output,
     figures,
     load_system,
     parse_numbers,
+    require_trajectory_name,
     require_writable,
     shows_progress,
 )
@@ -94,6 +95,7 @@ def simulate(
     as_json: Json = False,
 ) -> None:
     """Simulate a robot under tensions or other controls."""
+    require_trajectory_name(out)
     require_writable(out, figure)
     drawing = figures() if figure else None
     import knode_cosserat as kc
@@ -104,9 +106,7 @@ def simulate(
         dt = kc.controls.load(controls).dt if os.path.isfile(controls) and tensions_only else 0.05
     sequence = kc.named_controls.parse(system, controls, steps, dt)
     began = perf_counter()
-    with warnings.catch_warnings():
-        # a line of the output says it
-        warnings.filterwarnings("ignore", message="the grid is too coarse")
+    with coarse_grid_in_output():
         trajectory = kc.simulate(
             system, sequence, dt, time=time, space=space, progress=shows_progress(progress),
             on_failure="return" if allow_failure else "raise",
@@ -161,14 +161,17 @@ def equilibrium(
     as_json: Json = False,
 ) -> None:
     """Compute the static equilibrium under a constant control."""
+    require_trajectory_name(out)
     require_writable(out)
     import knode_cosserat as kc
 
     system = load_system(robot, changes, nodes)
-    rest = kc.equilibrium(system, _control(system, tension, control), space=space)
+    with coarse_grid_in_output():
+        rest = kc.equilibrium(system, _control(system, tension, control), space=space)
+        unstable = _unstable(rest, space)
     if out:
         rest.save(out)
-    facts = {"robot": robot, **equilibrium_summary(rest), "unstable": _unstable(rest, space)}
+    facts = {"robot": robot, **equilibrium_summary(rest), "unstable": unstable}
     lines = [
         f"tip: {vector_text(facts['tip_position'])} m",
         f"inclination of the tip from the z axis: {np.degrees(facts['tip_inclination']):.2f} degrees",
