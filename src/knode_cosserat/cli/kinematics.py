@@ -95,7 +95,8 @@ def reach(
     )
     found = kc.inverse_kinematics(
         system, target, orientation,
-        low=parse_limits("--low", low, size), high=parse_limits("--high", high, size), tolerance=tolerance, space=space,
+        low=parse_limits("--low", low, size), high=parse_limits("--high", high, size),
+        tolerance=tolerance, space=space,
     )  # fmt: skip
     facts: dict[str, Any] = {
         "robot": robot,
