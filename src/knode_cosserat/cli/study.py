@@ -8,7 +8,7 @@ import typer
 
 from knode_cosserat.cli.arguments import Json, Progress
 from knode_cosserat.cli.program import app, examples, studies
-from knode_cosserat.cli.study_options import Dask, Out, Seeds, Workers, chosen_of, prepare, run_study
+from knode_cosserat.cli.study_options import Dask, Out, Seeds, Workers, prepare, run_study, selected_names
 
 app.add_typer(studies, name="study")
 
@@ -43,7 +43,7 @@ def simulation(
     from knode_cosserat.studies.methods import METHODS
     from knode_cosserat.studies.simulation_report import rerun
 
-    chosen = chosen_of("methods", methods, METHODS)
+    chosen = selected_names("methods", methods, METHODS)
     run_study(
         lambda **how: rerun(out, seeds=range(seeds), methods=chosen, **how),
         {"methods": chosen, "seeds": seeds}, out, workers, dask, progress, as_json,
@@ -75,7 +75,7 @@ def imperfections(
     from knode_cosserat.studies.imperfections import IMPERFECTIONS
     from knode_cosserat.studies.imperfections_report import rerun
 
-    chosen = chosen_of("only", only, IMPERFECTIONS)
+    chosen = selected_names("only", only, IMPERFECTIONS)
     run_study(
         lambda **how: rerun(out, seeds=range(seeds), names=chosen, **how),
         {"imperfections": chosen, "seeds": seeds}, out, workers, dask, progress, as_json,
@@ -110,7 +110,7 @@ def data(
     from knode_cosserat.studies.data_efficiency import ALL
     from knode_cosserat.studies.data_report import rerun
 
-    chosen = chosen_of("methods", methods, ALL)
+    chosen = selected_names("methods", methods, ALL)
     run_study(
         lambda **how: rerun(out, seeds=range(seeds), methods=chosen, **how),
         {"methods": chosen, "seeds": seeds}, out, workers, dask, progress, as_json,

@@ -10,7 +10,7 @@ import typer
 
 from knode_cosserat.cli.arguments import Json, Progress, shows_progress
 from knode_cosserat.cli.program import examples, studies
-from knode_cosserat.cli.study_options import Dask, Out, Seeds, Workers, chosen_of, prepare, run_study
+from knode_cosserat.cli.study_options import Dask, Out, Seeds, Workers, prepare, run_study, selected_names
 
 
 @studies.command(
@@ -91,7 +91,7 @@ def recordings(
     from knode_cosserat.studies.recordings import METHODS, ROBOT, Options, described_in
     from knode_cosserat.studies.recordings_report import rerun
 
-    chosen = chosen_of("methods", methods, METHODS)
+    chosen = selected_names("methods", methods, METHODS)
     names = None if train is None else [name.strip() for each in train for name in each.split(",")]
     defaults = described_in(bags)
     used = [
@@ -200,23 +200,25 @@ def cables(
     )  # fmt: skip
 
 
-def _names(given: Sequence[str]) -> list[str]:
+def _names(options: Sequence[str]) -> list[str]:
     """Return names separated by commas, without file endings."""
-    return [name.strip().removesuffix(".csv") for each in given for name in each.split(",") if name.strip()]
+    return [
+        name.strip().removesuffix(".csv") for option in options for name in option.split(",") if name.strip()
+    ]
 
 
-def _loads(given: Sequence[str]) -> dict[str, float]:
+def _loads(options: Sequence[str]) -> dict[str, float]:
     """Return masses (kg) by name, from NAME=GRAMS."""
     masses = {}
-    for each in given:
-        name, _, grams = each.rpartition("=")
+    for option in options:
+        name, _, grams = option.rpartition("=")
         try:
             mass = 1e-3 * float(grams)
         except ValueError:
             mass = -1.0
         if not name or not 0.0 <= mass < 10.0:
             raise ValueError(
-                f"--load must be NAME=GRAMS with 0 to 10000 g, such as beam_run3=30 (got {each!r})"
+                f"--load must be NAME=GRAMS with 0 to 10000 g, such as beam_run3=30 (got {option!r})"
             )
         masses[name.strip().removesuffix(".csv")] = mass
     return masses

@@ -39,11 +39,11 @@ def prepare(out: Path, workers: int | None, dask: str | None) -> None:
     figures()
 
 
-def chosen_of(option: str, given: str | None, known: Iterable[str]) -> list[str]:
+def selected_names(option: str, names: str | None, known: Iterable[str]) -> list[str]:
     """Return the selected names in the order of the table. A known name may contain a comma."""
-    if given is None:
+    if names is None:
         return list(known)
-    rest = f"{given},"
+    rest = f"{names},"
     selected = set()
     while rest.strip():
         # the longest match: one name may begin with another
