@@ -28,7 +28,9 @@ def tendons() -> dict[str, Any]:
     robots = {
         "crude": crude,
         "straight": kc.robots.RoutedTendonRobot.like(crude),
-        "friction": kc.robots.RoutedTendonRobot.like(crude, friction=TendonFriction(wobble=0.6, curvature=0.1)),
+        "friction": kc.robots.RoutedTendonRobot.like(
+            crude, friction=TendonFriction(wobble=0.6, curvature=0.1)
+        ),
         "helical": kc.robots.RoutedTendonRobot.like(crude, routing=tuple(helix)),
         "ribs": kc.load_robot("delrin-routed-tendon-robot"),
     }

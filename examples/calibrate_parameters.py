@@ -14,7 +14,9 @@ import knode_cosserat as kc
 DT, NAMES = 0.05, ("youngs_modulus", "bending_damping")
 
 
-def main(out: str = "calibrate_parameters.png", steps: int = 60, noise: float = 1e-3) -> kc.calibration.Calibration:
+def main(
+    out: str = "calibrate_parameters.png", steps: int = 60, noise: float = 1e-3
+) -> kc.calibration.Calibration:
     """Calibrate from a sine with noise (m, and of other states alike), and predict random tensions."""
     robot = kc.load_robot("delrin-tendon-robot")  # stands for the real one
     guess = robot.replace(youngs_modulus=1.5e9, bending_damping=0.05)
@@ -28,7 +30,8 @@ def main(out: str = "calibrate_parameters.png", steps: int = 60, noise: float = 
     unseen = kc.controls.random(steps, seed=1, hold=10)
     truth, before, after = (kc.simulate(each, unseen, DT) for each in (robot, guess, found.robot))
     kc.figures.error(truth, {"before": before, "after": after}).savefig(out)
-    print(f"tip RMSE {kc.metrics.tip_rmse(before, truth):.2g} m before, {kc.metrics.tip_rmse(after, truth):.2g} m after")
+    errors = [kc.metrics.tip_rmse(each, truth) for each in (before, after)]
+    print(f"tip RMSE {errors[0]:.2g} m before, {errors[1]:.2g} m after")
     return found
 
 

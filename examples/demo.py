@@ -54,7 +54,9 @@ def learn_what_a_model_misses(out: Path) -> None:
     }
     sines = {label: prediction["sine"] for label, prediction in predictions.items()}
     study_figures.comparison(truth["sine"], sines).savefig(out / "learning.png")
-    kc.viewer.export_scene({"robot": truth["sine"], **sines}, out / "scene.html", title="What the model missed")
+    kc.viewer.export_scene(
+        {"robot": truth["sine"], **sines}, out / "scene.html", title="What the model missed"
+    )
 
     errors = {
         label: [

@@ -15,7 +15,9 @@ import knode_cosserat as kc
 class HangingString(kc.System):
     """A string pinned at the origin; the control is the position of the other end."""
 
-    y_layout: ClassVar = kc.robots.Layout(("p", 2, "m", "place"), ("n", 2, "N", "force"), ("q", 2, "m/s", "speed"))
+    y_layout: ClassVar = kc.robots.Layout(
+        ("p", 2, "m", "place"), ("n", 2, "N", "force"), ("q", 2, "m/s", "speed")
+    )
     z_layout: ClassVar = kc.robots.Layout(("T", 1, "N", "tension"))
     control_layout: ClassVar = kc.robots.Layout(("hand", 2, "m", "position of the hand"))
     base_unknowns: ClassVar = ("n",)

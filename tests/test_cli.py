@@ -155,9 +155,52 @@ def test_equilibrium_tells_the_shape_and_what_holds_it(tmp_path):
     assert facts["position_error"] == pytest.approx(error, rel=0.3)
     words = succeeded("equilibrium", ROBOT, "--tension", "7,5,5,7")
     assert "tip: (0.244533, 0, 0.57779) m" in words
-    assert "largest position error, by estimate: 0.66 mm (0.1 % of the length)" in words
+    assert "largest estimated position error: 0.66 mm (0.1 % of the length)" in words
     paper = succeeded("equilibrium", ROBOT, "--tension", "7,5,5,7", "--space", "euler")
     assert "tip: (0.28029, 0, 0.551513) m" in paper and "COARSE GRID: " in paper
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        ("--tension", "7", "5", "5", "7"),
+        ("--tension", "7 5 5 7"),
+        ("--tension=[7, 5, 5, 7]",),
+        ("--control", "7,5,5,7"),
+        ("--control", "tension_1=7,tension_2=5; tension_3 = 5", "tension_4=7"),
+    ],
+)
+def test_vectors_may_be_separated_by_commas_or_spaces(given):
+    control = told("equilibrium", ROBOT, *given)["control"]
+    assert control == [7.0, 5.0, 5.0, 7.0]
+
+
+def test_parameters_that_are_vectors():
+    for given in (
+        ("gravity=0", "0", "-1"),
+        ("gravity=0,0,-1",),
+        ("gravity=0 0 -1",),
+        ("gravity=[0, 0, -1]",),
+    ):
+        facts = told("info", ROBOT, "--set", *given)
+        assert facts["parameters"]["gravity"]["value"] == [0.0, 0.0, -1.0]
+
+
+def test_constant_controls_are_given_by_their_numbers(tmp_path):
+    out = tmp_path / "a.nc"
+    for controls in ("7,5,5,7", "constant:7 5 5 7"):
+        succeeded(*simulated(out, controls=controls, steps=2))
+        np.testing.assert_array_equal(kc.load_trajectory(out).control[1:], [[7, 5, 5, 7]] * 2)
+
+
+@pytest.mark.filterwarnings("always:bending_damping is 0")
+def test_undamped_motion_gives_a_warning(tmp_path):
+    result = run(*simulated(tmp_path / "a.nc", "--set", "bending_damping=0", "--json"))
+    assert result.exit_code == 0 and json.loads(result.stdout)["all_solved"]
+    assert result.stderr.startswith("warning: bending_damping is 0 and nothing else damps the motion")
+    assert "Set bending_damping, such as 0.0006 N m2 s" in result.stderr
+    assert result.stderr.count("\n") == 1
+    assert succeeded("equilibrium", ROBOT, "--tension", "7,5,5,7", "--set", "bending_damping=0")
 
 
 # info
@@ -243,7 +286,7 @@ def test_fit_tells_what_it_did(data, tmp_path):
     text = succeeded(
         "fit", ROBOT, data / "a.nc", "--set", "length=0.4", "--rows", 12, "--out", tmp_path / "m"
     )
-    assert f"learned what {ROBOT} misses from 1 trajectories of 12 rows in all: preset best" in text
+    assert f"learned a residual model of {ROBOT} from 1 trajectory (12 rows): preset best" in text
     assert "+0.5875 of the knowledge's length" in text
     assert text.endswith(f"wrote {tmp_path / 'm'}\n")
 

@@ -149,7 +149,7 @@ def test_robots_of_a_batch_that_are_not_right(tmp_path):
     path = tmp_path / "a.nc"
     synthetic((3,), robot=ROBOTS).save(path)
     edited(path, lambda file: file["robot_length"].__setitem__(1, -1.0))
-    with fails("a.nc: a robot of the batch is not possible: length is -1.0", "0.001 to 20 m"):
+    with fails("a.nc: a robot of the batch is not possible: length must be between 0.001 and 20 m (got -1)"):
         load_trajectory(path)
     data = xarray.load_dataset(path, decode_cf=False)
     data.drop_vars("robot_drag").to_netcdf(path, engine="h5netcdf")

@@ -160,7 +160,7 @@ def test_the_doctor_finds_this_installation_well():
     assert found.well and {check.name for check in found.checks} == {
         "precision", "cache", "simulation", "balance",
     }  # fmt: skip
-    assert "all is well" in str(found) and found.versions["jax"]
+    assert "all checks passed" in str(found) and found.versions["jax"]
 
 
 def test_the_doctor_says_what_is_wrong(monkeypatch):
@@ -168,7 +168,7 @@ def test_the_doctor_says_what_is_wrong(monkeypatch):
     found = kc.doctor()
     assert not found.well and "ZeroDivisionError" in str(found)
     done = CliRunner().invoke(app, ["doctor"])
-    assert done.exit_code == 1 and "WRONG" in done.output
+    assert done.exit_code == 1 and "FAILED" in done.output
 
 
 # the logger

@@ -80,11 +80,11 @@ class Diagnosis:
             f"cache      {self.cache} ({self.programs} compiled programs)",
         ]
         if extras:
-            lines.append(f"not here   {', '.join(missing)}: pip install 'knode-cosserat[{','.join(extras)}]'")
+            lines.append(f"missing    {', '.join(missing)}: pip install 'knode-cosserat[{','.join(extras)}]'")
         lines += [
-            f"{'ok' if check.well else 'WRONG':<10} {check.name}: {check.seen}" for check in self.checks
+            f"{'ok' if check.well else 'FAILED':<10} {check.name}: {check.seen}" for check in self.checks
         ]
-        lines.append("all is well" if self.well else "something is wrong: see above")
+        lines.append("all checks passed" if self.well else "a check failed: see above")
         return "\n".join(lines)
 
 

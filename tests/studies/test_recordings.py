@@ -123,8 +123,8 @@ def test_a_folder_describes_its_robot_and_its_topics(folder, tmp_path):
 
     (found, told), (same, silent) = errors("a"), errors("b", "--robot", own / "robot.yaml")
     assert found == same
-    assert f"taken from {own}: robot.yaml and recording.yaml" in told
-    assert f"taken from {own}: recording.yaml" in silent
+    assert f"using robot.yaml and recording.yaml of {own}" in told
+    assert f"using recording.yaml of {own}" in silent
     assert errors("c", "--robot", "delrin-tendon-robot")[0] != pytest.approx(found, rel=0.1)
 
 

@@ -31,6 +31,11 @@ from knode_cosserat.rods.surroundings import Obstacle
 from knode_cosserat.rods.system import History, Scales
 from knode_cosserat.rotation import cross, dot, quaternion_rate, rotation_matrix
 
+#: first root of cos(x) cosh(x) = -1, the frequency equation of a cantilever
+FIRST_ROOT = 1.875104068711961
+#: drag × length over mass per length, below which drag is weak: the damping ratio at an amplitude of a
+#: tenth of the length is then below 0.2 %
+WEAK_DRAG = 0.05
 #: default pose of the base
 AT_ORIGIN = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 
@@ -119,6 +124,26 @@ class Rod(ElasticRod):
     def held(self) -> bool:  # type: ignore[override]
         """True if an end is constrained, or there is an obstacle on which the rod may lie."""
         return self.base_end.held or self.tip_end.held or bool(self.surroundings)
+
+    @property
+    def is_undamped(self) -> bool:
+        """True if no parameter, part or internal variable damps a motion; weak drag does not count."""
+        values = (self.bending_damping, self.shear_damping, self.linear_drag)
+        internal = not set(self.z_layout.names) <= {"v", "u"}  # friction, relaxation
+        if (
+            internal
+            or self.surroundings
+            or any(value is not None and np.any(np.asarray(value)) for value in values)
+        ):
+            return False
+        drag = np.max(np.asarray(self.drag)) * np.max(self.length)
+        return bool(drag < WEAK_DRAG * np.min(self.mass_per_length))
+
+    @property
+    def bending_frequency(self) -> Any:
+        """First bending frequency (Hz) of the bare rod, clamped at the base, by beam theory."""
+        EI, mass = np.asarray(self.Kbt)[..., 0, 0], self.mass_per_length * self.length
+        return FIRST_ROOT**2 / (2 * np.pi) * np.sqrt(EI / (mass * self.length**3))
 
     def eased(self, part: float) -> Self:
         """Return the rod with smoothed contact and friction on its obstacles."""
