@@ -1,6 +1,7 @@
 """A robot that follows sliders: the page, what it says to the simulation, and who may speak to that."""
 
 import asyncio
+import dataclasses
 import json
 import threading
 import time
@@ -179,6 +180,21 @@ def test_a_cancelled_recovery_ends_without_a_solution_and_changes_nothing(robot)
     assert stepper.state is before and stepper.time == 0.0
     # a step that needs no recovery is not affected
     assert stepper.step([6.0] * 4, stop=lambda: True).result[0] == kc.Result.CONVERGED
+
+
+def test_a_shape_with_a_meaningless_error_is_neither_drawn_nor_kept(session, robot, monkeypatch):
+    preview, error = kc.Stepper.preview, 0.3 * float(robot.length)
+    monkeypatch.setattr(
+        kc.Stepper,
+        "preview",
+        lambda *given: dataclasses.replace(preview(*given), position_error=np.array([error])),
+    )
+    before = session.stepper
+    message, stuck = solve(session, np.full(4, 6.0), 3, over=False)
+    assert stuck and session.stepper is before
+    assert json.loads(message)["unsolved"].startswith(
+        "Not solved: the grid of 10 nodes is too coarse, positions would be off by about 0.19 m (30% of"
+    )
 
 
 def test_a_control_outside_its_range_is_said_and_the_session_goes_on(session):

@@ -39,6 +39,10 @@ CHECK = 0.02
 WORKERS = 2
 
 
+#: largest estimated error of a drawn shape, as a part of the length; above `COARSE_SHARE` it is drawn faded
+MOST_ERROR = 0.2
+
+
 class Solved(NamedTuple):
     """End of a solve: a message for the page, the stepper after it, and True if there is no solution."""
 
@@ -162,12 +166,18 @@ class Session:
     ) -> Solved:
         """Take the step if it is over, and solve the current one, on a copy of the stepper."""
         began = perf_counter()
-        stepper = copy.copy(self.stepper)
+        stepper = self.stepper
         try:
             if over:
-                stepper.step(control, stop)
+                moved = copy.copy(stepper)
+                _require_accurate(moved.step(control, stop))
+                stepper = moved
             ahead = stepper.preview(control, stop)
-        except (SimulationError, ValueError) as error:  # ValueError: a control outside its range
+            _require_accurate(ahead)
+        except (
+            SimulationError,
+            ValueError,
+        ) as error:  # ValueError: inaccurate, or a control outside its range
             reason = error.result.message if isinstance(error, SimulationError) else str(error)
             text = f"Not solved: {reason}. The last solved shape is shown; move a slider back."
             return Solved(json.dumps({"unsolved": text, "sequence": sequence}), stepper, True)
@@ -182,3 +192,14 @@ class Session:
         head = [sequence, ahead.time[0], ahead.result[0], ahead.position_error[0], self.pace, self.spent]
         row = row_of(self.stepper.robot, ahead, self.names)
         return np.concatenate([np.array(head, dtype=np.float32), row]).tobytes()
+
+
+def _require_accurate(row: Trajectory) -> None:
+    """Raise `ValueError` for a row whose estimated discretisation error makes its shape meaningless."""
+    error = float(row.position_error[0])
+    share = error / float(row.system.length)
+    if share > MOST_ERROR:
+        raise ValueError(
+            f"the grid of {row.system.nodes} nodes is too coarse, positions would be off by about "
+            f"{error:.2g} m ({share:.0%} of the length)"
+        )
