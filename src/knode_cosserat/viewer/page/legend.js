@@ -89,7 +89,7 @@ export function markTimes(place, tracks, [start, end]) {
   }
 }
 
-/** Tensions of all tendons at the base, below the picture: one line for each robot that is shown. */
+/** Tensions of all tendons at the base, in the picture: one line for each robot that is shown. */
 export class Tensions {
   constructor(place, robots, [low, high]) {
     this.place = place;
@@ -115,13 +115,19 @@ export class Tensions {
     place.prepend(...this.lines.map(({ line }) => line));
   }
 
+  /** Write the tensions of the drawn rows; robots with equal tensions share one line. */
   show() {
-    this.robots.forEach((robot, k) => {
+    const texts = this.robots.map((robot) =>
+      robot.tendons && robot.track.wanted ? robot.baseTensions().map((tension) => tension.toFixed(2)) : null,
+    );
+    const shared = new Set(texts.filter(Boolean).map(String)).size === 1;
+    const first = texts.findIndex(Boolean);
+    texts.forEach((values, k) => {
       const { line, mark, cells } = this.lines[k];
-      line.hidden = !robot.tendons || !robot.track.wanted;
-      mark.hidden = this.robots.length < 2;
+      line.hidden = !values || (shared && k !== first);
+      mark.hidden = shared;
       mark.style.background = robotColour(k);
-      if (!line.hidden) robot.baseTensions().forEach((tension, j) => (cells[j].value.textContent = tension.toFixed(2)));
+      if (!line.hidden) values.forEach((text, j) => (cells[j].value.textContent = text));
     });
   }
 }
