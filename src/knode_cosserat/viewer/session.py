@@ -35,10 +35,8 @@ PACE = 1.0
 PATIENCE = 0.3
 #: interval at which a solve in progress is checked for cancellation (s)
 CHECK = 0.02
-#: solves at once: the current one, and one that was dropped and ends after its current attempt
-WORKERS = 2
-
-
+#: threads for solves: the current one, and those that were dropped and end after their current attempt
+WORKERS = 4
 #: largest estimated error of a drawn shape, as a part of the length; above `COARSE_SHARE` it is drawn faded
 MOST_ERROR = 0.2
 
@@ -51,6 +49,32 @@ class Solved(NamedTuple):
     stuck: bool
 
 
+class Stop:
+    """Stop function of a solve. Its first call, at the start of a recovery, waits for other recoveries.
+
+    So the program of a recovery is compiled once, not at the same time in several threads.
+    """
+
+    def __init__(self, recovering: threading.Lock):
+        self._recovering, self._held, self._stopped = recovering, False, threading.Event()
+
+    def __call__(self) -> bool:
+        """Return True if the solve is no longer wanted."""
+        while not (self._held or self._stopped.is_set()):
+            self._held = self._recovering.acquire(timeout=CHECK)
+        return self._stopped.is_set()
+
+    def set(self) -> None:
+        """End the recovery after its current attempt."""
+        self._stopped.set()
+
+    def release(self) -> None:
+        """Let the next recovery begin."""
+        if self._held:
+            self._held = False
+            self._recovering.release()
+
+
 class Session:
     """Session of one page: its robot, its control and commands, and the clock."""
 
@@ -60,7 +84,7 @@ class Session:
         self.names = list(track(stepper.state, "robot")["arrays"])
         self.control = np.array([slider["start"] for slider in sliders(stepper.robot)])
         self.sequence, self.paused, self.begin_anew, self.cancelled = 0, False, False, False
-        self.wanted = asyncio.Event()
+        self.wanted, self.recovering = asyncio.Event(), threading.Lock()
         self.pace, self.spent = 1.0, 0.0
 
     async def run(self) -> None:
@@ -142,8 +166,8 @@ class Session:
     async def _solved(self, worker: concurrent.futures.Executor, over: bool) -> Solved | None:
         """Solve in a thread under the current control; None if a newer control or a reset replaced it."""
         loop, sequence = asyncio.get_running_loop(), self.sequence
-        stop, began, told = threading.Event(), loop.time(), False
-        task = loop.run_in_executor(worker, self.attempt, self.control, sequence, over, stop.is_set)
+        stop, began, told = Stop(self.recovering), loop.time(), False
+        task = loop.run_in_executor(worker, self._attempt, self.control, sequence, over, stop)
         try:
             while not (await asyncio.wait({task}, timeout=CHECK))[0]:
                 late = loop.time() - began > PATIENCE
@@ -160,6 +184,12 @@ class Session:
         finally:
             stop.set()
             task.cancel()
+
+    def _attempt(self, control: np.ndarray, sequence: int, over: bool, stop: Stop) -> Solved:
+        try:
+            return self.attempt(control, sequence, over, stop)
+        finally:
+            stop.release()
 
     def attempt(
         self, control: np.ndarray, sequence: int, over: bool, stop: Callable[[], bool] | None = None

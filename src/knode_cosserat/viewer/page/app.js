@@ -4,7 +4,7 @@ import { Capture, save, videoFormat } from "viewer/capture";
 import { onChange, robotColour } from "viewer/colours";
 import { Track } from "viewer/data";
 import { Hover } from "viewer/hover";
-import { Legend, Tensions, markTimes, warning } from "viewer/legend";
+import { Legend, Tensions, labelCells, markTimes, warning } from "viewer/legend";
 import { Live } from "viewer/live";
 import { Panels } from "viewer/panels";
 import { RobotModel } from "viewer/robot";
@@ -380,19 +380,7 @@ class Viewer {
     const key = JSON.stringify(cells);
     if (key === this.labelled) return;
     this.labelled = key;
-    const shown = this.tracks.map((track, k) => [track, k]).filter(([track]) => track.wanted);
-    $("labels").replaceChildren(...cells.map(({ x, y, width, height }, k) => {
-      const cell = document.createElement("div");
-      const label = document.createElement("span");
-      const mark = document.createElement("i");
-      mark.className = "swatch";
-      mark.style.background = robotColour(shown[k][1]);
-      Object.assign(cell.style, { left: `${x}px`, top: `${y}px`, width: `${width}px`, height: `${height}px` });
-      cell.style.borderWidth = `${y > 0 ? 1 : 0}px 0 0 ${x > 0 ? 1 : 0}px`;
-      label.append(mark, shown[k][0].name);
-      cell.append(label);
-      return cell;
-    }));
+    labelCells($("labels"), cells, this.tracks);
   }
 
   /** Where the tip of a trajectory is drawn (m). */

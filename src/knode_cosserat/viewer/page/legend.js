@@ -73,6 +73,22 @@ export function warning(track, moment) {
   return `${name}: drawn faded, because the grid is too coarse: positions are off ${size}. Use more nodes, or position_tolerance.`;
 }
 
+/** Names in the views side by side: one for each robot that is shown. */
+export function labelCells(place, cells, tracks) {
+  const shown = tracks.map((track, k) => [track, k]).filter(([track]) => track.wanted);
+  place.replaceChildren(...cells.map(({ x, y, width, height }, k) => {
+    const cell = element("div", "");
+    const label = element("span", "");
+    const mark = element("i", "swatch");
+    mark.style.background = robotColour(shown[k][1]);
+    Object.assign(cell.style, { left: `${x}px`, top: `${y}px`, width: `${width}px`, height: `${height}px` });
+    cell.style.borderWidth = `${y > 0 ? 1 : 0}px 0 0 ${x > 0 ? 1 : 0}px`;
+    label.append(mark, shown[k][0].name);
+    cell.append(label);
+    return cell;
+  }));
+}
+
 /** Marks above the time slider: rows that are not solved, or on too coarse a grid. */
 export function markTimes(place, tracks, [start, end]) {
   place.replaceChildren();
