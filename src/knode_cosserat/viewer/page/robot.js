@@ -7,6 +7,8 @@ import { length } from "viewer/units";
 const UP = new THREE.Vector3(0, 1, 0);
 const ALONG = new THREE.Quaternion().setFromUnitVectors(UP, new THREE.Vector3(0, 0, 1));
 
+/** Opacity of rigid plates. */
+const PLATE = 0.45;
 /** Opacity of a row that is not solved, or on too coarse a grid. */
 const FADED = 0.35;
 
@@ -74,8 +76,9 @@ export class RobotModel {
     geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(3 * (count + 1)), 3));
     geometry.setIndex(Array.from({ length: count - 1 }, (_, k) => [k, k + 1, count]).flat());
     const material = new THREE.MeshStandardMaterial({
-      color: this.colour, side: THREE.DoubleSide, transparent: true, opacity: 0.45, roughness: 0.6,
+      color: this.colour, side: THREE.DoubleSide, transparent: true, opacity: PLATE, roughness: 0.6,
     });
+    this.plateMaterial = material;
     const mesh = this.#add("rods", new THREE.Mesh(geometry, material));
     mesh.frustumCulled = false;
     this.outlines.push({ geometry, points, count });
@@ -253,6 +256,7 @@ export class RobotModel {
     this.path?.until(Math.max(0, this.pathRows.filter((row) => row <= moment.drawn).length - 1));
     const opacity = moment.solved && !moment.coarse ? 1 : FADED;
     for (const material of [this.material, this.tendonMaterial]) if (material) material.opacity = opacity;
+    if (this.plateMaterial) this.plateMaterial.opacity = PLATE * opacity;
     return moment;
   }
 
