@@ -67,8 +67,10 @@ def folder(tmp_path, monkeypatch):
     """A folder with what pages name: the examples and the tests' results are beside it."""
     monkeypatch.chdir(tmp_path)
     # these show until somebody closes them: here it is enough that there is something to show
-    monkeypatch.setattr("knode_cosserat.view", lambda scene: kc.viewer.export_scene(scene, "shown.html"))
-    monkeypatch.setattr("knode_cosserat.viewer.view_live", lambda robot: kc.solvers.Stepper(robot, 0.05))
+    monkeypatch.setattr(
+        "knode_cosserat.view", lambda scene, **more: kc.viewer.export_scene(scene, "s.html", **more)
+    )
+    monkeypatch.setattr("knode_cosserat.view_live", lambda robot: kc.solvers.Stepper(robot, 0.05))
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     return tmp_path
 

@@ -129,6 +129,26 @@ def test_what_is_no_trajectory_is_named(given, message):
         scene(given)
 
 
+def test_a_target_is_three_numbers_in_metres(truth):
+    assert scene(truth)["target"] is None
+    assert scene(truth, target=np.array([0.1, 0.0, 0.6]))["target"] == [0.1, 0.0, 0.6]
+    for wrong in ((0.1, 0.2), (0.1, 0.2, np.nan), "tip", 3.0):
+        with pytest.raises(ValueError, match=r"target must be a position \(x, y, z\)"):
+            scene(truth, target=wrong)
+    with pytest.raises(ValueError, match=r"got 274 m.*did you mean \(0\.1, 0\.05, 0\.25\)"):
+        scene(truth, target=(100.0, 50.0, 250.0))
+
+
+def test_the_estimated_error_of_each_row_is_in_the_scene(truth, coarse):
+    known = unpacked(track(coarse, "coarse")["position_error"])
+    np.testing.assert_allclose(known, coarse.position_error, rtol=1e-6)
+    measured = kc.Trajectory(
+        truth.system, None, truth.time, truth.y, truth.z, truth.control, truth.result, truth.residual,
+        truth.iterations,
+    )  # fmt: skip
+    assert np.all(np.isnan(unpacked(track(measured, "measured")["position_error"])))
+
+
 def test_texts_cannot_leave_their_place(truth):
     evil = "</script><script>window.hacked = 1</script><!-- @@SCENE@@ & \u2028"
     page = document(scene({evil: truth}, title=evil))
@@ -231,9 +251,7 @@ def test_the_server_gives_the_page_and_nothing_else(truth):
         address.append(found)
         known.set()
 
-    threading.Thread(
-        target=view, args=(truth,), kwargs={"open_browser": False, "ready": ready}, daemon=True
-    ).start()
+    threading.Thread(target=view, args=(truth,), kwargs={"open_browser": ready}, daemon=True).start()
     assert known.wait(30)
     assert address[0].startswith("http://127.0.0.1:")
     with urllib.request.urlopen(address[0]) as answer:

@@ -80,8 +80,10 @@ def view(
 
     names = files or []
 
-    def ready(address: str) -> None:
+    def announce(address: str) -> None:
         write_output(as_json, {"address": address}, [f"the viewer is at {address} (Ctrl-C ends it)"])
+        if not no_open:
+            viewer.serve.open_page(address)
 
     if live:
         if export:
@@ -99,7 +101,7 @@ def view(
             typer.echo(f"preparing {name} …", err=True)
         viewer.view_live(
             robot, dt=dt, space=space, title=name if name in catalog() else Path(name).name, port=port,
-            open_browser=not no_open, ready=ready,
+            open_browser=announce,
         )  # fmt: skip
         return
     if not names:
@@ -112,7 +114,7 @@ def view(
         viewer.export_scene(trajectories, export)
         write_output(as_json, {"trajectories": list(trajectories)}, [], export=export)
     else:
-        viewer.view(trajectories, port=port, open_browser=not no_open, ready=ready)
+        viewer.view(trajectories, port=port, open_browser=announce)
 
 
 def _by_name(files: list[str]) -> dict[str, Trajectory]:

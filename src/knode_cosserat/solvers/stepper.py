@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -32,6 +33,18 @@ class _Solved(NamedTuple):
     residual: float
     corrections: int
     position_error: float
+
+
+class _StoppableBudget(Budget):
+    """Time for recovery that is zero from when `stop` returns True."""
+
+    def __init__(self, seconds: float | None, stop: Callable[[], bool] | None):
+        super().__init__(seconds)
+        self._stop = stop
+
+    @property
+    def seconds(self) -> float:
+        return 0.0 if self._stop is not None and self._stop() else super().seconds
 
 
 class Stepper:
@@ -99,8 +112,13 @@ class Stepper:
         """Current state, a trajectory of one row."""
         return self._state
 
-    def step(self, control: Any) -> Trajectory:
+    def step(self, control: Any, stop: Callable[[], bool] | None = None) -> Trajectory:
         """Advance by one time step under a control (c,) and return the new state, a trajectory of one row.
+
+        Args:
+            control: the control (c,) during the step.
+            stop: called between the attempts of a recovery; if it returns True, the recovery ends and the
+                step counts as not solved.
 
         Raises:
             SimulationError: the step was not solved. The state is then unchanged, and another control may be
@@ -108,7 +126,7 @@ class Stepper:
             ValueError: a control of a wrong shape, or one that is not finite.
         """
         control = self._checked(control)
-        solved = self._solve(control)
+        solved = self._solve(control, stop)
         self._past, self._control = solved.past, control
         self._coarse = solved.result == Result.COARSE
         self._steps, self._index = self._steps + 1, self._index + 1
@@ -119,10 +137,10 @@ class Stepper:
         self._state = self._row(solved, control, self.time, self._begun_after(solved))
         return self._state
 
-    def preview(self, control: Any) -> Trajectory:
+    def preview(self, control: Any, stop: Callable[[], bool] | None = None) -> Trajectory:
         """Return the row that `step` would return, without changing the state. Raises the same errors."""
         control = self._checked(control)
-        solved = self._solve(control)
+        solved = self._solve(control, stop)
         return self._row(solved, control, self.time + self.dt, self._begun_after(solved))
 
     def _checked(self, control: Any) -> np.ndarray:
@@ -143,7 +161,7 @@ class Stepper:
             raise ValueError(f"the control: {beyond}")
         return control
 
-    def _solve(self, control: np.ndarray) -> _Solved:
+    def _solve(self, control: np.ndarray, stop: Callable[[], bool] | None) -> _Solved:
         i = self._index
         controls = self._controls.copy()  # the compiled loop may still read the previous array
         controls[i] = control
@@ -155,7 +173,7 @@ class Stepper:
             record, error = np.asarray(rows.records)[i], float(rows.error[i])
             found = _Solved(past, record, 0, error, int(rows.corrections[i]), float(rows.position_error[i]))
         else:
-            budget = Budget(self._task.recovery_budget)
+            budget = _StoppableBudget(self._task.recovery_budget, stop)
             outcome = rescue(self._task, self.robot, self._past, (self._control, control), i, budget)
             found = _Solved(
                 outcome.past, outcome.record, int(outcome.result), outcome.error, outcome.corrections,
