@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat._registry import provided
 from knode_cosserat.learning.residual import Residual
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.system import History, Scales, System, of_strands
@@ -223,6 +224,4 @@ class KNODE(System):
 
     def save(self, path: Any) -> None:
         """Write the model to a file (see `model_file.save`)."""
-        from knode_cosserat.learning.files import model_file
-
-        model_file.save(self, path)
+        provided(type(self), "save")(self, path)

@@ -1,5 +1,8 @@
 """Recordings of robots: measured data, on one clock and in the robot's frame."""
 
+from typing import Any
+
+from knode_cosserat._registry import provide
 from knode_cosserat.recordings.config import (
     BaseSource,
     CommandSource,
@@ -31,3 +34,29 @@ __all__ = [
     "load_example",
     "load_recording",
 ]
+
+
+# these modules import SciPy's optimisation and tables: only when they are needed
+
+
+def _health(recording: Recording) -> Any:
+    from knode_cosserat.recordings.health import health_of
+
+    return health_of(recording)
+
+
+def _measured(*args: Any) -> Any:
+    from knode_cosserat.recordings.exchange import measured
+
+    return measured(*args)
+
+
+def _save(*args: Any) -> None:
+    from knode_cosserat.recordings.exchange import save
+
+    save(*args)
+
+
+provide(Recording, "health", _health)
+provide(Measurements, "of", _measured)
+provide(Measurements, "save", _save)

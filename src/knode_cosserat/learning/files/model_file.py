@@ -24,6 +24,7 @@ import jax
 import numpy as np
 
 from knode_cosserat import trajectory_system
+from knode_cosserat._registry import provide
 from knode_cosserat.learning.files import container
 from knode_cosserat.learning.files.container import (
     Classes,
@@ -302,4 +303,5 @@ def _equations(model: KNODE, y: Any, control: Any, history: History) -> tuple[An
     return y_s, z, model.tip(np.zeros(()), control, y, history)
 
 
+provide(KNODE, "save", save)
 trajectory_system.register_codec(KNODE, encoded, decoded)
