@@ -84,7 +84,7 @@ def at_rest(rest: Trajectory) -> dict[str, Any]:
 
 def parameters(system: System) -> dict[str, dict[str, Any]]:
     """Every parameter by name, with its value, unit and meaning; of a model, those of its knowledge."""
-    system = _knowledge(system)
+    system = system.nominal
     stated = {name: (getattr(system, name), it.unit, it.meaning) for name, it in system.parameters().items()}
     nodes = {"nodes": (system.nodes, "1", "nodes along the rod, base and tip included")}
     return {name: _quantity(*parts) for name, parts in (stated | nodes).items()}
@@ -95,7 +95,7 @@ def derived(system: System) -> dict[str, dict[str, Any]]:
     from knode_cosserat.rods.loads import AttachedMass
     from knode_cosserat.rods.rod import Rod
 
-    system = _knowledge(system)
+    system = system.nominal
     if not isinstance(system, Rod):
         return {}
     Kse, Kbt, mass = np.asarray(system.Kse), np.asarray(system.Kbt), system.mass_per_length * system.length
@@ -126,7 +126,7 @@ def more_lines(system: System) -> list[str]:
     """Choices and parts of a robot that are not as they are by default, as its file would have them."""
     from knode_cosserat.rods.robot_file import KINDS, RobotFileError, more_of
 
-    system = _knowledge(system)
+    system = system.nominal
     try:
         return more_of(system) if type(system) in KINDS.values() else []
     except RobotFileError as error:
@@ -160,10 +160,3 @@ def learned(system: System) -> tuple[dict[str, Any], list[str]]:
         if len(found) > MOST_FINDINGS:
             lines.append(f"  … and {len(found) - MOST_FINDINGS} more; --json has all of them")
     return facts, lines
-
-
-def _knowledge(system: System) -> System:
-    """What a model was made of; any other system itself."""
-    from knode_cosserat.learning.knode import KNODE
-
-    return _knowledge(system.knowledge) if isinstance(system, KNODE) else system

@@ -157,7 +157,17 @@ class RoutedTendonRobot(TendonRod):
     @property
     def tendon_count(self) -> int:
         """Number of tendons."""
-        return len(self.routing) if self.routing is not None else int(np.shape(self.tendon_angles)[-1])
+        return len(self.routing) if self.routing is not None else super().tendon_count
+
+    @property
+    def tendon_ends(self) -> tuple[float, ...]:
+        """Places where the tendons end, as fractions of the length."""
+        return tuple(ends(self.routings).tolist())
+
+    @property
+    def moment_arm(self) -> float:
+        """Largest distance (m) of a tendon from the axis at the base."""
+        return float(np.linalg.norm(np.asarray(self.routes_at(0.0)[0]), axis=-1).max())
 
     @property
     def actuator_layout(self) -> Layout:
@@ -248,9 +258,7 @@ class RoutedTendonRobot(TendonRod):
         """Return r and r′ of the tendons at s."""
         if self.routing is not None:
             return routes(self.routing, s / self.length, self.length)
-        angles = jnp.asarray(self.tendon_angles)
-        around = jnp.stack([jnp.cos(angles), jnp.sin(angles), jnp.zeros_like(angles)], axis=-1)
-        return self.tendon_offset * around, np.zeros(around.shape)
+        return super().routes_at(s)
 
     def bending_directions(self, s: Any) -> Float[Any, "c 3"]:
         """Return eᵢ: the direction of u in which each tendon bends the rod at s, material frame."""
