@@ -3,19 +3,19 @@
 from typing import Any
 
 from knode_cosserat._registry import provide
-from knode_cosserat.recordings.config import (
-    BaseSource,
-    CommandSource,
-    MarkerSource,
-    MotorSource,
-    RecordingConfig,
-    TableSource,
-    TensionSource,
-)
+from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.findings import Finding, RecordingError
 from knode_cosserat.recordings.load import load_example, load_recording
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Body, Recording, Tensions
+from knode_cosserat.recordings.sources import (
+    BaseSource,
+    CommandSource,
+    MarkerSource,
+    MotorSource,
+    TableSource,
+    TensionSource,
+)
 
 __all__ = [
     "BaseSource",

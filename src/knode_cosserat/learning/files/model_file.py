@@ -29,11 +29,11 @@ from knode_cosserat.learning.files import container
 from knode_cosserat.learning.files.container import (
     Classes,
     ContainerError,
-    Reader,
     Title,
     UnknownClassError,
     Writer,
 )
+from knode_cosserat.learning.files.unpacking import Reader
 from knode_cosserat.learning.knode import KNODE, About
 from knode_cosserat.learning.passive import Passive, Sizes
 from knode_cosserat.learning.residual import Network, Nothing, Residual
