@@ -47,7 +47,9 @@ print(
 
 # %%
 stiff = kc.simulate(robot.replace(youngs_modulus=5e9), tensions, dt=0.05)
-print(f"tip DTW {kc.metrics.tip_dtw(stiff, truth):.2f} m, pose MSE {kc.metrics.pose_mse(stiff, truth):.2f}e-3")
+print(
+    f"tip DTW {kc.metrics.tip_dtw(stiff, truth):.2f} m, pose MSE {kc.metrics.pose_mse(stiff, truth):.2f}e-3"
+)
 kc.figures.compare(truth, {"too stiff": stiff})
 
 # %% [markdown]

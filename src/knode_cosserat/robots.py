@@ -7,6 +7,7 @@ from knode_cosserat.rods.load_cells import LoadCells
 from knode_cosserat.rods.parallel_robot import ParallelRobot
 from knode_cosserat.rods.parameters import ParameterError, parameter
 from knode_cosserat.rods.reels import Reels
+from knode_cosserat.rods.relaxation import Relaxation
 from knode_cosserat.rods.rib_spacing import RibSpacing
 from knode_cosserat.rods.robot_file import RobotFileError, catalog, load_robot, save_robot
 from knode_cosserat.rods.robot_schema import robot_schema
@@ -29,6 +30,7 @@ __all__ = [
     "ParallelRobot",
     "ParameterError",
     "Reels",
+    "Relaxation",
     "RibSpacing",
     "RobotFileError",
     "Rod",

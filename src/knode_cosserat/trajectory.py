@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from knode_cosserat._registry import provided
 from knode_cosserat._reprs import count_of, quantity
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.solvers.result import Result, ResultCodes
@@ -256,9 +257,7 @@ class Trajectory(eqx.Module):
 
     def save(self, path: Any) -> None:
         """Write a labelled netCDF file (see `trajectory_file.save`)."""
-        from knode_cosserat import trajectory_file
-
-        trajectory_file.save(self, path)
+        provided(type(self), "save")(self, path)
 
 
 def _picked(tree: Any, index: Any) -> Any:

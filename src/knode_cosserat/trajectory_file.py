@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from knode_cosserat._files import package_version, replacing
+from knode_cosserat._registry import provide
 from knode_cosserat.rods.layout import Field, Layout
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.history import Begun
@@ -81,6 +82,9 @@ def save(trajectory: Trajectory, path: str | Path) -> None:
         number = error.errno if isinstance(error, OSError) else None
         reason = os.strerror(number) if number else first_line(error)
         raise TrajectoryFileError(f"{path}: cannot be written: {reason}") from None
+
+
+provide(Trajectory, "save", save)
 
 
 def _dataset(trajectory: Trajectory, source: str) -> xarray.Dataset:

@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import knode_cosserat as kc
+from examples.hanging_string import HangingString
 from knode_cosserat.learning.passive import passive
 from knode_cosserat.rods.system import History
 
@@ -87,5 +88,20 @@ def test_its_file(tmp_path):
 
 
 def test_a_system_without_stiffness_is_refused():
-    with pytest.raises(TypeError, match="allowed is a rod"):
-        passive(kc.KNODE(ROBOT, EMPTY), TENSION[None])
+    with pytest.raises(TypeError, match=r"ParallelRobot without h, n, .* with bending stiffness"):
+        passive(kc.load_robot("six-legged-robot"), TENSION[None])
+    with pytest.raises(TypeError, match=r"HangingString without bending_stiffness, bending_damping, h, m"):
+        passive(HangingString(length=1.0, density=0.1, stiffness=1e3), TENSION[None])
+
+
+def test_a_residual_on_a_model_starts_without_effect():
+    """The nominal stiffness of a model is that of its robot; its own residual is kept."""
+    model = kc.KNODE(ROBOT, drawn(3, 0.1))
+    both = kc.KNODE(model, passive(model, TENSION[None]))
+    rng = np.random.default_rng(3)
+    y = np.concatenate([np.zeros(3), [1.0, 0.1, 0.2, 0.0], rng.normal(size=12)])
+    history = History(20.0, *(0.1 * rng.normal(size=size) for size in (19, 6, 19)))
+    for found, expected in zip(
+        *(each.derivatives(0.2, 0.0, y, TENSION, history) for each in (both, model)), strict=True
+    ):
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)

@@ -12,7 +12,7 @@ from knode_cosserat.cli.output import table, write_output
 from knode_cosserat.cli.program import app, examples
 
 if TYPE_CHECKING:
-    from knode_cosserat.recordings.health import Health, StreamHealth
+    from knode_cosserat.recordings.quality import Health, StreamHealth
 
 
 @app.command(

@@ -84,7 +84,7 @@ def equilibrium_summary(rest: Trajectory) -> dict[str, Any]:
 
 def parameters(system: System) -> dict[str, dict[str, Any]]:
     """Return the parameters by name, with value, unit and meaning; for a model, of its nominal robot."""
-    system = _nominal(system)
+    system = system.nominal
     stated = {name: (getattr(system, name), it.unit, it.meaning) for name, it in system.parameters().items()}
     nodes = {"nodes": (system.nodes, "1", "nodes along the rod, base and tip included")}
     return {name: _quantity(*parts) for name, parts in (stated | nodes).items()}
@@ -95,7 +95,7 @@ def derived(system: System) -> dict[str, dict[str, Any]]:
     from knode_cosserat.rods.loads import AttachedMass
     from knode_cosserat.rods.rod import Rod
 
-    system = _nominal(system)
+    system = system.nominal
     if not isinstance(system, Rod):
         return {}
     Kse, Kbt, mass = np.asarray(system.Kse), np.asarray(system.Kbt), system.mass_per_length * system.length
@@ -126,7 +126,7 @@ def more_lines(system: System) -> list[str]:
     """Return the choices and parts of a robot that differ from the defaults, as lines of a robot file."""
     from knode_cosserat.rods.robot_file import KINDS, RobotFileError, more_of
 
-    system = _nominal(system)
+    system = system.nominal
     try:
         return more_of(system) if type(system) in KINDS.values() else []
     except RobotFileError as error:
@@ -160,10 +160,3 @@ def residual_summary(system: System) -> tuple[dict[str, Any], list[str]]:
         if len(terms) > MOST_FINDINGS:
             lines.append(f"  … and {len(terms) - MOST_FINDINGS} more; --json prints all")
     return facts, lines
-
-
-def _nominal(system: System) -> System:
-    """Return the nominal robot of a model; a robot itself."""
-    from knode_cosserat.learning.knode import KNODE
-
-    return _nominal(system.knowledge) if isinstance(system, KNODE) else system

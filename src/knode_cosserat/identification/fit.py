@@ -20,7 +20,7 @@ from knode_cosserat.identification.result import Identified
 from knode_cosserat.identification.search import Search, SearchError
 from knode_cosserat.learning.config import FitConfig, PassiveOptions, StructuredOptions
 from knode_cosserat.learning.ensemble import Ensemble
-from knode_cosserat.learning.fit import BEST
+from knode_cosserat.learning.fit import BEST, require_allowed
 from knode_cosserat.learning.fit import fit as fit_states
 from knode_cosserat.learning.knode import KNODE, About
 from knode_cosserat.learning.passive import PARTS, Passive, passive
@@ -29,7 +29,6 @@ from knode_cosserat.learning.samples import DataError
 from knode_cosserat.learning.training.runs import FitError
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
-from knode_cosserat.rods.elastic_rod import ElasticRod
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
@@ -219,8 +218,7 @@ def _network(
     given: list[str], space: str | SpaceScheme, tell: Callable[[str], None],
 ) -> Any:  # fmt: skip
     """Return the knowledge with a passive network, searched from zero over horizons that grow."""
-    if not isinstance(knowledge, ElasticRod):
-        raise FitError(f"knowledge is a {type(knowledge).__name__}; allowed is a rod with bending stiffness")
+    require_allowed(knowledge, config)
     tension = np.concatenate([each.tension for each in measured])
     options = config.residual
     assert isinstance(options, PassiveOptions)

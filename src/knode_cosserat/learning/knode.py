@@ -6,14 +6,14 @@ from typing import Any, Self
 
 import equinox as eqx
 import jax
-import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat._registry import provided
 from knode_cosserat._reprs import count_of, quantity, robot_text, wrapped
 from knode_cosserat.learning.residual import Residual
-from knode_cosserat.rods.layout import Layout
-from knode_cosserat.rods.system import History, Scales, System, of_strands
+from knode_cosserat.rods.system import History, System, of_strands
 from knode_cosserat.rods.trained_range import TrainedRange
+from knode_cosserat.rods.wrapped import Wrapped
 
 
 class About:
@@ -32,8 +32,11 @@ class About:
         return hash(About)
 
 
-class KNODE(System):
-    """Nominal model with a residual; layouts and base conditions are the nominal model's."""
+class KNODE(Wrapped):
+    """Nominal model with a residual; layouts and base conditions are the nominal model's.
+
+    The nominal model may itself be a KNODE.
+    """
 
     knowledge: System
     residual: Residual
@@ -51,6 +54,10 @@ class KNODE(System):
         self.trained = trained
         self.nodes = knowledge.nodes
 
+    def around(self, knowledge: System) -> Self:
+        """Return a model with the same residual and another nominal model."""
+        return type(self)(knowledge, self.residual, self.about, self.trained)
+
     def __repr__(self) -> str:
         facts = self.about.facts
         parts = [f"KNODE of a {robot_text(self.knowledge)}", f"residual {self.residual!r}"]
@@ -65,74 +72,7 @@ class KNODE(System):
         """Nominal model with the residual's parameter changes."""
         return self.residual.adapted(self.knowledge)
 
-    @property
-    def y_layout(self) -> Layout:  # type: ignore[override]
-        """Layout of y, from the nominal model."""
-        return self.knowledge.y_layout
-
-    @property
-    def z_layout(self) -> Layout:  # type: ignore[override]
-        """Layout of z, from the nominal model."""
-        return self.knowledge.z_layout
-
-    @property
-    def control_layout(self) -> Layout:  # type: ignore[override]
-        """Layout of the control, from the nominal model."""
-        return self.knowledge.control_layout
-
-    @property
-    def base_unknowns(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Fields of y that are unknown at the base, from the nominal model."""
-        return self.knowledge.base_unknowns
-
-    @property
-    def mixed(self) -> bool:  # type: ignore[override]
-        """True if the nominal model has terms in y_st."""
-        return self.knowledge.mixed
-
-    @property
-    def cuts(self) -> tuple[float, ...]:  # type: ignore[override]
-        """Discontinuities of the nominal model (parts of the length)."""
-        return self.knowledge.cuts
-
-    @property
-    def jumps(self) -> bool:  # type: ignore[override]
-        """True if y jumps at discontinuities of the nominal model."""
-        return self.knowledge.jumps
-
-    @property
-    def rest_is_guess(self) -> bool:  # type: ignore[override]
-        """True if the nominal model's state at rest is only a guess."""
-        return self.knowledge.rest_is_guess
-
-    @property
-    def held(self) -> bool:  # type: ignore[override]
-        """True if the nominal model is held in place."""
-        return self.knowledge.held
-
-    @property
-    def strands(self) -> int:
-        """Number of strands of the nominal model."""
-        return self.knowledge.strands
-
-    @property
-    def strand(self) -> System:
-        """Strand of the nominal model with the residual; all strands share one residual."""
-        if self.strands == 1:
-            return self
-        return type(self)(self.knowledge.strand, self.residual, self.about, self.trained)
-
-    @property
-    def velocities(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Names of the observables that are velocities, from the nominal model."""
-        return self.knowledge.velocities
-
-    @property  # type: ignore[misc]
-    def length(self) -> Any:
-        """Length of the rod (m), corrected by the residual; one value each in a batch."""
-        if np.ndim(self.knowledge.length):
-            return jax.vmap(lambda model: model.adapted.length)(self)
-        return self.adapted.length
+    # the equations with the residual; it is the same for all strands
 
     def derivatives(
         self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
@@ -142,90 +82,48 @@ class KNODE(System):
             return of_strands(self, s, t, y, control, history)
         return self.residual.derivatives(self.adapted, s, t, y, control, history)
 
-    def crossed(
-        self, acting: Float[Any, " cuts"], t: Any, y: Float[Any, " y"], control: Any, history: History
+    def strains(
+        self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
+    ) -> Float[Any, " z"]:
+        """Return z of the nominal model with the residual."""
+        if self.strands > 1:
+            return self.derivatives(s, t, y, control, history)[1]
+        return self.residual.strains(self.adapted, s, t, y, control, history)
+
+    def rates(
+        self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
     ) -> Float[Any, " y"]:
-        """Return y on the far side of the active discontinuities, from the nominal model."""
-        return self.adapted.crossed(acting, t, y, control, history)
+        """Return y_s at strains z; with several strands, at the strains of their law."""
+        if self.strands > 1:
+            return self.derivatives(s, t, y, control, history)[0]
+        return self.residual.rates(self.adapted, s, t, y, z, control, history)
 
-    def rest(self, s: Any) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-        """Return the state at rest of the nominal model, at its corrected length."""
-        return self.adapted.rest(s)
+    def left_of_law(
+        self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
+    ) -> Float[Any, " z"]:
+        """Return the residual of the law of the strains at z, with the learned one."""
+        if self.strands > 1:
+            return z - self.strains(s, t, y, control, history)
+        return self.residual.left_of_law(self.adapted, s, t, y, z, control, history)
 
-    def base(self, t: Any, control: Any, unknowns: Float[Any, " k"], history: History) -> Float[Any, " y"]:
-        """Return y at the base, from the nominal model."""
-        return self.adapted.base(t, control, unknowns, history)
+    @property
+    def linear_law(self) -> bool:  # type: ignore[override]
+        """True if the law is linear in the strains, with the residual."""
+        return self.knowledge.linear_law and self.residual.linear
 
-    def unknowns(self, y: Float[Any, " y"]) -> Float[Any, " k"]:
-        """Return the unknowns in y at the base, from the nominal model."""
-        return self.adapted.unknowns(y)
+    def law_matrix(
+        self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
+    ) -> Float[Any, "z z"]:
+        """Return the derivative of `left_of_law` by z."""
+        return jax.jacfwd(lambda z: self.left_of_law(s, t, y, z, control, history))(z)
+
+    # a residual is not of the general form
+    constitutive = System.constitutive
+    balance = System.balance
 
     def tip(self, t: Any, control: Any, y: Float[Any, " y"], history: History) -> Float[Any, " k"]:
         """Return the residual of the tip's boundary conditions, with the learned residual."""
         return self.residual.tip(self.adapted, t, control, y, history)
-
-    @property
-    def tip_layout(self) -> Layout:
-        """Layout of the tip's boundary conditions, from the nominal model."""
-        return self.knowledge.tip_layout
-
-    def scales(self) -> Scales:
-        """Return the natural units of y and of the tip's residual, from the nominal model."""
-        return self.adapted.scales()
-
-    def actuation(self, control: Float[Any, " c"]) -> Float[Any, " a"]:
-        """Return the actuation of a control, from the nominal model."""
-        return self.knowledge.actuation(control)
-
-    @property
-    def observable_layout(self) -> Layout:
-        """Layout of the observables, from the nominal model."""
-        return self.knowledge.observable_layout
-
-    def observables(self, s: Any, y: Any, y_t: Any, z: Any, z_t: Any, control: Any) -> Float[Any, " o"]:
-        """Return the observables, from the nominal model."""
-        return self.adapted.observables(s, y, y_t, z, z_t, control)
-
-    def end_poses(self, control: Any) -> tuple[Any, Any]:
-        """Return the poses of the held ends, from the nominal model."""
-        return self.knowledge.end_poses(control)
-
-    def positions(self, y: Any) -> Any:
-        """Return the positions in y, from the nominal model."""
-        return self.knowledge.positions(y)
-
-    def unstressed(self, s: Any, control: Any) -> Float[Any, " z"]:
-        """Return the strains without stress, from the nominal model."""
-        return self.adapted.unstressed(s, control)
-
-    def law_factors(self, s: Any, control: Any) -> tuple[Any, Any] | None:
-        """Return the factors of strain and rate in the law, from the nominal model."""
-        return self.adapted.law_factors(s, control)
-
-    def curves(self, y: Any) -> list[Any]:
-        """Return the centrelines in y, from the nominal model."""
-        return self.knowledge.curves(y)
-
-    def quaternions(self, y: Any) -> Any:
-        """Return the quaternions in y, from the nominal model."""
-        return self.knowledge.quaternions(y)
-
-    def eased(self, part: float) -> Self:
-        """Return the model with eased friction and contact of the nominal model."""
-        easier = self.knowledge.eased(part)
-        if easier is self.knowledge:
-            return self
-        return type(self)(easier, self.residual, self.about, self.trained)
-
-    def replace(self, **changes: Any) -> Self:
-        """Return a copy in which the nominal model has other parameters (or nodes), by name."""
-        return type(self)(self.knowledge.replace(**changes), self.residual, self.about, self.trained)
-
-    def undelayed(
-        self, measured: Float[np.ndarray, "T c"], dt: float, before: Float[np.ndarray, " c"] | None = None
-    ) -> Float[np.ndarray, "T c"]:
-        """Return the controls that act, without sensor delay, from the nominal model."""
-        return self.knowledge.undelayed(measured, dt, before)
 
     def trained_range(self) -> TrainedRange | None:
         """Return the model's own training range, else the nominal model's."""
@@ -233,6 +131,4 @@ class KNODE(System):
 
     def save(self, path: Any) -> None:
         """Write the model to a file (see `model_file.save`)."""
-        from knode_cosserat.learning.files import model_file
-
-        model_file.save(self, path)
+        provided(type(self), "save")(self, path)

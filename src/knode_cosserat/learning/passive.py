@@ -39,7 +39,6 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.learning.residual import Residual
-from knode_cosserat.rods.elastic_rod import ElasticRod
 from knode_cosserat.rods.system import History, System
 from knode_cosserat.rotation import dot, rotation_matrix
 
@@ -90,23 +89,50 @@ class Passive(Residual):
         self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
         """Return y_s and z of the nominal model with stiffness of W, damping D and a reduced moment."""
+        changed, left = self._reduced(knowledge, s, y, control)
+        return changed.derivatives(s, t, left, control, history)
+
+    def strains(
+        self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
+    ) -> Float[Any, " z"]:
+        """Return z of the nominal model with stiffness of W, damping D and a reduced moment."""
+        changed, left = self._reduced(knowledge, s, y, control)
+        return changed.strains(s, t, left, control, history)
+
+    def rates(
+        self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any,
+        history: History,
+    ) -> Float[Any, " y"]:  # fmt: skip
+        """Return y_s of that nominal model at strains z."""
+        changed, left = self._reduced(knowledge, s, y, control)
+        return changed.rates(s, t, left, z, control, history)
+
+    def left_of_law(
+        self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any,
+        history: History,
+    ) -> Float[Any, " z"]:  # fmt: skip
+        """Return the residual of the law of that nominal model at z."""
+        changed, left = self._reduced(knowledge, s, y, control)
+        return changed.left_of_law(s, t, left, z, control, history)
+
+    def _reduced(self, knowledge: System, s: Any, y: Any, control: Any) -> tuple[System, Float[Any, " y"]]:
+        """Return the changed nominal model at a point, and y with the moment that it carries."""
         changed, moment = self.changed(knowledge, s, y, control)
         layout = knowledge.y_layout
         carried = dot(rotation_matrix(layout.get(y, "h")), moment)
         where = layout.slice("m")
-        left = jnp.concatenate([y[: where.start], y[where] - carried, y[where.stop :]])
-        return changed.derivatives(s, t, left, control, history)
+        return changed, jnp.concatenate([y[: where.start], y[where] - carried, y[where.stop :]])
 
     def changed(
         self, knowledge: System, s: Any, y: Float[Any, " y"], control: Any
     ) -> tuple[System, Float[Any, "3"]]:
         """Return the nominal model with the stiffness and damping at a point, and κ b/L (N m)."""
-        rod: Any = knowledge
-        L, kappa = rod.length, _least(rod.Kbt)
+        rod: Any = knowledge.nominal
+        L, kappa = knowledge.length, _least(rod.Kbt)
         sigma, x = 2.0 * s / L - 1.0, jnp.asarray(control) / self.sizes.control
         S, b = self.spring(sigma, x)
-        added = self.damped(self._seen(rod, y), sigma, x)
-        changed = rod.replace(
+        added = self.damped(self._seen(knowledge, y), sigma, x)
+        changed = knowledge.replace(
             bending_stiffness=rod.Kbt + kappa * jnp.zeros((3, 3)).at[:2, :2].set(S),
             bending_damping=rod.bending_damping + added * np.diag([1.0, 1.0, 0.0]),
         )
@@ -204,10 +230,9 @@ def passive(knowledge: System, controls: Float[np.ndarray, "T c"], seed: int = 0
         hidden: number of units of each network.
 
     Raises:
-        TypeError: the knowledge is no such rod.
+        TypeError: the knowledge is no such rod (`require_bending`).
     """
-    if not isinstance(knowledge, ElasticRod):
-        raise TypeError(f"knowledge is a {type(knowledge).__name__}; allowed is a rod with bending stiffness")
+    require_bending(knowledge)
     layout, natural = knowledge.y_layout, np.asarray(knowledge.scales().y)
     force, moment, velocity = (float(natural[layout.slice(name)][0]) for name in ("n", "m", "q"))
     length, count = float(knowledge.length), np.shape(controls)[1]
@@ -218,6 +243,20 @@ def passive(knowledge: System, controls: Float[np.ndarray, "T c"], seed: int = 0
         jnp.zeros((3, 3)), jnp.zeros((2, 2, count)), jnp.zeros((hidden, 5)), jnp.zeros(3), jnp.zeros(hidden),
         sizes, rng.normal(size=(hidden, count + 2)), rng.normal(size=(hidden, SEEN)),
     )  # fmt: skip
+
+
+def require_bending(knowledge: System) -> None:
+    """Raise `TypeError` unless a nominal model has the parameters and states that the residual needs."""
+    needed = ("bending_stiffness", "bending_damping", "h", "n", "m", "q", "w", "u")
+    has = (*knowledge.nominal.parameters(), *knowledge.y_layout.names, *knowledge.z_layout.names)
+    missing = [name for name in needed if name not in has]
+    if not missing and not hasattr(knowledge.nominal, "Kbt"):
+        missing = ["Kbt"]
+    if missing:
+        raise TypeError(
+            f"knowledge is a {type(knowledge.nominal).__name__} without {', '.join(missing)}; a passive "
+            "residual is for a rod with bending stiffness, such as a TendonRobot or a RoutedTendonRobot"
+        )
 
 
 def _not_negative(values: Any) -> Any:

@@ -40,6 +40,39 @@ class Residual(eqx.Module):
         `knowledge` is the adapted nominal model.
         """
 
+    def strains(
+        self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
+    ) -> Float[Any, " z"]:
+        """Return z of the adapted nominal model with this residual."""
+        return self.derivatives(knowledge, s, t, y, control, history)[1]
+
+    def rates(
+        self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any,
+        history: History,
+    ) -> Float[Any, " y"]:  # fmt: skip
+        """Return y_s at strains z, which need not be those of the law.
+
+        By default it follows z as the nominal model's y_s does, from `derivatives` on.
+        """
+        y_s, corrected = self.derivatives(knowledge, s, t, y, control, history)
+        z0 = knowledge.strains(s, t, y, control, history)
+        here, there = (knowledge.rates(s, t, y, at, control, history) for at in (z0, z0 + z - corrected))
+        return y_s + there - here
+
+    def left_of_law(
+        self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any,
+        history: History,
+    ) -> Float[Any, " z"]:  # fmt: skip
+        """Return the residual of the law at z; by default the nominal model's, at z less its correction."""
+        corrected = self.strains(knowledge, s, t, y, control, history)
+        z0 = knowledge.strains(s, t, y, control, history)
+        return knowledge.left_of_law(s, t, y, z0 + z - corrected, control, history)
+
+    @property
+    def linear(self) -> bool:
+        """True if `left_of_law` is linear in z wherever the nominal model's is."""
+        return True
+
     def tip(
         self, knowledge: System, t: Any, control: Any, y: Float[Any, " y"], history: History
     ) -> Float[Any, " k"]:
@@ -59,6 +92,26 @@ class Nothing(Residual):
     ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
         """Return y_s and z of the nominal model."""
         return knowledge.derivatives(s, t, y, control, history)
+
+    def strains(
+        self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
+    ) -> Float[Any, " z"]:
+        """Return z of the nominal model."""
+        return knowledge.strains(s, t, y, control, history)
+
+    def rates(
+        self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any,
+        history: History,
+    ) -> Float[Any, " y"]:  # fmt: skip
+        """Return y_s of the nominal model at strains z."""
+        return knowledge.rates(s, t, y, z, control, history)
+
+    def left_of_law(
+        self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any,
+        history: History,
+    ) -> Float[Any, " z"]:  # fmt: skip
+        """Return the residual of the nominal model's law at z."""
+        return knowledge.left_of_law(s, t, y, z, control, history)
 
 
 @jax.custom_jvp
@@ -117,6 +170,22 @@ class Network(Residual):
         y_s, z = knowledge.derivatives(s, t, y, control, history)
         added = self.correction(self.inputs(knowledge, y, z, control, history))
         return y_s + added[: y.shape[0]], z + added[y.shape[0] :]
+
+    def strains(
+        self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
+    ) -> Float[Any, " z"]:
+        """Return the nominal model's z plus the correction."""
+        z = knowledge.strains(s, t, y, control, history)
+        return z + self.correction(self.inputs(knowledge, y, z, control, history))[y.shape[0] :]
+
+    def rates(
+        self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any,
+        history: History,
+    ) -> Float[Any, " y"]:  # fmt: skip
+        """Return the nominal model's y_s at z less its correction, plus the correction of y_s."""
+        z0 = knowledge.strains(s, t, y, control, history)
+        added = self.correction(self.inputs(knowledge, y, z0, control, history))
+        return knowledge.rates(s, t, y, z - added[y.shape[0] :], control, history) + added[: y.shape[0]]
 
     def clamped(self) -> Self:
         """Return a convex network with its negative weights set to zero; any other unchanged."""

@@ -8,16 +8,16 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from knode_cosserat.recordings import cleaning
-from knode_cosserat.recordings.config import (
+from knode_cosserat.recordings.config import RecordingConfig
+from knode_cosserat.recordings.findings import Finding, RecordingError, Severity
+from knode_cosserat.recordings.recording import Body, Tensions, bridge, period
+from knode_cosserat.recordings.sources import (
     MOTOR_UNITS,
     POSITION_UNITS,
     TENSION_UNITS,
     MotorSource,
-    RecordingConfig,
     TensionSource,
 )
-from knode_cosserat.recordings.findings import Finding, RecordingError, Severity
-from knode_cosserat.recordings.recording import Body, Tensions, bridge, period
 
 #: smallest jumps that are removed (m, rad, N)
 SMALLEST_SHIFT, SMALLEST_TURN, SMALLEST_PULL = 5e-3, np.radians(8.0), 0.5

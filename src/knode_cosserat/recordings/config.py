@@ -25,161 +25,26 @@ from typing import Any, Literal, Self
 from knode_cosserat._files import replacing
 from knode_cosserat._yaml import YAMLTextError, did_you_mean, flow, mapping_of, shown
 from knode_cosserat.recordings.config_values import (
-    PLACE,
     Vector,
     checked_choice,
     checked_interval,
     checked_number,
     checked_numbers,
-    checked_order,
     checked_quaternion,
-    checked_text,
-    checked_titles,
 )  # fmt: skip
 from knode_cosserat.recordings.findings import RecordingError
+from knode_cosserat.recordings.sources import (
+    POSITION_UNITS,
+    BaseSource,
+    CommandSource,
+    MarkerSource,
+    MotorSource,
+    TableSource,
+    TensionSource,
+    set_field,
+)
 
 FORMAT = 1
-#: conversion factors to SI units
-TENSION_UNITS = {"N": 1.0, "gf": 9.81 / 1000.0}
-POSITION_UNITS = {"m": 1.0, "mm": 1e-3}
-#: units of motors: angles to rad, or wound-up lengths to m
-MOTOR_UNITS = {"rad": 1.0, "deg": math.pi / 180.0, "m": 1.0, "mm": 1e-3}
-
-
-@dataclasses.dataclass(frozen=True)
-class MarkerSource:
-    """Body on the rod, tracked by motion capture.
-
-    Attributes:
-        name: name in reports.
-        topic: topic of its poses; a body without orientation may have positions only.
-        fraction: its place, as a fraction of the rod's length: 0 is the clamped end, 1 the tip.
-        rotation: the body's axes in the rod's local frame, as a quaternion, scalar first; None: the axes
-            are calibrated at rest, when the rod points up.
-    """
-
-    name: str
-    topic: str
-    fraction: float
-    rotation: Vector | None = None
-
-    def __post_init__(self) -> None:
-        _set(self, "name", checked_text(self.name, "name"))
-        _set(self, "topic", checked_text(self.topic, "topic"))
-        _set(self, "fraction", checked_number(self.fraction, "fraction", 0.0, 1.0))
-        if self.rotation is not None:
-            _set(self, "rotation", checked_quaternion(self.rotation, "rotation"))
-
-
-@dataclasses.dataclass(frozen=True)
-class BaseSource:
-    """Body fixed to the base, `height` (m) above the rod's clamped end."""
-
-    topic: str
-    height: float = 0.0
-
-    def __post_init__(self) -> None:
-        _set(self, "topic", checked_text(self.topic, "topic"))
-        _set(self, "height", checked_number(self.height, "height", -10.0, 10.0, "m"))
-
-
-@dataclasses.dataclass(frozen=True)
-class TensionSource:
-    """Measured tensions.
-
-    Attributes:
-        topic: topic of the tensions.
-        order: tendon of each number in a message; tendons count from 1.
-        unit: "N" or "gf" (grams-force).
-        held: True if a tension acts unchanged until the next one, as commands do; otherwise it is a sample
-            at that instant, and tensions are interpolated linearly.
-    """
-
-    topic: str
-    order: tuple[int, ...]
-    unit: Literal["N", "gf"] = "N"
-    held: bool | None = None
-
-    def __post_init__(self) -> None:
-        _set(self, "topic", checked_text(self.topic, "topic"))
-        _set(self, "order", checked_order(self.order))
-        checked_choice(self.unit, "unit", TENSION_UNITS)
-        if self.held not in (None, True, False):
-            raise RecordingError(f"held is {shown(self.held)}; allowed is true or false")
-
-
-@dataclasses.dataclass(frozen=True)
-class CommandSource(TensionSource):
-    """Commanded tensions, each held until the next.
-
-    Attributes:
-        text: template of text messages, with `{}` in place of the numbers (other lines of a log are not
-            commands); None for messages of numbers.
-        latency: delay from a command's stamp until it reaches the tendons (s).
-    """
-
-    text: str | None = None
-    latency: float = 0.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.held is False:
-            raise RecordingError("held is false; allowed of a command is true: it is held until the next")
-        _set(self, "latency", checked_number(self.latency, "latency", 0.0, 10.0, "s"))
-        if self.text is not None and str(self.text).count(PLACE) != 1:
-            raise RecordingError(
-                f"text is {shown(self.text)}; allowed is text with one {PLACE} where the numbers stand"
-            )
-
-
-@dataclasses.dataclass(frozen=True)
-class MotorSource:
-    """Measured angles of motors that wind up tendons, or the wound-up lengths.
-
-    Attributes:
-        topic: topic of the angles or lengths.
-        order: motor of each number in a message; motors count from 1.
-        unit: "rad" or "deg" for angles; "m" or "mm" for lengths.
-        latency: delay from an angle's stamp until it acts on the robot (s): the offset between the clocks
-            of motors and motion capture.
-    """
-
-    topic: str
-    order: tuple[int, ...]
-    unit: Literal["rad", "deg", "m", "mm"] = "rad"
-    latency: float = 0.0
-
-    def __post_init__(self) -> None:
-        _set(self, "topic", checked_text(self.topic, "topic"))
-        _set(self, "order", checked_order(self.order))
-        checked_choice(self.unit, "unit", MOTOR_UNITS)
-        _set(self, "latency", checked_number(self.latency, "latency", -10.0, 10.0, "s"))
-
-
-@dataclasses.dataclass(frozen=True)
-class TableSource:
-    """Titles of a table's columns, where they differ from this package's convention.
-
-    Attributes:
-        rate: rows per second (Hz), for a table without a time column; None: the column `time [s]` is used.
-        position: titles of a body's position, with `{}` in place of its topic.
-        quaternion: titles of its orientation, scalar first; a body without these columns has no orientation.
-        motor: title of a motor's angle, or of a tension, with `{}` in place of its number.
-    """
-
-    rate: float | None = None
-    position: tuple[str, ...] | None = None
-    quaternion: tuple[str, ...] | None = None
-    motor: str | None = None
-
-    def __post_init__(self) -> None:
-        if self.rate is not None:
-            _set(self, "rate", checked_number(self.rate, "rate", 1e-6, 1e6, "Hz"))
-        for name, count in (("position", 3), ("quaternion", 4)):
-            if getattr(self, name) is not None:
-                _set(self, name, checked_titles(getattr(self, name), name, count))
-        if self.motor is not None:
-            _set(self, "motor", checked_titles([self.motor], "motor", 1)[0])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -234,7 +99,7 @@ class RecordingConfig:
     initial_tension: Vector | None = None
 
     def __post_init__(self) -> None:
-        _set(self, "markers", _markers(self.markers))
+        set_field(self, "markers", _markers(self.markers))
         for name, kind in _PARTS.items():
             value = getattr(self, name)
             if value is not None and type(value) is not kind:
@@ -245,12 +110,12 @@ class RecordingConfig:
         checked_choice(self.repeats, "repeats", ("keep", "drop"))
         if not isinstance(self.static, bool):
             raise RecordingError(f"static is {shown(self.static)}; allowed is true or false")
-        _set(self, "origin", checked_numbers(self.origin, "origin", 3, "three numbers (m)"))
-        _set(self, "rotation", checked_quaternion(self.rotation, "rotation"))
-        _set(self, "longest_gap", checked_number(self.longest_gap, "longest_gap", 0.0, 60.0, "s"))
+        set_field(self, "origin", checked_numbers(self.origin, "origin", 3, "three numbers (m)"))
+        set_field(self, "rotation", checked_quaternion(self.rotation, "rotation"))
+        set_field(self, "longest_gap", checked_number(self.longest_gap, "longest_gap", 0.0, 60.0, "s"))
         if self.rest is not None:
-            _set(self, "rest", checked_interval(self.rest, "rest", open_ended=False))
-        _set(self, "trim", checked_interval(self.trim, "trim", open_ended=True))
+            set_field(self, "rest", checked_interval(self.rest, "rest", open_ended=False))
+        set_field(self, "trim", checked_interval(self.trim, "trim", open_ended=True))
         if self.simulated is not None and not isinstance(self.simulated, bool):
             raise RecordingError(f"simulated is {shown(self.simulated)}; allowed is true or false")
         if not isinstance(self.description, str):
@@ -274,7 +139,7 @@ class RecordingConfig:
         if self.initial_tension is not None:
             words = f"{self.tendons} numbers (N), one of each tendon"
             given = checked_numbers(self.initial_tension, "initial_tension", self.tendons, words)
-            _set(self, "initial_tension", given)
+            set_field(self, "initial_tension", given)
         sources = (*self.markers, self.base, self.measured, self.command)
         topics = [source.topic for source in sources if source]
         twice = next((topic for topic in topics if topics.count(topic) > 1), None)
@@ -440,13 +305,6 @@ def _plain(value: Any) -> Any:
             named = {name: part for name, part in named.items() if part is not None}
         return named
     return [_plain(part) for part in value] if isinstance(value, tuple) else value
-
-
-# values
-
-
-def _set(settings: Any, name: str, value: Any) -> None:
-    object.__setattr__(settings, name, value)
 
 
 def _markers(value: Any) -> tuple[MarkerSource, ...]:

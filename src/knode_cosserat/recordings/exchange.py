@@ -8,14 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from knode_cosserat.recordings.config import MarkerSource, RecordingConfig, TensionSource
+from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.findings import RecordingError
+from knode_cosserat.recordings.measurements import Measurements
+from knode_cosserat.recordings.sources import MarkerSource, TensionSource
 from knode_cosserat.recordings.table import HELD
 from knode_cosserat.recordings.write import Poses, Pulls, write_recording
 from knode_cosserat.solvers.places import places_at, positions_at, quaternions_at
 
 if TYPE_CHECKING:
-    from knode_cosserat.recordings.measurements import Measurements
     from knode_cosserat.trajectory import Trajectory
 
 TABLES = (".csv", ".parquet")

@@ -9,9 +9,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from knode_cosserat.recordings.config import POSITION_UNITS, RecordingConfig
+from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.findings import Finding
 from knode_cosserat.recordings.recording import Body
+from knode_cosserat.recordings.sources import POSITION_UNITS
 
 #: shortest rest for the calibration of a body's axes (s), and smallest number of frames
 SHORTEST_REST, FEWEST_FRAMES = 0.2, 5

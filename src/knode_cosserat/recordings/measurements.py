@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from jaxtyping import Bool, Float
 
+from knode_cosserat._registry import provided
 from knode_cosserat._reprs import count_of, wrapped
 from knode_cosserat.recordings.findings import RecordingError
 
@@ -71,15 +72,11 @@ class Measurements:
             KeyError: the robot is not driven by tensions.
             ValueError: the trajectory is a batch, or its rows are further apart than the time steps.
         """
-        from knode_cosserat.recordings.exchange import measured
-
-        return cls(**measured(trajectory, fractions))
+        return cls(**provided(cls, "of")(trajectory, fractions))
 
     def save(self, path: str | Path) -> None:
         """Write a table (.csv, .parquet) for `load_recording`; see `exchange.save`."""
-        from knode_cosserat.recordings import exchange
-
-        exchange.save(self, path)
+        provided(type(self), "save")(self, path)
 
     @property
     def held_tension(self) -> Float[np.ndarray, "T tendons"]:

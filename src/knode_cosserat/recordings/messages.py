@@ -14,10 +14,10 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from knode_cosserat.recordings.config import CommandSource
 from knode_cosserat.recordings.config_values import PLACE
 from knode_cosserat.recordings.container import Topic
 from knode_cosserat.recordings.findings import RecordingError
+from knode_cosserat.recordings.sources import CommandSource
 
 Role = Literal["pose", "tension", "command"]
 

@@ -6,18 +6,17 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from knode_cosserat._registry import provided
 from knode_cosserat._reprs import count_of, wrapped
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.findings import Finding, RecordingError
 from knode_cosserat.recordings.measurements import Measurements
-
-if TYPE_CHECKING:
-    from knode_cosserat.recordings.health import Health
+from knode_cosserat.recordings.quality import Health
 
 #: largest number of rows of a grid: more rows are a mistake
 MOST_ROWS = 10_000_000
@@ -197,9 +196,8 @@ class Recording:
 
     def health(self) -> Health:
         """Return the quality report: rates, gaps, noise, latency, tension errors and findings."""
-        from knode_cosserat.recordings.health import health_of
-
-        return health_of(self)
+        report: Health = provided(type(self), "health")(self)
+        return report
 
     def _driver(self, kind: str) -> Tensions:
         if kind not in ("measured", "commanded"):

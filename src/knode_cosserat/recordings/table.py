@@ -29,16 +29,11 @@ import pandas as pd  # type: ignore[import-untyped]
 from jaxtyping import Float
 
 from knode_cosserat._yaml import shown
-from knode_cosserat.recordings.config import (
-    CommandSource,
-    MarkerSource,
-    RecordingConfig,
-    TableSource,
-    TensionSource,
-)
+from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.config_values import PLACE
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.messages import Stream
+from knode_cosserat.recordings.sources import CommandSource, MarkerSource, TableSource, TensionSource
 
 TIME = "time [s]"
 #: default prefixes of the columns of tensions

@@ -15,8 +15,9 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat import controls
-from knode_cosserat.recordings.config import TENSION_UNITS, RecordingConfig
+from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.findings import RecordingError
+from knode_cosserat.recordings.sources import TENSION_UNITS
 from knode_cosserat.recordings.write import FORMATS, Poses, Pulls, write_recording
 from knode_cosserat.rods.tendon_rod import TendonRod
 from knode_cosserat.rods.virtual_robot import VirtualRobot

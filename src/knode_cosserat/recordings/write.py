@@ -17,16 +17,11 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat._files import replacing
-from knode_cosserat.recordings.config import (
-    POSITION_UNITS,
-    TENSION_UNITS,
-    CommandSource,
-    RecordingConfig,
-    TensionSource,
-)
+from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.config_values import PLACE
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.messages import SIMULATED, typestore
+from knode_cosserat.recordings.sources import POSITION_UNITS, TENSION_UNITS, CommandSource, TensionSource
 
 BAGS = (".bag", ".mcap", ".db3")
 FORMATS = (*BAGS, ".csv", ".parquet")

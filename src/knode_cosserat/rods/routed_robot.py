@@ -168,7 +168,17 @@ class RoutedTendonRobot(TendonRod):
     @property
     def tendon_count(self) -> int:
         """Number of tendons."""
-        return len(self.routing) if self.routing is not None else int(np.shape(self.tendon_angles)[-1])
+        return len(self.routing) if self.routing is not None else super().tendon_count
+
+    @property
+    def tendon_ends(self) -> tuple[float, ...]:
+        """Places where the tendons end, as fractions of the length."""
+        return tuple(ends(self.routings).tolist())
+
+    @property
+    def moment_arm(self) -> float:
+        """Largest distance (m) of a tendon from the axis at the base."""
+        return float(np.linalg.norm(np.asarray(self.routes_at(0.0)[0]), axis=-1).max())
 
     @property
     def actuator_layout(self) -> Layout:
@@ -262,10 +272,10 @@ class RoutedTendonRobot(TendonRod):
         """Return r and r′ of the tendons at s."""
         if self.routing is not None:
             return routes(self.routing, s / self.length, self.length)
+        if self.tendon_twist is None:
+            return super().routes_at(s)
         angles = self._angles_at(s)
         r = self.tendon_offset * jnp.stack([jnp.cos(angles), jnp.sin(angles), jnp.zeros_like(angles)], -1)
-        if self.tendon_twist is None:
-            return r, np.zeros(r.shape)
         across = jnp.stack([-r[:, 1], r[:, 0], jnp.zeros_like(angles)], axis=-1)
         return r, self.tendon_twist / self.length * across
 

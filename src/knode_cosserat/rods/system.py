@@ -30,6 +30,7 @@ from knode_cosserat.rods.parameters import (
     check_fields,
     parameters_of,
     unknown_parameter,
+    with_value,
 )
 from knode_cosserat.rotation import dot, rotation_matrix
 
@@ -138,11 +139,7 @@ class System(Parametrised):
 
     @property
     def strand(self) -> System:
-        """The system of one strand; all strands share its equations.
-
-        Solvers and learning use its equations along the rod, but not its boundary conditions. It receives the
-        whole control.
-        """
+        """System of one strand, for its equations along the rod only; it receives the whole control."""
         return self
 
     # the equations
@@ -171,10 +168,26 @@ class System(Parametrised):
         A system with a nonlinear law of stresses defines it here, and sets `linear_law` to False.
         """
         c0 = history.c0
-        if type(self).constitutive is System.constitutive:
+        if not _gives(self, "constitutive"):
             return z - self.strains(s, t, y, control, history)
         C, D, f2 = self.constitutive(s, t, y, c0 * y + history.y, control)
         return C @ z + D @ (c0 * z + history.z) - f2
+
+    @property
+    def law_of_stresses(self) -> bool:
+        """True if the strains follow from a law of stresses; False if the system gives them directly."""
+        return _gives(self, "left_of_law") or _gives(self, "constitutive")
+
+    def law_matrix(
+        self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
+    ) -> Float[Any, "z z"]:
+        """Return the derivative of `left_of_law` by z: C + c0 D, or the identity without such a law."""
+        if not self.law_of_stresses:
+            return jnp.eye(self.z_layout.size)
+        if not self.linear_law:
+            return jax.jacfwd(lambda z: self.left_of_law(s, t, y, z, control, history))(z)
+        C, D, _ = self.constitutive(s, t, y, history.c0 * y + history.y, control)
+        return C + history.c0 * D
 
     def rates(
         self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
@@ -183,6 +196,14 @@ class System(Parametrised):
         c0 = history.c0
         A, B, f1 = self.balance(s, t, y, c0 * y + history.y, z, c0 * z + history.z, control)
         return jnp.linalg.solve(A + c0 * B, f1 - B @ history.y_s)
+
+    def load_matrix(
+        self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
+    ) -> Float[Any, "y y"]:
+        """Return A + c0 B, whose inverse turns loads into rates; only needed if B is not zero."""
+        z_t, y_t = history.c0 * z + history.z, history.c0 * y + history.y
+        A, B, _ = self.balance(s, t, y, y_t, z, z_t, control)
+        return A + history.c0 * B
 
     def derivatives(
         self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
@@ -245,6 +266,11 @@ class System(Parametrised):
         """Return the part of the control that enters the equations; the whole control by default."""
         return control
 
+    @property
+    def has_actuation(self) -> bool:
+        """True if the actuation differs from the control."""
+        return _gives(self, "actuation")
+
     def unstressed(self, s: Any, control: Any) -> Float[Any, " z"]:
         """Return z at s of the unstressed material under this control; by default z at rest."""
         return self.rest(s)[1]
@@ -297,6 +323,11 @@ class System(Parametrised):
         """
         return measured
 
+    @property
+    def nominal(self) -> System:
+        """Robot without learned residuals, whose parameters `replace` changes; by default the system."""
+        return self
+
     def trained_range(self) -> Any:
         """Return the `TrainedRange` of a model that was learned or identified; None if there is none."""
         return None
@@ -325,6 +356,10 @@ class System(Parametrised):
                 f"(there are {', '.join(self.y_layout.names)})"
             )
         return self.y_layout.get(y, name)
+
+    def scaled(self, factor: Any) -> Self:
+        """Return the system with its length multiplied by a factor."""
+        return self.replace(length=self.length * factor)
 
     def replace(self, **changes: Any) -> Self:
         """Return a copy with other parameters, by name; derived quantities follow.
@@ -355,21 +390,9 @@ class System(Parametrised):
         check_fields(self)
 
 
-def with_value(owner: Any, path: str, value: Any, name: str) -> Any:
-    """Return a part, or a tuple of parts, with another value at a path such as `0.mass`."""
-    first, _, rest = path.partition(".")
-    several = isinstance(owner, tuple)
-    stated = dataclasses.fields(owner) if dataclasses.is_dataclass(owner) else ()
-    known = [str(k) for k in range(len(owner))] if several else [field.name for field in stated]
-    if first not in known:
-        raise ParameterError(
-            f"there is no parameter {name!r}: no {first!r} among {', '.join(known) or 'nothing'}"
-        )
-    inner = owner[int(first)] if several else getattr(owner, first)
-    changed = with_value(inner, rest, value, name) if rest else value
-    if several:
-        return tuple(changed if k == int(first) else each for k, each in enumerate(owner))
-    return dataclasses.replace(owner, **{first: changed})
+def _gives(system: System, name: str) -> bool:
+    """True if the class of a system defines a method that `System` only declares."""
+    return getattr(type(system), name) is not getattr(System, name)
 
 
 def is_traced(tree: Any) -> bool:

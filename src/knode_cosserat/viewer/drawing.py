@@ -7,15 +7,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.rods.layout import Field, Layout
 from knode_cosserat.rods.loads import AttachedMass
-from knode_cosserat.rods.rod import Rod
-from knode_cosserat.rods.routed_robot import RoutedTendonRobot
-from knode_cosserat.rods.routing import ends
 from knode_cosserat.rods.surroundings import Cylinder, Obstacle, Plane, Sphere
 from knode_cosserat.rods.system import System
-from knode_cosserat.rods.tendon_rod import TendonRod
 
 #: default radius, as a fraction of the length
 SLIM = 0.006
@@ -30,8 +25,10 @@ NICE = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
 
 
 def physics_of(system: System) -> Any:
-    """Return the robot itself; for a model, its adapted nominal model."""
-    return system.adapted if isinstance(system, KNODE) else system
+    """Return the robot itself; for a model, its nominal robot with the model's length."""
+    robot = system.nominal
+    same = robot is system or float(robot.length) == float(system.length)
+    return robot if same else robot.replace(length=system.length)
 
 
 def drawing(system: System, nodes: np.ndarray) -> dict[str, Any]:
@@ -42,7 +39,7 @@ def drawing(system: System, nodes: np.ndarray) -> dict[str, Any]:
     tendons = _tendons(robot, s, radii)
     return {
         "kind": type(robot).__name__,
-        "model": isinstance(system, KNODE),
+        "model": robot is not system,
         "length": float(system.length),
         "up": _up(robot),
         "radii": _short(radii),
@@ -61,7 +58,7 @@ def _radii(robot: Any, s: np.ndarray) -> np.ndarray:
     radius = getattr(robot, "radius", None)
     if radius is None or np.ndim(radius):
         return np.full(len(s), SLIM * float(robot.length))
-    if isinstance(robot, Rod) and robot.sections:
+    if getattr(robot, "sections", ()):
         none = np.zeros(robot.control_size)
         return np.asarray(jax.vmap(lambda at: robot.material(at, none).radius + 0.0 * at)(s))
     return np.full(len(s), float(radius))
@@ -76,23 +73,18 @@ def _up(robot: Any) -> list[float]:
 
 def _tendons(robot: Any, s: np.ndarray, radii: np.ndarray) -> dict[str, Any] | None:
     """Return the tendons' routes (c, nodes, 3) in the material frame, their ends, and their tension."""
-    if not isinstance(robot, TendonRod):
+    if not hasattr(robot, "routes_at"):
         return None
-    if isinstance(robot, RoutedTendonRobot):
-        where = np.stack(
-            [np.broadcast_to(np.asarray(robot.routes_at(at)[0]), (robot.tendon_count, 3)) for at in s]
-        )
-        last = ends(robot.routings).tolist()
-    else:
-        angles = np.asarray(robot.tendon_angles, dtype=float)
-        around = np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=-1)
-        offset = float(robot.tendon_offset) or BESIDE * float(np.max(radii))
-        where, last = np.broadcast_to(offset * around, (len(s), *around.shape)), [1.0] * len(angles)
+    if robot.moment_arm is None and not float(robot.tendon_offset):
+        robot = robot.replace(tendon_offset=BESIDE * float(np.max(radii)))
+    where = np.stack(
+        [np.broadcast_to(np.asarray(robot.routes_at(at)[0]), (robot.tendon_count, 3)) for at in s]
+    )
     y, control = robot.y_layout, robot.control_layout
     array, layout = ("control", control) if "tension" in control.names else ("y", y)
     return {
         "routes": _short(np.moveaxis(where, 0, 1)),
-        "ends": last,
+        "ends": list(robot.tendon_ends),
         "tension": {"array": array, "offset": layout.slice("tension").start},
         "loss": {"array": "y", "offset": y.slice("loss").start} if "loss" in y.names else None,
     }
@@ -169,21 +161,19 @@ def sliders(system: System) -> list[dict[str, Any]]:
 def _range(system: System, field: Field) -> tuple[float, float, float]:
     robot = physics_of(system)
     length = float(robot.length)
-    if field.name == "tension" and isinstance(robot, TendonRod):
+    if field.name == "tension" and hasattr(robot, "routes_at"):
         bending = float(np.asarray(robot.Kbt)[0, 0])
-        if isinstance(robot, RoutedTendonRobot):  # one radian by a single tendon
-            arm = max(float(np.linalg.norm(np.asarray(robot.routes_at(0.0)[0]), axis=-1).max()), 1e-6)
-            return 0.0, _nice(bending / (length * arm)), 0.0
+        if robot.moment_arm is not None:  # one radian by a single tendon
+            return 0.0, _nice(bending / (length * max(robot.moment_arm, 1e-6))), 0.0
         # about two radians by a load of so many N/m: twice the paper's mean tension for its robot. The
         # stiffness that a model begins with may be far from the robot's.
-        high = 2.0 * MEAN_TENSION if isinstance(system, KNODE) else _nice(12.0 * bending / length**3)
+        high = 2.0 * MEAN_TENSION if robot is not system else _nice(12.0 * bending / length**3)
         return 0.0, high, high / 2.0
     if field.unit == "N":
         high = _nice(2.0 * float(np.max(np.abs(np.asarray(robot.scales().y)))))
         return -high, high, 0.0
     if field.name == "reel":
-        arm = float(np.linalg.norm(np.asarray(robot.routes_at(0.0)[0]), axis=-1).max())
-        return 0.0, _nice(1.2 * arm), 0.0
+        return 0.0, _nice(1.2 * robot.moment_arm), 0.0
     if field.unit == "m":
         reach = _nice(0.2 * length)
         return -reach, reach, 0.0

@@ -7,7 +7,6 @@ import contextlib
 import http
 from typing import TYPE_CHECKING, Any
 
-from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.result import SimulationError
 from knode_cosserat.solvers.stepper import Stepper
@@ -62,7 +61,8 @@ def view_live(
 
 def usual_step(robot: System) -> float:
     """Return the time step (s) of a model's training trajectories, or else 0.05 s."""
-    learned = robot.about.facts.get("trajectories") if isinstance(robot, KNODE) else None
+    about = getattr(robot, "about", None)
+    learned = None if about is None else about.facts.get("trajectories")
     try:
         return float(learned[0]["dt"]) if learned else USUAL
     except (KeyError, TypeError, ValueError):  # facts are the user's to change

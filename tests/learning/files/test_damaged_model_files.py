@@ -34,7 +34,7 @@ def forged(data, edit, arrays=None):
     header = edit(header) or header
     text, arrays = json.dumps(header).encode(), body[size:] if arrays is None else arrays
     sizes = f" {len(text)} {len(arrays)}\n".encode()
-    return first + b"\n" + container._checksum(first + b"\n", sizes, text + arrays) + sizes + text + arrays
+    return first + b"\n" + container.checksum(first + b"\n", sizes, text + arrays) + sizes + text + arrays
 
 
 def test_files_that_are_something_else(tmp_path):
@@ -178,7 +178,7 @@ def test_headers_that_are_nested_without_end(depth):
     header_end = int(with_marker.split(b"\n", 2)[1].split()[1])
     text, arrays = body[:header_end].replace(marker, nested), body[header_end:]
     sizes = f" {len(text)} {len(arrays)}\n".encode()
-    content = first + b"\n" + container._checksum(first + b"\n", sizes, text + arrays) + sizes + text + arrays
+    content = first + b"\n" + container.checksum(first + b"\n", sizes, text + arrays) + sizes + text + arrays
     with fails("model: "):
         model_file.decoded(content, "model")
 

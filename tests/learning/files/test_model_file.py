@@ -13,7 +13,7 @@ from hypothesis import given, settings
 
 import knode_cosserat as kc
 from examples.hanging_string import HangingString
-from knode_cosserat.learning.files import container, model_file
+from knode_cosserat.learning.files import container, model_file, unpacking
 from knode_cosserat.learning.files.model_file import ModelFileError, load_model
 from knode_cosserat.learning.knode import KNODE, About
 from knode_cosserat.learning.residual import Residual
@@ -223,7 +223,7 @@ def test_a_class_that_has_changed_since(tmp_path):
 
 
 def test_loading_asks_nothing_of_pickle_or_eval():
-    for module in (model_file, container):
+    for module in (model_file, container, unpacking):
         source = Path(module.__file__).read_text(encoding="utf-8")
         assert not re.search(r"\b(pickle|eval|exec|import_module|__import__)\b", source)
 

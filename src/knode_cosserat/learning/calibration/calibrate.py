@@ -22,7 +22,6 @@ from knode_cosserat.learning.calibration.unknowns import (
     labels,
     limits,
     logarithmic,
-    owner_of,
     searched,
     units,
     unknowns_of,
@@ -189,8 +188,8 @@ def _check(robot: Any, trajectories: Any, by: Any, level: Any) -> None:
         raise DataError("trajectories and measurements are mixed; allowed is a list of one kind")
     if isinstance(level, bool) or not isinstance(level, int | float) or not 0.0 < level < 1.0:
         raise CalibrationError(f"level is {level!r}; allowed is a number between 0 and 1")
-    if not owner_of(robot).parameters():
-        raise CalibrationError(f"{type(owner_of(robot)).__name__} has no parameters")
+    if not robot.nominal.parameters():
+        raise CalibrationError(f"{type(robot.nominal).__name__} has no parameters")
 
 
 def _by_segments(robot: System, trajectories: Sequence[Trajectory], unknowns: Unknowns) -> np.ndarray | None:

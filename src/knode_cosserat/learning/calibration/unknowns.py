@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.rods.parameters import Parameter, ParameterError, unknown_parameter
 from knode_cosserat.rods.system import System
 
@@ -46,11 +45,6 @@ class Unknown(NamedTuple):
 Unknowns = tuple[Unknown, ...]
 
 
-def owner_of(robot: System) -> System:
-    """Return the system that owns the parameters; for a KNODE, its nominal model."""
-    return owner_of(robot.knowledge) if isinstance(robot, KNODE) else robot
-
-
 def unknowns_of(robot: System, names: Sequence[str] | None) -> Unknowns:
     """Return the named parameters of a robot, or all that have a value and can be searched.
 
@@ -58,7 +52,7 @@ def unknowns_of(robot: System, names: Sequence[str] | None) -> Unknowns:
         ParameterError: a name that does not exist or is given twice, a parameter without a value, or a
             matrix that is not diagonal.
     """
-    owner = owner_of(robot)
+    owner = robot.nominal
     known = owner.parameters()
     if names is None:
         return tuple(
@@ -106,7 +100,7 @@ def labels(unknowns: Unknowns) -> tuple[str, ...]:
 
 def values(robot: System, unknowns: Unknowns) -> Float[np.ndarray, " n"]:
     """Return the robot's values of the numbers."""
-    owner = owner_of(robot)
+    owner = robot.nominal
     parts = []
     for unknown in unknowns:
         value = np.asarray(getattr(owner, unknown.name), dtype=float)
@@ -116,7 +110,7 @@ def values(robot: System, unknowns: Unknowns) -> Float[np.ndarray, " n"]:
 
 def limits(robot: System, unknowns: Unknowns) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Return the lowest and the highest allowed value of each number."""
-    known = owner_of(robot).parameters()
+    known = robot.nominal.parameters()
     low, high = (
         [getattr(known[u.name], end) for u in unknowns for _ in range(u.size)] for end in ("low", "high")
     )
@@ -125,7 +119,7 @@ def limits(robot: System, unknowns: Unknowns) -> tuple[Float[np.ndarray, " n"], 
 
 def units(robot: System, unknowns: Unknowns) -> tuple[str, ...]:
     """Return the unit of each number."""
-    known = owner_of(robot).parameters()
+    known = robot.nominal.parameters()
     return tuple(known[unknown.name].unit for unknown in unknowns for _ in range(unknown.size))
 
 

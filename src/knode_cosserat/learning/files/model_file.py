@@ -24,16 +24,17 @@ import jax
 import numpy as np
 
 from knode_cosserat import trajectory_system
+from knode_cosserat._registry import provide
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.learning.files import container
 from knode_cosserat.learning.files.container import (
     Classes,
     ContainerError,
-    Reader,
     Title,
     UnknownClassError,
     Writer,
 )
+from knode_cosserat.learning.files.unpacking import Reader
 from knode_cosserat.learning.knode import KNODE, About
 from knode_cosserat.learning.passive import Passive, Sizes
 from knode_cosserat.learning.residual import Network, Nothing, Residual
@@ -305,4 +306,5 @@ def _equations(model: KNODE, y: Any, control: Any, history: History) -> tuple[An
     return y_s, z, model.tip(np.zeros(()), control, y, history)
 
 
+provide(KNODE, "save", save)
 trajectory_system.register_codec(KNODE, encoded, decoded)

@@ -269,8 +269,7 @@ def _views(knowledge: System, points: Points) -> _Views:
         observables = knowledge.observables(point.s, point.y, y_t, point.z, z_t, point.control)
         matrix = None
         if knowledge.mixed:
-            A, B, _ = knowledge.balance(point.s, point.t, point.y, y_t, point.z, z_t, point.control)
-            matrix = A + point.c0 * B
+            matrix = knowledge.load_matrix(point.s, point.t, point.y, point.z, point.control, history)
         ambient = ambient_inputs(knowledge, point.control)
         return _Views(jnp.concatenate([observables, ambient]), ambient, matrix)
 

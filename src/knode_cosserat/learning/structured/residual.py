@@ -120,25 +120,30 @@ class Structured(Residual):
 
     def adapted(self, knowledge: System) -> System:
         """Return the nominal model with corrected length."""
-        return knowledge.replace(length=knowledge.length * (1.0 + self.stretch))
+        return knowledge.scaled(1.0 + self.stretch)
 
     def derivatives(
         self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
         """Return y_s and z: strains are corrected first, then loads are added to the balance equations."""
         z = self.strains(knowledge, s, t, y, control, history)
+        return self.rates(knowledge, s, t, y, z, control, history), z
+
+    def rates(
+        self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any,
+        history: History,
+    ) -> Float[Any, " y"]:  # fmt: skip
+        """Return y_s at strains z: the nominal model's, with the learned loads."""
         y_s = knowledge.rates(s, t, y, z, control, history)
         if self.load is None:
-            return y_s, z
+            return y_s
         observed = self._observed(self.load, knowledge, s, y, z, control, history)
         layout = loaded(knowledge)
         load = self.load(layout, knowledge.y_layout, y, observed, ambient_inputs(knowledge, control))
         added = jnp.zeros(y.shape[0]).at[knowledge.y_layout.indices(layout.names)].set(load)
         if knowledge.mixed:
-            z_t, y_t = history.c0 * z + history.z, history.c0 * y + history.y
-            A, B, _ = knowledge.balance(s, t, y, y_t, z, z_t, control)
-            added = jnp.linalg.solve(A + history.c0 * B, added)
-        return y_s + added, z
+            added = jnp.linalg.solve(knowledge.load_matrix(s, t, y, z, control, history), added)
+        return y_s + added
 
     def strains(
         self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
@@ -148,7 +153,7 @@ class Structured(Residual):
         if self.stress is None:
             return z0
         z_rest, factors = knowledge.unstressed(s, control), factors_at(knowledge, s, control)
-        M = strain_matrix(knowledge, s, t, y, z0, control, history)
+        M = knowledge.law_matrix(s, t, y, z0, control, history)
         point = None if knowledge.linear_law else (knowledge, s, t, y, control, history)
         law = _Law(self.stress, M, history.c0, z_rest, z0, history.z, factors, point)
         if knowledge.linear_law and not self.stress.curved:
@@ -161,6 +166,21 @@ class Structured(Residual):
         z = solved(jax.lax.stop_gradient(law))
         inverse = jax.lax.stop_gradient(small_inverse(jax.jacfwd(law.left)(z)))
         return z - dot(inverse, law.left(z))
+
+    def left_of_law(
+        self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any,
+        history: History,
+    ) -> Float[Any, " z"]:  # fmt: skip
+        """Return the residual of the nominal law at z, plus the learned stress."""
+        left = knowledge.left_of_law(s, t, y, z, control, history)
+        if self.stress is None:
+            return left
+        return left + self.stress(law_inputs(knowledge, s, control, z, history.c0 * z + history.z))
+
+    @property
+    def linear(self) -> bool:
+        """True if the learned stress is linear."""
+        return self.stress is None or not self.stress.curved
 
     def tip(
         self, knowledge: System, t: Any, control: Any, y: Float[Any, " y"], history: History
@@ -185,13 +205,7 @@ class Structured(Residual):
 
 def factors_at(knowledge: System, s: Any, control: Any) -> tuple[Any, Any] | None:
     """Return the local factors of a law of stresses at s; None for a law of strains."""
-    return None if _in_strains(knowledge) else knowledge.law_factors(s, control)
-
-
-def _in_strains(knowledge: System) -> bool:
-    """True if a system gives its strains directly, without a law of stresses."""
-    kind = type(knowledge)
-    return kind.left_of_law is System.left_of_law and kind.constitutive is System.constitutive
+    return knowledge.law_factors(s, control) if knowledge.law_of_stresses else None
 
 
 def law_inputs(knowledge: System, s: Any, control: Any, z: Any, z_t: Any) -> Float[Any, " 2z"]:
@@ -228,7 +242,7 @@ def material_layout(knowledge: System) -> Layout:
 
 def ambient_layout(knowledge: System) -> Layout:
     """Return the input layout of an ambient load: the control, and its actuation if that differs."""
-    if type(knowledge).actuation is System.actuation:
+    if not knowledge.has_actuation:
         return knowledge.control_layout
     size = jax.eval_shape(knowledge.actuation, np.zeros(knowledge.control_size)).shape[0]
     actuation = Field("actuation", size, "", "what of the control enters the equations")
@@ -237,21 +251,9 @@ def ambient_layout(knowledge: System) -> Layout:
 
 def ambient_inputs(knowledge: System, control: Any) -> Any:
     """Return the numbers laid out by `ambient_layout`."""
-    if type(knowledge).actuation is System.actuation:
+    if not knowledge.has_actuation:
         return control
     return jnp.concatenate([control, knowledge.actuation(control)])
-
-
-def strain_matrix(
-    knowledge: System, s: Any, t: Any, y: Any, z: Any, control: Any, history: History
-) -> Float[Any, "z z"]:
-    """Return the derivative of the law, C + c0 D; the identity if a system gives its strains directly."""
-    if _in_strains(knowledge):
-        return jnp.eye(knowledge.z_layout.size)
-    if not knowledge.linear_law:
-        return jax.jacfwd(lambda z: knowledge.left_of_law(s, t, y, z, control, history))(z)
-    C, D, _ = knowledge.constitutive(s, t, y, history.c0 * y + history.y, control)
-    return C + history.c0 * D
 
 
 def turned_back(layout: Layout, frames: Layout, y: Any, load: Any) -> Any:

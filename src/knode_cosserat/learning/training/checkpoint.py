@@ -21,8 +21,8 @@ import numpy as np
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.learning.config import FitConfig
 from knode_cosserat.learning.files import container
-from knode_cosserat.learning.files.container import ContainerError, Reader, Title, Writer
-from knode_cosserat.learning.knode import KNODE
+from knode_cosserat.learning.files.container import ContainerError, Title, Writer
+from knode_cosserat.learning.files.unpacking import Reader
 from knode_cosserat.rods.system import System
 from knode_cosserat.trajectory import Trajectory
 
@@ -79,7 +79,7 @@ def data_hash(trajectory: Trajectory) -> str:
 
 
 def _knowledge_hash(knowledge: System) -> str:
-    residual = knowledge.residual if isinstance(knowledge, KNODE) else None
+    residual = getattr(knowledge, "residual", None)
     leaves, _ = jax.tree_util.tree_flatten_with_path(knowledge)
     names = [type(knowledge).__qualname__, type(residual).__qualname__, str(knowledge.nodes)]
     names += [jax.tree_util.keystr(path) for path, _ in leaves]

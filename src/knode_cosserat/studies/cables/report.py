@@ -13,14 +13,13 @@ from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
 from knode_cosserat.evaluation.tables import markdown_table
 from knode_cosserat.rods.slender_rod import SlenderRod
 from knode_cosserat.studies.cables.model import DT
+from knode_cosserat.studies.cables.result import CableResult
 from knode_cosserat.studies.report import Report, as_json, write_figures, write_texts
 from knode_cosserat.trajectory import Trajectory
 from knode_cosserat.viewer.document import export_scene
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from knode_cosserat.studies.cables.study import CableResult
 
 METHODS = ("guess", "identified", "best")
 #: times that a figure shows (parts of a motion)

@@ -11,7 +11,7 @@ import dataclasses
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -22,6 +22,7 @@ from knode_cosserat.studies.cables.correction import Correction, learned_correct
 from knode_cosserat.studies.cables.identification import STAGES, Stage, identify_cable
 from knode_cosserat.studies.cables.model import CableModel, CableParameters, Grips
 from knode_cosserat.studies.cables.places import grip_tangents, marker_places
+from knode_cosserat.studies.cables.result import CableResult
 from knode_cosserat.studies.cables.rollouts import Rollouts
 from knode_cosserat.studies.report import Report
 
@@ -41,17 +42,6 @@ class CableOptions:
     stages: tuple[Stage, ...] = STAGES
     #: no stage of the search begins later (s of CPU time, each cable)
     seconds: float = 400.0
-
-
-class CableResult(NamedTuple):
-    """Parameters and predictions of one cable."""
-
-    data: CableData
-    model: CableModel
-    parameters: CableParameters
-    cells: list[dict[str, Any]]
-    predictions: dict[str, dict[str, Float[np.ndarray, "T M 3"]]]
-    notes: list[str]
 
 
 def mean_abs_error(free: Float[np.ndarray, "T M 3"], markers: Float[np.ndarray, "T+2 N 3"]) -> float:

@@ -1,0 +1,110 @@
+"""The modules of the package depend on each other in one direction, without cycles."""
+
+import ast
+import graphlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import knode_cosserat
+
+ROOT = Path(knode_cosserat.__file__).parent
+
+#: packages and modules, each line depends on lines above it and on itself only. The longest prefix counts
+LAYERS = (
+    ("_csv", "_files", "_jax", "_programs", "_registry", "_yaml", "rotation"),
+    ("rods",),
+    ("controls",),
+    ("solvers", "trajectory", "trajectory_file", "trajectory_system"),
+    ("named_controls",),
+    ("metrics", "evaluation.metrics", "evaluation.state_errors"),
+    ("recordings", "control", "statics"),
+    ("learning",),
+    ("identification",),
+    ("evaluation", "figures"),
+    ("viewer", "diagnosis"),
+    # the public names: `import knode_cosserat`
+    ("",),
+    ("studies",),
+    ("cli",),
+)
+
+
+def name_of(file: Path) -> str:
+    """Return a module's name within the package; that of the package itself is empty."""
+    parts = file.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+MODULES = {name_of(file): file for file in sorted(ROOT.rglob("*.py"))}
+
+
+def statements(node: ast.AST) -> Iterator[ast.Import | ast.ImportFrom]:
+    """Yield imports that can run, within functions too; not those for a type checker only."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test):
+            continue
+        if isinstance(child, ast.Import | ast.ImportFrom):
+            yield child
+        yield from statements(child)
+
+
+def imports(name: str) -> set[str]:
+    """Return the modules of the package that a module imports."""
+    found = set()
+    for statement in statements(ast.parse(MODULES[name].read_text(encoding="utf-8"))):
+        if isinstance(statement, ast.Import):
+            found |= {alias.name for alias in statement.names}
+        else:
+            assert statement.level == 0, f"{name} has a relative import; write whole names"
+            assert statement.module is not None
+            for alias in statement.names:
+                whole = f"{statement.module}.{alias.name}"
+                found.add(whole if inside(whole) in MODULES else statement.module)
+    return {inside(each) for each in found} & MODULES.keys() - {name}
+
+
+def inside(name: str) -> str:
+    """Return a name within the package; a name elsewhere has no module here."""
+    whole = knode_cosserat.__name__
+    return "" if name == whole else name.removeprefix(f"{whole}.") if name.startswith(f"{whole}.") else "?"
+
+
+GRAPH = {name: imports(name) for name in MODULES}
+
+
+def layer_of(name: str) -> int:
+    """Return the index of a module's layer; -1 if it has none."""
+    parts = name.split(".")
+    for count in range(len(parts), 0, -1):
+        for k, prefixes in enumerate(LAYERS):
+            if ".".join(parts[:count]) in prefixes:
+                return k
+    return -1
+
+
+def test_the_graph_is_that_of_the_package() -> None:
+    assert len(GRAPH) > 200
+    assert {"rods.system", "solvers.initial", "trajectory"} <= GRAPH["solvers.simulate"]
+    assert "recordings.health" in GRAPH["recordings"]  # within a function
+    assert "rods.system" in GRAPH[""]
+
+
+def test_no_module_imports_itself_by_way_of_others() -> None:
+    try:
+        graphlib.TopologicalSorter(GRAPH).prepare()
+    except graphlib.CycleError as error:
+        pytest.fail(f"a cycle of imports: {' <- '.join(error.args[1])}")
+
+
+def test_packages_depend_in_one_direction() -> None:
+    nowhere = [name for name in GRAPH if layer_of(name) < 0]
+    assert not nowhere, "modules in no layer; give them one"
+    upwards = [
+        f"{name} imports {other}"
+        for name, others in GRAPH.items()
+        for other in sorted(others)
+        if layer_of(other) > layer_of(name)
+    ]
+    assert not upwards

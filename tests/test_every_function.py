@@ -1,0 +1,340 @@
+"""Every public function that takes a robot takes a model, a model of a model, and a user's own system."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import knode_cosserat as kc
+from knode_cosserat.identification.evaluate import evaluate
+from knode_cosserat.learning.passive import passive
+from knode_cosserat.learning.residual import Nothing, Residual, network
+from knode_cosserat.learning.structured.expansion import CURVED, LINEAR, expansion
+from knode_cosserat.learning.structured.residual import Structured
+from knode_cosserat.rotation import cross, quaternion_rate, rotation_matrix
+from knode_cosserat.viewer import drawing
+
+DT, STEPS = 0.05, 12
+NETWORK = kc.FitConfig(residual=kc.learning.NetworkOptions(hidden=2), segments=kc.learning.Training(epochs=2))
+PASSIVE = kc.FitConfig(
+    residual=kc.learning.PassiveOptions(hidden=1), rollouts=kc.learning.RolloutTraining(updates=1)
+)
+
+
+class Cane(kc.System):
+    """A rod of a user: the paper's equations in the general form, pushed across by two forces."""
+
+    y_layout: ClassVar = kc.robots.Layout(
+        ("p", 3, "m", "position"), ("h", 4, "1", "orientation"), ("n", 3, "N", "force", "h", "N/m"),
+        ("m", 3, "N m", "moment", "h", "N"), ("q", 3, "m/s", "velocity"), ("w", 3, "rad/s", "spin"),
+    )  # fmt: skip
+    z_layout: ClassVar = kc.robots.Layout(("v", 3, "1", "stretch"), ("u", 3, "1/m", "curvature"))
+    control_layout: ClassVar = kc.robots.Layout(("tension", 2, "N", "pulls along x and y"))
+    base_unknowns: ClassVar = ("n", "m")
+    mixed: ClassVar = False
+
+    length: Any = kc.robots.parameter("m", "length", low=0.01, high=10.0)
+    mass: Any = kc.robots.parameter("kg/m", "mass per length", low=1e-3, high=10.0)
+    bending: Any = kc.robots.parameter("N m2", "EI", low=1e-6, high=1e3)
+    damping: Any = kc.robots.parameter("N m2 s", "of bending", low=0.0, high=10.0, default=1e-3)
+
+    def constitutive(self, s, t, y, y_t, control):
+        R = rotation_matrix(self.y_layout.get(y, "h")).T
+        stress = jnp.concatenate([R @ self.y_layout.get(y, "n"), R @ self.y_layout.get(y, "m")])
+        K = jnp.concatenate([1e4 * jnp.ones(3), self.bending * jnp.ones(3)])
+        B = jnp.concatenate([jnp.zeros(3), self.damping * jnp.ones(3)])
+        return jnp.diag(K), jnp.diag(B), stress + K * np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+
+    def rates(self, s, t, y, z, control, history):
+        get, y_t, z_t = self.y_layout.get, history.c0 * y + history.y, history.c0 * z + history.z
+        (v, u), (v_t, u_t), R = self.z_layout.split(z), self.z_layout.split(z_t), rotation_matrix(get(y, "h"))
+        q, w, q_t, w_t = get(y, "q"), get(y, "w"), get(y_t, "q"), get(y_t, "w")
+        push = jnp.concatenate([control, jnp.zeros(1)])
+        f = [
+            R @ v, quaternion_rate(get(y, "h"), u), self.mass * (R @ (cross(w, q) + q_t)) - push,
+            1e-6 * w_t - cross(R @ v, get(y, "n")), v_t - cross(u, q) + cross(w, v), u_t - cross(u, w),
+        ]  # fmt: skip
+        return jnp.concatenate(f)
+
+    def rest(self, s):
+        p = jnp.stack([jnp.zeros(()), jnp.zeros(()), jnp.asarray(s, dtype=float)])
+        y = jnp.concatenate([p, np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(12)])
+        return y, jnp.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+
+    def tip(self, t, control, y, history):
+        return jnp.concatenate([self.y_layout.get(y, "n"), self.y_layout.get(y, "m")])
+
+
+def with_network(system: kc.System, seed: int) -> kc.KNODE:
+    """Return a model with a small network, scaled so that it bends the rod a little."""
+    options = kc.learning.NetworkOptions(hidden=3, convex=False)
+    net = network(system, options, jax.random.key(seed))
+    layout = kc.robots.Layout(*system.y_layout.fields, *system.z_layout.fields)
+    size = np.concatenate([np.asarray(system.scales().y) / float(system.length), np.full(6, 1e-2)])
+    size = np.where(np.isin(np.arange(25), layout.indices(("n", "m", "u"))), size, 0.0)
+    return kc.KNODE(system, dataclasses.replace(net, output_scale=1e-2 * size))
+
+
+ROBOT = kc.load_robot("delrin-tendon-robot").replace(nodes=5, bending_damping=0.02)
+MODEL = with_network(ROBOT, 0)
+CANE = Cane(length=0.5, mass=0.2, bending=0.1, damping=5e-3, nodes=5)
+ROBOTS = {
+    "robot": ROBOT, "model": MODEL, "model of a model": with_network(MODEL, 1), "own": CANE,
+    "model of own": with_network(CANE, 2),
+}  # fmt: skip
+
+
+class Made(NamedTuple):
+    """A robot's controls, its equilibrium under the first of them, its motion, and measurements of that."""
+
+    controls: np.ndarray
+    rest: kc.Trajectory
+    motion: kc.Trajectory
+    seen: kc.recordings.Measurements
+
+    @property
+    def limits(self) -> tuple[np.ndarray, np.ndarray]:
+        return 0.9 * self.controls.min(axis=0), 1.1 * self.controls.max(axis=0)
+
+
+@functools.cache
+def made(kind: str) -> Made:
+    robot = ROBOTS[kind]
+    mean = np.array([6.0, 5.0, 4.0, 5.0] if robot.control_size == 4 else [0.3, 0.1])
+    controls = mean * (1.0 + 0.3 * np.sin(2.0 * np.pi * DT * np.arange(1, STEPS + 1) / 0.4)[:, None])
+    rest = kc.equilibrium(robot, controls[0])
+    motion = kc.simulate(robot, controls, DT, initial=rest)
+    return Made(controls, rest, motion, kc.recordings.Measurements.of(motion, (0.5, 1.0)))
+
+
+def name_of_a_parameter(robot: kc.System) -> str:
+    return "bending" if robot.control_size == 2 else "youngs_modulus"
+
+
+def fitted(robot: kc.System, it: Made, config: kc.FitConfig) -> Any:
+    model = kc.fit(robot, [it.motion], config)
+    assert isinstance(model, kc.KNODE) and model.knowledge is robot
+    return kc.simulate(model, it.controls[:2], DT, initial=it.rest).tip_position
+
+
+def structured(robot: kc.System, it: Made) -> Any:
+    model = kc.fit(robot, [it.motion])
+    # nothing is missing: the motion is the robot's own
+    assert abs(float(model.residual.stretch)) < 1e-6
+    assert all(abs(each.coefficient) < 1e-2 for each in kc.explain(model) if each.part == "stress")
+    return model.residual.stretch
+
+
+def estimated(robot: kc.System, it: Made, method: Any) -> Any:
+    states = kc.estimate_states(it.seen, robot, method, dt=DT)
+    tip = np.linalg.norm(states.tip_position - it.motion.tip_position, axis=-1)
+    assert np.max(tip) < 0.02 * float(robot.length)
+    assert len(kc.recordings.estimate_parts(it.seen, robot, method, dt=DT)) == 1
+    return states.y
+
+
+def stepped(robot: kc.System, it: Made) -> Any:
+    stepper = kc.solvers.Stepper(robot, DT, initial=it.rest)
+    for control in it.controls[:2]:
+        tip = stepper.step(control).tip_position
+    np.testing.assert_allclose(tip[0], it.motion.tip_position[2], atol=1e-7)
+    return tip
+
+
+def followed(robot: kc.System, it: Made) -> Any:
+    path = kc.statics.equilibrium_path(robot, it.controls[0], it.controls[1], points=3, with_stability=False)
+    return path.trajectory.y
+
+
+def reached(robot: kc.System, it: Made) -> Any:
+    low, high = it.limits
+    found = kc.inverse_kinematics(robot, it.rest.tip_position[0], low=low, high=high, starts=1)
+    assert found.converged
+    return found.control
+
+
+def calibrated(robot: kc.System, it: Made, by: Any) -> Any:
+    name = name_of_a_parameter(robot)
+    data = it.motion if by == "segments" else it.seen
+    found = kc.calibrate(robot, [data], [name], by=by)
+    assert type(found.robot) is type(robot)
+    np.testing.assert_allclose(getattr(found.robot.nominal, name), getattr(robot.nominal, name), rtol=1e-3)
+    return getattr(found.robot.nominal, name)
+
+
+def predicted(robot: kc.System, it: Made) -> Any:
+    found = evaluate(robot, it.seen)
+    assert found.failed is None and found.tip_rmse < 1e-6
+    return found.tip_rmse
+
+
+#: function by name: called with a robot and with what it `Made`, it returns numbers
+FUNCTIONS: dict[str, Callable[[Any, Made], Any]] = {
+    "simulate": lambda robot, it: it.motion.y,
+    "equilibrium": lambda robot, it: it.rest.y,
+    "stability": lambda robot, it: kc.statics.stability(it.rest).least,
+    "equilibrium_path": followed,
+    "configuration": lambda robot, it: kc.statics.configuration(robot, it.controls[0]).jacobian,
+    "compliance": lambda robot, it: kc.statics.compliance(robot, it.controls[0]),
+    "workspace": lambda robot, it: kc.workspace(robot, *it.limits, 2).position,
+    "inverse_kinematics": reached,
+    "Stepper": stepped,
+    "fit, structured": structured,
+    "fit, network": lambda robot, it: fitted(robot, it, NETWORK),
+    "fit, passive": lambda robot, it: fitted(robot, it, PASSIVE),
+    "calibrate, segments": lambda robot, it: calibrated(robot, it, "segments"),
+    "calibrate, rollouts": lambda robot, it: calibrated(robot, it, "rollouts"),
+    "estimate_states": lambda robot, it: estimated(robot, it, "best"),
+    "estimate_states, paper": lambda robot, it: estimated(robot, it, "paper"),
+    "evaluate": predicted,
+}
+#: they compile for long
+SLOW = {"stability", "equilibrium_path", "calibrate, rollouts", "fit, passive", "fit, network"}
+#: kinds for which every other function is called each time
+OFTEN = {"model of a model"}
+#: functions that are called each time for a user's own system
+OWN = {"simulate", "equilibrium", "estimate_states", "fit, structured", "configuration", "evaluate"}
+#: functions that need a capability, and the words of the error that names it
+LACKING = {
+    ("fit, passive", kind): (kc.learning.FitError, "without bending_stiffness, bending_damping")
+    for kind in ("own", "model of own")
+}
+
+
+def calls() -> Iterator[Any]:
+    for kind in ROBOTS:
+        for name in FUNCTIONS:
+            often = (kind in OFTEN and name not in SLOW) or (kind == "own" and name in OWN)
+            marks = [] if often or (name, kind) in LACKING else [pytest.mark.campaign]
+            yield pytest.param(name, kind, marks=marks, id=f"{name}-{kind}")
+
+
+@pytest.mark.parametrize(("name", "kind"), list(calls()))
+def test_every_function_takes_every_robot(name, kind):
+    if (name, kind) in LACKING:
+        error, words = LACKING[name, kind]
+        with pytest.raises(error, match=words):
+            kc.fit(ROBOTS[kind], [shown(kind)], PASSIVE)
+        return
+    found = np.asarray(FUNCTIONS[name](ROBOTS[kind], made(kind)), dtype=float)
+    assert found.size and np.all(np.isfinite(found))
+
+
+def shown(kind: str) -> kc.Trajectory:
+    """Rows that need no simulation: the robot at rest, then leaning over."""
+    robot = ROBOTS[kind]
+    s = np.linspace(0.0, 1.0, robot.nodes) * float(robot.length)
+    y, z = (np.stack([np.asarray(robot.rest(at)[k]) for at in s]) for k in (0, 1))
+    y, z = (np.tile(each, (4, 1, 1)) for each in (y, z))
+    y[..., :2] += 0.1 * s[:, None] * np.arange(4)[:, None, None]
+    rows = np.zeros(4, dtype=int)
+    return kc.Trajectory(
+        robot, None, DT * np.arange(4), y, z, np.zeros((4, robot.control_size)), rows, 0.0 * rows, rows
+    )
+
+
+@pytest.mark.parametrize("kind", ROBOTS)
+def test_files_figures_and_the_viewer_take_every_robot(kind, tmp_path):
+    robot, trajectory = ROBOTS[kind], shown(kind)
+    own = "own" in kind
+    trajectory.save(tmp_path / "a.nc")
+    again = kc.load_trajectory(tmp_path / "a.nc", system=robot if own else None)
+    np.testing.assert_array_equal(again.y, trajectory.y)
+    same(again.system, robot)
+    if isinstance(robot, kc.KNODE):
+        robot.save(tmp_path / "a.model")
+        same(kc.load_model(tmp_path / "a.model", knowledge=CANE if own else None), robot)
+        kc.learning.Ensemble([robot]).save(tmp_path / "members")
+        same(kc.learning.load_ensemble(tmp_path / "members", knowledge=CANE if own else None)[0], robot)
+    for draw in ("shape", "path", "tips", "states", "overview", "tensions"):
+        assert getattr(kc.figures, draw)(trajectory).axes
+    kc.viewer.export_scene(trajectory, tmp_path / "a.html")
+    assert drawing.drawing(robot, np.arange(robot.nodes))["model"] is isinstance(robot, kc.KNODE)
+    assert len(drawing.sliders(robot)) == robot.control_size
+    assert kc.named_controls.parse(robot, "constant:1.0", 3, DT).shape == (3, robot.control_size)
+
+
+def same(found: kc.System, expected: kc.System) -> None:
+    assert jax.tree.structure(found) == jax.tree.structure(expected)
+    for one, other in zip(*map(jax.tree.leaves, (found, expected)), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_a_change_of_a_model_is_one_of_its_robot():
+    nested = ROBOTS["model of a model"]
+    changed = nested.replace(youngs_modulus=1e9, nodes=7)
+    assert isinstance(changed, kc.KNODE) and changed.nominal.youngs_modulus == 1e9
+    assert changed.nodes == changed.knowledge.nodes == changed.nominal.nodes == 7
+    assert nested.nominal is ROBOT and ROBOT.nominal is ROBOT
+    longer = [Structured(np.array(stretch), None, None, None) for stretch in (0.1, 0.2)]
+    both = kc.KNODE(kc.KNODE(ROBOT, longer[0]), longer[1])
+    assert float(both.length) == pytest.approx(1.32 * float(ROBOT.length))
+
+
+def test_what_is_missing_is_named():
+    for kind in ("model of a model", "own"):
+        with pytest.raises(kc.identification.IdentificationError, match="allowed is a robot with tendons"):
+            kc.identify(ROBOTS[kind], [])
+    with pytest.raises(kc.robots.RobotFileError, match="KNODE"):
+        kc.save_robot(MODEL, "a.yaml")
+    with pytest.raises(TypeError, match="allowed is a KNODE"):
+        kc.explain(CANE)
+
+
+class Pull(Residual):
+    """A residual of a user, with nothing but what it must define: the load on n, and a strain."""
+
+    size: Any
+
+    def derivatives(self, knowledge, s, t, y, control, history):
+        y_s, z = knowledge.derivatives(s, t, y, control, history)
+        return y_s.at[7].add(self.size), z.at[4].add(self.size * y[10])
+
+
+@functools.cache
+def residuals() -> dict[str, Residual]:
+    rng = np.random.default_rng(5)
+    empty = passive(ROBOT, np.full((1, 4), 5.0))
+    stress = {}
+    for curved, forms in (("linear", LINEAR), ("curved", CURVED)):
+        layout = kc.robots.Layout(*((name, 3, "", name) for name in ("v", "u", "v_t", "u_t")))
+        plain = expansion(layout, rng.normal(size=(50, 12)), dict.fromkeys(layout.names, forms), 6)
+        weights = 1e-5 * rng.normal(size=np.shape(plain.weights))
+        stress[curved] = dataclasses.replace(plain, weights=weights)
+    return {
+        "nothing": Nothing(),
+        "network": MODEL.residual,
+        "passive": empty.with_numbers(0.1 * rng.normal(size=empty.size)).clamped(),
+        **{name: Structured(np.array(0.02), each, None, None) for name, each in stress.items()},
+        "a user's": Pull(np.array(0.1)),
+    }
+
+
+@pytest.mark.parametrize("nominal", [ROBOT, CANE, MODEL], ids=["robot", "own", "model"])
+@pytest.mark.parametrize("name", residuals())
+def test_the_parts_of_a_model_s_equations_agree(name, nominal):
+    """`strains` and `rates` are `derivatives`; the law is zero there, with the derivative it states."""
+    if name == "passive" and nominal is CANE:
+        pytest.skip("a passive residual is of a rod with bending stiffness")
+    model = with_network(nominal, 3) if name == "network" else kc.KNODE(nominal, residuals()[name])
+    rng = np.random.default_rng(7)
+    y = np.concatenate([np.zeros(3), [1.0, 0.1, 0.2, 0.0], 0.1 * rng.normal(size=12)])
+    history = kc.robots.History(20.0, *(0.1 * rng.normal(size=size) for size in (19, 6, 19)))
+    control = rng.uniform(1.0, 3.0, nominal.control_size)
+    at = (0.1, 0.0, y)
+    y_s, z = model.derivatives(*at, control, history)
+    np.testing.assert_allclose(model.strains(*at, control, history), z, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(model.rates(*at, z, control, history), y_s, rtol=1e-9, atol=1e-10)
+    matrix = model.law_matrix(*at, z, control, history)
+    size = np.abs(matrix) @ np.abs(z)
+    assert np.all(np.abs(model.left_of_law(*at, z, control, history)) < 1e-9 * size + 1e-12)
+    step = 1e-3 * rng.normal(size=6)
+    moved = model.left_of_law(*at, z + step, control, history)
+    if model.linear_law:
+        np.testing.assert_allclose(moved, matrix @ step, rtol=1e-6, atol=1e-9 * np.max(size))
+    assert model.law_of_stresses
