@@ -20,7 +20,7 @@ $(READY): requirements.lock pyproject.toml tools/bootstrap.py
 	@$(PYTHON) tools/bootstrap.py
 	@touch $@
 
-demo: $(READY) ## simulate the demonstration robot and write the results to demo/
+demo: $(READY) ## simulate, learn, and predict a held-out recording; results in demo/
 	$(BIN)/python examples/demo.py --out demo/
 
 pictures: $(READY) ## run all the examples, and draw their pictures for the documentation

@@ -27,7 +27,7 @@ RIGID = 1e10 * FORCE
 #: so soft that shear is a tenth of the deflection
 SOFT = 30 * FORCE
 #: solved so far that what is left is the schemes' error
-NEWTON = kc.NewtonOptions(tolerance=1e-13)
+NEWTON = kc.solvers.NewtonOptions(tolerance=1e-13)
 UP = np.array([1.0, 0.0, 0.0, 0.0])
 
 
@@ -36,14 +36,14 @@ def rod(
 ) -> Any:
     """Clamped at its foot, upright, loaded at its tip and evenly; it resists twist as it does bending."""
     loads = (
-        kc.loads.PointWrench(force=np.multiply(force, FORCE), moment=np.multiply(moment, MOMENT)),
-        kc.loads.DistributedWrench(force=np.multiply(even, FORCE / LENGTH)),
+        kc.robots.loads.PointWrench(force=np.multiply(force, FORCE), moment=np.multiply(moment, MOMENT)),
+        kc.robots.loads.DistributedWrench(force=np.multiply(even, FORCE / LENGTH)),
     )
     parameters = {
         "length": LENGTH, "radius": RADIUS, "youngs_modulus": YOUNGS_MODULUS, "density": DENSITY,
         "gravity": (0, 0, 0), "shear_stiffness": (RIGID, RIGID, RIGID), "bending_stiffness": (EI, EI, EI),
     }  # fmt: skip
-    return kc.SlenderRod(nodes=nodes, loads=loads, **{**parameters, **changes})
+    return kc.robots.SlenderRod(nodes=nodes, loads=loads, **{**parameters, **changes})
 
 
 def positions(robot: Any, space: str, control: Any = (), initial: Any = None) -> np.ndarray:
@@ -103,7 +103,7 @@ TENDON_TENSION, TENDON_OFFSET = 3.0, 0.02
 
 def tendon_circle(nodes: int, space: str) -> float:
     """Distance from the circle that one straight tendon makes of a rod."""
-    robot = kc.RoutedTendonRobot(
+    robot = kc.robots.RoutedTendonRobot(
         length=LENGTH, radius=4e-3, youngs_modulus=YOUNGS_MODULUS, density=DENSITY, gravity=(0, 0, 0),
         tendon_offset=TENDON_OFFSET, tendon_angles=(0.0, np.pi / 2), nodes=nodes,
     )  # fmt: skip
@@ -137,12 +137,12 @@ def hanging(nodes: int, curved: bool = True) -> tuple[Any, kc.Trajectory]:
     p, h = CATENARY.positions(s), Rotation.from_matrix(frames).as_quat(scalar_first=True)
     h *= np.where(h @ h[0] < 0, -1.0, 1.0)[:, None]
     stretch = 1 + np.hypot(CATENARY.tension, CATENARY.rise(s)) / CATENARY.EA
-    robot = kc.SlenderRod(
+    robot = kc.robots.SlenderRod(
         length=LENGTH, radius=RADIUS, youngs_modulus=YOUNGS_MODULUS, density=DENSITY,
         gravity=(0, 0, -CATENARY.weight / (DENSITY * AREA)), shear_stiffness=(RIGID, RIGID, CATENARY.EA),
         bending_stiffness=(EI, EI, EI), nodes=nodes,
         sections=(FunctionSection(function=_curved_like_the_catenary),) if curved else (),
-        base_end=kc.ends.Pinned(position=p[0]), tip_end=kc.ends.Pinned(position=p[-1]),
+        base_end=kc.robots.ends.Pinned(position=p[0]), tip_end=kc.robots.ends.Pinned(position=p[-1]),
     )  # fmt: skip
     return robot, resting(robot, p, h, stretch[:, None] * [0.0, 0.0, 1.0], np.zeros((nodes, 3)))
 
@@ -200,7 +200,7 @@ def strut(nodes: int, space: str) -> float:
 
 def shaft(nodes: int, space: str) -> float:
     """Relative error of the torque under which a twisted shaft buckles, one clamped end free to slide."""
-    robot = rod(nodes, tip_end=kc.ends.Sliding(axes=("rz",), along="z"))
+    robot = rod(nodes, tip_end=kc.robots.ends.Sliding(axes=("rz",), along="z"))
     s = np.linspace(0, LENGTH, nodes)[:, None]
 
     def twisted(torque: float) -> kc.Trajectory:
@@ -223,7 +223,7 @@ BUCKLING = {
 
 # vibration
 
-BDF2 = kc.BDF2()
+BDF2 = kc.solvers.BDF2()
 #: steps of a period, of a run, and of the time in which it settles
 PERIOD_STEPS, STEPS, SETTLED = 16, 96, 32
 

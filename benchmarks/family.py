@@ -24,12 +24,14 @@ def tendons() -> dict[str, Any]:
     import knode_cosserat as kc
 
     crude = kc.load_robot("delrin-tendon-robot")
-    helix = [kc.routing.Helical(0.02, angle, 0.5) for angle in np.asarray(crude.tendon_angles)]
+    helix = [kc.robots.routing.Helical(0.02, angle, 0.5) for angle in np.asarray(crude.tendon_angles)]
     robots = {
         "crude": crude,
-        "straight": kc.RoutedTendonRobot.like(crude),
-        "friction": kc.RoutedTendonRobot.like(crude, friction=TendonFriction(wobble=0.6, curvature=0.1)),
-        "helical": kc.RoutedTendonRobot.like(crude, routing=tuple(helix)),
+        "straight": kc.robots.RoutedTendonRobot.like(crude),
+        "friction": kc.robots.RoutedTendonRobot.like(
+            crude, friction=TendonFriction(wobble=0.6, curvature=0.1)
+        ),
+        "helical": kc.robots.RoutedTendonRobot.like(crude, routing=tuple(helix)),
         "ribs": kc.load_robot("delrin-routed-tendon-robot"),
     }
     controls = {
@@ -65,7 +67,7 @@ def reel() -> dict[str, Any]:
     import knode_cosserat as kc
 
     length, radius = 0.7144, 0.675e-3
-    robot = kc.RoutedTendonRobot(
+    robot = kc.robots.RoutedTendonRobot(
         length=length, radius=radius, density=0.034 / (length * np.pi * radius**2), youngs_modulus=207e9,
         bending_damping=5e-4, drag=1e-4, gravity=(9.81, 0.0, 0.0), tendon_offset=0.01506,
         tendon_angles=(np.pi / 2,), tendon_compliance=1e-4, drive="reel", nodes=200,

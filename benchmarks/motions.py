@@ -20,12 +20,12 @@ from benchmarks.cases import DT
 FINEST = 160
 
 
-def soft_rod(*ends: float) -> kc.SlenderRod:
+def soft_rod(*ends: float) -> kc.robots.SlenderRod:
     """A damped rod that falls to one side; up to each of these places it is twice as stiff as beyond."""
-    return kc.SlenderRod(
+    return kc.robots.SlenderRod(
         length=0.5, radius=0.005, density=1200.0, youngs_modulus=5e6, bending_damping=1e-3,
         linear_drag=(0.01, 0.01, 0.01), gravity=(2.0, 0.0, -2.0),
-        sections=tuple(kc.Stretch(end=end, stiffness=[2.0]) for end in ends),
+        sections=tuple(kc.robots.Stretch(end=end, stiffness=[2.0]) for end in ends),
     )  # fmt: skip
 
 
@@ -38,9 +38,9 @@ def _pulled(kind: str) -> tuple[Any, np.ndarray, float]:
     if kind == "ribs":
         return kc.load_robot("delrin-routed-tendon-robot"), controls, DT
     places = ((0.3, 1.0), (2.4, 0.63))
-    helices = tuple(kc.routing.Helical(0.02, angle, 0.5, end=end) for angle, end in places)
+    helices = tuple(kc.robots.routing.Helical(0.02, angle, 0.5, end=end) for angle, end in places)
     crude = kc.load_robot("delrin-tendon-robot")
-    return kc.RoutedTendonRobot.like(crude, routing=helices), controls[:, :2], DT
+    return kc.robots.RoutedTendonRobot.like(crude, routing=helices), controls[:, :2], DT
 
 
 @functools.lru_cache
@@ -60,7 +60,7 @@ def _case(name: str, motion: Callable[[], tuple[Any, np.ndarray, float]]) -> Cas
 
 
 MOTIONS = {
-    "alike": _case("a rod that is alike all along", _falling()),
+    "alike": _case("a uniform rod", _falling()),
     "section": _case("its section changes at 0.317 of its length", _falling(0.317)),
     "tendon ends": _case("one of two helical tendons ends at 0.63", functools.partial(_pulled, "ends")),
     "ribs": _case("`delrin-routed-tendon-robot`: sleeve and ribs", functools.partial(_pulled, "ribs")),

@@ -6,6 +6,7 @@ import argparse
 import json
 import os
 import platform
+import re
 import statistics
 import subprocess
 import sys
@@ -77,7 +78,7 @@ def measure() -> dict[str, Any]:
 
 
 def table(found: dict[str, Any]) -> str:
-    """The figures as Markdown, with what is aimed at."""
+    """Return the figures as a Markdown table, each with its aim and whether it was met."""
     steps, nodes, gradient = found["steps"], found["steps"]["nodes"], found["gradient"]
     schemes = found["schemes"]
     default, euler = (
@@ -107,7 +108,7 @@ def table(found: dict[str, Any]) -> str:
         ),
         ("first call (nothing compiled yet)", f"{found['first_call']['first_call']:.1f} s", "<= 6 s"),
         (
-            "the same of the robot with ribs and real tendons",
+            "the same, robot with ribs and routed tendons",
             f"{found['first_call']['ribs']:.1f} s",
             "<= 6 s",
         ),
@@ -127,12 +128,30 @@ def table(found: dict[str, Any]) -> str:
         *family_rows(found["family"]),
         *learning_rows(found),
     ]
-    lines = ["| what | measured | aim |", "| --- | --- | --- |"]
-    return "\n".join([*lines, *(f"| {what} | {value} | {aim} |" for what, value, aim in rows)])
+    lines = ["| case | measured | aim | result |", "| --- | --- | --- | --- |"]
+    return "\n".join(
+        [*lines, *(f"| {what} | {value} | {aim} | {verdict(value, aim)} |" for what, value, aim in rows)]
+    )
+
+
+def verdict(measured: str, aim: str) -> str:
+    """Return "met" or "missed", from the least favourable number of a cell; "–" without an aim."""
+    if aim == "none":
+        return "–"
+    found = [_number(text) for text in measured.partition("(")[0].split(" to ")]
+    limit = _number(aim[2:])
+    met = min(found) >= limit if aim.startswith(">=") else max(found) <= limit
+    return "met" if met else "**missed**"
+
+
+def _number(text: str) -> float:
+    """Return the number at the beginning of a text; milliseconds become seconds."""
+    number, unit = re.match(r"\s*([\d.,]+)\s*(\w*)", text).groups()  # type: ignore[union-attr]
+    return float(number.replace(",", "")) * (1e-3 if unit == "ms" else 1.0)
 
 
 def family_rows(found: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """What the other robots cost."""
+    """Return the rows of the other robots."""
 
     def ratios(kind: str) -> str:
         each = [case[kind]["ratio"] for case in found["tendons"].values()]
@@ -140,7 +159,7 @@ def family_rows(found: dict[str, Any]) -> list[tuple[str, str, str]]:
 
     reel = found["reel"]
     return [
-        ("a step with real tendons, against the crude ones", ratios("straight"), "<= 1.5x"),
+        ("a step with routed tendons, against the paper's tendon model", ratios("straight"), "<= 1.5x"),
         ("the same with friction", ratios("friction"), "<= 1.5x"),
         ("the same with helical tendons", ratios("helical"), "<= 1.5x"),
         ("the same with ribs and a sleeve, the catalog's robot", ratios("ribs"), "none"),
@@ -154,7 +173,7 @@ def family_rows(found: dict[str, Any]) -> list[tuple[str, str, str]]:
 
 
 def learning_rows(found: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """What learning costs."""
+    """Return the rows of learning."""
     paper, best = found["fits"]["paper"], found["fits"]["best"]
     steps = found["learned_steps"]
     ratios = [taken / steps["physics"] for name, taken in steps.items() if name not in ("physics", "paper")]

@@ -118,7 +118,7 @@ def dynamics(path: Path) -> None:
     axes[0].axvline(closed_forms.COLUMN, color="k", ls="--", lw=0.8, label="Greenhill: 7.837")
     axes[0].set(title="upright column", xlabel="ρ A g L³ / EI", ylabel="smallest singular value of ∂tip/∂ξ")
     axes[0].legend(fontsize=8)
-    for scheme, name in ((kc.BDF2(), "BDF2"), (kc.Trapezoidal(), "trapezoidal")):
+    for scheme, name in ((kc.solvers.BDF2(), "BDF2"), (kc.solvers.Trapezoidal(), "trapezoidal")):
         amplitude, _ = beams.swinging(1, 40, scheme=scheme)
         axes[1].plot(
             np.arange(len(amplitude)) / beams.PERIOD_STEPS, amplitude / amplitude[0], lw=1, label=name

@@ -28,7 +28,8 @@ from typing import Any
 import numpy as np
 
 import knode_cosserat as kc
-from knode_cosserat.viewer.live import Session, view_live
+from knode_cosserat.viewer.live import view_live
+from knode_cosserat.viewer.session import Session
 from tests.viewer.browser import Browser
 
 DT = 0.05
@@ -74,13 +75,13 @@ def spread(values: Any) -> dict[str, float]:
 
 def alone(robot: kc.System) -> dict[str, Any]:
     """What the server does for one event, and for one tick of the clock, without any browser."""
-    session = Session(robot, DT, "euler", None)
+    session = Session(kc.solvers.Stepper(robot, DT, space="euler"), None)
     controls = session.control + np.linspace(0.0, 1.0, 40)[:, None] * np.eye(len(session.control))[0]
     taken: dict[bool, list[float]] = {False: [], True: []}
     for k in range(400):
         for over in (False, True):
             began = time.perf_counter()
-            _, stuck = session.solve(controls[k % 40], k, over)
+            _, session.stepper, stuck = session.attempt(controls[k % 40], k, over)
             taken[over].append(1e3 * (time.perf_counter() - began))
             assert not stuck
     return {"event": spread(taken[False]), "tick": spread(taken[True])}
@@ -95,9 +96,7 @@ def in_browser(robot: kc.System) -> dict[str, Any]:
         found.append(address)
         known.set()
 
-    threading.Thread(
-        target=view_live, args=(robot,), kwargs={"open_browser": False, "ready": ready}, daemon=True
-    ).start()
+    threading.Thread(target=view_live, args=(robot,), kwargs={"open_browser": ready}, daemon=True).start()
     known.wait()
     browser = Browser()
     try:

@@ -1,7 +1,7 @@
-"""How sure is a prediction? Simulate a thousand robots whose stiffness and density are known to 10 % only.
+"""Uncertainty of a prediction: simulate a thousand robots with stiffness and density known to 10 % only.
 
-A list of robots is one compiled, batched program on all cores. The bands show where the tips are: what a
-measurement of the material would be worth.
+A list of robots runs as one compiled, batched program on all cores. The bands show the distribution of the
+tips, and therefore the value of a measurement of the material.
 """
 
 import numpy as np
@@ -11,7 +11,7 @@ import knode_cosserat as kc
 
 
 def main(out: str = "a_thousand_robots.png", robots: int = 1000, steps: int = 60) -> kc.Trajectory:
-    """A batch of robots under the same tensions."""
+    """Simulate a batch of robots under the same tensions."""
     robot = kc.load_robot("delrin-tendon-robot")
     rng = np.random.default_rng(0)
     factors = rng.normal(1.0, 0.1, (robots, 2)).clip(0.6, 1.4)

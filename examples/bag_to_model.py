@@ -1,7 +1,7 @@
-"""From recorded bags to a model that predicts: record, read, calibrate, check on what was kept back.
+"""From recorded bags to a model that predicts: record, read, calibrate, test on a held-out recording.
 
-No robot is at hand: a virtual one is recorded, with friction, ribs, a lag and noisy sensors that the model is
-not told of. `knode-cosserat record-virtual` makes the same bags; with your own, begin at `load_recording`.
+A virtual robot is recorded, with friction, ribs, a lag and noisy sensors that the model does not have.
+`knode-cosserat record-virtual` makes the same bags; with your own bags, start at `load_recording`.
 """
 
 import tempfile
@@ -16,17 +16,17 @@ NAMES = ("youngs_modulus", "bending_damping")
 
 
 def main(out: str = "bag_to_model.png", seconds: float = 4.0) -> tuple[float, float]:
-    """Calibrate from one sine, predict another; the tip's errors (RMSE in m) before and after."""
+    """Calibrate from one sine, predict another; return the tip's errors (RMSE in m) before and after."""
     with tempfile.TemporaryDirectory() as folder:
         bags = {"sine:1.5": Path(folder) / "seen.bag", "sine:1.0": Path(folder) / "unseen.bag"}
         for signal, path in bags.items():
             record_virtual(path, signal, seconds)
-        config = kc.RecordingConfig.paper_robot()
+        config = kc.recordings.RecordingConfig.paper_robot()
         recordings = [kc.load_recording(path, config) for path in bags.values()]
     seen, unseen = (recording.sampled(0.0125, mean=True) for recording in recordings)
 
-    # tendons as they are, which bend the rod; `kc.identify` finds their friction too, and takes longer
-    knowledge = kc.RoutedTendonRobot.like(kc.load_robot("delrin-tendon-robot"))
+    # realistic tendons, which bend the rod; `kc.identify` finds their friction too, and takes longer
+    knowledge = kc.robots.RoutedTendonRobot.like(kc.load_robot("delrin-tendon-robot"))
     found = kc.calibrate(knowledge, [seen], NAMES, by="rollouts")
     print(found)
     before, after = (kc.simulate(each, unseen.held_tension[:-1], 0.0125) for each in (knowledge, found.robot))
@@ -35,7 +35,7 @@ def main(out: str = "bag_to_model.png", seconds: float = 4.0) -> tuple[float, fl
         float(((each.tip_position - unseen.tip_position) ** 2).sum(axis=1).mean() ** 0.5)
         for each in (before, after)
     )
-    print(f"tip RMSE on the unseen one: {100 * errors[0]:.1f} cm before, {100 * errors[1]:.2f} cm after")
+    print(f"held-out tip RMSE: {100 * errors[0]:.1f} cm before, {100 * errors[1]:.2f} cm after")
     return errors[0], errors[1]
 
 

@@ -1,7 +1,7 @@
 """Three soft actuators, one after the other along a hanging rod, bend it into an S.
 
-Sections may have a curvature of their own that a control drives, and be stiffer as they are driven: a
-pneumatic robot, or one that heat or a magnet bends. No tendon is needed.
+A control may change the rest curvature and the stiffness of a section: a pneumatic robot, or one that heat
+or a magnet bends. No tendon is needed.
 """
 
 import numpy as np
@@ -11,7 +11,7 @@ import knode_cosserat as kc
 
 
 def main(out: str = "bend_by_pressure.png", steps: int = 100) -> kc.Trajectory:
-    """The first and the third stretch are driven in opposite directions, one after the other."""
+    """Drive the first and the third section in opposite directions, one after the other."""
     robot = kc.load_robot("variable-curvature-robot").replace(nodes=25)
     part = np.linspace(0.0, 1.0, steps)
     first = np.clip(2.0 * part, 0.0, 1.0)

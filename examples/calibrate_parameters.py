@@ -1,6 +1,6 @@
-"""Find stiffness and damping of a robot from one noisy motion, with intervals that say how sure they are.
+"""Calibrate stiffness and damping of a robot from one noisy motion, with confidence intervals.
 
-Where the equations are right and only numbers are wrong, calibration is the shortest way: least squares on
+If the equations are right and only parameters are wrong, calibration is the shortest way. Least squares on
 whole simulations needs positions and orientations only.
 """
 
@@ -14,7 +14,9 @@ import knode_cosserat as kc
 DT, NAMES = 0.05, ("youngs_modulus", "bending_damping")
 
 
-def main(out: str = "calibrate_parameters.png", steps: int = 60, noise: float = 1e-3) -> kc.Calibration:
+def main(
+    out: str = "calibrate_parameters.png", steps: int = 60, noise: float = 1e-3
+) -> kc.calibration.Calibration:
     """Calibrate from a sine with noise (m, and of other states alike), and predict random tensions."""
     robot = kc.load_robot("delrin-tendon-robot")  # stands for the real one
     guess = robot.replace(youngs_modulus=1.5e9, bending_damping=0.05)
@@ -28,7 +30,8 @@ def main(out: str = "calibrate_parameters.png", steps: int = 60, noise: float = 
     unseen = kc.controls.random(steps, seed=1, hold=10)
     truth, before, after = (kc.simulate(each, unseen, DT) for each in (robot, guess, found.robot))
     kc.figures.error(truth, {"before": before, "after": after}).savefig(out)
-    print(f"tip RMSE {kc.tip_rmse(before, truth):.2g} m before, {kc.tip_rmse(after, truth):.2g} m after")
+    errors = [kc.metrics.tip_rmse(each, truth) for each in (before, after)]
+    print(f"tip RMSE {errors[0]:.2g} m before, {errors[1]:.2g} m after")
     return found
 
 

@@ -1,8 +1,8 @@
-"""Trust, but check: a cantilever that a moment bends into a half circle, against the closed form.
+"""Validation: a cantilever that a moment bends into a half circle, compared with the closed form.
 
-The rod takes constant curvature M/EI, so that its tip is known exactly however far it is bent. The error
-falls with the first power of the segments' length by Euler's scheme, and with the second and the fourth by
-Lobatto's.
+The rod has constant curvature M/EI, so its tip position is known exactly for any bending. The error falls
+with the first power of the segment length for Euler's scheme, and with the second and the fourth for the
+Lobatto schemes.
 """
 
 import numpy as np
@@ -12,16 +12,16 @@ import knode_cosserat as kc
 
 
 def main(out: str = "closed_form.png", most_nodes: int = 21) -> tuple[list[int], dict[str, list[float]]]:
-    """Nodes, and the tip's error (m) by each scheme."""
+    """Return the numbers of nodes, and the tip's error (m) for each scheme."""
     length, radius, E = 0.5, 0.005, 1e7
     EI = E * np.pi * radius**4 / 4
     curvature = np.pi / length  # 1/m: half a circle
-    load = kc.loads.PointWrench(moment=(0.0, EI * curvature, 0.0), at=1.0)
+    load = kc.robots.loads.PointWrench(moment=(0.0, EI * curvature, 0.0), at=1.0)
     exact = np.array([2.0, 0.0, 0.0]) / curvature
     nodes = [n for n in (6, 11, 21, 41, 81) if n <= most_nodes]
     errors: dict[str, list[float]] = {"euler": [], "lobatto2": [], "lobatto4": []}
     for n in nodes:
-        rod = kc.SlenderRod(
+        rod = kc.robots.SlenderRod(
             length=length, radius=radius, density=1000.0, youngs_modulus=E, gravity=(0.0, 0.0, 0.0),
             loads=(load,), nodes=n,
         )  # fmt: skip

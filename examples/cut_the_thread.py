@@ -1,7 +1,7 @@
-"""The thread that holds a rod with a tip mass aside is cut, and it swings at the known frequency.
+"""A deflected rod with a tip mass is released, and vibrates at the frequency of beam theory.
 
 Beam theory gives the frequency of a cantilever with a tip mass as the root of an equation. The simulation
-knows none of it: it has a rod, a rigid body and a force that stops.
+does not use it: it has a rod, a rigid body and a force that vanishes.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ LENGTH, RADIUS, DENSITY, E, MASS = 0.3, 0.002, 1200.0, 3e9, 0.01
 
 
 def known_frequency() -> float:
-    """1 + cos cosh + (M/ρAL) β (cos sinh - sin cosh) = 0, of β; then Hz."""
+    """Return the frequency (Hz) from the root β of 1 + cos cosh + (M/ρAL) β (cos sinh - sin cosh) = 0."""
     rod = DENSITY * np.pi * RADIUS**2  # kg/m
     ratio, EI = MASS / (rod * LENGTH), E * np.pi * RADIUS**4 / 4
     beta = brentq(
@@ -25,11 +25,11 @@ def known_frequency() -> float:
 
 
 def main(out: str = "cut_the_thread.png", steps: int = 128, nodes: int = 11) -> tuple[float, float]:
-    """Frequencies (Hz): simulated, and known."""
-    thread = kc.loads.PointWrench(force=(0.05, 0.0, 0.0), at=1.0, controlled=True)
-    robot = kc.SlenderRod(
+    """Return the frequencies (Hz): simulated, and from beam theory."""
+    thread = kc.robots.loads.PointWrench(force=(0.05, 0.0, 0.0), at=1.0, controlled=True)
+    robot = kc.robots.SlenderRod(
         length=LENGTH, radius=RADIUS, density=DENSITY, youngs_modulus=E, gravity=(0.0, 0.0, 0.0),
-        loads=(kc.loads.AttachedMass(mass=MASS), thread), nodes=nodes,
+        loads=(kc.robots.loads.AttachedMass(mass=MASS), thread), nodes=nodes,
     )  # fmt: skip
     held = kc.equilibrium(robot, np.ones(1), space="lobatto4")
     known = known_frequency()

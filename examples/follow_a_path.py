@@ -1,7 +1,7 @@
-"""Follow a figure of eight with the tip: inverse kinematics, each point from the last.
+"""Follow a figure of eight with the tip: inverse kinematics, each point starting from the last.
 
-The paper's robot bends in two directions, so that its tip can be asked for x and y but not for z as well.
-`pose` says what is asked for: here two coordinates of the last node.
+The paper's robot bends in two directions, so x and y of its tip can be prescribed, but not z as well.
+`pose` defines the prescribed quantities: here two coordinates of the last node.
 """
 
 import numpy as np
@@ -10,8 +10,8 @@ import typer
 import knode_cosserat as kc
 
 
-def main(out: str = "follow_a_path.png", points: int = 60) -> kc.InverseKinematics:
-    """The tensions (points, 4) in N that follow the eight, and how far off each point is."""
+def main(out: str = "follow_a_path.png", points: int = 60) -> kc.statics.InverseKinematics:
+    """Return the tensions (points, 4) in N that follow the eight, and the error of each point."""
     robot = kc.load_robot("delrin-tendon-robot")
     turn = np.linspace(0.0, 2.0 * np.pi, points)
     wanted = np.stack([0.25 * np.sin(turn), 0.15 * np.sin(2.0 * turn)], axis=1)

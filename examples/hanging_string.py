@@ -1,6 +1,6 @@
 """A system of your own: an elastic string in the vertical plane, hung between a nail and a moving hand.
 
-Of the general class (paper eqs. 1-4): p_s = (1 + T/EA) n/T, n_s = ρ q_t + c q - ρ g, q_s = p_st, T = |n|.
+In the general class (paper eq. 1): p_s = (1 + T/EA) n/T, n_s = ρ q_t + c q - ρ g, q_s = p_st, T = |n|.
 """
 
 from typing import Any, ClassVar
@@ -13,16 +13,18 @@ import knode_cosserat as kc
 
 
 class HangingString(kc.System):
-    """Pinned at the origin; the control is where the hand holds the other end."""
+    """A string pinned at the origin; the control is the position of the other end."""
 
-    y_layout: ClassVar = kc.Layout(("p", 2, "m", "place"), ("n", 2, "N", "force"), ("q", 2, "m/s", "speed"))
-    z_layout: ClassVar = kc.Layout(("T", 1, "N", "tension"))
-    control_layout: ClassVar = kc.Layout(("hand", 2, "m", "position of the hand"))
+    y_layout: ClassVar = kc.robots.Layout(
+        ("p", 2, "m", "place"), ("n", 2, "N", "force"), ("q", 2, "m/s", "speed")
+    )
+    z_layout: ClassVar = kc.robots.Layout(("T", 1, "N", "tension"))
+    control_layout: ClassVar = kc.robots.Layout(("hand", 2, "m", "position of the hand"))
     base_unknowns: ClassVar = ("n",)
-    length: Any = kc.parameter("m", "unstretched length", low=0.01, high=100.0)
-    density: Any = kc.parameter("kg/m", "mass per length", low=1e-6, high=100.0)
-    stiffness: Any = kc.parameter("N", "EA", low=1e-3, high=1e9)
-    friction: Any = kc.parameter("kg/(m s)", "drag of the air", low=0.0, high=100.0, default=0.0)
+    length: Any = kc.robots.parameter("m", "unstretched length", low=0.01, high=100.0)
+    density: Any = kc.robots.parameter("kg/m", "mass per length", low=1e-6, high=100.0)
+    stiffness: Any = kc.robots.parameter("N", "EA", low=1e-3, high=1e9)
+    friction: Any = kc.robots.parameter("kg/(m s)", "drag of the air", low=0.0, high=100.0, default=0.0)
 
     def constitutive(self, s, t, y, y_t, control):  # C z + D z_t = f2
         return jnp.eye(1), jnp.zeros((1, 1)), jnp.linalg.norm(y[2:4])[None]
@@ -43,7 +45,7 @@ class HangingString(kc.System):
 
     def scales(self):  # natural sizes of y, and of what is left at the tip
         sizes = jnp.stack([self.length, 9.81 * self.density * self.length, (9.81 * self.length) ** 0.5])
-        return kc.Scales(jnp.repeat(sizes, 2), jnp.repeat(sizes[0], 2))
+        return kc.robots.Scales(jnp.repeat(sizes, 2), jnp.repeat(sizes[0], 2))
 
 
 def main(out: str = "hanging_string.png", steps: int = 100) -> kc.Trajectory:

@@ -1,7 +1,7 @@
-"""A tendon that winds around the rod twists it as well as bending it, by its handedness.
+"""A helical tendon bends and twists the rod; the direction of twist follows its handedness.
 
-Routings are parts of a robot: straight, tapered, helical, polynomial or any function. Left and right windings
-are mirror images, and so are the shapes that they make.
+Routings are parts of a robot: straight, tapered, helical, polynomial or any function. Left-handed and
+right-handed tendons are mirror images, and so are the resulting shapes.
 """
 
 import numpy as np
@@ -10,17 +10,17 @@ import typer
 import knode_cosserat as kc
 
 
-def wound(turns: float) -> kc.RoutedTendonRobot:
-    """A soft rod of 30 cm with one tendon, 8 mm from its axis."""
-    return kc.RoutedTendonRobot(
+def wound(turns: float) -> kc.robots.RoutedTendonRobot:
+    """Return a soft rod of 30 cm with one tendon, 8 mm from its axis."""
+    return kc.robots.RoutedTendonRobot(
         length=0.3, radius=0.004, density=1100.0, youngs_modulus=5e7, bending_damping=1e-3, nodes=21,
         gravity=(0.0, 0.0, 0.0), tendon_offset=0.008, tendon_angles=(0.0,),
-        routing=(kc.routing.Helical(radius=0.008, phase=0.0, turns=turns),),
+        routing=(kc.robots.routing.Helical(radius=0.008, phase=0.0, turns=turns),),
     )  # fmt: skip
 
 
 def main(out: str = "helical_tendons.png", tension: float = 6.0, turns: float = 1.0) -> list[kc.Trajectory]:
-    """Shapes at rest of a rod with a straight tendon, and with one wound to the left and to the right."""
+    """Return the equilibria with a straight, a left-handed and a right-handed tendon."""
     windings = (0.0, turns, -turns)
     shapes = [kc.equilibrium(wound(each), [tension], space="lobatto4") for each in windings]
     names = ("straight", f"{turns:g} turn to the left", f"{turns:g} turn to the right")

@@ -1,7 +1,7 @@
 """Find the tensions that bring the tip to a target in one second, by the gradient of the whole simulation.
 
-The derivative goes through every solved step by the implicit function theorem, so that SciPy's optimiser can
-change all tensions at once. The target is met with no speed left: the last rows all count.
+Every solved step is differentiable by the implicit function theorem, so SciPy's optimiser can change all
+tensions at once. The tip reaches the target at rest, because all of the last rows enter the objective.
 """
 
 import jax
@@ -17,7 +17,7 @@ REST = 5.0  # N, what all tendons are pulled with
 
 
 def main(out: str = "hit_a_target.png", steps: int = 20, iterations: int = 40) -> tuple[float, np.ndarray]:
-    """Search; how far the tip ends from the target (m), and the tensions (steps, 4) in N."""
+    """Return the final distance of the tip from the target (m), and the tensions (steps, 4) in N."""
     robot = kc.load_robot("delrin-tendon-robot")
     places = np.linspace(0.0, KNOTS - 1.0, steps)
 

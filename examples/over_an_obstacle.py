@@ -1,7 +1,7 @@
 """A soft robot is pushed along a table and climbs over a cylinder: contact and friction.
 
-Its base is moved by control, and everything else follows from touching. A step that is hard to solve is
-reached from gentler ones, and its result says so.
+A control moves its base, and the rest follows from contact. A step that is hard to solve is reached by
+continuation from easier ones, and its result reports it.
 """
 
 import numpy as np

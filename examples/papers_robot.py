@@ -1,7 +1,7 @@
-"""Simulate the paper's tendon-driven robot for five seconds, and look at all of it.
+"""Simulate the paper's tendon-driven robot for five seconds, and plot the result.
 
-A robot is a file (here one of the catalog), its tensions are an array, and what comes out is a trajectory
-that says of every step how it was solved.
+A robot is a file (here from the catalog), its tensions are an array, and the result is a trajectory that
+states for every step how it was solved.
 """
 
 import typer
@@ -10,7 +10,7 @@ import knode_cosserat as kc
 
 
 def main(out: str = "papers_robot.png", steps: int = 100) -> kc.Trajectory:
-    """Four tendons pull in turn; the tip goes round."""
+    """Pull four tendons in turn, so that the tip moves on a circle."""
     robot = kc.load_robot("delrin-tendon-robot")
     tensions = kc.controls.sine(period=1.5, steps=steps, dt=0.05)  # (steps, 4) in N
     truth = kc.simulate(robot, tensions, dt=0.05)

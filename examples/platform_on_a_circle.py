@@ -1,7 +1,7 @@
-"""Six flexible legs carry a platform around a circle, level all the way.
+"""Six flexible legs move a level platform around a circle.
 
-Inverse kinematics asks for position and orientation of the platform and finds how far each leg's actuator has
-to move; the dynamic simulation then shows what the platform does when they move that fast.
+Inverse kinematics finds the displacement of each leg's actuator for a position and orientation of the
+platform. The dynamic simulation then shows the motion of the platform at that speed.
 """
 
 import numpy as np
@@ -12,8 +12,8 @@ import knode_cosserat as kc
 
 def main(
     out: str = "platform_on_a_circle.png", points: int = 40, radius: float = 0.03
-) -> tuple[kc.InverseKinematics, kc.Trajectory]:
-    """Actuators' displacements (points, 6) in m for a circle of this radius (m), and the motion by them."""
+) -> tuple[kc.statics.InverseKinematics, kc.Trajectory]:
+    """Return actuator displacements (points, 6) in m for a circle of this radius (m), and the motion."""
     robot = kc.load_robot("six-legged-robot")
     still = kc.equilibrium(robot, np.zeros(6))
     centre, level = still.tip_position[0], np.asarray(still.quaternion)[0, -1]

@@ -1,7 +1,7 @@
-"""Where can the tip be at all? Thousands of equilibria, spread evenly over all tensions.
+"""Workspace of a robot: thousands of equilibria, spread evenly over all tensions.
 
-Each is solved from the unloaded robot, so that none depends on another; what is not solved says so and is not
-drawn. A limit of the curvature leaves out what would break the rod.
+Each is solved from the unloaded robot, so none depends on another. Unsolved cases are reported and not drawn.
+A limit of the curvature excludes shapes that would break the rod.
 """
 
 import numpy as np
@@ -10,8 +10,8 @@ import typer
 import knode_cosserat as kc
 
 
-def main(out: str = "where_it_reaches.png", count: int = 5000) -> kc.Workspace:
-    """The workspace for tensions from 0 to 10 N."""
+def main(out: str = "where_it_reaches.png", count: int = 5000) -> kc.statics.Workspace:
+    """Return the workspace for tensions from 0 to 10 N."""
     robot = kc.load_robot("delrin-tendon-robot")
     found = kc.workspace(robot, 0.0, 10.0, count)
     kc.figures.workspace(found).savefig(out)

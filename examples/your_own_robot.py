@@ -1,9 +1,9 @@
-"""A robot of your own in an afternoon: three tendons, one body at the tip, four CSV recordings of 8 s.
+"""Your own robot in an afternoon: three tendons, one body at the tip, four CSV recordings of 8 s.
 
 python examples/your_own_robot.py --out afternoon/
 
-No robot is at hand, so that a simulated one is recorded: `VirtualRobot`, which has what a model does not know
-(friction of another kind, masses of the ribs, a lag). Delete `record`, and put your own files there.
+A simulated robot is recorded: `VirtualRobot`, which has effects that the model does not have (another
+friction law, masses of the ribs, a lag). Delete `record`, and use your own files.
 """
 
 import argparse
@@ -24,7 +24,7 @@ DT, FINE, RESTING = 0.0125, 0.005, 1.0
 
 
 def record(path: Path, signal: str, seconds: float) -> None:
-    """What sensors would see of the robot that is not at hand: rest, then the signal."""
+    """Write the sensor data of the simulated robot: rest, then the signal."""
     real = VirtualRobot(
         length=0.4, radius=0.0025, density=1500, youngs_modulus=1.3e9, bending_damping=4e-3, drag=2e-3,
         tendon_offset=0.018, tendon_angles=np.arange(3) * 2 * np.pi / 3, rib_mass=4e-4, nodes=19,
@@ -40,7 +40,7 @@ def record(path: Path, signal: str, seconds: float) -> None:
     still = kc.equilibrium(real, tension[0], space="lobatto4")
     moved = kc.simulate(real, tension[1:], FINE, space="lobatto4", initial=still)[::2]
     rng = np.random.default_rng(list(signal.encode()))
-    config = kc.RecordingConfig.load(HERE / "your_own_recording.yaml")
+    config = kc.recordings.RecordingConfig.load(HERE / "your_own_recording.yaml")
     config = config.replace(simulated=True, description=f"{path.stem}: a virtual robot")
     seen = np.asarray(moved.tip_position) + config.origin + rng.normal(0.0, 2e-4, (len(moved.time), 3))
     turned = np.asarray(moved.quaternion)[:, -1] + rng.normal(0.0, 1e-3, (len(moved.time), 4))
@@ -49,10 +49,10 @@ def record(path: Path, signal: str, seconds: float) -> None:
 
 
 def main(out: Path, seconds: float = 8.0) -> tuple[float, float]:
-    """Record, identify, and predict what was not seen; the tip's errors (m) before and after."""
+    """Record, identify, and predict a held-out recording; return the tip's errors (m) before and after."""
     out.mkdir(parents=True, exist_ok=True)
     knowledge = kc.load_robot(HERE / "your_own_robot.yaml")
-    config = kc.RecordingConfig.load(HERE / "your_own_recording.yaml")
+    config = kc.recordings.RecordingConfig.load(HERE / "your_own_recording.yaml")
     for name, signal in SIGNALS.items():
         record(out / f"{name}.csv", signal, seconds)
     recordings = {name: kc.load_recording(out / f"{name}.csv", config) for name in SIGNALS}
@@ -69,7 +69,7 @@ def main(out: Path, seconds: float = 8.0) -> tuple[float, float]:
         prediction = kc.simulate(robot, tension, DT, initial=still)
         figures.prediction_against_measurement(prediction, unseen).savefig(out / f"{label}.png", dpi=130)
         errors.append(float(rms_distance(np.asarray(prediction.tip_position), unseen.tip_position)))
-    print(f"tip RMSE on an unseen recording: {100 * errors[0]:.1f} cm before, {100 * errors[1]:.2f} cm after")
+    print(f"held-out tip RMSE: {100 * errors[0]:.1f} cm before, {100 * errors[1]:.2f} cm after")
     return errors[0], errors[1]
 
 

@@ -52,7 +52,7 @@ def test_simulate_takes_schemes_and_parameters(tmp_path):
         "--set", "youngs_modulus=10e9", "--set", "gravity=[0, 0, -1e0]", "--set", "drag=0",
     )  # fmt: skip
     made = kc.load_trajectory(tmp_path / "a.nc")
-    assert (type(made.settings.time), type(made.settings.space)) == (kc.BDF1, kc.Lobatto4)
+    assert (type(made.settings.time), type(made.settings.space)) == (kc.solvers.BDF1, kc.solvers.Lobatto4)
     assert made.system.youngs_modulus == 10e9
     np.testing.assert_array_equal(made.system.gravity, [0, 0, -1])
     np.testing.assert_array_equal(made.system.drag, np.zeros((3, 3)))
@@ -155,9 +155,52 @@ def test_equilibrium_tells_the_shape_and_what_holds_it(tmp_path):
     assert facts["position_error"] == pytest.approx(error, rel=0.3)
     words = succeeded("equilibrium", ROBOT, "--tension", "7,5,5,7")
     assert "tip: (0.244533, 0, 0.57779) m" in words
-    assert "largest position error, by estimate: 0.66 mm (0.1 % of the length)" in words
+    assert "largest estimated position error: 0.66 mm (0.1 % of the length)" in words
     paper = succeeded("equilibrium", ROBOT, "--tension", "7,5,5,7", "--space", "euler")
     assert "tip: (0.28029, 0, 0.551513) m" in paper and "COARSE GRID: " in paper
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        ("--tension", "7", "5", "5", "7"),
+        ("--tension", "7 5 5 7"),
+        ("--tension=[7, 5, 5, 7]",),
+        ("--control", "7,5,5,7"),
+        ("--control", "tension_1=7,tension_2=5; tension_3 = 5", "tension_4=7"),
+    ],
+)
+def test_vectors_may_be_separated_by_commas_or_spaces(given):
+    control = told("equilibrium", ROBOT, *given)["control"]
+    assert control == [7.0, 5.0, 5.0, 7.0]
+
+
+def test_parameters_that_are_vectors():
+    for given in (
+        ("gravity=0", "0", "-1"),
+        ("gravity=0,0,-1",),
+        ("gravity=0 0 -1",),
+        ("gravity=[0, 0, -1]",),
+    ):
+        facts = told("info", ROBOT, "--set", *given)
+        assert facts["parameters"]["gravity"]["value"] == [0.0, 0.0, -1.0]
+
+
+def test_constant_controls_are_given_by_their_numbers(tmp_path):
+    out = tmp_path / "a.nc"
+    for controls in ("7,5,5,7", "constant:7 5 5 7"):
+        succeeded(*simulated(out, controls=controls, steps=2))
+        np.testing.assert_array_equal(kc.load_trajectory(out).control[1:], [[7, 5, 5, 7]] * 2)
+
+
+@pytest.mark.filterwarnings("always:bending_damping is 0")
+def test_undamped_motion_gives_a_warning(tmp_path):
+    result = run(*simulated(tmp_path / "a.nc", "--set", "bending_damping=0", "--json"))
+    assert result.exit_code == 0 and json.loads(result.stdout)["all_solved"]
+    assert result.stderr.startswith("warning: bending_damping is 0 and nothing else damps the motion")
+    assert "Set bending_damping, such as 0.0006 N m2 s" in result.stderr
+    assert result.stderr.count("\n") == 1
+    assert succeeded("equilibrium", ROBOT, "--tension", "7,5,5,7", "--set", "bending_damping=0")
 
 
 # info
@@ -243,7 +286,7 @@ def test_fit_tells_what_it_did(data, tmp_path):
     text = succeeded(
         "fit", ROBOT, data / "a.nc", "--set", "length=0.4", "--rows", 12, "--out", tmp_path / "m"
     )
-    assert f"learned what {ROBOT} misses from 1 trajectories of 12 rows in all: preset best" in text
+    assert f"learned a residual model of {ROBOT} from 1 trajectory (12 rows): preset best" in text
     assert "+0.5875 of the knowledge's length" in text
     assert text.endswith(f"wrote {tmp_path / 'm'}\n")
 
@@ -260,7 +303,7 @@ def test_fit_trains_an_ensemble_of_networks_at_once(data, tmp_path):
     assert one["steps"] == other["steps"] == 20
     assert one["loss"] != other["loss"]
     assert any((tmp_path / "kept").iterdir()) and any((tmp_path / "log").iterdir())
-    members = kc.load_ensemble(out)
+    members = kc.learning.load_ensemble(out)
     assert [member.about.facts["segments"]["loss"][-1] for member in members] == [one["loss"], other["loss"]]
     (row,) = told("evaluate", out, data / "a.nc", "--rows", 5)["references"]
     reference = kc.load_trajectory(data / "a.nc")
@@ -322,14 +365,19 @@ def test_the_demonstration_runs_and_says_what_it_shows(tmp_path):
     done = python(demo, "--out", "pictures", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     written = {path.name for path in (tmp_path / "pictures").iterdir()}
-    assert written == {"truth.nc", "overview.png", "recording.png", "model", "learning.png", "scene.html"}
-    assert "tip DTW 61." in done.stdout
-    assert "simulated stand-in robot" in done.stdout.replace("\n   ", " ")
+    assert written == {
+        "truth.nc", "overview.png", "model", "learning.png", "scene.html", "calibrated.yaml", "recording.png",
+    }  # fmt: skip
     rows = {line[3:33].strip(): line[33:].split() for line in done.stdout.splitlines()}
     before, published, ours = (
         [float(word) for word in rows[label]]
-        for label in ("the model, before", "the paper's KNODE, published", "this package's")
+        for label in ("imperfect model", "paper's network, published", "learned model")
     )
     assert before == pytest.approx([42.70, 34.57, 23.13, 21.44], rel=5e-3)
     assert published == pytest.approx([5.07, 10.95, 1.31, 5.94], rel=5e-3)
     assert all(own < 0.01 * paper for own, paper in zip(ours, published, strict=True))
+    # the last table: a held-out recording is predicted after calibration
+    title, nominal, calibrated = done.stdout.rstrip().splitlines()[-3:]
+    assert "held-out recording (simulated)" in title
+    assert "nominal model" in nominal and float(nominal.split()[-1]) > 15.0
+    assert "calibrated model" in calibrated and float(calibrated.split()[-1]) < 5.0

@@ -18,7 +18,11 @@ def test_evaluate_compares_trajectories(tmp_path, truth):
     succeeded(*simulated(other, "--set", "length=0.6"))
     facts = told("evaluate", other, truth, other)
     a, b = kc.load_trajectory(other), kc.load_trajectory(truth)
-    expected = {"tip_dtw": kc.tip_dtw(a, b), "pose_mse": kc.pose_mse(a, b), "tip_rmse": kc.tip_rmse(a, b)}
+    expected = {
+        "tip_dtw": kc.metrics.tip_dtw(a, b),
+        "pose_mse": kc.metrics.pose_mse(a, b),
+        "tip_rmse": kc.metrics.tip_rmse(a, b),
+    }
     first, second = facts["references"]
     assert first == {"reference": str(truth), "rows": 17, **expected}
     assert second == {"reference": str(other), "rows": 17, "tip_dtw": 0.0, "pose_mse": 0.0, "tip_rmse": 0.0}

@@ -32,11 +32,19 @@ def bad_inputs():
         ((*full, "--set", "colour=red"), "no parameter 'colour'"),
         ((*full, "--set", "length"), "NAME=VALUE"),
         ((*full, "--set", "length=["), "NAME=VALUE"),
-        ((*full, "--set", "length=long"), "length is 'long'"),
-        ((*full, "--set", "length=-1"), "length is -1"),
+        ((*full, "--set", "length=long"), "length must be a number between 0.001 and 20 m (got 'long')"),
+        ((*full, "--set", "length=-1"), "length must be between 0.001 and 20 m (got -1"),
         ((*full, "--set", "drag=1", "--set", " drag=2"), "drag is given by another --set too"),
         ((*full, "--set", "nodes=8", "--nodes", "9"), "nodes is given by --nodes too"),
-        ((*full, "--set", "youngs_modulus=2.7"), "youngs_modulus is 2.7"),
+        ((*full, "--set", "youngs_modulus=2.7"), "Did you mean 2700000000 (2.7 GPa)?"),
+        ((*full, "--set", "length=635"), "between 0.001 and 20 m (got 635). Did you mean 0.635 (635 mm)?"),
+        ((*full, "--set", "radius=6 mm"), "(got '6 mm'). Did you mean 0.006?"),
+        ((*full, "--set", "gravity=0", "0", "-9810"), "Did you mean [0, 0, -9.81] ([0, 0, -9810] mm/s2)?"),
+        ((*simulation, "--controls", "step:1e5", "--steps", "10"), "the step starts at 1.5 s, after the end"),
+        ((*simulation, "--controls", "step:1e5", "--steps", "10"), "use 30 steps or more, or at=0"),
+        ((*simulation, "--controls", "7,5,5", "--steps", "10"), "must be 4 finite numbers"),
+        ((*simulation, "--controls", "7,5,5,7"), "the number of steps is not given"),
+        ((*simulation, "--controls", "base_z=ramp:1", "--steps", "3"), "other than tensions"),
         ((*full, "--figure", "a.doc"), ".png"),
         ((*full, "--figure", "nowhere/a.png"), "no folder nowhere"),
         (("simulate", ROBOT, "--controls", "sine:1.5", "--steps", "3", "--out", "nowhere/a.nc"), "no folder"),
@@ -56,6 +64,30 @@ def bad_inputs():
             "tension_2 is given already",
         ),
         (("equilibrium", ROBOT, "--control", "tension_1=1,tension_1=2"), "tension_1 is given already"),
+        (("equilibrium", ROBOT, "--control", "7,5"), "4 numbers, in the order tension_1, tension_2"),
+        (("equilibrium", ROBOT, "--tension", "7", "5"), "4 numbers, such as 7,5,5,7 (got '7,5')"),
+        (("reach", ROBOT, "--position", "100", "50", "250"), "Did you mean 0.1 0.05 0.25 (100,50,250 mm)?"),
+        (("reach", ROBOT, "--position", "0.1", "0.05"), "--position must be 3 numbers"),
+        (("record-virtual", "step:4", "--seconds", "1", "--out", "a.bag"), "--seconds must be above 2"),
+        (
+            ("fit", ROBOT, "a b.csv", "--out", "m"),
+            "type: knode-cosserat identify delrin-tendon-robot 'a b.csv' --out m.yaml",
+        ),
+        (("evaluate", "broken.nc", "a.csv"), "knode-cosserat evaluate ROBOT a.csv --config recording.yaml"),
+        (("evaluate", "a.csv", ROBOT), "type: knode-cosserat evaluate delrin-tendon-robot a.csv"),
+        (
+            ("evaluate", ROBOT, "broken.nc", "a.csv"),
+            "type: knode-cosserat evaluate delrin-tendon-robot a.csv --config recording.yaml",
+        ),
+        (("evaluate", ROBOT, "columns.csv"), "or describe its own names in a YAML file with --config"),
+        (("identify", ROBOT, "broken.nc", "--out", "m"), "knode-cosserat fit ROBOT broken.nc --out model"),
+        (("inspect", "broken.nc"), "type: knode-cosserat plot broken.nc --out broken.png"),
+        (("plot", "broken.csv", "--out", "a.png"), "type: knode-cosserat inspect broken.csv"),
+        (("view", "broken.csv"), "type: knode-cosserat inspect broken.csv"),
+        (("info", "broken.csv"), "type: knode-cosserat inspect broken.csv"),
+        (("evaluate", "broken.nc", ROBOT), "Type: knode-cosserat evaluate delrin-tendon-robot broken.nc"),
+        (("simulate", ROBOT, "--controls", "sine:1", "--steps", "3", "--out", "a.csv"), "Did you mean a.nc?"),
+        (("workspace", ROBOT, "--out", "a.nc", "--high", "8,8"), "one number for all controls, or 4"),
         (("info", "nobot"), "the catalog has delrin-"),
         (("info", "--set", "length=1"), "name it"),
         (("fit", ROBOT, "nowhere.nc", "--out", "m"), "nowhere.nc: no such file"),
@@ -90,7 +122,7 @@ def bad_inputs():
         (("evaluate", ROBOT), "REFERENCE"),
         (("plot", "nowhere.nc", "--out", "a.png"), "nowhere.nc: no such file"),
         (("plot", "broken.nc", "--out", "a.png"), "broken.nc: not a netCDF-4 file"),
-        (("plot", "broken.nc", "--out", "a"), "ends in .png"),
+        (("plot", "broken.nc", "--out", "a"), "end in .png"),
         (("plot", "broken.nc", "--out", "a.png", "--kind", "cake"), "--kind"),
     ]
 
@@ -101,6 +133,7 @@ def test_bad_input_gives_status_2_and_one_line(tmp_path, monkeypatch, arguments,
     monkeypatch.chdir(tmp_path)
     for name in ("broken.csv", "broken.yaml", "broken.nc"):
         Path(name).write_text("this: [is\nnot right")
+    Path("columns.csv").write_text("t,x\n0,1\n")
     Path("broken.model").write_text("knode-cosserat model, format 1, package 0.1.0\nbroken")
     # a group of commands has no --json
     result = run(*arguments, *(["--json"] if as_json and arguments != ("study",) else []))

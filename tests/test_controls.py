@@ -299,7 +299,7 @@ def test_specifications(specification, expected):
     assert np.array_equal(controls.parse(specification, 40, DT), expected())
 
 
-@pytest.mark.parametrize("specification", ["sine:1", "step:1,tendons=1+3", "random:1", "constant:1"])
+@pytest.mark.parametrize("specification", ["sine:1", "step:1,at=0.1,tendons=1+3", "random:1", "constant:1"])
 def test_specifications_for_three_tendons(specification):
     assert controls.parse(specification, 5, DT, tendons=3).shape == (5, 3)
 
@@ -311,7 +311,7 @@ def test_a_file_as_specification(tmp_path):
     assert np.array_equal(controls.parse(str(path), None, DT), tensions)
     assert np.array_equal(controls.parse(str(path), 5, DT), tensions[:5])
     assert np.array_equal(controls.parse(str(path), None, 2 * DT), tensions[::2])
-    with fails("there are 20 steps of 0.05 s; 21 are asked for"):
+    with fails("there are 20 steps of 0.05 s; 21 are requested; allowed is up to 20"):
         controls.parse(str(path), 21, DT)
     with fails("there are 4 tendons; the robot has 3"):
         controls.parse(str(path), 5, DT, tendons=3)
@@ -323,7 +323,7 @@ def test_a_file_as_specification(tmp_path):
         ("sin:1.5", ["'sin:1.5'", "no such signal or file", "sine:PERIOD", "did you mean sine:PERIOD?"]),
         ("nothing.csv", ["'nothing.csv'", "no such signal or file", "CSV file"]),
         ("", ["''", "no such signal or file"]),
-        ("sine", ["'sine'", "period is ''", "a number"]),
+        ("sine", ["'sine'", "period is missing", "such as sine:1.5"]),
         ("sine:fast", ["period is 'fast'", "a number"]),
         ("sine:0", ["'sine:0'", "period is 0.0", "above 0"]),
         ("sine:1.5,speed=2", ["'speed=2' is not understood", "base=…, amplitude=…"]),
@@ -332,7 +332,7 @@ def test_a_file_as_specification(tmp_path):
         ("random:1.5", ["seed is '1.5'", "a whole number"]),
         ("random:1,hold=x", ["hold is 'x'", "a whole number"]),
         ("step:1,tendons=a", ["tendons is 'a'", "tendons like 1+4"]),
-        ("step:1,tendons=5", ["tendons is (4,)", "0 to 3"]),
+        ("step:1,tendons=5", ["tendons is 5", "numbers from 1 to 4"]),
         ("constant:-1", ["'constant:-1'", "a tension is -1 N"]),
         ("constant:nan", ["tension is nan"]),
         ("x" * 5000, ["no such signal or file"]),
@@ -353,3 +353,38 @@ def test_a_time_step_that_is_not_right(specification, dt):
 def test_a_signal_needs_a_number_of_steps():
     with fails("'sine:1.5'", "number of steps"):
         controls.parse("sine:1.5", None, DT)
+
+
+@pytest.mark.parametrize(
+    ("specification", "parts"),
+    [
+        ("step:1e5", ["the step starts at 1.5 s, after the end of the run (10 steps of 0.05 s: 0.5 s)",
+                      "use 30 steps or more, or at=0"]),
+        ("step:1,at=0.51", ["starts at 0.51 s", "use 11 steps or more"]),
+        ("ramp:1,start=2", ["start is 2.0 s", "before the end of the last step, 0.5 s", "use 41 steps"]),
+        ("ramp:1,start=2,end=3", ["the ramp starts at 2 s", "use 41 steps or more, or start=0"]),
+        ("sine:0.05", ["the sine has the same value at every time step", "period is 0.05 s"]),
+    ],
+)  # fmt: skip
+def test_a_signal_without_effect_during_the_run_is_refused(specification, parts):
+    with fails(f"'{specification}'", *parts):
+        controls.parse(specification, 10, DT)
+
+
+@pytest.mark.parametrize(
+    ("specification", "steps"),
+    [("step:1e5", 30), ("step:1,at=0.51", 11), ("ramp:1,start=2", 41), ("ramp:1,start=2,end=3", 41)],
+)
+def test_the_suggested_number_of_steps_is_the_least(specification, steps):
+    assert np.ptp(controls.parse(specification, steps, DT), axis=0).max() > 0.0
+    with fails("allowed" if specification == "ramp:1,start=2" else "after the end of the run"):
+        controls.parse(specification, steps - 1, DT)
+
+
+@pytest.mark.parametrize("specification", ["step:1,at=0", "step:0", "sine:1,amplitude=0", "random:0,hold=9"])
+def test_a_constant_signal_may_be_intended(specification):
+    assert controls.parse(specification, 9, DT).shape == (9, 4)
+
+
+def test_functions_may_return_a_signal_without_effect():
+    assert np.all(controls.step(1.0, 10, DT) == 5.0)

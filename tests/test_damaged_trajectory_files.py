@@ -149,7 +149,7 @@ def test_robots_of_a_batch_that_are_not_right(tmp_path):
     path = tmp_path / "a.nc"
     synthetic((3,), robot=ROBOTS).save(path)
     edited(path, lambda file: file["robot_length"].__setitem__(1, -1.0))
-    with fails("a.nc: a robot of the batch is not possible: length is -1.0", "0.001 to 20 m"):
+    with fails("a.nc: a robot of the batch is not possible: length must be between 0.001 and 20 m (got -1)"):
         load_trajectory(path)
     data = xarray.load_dataset(path, decode_cf=False)
     data.drop_vars("robot_drag").to_netcdf(path, engine="h5netcdf")
@@ -167,7 +167,7 @@ def test_what_cannot_be_saved(tmp_path):
     with fails("the trajectory's arrays do not fit together", "time"):
         dataclasses.replace(trajectory, residual=np.zeros(3)).save(tmp_path / "a.nc")
     with fails("the settings cannot be written"):
-        synthetic(settings=kc.Settings(time=Leapfrog(object()))).save(tmp_path / "a.nc")
+        synthetic(settings=kc.solvers.Settings(time=Leapfrog(object()))).save(tmp_path / "a.nc")
     assert os.listdir(tmp_path) == ["folder.nc"]
 
 
@@ -175,7 +175,9 @@ def test_what_cannot_be_saved(tmp_path):
     "name", ["time", "result", "a/b", "force", "robot_length", "force_index", "system_bytes", "system_sizes"]
 )
 def test_fields_whose_names_are_taken(tmp_path, monkeypatch, name):
-    layout = kc.Layout(("angle", 1, "rad", "angle"), ("force", 3, "N", "force"), (name, 1, "1", "taken"))
+    layout = kc.robots.Layout(
+        ("angle", 1, "rad", "angle"), ("force", 3, "N", "force"), (name, 1, "1", "taken")
+    )
     monkeypatch.setattr(Pendulum, "y_layout", layout)
     with fails(f"a Pendulum has a field '{name}'", "taken"):
         synthetic(robot=Pendulum(0.5)).save(tmp_path / "a.nc")

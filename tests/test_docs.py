@@ -67,8 +67,10 @@ def folder(tmp_path, monkeypatch):
     """A folder with what pages name: the examples and the tests' results are beside it."""
     monkeypatch.chdir(tmp_path)
     # these show until somebody closes them: here it is enough that there is something to show
-    monkeypatch.setattr("knode_cosserat.view", lambda scene: kc.export_scene(scene, "shown.html"))
-    monkeypatch.setattr("knode_cosserat.view_live", lambda robot: kc.Stepper(robot, 0.05))
+    monkeypatch.setattr(
+        "knode_cosserat.view", lambda scene, **more: kc.viewer.export_scene(scene, "s.html", **more)
+    )
+    monkeypatch.setattr("knode_cosserat.view_live", lambda robot: kc.solvers.Stepper(robot, 0.05))
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     return tmp_path
 
@@ -176,7 +178,7 @@ def test_targets_and_programs_exist():
 
 def lasting(text):
     """What is printed, without the times that it took, rounding errors, and the order of what is as large."""
-    text = re.sub(r"in [\d.]+ s of computing|[\d.]+ s$", "…", text, flags=re.MULTILINE)
+    text = re.sub(r"computed in [\d.]+ s|[\d.]+ s$", "…", text, flags=re.MULTILINE)
     return sorted(re.sub(r" *\d\.\d+e-(0[89]|[1-9]\d)", " 0", text).splitlines())
 
 

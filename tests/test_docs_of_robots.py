@@ -17,7 +17,17 @@ def blocks(language):
 
 def test_the_file_on_the_page_loads():
     robot = parse_robot(blocks("yaml")[0], "docs/robots.md")
-    assert isinstance(robot, kc.SlenderRod) and robot.control_layout.names == ("base_z", "base_ry")
+    assert isinstance(robot, kc.robots.SlenderRod) and robot.control_layout.names == ("base_z", "base_ry")
+
+
+def test_the_file_with_two_sections_is_that_of_its_page():
+    root = Path(__file__).parent.parent
+    page = (root / "docs" / "two-sections.md").read_text(encoding="utf-8")
+    (shown,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+    assert shown == (root / "examples" / "two_sections.yaml").read_text(encoding="utf-8")
+    robot = kc.load_robot(root / "examples" / "two_sections.yaml")
+    assert isinstance(robot, kc.RoutedTendonRobot) and robot.control_size == 6
+    assert robot.nodes == 17 and robot.cuts == (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875)
 
 
 def test_every_kind_is_on_the_page():

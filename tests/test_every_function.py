@@ -20,26 +20,28 @@ from knode_cosserat.rotation import cross, quaternion_rate, rotation_matrix
 from knode_cosserat.viewer import drawing
 
 DT, STEPS = 0.05, 12
-NETWORK = kc.FitConfig(residual=kc.NetworkOptions(hidden=2), segments=kc.Training(epochs=2))
-PASSIVE = kc.FitConfig(residual=kc.PassiveOptions(hidden=1), rollouts=kc.RolloutTraining(updates=1))
+NETWORK = kc.FitConfig(residual=kc.learning.NetworkOptions(hidden=2), segments=kc.learning.Training(epochs=2))
+PASSIVE = kc.FitConfig(
+    residual=kc.learning.PassiveOptions(hidden=1), rollouts=kc.learning.RolloutTraining(updates=1)
+)
 
 
 class Cane(kc.System):
     """A rod of a user: the paper's equations in the general form, pushed across by two forces."""
 
-    y_layout: ClassVar = kc.Layout(
+    y_layout: ClassVar = kc.robots.Layout(
         ("p", 3, "m", "position"), ("h", 4, "1", "orientation"), ("n", 3, "N", "force", "h", "N/m"),
         ("m", 3, "N m", "moment", "h", "N"), ("q", 3, "m/s", "velocity"), ("w", 3, "rad/s", "spin"),
     )  # fmt: skip
-    z_layout: ClassVar = kc.Layout(("v", 3, "1", "stretch"), ("u", 3, "1/m", "curvature"))
-    control_layout: ClassVar = kc.Layout(("tension", 2, "N", "pulls along x and y"))
+    z_layout: ClassVar = kc.robots.Layout(("v", 3, "1", "stretch"), ("u", 3, "1/m", "curvature"))
+    control_layout: ClassVar = kc.robots.Layout(("tension", 2, "N", "pulls along x and y"))
     base_unknowns: ClassVar = ("n", "m")
     mixed: ClassVar = False
 
-    length: Any = kc.parameter("m", "length", low=0.01, high=10.0)
-    mass: Any = kc.parameter("kg/m", "mass per length", low=1e-3, high=10.0)
-    bending: Any = kc.parameter("N m2", "EI", low=1e-6, high=1e3)
-    damping: Any = kc.parameter("N m2 s", "of bending", low=0.0, high=10.0, default=1e-3)
+    length: Any = kc.robots.parameter("m", "length", low=0.01, high=10.0)
+    mass: Any = kc.robots.parameter("kg/m", "mass per length", low=1e-3, high=10.0)
+    bending: Any = kc.robots.parameter("N m2", "EI", low=1e-6, high=1e3)
+    damping: Any = kc.robots.parameter("N m2 s", "of bending", low=0.0, high=10.0, default=1e-3)
 
     def constitutive(self, s, t, y, y_t, control):
         R = rotation_matrix(self.y_layout.get(y, "h")).T
@@ -70,9 +72,9 @@ class Cane(kc.System):
 
 def with_network(system: kc.System, seed: int) -> kc.KNODE:
     """Return a model with a small network, scaled so that it bends the rod a little."""
-    options = kc.NetworkOptions(hidden=3, convex=False)
+    options = kc.learning.NetworkOptions(hidden=3, convex=False)
     net = network(system, options, jax.random.key(seed))
-    layout = kc.Layout(*system.y_layout.fields, *system.z_layout.fields)
+    layout = kc.robots.Layout(*system.y_layout.fields, *system.z_layout.fields)
     size = np.concatenate([np.asarray(system.scales().y) / float(system.length), np.full(6, 1e-2)])
     size = np.where(np.isin(np.arange(25), layout.indices(("n", "m", "u"))), size, 0.0)
     return kc.KNODE(system, dataclasses.replace(net, output_scale=1e-2 * size))
@@ -93,7 +95,7 @@ class Made(NamedTuple):
     controls: np.ndarray
     rest: kc.Trajectory
     motion: kc.Trajectory
-    seen: kc.Measurements
+    seen: kc.recordings.Measurements
 
     @property
     def limits(self) -> tuple[np.ndarray, np.ndarray]:
@@ -107,7 +109,7 @@ def made(kind: str) -> Made:
     controls = mean * (1.0 + 0.3 * np.sin(2.0 * np.pi * DT * np.arange(1, STEPS + 1) / 0.4)[:, None])
     rest = kc.equilibrium(robot, controls[0])
     motion = kc.simulate(robot, controls, DT, initial=rest)
-    return Made(controls, rest, motion, kc.Measurements.of(motion, (0.5, 1.0)))
+    return Made(controls, rest, motion, kc.recordings.Measurements.of(motion, (0.5, 1.0)))
 
 
 def name_of_a_parameter(robot: kc.System) -> str:
@@ -132,12 +134,12 @@ def estimated(robot: kc.System, it: Made, method: Any) -> Any:
     states = kc.estimate_states(it.seen, robot, method, dt=DT)
     tip = np.linalg.norm(states.tip_position - it.motion.tip_position, axis=-1)
     assert np.max(tip) < 0.02 * float(robot.length)
-    assert len(kc.estimate_parts(it.seen, robot, method, dt=DT)) == 1
+    assert len(kc.recordings.estimate_parts(it.seen, robot, method, dt=DT)) == 1
     return states.y
 
 
 def stepped(robot: kc.System, it: Made) -> Any:
-    stepper = kc.Stepper(robot, DT, initial=it.rest)
+    stepper = kc.solvers.Stepper(robot, DT, initial=it.rest)
     for control in it.controls[:2]:
         tip = stepper.step(control).tip_position
     np.testing.assert_allclose(tip[0], it.motion.tip_position[2], atol=1e-7)
@@ -145,7 +147,7 @@ def stepped(robot: kc.System, it: Made) -> Any:
 
 
 def followed(robot: kc.System, it: Made) -> Any:
-    path = kc.equilibrium_path(robot, it.controls[0], it.controls[1], points=3, with_stability=False)
+    path = kc.statics.equilibrium_path(robot, it.controls[0], it.controls[1], points=3, with_stability=False)
     return path.trajectory.y
 
 
@@ -177,10 +179,10 @@ def predicted(robot: kc.System, it: Made) -> Any:
 FUNCTIONS: dict[str, Callable[[Any, Made], Any]] = {
     "simulate": lambda robot, it: it.motion.y,
     "equilibrium": lambda robot, it: it.rest.y,
-    "stability": lambda robot, it: kc.stability(it.rest).least,
+    "stability": lambda robot, it: kc.statics.stability(it.rest).least,
     "equilibrium_path": followed,
-    "configuration": lambda robot, it: kc.configuration(robot, it.controls[0]).jacobian,
-    "compliance": lambda robot, it: kc.compliance(robot, it.controls[0]),
+    "configuration": lambda robot, it: kc.statics.configuration(robot, it.controls[0]).jacobian,
+    "compliance": lambda robot, it: kc.statics.compliance(robot, it.controls[0]),
     "workspace": lambda robot, it: kc.workspace(robot, *it.limits, 2).position,
     "inverse_kinematics": reached,
     "Stepper": stepped,
@@ -201,7 +203,7 @@ OFTEN = {"model of a model"}
 OWN = {"simulate", "equilibrium", "estimate_states", "fit, structured", "configuration", "evaluate"}
 #: functions that need a capability, and the words of the error that names it
 LACKING = {
-    ("fit, passive", kind): (kc.FitError, "without bending_stiffness, bending_damping")
+    ("fit, passive", kind): (kc.learning.FitError, "without bending_stiffness, bending_damping")
     for kind in ("own", "model of own")
 }
 
@@ -249,11 +251,11 @@ def test_files_figures_and_the_viewer_take_every_robot(kind, tmp_path):
     if isinstance(robot, kc.KNODE):
         robot.save(tmp_path / "a.model")
         same(kc.load_model(tmp_path / "a.model", knowledge=CANE if own else None), robot)
-        kc.Ensemble([robot]).save(tmp_path / "members")
-        same(kc.load_ensemble(tmp_path / "members", knowledge=CANE if own else None)[0], robot)
+        kc.learning.Ensemble([robot]).save(tmp_path / "members")
+        same(kc.learning.load_ensemble(tmp_path / "members", knowledge=CANE if own else None)[0], robot)
     for draw in ("shape", "path", "tips", "states", "overview", "tensions"):
         assert getattr(kc.figures, draw)(trajectory).axes
-    kc.export_scene(trajectory, tmp_path / "a.html")
+    kc.viewer.export_scene(trajectory, tmp_path / "a.html")
     assert drawing.drawing(robot, np.arange(robot.nodes))["model"] is isinstance(robot, kc.KNODE)
     assert len(drawing.sliders(robot)) == robot.control_size
     assert kc.named_controls.parse(robot, "constant:1.0", 3, DT).shape == (3, robot.control_size)
@@ -278,9 +280,9 @@ def test_a_change_of_a_model_is_one_of_its_robot():
 
 def test_what_is_missing_is_named():
     for kind in ("model of a model", "own"):
-        with pytest.raises(kc.IdentificationError, match="allowed is a robot with tendons"):
+        with pytest.raises(kc.identification.IdentificationError, match="allowed is a robot with tendons"):
             kc.identify(ROBOTS[kind], [])
-    with pytest.raises(kc.RobotFileError, match="KNODE"):
+    with pytest.raises(kc.robots.RobotFileError, match="KNODE"):
         kc.save_robot(MODEL, "a.yaml")
     with pytest.raises(TypeError, match="allowed is a KNODE"):
         kc.explain(CANE)
@@ -302,7 +304,7 @@ def residuals() -> dict[str, Residual]:
     empty = passive(ROBOT, np.full((1, 4), 5.0))
     stress = {}
     for curved, forms in (("linear", LINEAR), ("curved", CURVED)):
-        layout = kc.Layout(*((name, 3, "", name) for name in ("v", "u", "v_t", "u_t")))
+        layout = kc.robots.Layout(*((name, 3, "", name) for name in ("v", "u", "v_t", "u_t")))
         plain = expansion(layout, rng.normal(size=(50, 12)), dict.fromkeys(layout.names, forms), 6)
         weights = 1e-5 * rng.normal(size=np.shape(plain.weights))
         stress[curved] = dataclasses.replace(plain, weights=weights)
@@ -324,7 +326,7 @@ def test_the_parts_of_a_model_s_equations_agree(name, nominal):
     model = with_network(nominal, 3) if name == "network" else kc.KNODE(nominal, residuals()[name])
     rng = np.random.default_rng(7)
     y = np.concatenate([np.zeros(3), [1.0, 0.1, 0.2, 0.0], 0.1 * rng.normal(size=12)])
-    history = kc.History(20.0, *(0.1 * rng.normal(size=size) for size in (19, 6, 19)))
+    history = kc.robots.History(20.0, *(0.1 * rng.normal(size=size) for size in (19, 6, 19)))
     control = rng.uniform(1.0, 3.0, nominal.control_size)
     at = (0.1, 0.0, y)
     y_s, z = model.derivatives(*at, control, history)

@@ -7,9 +7,9 @@ import knode_cosserat as kc
 from knode_cosserat import named_controls
 from tests.test_controls import DT, fails, written
 
-ROD = kc.SlenderRod(
+ROD = kc.robots.SlenderRod(
     length=0.5, radius=0.005, density=1000.0, youngs_modulus=2e7,
-    base_end=kc.ends.Driven(axes=("x", "z", "ry")),
+    base_end=kc.robots.ends.Driven(axes=("x", "z", "ry")),
 )  # fmt: skip
 NAMED = "time [s],base_z [m],base_ry [rad]\n"
 
@@ -20,7 +20,7 @@ def test_a_file_of_named_controls(tmp_path):
     assert found.tolist() == [[0, 1, 5], [0, 2, 6], [0, 3, 7]]
     assert np.array_equal(named_controls.parse(ROD, str(path), 2, 0.1), found[:2])
     assert named_controls.parse(ROD, str(path), 4, 0.05)[:, 1].tolist() == [1, 1, 2, 2]
-    with fails("there are 3 steps of 0.1 s; 4 are asked for"):
+    with fails("there are 3 steps of 0.1 s; 4 are requested; allowed is up to 3"):
         named_controls.parse(ROD, str(path), 4, 0.1)
     path = written(tmp_path, "time [s]\n0\n0.1\n")
     assert named_controls.parse(ROD, str(path), None, 0.1).tolist() == [[0, 0, 0]] * 2
@@ -96,3 +96,14 @@ def test_all_numbers_of_a_field_and_one_of_them_are_given_twice():
     for words in ("reel=ramp:0.01;reel_2=constant:0", "reel_2=constant:0;reel=ramp:0.01"):
         with fails("reel_2 is given already, by"):
             named_controls.parse(robot, words, 5, DT)
+
+
+def test_a_signal_without_effect_during_the_run_is_refused():
+    with fails("base_z=step:1,at=2", "the step starts at 2 s, after the end of the run", "use 40 steps"):
+        named_controls.parse(ROD, "base_z=step:1,at=2", 10, DT)
+    with fails("ramp: start is 2.0 s", "before the end of the last step"):
+        named_controls.parse(ROD, "base_z=ramp:1,start=2", 10, DT)
+    with fails("base_z=sine:0.1", "the sine has the same value at every time step"):
+        named_controls.parse(ROD, "base_z=sine:0.1", 10, DT)
+    assert named_controls.parse(ROD, "base_z=step:1,at=2", 40, DT)[-1, 1] == 1.0
+    assert np.all(named_controls.parse(ROD, "base_z=step:1", 10, DT)[:, 1] == 1.0)

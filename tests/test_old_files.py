@@ -17,7 +17,7 @@ TOLD = json.loads((FILES / "told.json").read_text())
 
 def test_a_robot_of_format_1():
     robot = kc.load_robot(FILES / "robot-1.yaml")
-    assert isinstance(robot, kc.TendonRobot) and robot.nodes == 5
+    assert isinstance(robot, kc.robots.TendonRobot) and robot.nodes == 5
     assert float(robot.youngs_modulus) == pytest.approx(2.757903e9)
 
 
@@ -67,7 +67,9 @@ def test_a_trajectory_with_settings_and_results_of_earlier_versions(tmp_path, mo
     data["begun_step"] = "begun_coefficient", np.zeros(5)
     data.to_netcdf(path, engine="h5netcdf")
     found = kc.load_trajectory(path)
-    assert found.settings == kc.Settings(space=kc.Lobatto4(), newton=kc.NewtonOptions(patience=6))
+    assert found.settings == kc.solvers.Settings(
+        space=kc.solvers.Lobatto4(), newton=kc.solvers.NewtonOptions(patience=6)
+    )
     codes = kc.Result
     expected = [codes.CONVERGED, codes.RECOVERED_LOAD_CONTINUATION, codes.CONVERGED, codes.NO_CONVERGENCE]
     assert found.result[1:5].tolist() == expected
@@ -94,4 +96,6 @@ def test_a_model_with_settings_of_earlier_versions(tmp_path):
     path = tmp_path / "old.model"
     path.write_bytes(writer.file(model_file.TITLE, header))
     found = kc.load_model(path).about.facts["settings"]
-    assert found == kc.Settings(space=kc.Lobatto4(), newton=kc.NewtonOptions(patience=6))
+    assert found == kc.solvers.Settings(
+        space=kc.solvers.Lobatto4(), newton=kc.solvers.NewtonOptions(patience=6)
+    )

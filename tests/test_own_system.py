@@ -82,5 +82,5 @@ def test_it_is_differentiable_and_runs_in_batches(string):
 def test_what_it_does_not_have_is_said(string):
     with pytest.raises(AttributeError, match="HangingString has no orientation"):
         _ = kc.equilibrium(string, HAND, space="lobatto4").quaternion
-    with pytest.raises(kc.ParameterError, match=r"no parameter 'youngs_modulus'.*stiffness"):
+    with pytest.raises(kc.robots.ParameterError, match=r"no parameter 'youngs_modulus'.*stiffness"):
         string.replace(youngs_modulus=1.0)

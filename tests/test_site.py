@@ -8,12 +8,11 @@ from pathlib import Path
 import pytest
 import yaml
 
-import knode_cosserat as kc
 from knode_cosserat.rods import ends, loads, routing, section, surroundings
 from knode_cosserat.rods.parts import kinds_of
 from knode_cosserat.rods.robot_file import KINDS
 from knode_cosserat.solvers.time import BDFAlpha
-from tools.site import api, examples, performance, robot_file, source
+from tools.site import api, changelog, examples, performance, robot_file, source
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -68,7 +67,21 @@ def test_every_public_name_is_on_one_page_of_the_api():
     shown = api.shown(DOCS / "api")
     assert sorted(shown) == sorted(api.rooms())
     named = [line for room in shown for line in api.page(room).split("\n\n")]
-    assert len(named) == len(set(named)) == len(kc.__all__)
+    assert len(named) == len(set(named)) == len(api.public())
+
+
+def test_main_functions_come_first_on_their_pages():
+    first = api.page("solvers", "trajectory").split("\n\n")[:2]
+    assert [line.rsplit(".", 1)[1] for line in first] == ["simulate", "equilibrium"]
+    assert api.page("learning").startswith("::: ") and ".calibrate" in api.page("learning").split("\n")[0]
+
+
+def test_the_changelog_is_a_page_with_released_versions():
+    page = changelog.page()
+    assert page.startswith(("| version | released |", "No version has been released yet."))
+    assert "## Unreleased" in page and "](docs/" not in page
+    text = "## [Unreleased]\n\n- a\n\n## [0.2.0] - 2026-12-01\n\n- b\n"
+    assert changelog.versions(text) == [("Unreleased", ""), ("0.2.0", "2026-12-01")]
 
 
 def test_every_example_has_its_section():

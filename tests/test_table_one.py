@@ -22,6 +22,6 @@ def truth():
 @pytest.mark.parametrize(("imperfection", "control"), PUBLISHED)
 def test_baseline_of_table_one(truth, imperfection, control):
     baseline = moved(kc.load_robot(ROBOT).replace(**IMPERFECTIONS[imperfection]), control)
-    found = kc.tip_dtw(baseline, truth[control]), kc.pose_mse(baseline, truth[control])
+    found = kc.metrics.tip_dtw(baseline, truth[control]), kc.metrics.pose_mse(baseline, truth[control])
     expected = TRUE.get((imperfection, control), PUBLISHED[imperfection, control].baseline)
     assert [f"{value:.2f}" for value in found] == [f"{value:.2f}" for value in expected]

@@ -66,10 +66,12 @@ def test_a_simulation_comes_back_the_same(tmp_path):
 @pytest.mark.parametrize(
     "chosen",
     [
-        kc.Settings(time=kc.BDF1(), space=kc.Lobatto4(), start="consistent"),
-        kc.Settings(time=kc.BDFAlpha(-1 / 3), newton=kc.NewtonOptions(tolerance=1 / 3e9, patience=2)),
-        kc.Settings(time=kc.Trapezoidal()),
-        kc.Settings(time=Static()),
+        kc.solvers.Settings(time=kc.solvers.BDF1(), space=kc.solvers.Lobatto4(), start="consistent"),
+        kc.solvers.Settings(
+            time=kc.solvers.BDFAlpha(-1 / 3), newton=kc.solvers.NewtonOptions(tolerance=1 / 3e9, patience=2)
+        ),
+        kc.solvers.Settings(time=kc.solvers.Trapezoidal()),
+        kc.solvers.Settings(time=Static()),
     ],
 )
 def test_settings_come_back_the_same(tmp_path, chosen):
@@ -82,7 +84,7 @@ def test_settings_come_back_the_same(tmp_path, chosen):
 
 def test_a_users_scheme_is_found_while_it_exists(tmp_path):
     path = tmp_path / "a.nc"
-    trajectory = synthetic(settings=kc.Settings(time=Leapfrog(0.25)))
+    trajectory = synthetic(settings=kc.solvers.Settings(time=Leapfrog(0.25)))
     save(trajectory, path)
     assert_same(load_trajectory(path), trajectory)
     with h5py.File(path, "a") as file:
@@ -107,10 +109,10 @@ def test_a_users_system_is_asked_for(tmp_path, batch):
 @pytest.mark.parametrize("part", ["FunctionRouting", "FunctionSection"])
 def test_a_robot_with_a_part_made_of_code_is_asked_for(tmp_path, part, batch):
     body = {"length": 0.5, "radius": 0.005, "density": 1000.0, "youngs_modulus": 1e6, "nodes": 5}
-    robot = kc.SlenderRod(**body, sections=(kc.FunctionSection(),))
+    robot = kc.robots.SlenderRod(**body, sections=(kc.robots.FunctionSection(),))
     if part == "FunctionRouting":
-        routing = (kc.routing.FunctionRouting(lambda s: (0.01 * s, 0.0 * s)),)
-        robot = kc.RoutedTendonRobot(**body, tendon_offset=0.01, tendon_angles=[0.0], routing=routing)
+        routing = (kc.robots.routing.FunctionRouting(lambda s: (0.01 * s, 0.0 * s)),)
+        robot = kc.robots.RoutedTendonRobot(**body, tendon_offset=0.01, tendon_angles=[0.0], routing=routing)
     robot = stacked(robot, robot.replace(length=0.25)) if batch else robot
     trajectory = synthetic(batch, robot=robot)
     trajectory.save(tmp_path / "a.nc")

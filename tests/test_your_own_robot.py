@@ -16,7 +16,7 @@ def test_its_files_are_those_of_the_page():
     for name in ("your_own_robot.yaml", "your_own_recording.yaml"):
         assert (HERE / name).read_text(encoding="utf-8") in page
     robot = kc.load_robot(HERE / "your_own_robot.yaml")
-    config = kc.RecordingConfig.load(HERE / "your_own_recording.yaml")
+    config = kc.recordings.RecordingConfig.load(HERE / "your_own_recording.yaml")
     assert robot.control_size == config.tendons == 3
     assert [marker.fraction for marker in config.markers] == [1.0]
     for picture in ("health", "before", "after"):
@@ -33,7 +33,7 @@ def test_it_predicts_what_it_has_not_seen(tmp_path, monkeypatch, capsys):
     assert after < 0.2 * before and after < 0.01
     assert "youngs_modulus" in capsys.readouterr().out
     found = kc.load_robot(tmp_path / "found.yaml")
-    assert isinstance(found, kc.RoutedTendonRobot) and found.friction is not None
+    assert isinstance(found, kc.robots.RoutedTendonRobot) and found.friction is not None
     assert {file.name for file in tmp_path.iterdir()} == {
         "sine-1.csv", "unseen.csv", "found.yaml", "health.png", "before.png", "after.png",
     }  # fmt: skip

@@ -15,7 +15,7 @@ from knode_cosserat.solvers.time import TimeScheme
 from knode_cosserat.trajectory_system import TrajectoryFileError
 
 ROBOT = kc.load_robot("delrin-tendon-robot")
-PAPER = kc.Settings()
+PAPER = kc.solvers.Settings()
 ARRAYS = ("time", "y", "z", "control", "result", "residual", "iterations")
 
 
@@ -33,9 +33,11 @@ class Leapfrog(TimeScheme):
 class Pendulum(kc.System):
     """A class that no robot file can name, with z and controls that hold nothing."""
 
-    y_layout: ClassVar[kc.Layout] = kc.Layout(("angle", 1, "rad", "angle"), ("force", 3, "N", "force"))
-    z_layout: ClassVar[kc.Layout] = kc.Layout()
-    control_layout: ClassVar[kc.Layout] = kc.Layout()
+    y_layout: ClassVar[kc.robots.Layout] = kc.robots.Layout(
+        ("angle", 1, "rad", "angle"), ("force", 3, "N", "force")
+    )
+    z_layout: ClassVar[kc.robots.Layout] = kc.robots.Layout()
+    control_layout: ClassVar[kc.robots.Layout] = kc.robots.Layout()
     base_unknowns: ClassVar[tuple[str, ...]] = ()
     length: Any = parameter("m", "length", low=0.0, high=1.0)
 

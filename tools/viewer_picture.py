@@ -26,6 +26,7 @@ def main() -> None:
     browser = Browser(1280, 760)
     try:
         browser.open(given.scene.resolve().as_uri())
+        browser.run("document.getElementById('hint-close').click()")
         browser.drag("#time", AT)
         # shadows and smooth edges come once nothing moves
         time.sleep(1.5)

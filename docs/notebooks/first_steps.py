@@ -1,8 +1,8 @@
 # %% [markdown]
 # # First steps
 #
-# Simulate a tendon-driven continuum robot, look at it, and compare a wrong model with it. Everything here runs in
-# seconds; the first call of each kind compiles for some more, and is kept on disk.
+# Simulate a tendon-driven continuum robot, plot it, and compare an imperfect model with it. Everything here runs in
+# seconds. The first call of each kind also compiles; compiled programs are kept on disk.
 
 # %% tags=["parameters"]
 steps = 100
@@ -11,7 +11,7 @@ steps = 100
 import knode_cosserat as kc
 
 # %% [markdown]
-# A robot is a file: one of the catalog, or your own YAML. Its parameters have units and ranges, and
+# A robot is a file: from the catalog, or your own YAML. Its parameters have units and ranges, and
 # `robot.replace(name=value)` changes any of them.
 
 # %%
@@ -20,7 +20,7 @@ print("in the catalog:", ", ".join(kc.catalog()))
 print(f"length {robot.length} m, modulus {robot.youngs_modulus:.3g} Pa, {robot.nodes} nodes")
 
 # %% [markdown]
-# Controls are an array, here four tensions in N for every step. Row 0 of what comes out is the robot at rest, row i
+# Controls are an array, here four tensions in N for every step. Row 0 of the result is the robot at rest, row i is
 # the state after control i.
 
 # %%
@@ -32,7 +32,7 @@ print("positions", truth.position.shape, "m; all steps solved:", truth.all_valid
 kc.figures.overview(truth)
 
 # %% [markdown]
-# Every step says how it was solved (`truth.result`), and how well (`truth.residual`, in natural units).
+# Every step has a result (`truth.result`) and a residual (`truth.residual`, in natural units).
 
 # %%
 print(
@@ -40,21 +40,23 @@ print(
 )
 
 # %% [markdown]
-# ## A wrong model
+# ## An imperfect model
 #
-# The same robot, believed to be almost twice as stiff. The paper's two metrics say how far off it is, and the
-# figure shows where.
+# The same robot with almost twice the stiffness. The paper's two metrics measure its error, and the
+# figure shows it over time.
 
 # %%
 stiff = kc.simulate(robot.replace(youngs_modulus=5e9), tensions, dt=0.05)
-print(f"tip DTW {kc.tip_dtw(stiff, truth):.2f} m, pose MSE {kc.pose_mse(stiff, truth):.2f}e-3")
+print(
+    f"tip DTW {kc.metrics.tip_dtw(stiff, truth):.2f} m, pose MSE {kc.metrics.pose_mse(stiff, truth):.2f}e-3"
+)
 kc.figures.compare(truth, {"too stiff": stiff})
 
 # %% [markdown]
-# ## At rest, and on disk
+# ## Equilibria and files
 #
 # `equilibrium` finds a static shape. Trajectories are labelled netCDF files, which any tool can read.
-# `kc.figures.animate(truth, "truth.gif")` makes a film of one.
+# `kc.figures.animate(truth, "truth.gif")` writes an animation.
 
 # %%
 rest = kc.equilibrium(robot, [7.0, 5.0, 5.0, 7.0])
@@ -63,5 +65,5 @@ truth.save("truth.nc")
 print("the same after loading:", bool((kc.load_trajectory("truth.nc").position == truth.position).all()))
 
 # %% [markdown]
-# What next: [learn what a model misses](learn_what_is_missed.ipynb), or go
+# Next: [learn what a model misses](learn_what_is_missed.ipynb), or go
 # [from a recording to control](recording_to_control.ipynb).

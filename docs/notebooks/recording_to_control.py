@@ -1,9 +1,9 @@
 # %% [markdown]
 # # From a recording to a model, and to control
 #
-# No robot is at hand, so a **virtual** one is recorded: a simulation with things that the model is not told of
+# A **virtual** robot is recorded: a simulation with effects that the model does not have
 # (friction of the tendons, ribs, a stiffer base, motors with a lag, noisy sensors). Its bags have the paper's format
-# and say that they are simulated. With a robot of your own, begin at *Read it*.
+# and say that they are simulated. With your own robot, start at *Read the recording*.
 
 # %% tags=["parameters"]
 seconds = 4.0
@@ -18,21 +18,21 @@ from knode_cosserat.recordings.virtual import record_virtual
 truths = {signal: record_virtual(f"{signal[5:]}.bag", signal, seconds) for signal in ("sine:1.5", "sine:1.0")}
 
 # %% [markdown]
-# ## Read it
+# ## Read the recording
 #
-# Poses and tensions come at different rates, with noise and lost frames; `sampled` puts them on one grid in time.
+# Poses and tensions have different rates, noise and lost frames; `sampled` resamples them on one time grid.
 
 # %%
-config = kc.RecordingConfig.paper_robot()
+config = kc.recordings.RecordingConfig.paper_robot()
 recording = kc.load_recording("1.5.bag", config)
 unseen = kc.load_recording("1.0.bag", config).sampled(0.025, mean=True)
 print("bodies:", ", ".join(body.name for body in recording.bodies), "| simulated:", recording.simulated)
 
 # %% [markdown]
-# ## What was not measured
+# ## Estimate the states
 #
-# Motion capture sees a few poses. Velocities, loads and curvature along the whole rod are estimated; here the tip's
-# velocity beside what the virtual robot truly did.
+# Motion capture measures a few poses. Velocities, loads and curvature along the rod are estimated; here the tip's
+# velocity beside the true velocity of the virtual robot.
 
 # %%
 crude = kc.load_robot("delrin-tendon-robot")
@@ -42,18 +42,18 @@ kc.figures.states({"truth": truths["sine:1.5"], "estimated": states}, ("q", "w")
 # %% [markdown]
 # ## A model from measured poses alone
 #
-# Tendons as they are bend the rod. Stiffness and damping are found through whole simulations, and the other recording
-# shows what that is worth. (`kc.identify` finds friction as well, and takes longer.)
+# Realistic tendons bend the rod. Stiffness and damping are calibrated by whole simulations, and the other recording
+# tests the result. (`kc.identify` finds friction as well, and takes longer.)
 
 # %%
-knowledge = kc.RoutedTendonRobot.like(crude)
+knowledge = kc.robots.RoutedTendonRobot.like(crude)
 measured = recording.sampled(0.025, mean=True)
 found = kc.calibrate(knowledge, [measured], ["youngs_modulus", "bending_damping"], by="rollouts")
 print(found)
 
 # %% [markdown]
-# The last line is honest: friction and ribs are missing, so that what is left is no noise, and the intervals are too
-# narrow. The prediction is what counts:
+# The last line is a warning: friction and ribs are missing, so the residual is not noise, and the intervals are too
+# narrow. The test is the prediction of the held-out recording:
 
 # %%
 before, after = (kc.simulate(each, unseen.held_tension[:-1], 0.025) for each in (knowledge, found.robot))
@@ -65,8 +65,8 @@ kc.figures.prediction_against_measurement(after, unseen)
 # %% [markdown]
 # ## Control: which tensions follow a path?
 #
-# Inverse kinematics with the model that was found, for x and y of the tip along a circle: each point from the last,
-# and of all tensions that reach it the least.
+# Inverse kinematics with the calibrated model, for x and y of the tip along a circle: each point starts from the last,
+# with the smallest tensions that reach it.
 
 # %%
 turn = np.linspace(0.0, 2.0 * np.pi, points)
@@ -80,8 +80,8 @@ print(
 )
 
 # %% [markdown]
-# Does the robot go there if these tensions are simply held, one after the other? The dynamic model says how far it is
-# behind:
+# Does the robot follow the path if these tensions are held one after the other? The dynamic model shows its lag
+# behind the path:
 
 # %%
 moved = kc.simulate(found.robot, np.repeat(reached.control, 4, axis=0), 0.05)

@@ -1,183 +1,126 @@
 """Simulate Cosserat-rod robots, learn what the physics misses, predict real robots.
 
-Everything public is here; see `simulate`, `load_robot` and `Trajectory` first. What goes on inside is told
-to the logger "knode_cosserat", which is quiet unless a handler is added.
+The names that a first script needs are here; start with `load_robot`, `simulate` and `Trajectory`. All other
+public names are in the namespaces `robots`, `solvers`, `learning`, `calibration`, `recordings`, `statics`,
+`identification`, `metrics`, `figures`, `viewer`, `controls` and `named_controls`. Events are logged to the
+logger "knode_cosserat", which is quiet unless a handler is added.
 """
 
+import importlib
 import logging
+import typing
+import warnings
 
 from knode_cosserat import _jax as _jax  # isort: split  (first: it sets JAX up)
-from knode_cosserat import controls, named_controls
-from knode_cosserat.control.configuration import (
-    Configuration,
-    Manipulability,
-    compliance,
-    configuration,
-    jacobian,
-    manipulability,
+from knode_cosserat import (
+    calibration,
+    controls,
+    figures,
+    identification,
+    learning,
+    metrics,
+    named_controls,
+    recordings,
+    robots,
+    solvers,
+    statics,
+    viewer,
 )
-from knode_cosserat.control.path import EquilibriumPath, equilibrium_path
-from knode_cosserat.control.reach import InverseKinematics, Reach, inverse_kinematics
-from knode_cosserat.control.stability import Stability, stability
-from knode_cosserat.control.workspace import Workspace, workspace
+from knode_cosserat.calibration import calibrate
 from knode_cosserat.diagnosis import Diagnosis, doctor
-from knode_cosserat.evaluation import figures
-from knode_cosserat.evaluation.metrics import node_error, pose_mse, tip_dtw, tip_rmse
-from knode_cosserat.evaluation.state_errors import StateError, state_errors
-from knode_cosserat.identification.fit import fit
-from knode_cosserat.identification.identify import IdentificationError, identify
-from knode_cosserat.identification.result import Identified
-from knode_cosserat.learning.calibration.calibrate import Calibration, CalibrationError, calibrate
-from knode_cosserat.learning.config import (
-    ConfigError,
-    FitConfig,
-    NetworkOptions,
-    PassiveOptions,
-    RolloutTraining,
-    StructuredOptions,
-    Training,
-)
-from knode_cosserat.learning.ensemble import Ensemble, load_ensemble
-from knode_cosserat.learning.explain import explain
-from knode_cosserat.learning.files.model_file import ModelFileError, load_model
-from knode_cosserat.learning.knode import KNODE
-from knode_cosserat.learning.residual import Residual
-from knode_cosserat.learning.samples import DataError
-from knode_cosserat.learning.training.checkpoint import CheckpointError
-from knode_cosserat.learning.training.runs import FitError
-from knode_cosserat.recordings.config import RecordingConfig
-from knode_cosserat.recordings.estimation.estimate import estimate_parts, estimate_states
-from knode_cosserat.recordings.findings import RecordingError
-from knode_cosserat.recordings.load import load_recording
-from knode_cosserat.recordings.measurements import Measurements
-from knode_cosserat.recordings.recording import Recording
-from knode_cosserat.rods import ends, loads, routing, surroundings
-from knode_cosserat.rods.layout import Field, Layout
-from knode_cosserat.rods.parallel_robot import ParallelRobot
-from knode_cosserat.rods.parameters import ParameterError, parameter
-from knode_cosserat.rods.robot_file import RobotFileError, catalog, load_robot, save_robot
-from knode_cosserat.rods.robot_schema import robot_schema
-from knode_cosserat.rods.rod import Rod
-from knode_cosserat.rods.routed_robot import RoutedTendonRobot
-from knode_cosserat.rods.section import Differences, FunctionSection, Stretch
-from knode_cosserat.rods.slender_rod import SlenderRod
-from knode_cosserat.rods.system import History, Scales, System
-from knode_cosserat.rods.tendon_robot import TendonRobot
-from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.equilibrium import equilibrium
-from knode_cosserat.solvers.result import Result, SimulationError
-from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.simulate import simulate
-from knode_cosserat.solvers.space import Euler, Lobatto2, Lobatto4
-from knode_cosserat.solvers.stepper import Stepper
-from knode_cosserat.solvers.time import BDF1, BDF2, BDFAlpha, Trapezoidal
+from knode_cosserat.errors import KnodeCosseratError
+from knode_cosserat.identification import fit, identify
+from knode_cosserat.learning import KNODE, FitConfig, explain, load_model
+from knode_cosserat.recordings import estimate_states, load_recording
+from knode_cosserat.robots import System, catalog, load_robot, save_robot
+from knode_cosserat.solvers import Result, SimulationError, equilibrium, simulate
+from knode_cosserat.statics import inverse_kinematics, workspace
 from knode_cosserat.trajectory import Trajectory
 from knode_cosserat.trajectory_file import load_trajectory
 from knode_cosserat.trajectory_system import TrajectoryFileError
-from knode_cosserat.viewer import export_scene, view, view_live
+from knode_cosserat.viewer import view
 
 logging.getLogger(__name__).addHandler(logging.NullHandler())
 
 __all__ = [
-    "BDF1",
-    "BDF2",
     "KNODE",
-    "BDFAlpha",
-    "Calibration",
-    "CalibrationError",
-    "CheckpointError",
-    "ConfigError",
-    "Configuration",
-    "DataError",
     "Diagnosis",
-    "Differences",
-    "Ensemble",
-    "EquilibriumPath",
-    "Euler",
-    "Field",
     "FitConfig",
-    "FitError",
-    "FunctionSection",
-    "History",
-    "IdentificationError",
-    "Identified",
-    "InverseKinematics",
-    "Layout",
-    "Lobatto2",
-    "Lobatto4",
-    "Manipulability",
-    "Measurements",
-    "ModelFileError",
-    "NetworkOptions",
-    "NewtonOptions",
-    "ParallelRobot",
-    "ParameterError",
-    "PassiveOptions",
-    "Reach",
-    "Recording",
-    "RecordingConfig",
-    "RecordingError",
-    "Residual",
+    "KnodeCosseratError",
     "Result",
-    "RobotFileError",
-    "Rod",
-    "RolloutTraining",
-    "RoutedTendonRobot",
-    "Scales",
-    "Settings",
     "SimulationError",
-    "SlenderRod",
-    "Stability",
-    "StateError",
-    "Stepper",
-    "Stretch",
-    "StructuredOptions",
     "System",
-    "TendonRobot",
-    "Training",
     "Trajectory",
     "TrajectoryFileError",
-    "Trapezoidal",
-    "Workspace",
     "calibrate",
+    "calibration",
     "catalog",
-    "compliance",
-    "configuration",
     "controls",
     "doctor",
-    "ends",
     "equilibrium",
-    "equilibrium_path",
-    "estimate_parts",
     "estimate_states",
     "explain",
-    "export_scene",
     "figures",
     "fit",
+    "identification",
     "identify",
     "inverse_kinematics",
-    "jacobian",
-    "load_ensemble",
+    "learning",
     "load_model",
     "load_recording",
     "load_robot",
     "load_trajectory",
-    "loads",
-    "manipulability",
+    "metrics",
     "named_controls",
-    "node_error",
-    "parameter",
-    "pose_mse",
-    "robot_schema",
-    "routing",
+    "recordings",
+    "robots",
     "save_robot",
     "simulate",
-    "stability",
-    "state_errors",
-    "surroundings",
-    "tip_dtw",
-    "tip_rmse",
+    "solvers",
+    "statics",
     "view",
-    "view_live",
+    "viewer",
     "workspace",
 ]
+
+#: names that used to be here, by the namespace that has them now
+_MOVED = {
+    "robots": (
+        "Differences Field FunctionSection History Layout ParallelRobot ParameterError RobotFileError Rod "
+        "RoutedTendonRobot Scales SlenderRod Stretch TendonRobot ends loads parameter robot_schema routing "
+        "surroundings"
+    ),
+    "solvers": ("BDF1 BDF2 BDFAlpha Euler Lobatto2 Lobatto4 NewtonOptions Settings Stepper Trapezoidal"),
+    "learning": (
+        "CheckpointError ConfigError DataError Ensemble FitError ModelFileError NetworkOptions "
+        "PassiveOptions Residual RolloutTraining StructuredOptions Training load_ensemble"
+    ),
+    "calibration": "Calibration CalibrationError",
+    "recordings": "Measurements Recording RecordingConfig RecordingError estimate_parts",
+    "statics": (
+        "Configuration EquilibriumPath InverseKinematics Manipulability Reach Stability Workspace compliance "
+        "configuration equilibrium_path jacobian manipulability stability"
+    ),
+    "identification": "IdentificationError Identified",
+    "metrics": "StateError node_error pose_mse state_errors tip_dtw tip_rmse",
+    "viewer": "export_scene view_live",
+}
+_NAMESPACES = {name: place for place, names in _MOVED.items() for name in names.split()}
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)
+
+
+if not typing.TYPE_CHECKING:  # a type checker is to report names that do not exist
+
+    def __getattr__(name: str) -> typing.Any:
+        place = _NAMESPACES.get(name)
+        if place is None:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        warnings.warn(
+            f"{__name__}.{name} is now {__name__}.{place}.{name}; the old name will be removed",
+            DeprecationWarning,
+            stacklevel=2,
+        )
+        return getattr(importlib.import_module(f"{__name__}.{place}"), name)

@@ -10,6 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.errors import KnodeCosseratError
+
 Rows = Float[np.ndarray, "rows columns"]
 Times = Float[np.ndarray, " rows"]
 
@@ -20,8 +22,10 @@ SAME_TIME = 1e-4
 MOST_STEPS = 10**8
 
 
-class CSVTextError(ValueError):
+class CSVTextError(KnodeCosseratError, ValueError):
     """A file cannot be read or sampled; the message is one line."""
+
+    code = "csv"
 
 
 class Column(NamedTuple):

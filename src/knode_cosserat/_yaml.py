@@ -9,9 +9,13 @@ from typing import Any
 
 import yaml
 
+from knode_cosserat.errors import KnodeCosseratError
 
-class YAMLTextError(ValueError):
+
+class YAMLTextError(KnodeCosseratError, ValueError):
     """A text is not YAML, or not a mapping; the message says why and names no file."""
+
+    code = "yaml"
 
 
 def mapping_of(text: str, keys: str) -> dict[Any, Any]:

@@ -12,24 +12,49 @@ import difflib
 import inspect
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
-from knode_cosserat._csv import SAME_TIME, Column, CSVTextError, held_rows, read_rows
+from knode_cosserat._csv import Column, CSVTextError, held_rows, read_rows
 from knode_cosserat._files import replacing
+from knode_cosserat._numbers import numbers_in
+from knode_cosserat._reprs import count_of
+from knode_cosserat._signals import (
+    ControlsError,
+    Tensions,
+    checked_tensions,
+    constant,
+    ramp,
+    random,
+    require_counts,
+    require_effect,
+    require_positive,
+    sine,
+    step,
+)
 
-Tensions = Float[np.ndarray, "steps tendons"]
+__all__ = [
+    "SPECIFICATIONS",
+    "TENSION_UNITS",
+    "Controls",
+    "ControlsError",
+    "Tensions",
+    "constant",
+    "constant_control",
+    "load",
+    "parse",
+    "ramp",
+    "random",
+    "save",
+    "sine",
+    "step",
+]
 
 #: factor from a unit that a file may use to newtons
 TENSION_UNITS = {"N": 1.0, "gf": 9.81 / 1000.0}
-
-
-class ControlsError(ValueError):
-    """Controls are not possible, or a file of them cannot be read; the message is one line."""
 
 
 class Controls(NamedTuple):
@@ -38,128 +63,10 @@ class Controls(NamedTuple):
     tensions: Tensions
     dt: float
 
-
-# signals
-
-
-def constant(tension: float, steps: int, *, tendons: int = 4) -> Tensions:
-    """Return one constant tension (N) in all tendons.
-
-    Raises:
-        ControlsError: an argument is not possible; likewise in every function here.
-    """
-    _require_numbers(tension=tension)
-    _require_counts(steps=steps, tendons=tendons)
-    return _pulling(np.full((steps, tendons), float(tension)), "constant")
-
-
-def sine(
-    period: float, steps: int, dt: float, *, base: float = 6.0, amplitude: float = 1.0, tendons: int = 4
-) -> Tensions:
-    """Return τ_k = base + amplitude sin(2πt/period + 2πk/tendons) in N, k = 0, 1, …; period in s."""
-    _require_numbers(base=base, amplitude=amplitude)
-    _require_counts(tendons=tendons)
-    phase = 2 * np.pi * np.arange(tendons) / tendons
-    t = _times(steps, dt)
-    _require_period(period, float(t[-1]))
-    return _pulling(base + amplitude * np.sin(2 * np.pi * t[:, None] / period + phase), "sine")
-
-
-def step(
-    height: float, steps: int, dt: float, *, base: float = 5.0, at: float = 1.5,
-    tendons: Sequence[int] = (0, 3), count: int = 4,
-) -> Tensions:  # fmt: skip
-    """Return `base` (N) in `count` tendons, and base + height in the named tendons from t = at (s)."""
-    _require_numbers(at=at)
-    t = _times(steps, dt)
-    return _raised("step", height, t >= at - SAME_TIME * dt, base, tendons, count)
-
-
-def ramp(
-    height: float, steps: int, dt: float, *, base: float = 5.0, start: float = 0.0, end: float | None = None,
-    tendons: Sequence[int] = (0, 3), count: int = 4,
-) -> Tensions:  # fmt: skip
-    """Return `base` (N) in `count` tendons, with a linear rise by `height` (N) in the named tendons.
-
-    The rise is from `start` to `end` (s), by default the end of the last step. The tension is constant after.
-    """
-    t = _times(steps, dt)
-    end = float(t[-1]) if end is None else end
-    _require_numbers(start=start, end=end)
-    if end <= start:
-        raise ControlsError(f"ramp: end is {end!r} s; allowed is a time after its start, {start!r} s")
-    part = np.clip((t - start) / (end - start), 0.0, 1.0)
-    return _raised("ramp", height, part, base, tendons, count)
-
-
-def random(
-    steps: int, *, low: float = 5.0, high: float = 10.0, seed: int = 0, tendons: int = 4, hold: int = 1
-) -> Tensions:
-    """Return independent uniform samples between `low` and `high` (N), each held for `hold` steps."""
-    _require_counts(steps=steps, tendons=tendons, hold=hold)
-    _require_counts(least=0, seed=seed)
-    _require_numbers(low=low, high=high)
-    if high < low:
-        raise ControlsError(f"random: high is {high!r} N; allowed is a tension from low, {low!r} N, on")
-    draws = np.random.default_rng(seed).uniform(low, high, (-(-steps // hold), tendons))
-    return _pulling(np.repeat(draws, hold, axis=0)[:steps], "random")
-
-
-def _raised(
-    signal: str, height: float, part: np.ndarray, base: float, tendons: Sequence[int], count: int
-) -> Tensions:
-    _require_counts(count=count)
-    _require_numbers(height=height, base=base)
-    if not set(tendons) <= set(range(count)):
-        raise ControlsError(f"{signal}: tendons is {tendons!r}; allowed is numbers from 0 to {count - 1}")
-    tensions = np.full((len(part), count), float(base))
-    tensions[:, [int(k) for k in tendons]] += height * part[:, None]
-    return _pulling(tensions, signal)
-
-
-def _times(steps: int, dt: float) -> np.ndarray:
-    """Return the ends of the steps (s)."""
-    _require_counts(steps=steps)
-    _require_positive("dt", dt)
-    return np.arange(1, steps + 1) * dt
-
-
-def _pulling(tensions: Tensions, signal: str) -> Tensions:
-    wrong = tensions[~(np.isfinite(tensions) & (tensions >= 0.0))]
-    if wrong.size:
-        raise ControlsError(f"{signal}: a tension is {wrong.min():g} N; allowed is 0 or more (a pull)")
-    return tensions
-
-
-def _require_numbers(**values: Any) -> None:
-    for name, value in values.items():
-        if not _is_number(value):
-            raise ControlsError(f"{name} is {value!r}; allowed is a finite number")
-
-
-def _require_positive(name: str, value: Any) -> None:
-    if not (_is_number(value) and value > 0.0):
-        raise ControlsError(f"{name} is {value!r}; allowed is a number of seconds above 0")
-
-
-def _require_period(period: Any, last: float) -> None:
-    """Raise `ControlsError` if 2πt/period is not finite at all times up to the last (s)."""
-    _require_positive("period", period)
-    least = 8.0 * (last / np.finfo(float).max)
-    if not period > least:
-        raise ControlsError(f"period is {period!r}; allowed is a number of seconds above {least:g}")
-
-
-def _require_counts(least: int = 1, **values: Any) -> None:
-    for name, value in values.items():
-        if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
-            raise ControlsError(f"{name} is {value!r}; allowed is a whole number from {least} on")
-
-
-def _is_number(value: Any) -> bool:
-    if not isinstance(value, int | float | np.integer | np.floating) or isinstance(value, bool):
-        return False
-    return bool(np.isfinite(value))
+    def __repr__(self) -> str:
+        rows, tendons = self.tensions.shape
+        span = f"{self.tensions.min():.4g} to {self.tensions.max():.4g} N" if rows else "none"
+        return f"Controls: {rows} steps of {self.dt:g} s; {count_of(tendons, 'tendon')}, {span}"
 
 
 # files
@@ -173,8 +80,8 @@ def save(path: str | Path, tensions: Any, dt: float) -> None:
     tensions = np.asarray(tensions, dtype=float)
     if tensions.ndim != 2 or 0 in tensions.shape:
         raise ControlsError(f"tensions have shape {tensions.shape}; allowed is (steps, tendons)")
-    _pulling(tensions, str(path))
-    _require_positive("dt", dt)
+    checked_tensions(tensions, str(path))
+    require_positive("dt", dt)
     names = [f"tension_{k + 1} [N]" for k in range(tensions.shape[1])]
     try:
         with replacing(Path(path)) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
@@ -202,7 +109,7 @@ def load(path: str | Path, dt: float | None = None) -> Controls:
         ControlsError: the file cannot be read; the message names the line and the column.
     """
     if dt is not None:
-        _require_positive("dt", dt)
+        require_positive("dt", dt)
     time, tensions = _read(Path(path))
     if dt is None:
         return Controls(tensions, _own_step(path, time))
@@ -295,7 +202,10 @@ _SIGNALS = {
 }
 
 #: specifications that `parse` accepts, for help texts
-SPECIFICATIONS = ", ".join(f"{name}:{it.main.upper()}" for name, it in _SIGNALS.items()) + " or a CSV file"
+SPECIFICATIONS = (
+    ", ".join(f"{name}:{it.main.upper()}" for name, it in _SIGNALS.items())
+    + ", one number for each tendon, or a CSV file"
+)
 
 
 def parse(specification: str, steps: int | None, dt: float, *, tendons: int = 4) -> Tensions:
@@ -303,7 +213,8 @@ def parse(specification: str, steps: int | None, dt: float, *, tendons: int = 4)
 
     `sine:1.5`, `step:1.5`, `ramp:2`, `random:0`, `constant:5`: the signal and its first number (period in s,
     height in N, height in N, seed, tension in N). Other arguments have names: `sine:1.5,base=8,amplitude=2`,
-    `step:1.5,at=2,tendons=1+4` (tendons numbered from 1). Anything else is a CSV file, sampled at dt.
+    `step:1.5,at=2,tendons=1+4` (tendons numbered from 1). Numbers are constant tensions, one for each tendon:
+    `7,5,5,7` or `constant:7,5,5,7`. Anything else is a CSV file, sampled at dt.
 
     Args:
         specification: signal or file, as above.
@@ -312,24 +223,62 @@ def parse(specification: str, steps: int | None, dt: float, *, tendons: int = 4)
         tendons: number of tendons of the robot.
 
     Raises:
-        ControlsError: the specification is not understood, or the file is invalid or too short.
+        ControlsError: the specification is not understood, the file is invalid or too short, or the signal
+            has no effect during the run, such as a step after its end.
     """
-    _require_positive("dt", dt)
+    require_positive("dt", dt)
     name, colon, rest = specification.partition(":")
+    held = constant_control(specification, tendons)
+    if held is not None:
+        count = _required_steps(specification, steps)
+        return checked_tensions(np.tile(held, (count, 1)), f"controls {specification!r}")
     if os.path.exists(specification) and not (colon and name in _SIGNALS):
         return _from_file(specification, steps, dt, tendons)
     if name not in _SIGNALS:
         close = difflib.get_close_matches(name, _SIGNALS, n=1)
         hint = f"; did you mean {close[0]}:{_SIGNALS[close[0]].main.upper()}?" if close else ""
+        if "=" in name:
+            hint = "; NAME=SIGNAL is for robots with controls other than tensions"
         raise ControlsError(
             f"controls {specification!r}: no such signal or file; allowed is {SPECIFICATIONS}{hint}"
         )
+    count = _required_steps(specification, steps)
     try:
-        if steps is None:
-            raise ControlsError("the number of steps is not given; a signal needs it")
-        return _from_signal(name, rest, steps, dt, tendons)
+        return _from_signal(name, rest, count, dt, tendons)
     except ControlsError as error:
         raise ControlsError(f"controls {specification!r}: {error}") from None
+
+
+def constant_control(specification: str, size: int) -> np.ndarray | None:
+    """Return a constant control (size,) given by its numbers: `7,5,5,7`, or with `constant:` before them.
+
+    None if the specification is something else, such as a signal, a file, or `constant:` and one number.
+
+    Raises:
+        ControlsError: there are not as many numbers as controls.
+    """
+    text = specification.strip().removeprefix("constant:")
+    numbers = numbers_in(text)
+    if numbers is None or (text != specification.strip() and len(numbers) == 1):
+        return None
+    if os.path.exists(specification):
+        return None
+    if len(numbers) != size or not np.all(np.isfinite(numbers)):
+        example = ",".join(["7", "5", "5", "7", *["5"] * size][:size]) or "none"
+        raise ControlsError(
+            f"controls {specification!r}: a constant control must be {size} finite numbers, one for each "
+            f"control (got {len(numbers)}), such as {example}"
+        )
+    return np.array(numbers)
+
+
+def _required_steps(specification: str, steps: int | None) -> int:
+    if steps is None:
+        raise ControlsError(
+            f"controls {specification!r}: the number of steps is not given; only a file states its own"
+        )
+    require_counts(steps=steps)
+    return steps
 
 
 def _from_file(path: str, steps: int | None, dt: float, tendons: int) -> Tensions:
@@ -338,15 +287,22 @@ def _from_file(path: str, steps: int | None, dt: float, tendons: int) -> Tension
         raise ControlsError(f"{path}: there are {tensions.shape[1]} tendons; the robot has {tendons}")
     if steps is None:
         return tensions
-    _require_counts(steps=steps)
+    require_counts(steps=steps)
     if len(tensions) < steps:
-        raise ControlsError(f"{path}: there are {len(tensions)} steps of {dt:g} s; {steps} are asked for")
+        raise ControlsError(
+            f"{path}: there are {len(tensions)} steps of {dt:g} s; {steps} are requested; "
+            f"allowed is up to {len(tensions)}"
+        )
     return tensions[:steps]
 
 
 def _from_signal(name: str, text: str, steps: int, dt: float, tendons: int) -> Tensions:
     signal = _SIGNALS[name]
     first, *others = text.split(",")
+    if not first.strip():
+        examples = {"period": "1.5", "height": "1.5", "seed": "0", "tension": "5"}
+        example = f"{name}:{examples[signal.main]}"
+        raise ControlsError(f"{signal.main} is missing; allowed is {name}:NUMBER, such as {example}")
     arguments = {signal.main: _read_as(int if signal.main == "seed" else float, signal.main, first)}
     for other in others:
         key, _, value = (part.strip() for part in other.partition("="))
@@ -356,7 +312,20 @@ def _from_signal(name: str, text: str, steps: int, dt: float, tendons: int) -> T
         arguments[key] = _read_as(signal.options[key], key, value)
     if "dt" in inspect.signature(signal.make).parameters:
         arguments["dt"] = dt
-    return signal.make(steps=steps, **arguments, **{signal.tendon_count: tendons})
+    if not set(arguments.get("tendons", ())) <= set(range(tendons)):
+        given = "+".join(str(k + 1) for k in arguments["tendons"])
+        raise ControlsError(
+            f"tendons is {given}; allowed is numbers from 1 to {tendons}, such as 1+{tendons}"
+        )
+    tensions = signal.make(steps=steps, **arguments, **{signal.tendon_count: tendons})
+    if name in ("sine", "step", "ramp") and steps > 1:
+        stated = {**_defaults(signal.make), **arguments}
+        require_effect(name, stated, tensions, steps, dt)
+    return tensions
+
+
+def _defaults(function: Callable[..., Any]) -> dict[str, Any]:
+    return {name: each.default for name, each in inspect.signature(function).parameters.items()}
 
 
 def _read_as(kind: Callable[[str], Any], key: str, text: str) -> Any:

@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from knode_cosserat._files import package_version
+from knode_cosserat._reprs import count_of
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.solvers.equilibrium import equilibrium
 from knode_cosserat.solvers.run import usable_cores
@@ -61,6 +62,12 @@ class Diagnosis:
         own = dataclasses.asdict(self)
         return {**own, "checks": [check._asdict() for check in self.checks], "well": self.well}
 
+    def __repr__(self) -> str:
+        wrong = [check.name for check in self.checks if not check.well]
+        return f"Diagnosis: {count_of(len(self.checks), 'check')}, " + (
+            f"wrong: {', '.join(wrong)}" if wrong else "all is well"
+        )
+
     def __str__(self) -> str:
         """Return a page of text."""
         there = [f"{name} {version}" for name, version in self.versions.items() if version]
@@ -73,11 +80,11 @@ class Diagnosis:
             f"cache      {self.cache} ({self.programs} compiled programs)",
         ]
         if extras:
-            lines.append(f"not here   {', '.join(missing)}: pip install 'knode-cosserat[{','.join(extras)}]'")
+            lines.append(f"missing    {', '.join(missing)}: pip install 'knode-cosserat[{','.join(extras)}]'")
         lines += [
-            f"{'ok' if check.well else 'WRONG':<10} {check.name}: {check.seen}" for check in self.checks
+            f"{'ok' if check.well else 'FAILED':<10} {check.name}: {check.seen}" for check in self.checks
         ]
-        lines.append("all is well" if self.well else "something is wrong: see above")
+        lines.append("all checks passed" if self.well else "a check failed: see above")
         return "\n".join(lines)
 
 

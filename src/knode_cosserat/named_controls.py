@@ -6,7 +6,6 @@ row i from time i dt to (i + 1) dt, and signals are evaluated at that step's end
 
 from __future__ import annotations
 
-import difflib
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -17,6 +16,8 @@ from jaxtyping import Float
 
 from knode_cosserat import controls
 from knode_cosserat._csv import SAME_TIME, Column, CSVTextError, held_rows, read_rows
+from knode_cosserat._signals import require_effect
+from knode_cosserat._yaml import did_you_mean
 from knode_cosserat.controls import ControlsError
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.system import System
@@ -50,8 +51,8 @@ def parse(robot: System, specification: str, steps: int | None, dt: float) -> Ar
     `base_z=ramp:0.1;reel_1=sine:2,amplitude=0.01`. The name of a field stands for all its numbers. Each
     control is given at most once, and the others are zero. Signals are `constant:VALUE`,
     `ramp:HEIGHT[,base=,start=,end=]`, `step:HEIGHT[,base=,at=]`, `sine:PERIOD[,base=,amplitude=,phase=]`. The
-    word may also be a CSV file with the columns `time [s]` and any of these names with their units. `none`
-    stands for zeros.
+    word may also be a CSV file with the columns `time [s]` and any of these names with their units, or the
+    numbers of a constant control in the layout's order. `none` stands for zeros.
 
     Raises:
         ControlsError: the specification is not understood, or the file is invalid or too short.
@@ -67,7 +68,12 @@ def parse(robot: System, specification: str, steps: int | None, dt: float) -> Ar
     if os.path.isfile(specification):
         return _sampled(specification, layout, steps, dt)
     if steps is None:
-        raise ControlsError(f"controls {specification!r}: the number of steps is not given")
+        raise ControlsError(
+            f"controls {specification!r}: the number of steps is not given; only a file states its own"
+        )
+    held = controls.constant_control(specification, layout.size)
+    if held is not None:
+        return np.tile(held, (steps, 1))
     words = [] if specification.strip() == "none" else specification.split(";")
     return parse_signals(layout, words, np.arange(1, steps + 1) * dt)
 
@@ -79,13 +85,19 @@ def parse_signals(layout: Layout, words: list[str], t: Float[np.ndarray, " steps
     for entry in words:
         name, equals, word = (part.strip() for part in entry.partition("="))
         if not equals:
+            known = labels(layout)
+            meant = known and name.partition(":")[0] in _SIGNALS
             raise ControlsError(
-                f"controls {entry.strip()!r}: allowed is NAME=SIGNAL;…, `none` or a CSV file; "
-                f"names are {', '.join(labels(layout)) or 'none'}"
+                f"controls {entry.strip()!r}: allowed is NAME=SIGNAL;…, one number for each control, `none` "
+                f"or a CSV file; names are {', '.join(known) or 'none'}"
+                + (f"; did you mean {known[0]}={name}?" if meant else "")
             )
         # a very short period, for example, overflows: the check below refuses it without a NumPy warning
-        with np.errstate(all="ignore"):
-            values = _signal(word, t)
+        try:
+            with np.errstate(all="ignore"):
+                values = _signal(word, t)
+        except ControlsError as error:
+            raise ControlsError(f"controls {entry.strip()!r}: {error}") from None
         if not np.all(np.isfinite(values)):
             raise ControlsError(
                 f"controls {entry.strip()!r}: a value is {values[~np.isfinite(values)][0]}; "
@@ -109,13 +121,17 @@ def _columns(layout: Layout, name: str) -> list[int]:
         return list(range(*layout.slice(name).indices(layout.size)))
     if name in known:
         return [known.index(name)]
-    close = difflib.get_close_matches(name, known, n=1)
-    hint = f"; did you mean {close[0]}?" if close else ""
-    raise ControlsError(f"the control {name!r} is unknown; there are {', '.join(known) or 'none'}{hint}")
+    raise ControlsError(
+        f"the control {name!r} is unknown; there are {', '.join(known) or 'none'}{did_you_mean(name, known)}"
+    )
 
 
 def _ramp(t: Any, height: float, *, base: float = 0.0, start: float = 0.0, end: float | None = None) -> Any:
     last = float(t[-1]) if end is None else end
+    if last <= start and end is None:
+        raise ControlsError(
+            f"ramp: start is {start!r} s; allowed is a time before the end of the last step, {last:g} s"
+        )
     if last <= start:
         raise ControlsError(f"ramp: end is {last!r} s; allowed is a time after its start, {start!r} s")
     return base + height * np.clip((t - start) / (last - start), 0.0, 1.0)
@@ -146,7 +162,9 @@ _SIGNALS: dict[str, tuple[Callable[..., Any], tuple[str, ...]]] = {
 def _signal(word: str, t: Float[np.ndarray, " steps"]) -> Float[np.ndarray, " steps"]:
     name, _, rest = word.partition(":")
     if name not in _SIGNALS:
-        raise ControlsError(f"the signal {word!r} is unknown; allowed is {', '.join(_SIGNALS)}")
+        raise ControlsError(
+            f"the signal {word!r} is unknown; allowed is {', '.join(_SIGNALS)}{did_you_mean(name, _SIGNALS)}"
+        )
     function, options = _SIGNALS[name]
     first, *others = rest.split(",")
     given = {}
@@ -156,7 +174,13 @@ def _signal(word: str, t: Float[np.ndarray, " steps"]) -> Float[np.ndarray, " st
             allowed = ", ".join(f"{option}=…" for option in options) or "nothing"
             raise ControlsError(f"{name}: {other!r} is not understood; allowed is {allowed}")
         given[key] = _number(name, text)
-    return np.asarray(function(t, _number(name, first), **given))
+    value = _number(name, first)
+    found = np.asarray(function(t, value, **given))
+    if len(t) > 1 and name != "constant" and np.all(np.isfinite(found)):
+        main = "period" if name == "sine" else "height"
+        known = function.__kwdefaults__ or {}
+        require_effect(name, {**known, main: value, **given}, found, len(t), float(t[0]))
+    return found
 
 
 def _number(where: str, text: str) -> float:
@@ -187,7 +211,10 @@ def _sampled(path: str, layout: Layout, steps: int | None, dt: float) -> Array:
     except CSVTextError as error:
         raise ControlsError(str(error)) from None
     if steps is not None and steps > len(rows):
-        raise ControlsError(f"{path}: there are {len(rows)} steps of {dt:g} s; {steps} are asked for")
+        raise ControlsError(
+            f"{path}: there are {len(rows)} steps of {dt:g} s; {steps} are requested; "
+            f"allowed is up to {len(rows)}"
+        )
     found = np.zeros((len(rows), layout.size))
     found[:, [place - 1 for place in places]] = values[rows]
     return found[:steps]

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import Any, Self
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
 from knode_cosserat._registry import provided
+from knode_cosserat._reprs import count_of, quantity
 from knode_cosserat.rods.system import System, is_traced
-from knode_cosserat.solvers.result import Result
+from knode_cosserat.solvers.result import Result, ResultCodes
 
 
 class Trajectory(eqx.Module):
@@ -31,7 +34,8 @@ class Trajectory(eqx.Module):
     z: Float[Any, "*batch T N z"]
     #: control in the row's equations: row i's acted from row i - 1 to i, row 0's before; see `held_control`
     control: Float[Any, "*batch T c"]
-    result: Int[Any, "*batch T"]
+    #: a `Result` for each row
+    result: Int[Any, "*batch T"] = eqx.field(converter=ResultCodes.of)
     #: largest residual in natural units
     residual: Float[Any, "*batch T"]
     iterations: Int[Any, "*batch T"]
@@ -180,14 +184,19 @@ class Trajectory(eqx.Module):
         )
 
     def __str__(self) -> str:
-        """Return rows, times, results, estimated error and extrapolation, in a few lines."""
+        """Return rows, times, results, tip, estimated error and extrapolation, in a few lines."""
+        if is_traced(self) or not isinstance(self.result, np.ndarray | jax.Array):
+            return f"Trajectory of a {type(self.system).__name__} (traced)"
         codes, counts = np.unique(np.asarray(self.result), return_counts=True)
         results = ", ".join(f"{n} {Result(int(code)).name}" for code, n in zip(codes, counts, strict=True))
         batch = f"{len(self.y)} robots, " if np.ndim(self.y) == 4 else ""
-        times = f" from {float(self.time[0]):g} to {float(self.time[-1]):g} s" if len(self.time) else ""
-        lines = [
-            f"Trajectory of a {type(self.system).__name__}: {batch}{len(self.time)} rows{times}: {results}"
-        ]
+        rows = count_of(len(self.time), "row")
+        if len(self.time) == 1:
+            rows += f" at {float(self.time[0]):g} s"
+        elif len(self.time):
+            rows += f" from {float(self.time[0]):g} to {float(self.time[-1]):g} s"
+        lines = [f"Trajectory of a {type(self.system).__name__}: {batch}{rows}: {results}"]
+        lines += self._tip_text()
         if self.position_error is not None and np.any(np.isfinite(self.position_error)):
             lines.append(
                 f"largest position error, by estimate: {1e3 * np.nanmax(self.position_error):.2g} mm"
@@ -195,6 +204,20 @@ class Trajectory(eqx.Module):
         if self.extrapolation:
             lines.append(f"EXTRAPOLATION: {self.extrapolation}")
         return "\n".join(lines)
+
+    def __repr__(self) -> str:
+        return str(self)
+
+    def _tip_text(self) -> list[str]:
+        """Return a line on the tip of one robot in the last solved row, if it has positions."""
+        solved = np.flatnonzero(self.valid)
+        if np.ndim(self.y) != 3 or not len(solved):
+            return []
+        # a user's own system may have no positions, or fail: a text must not
+        with contextlib.suppress(Exception):
+            tip = np.asarray(self.system.positions(np.asarray(self.y)[solved[-1], -1]))
+            return [f"tip at {float(self.time[solved[-1]]):g} s: {quantity(tip, 'm')}"]
+        return []
 
     @property
     def all_valid(self) -> bool:
@@ -238,6 +261,4 @@ class Trajectory(eqx.Module):
 
 
 def _picked(tree: Any, index: Any) -> Any:
-    import jax
-
     return jax.tree.map(lambda leaf: leaf[index], tree)

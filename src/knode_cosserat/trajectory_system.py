@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import numpy as np
 
+from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.rods import robot_file
 from knode_cosserat.rods.parameters import Parameter, ParameterError, parameters_of, slots_of
 from knode_cosserat.rods.system import System
@@ -28,8 +29,10 @@ PARAMETER = "robot_"
 BYTES, SIZES = "system_bytes", "system_sizes"
 
 
-class TrajectoryFileError(ValueError):
+class TrajectoryFileError(KnodeCosseratError, ValueError):
     """A trajectory's file cannot be read or written; the message is one line with the reason."""
+
+    code = "trajectory-file"
 
 
 class Codec(NamedTuple):

@@ -37,7 +37,7 @@ def trajectory():
 def recording(trajectory):
     rng = np.random.default_rng(0)
     tip = np.asarray(trajectory.tip_position) + rng.normal(0.0, 0.05, trajectory.tip_position.shape)
-    return kc.Measurements(
+    return kc.recordings.Measurements(
         time=7.0 + np.asarray(trajectory.time),
         tension=np.asarray(trajectory.held_tension),
         fractions=np.ones(1),

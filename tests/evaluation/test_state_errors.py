@@ -22,14 +22,14 @@ def with_added(truth, name, values):
 
 
 def test_nothing_is_wrong_with_the_truth(truth):
-    errors = kc.state_errors(truth, truth)
+    errors = kc.metrics.state_errors(truth, truth)
     assert set(errors) == {"p", "h", "n", "m", "q", "w", "v", "u"}
     assert all(error.rms == 0.0 and error.size > 0.0 for error in errors.values())
     assert errors["n"].unit == "N" and errors["h"].unit == "rad"
 
 
 def test_errors_are_lengths_of_vectors(truth):
-    errors = kc.state_errors(with_added(truth, "n", [3.0, 0.0, 4.0]), truth)
+    errors = kc.metrics.state_errors(with_added(truth, "n", [3.0, 0.0, 4.0]), truth)
     assert errors["n"].rms == pytest.approx(5.0)
     assert errors["p"].rms == 0.0
 
@@ -49,7 +49,9 @@ def test_an_orientation_s_error_is_an_angle_whatever_the_quaternion_s_sign_or_si
         axis=-1,
     )
     y[..., ROBOT.y_layout.slice("h")] = -2.0 * turned
-    assert kc.state_errors(dataclasses.replace(truth, y=y), truth)["h"].rms == pytest.approx(angle, rel=1e-6)
+    assert kc.metrics.state_errors(dataclasses.replace(truth, y=y), truth)["h"].rms == pytest.approx(
+        angle, rel=1e-6
+    )
 
 
 @pytest.mark.campaign
@@ -59,26 +61,26 @@ def test_a_finer_truth_is_looked_up(truth):
     coarse = dataclasses.replace(
         finer[::2], y=np.asarray(finer.y)[::2, ::3], z=np.asarray(finer.z)[::2, ::3], system=ROBOT
     )
-    assert all(error.rms == 0.0 for error in kc.state_errors(coarse, finer).values())
+    assert all(error.rms == 0.0 for error in kc.metrics.state_errors(coarse, finer).values())
 
 
 def test_rows_before_the_start_do_not_count(truth):
     y = np.array(truth.y)
     y[0, :, ROBOT.y_layout.slice("n")] += 9.0
     wrong = dataclasses.replace(truth, y=y)
-    assert kc.state_errors(wrong, truth)["n"].rms > 1.0
-    assert kc.state_errors(wrong, truth, start=0.05)["n"].rms == 0.0
+    assert kc.metrics.state_errors(wrong, truth)["n"].rms > 1.0
+    assert kc.metrics.state_errors(wrong, truth, start=0.05)["n"].rms == 0.0
 
 
 def test_what_cannot_be_compared(truth):
     later = dataclasses.replace(truth, time=np.asarray(truth.time) + 0.01)
     with pytest.raises(ValueError, match=r"the truth has no row at 0.01 s"):
-        kc.state_errors(later, truth)
+        kc.metrics.state_errors(later, truth)
     with pytest.raises(ValueError, match="no row to compare"):
-        kc.state_errors(truth, truth, start=9.0)
+        kc.metrics.state_errors(truth, truth, start=9.0)
     other = dataclasses.replace(truth, y=np.asarray(truth.y)[:, :8], z=np.asarray(truth.z)[:, :8])
     with pytest.raises(ValueError, match="the truth has no node at"):
-        kc.state_errors(truth, other)
+        kc.metrics.state_errors(truth, other)
     batch = dataclasses.replace(truth, y=np.stack([truth.y, truth.y]))
     with pytest.raises(ValueError, match="a batch of 2"):
-        kc.state_errors(batch, truth)
+        kc.metrics.state_errors(batch, truth)

@@ -20,9 +20,12 @@ def main(folder: Path) -> None:
     truth = kc.simulate(robot, tensions, 0.05)
     model = kc.fit(robot.replace(youngs_modulus=4e9), [truth])
     kc.save_robot(robot, folder / "robot-1.yaml", description="format 1: numbers only")
-    laden = kc.SlenderRod(
+    laden = kc.robots.SlenderRod(
         length=0.4, radius=0.005, density=1100.0, youngs_modulus=2e6, nodes=5, drag=0.01,
-        loads=(kc.loads.PointWrench(at=0.5, force=[0.01, 0.0, 0.0]), kc.loads.AttachedMass(mass=0.001)),
+        loads=(
+            kc.robots.loads.PointWrench(at=0.5, force=[0.01, 0.0, 0.0]),
+            kc.robots.loads.AttachedMass(mass=0.001),
+        ),
     )  # fmt: skip
     kc.save_robot(laden, folder / "robot-2.yaml", description="format 2: with parts")
     truth.save(folder / "trajectory-1.nc")

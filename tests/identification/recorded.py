@@ -38,7 +38,7 @@ def measured(robot, true_tension, source, *, seed=0, noise=NOISE, reading=None, 
         quaternion = since_first(quaternion)
     quaternion = quaternion + 5.0 * noise * rng.normal(size=quaternion.shape)
     seen = true_tension if reading is None else reading(true_tension)
-    return kc.Measurements(
+    return kc.recordings.Measurements(
         time=np.asarray(moved.time),
         # the last row's leads beyond the end
         tension=np.concatenate([seen, seen[-1:]]),

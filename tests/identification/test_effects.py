@@ -13,12 +13,12 @@ from knode_cosserat.identification.model import Model
 from knode_cosserat.rods.anchors import EarlyAnchors
 from knode_cosserat.rods.load_cells import LoadCells
 from knode_cosserat.rods.rib_spacing import RibSpacing, pressed
-from knode_cosserat.rods.routing import Straight
+from knode_cosserat.rods.routing import Helical, Straight
 from knode_cosserat.rods.section import Sleeve
 from knode_cosserat.rods.tendon_friction import TendonFriction
 
 NOMINAL = kc.load_robot("delrin-tendon-robot").replace(tendon_offset=0.02)
-ROUTED = kc.RoutedTendonRobot.like(NOMINAL)
+ROUTED = kc.robots.RoutedTendonRobot.like(NOMINAL)
 TENSION = np.array([7.0, 5.0, 3.0, 5.0])
 
 
@@ -82,8 +82,13 @@ def test_softening_by_tension_is_that_of_stiffness():
     EI = float(robot.Kbt[0, 0])
     left = float(pressed(np.asarray(3.0 * c * tension.sum() / EI)))
     soft = robot.replace(rib_spacing=RibSpacing(softening=c))
+    # of ribs whose places are known
+    spans = robot.replace(
+        rib_spacing=RibSpacing(at=(0.25, 0.5, 0.75, 1.0), share=c / (0.25 * robot.length) ** 2 * 12.0)
+    )
     softer = robot.replace(bending_stiffness=np.diag([EI * left, EI * left, float(robot.Kbt[2, 2])]))
     assert np.allclose(shape(soft, tension), shape(softer, tension), rtol=0.0, atol=1e-9)
+    assert np.allclose(shape(spans, tension), shape(softer, tension), rtol=0.0, atol=1e-8)
 
 
 def test_load_cells_correct_tensions():
@@ -103,6 +108,31 @@ def test_early_anchors_are_ends_of_routings():
         for k, angle in enumerate(np.asarray(NOMINAL.tendon_angles))
     )
     assert np.allclose(shape(early), shape(ROUTED.replace(routing=routing)), rtol=0.0, atol=1e-8)
+
+
+def test_twisted_tendons_are_helices():
+    twist = 0.7
+    routing = tuple(
+        Helical(0.02, phase=angle, turns=twist / (2.0 * np.pi)) for angle in np.asarray(NOMINAL.tendon_angles)
+    )
+    twisted = ROUTED.replace(tendon_twist=twist)
+    assert not np.allclose(shape(twisted), shape(ROUTED), atol=1e-3)
+    assert np.allclose(shape(twisted), shape(ROUTED.replace(routing=routing)), rtol=0.0, atol=1e-9)
+
+
+def test_tendons_whose_routing_is_stated_are_moved_by_effects_of_that():
+    """Angles of tendons mean nothing there; those of the routing turn each tendon."""
+    routing = tuple(
+        Straight(0.02 * np.cos(angle), 0.02 * np.sin(angle)) for angle in np.asarray(NOMINAL.tendon_angles)
+    )
+    model = Model(ROUTED.replace(routing=routing), np.tile(TENSION, (4, 1)))
+    assert not {"tendon offset", "tendon angles", "tendon twist"} & set(model.names)
+    x = np.zeros(model.size)
+    x[model.slice("routing by motor")] = [1.0, 0.0, 0.0, 0.0]
+    turn = model.numbers[model.slice("routing by motor").start].width
+    angles = np.asarray(NOMINAL.tendon_angles) + np.array([turn, 0.0, 0.0, 0.0])
+    found = shape(model.reduced(x, ("stiffness", "damping", "routing by motor")))
+    assert np.allclose(found, shape(ROUTED.replace(tendon_angles=angles)), rtol=0.0, atol=1e-9)
 
 
 def test_a_sleeve_is_stiffness_along_the_rod():

@@ -22,7 +22,7 @@ NOMINAL = kc.load_robot("delrin-tendon-robot").replace(
     gravity=(0.0, -9.81, 0.0),
 )  # fmt: skip
 #: tendons that run neither straight nor evenly: no effect of the library has them
-TRUE = kc.RoutedTendonRobot.like(
+TRUE = kc.robots.RoutedTendonRobot.like(
     NOMINAL,
     youngs_modulus=1.6e9,
     bending_damping=2e-3,
@@ -123,15 +123,15 @@ def test_poses_of_a_trajectory_are_measurements():
 
 def test_bad_input():
     rows = poses_of(kc.simulate(NOMINAL.replace(nodes=5), kc.controls.sine(1.0, 6, DT), DT), "a")
-    with pytest.raises(kc.FitError, match="needs full states"):
+    with pytest.raises(kc.learning.FitError, match="needs full states"):
         fit(NOMINAL, [rows], kc.FitConfig.paper())
-    with pytest.raises(kc.FitError, match="checkpoint is for trajectories"):
+    with pytest.raises(kc.learning.FitError, match="checkpoint is for trajectories"):
         fit(NOMINAL, [rows], checkpoint="a")
     with pytest.raises(DataError, match="recordings holds a float; allowed is"):
         fit(NOMINAL, [rows, 3.0])
-    with pytest.raises(kc.FitError, match="allowed is a list"):
+    with pytest.raises(kc.learning.FitError, match="allowed is a list"):
         fit(NOMINAL, rows)
-    with pytest.raises(kc.ConfigError, match="no rollouts"):
-        kc.FitConfig(kc.PassiveOptions())
+    with pytest.raises(kc.learning.ConfigError, match="no rollouts"):
+        kc.FitConfig(kc.learning.PassiveOptions())
     config = kc.FitConfig.network_recordings(seed=(0, 1), hidden=3)
     assert kc.FitConfig.from_dict(config.to_dict()) == config

@@ -24,7 +24,7 @@ NOMINAL = kc.load_robot("delrin-tendon-robot").replace(
     gravity=(0.0, -9.81, 0.0),
 )  # fmt: skip
 GAIN = np.array([1.0, 1.0, 0.93, 1.0])
-TRUE = kc.RoutedTendonRobot.like(
+TRUE = kc.robots.RoutedTendonRobot.like(
     NOMINAL,
     youngs_modulus=1.3e9,
     bending_damping=2e-3,
@@ -60,13 +60,13 @@ def test_a_robot_is_found_and_predicts_what_it_has_not_seen():
     assert all(error < 3e-3 for error in found.held_out_error.values())
     assert told and "friction.wobble" in str(found) and "held out" in str(found)
     # a robot like any other
-    assert isinstance(found.robot, kc.RoutedTendonRobot)
+    assert isinstance(found.robot, kc.robots.RoutedTendonRobot)
 
 
 @pytest.mark.campaign
 def test_named_effects_and_their_intervals(tmp_path):
     """All of the truth is searched for: the numbers lie where they are said to lie."""
-    true = kc.RoutedTendonRobot.like(
+    true = kc.robots.RoutedTendonRobot.like(
         NOMINAL, youngs_modulus=1.5e9, bending_damping=2e-3, load_cells=LoadCells(gain=GAIN)
     )
     given = recordings(true, kinds=(1.0, "random"), reading=None)
@@ -88,7 +88,7 @@ def test_named_effects_and_their_intervals(tmp_path):
 
 
 def test_a_robots_own_motion_is_predicted_however_bodies_are_mounted():
-    true = kc.RoutedTendonRobot.like(NOMINAL)
+    true = kc.robots.RoutedTendonRobot.like(NOMINAL)
     seen = measured(true, tensions(1.0, 1.0), "own", noise=0.0)
     found = evaluate(true, seen)
     assert found.tip_rmse < 1e-7 and found.pose_mse < 1e-12 and found.failed is None
@@ -100,7 +100,7 @@ def test_a_robots_own_motion_is_predicted_however_bodies_are_mounted():
 
 
 def test_trials_name_what_fails():
-    true = kc.RoutedTendonRobot.like(NOMINAL)
+    true = kc.robots.RoutedTendonRobot.like(NOMINAL)
     seen = measured(true, tensions(1.0, 1.0), "own", noise=0.0)
     data = data_of(seen, Model(NOMINAL, seen.tension), "own")
     assert failed_trial(true, [data], "lobatto2") is None
@@ -110,7 +110,7 @@ def test_trials_name_what_fails():
 
 
 def test_a_grid_is_too_coarse_or_fine_enough():
-    true = kc.RoutedTendonRobot.like(NOMINAL)
+    true = kc.robots.RoutedTendonRobot.like(NOMINAL)
     seen = measured(true, tensions(1.0, 1.0), "own", noise=0.0)
     data = [data_of(seen, Model(NOMINAL, seen.tension), "own")]
     assert not is_coarse(true, data, "lobatto2")
@@ -119,9 +119,11 @@ def test_a_grid_is_too_coarse_or_fine_enough():
 
 
 def test_bad_input_says_what_is_wrong():
-    rod = kc.SlenderRod(length=0.5, radius=0.003, density=1000.0, youngs_modulus=1e9)
-    seen = measured(kc.RoutedTendonRobot.like(NOMINAL), tensions(1.0, 1.0), "own", noise=0.0)
-    with pytest.raises(kc.IdentificationError, match="SlenderRod; allowed is a robot with tendons"):
+    rod = kc.robots.SlenderRod(length=0.5, radius=0.003, density=1000.0, youngs_modulus=1e9)
+    seen = measured(kc.robots.RoutedTendonRobot.like(NOMINAL), tensions(1.0, 1.0), "own", noise=0.0)
+    with pytest.raises(
+        kc.identification.IdentificationError, match="SlenderRod; allowed is a robot with tendons"
+    ):
         kc.identify(rod, [seen])
     with pytest.raises(DataError, match="allowed is a list"):
         kc.identify(NOMINAL, seen)

@@ -49,7 +49,7 @@ def test_readings_are_put_back_to_when_they_acted():
 
 def test_robots_and_models_of_them_say_what_acts():
     true = tensions("random", 1.0)
-    robot = kc.RoutedTendonRobot.like(NOMINAL, load_cells=cells(0.5 * DT))
+    robot = kc.robots.RoutedTendonRobot.like(NOMINAL, load_cells=cells(0.5 * DT))
     expected = 0.5 * (true[:-1] + true[1:])
     np.testing.assert_allclose(robot.undelayed(true, DT)[:-1], expected, rtol=1e-12)
     assert NOMINAL.undelayed(true, DT) is true
@@ -59,7 +59,7 @@ def test_robots_and_models_of_them_say_what_acts():
 def test_derivatives_by_latency_are_those_of_differences():
     """Where tensions rise linearly in time, what acts is linear in the latency, across rows too."""
     rising = np.concatenate([np.full((20, 4), 4.0), 4.0 + np.outer(np.arange(31), [0.2, 0.0, -0.1, 0.05])])
-    seen = measured(kc.RoutedTendonRobot.like(NOMINAL), rising, "own", noise=0.0)
+    seen = measured(kc.robots.RoutedTendonRobot.like(NOMINAL), rising, "own", noise=0.0)
     model = Model(NOMINAL, seen.tension)
     misfit = Misfit(model, [data_of(seen, model, "own")], "lobatto2")
     k = model.slice("latency").start
@@ -72,7 +72,10 @@ def test_derivatives_by_latency_are_those_of_differences():
 
 @pytest.mark.campaign
 def test_latency_is_found_and_kept_in_the_robots_file(tmp_path):
-    true, latency = kc.RoutedTendonRobot.like(NOMINAL, youngs_modulus=1.5e9, bending_damping=2e-3), 0.031
+    true, latency = (
+        kc.robots.RoutedTendonRobot.like(NOMINAL, youngs_modulus=1.5e9, bending_damping=2e-3),
+        0.031,
+    )
     given = [
         measured(true, pulled, f"recording {k}", seed=k, reading=lambda tension: late(tension, latency))
         for k, pulled in enumerate((tensions(1.0, 3.0), tensions("random", 3.0, seed=1)))

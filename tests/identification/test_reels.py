@@ -11,7 +11,7 @@ from knode_cosserat.rods.routing import Straight
 from knode_cosserat.rods.section import Stretch
 
 #: three cables in a soft rod that hangs; a control of 1 takes in 0.1 mm
-CABLES = kc.RoutedTendonRobot(
+CABLES = kc.robots.RoutedTendonRobot(
     length=0.12, radius=0.004, density=1100.0, youngs_modulus=3e5, gravity=(0.0, 0.0, 9.81), nodes=6,
     tendon_offset=0.004, tendon_angles=(0.0, 2.0944, 4.1888), drive="reel",
     reels=Reels(motors=(1, 2, 3), radius=(1e-4, 1e-4, 1e-4)),
@@ -65,7 +65,7 @@ def equilibria(robot, control, noise=5e-5):
     position = np.asarray(still.position)[:, :, -1]
     position = position + noise * np.random.default_rng(0).normal(size=position.shape)
     count = len(control)
-    return kc.Measurements(
+    return kc.recordings.Measurements(
         time=np.arange(float(count)), tension=control, fractions=np.ones(1), position=position,
         quaternion=np.full((count, 1, 4), np.nan), measured=np.ones((count, 1), dtype=bool), simulated=True,
         source="equilibria", static=True,

@@ -11,19 +11,19 @@ import knode_cosserat as kc
 class Bar(kc.System):
     """Clamped at s = 0 and pulled at the other end; it stretches, swings and is slowed down by the air."""
 
-    y_layout: ClassVar = kc.Layout(
+    y_layout: ClassVar = kc.robots.Layout(
         ("p", 1, "m", "position"), ("n", 1, "N", "internal force"), ("q", 1, "m/s", "velocity")
     )
-    z_layout: ClassVar = kc.Layout(("v", 1, "1", "stretch"))
-    control_layout: ClassVar = kc.Layout(("pull", 1, "N", "force at the end"))
+    z_layout: ClassVar = kc.robots.Layout(("v", 1, "1", "stretch"))
+    control_layout: ClassVar = kc.robots.Layout(("pull", 1, "N", "force at the end"))
     base_unknowns: ClassVar = ("n",)
     mixed: ClassVar = False
 
-    length: Any = kc.parameter("m", "length", low=0.01, high=100.0)
-    density: Any = kc.parameter("kg/m", "mass per length", low=1e-6, high=100.0)
-    stiffness: Any = kc.parameter("N", "EA", low=1e-3, high=1e9)
-    damping: Any = kc.parameter("N s", "of the material", low=0.0, high=1e3, default=0.0)
-    drag: Any = kc.parameter("kg/m2", "of the air, square law", low=0.0, high=100.0, default=0.0)
+    length: Any = kc.robots.parameter("m", "length", low=0.01, high=100.0)
+    density: Any = kc.robots.parameter("kg/m", "mass per length", low=1e-6, high=100.0)
+    stiffness: Any = kc.robots.parameter("N", "EA", low=1e-3, high=1e9)
+    damping: Any = kc.robots.parameter("N s", "of the material", low=0.0, high=1e3, default=0.0)
+    drag: Any = kc.robots.parameter("kg/m2", "of the air, square law", low=0.0, high=100.0, default=0.0)
 
     def strains(self, s, t, y, control, history):
         EA, B = self.stiffness, self.damping

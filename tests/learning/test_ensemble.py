@@ -57,8 +57,8 @@ def test_the_members_differ_by_as_much_as_they_may_be_wrong(prediction, truth):
 
 def test_the_mean_is_compared_like_a_trajectory(prediction, truth):
     baseline = kc.simulate(ROBOT.replace(youngs_modulus=6e9), kc.controls.sine(1.5, 40, DT), DT)
-    assert kc.tip_dtw(prediction, truth) < 0.1 * kc.tip_dtw(baseline, truth)
-    assert kc.pose_mse(prediction, truth) < 0.1 * kc.pose_mse(baseline, truth)
+    assert kc.metrics.tip_dtw(prediction, truth) < 0.1 * kc.metrics.tip_dtw(baseline, truth)
+    assert kc.metrics.pose_mse(prediction, truth) < 0.1 * kc.metrics.pose_mse(baseline, truth)
     np.testing.assert_allclose(np.linalg.norm(prediction.quaternion, axis=-1), 1.0, atol=1e-14)
     np.testing.assert_allclose(prediction.time, truth.time)
 
@@ -74,10 +74,10 @@ def test_another_run_gives_the_same_members(ensemble, training):
 
 def test_saved_and_loaded(ensemble, prediction, tmp_path):
     ensemble.save(tmp_path / "many")
-    again = kc.load_ensemble(tmp_path / "many").predict(kc.controls.sine(1.5, 40, DT), DT)
+    again = kc.learning.load_ensemble(tmp_path / "many").predict(kc.controls.sine(1.5, 40, DT), DT)
     np.testing.assert_array_equal(again.position, prediction.position)
     with pytest.raises(ModelFileError, match=r"there is no ensemble here"):
-        kc.load_ensemble(tmp_path)
+        kc.learning.load_ensemble(tmp_path)
 
 
 class Drawn:

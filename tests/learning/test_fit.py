@@ -71,7 +71,9 @@ def test_a_model_is_what_its_knowledge_is():
     """A model delegates the whole interface of a system, except what follows from the other members."""
     derived = {"nodes", "unknown_count", "control_size"}
     assert {name for name in vars(kc.System) if not name.startswith("_")} - set(vars(Wrapped)) == derived
-    loose = kc.SlenderRod(length=0.5, radius=0.005, density=1e3, youngs_modulus=5e7, base_end=kc.ends.Free())
+    loose = kc.robots.SlenderRod(
+        length=0.5, radius=0.005, density=1e3, youngs_modulus=5e7, base_end=kc.robots.ends.Free()
+    )
     assert not loose.held and not KNODE(loose, None).held
 
 
@@ -332,6 +334,6 @@ def test_table_one_of_the_paper(robot, sines, imperfection):
         truth = kc.simulate(robot, controls, DT, space="euler")[:ROWS]
         found = [kc.simulate(model, controls, DT, space="euler")[:ROWS] for model in models]
         dtw, mse = FIGURES[imperfection, name]
-        assert np.mean([kc.tip_dtw(each, truth) for each in found]) <= 1.3 * dtw
-        assert np.mean([kc.pose_mse(each, truth) for each in found]) <= 1.3 * mse
+        assert np.mean([kc.metrics.tip_dtw(each, truth) for each in found]) <= 1.3 * dtw
+        assert np.mean([kc.metrics.pose_mse(each, truth) for each in found]) <= 1.3 * mse
     assert all(math.isfinite(loss) for loss in losses)

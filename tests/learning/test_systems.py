@@ -23,7 +23,7 @@ def pushed(period, size, phases):
 
 
 def driven_in_contact():
-    robot = kc.SlenderRod(
+    robot = kc.robots.SlenderRod(
         length=0.4, radius=0.005, density=1100.0, youngs_modulus=2e6, nodes=41,
         bending_damping=2e-4, drag=0.01,
         base_end=Driven(axes=("x", "ry")), gravity=[0.0, 0.0, 9.81],
@@ -41,12 +41,12 @@ def variable_curvature():
 
 def helical_tendons():
     routing = tuple(Helical(0.02, angle, 0.25) for angle in FOUR)
-    robot = kc.RoutedTendonRobot.like(DELRIN, routing=routing)
+    robot = kc.robots.RoutedTendonRobot.like(DELRIN, routing=routing)
     return robot, kc.controls.sine(1.5, STEPS, DT), kc.controls.random(STEPS, seed=3, hold=10)
 
 
 def reels():
-    robot = kc.RoutedTendonRobot.like(DELRIN, drive="reel", tendon_compliance=5e-4)
+    robot = kc.robots.RoutedTendonRobot.like(DELRIN, drive="reel", tendon_compliance=5e-4)
     return robot, *(0.004 + pushed(T, 0.002, FOUR) for T in (1.5, 2.2))
 
 
@@ -79,7 +79,7 @@ def test_a_wrong_modulus_is_made_up_for(name):
 
 # samples where something acts
 
-LADEN = kc.SlenderRod(
+LADEN = kc.robots.SlenderRod(
     length=0.5, radius=0.005, density=1000.0, youngs_modulus=1e8, bending_damping=1e-2, nodes=11,
     loads=(PointWrench(at=0.4, force=[0.3, 0.0, 0.0], controlled=True), AttachedMass(at=0.4, mass=0.05)),
 )  # fmt: skip

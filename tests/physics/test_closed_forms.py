@@ -16,7 +16,7 @@ FORCE, MOMENT = EI / LENGTH**2, EI / LENGTH
 #: the elastica and the column neither shear nor stretch
 RIGID = 1e10 * FORCE
 #: solved so far that what is left is the schemes' error
-NEWTON = kc.NewtonOptions(tolerance=1e-13)
+NEWTON = kc.solvers.NewtonOptions(tolerance=1e-13)
 #: name, order, and the numbers of nodes at which it shows
 SPACES = [("euler", 1, (21, 41)), ("lobatto2", 2, (21, 41)), ("lobatto4", 4, (11, 21))]
 
@@ -25,7 +25,7 @@ def _vector(value):
     return np.asarray(value, dtype=float)
 
 
-class TipLoaded(kc.TendonRobot):
+class TipLoaded(kc.robots.TendonRobot):
     """A rod with a dead force (N) and moment (N m) at its tip."""
 
     tip_force: Any = eqx.field(converter=_vector, default=(0.0, 0.0, 0.0))
@@ -176,11 +176,11 @@ class Bar(kc.System):
     space, and history in the middle of the segments has its part in that.
     """
 
-    y_layout: ClassVar[kc.Layout] = kc.Layout(
+    y_layout: ClassVar[kc.robots.Layout] = kc.robots.Layout(
         ("p", 1, "m", "position"), ("n", 1, "N", "force"), ("q", 1, "m/s", "velocity")
     )
-    z_layout: ClassVar[kc.Layout] = kc.Layout(("v", 1, "1", "stretch"))
-    control_layout: ClassVar[kc.Layout] = kc.Layout(("load", 1, "N/m", "largest load"))
+    z_layout: ClassVar[kc.robots.Layout] = kc.robots.Layout(("v", 1, "1", "stretch"))
+    control_layout: ClassVar[kc.robots.Layout] = kc.robots.Layout(("load", 1, "N/m", "largest load"))
     base_unknowns: ClassVar[tuple[str, ...]] = ("n",)
     mixed: ClassVar[bool] = False
     #: a wave number at which nothing moves at the base nor pulls at the tip

@@ -30,7 +30,7 @@ def matrices(draw, low, high):
 
 @st.composite
 def robots(draw):
-    return kc.TendonRobot(
+    return kc.robots.TendonRobot(
         length=draw(st.floats(0.1, 2)),
         radius=draw(st.floats(1e-3, 2e-2)),
         density=draw(st.floats(500, 8000)),
@@ -51,7 +51,7 @@ def points(draw):
     y, z = draw(vectors(19)), draw(vectors(6))
     y[3:7] += 2.0  # quaternions of any length but nearly none
     c0 = draw(st.floats(0, 1000))
-    history = kc.History(np.array(c0), c0 * draw(vectors(19)), c0 * z, np.zeros(19))
+    history = kc.robots.History(np.array(c0), c0 * draw(vectors(19)), c0 * z, np.zeros(19))
     return draw(st.floats(0, 1)), draw(st.floats(0, 1)), y, 10 * draw(vectors(3)), history
 
 
@@ -61,7 +61,7 @@ def both(robot, s, t, y, control, history):
         z = of.strains(robot, s, t, y, control, history)
         return of.rates(robot, s, t, y, z, control, history), z
 
-    return derived(kc.TendonRobot), derived(kc.System)
+    return derived(kc.robots.TendonRobot), derived(kc.System)
 
 
 @settings(max_examples=200, deadline=None)
@@ -81,7 +81,7 @@ def test_direct_and_general_derivatives_agree(robot, point):
     np.testing.assert_allclose(y_s, general_y_s, rtol=0, atol=1e-11 * rounding * np.abs(general_y_s).max())
 
 
-class GeneralRobot(kc.TendonRobot):
+class GeneralRobot(kc.robots.TendonRobot):
     """The same robot, by the general form only."""
 
     strains = kc.System.strains

@@ -12,10 +12,10 @@ from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.time import Static
 
 SCHEMES = {
-    "bdf1": kc.BDF1(),
-    "bdf2": kc.BDF2(),
-    "bdf-alpha": kc.BDFAlpha(),
-    "trapezoidal": kc.Trapezoidal(),
+    "bdf1": kc.solvers.BDF1(),
+    "bdf2": kc.solvers.BDF2(),
+    "bdf-alpha": kc.solvers.BDFAlpha(),
+    "trapezoidal": kc.solvers.Trapezoidal(),
 }
 steps_in_time = st.floats(1e-4, 10.0)
 alphas = st.floats(-0.5, 0.0)
@@ -38,20 +38,20 @@ coefficients = st.lists(st.floats(-10, 10, allow_subnormal=False), min_size=3, m
 
 @given(steps_in_time, st.floats(0.05, 20.0), alphas, coefficients)
 def test_schemes_of_order_2_are_exact_for_quadratics_at_any_ratio_of_steps(dt, ratio, alpha, numbers):
-    for scheme in (kc.BDFAlpha(alpha), kc.BDF2(), kc.Trapezoidal()):
+    for scheme in (kc.solvers.BDFAlpha(alpha), kc.solvers.BDF2(), kc.solvers.Trapezoidal()):
         found, expected, size = differentiated(scheme, dt, ratio * dt, np.poly1d(numbers))
         assert found == pytest.approx(expected, rel=1e-12, abs=1e-12 * size)
 
 
 @given(steps_in_time, steps_in_time, coefficients)
 def test_bdf1_is_exact_for_lines(dt, previous_dt, numbers):
-    found, expected, size = differentiated(kc.BDF1(), dt, previous_dt, np.poly1d(numbers[:2]))
+    found, expected, size = differentiated(kc.solvers.BDF1(), dt, previous_dt, np.poly1d(numbers[:2]))
     assert found == pytest.approx(expected, rel=1e-12, abs=1e-12 * size)
 
 
 @given(steps_in_time, steps_in_time, alphas)
 def test_what_does_not_move_has_no_rate(dt, previous_dt, alpha):
-    for scheme in (kc.BDF1(), kc.BDFAlpha(alpha), Static()):
+    for scheme in (kc.solvers.BDF1(), kc.solvers.BDFAlpha(alpha), Static()):
         c0, c1, c2, _ = scheme.coefficients(dt, previous_dt)
         assert c0 + c1 + c2 == pytest.approx(0.0, abs=1e-14 * max(1.0, abs(c0), abs(c1), abs(c2)))
 
@@ -61,15 +61,21 @@ def test_equal_steps_have_the_published_coefficients(dt, alpha):
     # Till, Aloi & Rucker (2019)
     c0, c1, c2 = (1.5 + alpha) / (dt * (1 + alpha)), -2 / dt, (0.5 + alpha) / (dt * (1 + alpha))
     expected = (c0, c1, c2, alpha / (1 + alpha))
-    np.testing.assert_allclose(kc.BDFAlpha(alpha).coefficients(dt, dt), expected, rtol=1e-13, atol=1e-15 / dt)
+    np.testing.assert_allclose(
+        kc.solvers.BDFAlpha(alpha).coefficients(dt, dt), expected, rtol=1e-13, atol=1e-15 / dt
+    )
 
 
 @given(steps_in_time, steps_in_time)
 def test_the_ends_of_the_family(dt, previous_dt):
-    assert kc.BDFAlpha(0.0).coefficients(dt, previous_dt) == kc.BDF2().coefficients(dt, previous_dt)
-    np.testing.assert_allclose(kc.BDF2().coefficients(dt, dt), (1.5 / dt, -2 / dt, 0.5 / dt, 0), rtol=1e-14)
-    trapezoidal = kc.Trapezoidal().coefficients(dt, previous_dt)
-    assert trapezoidal == kc.BDFAlpha(-0.5).coefficients(dt, previous_dt)
+    assert kc.solvers.BDFAlpha(0.0).coefficients(dt, previous_dt) == kc.solvers.BDF2().coefficients(
+        dt, previous_dt
+    )
+    np.testing.assert_allclose(
+        kc.solvers.BDF2().coefficients(dt, dt), (1.5 / dt, -2 / dt, 0.5 / dt, 0), rtol=1e-14
+    )
+    trapezoidal = kc.solvers.Trapezoidal().coefficients(dt, previous_dt)
+    assert trapezoidal == kc.solvers.BDFAlpha(-0.5).coefficients(dt, previous_dt)
     # (y_t,n + y_t,{n-1}) / 2 = (y_n - y_{n-1}) / dt, whatever the step before
     np.testing.assert_allclose(trapezoidal, (2 / dt, -2 / dt, 0, -1), rtol=1e-14)
 
@@ -77,14 +83,14 @@ def test_the_ends_of_the_family(dt, previous_dt):
 @pytest.mark.parametrize("alpha", [-0.51, 0.01, 1.0, np.nan])
 def test_alpha_outside_the_family_is_refused(alpha):
     with pytest.raises(ValueError, match=r"alpha is .*; allowed is -0.5"):
-        kc.BDFAlpha(alpha)
+        kc.solvers.BDFAlpha(alpha)
 
 
 @pytest.mark.parametrize("name", SCHEMES)
 def test_first_step(name):
     scheme = SCHEMES[name]
     regular = scheme.coefficients(0.05, 0.05)
-    first = {"paper": regular, "consistent": kc.BDF1().coefficients(0.05, 0.05)}
+    first = {"paper": regular, "consistent": kc.solvers.BDF1().coefficients(0.05, 0.05)}
     for start in ("paper", "consistent"):
         table = coefficient_table(Settings(time=scheme, start=start), 0.05)
         np.testing.assert_array_equal(table, [first[start], regular])
@@ -165,7 +171,7 @@ def test_free_vibration_of_the_first_mode(robot):
     (a, b), *_ = np.linalg.lstsq(past, amplitude[2:])
     z = np.roots([1.0, -a, -b])[0]
     # what the scheme takes for the rate of zⁿ, so that what it damps and slows is not counted
-    c0, c1, c2, d1 = kc.BDFAlpha().coefficients(dt, dt)
+    c0, c1, c2, d1 = kc.solvers.BDFAlpha().coefficients(dt, dt)
     rate = (c0 + c1 / z + c2 / z**2) / (1 - d1 / z)
     # a beam without shear and rotary inertia swings faster by some 5e-5
     assert abs(rate) == pytest.approx(frequency, rel=2e-4)

@@ -49,7 +49,7 @@ def test_settings_come_back_from_their_file(tmp_path, config):
 
 
 def test_the_papers_robot_is_as_the_specification_has_it():
-    paper = kc.RecordingConfig.paper_robot()
+    paper = kc.recordings.RecordingConfig.paper_robot()
     assert [marker.topic for marker in paper.markers] == [f"/vicon/continuum_{k}/pose" for k in range(4)]
     np.testing.assert_allclose([marker.fraction * 9 for marker in paper.markers], [3, 5, 7, 9])
     assert (paper.base.topic, paper.base.height) == ("/vicon/continuum_base/pose", 0.0635)

@@ -157,7 +157,7 @@ def test_on_the_virtual_robot_the_best_is_three_times_better(virtual):
     path, truth = virtual
     recording = kc.load_recording(path)
     paper, best = (
-        kc.state_errors(kc.estimate_states(recording, virtual_robot(10), method), truth)
+        kc.metrics.state_errors(kc.estimate_states(recording, virtual_robot(10), method), truth)
         for method in ("paper", "best")
     )
     assert best["p"].rms < 0.15e-3 and best["h"].rms < 2e-3
@@ -169,7 +169,7 @@ def test_on_the_virtual_robot_the_best_is_three_times_better(virtual):
 def test_measurements_on_a_grid_will_do(virtual):
     path, truth = virtual
     states = kc.estimate_states(kc.load_recording(path).sampled(0.05), virtual_robot(10))
-    errors = kc.state_errors(states, truth)
+    errors = kc.metrics.state_errors(states, truth)
     assert errors["p"].rms < 0.4e-3 and errors["q"].rms < 0.05 * errors["q"].size
 
 
@@ -177,16 +177,16 @@ def test_measurements_on_a_grid_will_do(virtual):
 def test_what_is_estimated_can_be_learned_from(virtual):
     path, _ = virtual
     states = kc.estimate_states(kc.load_recording(path), ROBOT, end=2.0)
-    config = dataclasses.replace(kc.FitConfig.paper(history=True), segments=kc.Training(epochs=3))
+    config = dataclasses.replace(kc.FitConfig.paper(history=True), segments=kc.learning.Training(epochs=3))
     model = kc.fit(ROBOT, [states], config)
     assert isinstance(model, kc.KNODE)
 
 
 def test_a_recording_in_parts_says_so():
     recording = recorded(lost=[(1.0, 1.5)])
-    with pytest.raises(kc.RecordingError, match=r"in 2 parts .0 to .* estimate_parts"):
+    with pytest.raises(kc.recordings.RecordingError, match=r"in 2 parts .0 to .* estimate_parts"):
         kc.estimate_states(recording, BARE)
-    first, second = kc.estimate_parts(recording, BARE)
+    first, second = kc.recordings.estimate_parts(recording, BARE)
     assert first.time[-1] <= 1.0 + 1e-9 and second.time[0] >= 1.5 - 1e-9
     for part in (first, second):
         error = np.asarray(part.part("p")) - true_part("p", np.asarray(part.time))
@@ -221,7 +221,7 @@ def test_the_controls_are_those_that_led_to_each_row():
     ],
 )  # fmt: skip
 def test_bad_input_is_one_line(recording, robot, options, said):
-    with pytest.raises(kc.RecordingError, match=said) as caught:
+    with pytest.raises(kc.recordings.RecordingError, match=said) as caught:
         kc.estimate_states(recording, robot, **options)
     assert "\n" not in str(caught.value)
 
@@ -230,7 +230,7 @@ def test_the_paper_needs_every_orientation():
     recording = recorded()
     bodies = (dataclasses.replace(recording.bodies[0], quaternion=None), *recording.bodies[1:])
     recording = dataclasses.replace(recording, bodies=bodies)
-    with pytest.raises(kc.RecordingError, match="needs that of every body"):
+    with pytest.raises(kc.recordings.RecordingError, match="needs that of every body"):
         kc.estimate_states(recording, BARE, "paper")
     states = kc.estimate_states(recording, BARE)
     error = np.asarray(states.part("p")) - true_part("p", np.asarray(states.time))
@@ -238,9 +238,9 @@ def test_the_paper_needs_every_orientation():
 
 
 def test_systems_that_are_no_clamped_rods_are_turned_down():
-    class Other(kc.TendonRobot):
+    class Other(kc.robots.TendonRobot):
         base_unknowns = ("n", "w")
 
     other = Other(**{name: getattr(ROBOT, name) for name in ROBOT.parameters()})
-    with pytest.raises(kc.RecordingError, match="clamped"):
+    with pytest.raises(kc.recordings.RecordingError, match="clamped"):
         kc.estimate_states(recorded(), other)

@@ -43,7 +43,7 @@ def test_what_would_be_off_by_a_row_is_an_error(motion, tmp_path):
         _ = motion[::2].held_control
     motion[::2].save(tmp_path / "thinned.nc")
     with pytest.raises(ValueError, match="rows between were left out"):
-        kc.Measurements.of(kc.load_trajectory(tmp_path / "thinned.nc"))
+        kc.recordings.Measurements.of(kc.load_trajectory(tmp_path / "thinned.nc"))
     with pytest.raises(ValueError, match="finite"):
         kc.simulate(motion.system, motion.held_tension, DT)
 
@@ -52,7 +52,7 @@ def test_what_would_be_off_by_a_row_is_an_error(motion, tmp_path):
 def test_a_simulation_goes_through_a_table_without_error(robot, tensions, motion, tmp_path, ending):
     if ending == "parquet":
         pytest.importorskip("pyarrow")
-    seen = kc.Measurements.of(motion, FRACTIONS)
+    seen = kc.recordings.Measurements.of(motion, FRACTIONS)
     seen.save(tmp_path / f"motion.{ending}")
     loaded = kc.load_recording(tmp_path / f"motion.{ending}")
     assert loaded.simulated is True and seen.source in loaded.source
@@ -69,7 +69,7 @@ def test_a_simulation_goes_through_a_table_without_error(robot, tensions, motion
     assert found.tip_rmse < 1e-8 and found.pose_mse < 1e-15
     # and a row off, it is another motion
     late = np.concatenate([rows.tension[:1], rows.tension[:-1]])
-    assert evaluate(robot, kc.Measurements(**{**vars(rows), "tension": late})).tip_rmse > 1e-3
+    assert evaluate(robot, kc.recordings.Measurements(**{**vars(rows), "tension": late})).tip_rmse > 1e-3
 
 
 def test_a_table_written_by_hand_says_by_its_titles_that_tensions_are_held(motion, tensions, tmp_path):

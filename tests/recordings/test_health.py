@@ -138,7 +138,7 @@ def test_inspect_says_it_in_words(bag):
         "simulated: not stated",
         "at rest from 0.00 to 1.0",
         "/vicon/continuum_1/pose",
-        "measured less commanded [N]",
+        "measured minus commanded [N]",
         "warning: /vicon/continuum_3/pose: its axes were swapped at 3.000 s, by 90 degrees about (0, 0, 1)",
         "too long to be bridged (",
     ):

@@ -39,7 +39,7 @@ def test_what_was_put_in_is_found(virtual):
 
 def test_a_bag_read_with_another_statement_keeps_that(virtual):
     path, _ = virtual
-    config = kc.RecordingConfig.paper_robot().replace(simulated=False)
+    config = kc.recordings.RecordingConfig.paper_robot().replace(simulated=False)
     assert kc.load_recording(path, config).simulated is False
 
 
@@ -58,7 +58,7 @@ def test_friction_and_ribs_make_it_another_robot(virtual):
     _, truth = virtual
     bare = virtual_robot(10).replace(friction=0.0, rib_mass=0.0, sleeve_factor=1.0)
     without = kc.simulate(bare, np.asarray(truth.control)[5::5], 0.05)
-    assert kc.tip_rmse(without[21:], truth[105::5]) > 0.02
+    assert kc.metrics.tip_rmse(without[21:], truth[105::5]) > 0.02
 
 
 def test_signals_are_the_paper_s():

@@ -31,7 +31,7 @@ def rotations(h):
 
 L, RADIUS, DENSITY = 0.5, 0.005, 1000.0
 LEVEL = quaternion(0.0, np.pi / 2, 0.0)
-LOOSE = kc.SlenderRod(
+LOOSE = kc.robots.SlenderRod(
     length=L, radius=RADIUS, density=DENSITY, youngs_modulus=1e7, bending_damping=1e-3, nodes=11,
     base_end=Free(position=[0.0, 0.0, 0.0], orientation=LEVEL), linear_drag=0.0,
     surroundings=(Plane(stiffness=0.0, point=[0.0, 0.0, -0.2]),),
@@ -150,7 +150,7 @@ def test_a_rod_that_slides_is_slowed_by_friction():
 
 # held at the base, anywhere
 
-HELD = kc.SlenderRod(
+HELD = kc.robots.SlenderRod(
     length=L, radius=RADIUS, density=DENSITY, youngs_modulus=1e7, bending_damping=1e-3, nodes=11,
     base_end=Clamped(position=[0.0, 0.0, 0.0], orientation=[1.0, 0.0, 0.0, 0.0]),
 )  # fmt: skip
@@ -181,7 +181,7 @@ def test_where_the_base_is_moves_and_turns_everything():
 
 
 def quarter_period(amplitude, steps):
-    bar = kc.SlenderRod(
+    bar = kc.robots.SlenderRod(
         length=L, radius=0.01, density=DENSITY, youngs_modulus=1e11, nodes=11,
         base_end=Pinned(orientation=quaternion(0.0, np.pi - amplitude, 0.0)),
     )  # fmt: skip
@@ -220,7 +220,7 @@ BEAM = {
 @pytest.mark.parametrize("tip", [Clamped(), pytest.param(Pinned(), marks=pytest.mark.campaign)])
 def test_beams_held_at_both_ends(tip):
     w = 1e-3 * BEAM_EI
-    beam = kc.SlenderRod(**BEAM, tip_end=tip)
+    beam = kc.robots.SlenderRod(**BEAM, tip_end=tip)
     # the load is sideways: nothing else weighs
     beam = beam.replace(gravity=[w / float(beam.mass_per_length), 0.0, 0.0])
     found = kc.equilibrium(beam, np.zeros(0), space="lobatto4")
@@ -236,7 +236,7 @@ def test_beams_held_at_both_ends(tip):
 
 # a base that is driven
 
-DRIVEN = kc.SlenderRod(
+DRIVEN = kc.robots.SlenderRod(
     length=L, radius=RADIUS, density=DENSITY, youngs_modulus=1e7, bending_damping=2e-3, nodes=11,
     base_end=Driven(axes=("x", "ry", "z"), position=[0.1, 0.2, 0.3]),
     tip_end=Clamped(position=[0.12, 0.2, 0.75]),

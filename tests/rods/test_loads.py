@@ -15,7 +15,7 @@ from knode_cosserat.rods.loads import AttachedMass, DistributedWrench, Motion, P
 L, RADIUS, E = 0.5, 0.005, 1e8
 EI, GA = E * np.pi * RADIUS**4 / 4, E / 2.6 * np.pi * RADIUS**2
 #: loads 0 to 6: with all at zero but some, one compiled program serves every test of statics here
-LOADED = kc.SlenderRod(
+LOADED = kc.robots.SlenderRod(
     length=L, radius=RADIUS, density=1000.0, youngs_modulus=E, gravity=[0.0, 0.0, 0.0], nodes=11,
     loads=(
         PointWrench(at=0.35), PointWrench(at=0.6), DistributedWrench(begin=0.25, end=0.73),
@@ -289,7 +289,7 @@ def test_what_rounding_keeps_from_the_tip_is_at_the_tip(load):
     """Ten tenths are a digit less than one, and the load was not there at all."""
     beside = dataclasses.replace(load, at=sum([0.1] * 10))
     assert beside.at == 1.0 and dataclasses.replace(load, at=1.0 - 1e-8).at < 1.0
-    beam = kc.SlenderRod(length=0.5, radius=0.005, density=1e3, youngs_modulus=5e6, nodes=11)
+    beam = kc.robots.SlenderRod(length=0.5, radius=0.005, density=1e3, youngs_modulus=5e6, nodes=11)
     tips = [
         kc.equilibrium(beam.replace(loads=(each,)), np.zeros(0), space="lobatto4").tip_position[-1]
         for each in (beside, dataclasses.replace(load, at=1.0), dataclasses.replace(load, at=1.0 - 1e-8))

@@ -224,7 +224,7 @@ def test_displacements_for_a_wanted_pose_are_found_again():
         wanted = kc.equilibrium(ROBOT, displacements)
         pose = wanted.position[0, -1], wanted.quaternion[0, -1]
         found = kc.inverse_kinematics(ROBOT, *pose, low=-0.05, high=0.05)
-        assert found.result is kc.Reach.REACHED
+        assert found.result is kc.statics.Reach.REACHED
         if part < 1.0:
             np.testing.assert_allclose(found.control, displacements, atol=1e-7)
         reached = kc.equilibrium(ROBOT, found.control)
@@ -235,7 +235,7 @@ def test_displacements_for_a_wanted_pose_are_found_again():
 @pytest.mark.campaign
 def test_a_pose_beyond_the_actuators_is_not_reached():
     found = kc.inverse_kinematics(ROBOT, [0.0, 0.0, 0.6], low=-0.05, high=0.05)
-    assert found.result is kc.Reach.UNREACHABLE and np.all(found.control >= 0.05 - 1e-6)
+    assert found.result is kc.statics.Reach.UNREACHABLE and np.all(found.control >= 0.05 - 1e-6)
 
 
 # motion
@@ -288,7 +288,9 @@ def test_a_wrong_modulus_is_learned_from_one_trajectory():
     knowledge = ROBOT.replace(youngs_modulus=0.7 * ROBOT.youngs_modulus)
     model = kc.fit(knowledge, [swung()])
     unseen = kc.simulate(ROBOT, smooth(1), DT)
-    before, after = (kc.tip_rmse(kc.simulate(each, smooth(1), DT), unseen) for each in (knowledge, model))
+    before, after = (
+        kc.metrics.tip_rmse(kc.simulate(each, smooth(1), DT), unseen) for each in (knowledge, model)
+    )
     assert after < before / 1000
     # the legs are alike: one law is learned for all, and it is Young's modulus that was wrong
     found = {(each.target, each.function): each.coefficient for each in kc.explain(model)}
@@ -307,5 +309,5 @@ def test_a_file_gives_the_robot_back(tmp_path):
 
 
 def test_every_leg_needs_both_of_its_joints():
-    with pytest.raises(kc.ParameterError, match="there are 5 base_angles and 6 platform_angles"):
+    with pytest.raises(kc.robots.ParameterError, match="there are 5 base_angles and 6 platform_angles"):
         ROBOT.replace(base_angles=EVEN[:5])

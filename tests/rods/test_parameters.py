@@ -31,51 +31,60 @@ def test_matrices_in_three_ways(robot, given):
     [
         (
             {"youngs_modulo": 1e9},
-            "no parameter 'youngs_modulo'; did you mean youngs_modulus\\?; there are length, radius",
+            r"no parameter 'youngs_modulo'; there are length, radius, .*; did you mean youngs_modulus\?$",
         ),
-        ({"length": -0.1}, "length is -0.1; allowed is a number 0.001 to 20 m"),
-        ({"length": "long"}, "length is 'long'"),
-        ({"length": [1.0, 2.0]}, r"length has shape \(2,\)"),
-        ({"density": np.nan}, "density is nan"),
+        ({"length": -0.1}, r"length must be between 0.001 and 20 m \(got -0.1\)$"),
+        ({"length": "long"}, r"length must be a number between 0.001 and 20 m \(got 'long'\)$"),
+        ({"length": [1.0, 2.0]}, r"length must be a number .* \(got \[1, 2\]\)$"),
+        ({"density": np.nan}, r"density must be between .* \(got nan\)$"),
         ({"nodes": 1}, "nodes is 1; allowed is a whole number"),
         ({"nodes": 10.0}, "nodes is 10.0"),
-        ({"gravity": [0.0, 1.0]}, r"gravity has shape \(2,\)"),
-        ({"bending_stiffness": [[1.0, 0.5, 0], [0, 1, 0], [0, 0, 1]]}, "bending_stiffness is not symmetric"),
-        ({"bending_stiffness": [-1.0, 1.0, 1.0]}, "bending_stiffness is .*; allowed is one number, three"),
-        ({"drag": ["1", "2", "3"]}, "drag is"),
-        ({"drag": [True, True, False]}, "drag is"),
-        ({"drag": [[1.0], [1.0, 2.0]]}, "drag is"),
+        ({"gravity": [0.0, 1.0]}, r"gravity must be three numbers, .* \(got \[0, 1\]\)$"),
+        (
+            {"bending_stiffness": [[1.0, 0.5, 0], [0, 1, 0], [0, 0, 1]]},
+            r"bending_stiffness must be .*, not symmetric\)$",
+        ),
+        ({"bending_stiffness": [-1.0, 1.0, 1.0]}, "bending_stiffness must be one number, three"),
+        ({"drag": ["1", "2", "3"]}, "drag must be"),
+        ({"drag": [True, True, False]}, "drag must be"),
+        ({"drag": [[1.0], [1.0, 2.0]]}, "drag must be"),
     ],
 )
 def test_what_is_refused(robot, change, message):
-    with pytest.raises(kc.ParameterError, match=message) as caught:
+    with pytest.raises(kc.robots.ParameterError, match=message) as caught:
         robot.replace(**change)
     assert "\n" not in str(caught.value)
 
 
 def test_a_misspelt_name_of_a_constructor_is_answered_with_the_names():
     with pytest.raises(
-        kc.ParameterError, match=r"^TendonRobot has no parameter 'yongs_modulus'; did you mean"
+        kc.robots.ParameterError,
+        match=r"^TendonRobot has no parameter 'yongs_modulus'; .*; did you mean youngs_modulus\?$",
     ):
-        kc.TendonRobot(length=1.0, radius=0.01, density=1e3, yongs_modulus=1e9)
+        kc.robots.TendonRobot(length=1.0, radius=0.01, density=1e3, yongs_modulus=1e9)
     with pytest.raises(
-        kc.ParameterError, match=r"'trns'; did you mean turns\?; there are radius, phase, turns"
+        kc.robots.ParameterError, match=r"'trns'; there are radius, phase, turns, .*; did you mean turns\?"
     ):
-        kc.routing.Helical(0.02, 0.0, trns=1.0)
+        kc.robots.routing.Helical(0.02, 0.0, trns=1.0)
 
 
 def test_a_class_may_have_a_constructor_of_its_own():
-    class Wire(kc.SlenderRod):
+    class Wire(kc.robots.SlenderRod):
         def __init__(self, gauge):
             super().__init__(length=1.0, radius=1e-3 / gauge, density=8e3, youngs_modulus=2e11)
 
     assert Wire(gauge=2.0).radius == 5e-4
-    with pytest.raises(kc.ParameterError, match=r"^Wire has no parameter 'gage'; did you mean gauge"):
+    with pytest.raises(
+        kc.robots.ParameterError,
+        match=r"^Wire has no parameter 'gage'; there are gauge; did you mean gauge\?$",
+    ):
         Wire(gage=2.0)
 
 
 @pytest.mark.parametrize("short", [[1e-200, 0, 0, 0], [0, 0, 1e-9, 0], [0, 0, 0, 0]])
 def test_a_quaternion_has_a_length(short):
-    kc.ends.Clamped(orientation=[1e-8, 0, 0, 0])
-    with pytest.raises(kc.ParameterError, match=r"^Clamped: orientation is \[.* \(length above 1e-09\)"):
-        kc.ends.Clamped(orientation=short)
+    kc.robots.ends.Clamped(orientation=[1e-8, 0, 0, 0])
+    with pytest.raises(
+        kc.robots.ParameterError, match=r"^Clamped: orientation must be .* \(length above 1e-09\)"
+    ):
+        kc.robots.ends.Clamped(orientation=short)

@@ -9,7 +9,7 @@ from knode_cosserat.rods.parameters import ParameterError
 from knode_cosserat.rods.reels import Reels
 
 PAIRS = Reels(motors=(1, -1, 2, -2), radius=(0.02, 0.03), zero=(0.1, 0.0), taken_in=(1e-3, 1e-3, 0.0, 2e-3))
-ROBOT = kc.RoutedTendonRobot.like(
+ROBOT = kc.robots.RoutedTendonRobot.like(
     kc.load_robot("delrin-tendon-robot"), drive="reel", tendon_offset=0.02, tendon_compliance=1e-4,
     tendon_angles=(0.0, np.pi, np.pi / 2, -np.pi / 2), gravity=(0.0, 0.0, 0.0), nodes=6,
 )  # fmt: skip

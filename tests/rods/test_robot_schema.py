@@ -17,7 +17,7 @@ from knode_cosserat.recordings.virtual import virtual_robot
 from knode_cosserat.rods.robot_file import KINDS, RobotFileError, format_robot, parse_robot
 
 ROOT = Path(__file__).parents[2]
-SCHEMA = kc.robot_schema()
+SCHEMA = kc.robots.robot_schema()
 CHECK = jsonschema.Draft202012Validator(SCHEMA)
 CATALOG = files("knode_cosserat.rods") / "catalog"
 ROBOTS = {name: mapping_of((CATALOG / f"{name}.yaml").read_text("utf-8"), "") for name in kc.catalog()}
@@ -199,5 +199,5 @@ def test_an_editor_finds_what_it_needs():
         "# yaml-language-server: $schema=robot.schema.json\n"
         + (CATALOG / "six-legged-robot.yaml").read_text()
     )
-    assert isinstance(parse_robot(text, "it"), kc.ParallelRobot)
+    assert isinstance(parse_robot(text, "it"), kc.robots.ParallelRobot)
     assert yaml.safe_load(text)["kind"] == "parallel-robot"

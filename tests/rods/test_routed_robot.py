@@ -27,18 +27,18 @@ def moved(robot, steps=60, dt=0.025, control="sine:1.0", **options):
 @pytest.mark.parametrize("empty", [(), []])
 def test_a_robot_without_tendons_is_refused(empty):
     with pytest.raises(
-        kc.ParameterError, match=r"^routing is \[\]; allowed is one or more, one for each tendon"
+        kc.robots.ParameterError, match=r"^routing is \[\]; allowed is one or more, one for each tendon"
     ):
-        kc.RoutedTendonRobot.like(KNOWLEDGE, routing=empty)
-    text = format_robot(kc.RoutedTendonRobot.like(KNOWLEDGE)).replace("format: 1", "format: 2")
-    with pytest.raises(kc.RobotFileError, match=r"^mine.yaml: routing is \[\]; allowed is") as caught:
+        kc.robots.RoutedTendonRobot.like(KNOWLEDGE, routing=empty)
+    text = format_robot(kc.robots.RoutedTendonRobot.like(KNOWLEDGE)).replace("format: 1", "format: 2")
+    with pytest.raises(kc.robots.RobotFileError, match=r"^mine.yaml: routing is \[\]; allowed is") as caught:
         parse_robot(text + "  routing: []\n", "mine.yaml")
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("tension", [0.5, 3.0])
 def test_one_tendon_bends_the_rod_evenly(tension):
-    robot = kc.RoutedTendonRobot.like(KNOWLEDGE, **NO_LOADS)
+    robot = kc.robots.RoutedTendonRobot.like(KNOWLEDGE, **NO_LOADS)
     bent = kc.equilibrium(robot, np.array([tension, 0.0, 0.0, 0.0]))
     curvature = tension * 0.02 / float(robot.Kbt[0, 0])
     towards_the_tendon = curvature * np.sqrt(0.5) * np.array([-1.0, 1.0, 0.0])
@@ -47,8 +47,8 @@ def test_one_tendon_bends_the_rod_evenly(tension):
 
 @pytest.mark.campaign
 def test_one_tendon_bends_the_rod_to_a_circle():
-    tension, robot = 3.0, kc.RoutedTendonRobot.like(KNOWLEDGE, **NO_LOADS, nodes=40)
-    bent = kc.equilibrium(robot, np.array([tension, 0.0, 0.0, 0.0]), space=kc.Lobatto4())
+    tension, robot = 3.0, kc.robots.RoutedTendonRobot.like(KNOWLEDGE, **NO_LOADS, nodes=40)
+    bent = kc.equilibrium(robot, np.array([tension, 0.0, 0.0, 0.0]), space=kc.solvers.Lobatto4())
     L, curvature = 0.635, tension * 0.02 / float(robot.Kbt[0, 0])
     squeezed = 1.0 - tension / float(robot.Kse[2, 2])
     away = (1.0 - np.cos(curvature * L)) / curvature * squeezed
@@ -63,12 +63,12 @@ def test_tendons_pull_the_rod_to_their_side_like_the_crude_model():
         pulled = np.zeros(4)
         pulled[k] = 1.0
         crude = kc.equilibrium(KNOWLEDGE, pulled).tip_position[-1, :2]
-        real = kc.equilibrium(kc.RoutedTendonRobot.like(KNOWLEDGE), pulled).tip_position[-1, :2]
+        real = kc.equilibrium(kc.robots.RoutedTendonRobot.like(KNOWLEDGE), pulled).tip_position[-1, :2]
         assert np.dot(crude, real) > 0.99 * np.linalg.norm(crude) * np.linalg.norm(real)
 
 
 def test_a_quarter_turn_of_the_tendons_is_a_quarter_turn_of_the_robot():
-    robot = kc.RoutedTendonRobot.like(KNOWLEDGE, **RUBBING, sections=(Sleeve(stiffening=1.0),))
+    robot = kc.robots.RoutedTendonRobot.like(KNOWLEDGE, **RUBBING, sections=(Sleeve(stiffening=1.0),))
     control = kc.controls.parse("random:3", 60, 0.025)
     one, other = kc.simulate(robot, control, 0.025), kc.simulate(robot, np.roll(control, 1, axis=1), 0.025)
     turned = Rotation.from_euler("z", 90, degrees=True).apply(one.position.reshape(-1, 3))
@@ -77,9 +77,9 @@ def test_a_quarter_turn_of_the_tendons_is_a_quarter_turn_of_the_robot():
 
 @pytest.mark.campaign
 def test_nothing_is_remembered_without_friction():
-    robot = kc.RoutedTendonRobot.like(KNOWLEDGE)
+    robot = kc.robots.RoutedTendonRobot.like(KNOWLEDGE)
     assert robot.z_layout.names == ("v", "u") and "loss" not in robot.y_layout.names
-    rubbing = kc.RoutedTendonRobot.like(KNOWLEDGE, **RUBBING)
+    rubbing = kc.robots.RoutedTendonRobot.like(KNOWLEDGE, **RUBBING)
     there_and_back = np.concatenate([np.linspace(0, 3, 80), np.linspace(3, 0, 80), np.zeros(80)])
     control = np.outer(there_and_back, [1.0, 0.0, 0.0, 0.0]) + 3.0
     for each, least, most in ((robot, 0.0, 2e-4), (rubbing, 2e-3, 1.0)):
@@ -91,20 +91,20 @@ def test_nothing_is_remembered_without_friction():
 @pytest.mark.campaign
 def test_friction_is_the_same_however_fine_the_time_steps_are():
     """Quasi-static: friction has no time in it, only the way that was gone."""
-    robot = kc.RoutedTendonRobot.like(KNOWLEDGE, **{**RUBBING, "bending_damping": 0.03})
+    robot = kc.robots.RoutedTendonRobot.like(KNOWLEDGE, **{**RUBBING, "bending_damping": 0.03})
 
     def tip(steps, time):
         pull = 2.0 * (1.0 - np.cos(2 * np.pi * np.arange(1, steps + 1) / steps)) * (20.0 / 20.0)
         control = np.outer(pull, [1.0, 0.0, 0.0, 0.0]) + 3.0
         return kc.simulate(robot, control, 20.0 / steps, time=time).tip_position[-1]
 
-    exact = tip(3200, kc.BDF2())
-    errors = [np.linalg.norm(tip(steps, kc.BDF1()) - exact) for steps in (200, 400, 800)]
+    exact = tip(3200, kc.solvers.BDF2())
+    errors = [np.linalg.norm(tip(steps, kc.solvers.BDF1()) - exact) for steps in (200, 400, 800)]
     assert errors[0] > 1.6 * errors[1] > 2.5 * errors[2]
 
 
 def test_friction_stays_between_none_and_all_and_opposes_motion():
-    robot = kc.RoutedTendonRobot.like(KNOWLEDGE, **RUBBING)
+    robot = kc.robots.RoutedTendonRobot.like(KNOWLEDGE, **RUBBING)
     along = moved(robot, 160, control="random:1")
     f = np.asarray(along.z)[..., 6:10]
     assert np.all(np.abs(f) <= 1.0) and np.abs(f).max() > 0.5
@@ -122,7 +122,7 @@ def test_friction_stays_between_none_and_all_and_opposes_motion():
 
 @pytest.mark.campaign
 def test_vibration_frees_the_tendons_and_stays_until_tension_falls():
-    robot = kc.RoutedTendonRobot.like(
+    robot = kc.robots.RoutedTendonRobot.like(
         KNOWLEDGE, **RUBBING, vibration=Vibration(tension=20.0, rate=1.0, softening=1e-3)
     )
     total = np.concatenate([np.full(20, 16.0), np.full(20, 24.0), np.full(20, 18.0)])
@@ -134,7 +134,7 @@ def test_vibration_frees_the_tendons_and_stays_until_tension_falls():
 
 @pytest.mark.campaign
 def test_derivatives_are_those_of_the_solution():
-    robot = kc.RoutedTendonRobot.like(KNOWLEDGE, **RUBBING, sections=(Sleeve(stiffening=1.0),))
+    robot = kc.robots.RoutedTendonRobot.like(KNOWLEDGE, **RUBBING, sections=(Sleeve(stiffening=1.0),))
     control = kc.controls.parse("sine:0.7", 30, 0.05)
 
     def tip(wobble, reach):
@@ -152,7 +152,7 @@ def test_derivatives_are_those_of_the_solution():
 
 @pytest.mark.campaign
 def test_the_batch_does_what_each_robot_does():
-    robot = kc.RoutedTendonRobot.like(KNOWLEDGE, **RUBBING)
+    robot = kc.robots.RoutedTendonRobot.like(KNOWLEDGE, **RUBBING)
     controls = np.stack([kc.controls.parse(f"random:{k}", 40, 0.05) for k in range(3)])
     together = kc.simulate(robot, controls, 0.05)
     for k, control in enumerate(controls):
@@ -163,7 +163,7 @@ def test_the_batch_does_what_each_robot_does():
 
 @pytest.mark.campaign
 def test_strong_pulls_and_much_friction_are_solved_or_reported():
-    robot = kc.RoutedTendonRobot.like(
+    robot = kc.robots.RoutedTendonRobot.like(
         KNOWLEDGE, friction=TendonFriction(wobble=1.0, reach=0.03), bending_damping=2e-3
     )
     for seed in range(4):

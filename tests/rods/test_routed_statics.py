@@ -29,7 +29,7 @@ PATHS = (
         *([0.02 * f(2.5), -0.012 / 0.73 * f(2.5)] for f in (np.cos, np.sin)), L, T, end=0.73
     ),
 )
-ROBOT = kc.RoutedTendonRobot.like(DELRIN, routing=ROUTING, bending_damping=0.0)
+ROBOT = kc.robots.RoutedTendonRobot.like(DELRIN, routing=ROUTING, bending_damping=0.0)
 
 
 def rest(tensions, nodes=41):
@@ -69,8 +69,8 @@ def test_order_four_with_tendons_that_end_at_and_between_nodes():
 
 # reels
 
-REELED = kc.RoutedTendonRobot.like(DELRIN, drive="reel", tendon_compliance=0.0, bending_damping=0.03)
-PULLED = kc.RoutedTendonRobot.like(DELRIN, bending_damping=0.03)
+REELED = kc.robots.RoutedTendonRobot.like(DELRIN, drive="reel", tendon_compliance=0.0, bending_damping=0.03)
+PULLED = kc.robots.RoutedTendonRobot.like(DELRIN, bending_damping=0.03)
 
 
 def field(found, name, row=-1):
@@ -153,7 +153,7 @@ def test_a_batch_of_reeled_robots_is_each_by_itself():
 
 def helices(turn=0.0):
     routing = tuple(Helical(0.02, turn + k * np.pi / 2, 0.5) for k in range(4))
-    return kc.RoutedTendonRobot.like(
+    return kc.robots.RoutedTendonRobot.like(
         DELRIN, routing=routing, friction=TendonFriction(wobble=0.6, curvature=0.3, reach=0.02),
         gravity=[0.0, 0.0, 0.0],
     )  # fmt: skip

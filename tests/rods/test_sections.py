@@ -15,15 +15,15 @@ from knode_cosserat.rotation import rotation_matrix
 
 L, RADIUS, E = 0.4, 0.006, 1e7
 EI, GA = E * np.pi * RADIUS**4 / 4, E / 2.6 * np.pi * RADIUS**2
-CHANGED = kc.SlenderRod(
+CHANGED = kc.robots.SlenderRod(
     length=L, radius=RADIUS, density=1000.0, youngs_modulus=E, gravity=[0.0, 0.0, 0.0], nodes=11,
     bending_damping=1e-4,
     sections=(
-        kc.Stretch(
+        kc.robots.Stretch(
             end=0.47, radius=[1.0, 0.0], stiffness=[1.0, 0.0], controlled=True,
             stiffness_gain=0.0, curvature_gain=[0.0, 0.0, 0.0],
         ),
-        kc.Stretch(
+        kc.robots.Stretch(
             begin=0.47, radius=[1.0, 0.0], stiffness=[1.0, 0.0], controlled=True,
             stiffness_gain=0.0, curvature_gain=[0.0, 0.0, 0.0],
         ),
@@ -99,12 +99,12 @@ BENT = {0: ([1.0, 6.0, -2.0], [3.0, 5.0, -1.5]), 1: ([-4.0, 3.0, 5.0], [-4.5, 5.
 def resting(*stretches, cut, nodes=11):
     """Curved at rest, each stretch from its first curvature to its second."""
     (a, b), (c, d) = (np.asarray(each) for each in stretches)
-    return kc.SlenderRod(
+    return kc.robots.SlenderRod(
         length=L, radius=RADIUS, density=1000.0, youngs_modulus=E, gravity=[0.0, 0.0, 0.0], nodes=nodes,
         bending_damping=1e-3,
         sections=(
-            kc.Stretch(end=cut, curvature=a, curvature_slope=b - a),
-            kc.Stretch(begin=cut, curvature=c, curvature_slope=d - c),
+            kc.robots.Stretch(end=cut, curvature=a, curvature_slope=b - a),
+            kc.robots.Stretch(begin=cut, curvature=c, curvature_slope=d - c),
         ),
     )  # fmt: skip
 
@@ -202,9 +202,11 @@ def test_one_stretch_is_two():
     """A function over all of the rod is the polynomials in its two parts."""
 
     def function(part, control):
-        return kc.Differences(radius=1.0 - 0.3 * part, curvature=np.array([1.0, 0.0, 2.0]) * control[0])
+        return kc.robots.Differences(
+            radius=1.0 - 0.3 * part, curvature=np.array([1.0, 0.0, 2.0]) * control[0]
+        )
 
-    whole = dataclasses.replace(CHANGED, sections=(kc.FunctionSection(function=function, inputs=1),))
+    whole = dataclasses.replace(CHANGED, sections=(kc.robots.FunctionSection(function=function, inputs=1),))
     parts = changed(
         {"curvature_gain": [1.0, 0.0, 2.0]}, radius_0=[1.0, -0.141], radius_1=[0.859, -0.159]
     )  # fmt: skip
@@ -263,22 +265,26 @@ def test_derivatives_with_respect_to_a_section_and_its_control():
 )
 def test_nothing_is_left_of_no_section(given, said):
     with pytest.raises(ValueError, match=said):
-        kc.Stretch(**given)
-    kc.Stretch(radius=[1.0, -3.9, 4.0])
+        kc.robots.Stretch(**given)
+    kc.robots.Stretch(radius=[1.0, -3.9, 4.0])
 
 
 @pytest.mark.parametrize("gain", [0.2, -0.2])
 def test_a_control_leaves_some_stiffness(gain):
-    rod = kc.SlenderRod(
+    rod = kc.robots.SlenderRod(
         length=L, radius=RADIUS, density=1000.0, youngs_modulus=E,
-        sections=(kc.Stretch(controlled=True, stiffness_gain=gain),),
+        sections=(kc.robots.Stretch(controlled=True, stiffness_gain=gain),),
     )  # fmt: skip
     limit = -1.0 / gain
     assert kc.equilibrium(rod, np.array([0.9 * limit])).all_valid
     for beyond in (limit, 1.2 * limit):
-        for ask in (kc.equilibrium, kc.configuration, lambda rod, control: kc.workspace(rod, control[None])):
+        for ask in (
+            kc.equilibrium,
+            kc.statics.configuration,
+            lambda rod, control: kc.workspace(rod, control[None]),
+        ):
             with pytest.raises(ValueError, match=r"section0_input is .* allowed is (above|below)"):
                 ask(rod, np.array([beyond]))
-    stepper = kc.Stepper(rod, 0.02)
+    stepper = kc.solvers.Stepper(rod, 0.02)
     with pytest.raises(ValueError, match="section0_input"):
         stepper.step(np.array([1.2 * limit]))

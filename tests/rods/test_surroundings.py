@@ -40,9 +40,11 @@ def test_a_direction_is_of_any_length(length):
 @pytest.mark.parametrize("given", [[0, 0, 0], [0, 1e-12, 0], [1e-9, 0, 0], [1e-200, 0, 0]])
 @pytest.mark.parametrize(("cls", "name"), [(Plane, "normal"), (Cylinder, "axis")])
 def test_but_of_some(cls, name, given):
-    with pytest.raises(ParameterError, match=rf"^{cls.__name__}: {name} is \[.*direction, .*above 1e-09\), "):
+    with pytest.raises(
+        ParameterError, match=rf"^{cls.__name__}: {name} must be a direction, .*above 1e-09\), "
+    ):
         cls(**{name: given})
-    with pytest.raises(ParameterError, match=rf"^{cls.__name__}: {name} is 'up'; allowed is a direction"):
+    with pytest.raises(ParameterError, match=rf"^{cls.__name__}: {name} must be a direction, .*got 'up'"):
         cls(**{name: "up"})
 
 

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
+from knode_cosserat.rods.relaxation import Relaxation
 from knode_cosserat.rods.viscoelastic_rod import ViscoelasticRod
 
 BODY = {
     "length": 0.1, "radius": 0.015, "density": 1070.0, "youngs_modulus": 2.6e5, "nodes": 6,
-    "bending_damping": 1e-4, "loads": kc.loads.PointWrench(force=(1.0, 0.0, 0.0), controlled=True),
+    "bending_damping": 1e-4, "loads": kc.robots.loads.PointWrench(force=(1.0, 0.0, 0.0), controlled=True),
     "gravity": (0.0, 0.0, 0.0),
 }  # fmt: skip
 
@@ -18,20 +19,20 @@ def bent(rod, force=0.05):
 
 
 def test_at_rest_it_is_elastic():
-    elastic = bent(kc.SlenderRod(**BODY))
+    elastic = bent(kc.robots.SlenderRod(**BODY))
     assert bent(ViscoelasticRod(**BODY, branch_stiffness=2.0)) == pytest.approx(elastic, rel=1e-9)
 
 
 def test_without_its_branch_it_is_a_slender_rod():
     control = np.full((20, 1), 0.05)
-    plain = kc.simulate(kc.SlenderRod(**BODY), control, 5e-3)
+    plain = kc.simulate(kc.robots.SlenderRod(**BODY), control, 5e-3)
     rod = kc.simulate(ViscoelasticRod(**BODY, branch_stiffness=0.0), control, 5e-3)
     np.testing.assert_allclose(rod.tip_position, plain.tip_position, atol=1e-9)
 
 
 def test_under_a_lasting_force_it_creeps_from_the_stiff_shape_to_that_at_rest():
     rod = ViscoelasticRod(**BODY, branch_stiffness=1.0, relaxation_time=5.0)
-    stiff = bent(kc.SlenderRod(**{**BODY, "youngs_modulus": 2 * BODY["youngs_modulus"]}))
+    stiff = bent(kc.robots.SlenderRod(**{**BODY, "youngs_modulus": 2 * BODY["youngs_modulus"]}))
     # the vibration has died out after a second; the branch is a fifth of the way
     x = kc.simulate(rod, np.full((2000, 1), 0.05), 0.02).tip_position[:, 0]
     assert stiff < x[50] < 1.2 * stiff
@@ -50,3 +51,20 @@ def test_both_ways_to_state_the_law_agree():
     z = rod.strains(0.05, 0.0, y, np.zeros(1), history)
     C, D, f2 = rod.constitutive(0.05, 0.0, y, np.zeros(19), np.zeros(1))
     np.testing.assert_allclose(C @ z + D @ (history.c0 * z + history.z), f2, atol=1e-8 * np.abs(f2).max())
+
+
+def test_relaxation_of_a_tendon_robot_is_that_of_the_rod():
+    """A robot whose tendons pull with nothing moves under its weight as a rod of the same material."""
+    body = {name: value for name, value in BODY.items() if name != "loads"} | {"gravity": (9.81, 0.0, 0.0)}
+    stiff = 1e9 * np.eye(3)
+    rod = ViscoelasticRod(**body, shear_stiffness=stiff, branch_stiffness=1.5, relaxation_time=0.2)
+    robot = kc.RoutedTendonRobot(
+        **body, shear_stiffness=stiff, tendon_offset=0.01, relaxation=Relaxation(stiffness=1.5, time=0.2)
+    )
+    none, slack = np.zeros((40, 0)), np.zeros((40, 4))
+    expected = kc.simulate(rod, none, 0.01, initial=kc.equilibrium(rod.replace(gravity=(0.0, 0.0, 0.0)), []))
+    found = kc.simulate(
+        robot, slack, 0.01, initial=kc.equilibrium(robot.replace(gravity=(0.0, 0.0, 0.0)), np.zeros(4))
+    )
+    assert np.ptp(expected.tip_position[:, 0]) > 5e-3
+    np.testing.assert_allclose(found.tip_position, expected.tip_position, atol=1e-7)

@@ -13,25 +13,28 @@ from knode_cosserat.solvers.history import rest_record
 from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.space import SCHEMES
 
-HELIX = tuple(kc.routing.Helical(0.02, phase, 0.5, end=end) for phase, end in ((0.3, 1.0), (2.4, 0.63)))
+HELIX = tuple(
+    kc.robots.routing.Helical(0.02, phase, 0.5, end=end) for phase, end in ((0.3, 1.0), (2.4, 0.63))
+)
 BEAM = {"length": 0.5, "radius": 0.005, "density": 1200.0, "youngs_modulus": 5e6}
 ROBOTS = {
     "crude": lambda: kc.load_robot("delrin-tendon-robot"),
     "ribs, a sleeve and masses": lambda: kc.load_robot("delrin-routed-tendon-robot"),
-    "helical, one ends": lambda: kc.RoutedTendonRobot.like(
+    "helical, one ends": lambda: kc.robots.RoutedTendonRobot.like(
         kc.load_robot("delrin-tendon-robot"), routing=HELIX
     ),
-    "friction": lambda: kc.RoutedTendonRobot.like(
+    "friction": lambda: kc.robots.RoutedTendonRobot.like(
         kc.load_robot("delrin-tendon-robot"), friction=TendonFriction(wobble=0.6)
     ),
-    "friction, one ends": lambda: kc.RoutedTendonRobot.like(
+    "friction, one ends": lambda: kc.robots.RoutedTendonRobot.like(
         kc.load_robot("delrin-tendon-robot"), routing=HELIX, friction=TendonFriction(curvature=0.1)
     ),
-    "reel": lambda: kc.RoutedTendonRobot.like(
+    "reel": lambda: kc.robots.RoutedTendonRobot.like(
         kc.load_robot("delrin-tendon-robot"), drive="reel", tendon_compliance=1e-4
     ),
-    "sections that are controlled": lambda: kc.SlenderRod(
-        **BEAM, sections=(kc.Stretch(end=0.37, stiffness=[2.0, -0.5], controlled=True, stiffness_gain=0.3),)
+    "sections that are controlled": lambda: kc.robots.SlenderRod(
+        **BEAM,
+        sections=(kc.robots.Stretch(end=0.37, stiffness=[2.0, -0.5], controlled=True, stiffness_gain=0.3),),
     ),
     "six legs": lambda: kc.load_robot("six-legged-robot"),
 }

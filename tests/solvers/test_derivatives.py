@@ -107,11 +107,11 @@ def test_gradient_and_tangent_of_the_robot_by_other_schemes():
 class Bar(kc.System):
     """A bar that only stretches, softer the more it does, damped, with drag, under a load along it (N/m)."""
 
-    y_layout: ClassVar[kc.Layout] = kc.Layout(
+    y_layout: ClassVar[kc.robots.Layout] = kc.robots.Layout(
         ("p", 1, "m", "position"), ("n", 1, "N", "force"), ("q", 1, "m/s", "velocity")
     )
-    z_layout: ClassVar[kc.Layout] = kc.Layout(("v", 1, "1", "stretch"))
-    control_layout: ClassVar[kc.Layout] = kc.Layout(("load", 1, "N/m", "load"))
+    z_layout: ClassVar[kc.robots.Layout] = kc.robots.Layout(("v", 1, "1", "stretch"))
+    control_layout: ClassVar[kc.robots.Layout] = kc.robots.Layout(("load", 1, "N/m", "load"))
     base_unknowns: ClassVar[tuple[str, ...]] = ("n",)
     mixed: ClassVar[bool] = False
 

@@ -84,8 +84,8 @@ interpolated = jax.jit(at_places, static_argnums=1)
 
 def changing(cuts, nodes):
     """A rod whose section changes at these parts of its length."""
-    return kc.SlenderRod(
-        **BEAM, nodes=nodes, sections=tuple(kc.Stretch(end=cut, stiffness=[2.0]) for cut in cuts)
+    return kc.robots.SlenderRod(
+        **BEAM, nodes=nodes, sections=tuple(kc.robots.Stretch(end=cut, stiffness=[2.0]) for cut in cuts)
     )
 
 
@@ -152,7 +152,7 @@ def test_where_places_are_nodes_they_are_as_those():
 
 # equations over pieces
 
-STIFFER = (kc.Stretch(end=0.1, stiffness=[2.0]), kc.Stretch(begin=0.105, stiffness=[0.8]))
+STIFFER = (kc.robots.Stretch(end=0.1, stiffness=[2.0]), kc.robots.Stretch(begin=0.105, stiffness=[0.8]))
 
 
 def one_piece(problem):
@@ -180,10 +180,12 @@ def one_piece(problem):
     "changes",
     [
         pytest.param(
-            {"sections": STIFFER, "loads": (kc.loads.AttachedMass(at=0.52, mass=0.01),)}, id="parted"
+            {"sections": STIFFER, "loads": (kc.robots.loads.AttachedMass(at=0.52, mass=0.01),)}, id="parted"
         ),
         pytest.param(
-            {"loads": (kc.loads.AttachedMass(at=4 / 9, mass=0.01),)}, id="whole", marks=pytest.mark.campaign
+            {"loads": (kc.robots.loads.AttachedMass(at=4 / 9, mass=0.01),)},
+            id="whole",
+            marks=pytest.mark.campaign,
         ),
     ],
 )
@@ -226,7 +228,7 @@ def test_pieces_side_by_side_as_one_after_the_other(space, changes):
         assert linearisation.G is None
 
 
-class RememberingSlopes(kc.SlenderRod):
+class RememberingSlopes(kc.robots.SlenderRod):
     """The same rod, as if its equations asked for the history of y_s."""
 
     mixed = True
@@ -235,8 +237,8 @@ class RememberingSlopes(kc.SlenderRod):
 def test_a_history_of_slopes_begins_with_those_of_its_places():
     beam = {"length": 0.5, "radius": 0.005, "density": 1200.0, "youngs_modulus": 1e8, "nodes": 8}
     plain, other = (
-        rod(**beam, sections=(kc.Stretch(end=0.317, stiffness=[2.0]),))
-        for rod in (kc.SlenderRod, RememberingSlopes)
+        rod(**beam, sections=(kc.robots.Stretch(end=0.317, stiffness=[2.0]),))
+        for rod in (kc.robots.SlenderRod, RememberingSlopes)
     )
     begun = jax.jit(lambda rod: initial_past(rod, Settings(), rest_record(rod), jnp.zeros(0)))
     past = begun(other)
@@ -263,10 +265,10 @@ def test_a_discontinuity_close_beside_a_node_costs_no_accuracy(off):
     """Taken to be on the node, and looked at from beyond where it is, it was of order 1."""
 
     def tip(at):
-        rod = kc.SlenderRod(
+        rod = kc.robots.SlenderRod(
             length=0.5, radius=0.005, density=1200.0, youngs_modulus=5e6, nodes=11,
-            sections=(kc.Stretch(begin=at, stiffness=[0.2]),),
-            loads=(kc.loads.PointWrench(force=[0.1, 0.0, 0.0]),),
+            sections=(kc.robots.Stretch(begin=at, stiffness=[0.2]),),
+            loads=(kc.robots.loads.PointWrench(force=[0.1, 0.0, 0.0]),),
         )  # fmt: skip
         return kc.equilibrium(rod, np.zeros(0), space="lobatto4").tip_position[-1]
 

@@ -65,7 +65,7 @@ def test_a_motion_goes_on_as_if_it_had_not_been_parted(rod, time, tmp_path):
     first = kc.simulate(rod, NONE[:4], DT, space="lobatto4", time=time)
     second = gone_on(rod, first, 4, time=time)
     second.save(tmp_path / "second.nc")
-    stepper = kc.Stepper(rod, DT, space="lobatto4", time=time)
+    stepper = kc.solvers.Stepper(rod, DT, space="lobatto4", time=time)
     for _ in range(8):
         row = stepper.step(np.zeros(0))
     for before, count in (
@@ -91,7 +91,7 @@ def test_the_middle_of_a_motion_is_known_at_its_nodes_only(rod, whole):
 
 def test_rows_tell_what_the_last_step_looked_back_on(rod, whole):
     """The past that is found again is the one that the solver had."""
-    settings = Settings.of("bdf2", "lobatto4", "paper", kc.NewtonOptions())
+    settings = Settings.of("bdf2", "lobatto4", "paper", kc.solvers.NewtonOptions())
     begins = beginning(Run(rod, NONE, None, settings, DT, None, False))
     task = Task(settings, DT, len(NONE))
     _, past, _ = loop_one(rod, settings, task.table, NONE, DT, begins.start.past, 0, len(NONE))
@@ -131,13 +131,14 @@ def test_only_an_equilibrium_is_taken_for_one(rod):
 @pytest.mark.parametrize("space", ["lobatto2", pytest.param("lobatto4", marks=pytest.mark.campaign)])
 def test_rest_is_rest_at_all_places(space):
     """Also beside a discontinuity, on either side of it."""
-    bent = kc.SlenderRod(
+    bent = kc.robots.SlenderRod(
         length=0.5, radius=0.005, density=1200.0, youngs_modulus=5e6, nodes=6,
         sections=(
-            kc.Stretch(end=0.4, curvature=[6.0, 0.0, 0.0]), kc.Stretch(begin=0.73, curvature=[0.0, 3.0, 0.0]),
+            kc.robots.Stretch(end=0.4, curvature=[6.0, 0.0, 0.0]),
+            kc.robots.Stretch(begin=0.73, curvature=[0.0, 3.0, 0.0]),
         ),
     )  # fmt: skip
-    past = jax.jit(resting_past, static_argnums=1)(bent, kc.Settings(space=SCHEMES[space]))
+    past = jax.jit(resting_past, static_argnums=1)(bent, kc.solvers.Settings(space=SCHEMES[space]))
     records, grid = past.records[0], grid_of(bent, SCHEMES[space])
     u = bent.z_layout.get(records[..., bent.y_layout.size :], "u")
     middle = (grid.segment + grid.bounds.mean(axis=1)) / (bent.nodes - 1)
@@ -259,7 +260,11 @@ def growth(formula, time, passed):
     return largest
 
 
-@pytest.mark.parametrize("time", [kc.BDF1(), kc.BDF2(), kc.BDFAlpha(-0.3), kc.Trapezoidal()], ids=repr)
+@pytest.mark.parametrize(
+    "time",
+    [kc.solvers.BDF1(), kc.solvers.BDF2(), kc.solvers.BDFAlpha(-0.3), kc.solvers.Trapezoidal()],
+    ids=repr,
+)
 @pytest.mark.parametrize("space", ["lobatto2", "lobatto4"])
 def test_waves_grow_in_no_time_step(space, time):
     """Short or long: with history interpolated between nodes they grew where segments were long."""
@@ -272,6 +277,6 @@ def test_waves_grow_in_no_time_step(space, time):
 def test_schemes_with_a_memory_of_rates_stay_smooth_along_the_rod(alpha):
     """Where history was interpolated, waves between two nodes grew by up to a half a step."""
     rod = soft_rod().replace(nodes=11)
-    found = kc.simulate(rod, np.zeros((80, 0)), 5e-3, time=kc.BDFAlpha(alpha), space="lobatto4")
+    found = kc.simulate(rod, np.zeros((80, 0)), 5e-3, time=kc.solvers.BDFAlpha(alpha), space="lobatto4")
     rough = np.abs(np.diff(found.part("q"), n=4, axis=1)).max(axis=(1, 2))
     assert rough[-1] < 0.1 * np.abs(found.part("q")).max()

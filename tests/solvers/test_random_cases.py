@@ -23,7 +23,7 @@ HARD = (2, 13, 102, 197)
 
 @dataclasses.dataclass
 class Case:
-    robot: kc.TendonRobot
+    robot: kc.robots.TendonRobot
     tensions: np.ndarray
     dt: float
 
@@ -55,7 +55,7 @@ def draw(seed: int, nodes: tuple[int, ...] = NODES, undamped: bool = False) -> C
     else:
         tensions = generator.uniform(size=(STEPS, 4))
     transverse = np.hypot(tensions @ np.cos(ANGLES), tensions @ np.sin(ANGLES)).max()
-    robot = kc.TendonRobot(
+    robot = kc.robots.TendonRobot(
         length=length,
         radius=radius,
         density=density,

@@ -89,7 +89,7 @@ def with_loads(seed):
         AttachedMass(at=0.6, mass=mass * draws.log(0.1, 2.0), offset=draws.vector(0.1 * L)),
         AttachedMass(at=1.0, mass=mass * draws.log(0.01, 0.5), inertia=np.full(3, 0.01 * mass * L**2)),
     )
-    return Case(kc.SlenderRod(**parameters, loads=loads), draws.signals(2, -1.0, 1.0), dt)
+    return Case(kc.robots.SlenderRod(**parameters, loads=loads), draws.signals(2, -1.0, 1.0), dt)
 
 
 def with_ends(seed, hurry=QUICK):
@@ -104,7 +104,7 @@ def with_ends(seed, hurry=QUICK):
     )
     control = draws.signals(3, -1.0, 1.0) * np.array([0.1 * L, 0.05 * L, 0.4])
     control = unhurried(control, hurry * times * np.array([L, L, 1.0]))
-    return Case(kc.SlenderRod(**parameters, base_end=base, tip_end=tip), control, dt)
+    return Case(kc.robots.SlenderRod(**parameters, base_end=base, tip_end=tip), control, dt)
 
 
 def in_contact(seed, hurry=QUICK):
@@ -125,21 +125,21 @@ def in_contact(seed, hurry=QUICK):
     base = Driven(axes=("x", "z", "ry"))
     control = draws.signals(3, 0.0, 1.0) * np.array([0.2 * L, 0.2 * L, 0.5])
     control = unhurried(control, hurry * times * np.array([L, L, 1.0]))
-    return Case(kc.SlenderRod(**parameters, base_end=base, surroundings=surroundings), control, dt)
+    return Case(kc.robots.SlenderRod(**parameters, base_end=base, surroundings=surroundings), control, dt)
 
 
 def with_sections(seed):
     draws = Draws(seed)
     parameters, _, L, dt, _ = rod(draws)
     sections = tuple(
-        kc.Stretch(
+        kc.robots.Stretch(
             begin=begin, end=end, controlled=True, radius=[1.0, draws.generator.uniform(-0.3, 0.3)],
             stiffness=[draws.log(0.3, 3.0)], curvature=draws.vector(2.0 / L), stiffness_gain=0.3,
             curvature_gain=draws.vector(4.0 / L),
         )
         for begin, end in ((0.0, 0.37), (0.37, 1.0))
     )  # fmt: skip
-    return Case(kc.SlenderRod(**parameters, sections=sections), draws.signals(2, -1.0, 1.0), dt)
+    return Case(kc.robots.SlenderRod(**parameters, sections=sections), draws.signals(2, -1.0, 1.0), dt)
 
 
 def with_tendons(seed, drive="tension", hurry=QUICK):
@@ -162,7 +162,7 @@ def with_tendons(seed, drive="tension", hurry=QUICK):
     else:
         control = draws.signals(4, 0.0, 3.0 * EI / (L * r))
         more = {"friction": TendonFriction(wobble=draws.log(0.01, 1.0) / L, curvature=draws.log(0.01, 0.5))}
-    return Case(kc.RoutedTendonRobot(**parameters, routing=routing, **more), control, dt)
+    return Case(kc.robots.RoutedTendonRobot(**parameters, routing=routing, **more), control, dt)
 
 
 def with_reels(seed, hurry=QUICK):
@@ -181,7 +181,7 @@ def several_rods(seed, hurry=QUICK):
     gravity = np.linalg.norm(parameters["gravity"])
     heavy = 6.0 * np.pi**2 * EI / L**2 / gravity
     mass = min(1e4, draws.generator.uniform(0.0, 0.25) * heavy)
-    robot = kc.ParallelRobot(
+    robot = kc.robots.ParallelRobot(
         **{**parameters, "gravity": [0.0, 0.0, -gravity]},
         base_angles=base, platform_angles=base + draws.generator.uniform(-0.6, 0.6, 6),
         base_radius=L * draws.generator.uniform(0.1, 0.3),

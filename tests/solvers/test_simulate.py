@@ -104,14 +104,14 @@ def test_on_request_the_rest_is_marked_invalid(robot):
     with pytest.raises(ValueError, match=f"row {first}"):
         found.require_valid()
     with pytest.raises(ValueError, match="invalid"):
-        kc.tip_rmse(found, found)
+        kc.metrics.tip_rmse(found, found)
 
 
 def _step(robot, past, coefficients):
     return _Step(robot, Settings(), past, coefficients, DT, Budget(60.0))
 
 
-BDF2 = kc.BDF2().coefficients(DT, DT)
+BDF2 = kc.solvers.BDF2().coefficients(DT, DT)
 
 
 def test_load_continuation_reaches_the_solution_that_newton_finds(robot):
@@ -132,7 +132,7 @@ def test_a_divided_step_is_the_same_motion_in_smaller_steps(robot):
     _, found = _substeps(_step(robot, past, BDF2), (control, control), DT)
     by_hand = past
     for previous in (DT, DT / 2):
-        half = _step(robot, by_hand, kc.BDF2().coefficients(DT / 2, previous))
+        half = _step(robot, by_hand, kc.solvers.BDF2().coefficients(DT / 2, previous))
         by_hand = half.solve(control, *half.guesses()[0]).after
     np.testing.assert_allclose(found.after.records[0], by_hand.records[0], atol=1e-9)
     np.testing.assert_allclose(found.after.error[0], by_hand.error[0], atol=1e-9)
@@ -183,7 +183,7 @@ def test_time_of_recovery_is_in_proportion_to_that_of_the_run():
 @pytest.mark.parametrize("space", ["lobatto2", "lobatto4"])
 def test_short_time_steps_on_few_long_segments(space):
     """Forward Euler was unstable there: solved to rounding, and nonsense."""
-    soft = kc.TendonRobot(
+    soft = kc.robots.TendonRobot(
         length=0.87, radius=4.77e-3, density=1411.7, youngs_modulus=18.6e6, bending_damping=0.03, drag=1e-4,
         gravity=(0.0, 0.0, -0.15), nodes=5,
     )  # fmt: skip
@@ -214,7 +214,7 @@ def test_a_control_that_jumps_asks_for_a_new_linearisation(robot):
 def test_what_is_kept_is_not_seen_in_a_motion(robot, sine):
     """Solved to the tolerance, by old linearisations as by ones that are made anew in every step."""
     found = kc.simulate(robot, sine[:60], 0.01)
-    anew = kc.NewtonOptions(patience=1, tolerance=1e-12)
+    anew = kc.solvers.NewtonOptions(patience=1, tolerance=1e-12)
     exact = kc.simulate(robot, sine[:60], 0.01, newton=anew)
     np.testing.assert_allclose(found.position, exact.position, atol=1e-8)
 
@@ -238,12 +238,14 @@ def test_a_smooth_system_is_as_gentle_as_it_gets(robot):
 @pytest.mark.parametrize("part", [1.0, 0.1, 1e-3])
 def test_easing_spreads_contact_and_friction_and_nothing_else(robot, part):
     plane = Plane(smoothing=1e-4, slip=2e-3, friction=0.3)
-    slender = kc.SlenderRod(length=0.4, radius=0.005, density=1e3, youngs_modulus=1e6, surroundings=(plane,))
+    slender = kc.robots.SlenderRod(
+        length=0.4, radius=0.005, density=1e3, youngs_modulus=1e6, surroundings=(plane,)
+    )
     easier = slender.eased(part)
     assert float(easier.surroundings[0].smoothing) == pytest.approx(1e-4 / part)
     assert float(easier.surroundings[0].slip) == pytest.approx(2e-3 / part)
     assert float(easier.surroundings[0].friction) == 0.3 and float(easier.length) == 0.4
-    rubbing = kc.RoutedTendonRobot.like(robot, friction=TendonFriction(curvature=0.2, reach=0.05))
+    rubbing = kc.robots.RoutedTendonRobot.like(robot, friction=TendonFriction(curvature=0.2, reach=0.05))
     assert float(rubbing.eased(part).friction.reach) == pytest.approx(0.05 / part)
 
 
@@ -252,8 +254,8 @@ def test_easing_spreads_contact_and_friction_and_nothing_else(robot, part):
 
 def line(nodes):
     """A thin line that is pulled at its tip, far more than bends it."""
-    pull = kc.loads.PointWrench(force=[0.1, 0.0, 1.0])
-    return kc.SlenderRod(
+    pull = kc.robots.loads.PointWrench(force=[0.1, 0.0, 1.0])
+    return kc.robots.SlenderRod(
         length=1.0, radius=5e-4, density=1150.0, youngs_modulus=2e9, bending_damping=1e-6,
         gravity=[0.0, 0.0, 0.0], nodes=nodes, loads=(pull,),
     )  # fmt: skip
@@ -300,7 +302,7 @@ def test_lockstep_as_on_a_gpu_equals_one_after_the_other(robot, sine):
     past = resting_past(robot, Settings())
     tensions = np.stack([sine[:16], 1.2 * sine[:16], 0.8 * sine[:16]])
     pasts = jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), past)
-    table = np.array([kc.BDF2().coefficients(DT, DT)] * 2)
+    table = np.array([kc.solvers.BDF2().coefficients(DT, DT)] * 2)
     arguments = (robot, Settings(), table, padded_rows(tensions), DT, pasts, 16, False)
     one_by_one, together = loop_many(*arguments, lockstep=False), loop_many(*arguments, lockstep=True)
     np.testing.assert_array_equal(one_by_one[0], [16, 16, 16])
@@ -408,7 +410,7 @@ def test_another_robot_does_not_go_on(robot, sine, before, said):
 
 
 def test_a_robot_with_more_to_remember_does_not_go_on(sine):
-    robot = kc.RoutedTendonRobot.like(kc.load_robot("delrin-tendon-robot"))
+    robot = kc.robots.RoutedTendonRobot.like(kc.load_robot("delrin-tendon-robot"))
     before = kc.simulate(robot, sine[:3], DT)
     with pytest.raises(ValueError, match="numbers in z"):
         kc.simulate(robot.replace(vibration=Vibration(tension=20.0, rate=1.0)), sine, DT, initial=before)

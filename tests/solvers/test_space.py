@@ -83,8 +83,8 @@ def falling():
 @functools.cache
 def reeling():
     """A robot whose second tendon ends between two nodes."""
-    routing = (kc.routing.Straight(0.02, 0.0), kc.routing.Straight(0.0, 0.02, end=0.63))
-    return kc.RoutedTendonRobot.like(kc.load_robot("delrin-tendon-robot"), routing=routing)
+    routing = (kc.robots.routing.Straight(0.02, 0.0), kc.robots.routing.Straight(0.0, 0.02, end=0.63))
+    return kc.robots.RoutedTendonRobot.like(kc.load_robot("delrin-tendon-robot"), routing=routing)
 
 
 @functools.cache

@@ -55,7 +55,7 @@ def test_never_fewer_than_the_derivatives_say(function):
     assert set(np.flatnonzero(slopes)) <= set(found_in(function))
 
 
-class Tethered(kc.SlenderRod):
+class Tethered(kc.robots.SlenderRod):
     """A rod that a spring pulls back to its axis: its position enters."""
 
     def rates(self, s, t, y, z, control, history):
@@ -78,6 +78,6 @@ def fields_that_enter(robot):
 
 def test_of_a_rod_everything_enters_but_its_position():
     rod = {"length": 0.5, "radius": 1e-3, "density": 1e3, "youngs_modulus": 1e8}
-    assert fields_that_enter(kc.SlenderRod(**rod)) == set("hnmqw")
+    assert fields_that_enter(kc.robots.SlenderRod(**rod)) == set("hnmqw")
     assert fields_that_enter(kc.load_robot("delrin-tendon-robot")) == set("hnmqw")
     assert fields_that_enter(Tethered(**rod)) == set("phnmqw")

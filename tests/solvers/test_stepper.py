@@ -40,7 +40,7 @@ def assert_same(rows, wanted):
 
 
 def test_its_rows_are_those_of_a_simulation(robot, sine, truth):
-    stepper = kc.Stepper(robot, DT)
+    stepper = kc.solvers.Stepper(robot, DT)
     rows = [stepper.state, *(stepper.step(control) for control in sine)]
     assert_same(rows, truth)
     assert stepper.state is rows[-1] and stepper.time == truth.time[-1]
@@ -48,7 +48,7 @@ def test_its_rows_are_those_of_a_simulation(robot, sine, truth):
 
 def test_beyond_the_rows_of_one_program_it_goes_on_as_a_longer_simulation(robot, sine):
     controls = np.concatenate([sine, sine[:60]])
-    stepper = kc.Stepper(robot, DT)
+    stepper = kc.solvers.Stepper(robot, DT)
     rows = [stepper.state, *(stepper.step(control) for control in controls)]
     wanted = kc.simulate(robot, controls[100:], DT, initial=kc.simulate(robot, sine, DT))
     # residuals of either are below 1e-10; the factors that are kept, and hence the last digits, are others
@@ -59,12 +59,12 @@ def test_beyond_the_rows_of_one_program_it_goes_on_as_a_longer_simulation(robot,
 
 def test_from_a_trajectory_it_goes_on_as_a_simulation_does(robot, sine, truth):
     wanted = kc.simulate(robot, sine[:20], DT, initial=truth)
-    stepper = kc.Stepper(robot, DT, initial=truth)
+    stepper = kc.solvers.Stepper(robot, DT, initial=truth)
     assert_same([stepper.state, *(stepper.step(control) for control in sine[:20])][1:], wanted[1:])
 
 
 def test_a_preview_is_the_step_that_follows_and_changes_nothing(robot, sine, truth):
-    stepper = kc.Stepper(robot, DT)
+    stepper = kc.solvers.Stepper(robot, DT)
     for control, other, wanted in zip(sine[:5], sine[50:55], truth.y[1:6], strict=True):
         elsewhere = stepper.preview(other)
         ahead = stepper.preview(control)
@@ -79,13 +79,13 @@ def test_recovered_steps_are_those_of_a_simulation(robot, caplog):
     with caplog.at_level("INFO", logger="knode_cosserat.solvers.run"):
         wanted = kc.simulate(robot, hard, DT)
     assert wanted.all_valid and "step" in caplog.text
-    stepper = kc.Stepper(robot, DT)
+    stepper = kc.solvers.Stepper(robot, DT)
     assert_same([stepper.state, *(stepper.step(control) for control in hard)], wanted)
 
 
 def test_a_step_without_a_solution_is_said_and_leaves_the_robot_where_it_is(robot, sine):
     hopeless = [1e8, 0.0, 0.0, 1e8]
-    stepper, other = (kc.Stepper(robot, DT) for _ in range(2))
+    stepper, other = (kc.solvers.Stepper(robot, DT) for _ in range(2))
     for control in sine[:2]:
         row = stepper.step(control)
         other.step(control)
@@ -99,7 +99,7 @@ def test_a_step_without_a_solution_is_said_and_leaves_the_robot_where_it_is(robo
 
 
 def test_a_row_of_a_coarse_grid_says_so(robot):
-    stepper = kc.Stepper(robot.replace(nodes=3), DT)
+    stepper = kc.solvers.Stepper(robot.replace(nodes=3), DT)
     row = stepper.step([60.0, 0.0, 0.0, 60.0])
     assert row.position_error[0] > 0.02 * robot.length
     assert row.result[0] == kc.Result.COARSE and row.all_valid
@@ -110,7 +110,7 @@ def test_rows_that_follow_a_coarse_one_are_coarse_too(robot):
     robot = robot.replace(nodes=3)
     controls = np.full((60, 4), 5.0)
     controls[:2, [0, 3]] = 60.0
-    stepper = kc.Stepper(robot, DT)
+    stepper = kc.solvers.Stepper(robot, DT)
     rows = [stepper.step(control) for control in controls]
     with pytest.warns(UserWarning, match="too coarse in 60 of 60 rows"):
         whole = kc.simulate(robot, controls, DT)
@@ -136,7 +136,7 @@ def test_rows_that_follow_a_coarse_one_are_coarse_too(robot):
 )
 def test_wrong_arguments_are_named(robot, change, message):
     with pytest.raises(ValueError, match=message):
-        kc.Stepper(**{"robot": robot, "dt": DT, **change})
+        kc.solvers.Stepper(**{"robot": robot, "dt": DT, **change})
 
 
 @pytest.mark.parametrize(
@@ -145,4 +145,4 @@ def test_wrong_arguments_are_named(robot, change, message):
 )
 def test_a_wrong_control_is_named(robot, control, message):
     with pytest.raises(ValueError, match=message):
-        kc.Stepper(robot, DT).step(control)
+        kc.solvers.Stepper(robot, DT).step(control)

@@ -64,7 +64,7 @@ def test_a_linear_predictor_of_the_robot_beats_standing_still():
     truth = moved("sine:1.5", 100)
     still = Poses(np.repeat(truth.position[:1], 100, axis=0), np.repeat(truth.quaternion[:1], 100, axis=0))
     predicted = predictor(kc.controls.sine(1.5, 100, DT))
-    assert kc.tip_dtw(predicted, truth) < 0.2 * kc.tip_dtw(still, truth)
+    assert kc.metrics.tip_dtw(predicted, truth) < 0.2 * kc.metrics.tip_dtw(still, truth)
 
 
 def test_without_pydmd_it_says_how_to_get_it(monkeypatch):

@@ -65,7 +65,7 @@ def test_recording_on_the_command_line(tmp_path):
     recording = kc.load_recording(bag)
     assert recording.simulated is True
     found = kc.estimate_states(recording, truth.system.replace(nodes=10))
-    assert kc.state_errors(found, truth)["p"].rms < 0.3e-3
+    assert kc.metrics.state_errors(found, truth)["p"].rms < 0.3e-3
 
 
 @pytest.mark.parametrize(

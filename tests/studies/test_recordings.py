@@ -20,7 +20,7 @@ from knode_cosserat.studies.runner import StudyError
 
 PAPER = RecordingConfig.paper_robot()
 DT = 0.01
-TRUE = kc.RoutedTendonRobot.like(
+TRUE = kc.robots.RoutedTendonRobot.like(
     kc.load_robot("delrin-tendon-robot"),
     bending_damping=5e-3,
     friction=TendonFriction(wobble=0.5, reach=0.15),
@@ -112,7 +112,7 @@ def test_a_folder_describes_its_robot_and_its_topics(folder, tmp_path):
         (own / f"{name}.bag").symlink_to(folder / f"{name}.bag")
     softer = kc.load_robot("delrin-tendon-robot").replace(youngs_modulus=2.0e9)
     kc.save_robot(softer, own / "robot.yaml")
-    kc.RecordingConfig.paper_robot().replace(description="ours").save(own / "recording.yaml")
+    kc.recordings.RecordingConfig.paper_robot().replace(description="ours").save(own / "recording.yaml")
     given = (own, "--train", "sine_1p0", "--methods", "baseline", "--seconds", 2)
 
     def errors(name, *more):
@@ -123,8 +123,8 @@ def test_a_folder_describes_its_robot_and_its_topics(folder, tmp_path):
 
     (found, told), (same, silent) = errors("a"), errors("b", "--robot", own / "robot.yaml")
     assert found == same
-    assert f"taken from {own}: robot.yaml and recording.yaml" in told
-    assert f"taken from {own}: recording.yaml" in silent
+    assert f"using robot.yaml and recording.yaml of {own}" in told
+    assert f"using recording.yaml of {own}" in silent
     assert errors("c", "--robot", "delrin-tendon-robot")[0] != pytest.approx(found, rel=0.1)
 
 

@@ -149,7 +149,7 @@ def test_what_is_learned_is_tabled_beside_the_papers_and_kept(tmp_path, one_impe
     model = load_model(tmp_path / "models/length-best-1")
     truth = kc.load_trajectory(tmp_path / "trajectories/reference-step.nc")
     prediction = kc.simulate(model, kc.controls.step(1.5, 100, 0.05), 0.05, space="euler")[:100]
-    assert kc.tip_dtw(prediction, truth) == cells[-1]["tip_dtw"]
+    assert kc.metrics.tip_dtw(prediction, truth) == cells[-1]["tip_dtw"]
     assert kc.load_trajectory(tmp_path / "trajectories/length-best-sine.nc").y.shape == truth.y.shape
 
 

@@ -45,6 +45,19 @@ def failed(truth):
     )
 
 
+@pytest.fixture(scope="session")
+def coarse(truth):
+    """Its rows from 40 on are of too coarse a grid; those from 50 on only continue from such a row."""
+    result = np.array(truth.result)
+    result[40:] = int(kc.Result.COARSE)
+    error = np.full(len(result), 1e-4)
+    error[40:50] = 0.02
+    return kc.Trajectory(
+        truth.system, truth.settings, truth.time, truth.y, truth.z, truth.control, result, truth.residual,
+        truth.iterations, position_error=error,
+    )  # fmt: skip
+
+
 # one a file: a page that stays open draws on, and takes the processor from whatever is tested next
 @pytest.fixture(scope="module")
 def browser():

@@ -1,8 +1,10 @@
 """A robot that follows sliders: the page, what it says to the simulation, and who may speak to that."""
 
 import asyncio
+import dataclasses
 import json
 import threading
+import time
 import urllib.error
 import urllib.request
 
@@ -11,7 +13,8 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.viewer import view_live
-from knode_cosserat.viewer.live import Session, require_websockets, usual_step
+from knode_cosserat.viewer.live import require_websockets, usual_step
+from knode_cosserat.viewer.session import Session
 
 websockets = pytest.importorskip("websockets", reason="the live mode is of the extra viz")
 DT = 0.05
@@ -25,36 +28,40 @@ def address(robot):
         found.append(address)
         known.set()
 
-    threading.Thread(
-        target=view_live, args=(robot,), kwargs={"open_browser": False, "ready": ready}, daemon=True
-    ).start()
+    threading.Thread(target=view_live, args=(robot,), kwargs={"open_browser": ready}, daemon=True).start()
     assert known.wait(120)
     return found[0]
 
 
 @pytest.fixture
 def session(robot):
-    return Session(robot, DT, "lobatto2", None)
+    return Session(kc.solvers.Stepper(robot, DT), None)
+
+
+def solve(session, control, sequence, over):
+    """Solve as the session's clock does; the message, and whether there is no solution."""
+    message, session.stepper, stuck = session.attempt(control, sequence, over)
+    return message, stuck
 
 
 def numbers(message):
     """Head and row of a frame."""
     values = np.frombuffer(message, np.float32)
-    return values[:5], values[5:]
+    return values[:6], values[6:]
 
 
 def test_a_frame_is_the_step_in_progress_under_the_newest_control(session, robot):
     first, then = np.array([7.0, 5.0, 5.0, 7.0]), np.array([5.0, 7.0, 7.0, 5.0])
-    stepper = kc.Stepper(robot, DT)
+    stepper = kc.solvers.Stepper(robot, DT)
     # both of the same step, until it is over
     for sequence, control in ((1, first), (2, then)):
-        message, stuck = session.solve(control, sequence, over=False)
+        message, stuck = solve(session, control, sequence, over=False)
         wanted = stepper.preview(control)
         head, row = numbers(message)
         assert not stuck and head[0] == sequence and head[1] == np.float32(DT)
         np.testing.assert_array_equal(row[:190], wanted.y.astype(np.float32).ravel())
         np.testing.assert_array_equal(row[-4:], control)
-    message, _ = session.solve(then, 3, over=True)
+    message, _ = solve(session, then, 3, over=True)
     stepper.step(then)
     head, row = numbers(message)
     assert head[1] == np.float32(2 * DT)
@@ -65,10 +72,10 @@ def test_what_cannot_be_solved_is_said_and_nothing_moves(session):
     # in another unit: a thousand times less is solved, on a grid too coarse for it
     fair, hopeless = np.full(4, 6.0), np.array([1e9, 0.0, 0.0, 1e9])
     for _ in range(2):
-        session.solve(fair, 1, over=True)
+        solve(session, fair, 1, over=True)
     before = session.stepper.state
     for count in range(1, 10):
-        message, stuck = session.solve(hopeless, 7, over=count > 1)
+        message, stuck = solve(session, hopeless, 7, over=count > 1)
         reached = session.stepper.state
         if stuck:
             break
@@ -76,8 +83,123 @@ def test_what_cannot_be_solved_is_said_and_nothing_moves(session):
     said = json.loads(message)
     assert said["sequence"] == 7 and said["unsolved"].startswith("Not solved: no solution found.")
     assert session.stepper.state is reached and (count > 1 or reached is before)
-    message, stuck = session.solve(fair, 8, over=False)
+    message, stuck = solve(session, fair, 8, over=False)
     assert not stuck and np.all(np.isfinite(numbers(message)[1]))
+
+
+class Connection:
+    """A connection in whose place the test stands: messages to the session, and those it sends."""
+
+    def __init__(self):
+        self.given, self.sent = asyncio.Queue(), asyncio.Queue()
+
+    def __aiter__(self):
+        return self
+
+    async def __anext__(self):
+        return json.dumps(await self.given.get())
+
+    async def send(self, message):
+        await self.sent.put(message)
+
+    async def until(self, true):
+        """The next message for which something is true."""
+        while True:
+            message = await asyncio.wait_for(self.sent.get(), 20)
+            if true(json.loads(message) if isinstance(message, str) else numbers(message)[0].tolist()):
+                return message
+
+
+#: first tension (N) at which the tests' solves end only when they are cancelled
+SLOW = 11.0
+
+
+@pytest.fixture
+def slow_solves(monkeypatch):
+    """Solves above `SLOW` never end by themselves; the list has the sequence numbers of those that ended."""
+    attempt, ended = Session.attempt, []
+
+    def waits(self, control, sequence, over, stop=None):
+        while control[0] > SLOW and not stop():
+            time.sleep(0.002)
+        if control[0] > SLOW:
+            ended.append(sequence)
+        return attempt(self, np.minimum(control, SLOW), sequence, over, stop)
+
+    monkeypatch.setattr(Session, "attempt", waits)
+    return ended
+
+
+def test_a_slow_solve_is_cancelled_or_replaced_by_a_newer_control(robot, slow_solves):
+    async def moved():
+        connection = Connection()
+        own = Session(kc.solvers.Stepper(robot, DT), connection)
+        running = asyncio.create_task(own.run())
+        give = connection.given.put_nowait
+        try:
+            give({"control": [SLOW + 1, 6.0, 6.0, 6.0], "sequence": 1})
+            await connection.until(lambda said: said == {"solving": 1})
+            give({"command": "cancel"})
+            message = await connection.until(lambda said: isinstance(said, dict) and "unsolved" in said)
+            assert json.loads(message)["unsolved"].startswith("Cancelled: the last solved shape is shown.")
+            stepper = own.stepper
+            give({"command": "pause"})
+            give({"command": "resume"})
+            await asyncio.sleep(2.5 * DT)
+            assert own.stepper is stepper  # the clock stands still, and the same control is not tried again
+            give({"control": [7.0, 6.0, 6.0, 6.0], "sequence": 2})
+            await connection.until(lambda head: not isinstance(head, dict) and head[0] == 2)
+            # replaced without being cancelled, and the newest of several
+            give({"control": [SLOW + 1, 6.0, 6.0, 6.0], "sequence": 3})
+            await connection.until(lambda said: said == {"solving": 3})
+            for sequence in (4, 5):
+                give({"control": [6.5, 6.0, 6.0, float(sequence)], "sequence": sequence})
+            message = await connection.until(lambda head: not isinstance(head, dict) and head[0] >= 4)
+            head, row = numbers(message)
+            assert head[0] == 5 and row[-1] == 5.0
+            # a reset also ends it
+            give({"control": [SLOW + 1, 6.0, 6.0, 6.0], "sequence": 6})
+            await connection.until(lambda said: said == {"solving": 6})
+            give({"control": [6.0] * 4, "sequence": 7})
+            give({"command": "reset"})
+            message = await connection.until(lambda head: not isinstance(head, dict) and head[0] == 7)
+            assert numbers(message)[0][1] == np.float32(DT)
+        finally:
+            running.cancel()
+
+    asyncio.run(moved())
+    # dropped solves have ended: nothing goes on in the background
+    assert slow_solves == [1, 3, 6]
+
+
+def test_a_cancelled_recovery_ends_without_a_solution_and_changes_nothing(robot):
+    stepper = kc.solvers.Stepper(robot, DT)
+    before = stepper.state
+    with pytest.raises(kc.SimulationError):
+        stepper.step([1e9, 0.0, 0.0, 1e9], stop=lambda: True)
+    assert stepper.state is before and stepper.time == 0.0
+    # a step that needs no recovery is not affected
+    assert stepper.step([6.0] * 4, stop=lambda: True).result[0] == kc.Result.CONVERGED
+
+
+def test_a_shape_with_a_meaningless_error_is_neither_drawn_nor_kept(session, robot, monkeypatch):
+    preview, error = kc.solvers.Stepper.preview, 0.3 * float(robot.length)
+    monkeypatch.setattr(
+        kc.solvers.Stepper,
+        "preview",
+        lambda *given: dataclasses.replace(preview(*given), position_error=np.array([error])),
+    )
+    before = session.stepper
+    message, stuck = solve(session, np.full(4, 6.0), 3, over=False)
+    assert stuck and session.stepper is before
+    assert json.loads(message)["unsolved"].startswith(
+        "Not solved: the grid of 10 nodes is too coarse, positions would be off by about 0.19 m (30% of"
+    )
+
+
+def test_a_control_outside_its_range_is_said_and_the_session_goes_on(session):
+    message, stuck = solve(session, np.array([np.inf, 6.0, 6.0, 6.0]), 3, over=False)
+    assert stuck and json.loads(message)["unsolved"].startswith("Not solved: the control is")
 
 
 def test_a_model_moves_at_the_step_it_learned_at(robot):
@@ -158,6 +280,43 @@ def test_a_slider_bends_the_robot_that_is_drawn(browser, address, robot):
 
     assert browser.wait(settled)
     assert browser.run("viewer.live.latencies.length") > 0
+    assert browser.errors() == []
+
+
+def test_all_tendons_are_one_group_and_visible_at_once(browser, address):
+    browser.size(1280, 800)
+    browser.open(address)
+    titles = browser.run("[...document.querySelectorAll('#sliders h3')].map((e) => e.textContent)")
+    assert titles == ["tendon tension (N)"]
+    boxes = browser.run(
+        "[...document.querySelectorAll('.slider')].map((e) => { const r = e.getBoundingClientRect();"
+        " return [e.querySelector('span').textContent, r.top, r.bottom]; })"
+    )
+    assert [box[0] for box in boxes] == ["1", "2", "3", "4"]
+    assert all(0 <= top < bottom <= 800 for _, top, bottom in boxes)
+
+
+def test_the_page_shows_a_slow_solve_and_escape_cancels_it(browser, address, slow_solves):
+    browser.open(address)
+    browser.wait(lambda: browser.run("viewer.time > 0.2"))
+    pull = (
+        "(() => { const n = document.querySelectorAll('.slider input[type=number]')[%d]; n.value = %s;"
+        " n.dispatchEvent(new Event('change')); })()"
+    )
+    solving = "document.getElementById('solving').textContent"
+    assert browser.run("document.getElementById('cancel').disabled") is True
+    browser.run(pull % (0, SLOW + 1))
+    browser.wait(lambda: browser.run(solving).startswith("solving… "))
+    assert browser.run("document.getElementById('cancel').disabled") is False
+    browser.run("document.dispatchEvent(new KeyboardEvent('keydown', {key: 'Escape'}))")
+    message = "document.getElementById('message').textContent"
+    browser.wait(lambda: browser.run(message).startswith("Cancelled: the last solved shape is shown."))
+    assert browser.run(solving) == "" and browser.run("document.getElementById('cancel').disabled") is True
+    browser.wait(lambda: browser.run("viewer.robots[0].material.opacity") < 1)
+    tip = browser.run("viewer.tip()")
+    assert np.all(np.isfinite(tip))
+    browser.run(pull % (0, 7))
+    browser.wait(lambda: browser.run(message) == "" and browser.run("viewer.robots[0].material.opacity") == 1)
     assert browser.errors() == []
 
 

@@ -129,6 +129,26 @@ def test_what_is_no_trajectory_is_named(given, message):
         scene(given)
 
 
+def test_a_target_is_three_numbers_in_metres(truth):
+    assert scene(truth)["target"] is None
+    assert scene(truth, target=np.array([0.1, 0.0, 0.6]))["target"] == [0.1, 0.0, 0.6]
+    for wrong in ((0.1, 0.2), (0.1, 0.2, np.nan), "tip", 3.0):
+        with pytest.raises(ValueError, match=r"target must be a position \(x, y, z\)"):
+            scene(truth, target=wrong)
+    with pytest.raises(ValueError, match=r"got 274 m.*did you mean \(0\.1, 0\.05, 0\.25\)"):
+        scene(truth, target=(100.0, 50.0, 250.0))
+
+
+def test_the_estimated_error_of_each_row_is_in_the_scene(truth, coarse):
+    known = unpacked(track(coarse, "coarse")["position_error"])
+    np.testing.assert_allclose(known, coarse.position_error, rtol=1e-6)
+    measured = kc.Trajectory(
+        truth.system, None, truth.time, truth.y, truth.z, truth.control, truth.result, truth.residual,
+        truth.iterations,
+    )  # fmt: skip
+    assert np.all(np.isnan(unpacked(track(measured, "measured")["position_error"])))
+
+
 def test_texts_cannot_leave_their_place(truth):
     evil = "</script><script>window.hacked = 1</script><!-- @@SCENE@@ & \u2028"
     page = document(scene({evil: truth}, title=evil))
@@ -154,9 +174,9 @@ def test_the_page_may_not_reach_any_network(truth, tmp_path):
 class Flat(kc.System):
     """A system that says of its nodes where they are, in two numbers, and no more."""
 
-    y_layout = kc.Layout(("place", 2, "m", "place"), ("n", 1, "N", "force"))
-    z_layout = kc.Layout()
-    control_layout = kc.Layout(("pull", 1, "N", "pull"))
+    y_layout = kc.robots.Layout(("place", 2, "m", "place"), ("n", 1, "N", "force"))
+    z_layout = kc.robots.Layout()
+    control_layout = kc.robots.Layout(("pull", 1, "N", "pull"))
     base_unknowns = ("n",)
 
     length: float = 2.0
@@ -214,8 +234,8 @@ def test_every_robot_has_a_drawing_and_a_slider_for_each_control(name):
 
 
 def test_tendons_are_drawn_where_their_routing_has_them():
-    helix = kc.routing.Helical(radius=0.01, phase=0.3, turns=1.5)
-    short = kc.routing.Straight(x=0.008, y=0.0, end=0.5)
+    helix = kc.robots.routing.Helical(radius=0.01, phase=0.3, turns=1.5)
+    short = kc.robots.routing.Straight(x=0.008, y=0.0, end=0.5)
     robot = kc.load_robot("delrin-routed-tendon-robot").replace(routing=(helix, short))
     tendons = drawing(robot, np.arange(10))["tendons"]
     angle = 0.3 + 2.0 * np.pi * 1.5 * np.linspace(0.0, 1.0, 10)
@@ -231,9 +251,7 @@ def test_the_server_gives_the_page_and_nothing_else(truth):
         address.append(found)
         known.set()
 
-    threading.Thread(
-        target=view, args=(truth,), kwargs={"open_browser": False, "ready": ready}, daemon=True
-    ).start()
+    threading.Thread(target=view, args=(truth,), kwargs={"open_browser": ready}, daemon=True).start()
     assert known.wait(30)
     assert address[0].startswith("http://127.0.0.1:")
     with urllib.request.urlopen(address[0]) as answer:

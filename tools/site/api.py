@@ -10,13 +10,47 @@ from typing import Any
 import knode_cosserat as kc
 
 PACKAGE = "knode_cosserat"
+#: functions that most readers look for: first on their pages, in this order
+MAIN = (
+    "load_robot",
+    "simulate",
+    "equilibrium",
+    "fit",
+    "calibrate",
+    "load_recording",
+    "estimate_states",
+    "identify",
+    "tip_rmse",
+    "pose_mse",
+    "inverse_kinematics",
+    "workspace",
+    "stability",
+    "view",
+    "view_live",
+)
+
+
+def public() -> dict[str, Any]:
+    """All public objects by their path: those at the top level and in its namespaces."""
+    found: dict[str, Any] = {}
+    for space in [kc, *(thing for name in kc.__all__ if _is_namespace(thing := getattr(kc, name)))]:
+        for name in space.__all__:
+            thing = getattr(space, name)
+            if not _is_namespace(thing):
+                found.setdefault(_path(space, name, thing), thing)
+    return found
+
+
+def _is_namespace(thing: Any) -> bool:
+    """True for a module that lists its public names; a module without such a list is shown as a whole."""
+    return isinstance(thing, types.ModuleType) and hasattr(thing, "__all__")
 
 
 def rooms() -> dict[str, list[str]]:
-    """All public names by room: a folder of the package, or a module at its top."""
+    """Paths of all public objects by room: a folder of the package, or a module at its top."""
     found: dict[str, list[str]] = {}
-    for name in kc.__all__:
-        found.setdefault(where(getattr(kc, name)).split(".")[1], []).append(name)
+    for path, thing in public().items():
+        found.setdefault(where(thing).split(".")[1], []).append(path)
     return found
 
 
@@ -26,17 +60,26 @@ def where(thing: Any) -> str:
 
 
 def page(*named: str) -> str:
-    """What is public in some rooms: classes and functions, and modules of them with all that they hold."""
-    known = rooms()
-    names = [name for room in named for name in known[room]]
-    things = {name: getattr(kc, name) for name in sorted(names, key=str.lower)}
-    # modules last: they are longest
-    ordered = sorted(things, key=lambda name: isinstance(things[name], types.ModuleType))
-    return "\n\n".join(f"::: {_path(things[name])}" for name in ordered)
+    """Return the public names of some rooms: main functions first, modules with all their members last."""
+    known, things = rooms(), public()
+    paths = [path for room in named for path in known[room]]
+    ordered = sorted(paths, key=lambda path: _rank(path, things[path]))
+    return "\n\n".join(f"::: {path}" for path in ordered)
 
 
-def _path(thing: Any) -> str:
-    return where(thing) if isinstance(thing, types.ModuleType) else f"{where(thing)}.{thing.__qualname__}"
+def _rank(path: str, thing: Any) -> tuple[int, str]:
+    """Return the place of a name: main functions, then functions, then classes, then modules."""
+    name = path.rpartition(".")[2]
+    if name in MAIN:
+        return MAIN.index(name), name
+    return len(MAIN) + (2 if isinstance(thing, types.ModuleType) else isinstance(thing, type)), name.lower()
+
+
+def _path(space: types.ModuleType, name: str, thing: Any) -> str:
+    """Return an object's path where it is defined, or where it is public if its name differs."""
+    if isinstance(thing, types.ModuleType):
+        return where(thing)
+    return f"{where(thing) if thing.__qualname__ == name else space.__name__}.{name}"
 
 
 def shown(folder: Path) -> list[str]:

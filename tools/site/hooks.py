@@ -17,7 +17,7 @@ from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File
 
 import knode_cosserat as kc
-from tools.site import api, equations, examples, notebooks, performance, robot_file, source
+from tools.site import api, changelog, equations, examples, notebooks, performance, robot_file, source
 
 #: pages that others write: without them the site is whole
 OPTIONAL = ("viewer.md", "notebooks.md")
@@ -28,6 +28,7 @@ LINKED = re.compile(r'<a[^>]+href="(https?://[^"]+)"')
 LINKS: dict[str, set[str]] = {}
 MADE = {
     "api": api.page,
+    "changelog": changelog.page,
     "examples": examples.page,
     "notebook": notebooks.page,
     "performance": performance.page,

@@ -32,7 +32,7 @@ def _cell(cell: Any, name: str) -> str:
         data = output.get("data", {})
         if "image/png" in data:
             picture = "".join(data["image/png"]).replace("\n", "")
-            alt = html.escape(f"what {name.replace('_', ' ')} draws here")
+            alt = html.escape(f"figure of the notebook {name.replace('_', ' ')}")
             parts.append(f'<img alt="{alt}" src="data:image/png;base64,{picture}">')
         elif "text/plain" in data:
             parts.append(f"```text\n{''.join(data['text/plain']).rstrip()}\n```")

@@ -11,7 +11,7 @@ RESULTS = ROOT / "benchmarks" / "results.json"
 
 
 def page() -> str:
-    """The table of all figures, where they were measured, and what single cases took."""
+    """Return the table of all figures, the machine, and the times of single cases."""
     found = json.loads(RESULTS.read_text(encoding="utf-8"))
     steps = found["steps"]
     kinds = [kind for kind in steps if "ratio" in steps[kind]]
@@ -22,6 +22,6 @@ def page() -> str:
     )
     return (
         f"Measured on {found['machine']}.\n\n{table(found)}\n\n"
-        "## The paper's way, case by case\n\n"
-        "| controls | here [ms] | fsolve [ms] | ratio |\n| --- | --- | --- | --- |\n" + against
+        "## Comparison with fsolve, by case\n\n"
+        "| controls | this package [ms] | fsolve [ms] | ratio |\n| --- | --- | --- | --- |\n" + against
     )

@@ -21,7 +21,7 @@ SHAPES = {
     "matrix": "number, diagonal or 3×3",
     "list": "list of numbers",
 }
-HEAD = "| name | what | kind | unit | allowed | default |\n| --- | --- | --- | --- | --- | --- |\n"
+HEAD = "| name | meaning | kind | unit | accepted | default |\n| --- | --- | --- | --- | --- | --- |\n"
 FAMILIES = {
     "End": "Ends: `base_end`, `tip_end`",
     "Load": "Loads: `loads`",
@@ -32,6 +32,7 @@ FAMILIES = {
     "TendonFriction": "Friction of tendons: `friction`",
     "Vibration": "Vibration: `vibration`",
     "RibSpacing": "Rib spacing: `rib_spacing`",
+    "Relaxation": "Relaxation of the material: `relaxation`",
     "Reels": "Reels: `reels`",
     "TrainedRange": "Trained range: `trained`",
     "EarlyAnchors": "Early anchors: `anchors`",
@@ -39,20 +40,20 @@ FAMILIES = {
 
 
 def page() -> str:
-    """Kinds of robots, and then the families of their parts."""
+    """Return the reference: kinds of robots, then the families of their parts."""
     rod = set(parameters_of(Rod)) | set(slots_of(Rod)) | set(choices_of(Rod))
     of_a_rod = [cls for cls in KINDS.values() if issubclass(cls, Rod)]
     shared = [
         "[Download the schema](robot.schema.json)",
         "## Robots of one rod",
-        "What `" + "`, `".join(kind for kind, cls in KINDS.items() if cls in of_a_rod) + "` have in common.",
+        "Entries of all of `" + "`, `".join(kind for kind, cls in KINDS.items() if cls in of_a_rod) + "`.",
         HEAD + "\n".join([*_rows(Rod, rod), _nodes()]),
     ]
     parts = []
     for kind, cls in KINDS.items():
         one = issubclass(cls, Rod)
         rows = _rows(cls, None, without=rod) if one else [*_rows(cls, None), _nodes()]
-        after = "No parameters beside those of a rod." if one and not rows else HEAD + "\n".join(rows)
+        after = "No further entries." if one and not rows else HEAD + "\n".join(rows)
         parts += [f"## `{kind}`", _first(cls), after]
     families: dict[str, type] = {}
     for cls in KINDS.values():

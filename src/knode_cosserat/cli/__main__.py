@@ -1,4 +1,4 @@
-"""`python -m knode_cosserat.cli`."""
+"""Entry point of `python -m knode_cosserat.cli`."""
 
 from knode_cosserat.cli import main
 

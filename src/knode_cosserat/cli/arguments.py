@@ -1,31 +1,39 @@
-"""Arguments of several commands, and reading what was given for them."""
+"""Arguments shared by several commands, and functions that read them."""
 
 from __future__ import annotations
 
+import contextlib
 import os
+import shlex
 import sys
 import tempfile
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from knode_cosserat._numbers import numbers_in
+
 if TYPE_CHECKING:
     from knode_cosserat.learning.ensemble import Ensemble
+    from knode_cosserat.recordings.recording import Recording
     from knode_cosserat.rods.system import System
     from knode_cosserat.trajectory import Trajectory
 
-#: what figures can be written as
+#: endings of figure files
 FORMATS = (".png", ".pdf", ".svg")
-#: how netCDF-4 files begin, and the files of models
+#: endings of recordings
+RECORDINGS = (".bag", ".mcap", ".db3", ".csv", ".parquet", ".csv.gz", ".bag.active")
+#: first bytes of netCDF-4 files and of model files
 TRAJECTORY_MARK, MODEL_MARK = b"\x89HDF", b"knode-cosserat model,"
 
-ROBOT = "A robot of the catalog (`knode-cosserat info` lists them), a YAML file, or a model that was fitted."
+ROBOT = "Name of a catalog robot (listed by `knode-cosserat info`), robot file (YAML), or fitted model."
 
 
 def _robots(incomplete: str) -> list[str]:
-    """For the shell: what the catalog has; files it completes by itself."""
+    """Return the catalog's names for the shell's completion; the shell completes files itself."""
     from knode_cosserat.rods.robot_file import catalog
 
     return [name for name in catalog() if name.startswith(incomplete)]
@@ -35,77 +43,116 @@ Robot = Annotated[str, typer.Argument(metavar="ROBOT", help=ROBOT, autocompletio
 Changes = Annotated[
     list[str] | None,
     typer.Option(
-        "--set", metavar="NAME=VALUE", help="Change a parameter of the robot (or knowledge); may be repeated."
+        "--set",
+        metavar="NAME=VALUE",
+        help="Change a parameter of the robot, or of a model's nominal robot, in SI units: length=0.4, "
+        "gravity=0,0,-9.81. May be repeated.",
     ),
 ]
-Nodes = Annotated[int | None, typer.Option(metavar="N", help="Nodes along the rod, base and tip included.")]
+Nodes = Annotated[
+    int | None, typer.Option(metavar="N", help="Number of nodes along the rod, including base and tip.")
+]
 Space = Annotated[
     str,
     typer.Option(
         metavar="SCHEME",
-        help="Scheme along the rod: lobatto2 (order 2), lobatto4 (order 4), or euler (order 1, the paper's).",
+        help="Scheme along the rod: lobatto2 (order 2), lobatto4 (order 4) or euler (order 1, the paper's).",
     ),
 ]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout, and nothing else.")]
-NetCDF = typer.Option(metavar="FILE", help="Write the states to this netCDF file.")
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout instead of text.")]
+NetCDF = typer.Option(metavar="FILE", help="Write the trajectory to this netCDF file (.nc).")
 Picture = typer.Option(metavar="FILE", help="Write the figure to this PNG, PDF or SVG file.")
 Progress = Annotated[
     bool | None,
-    typer.Option(
-        "--progress/--no-progress", help="Progress bar on stderr.", show_default="if it is a terminal"
-    ),
+    typer.Option("--progress/--no-progress", help="Show progress on stderr.", show_default="on a terminal"),
 ]
+
+
+# numbers
+
+
+def parse_numbers(option: str, text: str, count: int | None = None, example: str = "7,5,5,7") -> list[float]:
+    """Return the numbers of an option, separated by commas or spaces. All vector options are read by it.
+
+    Args:
+        option: name of the option, for errors.
+        text: the given text.
+        count: the required number of numbers; None: one or more.
+        example: a valid text, for errors.
+    """
+    numbers = numbers_in(text)
+    if numbers is None or (count is not None and len(numbers) != count):
+        allowed = "numbers" if count is None else f"{count} numbers"
+        raise ValueError(f"{option} must be {allowed}, such as {example} (got {text!r})")
+    return numbers
+
+
+def parse_limits(option: str, text: str, count: int) -> float | list[float]:
+    """Return the limits of `count` controls: one number for all, or one for each."""
+    numbers = numbers_in(text)
+    if numbers is None or len(numbers) not in (1, count):
+        raise ValueError(
+            f"{option} must be one number for all controls, or {count}, one for each (got {text!r})"
+        )
+    return numbers[0] if len(numbers) == 1 else numbers
 
 
 # robots and models
 
 
-def system_of(name: str, changes: list[str] | None = None, nodes: int | None = None) -> System:
-    """The robot or model that a name or path stands for, with the parameters of `--set` and `--nodes`.
+def load_system(name: str, changes: list[str] | None = None, nodes: int | None = None) -> System:
+    """Return a robot or model by name or path, with the parameters of `--set` and `--nodes`.
 
-    A file's content decides what it is.
+    The content of a file decides its type.
     """
     import knode_cosserat as kc
 
-    if name not in kc.catalog() and _begins(name, TRAJECTORY_MARK):
+    if name in kc.catalog():
+        return modified(kc.load_robot(name), changes, nodes)
+    if _begins(name, TRAJECTORY_MARK):
         raise ValueError(f"{name}: this is a trajectory; allowed is a robot or a model")
-    if name not in kc.catalog() and _begins(name, MODEL_MARK):
+    if is_recording(name):
+        raise ValueError(
+            f"{name}: this is a recording or table; allowed is a robot or a model. To check a recording, "
+            f"type: {command_line('inspect', name)}"
+        )
+    if _begins(name, MODEL_MARK):
         from knode_cosserat.learning.files.model_file import load_model
 
-        return changed(load_model(name), changes, nodes)
-    if name not in kc.catalog() and os.path.isdir(name):
+        return modified(load_model(name), changes, nodes)
+    if os.path.isdir(name):
         raise ValueError(
-            f"{name}: this is a folder; allowed is a robot or a model, such as one in an ensemble's"
+            f"{name}: this is a folder; allowed is a robot or a model, such as one file of an ensemble"
         )
-    return changed(kc.load_robot(name), changes, nodes)
+    return modified(kc.load_robot(name), changes, nodes)
 
 
-def ensemble_of(name: str, changes: list[str] | None) -> Ensemble | None:
-    """The ensemble in a folder, with the parameters of `--set`; None if it is not a folder."""
+def load_ensemble_folder(name: str, changes: list[str] | None) -> Ensemble | None:
+    """Return the ensemble in a folder, with the parameters of `--set`; None if it is not a folder."""
     import knode_cosserat as kc
 
     if name in kc.catalog() or not os.path.isdir(name):
         return None
     from knode_cosserat.learning.ensemble import Ensemble, load_ensemble
 
-    members: Any = [changed(member, changes) for member in load_ensemble(name)]
+    members: Any = [modified(member, changes) for member in load_ensemble(name)]
     return Ensemble(members)
 
 
-def changed(system: System, changes: list[str] | None, nodes: int | None = None) -> System:
-    """The robot with the parameters of `--set` and `--nodes`."""
+def modified(system: System, changes: list[str] | None, nodes: int | None = None) -> System:
+    """Return the robot with the parameters of `--set` and `--nodes`."""
     import yaml
 
     values: dict[str, Any] = {} if nodes is None else {"nodes": nodes}
     for change in changes or ():
         name, equals, text = (part.strip() for part in change.partition("="))
         try:
-            value = _number(yaml.safe_load(text))
+            value = _parse_value(text)
         except yaml.YAMLError:
             equals = ""
         if not (name and equals):
             raise ValueError(
-                f"--set {change!r}: allowed is NAME=VALUE, such as length=0.4 or gravity=[0, 0, -9.81]"
+                f"--set must be NAME=VALUE, such as length=0.4 or gravity=0,0,-9.81 (got {change!r})"
             )
         if name in values:
             other = "--nodes" if name == "nodes" and nodes is not None else "another --set"
@@ -114,29 +161,47 @@ def changed(system: System, changes: list[str] | None, nodes: int | None = None)
     return system.replace(**values)
 
 
-def _number(value: Any) -> Any:
-    """Also where PyYAML, which reads YAML 1.1, sees text: in 10e9."""
-    if isinstance(value, list):
-        return [_number(each) for each in value]
-    try:
-        return float(value) if isinstance(value, str) else value
-    except ValueError:
-        return value
+def _parse_value(text: str) -> Any:
+    """Return a parameter's value from YAML, or from numbers with separators. Raises `yaml.YAMLError`."""
+    import yaml
+
+    value = yaml.safe_load(text)
+    # PyYAML reads YAML 1.1, in which 10e9 is text
+    if isinstance(value, str) or (isinstance(value, list) and any(isinstance(each, str) for each in value)):
+        numbers = numbers_in(text)
+        if numbers is not None:
+            return numbers[0] if len(numbers) == 1 and isinstance(value, str) else numbers
+    return value
 
 
 # files
 
 
 def is_trajectory(name: str) -> bool:
-    """Whether a name stands for a trajectory: by its content, or its ending if there is no such file."""
+    """True if a file is a trajectory by its content, or by its ending if there is no such file."""
     return Path(name).suffix == ".nc" or _begins(name, TRAJECTORY_MARK)
 
 
-def trajectory_of(path: Path) -> Trajectory:
-    """The trajectory in a file; also one of a model."""
-    import knode_cosserat as kc
-    from knode_cosserat.learning.files import model_file  # noqa: F401  (so that a trajectory's model is understood)
+def is_recording(name: str) -> bool:
+    """True if a file is a bag or a table by its ending, and not a trajectory by its content."""
+    return name.lower().endswith(RECORDINGS) and not _begins(name, TRAJECTORY_MARK)
 
+
+def command_line(*words: str | Path) -> str:
+    """Return a command of this program as it is typed in a shell."""
+    return shlex.join(["knode-cosserat", *map(str, words)])
+
+
+def load_trajectory_file(path: Path) -> Trajectory:
+    """Return the trajectory in a file, of a robot or of a model."""
+    import knode_cosserat as kc
+    from knode_cosserat.learning.files import model_file  # noqa: F401  (registers models with the reader)
+
+    if is_recording(str(path)) and path.exists():
+        raise ValueError(
+            f"{path}: this is a recording or table; allowed is a trajectory (.nc) with full states. To check "
+            f"a recording, type: {command_line('inspect', path)}"
+        )
     return kc.load_trajectory(path)
 
 
@@ -150,22 +215,25 @@ def _begins(name: str, mark: bytes) -> bool:
 def require_writable(
     file: Path | None = None, figure: Path | None = None, folders: Sequence[Path | None] = ()
 ) -> None:
-    """Better said before a long computation than after it; folders are made later, if they are not there."""
+    """Raise `ValueError` if an output cannot be written: before a long computation, not after it.
+
+    Folders need not exist.
+    """
     for path in (file, figure):
         if path and not path.parent.is_dir():
-            raise ValueError(f"{path}: there is no folder {path.parent}")
+            raise ValueError(f"{path}: there is no folder {path.parent}; create it, or give another path")
         if path and path.is_dir():
             raise ValueError(f"{path}: this is a folder; allowed is a file")
     if figure and figure.suffix not in FORMATS:
-        raise ValueError(f"{figure}: allowed for a figure is a name that ends in {', '.join(FORMATS)}")
+        raise ValueError(f"{figure}: the name of a figure must end in {', '.join(FORMATS)}")
     for path in (file, figure, *folders):
         if path:
             _try_to_write(path, folder=path in folders, replaced=path is file)
 
 
 def _try_to_write(path: Path, *, folder: bool, replaced: bool) -> None:
-    """Do it and leave nothing: permissions alone do not tell, of a read-only disk say."""
-    # files are written beside where they belong (`_files.replacing`), figures over what is there
+    """Raise `ValueError` if writing fails. Permissions alone do not show a read-only disk."""
+    # files are written to a temporary file in the same folder (`_files.replacing`), figures are overwritten
     over = path.exists() and not folder and not (replaced and path.is_file())
     at = path if folder else Path(os.path.realpath(path)).parent
     while folder and not at.exists():
@@ -180,13 +248,53 @@ def _try_to_write(path: Path, *, folder: bool, replaced: bool) -> None:
         raise ValueError(f"{path}: nothing can be written{where}: {error.strerror}") from None
 
 
-def wanted(progress: bool | None) -> bool:
-    """Whether to show progress: as told, or if somebody is looking."""
+def require_trajectory_name(path: Path | None) -> None:
+    """Raise `ValueError` if the name of a netCDF output has the ending of another type of file."""
+    if path and path.name.lower().endswith((*RECORDINGS, *FORMATS, ".yaml", ".yml", ".json", ".npz")):
+        raise ValueError(
+            f"{path}: the name of a trajectory must end in .nc. Did you mean {path.with_suffix('.nc')}?"
+        )
+
+
+@contextlib.contextmanager
+def coarse_grid_in_output() -> Iterator[None]:
+    """Suppress the warning of a coarse grid, for commands whose output states it."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="the grid is too coarse")
+        yield
+
+
+def load_recordings(paths: Sequence[Path], config: Path | None) -> list[Recording]:
+    """Return the recordings in files, read by a configuration file if there is one."""
+    from knode_cosserat.recordings.config import RecordingConfig
+    from knode_cosserat.recordings.findings import RecordingError
+    from knode_cosserat.recordings.load import load_recording
+
+    meaning = None if config is None else RecordingConfig.load(config)
+    recordings = []
+    for path in paths:
+        if is_trajectory(str(path)):
+            raise ValueError(
+                f"{path}: this is a trajectory; allowed is a recording (.bag, .mcap, .db3, .csv, .parquet). "
+                f"To draw a trajectory, type: {command_line('plot', path, '--out', path.stem + '.png')}. "
+                f"To learn a model from it, type: {command_line('fit', 'ROBOT', path, '--out', 'model')}"
+            )
+        try:
+            recordings.append(load_recording(path, meaning))
+        except RecordingError as error:
+            columns = config is None and ("the columns are" in str(error) or "is missing" in str(error))
+            hint = "; or describe its own names in a YAML file with --config" if columns else ""
+            raise ValueError(f"{error}{hint}") from None
+    return recordings
+
+
+def shows_progress(progress: bool | None) -> bool:
+    """True if progress is shown: by option, or by default on a terminal."""
     return sys.stderr.isatty() if progress is None else progress
 
 
 def figures() -> Any:
-    """The module of figures; `ImportError` if they cannot be drawn."""
+    """Return the module of figures. Raises `ImportError` without matplotlib."""
     from knode_cosserat.evaluation import figures
 
     figures.require_matplotlib()

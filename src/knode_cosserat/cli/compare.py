@@ -1,4 +1,4 @@
-"""Commands on trajectories: evaluate, plot, animate."""
+"""Commands that compare and draw trajectories: evaluate, plot, animate."""
 
 from __future__ import annotations
 
@@ -15,17 +15,19 @@ from knode_cosserat.cli.arguments import (
     Picture,
     Progress,
     Space,
-    ensemble_of,
+    command_line,
     figures,
+    is_recording,
     is_trajectory,
+    load_ensemble_folder,
+    load_system,
+    load_trajectory_file,
     require_writable,
-    system_of,
-    trajectory_of,
-    wanted,
+    shows_progress,
 )
 from knode_cosserat.cli.identify import Config, Seconds, Start, Step, evaluate_on_recordings
+from knode_cosserat.cli.output import table, write_output
 from knode_cosserat.cli.program import app, examples
-from knode_cosserat.cli.telling import table, tell
 
 if TYPE_CHECKING:
     from knode_cosserat.learning.ensemble import Ensemble
@@ -34,7 +36,7 @@ if TYPE_CHECKING:
 
 
 class Kind(enum.StrEnum):
-    """The figures of a trajectory that `plot` can draw."""
+    """Kinds of figures that `plot` draws."""
 
     overview = "overview"
     shape = "shape"
@@ -46,8 +48,8 @@ class Kind(enum.StrEnum):
     compare = "compare"
 
 
-class Seen(enum.StrEnum):
-    """From where a robot is looked at."""
+class Viewpoint(enum.StrEnum):
+    """Projections of a robot: in space, or onto a coordinate plane."""
 
     xyz = "xyz"
     xy = "xy"
@@ -55,12 +57,12 @@ class Seen(enum.StrEnum):
     yz = "yz"
 
 
-Several = Annotated[
+Trajectories = Annotated[
     list[Path], typer.Argument(metavar="TRAJECTORY…", help="Trajectory files; the first is the reference.")
 ]
-View = Annotated[Seen, typer.Option(help="In space, or along an axis.")]
+View = Annotated[Viewpoint, typer.Option(help="View in space (xyz), or projection onto a coordinate plane.")]
 Columns = Annotated[
-    int, typer.Option(min=1, max=2, metavar="N", help="As wide as one column of a paper, or as two.")
+    int, typer.Option(min=1, max=2, metavar="N", help="Width of the figure: one or two columns of a paper.")
 ]
 
 
@@ -78,18 +80,18 @@ def evaluate(
         str,
         typer.Argument(
             metavar="PREDICTION",
-            help="A trajectory file; or a model, an ensemble (a folder; its mean counts) or a robot, "
-            "which is simulated under each reference's controls.",
+            help="Trajectory file; or a robot, model or ensemble (a folder; its mean is compared), "
+            "which is simulated under the controls of each reference.",
         ),
     ],
     references: Annotated[
         list[Path],
-        typer.Argument(metavar="REFERENCE", help="Trajectory files; or recordings: bags or tables."),
+        typer.Argument(metavar="REFERENCE", help="Trajectory files (.nc); or recordings: bags or tables."),
     ],
     changes: Changes = None,
     rows: Annotated[
         int | None,
-        typer.Option(metavar="N", min=1, help="Compare the first N rows only; the paper's tables: 100."),
+        typer.Option(metavar="N", min=1, help="Compare only the first N rows; the paper's tables use 100."),
     ] = None,
     config: Config = None,
     start: Start = None,
@@ -99,42 +101,45 @@ def evaluate(
     progress: Progress = None,
     as_json: Json = False,
 ) -> None:
-    """Measure how far a prediction is from references.
+    """Compute the error of a prediction against references.
 
-    Tip DTW is the dynamic-time-warping distance between the tip paths in m, pose MSE the mean squared error
-    of positions and Euler angles times 1000 (both as in the paper), tip RMSE the root mean square distance of
-    the tips in m. Recordings are predicted by their measured tensions, from the equilibrium at their start;
-    rotations are those since then, and the options from --config to --space are theirs.
+    Tip RMSE: root mean square distance of the tips (m). Tip DTW: dynamic-time-warping distance between the
+    tip paths (m). Pose MSE: mean squared error of positions and Euler angles, times 1000. DTW and MSE are
+    defined as in the paper.
+
+    A recording is predicted from its measured tensions, starting at the equilibrium under the first ones.
+    Rotations are relative to the start. --config, --start, --seconds, --dt and --space apply to recordings.
     """
     import knode_cosserat as kc
 
+    _require_one_kind(prediction, references, config)
     if config is not None or not any(is_trajectory(str(path)) for path in references):
-        system = system_of(prediction, changes)
+        system = load_system(prediction, changes)
         return evaluate_on_recordings(system, references, config, start, seconds, dt, space, as_json)
-    given: Trajectory | System | Ensemble
+    predictor: Trajectory | System | Ensemble
     if not is_trajectory(prediction):
-        given = ensemble_of(prediction, changes) or system_of(prediction, changes)
+        predictor = load_ensemble_folder(prediction, changes) or load_system(prediction, changes)
     elif changes:
         raise ValueError(f"--set changes a robot; {prediction} is a trajectory")
     else:
-        given = trajectory_of(Path(prediction))
-    found = []
+        predictor = load_trajectory_file(Path(prediction))
+    compared = []
     for path in references:
-        reference = trajectory_of(path)
+        reference = load_trajectory_file(path)
         try:
-            own = (
-                given[:rows]
-                if isinstance(given, kc.Trajectory)
-                else _driven(given, reference, rows, wanted(progress))
+            predicted = (
+                predictor[:rows]
+                if isinstance(predictor, kc.Trajectory)
+                else _simulated(predictor, reference, rows, shows_progress(progress))
             )
-            measures = {measure.__name__: measure(own, reference[:rows]) for measure in _measures()}
+            measures = {measure.__name__: measure(predicted, reference[:rows]) for measure in _measures()}
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
-        found.append({"reference": str(path), "rows": len(reference.time[:rows]), **measures})
-    rows_told: list[list[str]] = [["reference", "rows", "tip DTW [m]", "pose MSE [1e-3]", "tip RMSE [m]"]]
-    for name, count, *numbers in (one.values() for one in found):
-        rows_told.append([name, str(count), *(f"{number:.4g}" for number in numbers)])
-    tell(as_json, {"prediction": prediction, "references": found}, table(rows_told))
+        compared.append({"reference": str(path), "rows": len(reference.time[:rows]), **measures})
+    lines: list[list[str]] = [["reference", "rows", "tip DTW [m]", "pose MSE [1e-3]", "tip RMSE [m]"]]
+    for name, count, *numbers in (one.values() for one in compared):
+        lines.append([name, str(count), *(f"{number:.4g}" for number in numbers)])
+    write_output(as_json, {"prediction": prediction, "references": compared}, table(lines))
 
 
 @app.command(
@@ -145,19 +150,21 @@ def evaluate(
     )
 )
 def plot(
-    trajectories: Several,
+    trajectories: Trajectories,
     out: Annotated[Path, Picture],
     kind: Annotated[
-        Kind, typer.Option(help="What to draw.", show_default="overview, and compare of several")
+        Kind,
+        typer.Option(help="Kind of figure.", show_default="overview; compare for several trajectories"),
     ] = Kind.overview,
-    view: View = Seen.xyz,
+    view: View = Viewpoint.xyz,
     columns: Columns = 1,
     as_json: Json = False,
 ) -> None:
-    """Draw one trajectory, or several over each other.
+    """Draw one trajectory, or overlay several.
 
-    One: its shapes over time, tensions, or an overview. Any number: path of the tip, the tip or the states
-    over time. Two or more: how far the tips are from the first one's (error), or shapes and tips (compare).
+    For one trajectory: overview, shape (shapes over time), tensions. For any number: path (of the tip), tip
+    and states (over time). For two or more: error (distance of the tips from the first trajectory's) and
+    compare (shapes and tips).
     """
     require_writable(figure=out)
     drawing = figures()
@@ -166,14 +173,14 @@ def plot(
     if others and kind is Kind.overview:
         kind = Kind.compare
     if others and kind in (Kind.shape, Kind.tensions):
-        raise ValueError(f"--kind {kind} draws one trajectory; {len(states)} were given")
+        raise ValueError(f"--kind {kind} draws one trajectory; {len(states)} were given. Use --kind compare")
     if not others and kind in (Kind.error, Kind.compare):
-        raise ValueError(f"--kind {kind} needs a reference and one trajectory or more; one was given")
+        raise ValueError(f"--kind {kind} needs a reference and at least one other trajectory; one was given")
     rest = dict(list(states.items())[1:])
     draw = {
         Kind.overview: lambda: drawing.overview(first),
-        Kind.shape: lambda: drawing.shape(first, view=_seen(first, view), columns=columns),
-        Kind.path: lambda: drawing.path(states, view=_seen(first, view), columns=columns),
+        Kind.shape: lambda: drawing.shape(first, view=_view(first, view), columns=columns),
+        Kind.path: lambda: drawing.path(states, view=_view(first, view), columns=columns),
         Kind.tip: lambda: drawing.tips(states, columns=columns),
         Kind.states: lambda: drawing.states(states, columns=columns),
         Kind.tensions: lambda: drawing.tensions(first, columns=columns),
@@ -181,7 +188,9 @@ def plot(
         Kind.compare: lambda: drawing.compare(first, rest),
     }
     draw[kind]().savefig(out)
-    tell(as_json, {"trajectories": [str(path) for path in trajectories], "kind": kind.value}, [], out=out)
+    write_output(
+        as_json, {"trajectories": [str(path) for path in trajectories], "kind": kind.value}, [], out=out
+    )
 
 
 @app.command(
@@ -190,54 +199,92 @@ def plot(
     )
 )
 def animate(
-    trajectories: Several,
-    out: Annotated[Path, typer.Option(metavar="FILE", help="Write the motion to this GIF or MP4 file.")],
-    fps: Annotated[float, typer.Option(metavar="F", help="Pictures a second, 1 to 50.")] = 25.0,
-    speed: Annotated[float, typer.Option(metavar="S", help="1 is real time, 0.5 half as fast.")] = 1.0,
-    view: View = Seen.xyz,
+    trajectories: Trajectories,
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Write the animation to this GIF or MP4 file.")],
+    fps: Annotated[float, typer.Option(metavar="F", help="Frames per second, 1 to 50.")] = 25.0,
+    speed: Annotated[
+        float, typer.Option(metavar="S", help="Playback speed: 1 is real time, 0.5 is half speed.")
+    ] = 1.0,
+    view: View = Viewpoint.xyz,
     columns: Columns = 1,
     as_json: Json = False,
 ) -> None:
-    """Show how robots move: one trajectory, or several over each other, in real time.
+    """Animate one trajectory, or several overlaid.
 
-    A GIF needs matplotlib only, an MP4 the program ffmpeg.
+    A GIF needs matplotlib; an MP4 also needs the program ffmpeg.
     """
     require_writable(out)
     drawing = figures()
     states = _by_stem(trajectories)
-    seen = _seen(next(iter(states.values())), view)
-    drawing.animate(states, out, fps=fps, speed=speed, view=seen, columns=columns)
-    tell(as_json, {"trajectories": [str(path) for path in trajectories]}, [], out=out)
+    projection = _view(next(iter(states.values())), view)
+    drawing.animate(states, out, fps=fps, speed=speed, view=projection, columns=columns)
+    write_output(as_json, {"trajectories": [str(path) for path in trajectories]}, [], out=out)
 
 
 def _by_stem(paths: list[Path]) -> dict[str, Trajectory]:
-    """Trajectories by their files' names, or whole paths where names are the same."""
+    """Return the trajectories by the stems of their files, or by their paths if stems are equal."""
     stems = [path.stem for path in paths]
     names = stems if len(set(stems)) == len(stems) else [str(path) for path in paths]
     if len(set(names)) < len(names):
-        raise ValueError(f"{names[0]}: given twice")
-    return {name: trajectory_of(path) for name, path in zip(names, paths, strict=True)}
+        raise ValueError(f"{names[0]}: given twice; allowed is each file once")
+    return {name: load_trajectory_file(path) for name, path in zip(names, paths, strict=True)}
 
 
-def _seen(trajectory: Trajectory, view: Seen) -> str | None:
-    """What was asked for; the only view of a system in a plane."""
-    return None if np.shape(trajectory.position)[-1] == 2 and view is Seen.xyz else view.value
+def _view(trajectory: Trajectory, view: Viewpoint) -> str | None:
+    """Return the name of a view; None for the only view of a planar system."""
+    return None if np.shape(trajectory.position)[-1] == 2 and view is Viewpoint.xyz else view.value
+
+
+def _require_one_kind(prediction: str, references: list[Path], config: Path | None) -> None:
+    """Raise `ValueError` with the right command if recordings and trajectories are mixed up."""
+    recordings = [str(path) for path in references if is_recording(str(path))]
+    others = [str(path) for path in references if str(path) not in recordings]
+    read = ["--config", str(config)] if config else []
+    if is_recording(prediction):
+        robot = next((name for name in others if not is_trajectory(name)), "ROBOT")
+        typed = command_line("evaluate", robot, prediction, *recordings, *read)
+        raise ValueError(
+            f"{prediction}: this is a recording; the prediction must be a robot or model, and recordings "
+            f"follow it. To evaluate a robot on recordings, type: {typed}"
+        )
+    if recordings and is_trajectory(prediction):
+        typed = command_line("evaluate", "ROBOT", *recordings, *(read or ["--config", "recording.yaml"]))
+        raise ValueError(
+            f"{recordings[0]}: this is a recording; only a robot or model is compared with it, not the "
+            f"trajectory {prediction}. Type: {typed}"
+        )
+    robots = [name for name in others if not is_trajectory(name)]
+    if is_trajectory(prediction) and robots:
+        raise ValueError(
+            f"{robots[0]}: a reference must be a trajectory or a recording; a robot or model comes "
+            f"first. Type: {command_line('evaluate', robots[0], prediction)}"
+        )
+    trajectories = [name for name in others if is_trajectory(name)]
+    if recordings and trajectories:
+        typed = command_line("evaluate", prediction, *recordings, *(read or ["--config", "recording.yaml"]))
+        raise ValueError(
+            f"{recordings[0]} is a recording and {trajectories[0]} a trajectory; evaluate them by two "
+            f"commands. For recordings, type: {typed}"
+        )
 
 
 def _measures() -> tuple[Any, ...]:
     import knode_cosserat as kc
 
-    return kc.tip_dtw, kc.pose_mse, kc.tip_rmse
+    return kc.metrics.tip_dtw, kc.metrics.pose_mse, kc.metrics.tip_rmse
 
 
-def _driven(system: System | Ensemble, reference: Trajectory, rows: int | None, progress: bool) -> Any:
-    """From rest under the controls of the reference, by the same schemes; an ensemble's mean."""
+def _simulated(system: System | Ensemble, reference: Trajectory, rows: int | None, progress: bool) -> Any:
+    """Return the simulation from rest under the reference's controls, with its schemes.
+
+    For an ensemble it is the prediction of all members, compared by its mean.
+    """
     import knode_cosserat as kc
     from knode_cosserat.learning.ensemble import Ensemble, Prediction
 
     if np.ndim(reference.y) != 3 or len(reference.time) < 2:
-        raise ValueError("allowed is a trajectory of one robot, of two rows or more")
-    it = reference.settings or kc.Settings()
+        raise ValueError("allowed is a trajectory of one robot, with two rows or more")
+    it = reference.settings or kc.solvers.Settings()
     options: Any = {
         "time": it.time, "space": it.space, "start": it.start, "newton": it.newton, "progress": progress,
     }  # fmt: skip

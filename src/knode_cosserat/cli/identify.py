@@ -1,4 +1,4 @@
-"""Command that identifies a robot from recordings, and the part of `evaluate` that compares with them."""
+"""Command that identifies a robot from recordings, and the evaluation of a robot on recordings."""
 
 from __future__ import annotations
 
@@ -15,16 +15,15 @@ from knode_cosserat.cli.arguments import (
     Progress,
     Robot,
     Space,
+    load_recordings,
+    load_system,
     require_writable,
-    system_of,
-    wanted,
+    shows_progress,
 )
+from knode_cosserat.cli.output import write_output
 from knode_cosserat.cli.program import app, examples
-from knode_cosserat.cli.telling import tell
 
 if TYPE_CHECKING:
-    from knode_cosserat.recordings.config import RecordingConfig
-    from knode_cosserat.recordings.recording import Recording
     from knode_cosserat.rods.system import System
 
 Recordings = Annotated[
@@ -33,14 +32,23 @@ Recordings = Annotated[
 ]
 Config = Annotated[
     Path | None,
-    typer.Option(metavar="YAML", help="How recordings are read.", show_default="the paper's robot"),
+    typer.Option(
+        metavar="YAML",
+        help="Meaning of the recordings' topics or columns.",
+        show_default="the paper's robot for bags; titles and comments for tables",
+    ),
 ]
 Start = Annotated[
-    float | None, typer.Option(metavar="S", help="First row, in s; the robot rests there.", show_default="0")
+    float | None,
+    typer.Option(
+        metavar="S", help="Start time in the recording (s), at which the robot rests.", show_default="0"
+    ),
 ]
-Seconds = Annotated[float | None, typer.Option(metavar="S", help="Length, in s.", show_default="to the end")]
+Seconds = Annotated[
+    float | None, typer.Option(metavar="S", help="Duration used (s).", show_default="to the end")
+]
 
-Step = Annotated[float, typer.Option(metavar="S", help="Time step of the simulation, in s.")]
+Step = Annotated[float, typer.Option(metavar="S", help="Time step of the simulation (s).")]
 
 
 @app.command(
@@ -62,66 +70,63 @@ def identify(
         typer.Option(
             "--effect",
             metavar="NAME",
-            help="Effect to identify; repeat for several.",
-            show_default="those worth their place",
+            help="Physical effect to identify, such as friction; may be repeated.",
+            show_default="selected by recordings left out",
         ),
+    ] = None,
+    checkpoint: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Keep finished searches here; an interrupted run resumes."),
     ] = None,
     space: Space = "lobatto2",
     changes: Changes = None,
     progress: Progress = None,
     as_json: Json = False,
 ) -> None:
-    """Identify a tendon robot from recordings: which effects it has, and their numbers.
+    """Identify a tendon robot's parameters from recordings.
 
-    ROBOT is the robot as ruler, scale and data sheet have it. Effects are kept that lower the error of
-    recordings left out of the search; the result has to pass trials with larger and random tensions.
+    ROBOT is the nominal robot, from measured dimensions, masses and data sheets. An effect is kept if it
+    lowers the error on recordings left out of the search. The result must pass trial simulations with larger
+    and with random tensions.
     """
     require_writable(out)
     import knode_cosserat as kc
     from knode_cosserat.identification.identify import identify as find
 
-    nominal = system_of(str(robot), changes)
-    given = [
+    nominal = load_system(str(robot), changes)
+    samples = [
         each.sampled(dt, start, None if seconds is None else (start or 0.0) + seconds, mean=True)
-        for each in _read(recordings, config)
+        for each in load_recordings(recordings, config)
     ]
     began = perf_counter()
-    say = _on_stderr if wanted(progress) else None
-    found = find(nominal, given, effects or None, space=space, progress=say)
-    kc.save_robot(found.robot, out)
-    facts = found.to_dict() | {"computing_time": round(perf_counter() - began, 1)}
-    tell(as_json, facts, str(found).splitlines(), out=out)
+    report = _print_on_stderr if shows_progress(progress) else None
+    identified = find(nominal, samples, effects or None, space=space, progress=report, checkpoint=checkpoint)
+    kc.save_robot(identified.robot, out)
+    facts = identified.to_dict() | {"computing_time": round(perf_counter() - began, 1)}
+    write_output(as_json, facts, str(identified).splitlines(), out=out)
 
 
 def evaluate_on_recordings(
     system: System, recordings: list[Path], config: Path | None, start: float | None, seconds: float | None,
     dt: float, space: str, as_json: bool,
 ) -> None:  # fmt: skip
-    """Predict recordings by their measured tensions, and compare: tip RMSE and pose MSE of each.
+    """Predict recordings from their measured tensions; print tip RMSE and pose MSE of each.
 
-    A prediction begins in the equilibrium under the tensions at its start. Rotations are those since then,
-    for how motion capture's bodies are mounted is not known.
+    A prediction starts at the equilibrium under the first tensions. Rotations are relative to the start,
+    because the mounting of the tracked bodies is unknown.
     """
     from knode_cosserat.identification.evaluate import evaluate as compare
 
     facts: dict[str, Any] = {}
     lines = []
-    for path, recording in zip(recordings, _read(recordings, config), strict=True):
+    for path, recording in zip(recordings, load_recordings(recordings, config), strict=True):
         end = None if seconds is None else (start or 0.0) + seconds
         rows = recording.sampled(dt, start, end, mean=True)
-        found = compare(system, rows, space=space)
-        facts[str(path)] = found.to_dict()
-        lines.append(f"{path}: {found}")
-    tell(as_json, {"recordings": facts}, lines)
+        evaluation = compare(system, rows, space=space)
+        facts[str(path)] = evaluation.to_dict()
+        lines.append(f"{path}: {evaluation}")
+    write_output(as_json, {"recordings": facts}, lines)
 
 
-def _read(paths: list[Path], config: Path | None) -> list[Recording]:
-    from knode_cosserat.recordings.config import RecordingConfig
-    from knode_cosserat.recordings.load import load_recording
-
-    chosen: RecordingConfig | None = None if config is None else RecordingConfig.load(config)
-    return [load_recording(path, chosen) for path in paths]
-
-
-def _on_stderr(line: str) -> None:
+def _print_on_stderr(line: str) -> None:
     print(line, file=sys.stderr, flush=True)

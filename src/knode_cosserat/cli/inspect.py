@@ -1,4 +1,4 @@
-"""The command that reports on a recording."""
+"""Command that checks a recording: inspect."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from knode_cosserat.cli.arguments import Json, Picture, figures, require_writable
+from knode_cosserat.cli.arguments import Json, Picture, figures, load_recordings, require_writable
+from knode_cosserat.cli.output import table, write_output
 from knode_cosserat.cli.program import app, examples
-from knode_cosserat.cli.telling import table, tell
 
 if TYPE_CHECKING:
     from knode_cosserat.recordings.quality import Health, StreamHealth
@@ -26,63 +26,61 @@ def inspect(
     recording: Annotated[
         Path,
         typer.Argument(
-            metavar="RECORDING", help="A bag of ROS 1 or 2 (a file or a folder), or a CSV or Parquet table."
+            metavar="RECORDING", help="ROS 1 or ROS 2 bag (a file or a folder), or CSV or Parquet table."
         ),
     ],
     config: Annotated[
         Path | None,
         typer.Option(
             metavar="YAML",
-            help="What its topics or columns mean.",
-            show_default="the paper's robot for bags, what it says itself for a table",
+            help="Meaning of the recording's topics or columns.",
+            show_default="the paper's robot for bags; titles and comments for tables",
         ),
     ] = None,
     plot: Annotated[Path | None, Picture] = None,
     as_json: Json = False,
 ) -> None:
-    """Report how good a recording is.
+    """Report the quality of a recording.
 
-    Rates, gaps, swapped axes, noise, how late tensions follow commands and how far they are from them; what
-    was wrong, and what was done about it.
+    Sampling rates, gaps, swapped axes, noise, and the delay and error of measured tensions relative to
+    commands. Lists the defects found and their corrections.
     """
     require_writable(figure=plot)
     if plot:
         figures()
-    import knode_cosserat as kc
-
-    read = kc.load_recording(recording, kc.RecordingConfig.load(config) if config else None)
-    report = read.health()
+    (loaded,) = load_recordings([recording], config)
+    report = loaded.health()
     if plot:
         from knode_cosserat.evaluation import recording_figures
 
-        recording_figures.health(read, report).savefig(plot)
+        recording_figures.health(loaded, report).savefig(plot)
     written = {"plot": plot} if plot or as_json else {}
-    tell(as_json, {"recording": str(recording), **report.to_dict()}, _lines(report), **written)
+    write_output(as_json, {"recording": str(recording), **report.to_dict()}, _lines(report), **written)
 
 
 def _lines(report: Health) -> list[str]:
-    said = {True: "yes", False: "no", None: "not stated"}[report.simulated]
-    lines = [report.source, f"simulated: {said}", _times(report)]
+    simulated = {True: "yes", False: "no", None: "not stated"}[report.simulated]
+    lines = [report.source, f"simulated: {simulated}", _duration(report)]
     if report.rod_length:
         lengths = ", ".join(f"{length:.4f}" for length in report.rod_length)
-        lines.append(f"length of the rod by each body: {lengths} m")
+        lines.append(f"length of the rod, from each body: {lengths} m")
     lines += ["", *table([_TITLES, *map(_row, report.streams)])]
     if report.latency is not None:
         it = report.latency
         lines += [
             "",
-            f"tensions follow commands: nearest {it.shift:.3f} s later; as a lag, {it.lag:.3f} s after a "
-            f"delay of {it.delay:.3f} s",
+            f"tensions follow commands: best shift {it.shift:.3f} s; or a delay of {it.delay:.3f} s and a "
+            f"first-order lag of {it.lag:.3f} s",
         ]
     if report.tension_errors:
-        rows = [["tendon", "measured less commanded [N]", "root mean square [N]"]]
+        rows = [["tendon", "measured minus commanded [N]", "root mean square [N]"]]
         rows += [[str(it.tendon), f"{it.bias:+.3f}", f"{it.rms:.3f}"] for it in report.tension_errors]
         lines += ["", *table(rows)]
     findings = [str(finding) for finding in report.findings]
-    return [*lines, "", *(findings or ["nothing wrong was found"])]
+    return [*lines, "", *(findings or ["no defects found"])]
 
 
-def _times(report: Health) -> str:
+def _duration(report: Health) -> str:
     rest = (
         "never at rest"
         if report.rest is None
@@ -93,28 +91,28 @@ def _times(report: Health) -> str:
 
 _TITLES = [
     "topic", "what", "rows", "rate [Hz]", "jitter [ms]", "missing [%]", "gaps", "longest [ms]", "delay [ms]",
-    "noise", "of angles [mrad]",
+    "noise", "angle noise [mrad]",
 ]  # fmt: skip
 
 
 def _row(stream: StreamHealth) -> list[str]:
-    noise = _told(stream.noise, 1.0, ".3f") + " N" if stream.what == "measured tensions" else None
+    noise = _number_text(stream.noise, 1.0, ".3f") + " N" if stream.what == "measured tensions" else None
     if noise is None:
-        noise = _told(stream.noise, 1e3, ".3f") + " mm"
+        noise = _number_text(stream.noise, 1e3, ".3f") + " mm"
     return [
         stream.topic,
         stream.what,
         str(stream.rows),
-        _told(stream.rate, 1.0, ".2f"),
-        _told(stream.jitter, 1e3, ".3f"),
-        _told(stream.missing, 100.0, ".2f"),
+        _number_text(stream.rate, 1.0, ".2f"),
+        _number_text(stream.jitter, 1e3, ".3f"),
+        _number_text(stream.missing, 100.0, ".2f"),
         "-" if stream.gaps is None else str(stream.gaps),
-        _told(stream.longest_gap, 1e3, ".1f"),
-        _told(stream.delay, 1e3, ".2f"),
+        _number_text(stream.longest_gap, 1e3, ".1f"),
+        _number_text(stream.delay, 1e3, ".2f"),
         "-" if stream.noise is None else noise,
-        _told(stream.turn_noise, 1e3, ".2f"),
+        _number_text(stream.turn_noise, 1e3, ".2f"),
     ]
 
 
-def _told(value: Any, factor: float, form: str) -> str:
+def _number_text(value: Any, factor: float, form: str) -> str:
     return "-" if value is None else format(factor * value, form)

@@ -1,4 +1,4 @@
-"""The command that learns a model from trajectories."""
+"""Command that learns a residual model from trajectories: fit."""
 
 from __future__ import annotations
 
@@ -10,21 +10,24 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from knode_cosserat._numbers import numbers_in
 from knode_cosserat.cli.arguments import (
     Changes,
     Json,
     Picture,
     Progress,
     Robot,
+    command_line,
     figures,
+    is_recording,
+    load_system,
+    load_trajectory_file,
     require_writable,
-    system_of,
-    trajectory_of,
-    wanted,
+    shows_progress,
 )
-from knode_cosserat.cli.facts import learned
+from knode_cosserat.cli.output import write_output
 from knode_cosserat.cli.program import app, examples
-from knode_cosserat.cli.telling import tell
+from knode_cosserat.cli.summaries import residual_summary
 
 if TYPE_CHECKING:
     from knode_cosserat.learning.config import FitConfig
@@ -33,7 +36,7 @@ if TYPE_CHECKING:
 
 
 class Preset(enum.StrEnum):
-    """What is learned, and how."""
+    """Presets of the learning method."""
 
     best = "best"
     paper = "paper"
@@ -49,96 +52,102 @@ class Preset(enum.StrEnum):
 def fit(
     robot: Robot,
     trajectories: Annotated[
-        list[Path], typer.Argument(metavar="TRAJECTORY", help="Trajectory files to learn from.")
+        list[Path],
+        typer.Argument(metavar="TRAJECTORY", help="Training trajectories (.nc) with full states."),
     ],
     out: Annotated[
         Path,
         typer.Option(
             metavar="PATH",
-            help="Write the model to this file; with several seeds, an ensemble to this folder.",
+            help="Write the model to this file; with --seeds, write an ensemble to this folder.",
         ),
     ],
     preset: Annotated[
         Preset,
         typer.Option(
-            help="best: a structured residual by sparse regression. paper: the paper's network and training. "
-            "network: one without its constraints."
+            help="best: structured residual by sparse regression. paper: the paper's network and training. "
+            "network: a network without the paper's constraints."
         ),
     ] = Preset.best,
-    seed: Annotated[
-        int | None, typer.Option(metavar="N", help="Of what is random.", show_default="0")
-    ] = None,
+    seed: Annotated[int | None, typer.Option(metavar="N", help="Random seed.", show_default="0")] = None,
     seeds: Annotated[
-        str | None, typer.Option(metavar="N,N,…", help="Several seeds, trained side by side: a model each.")
+        str | None, typer.Option(metavar="N,N,…", help="Several random seeds: train one model for each.")
     ] = None,
     epochs: Annotated[
-        int | None, typer.Option(metavar="N", help="Epochs of training.", show_default="the preset's")
+        int | None,
+        typer.Option(metavar="N", help="Training epochs of a network.", show_default="the preset's"),
     ] = None,
     rows: Annotated[
         int | None,
-        typer.Option(metavar="N", min=1, help="Learn from the first N rows only; the paper's study: 30."),
+        typer.Option(
+            metavar="N", min=1, help="Use the first N rows of each trajectory only; the paper uses 30."
+        ),
     ] = None,
     changes: Changes = None,
     held_out: Annotated[
         list[Path] | None,
-        typer.Option(metavar="FILE", help="A trajectory that training is stopped by; may be repeated."),
+        typer.Option(metavar="FILE", help="Validation trajectory for early stopping; may be repeated."),
     ] = None,
     checkpoint: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Keep the state of the training there, and go on from it."),
+        typer.Option(metavar="DIR", help="Save the training state in this folder, and resume from it."),
     ] = None,
     log: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Write event files for TensorBoard there.")
+        Path | None, typer.Option(metavar="DIR", help="Write TensorBoard event files to this folder.")
     ] = None,
     figure: Annotated[Path | None, Picture] = None,
     progress: Progress = None,
     as_json: Json = False,
 ) -> None:
-    """Learn from trajectories what a robot's physics misses.
+    """Learn a residual model from trajectories.
 
-    The result is a model, which can be used wherever a robot can.
+    The residual is the difference between the robot's physics and the trajectories. Trajectories have full
+    states, from a simulation or from state estimation; use `identify` for recordings. The resulting model is
+    accepted wherever a robot is.
     """
+    _refuse_recordings(robot, trajectories, out)
     numbers = _seeds(seed, seeds)
     several = isinstance(numbers, tuple)
     if several and out.exists() and not out.is_dir():
-        raise ValueError(f"{out}: this is a file; allowed with several seeds is a folder")
+        raise ValueError(f"{out}: this is a file; with several seeds --out must be a folder")
     require_writable(None if several else out, figure, (out if several else None, checkpoint, log))
     if figure:
         figures()
     from knode_cosserat.learning.fit import fit as learn
     from knode_cosserat.learning.samples import DataError
 
-    knowledge = system_of(robot, changes)
+    nominal = load_system(robot, changes)
     config = _config(preset, numbers, epochs)
-    given = [_loaded(path, rows) for path in trajectories]
-    others = [_loaded(path, None) for path in held_out or ()]
+    training = [_loaded(path, rows) for path in trajectories]
+    validation = [_loaded(path, None) for path in held_out or ()]
     began = perf_counter()
     try:
-        found = learn(
-            knowledge, given, config, held_out=others, checkpoint=checkpoint, log_dir=log,
-            progress=wanted(progress),
+        result = learn(
+            nominal, training, config, held_out=validation, checkpoint=checkpoint, log_dir=log,
+            progress=shows_progress(progress),
         )  # fmt: skip
     except DataError as error:
-        raise ValueError(_named(str(error), trajectories)) from None
+        raise ValueError(_with_file_names(str(error), trajectories)) from None
     seconds = perf_counter() - began
-    found.save(out)
+    result.save(out)
     if figure:
-        _draw(next(iter(found)) if several else found, given[0], figure)
-    count = sum(len(one.time) for one in given)
+        _draw(next(iter(result)) if several else result, training[0], figure)
+    count = sum(len(one.time) for one in training)
+    files = "1 trajectory" if len(training) == 1 else f"{len(training)} trajectories"
     lines = [
-        f"learned what {robot} misses from {len(given)} trajectories of {count} rows in all: "
+        f"learned a residual model of {robot} from {files} ({count} rows): "
         f"preset {preset.value}, {seconds:.2f} s"
     ]
-    told = []
-    for model in found if several else [found]:
-        facts, words = learned(model)
-        told.append({"seed": model.about.facts["seed"], **facts})
-        lines += [*([f"seed {told[-1]['seed']}:"] if several else []), *words]
-    tell(
+    models = []
+    for model in result if several else [result]:
+        facts, words = residual_summary(model)
+        models.append({"seed": model.about.facts["seed"], **facts})
+        lines += [*([f"seed {models[-1]['seed']}:"] if several else []), *words]
+    write_output(
         as_json,
         {
             "robot": robot, "preset": preset.value, "trajectories": [str(path) for path in trajectories],
-            "rows": count, "computing_time": round(seconds, 4), "models": told,
+            "rows": count, "computing_time": round(seconds, 4), "models": models,
         },
         lines,
         out=out,
@@ -147,7 +156,7 @@ def fit(
 
 
 def _draw(model: KNODE, states: Trajectory, path: Path) -> None:
-    """What the model adds to its knowledge, at the states of a trajectory."""
+    """Draw the residual at the states of a trajectory."""
     from knode_cosserat.evaluation.learning_figures import residual
 
     residual(model, states).savefig(path)
@@ -158,10 +167,10 @@ def _seeds(seed: int | None, seeds: str | None) -> int | tuple[int, ...]:
         return 0 if seed is None else seed
     if seed is not None:
         raise ValueError("--seed is for one model and --seeds for several; give one of them")
-    try:
-        return tuple(int(part) for part in seeds.split(","))
-    except ValueError:
-        raise ValueError(f"--seeds {seeds!r}: allowed is whole numbers, such as 0,1,2") from None
+    numbers = numbers_in(seeds)
+    if numbers is None or not all(number.is_integer() for number in numbers):
+        raise ValueError(f"--seeds must be whole numbers, such as 0,1,2 (got {seeds!r})")
+    return tuple(int(number) for number in numbers)
 
 
 def _config(preset: Preset, seed: int | tuple[int, ...], epochs: int | None) -> FitConfig:
@@ -172,7 +181,7 @@ def _config(preset: Preset, seed: int | tuple[int, ...], epochs: int | None) -> 
     if preset is Preset.best:
         if epochs is not None:
             raise ValueError(
-                "--epochs is for networks; the preset best has none, for it solves for its weights"
+                "--epochs is for networks; the preset best has none. Use --preset paper or --preset network"
             )
         return FitConfig(StructuredOptions(resample=isinstance(seed, tuple)), seed=seed)
     config = FitConfig.paper(seed) if preset is Preset.paper else FitConfig.network(seed)
@@ -182,12 +191,24 @@ def _config(preset: Preset, seed: int | tuple[int, ...], epochs: int | None) -> 
 
 
 def _loaded(path: Path, rows: int | None) -> Trajectory:
-    states = trajectory_of(path)
+    states = load_trajectory_file(path)
     return states if rows is None or states.y.ndim != 3 else states[:rows]
 
 
-def _named(message: str, paths: list[Path]) -> str:
-    """What is said of trajectory 0, 1, … said of its file."""
+def _refuse_recordings(robot: str, paths: list[Path], out: Path) -> None:
+    """Raise `ValueError` with the command for recordings, if a file is one."""
+    recordings = [path for path in paths if is_recording(str(path))]
+    if recordings:
+        typed = command_line("identify", robot, *recordings, "--out", out.with_suffix(".yaml"))
+        raise ValueError(
+            f"{recordings[0]}: this is a recording or table; fit needs trajectories (.nc) with full states. "
+            f"To identify the robot from recordings, type: {typed} (with --config recording.yaml if the "
+            "file does not state the meaning of its columns)"
+        )
+
+
+def _with_file_names(message: str, paths: list[Path]) -> str:
+    """Return a message with the files' names instead of the numbers of trajectories."""
 
     def path(found: re.Match[str]) -> str:
         number = int(found[1])

@@ -1,73 +1,139 @@
-"""The program itself: its name, how it fails, its help."""
+"""The typer application: name, options of the program, help and error handling."""
 
 from __future__ import annotations
 
 import logging
+import re
 import sys
+import warnings
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
+from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.solvers.result import SimulationError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
 PROGRAM = "knode-cosserat"
-#: what the user can do something about; anything else is a mistake of ours, and shows where it is
-_EXPECTED = (SimulationError, ValueError, OSError, ImportError, MemoryError, OverflowError)
+#: errors caused by the input; any other error is a defect of the package and shows its traceback
+_EXPECTED = (KnodeCosseratError, ValueError, OSError, ImportError, MemoryError, OverflowError)
+
+#: options that take several numbers
+VECTOR_OPTIONS = frozenset(
+    ["--tension", "--control", "--low", "--high", "--position", "--quaternion", "--seeds", "--set"]
+)
+#: options that take NAME=VALUE pairs
+_NAMED_OPTIONS = frozenset(["--control"])
 
 
 class _Program(TyperGroup):
-    """Says in one line what is wrong, and no more."""
+    """Group of all commands. Errors and warnings are printed in one line on stderr."""
 
     def main(
         self, args: Sequence[str] | None = None, prog_name: str | None = None, *_: Any, **extra: Any
     ) -> Any:
         args = list(sys.argv[1:] if args is None else args)
         try:
-            status = super().main(args or ["--help"], PROGRAM, **{**extra, "standalone_mode": False})
+            with warnings.catch_warnings():
+                warnings.showwarning = _print_warning
+                status = super().main(args or ["--help"], PROGRAM, **{**extra, "standalone_mode": False})
         except typer.Abort:
             sys.exit(1)
         except Exception as error:
-            parser_says = getattr(error, "format_message", None)
-            if parser_says is None and not isinstance(error, _EXPECTED):
+            parser_message = getattr(error, "format_message", None)
+            if parser_message is None and not isinstance(error, _EXPECTED):
                 raise
-            text = parser_says() if parser_says else str(error)
+            text = parser_message() if parser_message else str(error)
             typer.echo("error: " + " ".join(text.split()), err=True)
             sys.exit(1 if isinstance(error, SimulationError) else 2)
         sys.exit(status or 0)
 
 
+class _Command(TyperCommand):
+    """Command whose vector options accept separate words."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        return super().parse_args(ctx, joined_vectors(args))
+
+
+class _App(typer.Typer):
+    """Typer application with commands of class `_Command`."""
+
+    def command(self, *arguments: Any, **options: Any) -> Any:
+        return super().command(*arguments, **{"cls": _Command, **options})
+
+
+def joined_vectors(args: Sequence[str]) -> list[str]:
+    """Return the arguments with the numbers after a vector option joined by commas.
+
+    `--tension 7 5 5 7` becomes `--tension 7,5,5,7`, so that separate words are accepted as well.
+    """
+    joined: list[str] = []
+    rest = list(args)
+    while rest:
+        word = rest.pop(0)
+        option, equals, _ = word.partition("=")
+        if option in VECTOR_OPTIONS and (equals or rest):
+            values = [] if equals else [rest.pop(0)]
+            first = values[0] if values else word
+            while rest and _continues(option, first, rest[0]):
+                values.append(rest.pop(0))
+            joined += [",".join([word, *values])] if equals else [word, ",".join(values)]
+        else:
+            joined.append(word)
+    return joined
+
+
+def _continues(option: str, first: str, word: str) -> bool:
+    """True if a word belongs to the vector that begins with `first`."""
+    if option in _NAMED_OPTIONS and "=" in first and re.match(r"[A-Za-z_]\w*=", word):
+        return True
+    return _is_number(first.rpartition("=")[2].strip("[(,;")) and _is_number(word.strip("[](),;"))
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _print_warning(message: Warning | str, *_: Any, **__: Any) -> None:
+    typer.echo("warning: " + " ".join(str(message).split()), err=True)
+
+
 def _app(**options: Any) -> typer.Typer:
-    return typer.Typer(
+    return _App(
         add_completion=options.pop("add_completion", False),
         rich_markup_mode=None,
         pretty_exceptions_enable=False,
-        context_settings={"help_option_names": ["--help", "-h"]},
+        context_settings={"help_option_names": ["--help", "-h"], "max_content_width": 100},
         **options,
     )
 
 
 app = _app(cls=_Program, add_completion=True)
 #: the commands under `study`
-studies = _app(help="Rerun a study of the paper.")
+studies = _app(help="Repeat a study of the paper, or of a folder of recordings.")
 
 
 def main() -> None:
-    """The program `knode-cosserat`."""
+    """Run the program `knode-cosserat`."""
     app()
 
 
 def examples(*commands: str) -> str:
-    """The end of a help text; the mark keeps its lines as they are."""
+    """Return the examples at the end of a help text. The first character keeps the line breaks."""
     title = "Example:" if len(commands) == 1 else "Examples:"
     return "\n".join(["\b", title, *(f"  {PROGRAM} {command}" for command in commands)])
 
 
-def _version(wanted: bool) -> None:
-    if wanted:
+def _version(requested: bool) -> None:
+    if requested:
         from importlib.metadata import PackageNotFoundError, version
 
         try:
@@ -85,12 +151,16 @@ def program(
     ] = False,
     verbose: Annotated[
         bool,
-        typer.Option("--verbose", "-v", help="Tell on stderr what goes on inside: recovered steps, fits."),
+        typer.Option(
+            "--verbose",
+            "-v",
+            help="Log details on stderr, such as recovered time steps and fitting progress.",
+        ),
     ] = False,
 ) -> None:
-    """Simulate tendon-driven Cosserat-rod robots, and learn what the physics misses.
+    """Simulate Cosserat-rod robots, learn residual models and identify parameters.
 
-    Units are SI: m, s, N, Pa, rad.
+    Units are SI: m, s, kg, N, Pa, rad. Vectors are numbers separated by commas or spaces: 7,5,5,7.
     """
     if verbose:
         handler = logging.StreamHandler()

@@ -1,4 +1,4 @@
-"""The commands that rerun the paper's studies on simulations, and those that go beyond them."""
+"""Commands of the studies on simulated robots: the paper's, and further ones."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import typer
 
 from knode_cosserat.cli.arguments import Json, Progress
 from knode_cosserat.cli.program import app, examples, studies
-from knode_cosserat.cli.study_options import Dask, Out, Seeds, Workers, chosen_of, prepare, run_study
+from knode_cosserat.cli.study_options import Dask, Out, Seeds, Workers, prepare, run_study, selected_names
 
 app.add_typer(studies, name="study")
 
 
-def _some(words: str) -> Any:
-    return typer.Option(metavar="A,B,…", help=f"Some of {words}.", show_default="all")
+def _subset(names: str) -> Any:
+    return typer.Option(metavar="A,B,…", help=f"Subset of {names}.", show_default="all")
 
 
 @studies.command(
@@ -27,22 +27,23 @@ def _some(words: str) -> Any:
 def simulation(
     out: Out,
     seeds: Seeds = 5,
-    methods: Annotated[str | None, _some("baseline, paper, calibrated, best")] = None,
+    methods: Annotated[str | None, _subset("baseline, paper, calibrated, best")] = None,
     workers: Workers = None,
     dask: Dask = None,
     progress: Progress = None,
     as_json: Json = False,
 ) -> None:
-    """Rerun the paper's simulation study: four imperfect models, learned from two short sines each.
+    """Repeat the paper's simulation study, Table I.
 
-    Writes Table I beside the paper's figures (table1.md, .csv, .json), figures, trajectories and models. It
-    goes on where an earlier run on the same folder stopped.
+    Four imperfect models are each trained on two short sines. Writes Table I with the paper's published
+    values (table1.md, .csv, .json), figures, trajectories and models. Resumes an earlier run in the same
+    folder.
     """
     prepare(out, workers, dask)
     from knode_cosserat.studies.methods import METHODS
     from knode_cosserat.studies.simulation_report import rerun
 
-    chosen = chosen_of("methods", methods, METHODS)
+    chosen = selected_names("methods", methods, METHODS)
     run_study(
         lambda **how: rerun(out, seeds=range(seeds), methods=chosen, **how),
         {"methods": chosen, "seeds": seeds}, out, workers, dask, progress, as_json,
@@ -58,22 +59,23 @@ def simulation(
 def imperfections(
     out: Out,
     seeds: Seeds = 1,
-    only: Annotated[str | None, _some("the imperfections, such as damping, tip mass, stiffening")] = None,
+    only: Annotated[str | None, _subset("the imperfections, such as damping, tip mass, stiffening")] = None,
     workers: Workers = None,
     dask: Dask = None,
     progress: Progress = None,
     as_json: Json = False,
 ) -> None:
-    """Robots that differ from the model by more than a parameter: what the best preset leaves of the error.
+    """Measure errors for robots that differ from the model.
 
-    It learns from two sines of 30 rows and predicts 30 s of controls that it has not seen, and of twice the
-    tension. Writes imperfections.md, .json and a figure; goes on where an earlier run on the folder stopped.
+    The robots differ by more than a parameter. Each model is learned with the preset best. It is trained on
+    two sines of 30 rows. It predicts 30 s of held-out controls, and of controls with twice the tension.
+    Writes imperfections.md, .json and a figure. Resumes an earlier run in the same folder.
     """
     prepare(out, workers, dask)
     from knode_cosserat.studies.imperfections import IMPERFECTIONS
     from knode_cosserat.studies.imperfections_report import rerun
 
-    chosen = chosen_of("only", only, IMPERFECTIONS)
+    chosen = selected_names("only", only, IMPERFECTIONS)
     run_study(
         lambda **how: rerun(out, seeds=range(seeds), names=chosen, **how),
         {"imperfections": chosen, "seeds": seeds}, out, workers, dask, progress, as_json,
@@ -91,24 +93,24 @@ def data(
     seeds: Seeds = 3,
     methods: Annotated[
         str | None,
-        _some("baseline, best, paper; 'paper, no knowledge', 'network, no knowledge', 'linear (DMDc)'"),
+        _subset("baseline, best, paper; 'paper, no knowledge', 'network, no knowledge', 'linear (DMDc)'"),
     ] = None,
     workers: Workers = None,
     dask: Dask = None,
     progress: Progress = None,
     as_json: Json = False,
 ) -> None:
-    """How much data learning needs: errors from 5 to 30 rows of one sine and of two.
+    """Measure errors against the amount of training data.
 
-    With the paper's imperfect models, and without any knowledge: networks of the same size, and a linear
-    predictor (needs the extra `bench`). Writes data.md, .json and figures; goes on where an earlier run on
-    the folder stopped.
+    Trains on 5 to 30 rows of one sine, and of two. Compares the paper's imperfect models with predictors
+    without a physical model: networks of the same size and a linear predictor (needs the extra `bench`).
+    Writes data.md, .json and figures. Resumes an earlier run in the same folder.
     """
     prepare(out, workers, dask)
     from knode_cosserat.studies.data_efficiency import ALL
     from knode_cosserat.studies.data_report import rerun
 
-    chosen = chosen_of("methods", methods, ALL)
+    chosen = selected_names("methods", methods, ALL)
     run_study(
         lambda **how: rerun(out, seeds=range(seeds), methods=chosen, **how),
         {"methods": chosen, "seeds": seeds}, out, workers, dask, progress, as_json,
@@ -117,10 +119,10 @@ def data(
 
 @studies.command(epilog=examples("study estimation --out results"))
 def estimation(out: Out, as_json: Json = False) -> None:
-    """How well full states are estimated from recordings: the paper's method, and the best.
+    """Measure the error of state estimation.
 
-    Records the virtual robot (simulated: its states are known) and writes the errors of every quantity
-    (estimation.md, .json) and a figure; the bags stay in the folder.
+    Compares the paper's method and the best one. Records the virtual robot (simulated, so its true states are
+    known). Writes the errors of all quantities (estimation.md, .json), a figure, and the bags.
     """
     prepare(out, None, None)
     from knode_cosserat.studies.estimation import rerun

@@ -1,4 +1,4 @@
-"""The commands of studies on measured data: recordings of robots, a beam, cables."""
+"""Commands of the studies on recordings: robots, a beam, cables, virtual robots."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Annotated
 
 import typer
 
-from knode_cosserat.cli.arguments import Json, Progress, wanted
+from knode_cosserat.cli.arguments import Json, Progress, shows_progress
 from knode_cosserat.cli.program import examples, studies
-from knode_cosserat.cli.study_options import Dask, Out, Seeds, Workers, chosen_of, prepare, run_study
+from knode_cosserat.cli.study_options import Dask, Out, Seeds, Workers, prepare, run_study, selected_names
 
 
 @studies.command(
@@ -26,7 +26,7 @@ def recordings(
         list[str] | None,
         typer.Option(
             metavar="NAME,…",
-            help="Those to learn from, without endings; all others are predicted.",
+            help="Training recordings: file names without endings. All others are predicted.",
             show_default="sine_1p0, sine_3p0, rand_0",
         ),
     ] = None,
@@ -35,7 +35,7 @@ def recordings(
         str | None,
         typer.Option(
             metavar="ROBOT",
-            help="Nominal robot: a name or a file.",
+            help="Nominal robot: a catalog name or a file.",
             show_default="robot.yaml in BAGDIR, or delrin-tendon-robot",
         ),
     ] = None,
@@ -43,8 +43,8 @@ def recordings(
         Path | None,
         typer.Option(
             metavar="YAML",
-            help="What the recordings' topics or columns mean.",
-            show_default="recording.yaml in BAGDIR; or the paper's robot for bags, a table's own titles",
+            help="Meaning of the recordings' topics or columns.",
+            show_default="recording.yaml in BAGDIR; else the paper's robot for bags, titles for tables",
         ),
     ] = None,
     start: Annotated[
@@ -52,26 +52,27 @@ def recordings(
         typer.Option(
             metavar="S",
             min=0.0,
-            help="Where predictions begin; the robot still rests there.",
-            show_default="1, and 0 where the name begins with step",
+            help="Start time of predictions (s), at which the robot rests.",
+            show_default="1, and 0 for names that begin with step",
         ),
     ] = None,
-    seconds: Annotated[float, typer.Option(metavar="S", min=0.1, help="How long they go on.")] = 10.0,
+    seconds: Annotated[float, typer.Option(metavar="S", min=0.1, help="Duration of predictions (s).")] = 10.0,
     seeds: Seeds = 5,
     methods: Annotated[
         str,
         typer.Option(
             metavar="A,B,…",
-            help="Some of those; network: a passive network on the nominal model; residual: one on the best; "
-            "calibrated: the nominal model with five of its numbers found.",
+            help="Subset of: baseline (nominal model), paper-a, paper-b, best (identified model), network "
+            "(passive network on the nominal model), residual (passive network on the best model), "
+            "calibrated (nominal model with five identified parameters).",
         ),
     ] = "baseline,paper-a,paper-b,best",
     simulated: Annotated[
         bool | None,
         typer.Option(
             "--simulated/--physical",
-            help="Whether the robot was a simulation.",
-            show_default="what the recordings say",
+            help="Label the robot as simulated or physical in the report.",
+            show_default="stated by the recordings",
         ),
     ] = None,
     workers: Workers = None,
@@ -79,29 +80,31 @@ def recordings(
     progress: Progress = None,
     as_json: Json = False,
 ) -> None:
-    """Learn a robot from some of its recordings, and predict the others: the paper's Table II.
+    """Learn a robot from recordings, as in the paper's Table II.
 
-    Reads the bags, estimates states, trains the paper's model without (A) and with (B) the recordings whose
-    names begin with rand, and identifies the best model from measured poses alone. The folder's robot.yaml
-    and recording.yaml are taken for --robot and --config unless these are given. Writes table2.md, .json,
-    figures and models; goes on where an earlier run on the folder stopped.
+    Predicts the recordings that are not used for training. Estimates states, trains the paper's model without
+    (A) and with (B) the recordings named rand*, and identifies the best model from measured poses alone.
+    Files robot.yaml and recording.yaml in BAGDIR are the defaults of --robot and --config. Writes table2.md,
+    .json, figures and models. Resumes an earlier run in the same folder.
     """
     prepare(out, workers, dask)
     from knode_cosserat.studies.recordings import METHODS, ROBOT, Options, described_in
     from knode_cosserat.studies.recordings_report import rerun
 
-    chosen = chosen_of("methods", methods, METHODS)
+    chosen = selected_names("methods", methods, METHODS)
     names = None if train is None else [name.strip() for each in train for name in each.split(",")]
-    own = described_in(bags)
-    taken = [
-        own[what] for what, given in (("robot", robot), ("config", config)) if what in own and given is None
+    defaults = described_in(bags)
+    used = [
+        defaults[key]
+        for key, option in (("robot", robot), ("config", config))
+        if key in defaults and option is None
     ]
-    if taken:
-        typer.echo(f"taken from {bags}: {' and '.join(path.name for path in taken)}", err=True)
-    files = {what: str(path) for what, path in own.items()}
-    known = files.get("robot", ROBOT) if robot is None else robot
+    if used:
+        typer.echo(f"using {' and '.join(path.name for path in used)} of {bags}", err=True)
+    files = {key: str(path) for key, path in defaults.items()}
+    nominal = files.get("robot", ROBOT) if robot is None else robot
     columns = files.get("config") if config is None else str(config)
-    options = Options(known, columns, start, seconds, seeds)
+    options = Options(nominal, columns, start, seconds, seeds)
     run_study(
         lambda **how: rerun(
             out, bags, train=names, methods=chosen, options=options, simulated=simulated, **how
@@ -126,25 +129,25 @@ def beam(
         list[str] | None,
         typer.Option(
             metavar="NAME,…",
-            help="Those to learn from, without endings; all others are predicted.",
-            show_default="beam_gravity_V2_b, beam_load52_V2_a; else one of each of the two lightest loads",
+            help="Training recordings: file names without endings. All others are predicted.",
+            show_default="beam_gravity_V2_b, beam_load52_V2_a; else one for each of the two lightest loads",
         ),
     ] = None,
     load: Annotated[
         list[str] | None,
         typer.Option(
             metavar="NAME=GRAMS",
-            help="Load of a recording whose name does not tell it; may be repeated.",
+            help="Load (g) of a recording whose file name does not state it; may be repeated.",
         ),
     ] = None,
     progress: Progress = None,
     as_json: Json = False,
 ) -> None:
-    """Identify a real silicone beam that is let go by hand, and predict its other recordings.
+    """Identify a silicone beam from recordings.
 
-    Finds the release in each recording, identifies stiffness, damping and creep by least squares through
-    whole rollouts of the training recordings, and writes errors of the tip markers (beam.md, .json) and a
-    figure.
+    The beam is real and released by hand; recordings not used for training are predicted. Detects the release
+    in each recording, and identifies stiffness, damping and creep by least squares over whole rollouts of the
+    training recordings. Writes the errors of the tip markers (beam.md, .json) and a figure.
     """
     prepare(out, None, None)
     from knode_cosserat.studies.beam import rerun
@@ -152,12 +155,12 @@ def beam(
     names = None if train is None else _names(train)
     loads = _loads(load or [])
 
-    def told(line: str) -> None:
-        if wanted(progress):
+    def report(line: str) -> None:
+        if shows_progress(progress):
             typer.echo(line, err=True)
 
     run_study(
-        lambda **how: rerun(out, folder, names, loads, progress=told),
+        lambda **how: rerun(out, folder, names, loads, progress=report),
         {"train": names}, out, None, None, None, as_json,
     )  # fmt: skip
 
@@ -171,20 +174,21 @@ def cables(
         typer.Argument(metavar="DIR", help="Folder with NAME/train/*.pkl and NAME/eval/*.pkl, or NAME.npz."),
     ],
     out: Out = Path("cables-study"),
-    nodes: Annotated[int, typer.Option(metavar="N", min=5, help="Nodes of the rod.")] = 31,
+    nodes: Annotated[int, typer.Option(metavar="N", min=5, help="Number of nodes of the rod.")] = 31,
     space: Annotated[str, typer.Option(metavar="SCHEME", help="Scheme along the rod.")] = "lobatto2",
     train: Annotated[
-        int, typer.Option(metavar="N", min=2, help="Motions that are learned from, each cable.")
+        int, typer.Option(metavar="N", min=2, help="Number of training motions of each cable.")
     ] = 10,
     seconds: Annotated[
-        float, typer.Option(metavar="S", min=0.0, help="CPU time for the search of each cable.")
+        float, typer.Option(metavar="S", min=0.0, help="CPU time of the search for each cable (s).")
     ] = 400.0,
     as_json: Json = False,
 ) -> None:
-    """Identify cables held by two grippers, and predict the motions in `eval` open loop.
+    """Identify cables held by two grippers.
 
-    Positions of markers at 100 Hz, as in DEFORM's data set; pickles are read without running code of theirs.
-    Writes cables.json, cables.md, a figure, and a scene of prediction and measurement for each cable.
+    Predicts the motions in `eval` open loop. Reads marker positions at 100 Hz in the format of the DEFORM
+    data set; pickle files are read without running code from them. Writes cables.json, cables.md, a figure,
+    and a 3-D scene of prediction and measurement for each cable.
     """
     prepare(out, None, None)
     from knode_cosserat.studies.cables.study import CableOptions, rerun
@@ -196,26 +200,28 @@ def cables(
     )  # fmt: skip
 
 
-def _names(given: Sequence[str]) -> list[str]:
-    """Names separated by commas, without the endings of files."""
-    return [name.strip().removesuffix(".csv") for each in given for name in each.split(",") if name.strip()]
+def _names(options: Sequence[str]) -> list[str]:
+    """Return names separated by commas, without file endings."""
+    return [
+        name.strip().removesuffix(".csv") for option in options for name in option.split(",") if name.strip()
+    ]
 
 
-def _loads(given: Sequence[str]) -> dict[str, float]:
-    """Masses (kg) by name, from NAME=GRAMS."""
-    found = {}
-    for each in given:
-        name, _, grams = each.rpartition("=")
+def _loads(options: Sequence[str]) -> dict[str, float]:
+    """Return masses (kg) by name, from NAME=GRAMS."""
+    masses = {}
+    for option in options:
+        name, _, grams = option.rpartition("=")
         try:
             mass = 1e-3 * float(grams)
         except ValueError:
             mass = -1.0
         if not name or not 0.0 <= mass < 10.0:
             raise ValueError(
-                f"--load {each!r}: allowed is NAME=GRAMS with 0 to 10000 g, such as beam_run3=30"
+                f"--load must be NAME=GRAMS with 0 to 10000 g, such as beam_run3=30 (got {option!r})"
             )
-        found[name.strip().removesuffix(".csv")] = mass
-    return found
+        masses[name.strip().removesuffix(".csv")] = mass
+    return masses
 
 
 @studies.command(
@@ -224,17 +230,17 @@ def _loads(given: Sequence[str]) -> dict[str, float]:
 )
 def virtual_robots(
     out: Out = Path("virtual-robots-study"),
-    robots: Annotated[int, typer.Option(metavar="N", min=1, help="Number of robots, seeds 0 to N - 1.")] = 20,
+    robots: Annotated[int, typer.Option(metavar="N", min=1, help="Number of robots: seeds 0 to N - 1.")] = 20,
     workers: Workers = None,
     dask: Dask = None,
     progress: Progress = None,
     as_json: Json = False,
 ) -> None:
-    """Identify virtual robots with random imperfections, whose truth is known.
+    """Identify virtual robots with random, known imperfections.
 
-    Each is recorded with noise, identified from three recordings, and predicts two others. Writes how much
-    better than the data sheet, which effects are missed or false, and whether intervals hold the true values
-    (virtual_robots.md, .json). Some minutes for each robot; goes on where an earlier run stopped.
+    Each robot is recorded with noise, identified from three recordings, and evaluated on two others. Writes
+    the improvement over the nominal robot, missed and false effects, and the coverage of confidence intervals
+    (virtual_robots.md, .json). A robot takes some minutes. Resumes an earlier run in the same folder.
     """
     prepare(out, workers, dask)
     from knode_cosserat.studies.virtual_robots import rerun

@@ -1,4 +1,4 @@
-"""The command `view`: trajectories in the browser or in one file, and robots that follow sliders."""
+"""Command that shows trajectories and interactive robots in the browser: view."""
 
 from __future__ import annotations
 
@@ -13,18 +13,20 @@ from knode_cosserat.cli.arguments import (
     Json,
     Nodes,
     Space,
+    command_line,
+    is_recording,
     is_trajectory,
+    load_system,
+    load_trajectory_file,
     require_writable,
-    system_of,
-    trajectory_of,
 )
+from knode_cosserat.cli.output import write_output
 from knode_cosserat.cli.program import app, examples
-from knode_cosserat.cli.telling import tell
 
 if TYPE_CHECKING:
     from knode_cosserat.trajectory import Trajectory
 
-#: what moves if no robot is named
+#: robot of `view --live` without a name
 EXAMPLE = "delrin-tendon-robot"
 
 
@@ -40,29 +42,29 @@ def view(
     files: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="[FILE]…", help="Trajectories; with --live one robot or model.", show_default=False
+            metavar="[FILE]…", help="Trajectory files; with --live, one robot or model.", show_default=False
         ),
     ] = None,
     live: Annotated[
-        bool, typer.Option("--live", help="Move a robot or model by sliders, in real time.")
+        bool, typer.Option("--live", help="Simulate a robot or model in real time, controlled by sliders.")
     ] = False,
     export: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Write one HTML file that opens anywhere, and end."),
+        typer.Option(metavar="FILE", help="Write one self-contained HTML file and exit."),
     ] = None,
     port: Annotated[
         int,
         typer.Option(
             metavar="N",
-            help="Port of the page's server, which only this machine reaches.",
-            show_default="any that is free",
+            help="Port of the local web server, reachable from this machine only.",
+            show_default="any free port",
         ),
     ] = 0,
     no_open: Annotated[bool, typer.Option("--no-open", help="Do not open the browser.")] = False,
     dt: Annotated[
         float | None,
         typer.Option(
-            metavar="S", help="With --live: time step in s.", show_default="what a model learned at, or 0.05"
+            metavar="S", help="With --live: time step (s).", show_default="the model's training step, or 0.05"
         ),
     ] = None,
     space: Space = "lobatto2",
@@ -70,53 +72,61 @@ def view(
     nodes: Nodes = None,
     as_json: Json = False,
 ) -> None:
-    """Show trajectories in 3-D in the browser, or move a robot by sliders."""
+    """Show trajectories in 3-D, or control a robot by sliders.
+
+    The scene opens in the browser.
+    """
     from knode_cosserat import viewer
 
     names = files or []
 
-    def ready(address: str) -> None:
-        tell(as_json, {"address": address}, [f"the viewer is at {address} (Ctrl-C ends it)"])
+    def announce(address: str) -> None:
+        write_output(as_json, {"address": address}, [f"the viewer is at {address} (Ctrl-C ends it)"])
+        if not no_open:
+            viewer.serve.open_page(address)
 
     if live:
         if export:
-            raise ValueError("--live and --export exclude each other: a file has nobody to simulate")
+            raise ValueError(
+                "--live and --export exclude each other: a file cannot simulate. Give one of them"
+            )
         if len(names) > 1:
-            raise ValueError(f"--live moves one robot or model; given are {', '.join(names)}")
+            raise ValueError(f"--live needs one robot or model (got {', '.join(names)})")
         name = names[0] if names else EXAMPLE
         from knode_cosserat.rods.robot_file import catalog
 
         viewer.live.require_websockets()
-        robot = system_of(name, changes, nodes)
+        robot = load_system(name, changes, nodes)
         if sys.stderr.isatty():
             typer.echo(f"preparing {name} …", err=True)
         viewer.view_live(
             robot, dt=dt, space=space, title=name if name in catalog() else Path(name).name, port=port,
-            open_browser=not no_open, ready=ready,
+            open_browser=announce,
         )  # fmt: skip
         return
     if not names:
-        raise ValueError("no trajectory is given: knode-cosserat view FILE…, or view --live ROBOT")
+        raise ValueError("no trajectory is given; type: knode-cosserat view FILE…, or view --live ROBOT")
     if changes or nodes or dt is not None or space != "lobatto2":
-        raise ValueError("--set, --nodes, --dt and --space change what is simulated: they belong to --live")
+        raise ValueError("--set, --nodes, --dt and --space change a simulation; use them with --live")
     require_writable(export)
     trajectories = _by_name(names)
     if export:
         viewer.export_scene(trajectories, export)
-        tell(as_json, {"trajectories": list(trajectories)}, [], export=export)
+        write_output(as_json, {"trajectories": list(trajectories)}, [], export=export)
     else:
-        viewer.view(trajectories, port=port, open_browser=not no_open, ready=ready)
+        viewer.view(trajectories, port=port, open_browser=announce)
 
 
 def _by_name(files: list[str]) -> dict[str, Trajectory]:
-    """Trajectories by the names of their files, as short as tells them apart."""
+    """Return the trajectories by the stems of their files, or by paths if stems are equal."""
     short = [Path(file).stem for file in files]
-    found: dict[str, Trajectory] = {}
+    trajectories: dict[str, Trajectory] = {}
     for file, stem in zip(files, short, strict=True):
-        if Path(file).is_file() and not is_trajectory(file):
-            raise ValueError(f"{file}: not a trajectory; a robot or model is shown by view --live {file}")
+        if Path(file).is_file() and not is_trajectory(file) and not is_recording(file):
+            typed = command_line("view", "--live", file)
+            raise ValueError(f"{file}: not a trajectory. To show a robot or model, type: {typed}")
         name = stem if short.count(stem) == 1 else file
-        while name in found:
+        while name in trajectories:
             name += " (again)"
-        found[name] = trajectory_of(Path(file))
-    return found
+        trajectories[name] = load_trajectory_file(Path(file))
+    return trajectories

@@ -12,7 +12,7 @@ from knode_cosserat.evaluation.style import TIME_COLOURS, TWO_COLUMNS, require_m
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from knode_cosserat.control.workspace import Workspace
+    from knode_cosserat.statics.workspace import Workspace
 
 #: largest number of drawn points: more only make the file larger
 MOST_POINTS = 100_000

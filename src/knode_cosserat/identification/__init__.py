@@ -1,7 +1,17 @@
 """Identification of real robots: a library of effects, selected by recordings that were not searched."""
 
 from knode_cosserat.identification.effects import Effect, Number, effects_of
+from knode_cosserat.identification.fit import fit
 from knode_cosserat.identification.identify import IdentificationError, identify
 from knode_cosserat.identification.result import Estimate, Identified
 
-__all__ = ["Effect", "Estimate", "IdentificationError", "Identified", "Number", "effects_of", "identify"]
+__all__ = [
+    "Effect",
+    "Estimate",
+    "IdentificationError",
+    "Identified",
+    "Number",
+    "effects_of",
+    "fit",
+    "identify",
+]

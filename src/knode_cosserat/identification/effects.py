@@ -1,7 +1,7 @@
 """Library of identifiable effects: each is one physical cause with its numbers, units and prior ranges.
 
-An effect changes a robot by its numbers. With the numbers at their nominal values it changes nothing, so one
-compiled program serves any selection of effects: what is not selected stays nominal.
+An effect changes parameters of a robot. At their nominal values it changes nothing, so one compiled program
+serves any selection of effects: unselected parameters stay nominal.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ FIRST_MODE = 3.516
 DAMPING_RATIO = 0.02
 
 
-#: what an effect does to a robot, by the values of its numbers; equal for any robot of the same parts
+#: change of a robot by the values of an effect's parameters; equal for all robots of the same parts
 Change = Callable[[Any, list[Any]], Any]
 
 
@@ -31,7 +31,7 @@ class Number(NamedTuple):
     """One number of an effect: its nominal value, and the standard deviation of its prior.
 
     The search moves x = (value - nominal) / width, or log(value / nominal) / width if `logarithmic`. It
-    begins at `begin`, in these coordinates: from zero a friction, say, has no slope.
+    starts at `begin`, in these coordinates: for example, friction has no derivative at zero.
     """
 
     label: str
@@ -69,10 +69,10 @@ class Number(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Effect:
-    """A physical cause, its numbers, and what it does to a robot.
+    """A physical cause, its parameters, and the change that it makes to a robot.
 
-    `needs` names effects without which it has no meaning; a `basic` one is always identified, and a search
-    with few effects begins with the `usual` ones. One `of_recordings` is not the robot's own.
+    `needs` names effects that it requires. A `basic` effect is always identified. A search with few effects
+    starts with the `usual` ones. An effect `of_recordings` belongs to the recordings, not to the robot.
     """
 
     name: str
@@ -133,7 +133,7 @@ def effects_of(
     """Return the effects that a tendon robot may have.
 
     Args:
-        nominal: the robot as it is known, with the parts that effects need (see `model.extended`).
+        nominal: the nominal robot, with the parts that effects need (see `model.extended`).
         tensions: a usual tension of one tendon (N).
         highest: the highest tension of all tendons together (N).
         placed: uncertainty of the clamped end's position, as a part of the length.
@@ -153,6 +153,8 @@ def effects_of(
     frequency = FIRST_MODE * (EI * L / carried) ** 0.5 / L**2
     damping = 2.0 * DAMPING_RATIO * EI / frequency
     drag = 2.0 * DAMPING_RATIO * frequency * carried / L
+    ribbed = nominal.rib_spacing
+    spacing = (0.0, 0.0) if ribbed is None else (float(ribbed.softening), float(ribbed.share))
     effects = [
         Effect(
             "stiffness",
@@ -183,6 +185,12 @@ def effects_of(
                 for k, angle in enumerate(np.asarray(nominal.tendon_angles))
             ),
             _with_angles,
+        ),
+        Effect(
+            "tendon twist",
+            "angle by which ribs, and the tendons in them, turn about the rod from base to tip",
+            (Number("tendon_twist", "rad", float(nominal.tendon_twist or 0.0), 0.06),),
+            Replace(("tendon_twist",)),
         ),
         Effect(
             "load cell gains",
@@ -237,6 +245,15 @@ def effects_of(
             _with_axes,
         ),
         Effect(
+            "creep",
+            "relaxation of the material: a Maxwell branch beside its stiffness",
+            (
+                Number("relaxation.stiffness", "", 0.0, 0.2, 0.0, 100.0, begin=0.3),
+                Number("relaxation.time", "s", 1.0, 1.0, 0.02, 100.0, True),
+            ),
+            ReplaceInPart("relaxation", ("stiffness", "time")),
+        ),
+        Effect(
             "linear drag",
             "drag in proportion to velocity",
             (Number("linear_drag", "kg/(m s)", 0.0, 3.0 * drag, 0.0, 1e4, begin=0.1),),
@@ -276,8 +293,15 @@ def effects_of(
         Effect(
             "rib spacing",
             "softer bending under tension, for tendons are straight between ribs",
-            (Number("rib_spacing.softening", "m2", 0.0, (0.2 * L) ** 2 / 12.0, 0.0, L**2, begin=0.3),),
+            (Number("rib_spacing.softening", "m2", spacing[0], (0.2 * L) ** 2 / 12.0, 0.0, L**2, begin=0.3),),
             ReplaceInPart("rib_spacing", ("softening",)),
+        ),
+        Effect(
+            "rib spans",
+            "softer bending under tension between the ribs, or bodies, whose places are known",
+            (Number("rib_spacing.share", "", spacing[1], 0.5, 0.0, 10.0, begin=0.5),),
+            ReplaceInPart("rib_spacing", ("share",)),
+            usual=True,
         ),
         Effect(
             "friction",

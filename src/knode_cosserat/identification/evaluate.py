@@ -1,4 +1,4 @@
-"""Prediction of a recording by its measured tensions, compared with what was measured."""
+"""Prediction of a recording from its measured tensions, and its errors."""
 
 from __future__ import annotations
 
@@ -53,13 +53,16 @@ class Evaluation:
     extrapolated: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the figures, or the reason for there being none, as JSON has them."""
+        """Return the errors, or the reason of a failure, as plain JSON values."""
         figures: dict[str, Any] = {
             "tip_dtw": self.tip_dtw, "pose_mse": self.pose_mse, "tip_rmse": self.tip_rmse,
         }  # fmt: skip
         if self.extrapolated is not None:
             figures["extrapolated"] = self.extrapolated
         return figures if self.failed is None else {**figures, "failed": self.failed}
+
+    def __repr__(self) -> str:
+        return f"Evaluation: {self}"
 
     def __str__(self) -> str:
         if self.failed is not None:
@@ -74,10 +77,10 @@ def coverage(
     members: Iterable[System], measured: Measurements, level: float = 0.9, *,
     space: str | SpaceScheme = "lobatto2",
 ) -> float:  # fmt: skip
-    """Return which part of the measured positions lies where several models' spread says.
+    """Return the fraction of the measured positions within the spread of several models.
 
-    Each begins in its own equilibrium under the initial tensions. The interval is that of one more model with
-    the given probability (Student's t), as `Prediction.interval` has it; the first row is not counted.
+    Each starts in its own equilibrium under the initial tensions. The interval contains one more model with
+    the given probability (Student's t), as in `Prediction.interval`; the first row is not counted.
 
     Args:
         members: at least two models, such as an `Ensemble`.
@@ -128,13 +131,13 @@ def evaluate(
 ) -> Evaluation:  # fmt: skip
     """Predict a recording from the equilibrium under its initial tensions, and compare.
 
-    Rows of equilibria (`measured.static`) are each predicted by itself.
+    Rows of equilibria (`measured.static`) are predicted separately.
 
     Args:
         robot: any robot or model.
         measured: rows as far apart as steps of the simulation.
-        every: rows that are compared: each, every second, and so on.
-        last: how many of these are compared at most.
+        every: interval of compared rows: 1 for all, 2 for every second.
+        last: largest number of compared rows.
         space: the scheme along the rod.
         recovery: seconds that recovery from failed steps may take.
 
@@ -152,7 +155,7 @@ def evaluate(
     quaternion = np.asarray(quaternions_at(robot, y, places))
     seen, known = measured.position[rows], measured.complete[rows]
     off = position[known, -1] - seen[known, -1]
-    # how bodies are mounted is not known: rotations are those since the first row, in which the robot rests
+    # the mounting of bodies is unknown: rotations are relative to the first row, where the robot is at rest
     turned = turned_from(quaternion[0], since_first(measured.quaternion[rows]))
     oriented = np.isfinite(turned).all(axis=(1, 2)) & known
     mse = None

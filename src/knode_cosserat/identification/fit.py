@@ -1,4 +1,4 @@
-"""Fitting from whatever was recorded: full states, or measured poses."""
+"""Fitting from full states or from measured poses."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ from knode_cosserat.identification.residual import Learned, learn_residual
 from knode_cosserat.identification.residual_model import Known, ResidualModel
 from knode_cosserat.identification.result import Identified
 from knode_cosserat.identification.search import Search, SearchError
-from knode_cosserat.learning import fit as learning
 from knode_cosserat.learning.config import FitConfig, PassiveOptions, StructuredOptions
 from knode_cosserat.learning.ensemble import Ensemble
+from knode_cosserat.learning.fit import BEST, require_allowed
+from knode_cosserat.learning.fit import fit as fit_states
 from knode_cosserat.learning.knode import KNODE, About
 from knode_cosserat.learning.passive import PARTS, Passive, passive
 from knode_cosserat.learning.residual import Nothing
@@ -34,43 +35,42 @@ from knode_cosserat.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
 
-#: of a network's residual: widths of its priors, wide enough for what crude knowledge misses
+#: widths of the priors of a network's residual, wide enough for the errors of a crude nominal model
 WIDE = {"stiffness": 0.5, "levers": 3.0, "energy": 0.5, "damping": 3.0, "dissipation": 3.0}
 
 
 def fit(
     knowledge: System,
     data: Sequence[Trajectory | Recording | Measurements],
-    config: FitConfig = learning.BEST,
+    config: FitConfig = BEST,
     *,
     held_out: Sequence[Any] = (),
     space: str | SpaceScheme = "lobatto2",
     progress: bool = False,
     **options: Any,
 ) -> Any:
-    """Learn from trajectories of full states, or from recordings of poses, what an imperfect model misses.
+    """Learn the errors of an imperfect model from trajectories of full states, or from recordings of poses.
 
     From recordings (or their `Measurements`, or a mixture with trajectories) the robot is identified
     (`identify`), then a residual is learned on top, through rollouts and from measured poses alone. It is
-    passive: it cannot feed energy in. It is kept only if recordings that were left out are predicted better
-    with it. `FitConfig.network_recordings` learns a passive network on the knowledge itself, without
-    identification.
+    passive: it cannot add energy. It is kept only if it improves the prediction of held-out recordings.
+    `FitConfig.network_recordings` learns a passive network on the nominal model, without identification.
 
     Args:
-        knowledge: the imperfect model.
-        data: trajectories of full states at the nodes of the knowledge, or recordings that begin at rest;
-            several, for what is kept is decided by those left out.
-        config: what is learned, and how.
-        held_out: what is not learned from; what the model makes of it is reported.
+        knowledge: the imperfect (nominal) model.
+        data: trajectories of full states at the nodes of the nominal model, or recordings that begin at rest;
+            several recordings, because held-out ones decide if the residual is kept.
+        config: settings of the fit.
+        held_out: data that are not used for learning; the model's error on them is reported.
         space: the scheme along the rod, for recordings.
-        progress: show how it goes on.
+        progress: show progress.
         options: for trajectories only: `checkpoint`, `checkpoint_every` and `log_dir` of `learning.fit.fit`.
 
     Returns:
-        A `KNODE`, or an `Ensemble` of one for each seed if `config.seed` is several: from recordings, robots
-        drawn from what these leave possible, with a spread as wide as held-out recordings ask for. From
-        recordings `about.facts` has "given" (what was done with each), "steps" (in words), "identified" (see
-        `Identified.to_dict`), "residual" (whether it was kept) and "held_out_error" (m) by recording.
+        A `KNODE`, or an `Ensemble` of one for each seed if `config.seed` is several: from recordings, random
+        samples of the robots that agree with them, with a spread that covers held-out recordings. From
+        recordings, `about.facts` has "given" (the use of each), "steps" (in words), "identified" (see
+        `Identified.to_dict`), "residual" (true if it was kept) and "held_out_error" (m) by recording.
 
     Raises:
         DataError: recordings or trajectories that cannot be used.
@@ -81,7 +81,7 @@ def fit(
     several = isinstance(listed, Iterable) and not isinstance(listed, str | Trajectory)
     listed = list(listed) if several else listed
     if not several or all(isinstance(each, Trajectory) for each in listed):
-        return learning.fit(knowledge, listed, config, held_out=held_out, progress=progress, **options)
+        return fit_states(knowledge, listed, config, held_out=held_out, progress=progress, **options)
     if options:
         raise FitError(f"{next(iter(options))} is for trajectories; from recordings there are no checkpoints")
     if not isinstance(getattr(config, "residual", None), StructuredOptions | PassiveOptions):
@@ -128,7 +128,7 @@ def with_residual(
 
     Args:
         nominal: the robot that the identification began from.
-        recordings: the recordings; at least two, for one is left out in turn.
+        recordings: at least two recordings, because each is held out in turn.
         found: the identification.
         space: the scheme along the rod.
         progress: called with a line for each step.
@@ -142,7 +142,7 @@ def with_residual(
     if len(measured) < 2:
         raise DataError("there is one recording; a residual needs two at least, for one is left out in turn")
     tension = np.concatenate([each.tension for each in measured])
-    model = Model(nominal, tension)  # type: ignore[arg-type]
+    model = Model(nominal, tension, measured[0].fractions)  # type: ignore[arg-type]
     x = coordinates(model, found)
     robot = model.reduced(x, found.effects)
     both = ResidualModel(model, found.effects, passive(robot, tension, seed, hidden))
@@ -169,7 +169,7 @@ def _data(measured: Sequence[Measurements], model: Any) -> list[Data]:
 
 
 def _measured(given: Sequence[Any]) -> tuple[list[Measurements], list[str]]:
-    """Return the poses in everything that is given, and what was done with each, in words."""
+    """Return the poses in all data, and the use of each, in words."""
     found, words = [], []
     for k, each in enumerate(given):
         if isinstance(each, Trajectory):
@@ -199,13 +199,13 @@ def _models(
 
 
 def _unseen(robot: System, others: Sequence[Measurements], space: str | SpaceScheme) -> dict[str, Any]:
-    """Return errors of what was not learned from, if there is any."""
+    """Return errors of held-out data, if there are any."""
     errors = [evaluate(robot, each, space=space).tip_rmse for each in others]
     return {"unseen_error": dict(zip(names_of(others), errors, strict=True))} if others else {}
 
 
 def _named(system: System, config: FitConfig, facts: dict[str, Any]) -> KNODE:
-    """Return a model with what is known of it, and without parts of its residual that do nothing."""
+    """Return a model with its metadata, and without parts of its residual that have no effect."""
     about = About({**facts, "config": config.to_dict()})
     if not isinstance(system, KNODE):
         return KNODE(system, Nothing(), about)
@@ -218,12 +218,12 @@ def _network(
     given: list[str], space: str | SpaceScheme, tell: Callable[[str], None],
 ) -> Any:  # fmt: skip
     """Return the knowledge with a passive network, searched from zero over horizons that grow."""
-    learning.require_allowed(knowledge, config)
+    require_allowed(knowledge, config)
     tension = np.concatenate([each.tension for each in measured])
     options = config.residual
     assert isinstance(options, PassiveOptions)
     model = ResidualModel(Known(knowledge), (), passive(knowledge, tension, 0, options.hidden), WIDE)
-    # it offers what a Model does
+    # it has the members of a Model
     misfit = Misfit(model, _data(measured, model), space)  # type: ignore[arg-type]
     search = Search(misfit, tell)
     try:

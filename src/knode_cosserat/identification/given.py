@@ -1,4 +1,4 @@
-"""What is given to identify a robot from: recordings, their rows, or trajectories."""
+"""Input of an identification: recordings, their rows, or trajectories."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
 from knode_cosserat.trajectory import Trajectory
 
-#: rows of recordings are so far apart (s); at 0.025 s the errors of the time scheme are several standard
+#: time step of recordings' rows (s); at 0.025 s the errors of the time scheme are several standard
 #: deviations of the estimates (virtual robots 0, 1 and 2 of the study: 3.5 to 17, and 1.4 to 5.3 at 0.0125 s)
 DT = 0.0125
 #: effects are selected with steps twice as long where rows are closer than this (s)

@@ -1,15 +1,18 @@
-"""Identification of a robot from its recordings: which effects it has, and their numbers."""
+"""Identification of a robot from recordings: its physical effects, and their parameters."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 
 from knode_cosserat._yaml import did_you_mean
+from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.identification.given import SELECTED_DT, coarser, measurements_of, names_of, padded
 from knode_cosserat.identification.intervals import estimates_of
+from knode_cosserat.identification.journal import Journal
 from knode_cosserat.identification.misfit import Data, Misfit, data_of
 from knode_cosserat.identification.model import Model
 from knode_cosserat.identification.result import Estimate, Identified
@@ -27,12 +30,14 @@ log = logging.getLogger(__name__)
 
 #: nodes are doubled so often at most
 REFINEMENTS = 2
-#: corrections of a search that leaves a recording out
+#: most corrections of a search without one recording
 FOLD = (8, 5e-3)
 
 
-class IdentificationError(ValueError):
+class IdentificationError(KnodeCosseratError, ValueError):
     """A robot cannot be identified; one line says why."""
+
+    code = "identification"
 
 
 def identify(
@@ -42,27 +47,29 @@ def identify(
     *,
     space: str | SpaceScheme = "lobatto2",
     progress: Callable[[str], None] | None = None,
+    checkpoint: str | Path | None = None,
 ) -> Identified:
-    """Identify a tendon robot from recordings: find which effects it has, and their numbers.
+    """Identify a tendon robot from recordings: find its physical effects and their parameters.
 
-    Whole simulations, each from the equilibrium under the recording's initial tensions, are compared with
-    the measured positions and with the rotations since the first row; no velocity, force or strain has to
-    be known. Numbers are those of least (robust) squares with a prior about the data sheet's. An effect is
-    kept only if it lowers the error of recordings that were left out of the search, by more than two standard
-    errors of that. The result has to pass
-    trials with larger and random tensions; otherwise an effect is given up until it does.
+    Whole simulations start in the equilibrium under the recording's initial tensions. They are compared with
+    the measured positions and with the rotations since the first row; velocities, forces and strains need not
+    be known. Parameters minimise robust squares, with a prior about the data sheet. An effect is kept only if
+    it lowers the error of held-out recordings by more than two standard errors of the improvement. The result
+    has to pass trials with larger and random tensions; effects are removed until it does.
 
-    Where rows are closer than 0.02 s effects are selected with time steps twice as long; numbers and errors
-    are those of steps from row to row. If the grid is too coarse for the robot that was found, its nodes are
+    If rows are closer than 0.02 s, effects are selected with time steps twice as long; parameters and errors
+    are those of steps from row to row. If the grid is too coarse for the identified robot, its nodes are
     doubled and the last search is repeated: the result may have more nodes than the nominal robot.
 
     Args:
         robot: the nominal robot, from ruler, scale and data sheet; a robot with tendons.
         recordings: recordings, or their `Measurements` with mean tensions (`recording.sampled(0.0125,
-            mean=True)`), each from rest on; at least two for effects to be selected by held-out error.
-        effects: effects by name (`effects_of`), all of which are identified; None: those worth their place.
-        space: the scheme along the rod that the result is for.
+            mean=True)`), each starting at rest; at least two, to select effects by held-out error.
+        effects: names of effects (`effects_of`) that are all identified; None: select effects.
+        space: the scheme along the rod for which the result is valid.
         progress: called with a line for each step.
+        checkpoint: folder in which finished searches are kept; an interrupted run with the same arguments
+            resumes from there.
 
     Returns:
         The `Identified` robot, with estimates, intervals, and errors of held-out recordings.
@@ -79,10 +86,13 @@ def identify(
             "RoutedTendonRobot)"
         )
     measured = measurements_of(recordings)
-    search = _search(robot, measured, space, tell)
+    journal = None if checkpoint is None else Journal(checkpoint)
+    search = _search(robot, measured, space, tell, journal)
     model, data = search.misfit.model, search.misfit.data
     is_fine = data[0].dt < SELECTED_DT and not data[0].static
-    far = Search(Misfit(model, [coarser(each) for each in data], space), tell) if is_fine else search
+    far = search
+    if is_fine:
+        far = Search(Misfit(model, [coarser(each) for each in data], space), tell, journal=journal)
     steps: list[str] = []
     try:
         if effects is not None:
@@ -105,11 +115,13 @@ def identify(
 
 
 def _search(
-    robot: TendonRod, measured: Sequence[Measurements], space: str | SpaceScheme, tell: Callable[[str], None]
-) -> Search:
-    model = Model(robot, np.concatenate([each.tension for each in measured]))
+    robot: TendonRod, measured: Sequence[Measurements], space: str | SpaceScheme,
+    tell: Callable[[str], None], journal: Journal | None,
+) -> Search:  # fmt: skip
+    tension = np.concatenate([each.tension for each in measured])
+    model = Model(robot, tension, measured[0].fractions)
     data = [data_of(each, model, name) for each, name in zip(measured, names_of(measured), strict=True)]
-    return Search(Misfit(model, padded(data), space), tell)
+    return Search(Misfit(model, padded(data), space), tell, journal=journal)
 
 
 def _refined(
@@ -123,7 +135,7 @@ def _refined(
             break
         nodes = 2 * model.nominal.nodes
         tell(f"the grid of {model.nominal.nodes} nodes is too coarse: {nodes} nodes")
-        search = _search(model.nominal.replace(nodes=nodes), measured, space, tell)
+        search = _search(model.nominal.replace(nodes=nodes), measured, space, tell, search.journal)
         point = search.run(point.x, search.misfit.model.mask(names))
         steps.append(f"with {nodes} nodes, for the grid was too coarse: {sizes(point)}")
     return search, point

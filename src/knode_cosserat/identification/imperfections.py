@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -38,7 +38,9 @@ class Imperfect:
     x: Float[np.ndarray, " n"]
 
 
-def imperfect_robot(nominal: TendonRod, tension: Float[np.ndarray, "T c"], seed: int) -> Imperfect:
+def imperfect_robot(
+    nominal: TendonRod, tension: Float[np.ndarray, "T c"], seed: int, bodies: Sequence[float] = ()
+) -> Imperfect:
     """Return a robot with imperfections drawn from the library of effects.
 
     Basic effects (stiffness, damping) are always drawn, every other one with probability 1/3; numbers lie 0.5
@@ -48,13 +50,14 @@ def imperfect_robot(nominal: TendonRod, tension: Float[np.ndarray, "T c"], seed:
         nominal: the robot as its data sheet has it.
         tension: tensions (N) that it will be pulled with: some effects' sizes depend on them.
         seed: a whole number from 0 to 2**32 - 1.
+        bodies: places of bodies that may be on ribs, as parts of the length.
 
     Raises:
         ParameterError: a seed out of range.
     """
     if not 0 <= seed < 2**32:
         raise ParameterError(f"seed is {seed}; allowed is a whole number from 0 to {2**32 - 1}")
-    model, random = Model(nominal, tension), np.random.default_rng(seed)
+    model, random = Model(nominal, tension, bodies), np.random.default_rng(seed)
     names: list[str] = []
     own = [effect for effect in model.effects if not effect.of_recordings]
     for effect in own:

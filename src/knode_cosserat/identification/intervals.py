@@ -11,7 +11,7 @@ from knode_cosserat.identification.model import Model
 from knode_cosserat.identification.result import Estimate
 from knode_cosserat.identification.search import Point
 
-#: of a normal distribution, for 95 %
+#: quantile of the normal distribution for 95 %
 SIGMAS = 1.96
 #: a number whose uncertainty is more than this part of its prior's is held by the prior
 HELD = 0.8
@@ -24,7 +24,7 @@ def estimates_of(
 
     Args:
         model: all effects.
-        names: those that were identified.
+        names: the identified effects.
         point: end of their search.
         folds: ends of searches that left one recording out each.
     """
@@ -45,9 +45,9 @@ def estimates_of(
 def standard_deviations(point: Point, folds: Sequence[Float[np.ndarray, " n"]]) -> Float[np.ndarray, " n"]:
     """Return the standard deviations of the coordinates, widened by the scatter of the folds.
 
-    Least squares takes differences for random, and those of a model that misses something are not. Estimates
-    without one recording each then scatter by more than they should (jackknife, Efron & Stein 1981): all
-    standard deviations grow by the root of the mean ratio of both variances, up to the prior's.
+    Least squares assumes random differences; those of an incomplete model are systematic. Estimates that
+    leave out one recording then scatter more than expected (jackknife, Efron & Stein 1981). All standard
+    deviations are multiplied by the root of the mean ratio of both variances, up to the prior's.
     """
     spread = np.sqrt(np.diag(point.covariance()))
     count = len(folds)

@@ -1,4 +1,4 @@
-"""Simulated against measured poses of whole recordings, and derivatives by all coordinates."""
+"""Differences between simulated and measured poses of whole recordings, and their derivatives."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Data(NamedTuple):
     rotation: Float[np.ndarray, "rows M 4"]
     #: the first row in motion
     moves: int
-    #: whether each row is an equilibrium of its own
+    #: true if each row is a separate equilibrium
     static: bool = False
 
 
@@ -210,8 +210,8 @@ class Misfit:
     def _of_start(self, x: Any, data: Data, past: Any, first: Any) -> tuple[Any, Any]:
         """Derivatives of the equilibrium, and of the history that a motion begins with.
 
-        An equilibrium depends on no history: derivatives of that are zero, and those after it are of a motion
-        that rests.
+        An equilibrium has no history: derivatives of the history are zero before it, and those of a motion
+        at rest after it.
         """
         rows, xi = (_filled(each[:1], PIECE) for each in (first.records, first.unknowns))
         tension = np.broadcast_to(data.initial_tension, (PIECE, len(data.initial_tension)))

@@ -19,6 +19,7 @@ from knode_cosserat.rods.ends import Clamped
 from knode_cosserat.rods.load_cells import LoadCells
 from knode_cosserat.rods.loads import AttachedMass
 from knode_cosserat.rods.reels import Reels
+from knode_cosserat.rods.relaxation import Relaxation
 from knode_cosserat.rods.rib_spacing import RibSpacing
 from knode_cosserat.rods.routed_robot import RoutedTendonRobot
 from knode_cosserat.rods.section import Sleeve, Stretch
@@ -41,10 +42,11 @@ def routed(nominal: TendonRod) -> RoutedTendonRobot:
     return RoutedTendonRobot.like(nominal, tendon_offset=offset)
 
 
-def extended(robot: RoutedTendonRobot) -> RoutedTendonRobot:
+def extended(robot: RoutedTendonRobot, ribs: Sequence[float] = ()) -> RoutedTendonRobot:
     """Return the same robot with every part that effects change: a stretch, a sleeve, a tip mass and so on.
 
-    Base and load cells stay as they are if they are given; all others do nothing.
+    A base and load cells that the robot already has are unchanged; all added parts have no effect. Ribs may
+    be where the robot has masses, or at the given places if it has none.
     """
     held = robot.base_end
     if isinstance(held, Clamped):
@@ -58,11 +60,21 @@ def extended(robot: RoutedTendonRobot) -> RoutedTendonRobot:
         sections=(*robot.sections, Stretch(stiffness=(1.0, 0.0)), Sleeve()),
         loads=(*robot.loads, AttachedMass(at=1.0, mass=0.0)),
         linear_drag=np.zeros((3, 3)) if robot.linear_drag is None else robot.linear_drag,
+        relaxation=robot.relaxation or Relaxation(stiffness=0.0),
     )
-    return _with_reels(robot) if robot.drive == "reel" else _with_load_cells(robot)
+    if robot.routing is None and robot.tendon_twist is None:
+        robot = robot.replace(tendon_twist=0.0)
+    return _with_reels(robot) if robot.drive == "reel" else _with_load_cells(robot, _ribs(robot) or ribs)
 
 
-def _with_load_cells(robot: RoutedTendonRobot) -> RoutedTendonRobot:
+def _ribs(robot: RoutedTendonRobot) -> list[float]:
+    """Return the places of the robot's masses, if these are several: they are its ribs, as a rule."""
+    masses = [each for each in robot.loads if isinstance(each, AttachedMass)]
+    found = sorted({each.at for each in masses if each.at > 0.0 and float(each.mass) > 0.0})
+    return found if len(found) > 1 else []
+
+
+def _with_load_cells(robot: RoutedTendonRobot, ribs: Sequence[float]) -> RoutedTendonRobot:
     """Return the same robot with what changes tensions on their way from load cells to the tip."""
     count = robot.tendon_count
     return robot.replace(
@@ -70,7 +82,7 @@ def _with_load_cells(robot: RoutedTendonRobot) -> RoutedTendonRobot:
         load_cells=robot.load_cells or LoadCells(gain=np.ones(count), offset=np.zeros(count)),
         friction=robot.friction or TendonFriction(),
         vibration=robot.vibration or Vibration(tension=1e6, rate=0.0),
-        rib_spacing=robot.rib_spacing or RibSpacing(softening=0.0),
+        rib_spacing=robot.rib_spacing or RibSpacing(at=tuple(ribs) if len(ribs) > 1 else None, share=0.0),
     )
 
 
@@ -118,8 +130,8 @@ class Parametrised(eqx.Module):
         robot: the nominal robot with every part.
         nominal: nominal values (n,) of all numbers.
         width: widths (n,) of their priors.
-        logarithmic: which of them are logarithmic.
-        changes: for each effect, what it does to a robot, and how many numbers it has.
+        logarithmic: true for logarithmic parameters.
+        changes: for each effect, its change of a robot, and the number of its parameters.
     """
 
     robot: RoutedTendonRobot
@@ -153,10 +165,11 @@ class Model:
         robot: the robot with all effects, a function of coordinates.
     """
 
-    def __init__(self, nominal: TendonRod, tension: Float[np.ndarray, "T c"]):
+    def __init__(self, nominal: TendonRod, tension: Float[np.ndarray, "T c"], bodies: Iterable[float] = ()):
+        """Start from the nominal robot, usual tensions (N), and places of measured bodies (parts of L)."""
         tensions, highest = float(np.nanmean(tension)), float(np.nanmax(tension.sum(axis=1)))
         self.nominal = routed(nominal)
-        self._extended = extended(self.nominal)
+        self._extended = extended(self.nominal, [float(at) for at in bodies if at > 0.0])
         self.effects: tuple[Effect, ...] = tuple(all_effects(self._extended, tensions, highest))
         self.numbers: tuple[Number, ...] = tuple(each for effect in self.effects for each in effect.numbers)
         self.robot = Parametrised(
@@ -232,10 +245,12 @@ class Model:
             loads.pop(-1)
         changes: dict[str, Any] = {"sections": tuple(sections), "loads": tuple(loads)}
         gone = {
-            "friction": "friction", "vibration": "vibration", "rib spacing": "rib_spacing",
-            "early anchors": "anchors", "linear drag": "linear_drag",
+            "friction": "friction", "vibration": "vibration", "early anchors": "anchors",
+            "linear drag": "linear_drag", "creep": "relaxation", "tendon twist": "tendon_twist",
         }  # fmt: skip
         changes |= {part: getattr(nominal, part) for effect, part in gone.items() if effect not in names}
+        if not {"rib spacing", "rib spans"} & set(names):
+            changes["rib_spacing"] = nominal.rib_spacing
         if not {"load cell gains", "load cell offsets", "latency"} & set(names):
             changes["load_cells"] = nominal.load_cells
         if nominal.drive == "reel":

@@ -1,7 +1,7 @@
-"""Effects of robots whose tendons are wound up by reels: geometry, springs, and what reels take in.
+"""Effects of robots with reels or stated routing: geometry, springs, and the lengths that reels take in.
 
-Angles and poses alone leave the scale of all forces open: stiffness, springs and masses can grow together.
-It is the weights that are given (density, masses) that set it.
+Angles and poses alone do not determine the scale of forces: stiffness, springs and masses can grow together.
+The specified weights (density, masses) determine it.
 """
 
 from __future__ import annotations
@@ -16,24 +16,28 @@ from knode_cosserat.identification.effects import Effect, Number, effects_of
 from knode_cosserat.rods.routed_robot import RoutedTendonRobot
 from knode_cosserat.rods.routing import Straight
 
-#: of the length: uncertainty of what reels have taken in, and of angles about which tendons lie (rad)
+#: uncertainty of the wound-up length, as a fraction of the rod's length, and of tendon angles (rad)
 TAKEN_IN, TURN = 0.01, 0.1
 
 
 #: effects of measured tensions, which a robot with reels does not have
 OF_TENSIONS = ("load cell gains", "load cell offsets", "early anchors", "vibration", "latency")
 #: effects of tendons that are given by their offset and angles, and of friction
-OF_ANGLES, OF_FRICTION = ("tendon offset", "tendon angles"), ("friction", "friction by curvature")
-#: of the length: uncertainty of the clamped end's position
+OF_ANGLES = ("tendon offset", "tendon angles", "tendon twist")
+OF_FRICTION = ("friction", "friction by curvature")
+#: uncertainty of the clamped end's position, as a fraction of the length
 PLACED = 0.03
 
 
 def all_effects(nominal: RoutedTendonRobot, tensions: float, highest: float) -> list[Effect]:
     """Return the effects that a robot may have, by what drives its tendons; see `effects_of`."""
+    gone = set() if nominal.routing is None else {*OF_ANGLES}
+    if nominal.rib_spacing is None or nominal.rib_spacing.at is None:
+        gone |= {"rib spans"}
     if nominal.drive != "reel":
-        return effects_of(nominal, tensions, highest)
-    gone = {*OF_TENSIONS}
-    gone |= set() if nominal.routing is None else {*OF_ANGLES}
+        known = [each for each in effects_of(nominal, tensions, highest) if each.name not in gone]
+        return [*known, *routing_effects(nominal)]
+    gone |= {*OF_TENSIONS}
     # what costs time in each step is searched for where the nominal robot states it
     gone |= set() if nominal.friction is not None else {*OF_FRICTION}
     gone |= set() if nominal.rib_spacing is not None else {"rib spacing"}
@@ -104,16 +108,16 @@ def reel_effects(nominal: RoutedTendonRobot) -> list[Effect]:
                 lambda robot, v: _reels(robot, radius=jnp.stack(v) * (robot.reels.radius / radii)),
             ),
         ]
-    if nominal.routing is not None and all(isinstance(each, Straight) for each in nominal.routing):
-        effects += _routing_effects(nominal)
-    return effects
+    return [*effects, *routing_effects(nominal)]
 
 
-def _routing_effects(nominal: RoutedTendonRobot) -> list[Effect]:
-    """Return effects that move straight tendons about the rod."""
+def routing_effects(nominal: RoutedTendonRobot) -> list[Effect]:
+    """Return effects that move straight tendons about the rod, if the robot states where they run."""
     routing = nominal.routing
-    assert routing is not None
-    motors = np.abs(np.asarray(nominal.reels.motors)).astype(int)  # type: ignore[union-attr]
+    if routing is None or not all(isinstance(each, Straight) for each in routing):
+        return []
+    reels = nominal.reels
+    motors = np.arange(1, len(routing) + 1) if reels is None else np.abs(np.asarray(reels.motors)).astype(int)
 
     def turned(robot: Any, scale: Any, angles: list[Any]) -> Any:
         found = []
@@ -134,7 +138,7 @@ def _routing_effects(nominal: RoutedTendonRobot) -> list[Effect]:
         ),
         Effect(
             "routing by motor",
-            "rotation of each motor's tendons about the axis",
+            "rotation of each motor's tendons, or of each tendon, about the axis",
             tuple(Number(f"routing.turn[{k}]", "rad", 0.0, 0.5 * TURN) for k in range(motors.max())),
             lambda robot, v: turned(robot, 1.0, [v[k - 1] for k in motors]),
         ),

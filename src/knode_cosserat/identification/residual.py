@@ -1,9 +1,9 @@
 """A residual on an identified robot: learned through rollouts, kept only if held-out recordings improve.
 
-Its numbers are further coordinates of the search that identified the robot, with normal priors. First the
-equations that are linear about the identified robot tell which parts of the residual, with which widths of
-their priors, promise most for recordings that are left out. Then each recording in turn is left out in
-earnest: robot and residual are searched anew by the others, and so is, to compare, a robot without one.
+Its parameters are further coordinates of the search that identified the robot, with normal priors. First, the
+equations are linearised about the identified robot, to rank the parts of the residual and the widths of their
+priors by the expected held-out error. Then each recording is held out in turn: a search over the others finds
+robot and residual, and another finds a robot without a residual, for comparison.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ from knode_cosserat.solvers.space import SpaceScheme
 
 #: widths of priors that are tried, as multiples of those in `residual_model`
 TRIED = (0.3, 1.0, 3.0)
-#: a part has to promise as much less held-out cost
+#: least expected reduction of the held-out cost by a part
 PROMISE = 4.0
 #: parts of the way to the residual that are tried beside all of it
 SHRUNK = (0.5, 0.25)
-#: corrections of a search that leaves a recording out
+#: most corrections of a search without one recording
 FOLD = (5, 1e-2)
 #: parts by which a residual has to lower held-out errors on average, and may raise one of them
 LOWERS, RAISES = 0.02, 0.01
@@ -58,17 +58,17 @@ class Errors(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Learned:
-    """What came of a residual.
+    """Result of the search for a residual.
 
     Attributes:
-        robot: the identified robot with the residual, or alone if that is not kept.
-        kept: whether it is.
+        robot: the identified robot, with the residual if it is kept.
+        kept: true if the residual is kept.
         without: by recording, the held-out errors of the robot without a residual.
         with_residual: the same with it; empty if none was promising.
-        steps: what was tried, in words.
+        steps: the steps of the search, in words.
         x: coordinates of robot and residual.
-        covariance: of the coordinates, so wide that held-out recordings lie within the spread.
-        model: what the coordinates mean.
+        covariance: covariance of the coordinates, widened until held-out recordings lie within the spread.
+        model: the model that defines the coordinates.
     """
 
     robot: System
@@ -81,7 +81,7 @@ class Learned:
     model: ResidualModel
 
     def member(self, seed: int) -> System:
-        """Return a robot drawn from what the recordings leave possible."""
+        """Return a random sample of the robots that agree with the recordings."""
         rng = np.random.default_rng(seed)
         values, vectors = np.linalg.eigh(self.covariance)
         drawn = vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.normal(size=len(values)))
@@ -158,11 +158,11 @@ def _solved(misfit: Misfit, x: np.ndarray) -> list[Rollout]:
     return solved
 
 
-# what promises
+# parts that promise an improvement
 
 
 class _Scaled(NamedTuple):
-    """What `held_out` asks a model for."""
+    """Members of a model that `held_out` uses."""
 
     bounds: tuple[np.ndarray, np.ndarray]
 
@@ -194,13 +194,13 @@ def _promised(problem: Problem, x: np.ndarray, model: ResidualModel, widths: dic
     return held_out(scaled, x / by, model.mask(widths), _Scaled((low / by, high / by)))  # type: ignore[arg-type]
 
 
-# what is kept
+# acceptance
 
 
 class _Fold(NamedTuple):
-    """A search that did not see one recording, and that recording's errors.
+    """A search without one recording, and the errors of that recording.
 
-    `over` are differences of its positions over their standard deviations by the search's uncertainty.
+    `over` are the differences of its positions, divided by the standard deviations of the search.
     """
 
     point: Point | None

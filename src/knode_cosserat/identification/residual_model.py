@@ -49,13 +49,13 @@ class _WithResidual(eqx.Module):
 
 
 class ResidualModel:
-    """Coordinates: of the identified numbers first, as `Model` has them, then those of the residual.
+    """Coordinates of the identified parameters, as in `Model`, followed by those of the residual.
 
-    It offers a search what `Model` does.
+    It has the members of `Model` that a search uses.
 
     Attributes:
-        nominal: the robot whose length and controls count.
-        residual: with zeros for all that is learned.
+        nominal: the robot that defines length and controls.
+        residual: the residual with all learned parameters zero.
         robot: the robot with its residual, a function of coordinates.
         widths: standard deviations of the priors of the residual's numbers.
     """

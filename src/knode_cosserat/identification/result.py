@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from knode_cosserat._reprs import robot_text, wrapped
 from knode_cosserat.rods.system import System
 
 
@@ -53,6 +54,16 @@ class Identified:
             "held_out_error": dict(self.held_out_error),
             "steps": list(self.steps),
         }
+
+    def __repr__(self) -> str:
+        parts = [f"Identified {robot_text(self.robot)}", f"effects: {', '.join(self.effects) or 'none'}"]
+        for name, errors in (
+            ("nominal", self.nominal_error), ("identified", self.error), ("held out", self.held_out_error),
+        ):  # fmt: skip
+            known = [error for error in errors.values() if error is not None]
+            if known:
+                parts.append(f"tip error, {name}: {1e3 * sum(known) / len(known):.3g} mm")
+        return wrapped("; ".join(parts))
 
     def __str__(self) -> str:
         rows: list[tuple[str, ...]] = [

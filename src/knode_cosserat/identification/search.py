@@ -6,30 +6,32 @@ import dataclasses
 import itertools
 import logging
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from knode_cosserat.errors import KnodeCosseratError
+from knode_cosserat.identification.journal import Journal, hashed, identity
 from knode_cosserat.identification.misfit import Misfit, Rollout
 
 log = logging.getLogger(__name__)
 
-#: horizons (s) after the first motion; from a nominal robot that is far off all rows at once lead astray
+#: horizons (s) after the first motion; with all rows at once, a search from a poor nominal robot may fail
 HORIZONS = (0.0, 0.2, 0.4, 0.7, 1.1, 1.7, 2.5, 4.0)
-#: differences are correlated in time: as many seconds of them count as one
+#: correlation time of differences (s): rows within it count as one
 CORRELATED = 0.25
-#: and more bodies than this count as so many
+#: largest number of independent bodies
 BODIES = 2.0
-#: differences beyond so many scales count by their size, not by its square (Huber)
+#: threshold of the Huber loss, in units of the scale
 ROBUST = 3.0
-#: scale of the differences: never less than this part of the length
+#: smallest scale of the differences, as a fraction of the length
 LEAST_SCALE = 5e-4
 #: largest change of a coordinate in one correction
 LARGEST_MOVE = 1.0
-#: a recording that is alone is left out in so many pieces
+#: number of held-out pieces of a single recording
 FOLDS = 5
-#: pieces of a recording (s) over which the scatter of what an effect is worth is taken, two at least
+#: duration of the blocks (s) for the scatter of an effect's improvement; at least two blocks
 BLOCK = 1.0
 #: corrections of a search at one horizon, and of the last one; parts by which the cost falls at their end
 ROUGH, FINE = (6, 2e-2), (25, 1e-3)
@@ -53,12 +55,28 @@ class Point:
 
     x: Float[np.ndarray, " n"]
     scale: Float[np.ndarray, " R"]
-    #: of each part that is left out together, and of the blocks of each (as many of all), one after the other
+    #: rows of each part that is left out together, and of the blocks of each part (equally many), in order
     problem: Problem
     blocks: Problem
     free: Bool[np.ndarray, " n"]
     #: precision of each coordinate's prior
     prior: Float[np.ndarray, " n"]
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return its arrays by name, for a file."""
+        found = {name: getattr(self, name) for name in ("x", "scale", "free", "prior")}
+        for name in ("problem", "blocks"):
+            found |= {f"{name}.{part}": array for part, array in getattr(self, name)._asdict().items()}
+        return found
+
+    @classmethod
+    def of(cls, arrays: dict[str, np.ndarray]) -> Self:
+        """Return the point of these arrays: the inverse of `arrays`."""
+        problem, blocks = (
+            Problem(**{part: arrays[f"{name}.{part}"] for part in Problem._fields})
+            for name in ("problem", "blocks")
+        )
+        return cls(arrays["x"], arrays["scale"], problem, blocks, arrays["free"], arrays["prior"])
 
     @property
     def cost(self) -> float:
@@ -113,7 +131,7 @@ def _rows(rollout: Rollout, fold: Any) -> Rollout:
 def scales_of(rollouts: Sequence[Rollout], length: float) -> Float[np.ndarray, " R"]:
     """Return the usual size of the differences of each recording (m).
 
-    Each recording counts by what the model leaves of it: one that cannot be explained does not spoil others.
+    Each recording is weighted by its residual, so one that cannot be explained does not spoil the others.
     """
     known = [rollout.values[np.isfinite(rollout.values)] for rollout in rollouts]
     return np.array([max(1.4826 * float(np.median(np.abs(v))), LEAST_SCALE * length) for v in known])
@@ -126,14 +144,16 @@ class Search:
         misfit: the recordings and the model.
         tell: called with a line of progress.
         prior: precision of each coordinate's prior, about zero; by default 1.
+        journal: where the ends of finished searches are kept, and looked up.
     """
 
     def __init__(
         self, misfit: Misfit, tell: Callable[[str], None] = lambda line: None,
-        prior: Float[np.ndarray, " n"] | None = None,
+        prior: Float[np.ndarray, " n"] | None = None, journal: Journal | None = None,
     ):  # fmt: skip
-        self.misfit, self.tell = misfit, tell
+        self.misfit, self.tell, self.journal = misfit, tell, journal
         self.prior = np.ones(misfit.model.size) if prior is None else prior
+        self._identity = "" if journal is None else identity(misfit, self.prior)
         self.length = float(misfit.model.nominal.length)
         self.low, self.high = misfit.model.bounds
 
@@ -171,7 +191,7 @@ class Search:
         data = self.misfit.data
         longest = max(len(each.tension) - each.moves for each in data) * data[0].dt
         if data[0].static or self.misfit.model.nominal.drive == "reel":
-            # no row depends on those before; and what reels have taken in leads no robot far astray
+            # rows are independent of each other, and wound-up lengths keep the search near the solution
             longest = 0.0
         for horizon in [h for h in HORIZONS if h < 0.8 * longest]:
             rows = round(horizon / data[0].dt)
@@ -183,7 +203,30 @@ class Search:
         most: int = FINE[0], fall: float = FINE[1], which: Sequence[int] | None = None,
         scale: Float[np.ndarray, " R"] | None = None,
     ) -> Point:  # fmt: skip
-        """Return the end of a search (Levenberg-Marquardt) from a point, by some recordings and rows."""
+        """Return the end of a search (Levenberg-Marquardt) from a point, by some recordings and rows.
+
+        Raises:
+            SearchError: the robot at that point cannot be simulated.
+        """
+        if self.journal is None:
+            return self._searched(x, free, rows, most, fall, which, scale)
+        given = repr((rows, most, fall, None if which is None else tuple(which), scale is None))
+        key = hashed(self._identity, given, x, free, np.zeros(0) if scale is None else scale)
+        kept = self.journal.load(key)
+        if kept is None:
+            try:
+                kept = self._searched(x, free, rows, most, fall, which, scale).arrays()
+            except SearchError as error:
+                kept = {"failed": np.array(str(error))}
+            self.journal.save(key, kept)
+        if "failed" in kept:
+            raise SearchError(str(kept["failed"]))
+        return Point.of(kept)
+
+    def _searched(
+        self, x: Float[np.ndarray, " n"], free: Bool[np.ndarray, " n"], rows: int | None, most: int,
+        fall: float, which: Sequence[int] | None, scale: Float[np.ndarray, " R"] | None,
+    ) -> Point:  # fmt: skip
         now = self._solved(x, rows, which)
         if now is None:
             raise SearchError("the robot that the search begins from cannot be simulated")
@@ -237,7 +280,7 @@ class Search:
     def _proposed(
         self, x: np.ndarray, free: np.ndarray, gradient: np.ndarray, matrix: np.ndarray, damping: float
     ) -> np.ndarray:
-        """Return the point of a damped correction, within bounds: what meets one stays there."""
+        """Return the point of a damped correction; coordinates that meet a bound stay there."""
         active = free.copy()
         move = np.zeros(len(x))
         for _ in range(len(x)):
@@ -254,5 +297,7 @@ class Search:
         return np.clip(x + move, self.low, self.high)
 
 
-class SearchError(RuntimeError):
+class SearchError(KnodeCosseratError, RuntimeError):
     """A search cannot go on; one line says why."""
+
+    code = "search"

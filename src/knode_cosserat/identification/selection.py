@@ -1,4 +1,4 @@
-"""Selection of effects by recordings that were not searched: cross-validation, smallest model first."""
+"""Selection of effects by held-out recordings: cross-validation, smallest model first."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from jaxtyping import Bool, Float
 from knode_cosserat.identification.model import Model
 from knode_cosserat.identification.search import Point, Problem, Search, SearchError
 
-#: an effect is worth its place if it lowers the held-out cost by this much for each of its numbers
+#: least reduction of the held-out cost by an effect, for each of its parameters
 WORTH = 4.0
-#: and by so many standard errors of that
+#: and in standard errors of that reduction
 ERRORS = 2.0
-#: part of the cost that linear equations leave at least
+#: smallest remaining fraction of the cost in linearised predictions
 LEAST_LEFT = 1e-3
-#: few effects leave much more than all if it is so many times as much, on average
+#: mean ratio of costs above which few effects are too few
 MUCH_MORE = 1.3
-#: absent effects that are tried at a time
+#: number of absent effects that are tried in one round
 MOST_TRIES = 3
 
 
 class Chosen(NamedTuple):
-    """Selected effects, where their search ended, and what was tried on the way, in words."""
+    """Selected effects, the end of their search, and the steps of the selection, in words."""
 
     names: tuple[str, ...]
     point: Point
@@ -36,8 +36,8 @@ def held_out(
 ) -> float:
     """Return the cost of recordings that were each left out of a search, linearised about a point.
 
-    It is -2 times the logarithm of the likelihood of differences whose size is not known, by recording. All
-    numbers that are not free are nominal. Of a recording that is alone its pieces are left out.
+    It is -2 times the logarithm of the likelihood of differences of unknown size, by recording. Parameters
+    that are not free are nominal. A single recording is divided into pieces, which are left out in turn.
     """
     total = 0.0
     for k, move in enumerate(_moves(problem, x, free, model)):
@@ -69,7 +69,7 @@ class Left(NamedTuple):
 
     @classmethod
     def of(cls, point: Point, names: Iterable[str], model: Model) -> Self:
-        """Return what the named effects leave, linearised about the end of a search."""
+        """Return the remaining differences with the named effects, linearised about the end of a search."""
         free, blocks, count = model.mask(names), point.blocks, len(point.problem.cost)
         each = [part.reshape(count, -1, *part.shape[1:]) for part in blocks]
         scale = np.repeat(point.scale, count // len(point.scale)) ** 2
@@ -77,15 +77,15 @@ class Left(NamedTuple):
         for k, move in enumerate(_moves(point.problem, point.x, free, model)):
             now, gradient, matrix = each[0][k], each[2][k], each[3][k]
             left = now + 2.0 * gradient @ move + np.einsum("i,bij,j->b", move, matrix, move)
-            # linear equations may promise more than there is
+            # linearised equations may predict more than the whole cost
             costs.append(scale[k] * np.maximum(left, LEAST_LEFT * now.sum() / len(now)))
         return cls(np.array(costs), point.problem.amount)
 
     def worth(self, more: Left) -> tuple[float, float]:
-        """Return by how much more effects lower the cost of held-out parts, and the standard error of that.
+        """Return the reduction of the held-out cost by more effects, and its standard error.
 
-        The cost is -2 times the logarithm of the likelihood of differences whose size is not known, by part.
-        The error is from the scatter of the blocks' shares, for what a model misses is not random.
+        The cost is -2 times the logarithm of the likelihood of differences of unknown size, by part. The
+        error comes from the scatter of the blocks' shares, because model errors are not random.
         """
         without, with_them = self.cost.sum(axis=1), more.cost.sum(axis=1)
         fall = np.log(without / with_them)
@@ -96,7 +96,7 @@ class Left(NamedTuple):
         return float(shares.sum()), float(np.sqrt(scatter))
 
     def promise(self, more: Left, count: int) -> float:
-        """Return what so many more numbers are worth over what they have to be."""
+        """Return the expected reduction of the cost by more parameters, over the least reduction."""
         worth, error = self.worth(more)
         return worth / max(WORTH * count, ERRORS * error)
 
@@ -136,12 +136,12 @@ def _with_needs(names: Iterable[str], model: Model) -> tuple[str, ...]:
 
 
 def selected(search: Search, tell: Callable[[str], None]) -> Chosen:
-    """Return the effects that are worth their place, searched together.
+    """Return the selected effects, and the end of their common search.
 
-    Searches from the nominal robot begin with few effects and with all of them. With few a search finds its
-    way better; it is only if these leave much more than all that the selection goes on from all. Then effects
-    that are not worth their place go, one after the other, and absent ones are added that promise most for
-    recordings that are left out; each stays or goes as the next search shows.
+    One search from the nominal robot uses few effects, another uses all. A search with few effects converges
+    more reliably; the selection continues from all effects only if few leave a much larger error. Then
+    effects without a significant improvement are removed one by one, and absent effects with the largest
+    expected improvement of held-out recordings are added. The next search decides if a change is kept.
     """
     model = search.misfit.model
     usual = tuple(effect.name for effect in model.effects if effect.basic or effect.usual)
@@ -166,7 +166,7 @@ def selected(search: Search, tell: Callable[[str], None]) -> Chosen:
 def _better(
     search: Search, few: tuple[str, ...], many: tuple[str, ...], tell: Callable[[str], None]
 ) -> tuple[tuple[str, ...], Point]:
-    """Return few effects and the end of their search, or many if few leave much more."""
+    """Return few effects and the end of their search, or many if few leave a much larger error."""
     ends: dict[tuple[str, ...], Point] = {}
     for names in (few, many):
         try:
@@ -210,7 +210,7 @@ def _count(model: Model, names: Iterable[str]) -> int:
 def _promises(
     point: Point, names: tuple[str, ...], left: Left, model: Model
 ) -> list[tuple[float, str, tuple[str, ...]]]:
-    """Return absent effects by what they promise, over what they have to be worth, the most first."""
+    """Return absent effects by expected over required reduction of the cost, the largest first."""
     found = []
     for name in model.names:
         if name in names:
@@ -237,10 +237,10 @@ def _searched(search: Search, point: Point, names: tuple[str, ...]) -> Point | N
 def without_idle(
     search: Search, names: tuple[str, ...], point: Point, kept: Iterable[str] = ()
 ) -> tuple[tuple[str, ...], Point, list[str]]:
-    """Return the effects without those that are not worth their place, and those; `kept` ones stay.
+    """Return the effects with a significant improvement, and the removed ones; `kept` effects stay.
 
-    All of them go at once, by the equations linear about the point; a search without them shows whether that
-    holds. If it does not, half as many go.
+    All others are removed at once, by the linearised equations. A search without them tests the removal; if
+    it fails, half as many are removed.
     """
     model = search.misfit.model
     gone: list[str] = []
@@ -265,7 +265,7 @@ def without_idle(
 def _without_least(
     point: Point, names: tuple[str, ...], stay: set[str], model: Model, most: int
 ) -> tuple[str, ...]:
-    """Return the effects without at most so many that are not worth their place, the least one first."""
+    """Return the effects without the weakest ones, at most so many of them."""
     for _ in range(most):
         left = Left.of(point, names, model)
         options = []

@@ -1,4 +1,4 @@
-"""Trials that an identified robot has to pass before it is accepted."""
+"""Acceptance trials of an identified robot."""
 
 from __future__ import annotations
 
@@ -49,9 +49,9 @@ def failed_trial(robot: System, data: Sequence[Data], space: str | SpaceScheme) 
 
 
 def is_coarse(robot: System, data: Sequence[Data], space: str | SpaceScheme) -> bool:
-    """Return whether the grid is too coarse in more than a few rows of the recordings.
+    """Return True if the grid is too coarse in more than a few rows of the recordings.
 
-    A robot that cannot follow them is not said to be: `failed_trial` tells why.
+    A robot that cannot be simulated is not too coarse: `failed_trial` reports it.
     """
     for each in data:
         try:
@@ -101,7 +101,7 @@ def _moved(
     """Return the equilibrium under the initial tensions, and the motion, or the equilibria, from there."""
     time: Static | str = Static() if static else "bdf2"
     with warnings.catch_warnings():
-        # whether steps can be solved is the question here, not how exact they are
+        # this trial is about solvable steps, not about their accuracy
         warnings.filterwarnings("ignore", message="the grid is too coarse")
         still = equilibrium(robot, initial, space=space, recovery_budget=RECOVERY)
         tension = robot.undelayed(tension, dt, initial)

@@ -10,9 +10,13 @@ from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 
+from knode_cosserat.errors import KnodeCosseratError
 
-class ConfigError(ValueError):
+
+class ConfigError(KnodeCosseratError, ValueError):
     """Invalid setting. The message is one line: the setting, its value and the accepted values."""
+
+    code = "fit-config"
 
 
 # accepted values

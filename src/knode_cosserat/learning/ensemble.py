@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
+from knode_cosserat._reprs import count_of, wrapped
 from knode_cosserat.learning.files.model_file import ModelFileError, load_model
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.solvers.simulate import simulate
@@ -28,6 +29,10 @@ class Ensemble(Sequence[KNODE]):
         if not self.members or not all(isinstance(member, KNODE) for member in self.members):
             kinds = ", ".join(sorted({type(member).__name__ for member in self.members})) or "nothing"
             raise ValueError(f"members are {kinds}; allowed is one KNODE or more")
+
+    def __repr__(self) -> str:
+        first = " ".join(repr(self.members[0]).split())
+        return wrapped(f"Ensemble of {count_of(len(self), 'model')}; the first: {first}")
 
     def __len__(self) -> int:
         return len(self.members)
@@ -88,6 +93,9 @@ class Prediction:
 
     def __init__(self, members: Sequence[Trajectory]):
         self.members = list(members)
+
+    def __repr__(self) -> str:
+        return f"Prediction of {count_of(len(self.members), 'member')}; the first: {self.members[0]!r}"
 
     @property
     def time(self) -> Float[np.ndarray, " T"]:

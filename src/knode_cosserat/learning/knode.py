@@ -9,6 +9,7 @@ import jax
 from jaxtyping import Float
 
 from knode_cosserat._registry import provided
+from knode_cosserat._reprs import count_of, quantity, robot_text, wrapped
 from knode_cosserat.learning.residual import Residual
 from knode_cosserat.rods.system import History, System, of_strands
 from knode_cosserat.rods.trained_range import TrainedRange
@@ -32,7 +33,7 @@ class About:
 
 
 class KNODE(Wrapped):
-    """Nominal model with a residual (paper eq. 9); layouts and base conditions are the nominal model's.
+    """Nominal model with a residual; layouts and base conditions are the nominal model's.
 
     The nominal model may itself be a KNODE.
     """
@@ -57,6 +58,15 @@ class KNODE(Wrapped):
         """Return a model with the same residual and another nominal model."""
         return type(self)(knowledge, self.residual, self.about, self.trained)
 
+    def __repr__(self) -> str:
+        facts = self.about.facts
+        parts = [f"KNODE of a {robot_text(self.knowledge)}", f"residual {self.residual!r}"]
+        if "trajectories" in facts:
+            parts.append(f"fitted to {count_of(len(facts['trajectories']), 'trajectory', 'trajectories')}")
+        if isinstance(facts.get("held_out_error"), float):
+            parts.append(f"held-out tip error {quantity(1e3 * facts['held_out_error'], 'mm')}")
+        return wrapped("; ".join(parts))
+
     @property
     def adapted(self) -> System:
         """Nominal model with the residual's parameter changes."""
@@ -67,7 +77,7 @@ class KNODE(Wrapped):
     def derivatives(
         self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-        """Return y_s and z of the nominal model with the residual."""
+        """Return y_s and z of the nominal model with the residual (paper eq. 7, KNODE model)."""
         if self.strands > 1:
             return of_strands(self, s, t, y, control, history)
         return self.residual.derivatives(self.adapted, s, t, y, control, history)

@@ -1,4 +1,4 @@
-"""Base class of residuals, and networks that add to the nominal model's [y_s; z] (paper eq. 9)."""
+"""Base class of residuals, and networks that add to the nominal model's [y_s; z]."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat._reprs import count_of
 from knode_cosserat.learning.config import NetworkOptions
 from knode_cosserat.rods.layout import Field, Layout
 from knode_cosserat.rods.system import History, System
@@ -22,6 +23,10 @@ class Residual(eqx.Module):
     #: attributes that gradient training does not change (nested modules may have their own)
     fixed: ClassVar[tuple[str, ...]] = ()
 
+    def __repr__(self) -> str:
+        numbers = sum(int(np.size(leaf)) for leaf in jax.tree.leaves(self) if eqx.is_array(leaf))
+        return f"{type(self).__name__} with {count_of(numbers, 'number')}"
+
     def adapted(self, knowledge: System) -> System:
         """Return the nominal model with the residual's parameter changes, such as a corrected length."""
         return knowledge
@@ -30,7 +35,10 @@ class Residual(eqx.Module):
     def derivatives(
         self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-        """Return y_s and z of the adapted nominal model with this residual."""
+        """Return y_s and z of the nominal model plus Δ (paper eq. 6, true dynamics).
+
+        `knowledge` is the adapted nominal model.
+        """
 
     def strains(
         self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History

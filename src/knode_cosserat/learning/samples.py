@@ -1,7 +1,7 @@
 """One-segment samples of trajectories: the true states at both ends of every segment.
 
 A sample is one segment of the rod at one time. From the true y at its start, with the true history, a model
-predicts y at its end and z at its start (paper eq. 12). Integration spans one segment only, so that errors do
+predicts y at its end and z at its start (`predict`). Integration spans one segment only, so that errors do
 not accumulate and all samples are predicted in parallel.
 """
 
@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.learning.sides import far_side, slopes_of
 from knode_cosserat.rods.system import System, in_strands, records_in_strands, unpacked_history
 from knode_cosserat.solvers.grid import at_places, grid_of, inside
@@ -26,8 +27,10 @@ from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
 
 
-class DataError(ValueError):
+class DataError(KnodeCosseratError, ValueError):
     """Unusable trajectories. The message is one line: the trajectory, the place and the reason."""
+
+    code = "training-data"
 
 
 class Samples(NamedTuple):
@@ -87,7 +90,7 @@ CORRECTIONS = 4
 
 
 def predict(system: System, space: SpaceScheme, sample: Samples) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-    """Predict y at the end of one segment and z at its start.
+    """Predict y at the end of one segment and z at its start (paper eq. 9, integration over one segment).
 
     y at the end follows the scheme's formula, with stages from the true y at both ends.
     """

@@ -4,6 +4,7 @@ from typing import Any
 
 from knode_cosserat._registry import provide
 from knode_cosserat.recordings.config import RecordingConfig
+from knode_cosserat.recordings.estimation.estimate import estimate_parts, estimate_states
 from knode_cosserat.recordings.findings import Finding, RecordingError
 from knode_cosserat.recordings.load import load_example, load_recording
 from knode_cosserat.recordings.measurements import Measurements
@@ -31,6 +32,8 @@ __all__ = [
     "TableSource",
     "TensionSource",
     "Tensions",
+    "estimate_parts",
+    "estimate_states",
     "load_example",
     "load_recording",
 ]

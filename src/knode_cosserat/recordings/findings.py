@@ -5,13 +5,17 @@ from __future__ import annotations
 import dataclasses
 from typing import Literal
 
+from knode_cosserat.errors import KnodeCosseratError
+
 Severity = Literal["note", "warning", "problem"]
 #: severities, the gravest first
 SEVERITIES: tuple[Severity, ...] = ("problem", "warning", "note")
 
 
-class RecordingError(ValueError):
+class RecordingError(KnodeCosseratError, ValueError):
     """Error for a recording that cannot be read or used; the message is one line with the reason."""
+
+    code = "recording"
 
 
 @dataclasses.dataclass(frozen=True)

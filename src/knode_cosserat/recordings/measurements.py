@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from knode_cosserat._registry import provided
+from knode_cosserat._reprs import count_of, wrapped
 from knode_cosserat.recordings.findings import RecordingError
 
 if TYPE_CHECKING:
@@ -46,6 +47,18 @@ class Measurements:
     initial_tension: Float[np.ndarray, " tendons"] | None = None
     #: True if each row is a separate equilibrium under its tensions, not part of a motion
     static: bool = False
+
+    def __repr__(self) -> str:
+        times = f" from {self.time[0]:g} to {self.time[-1]:g} s" if len(self.time) else ""
+        kind = "equilibria" if self.static else "rows"
+        origin = {True: "simulated", False: "real", None: "origin not stated"}[self.simulated]
+        places = ", ".join(f"{each:.4g}" for each in self.fractions)
+        return wrapped(
+            f"Measurements ({origin}): {len(self.time)} {kind}{times}; "
+            f"{count_of(self.tension.shape[-1], 'tendon')}; "
+            f"{count_of(len(self.fractions), 'body', 'bodies')} at {places} of the length; "
+            f"source: {self.source}"
+        )
 
     @classmethod
     def of(cls, trajectory: Trajectory, fractions: Sequence[float] = (1.0,)) -> Self:

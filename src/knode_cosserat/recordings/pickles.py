@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.recordings.findings import RecordingError
 
 #: largest size of a file (bytes), and largest count of numbers in it
@@ -35,8 +36,10 @@ FORMATS = ("f2", "f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")
 SPARE_PLACES = 1 << 16
 
 
-class _RefusedError(Exception):
+class _RefusedError(KnodeCosseratError):
     """Error for content that is not an array of numbers."""
+
+    code = "pickle"
 
 
 class _Format:

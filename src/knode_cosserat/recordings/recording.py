@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from knode_cosserat._registry import provided
+from knode_cosserat._reprs import count_of, wrapped
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.findings import Finding, RecordingError
 from knode_cosserat.recordings.measurements import Measurements
@@ -43,6 +44,9 @@ class Body:
     position: Float[np.ndarray, "n 3"]
     quaternion: Float[np.ndarray, "n 4"] | None
 
+    def __repr__(self) -> str:
+        return f"Body {self.name} at {self.fraction:.4g} of the length: {count_of(len(self.time), 'pose')}"
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Tensions:
@@ -51,6 +55,10 @@ class Tensions:
     topic: str
     time: Float[np.ndarray, " n"]
     tension: Float[np.ndarray, "n tendons"]
+
+    def __repr__(self) -> str:
+        tendons = count_of(self.tension.shape[-1], "tendon")
+        return f"Tensions of {tendons} (topic {self.topic}): {count_of(len(self.time), 'row')}"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -83,6 +91,16 @@ class Recording:
     simulated: bool | None
     findings: tuple[Finding, ...]
     delays: Mapping[str, float]
+
+    def __repr__(self) -> str:
+        origin = {True: "simulated", False: "real", None: "origin not stated"}[self.simulated]
+        bodies = ", ".join(f"{body.name} at {body.fraction:.4g}" for body in self.bodies)
+        streams = [name for name in ("tension", "command") if getattr(self, name) is not None]
+        return wrapped(
+            f"Recording ({origin}): {self.end:.4g} s; {count_of(self.tendons, 'tendon')} "
+            f"({', '.join(streams)}); bodies {bodies} of the length; "
+            f"{count_of(len(self.findings), 'finding')}; source: {self.source}"
+        )
 
     @property
     def tendons(self) -> int:

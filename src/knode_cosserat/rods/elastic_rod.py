@@ -33,7 +33,7 @@ from knode_cosserat.rotation import dot, inverse, rotation_matrix
 
 
 class ElasticRod(System):
-    """A round rod with stiffness and damping, which may vary along it, and the paper's law (eq. 15)."""
+    """A round rod with stiffness and damping, which may vary along it, and the paper's constitutive law."""
 
     y_layout: ClassVar[Layout] = Layout(
         ("p", 3, "m", "position, global frame"),
@@ -161,7 +161,7 @@ class ElasticRod(System):
     def strains(
         self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> Float[Any, " z"]:
-        """Return v and u of the linear law (paper eq. 15)."""
+        """Return v and u of the linear law (paper eq. 12, constitutive law of the rod)."""
         c0, material = history.c0, self.material(s, control)
         n, m = self.stresses(y)
         hv, hu = self.z_layout.get(history.z, "v"), self.z_layout.get(history.z, "u")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 import math
+import re
 from collections.abc import Callable, Iterable
 from typing import Any, Literal, Self
 
@@ -16,20 +17,64 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from knode_cosserat._yaml import did_you_mean
+from knode_cosserat._reprs import object_text
+from knode_cosserat._yaml import did_you_mean, shown
+from knode_cosserat.errors import KnodeCosseratError
 
 #: smallest length of a direction or quaternion: the square of a much smaller length underflows
 SHORTEST = 1e-9
 
 
-class ParameterError(ValueError):
+class ParameterError(KnodeCosseratError, ValueError):
     """A parameter's name or value is not allowed; the message gives the value and the allowed range."""
+
+    code = "parameter"
 
 
 Shape = Literal["scalar", "vector", "direction", "quaternion", "matrix", "list"]
 
 #: fraction of the rod's length: a place nearer to an end than this is at the end
 AT_END = 1e-9
+
+
+#: largest number of elements of a list in an error message
+MOST_SHOWN = 12
+#: by unit: the typical range
+TYPICAL: dict[str, tuple[float, float]] = {
+    "m": (1e-5, 10.0),
+    "Pa": (1e5, 4e11),
+    "kg/m3": (100.0, 23e3),
+    "m/s2": (-30.0, 30.0),
+    "rad": (-2 * np.pi, 2 * np.pi),
+}
+#: by unit: the size of other common units, the likeliest first
+_OTHER_UNITS: dict[str, dict[str, float]] = {
+    "m": {"mm": 1e-3, "um": 1e-6},
+    "Pa": {"GPa": 1e9, "MPa": 1e6, "kPa": 1e3},
+    "kg/m3": {"g/cm3": 1e3, "g/m3": 1e-3},
+    "m/s2": {"mm/s2": 1e-3},
+    "rad": {"degrees": np.pi / 180.0},
+}
+
+
+def numbers_text(value: Any) -> str:
+    """Return a number or (nested) list of numbers as text of bounded length, without needless digits."""
+    if isinstance(value, list):
+        more = ", …" if len(value) > MOST_SHOWN else ""
+        return "[" + ", ".join(map(numbers_text, value[:MOST_SHOWN])) + more + "]"
+    return f"{value:.12g}"
+
+
+def in_other_unit(value: Any, unit: str, low: float, high: float) -> tuple[str, Any] | None:
+    """Return the unit in which numbers were likely meant, and their values in `unit`.
+
+    The first common unit is taken that brings all numbers between `low` and `high`. None if there is none.
+    """
+    for other, factor in _OTHER_UNITS.get(unit, {}).items():
+        scaled = np.asarray(value, dtype=float) * factor
+        if np.all((low <= scaled) & (scaled <= high)):
+            return other, np.vectorize(lambda number: float(f"{number:.12g}"))(scaled).tolist()
+    return None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,9 +89,13 @@ class Parameter:
     optional: bool
 
     @property
+    def bounds(self) -> str:
+        """Description of the allowed range, with the unit."""
+        return f"between {self.low:g} and {self.high:g}" + (f" {self.unit}" if self.unit else "")
+
+    @property
     def allowed(self) -> str:
         """Description of the allowed values."""
-        bounds = f"{self.low:g} to {self.high:g}" + (f" {self.unit}" if self.unit else "")
         kind = {
             "scalar": "a number",
             "vector": "three numbers, each",
@@ -55,7 +104,40 @@ class Parameter:
             "matrix": "one number, three (a diagonal) or a symmetric 3x3 matrix, with eigenvalues",
             "list": "a list of numbers, each",
         }[self.shape]
-        return f"{kind} {bounds}"
+        return f"{kind} {self.bounds}"
+
+    def refusal(self, name: str, given: str, value: Any = None) -> str:
+        """Return the error message for a value: the allowed ones, the given one, and the likely value.
+
+        Args:
+            name: the parameter's name.
+            given: the given value as text.
+            value: the given numbers (an array), if there are any.
+        """
+        size = np.shape(value)
+        if self.shape == "matrix" and size == (3, 3) and not _is_symmetric(value):
+            given = f"{given}, not symmetric"
+        scalar = value is not None and self.shape == "scalar" and size == ()
+        message = f"{name} must be {self.bounds if scalar else self.allowed} (got {given})"
+        if value is None or self.shape == "matrix" or (size == ()) != (self.shape == "scalar"):
+            return message
+        beyond = np.any((value < self.low) | (value > self.high))
+        meant = self._in_other_unit(value) if beyond else None
+        return f"{message}. Did you mean {numbers_text(meant[1])} ({given} {meant[0]})?" if meant else message
+
+    def refusal_of_text(self, name: str, text: str) -> str:
+        """Return the error message for a text, such as a number with its unit."""
+        message = f"{name} must be {self.allowed} (got {shown(text)})"
+        found = re.fullmatch(r"([-+.\deE]*\d\.?) *([a-zA-Z][\w/]*)", text.strip())
+        factor = {self.unit: 1.0, **_OTHER_UNITS.get(self.unit, {})}.get(found[2]) if found else None
+        if found is None or factor is None or self.shape != "scalar":
+            return message
+        return f"{message}. Did you mean {numbers_text(float(found[1]) * factor)}?"
+
+    def _in_other_unit(self, value: Any) -> tuple[str, Any] | None:
+        """Return the likely unit of a value and its conversion; None if no conversion would be typical."""
+        low, high = TYPICAL.get(self.unit, (np.inf, -np.inf))
+        return in_other_unit(value, self.unit, max(low, self.low), min(high, self.high))
 
 
 def parameter(
@@ -82,6 +164,12 @@ def place(
     return eqx.field(
         static=True, kw_only=kw_only, converter=_place_number, metadata={"parameter": stated}, **extra
     )
+
+
+def places(meaning: str) -> Any:
+    """Return an optional field for several places on the rod, as fractions of its length; static."""
+    stated = Parameter("", f"{meaning}, as parts of the length", "list", 0.0, 1.0, optional=True)
+    return eqx.field(static=True, default=None, converter=_place_numbers, metadata={"parameter": stated})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -160,12 +248,16 @@ class Parametrised(eqx.Module):
         """Return the physical parameters by name, with unit, meaning and allowed range."""
         return parameters_of(cls)
 
+    def __repr__(self) -> str:
+        units = {name: parameter.unit for name, parameter in parameters_of(type(self)).items()}
+        return object_text(self, units, always=("nodes", "length"))
+
 
 def unknown_parameter(cls: type, name: Any, known: Iterable[str]) -> str:
     """Return the error message for an unknown parameter name."""
     known = list(known)
     return (
-        f"{cls.__name__} has no parameter {name!r}{did_you_mean(name, known)}; there are {', '.join(known)}"
+        f"{cls.__name__} has no parameter {name!r}; there are {', '.join(known)}{did_you_mean(name, known)}"
     )
 
 
@@ -239,20 +331,30 @@ def checked(name: str, value: Any, parameter: Parameter) -> None:
     except (TypeError, ValueError):
         array = np.array("ragged")
     if array.dtype.kind not in "fiu":
-        raise ParameterError(f"{name} is {value!r}; allowed is {parameter.allowed}")
+        if isinstance(value, str):
+            raise ParameterError(parameter.refusal_of_text(name, value))
+        raise ParameterError(parameter.refusal(name, shown(value)))
     if (array.ndim != 1 or array.size == 0) if expected is None else array.shape != expected:
-        raise ParameterError(f"{name} has shape {array.shape}; allowed is {parameter.allowed}")
+        raise ParameterError(parameter.refusal(name, numbers_text(array.tolist())))
+    if not _is_within(array, parameter):
+        raise ParameterError(parameter.refusal(name, numbers_text(array.tolist()), array))
+
+
+def _is_symmetric(array: np.ndarray) -> bool:
+    return np.allclose(array, array.T, rtol=1e-9, atol=0.0)
+
+
+def _is_within(array: np.ndarray, parameter: Parameter) -> bool:
+    """True if numbers of the right shape are allowed."""
     if not np.all(np.isfinite(array)):
-        raise ParameterError(f"{name} is {array.tolist()}; allowed is {parameter.allowed}")
+        return False
     if parameter.shape in ("direction", "quaternion") and not math.hypot(*array) > SHORTEST:
-        raise ParameterError(f"{name} is {array.tolist()}; allowed is {parameter.allowed}")
+        return False
     if parameter.shape == "matrix":
-        if not np.allclose(array, array.T, rtol=1e-9, atol=0.0):
-            raise ParameterError(f"{name} is not symmetric: {array.tolist()}; allowed is {parameter.allowed}")
+        if not _is_symmetric(array):
+            return False
         array = np.linalg.eigvalsh(array)
-    if np.any(array < parameter.low) or np.any(array > parameter.high):
-        shown = np.asarray(value).tolist()
-        raise ParameterError(f"{name} is {shown}; allowed is {parameter.allowed}")
+    return bool(np.all((parameter.low <= array) & (array <= parameter.high)))
 
 
 def _converter(parameter: Parameter) -> Callable[[Any], Any]:
@@ -283,6 +385,12 @@ def _place_number(value: Any) -> Any:
     number = _plain_number(value)
     near = [end for end in (0.0, 1.0) if isinstance(number, float) and abs(number - end) < AT_END]
     return near[0] if near else number
+
+
+def _place_numbers(value: Any) -> Any:
+    """Return places as a tuple, which can be compared and hashed; `checked` judges anything else."""
+    several = isinstance(value, tuple | list | np.ndarray)
+    return tuple(_place_number(each) for each in value) if several else value
 
 
 def _as_matrix(value: Any) -> Any:

@@ -4,6 +4,8 @@ The tendons press on a bent rod between two ribs, a distance d apart, with the s
 rotation from rib to rib is that of a beam-column (Timoshenko & Gere 1961), with the effective bending
 stiffness EI x cot x, x = d/2 √(P/EI). The loss is P d²/12 to leading order; the stiffness is zero where the
 rod between two ribs buckles.
+
+The distance is that of the ribs `at` stated places, from the clamped end on, or the same everywhere.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.rods.parameters import parameter
+from knode_cosserat.rods.parameters import ParameterError, parameter, places
 from knode_cosserat.rods.parts import Part
 
 #: below this the series of √w cot √w is exact to rounding
@@ -30,15 +32,40 @@ class RibSpacing(Part):
 
     softening: Any = parameter(
         "m2",
-        "loss of bending stiffness by small tensions; d²/12 for ribs at a distance d",
+        "loss of bending stiffness by small tensions, the same everywhere; d²/12 for ribs at a distance d",
         low=0.0,
         high=1e4,
+        default=0.0,
     )
+    at: tuple[float, ...] | None = places("where the ribs are, in order")
+    share: Any = parameter(
+        "", "loss between ribs at these places, over that of tendons that are straight there", low=0.0,
+        high=10.0, default=1.0,
+    )  # fmt: skip
 
-    def softened(self, Kbt: Float[Any, "3 3"], total: Any) -> Float[Any, "3 3"]:
-        """Return the stiffness (N m²) under the sum (N) of all tensions."""
+    def __check_init__(self) -> None:
+        super().__check_init__()
+        if self.at is not None and not all(np.diff((0.0, *self.at)) > 0.0):
+            raise ParameterError(
+                f"at is {list(self.at)}; allowed is ribs in order, each beyond the one before"
+            )
+
+    def softening_at(self, sigma: Any) -> Any:
+        """Return d²/12 over the squared length at σ, of the span between two ribs, times `share`.
+
+        There are no tendons beyond the last rib.
+        """
+        if self.at is None:
+            return 0.0
+        ribs = np.array([0.0, *self.at])
+        spans = np.append(np.diff(ribs) ** 2 / 12.0, 0.0)
+        return self.share * jnp.asarray(spans)[jnp.sum(sigma >= ribs[1:])]
+
+    def softened(self, sigma: Any, length: Any, Kbt: Float[Any, "3 3"], total: Any) -> Float[Any, "3 3"]:
+        """Return the stiffness (N m²) at σ of a rod of that length (m), under the sum (N) of all tensions."""
         stiffness = 0.5 * (Kbt[0, 0] + Kbt[1, 1])
-        lost = 1.0 - pressed(3.0 * self.softening * total / stiffness)
+        softening = self.softening + self.softening_at(sigma) * length**2
+        lost = 1.0 - pressed(3.0 * softening * total / stiffness)
         return Kbt - lost * stiffness * np.diag([1.0, 1.0, 0.0])
 
 

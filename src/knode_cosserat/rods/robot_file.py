@@ -27,6 +27,7 @@ import numpy as np
 
 from knode_cosserat._files import replacing
 from knode_cosserat._yaml import YAMLTextError, did_you_mean, flow, mapping_of, shown
+from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.rods.old_keys import upgraded
 from knode_cosserat.rods.parallel_robot import ParallelRobot
 from knode_cosserat.rods.parameters import (
@@ -58,8 +59,10 @@ KINDS: dict[str, type[System]] = {
 }
 
 
-class RobotFileError(ValueError):
+class RobotFileError(KnodeCosseratError, ValueError):
     """A robot file is invalid: one line that names file, key, value and the allowed values."""
+
+    code = "robot-file"
 
 
 def load_robot(name_or_path: str | Path) -> System:
@@ -207,9 +210,11 @@ def _parts(value: Any, slot: Slot, source: str, where: str) -> Any:
 def _require_keys(mapping: dict[Any, Any], source: str, *, known: Any, required: Any) -> None:
     for key in mapping:
         if key not in known:
+            hint = did_you_mean(key, known)
+            if "parameters" in known and any(key in parameters_of(kind) for kind in KINDS.values()):
+                hint = "; a robot's parameters belong under the key parameters"
             raise RobotFileError(
-                f"{source}: the key {shown(key)} is unknown; allowed is {', '.join(known)}"
-                f"{did_you_mean(key, known)}"
+                f"{source}: the key {shown(key)} is unknown; allowed is {', '.join(known)}{hint}"
             )
     missing = [key for key in required if key not in mapping]
     if missing:
@@ -228,11 +233,11 @@ def _require_allowed(key: str, value: Any, parameter: Parameter, source: str) ->
     try:
         checked(key, np.asarray(None) if array is None else array, parameter)
     except ParameterError:
-        why = ", not symmetric" if _asymmetric(array, parameter) else ""
-        raise RobotFileError(
-            f"{source}: {key} is {shown(value)}{why}; allowed is {parameter.allowed}"
-            f"{_unit_hint(value, array, parameter)}"
-        ) from None
+        text = isinstance(value, str)
+        message = (
+            parameter.refusal_of_text(key, value) if text else parameter.refusal(key, shown(value), array)
+        )
+        raise RobotFileError(f"{source}: {message}") from None
 
 
 def _array(value: Any) -> np.ndarray | None:
@@ -251,36 +256,6 @@ def _array(value: Any) -> np.ndarray | None:
     if any(row is None for row in rows) or len({row.shape for row in rows if row is not None}) > 1:
         return None
     return np.array(rows, dtype=float)
-
-
-def _asymmetric(array: np.ndarray | None, parameter: Parameter) -> bool:
-    if array is None or parameter.shape != "matrix" or array.shape != (3, 3):
-        return False
-    return bool(np.all(np.isfinite(array))) and not np.allclose(array, array.T, rtol=1e-9, atol=0.0)
-
-
-#: by unit: the typical range, and other common units, the likeliest first
-_OTHER_UNITS: dict[str, tuple[float, float, dict[str, float]]] = {
-    "m": (1e-5, 10.0, {"mm": 1e-3, "um": 1e-6}),
-    "Pa": (1e5, 4e11, {"GPa": 1e9, "MPa": 1e6, "kPa": 1e3}),
-    "kg/m3": (100.0, 23e3, {"g/cm3": 1e3, "g/m3": 1e-3}),
-    "m/s2": (-30.0, 30.0, {"mm/s2": 1e-3}),
-    "rad": (-2 * np.pi, 2 * np.pi, {"degrees": np.pi / 180.0}),
-}
-
-
-def _unit_hint(value: Any, array: np.ndarray | None, parameter: Parameter) -> str:
-    """Return a hint with the same number in another unit, if that value would be typical."""
-    if array is None or parameter.unit not in _OTHER_UNITS or parameter.shape == "matrix":
-        return ""
-    low, high, others = _OTHER_UNITS[parameter.unit]
-    low, high = max(low, parameter.low), min(high, parameter.high)
-    for unit, factor in others.items():
-        scaled = array * factor
-        if np.all((low <= scaled) & (scaled <= high)):
-            meant = np.vectorize(lambda number: float(f"{number:.12g}"))(scaled).tolist()
-            return f"; did you mean {shown(value)} {unit} = {shown(meant)} {parameter.unit}?"
-    return ""
 
 
 # robot to text

@@ -31,6 +31,11 @@ from knode_cosserat.rods.surroundings import Obstacle
 from knode_cosserat.rods.system import History, Scales
 from knode_cosserat.rotation import cross, dot, quaternion_rate, rotation_matrix
 
+#: first root of cos(x) cosh(x) = -1, the frequency equation of a cantilever
+FIRST_ROOT = 1.875104068711961
+#: drag × length over mass per length, below which drag is weak: the damping ratio at an amplitude of a
+#: tenth of the length is then below 0.2 %
+WEAK_DRAG = 0.05
 #: default pose of the base
 AT_ORIGIN = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 
@@ -45,7 +50,7 @@ class PartControls(NamedTuple):
 
 
 class Rod(ElasticRod):
-    """A round rod with gravity, drag, loads, ends and surroundings (paper eqs. 13 and 14).
+    """A round rod with gravity, drag, loads, ends and surroundings.
 
     A subclass defines its actuators by its own law of strains, `strains` (it then has no `constitutive`), or
     by their load on the rod, `actuator_force`.
@@ -120,6 +125,26 @@ class Rod(ElasticRod):
         """True if an end is constrained, or there is an obstacle on which the rod may lie."""
         return self.base_end.held or self.tip_end.held or bool(self.surroundings)
 
+    @property
+    def is_undamped(self) -> bool:
+        """True if no parameter, part or internal variable damps a motion; weak drag does not count."""
+        values = (self.bending_damping, self.shear_damping, self.linear_drag)
+        internal = not set(self.z_layout.names) <= {"v", "u"}  # friction, relaxation
+        if (
+            internal
+            or self.surroundings
+            or any(value is not None and np.any(np.asarray(value)) for value in values)
+        ):
+            return False
+        drag = np.max(np.asarray(self.drag)) * np.max(self.length)
+        return bool(drag < WEAK_DRAG * np.min(self.mass_per_length))
+
+    @property
+    def bending_frequency(self) -> Any:
+        """First bending frequency (Hz) of the bare rod, clamped at the base, by beam theory."""
+        EI, mass = np.asarray(self.Kbt)[..., 0, 0], self.mass_per_length * self.length
+        return FIRST_ROOT**2 / (2 * np.pi) * np.sqrt(EI / (mass * self.length**3))
+
     def eased(self, part: float) -> Self:
         """Return the rod with smoothed contact and friction on its obstacles."""
         if not self.surroundings:
@@ -159,12 +184,12 @@ class Rod(ElasticRod):
     def rates(
         self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
     ) -> Float[Any, " y"]:
-        """Return y_s (paper eqs. 13 and 14)."""
+        """Return y_s from y_t = c0 y + ʰy and z_t = c0 z + ʰz (paper eq. 11, rates in time of the rod)."""
         y_t, z_t = history.c0 * y + history.y, history.c0 * z + history.z
         return self.spatial_rates(s, y, y_t, z, z_t, control)
 
     def spatial_rates(self, s, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
-        """Return the right-hand side of paper eq. 13, from y_t, z and z_t."""
+        """Return y_s (paper eq. 10, spatial derivatives of the rod), from y_t, z and z_t."""
         h, n = self.y_layout.get(y, "h"), self.y_layout.get(y, "n")
         motion = Motion.of(self.y_layout, y, y_t)
         _, R, q, w, q_t, w_t = motion

@@ -14,8 +14,8 @@ through the robot is ℓᵢ = ∫|ṗᵢ| ds. Either the tendon is taut and they
 
 Parts. Friction and vibration (`tendon_friction`) are internal variables: a tendon loses tension along its
 path, τᵢ = Tᵢ exp(-λᵢ). λ is a part of y. The mobilised part f of the friction and the part x that vibration
-removes are parts of z. `rib_spacing` softens the rod, `anchors` end tendons early, `load_cells` correct
-measured tensions.
+removes are parts of z, and so is the dashpot's curvature where the material has a `relaxation`. `rib_spacing`
+softens the rod, `anchors` end tendons early, `load_cells` correct measured tensions.
 """
 
 from __future__ import annotations
@@ -33,9 +33,10 @@ from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.load_cells import LoadCells
 from knode_cosserat.rods.parameters import ParameterError, choice, parameter, part
 from knode_cosserat.rods.reels import Reels
+from knode_cosserat.rods.relaxation import Relaxation, dashpot_strain
 from knode_cosserat.rods.rib_spacing import RibSpacing
 from knode_cosserat.rods.rod import Rod
-from knode_cosserat.rods.routing import Routing, Straight, ends, routes
+from knode_cosserat.rods.routing import Helical, Routing, Straight, ends, routes
 from knode_cosserat.rods.system import History, System
 from knode_cosserat.rods.tendon_friction import TendonFriction, Vibration
 from knode_cosserat.rods.tendon_law import (
@@ -66,6 +67,10 @@ class RoutedTendonRobot(TendonRod):
         "where the tendons run; by default straight, at their offset and angles", Routing, many=True,
         default=None,
     )  # fmt: skip
+    tendon_twist: Any = parameter(
+        "rad", "angle by which the tendons turn about the rod from base to tip; by default they are straight",
+        low=-10.0, high=10.0, default=None,
+    )  # fmt: skip
     drive: str = choice(
         "what is given of the tendons: their tension, or what reels take in", ("tension", "reel"), "tension"
     )
@@ -92,6 +97,9 @@ class RoutedTendonRobot(TendonRod):
         "softening by tendons that are straight between ribs; none: they are bent as the rod is", RibSpacing,
         default=None,
     )  # fmt: skip
+    relaxation: Relaxation | None = part(
+        "relaxation of the material, a Maxwell branch; none: it does not creep", Relaxation, default=None
+    )
     anchors: EarlyAnchors | None = part(
         "where tendons are anchored before the tip; none: at the tip, or where `routing` ends", EarlyAnchors,
         default=None,
@@ -151,6 +159,9 @@ class RoutedTendonRobot(TendonRod):
         if self.routing is not None:
             return self.routing
         angles = jnp.asarray(self.tendon_angles)
+        if self.tendon_twist is not None:
+            turns = self.tendon_twist / (2.0 * np.pi)
+            return tuple(Helical(self.tendon_offset, angles[k], turns) for k in range(angles.shape[0]))
         x, y = self.tendon_offset * jnp.cos(angles), self.tendon_offset * jnp.sin(angles)
         return tuple(Straight(x[k], y[k]) for k in range(angles.shape[0]))
 
@@ -192,7 +203,7 @@ class RoutedTendonRobot(TendonRod):
 
     @property
     def z_layout(self) -> Layout:  # type: ignore[override]
-        """Layout of z: strains, friction of each tendon, and vibration."""
+        """Layout of z: strains, friction of each tendon, vibration, and relaxation."""
         more = []
         if self.friction is not None:
             more.append(
@@ -200,6 +211,8 @@ class RoutedTendonRobot(TendonRod):
             )
         if self.vibration is not None:
             more.append(("x", 1, "1", "part of the friction that vibration has taken away"))
+        if self.relaxation is not None:
+            more.append(("u_branch", 3, "1/m", "curvature of the dashpot of the Maxwell branch"))
         return Rod.z_layout + Layout(*more)
 
     @property
@@ -209,9 +222,10 @@ class RoutedTendonRobot(TendonRod):
 
     @property
     def cuts(self) -> tuple[float, ...]:  # type: ignore[override]
-        """Places of discontinuity: those of the rod, and the tendons' anchors."""
+        """Places of discontinuity: those of the rod, the tendons' anchors, and ribs."""
         early = () if self.anchors is None else (self.anchors.at,)
-        return tuple(sorted({*super().cuts, *(end for end in (*self._ends, *early) if end < 1.0)}))
+        ribs = () if self.rib_spacing is None else self.rib_spacing.at or ()
+        return tuple(sorted({*super().cuts, *(at for at in (*self._ends, *early, *ribs) if at < 1.0)}))
 
     @property
     def _ends(self) -> tuple[float, ...]:
@@ -258,12 +272,22 @@ class RoutedTendonRobot(TendonRod):
         """Return r and r′ of the tendons at s."""
         if self.routing is not None:
             return routes(self.routing, s / self.length, self.length)
-        return super().routes_at(s)
+        if self.tendon_twist is None:
+            return super().routes_at(s)
+        angles = self._angles_at(s)
+        r = self.tendon_offset * jnp.stack([jnp.cos(angles), jnp.sin(angles), jnp.zeros_like(angles)], -1)
+        across = jnp.stack([-r[:, 1], r[:, 0], jnp.zeros_like(angles)], axis=-1)
+        return r, self.tendon_twist / self.length * across
+
+    def _angles_at(self, s: Any) -> Float[Any, " c"]:
+        """Return the angles (rad) of the tendons about the rod at s."""
+        angles = jnp.asarray(self.tendon_angles)
+        return angles if self.tendon_twist is None else angles + self.tendon_twist * (s / self.length)
 
     def bending_directions(self, s: Any) -> Float[Any, "c 3"]:
         """Return eᵢ: the direction of u in which each tendon bends the rod at s, material frame."""
         if self.routing is None:
-            angles = jnp.asarray(self.tendon_angles)
+            angles = self._angles_at(s)
             return jnp.stack([-jnp.sin(angles), jnp.cos(angles), jnp.zeros_like(angles)], axis=-1)
         r, _ = self.routes_at(s)
         across = jnp.stack([-r[:, 1], r[:, 0], jnp.zeros_like(r[:, 0])], axis=-1)
@@ -271,7 +295,8 @@ class RoutedTendonRobot(TendonRod):
 
     def actuation(self, control: Float[Any, " c"]) -> Float[Any, " a"]:
         """Return Σ Tᵢ d₃ × rᵢ of straight tendons (N·m), material frame; otherwise the control."""
-        if self.routing is not None or self.drive == "reel" or self.control_size > self.tendon_count:
+        straight = self.routing is None and self.tendon_twist is None
+        if not straight or self.drive == "reel" or self.control_size > self.tendon_count:
             return control
         return self.tendon_offset * dot(self.bending_directions(0.0).T, self._pulled(control))
 
@@ -289,7 +314,15 @@ class RoutedTendonRobot(TendonRod):
         y, z = super().rest(s)
         if self.drive == "reel":
             y = y.at[self.y_layout.slice("path")].set(self._ways(s))
-        return y, jnp.concatenate([z, np.zeros(self.z_layout.size - 6)])
+        return y, self._with_dashpot(jnp.concatenate([z, np.zeros(self.z_layout.size - 6)]))
+
+    def unstressed(self, s: Any, control: Any) -> Float[Any, " z"]:
+        """Return z of the unstressed rod at s, with a relaxed material."""
+        return self._with_dashpot(super().unstressed(s, control))
+
+    def _with_dashpot(self, z: Float[Any, " z"]) -> Float[Any, " z"]:
+        """Return z with the dashpot's curvature equal to the rod's."""
+        return z if self.relaxation is None else z.at[self.z_layout.slice("u_branch")].set(z[3:6])
 
     def _ways(self, s: Any) -> Float[Any, " c"]:
         """Return the tendons' lengths in the unloaded robot from the base to s, by Gauss quadrature."""
@@ -318,22 +351,29 @@ class RoutedTendonRobot(TendonRod):
         self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> Float[Any, " z"]:
         """Return v and u by the material's law, and f and x by their own laws."""
-        given, more = self._law_at(s, y, control, history)
+        given, shaken = self._law_at(s, y, control, history)
         v, u = tendon_strains(*given, flexibility=self._unbent_flexibility(s, y, control, history.c0))
-        if self.friction is not None:
-            more.insert(0, self._held(self.friction, s, u, control, history))
-        return jnp.concatenate([v, u, *more])
+        return jnp.concatenate([v, u, *self._internal(s, u, shaken, control, history)])
 
     linear_law = False
 
     def left_of_law(self, s, t, y, z, control, history):  # type: ignore[no-untyped-def]
         """Return the law's residual: rod and tendons less n and m; for f and x, their error."""
-        given, more = self._law_at(s, y, control, history)
+        given, shaken = self._law_at(s, y, control, history)
         v, u = self.z_layout.get(z, "v"), self.z_layout.get(z, "u")
-        if self.friction is not None:
-            more.insert(0, self._held(self.friction, s, u, control, history))
         left = tendon_balance(v, u, *given)
-        return jnp.concatenate([left, z[6:] - jnp.concatenate(more)]) if more else left
+        internal = self._internal(s, u, shaken, control, history)
+        return jnp.concatenate([left, z[6:] - jnp.concatenate(internal)]) if internal else left
+
+    def _internal(self, s: Any, u: Any, shaken: list[Any], control: Any, history: History) -> list[Any]:
+        """Return the internal variables at the curvature u, in the order of z."""
+        found = list(shaken)
+        if self.friction is not None:
+            found.insert(0, self._held(self.friction, s, u, control, history))
+        if self.relaxation is not None:
+            past = self.z_layout.get(history.z, "u_branch")
+            found.append(dashpot_strain(u, past, self.relaxation.time, history.c0))
+        return found
 
     def _law_at(self, s: Any, y: Any, control: Any, history: History) -> tuple[tuple[Any, ...], list[Any]]:
         """Return K_v, K_u, a, b, r, r′ and T of the law (see `tendon_law`), and x if there is vibration."""
@@ -352,13 +392,19 @@ class RoutedTendonRobot(TendonRod):
         b = m - dot(Bbt, hu) if not self.sections else m + dot(Kbt, material.u_star) - dot(Bbt, hu)
         if self.rib_spacing is not None:
             # tendons press on the bent rod, including its intrinsic curvature
-            Kbt = self.rib_spacing.softened(Kbt, jnp.sum(tension))
+            Kbt = self.rib_spacing.softened(s / self.length, self.length, Kbt, jnp.sum(tension))
+        if self.relaxation is not None:
+            branch = self.relaxation.damping(material.Kbt, c0)
+            b = b - dot(branch, self.z_layout.get(history.z, "u_branch"))
+            Bbt = Bbt + branch
         return (Kse + c0 * Bse, Kbt + c0 * Bbt, a, b, *self.routes_at(s), tension), more
 
     def _unbent_flexibility(self, s: Any, y: Any, control: Any, c0: Any) -> Float[Any, "6 6"]:
         """Return the approximate inverse for solving the law, known before y where tensions are controls."""
         Kse, Bse, Kbt, Bbt = self.material(s, control)[:4]
         tension = self._where_it_runs(s, self.base_tension(y, control))
+        if self.relaxation is not None:
+            Bbt = Bbt + self.relaxation.damping(Kbt, c0)
         return unbent_flexibility(Kse + c0 * Bse, Kbt + c0 * Bbt, *self.routes_at(s), tension)
 
     def _held(self, friction: TendonFriction, s: Any, u: Any, control: Any, history: History) -> Any:

@@ -1,4 +1,4 @@
-"""The general class of Cosserat-rod systems (paper eqs. 1-4).
+"""The general class of Cosserat-rod systems.
 
     A y_s + B y_st = f1,     C z + D z_t = f2
 
@@ -93,7 +93,7 @@ class Scales(NamedTuple):
 
 
 class System(Parametrised):
-    """A rod robot of the general class.
+    """A rod robot: A y_s + B y_st = f1, C z + D z_t = f2 (paper eq. 1, general class).
 
     A subclass defines the layouts below, `rest`, `base`, `tip`, and either `constitutive` and `balance`
     (the general form) or `strains` and `rates` (z and y_s directly). Its numeric parameters are leaves of a
@@ -155,7 +155,7 @@ class System(Parametrised):
     def strains(
         self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> Float[Any, " z"]:
-        """Return z at one point, semi-discretised in time (paper eq. 4, second line)."""
+        """Return z at one point, semi-discretised in time: (C + c0 D)⁻¹ (f2 - D ʰz)."""
         c0 = history.c0
         C, D, f2 = self.constitutive(s, t, y, c0 * y + history.y, control)
         return jnp.linalg.solve(C + c0 * D, f2 - D @ history.z)
@@ -192,7 +192,7 @@ class System(Parametrised):
     def rates(
         self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
     ) -> Float[Any, " y"]:
-        """Return y_s at one point with strains z, semi-discretised in time (paper eq. 4, first line)."""
+        """Return y_s at one point with strains z, semi-discretised in time: (A + c0 B)⁻¹ (f1 - B ʰy_s)."""
         c0 = history.c0
         A, B, f1 = self.balance(s, t, y, c0 * y + history.y, z, c0 * z + history.z, control)
         return jnp.linalg.solve(A + c0 * B, f1 - B @ history.y_s)
@@ -208,7 +208,7 @@ class System(Parametrised):
     def derivatives(
         self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-        """Return y_s and z at one point, for integration by the solvers."""
+        """Return y_s and z at one point (paper eq. 4, semi-discretised general class)."""
         z = self.strains(s, t, y, control, history)
         return self.rates(s, t, y, z, control, history), z
 

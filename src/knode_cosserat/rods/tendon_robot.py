@@ -12,7 +12,7 @@ from knode_cosserat.rods.tendons import transverse_force
 
 
 class TendonRobot(TendonRod):
-    """A round rod with tendons, gravity, drag and material damping, as in the paper (eqs. 13-15).
+    """A round rod with tendons, gravity, drag and material damping, as in the paper.
 
     The tendons load the rod as in the paper (`tendons.transverse_force`): a force across it, no moment. See
     `RoutedTendonRobot` for realistic tendons.
@@ -29,6 +29,6 @@ class TendonRobot(TendonRod):
         return transverse_force(control[: self.actuator_layout.size], self.tendon_angles)
 
     def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
-        """Return A = I, B = 0, and f1, the right-hand side of paper eq. 13."""
+        """Return A = I, B = 0, and f1 = `spatial_rates`."""
         size = self.y_layout.size
         return jnp.eye(size), jnp.zeros((size, size)), self.spatial_rates(s, y, y_t, z, z_t, control)

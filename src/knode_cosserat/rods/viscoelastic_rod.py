@@ -1,12 +1,4 @@
-"""A viscoelastic rod, such as rubber: it creeps, and is stiffer in fast motion (standard linear solid).
-
-A Maxwell branch acts in parallel with the elastic law of `elastic_rod`: a spring of stiffness r K in series
-with a dashpot. Its dashpot has the strain z_i,
-
-    K (z - z*) + B z_t + r K (z - z_i) = Rᵀ (n, m),      T z_i,t = z - z_i,
-
-with the relaxation time T. The stiffness is (1 + r) K in fast motion, and K at rest.
-"""
+"""A viscoelastic rod, such as rubber: it creeps, and is stiffer in fast motion (see `relaxation`)."""
 
 from __future__ import annotations
 
@@ -18,6 +10,7 @@ from jaxtyping import Float
 from knode_cosserat.rods.elastic_rod import ElasticRod
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parameters import parameter
+from knode_cosserat.rods.relaxation import branch_share, dashpot_strain
 from knode_cosserat.rods.slender_rod import SlenderRod
 from knode_cosserat.rods.system import History
 from knode_cosserat.rotation import dot, inverse
@@ -54,8 +47,7 @@ class ViscoelasticRod(SlenderRod):
         hv, hu, hv_branch, hu_branch = self.z_layout.split(history.z)
         n, m = self.stresses(y)
         T = self.relaxation_time
-        # z - z_i = T (c0 z + ʰz_i) / (1 + c0 T)
-        share = self.branch_stiffness * T / (1.0 + c0 * T)
+        share = branch_share(self.branch_stiffness, T, c0)
 
         def solved(K: Any, B: Any, stress: Any, z_star: Any, h: Any, h_branch: Any) -> Any:
             right = stress + dot(K, z_star) - dot(B, h) - share * dot(K, h_branch)
@@ -64,7 +56,7 @@ class ViscoelasticRod(SlenderRod):
         v = solved(Kse, Bse, n, self.v_star, hv, hv_branch)
         u = solved(Kbt, Bbt, m, u_star, hu, hu_branch)
         z, h_branch = jnp.concatenate([v, u]), jnp.concatenate([hv_branch, hu_branch])
-        return jnp.concatenate([z, (z - T * h_branch) / (1.0 + c0 * T)])
+        return jnp.concatenate([z, dashpot_strain(z, h_branch, T, c0)])
 
     def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
         """Return C, D, f2 of the same law."""

@@ -48,7 +48,7 @@ def equilibrium(
         A `Trajectory` of one row, at time 0; it can be the `initial` of a simulation. If direct iteration
         fails, three methods follow: a rod between two held ends starts from a hanging curve, the load is
         applied in parts, and a damped motion is simulated until the robot rests. If there are several
-        equilibria, this is one of them, stable or unstable: see `kc.stability`.
+        equilibria, this is one of them, stable or unstable: see `kc.statics.stability`.
 
     Raises:
         SimulationError: no equilibrium was found.

@@ -64,7 +64,10 @@ def coefficient_table(settings: Settings, dt: float) -> np.ndarray:
 
 
 def history_of(states: Any, rate: Any, coefficients: Any, settings: Settings) -> Any:
-    """Return the history terms ʰ = c1 (newest) + c2 (second newest) + d1 (newest rate), of y, z and y_s."""
+    """Return ʰ of y, z and y_s (paper eq. 3, lumped history terms).
+
+    ʰ = c1 (newest) + c2 (second newest) + d1 (newest rate)
+    """
     _, c1, c2, d1 = coefficients
     history = c1 * states[0] + c2 * states[1]
     return history + d1 * rate if settings.time.uses_rate else history

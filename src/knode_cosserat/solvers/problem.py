@@ -109,7 +109,10 @@ class StepProblem(eqx.Module):
         return dataclasses.replace(self, history=history)
 
     def point_rates(self, s: Any, y: Float[Any, " y"], history: Float[Any, " x"]) -> Any:
-        """Return y_s and z at one point of a strand, from a packed record of its history."""
+        """Return x = [y_s; z] at one point of a strand (paper eq. 5, compact form x = M⁻¹ f).
+
+        The history terms are one packed record.
+        """
         strand = self.system.strand
         return strand.derivatives(s, self.t, y, self.control, unpacked_history(strand, self.c0, history))
 

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import Solution, newton
 from knode_cosserat.solvers.grid import grid_of
@@ -45,8 +46,10 @@ REACHES = (1.0, 0.3, 3.0)
 BUDGET_SHARE, BUDGET_LEAST = 20.0, 5.0
 
 
-class BudgetError(Exception):
+class BudgetError(KnodeCosseratError):
     """The time for recovery is used up."""
+
+    code = "recovery-budget"
 
 
 class Budget:

@@ -3,9 +3,24 @@
 from __future__ import annotations
 
 import enum
+from typing import Any, ClassVar
+
+import numpy as np
+
+from knode_cosserat.errors import KnodeCosseratError
 
 
-class Result(enum.IntEnum):
+class Code(enum.IntEnum):
+    """Integer code that prints its name."""
+
+    def __str__(self) -> str:
+        return self.name
+
+    def __format__(self, spec: str) -> str:
+        return int.__format__(self, spec) if spec else self.name
+
+
+class Result(Code):
     """Outcome of a step. Zero and above: solved to tolerance. Below zero: not solved, the state is invalid.
 
     COARSE is also solved, but its estimated discretisation error is more than 2 % of the length.
@@ -44,6 +59,42 @@ _MESSAGES = {
     Result.NOT_REACHED: "not simulated: an earlier step failed",
 }
 
+
+class Codes(np.ndarray):
+    """Array of integer codes that prints their names; an element is a member of `members`."""
+
+    members: ClassVar[type[Code]]
+
+    @classmethod
+    def of(cls, values: Any) -> Any:
+        """Return an array of integers as codes; anything else, such as a traced array, as it is."""
+        known = isinstance(values, np.ndarray) and values.dtype.kind == "i"
+        return values.view(cls) if known else values
+
+    def __array_wrap__(self, array: Any, context: Any = None, return_scalar: bool = False) -> Any:
+        # the result of arithmetic or of a comparison is not a code
+        return array[()] if return_scalar else np.asarray(array)
+
+    def __getitem__(self, key: Any) -> Any:
+        found = super().__getitem__(key)
+        return found if isinstance(found, np.ndarray) else self._named(found)
+
+    def _named(self, code: Any) -> Any:
+        return {int(each): each for each in self.members}.get(int(code), code)
+
+    def __str__(self) -> str:
+        return np.array2string(np.asarray(self), formatter={"int": lambda code: str(self._named(code))})
+
+    def __repr__(self) -> str:
+        return str(self)
+
+
+class ResultCodes(Codes):
+    """Array of `Result` codes."""
+
+    members = Result
+
+
 #: result names in files of earlier versions, and their present equivalents
 EARLIER_RESULTS = {
     "recovered_stable_elimination": Result.CONVERGED,
@@ -52,11 +103,13 @@ EARLIER_RESULTS = {
 }
 
 
-class SimulationError(RuntimeError):
+class SimulationError(KnodeCosseratError, RuntimeError):
     """A step could not be solved.
 
     Attributes: `step`, `time` (s), `residual` (natural units), `result`, `cause` and `robot` (of a batch).
     """
+
+    code = "simulation"
 
     def __init__(
         self, step: int, time: float, residual: float, result: Result, cause: str, robot: int | None = None

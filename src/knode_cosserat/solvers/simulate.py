@@ -16,6 +16,7 @@ from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.rods.trained_range import without_range
 from knode_cosserat.solvers import sensitivity
 from knode_cosserat.solvers.boundary import NewtonOptions
+from knode_cosserat.solvers.damping import warn_if_undamped
 from knode_cosserat.solvers.initial import Beginning, Run, beginning
 from knode_cosserat.solvers.recovery import natural_time
 from knode_cosserat.solvers.result import Result, SimulationError
@@ -90,6 +91,8 @@ def simulate(
     if on_failure not in ("raise", "return"):
         raise ValueError(f'on_failure is {on_failure!r}; allowed is "raise" or "return"')
     dt = checked_dt(dt)
+    if not isinstance(settings.time, Static):
+        warn_if_undamped(robot, dt)
     if position_tolerance is not None:
         refine = functools.partial(
             simulate, controls=controls, dt=dt, time=time, space=space, start=start, newton=newton,

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from knode_cosserat._reprs import robot_text
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.history import Begun
@@ -33,13 +35,25 @@ class _Solved(NamedTuple):
     position_error: float
 
 
+class _StoppableBudget(Budget):
+    """Time for recovery that is zero from when `stop` returns True."""
+
+    def __init__(self, seconds: float | None, stop: Callable[[], bool] | None):
+        super().__init__(seconds)
+        self._stop = stop
+
+    @property
+    def seconds(self) -> float:
+        return 0.0 if self._stop is not None and self._stop() else super().seconds
+
+
 class Stepper:
     """A robot that moves one step at a time, by the program of `simulate` and with its recovery.
 
     Calls of `step` return the rows of one `simulate`, to the tolerance of Newton's method. A call takes the
     time of the step and a fraction of a millisecond in addition. Programs are shared with `simulate`.
 
-        stepper = kc.Stepper(robot, dt=0.05)
+        stepper = kc.solvers.Stepper(robot, dt=0.05)
         while True:
             row = stepper.step(tensions())
             row.tip_position[0], row.time[0]
@@ -85,6 +99,9 @@ class Stepper:
         first = _Solved(begun.past, np.asarray(begins.record), 0, 0.0, 0, 0.0)
         self._state = self._row(first, self._control, self.time, begins.begun)
 
+    def __repr__(self) -> str:
+        return f"Stepper of a {robot_text(self.robot)}: t = {self.time:g} s, dt = {self.dt:g} s"
+
     @property
     def time(self) -> float:
         """Time of the current state (s)."""
@@ -95,8 +112,13 @@ class Stepper:
         """Current state, a trajectory of one row."""
         return self._state
 
-    def step(self, control: Any) -> Trajectory:
+    def step(self, control: Any, stop: Callable[[], bool] | None = None) -> Trajectory:
         """Advance by one time step under a control (c,) and return the new state, a trajectory of one row.
+
+        Args:
+            control: the control (c,) during the step.
+            stop: called between the attempts of a recovery; if it returns True, the recovery ends and the
+                step counts as not solved.
 
         Raises:
             SimulationError: the step was not solved. The state is then unchanged, and another control may be
@@ -104,7 +126,7 @@ class Stepper:
             ValueError: a control of a wrong shape, or one that is not finite.
         """
         control = self._checked(control)
-        solved = self._solve(control)
+        solved = self._solve(control, stop)
         self._past, self._control = solved.past, control
         self._coarse = solved.result == Result.COARSE
         self._steps, self._index = self._steps + 1, self._index + 1
@@ -115,10 +137,10 @@ class Stepper:
         self._state = self._row(solved, control, self.time, self._begun_after(solved))
         return self._state
 
-    def preview(self, control: Any) -> Trajectory:
+    def preview(self, control: Any, stop: Callable[[], bool] | None = None) -> Trajectory:
         """Return the row that `step` would return, without changing the state. Raises the same errors."""
         control = self._checked(control)
-        solved = self._solve(control)
+        solved = self._solve(control, stop)
         return self._row(solved, control, self.time + self.dt, self._begun_after(solved))
 
     def _checked(self, control: Any) -> np.ndarray:
@@ -139,7 +161,7 @@ class Stepper:
             raise ValueError(f"the control: {beyond}")
         return control
 
-    def _solve(self, control: np.ndarray) -> _Solved:
+    def _solve(self, control: np.ndarray, stop: Callable[[], bool] | None) -> _Solved:
         i = self._index
         controls = self._controls.copy()  # the compiled loop may still read the previous array
         controls[i] = control
@@ -151,7 +173,7 @@ class Stepper:
             record, error = np.asarray(rows.records)[i], float(rows.error[i])
             found = _Solved(past, record, 0, error, int(rows.corrections[i]), float(rows.position_error[i]))
         else:
-            budget = Budget(self._task.recovery_budget)
+            budget = _StoppableBudget(self._task.recovery_budget, stop)
             outcome = rescue(self._task, self.robot, self._past, (self._control, control), i, budget)
             found = _Solved(
                 outcome.past, outcome.record, int(outcome.result), outcome.error, outcome.corrections,

@@ -35,7 +35,7 @@ class TimeScheme(abc.ABC):
 
     @abc.abstractmethod
     def coefficients(self, dt: float, previous_dt: float) -> Coefficients:
-        """Return the coefficients for a step of dt (s) after one of previous_dt (s)."""
+        """Return c and d of a step of dt after previous_dt (s) (paper eq. 2, backward differentiation)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,7 +85,7 @@ class BDFAlpha(TimeScheme):
 
 @dataclasses.dataclass(frozen=True)
 class BDF2(BDFAlpha):
-    """Backward differentiation of order 2: the paper's scheme. Damps vibrations faster than about 10 dt."""
+    """The paper's scheme (paper eq. 13, BDF2). Order 2; damps vibrations faster than about 10 dt."""
 
     alpha: float = 0.0
 

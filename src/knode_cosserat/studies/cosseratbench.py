@@ -40,7 +40,7 @@ CHUNK = 128
 #: error of the period of the slowest vibration that the time step may make
 PERIOD_ERROR = 2e-5
 #: almost the trapezoidal rule: its damping of a slow vibration is far below its error in time
-SCHEME = kc.BDFAlpha(-0.45)
+SCHEME = kc.solvers.BDFAlpha(-0.45)
 #: largest exponent of growth along the rod within one segment
 STEEPEST = 0.3
 #: points for each segment at which the tangent and the curvature of the given shape are taken
@@ -173,10 +173,10 @@ def _pull(rod: Rod, scenario: Scenario) -> float:
     return float(pull * rod.length**2 / EI)
 
 
-def _newton(rod: Rod, scenario: Scenario) -> kc.NewtonOptions:
+def _newton(rod: Rod, scenario: Scenario) -> kc.solvers.NewtonOptions:
     """Return Newton's options with tolerances scaled by the loads if these exceed EI / L²."""
-    usual, size = kc.NewtonOptions(), max(1.0, _pull(rod, scenario))
-    return kc.NewtonOptions(tolerance=size * usual.tolerance, acceptable=size * usual.acceptable)
+    usual, size = kc.solvers.NewtonOptions(), max(1.0, _pull(rod, scenario))
+    return kc.solvers.NewtonOptions(tolerance=size * usual.tolerance, acceptable=size * usual.acceptable)
 
 
 def _drag_rate(scenario: Scenario) -> float:
@@ -187,13 +187,13 @@ def _drag_rate(scenario: Scenario) -> float:
 # from a scenario's rod to ours
 
 
-def _system(rod: Rod, scenario: Scenario, shape: Shape) -> kc.SlenderRod:
+def _system(rod: Rod, scenario: Scenario, shape: Shape) -> kc.robots.SlenderRod:
     """Return the rod; unloaded, it is straight along its first tangent."""
     if rod.start is EndCondition.FREE and any(load.at is End.START for load in rod.loads):
         raise NotImplementedError("a load at a free start")
     force = np.sum([load.force for load in rod.loads if load.at is End.END] or np.zeros((1, 3)), axis=0)
     drag = _drag_rate(scenario) * rod.material.density * rod.area
-    return kc.SlenderRod(
+    return kc.robots.SlenderRod(
         length=rod.length,
         radius=rod.radius,
         density=rod.material.density,
@@ -204,7 +204,7 @@ def _system(rod: Rod, scenario: Scenario, shape: Shape) -> kc.SlenderRod:
         nodes=len(shape.p),
         base_end=_end(rod, End.START, shape.p[0], shape.h[0]),
         tip_end=_end(rod, End.END, shape.p[-1], shape.h[-1]),
-        loads=(kc.loads.PointWrench(force=force),) if force.any() else (),
+        loads=(kc.robots.loads.PointWrench(force=force),) if force.any() else (),
     )
 
 
@@ -212,16 +212,16 @@ def _end(rod: Rod, which: End, p: np.ndarray, h: np.ndarray) -> Any:
     """Return the boundary condition at an end of the rod."""
     condition, motion = rod.condition(which), rod.motion(which)
     if condition is EndCondition.FREE:
-        return kc.ends.Free()
+        return kc.robots.ends.Free()
     if condition is EndCondition.PINNED:
-        return kc.ends.Pinned(position=p)
+        return kc.robots.ends.Pinned(position=p)
     if motion is None:
-        return kc.ends.Clamped(position=p, orientation=h)
+        return kc.robots.ends.Clamped(position=p, orientation=h)
     if motion.slides_along is None:
-        return kc.ends.Driven(position=p, orientation=h, axes=AXES)
+        return kc.robots.ends.Driven(position=p, orientation=h, axes=AXES)
     if which is End.START:
         raise NotImplementedError("a start that slides")
-    return kc.ends.Sliding(position=p, orientation=h, axes=AXES, along=_axis(motion))
+    return kc.robots.ends.Sliding(position=p, orientation=h, axes=AXES, along=_axis(motion))
 
 
 def _axis(motion: Motion) -> str:
@@ -233,7 +233,7 @@ def _axis(motion: Motion) -> str:
 
 
 def _motion(
-    start: kc.Trajectory, rod: Rod, times: np.ndarray, dt: float, newton: kc.NewtonOptions
+    start: kc.Trajectory, rod: Rod, times: np.ndarray, dt: float, newton: kc.solvers.NewtonOptions
 ) -> np.ndarray:
     """Return the states at these times, in steps of dt."""
     steps = round(times[1] / dt)
@@ -261,7 +261,7 @@ def _controls(rod: Rod, times: np.ndarray) -> np.ndarray:
     return np.concatenate(found, axis=1)
 
 
-def _directors(system: kc.SlenderRod, states: np.ndarray) -> np.ndarray:
+def _directors(system: kc.robots.SlenderRod, states: np.ndarray) -> np.ndarray:
     """Return the first director of each element: the mean of its two nodes', normal to the element."""
     chord = np.diff(np.asarray(system.positions(states)), axis=1)
     chord /= np.linalg.norm(chord, axis=2, keepdims=True)

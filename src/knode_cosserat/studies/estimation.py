@@ -46,7 +46,7 @@ def rerun(out: Path, signals: Mapping[str, str] = SIGNALS, seed: int = 0) -> Rep
 
     Args:
         out: the folder; the bags are kept there.
-        signals: what to record, by name.
+        signals: signals of the recordings, by name.
         seed: of the sensors' noise.
     """
     out.mkdir(parents=True, exist_ok=True)

@@ -65,7 +65,7 @@ def _tendons(*wrong: float) -> dict[str, Any]:
     return _is(tendon_angles=np.deg2rad(_ANGLES + np.array(wrong)).tolist())
 
 
-#: those that every method is asked for: what the issue of this study names
+#: imperfections for every method
 NAMED: dict[str, dict[str, Any]] = {
     "damping": _is(bending_damping=0.2),
     "no drag": _is(drag=0.0),

@@ -94,7 +94,7 @@ def chosen(names: Sequence[str], train: Sequence[str] | None) -> tuple[list[str]
     """Return the names of the training recordings and of the held-out ones.
 
     Raises:
-        StudyError: a name does not exist, or no held-out recording is left.
+        StudyError: a name does not exist, or there is no held-out recording.
     """
     wanted = list(TRAIN if train is None else train)
     missing = [name for name in wanted if name not in names]
@@ -293,7 +293,7 @@ def _residual(knowledge: System, train: Sequence[str], read: _Read, seeds: Seque
     return Learned({0: model}, FINER, told="\n".join(f"- {step}" for step in model.about.facts["steps"]))
 
 
-#: those of the paper's Table II, and what of the best each part of it buys, which is without all later ones
+#: methods of the paper's Table II, and ablations of the best method, each without all later parts
 TABLE = ("baseline", "paper-a", "paper-b", "best")
 METHODS: dict[str, Callable[[System, Sequence[str], _Read, Sequence[int]], Learned]] = {
     "baseline": _baseline,

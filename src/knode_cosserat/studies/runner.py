@@ -26,17 +26,20 @@ from tqdm import tqdm
 
 import knode_cosserat
 from knode_cosserat._files import package_version, replacing
+from knode_cosserat.errors import KnodeCosseratError
 
 #: packages whose versions may change a figure
 PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "equinox", "optax")
 #: cores for each process, if it is not said how many; measured on two cores: 44 s in one process, 68 s in two
 CORES = 4
-#: how long a Dask cluster may take to answer, and to have a worker (s)
+#: time limits for a Dask cluster to answer, and to have a worker (s)
 PATIENCE = 60
 
 
-class StudyError(ValueError):
+class StudyError(KnodeCosseratError, ValueError):
     """Error for a study that cannot be run, or that may succeed when run again; the message is one line."""
+
+    code = "study"
 
 
 class Product(NamedTuple):

@@ -1,8 +1,8 @@
 """The paper's simulation study: a robot, four imperfect models of it, and learned corrections.
 
 All settings are data in this module, and are passed to the jobs as plain values. Each imperfect model
-learns from two short sines of the true robot, by each method, from several seeds at once; no method is told
-which imperfection it faces. It then predicts a held-out sine and a held-out step.
+learns from two short sines of the true robot, by each method, from several seeds at once; no method knows
+the imperfection. It then predicts a held-out sine and a held-out step.
 """
 
 from __future__ import annotations

@@ -19,6 +19,7 @@ from knode_cosserat.identification.given import DT
 from knode_cosserat.identification.identify import identify
 from knode_cosserat.identification.imperfections import Imperfect, imperfect_robot
 from knode_cosserat.identification.result import Identified
+from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.load import load_recording
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.virtual import commands, record_virtual
@@ -42,7 +43,7 @@ def jobs(seeds: Sequence[int]) -> list[Job]:
 
 
 def rerun(out: Path, seeds: Sequence[int], **how: Any) -> Report:
-    """Run the study on these seeds, and write virtual_robots.md and .json; interrupted runs go on.
+    """Run the study on these seeds, and write virtual_robots.md and .json; interrupted runs are continued.
 
     Args:
         out: the folder.
@@ -64,7 +65,8 @@ def nominal_robot() -> TendonRod:
 def drawn_robot(seed: int) -> Imperfect:
     """Return the virtual robot of a seed."""
     tension = np.concatenate([commands(signal, END).tension for signal in TRAIN.values()])
-    return imperfect_robot(nominal_robot(), tension, seed)
+    bodies = [each.fraction for each in RecordingConfig.paper_robot().markers]
+    return imperfect_robot(nominal_robot(), tension, seed, bodies)
 
 
 def recorded(truth: Imperfect, signals: Mapping[str, str], seed: int) -> list[Measurements]:

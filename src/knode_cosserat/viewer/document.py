@@ -1,4 +1,4 @@
-"""The page as one text: its files, the libraries and the scene, so that it opens from anywhere by itself."""
+"""The page as one self-contained text: its files, the libraries and the scene."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from knode_cosserat._files import replacing
-from knode_cosserat.viewer.scene import Given, scene
+from knode_cosserat.viewer.scene import Given, Point, scene
 
 _HERE = Path(__file__).parent
 #: names under which modules import each other, and their files
@@ -18,9 +18,12 @@ MODULES = {
     "orbit-controls": "vendor/OrbitControls.js",
     **{
         f"viewer/{name}": f"page/{name}.js"
-        for name in ("app", "data", "live", "plots", "robot", "stage", "tube")
+        for name in (
+            "app", "capture", "colours", "data", "hover", "legend", "live", "panels", "plots", "robot",
+            "stage", "triad", "tube", "units", "views",
+        )
     },
-}
+}  # fmt: skip
 #: security policy of the page: no network access, except to its own server in the live mode
 _POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' data:; style-src 'unsafe-inline'; img-src data:; "
@@ -28,19 +31,22 @@ _POLICY = (
 )
 
 
-def export_scene(trajectories: Given, path: str | Path, *, title: str | None = None) -> Path:
+def export_scene(
+    trajectories: Given, path: str | Path, *, title: str | None = None, target: Point | None = None
+) -> Path:
     """Write trajectories as one HTML file that any browser opens, without a server or a network.
 
     Args:
-        trajectories: a `Trajectory`, several, or several by name; those of a batch are shown one by one.
+        trajectories: a `Trajectory`, several, or several by name; a batch is shown as separate trajectories.
         path: the file to write.
-        title: what stands above it; by default the names.
+        title: heading of the page; by default the names.
+        target: position (x, y, z) in m that is marked, with the distance of every tip to it.
 
     Raises:
-        ValueError: no trajectory, more than 12, or one that has nothing to be drawn.
+        ValueError: no trajectory, more than 12, one that has nothing to be drawn, or an impossible target.
     """
     path = Path(path)
-    text = document(scene(trajectories, title))
+    text = document(scene(trajectories, title, target))
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
     return path
@@ -58,7 +64,7 @@ def document(shown: dict[str, Any], connects: str = "'none'") -> str:
         "SCENE": for_script(shown),
     }
     page = _text("page/index.html")
-    # one after the other between marks, so that what stands in a scene is never taken for a mark
+    # replaced one after the other between marks, so that text in a scene is never taken for a mark
     pieces = page.split("@@")
     return "".join(parts[piece] if k % 2 else piece for k, piece in enumerate(pieces))
 

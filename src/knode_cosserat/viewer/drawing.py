@@ -94,12 +94,17 @@ def _ribs(robot: Any, nodes: int, tendons: dict[str, Any] | None, radius: float)
     """Return discs that guide tendons, and masses: at the robot's masses, or else at its nodes."""
     masses = [load for load in getattr(robot, "loads", ()) if isinstance(load, AttachedMass)]
     if tendons is None:
-        return [{"at": float(load.at), "shape": "ball", "radius": 2.5 * radius} for load in masses]
+        return [_body(load, "ball", 2.5 * radius) for load in masses]
     width = RIM * max(float(np.linalg.norm(tendons["routes"], axis=-1).max()), 2.0 * radius)
     if masses:
-        return [{"at": float(load.at), "shape": "rib", "radius": width} for load in masses]
+        return [_body(load, "rib", width) for load in masses]
     count = min(nodes, 21)
     return [{"at": k / (count - 1), "shape": "guide", "radius": width} for k in range(1, count)]
+
+
+def _body(load: AttachedMass, shape: str, radius: float) -> dict[str, Any]:
+    """Return an attached body: its place (part of the length), its shape, and its mass (kg)."""
+    return {"at": float(load.at), "shape": shape, "radius": radius, "mass": float(load.mass)}
 
 
 def _obstacle(obstacle: Obstacle) -> dict[str, Any]:
@@ -139,15 +144,16 @@ def _components(field: Field, control: bool) -> list[str]:
 
 
 def sliders(system: System) -> list[dict[str, Any]]:
-    """Return a slider for each component of the control: name, unit, range and initial value."""
+    """Return a slider for each component of the control: names, unit, range and initial value."""
     found = []
     for field in system.control_layout.fields:
         low, high, start = _range(system, field)
         for component in _components(field, control=True):
             name = f"{field.name} {component}".strip()
             found.append(
-                {"name": name, "unit": field.unit, "meaning": field.meaning, "low": low, "high": high,
-                 "start": start, "step": (high - low) / 500.0}
+                {"name": name, "group": field.name, "label": component, "unit": field.unit,
+                 "meaning": field.meaning, "low": low, "high": high, "start": start,
+                 "step": (high - low) / 500.0}
             )  # fmt: skip
     return found
 

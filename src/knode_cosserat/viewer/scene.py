@@ -1,9 +1,9 @@
 """Scene of the page: trajectories as compact arrays, with the data to draw and to plot them.
 
 Arrays are float32, their bytes sorted by significance and compressed, in base64: 500 steps of the paper's
-robot take 0.5 MB at most. What is longer is thinned: at most 41 nodes of a rod are kept, and of the rows so
-many (evenly, the last one among them) that a trajectory takes 2 MB before compression, at least 200. The
-page says so. Nothing that is not a number or a text leaves here, and texts are shown as texts only.
+robot take 0.5 MB at most. Longer trajectories are thinned: at most 41 nodes of a rod are kept, and rows are
+evenly selected (with the last one) so that a trajectory takes 2 MB before compression, but at least 200. The
+page reports it. A scene contains only numbers and texts, and texts are never interpreted as markup.
 """
 
 from __future__ import annotations
@@ -33,7 +33,11 @@ MOST = 12
 #: limits for long trajectories: most nodes, most numbers in all rows, and least rows
 MOST_NODES, MOST_NUMBERS, LEAST_ROWS = 41, 500_000, 200
 
+#: largest distance of a target from the origin, in lengths of the longest robot
+FARTHEST_TARGET = 20.0
+
 Given = Trajectory | Sequence[Trajectory] | Mapping[str, Trajectory]
+Point = Sequence[float] | np.ndarray
 
 
 def named(trajectories: Given) -> dict[str, Trajectory]:
@@ -68,11 +72,11 @@ def _one(batch: Trajectory, k: int) -> Trajectory:
     return one
 
 
-def scene(trajectories: Given, title: str | None = None) -> dict[str, Any]:
-    """Return the page's scene as plain values for JSON.
+def scene(trajectories: Given, title: str | None = None, target: Point | None = None) -> dict[str, Any]:
+    """Return the page's scene as plain values for JSON. `target` is a position (x, y, z) in m to be marked.
 
     Raises:
-        ValueError: no trajectory, too many, or one that has nothing to be drawn.
+        ValueError: no trajectory, too many, one that has nothing to be drawn, or an impossible target.
     """
     by_name = named(trajectories)
     tracks = []
@@ -81,7 +85,34 @@ def scene(trajectories: Given, title: str | None = None) -> dict[str, Any]:
             tracks.append(track(each, name))
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from None
-    return {"title": title or ", ".join(by_name), "tracks": tracks}
+    marked = checked_target(target, [each.system for each in by_name.values()])
+    return {"title": title or ", ".join(by_name), "tracks": tracks, "target": marked}
+
+
+def checked_target(target: Point | None, systems: Sequence[System]) -> list[float] | None:
+    """Return a target (x, y, z) in m as a list; None without a target.
+
+    Raises:
+        ValueError: not three finite numbers, or a position far out of every robot's reach.
+    """
+    if target is None:
+        return None
+    try:
+        point = np.array(target, dtype=float)
+    except (TypeError, ValueError):
+        point = np.empty(0)
+    if point.shape != (3,) or not np.all(np.isfinite(point)):
+        raise ValueError(f"target must be a position (x, y, z) of three finite numbers in m (got {target!r})")
+    length = max(float(np.max(system.length)) for system in systems)
+    distance = float(np.linalg.norm(point))
+    if distance > FARTHEST_TARGET * length:
+        guess = ", ".join(f"{x:g}" for x in point / 1000.0)
+        farthest = FARTHEST_TARGET * length
+        raise ValueError(
+            f"target must be within {farthest:.3g} m of the origin, {FARTHEST_TARGET:g} times the robot's "
+            f"length (got {distance:.3g} m). Positions are in m: did you mean ({guess})?"
+        )
+    return [float(x) for x in point]
 
 
 def track(trajectory: Trajectory, name: str) -> dict[str, Any]:
@@ -97,6 +128,7 @@ def track(trajectory: Trajectory, name: str) -> dict[str, Any]:
         "name": name,
         "time": packed(np.asarray(trajectory.time)[rows], "f8"),
         "result": packed(result[rows], "f4"),
+        "position_error": packed(_position_error(trajectory)[rows], "f4"),
         "arrays": {key: packed(value, "f4") for key, value in arrays.items()},
         "all_rows": len(result),
         "all_nodes": int(system.nodes),
@@ -169,6 +201,13 @@ def row_of(system: System, trajectory: Trajectory, names: Sequence[str]) -> np.n
             values = values[:, nodes] if values.shape[1] == system.nodes else values
         parts.append(np.asarray(values, dtype=np.float32).reshape(-1))
     return np.concatenate(parts)
+
+
+def _position_error(trajectory: Trajectory) -> np.ndarray:
+    """Return the estimated discretisation error (m) of each row; NaN where unknown."""
+    rows = np.shape(trajectory.result)
+    error = trajectory.position_error
+    return np.full(rows, np.nan) if error is None else np.asarray(error, dtype=float)
 
 
 def _failure(trajectory: Trajectory, unsolved: np.ndarray) -> dict[str, Any] | None:

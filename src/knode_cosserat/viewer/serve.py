@@ -1,4 +1,4 @@
-"""A page on a small server of this machine, for this machine only."""
+"""Local server of the page, reachable from this machine only."""
 
 from __future__ import annotations
 
@@ -7,35 +7,40 @@ import sys
 from collections.abc import Callable
 
 from knode_cosserat.viewer.document import document
-from knode_cosserat.viewer.scene import Given, scene
+from knode_cosserat.viewer.scene import Given, Point, scene
 
 HOST = "127.0.0.1"
+
+#: True: open the page and print its address; False: print it only; a function is called with it instead
+Opening = bool | Callable[[str], None]
 
 
 def view(
     trajectories: Given,
     *,
     title: str | None = None,
+    target: Point | None = None,
     port: int = 0,
-    open_browser: bool = True,
-    ready: Callable[[str], None] | None = None,
+    open_browser: Opening = True,
 ) -> None:
     """Show trajectories in the browser until interrupted (Ctrl-C).
 
     Args:
         trajectories: a `Trajectory`, several, or several by name; those of a batch are shown one by one.
-        title: what stands above it; by default the names.
-        port: of the server, which only this machine reaches; 0 for any that is free.
-        open_browser: whether to open the page; its address is printed in any case.
-        ready: called with the address, instead of printing it.
+        title: heading of the page; by default the names.
+        target: position (x, y, z) in m that is marked, with the distance of every tip to it.
+        port: port of the server, which only this machine reaches; 0 for any free one.
+        open_browser: True opens the page and prints its address; False only prints it. A function is called
+            with the address instead.
 
     Raises:
-        ValueError: no trajectory, more than 12, one that has nothing to be drawn, or an impossible port.
+        ValueError: no trajectory, more than 12, one that has nothing to be drawn, or an impossible target or
+            port.
         OSError: the port is taken.
     """
     import http.server
 
-    page = document(scene(trajectories, title)).encode("utf-8")
+    page = document(scene(trajectories, title, target)).encode("utf-8")
 
     class Handler(http.server.BaseHTTPRequestHandler):
         def do_GET(self) -> None:
@@ -52,7 +57,7 @@ def view(
             pass
 
     with http.server.ThreadingHTTPServer((HOST, checked_port(port)), Handler) as server:
-        announce(f"http://{HOST}:{server.server_address[1]}/", open_browser, ready)
+        announce(f"http://{HOST}:{server.server_address[1]}/", open_browser)
         with contextlib.suppress(KeyboardInterrupt):
             server.serve_forever()
 
@@ -64,13 +69,18 @@ def checked_port(port: int) -> int:
     return port
 
 
-def announce(address: str, open_browser: bool, ready: Callable[[str], None] | None) -> None:
+def announce(address: str, open_browser: Opening) -> None:
     """Report the address of the page, and open it if requested."""
-    if ready is not None:
-        ready(address)
-    else:
-        print(f"the viewer is at {address} (Ctrl-C ends it)", file=sys.stderr, flush=True)
+    if callable(open_browser):
+        open_browser(address)
+        return
+    print(f"the viewer is at {address} (Ctrl-C ends it)", file=sys.stderr, flush=True)
     if open_browser:
-        import webbrowser
+        open_page(address)
 
-        webbrowser.open(address)
+
+def open_page(address: str) -> None:
+    """Open an address in the default browser."""
+    import webbrowser
+
+    webbrowser.open(address)

@@ -23,7 +23,7 @@ def noisy(trajectories: list[kc.Trajectory], part: float, seed: int) -> list[kc.
     rng = np.random.default_rng(seed)
     robot = trajectories[0].system
 
-    def sizes(layout: kc.Layout, name: str) -> np.ndarray:
+    def sizes(layout: kc.robots.Layout, name: str) -> np.ndarray:
         every = np.concatenate(
             [getattr(each, name) - getattr(each, name).mean(axis=0) for each in trajectories]
         )

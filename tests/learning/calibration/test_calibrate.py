@@ -36,7 +36,7 @@ from tests.learning.calibration.data import DT, FOUR, ROBOT, noisy, sines
 def test_imperfections_are_found(truth, start):
     true = ROBOT.replace(**truth)
     # so far that what is left of the data's own equations does not show in a force a millionth of the others'
-    data = sines(true, newton=kc.NewtonOptions(tolerance=1e-12))
+    data = sines(true, newton=kc.solvers.NewtonOptions(tolerance=1e-12))
     result = calibrate(ROBOT.replace(**start), data, FOUR)
     assert result.estimates["youngs_modulus"] == pytest.approx(float(true.youngs_modulus), rel=1e-8)
     assert result.estimates["length"] == pytest.approx(float(true.length), rel=1e-8)
@@ -50,7 +50,7 @@ def test_imperfections_are_found(truth, start):
     assert not result.undetermined and not result.unexplained
     controls = kc.controls.sine(1.5, 100, DT)
     again = kc.simulate(result.robot, controls, DT)[:100]
-    assert kc.tip_dtw(again, kc.simulate(true, controls, DT)[:100]) < 1e-6
+    assert kc.metrics.tip_dtw(again, kc.simulate(true, controls, DT)[:100]) < 1e-6
 
 
 @pytest.mark.campaign
@@ -75,7 +75,7 @@ def test_nobody_has_to_say_which_parameter_is_wrong(truth, start):
     np.testing.assert_allclose(result.robot.gravity, true.gravity, atol=1e-7)
     controls = kc.controls.sine(1.5, 100, DT)
     again = kc.simulate(result.robot, controls, DT)[:100]
-    assert kc.tip_dtw(again, kc.simulate(true, controls, DT)[:100]) < 1e-6
+    assert kc.metrics.tip_dtw(again, kc.simulate(true, controls, DT)[:100]) < 1e-6
 
 
 def test_a_robot_at_rest_tells_little():
@@ -164,8 +164,8 @@ def test_what_the_parameters_cannot_explain_is_said(swings):
 class Ropes(Bar):
     """A bar of so many ropes; the colour is for the eye."""
 
-    ropes: Any = kc.parameter("1", "how many", low=0.1, high=100.0, default=1.0)
-    colour: Any = kc.parameter("1", "not used", low=0.0, high=1.0, default=0.5)
+    ropes: Any = kc.robots.parameter("1", "how many", low=0.1, high=100.0, default=1.0)
+    colour: Any = kc.robots.parameter("1", "not used", low=0.0, high=1.0, default=0.5)
 
     def strains(self, s, t, y, control, history):
         every = self.replace(stiffness=self.stiffness * self.ropes, damping=self.damping * self.ropes)
@@ -200,7 +200,7 @@ def test_data_without_motion_do_not_tell_the_drag():
 class Soft(Bar):
     """A bar that may not be as stiff as it is."""
 
-    stiffness: Any = kc.parameter("N", "EA", low=1e-3, high=15.0)
+    stiffness: Any = kc.robots.parameter("N", "EA", low=1e-3, high=15.0)
 
 
 def test_the_end_of_the_allowed_range_is_no_estimate(swings):
@@ -238,7 +238,7 @@ def test_noise_that_hides_a_parameter_is_said(swings):
     ],
 )
 def test_names_that_are_not_allowed(swings, names, message):
-    with pytest.raises(kc.ParameterError, match=message):
+    with pytest.raises(kc.robots.ParameterError, match=message):
         calibrate(BAR, swings, names)
 
 
@@ -286,11 +286,11 @@ def test_matrices_and_vectors_as_numbers():
     full = np.diag([0.03, 0.04, 0.05])
     full[0, 1] = full[1, 0] = 1e-3
     with pytest.raises(
-        kc.ParameterError, match=r"^bending_damping is a matrix with more than a diagonal; allowed is"
+        kc.robots.ParameterError, match=r"^bending_damping is a matrix with more than a diagonal; allowed is"
     ):
         unknowns_of(ROBOT.replace(bending_damping=full), ["bending_damping"])
     with pytest.raises(
-        kc.ParameterError, match=r"^shear_modulus has no value: it follows from other parameters"
+        kc.robots.ParameterError, match=r"^shear_modulus has no value: it follows from other parameters"
     ):
         unknowns_of(ROBOT, ["shear_modulus"])
     assert "shear_modulus" not in [unknown.name for unknown in unknowns_of(ROBOT, None)]

@@ -41,7 +41,7 @@ def network(knowledge=ROBOT, hidden=3, seed=0, number=np.asarray):
 def structured(knowledge=ROBOT, seed=0):
     rng = np.random.default_rng(seed)
     y, z = knowledge.y_layout, knowledge.z_layout
-    rates = kc.Layout(*((f"{field.name}_t", field.size, "", "rate") for field in z.fields))
+    rates = kc.robots.Layout(*((f"{field.name}_t", field.size, "", "rate") for field in z.fields))
 
     def law(layout, outputs, **forms):
         found = expansion(layout, rng.normal(size=(9, layout.size)), forms, outputs)

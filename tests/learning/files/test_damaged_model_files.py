@@ -202,7 +202,7 @@ def test_robots_that_are_not_right():
     def edit(header):
         header["knowledge"]["robot"] = header["knowledge"]["robot"].replace("length: 0.635", "length: -1.0")
 
-    with fails("model: its robot file: length is -1.0; allowed is a number 0.001 to 20 m"):
+    with fails("model: its robot file: length must be between 0.001 and 20 m (got -1.0)"):
         model_file.decoded(forged(BYTES, edit), "model")
 
 
@@ -245,7 +245,7 @@ def test_shapes_that_do_not_fit_together(tmp_path):
         header["about"] = {}
 
     assert decoded(forged(BYTES, impossible, np.float64(0.1).tobytes())).length == 0.635 * 1.1
-    with fails("model: residual and knowledge do not fit together: length is"):
+    with fails("model: residual and knowledge do not fit together: length must be between"):
         model_file.decoded(forged(BYTES, impossible, np.float64(-2.0).tobytes()), "model")
 
 

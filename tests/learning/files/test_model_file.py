@@ -95,8 +95,10 @@ def test_what_is_known_of_a_model_comes_back_the_same(facts):
 
 def test_settings_and_a_loss_history_come_back(tmp_path):
     loss = np.random.default_rng(0).random((5, 1000))
-    chosen = kc.Settings(
-        time=kc.BDFAlpha(-1 / 3), space=kc.Lobatto4(), newton=kc.NewtonOptions(tolerance=1e-9 / 3)
+    chosen = kc.solvers.Settings(
+        time=kc.solvers.BDFAlpha(-1 / 3),
+        space=kc.solvers.Lobatto4(),
+        newton=kc.solvers.NewtonOptions(tolerance=1e-9 / 3),
     )
     facts = {"loss": loss, "settings": chosen, "data": [{"sha256": "ab" * 32, "rows": (0, 30)}]}
     KNODE(ROBOT, network(), About(facts)).save(tmp_path / "model")
@@ -153,7 +155,7 @@ def test_a_users_knowledge_is_asked_for(tmp_path):
 def test_a_users_knowledge_of_another_layout_is_turned_down(tmp_path, monkeypatch):
     path = tmp_path / "model"
     KNODE(STRING, network(STRING)).save(path)
-    longer = kc.Layout(*HangingString.y_layout.fields, ("angle", 1, "rad", "angle"))
+    longer = kc.robots.Layout(*HangingString.y_layout.fields, ("angle", 1, "rad", "angle"))
     monkeypatch.setattr(HangingString, "y_layout", longer)
     with fails("the knowledge given has other y", "angle", "not"):
         load_model(path, knowledge=STRING)

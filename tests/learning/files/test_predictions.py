@@ -67,7 +67,7 @@ def test_the_command_line_reads_predictions(prediction, tmp_path):
     runner = typer.testing.CliRunner()
     told = runner.invoke(app, ["evaluate", str(path), str(tmp_path / "truth.nc"), "--json"])
     assert told.exit_code == 0, told.stderr
-    assert json.loads(told.stdout)["references"][0]["tip_dtw"] == kc.tip_dtw(trajectory, truth) > 0.0
+    assert json.loads(told.stdout)["references"][0]["tip_dtw"] == kc.metrics.tip_dtw(trajectory, truth) > 0.0
     drawn = runner.invoke(app, ["plot", str(path), "--out", str(tmp_path / "prediction.png")])
     assert drawn.exit_code == 0, drawn.stderr
     assert (tmp_path / "prediction.png").stat().st_size > 10_000

@@ -36,7 +36,9 @@ def points(count=20, seed=0):
     draw = np.random.default_rng(seed)
     y = draw.normal(size=(count, 19)) * np.repeat([0.3, 1.0, 2.0, 0.5, 1.0, 3.0], [3, 4, 3, 3, 3, 3])
     z = draw.normal(size=(count, 6)) * np.repeat([1.0, 20.0], 3)
-    history = kc.History(np.full(count, 30.0), 30.0 * draw.normal(size=(count, 19)), z, np.zeros((count, 19)))
+    history = kc.robots.History(
+        np.full(count, 30.0), 30.0 * draw.normal(size=(count, 19)), z, np.zeros((count, 19))
+    )
     return y, draw.uniform(0.0, 10.0, (count, 4)), history
 
 
@@ -91,7 +93,7 @@ def test_a_stiffening_rod_has_the_moment_of_its_law_and_its_slope():
     robot = truths.extended(truths.Stiffening, ROBOT, law="exponential", curvature=2.0)
     y = np.zeros(19)
     y[3] = 1.0
-    still = kc.History(np.zeros(()), np.zeros(19), np.zeros(6), np.zeros(19))
+    still = kc.robots.History(np.zeros(()), np.zeros(19), np.zeros(6), np.zeros(19))
 
     def bent(moment):
         return robot.strains(0.0, 0.0, jnp.asarray(y).at[10].set(moment), None, still)[3]
@@ -113,11 +115,11 @@ def test_a_body_at_the_tip_hangs_by_its_weight_and_resists_being_moved():
     )
     y = np.zeros(19)
     y[3] = 1.0
-    still = kc.History(np.zeros(()), np.zeros(19), np.zeros(6), np.zeros(19))
+    still = kc.robots.History(np.zeros(()), np.zeros(19), np.zeros(6), np.zeros(19))
     left = np.asarray(robot.tip(0.0, None, y, still))
     np.testing.assert_allclose(left, [0, 0, -0.02 * 9.81, -0.1 * 0.02 * 9.81, 0, 0], atol=1e-15)
     # turned about its own axis ever faster: α = 5 about z, the centre on a lever along y
-    faster = kc.History(np.zeros(()), np.r_[np.zeros(16), 0.0, 0.0, 5.0], np.zeros(6), np.zeros(19))
+    faster = kc.robots.History(np.zeros(()), np.r_[np.zeros(16), 0.0, 0.0, 5.0], np.zeros(6), np.zeros(19))
     more = np.asarray(robot.tip(0.0, None, y, faster)) - left
     np.testing.assert_allclose(
         more, [0.02 * 5 * 0.1, 0, 0, 0, 0, -1e-4 * 5 - 0.1 * 0.02 * 5 * 0.1], atol=1e-15
@@ -139,14 +141,14 @@ def test_two_short_sines_are_enough(name):
     model = kc.fit(ROBOT, [moved(truth, control, 30) for control in imperfections.TRAINING])
     for control in ("random:0", "step:3"):
         truly, knowledge, learned = (moved(robot, control, 100) for robot in (truth, ROBOT, model))
-        assert kc.tip_dtw(learned, truly) <= 0.05 * kc.tip_dtw(knowledge, truly)
-        assert kc.pose_mse(learned, truly) <= 0.05 * kc.pose_mse(knowledge, truly)
+        assert kc.metrics.tip_dtw(learned, truly) <= 0.05 * kc.metrics.tip_dtw(knowledge, truly)
+        assert kc.metrics.pose_mse(learned, truly) <= 0.05 * kc.metrics.pose_mse(knowledge, truly)
     # twice the tension that it has learned from
     truly, knowledge, learned = (
         moved(robot, imperfections.FAR["double random"], 100) for robot in (truth, ROBOT, model)
     )
-    assert kc.tip_dtw(learned, truly) <= kc.tip_dtw(knowledge, truly)
-    assert kc.pose_mse(learned, truly) <= kc.pose_mse(knowledge, truly)
+    assert kc.metrics.tip_dtw(learned, truly) <= kc.metrics.tip_dtw(knowledge, truly)
+    assert kc.metrics.pose_mse(learned, truly) <= kc.metrics.pose_mse(knowledge, truly)
 
 
 def moved(robot, control, rows):
@@ -163,7 +165,9 @@ def test_a_job_says_how_well_its_knowledge_does():
     expected = moved(truth, "sine:1.5", 20)
     for cell in job.work(job.settings).facts["cells"]:
         assert cell["imperfection"] == "no drag" and cell["control"] == "sine"
-        assert cell["tip_dtw"] == pytest.approx(kc.tip_dtw(moved(ROBOT, "sine:1.5", 20), expected), rel=1e-6)
+        assert cell["tip_dtw"] == pytest.approx(
+            kc.metrics.tip_dtw(moved(ROBOT, "sine:1.5", 20), expected), rel=1e-6
+        )
 
 
 def test_noise_is_a_part_of_how_much_each_number_varies():

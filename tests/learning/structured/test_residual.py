@@ -45,7 +45,7 @@ def findings(model):
 def left(model, knowledge, truth, controls=UNSEEN, dt=DT, **options):
     """Tip error on unseen controls as a part of the knowledge's own."""
     true, base, ours = (kc.simulate(one, controls, dt, **options) for one in (truth, knowledge, model))
-    return kc.tip_dtw(ours, true) / kc.tip_dtw(base, true)
+    return kc.metrics.tip_dtw(ours, true) / kc.metrics.tip_dtw(base, true)
 
 
 def test_a_wrong_length_is_a_stretch_and_nothing_else(robot):
@@ -162,7 +162,9 @@ def test_derivatives_of_an_implicit_law(robot):
     model = learned(robot, recorded(like(robot, truths.Stiffening)))
     trajectory = recorded(robot, 4, (1.0,))[0]
     y = jnp.asarray(trajectory.y[3, 4])
-    history = kc.History(jnp.array(30.0), -30.0 * y, -30.0 * jnp.asarray(trajectory.z[2, 4]), jnp.zeros(19))
+    history = kc.robots.History(
+        jnp.array(30.0), -30.0 * y, -30.0 * jnp.asarray(trajectory.z[2, 4]), jnp.zeros(19)
+    )
 
     @jax.jit
     def strains(y):

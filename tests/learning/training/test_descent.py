@@ -171,7 +171,7 @@ def test_standardised_inputs_have_mean_zero_and_spread_one(bars):
     data = samples(WRONG, bars)
     net = network(WRONG, NetworkOptions(hidden=4, convex=False), jax.random.key(0))
     scaled = program.standardised(net, WRONG, data)
-    known = program.known(scaled, WRONG, data.segments, kc.Euler())
+    known = program.known(scaled, WRONG, data.segments, kc.solvers.Euler())
     np.testing.assert_allclose(np.mean(known.inputs[:-1], axis=1), 0.0, atol=1e-12)
     np.testing.assert_allclose(np.std(known.inputs[:-1], axis=1), 1.0)
     # an output of one is as large as what the knowledge lacks: z is off by n (1/EA - 1/EA'), and damping

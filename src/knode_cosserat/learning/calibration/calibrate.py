@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat._reprs import robot_text, wrapped
 from knode_cosserat.learning.calibration import search
 from knode_cosserat.learning.calibration.misfit import SegmentMisfit, by_group
 from knode_cosserat.learning.calibration.noise import Errors, errors_of, hidden_by_rounding
@@ -67,6 +68,18 @@ class Calibration:
     remainder: Mapping[str, float]
     #: fields whose remainder is not noise: another parameter is wrong, or the equations lack an effect
     unexplained: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        ends = np.concatenate([np.reshape(pair, (-1, 2)) for pair in self.intervals.values()])
+        values = [number for value in self.estimates.values() for number in np.atleast_1d(value)]
+        found = [
+            f"{label} = {value:.6g} {unit}".rstrip() + f" ({low:.6g} to {high:.6g})"
+            for label, unit, value, (low, high) in zip(self.labels, self.units, values, ends, strict=True)
+        ]
+        return wrapped(
+            f"Calibration of a {robot_text(self.robot)}, with {100 * self.level:g} % intervals: "
+            + ("; ".join(found) or "nothing")
+        )
 
     def __str__(self) -> str:
         def numbers(by_parameter: Mapping[str, Any]) -> list[Any]:
@@ -167,7 +180,10 @@ def _check(robot: Any, trajectories: Any, by: Any, level: Any) -> None:
         raise CalibrationError(f'by is {by!r}; allowed is "segments" or "rollouts"')
     measured = [isinstance(each, Measurements) for each in trajectories]
     if any(measured) and by != "rollouts":
-        raise DataError('measurements are no states: calibrate(…, by="rollouts") compares poses only')
+        raise DataError(
+            'calibrate needs full states (got Measurements); use calibrate(…, by="rollouts"), identify, '
+            "or estimate_states first"
+        )
     if any(measured) and not all(measured):
         raise DataError("trajectories and measurements are mixed; allowed is a list of one kind")
     if isinstance(level, bool) or not isinstance(level, int | float) or not 0.0 < level < 1.0:

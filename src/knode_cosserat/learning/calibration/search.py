@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.learning.calibration.misfit import SegmentMisfit, by_group
 from knode_cosserat.learning.calibration.rollouts import RolloutMisfit
 from knode_cosserat.learning.calibration.unknowns import (
@@ -54,8 +55,10 @@ ALIKE = 0.3
 PART = 0.1
 
 
-class CalibrationError(ValueError):
+class CalibrationError(KnodeCosseratError, ValueError):
     """Parameters that cannot be found. The message is one line: the parameters and the reason."""
+
+    code = "calibration"
 
 
 class Fit(NamedTuple):

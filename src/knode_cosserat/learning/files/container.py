@@ -26,6 +26,7 @@ import jax
 import numpy as np
 
 from knode_cosserat._files import package_version, replacing
+from knode_cosserat.errors import KnodeCosseratError
 
 #: largest number of bytes of the header and of the arrays, as a limit for hostile files
 MOST_HEADER = 4 * 2**20
@@ -41,8 +42,10 @@ TYPES = {
 _ALLOWED = "numbers, text, None, arrays of numbers, and lists, tuples and dictionaries of these"
 
 
-class ContainerError(ValueError):
+class ContainerError(KnodeCosseratError, ValueError):
     """A value that cannot be packed or unpacked. The message is one line that does not name the file."""
+
+    code = "file-content"
 
     def __init__(self, message: str):
         # text from a file may contain line ends and control characters
@@ -52,6 +55,8 @@ class ContainerError(ValueError):
 
 class UnknownClassError(ContainerError):
     """A file has an object of an unknown class; `name` is the name of the class."""
+
+    code = "unknown-class"
 
     def __init__(self, message: str, name: str):
         super().__init__(message)

@@ -25,6 +25,7 @@ import numpy as np
 
 from knode_cosserat import trajectory_system
 from knode_cosserat._registry import provide
+from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.learning.files import container
 from knode_cosserat.learning.files.container import (
     Classes,
@@ -55,8 +56,10 @@ _classes: dict[str, type] = {}
 _Class = TypeVar("_Class", bound=type)
 
 
-class ModelFileError(ValueError):
+class ModelFileError(KnodeCosseratError, ValueError):
     """A model file that cannot be read or written. The message is one line with the reason."""
+
+    code = "model-file"
 
 
 def register(cls: _Class) -> _Class:

@@ -18,6 +18,7 @@ from typing import Any, Self
 import jax
 import numpy as np
 
+from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.learning.config import FitConfig
 from knode_cosserat.learning.files import container
 from knode_cosserat.learning.files.container import ContainerError, Title, Writer
@@ -29,8 +30,10 @@ TITLE = Title("knode-cosserat checkpoint", 1)
 SUFFIX = ".checkpoint"
 
 
-class CheckpointError(ValueError):
+class CheckpointError(KnodeCosseratError, ValueError):
     """A checkpoint that cannot be used or written. The message is one line: the file and the reason."""
+
+    code = "checkpoint"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -50,7 +50,7 @@ class PaperLoss(Loss):
     layout: Layout = eqx.field(static=True)
 
     def __call__(self, y: Float[Any, "y S"], z: Float[Any, "z S"]) -> Float[Any, ""]:
-        """Return the loss, in mixed units."""
+        """Return the loss (paper eq. 8, training loss), in mixed units."""
         p, h, *rest = (y[self.layout.slice(name)] for name in PAPER_FIELDS)
         p_true, _, *rest_true = (self.y[self.layout.slice(name)] for name in PAPER_FIELDS)
         squares = (

@@ -13,13 +13,16 @@ from typing import Any
 import jax
 import numpy as np
 
+from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.learning.residual import Residual
 from knode_cosserat.learning.training.checkpoint import CheckpointError, Checkpoints, packed, unpacked
 from knode_cosserat.learning.training.watch import Watch
 
 
-class FitError(ValueError):
+class FitError(KnodeCosseratError, ValueError):
     """A fit that cannot start or continue. The message is one line: the reason, and the kept state."""
+
+    code = "fit"
 
 
 class Run(abc.ABC):

@@ -10,9 +10,13 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from knode_cosserat.errors import KnodeCosseratError
 
-class WatchError(ValueError):
+
+class WatchError(KnodeCosseratError, ValueError):
     """Metrics cannot be written. The message is one line with the reason."""
+
+    code = "training-log"
 
 
 class Watch:

@@ -141,7 +141,9 @@ def _strains(robot: System, rows: Rows, coefficients: Float[Any, "4"]) -> Float[
 def semi_discretised(
     robot: System, t: Any, control: Any, known: Float[Any, "T N y"], settings: Settings, dt: float
 ) -> tuple[Float[np.ndarray, "T N y"], Float[np.ndarray, "T N z"]]:
-    """Return y and z at the nodes from the discrete equations of a simulation with Euler segments.
+    """Return y and z at the nodes (paper eq. 14, n and m integrated backwards from the tip).
+
+    The equations are those of a simulation with Euler segments.
 
     Rates come from the time scheme and earlier rows. The history of the first row is constant (paper,
     section 3).

@@ -28,7 +28,7 @@ POINTS = 8
 OUTLIER = 0.015
 #: frames that are looked at, of each motion
 FRAMES = 10
-#: how loosely tangents are held (rad) where the grips' own directions are looked for
+#: tolerance of tangents (rad) in the search for the grips' directions
 LOOSE = 1.0
 
 

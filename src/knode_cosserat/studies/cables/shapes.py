@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from knode_cosserat.studies.cables import frames
 
-#: what a difference of 1 stands for: a marker's place (m), strain, tangent at an end (rad), and change of
+#: scales of differences: a marker's place (m), strain, tangent at an end (rad), and change of
 #: curvature (1/m over the length, by the root of the length). Chosen on DLO1 and DLO2 by the first 0.2 s of
 #: rollouts: with less smoothing the first steps are thrown by wiggles between markers
 PLACE, STRAIN, TANGENT, ROUGHNESS = 0.5e-3, 1e-4, 0.1, 5.0

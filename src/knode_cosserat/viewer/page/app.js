@@ -1,18 +1,22 @@
 // The page: what is shown, where the clock stands, and who must know when either changes.
 import * as THREE from "three";
+import { Capture, save, videoFormat } from "viewer/capture";
+import { onChange, robotColour } from "viewer/colours";
 import { Track } from "viewer/data";
+import { Hover } from "viewer/hover";
+import { Legend, Tensions, labelCells, markTimes, warning } from "viewer/legend";
 import { Live } from "viewer/live";
-import { Plot, dashStyle, errorLines, fieldLines, short } from "viewer/plots";
-import { RobotModel, rampColours } from "viewer/robot";
+import { Panels } from "viewer/panels";
+import { RobotModel } from "viewer/robot";
 import { Stage } from "viewer/stage";
+import { length } from "viewer/units";
+import { VIEWS } from "viewer/views";
 
-//: Okabe and Ito's colours, which the colour-blind can tell apart
-const LIGHT = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"];
-const DARK = ["#56B4E9", "#E69F00", "#2CC295", "#CC79A7", "#F0E442", "#E0703A"];
 const $ = (id) => document.getElementById(id);
-const dark = matchMedia("(prefers-color-scheme: dark)");
-/** How many rows the path of a live robot's tip has. */
+/** Number of rows in the path of a live robot's tip. */
 const TRAIL = 60;
+/** Time (s) after which the hint goes away by itself. */
+const HINT = 15;
 
 export async function start(scene) {
   try {
@@ -25,13 +29,13 @@ export async function start(scene) {
 }
 
 function say(text) {
-  $("message").textContent = text;
+  if ($("message").textContent !== text) $("message").textContent = text;
   $("message").hidden = !text;
 }
 
 class Viewer {
   constructor(scene, tracks) {
-    Object.assign(this, { scene, tracks, time: 0, speed: 1, playing: false, frames: 0 });
+    Object.assign(this, { scene, tracks, time: 0, speed: 1, playing: false, frames: 0, told: "" });
     this.parts = { tendons: true, ribs: true, frames: false, path: true };
     $("title").textContent = scene.title;
     for (const track of tracks) track.wanted = true;
@@ -40,107 +44,112 @@ class Viewer {
     this.span = [Math.min(...starts), Math.max(...ends)];
     this.time = this.span[0];
     this.#build();
+    this.#overlays();
     this.#bar();
-    this.#panels();
+    this.#keys();
+    this.panels = new Panels(tracks, this.robots, {
+      colours: () => this.colours, seek: (time) => this.seek(this.rowTime(time)), coloured: () => (this.stage.dirty = true),
+    });
     this.#notes();
     if (scene.live) this.#live();
     else if (this.span[1] === this.span[0]) document.querySelector("footer").hidden = true;
-    dark.addEventListener("change", () => this.#repaint());
+    onChange(() => this.#repaint());
     this.#seen();
     requestAnimationFrame((now) => this.#frame(now));
   }
 
-  colour(k) {
-    const palette = dark.matches ? DARK : LIGHT;
-    return palette[k % palette.length];
-  }
-
   get colours() {
-    return this.tracks.map((_, k) => this.colour(k));
+    return this.tracks.map((_, k) => robotColour(k));
   }
 
   // the space
 
   #build() {
-    const [low, high] = [new THREE.Vector3(Infinity, Infinity, Infinity), new THREE.Vector3(-Infinity, -Infinity, -Infinity)];
-    for (const track of this.tracks) {
-      const box = track.box();
-      low.min(new THREE.Vector3(...box[0]));
-      high.max(new THREE.Vector3(...box[1]));
-    }
+    const boxes = this.tracks.map((track) => {
+      const [low, high] = track.box().map((corner) => new THREE.Vector3(...corner));
+      return new THREE.Box3(low, high);
+    });
     const longest = Math.max(...this.tracks.map((track) => track.drawing.length));
     const up = this.tracks[0].drawing.up;
     // a live robot has been nowhere yet: there is room for it to bend to every side
-    if (this.scene.live) for (const k of [0, 1, 2]) {
-      const room = 0.45 * longest * Math.sqrt(1 - up[k] ** 2);
-      low.setComponent(k, low.getComponent(k) - room);
-      high.setComponent(k, high.getComponent(k) + room);
-    }
-    const size = Math.max(high.distanceTo(low), 0.6 * longest, 1e-6);
-    this.stage = new Stage($("canvas"), [low.toArray(), high.toArray()], up);
-    this.robots = this.tracks.map((track, k) => new RobotModel(track, this.colour(k), k, size));
+    if (this.scene.live) boxes[0].expandByVector(new THREE.Vector3(...up.map((x) => 0.45 * longest * Math.sqrt(1 - x ** 2))));
+    const all = boxes.reduce((a, b) => a.clone().union(b));
+    const size = Math.max(all.max.distanceTo(all.min), 0.6 * longest, 1e-6);
+    this.stage = new Stage($("canvas"), [all.min.toArray(), all.max.toArray()], up);
+    this.robots = this.tracks.map((track, k) => new RobotModel(track, robotColour(k), k, size));
     // the ground is under everything, and under the foot of the base
-    const heights = [low, high].map((corner) => corner.dot(this.stage.up));
+    const heights = [all.min, all.max].map((corner) => corner.dot(this.stage.up));
     const foot = this.tracks.map((track) => new THREE.Vector3(...track.firstPoint()).dot(this.stage.up));
     const under = Math.max(...this.robots.map((robot) => robot.baseHeight));
     const ground = Math.min(...heights, ...foot.map((height) => height - under));
-    this.stage.furnish(size, ground);
-    this.unknown = [];
     this.robots.forEach((robot, k) => {
-      robot.group.userData.wanted = true;
+      Object.assign(robot.group.userData, { wanted: true, box: boxes[k].expandByScalar(robot.margin) });
       this.stage.groups.push(robot.group);
       this.stage.scene.add(robot.group);
-      const same = JSON.stringify(this.tracks[k].drawing.obstacles);
-      const already = this.tracks.slice(0, k).some((track) => JSON.stringify(track.drawing.obstacles) === same);
-      // what all of them touch is there once, whichever is shown
-      const all = this.tracks.every((track) => JSON.stringify(track.drawing.obstacles) === same);
-      if (all && already) return;
-      for (const obstacle of this.tracks[k].drawing.obstacles)
-        if (!this.stage.obstacle(obstacle, all ? this.stage.scene : robot.group)) this.unknown.push(obstacle.name);
     });
-    $("scale").textContent = `grid ${length(this.stage.spacing)}`;
-    this.#tension();
+    this.stage.furnish(size, ground);
+    if (this.scene.target) this.stage.mark(this.scene.target);
+    this.unknown = this.tracks.flatMap((_, k) => this.#obstacles(k));
     for (const [part, wanted] of Object.entries(this.parts)) for (const robot of this.robots) robot.show(part, wanted);
   }
 
-  #tension() {
+  /** Draw the obstacles of a robot; gives the names of those that cannot be drawn. */
+  #obstacles(k) {
+    const texts = this.tracks.map((track) => JSON.stringify(track.drawing.obstacles));
+    // what all of them touch is there once, whichever is shown
+    const all = texts.every((text) => text === texts[k]);
+    if (all && k > 0) return [];
+    const place = all ? this.stage.scene : this.robots[k].group;
+    return this.tracks[k].drawing.obstacles.filter((obstacle) => !this.stage.obstacle(obstacle, place)).map(({ name }) => name);
+  }
+
+  /** The range of tensions (N) that has colours. */
+  #tensions() {
     const sliders = this.scene.live?.sliders.filter((slider) => slider.name.startsWith("tension")) ?? [];
     const tensions = [...this.robots.flatMap((robot) => robot.tensions), ...sliders.flatMap(({ low, high }) => [low, high])];
     const high = Math.max(1e-3, ...tensions);
     const low = Math.min(high, ...tensions);
     // where they hardly differ the colours should not either
-    this.range = [low > 0.9 * high ? 0 : low, high];
-    $("tension").hidden = !this.robots.some((robot) => robot.tendons);
-    $("tension").querySelector("i").style.background = `linear-gradient(90deg, ${rampColours().join(", ")})`;
-    $("tension").querySelector("b").textContent = `${this.range.map((x) => +x.toPrecision(2)).join(" to ")} N`;
+    return [low > 0.9 * high ? 0 : low, high];
+  }
+
+  // what lies over the picture
+
+  #overlays() {
+    this.range = this.#tensions();
+    this.legend = new Legend($("legend"), this.tracks, this.scene.target, (k) => {
+      const track = this.tracks[k];
+      track.wanted = this.robots[k].group.userData.wanted = !track.wanted;
+      this.#seen();
+    });
+    this.tensions = new Tensions($("tension"), this.robots, this.range);
+    $("scale").textContent = this.#scale();
+    this.hover = new Hover(this.stage, this.robots, { box: $("hover"), mark: $("hover-mark"), field: () => this.panels.field });
+    this.capture = new Capture(this.stage, () => this.#caption());
+    const gone = () => ($("hint").hidden = true);
+    $("hint-close").onclick = gone;
+    for (const name of ["pointerdown", "wheel"]) $("canvas").addEventListener(name, gone, { once: true, passive: true });
+    setTimeout(gone, 1000 * HINT);
+  }
+
+  #scale() {
+    return `grid ${length(this.stage.spacing)}`;
+  }
+
+  /** Words for an image or a video. */
+  #caption() {
+    const shown = this.tracks.map((track, k) => [robotColour(k), track.name]).filter((_, k) => this.tracks[k].wanted);
+    return { names: shown, time: `t = ${this.time.toFixed(2)} s`, scale: this.#scale(), warning: $("message").textContent };
   }
 
   // the bars above and below
 
   #bar() {
-    this.tracks.forEach((track, k) => {
-      const chip = document.createElement("button");
-      const mark = document.createElement("i");
-      const name = document.createElement("span");
-      mark.style.background = this.colour(k);
-      name.textContent = track.name;
-      chip.title = `${track.name}: ${track.drawing.kind}${track.drawing.model ? " with what was learned" : ""}; show or hide`;
-      chip.setAttribute("aria-pressed", "true");
-      chip.append(mark, name);
-      chip.onclick = () => {
-        track.wanted = !track.wanted;
-        this.robots[k].group.userData.wanted = track.wanted;
-        chip.setAttribute("aria-pressed", String(track.wanted));
-        this.#seen();
-      };
-      $("legend").append(chip);
-    });
-    $("legend").hidden = this.tracks.length < 2;
     $("apart").hidden = this.tracks.length < 2;
     $("apart").onclick = () => {
       this.stage.sideBySide = !this.stage.sideBySide;
       $("apart").setAttribute("aria-pressed", String(this.stage.sideBySide));
-      this.stage.home();
+      this.stage.fit();
     };
     for (const button of document.querySelectorAll("[data-part]")) {
       const { part } = button.dataset;
@@ -152,7 +161,10 @@ class Viewer {
         this.stage.dirty = true;
       };
     }
-    $("home").onclick = () => this.stage.home();
+    for (const button of document.querySelectorAll("[data-view]")) button.onclick = () => this.stage.view(button.dataset.view);
+    $("fit").onclick = () => this.stage.fit();
+    $("image").onclick = async () => save(await this.picture(), `${this.#fileName()}-${this.time.toFixed(2)}s.png`);
+    $("video").onclick = () => (this.capture.recording ? this.#endVideo() : this.#beginVideo());
     // the slider stops at the rows of the trajectory that has most of them
     this.clockwork = this.tracks.reduce((a, b) => (b.rows > a.rows ? b : a));
     $("time").max = this.clockwork.rows - 1;
@@ -162,11 +174,52 @@ class Viewer {
     };
     $("play").onclick = () => (this.playing ? this.pause() : this.play());
     $("speed").onchange = () => (this.speed = Number($("speed").value));
+  }
+
+  #keys() {
     document.addEventListener("keydown", (event) => {
-      if (event.code !== "Space" || /^(INPUT|SELECT|BUTTON)$/.test(event.target.tagName)) return;
-      event.preventDefault();
-      $("play").click();
+      const { tagName, type } = event.target;
+      if (event.ctrlKey || event.metaKey || event.altKey) return;
+      if (event.key === "Escape") this.live?.cancel();
+      if (tagName === "SELECT" || type === "number") return;
+      if (event.code === "Space" && !/^(INPUT|BUTTON)$/.test(tagName)) {
+        event.preventDefault();
+        $("play").click();
+      } else if (event.key === "f") this.stage.fit();
+      else if (event.key === "?") $("hint").hidden = !$("hint").hidden;
+      else if (VIEWS[event.key - 1]) this.stage.view(VIEWS[event.key - 1]);
     });
+  }
+
+  #fileName() {
+    return this.scene.title.replace(/[^\p{L}\p{N}]+/gu, "-").slice(0, 60) || "scene";
+  }
+
+  /** The picture as it is now, as a PNG. */
+  picture() {
+    if (this.stage.dirty) this.#draw(false);
+    return this.capture.image();
+  }
+
+  #beginVideo() {
+    if (!videoFormat() || !this.capture.start()) {
+      this.told = "This browser cannot record video (it lacks MediaRecorder with WebM). Use Image, or a screen recorder.";
+      this.stage.dirty = true;
+      return;
+    }
+    $("video").textContent = "Stop recording";
+    $("video").setAttribute("aria-pressed", "true");
+    // a trajectory is recorded up to its end
+    if (!this.live && this.span[1] > this.span[0]) this.play();
+  }
+
+  async #endVideo() {
+    const video = await this.capture.stop();
+    $("video").textContent = "Record video";
+    $("video").setAttribute("aria-pressed", "false");
+    if (video.size) return save(video, `${this.#fileName()}.webm`);
+    this.told = "Nothing was recorded: the recording was too short.";
+    this.stage.dirty = true;
   }
 
   play() {
@@ -178,7 +231,9 @@ class Viewer {
     $("play").setAttribute("aria-label", "Pause");
   }
 
+  /** Stop at a row: every shape that stands still is a solution. */
   pause() {
+    if (this.playing && !this.live) this.seek(this.rowTime(this.time));
     this.playing = false;
     this.live?.command("pause");
     $("play").textContent = "▶";
@@ -193,72 +248,16 @@ class Viewer {
     this.moved = true;
   }
 
-  // the panels
-
-  #panels() {
-    this.errorPlot = new Plot($("error-plot"), (t) => this.seek(t));
-    this.statePlot = new Plot($("state-plot"), (t) => this.seek(t));
-    const names = new Map();
-    for (const track of this.tracks)
-      for (const field of track.fields) if (!names.has(field.name)) names.set(field.name, field);
-    for (const [name, { meaning, unit }] of names) {
-      const words = unit && unit !== "1" ? `${meaning} (${unit})` : meaning;
-      $("field").append(new Option(`${name}: ${words}`, name));
-    }
-    if (names.has("p")) $("field").value = "p";
-    const nodes = Math.max(...this.tracks.map((track) => track.nodes));
-    $("node").max = nodes - 1;
-    $("node").value = nodes - 1;
-    $("field").onchange = () => {
-      this.#components();
-      this.#plotState();
-    };
-    $("component").onchange = $("node").oninput = () => this.#plotState();
-    this.#components();
+  /** The time (s) of the row at or before a time; in the live mode the time itself. */
+  rowTime(time) {
+    return this.live ? time : this.clockwork.times[this.clockwork.at(time).row];
   }
 
-  #field() {
-    const name = $("field").value;
-    return this.tracks.map((track) => track.fields.find((field) => field.name === name)).find(Boolean);
-  }
-
-  #components() {
-    const field = this.#field();
-    if (!field) return;
-    const many = field.components.length > 1;
-    $("component").hidden = !many;
-    const options = many ? [new Option("all", "all"), ...field.components.map((c, k) => new Option(c, k))] : [new Option("", "0")];
-    $("component").replaceChildren(...options);
-    // lines of several trajectories and several components are hard to tell apart
-    if (many && this.tracks.length > 1) $("component").value = "0";
-    $("node-box").hidden = field.array === "control";
-  }
-
-  #plotState() {
-    const field = this.#field();
-    if (!field) return;
-    const node = Number($("node").value);
-    const place = this.tracks[0].arclength[Math.min(node, this.tracks[0].nodes - 1)];
-    const last = node === Number($("node").max);
-    $("node-name").textContent = node === 0 ? "base" : last ? "tip" : `s = ${length(place)}`;
-    this.stateLines = () => fieldLines(this.tracks, this.colours, field.name, $("component").value, node);
-    const lines = this.stateLines();
-    this.statePlot.show(lines, field.unit);
-    const legend = $("component").value === "all" ? field.components : [];
-    $("state-legend").replaceChildren(...legend.map((name, c) => {
-      const entry = document.createElement("span");
-      const mark = document.createElement("i");
-      mark.style.borderTopStyle = dashStyle(c) === "dash-dot" ? "dashed" : dashStyle(c);
-      entry.append(mark, name);
-      return entry;
-    }));
-  }
+  // what changes with what is shown
 
   #seen() {
-    this.errors = errorLines(this.tracks, this.colours);
-    $("error-panel").hidden = this.tracks.length < 2;
-    this.errorPlot.show(this.errors, "mm");
-    this.#plotState();
+    this.panels.renew();
+    if (!this.live) markTimes($("marks"), this.tracks, this.span);
     this.stage.dirty = true;
     this.moved = true;
   }
@@ -274,8 +273,8 @@ class Viewer {
   }
 
   #repaint() {
-    this.robots.forEach((robot, k) => robot.recolour(this.colour(k)));
-    document.querySelectorAll("#legend i").forEach((mark, k) => (mark.style.background = this.colour(k)));
+    this.robots.forEach((robot, k) => robot.recolour(robotColour(k)));
+    this.legend.paint();
     this.labelled = null;
     this.stage.paint();
     this.#seen();
@@ -286,21 +285,30 @@ class Viewer {
   #live() {
     document.body.classList.add("live");
     $("controls").hidden = false;
-    this.live = new Live(this.scene.live, { list: $("sliders") }, {
+    this.live = new Live(this.scene.live, $("sliders"), {
       moved: (row) => this.#arrived(row),
-      told: (text) => say(text),
+      told: (text, unsolved) => {
+        this.told = text;
+        this.tracks[0].stale = unsolved;
+        this.stage.dirty = true;
+      },
+      solving: (seconds) => {
+        $("cancel").disabled = seconds === null;
+        $("solving").textContent = seconds === null ? "" : `solving… ${seconds.toFixed(1)} s`;
+      },
     });
     $("reset").onclick = () => this.live.reset();
+    $("cancel").onclick = () => this.live.cancel();
     this.playing = true;
     $("play").textContent = "❚❚";
     setInterval(() => this.#plotLive(), 200);
   }
 
-  #arrived({ time, result, row, since }) {
+  #arrived({ since, ...row }) {
     const [track] = this.tracks;
-    track.put(time, result, row);
-    this.span = [track.times[0], time];
-    this.time = time;
+    track.put(row);
+    this.span = [track.times[0], row.time];
+    this.time = row.time;
     this.answers ??= since;
     this.robots[0].rebuildPath(TRAIL);
     this.stage.dirty = true;
@@ -314,8 +322,7 @@ class Viewer {
 
   #plotLive() {
     if (!this.playing) return;
-    this.statePlot.renew(this.stateLines());
-    this.statePlot.time = this.time;
+    this.panels.live(this.time);
     const { pace, step, latency } = this.live;
     const words = latency === null ? "" : `, ${Math.round(latency)} ms from slider to shape`;
     if (pace !== undefined) $("pace").textContent = `${pace.toFixed(2)}× real time, ${step.toFixed(1)} ms a step${words}`;
@@ -329,7 +336,10 @@ class Viewer {
       if (this.last) {
         const next = this.time + (this.speed * Math.min(200, now - this.last)) / 1000;
         this.seek(next);
-        if (next >= this.span[1]) this.pause();
+        if (next >= this.span[1]) {
+          this.pause();
+          if (this.capture.recording) this.#endVideo();
+        }
       }
       this.last = now;
     }
@@ -341,72 +351,40 @@ class Viewer {
   }
 
   #draw(fine) {
-    const unsolved = [];
-    this.robots.forEach((robot, k) => {
+    const warnings = this.robots.map((robot, k) => {
       const moment = robot.update(this.time, this.range);
-      if (!moment.solved && this.tracks[k].wanted) unsolved.push(this.tracks[k]);
+      return this.tracks[k].wanted ? warning(this.tracks[k], moment) : "";
     });
     const cells = this.stage.draw(fine);
+    say([this.told, ...warnings].filter(Boolean).join(" "));
     if (this.live) {
       const since = this.answers;
       this.answers = undefined;
       if (since !== undefined) this.stage.finished().then(() => this.live.drawn(since));
       $("clock").textContent = `${this.time.toFixed(2)} s`;
-    } else {
-      $("clock").textContent = `${this.time.toFixed(2)} / ${this.span[1].toFixed(2)} s`;
-      say(unsolved.map(({ name, failure }) => `${name}: not solved from ${failure.time.toFixed(3)} s on (${failure.message}); its last solution is drawn.`).join(" "));
-    }
+    } else $("clock").textContent = `${this.time.toFixed(2)} / ${this.span[1].toFixed(2)} s`;
+    this.legend.note(this.robots);
+    this.tensions.show();
     this.#label(cells);
+    this.hover.update();
     if (this.moved) {
       this.moved = false;
-      this.errorPlot.at(this.time);
-      this.statePlot.at(this.time);
-      this.#errorNow();
+      this.panels.at(this.time);
     }
+    this.capture.frame();
     this.frames++;
     document.body.dataset.time = this.time;
-  }
-
-  #errorNow() {
-    const [first, ...others] = this.tracks;
-    const a = first.tipAt(this.time);
-    const words = others.flatMap((track) => {
-      const b = a && track.wanted && track.tipAt(this.time);
-      return b ? [distance(Math.hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2]))] : [];
-    });
-    $("error-now").textContent = `to ${first.name}${words.length ? `: ${words.join(", ")}` : ""}`;
   }
 
   #label(cells) {
     const key = JSON.stringify(cells);
     if (key === this.labelled) return;
     this.labelled = key;
-    const shown = this.tracks.map((track, k) => [track, k]).filter(([track]) => track.wanted);
-    $("labels").replaceChildren(...cells.map(({ x, y, width, height }, k) => {
-      const cell = document.createElement("div");
-      const label = document.createElement("span");
-      const mark = document.createElement("i");
-      mark.className = "swatch";
-      mark.style.background = this.colour(shown[k][1]);
-      Object.assign(cell.style, { left: `${x}px`, top: `${y}px`, width: `${width}px`, height: `${height}px` });
-      cell.style.borderWidth = `${y > 0 ? 1 : 0}px 0 0 ${x > 0 ? 1 : 0}px`;
-      label.append(mark, shown[k][0].name);
-      cell.append(label);
-      return cell;
-    }));
+    labelCells($("labels"), cells, this.tracks);
   }
 
   /** Where the tip of a trajectory is drawn (m). */
   tip(k = 0) {
     return this.robots[k].tip;
   }
-}
-
-/** Positions are float32: what is below a micrometre is not known. */
-function distance(metres) {
-  return metres < 1e-6 ? "< 0.001 mm" : `${short(1000 * metres)} mm`;
-}
-
-function length(metres) {
-  return metres >= 0.9995 ? `${short(metres)} m` : metres >= 0.01 ? `${short(100 * metres)} cm` : `${short(1000 * metres)} mm`;
 }

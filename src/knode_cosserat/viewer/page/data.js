@@ -19,19 +19,24 @@ export async function unpack({ shape, type, bytes }) {
   return { shape, width, values };
 }
 
+/** The result of a row that is solved, but on too coarse a grid: `Result.COARSE`. */
+const COARSE = 1;
+
 /** States over time of one robot. Rows that are not solved are never given: the last solved one stands for them. */
 export class Track {
   static async of(packed) {
-    const [time, result] = await Promise.all([unpack(packed.time), unpack(packed.result)]);
+    const [time, result, error] = await Promise.all([packed.time, packed.result, packed.position_error].map(unpack));
     const names = Object.keys(packed.arrays);
     const arrays = await Promise.all(names.map((name) => unpack(packed.arrays[name])));
-    return new Track(packed, time.values, result.values, Object.fromEntries(names.map((n, k) => [n, arrays[k]])));
+    return new Track(packed, [time.values, result.values, error.values], Object.fromEntries(names.map((n, k) => [n, arrays[k]])));
   }
 
-  constructor(about, time, result, arrays) {
+  constructor(about, [time, result, error], arrays) {
     Object.assign(this, about); // name, drawing, fields, curves, position, orientation, failure …
     this.times = Array.from(time);
     this.results = Array.from(result);
+    this.errors = Array.from(error);
+    this.stale = false; // a live robot whose newest control is not solved
     this.arrays = arrays;
     this.nodes = arrays.y.shape[1];
     this.solved = this.results.map((r) => r >= 0);
@@ -41,7 +46,10 @@ export class Track {
     return this.times.length;
   }
 
-  /** The last row at or before a time; `solved` says whether it is a solution, `drawn` is the row to be drawn. */
+  /**
+   * The last row at or before a time. `drawn` is the row to be drawn, `solved` is true if it is the row's solution,
+   * `coarse` if the grid is too coarse for it, `error` is its estimated position error (m).
+   */
   at(t) {
     let low = 0;
     let high = this.rows - 1;
@@ -60,7 +68,10 @@ export class Track {
       part = Math.min(1, Math.max(0, (t - this.times[low]) / (this.times[low + 1] - this.times[low])));
       if (part < 1e-6) part = 0;
     }
-    return { row: low, drawn, part, solved: this.solved[low] };
+    const rows = part > 0 ? [drawn, drawn + 1] : [drawn];
+    const coarse = rows.some((row) => this.results[row] === COARSE);
+    const error = Math.max(...rows.map((row) => this.errors[row]));
+    return { row: low, drawn, part, solved: this.solved[low] && !this.stale, coarse, error };
   }
 
   /** Numbers of every node (nodes × size) at a moment from `at`; between two rows, what lies between them. */
@@ -75,6 +86,39 @@ export class Track {
         into[n * size + k] = values[a + i] + part * (values[b + i] - values[a + i]);
       }
     return into;
+  }
+
+  /** One component of a field at a node (of a control: of the robot), at a moment. */
+  value(field, component, node, { drawn, part }) {
+    const { values, width } = this.arrays[field.array];
+    const at = drawn * width + (field.array === "control" ? 0 : node * (width / this.nodes)) + field.offset + component;
+    return part > 0 ? values[at] + part * (values[at + width] - values[at]) : values[at];
+  }
+
+  /** The largest magnitude of a field's components, over all nodes and rows; 0 without such a field. */
+  size(name) {
+    const field = this.fields.find((each) => each.name === name);
+    if (!field) return 0;
+    const { values, width } = this.arrays[field.array];
+    const stride = field.array === "control" ? width : width / this.nodes;
+    let largest = 0;
+    for (let at = field.offset; at < values.length; at += stride)
+      for (let c = 0; c < field.components.length; c++)
+        if (Math.abs(values[at + c]) > largest) largest = Math.abs(values[at + c]);
+    return largest;
+  }
+
+  /** Spans of time of rows that are no good solutions: {kind: "coarse" or "unsolved", from, to} in s. */
+  ranges() {
+    const found = [];
+    this.results.forEach((result, row) => {
+      const kind = result < 0 ? "unsolved" : result === COARSE ? "coarse" : null;
+      const last = found.at(-1);
+      const to = this.times[Math.min(row + 1, this.rows - 1)];
+      if (kind && last?.kind === kind && last.row === row - 1) Object.assign(last, { to, row });
+      else if (kind) found.push({ kind, from: this.times[row], to, row });
+    });
+    return found;
   }
 
   /** One array's whole row at a moment. */
@@ -115,9 +159,9 @@ export class Track {
   }
 
   /** Put a row in the place of the last one if it is of the same time, or else after it. */
-  put(time, result, row) {
+  put({ time, result, error, row }) {
     if (time < this.times[this.rows - 1]) this.forget();
-    else if (time > this.times[this.rows - 1]) return this.append(time, result, row);
+    else if (time > this.times[this.rows - 1]) return this.append({ time, result, error, row });
     let from = 0;
     for (const { values, width } of Object.values(this.arrays)) {
       values.set(row.subarray(from, from + width), (this.rows - 1) * width);
@@ -125,11 +169,12 @@ export class Track {
     }
     this.times[this.rows - 1] = time;
     this.results[this.rows - 1] = result;
+    this.errors[this.rows - 1] = error;
     this.solved[this.rows - 1] = result >= 0;
   }
 
   /** Add a row to a trajectory that grows; the oldest are forgotten. */
-  append(time, result, row, most = 600) {
+  append({ time, result, error, row }, most = 600) {
     const full = this.rows >= most;
     let from = 0;
     for (const array of Object.values(this.arrays)) {
@@ -149,9 +194,10 @@ export class Track {
       array.values.set(row.subarray(from, from + width), kept * width);
       from += width;
     }
-    if (full) for (const list of [this.times, this.results, this.solved]) list.shift();
+    if (full) for (const list of [this.times, this.results, this.errors, this.solved]) list.shift();
     this.times.push(time);
     this.results.push(result);
+    this.errors.push(error);
     this.solved.push(result >= 0);
   }
 
@@ -161,7 +207,7 @@ export class Track {
       array.values = array.values.slice(-array.width);
       array.grown = false;
     }
-    for (const name of ["results", "solved"]) this[name] = this[name].slice(-1);
+    for (const name of ["results", "errors", "solved"]) this[name] = this[name].slice(-1);
     this.times = [-Infinity];
   }
 

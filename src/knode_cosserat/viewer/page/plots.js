@@ -1,25 +1,21 @@
 // Plots beside the robots: any state over time, and how far tips are from that of the first trajectory.
 /* global uPlot */
+import { componentColour } from "viewer/colours";
+import { quantity, short } from "viewer/units";
 
 const DASHES = [[], [7, 4], [2, 3], [9, 3, 2, 3]];
 const style = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
-
-function short(value) {
-  if (value === null || value === undefined || !Number.isFinite(value)) return "–";
-  if (value === 0) return "0";
-  const size = Math.abs(value);
-  return size >= 1e5 || size < 1e-3 ? value.toExponential(1) : String(+value.toPrecision(4));
-}
 
 export class Plot {
   /** In an element; `seek` is called with the time that is clicked. */
   constructor(element, seek) {
     Object.assign(this, { element, seek, time: 0 });
+    this.readout = Object.assign(document.createElement("div"), { className: "readout" });
     new ResizeObserver(() => this.#size()).observe(element);
   }
 
-  /** Lines {label, times, values, colour, dash}, with the unit of all of them. */
-  show(lines, unit) {
+  /** Lines {label, times, values, colour, dash}, with the unit of all of them, on an axis of at least a span. */
+  show(lines, unit, least = 0) {
     this.lines = lines;
     this.unit = unit;
     this.plot?.destroy();
@@ -32,7 +28,7 @@ export class Plot {
     };
     const options = {
       width: Math.max(160, this.element.clientWidth), height: this.element.clientHeight || 180,
-      padding: [10, 10, 0, 0], legend: { show: false }, scales: { x: { time: false } },
+      padding: [10, 10, 0, 0], legend: { show: false }, scales: { x: { time: false }, y: { range: (_, low, high) => span(low, high, least) } },
       cursor: { drag: { x: false, y: false }, points: { size: 6 } },
       axes: [
         { ...axis, size: 24, label: "time (s)", labelSize: 18, labelGap: -2 },
@@ -41,9 +37,11 @@ export class Plot {
       series: [{}, ...lines.map(({ label, colour, dash }) => ({
         label, stroke: colour, width: 1.8, dash: DASHES[dash % DASHES.length], points: { show: false }, spanGaps: false,
       }))],
-      hooks: { draw: [(u) => this.#now(u)], ready: [(u) => this.#seekable(u)] },
+      hooks: { draw: [(u) => this.#now(u)], ready: [(u) => this.#seekable(u)], setCursor: [(u) => this.#values(u)] },
     };
     this.plot = new uPlot(options, this.#data(), this.element);
+    this.readout.hidden = true;
+    this.element.append(this.readout);
   }
 
   /** The same lines with other numbers. */
@@ -82,6 +80,16 @@ export class Plot {
     u.ctx.restore();
   }
 
+  /** Values under the mouse, with the unit. */
+  #values(u) {
+    const { idx } = u.cursor;
+    this.readout.hidden = idx === null || idx === undefined;
+    if (this.readout.hidden) return;
+    const values = this.lines.map(({ label }, k) => [label, u.data[k + 1][idx]]).filter(([, value]) => value !== null && value !== undefined);
+    const words = values.map(([label, value]) => `${label} ${quantity(value, this.unit)}`.trim());
+    this.readout.textContent = `${u.data[0][idx].toFixed(3)} s: ${words.join(", ") || "not solved"}`;
+  }
+
   #seekable(u) {
     const to = (event) => this.seek(u.posToVal(event.clientX - u.over.getBoundingClientRect().left, "x"));
     u.over.addEventListener("pointerdown", (event) => {
@@ -92,19 +100,33 @@ export class Plot {
   }
 }
 
-/** The lines of a field at a node, for every trajectory that has it. */
+/** The range of an axis: rounding errors do not fill it. */
+function span(low, high, least) {
+  if (low === null || high === null) return [0, 1];
+  if (high - low < least) return [0.5 * (low + high) - 0.5 * least, 0.5 * (low + high) + 0.5 * least];
+  return uPlot.rangeNum(low, high, 0.1, true);
+}
+
+/**
+ * The lines of a field at a node, for every trajectory that has it. Components of one trajectory have colours of
+ * their own; with several trajectories the colour is the trajectory's, and components differ by their dashes.
+ */
 export function fieldLines(tracks, colours, name, component, node) {
   const lines = [];
+  const fieldOf = (track) => track.wanted && track.fields.find((each) => each.name === name);
+  const single = tracks.filter(fieldOf).length === 1;
   tracks.forEach((track, k) => {
-    const field = track.fields.find((each) => each.name === name);
-    if (!field || !track.wanted) return;
+    const field = fieldOf(track);
+    if (!field) return;
     const place = Math.min(node, track.nodes - 1);
     field.components.forEach((label, c) => {
       if (component !== "all" && Number(component) !== c) return;
+      const own = single && field.components.length > 1;
       lines.push({
-        label: `${track.name} ${label}`.trim(), times: track.times, values: track.series(field, c, place),
-        // what may lie on what was drawn before lets it shine through
-        colour: colours[k], dash: component === "all" ? c : k, component: label,
+        label: (single ? label : `${track.name} ${label}`).trim(), times: track.times, values: track.series(field, c, place),
+        colour: own ? componentColour(label, c) : colours[k],
+        // what may lie on what was drawn before lets it shine through; colours repeat after six components
+        dash: own ? Math.floor(c / 6) : component === "all" ? c : k, component: label,
       });
     });
   });
@@ -126,4 +148,3 @@ export function errorLines(tracks, colours) {
 }
 
 export const dashStyle = (c) => ["solid", "dashed", "dotted", "dash-dot"][c % 4];
-export { short };

@@ -1,23 +1,16 @@
 // One robot as it is drawn: rods, tendons, ribs, frames, base, and the path of its tip.
 import * as THREE from "three";
+import { QUANTITY, TENSION, axisColours, rampColour } from "viewer/colours";
 import { Tube } from "viewer/tube";
+import { length } from "viewer/units";
 
-//: colours of tension, from none to the largest: dark to bright, for the colour-blind too
-const RAMP = ["#5b6c8f", "#a0617f", "#dd6a4b", "#f5b335"].map((c) => new THREE.Color(c));
-const AXES = ["#D55E00", "#009E73", "#0072B2"].map((c) => new THREE.Color(c));
 const UP = new THREE.Vector3(0, 1, 0);
 const ALONG = new THREE.Quaternion().setFromUnitVectors(UP, new THREE.Vector3(0, 0, 1));
 
-export const rampColours = () => RAMP.map((c) => `#${c.getHexString()}`);
-
-function rampColour(part, into, at) {
-  const place = Math.min(0.9999, Math.max(0, part)) * (RAMP.length - 1);
-  const low = Math.floor(place);
-  const [a, b] = [RAMP[low], RAMP[low + 1]];
-  into[at] = a.r + (place - low) * (b.r - a.r);
-  into[at + 1] = a.g + (place - low) * (b.g - a.g);
-  into[at + 2] = a.b + (place - low) * (b.b - a.b);
-}
+/** Opacity of rigid plates. */
+const PLATE = 0.45;
+/** Opacity of a row that is not solved, or on too coarse a grid. */
+const FADED = 0.35;
 
 export class RobotModel {
   constructor(track, colour, index, size) {
@@ -39,6 +32,7 @@ export class RobotModel {
     if (this.turns) this.#frames();
     this.#base();
     this.#path();
+    this.lines = [...this.#rodLines(), ...this.#tendonLines()];
   }
 
   #add(part, object, shadow = true) {
@@ -61,7 +55,7 @@ export class RobotModel {
     const seen = (r) => Math.max(r, 0.0025 * this.size);
     this.radii = track.drawing.radii.map(seen);
     if (track.curves.length === 0) {
-      const tube = new Tube(track.nodes, this.material, { parts });
+      const tube = new Tube(track.nodes, this.material, { parts, coloured: true });
       this.rods.push({ tube, radii: this.radii, points: this.points });
       this.#add("rods", tube.mesh);
     }
@@ -82,8 +76,9 @@ export class RobotModel {
     geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(3 * (count + 1)), 3));
     geometry.setIndex(Array.from({ length: count - 1 }, (_, k) => [k, k + 1, count]).flat());
     const material = new THREE.MeshStandardMaterial({
-      color: this.colour, side: THREE.DoubleSide, transparent: true, opacity: 0.45, roughness: 0.6,
+      color: this.colour, side: THREE.DoubleSide, transparent: true, opacity: PLATE, roughness: 0.6,
     });
+    this.plateMaterial = material;
     const mesh = this.#add("rods", new THREE.Mesh(geometry, material));
     mesh.frustumCulled = false;
     this.outlines.push({ geometry, points, count });
@@ -91,7 +86,8 @@ export class RobotModel {
 
   #tendons({ routes, ends }) {
     const { nodes, drawing } = this.track;
-    const material = new THREE.MeshStandardMaterial({ vertexColors: true, roughness: 0.6 });
+    const material = new THREE.MeshStandardMaterial({ vertexColors: true, roughness: 0.6, transparent: true });
+    this.tendonMaterial = material;
     const radius = Math.max(0.22 * Math.max(...drawing.radii), 0.0014 * this.size);
     this.tendons = routes.map((route, k) => {
       const count = Math.max(2, Math.round(ends[k] * (nodes - 1)) + 1);
@@ -102,7 +98,7 @@ export class RobotModel {
   }
 
   #ribs(ribs) {
-    this.ribs = ribs.map(({ at, shape, radius }) => {
+    this.ribs = ribs.map(({ at, shape, radius, mass }) => {
       const thick = shape === "rib" ? 0.16 * radius : 0.06 * radius;
       const ball = shape === "ball" || !this.turns;
       const geometry = ball
@@ -112,7 +108,7 @@ export class RobotModel {
         color: shape === "guide" ? this.colour : 0x8a94a6, transparent: true, depthWrite: shape !== "guide",
         opacity: { ball: 0.95, rib: 0.8, guide: 0.28 }[shape], roughness: 0.55,
       });
-      return { at, mesh: this.#add("ribs", new THREE.Mesh(geometry, material), shape !== "guide") };
+      return { at, mass, mesh: this.#add("ribs", new THREE.Mesh(geometry, material), shape !== "guide") };
     });
   }
 
@@ -120,12 +116,48 @@ export class RobotModel {
     const { nodes } = this.track;
     const geometry = new THREE.BufferGeometry();
     geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(18 * nodes), 3));
-    const colours = new Float32Array(18 * nodes);
-    for (let v = 0; v < 6 * nodes; v++) AXES[Math.floor((v % 6) / 2)].toArray(colours, 3 * v);
-    geometry.setAttribute("color", new THREE.BufferAttribute(colours, 3));
+    geometry.setAttribute("color", new THREE.BufferAttribute(new Float32Array(18 * nodes), 3));
     this.axes = new THREE.LineSegments(geometry, new THREE.LineBasicMaterial({ vertexColors: true }));
     this.axes.frustumCulled = false;
     this.#add("frames", this.axes, false);
+    this.#axisColours();
+  }
+
+  #axisColours() {
+    if (!this.axes) return;
+    const axes = axisColours().map((colour) => new THREE.Color(colour));
+    const { color } = this.axes.geometry.attributes;
+    for (let v = 0; v < color.count; v++) axes[Math.floor((v % 6) / 2)].toArray(color.array, 3 * v);
+    color.needsUpdate = true;
+  }
+
+  /** The lines whose nodes can be hovered: {kind, points, count, radius, place}. */
+  #rodLines() {
+    const { track } = this;
+    const last = track.nodes - 1;
+    const whole = track.nodes === track.all_nodes; // else nodes were left out, and their numbers are others
+    const place = (n) => {
+      const name = n === 0 ? "base, " : n === last ? "tip, " : "";
+      return `${whole ? `node ${n}, ` : ""}${name}s = ${length(track.arclength[n])}`;
+    };
+    const radius = Math.max(...this.radii);
+    if (!track.curves.length) return [{ kind: "rod", points: this.points, count: track.nodes, radius, place }];
+    return this.rods.map(({ points }, k) => {
+      const count = points.length / 3;
+      const outline = track.curves[k].shape !== "rod";
+      const s = (n) => length((track.drawing.length * n) / (count - 1));
+      return {
+        kind: outline ? "outline" : "curve", points, count, radius,
+        place: outline ? () => "rigid plate, its edge" : (n) => `rod ${k + 1}, s = ${s(n)}`,
+      };
+    });
+  }
+
+  #tendonLines() {
+    return (this.tendons ?? []).map(({ points, count, radius }, index) => ({
+      kind: "tendon", index, points, count, radius,
+      place: (n) => `tendon ${index + 1}, s = ${length(this.track.arclength[n])}`,
+    }));
   }
 
   #base() {
@@ -173,15 +205,34 @@ export class RobotModel {
     this.show("path", visible);
   }
 
+  /** Colour the rod by a quantity: {values: (node, moment) => number, range: [low, high]}, or null for none. */
+  colourBy(quantity) {
+    if (this.track.curves.length) return;
+    this.quantity = quantity;
+    this.material.vertexColors = Boolean(quantity);
+    const colour = quantity ? new THREE.Color("#ffffff") : this.colour;
+    this.material.color.copy(colour);
+    this.material.emissiveIntensity = quantity ? 0 : 0.22;
+    this.material.needsUpdate = true;
+  }
+
+  #quantityColours(moment) {
+    const { values, range: [low, high] } = this.quantity;
+    this.colours ??= new Float32Array(3 * this.track.nodes);
+    for (let n = 0; n < this.track.nodes; n++) rampColour(QUANTITY, (values(n, moment) - low) / (high - low), this.colours, 3 * n);
+    return this.colours;
+  }
+
   /** The state at a time, tensions (N) coloured within a range. Gives the moment that is drawn. */
   update(time, range) {
     const { track, points } = this;
     const moment = track.at(time);
+    this.moment = moment;
     track.perNode(track.position, 3, moment, points);
     if (this.turns) track.perNode(track.orientation, 4, moment, this.turns);
     for (const rod of this.rods) {
       if (rod.array) track.whole(rod.array, moment, rod.points);
-      rod.tube.update(rod.points, rod.radii);
+      rod.tube.update(rod.points, rod.radii, this.quantity ? this.#quantityColours(moment) : null);
     }
     for (const { geometry, points: edge, count } of this.outlines) {
       const array = geometry.attributes.position.array;
@@ -203,10 +254,15 @@ export class RobotModel {
     }
     if (this.axes) this.#orient();
     this.path?.until(Math.max(0, this.pathRows.filter((row) => row <= moment.drawn).length - 1));
-    const opacity = moment.solved ? 1 : 0.35;
-    if (this.material.opacity !== opacity) this.material.opacity = opacity;
-    this.moment = moment;
+    const opacity = moment.solved && !moment.coarse ? 1 : FADED;
+    for (const material of [this.material, this.tendonMaterial]) if (material) material.opacity = opacity;
+    if (this.plateMaterial) this.plateMaterial.opacity = PLATE * opacity;
     return moment;
+  }
+
+  /** How far (m) parts reach beyond the rods' lines. */
+  get margin() {
+    return Math.max(...this.radii, ...this.track.drawing.ribs.map((rib) => rib.radius), this.baseHeight);
   }
 
   /** Where the tip is drawn. */
@@ -237,23 +293,42 @@ export class RobotModel {
 
   #pull(moment, [low, high]) {
     const { track } = this;
-    const { tension, loss } = track.drawing.tendons;
-    const base = track.arrays[tension.array];
-    const row = moment.drawn * base.width + tension.offset;
+    const { loss } = track.drawing.tendons;
+    const base = this.baseTensions();
     const losses = loss && track.perNode(loss, this.tendons.length, moment, (this.losses ??= new Float32Array(track.nodes * this.tendons.length)));
     const r = new THREE.Vector3();
     this.tendons.forEach(({ tube, route, count, radius, points, colours }, k) => {
-      const pulled = base.values[row + k];
       for (let n = 0; n < count; n++) {
         r.fromArray(route[n]).applyQuaternion(this.#turn(n));
         points[3 * n] = this.points[3 * n] + r.x;
         points[3 * n + 1] = this.points[3 * n + 1] + r.y;
         points[3 * n + 2] = this.points[3 * n + 2] + r.z;
         const left = losses ? Math.exp(-losses[n * this.tendons.length + k]) : 1;
-        rampColour((pulled * left - low) / (high - low), colours, 3 * n);
+        rampColour(TENSION, (base[k] * left - low) / (high - low), colours, 3 * n);
       }
       tube.update(points, radius, colours);
     });
+  }
+
+  /** Tensions (N) of all tendons at the base. */
+  baseTensions() {
+    const { array, offset } = this.track.drawing.tendons.tension;
+    const { values, width } = this.track.arrays[array];
+    const from = this.moment.drawn * width + offset;
+    return Array.from(values.subarray(from, from + this.tendons.length));
+  }
+
+  /** The tension (N) of a tendon at a node, and at the base. */
+  tensionAt(tendon, node) {
+    const base = this.baseTensions()[tendon];
+    const lost = this.track.drawing.tendons.loss ? this.losses[node * this.tendons.length + tendon] : 0;
+    return { here: base * Math.exp(-lost), base };
+  }
+
+  /** The body that is attached nearest to a node, {mass} in kg, if there is one. */
+  bodyAt(node) {
+    const last = this.track.nodes - 1;
+    return this.ribs.find(({ at, mass }) => mass !== undefined && Math.abs(at * last - node) < 0.5);
   }
 
   #orient() {
@@ -288,8 +363,9 @@ export class RobotModel {
 
   recolour(colour) {
     this.colour.set(colour);
-    this.material.color.set(colour);
+    if (!this.quantity) this.material.color.set(colour);
     this.material.emissive.set(colour);
+    this.#axisColours();
     this.pathMaterial.color.set(colour);
     this.ghostMaterial.color.set(colour);
   }

@@ -1,6 +1,9 @@
 // The space that robots stand in: camera, light, ground, obstacles; all in one view or side by side.
 import * as THREE from "three";
 import { OrbitControls } from "orbit-controls";
+import { axisColours } from "viewer/colours";
+import { Triad } from "viewer/triad";
+import { direction, fitting } from "viewer/views";
 
 const style = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
@@ -42,6 +45,7 @@ export class Stage {
     this.groups = [];
     this.dirty = true;
     this.sideBySide = false;
+    this.triad = new Triad(axisColours());
     new ResizeObserver(() => this.resize()).observe(canvas.parentElement);
   }
 
@@ -53,8 +57,6 @@ export class Stage {
     this.controls.minDistance = size / 20;
     this.controls.maxDistance = size * 12;
     const turn = new THREE.Quaternion().setFromUnitVectors(new THREE.Vector3(0, 1, 0), this.up);
-    const across = new THREE.Vector3(0.75, 0, 0.66).applyQuaternion(turn);
-    this.across = across;
     const light = new THREE.DirectionalLight(0xffffff, 2.6);
     light.position.copy(this.centre).addScaledVector(this.up, 2.2 * size);
     light.position.add(new THREE.Vector3(-0.7 * size, 0, 1.1 * size).applyQuaternion(turn));
@@ -142,19 +144,62 @@ export class Stage {
     colours.needsUpdate = true;
     this.shade.material.opacity = Number(style("--shade"));
     this.sky.intensity = Number(style("--sky"));
+    for (const part of this.target?.children ?? []) part.material.color.set(style("--target"));
+    this.triad.paint(axisColours());
     this.dirty = true;
   }
 
-  /** The camera where it was at first. */
+  /** The camera where it was at first: obliquely from the front, with everything in the picture. */
   home() {
-    const { width, height } = this.#cells()[0] ?? { width: 1, height: 1 };
-    const narrow = Math.min(1, width / height || 1);
-    const distance = (1.75 * this.size) / Math.max(0.45, narrow);
-    this.controls.target.copy(this.centre);
-    this.camera.position.copy(this.centre).addScaledVector(this.across, distance).addScaledVector(this.up, 0.42 * distance);
-    this.camera.updateProjectionMatrix();
+    this.view("isometric");
+  }
+
+  /** Look from the front, the side, the top, or obliquely ("isometric"), with everything in the picture. */
+  view(name) {
+    this.camera.position.copy(this.controls.target).add(direction(name, this.up));
+    this.fit();
+  }
+
+  /** Everything that is shown in the picture, from where the camera looks now. */
+  fit() {
+    const towards = this.camera.position.clone().sub(this.controls.target).normalize();
+    const { width, height } = this.#cells()[0];
+    const box = this.bounds();
+    const distance = fitting(box, towards, this.up, this.camera.fov, width / Math.max(1, height));
+    box.getCenter(this.controls.target);
+    this.camera.position.copy(this.controls.target).addScaledVector(towards, Math.max(distance, this.controls.minDistance));
     this.controls.update();
     this.dirty = true;
+  }
+
+  /** The box of what is shown. */
+  bounds() {
+    const shown = this.groups.filter((group) => group.userData.wanted && group.userData.box);
+    const box = new THREE.Box3(this.low.clone(), this.high.clone());
+    if (shown.length) {
+      box.makeEmpty();
+      for (const group of shown) box.union(group.userData.box);
+    }
+    if (this.target) box.expandByPoint(this.target.position);
+    return box;
+  }
+
+  /** A cross at a position (m), which is seen through everything. */
+  mark(position) {
+    const size = 0.035 * this.size;
+    const corners = ["x", "y", "z"].flatMap((axis) => [-size, size].map((x) => Object.assign(new THREE.Vector3(), { [axis]: x })));
+    const cross = new THREE.LineSegments(
+      new THREE.BufferGeometry().setFromPoints(corners), new THREE.LineBasicMaterial({ depthTest: false, transparent: true }),
+    );
+    const ball = new THREE.Mesh(
+      new THREE.SphereGeometry(0.3 * size, 24, 16), new THREE.MeshBasicMaterial({ transparent: true, opacity: 0.75 }),
+    );
+    this.target = new THREE.Group().add(cross, ball);
+    this.target.position.set(...position);
+    cross.renderOrder = 1;
+    this.scene.add(this.target);
+    this.paint();
+    this.fit();
   }
 
   resize() {
@@ -192,7 +237,11 @@ export class Stage {
   /** Draw; gives where each robot that is shown was drawn. */
   draw(fine = false) {
     this.#quality(fine);
-    const { clientHeight: height } = this.canvas.parentElement;
+    return this.#render();
+  }
+
+  #render() {
+    const { clientWidth: width, clientHeight: height } = this.canvas.parentElement;
     const cells = this.#cells();
     const apart = cells.length > 1;
     cells.forEach((cell, k) => {
@@ -204,8 +253,30 @@ export class Stage {
       this.camera.updateProjectionMatrix();
       this.renderer.render(this.scene, this.camera);
     });
+    this.triad.draw(this.renderer, this.camera, width);
     this.dirty = false;
     return apart ? cells : [];
+  }
+
+  /** Draw once with so many pixels of the picture to one of the screen, call `after`, and draw as before. */
+  sharply(ratio, after) {
+    const before = this.renderer.getPixelRatio();
+    this.light.castShadow = this.shade.visible = true;
+    this.renderer.setPixelRatio(ratio);
+    this.resize();
+    this.#render();
+    after();
+    if (this.soft) this.light.castShadow = this.shade.visible = Boolean(this.fine);
+    this.renderer.setPixelRatio(before);
+    this.resize();
+    this.#render();
+  }
+
+  /** The part of the picture at a place (px), with the robots in it: {x, y, width, height, groups}. */
+  cellAt(x, y) {
+    const cells = this.#cells();
+    const k = cells.findIndex((cell) => x >= cell.x && x < cell.x + cell.width && y >= cell.y && y < cell.y + cell.height);
+    return k < 0 ? null : { ...cells[k], groups: cells.length > 1 ? [this.shown[k]] : this.shown };
   }
 
   /** When what was asked for is drawn: nothing waits for it in the meantime. */

@@ -51,7 +51,7 @@ export class Tube {
     this.mesh.frustumCulled = false;
   }
 
-  /** Along points (count × 3), with a radius for each, or one; and [r, g, b] of each if it is coloured. */
+  /** Along points (count × 3), with a radius for each, or one; and [r, g, b] of each, if it is to be coloured. */
   update(points, radii, colours = null) {
     const { samples, sides, parts, line } = this;
     if (parts === 1) line.set(points.subarray ? points.subarray(0, 3 * samples) : points);
@@ -83,7 +83,7 @@ export class Tube {
         for (let k = 0; k < 3; k++) {
           this.normal[v + k] = n[k];
           this.position[v + k] = line[3 * i + k] + radius * n[k];
-          if (this.coloured) this.colour[v + k] = of(colours, k, 3);
+          if (colours) this.colour[v + k] = of(colours, k, 3);
         }
       }
       if (i === 0) this.#close(0, 0, [-tx, -ty, -tz]);

@@ -6,12 +6,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import knode_cosserat as kc
-from knode_cosserat.control.reach import _same_shape
-from knode_cosserat.control.search import at_limits, rotation_between
 from knode_cosserat.learning.structured.residual import Structured
+from knode_cosserat.statics.reach import _same_shape
+from knode_cosserat.statics.search import at_limits, rotation_between
 
 ROBOT = kc.load_robot("delrin-tendon-robot")
-ROUTED = kc.RoutedTendonRobot.like(ROBOT)
+ROUTED = kc.robots.RoutedTendonRobot.like(ROBOT)
 HIGH = 10.0
 
 
@@ -34,7 +34,7 @@ def test_reachable_positions_are_reached(robot):
     for control in generator.uniform(0.0, HIGH, (30, 4)):
         position, _ = tip(robot, control)
         found = kc.inverse_kinematics(robot, position, low=0.0, high=HIGH)
-        assert found.result is kc.Reach.REACHED and found.converged
+        assert found.result is kc.statics.Reach.REACHED and found.converged
         assert np.all(found.control >= 0.0) and np.all(found.control <= HIGH)
         assert found.position_error < 1e-8
         if found.from_rest:
@@ -86,10 +86,10 @@ def test_least_tension_beyond_the_lower_limits_is_taken():
 def test_what_cannot_be_reached_gives_the_nearest(target):
     """First-order optimal: the distance has no slope but into limits that are active."""
     found = kc.inverse_kinematics(ROBOT, target, low=0.0, high=3.0)
-    assert found.result is kc.Reach.UNREACHABLE and not found.converged
+    assert found.result is kc.statics.Reach.UNREACHABLE and not found.converged
     away = found.position - np.array(target)
     assert found.position_error == pytest.approx(np.linalg.norm(away)) and found.position_error > 1e-2
-    slope = away @ kc.jacobian(ROBOT, found.control)[:3]
+    slope = away @ kc.statics.jacobian(ROBOT, found.control)[:3]
     inside = ~(found.at_low | found.at_high)
     assert np.all(np.abs(slope[inside]) < 1e-8)
     assert np.all(slope[found.at_low] > -1e-8) and np.all(slope[found.at_high] < 1e-8)
@@ -115,7 +115,7 @@ def test_a_beginning_beside_a_limit_is_at_it():
     assert np.any(found.at_high)
     beside = np.where(found.at_high, np.nextafter(3.0, 0.0), found.control)
     again = kc.inverse_kinematics(ROBOT, target, low=0.0, high=3.0, initial=beside, starts=1)
-    assert again.result is kc.Reach.UNREACHABLE
+    assert again.result is kc.statics.Reach.UNREACHABLE
     np.testing.assert_array_equal(again.at_high, found.at_high)
     np.testing.assert_allclose(again.control, found.control, atol=1e-6)
 
@@ -128,6 +128,7 @@ def test_a_path_is_followed():
     path = np.array([tip(ROBOT, pull)[0] for pull in pulls.T])
     found = kc.inverse_kinematics(ROBOT, path, low=0.0, high=HIGH)
     assert np.all(found.converged) and found.control.shape == (9, 4)
+    assert str(found.result).count("REACHED") == 9 and "9 REACHED" in repr(found)
     np.testing.assert_allclose(found.position, path, atol=1e-8)
     np.testing.assert_allclose(found.control[0], found.control[-1], atol=1e-5)
 
@@ -145,7 +146,7 @@ def test_near_is_reached_if_that_is_enough():
     exact, near = (
         kc.inverse_kinematics(ROBOT, position, low=0.0, high=HIGH, tolerance=part) for part in (1e-9, 2e-3)
     )
-    assert exact.result is kc.Reach.UNREACHABLE and near.result is kc.Reach.REACHED
+    assert exact.result is kc.statics.Reach.UNREACHABLE and near.result is kc.statics.Reach.REACHED
     np.testing.assert_allclose(near.position, exact.position, atol=1e-6)
 
 
@@ -171,13 +172,13 @@ def test_the_pose_may_be_any_function_of_the_last_node():
 def test_no_equilibrium_to_begin_with_is_said():
     held = {"low": 1e160, "high": 1e160}
     found = kc.inverse_kinematics(ROBOT, [0.0, 0.0, 0.5], **held, starts=1)
-    assert found.result is kc.Reach.NO_EQUILIBRIUM
+    assert found.result is kc.statics.Reach.NO_EQUILIBRIUM
     assert np.all(np.isnan(found.position)) and np.isnan(found.position_error)
     assert found.equilibrium.result[0] < 0 and np.all(np.isnan(found.equilibrium.y))
 
 
 #: inextensible tendons on reels: their tensions feel any residual far more than the shape does
-REELED = kc.RoutedTendonRobot(
+REELED = kc.robots.RoutedTendonRobot(
     length=0.3, radius=0.0015, density=1500.0, youngs_modulus=3.0e9, bending_damping=2.0e-3,
     tendon_offset=0.01, tendon_angles=[0.0, 2.0943951, 4.1887902], gravity=[0.0, 0.0, 0.0], drive="reel",
     nodes=21,
@@ -218,7 +219,7 @@ def test_of_reels_it_is_certain_that_nothing_is_nearer():
     found = kc.inverse_kinematics(
         REELED, [0.0441, 0.0, 0.2955], low=0.0, high=0.01, tolerance=1e-4, space="lobatto4"
     )
-    assert found.result is kc.Reach.UNREACHABLE and found.from_rest
+    assert found.result is kc.statics.Reach.UNREACHABLE and found.from_rest
     np.testing.assert_array_equal(found.at_low, [False, True, True])
 
 
@@ -231,7 +232,7 @@ def test_the_equilibrium_that_was_reached_is_given():
     alone = kc.equilibrium(ROBOT, one.control[0])
     for name in ("y", "z"):
         np.testing.assert_allclose(getattr(one, name), getattr(alone, name), atol=1e-6)
-    assert kc.stability(one).stable
+    assert kc.statics.stability(one).stable
     assert kc.simulate(ROBOT, one.control, 0.05, initial=one).y.shape[0] == 2
 
 

@@ -15,9 +15,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from knode_cosserat.control.asked import checked_control, checked_system, static_settings
-from knode_cosserat.control.stability import stability
-from knode_cosserat.control.statics import recorded, static_problem
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import NewtonOptions, factors_of, pivots_of
 from knode_cosserat.solvers.equilibrium import equilibrium
@@ -25,6 +22,9 @@ from knode_cosserat.solvers.linear import solved
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.statics.asked import checked_control, checked_system, static_settings
+from knode_cosserat.statics.response import recorded, static_problem
+from knode_cosserat.statics.stability import stability
 from knode_cosserat.trajectory import Trajectory
 
 #: largest number of corrections of a point; thresholds for a longer or a shorter next step

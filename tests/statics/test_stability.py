@@ -10,7 +10,7 @@ from knode_cosserat.rods.tendon_friction import TendonFriction, Vibration
 
 L, RADIUS, E = 0.5, 2e-3, 2e9
 EI, EA = E * np.pi * RADIUS**4 / 4, E * np.pi * RADIUS**2
-ROD = kc.SlenderRod(
+ROD = kc.robots.SlenderRod(
     length=L, radius=RADIUS, density=1200.0, youngs_modulus=E, bending_damping=1e-3, drag=1e-3,
     gravity=[0.0, 0.0, 0.0], nodes=21,
 )  # fmt: skip
@@ -37,7 +37,7 @@ def squeezed(end, load):
 @pytest.mark.campaign
 def test_a_column_buckles_every_way_at_once_at_each_of_its_loads(end, loads):
     counts = [
-        kc.stability(squeezed(end, part * load)).unstable_directions
+        kc.statics.stability(squeezed(end, part * load)).unstable_directions
         for load in loads
         for part in (0.98, 1.02)
     ]
@@ -55,7 +55,7 @@ def test_the_least_eigenvalue_crosses_zero_at_the_load_whatever_the_nodes():
         for load in at:
             end = Clamped(position=[0.0, 0.0, (1.0 - load * EI / L**2 / EA) * L])
             rest = kc.equilibrium(rod.replace(tip_end=end), np.zeros(0), space="lobatto4")
-            found.append(kc.stability(rest).least)
+            found.append(kc.statics.stability(rest).least)
         critical.append(at[0] - found[0] * (at[1] - at[0]) / (found[1] - found[0]))
     # P (1 + P/GA - P/EA) = 4π² EI/L²: shear makes it softer, and squeezing shorter
     exact = 4.0 * np.pi**2 * (1.0 - 4.0 * np.pi**2 * (EI / L**2) * (2.6 - 1.0) / EA)
@@ -68,7 +68,7 @@ def test_the_least_eigenvalue_crosses_zero_at_the_load_whatever_the_nodes():
 def test_an_upright_column_falls_beyond_greenhills_load_by_either_scheme(part, space):
     density = 7.83735 * EI / L**3 * part / (np.pi * RADIUS**2 * 98.1)
     rod = ROD.replace(density=density, gravity=[0.0, 0.0, -98.1], tip_end=Free())
-    found = kc.stability(kc.equilibrium(rod, np.zeros(0), space=space))
+    found = kc.statics.stability(kc.equilibrium(rod, np.zeros(0), space=space))
     assert found.unstable_directions == (2 if part > 1.0 else 0)
     assert found.stable == (part < 1.0) and (found.least > 0.0) == (part < 1.0)
     # it falls over: the tip moves most, and sideways
@@ -85,7 +85,7 @@ def test_a_buckled_column_has_nothing_to_lose_but_its_plane():
     rest, least = None, []
     for push in (5.0, 2.0, 1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01):
         rest = kc.equilibrium(pushed, [push * EI / L**2], space="lobatto4", initial=rest)
-        found = kc.stability(rest)
+        found = kc.statics.stability(rest)
         least.append(found.least)
         assert found.stable
     assert np.max(np.abs(rest.position[0, :, 0])) > 0.005 * L
@@ -112,7 +112,7 @@ def test_an_arch_snaps_where_it_is_no_longer_stable_and_says_so():
     for load in np.linspace(20.0, -40.0, 31) * unit * side:
         rest = kc.equilibrium(arch, [load], space="lobatto4", initial=rest)
         middle.append(side * float(rest.position[0, 10, 0]) / L)
-        least.append(kc.stability(rest).least)
+        least.append(kc.statics.stability(rest).least)
         results.append(int(rest.result[0]))
     jumps = np.flatnonzero(np.abs(np.diff(middle)) > 0.1) + 1
     assert len(jumps) == 1
@@ -131,7 +131,7 @@ def wire(slenderness, bend, nodes):
     """Bent by a force across its tip, which nothing makes unstable."""
     r, modulus = 0.3 / slenderness, 70e9
     force = 2.0 * bend * modulus * np.pi * r**4 / 4 / 0.3**2
-    return kc.SlenderRod(
+    return kc.robots.SlenderRod(
         length=0.3, radius=r, density=6450.0, youngs_modulus=modulus, gravity=[0.0, 0.0, 0.0], nodes=nodes,
         loads=(PointWrench(force=[force, 0.0, 0.0]),),
     )  # fmt: skip
@@ -143,7 +143,9 @@ def wire(slenderness, bend, nodes):
 def test_a_slender_wire_is_stable_however_it_is_bent_and_at_few_nodes(bends):
     for slenderness in (50.0, 300.0, 600.0, 6000.0, 60000.0):
         for bend in bends:
-            found = kc.stability(kc.equilibrium(wire(slenderness, bend, 10), np.zeros(0), space="lobatto4"))
+            found = kc.statics.stability(
+                kc.equilibrium(wire(slenderness, bend, 10), np.zeros(0), space="lobatto4")
+            )
             assert found.unstable_directions == 0 and found.least == pytest.approx(1.7, rel=0.25)
             assert found.asymmetry < 1e-9
 
@@ -152,7 +154,7 @@ def test_a_slender_wire_is_stable_however_it_is_bent_and_at_few_nodes(bends):
 @pytest.mark.parametrize("nodes", [5, 20, 40])
 def test_of_a_slender_wire_the_nodes_do_not_change_what_is_least(nodes):
     least = [
-        kc.stability(kc.equilibrium(wire(600.0, 1.5, each), np.zeros(0), space=space)).least
+        kc.statics.stability(kc.equilibrium(wire(600.0, 1.5, each), np.zeros(0), space=space)).least
         for each, space in ((10, "euler"), (10, "lobatto4"), (nodes, "lobatto4"))
     ]
     assert least[0] == pytest.approx(least[1], rel=1e-6) and least[1] == pytest.approx(least[2], rel=0.02)
@@ -161,7 +163,7 @@ def test_of_a_slender_wire_the_nodes_do_not_change_what_is_least(nodes):
 def test_the_six_legs_of_the_catalogs_robot_are_stable():
     robot = kc.load_robot("six-legged-robot")
     rest, moved = (
-        kc.stability(kc.equilibrium(robot, [push, 0.0, 0.0, 0.0, 0.0, 0.0])) for push in (0.0, 0.02)
+        kc.statics.stability(kc.equilibrium(robot, [push, 0.0, 0.0, 0.0, 0.0, 0.0])) for push in (0.0, 0.02)
     )
     # 7.29 at 40 nodes
     assert rest.stable and rest.least == pytest.approx(7.2, rel=0.02)
@@ -171,13 +173,13 @@ def test_the_six_legs_of_the_catalogs_robot_are_stable():
 @pytest.mark.campaign
 def test_a_slender_robot_bent_by_its_tendon_is_stable():
     modulus, r = 70e9, 1e-3
-    robot = kc.RoutedTendonRobot(
+    robot = kc.robots.RoutedTendonRobot(
         length=0.6, radius=r, density=6450.0, youngs_modulus=modulus, gravity=[0.0, 0.0, 0.0],
         tendon_offset=0.01, tendon_angles=[0.0],
     )  # fmt: skip
     for bend in (0.5, 1.0, 1.5):
         tension = bend * modulus * np.pi * r**4 / 4 / 0.6 / 0.01
-        found = kc.stability(kc.equilibrium(robot, [tension], space="lobatto4"))
+        found = kc.statics.stability(kc.equilibrium(robot, [tension], space="lobatto4"))
         assert found.stable and found.least == pytest.approx(1.9, rel=0.02)
 
 
@@ -187,7 +189,7 @@ def test_a_slender_arch_pushed_inwards_leaves_its_plane(nodes):
     """It turns about its line for nothing once nothing pushes it; pushed inwards it gains by that."""
     length, r = 0.6, 1e-3
     unit = 70e9 * np.pi * r**4 / 4 / length**2
-    arch = kc.SlenderRod(
+    arch = kc.robots.SlenderRod(
         length=length, radius=r, density=6450.0, youngs_modulus=70e9, bending_damping=1e-3, nodes=nodes,
         gravity=[0.0, 0.0, 0.0], tip_end=Pinned(position=[0.0, 0.0, 0.9 * length]),
         loads=(PointWrench(at=0.5, force=[1.0, 0.0, 0.0], controlled=True),),
@@ -197,7 +199,7 @@ def test_a_slender_arch_pushed_inwards_leaves_its_plane(nodes):
     found = []
     for load in (20.0, 0.0, -5.0, -20.0):
         rest = kc.equilibrium(arch, [load * unit * side], space="lobatto4", initial=rest)
-        found.append(kc.stability(rest))
+        found.append(kc.statics.stability(rest))
     assert [each.unstable_directions for each in found] == [0, 0, 1, 1]
     assert [each.least for each in found] == pytest.approx([1.81, 0.0, -4.27, -19.7], rel=0.02, abs=1e-3)
     # across the plane of the arch
@@ -211,7 +213,7 @@ def test_what_buckles_between_two_nodes_is_counted_too(nodes):
     for part in (0.98, 1.02, 1.5, 9.0):
         end = Clamped(position=[0.0, 0.0, (1.0 - part * 4.0 * np.pi**2 * EI / L**2 / EA) * L])
         rest = kc.equilibrium(ROD.replace(tip_end=end, nodes=nodes), np.zeros(0), space="lobatto4")
-        counts.append(kc.stability(rest).unstable_directions)
+        counts.append(kc.statics.stability(rest).unstable_directions)
     assert counts[:3] == [0, 2, 2] and counts[3] >= 8
 
 
@@ -222,7 +224,7 @@ def test_what_rounding_hides_is_refused():
         loads=(), base_end=Pinned(), tip_end=Pinned(position=[0.0, 0.0, 0.3 * (1.0 + 1e-9)])
     )
     with pytest.raises(ValueError, match=r"row -1 cannot be decided: its least eigenvalue, .* less slender"):
-        kc.stability(kc.equilibrium(free, np.zeros(0), space="lobatto4"))
+        kc.statics.stability(kc.equilibrium(free, np.zeros(0), space="lobatto4"))
 
 
 # several rods, and others
@@ -240,15 +242,15 @@ def test_a_platform_on_upright_legs_falls_under_its_buckling_load():
             base_angles=even, platform_angles=even, platform_radius=float(robot.base_radius), density=1.0,
             platform_mass=mass,
         )  # fmt: skip
-        found = kc.stability(kc.equilibrium(loaded, np.zeros(6), space="lobatto4"))
+        found = kc.statics.stability(kc.equilibrium(loaded, np.zeros(6), space="lobatto4"))
         assert found.stable == (part < 1.0)
         assert found.mode.shape == (robot.nodes, 6, 3)
 
 
 @pytest.mark.campaign
 def test_tendons_keep_a_potential():
-    robot = kc.RoutedTendonRobot.like(kc.load_robot("delrin-tendon-robot"), length=1.0)
-    found = kc.stability(kc.equilibrium(robot, [5.0, 2.0, 1.0, 3.0], space="lobatto4"))
+    robot = kc.robots.RoutedTendonRobot.like(kc.load_robot("delrin-tendon-robot"), length=1.0)
+    found = kc.statics.stability(kc.equilibrium(robot, [5.0, 2.0, 1.0, 3.0], space="lobatto4"))
     assert found.stable and found.asymmetry < 1e-3
 
 
@@ -256,31 +258,31 @@ def test_what_is_no_equilibrium_is_refused():
     robot = kc.load_robot("delrin-tendon-robot")
     moved = kc.simulate(robot, kc.controls.step(1.0, 5, 0.05), 0.05)
     with pytest.raises(ValueError, match=r"row 3 is no equilibrium"):
-        kc.stability(moved, row=3)
+        kc.statics.stability(moved, row=3)
     with pytest.raises(ValueError, match=r"row is 9; allowed is -6 to 5"):
-        kc.stability(moved, row=9)
+        kc.statics.stability(moved, row=9)
     with pytest.raises(ValueError, match=r"of a batch"):
-        kc.stability(kc.equilibrium(robot, np.zeros((2, 4))))
+        kc.statics.stability(kc.equilibrium(robot, np.zeros((2, 4))))
 
 
 @pytest.mark.campaign
 def test_reels_are_refused():
     robot = kc.load_robot("delrin-tendon-robot")
-    reels = kc.RoutedTendonRobot.like(robot, drive="reel", tendon_compliance=1e-3)
+    reels = kc.robots.RoutedTendonRobot.like(robot, drive="reel", tendon_compliance=1e-3)
     with pytest.raises(ValueError, match=r"RoutedTendonRobot has (tension|path) \(.*energy of its own"):
-        kc.stability(kc.equilibrium(reels, np.zeros(4)))
+        kc.statics.stability(kc.equilibrium(reels, np.zeros(4)))
 
 
 @pytest.mark.campaign
 def test_friction_is_not_counted():
     """All tendons together push a column down, with or without friction in it."""
-    robot = kc.RoutedTendonRobot.like(kc.load_robot("delrin-tendon-robot"), length=1.0)
+    robot = kc.robots.RoutedTendonRobot.like(kc.load_robot("delrin-tendon-robot"), length=1.0)
     rough = robot.replace(
         friction=TendonFriction(wobble=0.5, curvature=0.1), vibration=Vibration(tension=1e6, rate=0.0)
     )
     for gravity in (-9.81, -60.0):
         found = [
-            kc.stability(kc.equilibrium(each.replace(gravity=[0.0, 0.0, gravity]), np.full(4, 5.0)))
+            kc.statics.stability(kc.equilibrium(each.replace(gravity=[0.0, 0.0, gravity]), np.full(4, 5.0)))
             for each in (robot, rough)
         ]
         assert found[0].stable == (gravity > -20.0)

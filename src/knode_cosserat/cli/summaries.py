@@ -1,4 +1,4 @@
-"""What the commands tell: facts of trajectories and systems, ready for JSON."""
+"""Summaries of trajectories and systems, as values for JSON and lines of text."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ if TYPE_CHECKING:
     from knode_cosserat.trajectory import Trajectory
 
 
-#: how many terms of a residual are told in words
+#: largest number of residual terms in the text output
 MOST_FINDINGS = 24
 
 
-def outcome(trajectory: Trajectory) -> dict[str, Any]:
-    """What came of the steps, and where the tip was after the last that was solved."""
+def motion_summary(trajectory: Trajectory) -> dict[str, Any]:
+    """Return the results of the time steps, and the tip position after the last solved step."""
     codes = np.asarray(trajectory.result)
     valid = codes >= 0
     failure = None
@@ -53,14 +53,14 @@ def _largest_error(trajectory: Trajectory) -> float | None:
 
 
 def error_text(error: float | None, length: float) -> str:
-    """Return a position error in words: in mm, and as a share of the length."""
+    """Return a position error as text: in mm, and as a percentage of the length."""
     if error is None:
         return "unknown"
     return f"{1e3 * error:.2g} mm ({100 * error / length:.2g} % of the length)"
 
 
-def at_rest(rest: Trajectory) -> dict[str, Any]:
-    """The shape of an equilibrium, and what holds it (m, rad, N, N·m)."""
+def equilibrium_summary(rest: Trajectory) -> dict[str, Any]:
+    """Return the shape of an equilibrium, its control, and the reaction at the base (m, rad, N, N m)."""
     position, (w, x, y, z) = np.asarray(rest.position)[0], np.asarray(rest.quaternion)[0, -1]
     facts = {
         "control": np.asarray(rest.control)[0].tolist(),
@@ -83,7 +83,7 @@ def at_rest(rest: Trajectory) -> dict[str, Any]:
 
 
 def parameters(system: System) -> dict[str, dict[str, Any]]:
-    """Every parameter by name, with its value, unit and meaning; of a model, those of its knowledge."""
+    """Return the parameters by name, with value, unit and meaning; for a model, of its nominal robot."""
     system = system.nominal
     stated = {name: (getattr(system, name), it.unit, it.meaning) for name, it in system.parameters().items()}
     nodes = {"nodes": (system.nodes, "1", "nodes along the rod, base and tip included")}
@@ -91,7 +91,7 @@ def parameters(system: System) -> dict[str, dict[str, Any]]:
 
 
 def derived(system: System) -> dict[str, dict[str, Any]]:
-    """What follows from the parameters, in the same form."""
+    """Return quantities that follow from the parameters, in the same form."""
     from knode_cosserat.rods.loads import AttachedMass
     from knode_cosserat.rods.rod import Rod
 
@@ -100,20 +100,20 @@ def derived(system: System) -> dict[str, dict[str, Any]]:
         return {}
     Kse, Kbt, mass = np.asarray(system.Kse), np.asarray(system.Kbt), system.mass_per_length * system.length
     attached = sum(float(load.mass) for load in system.loads if isinstance(load, AttachedMass))
-    # 1.875… is the first root of cos(x) cosh(x) = -1
-    frequency = 1.875104068711961**2 / (2 * np.pi) * np.sqrt(Kbt[0, 0] / (mass * system.length**3))
     return {
         "G": _quantity(system.G, "Pa", "shear modulus"),
         "Kse": _quantity(np.diag(Kse), "N", "stiffness of shear, shear and extension"),
-        "Kbt": _quantity(np.diag(Kbt), "N m2", "stiffness of bending, bending and twisting"),
+        "Kbt": _quantity(np.diag(Kbt), "N m2", "stiffness of bending, bending and torsion"),
         "mass": _quantity(mass, "kg", "mass of the rod"),
-        **({"attached_mass": _quantity(attached, "kg", "mass of what is on it")} if attached else {}),
-        "frequency": _quantity(frequency, "Hz", "first bending mode of the bare rod, by beam theory"),
+        **({"attached_mass": _quantity(attached, "kg", "mass of the attached bodies")} if attached else {}),
+        "frequency": _quantity(
+            system.bending_frequency, "Hz", "first bending frequency of the bare rod, by beam theory"
+        ),
     }
 
 
-def driven_by(system: System) -> dict[str, dict[str, str]]:
-    """Every control, by the name that `--controls` and `--control` take, with its unit and meaning."""
+def control_summary(system: System) -> dict[str, dict[str, str]]:
+    """Return the controls by the names that `--controls` and `--control` accept, with unit and meaning."""
     from knode_cosserat import named_controls
 
     layout = system.control_layout
@@ -123,7 +123,7 @@ def driven_by(system: System) -> dict[str, dict[str, str]]:
 
 
 def more_lines(system: System) -> list[str]:
-    """Choices and parts of a robot that are not as they are by default, as its file would have them."""
+    """Return the choices and parts of a robot that differ from the defaults, as lines of a robot file."""
     from knode_cosserat.rods.robot_file import KINDS, RobotFileError, more_of
 
     system = system.nominal
@@ -138,8 +138,8 @@ def _quantity(value: Any, unit: str, meaning: str) -> dict[str, Any]:
     return {"value": plain, "unit": unit, "meaning": meaning}
 
 
-def learned(system: System) -> tuple[dict[str, Any], list[str]]:
-    """What a model learned, as facts and in words; nothing of a system that is not a model."""
+def residual_summary(system: System) -> tuple[dict[str, Any], list[str]]:
+    """Return the residual of a model as values and as text; both are empty for a robot."""
     from knode_cosserat.learning.explain import explain
     from knode_cosserat.learning.knode import KNODE
     from knode_cosserat.learning.structured.residual import Structured
@@ -154,9 +154,9 @@ def learned(system: System) -> tuple[dict[str, Any], list[str]]:
             facts[stage] = {"steps": len(losses), "loss": float(losses[-1])}
             lines.append(f"{stage}: loss {losses[-1]:.4g} at step {len(losses)}")
     if isinstance(system.residual, Structured):
-        found = explain(system)
-        facts["found"] = [finding._asdict() for finding in found]
-        lines += [f"  {finding}" for finding in found[:MOST_FINDINGS]] or ["  nothing is missing"]
-        if len(found) > MOST_FINDINGS:
-            lines.append(f"  … and {len(found) - MOST_FINDINGS} more; --json has all of them")
+        terms = explain(system)
+        facts["found"] = [term._asdict() for term in terms]
+        lines += [f"  {term}" for term in terms[:MOST_FINDINGS]] or ["  no terms: the residual is zero"]
+        if len(terms) > MOST_FINDINGS:
+            lines.append(f"  … and {len(terms) - MOST_FINDINGS} more; --json prints all")
     return facts, lines

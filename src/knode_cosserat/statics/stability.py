@@ -17,7 +17,13 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import block_diag
 
-from knode_cosserat.control.stiffness import (
+from knode_cosserat._reprs import count_of
+from knode_cosserat.rods.system import System, in_strands
+from knode_cosserat.solvers.boundary import static_error
+from knode_cosserat.solvers.equilibrium import equilibrium as rests
+from knode_cosserat.solvers.result import Result
+from knode_cosserat.solvers.space import Lobatto4
+from knode_cosserat.statics.stiffness import (
     NEEDED,
     Pieces,
     divided,
@@ -27,11 +33,6 @@ from knode_cosserat.control.stiffness import (
     symmetric,
     wide,
 )
-from knode_cosserat.rods.system import System, in_strands
-from knode_cosserat.solvers.boundary import static_error
-from knode_cosserat.solvers.equilibrium import equilibrium as rests
-from knode_cosserat.solvers.result import Result
-from knode_cosserat.solvers.space import Lobatto4
 from knode_cosserat.trajectory import Trajectory
 
 #: largest residual of an equilibrium, in natural units
@@ -66,6 +67,10 @@ class Stability(NamedTuple):
     #: asymmetry of the stiffness, as a fraction of its largest entry: conservative loads give a symmetric
     #: stiffness; follower loads do not
     asymmetry: float
+
+    def __repr__(self) -> str:
+        kind = "stable" if self.stable else f"unstable in {count_of(self.unstable_directions, 'direction')}"
+        return f"Stability: {kind}; smallest eigenvalue {self.least:.4g} (in units of EI/L)"
 
     @property
     def stable(self) -> bool:

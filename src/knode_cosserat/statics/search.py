@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from knode_cosserat.control.statics import Pose, Response, respond
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.statics.response import Pose, Response, respond
 
 #: ε of the stages: large first, so that controls do not drift along directions with little effect on the pose
 STAGES = (3e-2, 1e-3, 1e-5, 1e-7)

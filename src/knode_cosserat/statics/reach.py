@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
-import enum
 from typing import Any
 
 import numpy as np
 
-from knode_cosserat.control.asked import (
+from knode_cosserat._reprs import packed_text, quantity, wrapped
+from knode_cosserat.rods.system import System, in_strands
+from knode_cosserat.solvers.boundary import NewtonOptions
+from knode_cosserat.solvers.result import Code, Codes, Result, SimulationError
+from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.statics.asked import (
     checked_control,
     checked_limits,
     checked_numbers,
     checked_system,
     static_settings,
 )
-from knode_cosserat.control.search import Search, Wanted
-from knode_cosserat.control.statics import Pose, Response, first_solved, recorded, tip_pose
-from knode_cosserat.rods.system import System, in_strands
-from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.result import Result, SimulationError
-from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.statics.response import Pose, Response, first_solved, recorded, tip_pose
+from knode_cosserat.statics.search import Search, Wanted
 from knode_cosserat.trajectory import Trajectory
 
 #: fields of a trajectory with one entry per row
@@ -32,7 +32,7 @@ EXACT = 1e-13
 SAME_SHAPE = 1e-5
 
 
-class Reach(enum.IntEnum):
+class Reach(Code):
     """Result of inverse kinematics. Zero: reached. Below zero: not reached; the pose is another."""
 
     REACHED = 0
@@ -49,6 +49,12 @@ class Reach(enum.IntEnum):
             Reach.NOT_CONVERGED: "stopped before it was certain that nothing is nearer",
             Reach.NO_EQUILIBRIUM: "no equilibrium to begin with",
         }[self]
+
+
+class ReachCodes(Codes):
+    """Array of `Reach` codes."""
+
+    members = Reach
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,8 +82,22 @@ class InverseKinematics:
     from_rest: Any
     #: number of equilibria computed
     iterations: Any
-    #: the equilibrium, a `Trajectory` as from `kc.equilibrium`: for `kc.stability`, or as an initial state
+    #: the equilibrium, a `Trajectory` as from `kc.equilibrium`: for `kc.statics.stability`, or as an initial
+    #: state
     equilibrium: Any
+
+    def __repr__(self) -> str:
+        if np.ndim(self.result):
+            codes, counts = np.unique(np.asarray(self.result), return_counts=True)
+            results = ", ".join(f"{n} {Reach(int(code))}" for code, n in zip(codes, counts, strict=True))
+            largest = quantity(1e3 * np.max(self.position_error), "mm")
+            return f"InverseKinematics of {len(self.result)} poses: {results}; largest error {largest}"
+        layout = self.equilibrium.system.control_layout
+        return wrapped(
+            f"InverseKinematics: {self.result}; {packed_text(layout, self.control)}; tip at "
+            f"{quantity(self.position, 'm')}; error {quantity(1e3 * self.position_error, 'mm')}, "
+            f"{quantity(self.angle_error, 'rad')}"
+        )
 
     @property
     def converged(self) -> Any:
@@ -121,7 +141,7 @@ def inverse_kinematics(
         starts: number of initial controls to try before a pose counts as unreachable.
         space: "lobatto2", "lobatto4", "euler", or a scheme.
         newton: tolerances and limits of the solve.
-        pose: pose function, as for `kc.configuration`.
+        pose: pose function, as for `kc.statics.configuration`.
 
     Raises:
         ValueError: arguments of a wrong shape, not finite, or low above high.
@@ -150,6 +170,7 @@ def inverse_kinematics(
     columns = {name: [getattr(row, name) for row in rows] for name in names}
     rests = columns.pop("equilibrium")
     numbers = {name: None if column[0] is None else np.array(column) for name, column in columns.items()}
+    numbers["result"] = ReachCodes.of(numbers["result"])
     arrays = {name: np.stack([getattr(rest, name) for rest in rests]) for name in OF_A_ROW}
     return InverseKinematics(**numbers, equilibrium=dataclasses.replace(rests[0], **arrays))
 
@@ -187,7 +208,7 @@ def _one(
 
 
 def _others(size: int, count: int, free: np.ndarray) -> np.ndarray:
-    from knode_cosserat.control.workspace import sample
+    from knode_cosserat.statics.workspace import sample
 
     return np.where(free, sample(np.zeros(size), np.ones(size), max(count, 1))[:count], 0.0)
 

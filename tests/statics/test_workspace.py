@@ -64,6 +64,7 @@ def test_what_has_no_equilibrium_is_nan_and_counted():
     controls = np.array([[1.0, 0.0, 0.0, 0.0], [1e160, 0.0, 0.0, 0.0], [0.0, 2.0, 0.0, 0.0]])
     found = kc.workspace(ROBOT, controls)
     np.testing.assert_array_equal(found.valid, [True, False, True])
+    assert str(found.result) == "[CONVERGED NO_CONVERGENCE CONVERGED]"
     assert found.unsolved == 1
     assert np.all(np.isnan(found.position[1])) and np.all(np.isnan(found.quaternion[1]))
     assert not found.within(u=np.inf)[1]

@@ -13,21 +13,22 @@ from tqdm import tqdm
 
 from knode_cosserat import named_controls
 from knode_cosserat._files import replacing
-from knode_cosserat.control.asked import (
+from knode_cosserat._reprs import quantity, robot_text, wrapped
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.boundary import NewtonOptions
+from knode_cosserat.solvers.equilibrium import equilibrium
+from knode_cosserat.solvers.result import Result, ResultCodes
+from knode_cosserat.solvers.run import usable_cores
+from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.statics.asked import (
     checked_limits,
     checked_numbers,
     checked_system,
     static_settings,
     within_limits,
 )
-from knode_cosserat.control.statics import Pose, poses_of, tip_pose
-from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.equilibrium import equilibrium
-from knode_cosserat.solvers.result import Result
-from knode_cosserat.solvers.run import usable_cores
-from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.statics.response import Pose, poses_of, tip_pose
 
 #: samples per task of a thread; fewer are padded to a power of two
 CHUNK = 1024
@@ -52,6 +53,17 @@ class Workspace:
     residual: np.ndarray
     #: (B, fields): largest magnitude of each strain's change from rest along the rod, in z's own units
     strain: np.ndarray
+
+    def __repr__(self) -> str:
+        solved = self.position[self.valid]
+        spans = [
+            f"{axis} {quantity([low, high], 'm')}"
+            for axis, low, high in zip("xyz", solved.min(axis=0), solved.max(axis=0), strict=False)
+        ] if len(solved) else []  # fmt: skip
+        return wrapped(
+            f"Workspace of a {robot_text(self.system)}: {len(self.result)} samples, "
+            f"{self.unsolved} without a solution; {', '.join(spans)}"
+        )
 
     @property
     def valid(self) -> np.ndarray:
@@ -164,8 +176,8 @@ def workspace(
 
     Every equilibrium is solved from the unloaded robot, as in `kc.equilibrium`, so a sample does not depend
     on the others. A robot with several equilibria gives the one found from there. Its stability is not
-    computed (see `kc.configuration(…).unstable`). A sample that does not converge goes through the recoveries
-    of `kc.equilibrium`. Only the poses are kept: memory does not grow with the nodes.
+    computed (see `kc.statics.configuration(…).unstable`). A sample that does not converge goes through the
+    recoveries of `kc.equilibrium`. Only the poses are kept: memory does not grow with the nodes.
 
     Args:
         robot: one robot or model.
@@ -176,7 +188,7 @@ def workspace(
         seed: seed of the samples.
         space: "lobatto2", "lobatto4", "euler", or a scheme.
         newton: tolerances and limits of the solve.
-        pose: pose function, as for `kc.configuration`.
+        pose: pose function, as for `kc.statics.configuration`.
         progress: show a progress bar.
 
     Raises:
@@ -227,7 +239,7 @@ def _found(system: System, settings: Settings, pose: Pose, controls: np.ndarray,
         None if parts[0] is None else np.concatenate(parts) for parts in zip(*chunks, strict=True)
     ]
     position, quaternion, residual, _, strain = joined
-    result = np.full(total, int(Result.CONVERGED))
+    result = ResultCodes.of(np.full(total, int(Result.CONVERGED)))
     found = Workspace(system, controls, position, quaternion, result, residual, strain)
     for i in np.flatnonzero(~(residual <= settings.newton.acceptable)):
         _recovered(found, int(i), settings, pose)

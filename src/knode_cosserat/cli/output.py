@@ -1,4 +1,4 @@
-"""Telling the user: facts as JSON, or the same in words, and the files that were written."""
+"""Output of the commands: text or JSON on stdout."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 import typer
 
 
-def tell(as_json: bool, facts: dict[str, Any], lines: list[str], **written: Path | None) -> None:
-    """Facts as JSON, or the same in words; and the files that were written."""
+def write_output(as_json: bool, facts: dict[str, Any], lines: list[str], **written: Path | None) -> None:
+    """Print the facts as one JSON object, or the lines of text; then the names of the files written."""
     if as_json:
         files = {name: str(path) if path else None for name, path in written.items()}
         typer.echo(json.dumps(facts | files, allow_nan=False))
@@ -22,25 +22,25 @@ def tell(as_json: bool, facts: dict[str, Any], lines: list[str], **written: Path
 
 
 def table(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines with the cells of each column below each other."""
+    """Return the lines of a table with aligned columns."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     padded = ((cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)
     return ["  ".join(row).rstrip() for row in padded]
 
 
-def vector(values: list[float]) -> str:
-    """Numbers in words, without those that are rounding errors beside the largest."""
+def vector_text(values: list[float]) -> str:
+    """Return a vector as text; components below 1e-9 of the largest are printed as 0."""
     size = max(map(abs, values))
     return "(" + ", ".join(f"{value if abs(value) > 1e-9 * size else 0.0:.6g}" for value in values) + ")"
 
 
-def shown(value: Any) -> str:
-    """A parameter's value in words."""
+def value_text(value: Any) -> str:
+    """Return a parameter's value as text."""
     if value is None:
         return "not given"
     array = np.asarray(value)
     if array.ndim == 2 and np.array_equal(array, np.diag(np.diag(array))):
-        return f"diag {shown(np.diag(array).tolist())}"
+        return f"diag {value_text(np.diag(array).tolist())}"
     if array.ndim:
-        return "[" + ", ".join(shown(each) for each in value) + "]"
+        return "[" + ", ".join(value_text(each) for each in value) + "]"
     return f"{value:.6g}"

@@ -7,11 +7,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from knode_cosserat.control.asked import checked_control, checked_system, static_settings
-from knode_cosserat.control.statics import Pose, first_solved, tip_pose
+from knode_cosserat._reprs import quantity, wrapped
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.statics.asked import checked_control, checked_system, static_settings
+from knode_cosserat.statics.response import Pose, first_solved, tip_pose
 
 #: error of the schemes along the rod in a compliance, as a fraction of its largest eigenvalue
 ASYMMETRY = 1e-4
@@ -28,6 +29,12 @@ class Ellipsoid(NamedTuple):
     #: ratio of largest to smallest singular value; infinite if a direction is lost
     condition: float
 
+    def __repr__(self) -> str:
+        return (
+            f"Ellipsoid: singular values {quantity(self.singular_values)}; measure {self.measure:.4g}; "
+            f"condition {self.condition:.4g}"
+        )
+
 
 class Manipulability(NamedTuple):
     """Yoshikawa's ellipsoids: velocity (m per control), rotation (rad per control), and both combined.
@@ -39,6 +46,10 @@ class Manipulability(NamedTuple):
     translation: Ellipsoid
     rotation: Ellipsoid | None
     whole: Ellipsoid | None
+
+    def __repr__(self) -> str:
+        parts = zip(self._fields, self, strict=True)
+        return "\n".join(["Manipulability", *(f"    {name}: {each}" for name, each in parts)])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,6 +69,13 @@ class Configuration:
     jacobian: np.ndarray
     _compliance: np.ndarray
     _length: float
+
+    def __repr__(self) -> str:
+        turned = "" if self.quaternion is None else f", quaternion {quantity(self.quaternion)}"
+        return wrapped(
+            f"Configuration: control {quantity(self.control)}; "
+            f"position {quantity(self.position, 'm')}{turned}; jacobian {self.jacobian.shape}"
+        )
 
     @property
     def compliance(self) -> np.ndarray:

@@ -1,0 +1,42 @@
+"""Packages whose public names are imported on first use, where importing them at once would make a cycle."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import types
+from collections.abc import Mapping
+from typing import Any
+
+
+class _LazyPackage(types.ModuleType):
+    """A package whose public names come from the modules in `_homes` (name: module)."""
+
+    _homes: Mapping[str, str]
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in self._homes:
+            raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}")
+        value = getattr(importlib.import_module(self._homes[name]), name)
+        self.__dict__[name] = value
+        return value
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        # Python sets a submodule as an attribute of its package; a public function of the same name wins
+        if not (name in self._homes and isinstance(value, types.ModuleType)):
+            super().__setattr__(name, value)
+
+    def __dir__(self) -> list[str]:
+        return sorted(self._homes)
+
+
+def make_lazy(package: str, names: Mapping[str, str]) -> None:
+    """Give a package its public names, each imported from its module on first use.
+
+    Args:
+        package: its `__name__`.
+        names: module, and the names that come from it, separated by spaces.
+    """
+    module = sys.modules[package]
+    module.__dict__["_homes"] = {name: home for home, listed in names.items() for name in listed.split()}
+    module.__class__ = _LazyPackage

@@ -1,1 +1,0 @@
-"""Static tasks of a robot: inverse kinematics, workspace, stability, compliance, equilibrium paths."""

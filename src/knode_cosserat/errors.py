@@ -1,0 +1,16 @@
+"""Base class of all errors that this package raises on purpose."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+
+class KnodeCosseratError(Exception):
+    """Base class of the package's errors.
+
+    Every public error also has a built-in base, such as `ValueError` for wrong input or `RuntimeError` for a
+    computation that failed.
+    """
+
+    #: short, stable name of the class of error, such as "parameter" or "simulation"
+    code: ClassVar[str] = "error"

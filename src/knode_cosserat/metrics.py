@@ -1,0 +1,6 @@
+"""Metrics that compare a prediction with a reference."""
+
+from knode_cosserat.evaluation.metrics import dtw_distance, node_error, pose_mse, tip_dtw, tip_rmse
+from knode_cosserat.evaluation.state_errors import StateError, state_errors
+
+__all__ = ["StateError", "dtw_distance", "node_error", "pose_mse", "state_errors", "tip_dtw", "tip_rmse"]

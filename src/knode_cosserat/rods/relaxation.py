@@ -1,0 +1,41 @@
+"""Relaxation of the material by a Maxwell branch: a spring in series with a dashpot (standard linear solid).
+
+The branch acts in parallel with the elastic law. Its spring has the stiffness r K, and its dashpot the strain
+z_i,
+
+    K (z - z*) + B z_t + r K (z - z_i) = Rᵀ (n, m),      T z_i,t = z - z_i,
+
+with the relaxation time T. The stiffness is (1 + r) K in fast motion, and K at rest.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+from knode_cosserat.rods.parameters import parameter
+from knode_cosserat.rods.parts import Part
+
+
+class Relaxation(Part):
+    """Relaxation of bending and twisting; z then has the curvature of the branch's dashpot."""
+
+    kind: ClassVar[str] = "relaxation"
+
+    stiffness: Any = parameter(
+        "", "r, stiffness of the Maxwell branch over the stiffness at rest", low=0.0, high=1e3
+    )
+    time: Any = parameter("s", "T, relaxation time of the branch", low=1e-6, high=1e6, default=1.0)
+
+    def damping(self, Kbt: Any, c0: Any) -> Any:
+        """Return what the branch adds to the damping of bending and twisting (N·m² s)."""
+        return branch_share(self.stiffness, self.time, c0) * Kbt
+
+
+def branch_share(stiffness: Any, time: Any, c0: Any) -> Any:
+    """Return r T / (1 + c0 T), the branch's damping over K: r (z - z_i) is this times c0 z + ʰz_i."""
+    return stiffness * time / (1.0 + c0 * time)
+
+
+def dashpot_strain(z: Any, past: Any, time: Any, c0: Any) -> Any:
+    """Return z_i, the strain of the dashpot, from its history ʰz_i and the strain z."""
+    return (z - time * past) / (1.0 + c0 * time)
