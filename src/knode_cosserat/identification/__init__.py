@@ -1,8 +1,9 @@
 """Identification of real robots: a library of effects, selected by recordings that were not searched."""
 
-from knode_cosserat.identification.effects import Effect, Number, effects_of
+from knode_cosserat.identification.effects import Effect, Number
 from knode_cosserat.identification.fit import fit
 from knode_cosserat.identification.identify import IdentificationError, identify
+from knode_cosserat.identification.library import effects_of
 from knode_cosserat.identification.result import Estimate, Identified
 
 __all__ = [

@@ -64,9 +64,7 @@ def imperfect_robot(
         present = bool(random.uniform() < SHARE) or effect.basic
         if present and set(effect.needs) <= set(names):
             names.append(effect.name)
-    count = sum(len(effect.numbers) for effect in own)
-    drawn = random.uniform(*SIZES, count) * random.choice([-1.0, 1.0], count)
-    sizes = np.concatenate([drawn, np.zeros(model.size - count)])
+    sizes = random.uniform(*SIZES, model.size) * random.choice([-1.0, 1.0], model.size)
     low, high = model.bounds
     # numbers that are not negative, say, and nominally zero
     sizes = np.where((low >= 0.0) | (high <= 0.0), np.abs(sizes) * np.where(high <= 0.0, -1.0, 1.0), sizes)

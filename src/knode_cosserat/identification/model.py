@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from knode_cosserat.identification.effects import Change, Effect, Number
-from knode_cosserat.identification.reel_effects import all_effects
+from knode_cosserat.identification.library import effects_of
 from knode_cosserat.rods.anchors import EarlyAnchors
 from knode_cosserat.rods.ends import Clamped
 from knode_cosserat.rods.load_cells import LoadCells
@@ -170,7 +170,7 @@ class Model:
         tensions, highest = float(np.nanmean(tension)), float(np.nanmax(tension.sum(axis=1)))
         self.nominal = routed(nominal)
         self._extended = extended(self.nominal, [float(at) for at in bodies if at > 0.0])
-        self.effects: tuple[Effect, ...] = tuple(all_effects(self._extended, tensions, highest))
+        self.effects: tuple[Effect, ...] = tuple(effects_of(self._extended, tensions, highest))
         self.numbers: tuple[Number, ...] = tuple(each for effect in self.effects for each in effect.numbers)
         self.robot = Parametrised(
             self._extended,

@@ -12,37 +12,12 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from knode_cosserat.identification.effects import Effect, Number, effects_of
+from knode_cosserat.identification.effects import Effect, Number
 from knode_cosserat.rods.routed_robot import RoutedTendonRobot
 from knode_cosserat.rods.routing import Straight
 
 #: uncertainty of the wound-up length, as a fraction of the rod's length, and of tendon angles (rad)
 TAKEN_IN, TURN = 0.01, 0.1
-
-
-#: effects of measured tensions, which a robot with reels does not have
-OF_TENSIONS = ("load cell gains", "load cell offsets", "early anchors", "vibration", "latency")
-#: effects of tendons that are given by their offset and angles, and of friction
-OF_ANGLES = ("tendon offset", "tendon angles", "tendon twist")
-OF_FRICTION = ("friction", "friction by curvature")
-#: uncertainty of the clamped end's position, as a fraction of the length
-PLACED = 0.03
-
-
-def all_effects(nominal: RoutedTendonRobot, tensions: float, highest: float) -> list[Effect]:
-    """Return the effects that a robot may have, by what drives its tendons; see `effects_of`."""
-    gone = set() if nominal.routing is None else {*OF_ANGLES}
-    if nominal.rib_spacing is None or nominal.rib_spacing.at is None:
-        gone |= {"rib spans"}
-    if nominal.drive != "reel":
-        known = [each for each in effects_of(nominal, tensions, highest) if each.name not in gone]
-        return [*known, *routing_effects(nominal)]
-    gone |= {*OF_TENSIONS}
-    # what costs time in each step is searched for where the nominal robot states it
-    gone |= set() if nominal.friction is not None else {*OF_FRICTION}
-    gone |= set() if nominal.rib_spacing is not None else {"rib spacing"}
-    known = effects_of(nominal, tensions, highest, placed=PLACED)
-    return [*(each for each in known if each.name not in gone), *reel_effects(nominal)]
 
 
 def reel_effects(nominal: RoutedTendonRobot) -> list[Effect]:
