@@ -162,7 +162,7 @@ def calibrated(robot: kc.System, it: Made, by: Any) -> Any:
     name = name_of_a_parameter(robot)
     data: Any = it.motion
     if by == "rollouts":  # they begin unloaded
-        data = kc.Measurements.of(kc.simulate(robot, it.controls, DT), (0.5, 1.0))
+        data = kc.recordings.Measurements.of(kc.simulate(robot, it.controls, DT), (0.5, 1.0))
     found = kc.calibrate(robot, [data], [name], by=by)
     assert type(found.robot) is type(robot)
     np.testing.assert_allclose(getattr(found.robot.nominal, name), getattr(robot.nominal, name), rtol=1e-3)
