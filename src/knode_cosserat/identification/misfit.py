@@ -233,7 +233,7 @@ class Misfit:
 
 def _cells(system: Any) -> LoadCells | None:
     """Return the load cells of a robot, also of one with a residual."""
-    return getattr(getattr(system, "knowledge", system), "load_cells", None)
+    return getattr(system.nominal, "load_cells", None)
 
 
 def _acting(system: Any, data: Data) -> tuple[np.ndarray, np.ndarray]:

@@ -190,7 +190,8 @@ class Search:
         x = np.where(free, self.misfit.model.begin, 0.0)
         data = self.misfit.data
         longest = max(len(each.tension) - each.moves for each in data) * data[0].dt
-        if data[0].static or self.misfit.model.nominal.drive == "reel":
+        wound = {"reel", "motor"} & {*self.misfit.model.nominal.control_layout.names}
+        if data[0].static or wound:
             # rows are independent of each other, and wound-up lengths keep the search near the solution
             longest = 0.0
         for horizon in [h for h in HORIZONS if h < 0.8 * longest]:
