@@ -36,7 +36,7 @@ def public() -> dict[str, Any]:
     for space in [kc, *(thing for name in kc.__all__ if _is_namespace(thing := getattr(kc, name)))]:
         for name in space.__all__:
             thing = getattr(space, name)
-            if not _is_namespace(thing):
+            if not _is_namespace(thing) and not _is_constant(thing):
                 found.setdefault(_path(space, name, thing), thing)
     return found
 
@@ -44,6 +44,12 @@ def public() -> dict[str, Any]:
 def _is_namespace(thing: Any) -> bool:
     """True for a module that lists its public names; a module without such a list is shown as a whole."""
     return isinstance(thing, types.ModuleType) and hasattr(thing, "__all__")
+
+
+def _is_constant(thing: Any) -> bool:
+    """True for a constant or an array type, which have no page of their own."""
+    named = isinstance(thing, types.ModuleType) or hasattr(thing, "__qualname__")
+    return not named or not getattr(inspect.getmodule(thing), "__name__", "").startswith(PACKAGE)
 
 
 def rooms() -> dict[str, list[str]]:
