@@ -70,7 +70,7 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.setattr(
         "knode_cosserat.view", lambda scene, **more: kc.viewer.export_scene(scene, "s.html", **more)
     )
-    monkeypatch.setattr("knode_cosserat.view_live", lambda robot: kc.solvers.Stepper(robot, 0.05))
+    monkeypatch.setattr("knode_cosserat.viewer.view_live", lambda robot: kc.solvers.Stepper(robot, 0.05))
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     return tmp_path
 
