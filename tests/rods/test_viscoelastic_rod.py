@@ -58,7 +58,7 @@ def test_relaxation_of_a_tendon_robot_is_that_of_the_rod():
     body = {name: value for name, value in BODY.items() if name != "loads"} | {"gravity": (9.81, 0.0, 0.0)}
     stiff = 1e9 * np.eye(3)
     rod = ViscoelasticRod(**body, shear_stiffness=stiff, branch_stiffness=1.5, relaxation_time=0.2)
-    robot = kc.RoutedTendonRobot(
+    robot = kc.robots.RoutedTendonRobot(
         **body, shear_stiffness=stiff, tendon_offset=0.01, relaxation=Relaxation(stiffness=1.5, time=0.2)
     )
     none, slack = np.zeros((40, 0)), np.zeros((40, 4))

@@ -58,7 +58,7 @@ def _is_one(entry: Any, names: list[str]) -> bool:
 
 def on_files(files: Any, config: Any) -> Any:
     """The schema of robot files, at a place that does not change."""
-    text = json.dumps(kc.robot_schema(), indent=2, ensure_ascii=False) + "\n"
+    text = json.dumps(kc.robots.robot_schema(), indent=2, ensure_ascii=False) + "\n"
     files.append(File.generated(config, "robot.schema.json", content=text))
     return files
 
