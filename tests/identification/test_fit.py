@@ -10,7 +10,7 @@ from knode_cosserat.identification.evaluate import coverage, evaluate
 from knode_cosserat.identification.fit import coordinates, fit
 from knode_cosserat.identification.given import poses_of
 from knode_cosserat.identification.model import Model
-from knode_cosserat.identification.residual import Errors, _verdict
+from knode_cosserat.identification.residual import PositionErrors, _verdict
 from knode_cosserat.identification.result import Estimate, Identified
 from knode_cosserat.identification.trials import failed_trial
 from knode_cosserat.learning.samples import DataError
@@ -79,7 +79,7 @@ def test_a_passive_network_does_not_diverge_and_its_spread_is_told():
 
 
 def errors(*tips):
-    return [Errors(tip, tip) for tip in tips]
+    return [PositionErrors(tip, tip) for tip in tips]
 
 
 def test_what_is_kept():

@@ -12,7 +12,7 @@ from benchmarks.motions import soft_rod
 from examples.hanging_string import HangingString
 from knode_cosserat.solvers.grid import at_places, grid_of
 from knode_cosserat.solvers.history import resting_past, still_records
-from knode_cosserat.solvers.initial import Run, beginning, histories_along
+from knode_cosserat.solvers.initial import SimulationRun, beginning, histories_along
 from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SCHEMES
@@ -92,10 +92,10 @@ def test_the_middle_of_a_motion_is_known_at_its_nodes_only(rod, whole):
 def test_rows_tell_what_the_last_step_looked_back_on(rod, whole):
     """The past that is found again is the one that the solver had."""
     settings = Settings.of("bdf2", "lobatto4", "paper", kc.solvers.NewtonOptions())
-    begins = beginning(Run(rod, NONE, None, settings, DT, None, False))
+    begins = beginning(SimulationRun(rod, NONE, None, settings, DT, None, False))
     task = Task(settings, DT, len(NONE))
     _, past, _ = loop_one(rod, settings, task.table, NONE, DT, begins.start.past, 0, len(NONE))
-    again = beginning(Run(rod, NONE, whole, settings, DT, None, False))
+    again = beginning(SimulationRun(rod, NONE, whole, settings, DT, None, False))
     assert again.first == "regular" and again.start.past.t0 == pytest.approx(len(NONE) * DT)
     np.testing.assert_allclose(again.start.past.records, past.records, atol=2e-8)
 

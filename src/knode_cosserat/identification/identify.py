@@ -13,7 +13,7 @@ from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.identification.given import SELECTED_DT, coarser, measurements_of, names_of, padded
 from knode_cosserat.identification.intervals import estimates_of
 from knode_cosserat.identification.journal import Journal
-from knode_cosserat.identification.misfit import Data, Misfit, data_of
+from knode_cosserat.identification.misfit import Misfit, RecordingData, data_of
 from knode_cosserat.identification.model import Model
 from knode_cosserat.identification.result import Estimate, Identified
 from knode_cosserat.identification.search import Point, Search, SearchError
@@ -153,7 +153,7 @@ def _known(effects: Sequence[str], model: Model) -> tuple[str, ...]:
 
 
 def _accepted(
-    search: Search, names: tuple[str, ...], point: Point, data: Sequence[Data], steps: list[str],
+    search: Search, names: tuple[str, ...], point: Point, data: Sequence[RecordingData], steps: list[str],
     space: str | SpaceScheme, tell: Callable[[str], None],
 ) -> Identified:  # fmt: skip
     """Return the identified robot after its trials: with fewer effects if it fails, nominal if that fails."""
@@ -227,7 +227,7 @@ def _errors(search: Search, x: np.ndarray, which: Sequence[int] | None = None) -
 
 
 def _result(
-    search: Search, robot: System, names: tuple[str, ...], point: Point | None, data: Sequence[Data],
+    search: Search, robot: System, names: tuple[str, ...], point: Point | None, data: Sequence[RecordingData],
     steps: Sequence[str], left_out: Sequence[float | None] = (), estimates: Sequence[Estimate] = (),
 ) -> Identified:  # fmt: skip
     model = search.misfit.model

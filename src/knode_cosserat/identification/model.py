@@ -123,7 +123,7 @@ def _without_idle_reels(nominal: RoutedTendonRobot, found: Any, names: Sequence[
     return changes
 
 
-class Parametrised(eqx.Module):
+class ParametrisedRobot(eqx.Module):
     """A robot with all effects as a function of coordinates: a pytree, so that programs serve any robot.
 
     Attributes:
@@ -172,7 +172,7 @@ class Model:
         self._extended = extended(self.nominal, [float(at) for at in bodies if at > 0.0])
         self.effects: tuple[Effect, ...] = tuple(effects_of(self._extended, tensions, highest))
         self.numbers: tuple[Number, ...] = tuple(each for effect in self.effects for each in effect.numbers)
-        self.robot = Parametrised(
+        self.robot = ParametrisedRobot(
             self._extended,
             np.array([each.nominal for each in self.numbers]),
             np.array([each.width for each in self.numbers]),

@@ -165,7 +165,7 @@ def padded_rows(rows: Any, least: int = 1) -> np.ndarray:
     return np.pad(rows, width, mode="edge")
 
 
-class Motion(NamedTuple):
+class ContinuedMotion(NamedTuple):
     """Rows of a motion with the history of the first."""
 
     begun: Begun
@@ -187,7 +187,7 @@ def begun_between(system: System, space: SpaceScheme, rows: Any, coefficients: A
     return Begun(found[::-1], jnp.zeros_like(found[0]), jnp.asarray(coefficients), jnp.asarray(dt))
 
 
-def past_along(system: System, settings: Settings, motion: Motion) -> tuple[Past, Any]:
+def past_along(system: System, settings: Settings, motion: ContinuedMotion) -> tuple[Past, Any]:
     """Return the history after a motion's last row, and the history terms (rows - 1, places, x) of each step.
 
     The equations are evaluated again at every place of each step. If a row was changed after it was solved,

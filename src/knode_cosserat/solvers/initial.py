@@ -15,7 +15,7 @@ from knode_cosserat.solvers import sensitivity
 from knode_cosserat.solvers.grid import at_places, grid_of
 from knode_cosserat.solvers.history import (
     Begun,
-    Motion,
+    ContinuedMotion,
     Past,
     begun_between,
     coefficient_table,
@@ -42,7 +42,7 @@ FORGOTTEN = 1e-9
 AT_REST = 1e-12
 
 
-class Run(NamedTuple):
+class SimulationRun(NamedTuple):
     """The checked arguments of one call; `many` is true if the systems themselves are batched."""
 
     system: System
@@ -70,7 +70,7 @@ class Beginning(NamedTuple):
     begun: Begun | None
 
 
-def beginning(run: Run) -> Beginning:
+def beginning(run: SimulationRun) -> Beginning:
     """Return the initial state and history of a run."""
     system, controls, initial, settings, dt, batch, many, _ = run
     if initial is not None:
@@ -111,7 +111,7 @@ def _all_at_rest(system: System, settings: Settings) -> Any:
     return jax.vmap(lambda each: _at_rest(each, settings))(system)
 
 
-def _settled(run: Run, past: Any) -> tuple[Any, Any, Any]:
+def _settled(run: SimulationRun, past: Any) -> tuple[Any, Any, Any]:
     """Return the equilibrium under zero control, its history, and a flag: true if its grid is too coarse."""
     system, many = run.system, run.many
     task = Task(run.settings, run.dt, 1, "still")
@@ -210,7 +210,7 @@ def _known(
     if not is_traced((rows, controls)):
         packed = padded_rows(np.reshape(rows, (count, -1)))
         rows, controls = packed.reshape(-1, *np.shape(rows)[1:]), padded_rows(controls)
-    motion = Motion(begun, regular, rows, controls, initial.time[row], count)
+    motion = ContinuedMotion(begun, regular, rows, controls, initial.time[row], count)
     past, _ = _along(system, made, motion)
     alone = past_of_one(system, made.space, past.records[0], past.y[0], past.t0)
     # traced times cannot be compared: the rows are assumed to have the same time step as the continuation
@@ -304,5 +304,5 @@ def histories_along(system: System, moved: Trajectory) -> tuple[int, Float[Any, 
         return None
     row, count = known.row, len(rows) - known.row
     controls = jnp.asarray(moved.control[row:])
-    motion = Motion(known.begun, known.regular, rows[row:], controls, moved.time[row], count)
+    motion = ContinuedMotion(known.begun, known.regular, rows[row:], controls, moved.time[row], count)
     return row + 1, _along(system, made, motion)[1]

@@ -26,7 +26,7 @@ from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.time import BDF1, Static
-from knode_cosserat.solvers.time_loop import Rows, recorded
+from knode_cosserat.solvers.time_loop import StepRows, recorded
 
 #: smallest substep as a part of a time step, and largest number of substeps tried
 LEAST_SUBSTEP, MOST_SUBSTEPS = 2.0**-14, 400
@@ -93,7 +93,7 @@ class Attempt(NamedTuple):
 
     solution: Solution
     after: Past
-    row: Rows
+    row: StepRows
 
 
 @functools.partial(jax.jit, static_argnames="settings")

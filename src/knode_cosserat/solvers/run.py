@@ -20,7 +20,7 @@ from knode_cosserat.solvers.recovery import Budget, Outcome, recover
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.task import Start, Steps, Task
 from knode_cosserat.solvers.time import Static
-from knode_cosserat.solvers.time_loop import Rows, loop_many, loop_one
+from knode_cosserat.solvers.time_loop import StepRows, loop_many, loop_one
 
 log = logging.getLogger(__name__)
 
@@ -171,7 +171,7 @@ def usable_cores() -> int:
     return os.cpu_count() or 1
 
 
-def _merged(rows: Steps | None, new: Rows, first: int, last: int, total: int) -> Steps:
+def _merged(rows: Steps | None, new: StepRows, first: int, last: int, total: int) -> Steps:
     """Add the rows `first` to `last` of a time loop to the existing rows."""
     if rows is None:
         leaves = [np.asarray(leaf)[:total] for leaf in new]

@@ -22,11 +22,11 @@ from knode_cosserat.solvers.linear import solved
 from knode_cosserat.solvers.problem import StepProblem, row_of
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.task import Task
-from knode_cosserat.solvers.time_loop import Rows, loop_one
+from knode_cosserat.solvers.time_loop import StepRows, loop_one
 
 
 @functools.lru_cache(maxsize=64)
-def rollout(task: Task) -> Callable[[System, Any, Past], Rows]:
+def rollout(task: Task) -> Callable[[System, Any, Past], StepRows]:
     """Return a differentiable function from (system, controls (T, c), past) to the rows of all steps.
 
     Cached between calls: JAX recognises functions that it has already traced by identity.
@@ -34,10 +34,10 @@ def rollout(task: Task) -> Callable[[System, Any, Past], Rows]:
     settings, table, dt, steps = task.settings, task.table, task.dt, task.steps
 
     @jax.custom_jvp
-    def run(system: System, controls: Any, past: Past) -> Rows:
+    def run(system: System, controls: Any, past: Past) -> StepRows:
         done, _, rows = loop_one(system, settings, table, controls, dt, past, 0, steps)
         unsolved = jnp.arange(steps) >= done
-        return Rows(
+        return StepRows(
             jnp.where(unsolved[:, None, None], jnp.nan, rows.records),
             jnp.where(unsolved[:, None], jnp.nan, rows.unknowns),
             jnp.where(unsolved, jnp.inf, rows.error),
@@ -56,7 +56,7 @@ def rollout(task: Task) -> Callable[[System, Any, Past], Rows]:
         )  # fmt: skip
         still = np.zeros(steps, dtype=jax.dtypes.float0)
         none = jnp.zeros_like(rows.error)
-        return rows, Rows(d_records, d_unknowns, none, still, none)
+        return rows, StepRows(d_records, d_unknowns, none, still, none)
 
     return run
 

@@ -17,7 +17,7 @@ from knode_cosserat.rods.trained_range import without_range
 from knode_cosserat.solvers import sensitivity
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.damping import warn_if_undamped
-from knode_cosserat.solvers.initial import Beginning, Run, beginning
+from knode_cosserat.solvers.initial import Beginning, SimulationRun, beginning
 from knode_cosserat.solvers.recovery import natural_time
 from knode_cosserat.solvers.result import Result, SimulationError
 from knode_cosserat.solvers.run import mark_coarse, run_batch, run_one
@@ -107,7 +107,9 @@ def simulate(
         check_initial(system, initial, batch)
     # ranges are not part of the equations: programs are compiled for systems without them
     bare, begins = without_range(system), without_range(_unmarked(initial))
-    run = Run(bare, controls, begins, settings, dt, batch, isinstance(robot, Sequence), recovery_budget)
+    run = SimulationRun(
+        bare, controls, begins, settings, dt, batch, isinstance(robot, Sequence), recovery_budget
+    )
     if is_traced((system, controls, initial)):
         found = _traced(*run[:7])
     elif batch:
@@ -288,7 +290,7 @@ def check_initial(system: System, initial: Trajectory, batch: int | None) -> Non
 # the three ways to run
 
 
-def _single(run: Run, on_failure: str, progress: bool) -> Trajectory:
+def _single(run: SimulationRun, on_failure: str, progress: bool) -> Trajectory:
     system, controls, settings, dt = run.system, run.controls, run.settings, run.dt
     begins = beginning(run)
     task = Task(settings, dt, len(controls), begins.first, run.budget)
@@ -299,7 +301,7 @@ def _single(run: Run, on_failure: str, progress: bool) -> Trajectory:
     return _trajectory(run, begins, steps)
 
 
-def _batch(run: Run, on_failure: str, progress: bool) -> Trajectory:
+def _batch(run: SimulationRun, on_failure: str, progress: bool) -> Trajectory:
     system, controls, settings, dt, many = run.system, run.controls, run.settings, run.dt, run.many
     begins = beginning(run)
     task = Task(settings, dt, controls.shape[1], recovery_budget=run.budget)
@@ -311,7 +313,7 @@ def _batch(run: Run, on_failure: str, progress: bool) -> Trajectory:
     return _trajectory(run, begins, steps)
 
 
-def _warn_of_coarse_grids(run: Run, steps: Steps) -> None:
+def _warn_of_coarse_grids(run: SimulationRun, steps: Steps) -> None:
     """Warn of rows with a large discretisation error; not for Euler, which only reproduces the paper."""
     coarse = np.asarray(steps.result) == Result.COARSE
     if np.any(coarse) and not isinstance(run.settings.space, Euler):
@@ -339,7 +341,7 @@ def _traced(system, controls, initial, settings, dt, batch, many):  # type: igno
 
     A single jitted function, so that a transformation traces it once and not at every call.
     """
-    run = Run(system, controls, initial, settings, dt, batch, many)
+    run = SimulationRun(system, controls, initial, settings, dt, batch, many)
     begins = beginning(run)
     task = Task(settings, dt, np.shape(controls)[-2], begins.first)
     one = sensitivity.rollout(task)
@@ -351,7 +353,7 @@ def _traced(system, controls, initial, settings, dt, batch, many):  # type: igno
     return _trajectory(run, begins, mark_coarse(Steps._make([*rows, result]), system, task, begins.start))
 
 
-def _trajectory(run: Run, begins: Beginning, steps: Steps) -> Trajectory:
+def _trajectory(run: SimulationRun, begins: Beginning, steps: Steps) -> Trajectory:
     """Return the trajectory: the initial row, then the steps, with NaN in unsolved rows."""
     system, controls, settings, dt, batch = run.system, run.controls, run.settings, run.dt, run.batch
     numeric: Any = jnp if is_traced((begins.record, steps)) else np

@@ -11,7 +11,7 @@ from knode_cosserat._reprs import robot_text
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.history import Begun
-from knode_cosserat.solvers.initial import Run, beginning
+from knode_cosserat.solvers.initial import SimulationRun, beginning
 from knode_cosserat.solvers.recovery import Budget
 from knode_cosserat.solvers.result import Result, SimulationError
 from knode_cosserat.solvers.run import LEAST_CAPACITY, is_coarse, rescue
@@ -87,7 +87,9 @@ class Stepper:
         if initial is not None:
             check_initial(robot, initial, None)
         count = robot.control_size
-        begins = beginning(Run(robot, np.zeros((1, count)), initial, settings, self.dt, None, False))
+        begins = beginning(
+            SimulationRun(robot, np.zeros((1, count)), initial, settings, self.dt, None, False)
+        )
         begun, t0 = begins.start, begins.t0
         self._task = Task(settings, self.dt, 1, begins.first, recovery_budget)
         self._settings = settings

@@ -24,7 +24,7 @@ BATCH = "robots"
 ROUNDING = 1e-12
 
 
-class Rows(NamedTuple):
+class StepRows(NamedTuple):
     """The steps' results, one row a step."""
 
     records: Float[Any, "steps nodes x"]
@@ -55,7 +55,7 @@ def step(
 
 def recorded(
     problem: StepProblem, settings: Settings, past: Past, coefficients: Any, solution: Any, factors: Factors
-) -> tuple[Past, Rows]:
+) -> tuple[Past, StepRows]:
     """Return the history after a solved step, and its row, with the discretisation error.
 
     The error e of a step solves the step's linear equations. Their right-hand side is the defect of the check
@@ -84,7 +84,7 @@ def recorded(
         rate, d_rate = past.rate, past.error[2]
     # residual of the returned state, evaluated independently of the iteration
     residual = jnp.maximum(solution.error, largest_residual(problem, reached - y[1:], tip))
-    row = Rows(
+    row = StepRows(
         row_of(system, y, records), solution.unknowns, _finite_or_infinite(residual, records),
         solution.corrections, position_error(system, e),
     )  # fmt: skip
@@ -119,9 +119,9 @@ def no_factors(system: System, settings: Settings, past: Past, control: Any) -> 
     return none_kept(problem, y, system.unknowns(y[0]))
 
 
-def _no_rows(system: System, shape: tuple[int, ...], past: Past) -> Rows:
+def _no_rows(system: System, shape: tuple[int, ...], past: Past) -> StepRows:
     """Return rows of zeros, (steps,) or (robots, steps)."""
-    return Rows(
+    return StepRows(
         jnp.zeros((*shape, system.nodes, past.records.shape[-1])),
         jnp.zeros((*shape, system.unknown_count)),
         jnp.zeros(shape),
@@ -133,7 +133,7 @@ def _no_rows(system: System, shape: tuple[int, ...], past: Past) -> Rows:
 def _attempt(
     system: System, settings: Settings, table: Any, past: Past, control: Any, i: Any, dt: Any, kept: Kept,
     batch: str | None = None,
-) -> tuple[Any, Past, Rows, Kept]:  # fmt: skip
+) -> tuple[Any, Past, StepRows, Kept]:  # fmt: skip
     """Try step i: return a failure flag, the next history (unchanged on failure), row and factors."""
     coefficients = jnp.where(i == 0, table[0], table[1])
     t = past.t0 + (i + 1) * dt
@@ -149,7 +149,7 @@ def _where(condition: Any, one: Any, other: Any) -> Any:
 def time_loop(
     system: System, settings: Settings, table: Any, controls: Any, dt: Any, past: Past, start: Any, stop: Any,
     batch: str | None = None,
-) -> tuple[Any, Past, Rows]:  # fmt: skip
+) -> tuple[Any, Past, StepRows]:  # fmt: skip
     """Solve the steps `start` to `stop` (exclusive; step i uses controls[i] and ends at t0 + (i + 1) dt).
 
     Stops at a step that does not converge. Returns the number of steps done, the history of the next step,
@@ -181,7 +181,7 @@ def loop_in_turn(
     pasts: Past,
     stop: Any,
     batched: Any,
-) -> tuple[Any, Rows]:
+) -> tuple[Any, StepRows]:
     """Solve all steps, one robot after the other; return the numbers of steps done, and all rows.
 
     It is a single loop over robots and steps: XLA would copy all rows at every turn of an inner loop.
@@ -233,7 +233,7 @@ def loop_many(system, settings, table, controls, dt, pasts, stop, batched, locks
     if not lockstep:
         return loop_in_turn(system, settings, table, controls, dt, pasts, stop, batched)
 
-    def one(system: System, control: Any, past: Past) -> tuple[Any, Rows]:
+    def one(system: System, control: Any, past: Past) -> tuple[Any, StepRows]:
         done, _, rows = time_loop(system, settings, table, control, dt, past, 0, stop, BATCH)
         return done, rows
 

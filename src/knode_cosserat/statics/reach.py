@@ -20,7 +20,7 @@ from knode_cosserat.statics.asked import (
     static_settings,
 )
 from knode_cosserat.statics.response import Pose, Response, first_solved, recorded, tip_pose
-from knode_cosserat.statics.search import Search, Wanted
+from knode_cosserat.statics.search import EquilibriumSearch, Wanted
 from knode_cosserat.trajectory import Trajectory
 
 #: fields of a trajectory with one entry per row
@@ -157,7 +157,7 @@ def inverse_kinematics(
             raise ValueError(f"initial is {begin.tolist()}; it must be between low and high")
     if not _whole(starts):
         raise ValueError(f"starts is {starts!r}; allowed is a whole number from 1")
-    search = Search(system, settings, pose, *limits)
+    search = EquilibriumSearch(system, settings, pose, *limits)
     free = np.where(search.free, search.span, 1.0)
     last = np.where(search.free, 0.5, 0.0) if begin is None else (begin - limits[0]) / free
     rows, shape = [], None
@@ -180,7 +180,7 @@ def _whole(number: Any) -> bool:
 
 
 def _one(
-    search: Search, wanted: Wanted, begin: np.ndarray, shape: Response | None, starts: int
+    search: EquilibriumSearch, wanted: Wanted, begin: np.ndarray, shape: Response | None, starts: int
 ) -> tuple[InverseKinematics, np.ndarray, Response | None]:
     """Solve for one pose, from `begin` and its equilibrium (None: from rest), then from other controls."""
     best: tuple[float, np.ndarray, Response, bool] | None = None
@@ -213,7 +213,9 @@ def _others(size: int, count: int, free: np.ndarray) -> np.ndarray:
     return np.where(free, sample(np.zeros(size), np.ones(size), max(count, 1))[:count], 0.0)
 
 
-def _told(search: Search, wanted: Wanted, u: np.ndarray, found: Response, result: Reach) -> InverseKinematics:
+def _told(
+    search: EquilibriumSearch, wanted: Wanted, u: np.ndarray, found: Response, result: Reach
+) -> InverseKinematics:
     control = search.control(u)
     position, turned = wanted.errors(found)
     same = _from_rest(search, control, found)
@@ -227,7 +229,7 @@ def _told(search: Search, wanted: Wanted, u: np.ndarray, found: Response, result
     )  # fmt: skip
 
 
-def _from_rest(search: Search, control: np.ndarray, found: Response) -> bool:
+def _from_rest(search: EquilibriumSearch, control: np.ndarray, found: Response) -> bool:
     """True if the equilibrium found from the unloaded robot has the same shape."""
     try:
         cold = first_solved(search.system, search.settings, search.pose, control)
@@ -260,7 +262,7 @@ def _same_shape(system: System, one: np.ndarray, other: np.ndarray) -> bool:
     return max(off, float(np.max(turned))) <= SAME_SHAPE
 
 
-def _nothing(search: Search, u: np.ndarray) -> InverseKinematics:
+def _nothing(search: EquilibriumSearch, u: np.ndarray) -> InverseKinematics:
     control = search.control(u)
     system = search.system
     position, quaternion = search.pose(system, np.full(system.y_layout.size, np.nan))
@@ -273,7 +275,9 @@ def _nothing(search: Search, u: np.ndarray) -> InverseKinematics:
     )  # fmt: skip
 
 
-def _rest(search: Search, control: np.ndarray, state: Any, result: Result, residual: float) -> Trajectory:
+def _rest(
+    search: EquilibriumSearch, control: np.ndarray, state: Any, result: Result, residual: float
+) -> Trajectory:
     y, z = (np.asarray(part)[None] for part in state)
     return Trajectory(
         system=search.system, settings=search.settings, time=np.zeros(1), y=y, z=z, control=control[None],

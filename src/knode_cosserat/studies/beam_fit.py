@@ -34,7 +34,7 @@ LOST = 100.0
 STEP, TOLERANCE = 1e-3, 3e-3
 
 
-class Identified(NamedTuple):
+class IdentifiedBeam(NamedTuple):
     """Identified beam, and the number of evaluations."""
 
     beam: Beam
@@ -58,7 +58,7 @@ def identify_beam(
     steps: int,
     numerics: Numerics = DEFAULT,
     progress: Callable[[str], None] = lambda line: None,
-) -> Identified:
+) -> IdentifiedBeam:
     """Return the beam whose parameters fit the training recordings best.
 
     Each recording has the same weight, independent of its number of rows.
@@ -82,7 +82,7 @@ def identify_beam(
     found = scipy.optimize.least_squares(
         residuals, np.zeros(len(names)), jacobian, bounds=(-most, most), xtol=TOLERANCE, ftol=TOLERANCE
     )
-    return Identified(_moved(start, found.x), calls)
+    return IdentifiedBeam(_moved(start, found.x), calls)
 
 
 def _moved(start: Beam, x: Float[np.ndarray, " k"]) -> Beam:

@@ -12,10 +12,10 @@ from jaxtyping import Float
 from knode_cosserat._reprs import robot_text, wrapped
 from knode_cosserat.learning.calibration import search
 from knode_cosserat.learning.calibration.misfit import SegmentMisfit, by_group
-from knode_cosserat.learning.calibration.noise import Errors, errors_of, hidden_by_rounding
+from knode_cosserat.learning.calibration.noise import CoordinateErrors, errors_of, hidden_by_rounding
 from knode_cosserat.learning.calibration.rollouts import RolloutMisfit
 from knode_cosserat.learning.calibration.search import CalibrationError as CalibrationError
-from knode_cosserat.learning.calibration.search import Fit, Misfit
+from knode_cosserat.learning.calibration.search import Misfit, SearchResult
 from knode_cosserat.learning.calibration.unknowns import (
     Unknowns,
     found,
@@ -201,7 +201,7 @@ def _by_segments(robot: System, trajectories: Sequence[Trajectory], unknowns: Un
         return None
 
 
-def _ended(misfit: Misfit, start: np.ndarray, may_leave_out: bool) -> tuple[Fit, Errors]:
+def _ended(misfit: Misfit, start: np.ndarray, may_leave_out: bool) -> tuple[SearchResult, CoordinateErrors]:
     """Return the result of the search and its errors; undetermined parameters are left out or raise."""
     left_out: tuple[str, ...] = ()
     while True:
@@ -226,8 +226,8 @@ def _ended(misfit: Misfit, start: np.ndarray, may_leave_out: bool) -> tuple[Fit,
 
 
 def _with_its_own_past(
-    misfit: SegmentMisfit, ended: Fit, errors: Errors, may_leave_out: bool
-) -> tuple[SegmentMisfit, Fit, Errors]:
+    misfit: SegmentMisfit, ended: SearchResult, errors: CoordinateErrors, may_leave_out: bool
+) -> tuple[SegmentMisfit, SearchResult, CoordinateErrors]:
     """Repeat the search with the history between nodes from the calibrated robot, while the fit improves."""
     for _ in range(MOST_ROUNDS):
         numbers = found(misfit.unknowns, ended.coordinates)
@@ -244,7 +244,7 @@ def _with_its_own_past(
     return misfit, ended, errors
 
 
-def _calibration(misfit: Misfit, ended: Fit, errors: Errors, level: float) -> Calibration:
+def _calibration(misfit: Misfit, ended: SearchResult, errors: CoordinateErrors, level: float) -> Calibration:
     # imported here: it takes a third of a second
     from scipy.special import stdtrit
 

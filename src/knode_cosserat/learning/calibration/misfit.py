@@ -34,7 +34,7 @@ def by_group(squares: Any, groups: np.ndarray) -> Float[np.ndarray, " G"]:
     return np.bincount(groups, weights=squares) / np.bincount(groups)
 
 
-class Differences(NamedTuple):
+class LinearisedMisfit(NamedTuple):
     """Predictions minus data, and their derivatives with respect to the coordinates of the search."""
 
     values: Float[np.ndarray, " M"]
@@ -126,13 +126,13 @@ class SegmentMisfit:
 
     def __call__(
         self, coordinates: np.ndarray, moved: tuple[Samples, TipSamples] | None = None
-    ) -> Differences:
+    ) -> LinearisedMisfit:
         """Return differences at the samples, or at `moved` samples of the same shape."""
         data = self._on_device if moved is None else moved
         slopes, values = _differences_and_slopes(
             self.robot, coordinates, data, self.length, self.unknowns, self.data.space
         )
-        return Differences(np.asarray(values), np.asarray(slopes))
+        return LinearisedMisfit(np.asarray(values), np.asarray(slopes))
 
     def looking_back_on(self, model: System) -> SegmentMisfit | None:
         """Return a copy with the history between nodes from a model; None if the nodes hold all of it."""

@@ -20,14 +20,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.learning.calibration.misfit import LEAST, Differences
+from knode_cosserat.learning.calibration.misfit import LEAST, LinearisedMisfit
 from knode_cosserat.learning.calibration.unknowns import Unknowns, found, with_coordinates, with_numbers
 from knode_cosserat.learning.samples import DataError, samples
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.history import Past, initial_past, resting_past
-from knode_cosserat.solvers.initial import Run, beginning
+from knode_cosserat.solvers.initial import SimulationRun, beginning
 from knode_cosserat.solvers.places import Places, places_at, positions_at, quaternions_at
 from knode_cosserat.solvers.run import run_one
 from knode_cosserat.solvers.sensitivity import tangent_march
@@ -180,7 +180,7 @@ class RolloutMisfit:
         if not self.rollouts:
             raise DataError("there are no trajectories to compare with")
         self._begun = False
-        self._kept: dict[bytes, Differences] = {}
+        self._kept: dict[bytes, LinearisedMisfit] = {}
         self._known = [np.isfinite(one.target).ravel() for one in self.rollouts]
         #: compared fields; separate for each recording, because the model's error may differ between them
         self.fields, self._natural, self._groups = self._fields_of(given, sizes)
@@ -215,17 +215,17 @@ class RolloutMisfit:
             [number[each] for each in groups],
         )
 
-    def __call__(self, coordinates: np.ndarray) -> Differences:
+    def __call__(self, coordinates: np.ndarray) -> LinearisedMisfit:
         """Return differences of all rollouts; infinite if a rollout has no solution. The last are cached."""
         key = np.asarray(coordinates).tobytes()
         if key not in self._kept:
             self._kept = {key: self._computed(coordinates)}
         return self._kept[key]
 
-    def _computed(self, coordinates: np.ndarray) -> Differences:
+    def _computed(self, coordinates: np.ndarray) -> LinearisedMisfit:
         system = with_numbers(self.robot, self.unknowns, found(self.unknowns, coordinates))
 
-        def work(rollout: _Rollout) -> Differences | None:
+        def work(rollout: _Rollout) -> LinearisedMisfit | None:
             return self._of_one(system, coordinates, rollout)
 
         if self._begun:
@@ -234,19 +234,19 @@ class RolloutMisfit:
         else:  # programs are compiled one by one
             self._begun, parts = True, list(map(work, self.rollouts))
         solved = [
-            Differences(part.values[known], part.slopes[known])
+            LinearisedMisfit(part.values[known], part.slopes[known])
             for part, known in zip(parts, self._known, strict=True)
             if part is not None
         ]
         if len(solved) < len(parts):
             size = len(self.groups)
-            return Differences(np.full(size, np.inf), np.zeros((size, len(coordinates))))
+            return LinearisedMisfit(np.full(size, np.inf), np.zeros((size, len(coordinates))))
         values, slopes = zip(*solved, strict=True)
-        return Differences(np.concatenate(values), np.concatenate(slopes))
+        return LinearisedMisfit(np.concatenate(values), np.concatenate(slopes))
 
-    def _of_one(self, system: System, coordinates: np.ndarray, rollout: _Rollout) -> Differences | None:
+    def _of_one(self, system: System, coordinates: np.ndarray, rollout: _Rollout) -> LinearisedMisfit | None:
         settings, dt, initial, control, places, target = rollout
-        begins = beginning(Run(system, control, initial, settings, dt, None, False))
+        begins = beginning(SimulationRun(system, control, initial, settings, dt, None, False))
         task = Task(settings, dt, len(control), begins.first)
         steps, _ = run_one(task, system, control, begins.start)
         if steps.result.min() < 0:
@@ -258,7 +258,7 @@ class RolloutMisfit:
             self.robot, coordinates, rows, task.table, dt, self.unknowns, settings, self.oriented,
             begins.first == "start",
         )  # fmt: skip
-        return Differences(np.asarray(values), np.asarray(slopes))
+        return LinearisedMisfit(np.asarray(values), np.asarray(slopes))
 
     def blocks(self, values: Float[np.ndarray, " M"]) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return for each trajectory the field (n,) of a row's differences, and the differences (R, n)."""

@@ -58,7 +58,7 @@ def _is_weight(node: Any, path: Any, leaf: Any) -> bool:
 # predictions of the nominal model
 
 
-class Known(NamedTuple):
+class NominalPredictions(NamedTuple):
     """Predictions of the samples (S) by the nominal model alone, and a network's scaled inputs."""
 
     #: at the starts of segments, then at their ends if the scheme uses them; the last row is ones, for the
@@ -70,7 +70,7 @@ class Known(NamedTuple):
     steps: Float[Any, "2"]
 
 
-def known(net: Network, knowledge: System, samples: Samples, space: SpaceScheme) -> Known:
+def known(net: Network, knowledge: System, samples: Samples, space: SpaceScheme) -> NominalPredictions:
     """Evaluate the terms that do not depend on a network's weights; for schemes without stages."""
     steps = knowledge.length / (knowledge.nodes - 1) * jnp.asarray(space.formula.weights[:2])
 
@@ -90,10 +90,10 @@ def known(net: Network, knowledge: System, samples: Samples, space: SpaceScheme)
 
     inputs, y, z = jax.vmap(one, out_axes=-1)(samples)
     joined = jnp.concatenate(inputs, axis=1)
-    return Known(jnp.concatenate([joined, jnp.ones_like(joined[:1])]), y, z, steps)
+    return NominalPredictions(jnp.concatenate([joined, jnp.ones_like(joined[:1])]), y, z, steps)
 
 
-def corrected(net: Network, known: Known) -> tuple[Float[Any, "y S"], Float[Any, "z S"]]:
+def corrected(net: Network, known: NominalPredictions) -> tuple[Float[Any, "y S"], Float[Any, "z S"]]:
     """Return the predictions of all samples by nominal model and network, equal to `samples.predict`.
 
     Hidden units first and the biases as an additional column was the fastest layout tried (0.61 s for 1000
@@ -174,13 +174,13 @@ class Recipe(NamedTuple):
     noisy: bool
 
 
-class Data(NamedTuple):
+class TrainingData(NamedTuple):
     """Inputs of an epoch besides the weights: `known` if predictions are fixed, otherwise `samples`."""
 
     knowledge: System
     rest: Any
     samples: Samples | None
-    known: Known | None
+    known: NominalPredictions | None
     loss: Loss
     y_spread: Float[Any, " y"]
     history_spread: Float[Any, " x"]
@@ -199,7 +199,7 @@ class State(NamedTuple):
     key: UInt32[Any, "G 2"]
 
 
-def _loss(weights: Any, recipe: Recipe, data: Data, noise: Any, key: Any) -> Any:
+def _loss(weights: Any, recipe: Recipe, data: TrainingData, noise: Any, key: Any) -> Any:
     residual = eqx.combine(weights, data.rest)
     if data.known is not None:
         return data.loss(*corrected(residual, data.known))
@@ -218,7 +218,7 @@ def _adds(residual: Residual, space: SpaceScheme, knowledge: System) -> bool:
     return isinstance(residual, Network) and not space.formula.stages and not parted
 
 
-def _noisy(samples: Samples, data: Data, noise: Any, key: Any) -> Samples:
+def _noisy(samples: Samples, data: TrainingData, noise: Any, key: Any) -> Samples:
     """Return samples with noise in states and histories at the segments' starts; targets are unchanged."""
     for_y, for_history = jax.random.split(key)
     y = samples.y + noise * data.y_spread * jax.random.normal(for_y, samples.y.shape)
@@ -246,7 +246,7 @@ def plateau(numbers: Numbers, loss: Any, rate: Any, best: Any, waited: Any) -> t
     )
 
 
-def _epoch(recipe: Recipe, numbers: Numbers, data: Data, epoch: Any, of_seed: Any) -> Any:
+def _epoch(recipe: Recipe, numbers: Numbers, data: TrainingData, epoch: Any, of_seed: Any) -> Any:
     """Run one update of one seed: return its new state, the loss before, and the rate."""
     weights, adam, rate, best, waited, key = of_seed
     fresh = jax.random.fold_in(key, epoch) if recipe.noisy else None
@@ -267,7 +267,7 @@ def _epoch(recipe: Recipe, numbers: Numbers, data: Data, epoch: Any, of_seed: An
 
 @functools.partial(jax.jit, static_argnames="recipe")
 def run_epochs(
-    recipe: Recipe, numbers: Numbers, data: Data, state: State, stop: Any
+    recipe: Recipe, numbers: Numbers, data: TrainingData, state: State, stop: Any
 ) -> tuple[State, Float[Any, "PIECE G"], Float[Any, "PIECE G"]]:
     """Run epochs up to `stop`, at most `PIECE`: return the new state, the losses and the rates.
 
@@ -302,7 +302,7 @@ def _side_by_side(update: Any, of_seeds: Any) -> Any:
 
 def prepared(
     knowledge: System, residual: Residual, dataset: Dataset, training: Training
-) -> tuple[Recipe, Numbers, Data]:
+) -> tuple[Recipe, Numbers, TrainingData]:
     """Return the program's inputs besides its state."""
     segments = dataset.segments
     recipe = Recipe(dataset.space, training.schedule, training.noise > 0.0)
@@ -319,7 +319,7 @@ def prepared(
     )
     per_y, per_z = sizes(knowledge.y_layout), sizes(knowledge.z_layout)
     fields = [*per_y, *per_z, *(per_y if knowledge.mixed else [])]
-    data = Data(
+    data = TrainingData(
         knowledge, rest, None if ready else segments, ready,
         loss_for(training.loss, knowledge, segments),
         spread(segments.y, per_y), spread(segments.history[:, 0], fields),

@@ -13,14 +13,14 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.recordings.estimation import balance, kinematics
-from knode_cosserat.recordings.estimation.observations import Part
+from knode_cosserat.recordings.estimation.observations import RecordingPart
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.settings import Settings
 
 
 def states(
-    part: Part, robot: System, control: Float[np.ndarray, "T c"], settings: Settings
+    part: RecordingPart, robot: System, control: Float[np.ndarray, "T c"], settings: Settings
 ) -> tuple[Float[np.ndarray, "T N y"], Float[np.ndarray, "T N z"]]:
     """Return y and z of the rows. Raises `RecordingError` if a body has no orientation."""
     rows = part.rows

@@ -22,7 +22,7 @@ from knode_cosserat.rods.parameters import parameter
 from knode_cosserat.rods.section import Stretch
 from knode_cosserat.rods.slender_rod import SlenderRod
 from knode_cosserat.studies.cables import frames
-from knode_cosserat.studies.cables.shapes import Fitter, Grid, Shape
+from knode_cosserat.studies.cables.shapes import CableGrid, CableShape, Fitter
 from knode_cosserat.trajectory import Trajectory
 
 #: time between frames (s): motion capture at 100 Hz
@@ -195,14 +195,14 @@ class CableModel:
         key = float(p.stretch)
         found = self._fitters.get(key)
         if found is None:
-            found = Fitter(Grid(self.places * key, 2 * (self.nodes - 1)))
+            found = Fitter(CableGrid(self.places * key, 2 * (self.nodes - 1)))
             # a new dictionary, for other threads may be reading the old one
             self._fitters = {**dict(list(self._fitters.items())[-4:]), key: found}
         return found
 
     def shapes(
-        self, p: CableParameters, markers: Any, start: Sequence[Shape] | None = None
-    ) -> tuple[Shape, Shape]:
+        self, p: CableParameters, markers: Any, start: Sequence[CableShape] | None = None
+    ) -> tuple[CableShape, CableShape]:
         """Return the shapes of the first two frames, from those of nearly the same parameters if given."""
         offset = np.array([*p.offset, 0.0])
         fitter, (base, tip) = self.fitter(p), self.end_frames(p, markers[:2])
@@ -212,8 +212,8 @@ class CableModel:
         return first, second
 
     def prepared(
-        self, p: CableParameters, markers: Any, start: Sequence[Shape] | None = None
-    ) -> tuple[Prepared, tuple[Shape, Shape]]:
+        self, p: CableParameters, markers: Any, start: Sequence[CableShape] | None = None
+    ) -> tuple[Prepared, tuple[CableShape, CableShape]]:
         """Return a motion ready to be simulated, and the shapes at its start."""
         shapes = self.shapes(p, markers, start)
         beside = shapes[0].beside

@@ -20,7 +20,7 @@ from jaxtyping import Float
 
 from knode_cosserat.studies.cables import frames
 from knode_cosserat.studies.cables.model import CableModel, CableParameters, Grips
-from knode_cosserat.studies.cables.shapes import Fitter, Grid
+from knode_cosserat.studies.cables.shapes import CableGrid, Fitter
 
 #: points of a piece at which its turning is summed
 POINTS = 8
@@ -64,7 +64,7 @@ def grip_tangents(
     model: CableModel, p: CableParameters, motions: Sequence[Float[np.ndarray, "T N 3"]]
 ) -> CableParameters:
     """Return the parameters with tangents in the grips as shapes with loosely held ends have them."""
-    fitter = Fitter(Grid(model.places * p.stretch, 2 * (model.nodes - 1)), LOOSE)
+    fitter = Fitter(CableGrid(model.places * p.stretch, 2 * (model.nodes - 1)), LOOSE)
     offset = np.array([*p.offset, 0.0])
     off: list[list[Any]] = [[], []]
     for markers in motions:
