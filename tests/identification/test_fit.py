@@ -8,7 +8,7 @@ import pytest
 import knode_cosserat as kc
 from knode_cosserat.identification.evaluate import coverage, evaluate
 from knode_cosserat.identification.fit import coordinates, fit
-from knode_cosserat.identification.given import poses_of
+from knode_cosserat.identification.inputs import poses_of
 from knode_cosserat.identification.model import Model
 from knode_cosserat.identification.residual import PositionErrors, _verdict
 from knode_cosserat.identification.result import Estimate, Identified

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from knode_cosserat.identification.evaluate import evaluate
-from knode_cosserat.identification.given import DT, measurements_of, names_of, padded, poses_of
 from knode_cosserat.identification.identify import identify
+from knode_cosserat.identification.inputs import DT, measurements_of, names_of, padded, poses_of
 from knode_cosserat.identification.misfit import Misfit, RecordingData, data_of
 from knode_cosserat.identification.model import Model
 from knode_cosserat.identification.residual import LearnedResidual, learn_residual

@@ -10,7 +10,7 @@ import numpy as np
 
 from knode_cosserat._yaml import did_you_mean
 from knode_cosserat.errors import KnodeCosseratError
-from knode_cosserat.identification.given import SELECTED_DT, coarser, measurements_of, names_of, padded
+from knode_cosserat.identification.inputs import SELECTED_DT, coarser, measurements_of, names_of, padded
 from knode_cosserat.identification.intervals import estimates_of
 from knode_cosserat.identification.journal import Journal
 from knode_cosserat.identification.misfit import Misfit, RecordingData, data_of

@@ -19,13 +19,13 @@ from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.load_cells import LoadCells
 from knode_cosserat.rotation import conjugate, quaternion_product
 from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.history import initial_past, resting_past
+from knode_cosserat.solvers.history import constant_history, resting_history
 from knode_cosserat.solvers.places import Places, places_at, positions_at, quaternions_at
 from knode_cosserat.solvers.run import run_one, usable_cores
+from knode_cosserat.solvers.run_types import FirstStep, InitialCondition, RunSettings
 from knode_cosserat.solvers.sensitivity import tangent_piece
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.solvers.task import FirstStep, Start, Task
 
 #: rows of one compiled program with derivatives
 PIECE = 40
@@ -167,7 +167,10 @@ class Misfit:
         # controls have room for a motion: one program for equilibrium and motion
         still = np.broadcast_to(data.initial_tension, data.tension.shape)
         first, _ = run_one(
-            Task(settings, data.dt, 1, "still", RECOVERY), system, still, Start(past, still[0])
+            RunSettings(settings, data.dt, 1, "still", RECOVERY),
+            system,
+            still,
+            InitialCondition(past, still[0]),
         )
         if first.result[0] < 0:
             return None
@@ -178,8 +181,8 @@ class Misfit:
             else _initial(system, settings, first.records[0][:, :count], data.initial_tension)
         )
         kind: FirstStep = "still" if data.static else "start"
-        task = Task(settings, data.dt, max(steps, 1), kind, recovery_budget=RECOVERY)
-        found, _ = run_one(task, system, acting, Start(begun, data.initial_tension))
+        task = RunSettings(settings, data.dt, max(steps, 1), kind, recovery_budget=RECOVERY)
+        found, _ = run_one(task, system, acting, InitialCondition(begun, data.initial_tension))
         if found.result.min() < 0:
             return None
         ny = system.y_layout.size
@@ -263,8 +266,8 @@ def _system(robot: ParametrisedRobot, x: Any) -> Any:
     return robot(x)
 
 
-_resting = jax.jit(resting_past, static_argnames="settings")
-_initial = jax.jit(initial_past, static_argnames="settings")
+_resting = jax.jit(resting_history, static_argnames="settings")
+_initial = jax.jit(constant_history, static_argnames="settings")
 
 
 @functools.partial(jax.jit, static_argnames="settings")

@@ -10,7 +10,7 @@ from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.findings import SEVERITIES, Finding, RecordingError
 from knode_cosserat.recordings.frame import placed
 from knode_cosserat.recordings.messages import Stream
-from knode_cosserat.recordings.plausible import units_doubted
+from knode_cosserat.recordings.plausibility import units_doubted
 from knode_cosserat.recordings.recording import Recording
 
 

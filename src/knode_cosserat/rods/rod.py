@@ -245,7 +245,7 @@ class Rod(ElasticRod):
         """True if a point load acts before the tip."""
         return any(isinstance(load, PointLoad) and load.at < 1.0 for load in self.loads)
 
-    def crossed(
+    def jump(
         self, acting: Float[Any, " cuts"], t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> Float[Any, " y"]:
         """Return y on the far side of the acting cuts: n and m less the point loads there."""

@@ -12,7 +12,7 @@ from knode_cosserat.rods.system import System, in_strands
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.result import Code, Codes, Result, SimulationError
 from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.statics.asked import (
+from knode_cosserat.statics.arguments import (
     checked_control,
     checked_limits,
     checked_numbers,

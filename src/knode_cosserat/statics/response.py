@@ -18,7 +18,7 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import Solution, factors_of, newton, pivots_of
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.history import rest_record
-from knode_cosserat.solvers.linear import solved
+from knode_cosserat.solvers.linear import solved_correction
 from knode_cosserat.solvers.problem import StepProblem, row_of
 from knode_cosserat.solvers.settings import Settings
 
@@ -118,11 +118,11 @@ def respond(system, settings, pose, control, y, unknowns):  # type: ignore[no-un
             return *problem.residuals(found.y), problem.base(found.unknowns)
 
         defects, tip, base = jax.jvp(at_solution, (control,), (d_control,))[1]
-        dy, _ = solved(factors, pivots, defects, tip, base)
+        dy, _ = solved_correction(factors, pivots, defects, tip, base)
         return twist(system, pose, found.y[-1], dy[-1])
 
     def by_wrench(tip: Any) -> Any:
-        dy, _ = solved(factors, pivots, jnp.zeros_like(found.y[1:]), tip)
+        dy, _ = solved_correction(factors, pivots, jnp.zeros_like(found.y[1:]), tip)
         return twist(system, pose, found.y[-1], dy[-1])
 
     names = wrench_fields(system)

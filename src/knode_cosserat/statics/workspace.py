@@ -21,7 +21,7 @@ from knode_cosserat.solvers.result import Result, ResultCodes
 from knode_cosserat.solvers.run import usable_cores
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.statics.asked import (
+from knode_cosserat.statics.arguments import (
     checked_limits,
     checked_numbers,
     checked_system,

@@ -16,8 +16,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.learning.calibration.unknowns import Unknowns, found, with_coordinates, with_numbers
-from knode_cosserat.learning.samples import Dataset, Samples, TipSamples, predict, samples, told_by_rows
+from knode_cosserat.learning.calibration.unknowns import (
+    Unknowns,
+    searched_numbers,
+    with_coordinates,
+    with_numbers,
+)
+from knode_cosserat.learning.samples import (
+    Dataset,
+    Samples,
+    TipSamples,
+    predict_segment,
+    samples,
+    told_by_rows,
+)
 from knode_cosserat.rods.system import System, unpacked_history
 from knode_cosserat.trajectory import Trajectory
 
@@ -57,7 +69,7 @@ def _differences(robot, coordinates, data, length, unknowns, space):  # type: ig
 
     def of_segment(sample: Samples) -> Any:
         own = sample._replace(history=scaled(sample.history), later=scaled(sample.later))
-        y_next, z = predict(system, space, own)
+        y_next, z = predict_segment(system, space, own)
         return jnp.concatenate([y_next - sample.y_next, z - sample.z])
 
     def of_tip(sample: TipSamples) -> Any:
@@ -183,7 +195,7 @@ class SegmentMisfit:
 
         Noise is added to y only; z follows from y without an additional error.
         """
-        system = with_numbers(self.robot, self.unknowns, found(self.unknowns, coordinates))
+        system = with_numbers(self.robot, self.unknowns, searched_numbers(self.unknowns, coordinates))
         natural = LEAST * np.asarray(system.scales().y)
         noise = np.concatenate([natural, np.zeros(self.robot.z_layout.size)])
         change = self(coordinates, self.moved(self.draws[0], noise)).values - self(coordinates).values

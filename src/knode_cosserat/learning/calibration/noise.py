@@ -17,8 +17,8 @@ from jaxtyping import Float
 
 from knode_cosserat.learning.calibration.misfit import LinearisedMisfit, SegmentMisfit, by_group
 from knode_cosserat.learning.calibration.search import Misfit, SearchResult
+from knode_cosserat.learning.discontinuities import slopes_of
 from knode_cosserat.learning.samples import histories, past_of_segments, settings_of
-from knode_cosserat.learning.sides import slopes_of
 from knode_cosserat.trajectory import Trajectory
 
 #: relative accuracy of the numbers of states

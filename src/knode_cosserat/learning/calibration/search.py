@@ -12,11 +12,11 @@ from knode_cosserat.learning.calibration.misfit import SegmentMisfit, by_group
 from knode_cosserat.learning.calibration.rollouts import RolloutMisfit
 from knode_cosserat.learning.calibration.unknowns import (
     Unknowns,
-    found,
-    labels,
     limits,
     logarithmic,
+    number_names,
     searched,
+    searched_numbers,
     values,
 )
 
@@ -92,7 +92,7 @@ class Gap(NamedTuple):
     every: bool
 
 
-def fit(
+def search_coordinates(
     misfit: Misfit, start: Float[np.ndarray, " n"], may_leave_out: bool, left_out: tuple[str, ...] = ()
 ) -> SearchResult:
     """Search from a start, with weights from the remaining differences.
@@ -259,7 +259,9 @@ def _magnitudes(misfit: Misfit, ended: SearchResult) -> Float[np.ndarray, " n"]:
     """Return the largest size of each number's parameter, before or after; its range if all are zero."""
     unknowns = misfit.unknowns
     names = np.array(labels_of(unknowns))
-    largest = np.maximum(np.abs(values(misfit.robot, unknowns)), np.abs(found(unknowns, ended.coordinates)))
+    largest = np.maximum(
+        np.abs(values(misfit.robot, unknowns)), np.abs(searched_numbers(unknowns, ended.coordinates))
+    )
     low, high = limits(misfit.robot, unknowns)
     largest = np.array([np.max(largest[names == name]) for name in names])
     return np.where(largest > 0.0, largest, high - low)
@@ -277,8 +279,8 @@ def _check_range(misfit: Misfit, ended: SearchResult) -> None:
     """Raise if a number ended at a limit of its allowed range; a limit of zero is accepted."""
     unknowns = misfit.unknowns
     low, high = limits(misfit.robot, unknowns)
-    numbers = found(unknowns, ended.coordinates)
-    for k, label in enumerate(labels(unknowns)):
+    numbers = searched_numbers(unknowns, ended.coordinates)
+    for k, label in enumerate(number_names(unknowns)):
         end = high[k] if high[k] - numbers[k] < numbers[k] - low[k] else low[k]
         if ended.free[k] and end != 0.0 and abs(numbers[k] - end) <= 1e-6 * abs(end):
             raise CalibrationError(

@@ -2,7 +2,7 @@
 
 With a scheme without stages, a network adds to the prediction of the nominal model. That prediction does not
 depend on the weights and is evaluated once; an epoch is then two matrix products and their derivatives. Other
-schemes and residuals are predicted in every epoch by `samples.predict`.
+schemes and residuals are predicted in every epoch by `samples.predict_segment`.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from jaxtyping import Float, Int, UInt32
 from knode_cosserat.learning.config import Training
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import Network, Residual, elu, input_layout
-from knode_cosserat.learning.samples import Dataset, Samples, end_of, predict
-from knode_cosserat.learning.training.losses import Loss, loss_for, sizes, spread
+from knode_cosserat.learning.samples import Dataset, Samples, end_of, predict_segment
+from knode_cosserat.learning.training.losses import Loss, field_sizes, loss_for, value_scales
 from knode_cosserat.rods.system import System, unpacked_history
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.space import Euler, SpaceScheme
@@ -70,7 +70,9 @@ class NominalPredictions(NamedTuple):
     steps: Float[Any, "2"]
 
 
-def known(net: Network, knowledge: System, samples: Samples, space: SpaceScheme) -> NominalPredictions:
+def nominal_predictions(
+    net: Network, knowledge: System, samples: Samples, space: SpaceScheme
+) -> NominalPredictions:
     """Evaluate the terms that do not depend on a network's weights; for schemes without stages."""
     steps = knowledge.length / (knowledge.nodes - 1) * jnp.asarray(space.formula.weights[:2])
 
@@ -79,7 +81,7 @@ def known(net: Network, knowledge: System, samples: Samples, space: SpaceScheme)
         return (inputs - net.input_mean) / net.input_scale
 
     def one(sample: Samples) -> Any:
-        y, z = predict(knowledge, space, sample)
+        y, z = predict_segment(knowledge, space, sample)
         inputs = [seen(sample, sample.y, z, sample.history[0])]
         if space.implicit:
             history = unpacked_history(knowledge, sample.c0, sample.history[1])
@@ -94,7 +96,7 @@ def known(net: Network, knowledge: System, samples: Samples, space: SpaceScheme)
 
 
 def corrected(net: Network, known: NominalPredictions) -> tuple[Float[Any, "y S"], Float[Any, "z S"]]:
-    """Return the predictions of all samples by nominal model and network, equal to `samples.predict`.
+    """Return the predictions of all samples by nominal model and network, equal to `samples.predict_segment`.
 
     Hidden units first and the biases as an additional column was the fastest layout tried (0.61 s for 1000
     epochs of the paper's preset on one core, 0.54 s with `_product`; samples first 0.69 to 1.0 s).
@@ -139,17 +141,17 @@ def standardised(net: Network, knowledge: System, data: Dataset) -> Network:
     return dataclasses.replace(
         net,
         input_mean=jnp.asarray(inputs.mean(axis=0)),
-        input_scale=jnp.asarray(spread(inputs, sizes(input_layout(knowledge, net.history)))),
+        input_scale=jnp.asarray(value_scales(inputs, field_sizes(input_layout(knowledge, net.history)))),
         output_scale=jnp.asarray(scale),
     )
 
 
-_known = jax.jit(known, static_argnames="space")
+_known = jax.jit(nominal_predictions, static_argnames="space")
 
 
 @functools.partial(jax.jit, static_argnames="space")
 def _predicted(system: System, space: SpaceScheme, samples: Samples) -> Any:
-    return jax.vmap(lambda one: predict(system, space, one), out_axes=-1)(samples)
+    return jax.vmap(lambda one: predict_segment(system, space, one), out_axes=-1)(samples)
 
 
 # the program
@@ -207,9 +209,11 @@ def _loss(weights: Any, recipe: Recipe, data: TrainingData, noise: Any, key: Any
     if recipe.noisy:
         samples = _noisy(samples, data, noise, key)
     if _adds(residual, recipe.space, data.knowledge):
-        return data.loss(*corrected(residual, known(residual, data.knowledge, samples, recipe.space)))
+        return data.loss(
+            *corrected(residual, nominal_predictions(residual, data.knowledge, samples, recipe.space))
+        )
     model = KNODE(data.knowledge, residual)
-    return data.loss(*jax.vmap(lambda one: predict(model, recipe.space, one), out_axes=-1)(samples))
+    return data.loss(*jax.vmap(lambda one: predict_segment(model, recipe.space, one), out_axes=-1)(samples))
 
 
 def _adds(residual: Residual, space: SpaceScheme, knowledge: System) -> bool:
@@ -317,12 +321,12 @@ def prepared(
         if _adds(residual, dataset.space, knowledge) and not recipe.noisy
         else None
     )
-    per_y, per_z = sizes(knowledge.y_layout), sizes(knowledge.z_layout)
+    per_y, per_z = field_sizes(knowledge.y_layout), field_sizes(knowledge.z_layout)
     fields = [*per_y, *per_z, *(per_y if knowledge.mixed else [])]
     data = TrainingData(
         knowledge, rest, None if ready else segments, ready,
         loss_for(training.loss, knowledge, segments),
-        spread(segments.y, per_y), spread(segments.history[:, 0], fields),
+        value_scales(segments.y, per_y), value_scales(segments.history[:, 0], fields),
     )  # fmt: skip
     return recipe, numbers, jax.tree.map(jnp.asarray, data)
 
