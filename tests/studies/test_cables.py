@@ -16,7 +16,7 @@ from knode_cosserat.studies.cables.correction import learned_correction
 from knode_cosserat.studies.cables.identification import SearchStage, identify_cable
 from knode_cosserat.studies.cables.model import DT, CableModel, CableParameters, Grips
 from knode_cosserat.studies.cables.places import marker_places
-from knode_cosserat.studies.cables.rollouts import CHUNK, NAMES, Rollouts, coordinates, parameters_of
+from knode_cosserat.studies.cables.rollouts import CHUNK, NAMES, Rollouts, cable_coordinates, cable_parameters
 from knode_cosserat.studies.cables.shapes import CableGrid, Fitter
 
 SPACE, NODES = "lobatto2", 9
@@ -79,14 +79,14 @@ def test_frames_follow_a_curve_and_meet_both_ends():
     rng = np.random.default_rng(0)
     edges = np.array([0.0, 0.0, 1.0]) + 0.3 * rng.normal(size=(50, 3)).cumsum(axis=0) / 10.0
     first = frames.shortest(frames.AXIS, frames.unit(edges[0]))
-    last = frames.product(
+    last = frames.quaternion_product(
         frames.shortest(frames.AXIS, frames.unit(edges[-1])), frames.from_vector(0.4 * frames.AXIS)
     )
     found = frames.along_curve(edges, first, last)
     np.testing.assert_allclose(
         frames.rotated(found, np.tile(frames.AXIS, (50, 1))), frames.unit(edges), atol=1e-9
     )
-    step = frames.to_vector(frames.product(frames.conjugate(found[-1]), last))
+    step = frames.to_vector(frames.quaternion_product(frames.conjugate(found[-1]), last))
     assert np.abs(step).max() < 0.05
 
 
@@ -113,7 +113,7 @@ def test_places_of_markers_are_near_the_true_ones(motions):
 
 
 def test_coordinates_go_there_and_back():
-    again = parameters_of(coordinates(TRUE))
+    again = cable_parameters(cable_coordinates(TRUE))
     for field in dataclasses.fields(TRUE):
         np.testing.assert_allclose(getattr(again, field.name), getattr(TRUE, field.name), rtol=1e-12)
 
@@ -121,7 +121,7 @@ def test_coordinates_go_there_and_back():
 @pytest.mark.campaign
 def test_long_motions_are_those_of_one_simulation(motions, rollouts):
     markers = np.concatenate([motions[0], motions[0][::-1]] * 2)[: 2 * CHUNK + 2]
-    values, _ = rollouts.columns(coordinates(TRUE), markers, "long")
+    values, _ = rollouts.columns(cable_coordinates(TRUE), markers, "long")
     predicted = rollouts.predict(TRUE, markers)
     assert predicted.markers is not None and predicted.failure == ""
     np.testing.assert_allclose(values, predicted.markers - markers[2:, 2:-2], atol=2e-4)
@@ -129,7 +129,7 @@ def test_long_motions_are_those_of_one_simulation(motions, rollouts):
 
 @pytest.mark.campaign
 def test_derivatives_are_those_of_the_rollout(motions, rollouts):
-    x, markers = coordinates(TRUE.replace(eccentric=0.2)), motions[0]
+    x, markers = cable_coordinates(TRUE.replace(eccentric=0.2)), motions[0]
     values, slopes = rollouts.columns(x, markers, "key")
     for name in ("bending", "curvature0", "eccentric", "tip_tangent1", "twist"):
         slope, step = slopes[NAMES.index(name)], 0.01 * np.eye(len(x))[NAMES.index(name)]
@@ -213,7 +213,7 @@ class OneBreaks:
     """Rollouts off by the logarithm of the stiffness; one piece can be simulated at the start only."""
 
     def __init__(self, start):
-        self.start = coordinates(start)
+        self.start = cable_coordinates(start)
 
     def forget(self):
         pass

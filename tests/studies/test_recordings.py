@@ -173,8 +173,8 @@ def test_a_model_that_fails_is_reported_soon(folder, monkeypatch, solved):
 
     monkeypatch.setattr(study, "evaluate", failing)
     monkeypatch.setitem(study.METHODS, "baseline", nothing_learned)
-    paths = study.found(folder)
-    train, _ = study.chosen(list(paths), ["sine_1p0"])
+    paths = study.recordings_in(folder)
+    train, _ = study.recording_split(list(paths), ["sine_1p0"])
     jobs = study.jobs(paths, train, ["baseline"], study.RecordingsOptions(seconds=3.0))
     product = study.predicted(next(each for each in jobs if each.key == "baseline").settings)
     assert given == [0.0] * len(paths) + [study.RECOVERY] * (solved > 0)
@@ -198,8 +198,8 @@ def test_what_is_nearly_all_is_not_all():
 
 def test_which_are_learned_from():
     names = ["a", "rand_0", "sine_1p0", "sine_3p0", "step"]
-    assert study.chosen(names, None) == (["sine_1p0", "sine_3p0", "rand_0"], ["a", "step"])
-    assert study.chosen(names, ["a"])[1] == ["rand_0", "sine_1p0", "sine_3p0", "step"]
+    assert study.recording_split(names, None) == (["sine_1p0", "sine_3p0", "rand_0"], ["a", "step"])
+    assert study.recording_split(names, ["a"])[1] == ["rand_0", "sine_1p0", "sine_3p0", "step"]
 
 
 @pytest.mark.parametrize(
@@ -216,7 +216,7 @@ def test_folders_that_will_not_do(tmp_path, files, train, parts):
     for name in files:
         (tmp_path / name).touch()
     with pytest.raises(StudyError) as error:
-        study.chosen(list(study.found(tmp_path)), train)
+        study.recording_split(list(study.recordings_in(tmp_path)), train)
     message = str(error.value)
     assert "\n" not in message and all(part in message for part in parts)
 

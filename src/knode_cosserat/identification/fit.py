@@ -11,7 +11,7 @@ import numpy as np
 
 from knode_cosserat.identification.evaluate import evaluate
 from knode_cosserat.identification.identify import identify
-from knode_cosserat.identification.inputs import DT, measurements_of, names_of, padded, poses_of
+from knode_cosserat.identification.inputs import DT, measurements_of, names_of, padded, poses_of_nodes
 from knode_cosserat.identification.misfit import Misfit, RecordingData, data_of
 from knode_cosserat.identification.model import Model
 from knode_cosserat.identification.residual import LearnedResidual, learn_residual
@@ -143,13 +143,13 @@ def with_residual(
         raise DataError("there is one recording; a residual needs two at least, for one is left out in turn")
     tension = np.concatenate([each.tension for each in measured])
     model = Model(nominal, tension, measured[0].fractions)  # type: ignore[arg-type]
-    x = coordinates(model, found)
+    x = coordinates_of(model, found)
     robot = model.reduced(x, found.effects)
     both = ResidualModel(model, found.effects, passive(robot, tension, seed, hidden))
     return learn_residual(both, x, _data(measured, model), space, progress or log.info)
 
 
-def coordinates(model: Model, found: Identified) -> np.ndarray:
+def coordinates_of(model: Model, found: Identified) -> np.ndarray:
     """Return the coordinates of an identified robot, by its estimates."""
     x = np.zeros(model.size)
     for name in found.effects:
@@ -173,7 +173,7 @@ def _measured(given: Sequence[Any]) -> tuple[list[Measurements], list[str]]:
     found, words = [], []
     for k, each in enumerate(given):
         if isinstance(each, Trajectory):
-            found.append(poses_of(each, f"trajectory {k}"))
+            found.append(poses_of_nodes(each, f"trajectory {k}"))
             words.append(f"trajectory {k}: poses of its {len(each.time)} rows, not its other states")
             continue
         (rows,) = measurements_of([each])

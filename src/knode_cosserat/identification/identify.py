@@ -18,7 +18,7 @@ from knode_cosserat.identification.model import Model
 from knode_cosserat.identification.result import Estimate, Identified
 from knode_cosserat.identification.search import Point, Search, SearchError
 from knode_cosserat.identification.selection import held_out, selected, sizes, without_idle
-from knode_cosserat.identification.trials import failed_trial, is_coarse, trained_range
+from knode_cosserat.identification.trials import failed_trial, has_coarse_rows, trained_range
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
 from knode_cosserat.rods.parameters import ParameterError
@@ -131,7 +131,7 @@ def _refined(
     space, tell = search.misfit.settings.space, search.tell
     for _ in range(REFINEMENTS):
         model, data = search.misfit.model, search.misfit.data
-        if not is_coarse(model.reduced(point.x, names), data, space):
+        if not has_coarse_rows(model.reduced(point.x, names), data, space):
             break
         nodes = 2 * model.nominal.nodes
         tell(f"the grid of {model.nominal.nodes} nodes is too coarse: {nodes} nodes")

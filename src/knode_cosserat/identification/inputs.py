@@ -76,7 +76,7 @@ def coarser(data: RecordingData) -> RecordingData:
     )  # fmt: skip
 
 
-def poses_of(trajectory: Trajectory, name: str) -> Measurements:
+def poses_of_nodes(trajectory: Trajectory, name: str) -> Measurements:
     """Return the poses of a trajectory's nodes as if they had been measured, with its controls as tensions.
 
     Raises:

@@ -48,7 +48,7 @@ def failed_trial(robot: System, data: Sequence[RecordingData], space: str | Spac
     return f"random tensions: {reason}" if reason else None
 
 
-def is_coarse(robot: System, data: Sequence[RecordingData], space: str | SpaceScheme) -> bool:
+def has_coarse_rows(robot: System, data: Sequence[RecordingData], space: str | SpaceScheme) -> bool:
     """Return True if the grid is too coarse in more than a few rows of the recordings.
 
     A robot that cannot be simulated is not too coarse: `failed_trial` reports it.

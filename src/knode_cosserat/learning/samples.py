@@ -188,7 +188,7 @@ def samples(
     return Dataset(segments, tips, settings_of(trajectories[0]).space, len(ends), doubt)
 
 
-def told_by_rows(knowledge: System, trajectories: Sequence[Trajectory]) -> bool:
+def rows_are_states(knowledge: System, trajectories: Sequence[Trajectory]) -> bool:
     """True if the rows hold every state that steps need, or were not simulated."""
     made = [each.settings for each in trajectories]
     return all(settings is None or rows_suffice(knowledge, settings.space) for settings in made)
@@ -277,14 +277,14 @@ def _past_of_rows(
     simulated = trajectory.settings is not None
     known = histories_along(model, trajectory) if model is not None and simulated else None
     if known is None:
-        past = jax.vmap(lambda each: past_of_segments(knowledge, space, each))(history)
+        past = jax.vmap(lambda each: segment_history(knowledge, space, each))(history)
     else:
         first, along = known
         past = jax.vmap(lambda each: in_segments(knowledge, space, each))(along[rows - first])
     return np.asarray(past[0]), np.asarray(past[1])
 
 
-def past_of_segments(knowledge: System, space: SpaceScheme, records: Float[Any, "nodes x"]) -> Any:
+def segment_history(knowledge: System, space: SpaceScheme, records: Float[Any, "nodes x"]) -> Any:
     """Return `Samples.history` and `Samples.later` of one row's segments, from its history at the nodes."""
     return in_segments(knowledge, space, at_places(knowledge, space, records))
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 TABLES = (".csv", ".parquet")
 
 
-def measured(trajectory: Trajectory, fractions: Sequence[float]) -> dict[str, Any]:
+def measurement_fields(trajectory: Trajectory, fractions: Sequence[float]) -> dict[str, Any]:
     """Return the fields of `Measurements` for a trajectory; see `Measurements.of`."""
     y, system = np.asarray(trajectory.y), trajectory.system
     if y.ndim == 4:

@@ -116,7 +116,7 @@ def record_virtual(
         raise RecordingError(f"the robot has {robot.control_size} controls; allowed is one with four tendons")
     sent = commands(signal, seconds)
     truth = driven(sent, sensors.lag, virtual_robot() if robot is None else robot)
-    poses, tension = measured(truth, sent, seed, sensors)
+    poses, tension = simulated_sensors(truth, sent, seed, sensors)
     config = RecordingConfig.paper_robot().replace(
         simulated=True, description=f"a virtual robot, simulated: {signal}"
     )
@@ -192,7 +192,7 @@ def driven(sent: Pulls, lag: float, robot: TendonRod) -> Trajectory:
 # sensors
 
 
-def measured(
+def simulated_sensors(
     truth: Trajectory, sent: Pulls, seed: int, sensors: Sensors
 ) -> tuple[dict[str, MocapPoses], Pulls]:
     """Return simulated motion capture (poses by the paper's marker names) and load cells of a motion."""

@@ -23,7 +23,7 @@ from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.statics.arguments import checked_control, checked_system, static_settings
-from knode_cosserat.statics.response import recorded, static_problem
+from knode_cosserat.statics.response import node_values, static_problem
 from knode_cosserat.statics.stability import stability
 from knode_cosserat.trajectory import Trajectory
 
@@ -211,7 +211,7 @@ def _corrected(system, settings, ends, start, tangent, plane):  # type: ignore[n
 def _trajectory(system: System, settings: Settings, walk: _Walk) -> Trajectory:
     controls = walk.ends[0] + np.array(walk.parts)[:, None] * (walk.ends[1] - walk.ends[0])
     rows = [
-        recorded(system, settings, control, jnp.asarray(y))
+        node_values(system, settings, control, jnp.asarray(y))
         for control, y in zip(controls, walk.y, strict=True)
     ]
     y, z = (np.stack([np.asarray(row[k]) for row in rows]) for k in (0, 1))

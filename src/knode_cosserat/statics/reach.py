@@ -15,11 +15,11 @@ from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.statics.arguments import (
     checked_control,
     checked_limits,
-    checked_numbers,
     checked_system,
+    checked_vectors,
     static_settings,
 )
-from knode_cosserat.statics.response import Pose, Response, first_solved, recorded, tip_pose
+from knode_cosserat.statics.response import Pose, Response, first_solved, node_values, tip_pose
 from knode_cosserat.statics.search import EquilibriumSearch, Wanted
 from knode_cosserat.trajectory import Trajectory
 
@@ -219,7 +219,7 @@ def _told(
     control = search.control(u)
     position, turned = wanted.errors(found)
     same = _from_rest(search, control, found)
-    y, z = recorded(search.system, search.settings, control, found.y)
+    y, z = node_values(search.system, search.settings, control, found.y)
     return InverseKinematics(
         result, control, np.asarray(found.position),
         None if found.quaternion is None else np.asarray(found.quaternion),
@@ -293,19 +293,19 @@ def _checked_wanted(
     given: dict[str, np.ndarray] = {}
     if position is not None:
         size = len(here)
-        given["position"] = checked_numbers("position", position, size, f"({size},) or (B, {size}) in m")
+        given["position"] = checked_vectors("position", position, size, f"({size},) or (B, {size}) in m")
     if quaternion is not None:
         if turned is None:
             raise ValueError(f"quaternion is given, but {type(system).__name__} has no orientation")
-        given["quaternion"] = checked_numbers("quaternion", quaternion, 4, "(4,) or (B, 4), scalar first")
+        given["quaternion"] = checked_vectors("quaternion", quaternion, 4, "(4,) or (B, 4), scalar first")
         if np.any(np.linalg.norm(given["quaternion"], axis=-1) < 1e-9):
             raise ValueError("quaternion is zero; allowed is any other length")
     if not given:
         raise ValueError("neither position nor quaternion is given; give one or both")
-    tolerance = float(checked_numbers("tolerance", np.atleast_1d(measured_by[1]), 1, "a number", most=1)[0])
+    tolerance = float(checked_vectors("tolerance", np.atleast_1d(measured_by[1]), 1, "a number", most=1)[0])
     if tolerance <= 0.0:
         raise ValueError(f"tolerance is {tolerance:g}; allowed is above 0")
-    weights = checked_numbers("weights", measured_by[0], 2, "(2,): of position and of orientation", most=1)
+    weights = checked_vectors("weights", measured_by[0], 2, "(2,): of position and of orientation", most=1)
     if np.any(weights <= 0.0):
         raise ValueError(f"weights are {weights.tolist()}; allowed is above 0")
     if len({array.shape[:-1] for array in given.values()}) > 1:

@@ -12,7 +12,7 @@ import scipy.optimize
 from jaxtyping import Float
 
 from knode_cosserat.recordings.beam import BeamRecording
-from knode_cosserat.studies.beam_model import DEFAULT, Beam, Numerics, predict, tip_height
+from knode_cosserat.studies.beam_model import DEFAULT, Beam, Numerics, predict_markers, tip_height
 
 #: Young's modulus published with the recordings (Pa); the other parameters are initial values
 NOMINAL = Beam(youngs_modulus=263_824.0, damping_time=5e-3)
@@ -98,7 +98,7 @@ def _residual(
 ) -> Float[np.ndarray, " r"]:
     """Return the scaled residuals (mm) of rows from the threshold on; their squares sum to the MSE."""
     rows = recording.time >= recording.crossing
-    left = 1e3 * (predict(beam, recording, steps, numerics) - recording.tip)[rows]
+    left = 1e3 * (predict_markers(beam, recording, steps, numerics) - recording.tip)[rows]
     seen = np.isfinite(recording.tip[rows])
     left = np.where(seen, np.nan_to_num(left, nan=LOST), 0.0)
     return np.asarray(left.ravel()) / math.sqrt(max(int(np.count_nonzero(seen.all(axis=2))), 1))

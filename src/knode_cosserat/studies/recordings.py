@@ -61,7 +61,7 @@ class Window(NamedTuple):
 # the jobs
 
 
-def found(folder: Path) -> dict[str, Path]:
+def recordings_in(folder: Path) -> dict[str, Path]:
     """Return the recordings in a folder by name: bags, tables, and folders of ROS 2 bags.
 
     Raises:
@@ -90,7 +90,7 @@ def described_in(folder: Path) -> dict[str, Path]:
     return {what: path for what, path in usual.items() if path.is_file()}
 
 
-def chosen(names: Sequence[str], train: Sequence[str] | None) -> tuple[list[str], list[str]]:
+def recording_split(names: Sequence[str], train: Sequence[str] | None) -> tuple[list[str], list[str]]:
     """Return the names of the training recordings and of the held-out ones.
 
     Raises:

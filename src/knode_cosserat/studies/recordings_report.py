@@ -60,8 +60,8 @@ def rerun(
         StudyError: recordings are not there, or as in `runner.run`.
         RecordingError: a recording cannot be read.
     """
-    paths = recordings.found(folder)
-    learned, rest = recordings.chosen(list(paths), train)
+    paths = recordings.recordings_in(folder)
+    learned, rest = recordings.recording_split(list(paths), train)
     ordered = {name: paths[name] for name in (*rest, *learned)}
     jobs = recordings.jobs(ordered, learned, methods, options)
     facts = runner.run(jobs, out, workers=workers, dask=dask, progress=progress)
@@ -188,7 +188,7 @@ def draw(facts: Facts, methods: Sequence[str], names: Sequence[str], out: Path) 
     """Write figures of tensions, paths, tip x, error over the horizon, and losses and repetitions if any."""
     seen = {name: _predicted(facts, methods, name) for name in names}
     drawn = {
-        "tensions": table_two_figures.tensions(seen),
+        "tensions": table_two_figures.measured_tensions(seen),
         "paths": table_two_figures.paths(seen),
         "tip-x": table_two_figures.tip_x(seen),
         "horizon": table_two_figures.horizon(seen),

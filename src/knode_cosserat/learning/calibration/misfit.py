@@ -27,8 +27,8 @@ from knode_cosserat.learning.samples import (
     Samples,
     TipSamples,
     predict_segment,
+    rows_are_states,
     samples,
-    told_by_rows,
 )
 from knode_cosserat.rods.system import System, unpacked_history
 from knode_cosserat.trajectory import Trajectory
@@ -148,7 +148,7 @@ class SegmentMisfit:
 
     def looking_back_on(self, model: System) -> SegmentMisfit | None:
         """Return a copy with the history between nodes from a model; None if the nodes hold all of it."""
-        if told_by_rows(self.robot, self.trajectories):
+        if rows_are_states(self.robot, self.trajectories):
             return None
         return SegmentMisfit(self.robot, self.trajectories, self.unknowns, model)
 

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from knode_cosserat.learning.calibration.misfit import LinearisedMisfit, SegmentMisfit, by_group
 from knode_cosserat.learning.calibration.search import Misfit, SearchResult
 from knode_cosserat.learning.discontinuities import slopes_of
-from knode_cosserat.learning.samples import histories, past_of_segments, settings_of
+from knode_cosserat.learning.samples import histories, segment_history, settings_of
 from knode_cosserat.trajectory import Trajectory
 
 #: relative accuracy of the numbers of states
@@ -159,7 +159,7 @@ def _by_states(
     total[:, rows, -1, :ny] += tip_y[:, tips]
 
     still = np.zeros((nodes, tip_history.shape[-1]))
-    _, back = jax.vjp(lambda records: past_of_segments(robot, settings.space, records), still)
+    _, back = jax.vjp(lambda records: segment_history(robot, settings.space, records), still)
     own = jax.tree.map(per_row, tuple(past))
     history = np.array(jax.vmap(jax.vmap(lambda *each: back(each)[0]))(*own))
     history[:, :, -1] += tip_history[:, tips]

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 from knode_cosserat.learning.config import StructuredOptions
 from knode_cosserat.learning.knode import KNODE
-from knode_cosserat.learning.samples import samples, strand_samples, told_by_rows
+from knode_cosserat.learning.samples import rows_are_states, samples, strand_samples
 from knode_cosserat.learning.structured.regression import solve_residuals
 from knode_cosserat.learning.structured.residual import Structured
 from knode_cosserat.rods.system import System
@@ -31,7 +31,7 @@ def residuals_of(
     found = solve_residuals(
         knowledge, strand_samples(knowledge, samples(knowledge, trajectories)), options, seeds
     )
-    if told_by_rows(knowledge, trajectories):
+    if rows_are_states(knowledge, trajectories):
         return found
     for _ in range(ROUNDS):
         found = [

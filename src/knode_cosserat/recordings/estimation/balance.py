@@ -209,7 +209,9 @@ def _padded(rows: Any) -> Any:
     return jax.tree.map(longer, rows)
 
 
-def packed(robot: System, part: str, **fields: Float[np.ndarray, "... size"]) -> Float[np.ndarray, "... y"]:
+def packed_fields(
+    robot: System, part: str, **fields: Float[np.ndarray, "... size"]
+) -> Float[np.ndarray, "... y"]:
     """Return a vector y (or z, by `part`) with the given fields, zero elsewhere."""
     layout = robot.y_layout if part == "y" else robot.z_layout
     shape = next(iter(fields.values())).shape[:-1]

@@ -89,7 +89,7 @@ def fitted(rod: RodGeometry, poses: BodyPoses, stretch: float, noise: tuple[floa
     profile = np.ones(splines.points)
     for correction in range(CORRECTIONS + CHOICES):
         a = np.asarray(design @ curves)
-        it = kinematics.shape(rod, a, stretch)
+        it = kinematics.rod_shape(rod, a, stretch)
         left = _left(rod, it, poses)
         moves = kinematics.sensitivity(rod, it)
         H, g = _normal(moves, left, poses, noise, a)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.recordings.estimation import balance, curvature, kinematics, paper
-from knode_cosserat.recordings.estimation.balance import KnownRows, packed
+from knode_cosserat.recordings.estimation.balance import KnownRows, packed_fields
 from knode_cosserat.recordings.estimation.observations import RecordingPart, parts_of
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.measurements import Measurements
@@ -129,7 +129,7 @@ def _estimated(part: RecordingPart, robot: System, method: str) -> Trajectory:
     control, settings = applied_controls(part), None
     if method == "paper":
         settings = Settings(space=Euler())
-        y, z = paper.states(part, robot, control, settings)
+        y, z = paper.paper_states(part, robot, control, settings)
     else:
         y, z = _best(part, robot, control)
     rows = len(part.rows.time)
@@ -187,10 +187,10 @@ def completed(
     rows = KnownRows(
         t=time,
         control=control,
-        y=packed(robot, "y", p=it.shape.p, h=it.shape.h, q=it.q, w=it.w),
-        y_t=packed(robot, "y", p=p_t, h=h_t, q=it.q_t, w=it.w_t),
+        y=packed_fields(robot, "y", p=it.shape.p, h=it.shape.h, q=it.q, w=it.w),
+        y_t=packed_fields(robot, "y", p=p_t, h=h_t, q=it.q_t, w=it.w_t),
         z=z,
-        z_t=packed(robot, "z", u=it.u_t),
+        z_t=packed_fields(robot, "z", u=it.u_t),
     )
     y = balance.loads_of(robot, rod.s, rows)[:, rod.nodes]
     at_nodes = rows._replace(y=y, y_t=rows.y_t[:, rod.nodes], z=z[:, rod.nodes], z_t=rows.z_t[:, rod.nodes])

@@ -120,7 +120,7 @@ class RodShape(NamedTuple):
     p: Float[np.ndarray, "F P 3"]
 
 
-def shape(rod: RodGeometry, a: Float[np.ndarray, "F K"], stretch: float) -> RodShape:
+def rod_shape(rod: RodGeometry, a: Float[np.ndarray, "F K"], stretch: float) -> RodShape:
     """Return the shape of a rod from the curvature's coefficients a (1/m); order 4 in the segments."""
     half = np.diff(rod.s)
     u1, u2 = (np.einsum("hck,fk->fhc", rod.gauss[:, i], a, optimize=True) for i in (0, 1))
@@ -181,7 +181,7 @@ class RodMotion(NamedTuple):
 
 def motion(rod: RodGeometry, a: Float[np.ndarray, "3 F K"], stretch: float) -> RodMotion:
     """Return shape, velocities and accelerations from the coefficients and their first two rates."""
-    it = shape(rod, a[0], stretch)
+    it = rod_shape(rod, a[0], stretch)
     u_t, u_tt = (np.einsum("pck,fk->fpc", rod.basis, each, optimize=True) for each in a[1:])
     p_s = stretch * it.R[..., 2]
     turned = _turned(it.R, u_t)

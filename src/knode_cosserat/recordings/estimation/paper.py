@@ -19,7 +19,7 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.settings import Settings
 
 
-def states(
+def paper_states(
     part: RecordingPart, robot: System, control: Float[np.ndarray, "T c"], settings: Settings
 ) -> tuple[Float[np.ndarray, "T N y"], Float[np.ndarray, "T N z"]]:
     """Return y and z of the rows. Raises `RecordingError` if a body has no orientation."""
@@ -43,7 +43,7 @@ def states(
     h_t = np.gradient(h, dt, axis=0, edge_order=2)
     q = (np.swapaxes(R, -1, -2) @ p_t[..., None])[..., 0]
     w = 2.0 * kinematics.hamilton(h * np.array([1.0, -1.0, -1.0, -1.0]), h_t)[..., 1:]
-    known = balance.packed(robot, "y", p=p, h=h, q=q, w=w)
+    known = balance.packed_fields(robot, "y", p=p, h=h, q=q, w=w)
     return balance.semi_discretised(robot, rows.time, control, known, settings, round(dt, 9))
 
 

@@ -20,9 +20,9 @@ from knode_cosserat.studies.cables.rollouts import (
     NAMES,
     UNKNOWNS,
     Rollouts,
-    coordinates,
+    cable_coordinates,
+    cable_parameters,
     in_threads,
-    parameters_of,
 )
 
 _LOG = logging.getLogger(__name__)
@@ -127,7 +127,7 @@ def _searched(
     rollouts.forget()
     pieces = _pieces(motions, stage, seed)
     least = SIMULATED * len(pieces)
-    x, damping = coordinates(start), DAMPING
+    x, damping = cable_coordinates(start), DAMPING
     chosen = np.array([NAMES.index(name) for name in stage.names])
     prior, moves = (
         np.array([getattr(UNKNOWNS[name], part) for name in stage.names]) for part in ("width", "move")
@@ -157,7 +157,7 @@ def _searched(
                 break
             damping *= 6.0
             if time.process_time() > until:
-                return parameters_of(x)
+                return cable_parameters(x)
         else:
             break
         gain, x, damping = before.loss - after.loss, moved, max(damping / 5.0, 1e-4)
@@ -165,7 +165,7 @@ def _searched(
         _LOG.info("%d frames: loss %.4f to %.4f", stage.frames, before.loss, after.loss)
         if gain < ENOUGH * before.loss or time.process_time() > until:
             break
-    return parameters_of(x)
+    return cable_parameters(x)
 
 
 def _finite(both: Sequence[Any]) -> list[bool]:

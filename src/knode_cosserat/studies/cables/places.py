@@ -106,7 +106,7 @@ def _pieces(markers: Any, base: Any) -> tuple[Any, Any]:
     edges = frames.along_curve(directions[:-1], base, base)
     edges[0] = base
     for k in range(1, len(edges)):  # without the twist that would meet an end
-        edges[k] = frames.product(frames.shortest(directions[k - 1], directions[k]), edges[k - 1])
+        edges[k] = frames.quaternion_product(frames.shortest(directions[k - 1], directions[k]), edges[k - 1])
     change = frames.rotated(frames.conjugate(edges), np.diff(directions, axis=0))
     turning = np.stack([-change[:, 1], change[:, 0]], axis=1).reshape(-1, POINTS, 2).sum(axis=1)
     return lengths, turning

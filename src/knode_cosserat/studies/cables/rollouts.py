@@ -61,7 +61,7 @@ STEP = 0.05
 NAMES = tuple(UNKNOWNS)
 
 
-def coordinates(p: CableParameters) -> Float[np.ndarray, " n"]:
+def cable_coordinates(p: CableParameters) -> Float[np.ndarray, " n"]:
     """Return all numbers of a cable without bounds: those that are logarithmic by their logarithms."""
     found = []
     for unknown in UNKNOWNS.values():
@@ -71,7 +71,7 @@ def coordinates(p: CableParameters) -> Float[np.ndarray, " n"]:
     return np.array(found, dtype=float)
 
 
-def parameters_of(x: Any) -> CableParameters:
+def cable_parameters(x: Any) -> CableParameters:
     """Return the parameters with these coordinates; they may be traced by JAX."""
     traced = isinstance(x, jax.core.Tracer)
     changes: dict[str, Any] = {}
@@ -166,7 +166,7 @@ class Rollouts:
 
     def _prepared(self, x: Any, markers: Any, key: Any) -> tuple[Prepared, Prepared]:
         """A motion ready to be simulated, and derivatives of that by all unknowns, as stacked arrays."""
-        p = parameters_of(x)
+        p = cable_parameters(x)
         if key in self._starts:
             shapes, slopes = self._starts[key]
             prepared, shapes = self.model.prepared(p, markers, shapes)
@@ -181,7 +181,7 @@ class Rollouts:
                 each.append(jax.tree.map(np.zeros_like, prepared))
                 continue
             step = STEP * unknown.move
-            moved = parameters_of(x + step * np.eye(len(x))[k])
+            moved = cable_parameters(x + step * np.eye(len(x))[k])
             near = self.model.prepared(moved, markers, shapes)[0]
             each.append(jax.tree.map(lambda a, b, h=step: (a - b) / h, near, prepared))
         slopes = jax.tree.map(lambda *leaves: np.stack(leaves), *each)
@@ -190,7 +190,7 @@ class Rollouts:
 
     def _chunk_with_derivatives(self, x: Any, prepared: Any, d_x: Any, d_prepared: Any) -> Any:
         def run(x: Any, prepared: Any) -> Any:
-            p = parameters_of(x)
+            p = cable_parameters(x)
             robot = self.model.robot(p, prepared.base, prepared.tip)
             initial = self.model.initial(robot, prepared)
             found = simulate(robot, prepared.controls, DT, initial=initial, space=self.space)

@@ -59,7 +59,7 @@ def rerun(
     """Run the study for every cable of a folder, and write cables.json, cables.md, a figure and scenes."""
     cables = load_cables(folder)
     out.mkdir(parents=True, exist_ok=True)
-    return report.write(out, [study_cable(data, options, tell) for data in cables])
+    return report.write_report(out, [study_cable(data, options, tell) for data in cables])
 
 
 def study_cable(data: CableData, options: CableOptions, tell: Callable[[str], None]) -> CableResult:
