@@ -10,7 +10,7 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.rods.parameters import parameter
-from knode_cosserat.solvers.history import Begun
+from knode_cosserat.solvers.history import InitialHistory
 from knode_cosserat.solvers.time import TimeScheme
 from knode_cosserat.trajectory_system import TrajectoryFileError
 
@@ -91,7 +91,7 @@ def synthetic(batch=(), steps=4, nodes=5, robot=ROBOT, settings=PAPER, seed=0, p
         residual=rng.normal(size=rows),
         iterations=rng.integers(0, 100, size=rows),
         position_error=rng.uniform(size=rows) if places else None,
-        begun=Begun(
+        begun=InitialHistory(
             rng.normal(size=(*batch, 2, places, 25)),
             rng.normal(size=(*batch, places, 25)),
             rng.normal(size=(*batch, 4)),

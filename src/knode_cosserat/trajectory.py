@@ -41,7 +41,7 @@ class Trajectory(eqx.Module):
     iterations: Int[Any, "*batch T"]
     #: estimated discretisation error of positions along the rod (m), the largest over the nodes; NaN: unknown
     position_error: Any = None
-    #: initial history of a motion (`solvers.history.Begun`); None if unknown
+    #: initial history of a motion (`solvers.history.InitialHistory`); None if unknown
     begun: Any = None
     #: True in rows outside the training range of a learned or identified model; None if unknown
     extrapolated: Any = None

@@ -19,7 +19,7 @@ from knode_cosserat._files import package_version, replacing
 from knode_cosserat._registry import provide
 from knode_cosserat.rods.layout import Field, Layout
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.history import Begun
+from knode_cosserat.solvers.history import InitialHistory
 from knode_cosserat.solvers.result import EARLIER_RESULTS, Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.trajectory import Trajectory
@@ -120,7 +120,7 @@ def _dataset(trajectory: Trajectory, source: str) -> xarray.Dataset:
         variables[name] = (rows, marks, labels(unit, meaning))
     variables["result"][2].update(_flags(variables["result"][1].dtype))
     if trajectory.begun is not None:
-        begun = Begun(*map(np.asarray, trajectory.begun))
+        begun = InitialHistory(*map(np.asarray, trajectory.begun))
         states = np.concatenate([begun.records, np.expand_dims(begun.rate, -3)], axis=-3)
         step = np.concatenate([begun.coefficients, begun.dt[..., None]], axis=-1)
         variables[_BEGUN] = (
@@ -248,7 +248,7 @@ def _current_codes(codes: np.ndarray, attributes: dict[Any, Any]) -> np.ndarray:
     return current
 
 
-def _begun(path: Path, data: xarray.Dataset) -> Begun | None:
+def _begun(path: Path, data: xarray.Dataset) -> InitialHistory | None:
     """Return the initial history, if the file has it."""
     if _BEGUN not in data.variables:
         return None
@@ -257,7 +257,7 @@ def _begun(path: Path, data: xarray.Dataset) -> Begun | None:
     states = values_of(path, data, _BEGUN, (*batch, 3, *sizes))
     step = values_of(path, data, _BEGUN_STEP, (*batch, 5))
     newest, before, rate = np.moveaxis(states, -3, 0)
-    return Begun(np.stack([newest, before], axis=-3), rate, step[..., :4], step[..., 4])
+    return InitialHistory(np.stack([newest, before], axis=-3), rate, step[..., :4], step[..., 4])
 
 
 def _read(path: Path) -> xarray.Dataset:

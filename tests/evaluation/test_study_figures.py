@@ -69,7 +69,7 @@ def test_shapes_stand_beside_the_references(truth, baseline):
 
 def test_tips_are_drawn_over_time_a_column_for_each_case(truth, baseline):
     cases = {"sine": (truth, {"baseline": baseline}), "step": (baseline, {"best": truth})}
-    figure = study_figures.tips(cases)
+    figure = study_figures.predicted_tips(cases)
     assert drawn(figure).startswith(b"\x89PNG")
     assert labels(figure) == ["reference", "baseline", "best"]
     grid = np.array(figure.axes).reshape(3, 2)
@@ -122,7 +122,7 @@ def test_what_cannot_be_drawn_is_said(truth):
     for draw in (
         lambda: study_figures.controls({}),
         lambda: study_figures.shapes(truth, {}),
-        lambda: study_figures.tips({}),
+        lambda: study_figures.predicted_tips({}),
         lambda: study_figures.comparison(truth, {}),
         lambda: study_figures.losses({}),
     ):
@@ -131,7 +131,7 @@ def test_what_cannot_be_drawn_is_said(truth):
     for draw in (
         lambda: study_figures.controls({"": batch}),
         lambda: study_figures.shapes(truth, {"": batch}),
-        lambda: study_figures.tips({"": (truth, {"": batch})}),
+        lambda: study_figures.predicted_tips({"": (truth, {"": batch})}),
     ):
         with pytest.raises(ValueError, match="a batch of 1 trajectories"):
             draw()

@@ -7,10 +7,10 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.identification.evaluate import coverage, evaluate
-from knode_cosserat.identification.fit import coordinates, fit
-from knode_cosserat.identification.given import poses_of
+from knode_cosserat.identification.fit import coordinates_of, fit
+from knode_cosserat.identification.inputs import poses_of_nodes
 from knode_cosserat.identification.model import Model
-from knode_cosserat.identification.residual import Errors, _verdict
+from knode_cosserat.identification.residual import PositionErrors, _verdict
 from knode_cosserat.identification.result import Estimate, Identified
 from knode_cosserat.identification.trials import failed_trial
 from knode_cosserat.learning.samples import DataError
@@ -79,7 +79,7 @@ def test_a_passive_network_does_not_diverge_and_its_spread_is_told():
 
 
 def errors(*tips):
-    return [Errors(tip, tip) for tip in tips]
+    return [PositionErrors(tip, tip) for tip in tips]
 
 
 def test_what_is_kept():
@@ -107,7 +107,7 @@ def test_coordinates_are_those_of_the_estimates():
         for number in [model.numbers[k]]
     ]
     found = Identified(NOMINAL, ("stiffness", "damping", "rest curvature"), tuple(estimates), {}, {}, {}, ())
-    assert np.allclose(coordinates(model, found), x, rtol=0.0, atol=1e-12)
+    assert np.allclose(coordinates_of(model, found), x, rtol=0.0, atol=1e-12)
 
 
 def test_poses_of_a_trajectory_are_measurements():
@@ -115,14 +115,14 @@ def test_poses_of_a_trajectory_are_measurements():
     tension = kc.controls.sine(1.0, 6, DT)
     robot = NOMINAL.replace(nodes=5)
     states = kc.simulate(robot, tension, DT)
-    rows = poses_of(states, "a trajectory")
+    rows = poses_of_nodes(states, "a trajectory")
     assert np.allclose(rows.tension[:-1], tension, rtol=0.0, atol=0.0)
     assert rows.fractions[-1] == 1.0 and rows.dt == pytest.approx(DT)
     assert np.array_equal(rows.tip_position, np.asarray(states.position)[:, -1])
 
 
 def test_bad_input():
-    rows = poses_of(kc.simulate(NOMINAL.replace(nodes=5), kc.controls.sine(1.0, 6, DT), DT), "a")
+    rows = poses_of_nodes(kc.simulate(NOMINAL.replace(nodes=5), kc.controls.sine(1.0, 6, DT), DT), "a")
     with pytest.raises(kc.learning.FitError, match="needs full states"):
         fit(NOMINAL, [rows], kc.FitConfig.paper())
     with pytest.raises(kc.learning.FitError, match="checkpoint is for trajectories"):

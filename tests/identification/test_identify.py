@@ -9,7 +9,7 @@ import knode_cosserat as kc
 from knode_cosserat.identification.evaluate import evaluate
 from knode_cosserat.identification.misfit import data_of
 from knode_cosserat.identification.model import Model
-from knode_cosserat.identification.trials import failed_trial, is_coarse
+from knode_cosserat.identification.trials import failed_trial, has_coarse_rows
 from knode_cosserat.learning.samples import DataError
 from knode_cosserat.rods.load_cells import LoadCells
 from knode_cosserat.rods.parameters import ParameterError
@@ -113,9 +113,9 @@ def test_a_grid_is_too_coarse_or_fine_enough():
     true = kc.robots.RoutedTendonRobot.like(NOMINAL)
     seen = measured(true, tensions(1.0, 1.0), "own", noise=0.0)
     data = [data_of(seen, Model(NOMINAL, seen.tension), "own")]
-    assert not is_coarse(true, data, "lobatto2")
+    assert not has_coarse_rows(true, data, "lobatto2")
     soft = true.replace(nodes=5, youngs_modulus=2e8, sections=(Sleeve(stiffening=8.0, length=0.1),))
-    assert is_coarse(soft, data, "lobatto2")
+    assert has_coarse_rows(soft, data, "lobatto2")
 
 
 def test_bad_input_says_what_is_wrong():

@@ -18,8 +18,8 @@ from knode_cosserat.learning.fit import fit
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.samples import DataError
 from knode_cosserat.learning.training.checkpoint import data_hash
+from knode_cosserat.learning.training.progress import WatchError
 from knode_cosserat.learning.training.runs import FitError
-from knode_cosserat.learning.training.watch import WatchError
 from knode_cosserat.rods.wrapped import Wrapped
 from tests.learning.bar import BAR, WRONG, pulled
 

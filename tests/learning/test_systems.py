@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
+from knode_cosserat.learning.discontinuities import pieces
 from knode_cosserat.learning.samples import samples
-from knode_cosserat.learning.sides import pieces
 from knode_cosserat.rods.ends import Driven
 from knode_cosserat.rods.loads import AttachedMass, PointWrench
 from knode_cosserat.rods.routing import Helical

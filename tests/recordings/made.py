@@ -4,7 +4,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from knode_cosserat.recordings import CommandSource, MarkerSource, RecordingConfig, TensionSource
-from knode_cosserat.recordings.write import Poses, Pulls, write_recording
+from knode_cosserat.recordings.write import MocapPoses, Pulls, write_recording
 
 LENGTH = 0.635
 PAPER = RecordingConfig.paper_robot()
@@ -37,14 +37,14 @@ def made(seconds=3.0, noise=1e-4, seed=0, config=PAPER):
         position, rotation = moved(time, marker.fraction)
         shaken = rotation * Rotation.from_rotvec(rng.normal(0.0, 10 * noise, (len(time), 3)))
         quaternion = (shaken * TURNED[k % 4]).as_quat(scalar_first=True)
-        poses[marker.name] = Poses(
+        poses[marker.name] = MocapPoses(
             time, position + CLAMP + rng.normal(0.0, noise, position.shape), quaternion
         )
     if config.base is not None:
         above = np.array([0.0, 0.0, config.base.height])
         still = np.tile(CLAMP + above, (len(time), 1))
         turned = np.tile([1.0, 0.0, 0.0, 0.0], (len(time), 1))
-        poses["base"] = Poses(time, still + rng.normal(0.0, noise, still.shape), turned)
+        poses["base"] = MocapPoses(time, still + rng.normal(0.0, noise, still.shape), turned)
     sent = np.round(np.arange(0.0, seconds, 0.05), 6)
     phase = 2 * np.pi * (sent[:, None] - np.arange(config.tendons) / config.tendons)
     grams = np.round(500.0 + np.where(sent[:, None] < 1.0, 0.0, 200.0 * np.cos(phase)))
@@ -81,4 +81,4 @@ def changed(streams, name, rows=None, **parts):
     new = {"time": pose.time, "position": pose.position, "quaternion": pose.quaternion} | parts
     if rows is not None:
         new = {key: value[rows] for key, value in new.items()}
-    return {**poses, name: Poses(**new)}, tension, command
+    return {**poses, name: MocapPoses(**new)}, tension, command

@@ -83,19 +83,19 @@ def test_the_kinematics_are_of_order_four():
     for finest in (1 / 18, 1 / 36, 1 / 288):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(kinematics, "FINEST", finest)
-            rod = kinematics.Rod.of(LENGTH, 10, FRACTIONS, np.array([1.0, 0, 0, 0]), np.zeros(3))
-        tips.append(kinematics.shape(rod, a, 1.0).p[:, -1])
+            rod = kinematics.RodGeometry.of(LENGTH, 10, FRACTIONS, np.array([1.0, 0, 0, 0]), np.zeros(3))
+        tips.append(kinematics.rod_shape(rod, a, 1.0).p[:, -1])
     coarse, fine = (np.abs(tip - tips[2]).max() for tip in tips[:2])
     assert 12.0 < coarse / fine < 24.0
 
 
 def test_sensitivities_are_derivatives():
-    rod = kinematics.Rod.of(LENGTH, 10, FRACTIONS, np.array([1.0, 0, 0, 0]), np.zeros(3))
+    rod = kinematics.RodGeometry.of(LENGTH, 10, FRACTIONS, np.array([1.0, 0, 0, 0]), np.zeros(3))
     random = np.random.default_rng(1)
     a, da = random.normal(size=(2, 1, rod.modes))
-    it = kinematics.shape(rod, a, 1.01)
+    it = kinematics.rod_shape(rod, a, 1.01)
     moves = kinematics.sensitivity(rod, it)
-    ahead, behind = (kinematics.shape(rod, a + step * da, 1.01) for step in (1e-5, -1e-5))
+    ahead, behind = (kinematics.rod_shape(rod, a + step * da, 1.01) for step in (1e-5, -1e-5))
     shift = (ahead.p - behind.p)[:, rod.bodies] / 2e-5
     turn = kinematics.turn_between(ahead.h, behind.h)[:, rod.bodies] / 2e-5
     np.testing.assert_allclose((moves.shift @ da[0]), shift, atol=3e-5)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 import knode_cosserat as kc
 from knode_cosserat.cli import app
 from knode_cosserat.evaluation import recording_figures
-from knode_cosserat.recordings.write import Poses, Pulls
+from knode_cosserat.recordings.write import MocapPoses, Pulls
 from tests.recordings.made import LAG, PAPER, changed, made, write
 
 NOISE = 2e-4
@@ -111,7 +111,7 @@ def test_the_rod_and_its_rest_are_told(report):
 def test_a_recording_without_commands_or_rest_still_has_a_report(tmp_path):
     poses, tension, _ = made(seconds=4.0)
     moving = {
-        name: Poses(it.time[120:], it.position[120:], it.quaternion[120:]) for name, it in poses.items()
+        name: MocapPoses(it.time[120:], it.position[120:], it.quaternion[120:]) for name, it in poses.items()
     }
     recording = kc.load_recording(write(tmp_path / "it.bag", (moving, tension, None)))
     report = recording.health()

@@ -17,7 +17,7 @@ from knode_cosserat.recordings import (
     TensionSource,
     messages,
 )
-from knode_cosserat.recordings.write import FORMATS, Poses, Pulls, write_recording
+from knode_cosserat.recordings.write import FORMATS, MocapPoses, Pulls, write_recording
 from tests.recordings.made import LAG, PAPER, SMALL, changed, moved, write
 
 
@@ -52,7 +52,7 @@ def test_another_robot_of_three_tendons_and_one_body_that_has_no_orientation_com
     time = np.round(np.arange(0.0, 2.0, 0.02), 6)
     position, _ = moved(time, 1.0)
     pulls = Pulls(time[::2], 3.0 + np.random.default_rng(0).uniform(0.0, 1.0, (50, 3)))
-    write_recording(tmp_path / f"it{ending}", SMALL, {"tip": Poses(time, position)}, pulls, pulls)
+    write_recording(tmp_path / f"it{ending}", SMALL, {"tip": MocapPoses(time, position)}, pulls, pulls)
     recording = kc.load_recording(tmp_path / f"it{ending}", SMALL)
     (tip,) = recording.bodies
     np.testing.assert_allclose(tip.position, position, rtol=0, atol=1e-12)
@@ -94,7 +94,7 @@ def test_a_table_explains_itself(tmp_path, exact):
 def test_arrays_have_no_stamps_and_are_taken_when_they_were_recorded(tmp_path):
     config = dataclasses.replace(SMALL, tension=TensionSource("/pull", (2, 1)), command=None)
     time = np.round(np.arange(0.0, 1.0, 0.01), 6)
-    tip = {"tip": Poses(time, moved(time, 1.0)[0])}
+    tip = {"tip": MocapPoses(time, moved(time, 1.0)[0])}
     pulls = Pulls(time, np.stack([5.0 + time, 6.0 - time], axis=1))
     write_recording(tmp_path / "it.mcap", config, tip, pulls)
     recording = kc.load_recording(tmp_path / "it.mcap", config)
@@ -230,7 +230,7 @@ def test_another_frame_and_other_units(tmp_path, exact):
     )
     poses, tension, command = exact
     seen = {
-        name: Poses(
+        name: MocapPoses(
             it.time,
             up.inv().apply(it.position),
             (up.inv() * Rotation.from_quat(it.quaternion, scalar_first=True)).as_quat(scalar_first=True),
@@ -271,7 +271,8 @@ def test_a_base_that_is_not_there_can_be_stated(tmp_path, exact):
 
 def test_a_rotation_that_is_stated_needs_no_rest(tmp_path, exact):
     moving = {
-        name: Poses(it.time[120:], it.position[120:], it.quaternion[120:]) for name, it in exact[0].items()
+        name: MocapPoses(it.time[120:], it.position[120:], it.quaternion[120:])
+        for name, it in exact[0].items()
     }
     streams = moving, *exact[1:]
     path = write(tmp_path / "it.bag", streams)

@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.recordings.virtual import GRAM, Sensors, commands, lagged, measured, record_virtual
+from knode_cosserat.recordings.virtual import (
+    GRAM,
+    Sensors,
+    commands,
+    lagged,
+    record_virtual,
+    simulated_sensors,
+)
 from knode_cosserat.recordings.write import Pulls
 
 
@@ -95,14 +102,14 @@ def test_sensors_without_noise_tell_the_truth_but_for_axes_and_place(virtual):
     _, truth = virtual
     exact = Sensors(position_noise=0.0, turn_noise=0.0, lost=0.0, tension_noise=0.0, tension_step=0.0)
     sent = commands("sine:1.0", 5.0)
-    poses, tension = measured(truth, sent, 0, exact)
+    poses, tension = simulated_sensors(truth, sent, 0, exact)
     moved = poses["rib 4"].position - poses["rib 4"].position[0]
     tip = np.asarray(truth.tip_position)
     np.testing.assert_allclose(moved, tip - tip[0], atol=1e-12)
     np.testing.assert_allclose(tension.tension[:50], 500.0 * GRAM, rtol=1e-12)
-    same, _ = measured(truth, sent, 0, exact)
+    same, _ = simulated_sensors(truth, sent, 0, exact)
     np.testing.assert_array_equal(same["base"].position, poses["base"].position)
-    other, _ = measured(truth, sent, 1, exact)
+    other, _ = simulated_sensors(truth, sent, 1, exact)
     assert np.abs(other["base"].position - poses["base"].position).max() > 0.01
 
 

@@ -10,7 +10,7 @@ from hypothesis import settings as given_settings
 
 import knode_cosserat as kc
 from knode_cosserat.solvers.grid import Grid, at_places, grid_of, taken
-from knode_cosserat.solvers.history import initial_past, rest_record
+from knode_cosserat.solvers.history import constant_history, rest_record
 from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SCHEMES
@@ -163,7 +163,7 @@ def one_piece(problem):
         def rates(k, y):
             return problem.point_rates(s[k], y, history[k])[0]
 
-        far = problem.crossed(acting, start, history[0]) if problem.system.jumps else start
+        far = problem.jump(acting, start, history[0]) if problem.system.jumps else start
         f = [rates(0, far), rates(1, end)]
         for k, stage in enumerate(formula.stages):
             moved = sum(x * rate for x, rate in zip(stage.rates, f, strict=True))
@@ -240,7 +240,7 @@ def test_a_history_of_slopes_begins_with_those_of_its_places():
         rod(**beam, sections=(kc.robots.Stretch(end=0.317, stiffness=[2.0]),))
         for rod in (kc.robots.SlenderRod, RememberingSlopes)
     )
-    begun = jax.jit(lambda rod: initial_past(rod, Settings(), rest_record(rod), jnp.zeros(0)))
+    begun = jax.jit(lambda rod: constant_history(rod, Settings(), rest_record(rod), jnp.zeros(0)))
     past = begun(other)
     # straight, and so alike all along
     np.testing.assert_allclose(past.records[0, :, -plain.y_layout.size :][:, 2], 1.0, atol=1e-12)

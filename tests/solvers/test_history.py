@@ -11,12 +11,12 @@ import knode_cosserat as kc
 from benchmarks.motions import soft_rod
 from examples.hanging_string import HangingString
 from knode_cosserat.solvers.grid import at_places, grid_of
-from knode_cosserat.solvers.history import resting_past, still_records
-from knode_cosserat.solvers.initial import Run, beginning, histories_along
+from knode_cosserat.solvers.history import resting_history, still_records
+from knode_cosserat.solvers.initial import SimulationRun, histories_along, initial_state
 from knode_cosserat.solvers.problem import StepProblem
+from knode_cosserat.solvers.run_types import RunSettings
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SCHEMES
-from knode_cosserat.solvers.task import Task
 from knode_cosserat.solvers.time_loop import loop_one
 
 DT = 0.02
@@ -92,10 +92,10 @@ def test_the_middle_of_a_motion_is_known_at_its_nodes_only(rod, whole):
 def test_rows_tell_what_the_last_step_looked_back_on(rod, whole):
     """The past that is found again is the one that the solver had."""
     settings = Settings.of("bdf2", "lobatto4", "paper", kc.solvers.NewtonOptions())
-    begins = beginning(Run(rod, NONE, None, settings, DT, None, False))
-    task = Task(settings, DT, len(NONE))
+    begins = initial_state(SimulationRun(rod, NONE, None, settings, DT, None, False))
+    task = RunSettings(settings, DT, len(NONE))
     _, past, _ = loop_one(rod, settings, task.table, NONE, DT, begins.start.past, 0, len(NONE))
-    again = beginning(Run(rod, NONE, whole, settings, DT, None, False))
+    again = initial_state(SimulationRun(rod, NONE, whole, settings, DT, None, False))
     assert again.first == "regular" and again.start.past.t0 == pytest.approx(len(NONE) * DT)
     np.testing.assert_allclose(again.start.past.records, past.records, atol=2e-8)
 
@@ -138,7 +138,7 @@ def test_rest_is_rest_at_all_places(space):
             kc.robots.Stretch(begin=0.73, curvature=[0.0, 3.0, 0.0]),
         ),
     )  # fmt: skip
-    past = jax.jit(resting_past, static_argnums=1)(bent, kc.solvers.Settings(space=SCHEMES[space]))
+    past = jax.jit(resting_history, static_argnums=1)(bent, kc.solvers.Settings(space=SCHEMES[space]))
     records, grid = past.records[0], grid_of(bent, SCHEMES[space])
     u = bent.z_layout.get(records[..., bent.y_layout.size :], "u")
     middle = (grid.segment + grid.bounds.mean(axis=1)) / (bent.nodes - 1)

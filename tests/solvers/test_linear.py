@@ -10,9 +10,9 @@ from knode_cosserat.solvers.linear import (
     factored,
     filled_up,
     inverted,
-    product,
+    matrix_products,
     quotient,
-    solved,
+    solved_correction,
 )
 
 STATES, UNKNOWNS = 6, 3
@@ -102,7 +102,7 @@ class Equations:
 
 @jax.jit
 def solution_of(linearisation, pivots, defects, tip, base):
-    return solved(factored(linearisation, pivots), pivots, defects, tip, base)
+    return solved_correction(factored(linearisation, pivots), pivots, defects, tip, base)
 
 
 def correction(equations, base=None):
@@ -148,7 +148,7 @@ def test_factors_serve_for_other_residuals():
     scale = SCALES["natural"]
     equations, other = (Equations(10, 1.3, seed, scale=scale) for seed in (7, 8))
     factors = jax.jit(factored)(equations.linearisation, PIVOTS)
-    found = jax.jit(solved)(factors, PIVOTS, other.defects, other.tip)
+    found = jax.jit(solved_correction)(factors, PIVOTS, other.defects, other.tip)
     # the product with G is of the first ones
     equations.defects, equations.tip = other.defects, other.tip
     assert_solves(tuple(map(np.asarray, found)), equations)
@@ -181,7 +181,7 @@ def test_growth_along_the_rod_does_no_harm(growth, first):
             # G⁻¹ of what is missing at the ends of pieces
             missing = np.einsum("jab,jb->ja", F, dy[:-1]) - dy[1:] + equations.right
             left = np.linalg.solve(G, missing[..., None])[..., 0]
-            change = jax.jit(solved)(factors, PIVOTS, left, equations.M @ dy[-1] + equations.tip)
+            change = jax.jit(solved_correction)(factors, PIVOTS, left, equations.M @ dy[-1] + equations.tip)
             dy, dxi = dy + change[0], dxi + change[1]
             if k == 0:
                 np.testing.assert_allclose(dy, expected, rtol=0, atol=first * np.abs(expected).max())
@@ -207,7 +207,7 @@ def test_inverses_are_those_of_numpy(size):
 def test_products_of_matrices_that_are_last():
     A, B = np.random.default_rng(0).normal(size=(2, 4, 4, 7))
     np.testing.assert_allclose(
-        product(jnp.asarray(A), jnp.asarray(B)), np.einsum("abn,bcn->acn", A, B), atol=1e-13
+        matrix_products(jnp.asarray(A), jnp.asarray(B)), np.einsum("abn,bcn->acn", A, B), atol=1e-13
     )
 
 

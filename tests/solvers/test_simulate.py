@@ -16,7 +16,7 @@ import knode_cosserat as kc
 from knode_cosserat.rods.surroundings import Plane
 from knode_cosserat.rods.tendon_friction import TendonFriction, Vibration
 from knode_cosserat.solvers.grid import at_places
-from knode_cosserat.solvers.history import EXTRAPOLATIONS, advanced, history_of, padded_rows, resting_past
+from knode_cosserat.solvers.history import EXTRAPOLATIONS, advanced, history_of, padded_rows, resting_history
 from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.recovery import Budget, BudgetError, _continue_load, _Step, _substeps
 from knode_cosserat.solvers.settings import Settings
@@ -115,7 +115,7 @@ BDF2 = kc.solvers.BDF2().coefficients(DT, DT)
 
 
 def test_load_continuation_reaches_the_solution_that_newton_finds(robot):
-    step = _step(robot, resting_past(robot, Settings()), BDF2)
+    step = _step(robot, resting_history(robot, Settings()), BDF2)
     control = np.array([30.0, 5.0, 5.0, 30.0])
     direct = step.solve(control, *step.guesses()[0])
     assert step.solved(direct)
@@ -127,7 +127,7 @@ def test_load_continuation_reaches_the_solution_that_newton_finds(robot):
 
 def test_a_divided_step_is_the_same_motion_in_smaller_steps(robot):
     """Two halves by hand, with the coefficients for unequal steps, give the row that dividing gives."""
-    past = resting_past(robot, Settings())
+    past = resting_history(robot, Settings())
     control = np.array([7.0, 5.0, 5.0, 7.0])
     _, found = _substeps(_step(robot, past, BDF2), (control, control), DT)
     by_hand = past
@@ -299,7 +299,7 @@ def test_jit_equals_plain(robot, sine, truth):
 
 @pytest.mark.campaign
 def test_lockstep_as_on_a_gpu_equals_one_after_the_other(robot, sine):
-    past = resting_past(robot, Settings())
+    past = resting_history(robot, Settings())
     tensions = np.stack([sine[:16], 1.2 * sine[:16], 0.8 * sine[:16]])
     pasts = jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), past)
     table = np.array([kc.solvers.BDF2().coefficients(DT, DT)] * 2)
@@ -328,7 +328,7 @@ def test_equilibria_in_a_batch(robot):
 
 
 def test_the_past_keeps_the_newest_first(robot):
-    past = resting_past(robot, Settings())
+    past = resting_history(robot, Settings())
     record = past.records[0] + 1.0
     after = advanced(past, record, past.rate, past.y[0] + 1.0, past.weights)
     np.testing.assert_array_equal(after.y[1:], past.y[:-1])

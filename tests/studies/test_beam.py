@@ -17,7 +17,7 @@ from knode_cosserat.studies.beam_model import (
     Numerics,
     beam_rod,
     held_beam,
-    predict,
+    predict_markers,
     shear_factor,
     step_count,
     torsion_constant,
@@ -127,7 +127,7 @@ def test_the_held_out_recording_is_predicted(recordings):
     found = identify_beam(train, steps, COARSE).beam
     assert 2.2e5 < found.youngs_modulus < 3.0e5 and 0.0 < found.tilt < 0.15
     rmse = {
-        name: marker_rmse(predict(each, held_out, steps, COARSE), held_out)
+        name: marker_rmse(predict_markers(each, held_out, steps, COARSE), held_out)
         for name, each in {"nominal": NOMINAL, "identified": found}.items()
     }
     # of the wildest part of the motion; of the whole recording 0.9 mm

@@ -13,11 +13,11 @@ from knode_cosserat.cli import app
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.studies.cables import frames, study
 from knode_cosserat.studies.cables.correction import learned_correction
-from knode_cosserat.studies.cables.identification import Stage, identify_cable
+from knode_cosserat.studies.cables.identification import SearchStage, identify_cable
 from knode_cosserat.studies.cables.model import DT, CableModel, CableParameters, Grips
 from knode_cosserat.studies.cables.places import marker_places
-from knode_cosserat.studies.cables.rollouts import CHUNK, NAMES, Rollouts, coordinates, parameters_of
-from knode_cosserat.studies.cables.shapes import Fitter, Grid
+from knode_cosserat.studies.cables.rollouts import CHUNK, NAMES, Rollouts, cable_coordinates, cable_parameters
+from knode_cosserat.studies.cables.shapes import CableGrid, Fitter
 
 SPACE, NODES = "lobatto2", 9
 TRUE = CableParameters(
@@ -79,14 +79,14 @@ def test_frames_follow_a_curve_and_meet_both_ends():
     rng = np.random.default_rng(0)
     edges = np.array([0.0, 0.0, 1.0]) + 0.3 * rng.normal(size=(50, 3)).cumsum(axis=0) / 10.0
     first = frames.shortest(frames.AXIS, frames.unit(edges[0]))
-    last = frames.product(
+    last = frames.quaternion_product(
         frames.shortest(frames.AXIS, frames.unit(edges[-1])), frames.from_vector(0.4 * frames.AXIS)
     )
     found = frames.along_curve(edges, first, last)
     np.testing.assert_allclose(
         frames.rotated(found, np.tile(frames.AXIS, (50, 1))), frames.unit(edges), atol=1e-9
     )
-    step = frames.to_vector(frames.product(frames.conjugate(found[-1]), last))
+    step = frames.to_vector(frames.quaternion_product(frames.conjugate(found[-1]), last))
     assert np.abs(step).max() < 0.05
 
 
@@ -97,7 +97,7 @@ def test_rotation_vectors_do_not_jump():
 
 
 def test_a_shape_has_the_cables_length_and_passes_its_markers():
-    fitter, markers = Fitter(Grid(PLACES, 16)), held(3, 0)
+    fitter, markers = Fitter(CableGrid(PLACES, 16)), held(3, 0)
     base, tip = MODEL.end_frames(CableParameters(), markers)
     shape = fitter.shape(markers[0, 1:-1], (base[0], tip[0]), np.zeros(3))
     lengths = np.linalg.norm(np.diff(shape.points, axis=0), axis=1)
@@ -113,7 +113,7 @@ def test_places_of_markers_are_near_the_true_ones(motions):
 
 
 def test_coordinates_go_there_and_back():
-    again = parameters_of(coordinates(TRUE))
+    again = cable_parameters(cable_coordinates(TRUE))
     for field in dataclasses.fields(TRUE):
         np.testing.assert_allclose(getattr(again, field.name), getattr(TRUE, field.name), rtol=1e-12)
 
@@ -121,7 +121,7 @@ def test_coordinates_go_there_and_back():
 @pytest.mark.campaign
 def test_long_motions_are_those_of_one_simulation(motions, rollouts):
     markers = np.concatenate([motions[0], motions[0][::-1]] * 2)[: 2 * CHUNK + 2]
-    values, _ = rollouts.columns(coordinates(TRUE), markers, "long")
+    values, _ = rollouts.columns(cable_coordinates(TRUE), markers, "long")
     predicted = rollouts.predict(TRUE, markers)
     assert predicted.markers is not None and predicted.failure == ""
     np.testing.assert_allclose(values, predicted.markers - markers[2:, 2:-2], atol=2e-4)
@@ -129,7 +129,7 @@ def test_long_motions_are_those_of_one_simulation(motions, rollouts):
 
 @pytest.mark.campaign
 def test_derivatives_are_those_of_the_rollout(motions, rollouts):
-    x, markers = coordinates(TRUE.replace(eccentric=0.2)), motions[0]
+    x, markers = cable_coordinates(TRUE.replace(eccentric=0.2)), motions[0]
     values, slopes = rollouts.columns(x, markers, "key")
     for name in ("bending", "curvature0", "eccentric", "tip_tangent1", "twist"):
         slope, step = slopes[NAMES.index(name)], 0.01 * np.eye(len(x))[NAMES.index(name)]
@@ -145,7 +145,7 @@ def test_a_wrong_stiffness_is_found(motions, rollouts):
     def validate(p):
         return study._errors(rollouts, p, motions[2:])[0]
 
-    stages = (Stage(12, 3, ("bending", "curvature0", "curvature1"), 4),)
+    stages = (SearchStage(12, 3, ("bending", "curvature0", "curvature1"), 4),)
     found = identify_cable(rollouts, start, motions[:2], validate, stages)
     assert found.errors[1] < 0.7 * found.errors[0]
     assert found.parameters != start
@@ -158,7 +158,7 @@ def test_a_failing_stage_leaves_the_start(motions):
             raise ValueError("nothing works")
 
     found = identify_cable(
-        Failing(MODEL, SPACE), TRUE, motions[:1], lambda p: 1.0, (Stage(6, 1, ("bending",), 1),)
+        Failing(MODEL, SPACE), TRUE, motions[:1], lambda p: 1.0, (SearchStage(6, 1, ("bending",), 1),)
     )
     assert found.parameters == TRUE and "nothing works" in found.notes[0]
 
@@ -194,7 +194,7 @@ def test_the_study_writes_errors_of_all_methods(tmp_path, motions):
         for k, markers in enumerate(chosen):
             (tmp_path / "A" / part / f"{k}.pkl").write_bytes(pickle.dumps(list(markers.astype("f4"))))
     options = study.CableOptions(
-        nodes=NODES, space=SPACE, stages=(Stage(8, 2, ("bending", "curvature0"), 1),), validation=1
+        nodes=NODES, space=SPACE, stages=(SearchStage(8, 2, ("bending", "curvature0"), 1),), validation=1
     )
     told = []
     study.rerun(tmp_path / "out", tmp_path, options=options, tell=told.append)
@@ -213,7 +213,7 @@ class OneBreaks:
     """Rollouts off by the logarithm of the stiffness; one piece can be simulated at the start only."""
 
     def __init__(self, start):
-        self.start = coordinates(start)
+        self.start = cable_coordinates(start)
 
     def forget(self):
         pass
@@ -229,6 +229,10 @@ def test_a_piece_that_cannot_be_simulated_does_not_stop_the_search():
     start = CableParameters(bending=0.5)
     motions = [np.zeros((8, 5, 3))] * 4
     found = identify_cable(
-        OneBreaks(start), start, motions, lambda p: abs(np.log(p.bending)), [Stage(6, 4, ("bending",), 8, 1)]
+        OneBreaks(start),
+        start,
+        motions,
+        lambda p: abs(np.log(p.bending)),
+        [SearchStage(6, 4, ("bending",), 8, 1)],
     )
     assert found.parameters.bending == pytest.approx(1.0, abs=1e-3) and not found.notes

@@ -11,7 +11,7 @@ import knode_cosserat as kc
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.studies import comparisons, data_efficiency, simulation
-from knode_cosserat.studies.comparisons import NoKnowledge, Poses, compared, linear_predictor
+from knode_cosserat.studies.comparisons import NodePoses, NoKnowledge, compared, linear_predictor
 from knode_cosserat.studies.data_report import as_markdown, figure, rerun
 
 pydmd = pytest.mark.skipif(importlib.util.find_spec("pydmd") is None, reason="needs PyDMD")
@@ -62,7 +62,9 @@ def test_a_linear_predictor_of_the_robot_beats_standing_still():
 
     predictor = linear_predictor(ROBOT, [moved(control, 30) for control in simulation.TRAINING])
     truth = moved("sine:1.5", 100)
-    still = Poses(np.repeat(truth.position[:1], 100, axis=0), np.repeat(truth.quaternion[:1], 100, axis=0))
+    still = NodePoses(
+        np.repeat(truth.position[:1], 100, axis=0), np.repeat(truth.quaternion[:1], 100, axis=0)
+    )
     predicted = predictor(kc.controls.sine(1.5, 100, DT))
     assert kc.metrics.tip_dtw(predicted, truth) < 0.2 * kc.metrics.tip_dtw(still, truth)
 
@@ -106,7 +108,7 @@ def test_what_knows_nothing_does_not_see_the_imperfection():
 
 
 def test_a_cell_without_figures_has_a_reason():
-    poses = Poses(np.zeros((5, 2, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (5, 2, 1)))
+    poses = NodePoses(np.zeros((5, 2, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (5, 2, 1)))
     assert compared(poses, poses) == {"tip_dtw": 0.0, "pose_mse": 0.0}
     away = poses._replace(position=np.add(poses.position, [0.0, 0.0, 0.1]))
     assert compared(away, poses)["tip_dtw"] == pytest.approx(0.5)

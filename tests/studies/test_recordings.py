@@ -11,7 +11,7 @@ import knode_cosserat as kc
 from knode_cosserat.cli import app
 from knode_cosserat.learning.residual import Nothing
 from knode_cosserat.recordings import RecordingConfig
-from knode_cosserat.recordings.write import Poses, Pulls, write_recording
+from knode_cosserat.recordings.write import MocapPoses, Pulls, write_recording
 from knode_cosserat.rods.section import Sleeve
 from knode_cosserat.rods.tendon_friction import TendonFriction
 from knode_cosserat.studies import recordings as study
@@ -40,13 +40,13 @@ def recorded(path, tension, seed):
     poses = {}
     for name, node in nodes.items():
         turned = Rotation.from_quat(np.asarray(moved.quaternion)[:, node], scalar_first=True)
-        poses[name] = Poses(
+        poses[name] = MocapPoses(
             time,
             np.asarray(moved.position)[:, node] + rng.normal(0.0, 2e-4, (len(time), 3)),
             (turned * Rotation.from_rotvec(rng.normal(0.0, 2e-3, (len(time), 3)))).as_quat(scalar_first=True),
         )
     still = np.tile([0.0, 0.0, PAPER.base.height], (len(time), 1))
-    poses["base"] = Poses(time, still, np.tile([1.0, 0.0, 0.0, 0.0], (len(time), 1)))
+    poses["base"] = MocapPoses(time, still, np.tile([1.0, 0.0, 0.0, 0.0], (len(time), 1)))
     pulled = Pulls(time[::2][: len(control[::2])], control[::2])
     write_recording(path, PAPER, poses, pulled, pulled)
 
@@ -169,13 +169,13 @@ def test_a_model_that_fails_is_reported_soon(folder, monkeypatch, solved):
         return study.Evaluation(0.0, 0.0, 0.0) if ends else study.Evaluation(failed="no solution")
 
     def nothing_learned(knowledge, *_):
-        return study.Learned({0: kc.KNODE(knowledge, Nothing())})
+        return study.TrainedSystems({0: kc.KNODE(knowledge, Nothing())})
 
     monkeypatch.setattr(study, "evaluate", failing)
     monkeypatch.setitem(study.METHODS, "baseline", nothing_learned)
-    paths = study.found(folder)
-    train, _ = study.chosen(list(paths), ["sine_1p0"])
-    jobs = study.jobs(paths, train, ["baseline"], study.Options(seconds=3.0))
+    paths = study.recordings_in(folder)
+    train, _ = study.recording_split(list(paths), ["sine_1p0"])
+    jobs = study.jobs(paths, train, ["baseline"], study.RecordingsOptions(seconds=3.0))
     product = study.predicted(next(each for each in jobs if each.key == "baseline").settings)
     assert given == [0.0] * len(paths) + [study.RECOVERY] * (solved > 0)
     failed = [cell for cell in product.facts["cells"] if "failed" in cell]
@@ -198,8 +198,8 @@ def test_what_is_nearly_all_is_not_all():
 
 def test_which_are_learned_from():
     names = ["a", "rand_0", "sine_1p0", "sine_3p0", "step"]
-    assert study.chosen(names, None) == (["sine_1p0", "sine_3p0", "rand_0"], ["a", "step"])
-    assert study.chosen(names, ["a"])[1] == ["rand_0", "sine_1p0", "sine_3p0", "step"]
+    assert study.recording_split(names, None) == (["sine_1p0", "sine_3p0", "rand_0"], ["a", "step"])
+    assert study.recording_split(names, ["a"])[1] == ["rand_0", "sine_1p0", "sine_3p0", "step"]
 
 
 @pytest.mark.parametrize(
@@ -216,7 +216,7 @@ def test_folders_that_will_not_do(tmp_path, files, train, parts):
     for name in files:
         (tmp_path / name).touch()
     with pytest.raises(StudyError) as error:
-        study.chosen(list(study.found(tmp_path)), train)
+        study.recording_split(list(study.recordings_in(tmp_path)), train)
     message = str(error.value)
     assert "\n" not in message and all(part in message for part in parts)
 

@@ -15,12 +15,12 @@ import knode_cosserat as kc
 from knode_cosserat.cli import main
 from knode_cosserat.viewer.document import document, export_scene
 from knode_cosserat.viewer.drawing import drawing, sliders
-from knode_cosserat.viewer.scene import LEAST_ROWS, MOST, MOST_NODES, kept, packed, scene, track
+from knode_cosserat.viewer.scene import LEAST_ROWS, MOST, MOST_NODES, encoded_array, kept, scene, track
 from knode_cosserat.viewer.serve import view
 
 
 def unpacked(array):
-    """What `scene.packed` says of its bytes, done in numpy."""
+    """What `scene.encoded_array` says of its bytes, done in numpy."""
     kind = np.dtype(f"<{array['type']}")
     data = np.frombuffer(gzip.decompress(base64.b64decode(array["bytes"])), np.uint8)
     columns = np.ascontiguousarray(data.reshape(kind.itemsize, -1).T).view(kind).reshape(-1)
@@ -57,7 +57,7 @@ def test_arrays_come_back(shape, kind):
     values = np.random.default_rng(0).normal(size=shape).astype(kind)
     if values.size:
         values.flat[0] = np.nan
-    np.testing.assert_array_equal(unpacked(packed(values, kind)), values)
+    np.testing.assert_array_equal(unpacked(encoded_array(values, kind)), values)
 
 
 def test_a_track_holds_the_states_and_says_where_things_stand_in_them(truth):

@@ -88,7 +88,7 @@ def recordings(
     .json, figures and models. Resumes an earlier run in the same folder.
     """
     prepare(out, workers, dask)
-    from knode_cosserat.studies.recordings import METHODS, ROBOT, Options, described_in
+    from knode_cosserat.studies.recordings import METHODS, ROBOT, RecordingsOptions, described_in
     from knode_cosserat.studies.recordings_report import rerun
 
     chosen = selected_names("methods", methods, METHODS)
@@ -104,7 +104,7 @@ def recordings(
     files = {key: str(path) for key, path in defaults.items()}
     nominal = files.get("robot", ROBOT) if robot is None else robot
     columns = files.get("config") if config is None else str(config)
-    options = Options(nominal, columns, start, seconds, seeds)
+    options = RecordingsOptions(nominal, columns, start, seconds, seeds)
     run_study(
         lambda **how: rerun(
             out, bags, train=names, methods=chosen, options=options, simulated=simulated, **how

@@ -143,6 +143,6 @@ def one_of(trajectory: Trajectory) -> Trajectory:
 
 def new_figure(width: float, height: float) -> Any:
     """Return an empty figure of a given size (in)."""
-    from knode_cosserat.evaluation.styled import StyledFigure
+    from knode_cosserat.evaluation.styled_figure import StyledFigure
 
     return StyledFigure(figsize=(width, height), layout="constrained", dpi=150)

@@ -24,7 +24,9 @@ _SHOWN = (
 )
 
 
-def states(truth: Trajectory, estimates: Mapping[str, Trajectory], span: tuple[float, float]) -> Figure:
+def estimated_states(
+    truth: Trajectory, estimates: Mapping[str, Trajectory], span: tuple[float, float]
+) -> Figure:
     """Return a figure of tip velocities, base force and base moment over a time span (s), with their errors.
 
     Raises:

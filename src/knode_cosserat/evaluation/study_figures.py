@@ -77,7 +77,7 @@ def shapes(reference: Trajectory, predictions: Mapping[str, Trajectory], count: 
     return figure
 
 
-def tips(cases: Mapping[str, tuple[Trajectory, Mapping[str, Trajectory]]]) -> Figure:
+def predicted_tips(cases: Mapping[str, tuple[Trajectory, Mapping[str, Trajectory]]]) -> Figure:
     """Return a figure of the tips over time: a column per case, given by its reference and predictions."""
     require_some(cases)
     with style():

@@ -42,7 +42,7 @@ class Predicted(NamedTuple):
     command: Float[np.ndarray, "T c"] | None
 
 
-def tensions(recordings: Mapping[str, Predicted]) -> Figure:
+def measured_tensions(recordings: Mapping[str, Predicted]) -> Figure:
     """Return a figure of commanded and measured tensions by tendon.
 
     Raises:

@@ -24,7 +24,7 @@ OBSTACLE = "#C8C8C8"
 _GRID = 240
 
 
-class Points(NamedTuple):
+class PathPoints(NamedTuple):
     """Tip positions without times, such as a desired path."""
 
     tip_position: NDArray[np.float64]

@@ -25,7 +25,7 @@ from knode_cosserat.trajectory import Trajectory
 RECOVERY = 5.0
 
 
-class Poses(NamedTuple):
+class PredictedPoses(NamedTuple):
     """Positions (m) and orientations of bodies."""
 
     position: Float[np.ndarray, "T M 3"]
@@ -161,7 +161,8 @@ def evaluate(
     mse = None
     if oriented.any():
         mse = pose_mse(
-            Poses(position[oriented], quaternion[oriented]), Poses(seen[oriented], turned[oriented])
+            PredictedPoses(position[oriented], quaternion[oriented]),
+            PredictedPoses(seen[oriented], turned[oriented]),
         )
     return Evaluation(
         tip_dtw=dtw_distance(position[known, -1], seen[known, -1]),

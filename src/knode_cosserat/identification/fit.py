@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from knode_cosserat.identification.evaluate import evaluate
-from knode_cosserat.identification.given import DT, measurements_of, names_of, padded, poses_of
 from knode_cosserat.identification.identify import identify
-from knode_cosserat.identification.misfit import Data, Misfit, data_of
+from knode_cosserat.identification.inputs import DT, measurements_of, names_of, padded, poses_of_nodes
+from knode_cosserat.identification.misfit import Misfit, RecordingData, data_of
 from knode_cosserat.identification.model import Model
-from knode_cosserat.identification.residual import Learned, learn_residual
-from knode_cosserat.identification.residual_model import Known, ResidualModel
+from knode_cosserat.identification.residual import LearnedResidual, learn_residual
+from knode_cosserat.identification.residual_model import FixedModel, ResidualModel
 from knode_cosserat.identification.result import Identified
 from knode_cosserat.identification.search import Search, SearchError
 from knode_cosserat.learning.config import FitConfig, PassiveOptions, StructuredOptions
@@ -123,7 +123,7 @@ def with_residual(
     nominal: System, recordings: Sequence[Recording | Measurements], found: Identified, *,
     space: str | SpaceScheme = "lobatto2", progress: Callable[[str], None] | None = None, hidden: int = 4,
     seed: int = 0,
-) -> Learned:  # fmt: skip
+) -> LearnedResidual:  # fmt: skip
     """Learn a passive residual on an identified robot from the recordings that it was identified from.
 
     Args:
@@ -143,13 +143,13 @@ def with_residual(
         raise DataError("there is one recording; a residual needs two at least, for one is left out in turn")
     tension = np.concatenate([each.tension for each in measured])
     model = Model(nominal, tension, measured[0].fractions)  # type: ignore[arg-type]
-    x = coordinates(model, found)
+    x = coordinates_of(model, found)
     robot = model.reduced(x, found.effects)
     both = ResidualModel(model, found.effects, passive(robot, tension, seed, hidden))
     return learn_residual(both, x, _data(measured, model), space, progress or log.info)
 
 
-def coordinates(model: Model, found: Identified) -> np.ndarray:
+def coordinates_of(model: Model, found: Identified) -> np.ndarray:
     """Return the coordinates of an identified robot, by its estimates."""
     x = np.zeros(model.size)
     for name in found.effects:
@@ -163,7 +163,7 @@ def _teller(progress: bool) -> Callable[[str], None]:
     return (lambda line: print(line, file=sys.stderr, flush=True)) if progress else log.info
 
 
-def _data(measured: Sequence[Measurements], model: Any) -> list[Data]:
+def _data(measured: Sequence[Measurements], model: Any) -> list[RecordingData]:
     named = zip(measured, names_of(measured), strict=True)
     return padded([data_of(each, model, name) for each, name in named])
 
@@ -173,7 +173,7 @@ def _measured(given: Sequence[Any]) -> tuple[list[Measurements], list[str]]:
     found, words = [], []
     for k, each in enumerate(given):
         if isinstance(each, Trajectory):
-            found.append(poses_of(each, f"trajectory {k}"))
+            found.append(poses_of_nodes(each, f"trajectory {k}"))
             words.append(f"trajectory {k}: poses of its {len(each.time)} rows, not its other states")
             continue
         (rows,) = measurements_of([each])
@@ -183,12 +183,12 @@ def _measured(given: Sequence[Any]) -> tuple[list[Measurements], list[str]]:
     return measurements_of(found), words
 
 
-def _with(learned: Learned, name: str) -> dict[str, float]:
+def _with(learned: LearnedResidual, name: str) -> dict[str, float]:
     return {"residual": learned.with_residual[name].tip} if name in learned.with_residual else {}
 
 
 def _models(
-    learned: Learned, config: FitConfig, facts: dict[str, Any], others: Sequence[Measurements],
+    learned: LearnedResidual, config: FitConfig, facts: dict[str, Any], others: Sequence[Measurements],
     space: str | SpaceScheme,
 ) -> Any:  # fmt: skip
     """Return the learned model, or one drawn for each of several seeds."""
@@ -222,7 +222,7 @@ def _network(
     tension = np.concatenate([each.tension for each in measured])
     options = config.residual
     assert isinstance(options, PassiveOptions)
-    model = ResidualModel(Known(knowledge), (), passive(knowledge, tension, 0, options.hidden), WIDE)
+    model = ResidualModel(FixedModel(knowledge), (), passive(knowledge, tension, 0, options.hidden), WIDE)
     # it has the members of a Model
     misfit = Misfit(model, _data(measured, model), space)  # type: ignore[arg-type]
     search = Search(misfit, tell)
@@ -231,5 +231,5 @@ def _network(
     except SearchError as error:
         raise FitError(f"{error}: the knowledge is too far from the robot") from None
     robot = model.robot(point.x)
-    learned = Learned(robot, True, {}, {}, (), point.x, point.covariance(), model)
+    learned = LearnedResidual(robot, True, {}, {}, (), point.x, point.covariance(), model)
     return _models(learned, config, {"given": given, "residual": True}, others, space)

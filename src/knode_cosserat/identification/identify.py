@@ -10,15 +10,15 @@ import numpy as np
 
 from knode_cosserat._yaml import did_you_mean
 from knode_cosserat.errors import KnodeCosseratError
-from knode_cosserat.identification.given import SELECTED_DT, coarser, measurements_of, names_of, padded
+from knode_cosserat.identification.inputs import SELECTED_DT, coarser, measurements_of, names_of, padded
 from knode_cosserat.identification.intervals import estimates_of
 from knode_cosserat.identification.journal import Journal
-from knode_cosserat.identification.misfit import Data, Misfit, data_of
+from knode_cosserat.identification.misfit import Misfit, RecordingData, data_of
 from knode_cosserat.identification.model import Model
 from knode_cosserat.identification.result import Estimate, Identified
 from knode_cosserat.identification.search import Point, Search, SearchError
 from knode_cosserat.identification.selection import held_out, selected, sizes, without_idle
-from knode_cosserat.identification.trials import failed_trial, is_coarse, trained_range
+from knode_cosserat.identification.trials import failed_trial, has_coarse_rows, trained_range
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
 from knode_cosserat.rods.parameters import ParameterError
@@ -131,7 +131,7 @@ def _refined(
     space, tell = search.misfit.settings.space, search.tell
     for _ in range(REFINEMENTS):
         model, data = search.misfit.model, search.misfit.data
-        if not is_coarse(model.reduced(point.x, names), data, space):
+        if not has_coarse_rows(model.reduced(point.x, names), data, space):
             break
         nodes = 2 * model.nominal.nodes
         tell(f"the grid of {model.nominal.nodes} nodes is too coarse: {nodes} nodes")
@@ -153,7 +153,7 @@ def _known(effects: Sequence[str], model: Model) -> tuple[str, ...]:
 
 
 def _accepted(
-    search: Search, names: tuple[str, ...], point: Point, data: Sequence[Data], steps: list[str],
+    search: Search, names: tuple[str, ...], point: Point, data: Sequence[RecordingData], steps: list[str],
     space: str | SpaceScheme, tell: Callable[[str], None],
 ) -> Identified:  # fmt: skip
     """Return the identified robot after its trials: with fewer effects if it fails, nominal if that fails."""
@@ -227,7 +227,7 @@ def _errors(search: Search, x: np.ndarray, which: Sequence[int] | None = None) -
 
 
 def _result(
-    search: Search, robot: System, names: tuple[str, ...], point: Point | None, data: Sequence[Data],
+    search: Search, robot: System, names: tuple[str, ...], point: Point | None, data: Sequence[RecordingData],
     steps: Sequence[str], left_out: Sequence[float | None] = (), estimates: Sequence[Estimate] = (),
 ) -> Identified:  # fmt: skip
     model = search.misfit.model

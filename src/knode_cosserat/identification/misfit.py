@@ -13,19 +13,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.identification.model import Model, Parametrised
+from knode_cosserat.identification.model import Model, ParametrisedRobot
 from knode_cosserat.learning.samples import DataError
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.load_cells import LoadCells
 from knode_cosserat.rotation import conjugate, quaternion_product
 from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.history import initial_past, resting_past
+from knode_cosserat.solvers.history import constant_history, resting_history
 from knode_cosserat.solvers.places import Places, places_at, positions_at, quaternions_at
 from knode_cosserat.solvers.run import run_one, usable_cores
+from knode_cosserat.solvers.run_types import FirstStep, InitialCondition, RunSettings
 from knode_cosserat.solvers.sensitivity import tangent_piece
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.solvers.task import FirstStep, Start, Task
 
 #: rows of one compiled program with derivatives
 PIECE = 40
@@ -37,7 +37,7 @@ ARM = 0.2
 STILL = np.zeros((2, 4))
 
 
-class Data(NamedTuple):
+class RecordingData(NamedTuple):
     """One recording, ready to be compared with."""
 
     name: str
@@ -55,7 +55,7 @@ class Data(NamedTuple):
     static: bool = False
 
 
-def data_of(given: Measurements, model: Model, name: str) -> Data:
+def data_of(given: Measurements, model: Model, name: str) -> RecordingData:
     """Return a recording's data.
 
     Raises:
@@ -80,7 +80,7 @@ def data_of(given: Measurements, model: Model, name: str) -> Data:
     initial = tension[0] if given.initial_tension is None else given.initial_tension
     swing = np.max(np.abs(tension - initial), axis=1)
     moving = np.flatnonzero(swing > 0.05 * max(np.max(swing), 1e-12))
-    return Data(
+    return RecordingData(
         name, given.dt, np.asarray(initial), tension, places_at(given.fractions, model.nominal.nodes),
         given.position, since_first(given.quaternion),
         int(moving[0]) if len(moving) and not given.static else 0, given.static,
@@ -130,7 +130,7 @@ class Rollout(NamedTuple):
 class Misfit:
     """Differences of simulations from recordings, by the coordinates of a model."""
 
-    def __init__(self, model: Model, data: Sequence[Data], space: str | SpaceScheme):
+    def __init__(self, model: Model, data: Sequence[RecordingData], space: str | SpaceScheme):
         self.model, self.data = model, tuple(data)
         self.settings = Settings.of("bdf2", space, "paper", NewtonOptions())
         self._first = True
@@ -149,7 +149,7 @@ class Misfit:
         """
         chosen = [self.data[k] for k in (range(len(self.data)) if which is None else which)]
 
-        def work(data: Data) -> Rollout | None:
+        def work(data: RecordingData) -> Rollout | None:
             return self._of_one(x, data, rows, derivatives)
 
         if self._first:  # programs are compiled one by one
@@ -158,7 +158,7 @@ class Misfit:
         with concurrent.futures.ThreadPoolExecutor(usable_cores()) as pool:
             return list(pool.map(work, chosen))
 
-    def _of_one(self, x: Any, data: Data, rows: int | None, derivatives: bool) -> Rollout | None:
+    def _of_one(self, x: Any, data: RecordingData, rows: int | None, derivatives: bool) -> Rollout | None:
         x = np.asarray(x, dtype=float)
         steps = len(data.tension) if rows is None else min(len(data.tension), data.moves + rows)
         system, settings = _system(self.model.robot, x), self.settings
@@ -167,7 +167,10 @@ class Misfit:
         # controls have room for a motion: one program for equilibrium and motion
         still = np.broadcast_to(data.initial_tension, data.tension.shape)
         first, _ = run_one(
-            Task(settings, data.dt, 1, "still", RECOVERY), system, still, Start(past, still[0])
+            RunSettings(settings, data.dt, 1, "still", RECOVERY),
+            system,
+            still,
+            InitialCondition(past, still[0]),
         )
         if first.result[0] < 0:
             return None
@@ -178,8 +181,8 @@ class Misfit:
             else _initial(system, settings, first.records[0][:, :count], data.initial_tension)
         )
         kind: FirstStep = "still" if data.static else "start"
-        task = Task(settings, data.dt, max(steps, 1), kind, recovery_budget=RECOVERY)
-        found, _ = run_one(task, system, acting, Start(begun, data.initial_tension))
+        task = RunSettings(settings, data.dt, max(steps, 1), kind, recovery_budget=RECOVERY)
+        found, _ = run_one(task, system, acting, InitialCondition(begun, data.initial_tension))
         if found.result.min() < 0:
             return None
         ny = system.y_layout.size
@@ -204,10 +207,10 @@ class Misfit:
         values, slopes = _with_slopes(system, y, d_y, *self._target(data, steps))
         return Rollout(np.asarray(values), np.asarray(slopes))
 
-    def _target(self, data: Data, steps: int) -> tuple[Any, ...]:
+    def _target(self, data: RecordingData, steps: int) -> tuple[Any, ...]:
         return data.places, data.position[: steps + 1], data.rotation[: steps + 1]
 
-    def _of_start(self, x: Any, data: Data, past: Any, first: Any) -> tuple[Any, Any]:
+    def _of_start(self, x: Any, data: RecordingData, past: Any, first: Any) -> tuple[Any, Any]:
         """Derivatives of the equilibrium, and of the history that a motion begins with.
 
         An equilibrium has no history: derivatives of the history are zero before it, and those of a motion
@@ -236,7 +239,7 @@ def _cells(system: Any) -> LoadCells | None:
     return getattr(system.nominal, "load_cells", None)
 
 
-def _acting(system: Any, data: Data) -> tuple[np.ndarray, np.ndarray]:
+def _acting(system: Any, data: RecordingData) -> tuple[np.ndarray, np.ndarray]:
     """Return the tensions (T, c) that act by the load cells' latency, and their derivative by it (N/s).
 
     The derivative is over one row: between rows it jumps, and at no latency it is of both sides.
@@ -259,18 +262,18 @@ def _filled(rows: Any, count: int) -> np.ndarray:
 
 
 @jax.jit
-def _system(robot: Parametrised, x: Any) -> Any:
+def _system(robot: ParametrisedRobot, x: Any) -> Any:
     return robot(x)
 
 
-_resting = jax.jit(resting_past, static_argnames="settings")
-_initial = jax.jit(initial_past, static_argnames="settings")
+_resting = jax.jit(resting_history, static_argnames="settings")
+_initial = jax.jit(constant_history, static_argnames="settings")
 
 
 @functools.partial(jax.jit, static_argnames="settings")
 def _piece(
-    robot: Parametrised, x: Any, settings: Settings, table: Any, dt: Any, rows: Any, xi: Any, controls: Any,
-    by_latency: Any, carry: Any,
+    robot: ParametrisedRobot, x: Any, settings: Settings, table: Any, dt: Any, rows: Any, xi: Any,
+    controls: Any, by_latency: Any, carry: Any,
 ) -> Any:  # fmt: skip
     """Derivatives of a piece's rows, and the history after it; `by_latency` are those of the controls."""
     past, d_records, d_rate = carry

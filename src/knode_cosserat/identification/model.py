@@ -42,7 +42,7 @@ def routed(nominal: TendonRod) -> RoutedTendonRobot:
     return RoutedTendonRobot.like(nominal, tendon_offset=offset)
 
 
-def extended(robot: RoutedTendonRobot, ribs: Sequence[float] = ()) -> RoutedTendonRobot:
+def extended_robot(robot: RoutedTendonRobot, ribs: Sequence[float] = ()) -> RoutedTendonRobot:
     """Return the same robot with every part that effects change: a stretch, a sleeve, a tip mass and so on.
 
     A base and load cells that the robot already has are unchanged; all added parts have no effect. Ribs may
@@ -123,7 +123,7 @@ def _without_idle_reels(nominal: RoutedTendonRobot, found: Any, names: Sequence[
     return changes
 
 
-class Parametrised(eqx.Module):
+class ParametrisedRobot(eqx.Module):
     """A robot with all effects as a function of coordinates: a pytree, so that programs serve any robot.
 
     Attributes:
@@ -169,10 +169,10 @@ class Model:
         """Start from the nominal robot, usual tensions (N), and places of measured bodies (parts of L)."""
         tensions, highest = float(np.nanmean(tension)), float(np.nanmax(tension.sum(axis=1)))
         self.nominal = routed(nominal)
-        self._extended = extended(self.nominal, [float(at) for at in bodies if at > 0.0])
+        self._extended = extended_robot(self.nominal, [float(at) for at in bodies if at > 0.0])
         self.effects: tuple[Effect, ...] = tuple(effects_of(self._extended, tensions, highest))
         self.numbers: tuple[Number, ...] = tuple(each for effect in self.effects for each in effect.numbers)
-        self.robot = Parametrised(
+        self.robot = ParametrisedRobot(
             self._extended,
             np.array([each.nominal for each in self.numbers]),
             np.array([each.width for each in self.numbers]),

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.identification.misfit import Data, Misfit, Rollout
+from knode_cosserat.identification.misfit import Misfit, RecordingData, Rollout
 from knode_cosserat.identification.residual_model import ResidualModel
 from knode_cosserat.identification.search import (
     FINE,
@@ -49,7 +49,7 @@ LEVEL, NORMAL = 0.9, 1.645
 MOST_INFLATED = 30.0
 
 
-class Errors(NamedTuple):
+class PositionErrors(NamedTuple):
     """Root mean square errors of a recording's positions (m): of the last body, and of all."""
 
     tip: float
@@ -57,7 +57,7 @@ class Errors(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Learned:
+class LearnedResidual:
     """Result of the search for a residual.
 
     Attributes:
@@ -73,8 +73,8 @@ class Learned:
 
     robot: System
     kept: bool
-    without: dict[str, Errors]
-    with_residual: dict[str, Errors]
+    without: dict[str, PositionErrors]
+    with_residual: dict[str, PositionErrors]
     steps: tuple[str, ...]
     x: Float[np.ndarray, " n"]
     covariance: Float[np.ndarray, "n n"]
@@ -90,9 +90,9 @@ class Learned:
 
 
 def learn_residual(
-    model: ResidualModel, x: Float[np.ndarray, " m"], data: Sequence[Data], space: str | SpaceScheme,
+    model: ResidualModel, x: Float[np.ndarray, " m"], data: Sequence[RecordingData], space: str | SpaceScheme,
     tell: Callable[[str], None],
-) -> Learned:  # fmt: skip
+) -> LearnedResidual:  # fmt: skip
     """Learn a residual on an identified robot from at least two recordings.
 
     Args:
@@ -115,7 +115,7 @@ def learn_residual(
     widths = promising(problem, begin, model)
     without = [_fold(search, point, k) for k in range(len(data))]
     before, steps = [each.errors for each in without], []
-    tested: dict[float, list[Errors]] = {}
+    tested: dict[float, list[PositionErrors]] = {}
     if not widths:
         steps.append("no part of a residual promises anything for held-out recordings")
     while widths:
@@ -142,12 +142,14 @@ def learn_residual(
 
 
 def _learned(
-    model: ResidualModel, robot: System, data: Sequence[Data], before: Sequence[Errors],
-    after: Sequence[Errors] | None, steps: list[str], x: np.ndarray, covariance: np.ndarray,
-) -> Learned:  # fmt: skip
+    model: ResidualModel, robot: System, data: Sequence[RecordingData], before: Sequence[PositionErrors],
+    after: Sequence[PositionErrors] | None, steps: list[str], x: np.ndarray, covariance: np.ndarray,
+) -> LearnedResidual:  # fmt: skip
     names = [each.name for each in data]
     without, found = (dict(zip(names, each or (), strict=False)) for each in (before, after))
-    return Learned(robot, isinstance(robot, KNODE), without, found, tuple(steps), x, covariance, model)
+    return LearnedResidual(
+        robot, isinstance(robot, KNODE), without, found, tuple(steps), x, covariance, model
+    )
 
 
 def _solved(misfit: Misfit, x: np.ndarray) -> list[Rollout]:
@@ -204,7 +206,7 @@ class _Fold(NamedTuple):
     """
 
     point: Point | None
-    errors: Errors
+    errors: PositionErrors
     over: Float[np.ndarray, " m"]
 
 
@@ -225,28 +227,30 @@ def _fold(search: Search, point: Point, k: int, from_: Any = None) -> _Fold:
     except SearchError:
         found = None
     if found is None:
-        return _Fold(None, Errors(np.inf, np.inf), np.zeros(0))
+        return _Fold(None, PositionErrors(np.inf, np.inf), np.zeros(0))
     return _Fold(fold, _errors(found), _over_spread(found, fold))
 
 
-def _in_parts(misfit: Misfit, without: Sequence[_Fold], folds: Sequence[_Fold]) -> dict[float, list[Errors]]:
+def _in_parts(
+    misfit: Misfit, without: Sequence[_Fold], folds: Sequence[_Fold]
+) -> dict[float, list[PositionErrors]]:
     """Return the held-out errors of parts of the way from the robots without to those with a residual."""
-    found: dict[float, list[Errors]] = {1.0: [each.errors for each in folds]}
+    found: dict[float, list[PositionErrors]] = {1.0: [each.errors for each in folds]}
     for part in SHRUNK:
         found[part] = []
         for k, (one, other) in enumerate(zip(without, folds, strict=True)):
             if one.point is None or other.point is None:
-                found[part].append(Errors(np.inf, np.inf))
+                found[part].append(PositionErrors(np.inf, np.inf))
                 continue
             x = one.point.x + part * (other.point.x - one.point.x)
             (rollout,) = misfit.differences(x, which=[k], derivatives=False)
-            found[part].append(Errors(np.inf, np.inf) if rollout is None else _errors(rollout))
+            found[part].append(PositionErrors(np.inf, np.inf) if rollout is None else _errors(rollout))
     return found
 
 
-def _errors(found: Rollout) -> Errors:
+def _errors(found: Rollout) -> PositionErrors:
     square = np.sum(found.values[..., :3] ** 2, axis=-1)
-    return Errors(float(np.sqrt(np.nanmean(square[:, -1]))), float(np.sqrt(np.nanmean(square))))
+    return PositionErrors(float(np.sqrt(np.nanmean(square[:, -1]))), float(np.sqrt(np.nanmean(square))))
 
 
 def _over_spread(found: Rollout, fold: Point) -> Float[np.ndarray, " m"]:
@@ -259,7 +263,9 @@ def _over_spread(found: Rollout, fold: Point) -> Float[np.ndarray, " m"]:
     return np.abs(values[known]) / np.maximum(spread[known], 1e-9)
 
 
-def _verdict(without: Sequence[Errors], tested: dict[float, list[Errors]]) -> tuple[float, str]:
+def _verdict(
+    without: Sequence[PositionErrors], tested: dict[float, list[PositionErrors]]
+) -> tuple[float, str]:
     """Return the part of the residual that is kept, 0 for none, and why, in words.
 
     It must raise no held-out error, of tip or bodies, and lower them by more than their scatter.

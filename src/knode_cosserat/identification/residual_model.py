@@ -19,7 +19,7 @@ from knode_cosserat.rods.system import System
 WIDTHS = {"stiffness": 0.2, "levers": 0.3, "energy": 0.2, "damping": 1.0, "dissipation": 1.0}
 
 
-class Known:
+class FixedModel:
     """A robot of which nothing is identified, as `Model` has one."""
 
     size = 0
@@ -62,7 +62,7 @@ class ResidualModel:
 
     def __init__(
         self,
-        model: Model | Known,
+        model: Model | FixedModel,
         names: Sequence[str],
         residual: Passive,
         widths: Mapping[str, float] = WIDTHS,

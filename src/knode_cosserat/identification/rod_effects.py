@@ -26,7 +26,7 @@ FIRST_MODE = 3.516
 DAMPING_RATIO = 0.02
 
 
-class Sizes(NamedTuple):
+class UsualSizes(NamedTuple):
     """Usual sizes of a robot's quantities, for the widths of priors.
 
     Attributes:
@@ -58,7 +58,7 @@ class Sizes(NamedTuple):
 
 def rod_effects(nominal: RoutedTendonRobot, placed: float) -> list[Effect]:
     """Return the effects of the rod; `placed` is the uncertainty of the clamped end, in lengths."""
-    sizes = Sizes.of(nominal)
+    sizes = UsualSizes.of(nominal)
     return [
         *_stiffness_effects(nominal, sizes),
         *_damping_effects(nominal, sizes),
@@ -67,7 +67,7 @@ def rod_effects(nominal: RoutedTendonRobot, placed: float) -> list[Effect]:
     ]
 
 
-def _stiffness_effects(nominal: RoutedTendonRobot, sizes: Sizes) -> list[Effect]:
+def _stiffness_effects(nominal: RoutedTendonRobot, sizes: UsualSizes) -> list[Effect]:
     L = sizes.length
     return [
         Effect(
@@ -114,7 +114,7 @@ def _stiffness_effects(nominal: RoutedTendonRobot, sizes: Sizes) -> list[Effect]
     ]
 
 
-def _damping_effects(nominal: RoutedTendonRobot, sizes: Sizes) -> list[Effect]:
+def _damping_effects(nominal: RoutedTendonRobot, sizes: UsualSizes) -> list[Effect]:
     branch, linear = nominal.relaxation, nominal.linear_drag
     slow = (0.0, 1.0) if branch is None else (float(branch.stiffness), float(branch.time))
     fluid = 0.0 if linear is None else float(linear[0, 0])
@@ -156,7 +156,7 @@ def _damping_effects(nominal: RoutedTendonRobot, sizes: Sizes) -> list[Effect]:
     ]  # fmt: skip
 
 
-def _mass_effects(nominal: RoutedTendonRobot, sizes: Sizes) -> list[Effect]:
+def _mass_effects(nominal: RoutedTendonRobot, sizes: UsualSizes) -> list[Effect]:
     carried = sizes.carried
     effects = [
         Effect(

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.identification.misfit import Data
+from knode_cosserat.identification.misfit import RecordingData
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.trained_range import TrainedRange
 from knode_cosserat.solvers.equilibrium import equilibrium
@@ -28,7 +28,7 @@ FEW = 0.01
 RECOVERY = 2.0
 
 
-def failed_trial(robot: System, data: Sequence[Data], space: str | SpaceScheme) -> str | None:
+def failed_trial(robot: System, data: Sequence[RecordingData], space: str | SpaceScheme) -> str | None:
     """Return why a robot is not accepted, or None if it passes all trials.
 
     It has to follow the tensions of every recording, the same with 1.5 times the amplitude, and random
@@ -48,7 +48,7 @@ def failed_trial(robot: System, data: Sequence[Data], space: str | SpaceScheme) 
     return f"random tensions: {reason}" if reason else None
 
 
-def is_coarse(robot: System, data: Sequence[Data], space: str | SpaceScheme) -> bool:
+def has_coarse_rows(robot: System, data: Sequence[RecordingData], space: str | SpaceScheme) -> bool:
     """Return True if the grid is too coarse in more than a few rows of the recordings.
 
     A robot that cannot be simulated is not too coarse: `failed_trial` reports it.
@@ -63,7 +63,9 @@ def is_coarse(robot: System, data: Sequence[Data], space: str | SpaceScheme) -> 
     return False
 
 
-def trained_range(robot: System, data: Sequence[Data], space: str | SpaceScheme) -> TrainedRange | None:
+def trained_range(
+    robot: System, data: Sequence[RecordingData], space: str | SpaceScheme
+) -> TrainedRange | None:
     """Return the range of controls, strains and strain rates of the robot in its recordings."""
     return TrainedRange.of(
         part
@@ -72,7 +74,7 @@ def trained_range(robot: System, data: Sequence[Data], space: str | SpaceScheme)
     )
 
 
-def _random(data: Sequence[Data]) -> Float[np.ndarray, "T c"]:
+def _random(data: Sequence[RecordingData]) -> Float[np.ndarray, "T c"]:
     low = np.min([each.tension.min(axis=0) for each in data], axis=0)
     high = np.max([each.tension.max(axis=0) for each in data], axis=0)
     dt = data[0].dt

@@ -17,7 +17,7 @@ from knode_cosserat.rods.system import System, unpacked_history
 from knode_cosserat.trajectory import Trajectory
 
 
-class Finding(NamedTuple):
+class ExplainedTerm(NamedTuple):
     """One term: part, corrected field, function, coefficient, and the coefficient's unit."""
 
     part: str
@@ -30,7 +30,7 @@ class Finding(NamedTuple):
         return f"{self.part:<8} {self.target:<5} {self.coefficient:+.5g} {self.function}  [{self.unit}]"
 
 
-def explain(model: KNODE) -> list[Finding]:
+def explain(model: KNODE) -> list[ExplainedTerm]:
     """Return the terms that the residual adds to the nominal model, the largest first within each part.
 
     The parts are length, stress, load and tip. A star marks terms in the global frame; all others are in the
@@ -50,7 +50,7 @@ def explain(model: KNODE) -> list[Finding]:
         raise TypeError(f"a {type(residual).__name__} has no terms to read; allowed is a structured residual")
     found = []
     if float(residual.stretch) != 0.0:
-        found.append(Finding("length", "", "of the knowledge's length", float(residual.stretch), "1"))
+        found.append(ExplainedTerm("length", "", "of the knowledge's length", float(residual.stretch), "1"))
     strain = knowledge.z_layout
     rates = Layout(
         *((f"{name}_t", size, f"{unit}/s", meaning) for name, size, unit, meaning, *_ in strain.fields)
@@ -68,18 +68,18 @@ def explain(model: KNODE) -> list[Finding]:
     return found
 
 
-def _terms(part: str, targets: Layout, expansion: Expansion | None, inputs: Layout) -> list[Finding]:
+def _terms(part: str, targets: Layout, expansion: Expansion | None, inputs: Layout) -> list[ExplainedTerm]:
     if expansion is None:
         return []
     rows = [
         (field, f"{field.name}{_axis(field.size, i)}") for field in targets.fields for i in range(field.size)
     ]
-    found: list[tuple[float, Finding]] = []
+    found: list[tuple[float, ExplainedTerm]] = []
     weights = np.asarray(expansion.weights)
     for (field, target), row in zip(rows, weights, strict=True):
         base = field.load or field.unit
         if row[0] != 0.0:
-            found.append((abs(float(row[0])), Finding(part, target, "1", float(row[0]), base)))
+            found.append((abs(float(row[0])), ExplainedTerm(part, target, "1", float(row[0]), base)))
         for term, where in expansion.columns():
             unit = inputs.fields[inputs.names.index(term.name)].unit
             for axis, k in enumerate(where):
@@ -90,7 +90,7 @@ def _terms(part: str, targets: Layout, expansion: Expansion | None, inputs: Layo
                     size = float(row[k]) / float(expansion.scales[term.scale]) ** power
                     shape = _function(term, axis, expansion)
                     divided = f"{base} / ({unit}){'' if power == 1 else f'^{power}'}"
-                    found.append((abs(float(row[k])), Finding(part, target, shape, size, divided)))
+                    found.append((abs(float(row[k])), ExplainedTerm(part, target, shape, size, divided)))
     return [finding for _, finding in sorted(found, key=lambda pair: -pair[0])]
 
 

@@ -20,14 +20,19 @@ from knode_cosserat.learning.ensemble import Ensemble
 from knode_cosserat.learning.knode import KNODE, About
 from knode_cosserat.learning.passive import passive, require_bending
 from knode_cosserat.learning.residual import Residual, network
-from knode_cosserat.learning.samples import Dataset, of_strands, samples
-from knode_cosserat.learning.structured.solved import solved
+from knode_cosserat.learning.samples import Dataset, samples, strand_samples
+from knode_cosserat.learning.structured.solved import residuals_of
 from knode_cosserat.learning.training.checkpoint import Checkpoints, Identity, data_hash
-from knode_cosserat.learning.training.courses import Courses, courses, held_out_courses, tip_error
 from knode_cosserat.learning.training.descent import standardised
+from knode_cosserat.learning.training.progress import ProgressMonitor
+from knode_cosserat.learning.training.rollouts import (
+    TrajectoryBatches,
+    held_out_batches,
+    tip_error,
+    trajectory_batches,
+)
 from knode_cosserat.learning.training.runs import FitError, Run, run_all
 from knode_cosserat.learning.training.stages import RolloutRun, SegmentRun
-from knode_cosserat.learning.training.watch import Watch
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.rods.trained_range import TrainedRange
 from knode_cosserat.trajectory import Trajectory
@@ -83,13 +88,13 @@ def fit(
     _check(knowledge, config, held_out, checkpoint_every)
     trajectories, held_out = _listed("trajectories", trajectories), _listed("held_out", held_out)
     first = _first(knowledge, trajectories, config)
-    given = _Given(knowledge, trajectories, config, first.dataset, held_out_courses(knowledge, held_out))
+    given = _Given(knowledge, trajectories, config, first.dataset, held_out_batches(knowledge, held_out))
     kept = None
     if checkpoint is not None:
         kept = Checkpoints(checkpoint, Identity.of(knowledge, trajectories, held_out, config))
     learned = dict(zip(config.seeds, first.residuals, strict=True))
     histories: dict[int, dict[str, Any]] = {seed: {} for seed in config.seeds}
-    with Watch(progress, log_dir) as watch:
+    with ProgressMonitor(progress, log_dir) as watch:
         for stage in (_segment_runs, _rollout_runs):
             runs = stage(given, learned)
             if not runs:
@@ -156,7 +161,7 @@ class _Given(NamedTuple):
     trajectories: Sequence[Trajectory]
     config: FitConfig
     dataset: Any
-    held_out: Courses | None
+    held_out: TrajectoryBatches | None
 
 
 def _first(knowledge: System, trajectories: Sequence[Trajectory], config: FitConfig) -> _First:
@@ -165,7 +170,7 @@ def _first(knowledge: System, trajectories: Sequence[Trajectory], config: FitCon
         nodes = None if config.segments is None else config.segments.nodes
         noise = 0.0 if config.segments is None else config.segments.data_noise
         noisy = [_noisy(each, noise, k) for k, each in enumerate(trajectories)]
-        dataset = of_strands(knowledge, samples(knowledge, noisy, nodes))
+        dataset = strand_samples(knowledge, samples(knowledge, noisy, nodes))
     if isinstance(options, NetworkOptions):
         networks = [network(knowledge.strand, options, jax.random.key(seed)) for seed in config.seeds]
         if options.standardised and dataset is not None:
@@ -174,7 +179,7 @@ def _first(knowledge: System, trajectories: Sequence[Trajectory], config: FitCon
     if isinstance(options, PassiveOptions):
         controls = np.concatenate([np.asarray(each.control) for each in trajectories])
         return _First(dataset, [passive(knowledge, controls, seed, options.hidden) for seed in config.seeds])
-    return _First(dataset, list(solved(knowledge, trajectories, options, config.seeds)))
+    return _First(dataset, list(residuals_of(knowledge, trajectories, options, config.seeds)))
 
 
 def _noisy(trajectory: Trajectory, size: float, number: int) -> Trajectory:
@@ -213,7 +218,7 @@ def _rollout_runs(given: _Given, learned: dict[int, Residual]) -> list[Run]:
     options = given.config.rollouts
     if options is None:
         return []
-    along = courses(given.knowledge, given.trajectories, options)
+    along = trajectory_batches(given.knowledge, given.trajectories, options)
     return [
         RolloutRun(given.knowledge, residual, along, options, seed, given.held_out)
         for seed, residual in learned.items()

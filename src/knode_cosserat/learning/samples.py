@@ -1,8 +1,8 @@
 """One-segment samples of trajectories: the true states at both ends of every segment.
 
 A sample is one segment of the rod at one time. From the true y at its start, with the true history, a model
-predicts y at its end and z at its start (`predict`). Integration spans one segment only, so that errors do
-not accumulate and all samples are predicted in parallel.
+predicts y at its end and z at its start (`predict_segment`). Integration spans one segment only, so that
+errors do not accumulate and all samples are predicted in parallel.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.errors import KnodeCosseratError
-from knode_cosserat.learning.sides import far_side, slopes_of
+from knode_cosserat.learning.discontinuities import far_side, slopes_of
 from knode_cosserat.rods.system import System, in_strands, records_in_strands, unpacked_history
 from knode_cosserat.solvers.grid import at_places, grid_of, inside
 from knode_cosserat.solvers.history import coefficient_table, rows_suffice
@@ -89,7 +89,9 @@ class Dataset:
 CORRECTIONS = 4
 
 
-def predict(system: System, space: SpaceScheme, sample: Samples) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
+def predict_segment(
+    system: System, space: SpaceScheme, sample: Samples
+) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
     """Predict y at the end of one segment and z at its start (paper eq. 9, integration over one segment).
 
     y at the end follows the scheme's formula, with stages from the true y at both ends.
@@ -127,7 +129,7 @@ def predict(system: System, space: SpaceScheme, sample: Samples) -> tuple[Float[
         history = unpacked_history(system, sample.c0, records[0])
         if system.jumps:
             acting = jnp.asarray(grid.acting)[own]
-            beyond = system.crossed(acting, sample.t, y, sample.control, history)
+            beyond = system.jump(acting, sample.t, y, sample.control, history)
             y = jnp.where(k > 0, beyond, y)
 
         def corrected(_: Any, end: Any) -> Any:
@@ -186,13 +188,13 @@ def samples(
     return Dataset(segments, tips, settings_of(trajectories[0]).space, len(ends), doubt)
 
 
-def told_by_rows(knowledge: System, trajectories: Sequence[Trajectory]) -> bool:
+def rows_are_states(knowledge: System, trajectories: Sequence[Trajectory]) -> bool:
     """True if the rows hold every state that steps need, or were not simulated."""
     made = [each.settings for each in trajectories]
     return all(settings is None or rows_suffice(knowledge, settings.space) for settings in made)
 
 
-def of_strands(knowledge: System, data: Dataset) -> Dataset:
+def strand_samples(knowledge: System, data: Dataset) -> Dataset:
     """Return the segments strand by strand, as samples of `knowledge.strand`; the tips are unchanged."""
     count, segments = knowledge.strands, data.segments
     if count == 1:
@@ -275,14 +277,14 @@ def _past_of_rows(
     simulated = trajectory.settings is not None
     known = histories_along(model, trajectory) if model is not None and simulated else None
     if known is None:
-        past = jax.vmap(lambda each: past_of_segments(knowledge, space, each))(history)
+        past = jax.vmap(lambda each: segment_history(knowledge, space, each))(history)
     else:
         first, along = known
         past = jax.vmap(lambda each: in_segments(knowledge, space, each))(along[rows - first])
     return np.asarray(past[0]), np.asarray(past[1])
 
 
-def past_of_segments(knowledge: System, space: SpaceScheme, records: Float[Any, "nodes x"]) -> Any:
+def segment_history(knowledge: System, space: SpaceScheme, records: Float[Any, "nodes x"]) -> Any:
     """Return `Samples.history` and `Samples.later` of one row's segments, from its history at the nodes."""
     return in_segments(knowledge, space, at_places(knowledge, space, records))
 

@@ -49,9 +49,9 @@ def _health(recording: Recording) -> Any:
 
 
 def _measured(*args: Any) -> Any:
-    from knode_cosserat.recordings.exchange import measured
+    from knode_cosserat.recordings.exchange import measurement_fields
 
-    return measured(*args)
+    return measurement_fields(*args)
 
 
 def _save(*args: Any) -> None:

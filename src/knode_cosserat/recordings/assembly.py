@@ -8,9 +8,9 @@ from knode_cosserat.recordings import clocks
 from knode_cosserat.recordings.cleaned import cleaned_poses, cleaned_tensions
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.findings import SEVERITIES, Finding, RecordingError
-from knode_cosserat.recordings.frame import placed
+from knode_cosserat.recordings.frame import bodies_in_robot_frame
 from knode_cosserat.recordings.messages import Stream
-from knode_cosserat.recordings.plausible import units_doubted
+from knode_cosserat.recordings.plausibility import implausible_units
 from knode_cosserat.recordings.recording import Recording
 
 
@@ -33,7 +33,7 @@ def assembled(
         if stream.broken:
             what = f"{stream.broken} messages could not be understood, and are left out"
             findings.append(Finding("warning", stream.topic, what))
-    times, about_clocks = clocks.chosen(list(found.values()), config.clock)
+    times, about_clocks = clocks.measurement_times(list(found.values()), config.clock)
     rows = {}
     for topic in found:
         rows[topic], about_order = clocks.ordered(topic, times[topic])
@@ -52,9 +52,11 @@ def assembled(
     *bodies, base = poses
     tension, command, about_tensions = cleaned_tensions(config, seconds, values, path)
     assert all(body is not None for body in bodies)
-    in_frame, base, rest, about_frame = placed([body for body in bodies if body is not None], base, config)
+    in_frame, base, rest, about_frame = bodies_in_robot_frame(
+        [body for body in bodies if body is not None], base, config
+    )
     findings += about_poses + about_tensions + about_frame
-    findings += units_doubted(in_frame, None if config.motors else tension, command, rest)
+    findings += implausible_units(in_frame, None if config.motors else tension, command, rest)
     if config.simulated:
         findings.append(Finding("note", "", "the robot was itself a simulation, and not a physical one"))
     description = f"{name}: {config.description}" if config.description else name

@@ -29,7 +29,9 @@ def _offset(stream: Stream) -> float:
     return float(np.median((stream.received - stream.stamped)[known])) * 1e-9
 
 
-def chosen(streams: Sequence[Stream], clock: str) -> tuple[dict[str, Int[np.ndarray, " n"]], list[Finding]]:
+def measurement_times(
+    streams: Sequence[Stream], clock: str
+) -> tuple[dict[str, Int[np.ndarray, " n"]], list[Finding]]:
     """Return the measurement times (ns) by topic, on the better of the two clocks, and the findings."""
     findings: list[Finding] = []
     late = offsets(streams)

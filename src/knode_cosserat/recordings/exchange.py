@@ -13,7 +13,7 @@ from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.sources import MarkerSource, TensionSource
 from knode_cosserat.recordings.table import HELD
-from knode_cosserat.recordings.write import Poses, Pulls, write_recording
+from knode_cosserat.recordings.write import MocapPoses, Pulls, write_recording
 from knode_cosserat.solvers.places import places_at, positions_at, quaternions_at
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 TABLES = (".csv", ".parquet")
 
 
-def measured(trajectory: Trajectory, fractions: Sequence[float]) -> dict[str, Any]:
+def measurement_fields(trajectory: Trajectory, fractions: Sequence[float]) -> dict[str, Any]:
     """Return the fields of `Measurements` for a trajectory; see `Measurements.of`."""
     y, system = np.asarray(trajectory.y), trajectory.system
     if y.ndim == 4:
@@ -67,7 +67,7 @@ def save(measurements: Measurements, path: str | Path) -> None:
         rows = it.measured[:, k]
         oriented = bool(np.isfinite(it.quaternion[rows, k]).any())
         quaternion = it.quaternion[rows, k] if oriented else None
-        poses[name] = Poses(it.time[rows], it.position[rows, k], quaternion)
+        poses[name] = MocapPoses(it.time[rows], it.position[rows, k], quaternion)
     before = it.initial_tension
     config = RecordingConfig(
         markers=tuple(

@@ -44,7 +44,7 @@ def rest_of(bodies: Sequence[Body]) -> tuple[float, float] | None:
     return (float(start), float(end)) if end - start >= SHORTEST_REST and rows >= FEWEST_FRAMES else None
 
 
-def placed(
+def bodies_in_robot_frame(
     bodies: Sequence[Body], base: Body | None, config: RecordingConfig
 ) -> tuple[list[Body], Body | None, tuple[float, float] | None, list[Finding]]:
     """Return the bodies (with the rod's orientations) and the base in the robot's frame, rest and findings.
@@ -93,7 +93,7 @@ def _of_the_rod(
     if rotation is not None:
         constant = Rotation.from_quat(rotation, scalar_first=True)
     else:
-        still = at_rest(body.time, rest)
+        still = rest_mask(body.time, rest)
         if still.sum() < FEWEST_FRAMES:
             what = (
                 "how its axes are turned is not known, because it was not seen at rest; its orientations are "
@@ -106,7 +106,7 @@ def _of_the_rod(
     return dataclasses.replace(body, quaternion=turned), []
 
 
-def at_rest(time: Float[np.ndarray, " n"], rest: tuple[float, float] | None) -> np.ndarray:
+def rest_mask(time: Float[np.ndarray, " n"], rest: tuple[float, float] | None) -> np.ndarray:
     """Return a mask of the rows within the rest."""
     return np.zeros(len(time), dtype=bool) if rest is None else (time >= rest[0] - 1e-6) & (time < rest[1])
 
@@ -115,7 +115,7 @@ def rest_positions(
     bodies: Sequence[Body], rest: tuple[float, float] | None
 ) -> Float[np.ndarray, "M 3"] | None:
     """Return the mean positions of the bodies at rest (m), or None if one of them is not seen at rest."""
-    means = [body.position[at_rest(body.time, rest)] for body in bodies]
+    means = [body.position[rest_mask(body.time, rest)] for body in bodies]
     if any(len(positions) == 0 for positions in means):
         return None
     return np.array([positions.mean(axis=0) for positions in means])

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from knode_cosserat.recordings.cleaning import rotation_steps
 from knode_cosserat.recordings.findings import Finding
-from knode_cosserat.recordings.frame import at_rest, rest_positions, rod_lengths
+from knode_cosserat.recordings.frame import rest_mask, rest_positions, rod_lengths
 from knode_cosserat.recordings.quality import Health, Latency, StreamHealth, TensionError
 from knode_cosserat.recordings.recording import Body, Recording, Tensions, period
 
@@ -102,7 +102,7 @@ def _noise(
     time: Float[np.ndarray, " n"], values: Float[np.ndarray, "n size"], rest: tuple[float, float] | None
 ) -> float | None:
     """Return the noise's standard deviation from third differences, at rest if possible; None if unknown."""
-    still = values[at_rest(time, rest)]
+    still = values[rest_mask(time, rest)]
     known = still if len(still) >= _ENOUGH else values
     if len(known) < _ENOUGH:
         return None

@@ -18,7 +18,7 @@ from knode_cosserat.recordings import ros1, ros2
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.container import Container
 from knode_cosserat.recordings.findings import Finding, RecordingError
-from knode_cosserat.recordings.messages import SIMULATED, Role, Stream, decoded
+from knode_cosserat.recordings.messages import SIMULATED, Role, Stream, decoded_messages
 from knode_cosserat.recordings.recording import Recording
 
 GZIP_MAGIC = b"\x1f\x8b"
@@ -118,7 +118,7 @@ def _from_bag(path: Path, begin: bytes, config: RecordingConfig) -> Recording:
         if topic is None:
             there = ", ".join(sorted(container.topics)) or "none"
             raise RecordingError(f"{path}: topic {name} ({role}) is missing; the bag has {there}")
-        found[name] = decoded(topic, container.ros, role, config.command, str(path))
+        found[name] = decoded_messages(topic, container.ros, role, config.command, str(path))
         # messages contain text verbatim
         if config.simulated is None and any(SIMULATED.encode() in bytes(raw) for raw in topic.raw[:100]):
             config = config.replace(simulated=True)

@@ -83,7 +83,9 @@ def typestore(ros: int) -> Any:
     return get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_HUMBLE)
 
 
-def decoded(topic: Topic, ros: int, role: Role, command: CommandSource | None, source: str) -> Stream:
+def decoded_messages(
+    topic: Topic, ros: int, role: Role, command: CommandSource | None, source: str
+) -> Stream:
     """Return the numbers in a topic's messages; messages that cannot be decoded are left out and counted.
 
     Raises:

@@ -18,7 +18,7 @@ from knode_cosserat import controls
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.sources import TENSION_UNITS
-from knode_cosserat.recordings.write import FORMATS, Poses, Pulls, write_recording
+from knode_cosserat.recordings.write import FORMATS, MocapPoses, Pulls, write_recording
 from knode_cosserat.rods.tendon_rod import TendonRod
 from knode_cosserat.rods.virtual_robot import VirtualRobot
 from knode_cosserat.solvers.equilibrium import equilibrium
@@ -116,7 +116,7 @@ def record_virtual(
         raise RecordingError(f"the robot has {robot.control_size} controls; allowed is one with four tendons")
     sent = commands(signal, seconds)
     truth = driven(sent, sensors.lag, virtual_robot() if robot is None else robot)
-    poses, tension = measured(truth, sent, seed, sensors)
+    poses, tension = simulated_sensors(truth, sent, seed, sensors)
     config = RecordingConfig.paper_robot().replace(
         simulated=True, description=f"a virtual robot, simulated: {signal}"
     )
@@ -192,7 +192,9 @@ def driven(sent: Pulls, lag: float, robot: TendonRod) -> Trajectory:
 # sensors
 
 
-def measured(truth: Trajectory, sent: Pulls, seed: int, sensors: Sensors) -> tuple[dict[str, Poses], Pulls]:
+def simulated_sensors(
+    truth: Trajectory, sent: Pulls, seed: int, sensors: Sensors
+) -> tuple[dict[str, MocapPoses], Pulls]:
     """Return simulated motion capture (poses by the paper's marker names) and load cells of a motion."""
     random = np.random.default_rng(seed)
     time = np.round(np.asarray(truth.time), 9)
@@ -225,7 +227,7 @@ def _seen(
     swap: float | None,
     random: np.random.Generator,
     sensors: Sensors,
-) -> Poses:
+) -> MocapPoses:
     """Return noisy poses of a body with randomly rotated axes, without its lost frames."""
     from scipy.spatial.transform import Rotation
 
@@ -239,4 +241,4 @@ def _seen(
         late = time >= swap
         seen = Rotation.concatenate([seen[~late], seen[late] * quarter]) if late.any() else seen
     position = place + random.normal(0.0, sensors.position_noise, place.shape)
-    return Poses(time[kept], position[kept], seen.as_quat(scalar_first=True)[kept])
+    return MocapPoses(time[kept], position[kept], seen.as_quat(scalar_first=True)[kept])

@@ -43,7 +43,7 @@ _PARTS = (
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Poses:
+class MocapPoses:
     """Poses of a body from motion capture, in motion capture's frame and with the body's own axes.
 
     Attributes:
@@ -68,7 +68,7 @@ class Pulls:
 def write_recording(
     path: str | Path,
     config: RecordingConfig,
-    poses: Mapping[str, Poses],
+    poses: Mapping[str, MocapPoses],
     tension: Pulls | None = None,
     command: Pulls | None = None,
     *,
@@ -122,7 +122,7 @@ class _Stream:
 def _on_the_wire(
     path: Path,
     config: RecordingConfig,
-    poses: Mapping[str, Poses],
+    poses: Mapping[str, MocapPoses],
     tension: Pulls | None,
     command: Pulls | None,
 ) -> list[_Stream]:

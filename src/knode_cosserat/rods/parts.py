@@ -49,7 +49,7 @@ def kinds_of(family: type) -> dict[str, type[Part]]:
     return dict(sorted(found.items()))
 
 
-def placed(fields: tuple[Field, ...], prefix: str) -> tuple[Field, ...]:
+def prefixed_fields(fields: tuple[Field, ...], prefix: str) -> tuple[Field, ...]:
     """Return fields with their part's prefix before their names."""
     return tuple(field._replace(name=f"{prefix}_{field.name}") for field in fields)
 

@@ -25,7 +25,7 @@ from knode_cosserat.rods.loads import (
     square_law_drag,
 )
 from knode_cosserat.rods.parameters import ParameterError, parameter, part
-from knode_cosserat.rods.parts import placed, shares
+from knode_cosserat.rods.parts import prefixed_fields, shares
 from knode_cosserat.rods.section import INWARD, shape_at_rest
 from knode_cosserat.rods.surroundings import Obstacle
 from knode_cosserat.rods.system import History, Scales
@@ -95,7 +95,9 @@ class Rod(ElasticRod):
     @property
     def control_layout(self) -> Layout:  # type: ignore[override]
         """Layout of the actuators' controls, then the controls of ends, sections and loads."""
-        driven = [field for prefix, each in self._driven for field in placed(each.control_fields, prefix)]
+        driven = [
+            field for prefix, each in self._driven for field in prefixed_fields(each.control_fields, prefix)
+        ]
         return Layout(*self.actuator_layout.fields, *driven)
 
     @property
@@ -245,7 +247,7 @@ class Rod(ElasticRod):
         """True if a point load acts before the tip."""
         return any(isinstance(load, PointLoad) and load.at < 1.0 for load in self.loads)
 
-    def crossed(
+    def jump(
         self, acting: Float[Any, " cuts"], t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> Float[Any, " y"]:
         """Return y on the far side of the acting cuts: n and m less the point loads there."""

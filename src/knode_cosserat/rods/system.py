@@ -212,11 +212,11 @@ class System(Parametrised):
         z = self.strains(s, t, y, control, history)
         return self.rates(s, t, y, z, control, history), z
 
-    def crossed(
+    def jump(
         self, acting: Float[Any, " cuts"], t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> Float[Any, " y"]:
         """Return y on the far side of the acting cuts (ones; zeros elsewhere), from y on the near side."""
-        raise NotImplementedError(f"{type(self).__name__} has `jumps`, but gives no `crossed`")
+        raise NotImplementedError(f"{type(self).__name__} has `jumps`, but gives no `jump`")
 
     # the two ends, and rest
 

@@ -178,11 +178,11 @@ class Wrapped(System):
         """Return y_s and z of the wrapped system."""
         return self.adapted.derivatives(s, t, y, control, history)
 
-    def crossed(
+    def jump(
         self, acting: Float[Any, " cuts"], t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> Float[Any, " y"]:
         """Return y on the far side of the active discontinuities, from the wrapped system."""
-        return self.adapted.crossed(acting, t, y, control, history)
+        return self.adapted.jump(acting, t, y, control, history)
 
     def rest(self, s: Any) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
         """Return the state at rest of the wrapped system."""

@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from knode_cosserat.rods.system import Scales, System
-from knode_cosserat.solvers.linear import Factors, factored, solved
+from knode_cosserat.solvers.linear import Factors, factored, solved_correction
 from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.space import SpaceScheme
 
@@ -176,7 +176,7 @@ def newton(
         y, _ = unpacked(trial)
         defects, tip = problem.residuals(y)
         error = largest_of(scales, defects, tip)
-        dy, dxi = solved(factors, pivots, defects, tip)
+        dy, dxi = solved_correction(factors, pivots, defects, tip)
         size = jnp.max(jnp.abs(dy) / scales.y)
         good = error <= options.tolerance
         shorter = (size <= (1.0 - last.damping / 4.0) * last.size) & jnp.isfinite(size)

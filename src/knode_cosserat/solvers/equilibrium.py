@@ -13,7 +13,7 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.guess import state_from_positions
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.simulate import refined, simulate
+from knode_cosserat.solvers.simulate import refined_trajectory, simulate
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.time import Static
 from knode_cosserat.trajectory import Trajectory
@@ -69,7 +69,7 @@ def equilibrium(
             recovery_budget=recovery_budget, on_failure=on_failure,
         )  # fmt: skip
         order = Settings.of("bdf2", space, "paper", newton).space.order
-        return refined(solve, robot, initial, position_tolerance, order)
+        return refined_trajectory(solve, robot, initial, position_tolerance, order)
     if initial is not None and not isinstance(initial, Trajectory):
         initial = _guess(robot, initial, control)
     found = simulate(

@@ -23,14 +23,14 @@ from knode_cosserat.solvers.time import BDF1
 
 #: number of earlier states in the first guess of a step, and the extrapolations in time (constant, linear,
 #: quadratic) of which the guess is the weighted mean
-PAST = 3
+GUESS_STATES = 3
 EXTRAPOLATIONS = np.array([[1.0, 0.0, 0.0], [2.0, -1.0, 0.0], [3.0, -3.0, 1.0]])
 #: a row counts as an equilibrium of its grid if its residuals are at most this (natural units); it is larger
 #: than the solver's `acceptable`
 SOLVED = 2e-8
 
 
-class Past(NamedTuple):
+class StateHistory(NamedTuple):
     """The states before a step, newest first."""
 
     records: Float[Any, "2 places x"]
@@ -45,7 +45,7 @@ class Past(NamedTuple):
     error: Float[Any, "3 used x"]
 
 
-class Begun(NamedTuple):
+class InitialHistory(NamedTuple):
     """Initial history: the states before the first step of a motion."""
 
     records: Float[Any, "2 places x"]
@@ -73,7 +73,7 @@ def history_of(states: Any, rate: Any, coefficients: Any, settings: Settings) ->
     return history + d1 * rate if settings.time.uses_rate else history
 
 
-def advanced(past: Past, records: Any, rate: Any, y: Any, weights: Any) -> Past:
+def advanced(past: StateHistory, records: Any, rate: Any, y: Any, weights: Any) -> StateHistory:
     """Return the history of the next step."""
     return past._replace(
         records=jnp.stack([records, past.records[0]]),
@@ -93,17 +93,21 @@ def rest_record(system: System) -> Float[Any, "nodes x"]:
     return jnp.concatenate([y, z], axis=1)
 
 
-def resting_past(system: System, settings: Settings) -> Past:
+def resting_history(system: System, settings: Settings) -> StateHistory:
     """Return the history of the robot at rest under zero control, at time 0."""
     none = jnp.zeros(system.control_size)
     if system.mixed:
-        return initial_past(system, settings, rest_record(system), none)
+        return constant_history(system, settings, rest_record(system), none)
     grid = grid_of(system, settings.space)
     y, z = jax.vmap(system.rest)(StepProblem.still(system, settings.space, none).places)
-    return past_of_one(system, settings.space, jnp.concatenate([y, z], axis=-1), y[: grid.tip + 1], 0.0)
+    return repeated_record_history(
+        system, settings.space, jnp.concatenate([y, z], axis=-1), y[: grid.tip + 1], 0.0
+    )
 
 
-def initial_past(system: System, settings: Settings, row: Any, control: Any, t0: Any = 0.0) -> Past:
+def constant_history(
+    system: System, settings: Settings, row: Any, control: Any, t0: Any = 0.0
+) -> StateHistory:
     """Return a history in which all earlier states equal one state, given by y and z at the nodes.
 
     Between nodes, an equilibrium under this control is evaluated from its equations; any other state is
@@ -111,18 +115,18 @@ def initial_past(system: System, settings: Settings, row: Any, control: Any, t0:
     """
     still = StepProblem.still(system, settings.space, control, t0)
     y = still.filled(row[:, : system.y_layout.size])
-    return past_of_one(system, settings.space, still_records(still, row, y), y, t0)
+    return repeated_record_history(system, settings.space, still_records(still, row, y), y, t0)
 
 
-def past_of_one(
+def repeated_record_history(
     system: System, space: SpaceScheme, records: Float[Any, "places x"], y: Float[Any, "points y"], t0: Any
-) -> Past:
+) -> StateHistory:
     """Return a history in which all earlier states equal one state."""
     used = used_places(system, space)
-    return Past(
+    return StateHistory(
         jnp.stack([records] * 2),
         jnp.zeros_like(records),
-        jnp.stack([y] * PAST),
+        jnp.stack([y] * GUESS_STATES),
         jnp.asarray(EXTRAPOLATIONS[0]),
         jnp.asarray(t0, dtype=float),
         jnp.zeros((3, used, records.shape[-1])),
@@ -165,10 +169,10 @@ def padded_rows(rows: Any, least: int = 1) -> np.ndarray:
     return np.pad(rows, width, mode="edge")
 
 
-class Motion(NamedTuple):
+class ContinuedMotion(NamedTuple):
     """Rows of a motion with the history of the first."""
 
-    begun: Begun
+    begun: InitialHistory
     #: coefficients of each step after the first
     regular: Float[Any, "4"]
     #: y and z of the nodes
@@ -181,13 +185,15 @@ class Motion(NamedTuple):
     count: Any
 
 
-def begun_between(system: System, space: SpaceScheme, rows: Any, coefficients: Any, dt: Any) -> Begun:
+def history_of_rows(
+    system: System, space: SpaceScheme, rows: Any, coefficients: Any, dt: Any
+) -> InitialHistory:
     """Return the history at the second of two rows (2, nodes, x) of a system without y_st."""
     found = jax.vmap(lambda row: at_places(system, space, row))(rows)
-    return Begun(found[::-1], jnp.zeros_like(found[0]), jnp.asarray(coefficients), jnp.asarray(dt))
+    return InitialHistory(found[::-1], jnp.zeros_like(found[0]), jnp.asarray(coefficients), jnp.asarray(dt))
 
 
-def past_along(system: System, settings: Settings, motion: Motion) -> tuple[Past, Any]:
+def history_along(system: System, settings: Settings, motion: ContinuedMotion) -> tuple[StateHistory, Any]:
     """Return the history after a motion's last row, and the history terms (rows - 1, places, x) of each step.
 
     The equations are evaluated again at every place of each step. If a row was changed after it was solved,
@@ -196,7 +202,7 @@ def past_along(system: System, settings: Settings, motion: Motion) -> tuple[Past
     begun, regular, rows, controls, t0, count = motion
     ny, dt, space = system.y_layout.size, begun.dt, settings.space
 
-    def one(past: Past, step: Any) -> Any:
+    def one(past: StateHistory, step: Any) -> Any:
         i, row, control = step
         coefficients = jnp.where(i == 1, begun.coefficients, jnp.asarray(regular))
         history = history_of(past.records, past.rate, coefficients, settings)
@@ -208,7 +214,7 @@ def past_along(system: System, settings: Settings, motion: Motion) -> tuple[Past
 
     steps = jnp.arange(1, len(rows)), rows[1:], controls[1:]
     y = grid_of(system).spread(rows[0, :, :ny])
-    first = past_of_one(system, space, begun.records[0], y, t0)
+    first = repeated_record_history(system, space, begun.records[0], y, t0)
     first = first._replace(records=begun.records, rate=begun.rate, weights=jnp.asarray(EXTRAPOLATIONS[1]))
     past, histories = jax.lax.scan(one, first, steps)
     return past._replace(t0=t0 + (count - 1) * dt), histories

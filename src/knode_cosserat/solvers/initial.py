@@ -14,25 +14,25 @@ from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.solvers import sensitivity
 from knode_cosserat.solvers.grid import at_places, grid_of
 from knode_cosserat.solvers.history import (
-    Begun,
-    Motion,
-    Past,
-    begun_between,
+    ContinuedMotion,
+    InitialHistory,
+    StateHistory,
     coefficient_table,
-    initial_past,
+    constant_history,
+    history_along,
+    history_of_rows,
     padded_rows,
-    past_along,
-    past_of_one,
+    repeated_record_history,
     rest_record,
-    resting_past,
+    resting_history,
     rows_suffice,
 )
 from knode_cosserat.solvers.problem import no_history
 from knode_cosserat.solvers.result import Result, SimulationError
 from knode_cosserat.solvers.run import is_coarse, run_one
+from knode_cosserat.solvers.run_types import FirstStep, InitialCondition, RunSettings
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.solvers.task import FirstStep, Start, Task
 from knode_cosserat.solvers.time import Static
 from knode_cosserat.trajectory import Trajectory
 
@@ -42,7 +42,7 @@ FORGOTTEN = 1e-9
 AT_REST = 1e-12
 
 
-class Run(NamedTuple):
+class SimulationRun(NamedTuple):
     """The checked arguments of one call; `many` is true if the systems themselves are batched."""
 
     system: System
@@ -56,21 +56,21 @@ class Run(NamedTuple):
     budget: float | None = None
 
 
-class Beginning(NamedTuple):
+class InitialState(NamedTuple):
     """Initial state and history of a run."""
 
     #: y and z at the nodes
     record: Any
-    start: Start
+    start: InitialCondition
     #: time of the initial state (s)
     t0: Any
-    #: kind of the first step (`Task.first`)
+    #: kind of the first step (`RunSettings.first`)
     first: FirstStep
     #: initial history of a motion; None for statics
-    begun: Begun | None
+    begun: InitialHistory | None
 
 
-def beginning(run: Run) -> Beginning:
+def initial_state(run: SimulationRun) -> InitialState:
     """Return the initial state and history of a run."""
     system, controls, initial, settings, dt, batch, many, _ = run
     if initial is not None:
@@ -80,7 +80,7 @@ def beginning(run: Run) -> Beginning:
     coarse: Any = False
     if system.rest_is_guess and not still:
         record, past, coarse = _settled(run, past)
-    begun = None if still else _begun(past, Task(settings, dt, 1).table[0], dt)
+    begun = None if still else _begun(past, RunSettings(settings, dt, 1).table[0], dt)
 
     def for_each(tree: Any) -> Any:
         return jax.tree.map(lambda x: jnp.broadcast_to(x, (batch, *jnp.shape(x))), tree)
@@ -90,7 +90,7 @@ def beginning(run: Run) -> Beginning:
     elif batch and begun is not None:
         begun = begun._replace(coefficients=for_each(begun.coefficients), dt=for_each(begun.dt))
     none_yet = np.zeros((*np.shape(controls)[:-2], system.control_size))
-    return Beginning(record, Start(past, none_yet, coarse), 0.0, "start", begun)
+    return InitialState(record, InitialCondition(past, none_yet, coarse), 0.0, "start", begun)
 
 
 # at rest, or in equilibrium
@@ -103,7 +103,7 @@ def _of_past(settings: Settings) -> Settings:
 
 @functools.partial(jax.jit, static_argnames="settings")
 def _at_rest(system: System, settings: Settings) -> Any:
-    return rest_record(system), resting_past(system, settings)
+    return rest_record(system), resting_history(system, settings)
 
 
 @functools.partial(jax.jit, static_argnames="settings")
@@ -111,10 +111,10 @@ def _all_at_rest(system: System, settings: Settings) -> Any:
     return jax.vmap(lambda each: _at_rest(each, settings))(system)
 
 
-def _settled(run: Run, past: Any) -> tuple[Any, Any, Any]:
+def _settled(run: SimulationRun, past: Any) -> tuple[Any, Any, Any]:
     """Return the equilibrium under zero control, its history, and a flag: true if its grid is too coarse."""
     system, many = run.system, run.many
-    task = Task(run.settings, run.dt, 1, "still")
+    task = RunSettings(run.settings, run.dt, 1, "still")
     none = np.zeros((1, system.control_size))
     if is_traced((system, past)):
         find = sensitivity.rollout(task)
@@ -129,9 +129,9 @@ def _settled(run: Run, past: Any) -> tuple[Any, Any, Any]:
     return kept, history, coarse
 
 
-def _settled_one(task: Task, system: System, none: Any, past: Any, i: Any) -> tuple[Any, Any]:
+def _settled_one(task: RunSettings, system: System, none: Any, past: Any, i: Any) -> tuple[Any, Any]:
     """Return the equilibrium of one robot, and a flag for a too coarse grid; raise if there is none."""
-    steps, cause = run_one(task, system, none, Start(past, none[0]))
+    steps, cause = run_one(task, system, none, InitialCondition(past, none[0]))
     if steps.result[0] < 0:
         robot = None if i is ... else i
         raise SimulationError(0, 0.0, float(steps.error[0]), Result(int(steps.result[0])), cause, robot)
@@ -142,18 +142,18 @@ def _part(tree: Any, i: Any) -> Any:
     return tree if i is ... else jax.tree.map(lambda leaf: leaf[i], tree)
 
 
-_past = jax.jit(initial_past, static_argnames="settings")
+_past = jax.jit(constant_history, static_argnames="settings")
 
 
 @functools.partial(jax.jit, static_argnames="settings")
 def _all_pasts(system: System, settings: Settings, rows: Any, control: Any, t0: Any) -> Any:
-    return jax.vmap(lambda each, row: initial_past(each, settings, row, control, t0))(system, rows)
+    return jax.vmap(lambda each, row: constant_history(each, settings, row, control, t0))(system, rows)
 
 
 # continuation of another motion
 
 
-def _going_on(system: System, initial: Trajectory, settings: Settings, dt: float) -> Beginning:
+def _going_on(system: System, initial: Trajectory, settings: Settings, dt: float) -> InitialState:
     record = jnp.concatenate([initial.y[-1], initial.z[-1]], axis=-1)
     control, t0 = initial.control[-1], initial.time[-1]
     made = initial.settings
@@ -167,26 +167,28 @@ def _going_on(system: System, initial: Trajectory, settings: Settings, dt: float
         past = _past(system, _of_past(settings), record, control, t0)
     else:
         past, first = known
-    begun = None if still else _begun(past, Task(settings, dt, 1, first).table[0], dt)
-    return Beginning(record, Start(past, control, initial.result[-1] == Result.COARSE), t0, first, begun)
+    begun = None if still else _begun(past, RunSettings(settings, dt, 1, first).table[0], dt)
+    return InitialState(
+        record, InitialCondition(past, control, initial.result[-1] == Result.COARSE), t0, first, begun
+    )
 
 
 @functools.partial(jax.jit, static_argnames="space")
-def _shape(system: System, space: SpaceScheme, record: Any, t0: Any) -> Past:
+def _shape(system: System, space: SpaceScheme, record: Any, t0: Any) -> StateHistory:
     """Return a history of one shape, the start of a search for an equilibrium; interpolated between nodes."""
     more = no_history(system, space).shape[-1] - record.shape[-1]
     y = grid_of(system).spread(record[:, : system.y_layout.size])
     records = at_places(system, space, jnp.pad(record, ((0, 0), (0, more))))
-    return past_of_one(system, space, records, y, t0)
+    return repeated_record_history(system, space, records, y, t0)
 
 
-def _begun(past: Past, coefficients: Any, dt: Any) -> Begun:
-    return Begun(past.records, past.rate, np.asarray(coefficients), np.asarray(dt))
+def _begun(past: StateHistory, coefficients: Any, dt: Any) -> InitialHistory:
+    return InitialHistory(past.records, past.rate, np.asarray(coefficients), np.asarray(dt))
 
 
 def _known(
     system: System, initial: Trajectory, settings: Settings, dt: float
-) -> tuple[Past, FirstStep] | None:
+) -> tuple[StateHistory, FirstStep] | None:
     """Return the history from a motion's rows, and the kind of the next step; None if one state is all.
 
     A motion that was simulated on the same points and stages is evaluated again by its own equations. Other
@@ -210,9 +212,9 @@ def _known(
     if not is_traced((rows, controls)):
         packed = padded_rows(np.reshape(rows, (count, -1)))
         rows, controls = packed.reshape(-1, *np.shape(rows)[1:]), padded_rows(controls)
-    motion = Motion(begun, regular, rows, controls, initial.time[row], count)
+    motion = ContinuedMotion(begun, regular, rows, controls, initial.time[row], count)
     past, _ = _along(system, made, motion)
-    alone = past_of_one(system, made.space, past.records[0], past.y[0], past.t0)
+    alone = repeated_record_history(system, made.space, past.records[0], past.y[0], past.t0)
     # traced times cannot be compared: the rows are assumed to have the same time step as the continuation
     if not is_traced(begun.dt) and not np.isclose(begun.dt, dt):
         return alone, "start"
@@ -236,7 +238,7 @@ def _alike(one: System, other: System) -> bool:
 class _Known(NamedTuple):
     """Known history of a motion at one of its rows, a flag for a known rate, and the steps' coefficients."""
 
-    begun: Begun
+    begun: InitialHistory
     row: int
     rate: bool
     regular: np.ndarray
@@ -286,10 +288,10 @@ def _of_rows(system: System, made: Settings, two: Any, apart: float, row: int) -
     return _Known(_between(system, made.space, two, regular, apart), row, False, regular)
 
 
-_between = jax.jit(begun_between, static_argnames="space")
+_between = jax.jit(history_of_rows, static_argnames="space")
 
 
-_along = jax.jit(past_along, static_argnames="settings")
+_along = jax.jit(history_along, static_argnames="settings")
 
 
 def histories_along(system: System, moved: Trajectory) -> tuple[int, Float[Any, "steps places x"]] | None:
@@ -304,5 +306,5 @@ def histories_along(system: System, moved: Trajectory) -> tuple[int, Float[Any, 
         return None
     row, count = known.row, len(rows) - known.row
     controls = jnp.asarray(moved.control[row:])
-    motion = Motion(known.begun, known.regular, rows[row:], controls, moved.time[row], count)
+    motion = ContinuedMotion(known.begun, known.regular, rows[row:], controls, moved.time[row], count)
     return row + 1, _along(system, made, motion)[1]

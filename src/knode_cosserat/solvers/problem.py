@@ -19,9 +19,9 @@ from knode_cosserat.rods.system import (
     records_in_strands,
     unpacked_history,
 )
-from knode_cosserat.solvers.ahead import in_two
 from knode_cosserat.solvers.grid import Grid, grid_of, inside, taken
-from knode_cosserat.solvers.linear import Linearisation, filled_up, product, quotient
+from knode_cosserat.solvers.hoisting import split_function
+from knode_cosserat.solvers.linear import Linearisation, filled_up, matrix_products, quotient
 from knode_cosserat.solvers.space import Formula, SpaceScheme
 from knode_cosserat.solvers.sparsity import nonzero_columns
 
@@ -92,7 +92,7 @@ class StepProblem(eqx.Module):
             return self.point_rates(s, *state)
 
         record = self._history_by_strand(self.history[:1])[0]
-        parts = in_two(at_point, places[0], (jnp.zeros(strand.y_layout.size), record))
+        parts = split_function(at_point, places[0], (jnp.zeros(strand.y_layout.size), record))
         # if y does not enter the equations: one column of zeros
         columns = nonzero_columns(parts.traced, 1).tolist() or [0]
         hoisted = Hoisted(parts.then, jax.vmap(parts.first)(places), tuple(columns))
@@ -130,16 +130,16 @@ class StepProblem(eqx.Module):
         left = self.system.tip(self.t, self.control, y, self._unpack(self.history[self.grid.tip]))
         return left if self.tip_offset is None else left - self.tip_offset
 
-    def crossed(self, acting: Any, y: Float[Any, " y"], history: Float[Any, " x"]) -> Float[Any, " y"]:
+    def jump(self, acting: Any, y: Float[Any, " y"], history: Float[Any, " x"]) -> Float[Any, " y"]:
         """Return y on the far side of the active discontinuities."""
-        return self.system.crossed(acting, self.t, y, self.control, self._unpack(history))
+        return self.system.jump(acting, self.t, y, self.control, self._unpack(history))
 
     def _far(self, y: Float[Any, "points y"]) -> Float[Any, "pieces y"]:
         """Return y where pieces start, on the far side of their discontinuities."""
         grid = self.grid
         if not self.system.jumps:
             return y[:-1]
-        return jax.vmap(self.crossed)(jnp.asarray(grid.acting), y[:-1], self.history[: grid.tip])
+        return jax.vmap(self.jump)(jnp.asarray(grid.acting), y[:-1], self.history[: grid.tip])
 
     # places
 
@@ -285,7 +285,7 @@ class StepProblem(eqx.Module):
             rates.append(f)
             for ways, part in ((by_start, 1.0 - stage.end), (by_end, stage.end)):
                 moved = sum(x * way for x, way in zip(stage.rates, ways, strict=False))
-                ways.append(product(slopes, taken(part * eye + h * moved, used)))
+                ways.append(matrix_products(slopes, taken(part * eye + h * moved, used)))
         A, B = (
             eye + sign * h * sum(b * way for b, way in zip(formula.weights, ways, strict=True))
             for sign, ways in ((1.0, by_start), (-1.0, by_end))
@@ -312,8 +312,8 @@ class StepProblem(eqx.Module):
         """Return F with respect to y on the near side of jumps at the starts of pieces."""
         if not self.system.jumps:
             return F
-        jump = jax.vmap(jax.jacfwd(self.crossed, 1))
-        D = jump(jnp.asarray(self.grid.acting), y[:-1], self.history[: self.grid.tip])
+        slopes = jax.vmap(jax.jacfwd(self.jump, 1))
+        D = slopes(jnp.asarray(self.grid.acting), y[:-1], self.history[: self.grid.tip])
         return jnp.sum(F[..., :, :, None] * D[..., None, :, :], axis=-2)
 
     def _blocks(self, matrices: Any) -> Any:

@@ -21,12 +21,12 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import Solution, newton
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.guess import hanging_curve, natural_reach, state_from_positions
-from knode_cosserat.solvers.history import EXTRAPOLATIONS, Past, history_of
+from knode_cosserat.solvers.history import EXTRAPOLATIONS, StateHistory, history_of
 from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.time import BDF1, Static
-from knode_cosserat.solvers.time_loop import Rows, recorded
+from knode_cosserat.solvers.time_loop import StepRows, recorded_step
 
 #: smallest substep as a part of a time step, and largest number of substeps tried
 LEAST_SUBSTEP, MOST_SUBSTEPS = 2.0**-14, 400
@@ -79,7 +79,7 @@ class Outcome(NamedTuple):
     """A recovered step, or the best attempt (`result` < 0)."""
 
     result: Result
-    past: Past
+    past: StateHistory
     record: np.ndarray
     unknowns: np.ndarray
     error: float
@@ -92,13 +92,13 @@ class Attempt(NamedTuple):
     """Result of one boundary-value problem."""
 
     solution: Solution
-    after: Past
-    row: Rows
+    after: StateHistory
+    row: StepRows
 
 
 @functools.partial(jax.jit, static_argnames="settings")
 def attempt(
-    system: System, settings: Settings, past: Past, coefficients: Any, control: Any, t: Any, y: Any,
+    system: System, settings: Settings, past: StateHistory, coefficients: Any, control: Any, t: Any, y: Any,
     unknowns: Any,
     part: Any, from_y: Any,
 ) -> Attempt:  # fmt: skip
@@ -111,7 +111,7 @@ def attempt(
     problem = dataclasses.replace(problem, tip_offset=(1.0 - part) * problem.tip_residual(from_y[-1]))
     patient = dataclasses.replace(settings.newton, max_linearisations=40)
     solution, kept = newton(problem, y, unknowns, patient)
-    after, row = recorded(problem, settings, past, coefficients, solution, kept.factors)
+    after, row = recorded_step(problem, settings, past, coefficients, solution, kept.factors)
     return Attempt(solution, after._replace(weights=jnp.asarray(EXTRAPOLATIONS[0])), row)
 
 
@@ -123,7 +123,13 @@ class _Step:
     """One time step as boundary-value problems, for one history and one set of coefficients."""
 
     def __init__(
-        self, system: System, settings: Settings, past: Past, coefficients: Any, t: float, budget: Budget
+        self,
+        system: System,
+        settings: Settings,
+        past: StateHistory,
+        coefficients: Any,
+        t: float,
+        budget: Budget,
     ):
         self.system, self.settings, self.past, self.t = system, settings, past, t
         self.coefficients, self.budget = np.asarray(coefficients, dtype=float), budget
@@ -169,7 +175,7 @@ class _Step:
 def recover(
     system: System,
     settings: Settings,
-    past: Past,
+    past: StateHistory,
     coefficients: Any,
     controls: tuple[Any, Any],
     t: float,

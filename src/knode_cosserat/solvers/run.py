@@ -15,12 +15,12 @@ import numpy as np
 from tqdm import tqdm
 
 from knode_cosserat.rods.system import System, is_traced
-from knode_cosserat.solvers.history import Past, padded_rows
+from knode_cosserat.solvers.history import StateHistory, padded_rows
 from knode_cosserat.solvers.recovery import Budget, Outcome, recover
 from knode_cosserat.solvers.result import Result
-from knode_cosserat.solvers.task import Start, Steps, Task
+from knode_cosserat.solvers.run_types import InitialCondition, RunSettings, StepResults
 from knode_cosserat.solvers.time import Static
-from knode_cosserat.solvers.time_loop import Rows, loop_many, loop_one
+from knode_cosserat.solvers.time_loop import StepRows, loop_many, loop_one
 
 log = logging.getLogger(__name__)
 
@@ -35,13 +35,13 @@ COARSE_SHARE = 0.02
 
 
 def run_one(
-    task: Task, system: System, controls: np.ndarray, start: Start, progress: bool = False
-) -> tuple[Steps, str]:
+    task: RunSettings, system: System, controls: np.ndarray, start: InitialCondition, progress: bool = False
+) -> tuple[StepResults, str]:
     """Return all steps of one robot, and the likely cause if a step failed (`result` < 0)."""
     past, total, piece = start.past, task.steps, FIRST_STEPS
     padded = padded_rows(controls, least=LEAST_CAPACITY)
     budget = Budget(task.recovery_budget)
-    rows: Steps | None = None
+    rows: StepResults | None = None
     done, cause = 0, ""
     with tqdm(total=total, disable=not progress, unit="step", leave=False) as bar:
         while done < total and not cause:
@@ -70,7 +70,7 @@ def run_one(
 
 
 def rescue(
-    task: Task, system: System, past: Past, controls: tuple[Any, Any], i: int, budget: Budget
+    task: RunSettings, system: System, past: StateHistory, controls: tuple[Any, Any], i: int, budget: Budget
 ) -> Outcome:
     """Recover step i after the compiled loop failed; `controls` are the previous step's and its own."""
     settings = task.settings
@@ -86,7 +86,9 @@ def is_coarse(position_error: Any, system: System) -> Any:
     return ~(position_error <= COARSE_SHARE * (length[..., None] if np.ndim(length) else length))
 
 
-def mark_coarse(steps: Steps, system: System, task: Task, start: Start) -> Steps:
+def mark_coarse(
+    steps: StepResults, system: System, task: RunSettings, start: InitialCondition
+) -> StepResults:
     """Mark solved rows for which the grid is too coarse, and in a motion all rows after such a row.
 
     The error is propagated by linearised equations. They give its decay along the computed motion, but cannot
@@ -102,8 +104,13 @@ def mark_coarse(steps: Steps, system: System, task: Task, start: Start) -> Steps
 
 
 def run_batch(
-    task: Task, system: System, batched: bool, controls: np.ndarray, start: Start, progress: bool
-) -> tuple[Steps, dict[int, str]]:
+    task: RunSettings,
+    system: System,
+    batched: bool,
+    controls: np.ndarray,
+    start: InitialCondition,
+    progress: bool,
+) -> tuple[StepResults, dict[int, str]]:
     """Return the steps of all robots, and the likely cause for each robot that failed.
 
     Robots are solved in chunks, one thread a core. A robot with a failed step is then run by itself, with
@@ -140,11 +147,13 @@ def run_batch(
             chunks = first + list(pool.map(work, firsts[len(first) :]))
     done, *rows = (np.concatenate(parts) for parts in zip(*chunks, strict=True))
     results = np.zeros((*done.shape, task.steps), dtype=int)
-    steps = mark_coarse(Steps._make([*rows, results]), system, task, start)
+    steps = mark_coarse(StepResults._make([*rows, results]), system, task, start)
     causes = {}
     coarse = np.broadcast_to(start.coarse, size)
     for i in np.flatnonzero(done < task.steps):
-        own = Start(jax.tree.map(lambda leaf, i=i: leaf[i], start.past), start.control[i], coarse[i])
+        own = InitialCondition(
+            jax.tree.map(lambda leaf, i=i: leaf[i], start.past), start.control[i], coarse[i]
+        )
         alone, cause = run_one(task, robot(i), controls[i], own)
         for all_robots, one in zip(steps, alone, strict=True):
             all_robots[i] = one
@@ -171,20 +180,20 @@ def usable_cores() -> int:
     return os.cpu_count() or 1
 
 
-def _merged(rows: Steps | None, new: Rows, first: int, last: int, total: int) -> Steps:
+def _merged(rows: StepResults | None, new: StepRows, first: int, last: int, total: int) -> StepResults:
     """Add the rows `first` to `last` of a time loop to the existing rows."""
     if rows is None:
         leaves = [np.asarray(leaf)[:total] for leaf in new]
         if last == total:
-            return Steps._make([*leaves, np.zeros(total, dtype=int)])
-        rows = Steps._make([*map(np.array, leaves), np.full(total, int(Result.NOT_REACHED))])
+            return StepResults._make([*leaves, np.zeros(total, dtype=int)])
+        rows = StepResults._make([*map(np.array, leaves), np.full(total, int(Result.NOT_REACHED))])
     for old, leaf in zip(rows[:-1], new, strict=True):
         old[first:last] = np.asarray(leaf)[first:last]
     rows.result[first:last] = Result.CONVERGED
     return rows
 
 
-def _set_row(rows: Steps, i: int, outcome: Outcome) -> None:
+def _set_row(rows: StepResults, i: int, outcome: Outcome) -> None:
     rows.records[i], rows.unknowns[i] = outcome.record, outcome.unknowns
     rows.error[i], rows.corrections[i] = outcome.error, outcome.corrections
     rows.position_error[i] = outcome.position_error

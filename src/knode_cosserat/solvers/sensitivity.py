@@ -17,16 +17,16 @@ import numpy as np
 
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import factors_of, pivots_of
-from knode_cosserat.solvers.history import Past, advanced, history_of
-from knode_cosserat.solvers.linear import solved
+from knode_cosserat.solvers.history import StateHistory, advanced, history_of
+from knode_cosserat.solvers.linear import solved_correction
 from knode_cosserat.solvers.problem import StepProblem, row_of
+from knode_cosserat.solvers.run_types import RunSettings
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.task import Task
-from knode_cosserat.solvers.time_loop import Rows, loop_one
+from knode_cosserat.solvers.time_loop import StepRows, loop_one
 
 
 @functools.lru_cache(maxsize=64)
-def rollout(task: Task) -> Callable[[System, Any, Past], Rows]:
+def rollout(task: RunSettings) -> Callable[[System, Any, StateHistory], StepRows]:
     """Return a differentiable function from (system, controls (T, c), past) to the rows of all steps.
 
     Cached between calls: JAX recognises functions that it has already traced by identity.
@@ -34,10 +34,10 @@ def rollout(task: Task) -> Callable[[System, Any, Past], Rows]:
     settings, table, dt, steps = task.settings, task.table, task.dt, task.steps
 
     @jax.custom_jvp
-    def run(system: System, controls: Any, past: Past) -> Rows:
+    def run(system: System, controls: Any, past: StateHistory) -> StepRows:
         done, _, rows = loop_one(system, settings, table, controls, dt, past, 0, steps)
         unsolved = jnp.arange(steps) >= done
-        return Rows(
+        return StepRows(
             jnp.where(unsolved[:, None, None], jnp.nan, rows.records),
             jnp.where(unsolved[:, None], jnp.nan, rows.unknowns),
             jnp.where(unsolved, jnp.inf, rows.error),
@@ -50,21 +50,21 @@ def rollout(task: Task) -> Callable[[System, Any, Past], Rows]:
         rows = run(*primals)
         system, controls, past = primals
         d_system, d_controls, d_past = tangents
-        d_records, d_unknowns = tangent_march(
+        d_records, d_unknowns = tangent_time_loop(
             settings, table, dt, rows.records, rows.unknowns, system, controls, past, d_system, d_controls,
             d_past.records, d_past.rate,
         )  # fmt: skip
         still = np.zeros(steps, dtype=jax.dtypes.float0)
         none = jnp.zeros_like(rows.error)
-        return rows, Rows(d_records, d_unknowns, none, still, none)
+        return rows, StepRows(d_records, d_unknowns, none, still, none)
 
     return run
 
 
 @functools.partial(jax.jit, static_argnames="settings")
-def tangent_march(
+def tangent_time_loop(
     settings: Settings, table: Any, dt: Any, rows: Any, unknowns: Any, system: System, controls: Any,
-    past: Past, d_system: Any, d_controls: Any, d_records: Any, d_rate: Any,
+    past: StateHistory, d_system: Any, d_controls: Any, d_records: Any, d_rate: Any,
 ) -> Any:  # fmt: skip
     """Return tangents of all rows and unknowns, linear in the tangents of system, controls and history."""
     return tangent_piece(
@@ -74,9 +74,9 @@ def tangent_march(
 
 def tangent_piece(
     settings: Settings, table: Any, dt: Any, rows: Any, unknowns: Any, system: System, controls: Any,
-    past: Past, d_system: Any, d_controls: Any, d_records: Any, d_rate: Any,
+    past: StateHistory, d_system: Any, d_controls: Any, d_records: Any, d_rate: Any,
 ) -> Any:  # fmt: skip
-    """Return the history after the last row with its tangents, and the result of `tangent_march`."""
+    """Return the history after the last row with its tangents, and the result of `tangent_time_loop`."""
     ny, pivots = system.y_layout.size, pivots_of(system)
 
     def one(carry: Any, now: Any) -> Any:
@@ -100,7 +100,7 @@ def tangent_piece(
 
         given, d_given = (system, control, history), (d_system, d_control, d_history)
         defects, tip, base = jax.jvp(at_solution, given, d_given)[1]
-        dy, dxi = solved(factors, pivots, defects, tip, base)
+        dy, dxi = solved_correction(factors, pivots, defects, tip, base)
 
         def kept_of(system: Any, control: Any, history: Any, y: Any) -> Any:
             records = now_with(system, control, history).records(y)

@@ -17,13 +17,13 @@ from knode_cosserat.rods.trained_range import without_range
 from knode_cosserat.solvers import sensitivity
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.damping import warn_if_undamped
-from knode_cosserat.solvers.initial import Beginning, Run, beginning
+from knode_cosserat.solvers.initial import InitialState, SimulationRun, initial_state
 from knode_cosserat.solvers.recovery import natural_time
 from knode_cosserat.solvers.result import Result, SimulationError
 from knode_cosserat.solvers.run import mark_coarse, run_batch, run_one
+from knode_cosserat.solvers.run_types import RunSettings, StepResults
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import Euler, SpaceScheme
-from knode_cosserat.solvers.task import Steps, Task
 from knode_cosserat.solvers.time import Static, TimeScheme
 from knode_cosserat.trajectory import Trajectory
 
@@ -98,7 +98,7 @@ def simulate(
             simulate, controls=controls, dt=dt, time=time, space=space, start=start, newton=newton,
             recovery_budget=recovery_budget, on_failure=on_failure, progress=progress,
         )  # fmt: skip
-        return refined(refine, robot, initial, position_tolerance, settings.space.order)
+        return refined_trajectory(refine, robot, initial, position_tolerance, settings.space.order)
     system, batch = _stacked(robot)
     controls, batch = _checked_controls(system, controls, batch)
     if not isinstance(settings.time, Static):
@@ -107,7 +107,9 @@ def simulate(
         check_initial(system, initial, batch)
     # ranges are not part of the equations: programs are compiled for systems without them
     bare, begins = without_range(system), without_range(_unmarked(initial))
-    run = Run(bare, controls, begins, settings, dt, batch, isinstance(robot, Sequence), recovery_budget)
+    run = SimulationRun(
+        bare, controls, begins, settings, dt, batch, isinstance(robot, Sequence), recovery_budget
+    )
     if is_traced((system, controls, initial)):
         found = _traced(*run[:7])
     elif batch:
@@ -138,7 +140,7 @@ def marked(trajectory: Trajectory, initial: Trajectory | None) -> Trajectory:
     return dataclasses.replace(trajectory, extrapolated=outside)
 
 
-def refined(
+def refined_trajectory(
     solve: Callable[[System], Trajectory], robot: Any, initial: Any, tolerance: Any, order: int
 ) -> Trajectory:
     """Return the trajectory of `solve` with enough nodes for a position tolerance (m)."""
@@ -288,10 +290,10 @@ def check_initial(system: System, initial: Trajectory, batch: int | None) -> Non
 # the three ways to run
 
 
-def _single(run: Run, on_failure: str, progress: bool) -> Trajectory:
+def _single(run: SimulationRun, on_failure: str, progress: bool) -> Trajectory:
     system, controls, settings, dt = run.system, run.controls, run.settings, run.dt
-    begins = beginning(run)
-    task = Task(settings, dt, len(controls), begins.first, run.budget)
+    begins = initial_state(run)
+    task = RunSettings(settings, dt, len(controls), begins.first, run.budget)
     steps, cause = run_one(task, system, controls, begins.start, progress)
     if on_failure == "raise" and steps.result.min() < 0:
         raise _failure(task, float(begins.t0), steps, cause, None)
@@ -299,19 +301,19 @@ def _single(run: Run, on_failure: str, progress: bool) -> Trajectory:
     return _trajectory(run, begins, steps)
 
 
-def _batch(run: Run, on_failure: str, progress: bool) -> Trajectory:
+def _batch(run: SimulationRun, on_failure: str, progress: bool) -> Trajectory:
     system, controls, settings, dt, many = run.system, run.controls, run.settings, run.dt, run.many
-    begins = beginning(run)
-    task = Task(settings, dt, controls.shape[1], recovery_budget=run.budget)
+    begins = initial_state(run)
+    task = RunSettings(settings, dt, controls.shape[1], recovery_budget=run.budget)
     steps, causes = run_batch(task, system, many, controls, begins.start, progress)
     if on_failure == "raise" and causes:
         robot, cause = next(iter(causes.items()))
-        raise _failure(task, 0.0, Steps(*(leaf[robot] for leaf in steps)), cause, robot)
+        raise _failure(task, 0.0, StepResults(*(leaf[robot] for leaf in steps)), cause, robot)
     _warn_of_coarse_grids(run, steps)
     return _trajectory(run, begins, steps)
 
 
-def _warn_of_coarse_grids(run: Run, steps: Steps) -> None:
+def _warn_of_coarse_grids(run: SimulationRun, steps: StepResults) -> None:
     """Warn of rows with a large discretisation error; not for Euler, which only reproduces the paper."""
     coarse = np.asarray(steps.result) == Result.COARSE
     if np.any(coarse) and not isinstance(run.settings.space, Euler):
@@ -325,7 +327,9 @@ def _warn_of_coarse_grids(run: Run, steps: Steps) -> None:
         )
 
 
-def _failure(task: Task, t0: float, steps: Steps, cause: str, robot: int | None) -> SimulationError:
+def _failure(
+    task: RunSettings, t0: float, steps: StepResults, cause: str, robot: int | None
+) -> SimulationError:
     i = int(np.argmax(steps.result < 0))
     number = 0 if isinstance(task.settings.time, Static) else i + 1
     return SimulationError(
@@ -339,19 +343,21 @@ def _traced(system, controls, initial, settings, dt, batch, many):  # type: igno
 
     A single jitted function, so that a transformation traces it once and not at every call.
     """
-    run = Run(system, controls, initial, settings, dt, batch, many)
-    begins = beginning(run)
-    task = Task(settings, dt, np.shape(controls)[-2], begins.first)
+    run = SimulationRun(system, controls, initial, settings, dt, batch, many)
+    begins = initial_state(run)
+    task = RunSettings(settings, dt, np.shape(controls)[-2], begins.first)
     one = sensitivity.rollout(task)
     if batch:
         rows = jax.vmap(one, in_axes=(0 if many else None, 0, 0))(system, controls, begins.start.past)
     else:
         rows = one(system, controls, begins.start.past)
     result = jnp.where(rows.error <= settings.newton.acceptable, 0, int(Result.NO_CONVERGENCE))
-    return _trajectory(run, begins, mark_coarse(Steps._make([*rows, result]), system, task, begins.start))
+    return _trajectory(
+        run, begins, mark_coarse(StepResults._make([*rows, result]), system, task, begins.start)
+    )
 
 
-def _trajectory(run: Run, begins: Beginning, steps: Steps) -> Trajectory:
+def _trajectory(run: SimulationRun, begins: InitialState, steps: StepResults) -> Trajectory:
     """Return the trajectory: the initial row, then the steps, with NaN in unsolved rows."""
     system, controls, settings, dt, batch = run.system, run.controls, run.settings, run.dt, run.batch
     numeric: Any = jnp if is_traced((begins.record, steps)) else np

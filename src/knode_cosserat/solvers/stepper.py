@@ -10,15 +10,15 @@ import numpy as np
 from knode_cosserat._reprs import robot_text
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.history import Begun
-from knode_cosserat.solvers.initial import Run, beginning
+from knode_cosserat.solvers.history import InitialHistory
+from knode_cosserat.solvers.initial import SimulationRun, initial_state
 from knode_cosserat.solvers.recovery import Budget
 from knode_cosserat.solvers.result import Result, SimulationError
 from knode_cosserat.solvers.run import LEAST_CAPACITY, is_coarse, rescue
+from knode_cosserat.solvers.run_types import RunSettings
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.simulate import check_initial, checked_dt, marked
 from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.solvers.task import Task
 from knode_cosserat.solvers.time import Static, TimeScheme
 from knode_cosserat.solvers.time_loop import loop_one
 from knode_cosserat.trajectory import Trajectory
@@ -87,9 +87,11 @@ class Stepper:
         if initial is not None:
             check_initial(robot, initial, None)
         count = robot.control_size
-        begins = beginning(Run(robot, np.zeros((1, count)), initial, settings, self.dt, None, False))
+        begins = initial_state(
+            SimulationRun(robot, np.zeros((1, count)), initial, settings, self.dt, None, False)
+        )
         begun, t0 = begins.start, begins.t0
-        self._task = Task(settings, self.dt, 1, begins.first, recovery_budget)
+        self._task = RunSettings(settings, self.dt, 1, begins.first, recovery_budget)
         self._settings = settings
         self._past, self._t0, self._index, self._steps = begun.past, float(t0), 0, 0
         self._coarse = bool(begun.coarse)
@@ -188,12 +190,14 @@ class Stepper:
         coarse = self._coarse or is_coarse(np.asarray(found.position_error), self.robot)
         return found._replace(result=int(Result.COARSE)) if coarse else found
 
-    def _begun_after(self, solved: _Solved) -> Begun:
+    def _begun_after(self, solved: _Solved) -> InitialHistory:
         """Return the initial history of a motion that continues from a step."""
         past = solved.past
-        return Begun(*map(np.asarray, (past.records, past.rate, self._task.table[1], self.dt)))
+        return InitialHistory(*map(np.asarray, (past.records, past.rate, self._task.table[1], self.dt)))
 
-    def _row(self, solved: _Solved, control: np.ndarray, time: float, begun: Begun | None) -> Trajectory:
+    def _row(
+        self, solved: _Solved, control: np.ndarray, time: float, begun: InitialHistory | None
+    ) -> Trajectory:
         ny, nz = self.robot.y_layout.size, self.robot.z_layout.size
         record = solved.record[None, :, : ny + nz]
         row = Trajectory(

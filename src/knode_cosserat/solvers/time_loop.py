@@ -11,8 +11,8 @@ from jaxtyping import Float, Int
 
 from knode_cosserat.rods.system import System, in_strands
 from knode_cosserat.solvers.boundary import Kept, largest_residual, newton, none_kept, pivots_of
-from knode_cosserat.solvers.history import EXTRAPOLATIONS, Past, advanced, history_of
-from knode_cosserat.solvers.linear import Factors, solved
+from knode_cosserat.solvers.history import EXTRAPOLATIONS, StateHistory, advanced, history_of
+from knode_cosserat.solvers.linear import Factors, solved_correction
 from knode_cosserat.solvers.problem import Stages, StepProblem, row_of
 from knode_cosserat.solvers.settings import Settings
 
@@ -24,7 +24,7 @@ BATCH = "robots"
 ROUNDING = 1e-12
 
 
-class Rows(NamedTuple):
+class StepRows(NamedTuple):
     """The steps' results, one row a step."""
 
     records: Float[Any, "steps nodes x"]
@@ -36,9 +36,9 @@ class Rows(NamedTuple):
     position_error: Float[Any, " steps"]
 
 
-def step(
-    system: System, settings: Settings, past: Past, coefficients: Any, control: Any, t: Any, kept: Kept,
-    batch: str | None = None,
+def solve_time_step(
+    system: System, settings: Settings, past: StateHistory, coefficients: Any, control: Any, t: Any,
+    kept: Kept, batch: str | None = None,
 ) -> Any:  # fmt: skip
     """Solve one time step: return the next history, the step's row, and the kept factors."""
     history = history_of(past.records, past.rate, coefficients, settings)
@@ -46,16 +46,21 @@ def step(
     # sum of products instead of a matrix product: XLA fuses it with the next operations
     guess = jnp.sum(past.weights[:, None, None] * past.y, axis=0)
     solution, kept = newton(problem, guess, system.unknowns(guess[0]), settings.newton, kept, batch)
-    after, row = recorded(problem, settings, past, coefficients, solution, kept.factors)
+    after, row = recorded_step(problem, settings, past, coefficients, solution, kept.factors)
     scale = system.scales().y
     extrapolated = jnp.sum(EXTRAPOLATIONS[:, :, None, None] * past.y, axis=1)
     weights = weights_by(jnp.max(jnp.abs(extrapolated - solution.y) / scale, axis=(1, 2)))
     return after._replace(weights=weights), row, kept
 
 
-def recorded(
-    problem: StepProblem, settings: Settings, past: Past, coefficients: Any, solution: Any, factors: Factors
-) -> tuple[Past, Rows]:
+def recorded_step(
+    problem: StepProblem,
+    settings: Settings,
+    past: StateHistory,
+    coefficients: Any,
+    solution: Any,
+    factors: Factors,
+) -> tuple[StateHistory, StepRows]:
     """Return the history after a solved step, and its row, with the discretisation error.
 
     The error e of a step solves the step's linear equations. Their right-hand side is the defect of the check
@@ -75,7 +80,7 @@ def recorded(
     (found, reached, tip, _), (_, *moved) = jax.jvp(lambda h: scheme(h, y), (history,), (d_history,))
     checked = problem.stages(y, space.check, found)
     defects = problem.reached_by(space.check, checked) - y[1:]
-    e, _ = solved(factors, pivots_of(system), defects + moved[0], *moved[1:])
+    e, _ = solved_correction(factors, pivots_of(system), defects + moved[0], *moved[1:])
     records = problem.packed(checked)
     error = jax.jvp(lambda *at: problem.packed(scheme(*at)[0]), (history, y), (d_history, e))[1]
     if settings.time.uses_rate:
@@ -84,7 +89,7 @@ def recorded(
         rate, d_rate = past.rate, past.error[2]
     # residual of the returned state, evaluated independently of the iteration
     residual = jnp.maximum(solution.error, largest_residual(problem, reached - y[1:], tip))
-    row = Rows(
+    row = StepRows(
         row_of(system, y, records), solution.unknowns, _finite_or_infinite(residual, records),
         solution.corrections, position_error(system, e),
     )  # fmt: skip
@@ -112,16 +117,16 @@ def weights_by(misfit: Float[Any, " extrapolations"]) -> Float[Any, " past"]:
     return jnp.sum((trust / jnp.sum(trust))[:, None] * EXTRAPOLATIONS, axis=0)
 
 
-def no_factors(system: System, settings: Settings, past: Past, control: Any) -> Kept:
+def no_factors(system: System, settings: Settings, past: StateHistory, control: Any) -> Kept:
     """Return factors of the right shape that are not usable."""
     problem = StepProblem.still(system, settings.space, control)
     y = past.y[0]
     return none_kept(problem, y, system.unknowns(y[0]))
 
 
-def _no_rows(system: System, shape: tuple[int, ...], past: Past) -> Rows:
+def _no_rows(system: System, shape: tuple[int, ...], past: StateHistory) -> StepRows:
     """Return rows of zeros, (steps,) or (robots, steps)."""
-    return Rows(
+    return StepRows(
         jnp.zeros((*shape, system.nodes, past.records.shape[-1])),
         jnp.zeros((*shape, system.unknown_count)),
         jnp.zeros(shape),
@@ -131,13 +136,13 @@ def _no_rows(system: System, shape: tuple[int, ...], past: Past) -> Rows:
 
 
 def _attempt(
-    system: System, settings: Settings, table: Any, past: Past, control: Any, i: Any, dt: Any, kept: Kept,
-    batch: str | None = None,
-) -> tuple[Any, Past, Rows, Kept]:  # fmt: skip
+    system: System, settings: Settings, table: Any, past: StateHistory, control: Any, i: Any, dt: Any,
+    kept: Kept, batch: str | None = None,
+) -> tuple[Any, StateHistory, StepRows, Kept]:  # fmt: skip
     """Try step i: return a failure flag, the next history (unchanged on failure), row and factors."""
     coefficients = jnp.where(i == 0, table[0], table[1])
     t = past.t0 + (i + 1) * dt
-    after, row, kept = step(system, settings, past, coefficients, control, t, kept, batch)
+    after, row, kept = solve_time_step(system, settings, past, coefficients, control, t, kept, batch)
     failed = ~(row.error <= settings.newton.acceptable)
     return failed, _where(failed, past, after), row, kept
 
@@ -147,9 +152,9 @@ def _where(condition: Any, one: Any, other: Any) -> Any:
 
 
 def time_loop(
-    system: System, settings: Settings, table: Any, controls: Any, dt: Any, past: Past, start: Any, stop: Any,
-    batch: str | None = None,
-) -> tuple[Any, Past, Rows]:  # fmt: skip
+    system: System, settings: Settings, table: Any, controls: Any, dt: Any, past: StateHistory, start: Any,
+    stop: Any, batch: str | None = None,
+) -> tuple[Any, StateHistory, StepRows]:  # fmt: skip
     """Solve the steps `start` to `stop` (exclusive; step i uses controls[i] and ends at t0 + (i + 1) dt).
 
     Stops at a step that does not converge. Returns the number of steps done, the history of the next step,
@@ -178,10 +183,10 @@ def loop_in_turn(
     table: Any,
     controls: Any,
     dt: Any,
-    pasts: Past,
+    pasts: StateHistory,
     stop: Any,
     batched: Any,
-) -> tuple[Any, Rows]:
+) -> tuple[Any, StepRows]:
     """Solve all steps, one robot after the other; return the numbers of steps done, and all rows.
 
     It is a single loop over robots and steps: XLA would copy all rows at every turn of an inner loop.
@@ -233,7 +238,7 @@ def loop_many(system, settings, table, controls, dt, pasts, stop, batched, locks
     if not lockstep:
         return loop_in_turn(system, settings, table, controls, dt, pasts, stop, batched)
 
-    def one(system: System, control: Any, past: Past) -> tuple[Any, Rows]:
+    def one(system: System, control: Any, past: StateHistory) -> tuple[Any, StepRows]:
         done, _, rows = time_loop(system, settings, table, control, dt, past, 0, stop, BATCH)
         return done, rows
 

@@ -18,12 +18,12 @@ import numpy as np
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import NewtonOptions, factors_of, pivots_of
 from knode_cosserat.solvers.equilibrium import equilibrium
-from knode_cosserat.solvers.linear import solved
+from knode_cosserat.solvers.linear import solved_correction
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.statics.asked import checked_control, checked_system, static_settings
-from knode_cosserat.statics.response import recorded, static_problem
+from knode_cosserat.statics.arguments import checked_control, checked_system, static_settings
+from knode_cosserat.statics.response import node_values, static_problem
 from knode_cosserat.statics.stability import stability
 from knode_cosserat.trajectory import Trajectory
 
@@ -181,8 +181,8 @@ def _corrected(system, settings, ends, start, tangent, plane):  # type: ignore[n
         error = jnp.maximum(jnp.max(jnp.abs(defects) / scale), jnp.max(jnp.abs(tip) / system.scales().tip))
         problem = static_problem(system, settings, ends[0] + part * (ends[1] - ends[0]))
         factors = factors_of(problem, y, system.unknowns(y[0]))
-        remove, _ = solved(factors, pivots, defects, tip, base)
-        follow, _ = solved(factors, pivots, *moved)
+        remove, _ = solved_correction(factors, pivots, defects, tip, base)
+        follow, _ = solved_correction(factors, pivots, *moved)
         return jnp.where(jnp.isnan(error), jnp.inf, error), remove, follow
 
     def correct(state: Any) -> Any:
@@ -211,7 +211,7 @@ def _corrected(system, settings, ends, start, tangent, plane):  # type: ignore[n
 def _trajectory(system: System, settings: Settings, walk: _Walk) -> Trajectory:
     controls = walk.ends[0] + np.array(walk.parts)[:, None] * (walk.ends[1] - walk.ends[0])
     rows = [
-        recorded(system, settings, control, jnp.asarray(y))
+        node_values(system, settings, control, jnp.asarray(y))
         for control, y in zip(controls, walk.y, strict=True)
     ]
     y, z = (np.stack([np.asarray(row[k]) for row in rows]) for k in (0, 1))

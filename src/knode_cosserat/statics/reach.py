@@ -12,15 +12,15 @@ from knode_cosserat.rods.system import System, in_strands
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.result import Code, Codes, Result, SimulationError
 from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.statics.asked import (
+from knode_cosserat.statics.arguments import (
     checked_control,
     checked_limits,
-    checked_numbers,
     checked_system,
+    checked_vectors,
     static_settings,
 )
-from knode_cosserat.statics.response import Pose, Response, first_solved, recorded, tip_pose
-from knode_cosserat.statics.search import Search, Wanted
+from knode_cosserat.statics.response import Pose, Response, first_solved, node_values, tip_pose
+from knode_cosserat.statics.search import EquilibriumSearch, Wanted
 from knode_cosserat.trajectory import Trajectory
 
 #: fields of a trajectory with one entry per row
@@ -157,7 +157,7 @@ def inverse_kinematics(
             raise ValueError(f"initial is {begin.tolist()}; it must be between low and high")
     if not _whole(starts):
         raise ValueError(f"starts is {starts!r}; allowed is a whole number from 1")
-    search = Search(system, settings, pose, *limits)
+    search = EquilibriumSearch(system, settings, pose, *limits)
     free = np.where(search.free, search.span, 1.0)
     last = np.where(search.free, 0.5, 0.0) if begin is None else (begin - limits[0]) / free
     rows, shape = [], None
@@ -180,7 +180,7 @@ def _whole(number: Any) -> bool:
 
 
 def _one(
-    search: Search, wanted: Wanted, begin: np.ndarray, shape: Response | None, starts: int
+    search: EquilibriumSearch, wanted: Wanted, begin: np.ndarray, shape: Response | None, starts: int
 ) -> tuple[InverseKinematics, np.ndarray, Response | None]:
     """Solve for one pose, from `begin` and its equilibrium (None: from rest), then from other controls."""
     best: tuple[float, np.ndarray, Response, bool] | None = None
@@ -213,11 +213,13 @@ def _others(size: int, count: int, free: np.ndarray) -> np.ndarray:
     return np.where(free, sample(np.zeros(size), np.ones(size), max(count, 1))[:count], 0.0)
 
 
-def _told(search: Search, wanted: Wanted, u: np.ndarray, found: Response, result: Reach) -> InverseKinematics:
+def _told(
+    search: EquilibriumSearch, wanted: Wanted, u: np.ndarray, found: Response, result: Reach
+) -> InverseKinematics:
     control = search.control(u)
     position, turned = wanted.errors(found)
     same = _from_rest(search, control, found)
-    y, z = recorded(search.system, search.settings, control, found.y)
+    y, z = node_values(search.system, search.settings, control, found.y)
     return InverseKinematics(
         result, control, np.asarray(found.position),
         None if found.quaternion is None else np.asarray(found.quaternion),
@@ -227,7 +229,7 @@ def _told(search: Search, wanted: Wanted, u: np.ndarray, found: Response, result
     )  # fmt: skip
 
 
-def _from_rest(search: Search, control: np.ndarray, found: Response) -> bool:
+def _from_rest(search: EquilibriumSearch, control: np.ndarray, found: Response) -> bool:
     """True if the equilibrium found from the unloaded robot has the same shape."""
     try:
         cold = first_solved(search.system, search.settings, search.pose, control)
@@ -260,7 +262,7 @@ def _same_shape(system: System, one: np.ndarray, other: np.ndarray) -> bool:
     return max(off, float(np.max(turned))) <= SAME_SHAPE
 
 
-def _nothing(search: Search, u: np.ndarray) -> InverseKinematics:
+def _nothing(search: EquilibriumSearch, u: np.ndarray) -> InverseKinematics:
     control = search.control(u)
     system = search.system
     position, quaternion = search.pose(system, np.full(system.y_layout.size, np.nan))
@@ -273,7 +275,9 @@ def _nothing(search: Search, u: np.ndarray) -> InverseKinematics:
     )  # fmt: skip
 
 
-def _rest(search: Search, control: np.ndarray, state: Any, result: Result, residual: float) -> Trajectory:
+def _rest(
+    search: EquilibriumSearch, control: np.ndarray, state: Any, result: Result, residual: float
+) -> Trajectory:
     y, z = (np.asarray(part)[None] for part in state)
     return Trajectory(
         system=search.system, settings=search.settings, time=np.zeros(1), y=y, z=z, control=control[None],
@@ -289,19 +293,19 @@ def _checked_wanted(
     given: dict[str, np.ndarray] = {}
     if position is not None:
         size = len(here)
-        given["position"] = checked_numbers("position", position, size, f"({size},) or (B, {size}) in m")
+        given["position"] = checked_vectors("position", position, size, f"({size},) or (B, {size}) in m")
     if quaternion is not None:
         if turned is None:
             raise ValueError(f"quaternion is given, but {type(system).__name__} has no orientation")
-        given["quaternion"] = checked_numbers("quaternion", quaternion, 4, "(4,) or (B, 4), scalar first")
+        given["quaternion"] = checked_vectors("quaternion", quaternion, 4, "(4,) or (B, 4), scalar first")
         if np.any(np.linalg.norm(given["quaternion"], axis=-1) < 1e-9):
             raise ValueError("quaternion is zero; allowed is any other length")
     if not given:
         raise ValueError("neither position nor quaternion is given; give one or both")
-    tolerance = float(checked_numbers("tolerance", np.atleast_1d(measured_by[1]), 1, "a number", most=1)[0])
+    tolerance = float(checked_vectors("tolerance", np.atleast_1d(measured_by[1]), 1, "a number", most=1)[0])
     if tolerance <= 0.0:
         raise ValueError(f"tolerance is {tolerance:g}; allowed is above 0")
-    weights = checked_numbers("weights", measured_by[0], 2, "(2,): of position and of orientation", most=1)
+    weights = checked_vectors("weights", measured_by[0], 2, "(2,): of position and of orientation", most=1)
     if np.any(weights <= 0.0):
         raise ValueError(f"weights are {weights.tolist()}; allowed is above 0")
     if len({array.shape[:-1] for array in given.values()}) > 1:

@@ -18,7 +18,7 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import Solution, factors_of, newton, pivots_of
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.history import rest_record
-from knode_cosserat.solvers.linear import solved
+from knode_cosserat.solvers.linear import solved_correction
 from knode_cosserat.solvers.problem import StepProblem, row_of
 from knode_cosserat.solvers.settings import Settings
 
@@ -61,16 +61,16 @@ def static_problem(system: System, settings: Settings, control: Any) -> StepProb
     return StepProblem.still(system, settings.space, control, TIME)
 
 
-def at_rest(system: System) -> tuple[Any, Any]:
+def unloaded_guess(system: System) -> tuple[Any, Any]:
     """Return the unloaded initial guess of y at all points and of ξ."""
     y = grid_of(system).spread(rest_record(system)[:, : system.y_layout.size])
     return y, system.unknowns(y[0])
 
 
-rest_guess = jax.jit(at_rest)
+rest_guess = jax.jit(unloaded_guess)
 
 
-def solve(system: System, settings: Settings, control: Any, y: Any, unknowns: Any) -> Solution:
+def solve_response(system: System, settings: Settings, control: Any, y: Any, unknowns: Any) -> Solution:
     """Solve for an equilibrium from a guess; its `error` tells if it converged."""
     problem = static_problem(system, settings, control).ready()
     return newton(problem, y, unknowns, settings.newton)[0]
@@ -83,7 +83,7 @@ def _filled(system, settings, control, y):  # type: ignore[no-untyped-def]
 
 
 @functools.partial(jax.jit, static_argnames="settings")
-def recorded(system, settings, control, y):  # type: ignore[no-untyped-def]
+def node_values(system, settings, control, y):  # type: ignore[no-untyped-def]
     """Return y and z of an equilibrium at the nodes, from y at all points."""
     record = row_of(system, y, static_problem(system, settings, control).records(y))
     ny = system.y_layout.size
@@ -108,7 +108,7 @@ def twist(system: System, pose: Pose, y: Any, dy: Any) -> Any:
 @functools.partial(jax.jit, static_argnames=("settings", "pose"))
 def respond(system, settings, pose, control, y, unknowns):  # type: ignore[no-untyped-def]
     """Return a `Response`: the equilibrium found from a guess, its pose, and the pose's derivatives."""
-    found = solve(system, settings, control, y, unknowns)
+    found = solve_response(system, settings, control, y, unknowns)
     problem = static_problem(system, settings, control)
     factors, pivots = factors_of(problem, found.y, found.unknowns), pivots_of(system)
 
@@ -118,11 +118,11 @@ def respond(system, settings, pose, control, y, unknowns):  # type: ignore[no-un
             return *problem.residuals(found.y), problem.base(found.unknowns)
 
         defects, tip, base = jax.jvp(at_solution, (control,), (d_control,))[1]
-        dy, _ = solved(factors, pivots, defects, tip, base)
+        dy, _ = solved_correction(factors, pivots, defects, tip, base)
         return twist(system, pose, found.y[-1], dy[-1])
 
     def by_wrench(tip: Any) -> Any:
-        dy, _ = solved(factors, pivots, jnp.zeros_like(found.y[1:]), tip)
+        dy, _ = solved_correction(factors, pivots, jnp.zeros_like(found.y[1:]), tip)
         return twist(system, pose, found.y[-1], dy[-1])
 
     names = wrench_fields(system)
@@ -137,17 +137,17 @@ def respond(system, settings, pose, control, y, unknowns):  # type: ignore[no-un
 
 
 @functools.partial(jax.jit, static_argnames=("settings", "pose"))
-def poses_of(system, settings, pose, controls):  # type: ignore[no-untyped-def]
+def equilibrium_poses(system, settings, pose, controls):  # type: ignore[no-untyped-def]
     """Return the poses of many equilibria (B, c), each solved from rest in sequence; only poses are kept.
 
     Position, quaternion, error, corrections, and the largest change from rest of each strain's magnitude.
     """
-    begin = at_rest(system)
+    begin = unloaded_guess(system)
     ny = system.y_layout.size
     z_rest = rest_record(system)[:, ny : ny + system.z_layout.size]
 
     def one(control: Any) -> Any:
-        found = solve(system, settings, control, *begin)
+        found = solve_response(system, settings, control, *begin)
         records = static_problem(system, settings, control).records(found.y)
         strain = row_of(system, found.y, records)[:, ny : ny + system.z_layout.size] - z_rest
         lengths = [jnp.max(jnp.linalg.norm(part, axis=-1)) for part in system.z_layout.split(strain)]

@@ -92,7 +92,7 @@ def at_limits(u: np.ndarray) -> np.ndarray:
     return np.where(u < AT_LIMIT, 0.0, np.where(u > 1.0 - AT_LIMIT, 1.0, u))
 
 
-class Search:
+class EquilibriumSearch:
     """State of the searches of one call: the robot, the limits, and the number of equilibria computed."""
 
     def __init__(self, system: System, settings: Settings, pose: Pose, low: np.ndarray, high: np.ndarray):

@@ -156,7 +156,7 @@ def _along(
     def piece(y: Any, low: Any, high: Any, acting: Any) -> Any:
         jump = jnp.eye(12)
         if system.jumps:
-            near, (y, slope) = y, (problem.crossed(acting, y, rest), jax.jacfwd(problem.crossed, 1))
+            near, (y, slope) = y, (problem.jump(acting, y, rest), jax.jacfwd(problem.jump, 1))
             jump = narrow(strand, y) @ slope(acting, near, rest) @ wide(strand, near)
 
         def on(y: Any, step: Any) -> Any:

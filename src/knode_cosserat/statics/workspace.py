@@ -21,14 +21,14 @@ from knode_cosserat.solvers.result import Result, ResultCodes
 from knode_cosserat.solvers.run import usable_cores
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.statics.asked import (
+from knode_cosserat.statics.arguments import (
     checked_limits,
-    checked_numbers,
     checked_system,
+    checked_vectors,
     static_settings,
     within_limits,
 )
-from knode_cosserat.statics.response import Pose, poses_of, tip_pose
+from knode_cosserat.statics.response import Pose, equilibrium_poses, tip_pose
 
 #: samples per task of a thread; fewer are padded to a power of two
 CHUNK = 1024
@@ -210,7 +210,7 @@ def workspace(
         samples = sample(*limits, int(number), seed)
     else:
         size = system.control_size
-        samples = checked_numbers("controls", controls, size, f"(B, {size})")
+        samples = checked_vectors("controls", controls, size, f"(B, {size})")
         if samples.ndim != 2:
             raise ValueError(f"controls have shape {samples.shape}; allowed is (B, {size})")
         within_limits(system, samples, "controls")
@@ -225,7 +225,7 @@ def _found(system: System, settings: Settings, pose: Pose, controls: np.ndarray,
         def work(first: int) -> Any:
             # the last chunk is padded with its last sample: one shape, one program
             index = np.minimum(np.arange(first, first + chunk), total - 1)
-            found = poses_of(system, settings, pose, controls[index])
+            found = equilibrium_poses(system, settings, pose, controls[index])
             count = min(chunk, total - first)
             bar.update(count)
             return [None if leaf is None else np.asarray(leaf)[:count] for leaf in found]

@@ -14,7 +14,7 @@ from knode_cosserat.evaluation.tables import markdown_table
 from knode_cosserat.recordings.beam import BeamRecording, read_beam
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.studies.beam_fit import NOMINAL, identify_beam, marker_rmse
-from knode_cosserat.studies.beam_model import DEFAULT, Beam, Numerics, predict, step_count
+from knode_cosserat.studies.beam_model import DEFAULT, Beam, Numerics, predict_markers, step_count
 from knode_cosserat.studies.report import Report, as_json, write_figures, write_texts
 
 #: names of the files
@@ -97,7 +97,7 @@ def rerun(
     found = identify_beam([by_name[name] for name in names], steps, numerics, progress)
     beams = {"nominal": NOMINAL, "identified": found.beam}
     predictions = {
-        each.name: {method: predict(beam, each, steps, numerics) for method, beam in beams.items()}
+        each.name: {method: predict_markers(beam, each, steps, numerics) for method, beam in beams.items()}
         for each in recordings
     }
     cells = _cells(recordings, names, predictions)

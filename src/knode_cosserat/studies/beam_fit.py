@@ -12,7 +12,7 @@ import scipy.optimize
 from jaxtyping import Float
 
 from knode_cosserat.recordings.beam import BeamRecording
-from knode_cosserat.studies.beam_model import DEFAULT, Beam, Numerics, predict, tip_height
+from knode_cosserat.studies.beam_model import DEFAULT, Beam, Numerics, predict_markers, tip_height
 
 #: Young's modulus published with the recordings (Pa); the other parameters are initial values
 NOMINAL = Beam(youngs_modulus=263_824.0, damping_time=5e-3)
@@ -34,7 +34,7 @@ LOST = 100.0
 STEP, TOLERANCE = 1e-3, 3e-3
 
 
-class Identified(NamedTuple):
+class IdentifiedBeam(NamedTuple):
     """Identified beam, and the number of evaluations."""
 
     beam: Beam
@@ -58,7 +58,7 @@ def identify_beam(
     steps: int,
     numerics: Numerics = DEFAULT,
     progress: Callable[[str], None] = lambda line: None,
-) -> Identified:
+) -> IdentifiedBeam:
     """Return the beam whose parameters fit the training recordings best.
 
     Each recording has the same weight, independent of its number of rows.
@@ -82,7 +82,7 @@ def identify_beam(
     found = scipy.optimize.least_squares(
         residuals, np.zeros(len(names)), jacobian, bounds=(-most, most), xtol=TOLERANCE, ftol=TOLERANCE
     )
-    return Identified(_moved(start, found.x), calls)
+    return IdentifiedBeam(_moved(start, found.x), calls)
 
 
 def _moved(start: Beam, x: Float[np.ndarray, " k"]) -> Beam:
@@ -98,7 +98,7 @@ def _residual(
 ) -> Float[np.ndarray, " r"]:
     """Return the scaled residuals (mm) of rows from the threshold on; their squares sum to the MSE."""
     rows = recording.time >= recording.crossing
-    left = 1e3 * (predict(beam, recording, steps, numerics) - recording.tip)[rows]
+    left = 1e3 * (predict_markers(beam, recording, steps, numerics) - recording.tip)[rows]
     seen = np.isfinite(recording.tip[rows])
     left = np.where(seen, np.nan_to_num(left, nan=LOST), 0.0)
     return np.asarray(left.ravel()) / math.sqrt(max(int(np.count_nonzero(seen.all(axis=2))), 1))

@@ -149,7 +149,7 @@ def _matrices(h: Float[np.ndarray, "T 4"]) -> Float[np.ndarray, "T 3 3"]:
     return np.asarray(jax.vmap(rotation_matrix)(h))
 
 
-def predict(
+def predict_markers(
     beam: Beam, recording: BeamRecording, steps: int, numerics: Numerics = DEFAULT
 ) -> Float[np.ndarray, "T 3 3"]:
     """Return the markers' displacements (m) at the times of a recording; NaN before the release.

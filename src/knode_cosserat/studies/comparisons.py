@@ -107,7 +107,7 @@ class NoKnowledge(System):
         return type(self)(self.model.replace(**changes))
 
 
-class Poses(NamedTuple):
+class NodePoses(NamedTuple):
     """Poses for the metrics: positions (T, N, 3) in m and quaternions (T, N, 4)."""
 
     position: np.ndarray
@@ -147,7 +147,7 @@ class LinearPredictor(NamedTuple):
         """Spectral radius of A: the largest growth factor from row to row without actuation."""
         return float(np.max(np.abs(np.linalg.eigvals(self.A))))
 
-    def __call__(self, tensions: Float[Any, "T c"]) -> Poses:
+    def __call__(self, tensions: Float[Any, "T c"]) -> NodePoses:
         """Return T rows from rest under these controls, as the paper counts; they may overflow."""
         x = np.zeros_like(self.rest)
         rows = [x]
@@ -156,7 +156,7 @@ class LinearPredictor(NamedTuple):
                 x = self.A @ x + self.B @ force
                 rows.append(x)
             y = (self.rest + self.scale * np.array(rows)).reshape(len(rows), self.system.nodes, -1)
-        return Poses(np.asarray(self.system.positions(y)), np.asarray(self.system.quaternions(y)))
+        return NodePoses(np.asarray(self.system.positions(y)), np.asarray(self.system.quaternions(y)))
 
 
 #: candidate ranks

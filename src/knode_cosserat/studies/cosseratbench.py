@@ -95,7 +95,7 @@ def _usual_time_step(scenario: Scenario) -> float:
     return math.sqrt(12.0 * PERIOD_ERROR) / scenario.slowest_frequency()
 
 
-class Shape(NamedTuple):
+class InitialShape(NamedTuple):
     """Initial shape of a rod at its nodes: p, h, and the strains v and u."""
 
     p: np.ndarray
@@ -104,7 +104,7 @@ class Shape(NamedTuple):
     u: np.ndarray
 
     @classmethod
-    def of(cls, rod: Rod, segments: int) -> Shape:
+    def of(cls, rod: Rod, segments: int) -> InitialShape:
         """Return the shape of the scenario's polyline, without shear and, as the suite requires, twist."""
         points = np.asarray(rod.centerline, dtype=float)
         along = rod.rest_arc_length
@@ -132,7 +132,7 @@ class Shape(NamedTuple):
 def _frames(rod: Rod, scenario: Scenario, times: np.ndarray, dt: float | None, n_elements: int) -> Any:
     """Return positions and directors of one rod at these times, in steps of dt or at rest."""
     segments, newton = _segments(rod, scenario, n_elements, dt), _newton(rod, scenario)
-    shape = Shape.of(rod, segments * n_elements)
+    shape = InitialShape.of(rod, segments * n_elements)
     system = _system(rod, scenario, shape)
     start = resting(system, *shape)
     try:
@@ -187,7 +187,7 @@ def _drag_rate(scenario: Scenario) -> float:
 # from a scenario's rod to ours
 
 
-def _system(rod: Rod, scenario: Scenario, shape: Shape) -> kc.robots.SlenderRod:
+def _system(rod: Rod, scenario: Scenario, shape: InitialShape) -> kc.robots.SlenderRod:
     """Return the rod; unloaded, it is straight along its first tangent."""
     if rod.start is EndCondition.FREE and any(load.at is End.START for load in rod.loads):
         raise NotImplementedError("a load at a free start")

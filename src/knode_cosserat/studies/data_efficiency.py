@@ -19,7 +19,7 @@ from knode_cosserat.solvers.result import SimulationError
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.studies import simulation
 from knode_cosserat.studies.comparisons import NoKnowledge, compared, linear_predictor
-from knode_cosserat.studies.methods import METHODS, Learned
+from knode_cosserat.studies.methods import METHODS, LearnedSystems
 from knode_cosserat.studies.runner import Job, Product
 from knode_cosserat.trajectory import Trajectory
 
@@ -30,25 +30,27 @@ SINES = (1, 2)
 SEEDS = 3
 
 
-def paper_alone(imperfect: System, training: Sequence[Trajectory], seeds: Sequence[int]) -> Learned:
+def paper_alone(imperfect: System, training: Sequence[Trajectory], seeds: Sequence[int]) -> LearnedSystems:
     """Return the paper's network, trained on a system without physics."""
     return _without_knowledge(imperfect, training, FitConfig.paper(seed=tuple(seeds)))
 
 
-def network_alone(imperfect: System, training: Sequence[Trajectory], seeds: Sequence[int]) -> Learned:
+def network_alone(imperfect: System, training: Sequence[Trajectory], seeds: Sequence[int]) -> LearnedSystems:
     """Return a standardised, unconstrained network of the paper's size, on a system without physics."""
     return _without_knowledge(imperfect, training, FitConfig.network(seed=tuple(seeds), hidden=512))
 
 
-def _without_knowledge(imperfect: System, training: Sequence[Trajectory], config: FitConfig) -> Learned:
+def _without_knowledge(
+    imperfect: System, training: Sequence[Trajectory], config: FitConfig
+) -> LearnedSystems:
     try:
         models = fit(NoKnowledge(imperfect), training, config)
     except FitError as error:
-        return Learned(dict.fromkeys(config.seeds, str(error)))
-    return Learned(dict(zip(config.seeds, models, strict=True)))
+        return LearnedSystems(dict.fromkeys(config.seeds, str(error)))
+    return LearnedSystems(dict(zip(config.seeds, models, strict=True)))
 
 
-Method = Callable[[System, Sequence[Trajectory], Sequence[int]], Learned]
+Method = Callable[[System, Sequence[Trajectory], Sequence[int]], LearnedSystems]
 INFORMED: dict[str, Method] = {name: METHODS[name] for name in ("baseline", "paper", "best")}
 ALONE: dict[str, Method] = {"paper, no knowledge": paper_alone, "network, no knowledge": network_alone}
 LINEAR = "linear (DMDc)"

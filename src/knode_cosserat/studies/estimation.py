@@ -70,7 +70,9 @@ def rerun(out: Path, signals: Mapping[str, str] = SIGNALS, seed: int = 0) -> Rep
     texts = {"estimation.md": as_markdown(cells), "estimation.json": as_json(cells)}
     tables = write_texts(out, texts)
     assert drawn is not None
-    return Report(cells, tables, write_figures(out, {"estimation": estimation_figures.states(*drawn, DRAWN)}))
+    return Report(
+        cells, tables, write_figures(out, {"estimation": estimation_figures.estimated_states(*drawn, DRAWN)})
+    )
 
 
 def as_markdown(cells: Sequence[Mapping[str, Any]]) -> str:

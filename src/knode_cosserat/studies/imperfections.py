@@ -154,7 +154,7 @@ def settings(name: str, seeds: Sequence[int], **changes: Any) -> dict[str, Any]:
 def assess(settings: Any) -> Product:
     """Return the cells of one imperfection: the nominal and the learned model, under every control."""
     knowledge: Any = load_robot(settings["robot"]).replace(nodes=settings["nodes"])
-    truth = truths.extended(KINDS[settings["kind"]], knowledge, **settings["truth"])
+    truth = truths.derived_robot(KINDS[settings["kind"]], knowledge, **settings["truth"])
     training, references = _truths(truth, settings)
     learned = METHODS[settings["method"]](knowledge, training, settings["seeds"])
     systems: list[tuple[str, int, System | str]] = [("baseline", 0, knowledge)]

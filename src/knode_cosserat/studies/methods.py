@@ -19,7 +19,7 @@ Trajectories = Sequence[Trajectory]
 
 
 @dataclasses.dataclass(frozen=True)
-class Learned:
+class LearnedSystems:
     """System for each seed, or the reason of its failure, and facts on the fit (plain JSON values)."""
 
     systems: dict[int, System | str]
@@ -28,46 +28,46 @@ class Learned:
     found: dict[str, Any] = dataclasses.field(default_factory=dict)
 
 
-def baseline(imperfect: System, training: Trajectories, seeds: Sequence[int]) -> Learned:
+def baseline(imperfect: System, training: Trajectories, seeds: Sequence[int]) -> LearnedSystems:
     """Return the imperfect model unchanged."""
-    return Learned({0: imperfect})
+    return LearnedSystems({0: imperfect})
 
 
-def calibrated(imperfect: System, training: Trajectories, seeds: Sequence[int]) -> Learned:
+def calibrated(imperfect: System, training: Trajectories, seeds: Sequence[int]) -> LearnedSystems:
     """Return the imperfect model with calibrated parameters, without a residual."""
     try:
         result = calibrate(imperfect, training)
     except CalibrationError as error:
-        return Learned({0: str(error)})
+        return LearnedSystems({0: str(error)})
     found = {
         name: {"before": np.asarray(result.before[name]).tolist(), "estimate": np.asarray(value).tolist()}
         for name, value in result.estimates.items()
     }
-    return Learned(
+    return LearnedSystems(
         {0: result.robot}, found={**found, "undetermined": [str(name) for name in result.undetermined]}
     )
 
 
-def paper(imperfect: System, training: Trajectories, seeds: Sequence[int]) -> Learned:
+def paper(imperfect: System, training: Trajectories, seeds: Sequence[int]) -> LearnedSystems:
     """Return the paper's network after the paper's training."""
     return _fitted(imperfect, training, FitConfig.paper(seed=tuple(seeds)))
 
 
-def best(imperfect: System, training: Trajectories, seeds: Sequence[int]) -> Learned:
+def best(imperfect: System, training: Trajectories, seeds: Sequence[int]) -> LearnedSystems:
     """Return the best preset's model; seeds resample the data's rows, because the fit is deterministic."""
     return _fitted(imperfect, training, FitConfig(StructuredOptions(resample=True), seed=tuple(seeds)))
 
 
-def _fitted(imperfect: System, training: Trajectories, config: FitConfig) -> Learned:
+def _fitted(imperfect: System, training: Trajectories, config: FitConfig) -> LearnedSystems:
     try:
         models = fit(imperfect, training, config)
     except FitError as error:
-        return Learned(dict.fromkeys(config.seeds, str(error)))
+        return LearnedSystems(dict.fromkeys(config.seeds, str(error)))
     histories = {str(model.about.facts["seed"]): model.about.facts.get("segments") for model in models}
     losses = {seed: np.asarray(it["loss"]).tolist() for seed, it in histories.items() if it}
-    return Learned(dict(zip(config.seeds, models, strict=True)), losses)
+    return LearnedSystems(dict(zip(config.seeds, models, strict=True)), losses)
 
 
-Method = Callable[[System, Trajectories, Sequence[int]], Learned]
+Method = Callable[[System, Trajectories, Sequence[int]], LearnedSystems]
 #: methods by name, in the order of the table
 METHODS: dict[str, Method] = {method.__name__: method for method in (baseline, paper, calibrated, best)}

@@ -61,7 +61,7 @@ class Window(NamedTuple):
 # the jobs
 
 
-def found(folder: Path) -> dict[str, Path]:
+def recordings_in(folder: Path) -> dict[str, Path]:
     """Return the recordings in a folder by name: bags, tables, and folders of ROS 2 bags.
 
     Raises:
@@ -90,7 +90,7 @@ def described_in(folder: Path) -> dict[str, Path]:
     return {what: path for what, path in usual.items() if path.is_file()}
 
 
-def chosen(names: Sequence[str], train: Sequence[str] | None) -> tuple[list[str], list[str]]:
+def recording_split(names: Sequence[str], train: Sequence[str] | None) -> tuple[list[str], list[str]]:
     """Return the names of the training recordings and of the held-out ones.
 
     Raises:
@@ -109,7 +109,7 @@ def chosen(names: Sequence[str], train: Sequence[str] | None) -> tuple[list[str]
     return wanted, rest
 
 
-class Options(NamedTuple):
+class RecordingsOptions(NamedTuple):
     """Options of a study of recordings."""
 
     robot: str = ROBOT
@@ -121,7 +121,7 @@ class Options(NamedTuple):
 
 
 def jobs(
-    paths: Mapping[str, Path], train: Sequence[str], methods: Sequence[str], options: Options
+    paths: Mapping[str, Path], train: Sequence[str], methods: Sequence[str], options: RecordingsOptions
 ) -> list[Job]:
     """Return one job for each method, with all seeds and recordings, and one for the measurements."""
     windows = {
@@ -217,7 +217,7 @@ def _plain(values: Any, digits: int) -> Any:
 # learning
 
 
-class Learned(NamedTuple):
+class TrainedSystems(NamedTuple):
     """System for each seed, or the reason of its failure."""
 
     systems: dict[int, System | str]
@@ -229,15 +229,15 @@ class Learned(NamedTuple):
     told: str = ""
 
 
-def _baseline(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence[int]) -> Learned:
-    return Learned({0: knowledge})
+def _baseline(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence[int]) -> TrainedSystems:
+    return TrainedSystems({0: knowledge})
 
 
-def _paper_a(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence[int]) -> Learned:
+def _paper_a(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence[int]) -> TrainedSystems:
     return _paper(knowledge, [name for name in train if not name.startswith(RANDOM)] or train, read, seeds)
 
 
-def _paper(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence[int]) -> Learned:
+def _paper(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence[int]) -> TrainedSystems:
     states = []
     for name in train:
         _, start, seconds = read.window(name)
@@ -246,56 +246,58 @@ def _paper(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence
     try:
         models = fit(knowledge, states, config)
     except FitError as error:
-        return Learned(dict.fromkeys(seeds, str(error)))
+        return TrainedSystems(dict.fromkeys(seeds, str(error)))
     losses = {
         str(model.about.facts["seed"]): np.asarray(model.about.facts["segments"]["loss"]).tolist()
         for model in models
     }
-    return Learned(dict(zip(seeds, models, strict=True)), space=PAPER_SPACE, loss=losses)
+    return TrainedSystems(dict(zip(seeds, models, strict=True)), space=PAPER_SPACE, loss=losses)
 
 
-def _best(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence[int]) -> Learned:
+def _best(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence[int]) -> TrainedSystems:
     """Return the identified robot; identification is deterministic, so there is one seed."""
     try:
         found = identify(knowledge, [read.rows(name, FINER) for name in train], space=SPACE)
     except IdentificationError as error:
-        return Learned({0: str(error)}, FINER)
-    return Learned({0: found.robot}, FINER, told=str(found))
+        return TrainedSystems({0: str(error)}, FINER)
+    return TrainedSystems({0: found.robot}, FINER, told=str(found))
 
 
-def _calibrated(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence[int]) -> Learned:
+def _calibrated(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence[int]) -> TrainedSystems:
     names = ("youngs_modulus", "density", "bending_damping", "drag", "gravity")
     rows = [read.rows(name, FINER) for name in train]
     try:
         found = calibrate(knowledge, rows, names, by="rollouts", undetermined="keep", space=SPACE)
     except CalibrationError as error:
-        return Learned({0: str(error)}, FINER)
-    return Learned({0: found.robot}, FINER, told=str(found))
+        return TrainedSystems({0: str(error)}, FINER)
+    return TrainedSystems({0: found.robot}, FINER, told=str(found))
 
 
-def _network(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence[int]) -> Learned:
+def _network(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence[int]) -> TrainedSystems:
     """Return a passive network on the nominal model; its training is deterministic too."""
     try:
         model = learn(
             knowledge, [read.rows(name, FINER) for name in train], FitConfig.network_recordings(), space=SPACE
         )
     except (FitError, DataError) as error:
-        return Learned({0: str(error)}, FINER)
-    return Learned({0: model}, FINER)
+        return TrainedSystems({0: str(error)}, FINER)
+    return TrainedSystems({0: model}, FINER)
 
 
-def _residual(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence[int]) -> Learned:
+def _residual(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence[int]) -> TrainedSystems:
     """Return the identified robot, with a passive residual if this improves held-out recordings."""
     try:
         model = learn(knowledge, [read.rows(name, FINER) for name in train], space=SPACE)
     except (IdentificationError, FitError, DataError) as error:
-        return Learned({0: str(error)}, FINER)
-    return Learned({0: model}, FINER, told="\n".join(f"- {step}" for step in model.about.facts["steps"]))
+        return TrainedSystems({0: str(error)}, FINER)
+    return TrainedSystems(
+        {0: model}, FINER, told="\n".join(f"- {step}" for step in model.about.facts["steps"])
+    )
 
 
 #: methods of the paper's Table II, and ablations of the best method, each without all later parts
 TABLE = ("baseline", "paper-a", "paper-b", "best")
-METHODS: dict[str, Callable[[System, Sequence[str], _Read, Sequence[int]], Learned]] = {
+METHODS: dict[str, Callable[[System, Sequence[str], _Read, Sequence[int]], TrainedSystems]] = {
     "baseline": _baseline,
     "paper-a": _paper_a,
     "paper-b": _paper,
@@ -338,7 +340,7 @@ def predicted(settings: Any) -> Product:
 
 
 def _outcomes(
-    system: System | str, read: _Read, names: Sequence[str], learned: Learned
+    system: System | str, read: _Read, names: Sequence[str], learned: TrainedSystems
 ) -> dict[str, Evaluation]:
     """Return a model's metrics for all recordings.
 
@@ -358,7 +360,9 @@ def _outcomes(
     return found
 
 
-def _outcome(system: System | str, read: _Read, name: str, learned: Learned, recovery: float) -> Evaluation:
+def _outcome(
+    system: System | str, read: _Read, name: str, learned: TrainedSystems, recovery: float
+) -> Evaluation:
     """Return a model's metrics for a recording, or the cause of a failure."""
     if isinstance(system, str):
         return Evaluation(failed=system)

@@ -13,7 +13,7 @@ from knode_cosserat.evaluation import study_figures, table_two_figures
 from knode_cosserat.evaluation.table_two_figures import Predicted
 from knode_cosserat.evaluation.tables import Spread, in_words, markdown_table
 from knode_cosserat.studies import recordings, runner
-from knode_cosserat.studies.recordings import DT, Options
+from knode_cosserat.studies.recordings import DT, RecordingsOptions
 from knode_cosserat.studies.report import Report, as_json, write_figures, write_texts
 
 Facts = Mapping[str, Mapping[str, Any]]
@@ -37,7 +37,7 @@ def rerun(
     *,
     train: Sequence[str] | None,
     methods: Sequence[str],
-    options: Options,
+    options: RecordingsOptions,
     simulated: bool | None = None,
     workers: int | None = None,
     dask: str | None = None,
@@ -50,7 +50,7 @@ def rerun(
         folder: the folder of bags and tables.
         train: names (without suffixes) of the training recordings; None: the paper's.
         methods: some of `recordings.METHODS`.
-        options: see `recordings.Options`.
+        options: see `recordings.RecordingsOptions`.
         simulated: True if the robot was simulated; None: as stated by the recordings.
         workers: see `runner.run`.
         dask: see `runner.run`.
@@ -60,8 +60,8 @@ def rerun(
         StudyError: recordings are not there, or as in `runner.run`.
         RecordingError: a recording cannot be read.
     """
-    paths = recordings.found(folder)
-    learned, rest = recordings.chosen(list(paths), train)
+    paths = recordings.recordings_in(folder)
+    learned, rest = recordings.recording_split(list(paths), train)
     ordered = {name: paths[name] for name in (*rest, *learned)}
     jobs = recordings.jobs(ordered, learned, methods, options)
     facts = runner.run(jobs, out, workers=workers, dask=dask, progress=progress)
@@ -188,7 +188,7 @@ def draw(facts: Facts, methods: Sequence[str], names: Sequence[str], out: Path) 
     """Write figures of tensions, paths, tip x, error over the horizon, and losses and repetitions if any."""
     seen = {name: _predicted(facts, methods, name) for name in names}
     drawn = {
-        "tensions": table_two_figures.tensions(seen),
+        "tensions": table_two_figures.measured_tensions(seen),
         "paths": table_two_figures.paths(seen),
         "tip-x": table_two_figures.tip_x(seen),
         "horizon": table_two_figures.horizon(seen),

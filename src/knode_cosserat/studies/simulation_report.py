@@ -75,7 +75,7 @@ def draw(facts: Facts, methods: Sequence[str], out: Path) -> list[Path]:
             control: (truth, {method: each[control] for method, each in found.items() if control in each})
             for control, truth in truths.items()
         }
-        drawn[f"tips-{imperfection}"] = study_figures.tips(cases)
+        drawn[f"tips-{imperfection}"] = study_figures.predicted_tips(cases)
         for control, (truth, predictions) in cases.items():
             if predictions:
                 drawn[f"shapes-{imperfection}-{control}"] = study_figures.shapes(truth, predictions)

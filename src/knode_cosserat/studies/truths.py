@@ -31,7 +31,7 @@ TOLERANCE = 1e-12
 Robot = TypeVar("Robot", bound=TendonRobot)
 
 
-def extended(kind: type[Robot], robot: TendonRobot, **more: Any) -> Robot:
+def derived_robot(kind: type[Robot], robot: TendonRobot, **more: Any) -> Robot:
     """Return a robot of the given class with another robot's parameters and the class's own ones."""
     own = {name: getattr(robot, name) for name in robot.parameters() if name in kind.parameters()}
     return kind(**{**own, "nodes": robot.nodes, **more})
@@ -152,7 +152,7 @@ class Tapered(TendonRobot):
 
     def _there(self, s: Any) -> TendonRobot:
         part = 1.0 - self.tip_softening * s / self.length
-        return extended(TendonRobot, self, youngs_modulus=self.youngs_modulus * part)
+        return derived_robot(TendonRobot, self, youngs_modulus=self.youngs_modulus * part)
 
     def strains(
         self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History

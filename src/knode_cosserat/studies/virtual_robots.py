@@ -15,9 +15,9 @@ import numpy as np
 
 from knode_cosserat.evaluation.tables import markdown_table
 from knode_cosserat.identification.evaluate import Evaluation, evaluate
-from knode_cosserat.identification.given import DT
 from knode_cosserat.identification.identify import identify
 from knode_cosserat.identification.imperfections import Imperfect, imperfect_robot
+from knode_cosserat.identification.inputs import DT
 from knode_cosserat.identification.result import Identified
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.load import load_recording
@@ -69,7 +69,7 @@ def drawn_robot(seed: int) -> Imperfect:
     return imperfect_robot(nominal_robot(), tension, seed, bodies)
 
 
-def recorded(truth: Imperfect, signals: Mapping[str, str], seed: int) -> list[Measurements]:
+def recordings_of(truth: Imperfect, signals: Mapping[str, str], seed: int) -> list[Measurements]:
     """Return recordings of a robot, read from bags as any others."""
     found = []
     # all parts, also inactive ones: one compiled program serves every robot
@@ -86,8 +86,8 @@ def robot_facts(settings: Any) -> Product:
     """Return the identification's result for one robot, and its prediction errors."""
     seed = int(settings["seed"])
     truth = drawn_robot(seed)
-    given = recorded(truth, TRAIN, seed)
-    unseen = recorded(truth, UNSEEN, 1000 + seed)
+    given = recordings_of(truth, TRAIN, seed)
+    unseen = recordings_of(truth, UNSEEN, 1000 + seed)
     found = identify(nominal_robot(), given)
     outcomes = {}
     for name, each in zip(UNSEEN, unseen, strict=True):

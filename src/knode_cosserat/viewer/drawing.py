@@ -214,7 +214,7 @@ def quaternions_of(system: System, y: np.ndarray) -> np.ndarray | None:
         return None
 
 
-def curves_of(system: System, y: np.ndarray, positions: np.ndarray) -> list[dict[str, Any]]:
+def drawn_lines(system: System, y: np.ndarray, positions: np.ndarray) -> list[dict[str, Any]]:
     """Lines to be drawn beside that of the positions, if there are others: rods, and outlines that close."""
     flat = type(system).curves is System.curves
     found = [] if flat else [np.asarray(curve, dtype=float) for curve in system.curves(y)]

@@ -20,8 +20,8 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.trajectory import Trajectory
 from knode_cosserat.viewer.drawing import (
-    curves_of,
     drawing,
+    drawn_lines,
     fields,
     offset_of,
     positions_of,
@@ -126,10 +126,10 @@ def track(trajectory: Trajectory, name: str) -> dict[str, Any]:
     unsolved = np.flatnonzero(result < 0)
     return {
         "name": name,
-        "time": packed(np.asarray(trajectory.time)[rows], "f8"),
-        "result": packed(result[rows], "f4"),
-        "position_error": packed(_position_error(trajectory)[rows], "f4"),
-        "arrays": {key: packed(value, "f4") for key, value in arrays.items()},
+        "time": encoded_array(np.asarray(trajectory.time)[rows], "f8"),
+        "result": encoded_array(result[rows], "f4"),
+        "position_error": encoded_array(_position_error(trajectory)[rows], "f4"),
+        "arrays": {key: encoded_array(value, "f4") for key, value in arrays.items()},
         "all_rows": len(result),
         "all_nodes": int(system.nodes),
         "failure": _failure(trajectory, unsolved),
@@ -156,7 +156,7 @@ def arrays_of(
     y = np.asarray(trajectory.y, dtype=float)[rows]
     position = positions_of(system, y)
     orientation = quaternions_of(system, y)
-    curves = curves_of(system, y, position)
+    curves = drawn_lines(system, y, position)
     arrays = {
         "y": y[:, nodes],
         "z": np.asarray(trajectory.z, dtype=float)[rows][:, nodes],
@@ -183,7 +183,7 @@ def arrays_of(
     }
 
 
-def row_of(system: System, trajectory: Trajectory, names: Sequence[str]) -> np.ndarray:
+def last_row(system: System, trajectory: Trajectory, names: Sequence[str]) -> np.ndarray:
     """Return the values of a trajectory's last row, array after array, for the live page."""
     nodes, _ = kept(np.shape(trajectory.y), system.z_layout.size)
     y = np.asarray(trajectory.y)[-1:]
@@ -219,7 +219,7 @@ def _failure(trajectory: Trajectory, unsolved: np.ndarray) -> dict[str, Any] | N
     return {"time": float(np.asarray(trajectory.time)[first]), "message": result.message}
 
 
-def packed(values: Any, kind: str) -> dict[str, Any]:
+def encoded_array(values: Any, kind: str) -> dict[str, Any]:
     """An array as the page reads it: its shape, its type, and its bytes."""
     values = np.ascontiguousarray(jax.device_get(values), dtype=f"<{kind}")
     # bytes of one significance side by side: neighbours in time are alike in the high ones

@@ -27,7 +27,7 @@ from knode_cosserat.solvers.result import SimulationError
 from knode_cosserat.solvers.stepper import Stepper
 from knode_cosserat.trajectory import Trajectory
 from knode_cosserat.viewer.drawing import sliders
-from knode_cosserat.viewer.scene import row_of, track
+from knode_cosserat.viewer.scene import last_row, track
 
 #: time over which the pace is averaged (s)
 PACE = 1.0
@@ -220,7 +220,7 @@ class Session:
         The head is: sequence, time, result, estimated position error (m), pace, computing time (ms).
         """
         head = [sequence, ahead.time[0], ahead.result[0], ahead.position_error[0], self.pace, self.spent]
-        row = row_of(self.stepper.robot, ahead, self.names)
+        row = last_row(self.stepper.robot, ahead, self.names)
         return np.concatenate([np.array(head, dtype=np.float32), row]).tobytes()
 
 

@@ -9,7 +9,13 @@ import pytest
 import knode_cosserat as kc
 from knode_cosserat.learning.calibration import search
 from knode_cosserat.learning.calibration.calibrate import CalibrationError, calibrate
-from knode_cosserat.learning.calibration.unknowns import found, searched, unknowns_of, values, with_numbers
+from knode_cosserat.learning.calibration.unknowns import (
+    searched,
+    searched_numbers,
+    unknowns_of,
+    values,
+    with_numbers,
+)
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import Residual
 from knode_cosserat.learning.samples import DataError
@@ -277,7 +283,7 @@ def test_matrices_and_vectors_as_numbers():
     assert [unknown.kind for unknown in unknowns] == ["diagonal", "multiple", "components", "number"]
     numbers = values(robot, unknowns)
     np.testing.assert_array_equal(numbers, [0.03, 0.04, 0.05, 1e-4, 0.0, 0.0, -9.81, 0.003175])
-    np.testing.assert_allclose(found(unknowns, searched(unknowns, numbers)), numbers, rtol=1e-14)
+    np.testing.assert_allclose(searched_numbers(unknowns, searched(unknowns, numbers)), numbers, rtol=1e-14)
     changed = with_numbers(robot, unknowns, np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0]))
     np.testing.assert_array_equal(changed.bending_damping, np.diag([1.0, 2.0, 3.0]))
     np.testing.assert_array_equal(changed.drag, 4.0 * np.eye(3))

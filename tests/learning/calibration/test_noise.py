@@ -71,7 +71,7 @@ def test_what_noise_does_on_average_is_taken_away(swings):
     raw, corrected, errors = [], [], []
     for seed in range(30):
         misfit = SegmentMisfit(BAR, noisy(swings, 7e-2, seed), unknowns)
-        ended = search.fit(misfit, truth, may_leave_out=False)
+        ended = search.search_coordinates(misfit, truth, may_leave_out=False)
         found_errors = errors_of(misfit, ended)
         raw.append(ended.coordinates - truth)
         corrected.append(raw[-1] - found_errors.shift)

@@ -66,7 +66,7 @@ def test_files_that_are_something_else(tmp_path):
 def test_newer_versions():
     newer = re.sub(rb"^(.*) format 1, package [^\n]*", rb"\1 format 2, package 9.1", BYTES)
     with fails("model: its format is 2; allowed is 1", "knode-cosserat 9.1"):
-        model_file.decoded(newer, "model")
+        model_file.decoded_model(newer, "model")
 
 
 @settings(max_examples=150, deadline=None)
@@ -74,7 +74,7 @@ def test_newer_versions():
 def test_truncated_files(data):
     length = data.draw(st.integers(1, len(BYTES) - 1) | st.integers(1, 200))
     with fails("model: truncated"):
-        model_file.decoded(BYTES[:length], "model")
+        model_file.decoded_model(BYTES[:length], "model")
 
 
 @settings(max_examples=200, deadline=None)
@@ -86,16 +86,16 @@ def test_damaged_files(data):
         content[place] ^= 1 << data.draw(st.integers(0, 7))
     assume(bytes(content) != BYTES)
     with fails("model: "):
-        model_file.decoded(bytes(content), "model")
+        model_file.decoded_model(bytes(content), "model")
 
 
 def test_added_and_swapped_bytes():
     with fails("model: damaged"):
-        model_file.decoded(BYTES + b"\0", "model")
+        model_file.decoded_model(BYTES + b"\0", "model")
     other = model_file.encoded(KNODE(ROBOT, network(seed=1), About({"loss": np.arange(9.0)})), "model")
     assert len(other) == len(BYTES)
     with fails("model: damaged: its content does not have the checksum"):
-        model_file.decoded(BYTES[:300] + other[300:], "model")
+        model_file.decoded_model(BYTES[:300] + other[300:], "model")
 
 
 def places(value, path=()):
@@ -138,7 +138,7 @@ def test_forged_headers_give_an_error_or_a_model(kind, data):
             changed(header, path, copy.deepcopy(data.draw(_HOSTILE)))
 
     try:
-        found = model_file.decoded(forged(STRUCTURED if kind == "structured" else BYTES, edit), "model")
+        found = model_file.decoded_model(forged(STRUCTURED if kind == "structured" else BYTES, edit), "model")
     except ModelFileError as error:
         assert "\n" not in str(error) and len(str(error)) < 700  # noqa: PT017 - not every one is wrong
     else:
@@ -161,7 +161,7 @@ def test_arrays_that_are_larger_than_the_file(entry, parts):
     tracemalloc.start()
     try:
         with fails("model: ", *parts):
-            model_file.decoded(content, "model")
+            model_file.decoded_model(content, "model")
         assert tracemalloc.get_traced_memory()[1] < 20 * len(BYTES) + 2**20
     finally:
         tracemalloc.stop()
@@ -180,22 +180,24 @@ def test_headers_that_are_nested_without_end(depth):
     sizes = f" {len(text)} {len(arrays)}\n".encode()
     content = first + b"\n" + container.checksum(first + b"\n", sizes, text + arrays) + sizes + text + arrays
     with fails("model: "):
-        model_file.decoded(content, "model")
+        model_file.decoded_model(content, "model")
 
 
 def test_headers_and_robots_that_are_too_long(tmp_path):
     with fails("its header takes", "allowed is 4194304"):
-        model_file.decoded(forged(BYTES, lambda h: h["about"].__setitem__("x", "a" * 2**22)), "model")
+        model_file.decoded_model(forged(BYTES, lambda h: h["about"].__setitem__("x", "a" * 2**22)), "model")
     with fails("keep long lists of numbers as arrays"):
         KNODE(ROBOT, network(), About({"loss": [0.1] * 2**20})).save(tmp_path / "model")
     with fails("its robot file has", "allowed is 100000"):
-        model_file.decoded(forged(BYTES, lambda h: h["knowledge"].__setitem__("robot", "#" * 2**20)), "model")
+        model_file.decoded_model(
+            forged(BYTES, lambda h: h["knowledge"].__setitem__("robot", "#" * 2**20)), "model"
+        )
     many = {
         "$tuple": [{"$class": "Term", "fields": dict.fromkeys(("name", "start", "stop", "form", "scale"))}]
     }
     many["$tuple"] *= 10_000
     with fails("more than 5000 objects"):
-        model_file.decoded(forged(BYTES, lambda h: h["about"].__setitem__("x", many)), "model")
+        model_file.decoded_model(forged(BYTES, lambda h: h["about"].__setitem__("x", many)), "model")
 
 
 def test_robots_that_are_not_right():
@@ -203,7 +205,7 @@ def test_robots_that_are_not_right():
         header["knowledge"]["robot"] = header["knowledge"]["robot"].replace("length: 0.635", "length: -1.0")
 
     with fails("model: its robot file: length must be between 0.001 and 20 m (got -1.0)"):
-        model_file.decoded(forged(BYTES, edit), "model")
+        model_file.decoded_model(forged(BYTES, edit), "model")
 
 
 def test_shapes_that_do_not_fit_together(tmp_path):
@@ -228,9 +230,9 @@ def test_shapes_that_do_not_fit_together(tmp_path):
         header["arrays"][:2] = [["<f8", [4, 21]], ["<f8", [3]]]
 
     with fails("model: residual and knowledge do not fit together: "):
-        model_file.decoded(forged(BYTES, fewer), "model")
+        model_file.decoded_model(forged(BYTES, fewer), "model")
     with fails("model: its residual is a Load; allowed is a Residual"):
-        model_file.decoded(
+        model_file.decoded_model(
             forged(BYTES, lambda h: h["residual"].update({"$class": "Load", "fields": {"material": None,
                                                                                        "ambient": None}})),
             "model",
@@ -246,8 +248,8 @@ def test_shapes_that_do_not_fit_together(tmp_path):
 
     assert decoded(forged(BYTES, impossible, np.float64(0.1).tobytes())).length == 0.635 * 1.1
     with fails("model: residual and knowledge do not fit together: length must be between"):
-        model_file.decoded(forged(BYTES, impossible, np.float64(-2.0).tobytes()), "model")
+        model_file.decoded_model(forged(BYTES, impossible, np.float64(-2.0).tobytes()), "model")
 
 
 def decoded(content):
-    return model_file.decoded(content, "model")
+    return model_file.decoded_model(content, "model")

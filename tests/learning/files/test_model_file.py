@@ -49,7 +49,7 @@ def test_models_come_back_the_same(tmp_path, name):
 
 def test_the_classes_inside_a_users_residual_come_back():
     data = model_file.encoded(MODELS["a user's"], "model")
-    odd = model_file.decoded(data, "model", residuals=YOURS).residual.options[0]
+    odd = model_file.decoded_model(data, "model", residuals=YOURS).residual.options[0]
     assert isinstance(odd, Odd) and odd.power == 2
 
 
@@ -89,7 +89,7 @@ _FACTS = st.recursive(
 @given(st.dictionaries(st.text(max_size=5), _FACTS, max_size=3))
 def test_what_is_known_of_a_model_comes_back_the_same(facts):
     model = KNODE(ROBOT, network(), About(facts))
-    found = model_file.decoded(model_file.encoded(model, "model"), "model").about.facts
+    found = model_file.decoded_model(model_file.encoded(model, "model"), "model").about.facts
     assert bits(found) == bits(facts)
 
 

@@ -62,8 +62,8 @@ def test_a_truth_is_the_knowledge_where_its_one_thing_more_is_nothing():
     assert set(NEUTRAL) == set(imperfections.KINDS) - {"TendonRobot"}
     for kind, parameters in NEUTRAL.items():
         cls = imperfections.KINDS[kind]
-        same = at_points(truths.extended(cls, ROBOT, **parameters), *points())
-        other = at_points(truths.extended(cls, ROBOT), *points())
+        same = at_points(truths.derived_robot(cls, ROBOT, **parameters), *points())
+        other = at_points(truths.derived_robot(cls, ROBOT), *points())
         for a, b in zip(same, expected, strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * np.max(np.abs(b)), err_msg=kind)
         assert any(np.max(np.abs(a - b)) > 1e-3 for a, b in zip(other, expected, strict=True)), kind
@@ -71,7 +71,7 @@ def test_a_truth_is_the_knowledge_where_its_one_thing_more_is_nothing():
 
 @pytest.mark.parametrize("law", ["each axis", "isotropic", "stribeck"])
 def test_a_material_with_friction_balances_its_moment(law):
-    robot = truths.extended(truths.InternalFriction, ROBOT, law=law, least=0.1)
+    robot = truths.derived_robot(truths.InternalFriction, ROBOT, law=law, least=0.1)
     y, control, history = points(200)
     u = np.asarray(at_points(robot, y, control, history)[1])[:, 3:]
     R = np.asarray(jax.vmap(rotation_matrix)(y[:, 3:7]))
@@ -90,7 +90,7 @@ def test_a_material_with_friction_balances_its_moment(law):
 
 @pytest.mark.campaign
 def test_a_stiffening_rod_has_the_moment_of_its_law_and_its_slope():
-    robot = truths.extended(truths.Stiffening, ROBOT, law="exponential", curvature=2.0)
+    robot = truths.derived_robot(truths.Stiffening, ROBOT, law="exponential", curvature=2.0)
     y = np.zeros(19)
     y[3] = 1.0
     still = kc.robots.History(np.zeros(()), np.zeros(19), np.zeros(6), np.zeros(19))
@@ -110,7 +110,7 @@ def test_a_stiffening_rod_has_the_moment_of_its_law_and_its_slope():
 
 
 def test_a_body_at_the_tip_hangs_by_its_weight_and_resists_being_moved():
-    robot = truths.extended(
+    robot = truths.derived_robot(
         truths.TipMass, ROBOT, tip_mass=0.02, tip_inertia=1e-4, tip_offset=(0.0, 0.1, 0.0)
     )
     y = np.zeros(19)
@@ -137,7 +137,7 @@ LEARNED = ("damping and stiffness", "tip mass")
 @pytest.mark.parametrize("name", LEARNED)
 def test_two_short_sines_are_enough(name):
     case = imperfections.IMPERFECTIONS[name]
-    truth = truths.extended(imperfections.KINDS[case["kind"]], ROBOT, **case["truth"])
+    truth = truths.derived_robot(imperfections.KINDS[case["kind"]], ROBOT, **case["truth"])
     model = kc.fit(ROBOT, [moved(truth, control, 30) for control in imperfections.TRAINING])
     for control in ("random:0", "step:3"):
         truly, knowledge, learned = (moved(robot, control, 100) for robot in (truth, ROBOT, model))

@@ -7,8 +7,8 @@ from hypothesis import given, settings
 
 from knode_cosserat.learning.structured.evidence import relevant
 from knode_cosserat.learning.structured.expansion import CURVED, LINEAR, expansion
-from knode_cosserat.learning.structured.selection import folds, held_out_error, moments, selected
-from knode_cosserat.learning.structured.slopes import refined
+from knode_cosserat.learning.structured.selection import folds, held_out_error, moments, selected_groups
+from knode_cosserat.learning.structured.slopes import refined_slopes
 from knode_cosserat.rods.layout import Layout
 
 
@@ -79,7 +79,7 @@ def test_terms_that_do_not_carry_over_are_left_out():
     fold = np.repeat([0, 1], 100)
     features = np.stack([truth, np.where(fold == 0, chance, -chance)], axis=1)
     values = (truth + 0.5 * chance)[:, None]
-    taken, error = selected(moments(features, values, fold), [np.array([0]), np.array([1])], floor=0.0)
+    taken, error = selected_groups(moments(features, values, fold), [np.array([0]), np.array([1])], floor=0.0)
     assert taken == [0]
     assert error == pytest.approx(held_out_error(moments(features, values, fold), np.array([0])))
 
@@ -99,7 +99,7 @@ def test_slopes_are_found_between_those_of_the_start():
 
     start = np.array([1.0, 4.0])
     owned = np.array([[False, True, False], [False, False, True]])
-    found = refined(build, target, np.array([False, True, False]), start, owned, ["a", "a"])
+    found = refined_slopes(build, target, np.array([False, True, False]), start, owned, ["a", "a"])
     assert found[0] == pytest.approx(1.37, rel=1e-6)
     assert found[1] == 4.0
 

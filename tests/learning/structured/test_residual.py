@@ -12,7 +12,7 @@ from examples.hanging_string import HangingString
 from knode_cosserat.learning.config import StructuredOptions
 from knode_cosserat.learning.explain import explain
 from knode_cosserat.learning.knode import KNODE
-from knode_cosserat.learning.structured.solved import solved
+from knode_cosserat.learning.structured.solved import residuals_of
 from knode_cosserat.studies import truths
 from tests.learning.bar import BAR, pulled
 
@@ -34,7 +34,7 @@ def recorded(truth, rows=30, periods=(0.5, 1.0), **options):
 
 
 def learned(knowledge, trajectories, **options):
-    [residual] = solved(knowledge, trajectories, StructuredOptions(**options), [0])
+    [residual] = residuals_of(knowledge, trajectories, StructuredOptions(**options), [0])
     return KNODE(knowledge, residual)
 
 

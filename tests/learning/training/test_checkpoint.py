@@ -23,7 +23,7 @@ from knode_cosserat.learning.training.checkpoint import (
     data_hash,
     unpacked,
 )
-from knode_cosserat.learning.training.watch import Watch
+from knode_cosserat.learning.training.progress import ProgressMonitor
 from tests.learning.bar import BAR, WRONG, pulled
 
 ROOT = Path(__file__).parents[3]
@@ -70,7 +70,7 @@ def interrupted(monkeypatch):
 
     def after(count):
         left = [count]
-        steps = Watch.steps
+        steps = ProgressMonitor.steps
 
         def limited(self, *arguments):
             if left[0] == 0:
@@ -78,7 +78,7 @@ def interrupted(monkeypatch):
             left[0] -= 1
             return steps(self, *arguments)
 
-        monkeypatch.setattr(Watch, "steps", limited)
+        monkeypatch.setattr(ProgressMonitor, "steps", limited)
 
     return after
 

@@ -15,14 +15,14 @@ import knode_cosserat as kc
 from knode_cosserat.learning.config import NetworkOptions, Training
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import Network, Residual, elu, network
-from knode_cosserat.learning.samples import predict, samples
+from knode_cosserat.learning.samples import predict_segment, samples
 from knode_cosserat.learning.training import descent as program
 from knode_cosserat.learning.training.losses import (
     PaperLoss,
     StandardisedLoss,
     euler_angles,
     loss_for,
-    spread,
+    value_scales,
 )
 from tests.learning.bar import BAR, WRONG, pulled
 
@@ -100,7 +100,7 @@ def test_spread_is_never_zero():
     values[:, :2] = rng.normal(size=(100, 2)) * [1.0, 1e-9]  # a number that hardly varies beside its field
     values[:, 3:5] = 1.0 + 1e-16 * rng.normal(size=(100, 2))  # rounding about one
     values[:, 5:7] = rng.normal(size=(100, 2)) * 1e-6
-    found = spread(values, [3, 2, 2])
+    found = value_scales(values, [3, 2, 2])
     deviation = np.std(values, axis=0)
     np.testing.assert_allclose(found[[0, 5, 6]], deviation[[0, 5, 6]])
     np.testing.assert_allclose(found[[1, 2]], 1e-3 * deviation[0])
@@ -131,13 +131,13 @@ def test_what_no_weight_changes_is_found_once(robot, moved, bars, system):
     target = jnp.asarray(np.random.default_rng(0).normal(size=(size, len(data.segments.t))))
 
     def fast(net):
-        known = program.known(net, imperfect, data.segments, data.space)
+        known = program.nominal_predictions(net, imperfect, data.segments, data.space)
         return jnp.concatenate(program.corrected(net, known))
 
     def slow(net):
         model = KNODE(imperfect, net)
         return jnp.concatenate(
-            jax.vmap(lambda one: predict(model, data.space, one), out_axes=-1)(data.segments)
+            jax.vmap(lambda one: predict_segment(model, data.space, one), out_axes=-1)(data.segments)
         )
 
     def found(predicted):
@@ -160,7 +160,7 @@ def test_what_no_weight_changes_is_found_once(robot, moved, bars, system):
 
 @functools.partial(jax.jit, static_argnums=1)
 def _predicted(system, space, segments):
-    return jax.vmap(lambda one: predict(system, space, one))(segments)
+    return jax.vmap(lambda one: predict_segment(system, space, one))(segments)
 
 
 def _alone(system, data):
@@ -171,7 +171,7 @@ def test_standardised_inputs_have_mean_zero_and_spread_one(bars):
     data = samples(WRONG, bars)
     net = network(WRONG, NetworkOptions(hidden=4, convex=False), jax.random.key(0))
     scaled = program.standardised(net, WRONG, data)
-    known = program.known(scaled, WRONG, data.segments, kc.solvers.Euler())
+    known = program.nominal_predictions(scaled, WRONG, data.segments, kc.solvers.Euler())
     np.testing.assert_allclose(np.mean(known.inputs[:-1], axis=1), 0.0, atol=1e-12)
     np.testing.assert_allclose(np.std(known.inputs[:-1], axis=1), 1.0)
     # an output of one is as large as what the knowledge lacks: z is off by n (1/EA - 1/EA'), and damping
@@ -238,7 +238,9 @@ def test_an_epoch_is_a_step_of_adam(bars, convex):
 
     def slow(weights):
         model = KNODE(WRONG, eqx.combine(weights, rest))
-        return loss(*jax.vmap(lambda one: predict(model, data.space, one), out_axes=-1)(data.segments))
+        return loss(
+            *jax.vmap(lambda one: predict_segment(model, data.space, one), out_axes=-1)(data.segments)
+        )
 
     expected, rest = program.split(net)
     optimiser = optax.adamw(0.03, weight_decay=0.1, mask=lambda w: jax.tree.map(lambda x: x.ndim > 1, w))

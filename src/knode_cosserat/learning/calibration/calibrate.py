@@ -12,18 +12,18 @@ from jaxtyping import Float
 from knode_cosserat._reprs import robot_text, wrapped
 from knode_cosserat.learning.calibration import search
 from knode_cosserat.learning.calibration.misfit import SegmentMisfit, by_group
-from knode_cosserat.learning.calibration.noise import Errors, errors_of, hidden_by_rounding
+from knode_cosserat.learning.calibration.noise import CoordinateErrors, errors_of, hidden_by_rounding
 from knode_cosserat.learning.calibration.rollouts import RolloutMisfit
 from knode_cosserat.learning.calibration.search import CalibrationError as CalibrationError
-from knode_cosserat.learning.calibration.search import Fit, Misfit
+from knode_cosserat.learning.calibration.search import Misfit, SearchResult
 from knode_cosserat.learning.calibration.unknowns import (
     Unknowns,
-    found,
-    labels,
     limits,
     logarithmic,
+    number_names,
+    number_units,
     searched,
-    units,
+    searched_numbers,
     unknowns_of,
     values,
     with_numbers,
@@ -196,22 +196,24 @@ def _by_segments(robot: System, trajectories: Sequence[Trajectory], unknowns: Un
     """Return the coordinates from a calibration by segments; None if it fails or the data do not suffice."""
     try:
         misfit = SegmentMisfit(robot, trajectories, unknowns)
-        return search.fit(misfit, searched(unknowns, values(robot, unknowns)), may_leave_out=True).coordinates
+        return search.search_coordinates(
+            misfit, searched(unknowns, values(robot, unknowns)), may_leave_out=True
+        ).coordinates
     except (CalibrationError, DataError):
         return None
 
 
-def _ended(misfit: Misfit, start: np.ndarray, may_leave_out: bool) -> tuple[Fit, Errors]:
+def _ended(misfit: Misfit, start: np.ndarray, may_leave_out: bool) -> tuple[SearchResult, CoordinateErrors]:
     """Return the result of the search and its errors; undetermined parameters are left out or raise."""
     left_out: tuple[str, ...] = ()
     while True:
-        ended = search.fit(misfit, start, may_leave_out, left_out)
+        ended = search.search_coordinates(misfit, start, may_leave_out, left_out)
         hidden = hidden_by_rounding(misfit, ended) & ended.free
         if may_leave_out and np.any(hidden):
             left_out = (*ended.left_out, search.labels_of(misfit.unknowns)[int(np.argmax(hidden))])
             continue
         errors = errors_of(misfit, ended)
-        numbers = np.abs(found(misfit.unknowns, ended.coordinates))
+        numbers = np.abs(searched_numbers(misfit.unknowns, ended.coordinates))
         size = np.where(logarithmic(misfit.unknowns), 1.0, numbers)[ended.free]
         beyond = np.abs(errors.shift) / np.maximum(MOST_SHIFT * size, 3.0 * errors.standard)
         worst = np.flatnonzero(ended.free)[np.argmax(beyond)]
@@ -219,18 +221,18 @@ def _ended(misfit: Misfit, start: np.ndarray, may_leave_out: bool) -> tuple[Fit,
             return ended, errors
         if not may_leave_out:
             raise CalibrationError(
-                f"noise in these states hides {labels(misfit.unknowns)[worst]} from one-segment predictions; "
-                'use by="rollouts", or leave it out of names'
+                f"noise in these states hides {number_names(misfit.unknowns)[worst]} from one-segment "
+                'predictions; use by="rollouts", or leave it out of names'
             )
         left_out = (*ended.left_out, search.labels_of(misfit.unknowns)[worst])
 
 
 def _with_its_own_past(
-    misfit: SegmentMisfit, ended: Fit, errors: Errors, may_leave_out: bool
-) -> tuple[SegmentMisfit, Fit, Errors]:
+    misfit: SegmentMisfit, ended: SearchResult, errors: CoordinateErrors, may_leave_out: bool
+) -> tuple[SegmentMisfit, SearchResult, CoordinateErrors]:
     """Repeat the search with the history between nodes from the calibrated robot, while the fit improves."""
     for _ in range(MOST_ROUNDS):
-        numbers = found(misfit.unknowns, ended.coordinates)
+        numbers = searched_numbers(misfit.unknowns, ended.coordinates)
         again = misfit.looking_back_on(with_numbers(misfit.robot, misfit.unknowns, numbers))
         if again is None:
             break
@@ -244,7 +246,7 @@ def _with_its_own_past(
     return misfit, ended, errors
 
 
-def _calibration(misfit: Misfit, ended: Fit, errors: Errors, level: float) -> Calibration:
+def _calibration(misfit: Misfit, ended: SearchResult, errors: CoordinateErrors, level: float) -> Calibration:
     # imported here: it takes a third of a second
     from scipy.special import stdtrit
 
@@ -252,9 +254,11 @@ def _calibration(misfit: Misfit, ended: Fit, errors: Errors, level: float) -> Ca
     kept = tuple(unknown for unknown in unknowns if unknown.name not in ended.left_out)
     low, high = limits(robot, kept)
     coordinates, left = ended.coordinates[free] - errors.shift, misfit(ended.coordinates).values
-    numbers = np.clip(found(kept, coordinates), low, high)
+    numbers = np.clip(searched_numbers(kept, coordinates), low, high)
     reach = stdtrit(len(left) - len(numbers), 0.5 + level / 2.0) * errors.standard
-    ends = np.column_stack([np.clip(found(kept, coordinates + side * reach), low, high) for side in (-1, 1)])
+    ends = np.column_stack(
+        [np.clip(searched_numbers(kept, coordinates + side * reach), low, high) for side in (-1, 1)]
+    )
     sizes = np.sqrt(by_group(np.square(left), misfit.groups))
     return Calibration(
         robot=with_numbers(robot, kept, numbers),
@@ -263,8 +267,8 @@ def _calibration(misfit: Misfit, ended: Fit, errors: Errors, level: float) -> Ca
         standard_errors=_by_parameter(kept, np.where(logarithmic(kept), numbers, 1.0) * errors.standard),
         intervals=_by_parameter(kept, ends),
         level=float(level),
-        labels=labels(kept),
-        units=units(robot, kept),
+        labels=number_names(kept),
+        units=number_units(robot, kept),
         correlation=errors.covariance / np.outer(errors.standard, errors.standard),
         undetermined=ended.left_out,
         remainder=dict(zip(misfit.fields, sizes.tolist(), strict=True)),

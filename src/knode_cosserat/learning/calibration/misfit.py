@@ -16,8 +16,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.learning.calibration.unknowns import Unknowns, found, with_coordinates, with_numbers
-from knode_cosserat.learning.samples import Dataset, Samples, TipSamples, predict, samples, told_by_rows
+from knode_cosserat.learning.calibration.unknowns import (
+    Unknowns,
+    searched_numbers,
+    with_coordinates,
+    with_numbers,
+)
+from knode_cosserat.learning.samples import (
+    Dataset,
+    Samples,
+    TipSamples,
+    predict_segment,
+    rows_are_states,
+    samples,
+)
 from knode_cosserat.rods.system import System, unpacked_history
 from knode_cosserat.trajectory import Trajectory
 
@@ -34,7 +46,7 @@ def by_group(squares: Any, groups: np.ndarray) -> Float[np.ndarray, " G"]:
     return np.bincount(groups, weights=squares) / np.bincount(groups)
 
 
-class Differences(NamedTuple):
+class LinearisedMisfit(NamedTuple):
     """Predictions minus data, and their derivatives with respect to the coordinates of the search."""
 
     values: Float[np.ndarray, " M"]
@@ -57,7 +69,7 @@ def _differences(robot, coordinates, data, length, unknowns, space):  # type: ig
 
     def of_segment(sample: Samples) -> Any:
         own = sample._replace(history=scaled(sample.history), later=scaled(sample.later))
-        y_next, z = predict(system, space, own)
+        y_next, z = predict_segment(system, space, own)
         return jnp.concatenate([y_next - sample.y_next, z - sample.z])
 
     def of_tip(sample: TipSamples) -> Any:
@@ -126,17 +138,17 @@ class SegmentMisfit:
 
     def __call__(
         self, coordinates: np.ndarray, moved: tuple[Samples, TipSamples] | None = None
-    ) -> Differences:
+    ) -> LinearisedMisfit:
         """Return differences at the samples, or at `moved` samples of the same shape."""
         data = self._on_device if moved is None else moved
         slopes, values = _differences_and_slopes(
             self.robot, coordinates, data, self.length, self.unknowns, self.data.space
         )
-        return Differences(np.asarray(values), np.asarray(slopes))
+        return LinearisedMisfit(np.asarray(values), np.asarray(slopes))
 
     def looking_back_on(self, model: System) -> SegmentMisfit | None:
         """Return a copy with the history between nodes from a model; None if the nodes hold all of it."""
-        if told_by_rows(self.robot, self.trajectories):
+        if rows_are_states(self.robot, self.trajectories):
             return None
         return SegmentMisfit(self.robot, self.trajectories, self.unknowns, model)
 
@@ -183,7 +195,7 @@ class SegmentMisfit:
 
         Noise is added to y only; z follows from y without an additional error.
         """
-        system = with_numbers(self.robot, self.unknowns, found(self.unknowns, coordinates))
+        system = with_numbers(self.robot, self.unknowns, searched_numbers(self.unknowns, coordinates))
         natural = LEAST * np.asarray(system.scales().y)
         noise = np.concatenate([natural, np.zeros(self.robot.z_layout.size)])
         change = self(coordinates, self.moved(self.draws[0], noise)).values - self(coordinates).values

@@ -15,10 +15,10 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.learning.calibration.misfit import Differences, SegmentMisfit, by_group
-from knode_cosserat.learning.calibration.search import Fit, Misfit
-from knode_cosserat.learning.samples import histories, past_of_segments, settings_of
-from knode_cosserat.learning.sides import slopes_of
+from knode_cosserat.learning.calibration.misfit import LinearisedMisfit, SegmentMisfit, by_group
+from knode_cosserat.learning.calibration.search import Misfit, SearchResult
+from knode_cosserat.learning.discontinuities import slopes_of
+from knode_cosserat.learning.samples import histories, segment_history, settings_of
 from knode_cosserat.trajectory import Trajectory
 
 #: relative accuracy of the numbers of states
@@ -27,7 +27,7 @@ ROUNDING = 1e-14
 PROBES = 3
 
 
-class Errors(NamedTuple):
+class CoordinateErrors(NamedTuple):
     """Errors of the searched coordinates: covariance and bias."""
 
     covariance: Float[np.ndarray, "n n"]
@@ -39,7 +39,7 @@ class Errors(NamedTuple):
         return np.sqrt(np.diag(self.covariance))
 
 
-def errors_of(misfit: Misfit, ended: Fit) -> Errors:
+def errors_of(misfit: Misfit, ended: SearchResult) -> CoordinateErrors:
     """Return the errors of a search's result, from noise of the size of the differences."""
     weights = ended.weights(misfit)
     slopes = misfit(ended.coordinates).slopes[:, ended.free] * weights[:, None]
@@ -47,7 +47,7 @@ def errors_of(misfit: Misfit, ended: Fit) -> Errors:
     inverse = np.linalg.inv((slopes / lengths).T @ (slopes / lengths)) / np.outer(lengths, lengths)
     if not isinstance(misfit, SegmentMisfit):
         freedom = len(slopes) - len(inverse)
-        return Errors(inverse * len(slopes) / freedom, np.zeros(len(inverse)))
+        return CoordinateErrors(inverse * len(slopes) / freedom, np.zeros(len(inverse)))
     sizes = noise_sizes(misfit, ended)
     covariance = np.zeros_like(inverse)
     # includes zeros for left-out coordinates, so that one compiled program serves all cases
@@ -56,10 +56,10 @@ def errors_of(misfit: Misfit, ended: Fit) -> Errors:
     for effects in by_states(misfit, ended.coordinates, moves):
         each = (sizes * effects[ended.free]).reshape(len(inverse), -1)
         covariance += each @ each.T
-    return Errors(covariance, _shift(misfit, ended, sizes))
+    return CoordinateErrors(covariance, _shift(misfit, ended, sizes))
 
 
-def hidden_by_rounding(misfit: Misfit, ended: Fit) -> np.ndarray:
+def hidden_by_rounding(misfit: Misfit, ended: SearchResult) -> np.ndarray:
     """Return true for coordinates (n,) whose effect on the data is at the level of rounding errors.
 
     Noise of the size of rounding errors then changes their derivatives noticeably. An example is a
@@ -81,7 +81,7 @@ def typical_sizes(misfit: SegmentMisfit) -> Float[np.ndarray, " fields"]:
     return np.sqrt(by_group(squares, misfit.state_groups))
 
 
-def noise_sizes(misfit: SegmentMisfit, ended: Fit) -> Float[np.ndarray, " x"]:
+def noise_sizes(misfit: SegmentMisfit, ended: SearchResult) -> Float[np.ndarray, " x"]:
     """Return standard deviations of white noise in y and z that explain the differences."""
     # imported here: it takes a third of a second
     from scipy.optimize import nnls
@@ -102,7 +102,9 @@ def noise_sizes(misfit: SegmentMisfit, ended: Fit) -> Float[np.ndarray, " x"]:
     return np.sqrt(squares)[groups]
 
 
-def _shift(misfit: SegmentMisfit, ended: Fit, sizes: Float[np.ndarray, " x"]) -> Float[np.ndarray, " n"]:
+def _shift(
+    misfit: SegmentMisfit, ended: SearchResult, sizes: Float[np.ndarray, " x"]
+) -> Float[np.ndarray, " n"]:
     """Return the bias of the estimates by noise of these sizes, to leading order.
 
     Noise is added once more, with both signs, and each time one step of the search is made. It is linear
@@ -115,7 +117,9 @@ def _shift(misfit: SegmentMisfit, ended: Fit, sizes: Float[np.ndarray, " x"]) ->
     return np.mean(steps, axis=0) - _step(misfit(ended.coordinates), weights, free)
 
 
-def _step(there: Differences, weights: Float[np.ndarray, " M"], free: np.ndarray) -> Float[np.ndarray, " n"]:
+def _step(
+    there: LinearisedMisfit, weights: Float[np.ndarray, " M"], free: np.ndarray
+) -> Float[np.ndarray, " n"]:
     """Return one Gauss-Newton step of the weighted least squares."""
     weighted = there.slopes[:, free] * weights[:, None]
     lengths = np.linalg.norm(weighted, axis=0)
@@ -155,7 +159,7 @@ def _by_states(
     total[:, rows, -1, :ny] += tip_y[:, tips]
 
     still = np.zeros((nodes, tip_history.shape[-1]))
-    _, back = jax.vjp(lambda records: past_of_segments(robot, settings.space, records), still)
+    _, back = jax.vjp(lambda records: segment_history(robot, settings.space, records), still)
     own = jax.tree.map(per_row, tuple(past))
     history = np.array(jax.vmap(jax.vmap(lambda *each: back(each)[0]))(*own))
     history[:, :, -1] += tip_history[:, tips]

@@ -20,20 +20,25 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.learning.calibration.misfit import LEAST, Differences
-from knode_cosserat.learning.calibration.unknowns import Unknowns, found, with_coordinates, with_numbers
+from knode_cosserat.learning.calibration.misfit import LEAST, LinearisedMisfit
+from knode_cosserat.learning.calibration.unknowns import (
+    Unknowns,
+    searched_numbers,
+    with_coordinates,
+    with_numbers,
+)
 from knode_cosserat.learning.samples import DataError, samples
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.history import Past, initial_past, resting_past
-from knode_cosserat.solvers.initial import Run, beginning
+from knode_cosserat.solvers.history import StateHistory, constant_history, resting_history
+from knode_cosserat.solvers.initial import SimulationRun, initial_state
 from knode_cosserat.solvers.places import Places, places_at, positions_at, quaternions_at
 from knode_cosserat.solvers.run import run_one
-from knode_cosserat.solvers.sensitivity import tangent_march
+from knode_cosserat.solvers.run_types import RunSettings
+from knode_cosserat.solvers.sensitivity import tangent_time_loop
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.solvers.task import Task
 from knode_cosserat.trajectory import Trajectory
 
 #: growth factor of the number of rows in preliminary searches
@@ -76,7 +81,7 @@ class _Rows(NamedTuple):
 
     records: Float[Any, "T N x"]
     unknowns: Float[Any, "T k"]
-    past: Past
+    past: StateHistory
     #: last row and control of the initial rows, if there are any
     before: Any
     #: y and z of the initial state at the nodes
@@ -94,10 +99,10 @@ def _differences(robot, coordinates, rows, table, dt, unknowns, settings, orient
     def start(x: Any) -> Any:
         system = with_coordinates(robot, unknowns, x)
         if rows.before is None:
-            return system, resting_past(system, settings)
+            return system, resting_history(system, settings)
         if system.mixed and one_state:
             record, control = rows.before
-            return system, initial_past(system, settings, record, control, rows.past.t0)
+            return system, constant_history(system, settings, record, control, rows.past.t0)
         return system, rows.past
 
     def left(y: Any) -> Any:
@@ -112,15 +117,15 @@ def _differences(robot, coordinates, rows, table, dt, unknowns, settings, orient
 
     def settled(system: Any, d_system: Any) -> Any:
         """Return the initial history and its tangent, if the initial state is a solved equilibrium."""
-        none, guess = jnp.zeros(system.control_size), resting_past(system, settings)
+        none, guess = jnp.zeros(system.control_size), resting_history(system, settings)
         d_none, d_guess = jax.tree.map(jnp.zeros_like, (none[None], guess))
-        d_first, _ = tangent_march(
+        d_first, _ = tangent_time_loop(
             settings, STILL, dt, rows.first[None], system.unknowns(rows.first[0])[None], system, none[None],
             guess, d_system, d_none, d_guess.records, d_guess.rate,
         )  # fmt: skip
         d_first = d_first[0, :, : rows.first.shape[1]]
         return jax.jvp(
-            lambda system, row: initial_past(system, settings, row, none),
+            lambda system, row: constant_history(system, settings, row, none),
             (system, rows.first), (d_system, d_first),
         )  # fmt: skip
 
@@ -128,7 +133,7 @@ def _differences(robot, coordinates, rows, table, dt, unknowns, settings, orient
         (system, past), (d_system, d_past) = jax.jvp(start, (coordinates,), (direction,))
         if rows.before is None and system.rest_is_guess:
             past, d_past = settled(system, d_system)
-        d_records, _ = tangent_march(
+        d_records, _ = tangent_time_loop(
             settings, table, dt, rows.records, rows.unknowns, system, rows.control, past, d_system,
             jnp.zeros_like(rows.control), d_past.records, d_past.rate,
         )  # fmt: skip
@@ -180,7 +185,7 @@ class RolloutMisfit:
         if not self.rollouts:
             raise DataError("there are no trajectories to compare with")
         self._begun = False
-        self._kept: dict[bytes, Differences] = {}
+        self._kept: dict[bytes, LinearisedMisfit] = {}
         self._known = [np.isfinite(one.target).ravel() for one in self.rollouts]
         #: compared fields; separate for each recording, because the model's error may differ between them
         self.fields, self._natural, self._groups = self._fields_of(given, sizes)
@@ -215,17 +220,17 @@ class RolloutMisfit:
             [number[each] for each in groups],
         )
 
-    def __call__(self, coordinates: np.ndarray) -> Differences:
+    def __call__(self, coordinates: np.ndarray) -> LinearisedMisfit:
         """Return differences of all rollouts; infinite if a rollout has no solution. The last are cached."""
         key = np.asarray(coordinates).tobytes()
         if key not in self._kept:
             self._kept = {key: self._computed(coordinates)}
         return self._kept[key]
 
-    def _computed(self, coordinates: np.ndarray) -> Differences:
-        system = with_numbers(self.robot, self.unknowns, found(self.unknowns, coordinates))
+    def _computed(self, coordinates: np.ndarray) -> LinearisedMisfit:
+        system = with_numbers(self.robot, self.unknowns, searched_numbers(self.unknowns, coordinates))
 
-        def work(rollout: _Rollout) -> Differences | None:
+        def work(rollout: _Rollout) -> LinearisedMisfit | None:
             return self._of_one(system, coordinates, rollout)
 
         if self._begun:
@@ -234,20 +239,20 @@ class RolloutMisfit:
         else:  # programs are compiled one by one
             self._begun, parts = True, list(map(work, self.rollouts))
         solved = [
-            Differences(part.values[known], part.slopes[known])
+            LinearisedMisfit(part.values[known], part.slopes[known])
             for part, known in zip(parts, self._known, strict=True)
             if part is not None
         ]
         if len(solved) < len(parts):
             size = len(self.groups)
-            return Differences(np.full(size, np.inf), np.zeros((size, len(coordinates))))
+            return LinearisedMisfit(np.full(size, np.inf), np.zeros((size, len(coordinates))))
         values, slopes = zip(*solved, strict=True)
-        return Differences(np.concatenate(values), np.concatenate(slopes))
+        return LinearisedMisfit(np.concatenate(values), np.concatenate(slopes))
 
-    def _of_one(self, system: System, coordinates: np.ndarray, rollout: _Rollout) -> Differences | None:
+    def _of_one(self, system: System, coordinates: np.ndarray, rollout: _Rollout) -> LinearisedMisfit | None:
         settings, dt, initial, control, places, target = rollout
-        begins = beginning(Run(system, control, initial, settings, dt, None, False))
-        task = Task(settings, dt, len(control), begins.first)
+        begins = initial_state(SimulationRun(system, control, initial, settings, dt, None, False))
+        task = RunSettings(settings, dt, len(control), begins.first)
         steps, _ = run_one(task, system, control, begins.start)
         if steps.result.min() < 0:
             return None
@@ -258,7 +263,7 @@ class RolloutMisfit:
             self.robot, coordinates, rows, task.table, dt, self.unknowns, settings, self.oriented,
             begins.first == "start",
         )  # fmt: skip
-        return Differences(np.asarray(values), np.asarray(slopes))
+        return LinearisedMisfit(np.asarray(values), np.asarray(slopes))
 
     def blocks(self, values: Float[np.ndarray, " M"]) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return for each trajectory the field (n,) of a row's differences, and the differences (R, n)."""

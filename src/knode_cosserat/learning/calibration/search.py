@@ -12,11 +12,11 @@ from knode_cosserat.learning.calibration.misfit import SegmentMisfit, by_group
 from knode_cosserat.learning.calibration.rollouts import RolloutMisfit
 from knode_cosserat.learning.calibration.unknowns import (
     Unknowns,
-    found,
-    labels,
     limits,
     logarithmic,
+    number_names,
     searched,
+    searched_numbers,
     values,
 )
 
@@ -32,7 +32,7 @@ MOST_WAYS = 3
 MOST_EVALUATIONS = 100
 
 
-class End(NamedTuple):
+class SearchTolerances(NamedTuple):
     """Stopping tolerances of a search: step, in natural sizes, and relative decrease of the squares."""
 
     step: float
@@ -40,7 +40,11 @@ class End(NamedTuple):
 
 
 #: tolerances of the final search, of preliminary ones, and of the final one for a real robot
-FINE, ROUGH, PLAIN = End(1e-12, 1e-15), End(1e-3, 1e-6), End(1e-3, 1e-3)
+FINE, ROUGH, PLAIN = (
+    SearchTolerances(1e-12, 1e-15),
+    SearchTolerances(1e-3, 1e-6),
+    SearchTolerances(1e-3, 1e-3),
+)
 #: a combination of parameters is undetermined if its relative effect is below this
 FLAT = 1e-8
 #: a positive parameter is undetermined if the standard error of its logarithm is above this
@@ -61,7 +65,7 @@ class CalibrationError(KnodeCosseratError, ValueError):
     code = "calibration"
 
 
-class Fit(NamedTuple):
+class SearchResult(NamedTuple):
     """Result of a search."""
 
     coordinates: Float[np.ndarray, " n"]
@@ -88,9 +92,9 @@ class Gap(NamedTuple):
     every: bool
 
 
-def fit(
+def search_coordinates(
     misfit: Misfit, start: Float[np.ndarray, " n"], may_leave_out: bool, left_out: tuple[str, ...] = ()
-) -> Fit:
+) -> SearchResult:
     """Search from a start, with weights from the remaining differences.
 
     Parameters in `left_out` are not searched; `may_leave_out` allows further ones to be left out.
@@ -104,7 +108,7 @@ def fit(
         if not free.any():
             raise CalibrationError(f"these data determine none of {', '.join(left_out)}")
         # checked at the start: there a symmetry that hides a parameter is exact, later noise breaks it
-        gap = _gap(misfit, Fit(start, free, (), misfit.first_sizes(), np.zeros(0)), np.inf)
+        gap = _gap(misfit, SearchResult(start, free, (), misfit.first_sizes(), np.zeros(0)), np.inf)
         if gap is None:
             converged, ended = _search(misfit, start, free)
             gap = _gap(misfit, ended, np.inf if not converged else POOR if may_leave_out else HOPELESS)
@@ -126,13 +130,13 @@ def labels_of(unknowns: Unknowns) -> tuple[str, ...]:
     return tuple(unknown.name for unknown in unknowns for _ in range(unknown.size))
 
 
-def _search(misfit: Misfit, start: np.ndarray, free: np.ndarray) -> tuple[bool, Fit]:
+def _search(misfit: Misfit, start: np.ndarray, free: np.ndarray) -> tuple[bool, SearchResult]:
     """Return the result of the first path that leaves only noise, else the best of all paths.
 
     With noise the first rows of a rollout may mislead the search, while another number of rows does not.
     """
     beginnings = misfit.beginnings()
-    best: tuple[bool, Fit] | None = None
+    best: tuple[bool, SearchResult] | None = None
     for skipped in range(0, len(beginnings) + 1, max(1, len(beginnings) // MOST_WAYS)):
         converged, ended = _one_way(misfit, start, free, beginnings[skipped:])
         if best is None or (converged, -remainder(ended)) > (best[0], -remainder(best[1])):
@@ -143,12 +147,14 @@ def _search(misfit: Misfit, start: np.ndarray, free: np.ndarray) -> tuple[bool, 
     return best
 
 
-def remainder(ended: Fit) -> float:
+def remainder(ended: SearchResult) -> float:
     """Return the total log size of the remaining differences over all fields; smaller is better."""
     return float(np.sum(np.log(np.maximum(ended.sizes, 1e-300))))
 
 
-def _one_way(misfit: Misfit, start: np.ndarray, free: np.ndarray, beginnings: Any) -> tuple[bool, Fit]:
+def _one_way(
+    misfit: Misfit, start: np.ndarray, free: np.ndarray, beginnings: Any
+) -> tuple[bool, SearchResult]:
     """Run searches in sequence, each weighted by the remaining differences of the last one."""
     sizes, least = misfit.first_sizes(), np.zeros(len(misfit.fields))
     coordinates, converged, left = start, True, sizes
@@ -163,7 +169,7 @@ def _one_way(misfit: Misfit, start: np.ndarray, free: np.ndarray, beginnings: An
         before, sizes = sizes, np.maximum(left, least)
         if not converged or np.all(np.abs(sizes - before) <= settled * before):
             break
-    return converged, Fit(coordinates, free, (), sizes, left <= least)
+    return converged, SearchResult(coordinates, free, (), sizes, left <= least)
 
 
 def _least_squares(
@@ -172,7 +178,7 @@ def _least_squares(
     free: np.ndarray,
     sizes: np.ndarray,
     mask: Any = 1.0,
-    end: End = FINE,
+    end: SearchTolerances = FINE,
 ) -> tuple[bool, np.ndarray]:
     """Run one least-squares search: return a convergence flag and the coordinates."""
     # imported here: it takes a third of a second
@@ -225,7 +231,7 @@ def _least_squares(
     return ended.status > 0, whole(ended.x)
 
 
-def _gap(misfit: Misfit, ended: Fit, worst: float) -> Gap | None:
+def _gap(misfit: Misfit, ended: SearchResult, worst: float) -> Gap | None:
     """Return the undetermined parameters, if any; `worst` limits errors relative to the values."""
     unknowns, free = misfit.unknowns, ended.free
     names = np.array(labels_of(unknowns))[free]
@@ -249,11 +255,13 @@ def _gap(misfit: Misfit, ended: Fit, worst: float) -> Gap | None:
     return _together(names, np.abs(covariance[k] / errors / errors[k]) ** 20)
 
 
-def _magnitudes(misfit: Misfit, ended: Fit) -> Float[np.ndarray, " n"]:
+def _magnitudes(misfit: Misfit, ended: SearchResult) -> Float[np.ndarray, " n"]:
     """Return the largest size of each number's parameter, before or after; its range if all are zero."""
     unknowns = misfit.unknowns
     names = np.array(labels_of(unknowns))
-    largest = np.maximum(np.abs(values(misfit.robot, unknowns)), np.abs(found(unknowns, ended.coordinates)))
+    largest = np.maximum(
+        np.abs(values(misfit.robot, unknowns)), np.abs(searched_numbers(unknowns, ended.coordinates))
+    )
     low, high = limits(misfit.robot, unknowns)
     largest = np.array([np.max(largest[names == name]) for name in names])
     return np.where(largest > 0.0, largest, high - low)
@@ -267,12 +275,12 @@ def _together(names: np.ndarray, parts: np.ndarray) -> Gap:
     return Gap(involved, f"these data determine only a combination of {listed}", every=False)
 
 
-def _check_range(misfit: Misfit, ended: Fit) -> None:
+def _check_range(misfit: Misfit, ended: SearchResult) -> None:
     """Raise if a number ended at a limit of its allowed range; a limit of zero is accepted."""
     unknowns = misfit.unknowns
     low, high = limits(misfit.robot, unknowns)
-    numbers = found(unknowns, ended.coordinates)
-    for k, label in enumerate(labels(unknowns)):
+    numbers = searched_numbers(unknowns, ended.coordinates)
+    for k, label in enumerate(number_names(unknowns)):
         end = high[k] if high[k] - numbers[k] < numbers[k] - low[k] else low[k]
         if ended.free[k] and end != 0.0 and abs(numbers[k] - end) <= 1e-6 * abs(end):
             raise CalibrationError(
@@ -284,7 +292,7 @@ def _inverse(sizes: np.ndarray) -> np.ndarray:
     return np.where(sizes > 0.0, 1.0 / np.where(sizes > 0.0, sizes, 1.0), 0.0)
 
 
-def systematic(misfit: Misfit, ended: Fit) -> tuple[str, ...]:
+def systematic(misfit: Misfit, ended: SearchResult) -> tuple[str, ...]:
     """Return the fields whose remainder is not noise: its rows are correlated at large lags."""
     blocks = misfit.blocks(misfit(ended.coordinates).values)
     which = np.zeros(len(misfit.fields), dtype=bool)

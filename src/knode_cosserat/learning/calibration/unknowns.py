@@ -93,7 +93,7 @@ def _unknown(owner: System, name: str, parameter: Parameter) -> Unknown | str:
     return Unknown(name, "multiple" if alike else "diagonal", 1 if alike else 3, logarithmic)
 
 
-def labels(unknowns: Unknowns) -> tuple[str, ...]:
+def number_names(unknowns: Unknowns) -> tuple[str, ...]:
     """Return a name for each searched number."""
     return tuple(label for unknown in unknowns for label in unknown.labels)
 
@@ -117,7 +117,7 @@ def limits(robot: System, unknowns: Unknowns) -> tuple[Float[np.ndarray, " n"], 
     return np.array(low, dtype=float), np.array(high, dtype=float)
 
 
-def units(robot: System, unknowns: Unknowns) -> tuple[str, ...]:
+def number_units(robot: System, unknowns: Unknowns) -> tuple[str, ...]:
     """Return the unit of each number."""
     known = robot.nominal.parameters()
     return tuple(known[unknown.name].unit for unknown in unknowns for _ in range(unknown.size))
@@ -134,7 +134,7 @@ def searched(unknowns: Unknowns, numbers: np.ndarray) -> np.ndarray:
     return np.where(which, np.log(np.where(which, numbers, 1.0)), numbers)
 
 
-def found(unknowns: Unknowns, coordinates: np.ndarray) -> np.ndarray:
+def searched_numbers(unknowns: Unknowns, coordinates: np.ndarray) -> np.ndarray:
     """Return the numbers from the coordinates of the search."""
     which = logarithmic(unknowns)
     return np.where(which, np.exp(np.where(which, coordinates, 0.0)), coordinates)

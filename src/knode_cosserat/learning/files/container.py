@@ -185,7 +185,7 @@ class Writer:
         return first + checksum(first, sizes, body) + sizes + body
 
 
-def write(path: Path, data: bytes) -> None:
+def write_container(path: Path, data: bytes) -> None:
     """Write a file atomically. Raises `ContainerError`."""
     try:
         with replacing(path) as temporary:

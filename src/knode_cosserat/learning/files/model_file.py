@@ -105,7 +105,7 @@ def save(model: KNODE, path: str | Path) -> None:
     """
     data = encoded(model, str(path))
     try:
-        container.write(Path(path), data)
+        container.write_container(Path(path), data)
     except ContainerError as error:
         raise ModelFileError(f"{path}: {error}") from None
 
@@ -127,7 +127,7 @@ def load_model(path: str | Path, *, knowledge: System | None = None, residuals: 
         data = container.read(Path(path))
     except ContainerError as error:
         raise ModelFileError(f"{path}: {error}") from None
-    return decoded(data, str(path), knowledge=knowledge, residuals=residuals)
+    return decoded_model(data, str(path), knowledge=knowledge, residuals=residuals)
 
 
 # model to bytes
@@ -188,7 +188,7 @@ def _traits(system: System) -> dict[str, Any]:
 # bytes to model
 
 
-def decoded(
+def decoded_model(
     data: bytes, source: str, *, knowledge: System | None = None, residuals: Iterable[type] = ()
 ) -> KNODE:
     """Return the model in a file's bytes; see `load_model`."""
@@ -307,4 +307,4 @@ def _equations(model: KNODE, y: Any, control: Any, history: History) -> tuple[An
 
 
 provide(KNODE, "save", save)
-trajectory_system.register_codec(KNODE, encoded, decoded)
+trajectory_system.register_codec(KNODE, encoded, decoded_model)

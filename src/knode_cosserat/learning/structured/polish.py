@@ -17,7 +17,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
 from knode_cosserat.learning.knode import KNODE
-from knode_cosserat.learning.samples import Dataset, Samples, predict
+from knode_cosserat.learning.samples import Dataset, Samples, predict_segment
 from knode_cosserat.learning.structured.residual import Structured
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.space import SpaceScheme
@@ -80,7 +80,7 @@ def _linearised(
 
     def reached(move: Any) -> Any:
         model = KNODE(knowledge, _moved(residual, free, move))
-        return jax.vmap(lambda sample: predict(model, space, sample)[0])(data)
+        return jax.vmap(lambda sample: predict_segment(model, space, sample)[0])(data)
 
     at = jnp.zeros(free.shape[0])
     here, along = jax.linearize(reached, at)

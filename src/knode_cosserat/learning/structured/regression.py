@@ -20,8 +20,8 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.learning.config import StructuredOptions
+from knode_cosserat.learning.discontinuities import whole
 from knode_cosserat.learning.samples import Dataset, Samples, TipSamples, end_of, start_of
-from knode_cosserat.learning.sides import whole
 from knode_cosserat.learning.structured.expansion import CURVED, DRAG, LINEAR, Expansion, expansion
 from knode_cosserat.learning.structured.polish import polished
 from knode_cosserat.learning.structured.residual import (
@@ -56,7 +56,7 @@ LEAST = 1e-9
 TOLERANCE = 3e-10
 
 
-def solve(
+def solve_residuals(
     knowledge: System, data: Dataset, options: StructuredOptions, seeds: Sequence[int]
 ) -> list[Structured]:
     """Return the structured residuals that explain the samples, one for each seed.

@@ -81,7 +81,7 @@ class _Law(NamedTuple):
         return knowledge.left_of_law(s, t, y, z, control, history)
 
 
-def solved(law: _Law) -> Float[Any, " z"]:
+def solved_strains(law: _Law) -> Float[Any, " z"]:
     """Return the strains of a nonlinear law, by damped Newton's method from z0; NaN if it fails.
 
     Each correction uses the damping factor with the least residual: with friction, laws are so steep that
@@ -163,7 +163,7 @@ class Structured(Residual):
             return z0 - dot(inverse, law.left(z0))
         # the iteration is not differentiated: at the solution one more correction changes nothing, but has
         # the derivatives of the implicit function
-        z = solved(jax.lax.stop_gradient(law))
+        z = solved_strains(jax.lax.stop_gradient(law))
         inverse = jax.lax.stop_gradient(small_inverse(jax.jacfwd(law.left)(z)))
         return z - dot(inverse, law.left(z))
 

@@ -57,7 +57,7 @@ def held_out_error(parts: Sequence[Moments], columns: Any) -> float:
     return max(error, 0.0)
 
 
-def selected(parts: Sequence[Moments], groups: Sequence[Any], floor: float) -> tuple[list[int], float]:
+def selected_groups(parts: Sequence[Moments], groups: Sequence[Any], floor: float) -> tuple[list[int], float]:
     """Return the selected groups of columns, and their held-out error; stops at the error `floor`."""
     taken: list[int] = []
     columns = np.zeros(0, dtype=int)

@@ -16,7 +16,7 @@ from jaxtyping import Float
 FURTHEST = 30.0
 
 
-def refined(
+def refined_slopes(
     build: Callable[[Any], Float[Any, "S k"]],
     target: Float[Any, " S"],
     used: Float[Any, " k"],

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 
 from knode_cosserat.learning.config import StructuredOptions
 from knode_cosserat.learning.knode import KNODE
-from knode_cosserat.learning.samples import of_strands, samples, told_by_rows
-from knode_cosserat.learning.structured.regression import solve
+from knode_cosserat.learning.samples import rows_are_states, samples, strand_samples
+from knode_cosserat.learning.structured.regression import solve_residuals
 from knode_cosserat.learning.structured.residual import Structured
 from knode_cosserat.rods.system import System
 from knode_cosserat.trajectory import Trajectory
@@ -20,7 +20,7 @@ from knode_cosserat.trajectory import Trajectory
 ROUNDS = 2
 
 
-def solved(
+def residuals_of(
     knowledge: System, trajectories: Sequence[Trajectory], options: StructuredOptions, seeds: Sequence[int]
 ) -> list[Structured]:
     """Return the structured residuals that explain the trajectories, one for each seed.
@@ -28,8 +28,10 @@ def solved(
     Raises:
         DataError: a trajectory does not fit the knowledge or the others, is too short or not finite.
     """
-    found = solve(knowledge, of_strands(knowledge, samples(knowledge, trajectories)), options, seeds)
-    if told_by_rows(knowledge, trajectories):
+    found = solve_residuals(
+        knowledge, strand_samples(knowledge, samples(knowledge, trajectories)), options, seeds
+    )
+    if rows_are_states(knowledge, trajectories):
         return found
     for _ in range(ROUNDS):
         found = [
@@ -47,4 +49,4 @@ def _again(
     before: Structured,
 ) -> Structured:
     data = samples(knowledge, trajectories, model=KNODE(knowledge, before))
-    return solve(knowledge, of_strands(knowledge, data), options, (seed,))[0]
+    return solve_residuals(knowledge, strand_samples(knowledge, data), options, (seed,))[0]

@@ -20,8 +20,8 @@ from jaxtyping import Float
 from knode_cosserat.learning.structured.evidence import relevant
 from knode_cosserat.learning.structured.expansion import Expansion
 from knode_cosserat.learning.structured.residual import Load
-from knode_cosserat.learning.structured.selection import held_out_error, moments, selected
-from knode_cosserat.learning.structured.slopes import refined
+from knode_cosserat.learning.structured.selection import held_out_error, moments, selected_groups
+from knode_cosserat.learning.structured.slopes import refined_slopes
 
 #: a remainder below this part of the target is explained well enough by the simple functions
 WELL = 1e-6
@@ -186,7 +186,7 @@ class _Problem:
         parts = moments(self.columns * root, self.values * root, self.fold)
         groups = self.groups(part)
         floor = float(np.mean(np.square(self.floors))) * self.values.size
-        taken, error = selected(parts, groups, floor)
+        taken, error = selected_groups(parts, groups, floor)
         if error > WORTH * held_out_error(parts, np.flatnonzero(simple.used)):
             return None
         among = np.zeros(self.columns.shape[1], dtype=bool)
@@ -255,4 +255,4 @@ def _with_slopes(
 
     owned = problem.spread(part.owned())
     target = problem.values[:, worst] * root
-    return rich.with_slopes(refined(build, target, fits[k].used, part.slopes, owned, part.kinds()))
+    return rich.with_slopes(refined_slopes(build, target, fits[k].used, part.slopes, owned, part.kinds()))

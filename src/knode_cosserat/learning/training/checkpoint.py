@@ -135,7 +135,7 @@ class Checkpoints:
                 "name": name,
                 "snapshot": writer.value(snapshot, "snapshot", {}),
             }
-            container.write(self.path(name), writer.file(TITLE, header))
+            container.write_container(self.path(name), writer.file(TITLE, header))
         except ContainerError as error:
             raise CheckpointError(f"{self.path(name)}: {error}") from None
 
@@ -162,7 +162,7 @@ class Checkpoints:
         return dict(snapshot)
 
 
-def packed(tree: Any) -> list[np.ndarray]:
+def packed_tree(tree: Any) -> list[np.ndarray]:
     """Return the arrays of a pytree, for a snapshot."""
     return [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
 

@@ -2,7 +2,7 @@
 
 With a scheme without stages, a network adds to the prediction of the nominal model. That prediction does not
 depend on the weights and is evaluated once; an epoch is then two matrix products and their derivatives. Other
-schemes and residuals are predicted in every epoch by `samples.predict`.
+schemes and residuals are predicted in every epoch by `samples.predict_segment`.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from jaxtyping import Float, Int, UInt32
 from knode_cosserat.learning.config import Training
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import Network, Residual, elu, input_layout
-from knode_cosserat.learning.samples import Dataset, Samples, end_of, predict
-from knode_cosserat.learning.training.losses import Loss, loss_for, sizes, spread
+from knode_cosserat.learning.samples import Dataset, Samples, end_of, predict_segment
+from knode_cosserat.learning.training.losses import Loss, field_sizes, loss_for, value_scales
 from knode_cosserat.rods.system import System, unpacked_history
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.space import Euler, SpaceScheme
@@ -58,7 +58,7 @@ def _is_weight(node: Any, path: Any, leaf: Any) -> bool:
 # predictions of the nominal model
 
 
-class Known(NamedTuple):
+class NominalPredictions(NamedTuple):
     """Predictions of the samples (S) by the nominal model alone, and a network's scaled inputs."""
 
     #: at the starts of segments, then at their ends if the scheme uses them; the last row is ones, for the
@@ -70,7 +70,9 @@ class Known(NamedTuple):
     steps: Float[Any, "2"]
 
 
-def known(net: Network, knowledge: System, samples: Samples, space: SpaceScheme) -> Known:
+def nominal_predictions(
+    net: Network, knowledge: System, samples: Samples, space: SpaceScheme
+) -> NominalPredictions:
     """Evaluate the terms that do not depend on a network's weights; for schemes without stages."""
     steps = knowledge.length / (knowledge.nodes - 1) * jnp.asarray(space.formula.weights[:2])
 
@@ -79,7 +81,7 @@ def known(net: Network, knowledge: System, samples: Samples, space: SpaceScheme)
         return (inputs - net.input_mean) / net.input_scale
 
     def one(sample: Samples) -> Any:
-        y, z = predict(knowledge, space, sample)
+        y, z = predict_segment(knowledge, space, sample)
         inputs = [seen(sample, sample.y, z, sample.history[0])]
         if space.implicit:
             history = unpacked_history(knowledge, sample.c0, sample.history[1])
@@ -90,11 +92,11 @@ def known(net: Network, knowledge: System, samples: Samples, space: SpaceScheme)
 
     inputs, y, z = jax.vmap(one, out_axes=-1)(samples)
     joined = jnp.concatenate(inputs, axis=1)
-    return Known(jnp.concatenate([joined, jnp.ones_like(joined[:1])]), y, z, steps)
+    return NominalPredictions(jnp.concatenate([joined, jnp.ones_like(joined[:1])]), y, z, steps)
 
 
-def corrected(net: Network, known: Known) -> tuple[Float[Any, "y S"], Float[Any, "z S"]]:
-    """Return the predictions of all samples by nominal model and network, equal to `samples.predict`.
+def corrected(net: Network, known: NominalPredictions) -> tuple[Float[Any, "y S"], Float[Any, "z S"]]:
+    """Return the predictions of all samples by nominal model and network, equal to `samples.predict_segment`.
 
     Hidden units first and the biases as an additional column was the fastest layout tried (0.61 s for 1000
     epochs of the paper's preset on one core, 0.54 s with `_product`; samples first 0.69 to 1.0 s).
@@ -139,17 +141,17 @@ def standardised(net: Network, knowledge: System, data: Dataset) -> Network:
     return dataclasses.replace(
         net,
         input_mean=jnp.asarray(inputs.mean(axis=0)),
-        input_scale=jnp.asarray(spread(inputs, sizes(input_layout(knowledge, net.history)))),
+        input_scale=jnp.asarray(value_scales(inputs, field_sizes(input_layout(knowledge, net.history)))),
         output_scale=jnp.asarray(scale),
     )
 
 
-_known = jax.jit(known, static_argnames="space")
+_known = jax.jit(nominal_predictions, static_argnames="space")
 
 
 @functools.partial(jax.jit, static_argnames="space")
 def _predicted(system: System, space: SpaceScheme, samples: Samples) -> Any:
-    return jax.vmap(lambda one: predict(system, space, one), out_axes=-1)(samples)
+    return jax.vmap(lambda one: predict_segment(system, space, one), out_axes=-1)(samples)
 
 
 # the program
@@ -174,13 +176,13 @@ class Recipe(NamedTuple):
     noisy: bool
 
 
-class Data(NamedTuple):
+class TrainingData(NamedTuple):
     """Inputs of an epoch besides the weights: `known` if predictions are fixed, otherwise `samples`."""
 
     knowledge: System
     rest: Any
     samples: Samples | None
-    known: Known | None
+    known: NominalPredictions | None
     loss: Loss
     y_spread: Float[Any, " y"]
     history_spread: Float[Any, " x"]
@@ -199,7 +201,7 @@ class State(NamedTuple):
     key: UInt32[Any, "G 2"]
 
 
-def _loss(weights: Any, recipe: Recipe, data: Data, noise: Any, key: Any) -> Any:
+def _loss(weights: Any, recipe: Recipe, data: TrainingData, noise: Any, key: Any) -> Any:
     residual = eqx.combine(weights, data.rest)
     if data.known is not None:
         return data.loss(*corrected(residual, data.known))
@@ -207,9 +209,11 @@ def _loss(weights: Any, recipe: Recipe, data: Data, noise: Any, key: Any) -> Any
     if recipe.noisy:
         samples = _noisy(samples, data, noise, key)
     if _adds(residual, recipe.space, data.knowledge):
-        return data.loss(*corrected(residual, known(residual, data.knowledge, samples, recipe.space)))
+        return data.loss(
+            *corrected(residual, nominal_predictions(residual, data.knowledge, samples, recipe.space))
+        )
     model = KNODE(data.knowledge, residual)
-    return data.loss(*jax.vmap(lambda one: predict(model, recipe.space, one), out_axes=-1)(samples))
+    return data.loss(*jax.vmap(lambda one: predict_segment(model, recipe.space, one), out_axes=-1)(samples))
 
 
 def _adds(residual: Residual, space: SpaceScheme, knowledge: System) -> bool:
@@ -218,7 +222,7 @@ def _adds(residual: Residual, space: SpaceScheme, knowledge: System) -> bool:
     return isinstance(residual, Network) and not space.formula.stages and not parted
 
 
-def _noisy(samples: Samples, data: Data, noise: Any, key: Any) -> Samples:
+def _noisy(samples: Samples, data: TrainingData, noise: Any, key: Any) -> Samples:
     """Return samples with noise in states and histories at the segments' starts; targets are unchanged."""
     for_y, for_history = jax.random.split(key)
     y = samples.y + noise * data.y_spread * jax.random.normal(for_y, samples.y.shape)
@@ -246,7 +250,7 @@ def plateau(numbers: Numbers, loss: Any, rate: Any, best: Any, waited: Any) -> t
     )
 
 
-def _epoch(recipe: Recipe, numbers: Numbers, data: Data, epoch: Any, of_seed: Any) -> Any:
+def _epoch(recipe: Recipe, numbers: Numbers, data: TrainingData, epoch: Any, of_seed: Any) -> Any:
     """Run one update of one seed: return its new state, the loss before, and the rate."""
     weights, adam, rate, best, waited, key = of_seed
     fresh = jax.random.fold_in(key, epoch) if recipe.noisy else None
@@ -267,7 +271,7 @@ def _epoch(recipe: Recipe, numbers: Numbers, data: Data, epoch: Any, of_seed: An
 
 @functools.partial(jax.jit, static_argnames="recipe")
 def run_epochs(
-    recipe: Recipe, numbers: Numbers, data: Data, state: State, stop: Any
+    recipe: Recipe, numbers: Numbers, data: TrainingData, state: State, stop: Any
 ) -> tuple[State, Float[Any, "PIECE G"], Float[Any, "PIECE G"]]:
     """Run epochs up to `stop`, at most `PIECE`: return the new state, the losses and the rates.
 
@@ -302,7 +306,7 @@ def _side_by_side(update: Any, of_seeds: Any) -> Any:
 
 def prepared(
     knowledge: System, residual: Residual, dataset: Dataset, training: Training
-) -> tuple[Recipe, Numbers, Data]:
+) -> tuple[Recipe, Numbers, TrainingData]:
     """Return the program's inputs besides its state."""
     segments = dataset.segments
     recipe = Recipe(dataset.space, training.schedule, training.noise > 0.0)
@@ -317,12 +321,12 @@ def prepared(
         if _adds(residual, dataset.space, knowledge) and not recipe.noisy
         else None
     )
-    per_y, per_z = sizes(knowledge.y_layout), sizes(knowledge.z_layout)
+    per_y, per_z = field_sizes(knowledge.y_layout), field_sizes(knowledge.z_layout)
     fields = [*per_y, *per_z, *(per_y if knowledge.mixed else [])]
-    data = Data(
+    data = TrainingData(
         knowledge, rest, None if ready else segments, ready,
         loss_for(training.loss, knowledge, segments),
-        spread(segments.y, per_y), spread(segments.history[:, 0], fields),
+        value_scales(segments.y, per_y), value_scales(segments.history[:, 0], fields),
     )  # fmt: skip
     return recipe, numbers, jax.tree.map(jnp.asarray, data)
 

@@ -88,9 +88,12 @@ def loss_for(name: str, knowledge: System, segments: Samples) -> Loss:
         return PaperLoss(y, z, angles, segments.weight, knowledge.y_layout)
     increments = segments.y_next - segments.y
     return StandardisedLoss(
-        y, z, spread(increments, sizes(knowledge.y_layout)), spread(segments.z, sizes(knowledge.z_layout)),
+        y,
+        z,
+        value_scales(increments, field_sizes(knowledge.y_layout)),
+        value_scales(segments.z, field_sizes(knowledge.z_layout)),
         segments.weight,
-    )  # fmt: skip
+    )
 
 
 def euler_angles(h: Float[Any, "4 S"]) -> Float[Any, "3 S"]:
@@ -111,12 +114,12 @@ def euler_angles(h: Float[Any, "4 S"]) -> Float[Any, "3 S"]:
 _angles = jax.jit(euler_angles)
 
 
-def sizes(layout: Layout) -> list[int]:
+def field_sizes(layout: Layout) -> list[int]:
     """Return the size of each field."""
     return [field.size for field in layout.fields]
 
 
-def spread(values: Float[Any, "S x"], fields: Sequence[int]) -> Float[np.ndarray, " x"]:
+def value_scales(values: Float[Any, "S x"], fields: Sequence[int]) -> Float[np.ndarray, " x"]:
     """Return the standard deviation of every number, never zero, as a scale of errors, noise and inputs.
 
     Args:

@@ -15,8 +15,8 @@ import numpy as np
 
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.learning.residual import Residual
-from knode_cosserat.learning.training.checkpoint import CheckpointError, Checkpoints, packed, unpacked
-from knode_cosserat.learning.training.watch import Watch
+from knode_cosserat.learning.training.checkpoint import CheckpointError, Checkpoints, packed_tree, unpacked
+from knode_cosserat.learning.training.progress import ProgressMonitor
 
 
 class FitError(KnodeCosseratError, ValueError):
@@ -52,7 +52,7 @@ class Run(abc.ABC):
         """Compile the program of `advance` before threads would each compile it."""
 
     @abc.abstractmethod
-    def advance(self, stop: int, watch: Watch) -> None:
+    def advance(self, stop: int, watch: ProgressMonitor) -> None:
         """Run some steps, up to number `stop` at most. Raises `FitError`."""
 
     @abc.abstractmethod
@@ -111,7 +111,7 @@ class Best:
         """Return the state for `restore`."""
         return {
             "errors": self.errors, "steps": self.steps, "stopped": self.stopped,
-            "weights": packed(self.weights), "seen": np.array(self.seen),
+            "weights": packed_tree(self.weights), "seen": np.array(self.seen),
         }  # fmt: skip
 
     def restore(self, snapshot: dict[str, Any]) -> None:
@@ -123,7 +123,7 @@ class Best:
         self.seen = [list(row) for row in np.asarray(snapshot.get("seen")).tolist()]
 
 
-def run_all(runs: Sequence[Run], checkpoints: Checkpoints | None, every: int, watch: Watch) -> None:
+def run_all(runs: Sequence[Run], checkpoints: Checkpoints | None, every: int, watch: ProgressMonitor) -> None:
     """Complete all runs, from their checkpoints if there are any, with a checkpoint every `every` steps.
 
     Raises:

@@ -14,11 +14,17 @@ from knode_cosserat.learning.config import RolloutTraining, Training
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import Residual
 from knode_cosserat.learning.samples import Dataset
-from knode_cosserat.learning.training.checkpoint import packed, unpacked
-from knode_cosserat.learning.training.courses import Aim, Courses, loss_and_slope, scales, tip_error
+from knode_cosserat.learning.training.checkpoint import packed_tree, unpacked
 from knode_cosserat.learning.training.descent import ADAM, PIECE, prepared, run_epochs, split, started
+from knode_cosserat.learning.training.progress import ProgressMonitor
+from knode_cosserat.learning.training.rollouts import (
+    RolloutTargets,
+    TrajectoryBatches,
+    loss_and_slope,
+    scales,
+    tip_error,
+)
 from knode_cosserat.learning.training.runs import Best, FitError, Run
-from knode_cosserat.learning.training.watch import Watch
 from knode_cosserat.rods.system import System
 
 #: a loss above this multiple of its initial value has diverged; the initial value counts as at least NOTHING
@@ -37,7 +43,7 @@ class SegmentRun(Run):
 
     def __init__(
         self, knowledge: System, residuals: Sequence[Residual], dataset: Dataset, training: Training,
-        seeds: tuple[int, ...], held_out: Courses | None,
+        seeds: tuple[int, ...], held_out: TrajectoryBatches | None,
     ):  # fmt: skip
         self.name = "-".join(["segments", *map(str, seeds)])
         self.seeds, self.steps = seeds, training.epochs
@@ -59,7 +65,7 @@ class SegmentRun(Run):
         if self._held_out:
             tip_error(KNODE(self._knowledge, self._last()[0]), self._held_out)
 
-    def advance(self, stop: int, watch: Watch) -> None:
+    def advance(self, stop: int, watch: ProgressMonitor) -> None:
         """Run epochs up to the next check, at most `PIECE`."""
         every = self._training.check_every
         stop = min(stop, self.done + PIECE, self.steps)
@@ -119,7 +125,7 @@ class SegmentRun(Run):
     def snapshot(self) -> dict[str, Any]:
         """Return state, histories and best weights."""
         return {
-            "state": packed(self._state), "losses": self._losses, "rates": self._rates,
+            "state": packed_tree(self._state), "losses": self._losses, "rates": self._rates,
             "best": self._best.snapshot(),
         }  # fmt: skip
 
@@ -152,8 +158,8 @@ class RolloutRun(Run):
     stage = "rollouts"
 
     def __init__(
-        self, knowledge: System, residual: Residual, courses: Courses, options: RolloutTraining, seed: int,
-        held_out: Courses | None,
+        self, knowledge: System, residual: Residual, courses: TrajectoryBatches, options: RolloutTraining,
+        seed: int, held_out: TrajectoryBatches | None,
     ):  # fmt: skip
         self.name = f"rollouts-{seed}"
         self.seeds, self.steps = (seed,), options.updates
@@ -161,7 +167,7 @@ class RolloutRun(Run):
         weights, self._rest = split(residual)
         self._weights = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), weights)
         measured = np.array(scales(courses, knowledge.y_layout))
-        self._aim = Aim(knowledge, self._rest, courses.parts, measured)
+        self._aim = RolloutTargets(knowledge, self._rest, courses.parts, measured)
         self._adam = ADAM.init(self._weights)
         #: factor on the step after halvings
         self._scale = 1.0
@@ -191,7 +197,7 @@ class RolloutRun(Run):
         loss, slope = loss_and_slope(weights, self._aim, courses.compared, courses.settings, courses.dt)
         return float(loss), slope
 
-    def begin(self, watch: Watch) -> None:
+    def begin(self, watch: ProgressMonitor) -> None:
         """Evaluate the loss before the first update. Raises `FitError` if the simulation fails."""
         loss, self._slope = self._evaluated(self._weights)
         if not np.isfinite(loss) or not _finite(self._slope):
@@ -202,7 +208,7 @@ class RolloutRun(Run):
         self._losses = np.array([loss])
         self._check(watch)
 
-    def advance(self, stop: int, watch: Watch) -> None:
+    def advance(self, stop: int, watch: ProgressMonitor) -> None:
         """Run one update."""
         if len(self._losses) == 0:
             self.begin(watch)
@@ -233,7 +239,7 @@ class RolloutRun(Run):
     def _model(self) -> KNODE:
         return KNODE(self._aim.knowledge, eqx.combine(self._weights, self._rest))
 
-    def _check(self, watch: Watch) -> None:
+    def _check(self, watch: ProgressMonitor) -> None:
         if self._held_out is None or (self.done % self._options.check_every and self.done < self.steps):
             return
         error = tip_error(self._model(), self._held_out)
@@ -255,7 +261,7 @@ class RolloutRun(Run):
     def snapshot(self) -> dict[str, Any]:
         """Return weights, optimiser state, gradient, histories and best weights."""
         return {
-            "state": packed(self._state()), "losses": self._losses, "rates": self._rates,
+            "state": packed_tree(self._state()), "losses": self._losses, "rates": self._rates,
             "best": self._best.snapshot(),
         }  # fmt: skip
 

@@ -42,7 +42,7 @@ def require_rod(robot: System) -> None:
         )
 
 
-class Rows(NamedTuple):
+class KnownRows(NamedTuple):
     """Known values at T rows and P points: y with n and m set to zero, its rate, z and its rate."""
 
     t: Float[Any, " T"]
@@ -53,13 +53,13 @@ class Rows(NamedTuple):
     z_t: Float[Any, "T P z"]
 
 
-def loads_of(robot: System, s: Float[Any, " P"], rows: Rows) -> Float[np.ndarray, "T P y"]:
+def loads_of(robot: System, s: Float[Any, " P"], rows: KnownRows) -> Float[np.ndarray, "T P y"]:
     """Return y with n and m. Points alternate between ends and middles of segments; the order is 4."""
     return np.asarray(_loads(robot, s, _padded(rows)))[: len(rows.t)]
 
 
 @jax.jit
-def _loads(robot: System, s: Float[Any, " P"], rows: Rows) -> Float[Any, "T P y"]:
+def _loads(robot: System, s: Float[Any, " P"], rows: KnownRows) -> Float[Any, "T P y"]:
     where = robot.y_layout.indices(LOADS)
 
     def one(t: Any, control: Any, y: Any, y_t: Any, z: Any, z_t: Any) -> Any:
@@ -102,7 +102,7 @@ def _at_tip(robot: System, t: Any, control: Any, y: Any, history: History) -> An
     return jax.lax.fori_loop(0, _CORRECTIONS, corrected, jnp.zeros(len(where)))
 
 
-def strains_of(robot: System, rows: Rows, settings: Settings, dt: float) -> Float[np.ndarray, "T N z"]:
+def strains_of(robot: System, rows: KnownRows, settings: Settings, dt: float) -> Float[np.ndarray, "T N z"]:
     """Return z at the nodes from the robot's constitutive law; z_t comes from the time scheme.
 
     `rows.y` must be complete; `rows.z` is ignored. The first row is assumed to be at rest.
@@ -112,7 +112,7 @@ def strains_of(robot: System, rows: Rows, settings: Settings, dt: float) -> Floa
 
 
 @jax.jit
-def _strains(robot: System, rows: Rows, coefficients: Float[Any, "4"]) -> Float[Any, "T N z"]:
+def _strains(robot: System, rows: KnownRows, coefficients: Float[Any, "4"]) -> Float[Any, "T N z"]:
     s = jnp.linspace(0.0, 1.0, robot.nodes) * robot.length
     c0, c1, c2, d1 = coefficients
 
@@ -209,7 +209,9 @@ def _padded(rows: Any) -> Any:
     return jax.tree.map(longer, rows)
 
 
-def packed(robot: System, part: str, **fields: Float[np.ndarray, "... size"]) -> Float[np.ndarray, "... y"]:
+def packed_fields(
+    robot: System, part: str, **fields: Float[np.ndarray, "... size"]
+) -> Float[np.ndarray, "... y"]:
     """Return a vector y (or z, by `part`) with the given fields, zero elsewhere."""
     layout = robot.y_layout if part == "y" else robot.z_layout
     shape = next(iter(fields.values())).shape[:-1]

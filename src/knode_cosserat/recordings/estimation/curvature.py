@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from knode_cosserat.recordings.estimation import kinematics
-from knode_cosserat.recordings.estimation.kinematics import MODES, Rod, Sensitivity, Shape
+from knode_cosserat.recordings.estimation.kinematics import MODES, RodGeometry, RodShape, Sensitivity
 from knode_cosserat.recordings.estimation.smoothing import ORDER, Banded, Splines
 
 #: largest spacing of knots (s); the frame period if that is longer
@@ -38,7 +38,7 @@ _PROBES = 4
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Poses:
+class BodyPoses:
     """Poses of all bodies at F times; masked values are arbitrary but finite.
 
     Attributes:
@@ -57,7 +57,7 @@ class Poses:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Fit:
+class CurvatureFit:
     """Fitted curvature.
 
     Attributes:
@@ -77,7 +77,7 @@ class Fit:
         return np.stack([np.asarray(self.splines.design(time, order) @ self.curves) for order in range(3)])
 
 
-def fitted(rod: Rod, poses: Poses, stretch: float, noise: tuple[float, float]) -> Fit:
+def fitted(rod: RodGeometry, poses: BodyPoses, stretch: float, noise: tuple[float, float]) -> CurvatureFit:
     """Return the most likely curvature over time; `noise` and `stretch` are initial values."""
     usual = float(np.median(np.diff(poses.time)))
     splines = Splines.of(poses.time[0], poses.time[-1], max(SPACING, usual))
@@ -89,7 +89,7 @@ def fitted(rod: Rod, poses: Poses, stretch: float, noise: tuple[float, float]) -
     profile = np.ones(splines.points)
     for correction in range(CORRECTIONS + CHOICES):
         a = np.asarray(design @ curves)
-        it = kinematics.shape(rod, a, stretch)
+        it = kinematics.rod_shape(rod, a, stretch)
         left = _left(rod, it, poses)
         moves = kinematics.sensitivity(rod, it)
         H, g = _normal(moves, left, poses, noise, a)
@@ -111,17 +111,17 @@ def fitted(rod: Rod, poses: Poses, stretch: float, noise: tuple[float, float]) -
         curves = new
         if correction >= CORRECTIONS and change < CLOSE:
             break
-    return Fit(splines, curves, stretch, noise)
+    return CurvatureFit(splines, curves, stretch, noise)
 
 
-def _left(rod: Rod, it: Shape, poses: Poses) -> tuple[np.ndarray, np.ndarray]:
+def _left(rod: RodGeometry, it: RodShape, poses: BodyPoses) -> tuple[np.ndarray, np.ndarray]:
     """Return the residuals of poses: rotations (rad) and shifts (m), zero where nothing was seen."""
     turns = kinematics.turn_between(poses.quaternion, it.h[:, rod.bodies])
     shifts = poses.position - it.p[:, rod.bodies]
     return turns * poses.turned[..., None], shifts * poses.placed[..., None]
 
 
-def _stretching(rod: Rod, it: Shape, shifts: Float[np.ndarray, "F M 3"]) -> float:
+def _stretching(rod: RodGeometry, it: RodShape, shifts: Float[np.ndarray, "F M 3"]) -> float:
     """Return the least-squares correction of the stretch from the residual shifts along the position."""
     along = it.p[:, rod.bodies] - rod.origin
     return float(np.sum(along * shifts) / np.sum(along**2))
@@ -130,7 +130,7 @@ def _stretching(rod: Rod, it: Shape, shifts: Float[np.ndarray, "F M 3"]) -> floa
 def _normal(
     moves: Sensitivity,
     left: tuple[np.ndarray, np.ndarray],
-    poses: Poses,
+    poses: BodyPoses,
     noise: tuple[float, float],
     a: Float[np.ndarray, "F K"],
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -208,7 +208,10 @@ def _profile(
 
 
 def _after(
-    moves: Sensitivity, left: tuple[np.ndarray, np.ndarray], poses: Poses, change: Float[np.ndarray, "F K"]
+    moves: Sensitivity,
+    left: tuple[np.ndarray, np.ndarray],
+    poses: BodyPoses,
+    change: Float[np.ndarray, "F K"],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the residual rotations (rad) and shifts (m) after a change of the coefficients."""
     by = change[:, None, :, None]
@@ -217,7 +220,7 @@ def _after(
 
 
 def _noise(
-    after: tuple[np.ndarray, np.ndarray], poses: Poses, effective: float, noise: tuple[float, float]
+    after: tuple[np.ndarray, np.ndarray], poses: BodyPoses, effective: float, noise: tuple[float, float]
 ) -> tuple[float, float]:
     """Return the standard deviations of a coordinate and of an angle, from the residuals."""
     counts = 3.0 * np.array([poses.placed.sum(), poses.turned.sum()])

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.recordings.estimation import balance, curvature, kinematics, paper
-from knode_cosserat.recordings.estimation.balance import Rows, packed
-from knode_cosserat.recordings.estimation.observations import Part, parts_of
+from knode_cosserat.recordings.estimation.balance import KnownRows, packed_fields
+from knode_cosserat.recordings.estimation.observations import RecordingPart, parts_of
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
@@ -95,7 +95,7 @@ def _parts(
     dt: float,
     start: float | None,
     end: float | None,
-) -> list[Part]:
+) -> list[RecordingPart]:
     if method not in get_args(Method):
         raise RecordingError(f'method is {method!r}; allowed is "best" or "paper"')
     if not isinstance(robot, System):
@@ -112,24 +112,24 @@ def _parts(
     return parts
 
 
-def _stretch(part: Part, robot: System) -> float:
+def _stretch(part: RecordingPart, robot: System) -> float:
     """Return the ratio of the rod's length to its model's, from the straightest row."""
     places = part.fractions * float(robot.length)
     reach = np.linalg.norm(part.rows.position[:, part.rows.fractions > 0.0], axis=2)
     return float(np.nanmax(reach @ places / (places @ places)))
 
 
-def applied_controls(part: Part) -> Float[np.ndarray, "T c"]:
+def applied_controls(part: RecordingPart) -> Float[np.ndarray, "T c"]:
     """Return for each row the tension held from the row before; for the first, its own."""
     tension = part.rows.tension
     return np.concatenate([tension[:1], tension[:-1]])
 
 
-def _estimated(part: Part, robot: System, method: str) -> Trajectory:
+def _estimated(part: RecordingPart, robot: System, method: str) -> Trajectory:
     control, settings = applied_controls(part), None
     if method == "paper":
         settings = Settings(space=Euler())
-        y, z = paper.states(part, robot, control, settings)
+        y, z = paper.paper_states(part, robot, control, settings)
     else:
         y, z = _best(part, robot, control)
     rows = len(part.rows.time)
@@ -148,11 +148,11 @@ def _estimated(part: Part, robot: System, method: str) -> Trajectory:
     )
 
 
-def rod_of(part: Part, robot: System) -> kinematics.Rod:
+def rod_of(part: RecordingPart, robot: System) -> kinematics.RodGeometry:
     """Return the grid for a robot and the bodies of a recording."""
     y0 = np.asarray(robot.rest(jnp.zeros(()))[0], dtype=float)
     h = y0[robot.y_layout.slice("h")]
-    return kinematics.Rod.of(
+    return kinematics.RodGeometry.of(
         float(robot.length),
         robot.nodes,
         part.fractions,
@@ -161,7 +161,9 @@ def rod_of(part: Part, robot: System) -> kinematics.Rod:
     )
 
 
-def _best(part: Part, robot: System, control: Float[np.ndarray, "T c"]) -> tuple[np.ndarray, np.ndarray]:
+def _best(
+    part: RecordingPart, robot: System, control: Float[np.ndarray, "T c"]
+) -> tuple[np.ndarray, np.ndarray]:
     rod, time = rod_of(part, robot), part.rows.time
     fit = curvature.fitted(rod, part.poses, _stretch(part, robot), NOISE)
     it = kinematics.motion(rod, fit.at(time), fit.stretch)
@@ -170,8 +172,8 @@ def _best(part: Part, robot: System, control: Float[np.ndarray, "T c"]) -> tuple
 
 def completed(
     robot: System,
-    rod: kinematics.Rod,
-    it: kinematics.Motion,
+    rod: kinematics.RodGeometry,
+    it: kinematics.RodMotion,
     time: Float[np.ndarray, " T"],
     control: Float[np.ndarray, "T c"],
 ) -> tuple[Float[np.ndarray, "T N y"], Float[np.ndarray, "T N z"]]:
@@ -182,13 +184,13 @@ def completed(
     _, z_rest = robot.rest(jnp.zeros(()))
     z = np.broadcast_to(np.asarray(z_rest), (*it.q.shape[:2], robot.z_layout.size)).copy()
     z[..., robot.z_layout.slice("u")] = it.shape.u
-    rows = Rows(
+    rows = KnownRows(
         t=time,
         control=control,
-        y=packed(robot, "y", p=it.shape.p, h=it.shape.h, q=it.q, w=it.w),
-        y_t=packed(robot, "y", p=p_t, h=h_t, q=it.q_t, w=it.w_t),
+        y=packed_fields(robot, "y", p=it.shape.p, h=it.shape.h, q=it.q, w=it.w),
+        y_t=packed_fields(robot, "y", p=p_t, h=h_t, q=it.q_t, w=it.w_t),
         z=z,
-        z_t=packed(robot, "z", u=it.u_t),
+        z_t=packed_fields(robot, "z", u=it.u_t),
     )
     y = balance.loads_of(robot, rod.s, rows)[:, rod.nodes]
     at_nodes = rows._replace(y=y, y_t=rows.y_t[:, rod.nodes], z=z[:, rod.nodes], z_t=rows.z_t[:, rod.nodes])

@@ -30,7 +30,7 @@ _GAUSS = 0.5 / np.sqrt(3.0)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Rod:
+class RodGeometry:
     """Grid along a rod that contains its nodes and bodies, and the curvature's basis.
 
     Points alternate between ends and middles of segments, from base to tip.
@@ -68,7 +68,7 @@ class Rod:
         fractions: Float[np.ndarray, " M"],
         base: Float[np.ndarray, " 4"],
         origin: Float[np.ndarray, " 3"],
-    ) -> Rod:
+    ) -> RodGeometry:
         """Return the grid of a rod from its length (m), its number of nodes and its bodies' fractions."""
         fixed = np.unique(np.round(np.concatenate([np.linspace(0.0, 1.0, nodes), fractions]), 9))
         ends = [np.zeros(1)]
@@ -111,7 +111,7 @@ def _basis(places: Float[np.ndarray, "..."]) -> Float[np.ndarray, "... 3 K"]:
     return basis
 
 
-class Shape(NamedTuple):
+class RodShape(NamedTuple):
     """Shape of a rod at F times: curvature (1/m), orientation (also as a matrix) and position (m)."""
 
     u: Float[np.ndarray, "F P 3"]
@@ -120,7 +120,7 @@ class Shape(NamedTuple):
     p: Float[np.ndarray, "F P 3"]
 
 
-def shape(rod: Rod, a: Float[np.ndarray, "F K"], stretch: float) -> Shape:
+def rod_shape(rod: RodGeometry, a: Float[np.ndarray, "F K"], stretch: float) -> RodShape:
     """Return the shape of a rod from the curvature's coefficients a (1/m); order 4 in the segments."""
     half = np.diff(rod.s)
     u1, u2 = (np.einsum("hck,fk->fhc", rod.gauss[:, i], a, optimize=True) for i in (0, 1))
@@ -135,7 +135,7 @@ def shape(rod: Rod, a: Float[np.ndarray, "F K"], stretch: float) -> Shape:
         h[:, j + 1] = hamilton(h[:, j], steps[:, j])
     R = matrices(h)
     p = rod.origin + cumulative(rod, stretch * R[..., 2])
-    return Shape(np.einsum("pck,fk->fpc", rod.basis, a, optimize=True), h, R, p)
+    return RodShape(np.einsum("pck,fk->fpc", rod.basis, a, optimize=True), h, R, p)
 
 
 class Sensitivity(NamedTuple):
@@ -145,7 +145,7 @@ class Sensitivity(NamedTuple):
     shift: Float[np.ndarray, "F M 3 K"]
 
 
-def sensitivity(rod: Rod, it: Shape) -> Sensitivity:
+def sensitivity(rod: RodGeometry, it: RodShape) -> Sensitivity:
     """Return the derivatives of the bodies' poses by the coefficients, as integrals without recursion."""
     weights = _weights(rod)  # (M, P)
     F, P = it.p.shape[:2]
@@ -168,10 +168,10 @@ def sensitivity(rod: Rod, it: Shape) -> Sensitivity:
     return Sensitivity(turn, shift)
 
 
-class Motion(NamedTuple):
+class RodMotion(NamedTuple):
     """Motion of a rod at F times; q, w and their rates are in the material frame, in SI units."""
 
-    shape: Shape
+    shape: RodShape
     q: Float[np.ndarray, "F P 3"]
     w: Float[np.ndarray, "F P 3"]
     q_t: Float[np.ndarray, "F P 3"]
@@ -179,9 +179,9 @@ class Motion(NamedTuple):
     u_t: Float[np.ndarray, "F P 3"]
 
 
-def motion(rod: Rod, a: Float[np.ndarray, "3 F K"], stretch: float) -> Motion:
+def motion(rod: RodGeometry, a: Float[np.ndarray, "3 F K"], stretch: float) -> RodMotion:
     """Return shape, velocities and accelerations from the coefficients and their first two rates."""
-    it = shape(rod, a[0], stretch)
+    it = rod_shape(rod, a[0], stretch)
     u_t, u_tt = (np.einsum("pck,fk->fpc", rod.basis, each, optimize=True) for each in a[1:])
     p_s = stretch * it.R[..., 2]
     turned = _turned(it.R, u_t)
@@ -193,13 +193,13 @@ def motion(rod: Rod, a: Float[np.ndarray, "3 F K"], stretch: float) -> Motion:
     q_local, w_local = _turned(back, p_t), _turned(back, w)
     # rates in a rotating frame; for ω the extra term vanishes
     q_t = _turned(back, p_tt) - np.cross(w_local, q_local)
-    return Motion(it, q_local, w_local, q_t, _turned(back, w_t), u_t)
+    return RodMotion(it, q_local, w_local, q_t, _turned(back, w_t), u_t)
 
 
 # integrals
 
 
-def cumulative(rod: Rod, values: Float[np.ndarray, "F P 3"]) -> Float[np.ndarray, "F P 3"]:
+def cumulative(rod: RodGeometry, values: Float[np.ndarray, "F P 3"]) -> Float[np.ndarray, "F P 3"]:
     """Return the integrals from the base to every point, by Simpson's rule in each segment."""
     ds = (rod.s[2::2] - rod.s[:-2:2])[:, None]
     first, middle, last = values[:, :-2:2], values[:, 1::2], values[:, 2::2]
@@ -209,7 +209,7 @@ def cumulative(rod: Rod, values: Float[np.ndarray, "F P 3"]) -> Float[np.ndarray
     return total
 
 
-def _weights(rod: Rod) -> Float[np.ndarray, "M P"]:
+def _weights(rod: RodGeometry) -> Float[np.ndarray, "M P"]:
     """Return Simpson's weights of the integrals from the base to the bodies."""
     ds = rod.s[2::2] - rod.s[:-2:2]
     weights = np.zeros((len(rod.bodies), len(rod.s)))

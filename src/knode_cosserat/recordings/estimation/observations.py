@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.recordings.estimation.curvature import Poses
+from knode_cosserat.recordings.estimation.curvature import BodyPoses
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Body, Recording
@@ -22,7 +22,7 @@ FEWEST_BODIES, FEWEST_ROWS = 2, 4
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Part:
+class RecordingPart:
     """An unbroken part of a recording.
 
     Attributes:
@@ -32,13 +32,13 @@ class Part:
     """
 
     rows: Measurements
-    poses: Poses
+    poses: BodyPoses
     fractions: Float[np.ndarray, " M"]
 
 
 def parts_of(
     recording: Recording | Measurements, robot: System, dt: float, start: float | None, end: float | None
-) -> list[Part]:
+) -> list[RecordingPart]:
     """Return the parts with enough rows for an estimation.
 
     Raises:
@@ -73,7 +73,7 @@ def parts_of(
             if isinstance(recording, Recording)
             else _of_rows(piece, used)
         )
-        made.append(Part(piece, poses, rows.fractions[used]))
+        made.append(RecordingPart(piece, poses, rows.fractions[used]))
     return made
 
 
@@ -97,16 +97,16 @@ def _check(rows: Measurements, robot: System) -> None:
         )
 
 
-def _of_rows(rows: Measurements, used: np.ndarray) -> Poses:
+def _of_rows(rows: Measurements, used: np.ndarray) -> BodyPoses:
     position, quaternion = rows.position[:, used], rows.quaternion[:, used]
     turned = np.isfinite(quaternion).all(axis=2)
     filled = np.where(turned[..., None], quaternion, [1.0, 0.0, 0.0, 0.0])
     # bridged poses are not observations
     seen = rows.measured[:, used]
-    return Poses(rows.time, position, filled, seen, turned & seen)
+    return BodyPoses(rows.time, position, filled, seen, turned & seen)
 
 
-def _frames(bodies: list[Body], time: Float[np.ndarray, " T"]) -> Poses:
+def _frames(bodies: list[Body], time: Float[np.ndarray, " T"]) -> BodyPoses:
     """Return the poses of all bodies, grouped by frame."""
     first, last = time[0] - AROUND, time[-1] + AROUND
     inside = [body.time[(body.time >= first) & (body.time <= last)] for body in bodies]
@@ -121,4 +121,4 @@ def _frames(bodies: list[Body], time: Float[np.ndarray, " T"]) -> Poses:
         position[row, k], placed[row, k] = body.position[mine], True
         if body.quaternion is not None:
             quaternion[row, k], turned[row, k] = body.quaternion[mine], True
-    return Poses(frames, position, quaternion, placed, turned)
+    return BodyPoses(frames, position, quaternion, placed, turned)

@@ -13,14 +13,14 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.recordings.estimation import balance, kinematics
-from knode_cosserat.recordings.estimation.observations import Part
+from knode_cosserat.recordings.estimation.observations import RecordingPart
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.settings import Settings
 
 
-def states(
-    part: Part, robot: System, control: Float[np.ndarray, "T c"], settings: Settings
+def paper_states(
+    part: RecordingPart, robot: System, control: Float[np.ndarray, "T c"], settings: Settings
 ) -> tuple[Float[np.ndarray, "T N y"], Float[np.ndarray, "T N z"]]:
     """Return y and z of the rows. Raises `RecordingError` if a body has no orientation."""
     rows = part.rows
@@ -43,7 +43,7 @@ def states(
     h_t = np.gradient(h, dt, axis=0, edge_order=2)
     q = (np.swapaxes(R, -1, -2) @ p_t[..., None])[..., 0]
     w = 2.0 * kinematics.hamilton(h * np.array([1.0, -1.0, -1.0, -1.0]), h_t)[..., 1:]
-    known = balance.packed(robot, "y", p=p, h=h, q=q, w=w)
+    known = balance.packed_fields(robot, "y", p=p, h=h, q=q, w=w)
     return balance.semi_discretised(robot, rows.time, control, known, settings, round(dt, 9))
 
 

@@ -22,7 +22,9 @@ def cross(a: Float[np.ndarray, "*n 3"], b: Float[np.ndarray, "*n 3"]) -> Float[n
     )
 
 
-def product(a: Float[np.ndarray, "*n 4"], b: Float[np.ndarray, "*n 4"]) -> Float[np.ndarray, "*n 4"]:
+def quaternion_product(
+    a: Float[np.ndarray, "*n 4"], b: Float[np.ndarray, "*n 4"]
+) -> Float[np.ndarray, "*n 4"]:
     """Return the rotation b followed by a, as a ∘ b."""
     real = a[..., :1] * b[..., :1] - np.sum(a[..., 1:] * b[..., 1:], axis=-1, keepdims=True)
     vector = a[..., :1] * b[..., 1:] + b[..., :1] * a[..., 1:] + cross(a[..., 1:], b[..., 1:])
@@ -99,10 +101,10 @@ def along_curve(
         )  # fmt: skip
         frames[k] = w, x, y, z
     frame, along = frames[-1], directions[-1]
-    end = product(shortest(along, rotated(last, AXIS)), frame)
-    left = product(conjugate(end), last)
+    end = quaternion_product(shortest(along, rotated(last, AXIS)), frame)
+    left = quaternion_product(conjugate(end), last)
     twist = 2.0 * np.arctan2(left[3], left[0])
     twist = (twist + np.pi) % (2.0 * np.pi) - np.pi
     half = 0.5 * twist * (np.arange(len(frames)) + 0.5) / len(frames)
     zero = np.zeros_like(half)
-    return product(frames, np.stack([np.cos(half), zero, zero, np.sin(half)], axis=-1))
+    return quaternion_product(frames, np.stack([np.cos(half), zero, zero, np.sin(half)], axis=-1))

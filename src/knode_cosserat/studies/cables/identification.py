@@ -20,9 +20,9 @@ from knode_cosserat.studies.cables.rollouts import (
     NAMES,
     UNKNOWNS,
     Rollouts,
-    coordinates,
+    cable_coordinates,
+    cable_parameters,
     in_threads,
-    parameters_of,
 )
 
 _LOG = logging.getLogger(__name__)
@@ -38,7 +38,7 @@ SIMULATED = 2 / 3
 ENOUGH = 5e-3
 
 
-class Stage(NamedTuple):
+class SearchStage(NamedTuple):
     """Pieces of motions (frames, number), unknowns, corrections at most; one in `every` frames counts."""
 
     frames: int
@@ -59,15 +59,15 @@ MORE = (
 MOST = tuple(name for name in NAMES if name != "eccentric")
 #: chosen on DLO1 and DLO2
 STAGES = (
-    Stage(40, 12, FIRST, 6),
-    Stage(40, 18, MORE, 8),
-    Stage(120, 12, MOST, 5, 4),
-    Stage(480, 6, MOST, 6, 6),
-    Stage(480, 6, NAMES, 4, 6),
+    SearchStage(40, 12, FIRST, 6),
+    SearchStage(40, 18, MORE, 8),
+    SearchStage(120, 12, MOST, 5, 4),
+    SearchStage(480, 6, MOST, 6, 6),
+    SearchStage(480, 6, NAMES, 4, 6),
 )
 
 
-class Identified(NamedTuple):
+class IdentifiedCable(NamedTuple):
     """Best parameters, and the error of each stage on held-out motions (m)."""
 
     parameters: CableParameters
@@ -80,9 +80,9 @@ def identify_cable(
     start: CableParameters,
     motions: Sequence[Float[np.ndarray, "T N 3"]],
     validate: Callable[[CableParameters], float],
-    stages: Sequence[Stage] = STAGES,
+    stages: Sequence[SearchStage] = STAGES,
     seconds: float = np.inf,
-) -> Identified:
+) -> IdentifiedCable:
     """Return the parameters that predict motions best, by `validate` (m, lower is better).
 
     A stage that fails, or is worse, leaves the best parameters as they are. No stage begins after `seconds`.
@@ -109,7 +109,7 @@ def identify_cable(
         if errors[-1] < min(errors[:-1]):
             best = latest
         _LOG.info("stage %d: %.2f mm on motions not used; %s", number + 1, 1e3 * errors[-1], latest)
-    return Identified(best, tuple(errors), tuple(notes))
+    return IdentifiedCable(best, tuple(errors), tuple(notes))
 
 
 def _twisted(start: CableParameters) -> list[CableParameters]:
@@ -118,7 +118,7 @@ def _twisted(start: CableParameters) -> list[CableParameters]:
 
 
 def _searched(
-    rollouts: Rollouts, start: CableParameters, motions: Any, stage: Stage, seed: int, until: float
+    rollouts: Rollouts, start: CableParameters, motions: Any, stage: SearchStage, seed: int, until: float
 ) -> CableParameters:
     """Least squares by Levenberg-Marquardt with a robust loss.
 
@@ -127,7 +127,7 @@ def _searched(
     rollouts.forget()
     pieces = _pieces(motions, stage, seed)
     least = SIMULATED * len(pieces)
-    x, damping = coordinates(start), DAMPING
+    x, damping = cable_coordinates(start), DAMPING
     chosen = np.array([NAMES.index(name) for name in stage.names])
     prior, moves = (
         np.array([getattr(UNKNOWNS[name], part) for name in stage.names]) for part in ("width", "move")
@@ -157,7 +157,7 @@ def _searched(
                 break
             damping *= 6.0
             if time.process_time() > until:
-                return parameters_of(x)
+                return cable_parameters(x)
         else:
             break
         gain, x, damping = before.loss - after.loss, moved, max(damping / 5.0, 1e-4)
@@ -165,7 +165,7 @@ def _searched(
         _LOG.info("%d frames: loss %.4f to %.4f", stage.frames, before.loss, after.loss)
         if gain < ENOUGH * before.loss or time.process_time() > until:
             break
-    return parameters_of(x)
+    return cable_parameters(x)
 
 
 def _finite(both: Sequence[Any]) -> list[bool]:
@@ -204,7 +204,7 @@ def _weight(width: Any) -> Any:
     return 10.0 * 0.01**2 / np.asarray(width) ** 2
 
 
-def _pieces(motions: Any, stage: Stage, seed: int) -> list[tuple[Any, Any]]:
+def _pieces(motions: Any, stage: SearchStage, seed: int) -> list[tuple[Any, Any]]:
     """Pieces at random places of all motions in turn, with a key each."""
     rng = np.random.default_rng(seed)
     found = []

@@ -22,7 +22,7 @@ from knode_cosserat.rods.parameters import parameter
 from knode_cosserat.rods.section import Stretch
 from knode_cosserat.rods.slender_rod import SlenderRod
 from knode_cosserat.studies.cables import frames
-from knode_cosserat.studies.cables.shapes import Fitter, Grid, Shape
+from knode_cosserat.studies.cables.shapes import CableGrid, CableShape, Fitter
 from knode_cosserat.trajectory import Trajectory
 
 #: time between frames (s): motion capture at 100 Hz
@@ -104,7 +104,7 @@ class Grips(NamedTuple):
         pairs = [np.concatenate([each.reshape(-1, 3) for each in pair]) for pair in both]
         directions = np.stack([frames.unit(np.mean(each, axis=0)) for each in pairs])
         first = frames.shortest(frames.AXIS, directions[0])
-        last = frames.product(frames.shortest(directions[0], directions[1]), first)
+        last = frames.quaternion_product(frames.shortest(directions[0], directions[1]), first)
         return cls(directions, np.stack([first, last]))
 
 
@@ -181,13 +181,13 @@ class CableModel:
             (np.array([*p.tip_tangent, 0.0]), p.twist),
         )
         for k, (directions, (tangent, twist)) in enumerate(zip(_pairs(markers), turns, strict=True)):
-            gripper = frames.product(
+            gripper = frames.quaternion_product(
                 frames.shortest(self.grips.directions[k], directions), self.grips.frames[k]
             )
-            held = frames.product(
+            held = frames.quaternion_product(
                 frames.from_vector(np.array([0.0, 0.0, twist])), frames.from_vector(tangent)
             )
-            found.append(frames.product(gripper, held))
+            found.append(frames.quaternion_product(gripper, held))
         return found[0], found[1]
 
     def fitter(self, p: CableParameters) -> Fitter:
@@ -195,14 +195,14 @@ class CableModel:
         key = float(p.stretch)
         found = self._fitters.get(key)
         if found is None:
-            found = Fitter(Grid(self.places * key, 2 * (self.nodes - 1)))
+            found = Fitter(CableGrid(self.places * key, 2 * (self.nodes - 1)))
             # a new dictionary, for other threads may be reading the old one
             self._fitters = {**dict(list(self._fitters.items())[-4:]), key: found}
         return found
 
     def shapes(
-        self, p: CableParameters, markers: Any, start: Sequence[Shape] | None = None
-    ) -> tuple[Shape, Shape]:
+        self, p: CableParameters, markers: Any, start: Sequence[CableShape] | None = None
+    ) -> tuple[CableShape, CableShape]:
         """Return the shapes of the first two frames, from those of nearly the same parameters if given."""
         offset = np.array([*p.offset, 0.0])
         fitter, (base, tip) = self.fitter(p), self.end_frames(p, markers[:2])
@@ -212,15 +212,15 @@ class CableModel:
         return first, second
 
     def prepared(
-        self, p: CableParameters, markers: Any, start: Sequence[Shape] | None = None
-    ) -> tuple[Prepared, tuple[Shape, Shape]]:
+        self, p: CableParameters, markers: Any, start: Sequence[CableShape] | None = None
+    ) -> tuple[Prepared, tuple[CableShape, CableShape]]:
         """Return a motion ready to be simulated, and the shapes at its start."""
         shapes = self.shapes(p, markers, start)
         beside = shapes[0].beside
         ends, controls = [], []
         for frame, held, place in zip(self.end_frames(p, markers), (1, -2), (0, -1), strict=True):
             at = markers[:, held] - frames.rotated(frame, np.broadcast_to(beside[place], (len(frame), 3)))
-            turn = frames.to_vector(frames.product(frame, frames.conjugate(frame[0])))
+            turn = frames.to_vector(frames.quaternion_product(frame, frames.conjugate(frame[0])))
             ends.append((at[0], frame[0]))
             controls.append(np.concatenate([at - at[0], frames.continuous(turn)], axis=1))
         both = np.concatenate(controls, axis=1)
@@ -234,19 +234,19 @@ class CableModel:
         for k, shape in enumerate(shapes):
             inner = frames.mean_of_two(shape.edges[1:-2:2], shape.edges[2:-1:2])
             first, last = (
-                frames.product(frames.from_vector(controls[k, part]), end[1])
+                frames.quaternion_product(frames.from_vector(controls[k, part]), end[1])
                 for part, end in zip((slice(3, 6), slice(9, 12)), ends, strict=True)
             )
             h = np.concatenate([first[None], inner, last[None]])
             for i in range(1, len(h)):
                 h[i] *= -1.0 if h[i] @ h[i - 1] < 0.0 else 1.0
-            u = frames.to_vector(frames.product(frames.conjugate(h[:-1]), h[1:])) / ds
+            u = frames.to_vector(frames.quaternion_product(frames.conjugate(h[:-1]), h[1:])) / ds
             u = np.concatenate([u[:1], 0.5 * (u[1:] + u[:-1]), u[-1:]])
             points.append(shape.points[::2])
             turns.append(h)
             bent.append(u)
         velocity = (points[1] - points[0]) / DT
-        spin = frames.to_vector(frames.product(frames.conjugate(turns[0]), turns[1])) / DT
+        spin = frames.to_vector(frames.quaternion_product(frames.conjugate(turns[0]), turns[1])) / DT
         y, z = np.zeros((2, self.nodes, 19)), np.zeros((2, self.nodes, 6))
         stiffness = np.array([p.bending, p.bending, p.torsion])
         rest = np.array([*p.curvature, 0.0])

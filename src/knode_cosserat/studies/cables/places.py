@@ -20,7 +20,7 @@ from jaxtyping import Float
 
 from knode_cosserat.studies.cables import frames
 from knode_cosserat.studies.cables.model import CableModel, CableParameters, Grips
-from knode_cosserat.studies.cables.shapes import Fitter, Grid
+from knode_cosserat.studies.cables.shapes import CableGrid, Fitter
 
 #: points of a piece at which its turning is summed
 POINTS = 8
@@ -64,7 +64,7 @@ def grip_tangents(
     model: CableModel, p: CableParameters, motions: Sequence[Float[np.ndarray, "T N 3"]]
 ) -> CableParameters:
     """Return the parameters with tangents in the grips as shapes with loosely held ends have them."""
-    fitter = Fitter(Grid(model.places * p.stretch, 2 * (model.nodes - 1)), LOOSE)
+    fitter = Fitter(CableGrid(model.places * p.stretch, 2 * (model.nodes - 1)), LOOSE)
     offset = np.array([*p.offset, 0.0])
     off: list[list[Any]] = [[], []]
     for markers in motions:
@@ -106,7 +106,7 @@ def _pieces(markers: Any, base: Any) -> tuple[Any, Any]:
     edges = frames.along_curve(directions[:-1], base, base)
     edges[0] = base
     for k in range(1, len(edges)):  # without the twist that would meet an end
-        edges[k] = frames.product(frames.shortest(directions[k - 1], directions[k]), edges[k - 1])
+        edges[k] = frames.quaternion_product(frames.shortest(directions[k - 1], directions[k]), edges[k - 1])
     change = frames.rotated(frames.conjugate(edges), np.diff(directions, axis=0))
     turning = np.stack([-change[:, 1], change[:, 0]], axis=1).reshape(-1, POINTS, 2).sum(axis=1)
     return lengths, turning

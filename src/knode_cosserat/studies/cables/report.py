@@ -26,7 +26,7 @@ METHODS = ("guess", "identified", "best")
 SHOWN = (0.1, 0.4, 0.7, 1.0)
 
 
-def write(out: Path, results: Sequence[CableResult]) -> Report:
+def write_report(out: Path, results: Sequence[CableResult]) -> Report:
     """Write all of the report into a folder."""
     cells = [cell for result in results for cell in result.cells]
     texts = {"cables.md": as_markdown(results), "cables.json": as_json(cells)}

@@ -16,11 +16,11 @@ from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.run import usable_cores
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.studies.cables.model import DT, CableModel, CableParameters, Prepared
-from knode_cosserat.studies.cables.shapes import Shape
+from knode_cosserat.studies.cables.shapes import CableShape
 from knode_cosserat.trajectory import Trajectory
 
 
-class Unknown(NamedTuple):
+class CableUnknown(NamedTuple):
     """A number to be identified: its field, place in it, and how far it may move in one correction.
 
     A `logarithmic` one is positive and moves by factors. Those of the grip change the initial state. `width`
@@ -35,21 +35,21 @@ class Unknown(NamedTuple):
     width: float = np.inf
 
 
-UNKNOWNS: dict[str, Unknown] = {
-    "bending": Unknown("bending", None, 0.8, logarithmic=True),
-    "torsion": Unknown("torsion", None, 0.8, logarithmic=True),
-    "damping_time": Unknown("damping_time", None, 0.8, logarithmic=True),
-    "drag": Unknown("drag", None, 0.8, logarithmic=True),
-    "drag_ratio": Unknown("drag_ratio", None, 0.8, logarithmic=True, width=1.0),
-    "square_drag": Unknown("square_drag", None, 0.8, logarithmic=True, width=1.0),
-    **{f"curvature{k}": Unknown("curvature", k, 1.6) for k in range(2)},
-    **{f"curvature_change{k}": Unknown("curvature_change", k, 3.2, width=10.0) for k in range(2)},
-    "eccentric": Unknown("eccentric", None, 0.15, width=0.3),
-    "twist": Unknown("twist", None, 0.6, grip=True),
-    **{f"base_tangent{k}": Unknown("base_tangent", k, 0.3, grip=True, width=0.2) for k in range(2)},
-    **{f"tip_tangent{k}": Unknown("tip_tangent", k, 0.3, grip=True, width=0.2) for k in range(2)},
-    **{f"offset{k}": Unknown("offset", k, 3e-3, grip=True, width=3e-3) for k in range(2)},
-    "stretch": Unknown("stretch", None, 3e-3, grip=True, width=3e-3),
+UNKNOWNS: dict[str, CableUnknown] = {
+    "bending": CableUnknown("bending", None, 0.8, logarithmic=True),
+    "torsion": CableUnknown("torsion", None, 0.8, logarithmic=True),
+    "damping_time": CableUnknown("damping_time", None, 0.8, logarithmic=True),
+    "drag": CableUnknown("drag", None, 0.8, logarithmic=True),
+    "drag_ratio": CableUnknown("drag_ratio", None, 0.8, logarithmic=True, width=1.0),
+    "square_drag": CableUnknown("square_drag", None, 0.8, logarithmic=True, width=1.0),
+    **{f"curvature{k}": CableUnknown("curvature", k, 1.6) for k in range(2)},
+    **{f"curvature_change{k}": CableUnknown("curvature_change", k, 3.2, width=10.0) for k in range(2)},
+    "eccentric": CableUnknown("eccentric", None, 0.15, width=0.3),
+    "twist": CableUnknown("twist", None, 0.6, grip=True),
+    **{f"base_tangent{k}": CableUnknown("base_tangent", k, 0.3, grip=True, width=0.2) for k in range(2)},
+    **{f"tip_tangent{k}": CableUnknown("tip_tangent", k, 0.3, grip=True, width=0.2) for k in range(2)},
+    **{f"offset{k}": CableUnknown("offset", k, 3e-3, grip=True, width=3e-3) for k in range(2)},
+    "stretch": CableUnknown("stretch", None, 3e-3, grip=True, width=3e-3),
 }
 #: frames of one compiled program with derivatives, and seconds for recovery of one motion
 CHUNK, RECOVERY = 40, 1.0
@@ -61,7 +61,7 @@ STEP = 0.05
 NAMES = tuple(UNKNOWNS)
 
 
-def coordinates(p: CableParameters) -> Float[np.ndarray, " n"]:
+def cable_coordinates(p: CableParameters) -> Float[np.ndarray, " n"]:
     """Return all numbers of a cable without bounds: those that are logarithmic by their logarithms."""
     found = []
     for unknown in UNKNOWNS.values():
@@ -71,7 +71,7 @@ def coordinates(p: CableParameters) -> Float[np.ndarray, " n"]:
     return np.array(found, dtype=float)
 
 
-def parameters_of(x: Any) -> CableParameters:
+def cable_parameters(x: Any) -> CableParameters:
     """Return the parameters with these coordinates; they may be traced by JAX."""
     traced = isinstance(x, jax.core.Tracer)
     changes: dict[str, Any] = {}
@@ -84,7 +84,7 @@ def parameters_of(x: Any) -> CableParameters:
     return CableParameters(**changes)
 
 
-class Prediction(NamedTuple):
+class CablePrediction(NamedTuple):
     """Predicted positions of the free markers from frame 2 on, or the reason for there being none."""
 
     markers: Float[np.ndarray, "T M 3"] | None
@@ -102,9 +102,9 @@ class Rollouts:
     def __init__(self, model: CableModel, space: Any = "lobatto2"):
         self.model, self.space = model, space
         self._chunk = jax.jit(self._chunk_with_derivatives)
-        self._starts: dict[Any, tuple[tuple[Shape, Shape], Prepared]] = {}
+        self._starts: dict[Any, tuple[tuple[CableShape, CableShape], Prepared]] = {}
 
-    def predict(self, p: CableParameters, markers: Float[np.ndarray, "T N 3"]) -> Prediction:
+    def predict(self, p: CableParameters, markers: Float[np.ndarray, "T N 3"]) -> CablePrediction:
         """Return the free markers for the given motion of those that are held, from the first two frames."""
         try:
             prepared, _ = self.model.prepared(p, markers)
@@ -114,17 +114,17 @@ class Rollouts:
                 recovery_budget=RECOVERY, on_failure="return",
             )  # fmt: skip
         except (ValueError, RuntimeError, ArithmeticError) as error:
-            return Prediction(None, None, " ".join(str(error).split()))
+            return CablePrediction(None, None, " ".join(str(error).split()))
         result = np.asarray(found.result)
         if result.min() < 0:
             row = int(np.argmax(result < 0))
-            return Prediction(None, None, f"frame {row + 1}: {Result(int(result[row])).message}")
+            return CablePrediction(None, None, f"frame {row + 1}: {Result(int(result[row])).message}")
         seen = np.asarray(self.model.free_markers(np.asarray(found.y)[1:], prepared.beside, p.stretch))
         if not np.all(np.isfinite(seen)):
-            return Prediction(None, None, "positions are not finite")
-        return Prediction(seen, found)
+            return CablePrediction(None, None, "positions are not finite")
+        return CablePrediction(seen, found)
 
-    def predict_all(self, p: CableParameters, motions: Sequence[Any]) -> list[Prediction]:
+    def predict_all(self, p: CableParameters, motions: Sequence[Any]) -> list[CablePrediction]:
         """Return the predictions of many motions, one thread a core."""
         with warnings.catch_warnings():
             # grids are too coarse for a few frames after jerks: the report gives the estimated errors
@@ -166,7 +166,7 @@ class Rollouts:
 
     def _prepared(self, x: Any, markers: Any, key: Any) -> tuple[Prepared, Prepared]:
         """A motion ready to be simulated, and derivatives of that by all unknowns, as stacked arrays."""
-        p = parameters_of(x)
+        p = cable_parameters(x)
         if key in self._starts:
             shapes, slopes = self._starts[key]
             prepared, shapes = self.model.prepared(p, markers, shapes)
@@ -181,7 +181,7 @@ class Rollouts:
                 each.append(jax.tree.map(np.zeros_like, prepared))
                 continue
             step = STEP * unknown.move
-            moved = parameters_of(x + step * np.eye(len(x))[k])
+            moved = cable_parameters(x + step * np.eye(len(x))[k])
             near = self.model.prepared(moved, markers, shapes)[0]
             each.append(jax.tree.map(lambda a, b, h=step: (a - b) / h, near, prepared))
         slopes = jax.tree.map(lambda *leaves: np.stack(leaves), *each)
@@ -190,7 +190,7 @@ class Rollouts:
 
     def _chunk_with_derivatives(self, x: Any, prepared: Any, d_x: Any, d_prepared: Any) -> Any:
         def run(x: Any, prepared: Any) -> Any:
-            p = parameters_of(x)
+            p = cable_parameters(x)
             robot = self.model.robot(p, prepared.base, prepared.tip)
             initial = self.model.initial(robot, prepared)
             found = simulate(robot, prepared.controls, DT, initial=initial, space=self.space)

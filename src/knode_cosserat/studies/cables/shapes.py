@@ -27,7 +27,7 @@ CORRECTIONS = 25
 BAND = 9
 
 
-class Shape(NamedTuple):
+class CableShape(NamedTuple):
     """A cable's curve: corners, frames of edges, and the markers as seen from the frames nearest to them."""
 
     points: Float[np.ndarray, "n+1 3"]
@@ -36,7 +36,7 @@ class Shape(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Grid:
+class CableGrid:
     """A polygon of equal edges, and the places of markers (m from its start, both ends among them)."""
 
     places: Float[np.ndarray, " M"]
@@ -80,7 +80,7 @@ class Grid:
 class Fitter:
     """Finds the shapes of one cable; the matrices of a grid are kept between frames."""
 
-    def __init__(self, grid: Grid, tangent: float = TANGENT):
+    def __init__(self, grid: CableGrid, tangent: float = TANGENT):
         """`tangent`: how far the curve's direction at an end may be from its frame (rad)."""
         self.tangent = tangent
         n, ds = grid.edges, grid.edge
@@ -102,9 +102,9 @@ class Fitter:
         markers: Float[np.ndarray, "M 3"],
         ends: tuple[Float[np.ndarray, "4"], Float[np.ndarray, "4"]],
         offset: Float[np.ndarray, "3"],
-        start: Shape | None = None,
+        start: CableShape | None = None,
         rounds: int = 3,
-    ) -> Shape:
+    ) -> CableShape:
         """Return the shape of one frame.
 
         Args:
@@ -132,7 +132,7 @@ class Fitter:
         edges = frames.along_curve(np.diff(points, axis=0), first, last)
         at = grid.frames_at_places(edges, first, last)
         beside = frames.rotated(frames.conjugate(at), markers - self._places @ points)
-        return Shape(points, edges, beside)
+        return CableShape(points, edges, beside)
 
     def _first_guess(self, markers: Any, first: Any, last: Any, offset: Any) -> Float[np.ndarray, "n+1 3"]:
         from scipy.interpolate import CubicSpline

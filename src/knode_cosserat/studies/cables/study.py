@@ -19,7 +19,7 @@ from jaxtyping import Float
 from knode_cosserat.recordings.cables import CableData, CableMotion, load_cables
 from knode_cosserat.studies.cables import report
 from knode_cosserat.studies.cables.correction import Correction, learned_correction
-from knode_cosserat.studies.cables.identification import STAGES, Stage, identify_cable
+from knode_cosserat.studies.cables.identification import STAGES, SearchStage, identify_cable
 from knode_cosserat.studies.cables.model import CableModel, CableParameters, Grips
 from knode_cosserat.studies.cables.places import grip_tangents, marker_places
 from knode_cosserat.studies.cables.result import CableResult
@@ -39,7 +39,7 @@ class CableOptions:
     #: motions that are learned from, and how many of these choose between models only
     train: int = 10
     validation: int = 4
-    stages: tuple[Stage, ...] = STAGES
+    stages: tuple[SearchStage, ...] = STAGES
     #: no stage of the search begins later (s of CPU time, each cable)
     seconds: float = 400.0
 
@@ -59,7 +59,7 @@ def rerun(
     """Run the study for every cable of a folder, and write cables.json, cables.md, a figure and scenes."""
     cables = load_cables(folder)
     out.mkdir(parents=True, exist_ok=True)
-    return report.write(out, [study_cable(data, options, tell) for data in cables])
+    return report.write_report(out, [study_cable(data, options, tell) for data in cables])
 
 
 def study_cable(data: CableData, options: CableOptions, tell: Callable[[str], None]) -> CableResult:

@@ -2,7 +2,7 @@
 
 const TYPES = { f4: Float32Array, f8: Float64Array };
 
-/** An array as `scene.packed` writes it: {shape, values}, values in the order of the shape. */
+/** An array as `scene.encoded_array` writes it: {shape, values}, values in the order of the shape. */
 export async function unpack({ shape, type, bytes }) {
   const zipped = Uint8Array.from(atob(bytes), (c) => c.charCodeAt(0));
   const stream = new Blob([zipped]).stream().pipeThrough(new DecompressionStream("gzip"));

@@ -25,7 +25,7 @@ def checked_system(robot: Any) -> System:
     return robot
 
 
-def checked_numbers(name: str, given: Any, size: int, allowed: str, most: int = 2) -> np.ndarray:
+def checked_vectors(name: str, given: Any, size: int, allowed: str, most: int = 2) -> np.ndarray:
     """Return finite numbers (size,), or with `most` 2 also (B, size)."""
     try:
         numbers = np.asarray(given, dtype=float)
@@ -44,7 +44,7 @@ def checked_control(system: System, control: Any, name: str = "control") -> np.n
     """Return one control (c,)."""
     size = system.control_size
     names = ", ".join(f"{field.name} ({field.unit})" for field in system.control_layout.fields)
-    numbers = checked_numbers(name, control, size, f"({size},): {names or 'there are no controls'}", most=1)
+    numbers = checked_vectors(name, control, size, f"({size},): {names or 'there are no controls'}", most=1)
     return within_limits(system, numbers, name)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from knode_cosserat.identification.misfit import Data
+from knode_cosserat.identification.misfit import RecordingData
 from knode_cosserat.learning.samples import DataError
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
@@ -50,7 +50,7 @@ def names_of(given: Sequence[Measurements]) -> list[str]:
     return [f"{name} ({k + 1})" if names.count(name) > 1 else name for k, name in enumerate(names)]
 
 
-def padded(data: Sequence[Data]) -> list[Data]:
+def padded(data: Sequence[RecordingData]) -> list[RecordingData]:
     """Return recordings of one length, the last tension held and nothing measured: one compiled program."""
     longest = max(len(each.tension) for each in data)
     found = []
@@ -66,7 +66,7 @@ def padded(data: Sequence[Data]) -> list[Data]:
     return found
 
 
-def coarser(data: Data) -> Data:
+def coarser(data: RecordingData) -> RecordingData:
     """Return every second row; the tension of a step is that at its end."""
     count = len(data.tension) // 2
     rows = slice(0, 2 * count + 1, 2)
@@ -76,7 +76,7 @@ def coarser(data: Data) -> Data:
     )  # fmt: skip
 
 
-def poses_of(trajectory: Trajectory, name: str) -> Measurements:
+def poses_of_nodes(trajectory: Trajectory, name: str) -> Measurements:
     """Return the poses of a trajectory's nodes as if they had been measured, with its controls as tensions.
 
     Raises:

@@ -24,7 +24,7 @@ class _On(enum.IntEnum):
     STATE = 3
 
 
-class InTwo(NamedTuple):
+class SplitFunction(NamedTuple):
     """`function(place, state)` in two parts: `then(first(place), place, state)` gives the same result.
 
     Terms that depend on neither argument are evaluated once, when the function is split.
@@ -36,7 +36,7 @@ class InTwo(NamedTuple):
     traced: ClosedJaxpr
 
 
-def in_two(function: Callable[[Any, Any], Any], place: Any, state: Any) -> InTwo:
+def split_function(function: Callable[[Any, Any], Any], place: Any, state: Any) -> SplitFunction:
     """Split a function into a part that depends only on its first argument, and the rest.
 
     Args:
@@ -84,7 +84,7 @@ def in_two(function: Callable[[Any, Any], Any], place: Any, state: Any) -> InTwo
         found = evaluated(_On.STATE, inputs, jaxpr.outvars)
         return jax.tree.unflatten(jax.tree.structure(shape), found)
 
-    return InTwo(first, then, closed)
+    return SplitFunction(first, then, closed)
 
 
 def _variables(*groups: Iterable[Any]) -> list[Var]:

@@ -7,14 +7,14 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from knode_cosserat.solvers.history import Past, coefficient_table
+from knode_cosserat.solvers.history import StateHistory, coefficient_table
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.time import Static
 
 FirstStep = Literal["start", "regular", "consistent", "still"]
 
 
-class Steps(NamedTuple):
+class StepResults(NamedTuple):
     """The steps of one robot (or, with a batch axis in front, of several), with their result codes."""
 
     records: Any
@@ -25,17 +25,17 @@ class Steps(NamedTuple):
     result: Any
 
 
-class Start(NamedTuple):
+class InitialCondition(NamedTuple):
     """Initial history of a run, and the control before the first step."""
 
-    past: Past
+    past: StateHistory
     control: Any
     #: true if the grid was too coarse for the state before the first step
     coarse: Any = False
 
 
 @dataclasses.dataclass(frozen=True)
-class Task:
+class RunSettings:
     """Settings and sizes shared by every robot of a run."""
 
     settings: Settings

@@ -32,16 +32,14 @@ def far_side(
     if not len(jumping):
         return y
     beyond = y.copy()
-    beyond[:, jumping] = _crossed(
-        knowledge, acting[jumping], t, c0, y[:, jumping], control, history[:, jumping]
-    )
+    beyond[:, jumping] = _jump(knowledge, acting[jumping], t, c0, y[:, jumping], control, history[:, jumping])
     return beyond
 
 
 @jax.jit
-def _crossed(knowledge, acting, t, c0, y, control, history):  # type: ignore[no-untyped-def]
+def _jump(knowledge, acting, t, c0, y, control, history):  # type: ignore[no-untyped-def]
     def at_node(acting: Any, t: Any, c0: Any, y: Any, control: Any, record: Any) -> Any:
-        return knowledge.crossed(acting, t, y, control, unpacked_history(knowledge, c0, record))
+        return knowledge.jump(acting, t, y, control, unpacked_history(knowledge, c0, record))
 
     at_row = jax.vmap(at_node, in_axes=(0, None, None, 0, None, 0))
     return jax.vmap(at_row, in_axes=(None, 0, 0, 0, 0, 0))(

@@ -18,7 +18,7 @@ SHORT, LONG = 0.02, 20.0
 FACTOR = 20.0
 
 
-def units_doubted(
+def implausible_units(
     bodies: Sequence[Body],
     tension: Tensions | None,
     command: Tensions | None,

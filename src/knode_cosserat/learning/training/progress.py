@@ -19,7 +19,7 @@ class WatchError(KnodeCosseratError, ValueError):
     code = "training-log"
 
 
-class Watch:
+class ProgressMonitor:
     """Receiver of progress from all parts of a fit, from any thread. Use as a context manager."""
 
     def __init__(self, progress: bool, log_dir: str | Path | None):
@@ -30,7 +30,7 @@ class Watch:
         self._bar: Any = None
         self._progress = progress
 
-    def __enter__(self) -> Watch:
+    def __enter__(self) -> ProgressMonitor:
         return self
 
     def __exit__(self, *_: object) -> None:

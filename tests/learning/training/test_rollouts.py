@@ -13,19 +13,19 @@ from knode_cosserat.learning.fit import fit
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import network
 from knode_cosserat.learning.samples import DataError
-from knode_cosserat.learning.training import courses as module
-from knode_cosserat.learning.training.courses import (
-    Aim,
-    courses,
-    held_out_courses,
+from knode_cosserat.learning.training import rollouts as module
+from knode_cosserat.learning.training.descent import split
+from knode_cosserat.learning.training.progress import ProgressMonitor
+from knode_cosserat.learning.training.rollouts import (
+    RolloutTargets,
+    held_out_batches,
     loss_and_slope,
     scales,
     tip_error,
+    trajectory_batches,
 )
-from knode_cosserat.learning.training.descent import split
 from knode_cosserat.learning.training.runs import FitError
 from knode_cosserat.learning.training.stages import RolloutRun
-from knode_cosserat.learning.training.watch import Watch
 from tests.learning.bar import BAR, WRONG, pulled
 
 OPTIONS = RolloutTraining(horizon=6, updates=60, learning_rate=5e-3)
@@ -44,7 +44,7 @@ def residual():
 
 def aim_of(along, residual):
     weights, rest = split(residual)
-    return weights, Aim(WRONG, rest, along.parts, np.array(scales(along, WRONG.y_layout)))
+    return weights, RolloutTargets(WRONG, rest, along.parts, np.array(scales(along, WRONG.y_layout)))
 
 
 def evaluated(along, residual):
@@ -65,7 +65,7 @@ def test_loss_and_gradient(bars, residual, first):
     """The loss by `simulate` and NumPy; the gradient by finite differences along random directions."""
     options = dataclasses.replace(OPTIONS, first_row=first)
     known = [only_positions(each, 0 if first is None else first + 1) for each in bars]
-    along = courses(WRONG, known, options)
+    along = trajectory_batches(WRONG, known, options)
     value, slope = evaluated(along, residual)
     start, model, squares, paths = first or 0, KNODE(WRONG, residual), [], []
     for each in bars:
@@ -94,11 +94,11 @@ def _moved(residual, ways, step):
 
 def test_one_program_for_trajectories_of_one_length(bars, residual):
     """Two lengths are two parts, each trajectory counting one; more of the same length trace nothing anew."""
-    both = courses(WRONG, [bars[0], bars[1][:5], bars[1]], RolloutTraining())
+    both = trajectory_batches(WRONG, [bars[0], bars[1][:5], bars[1]], RolloutTraining())
     assert [part.control.shape for part in both.parts] == [(2, 20, 1), (1, 4, 1)]
-    one = evaluated(courses(WRONG, bars, OPTIONS), residual)[0]
+    one = evaluated(trajectory_batches(WRONG, bars, OPTIONS), residual)[0]
     before = loss_and_slope._cache_size()
-    other = evaluated(courses(WRONG, bars[::-1], OPTIONS), residual)[0]
+    other = evaluated(trajectory_batches(WRONG, bars[::-1], OPTIONS), residual)[0]
     assert loss_and_slope._cache_size() == before
     np.testing.assert_allclose(one, other, rtol=1e-9)
 
@@ -124,9 +124,9 @@ def test_held_out_error_is_that_of_simulate(bars, residual):
     for each in (bars[0], shorter):
         found = kc.simulate(model, each.control[1:], each.dt)
         expected.append(np.sqrt(np.mean((found.tip_position - each.tip_position) ** 2)))
-    along = held_out_courses(WRONG, [only_positions(bars[0]), shorter])
+    along = held_out_batches(WRONG, [only_positions(bars[0]), shorter])
     np.testing.assert_allclose(tip_error(model, along), np.mean(expected), rtol=1e-9)
-    assert held_out_courses(WRONG, []) is None
+    assert held_out_batches(WRONG, []) is None
     broken = dataclasses.replace(residual, output_biases=residual.output_biases + np.nan)
     assert tip_error(KNODE(WRONG, broken), along) == np.inf
 
@@ -161,9 +161,9 @@ def test_any_residual_is_fine_tuned(bars):
     model = fit(WRONG, bars, config)
     loss = model.about.facts["rollouts"]["loss"]
     assert loss[0] > 1e-9 and loss.min() < 0.7 * loss[0]
-    along = courses(WRONG, bars, OPTIONS)
+    along = trajectory_batches(WRONG, bars, OPTIONS)
     weights, rest = split(model.residual)
-    aim = Aim(WRONG, rest, along.parts, np.array(scales(along, WRONG.y_layout)))
+    aim = RolloutTargets(WRONG, rest, along.parts, np.array(scales(along, WRONG.y_layout)))
     found, _ = loss_and_slope(weights, aim, along.compared, along.settings, along.dt)
     np.testing.assert_allclose(found, loss.min(), rtol=1e-9)
 
@@ -189,11 +189,11 @@ def bumpy_run(bars, residual, monkeypatch, wall, **options):
     monkeypatch.setattr(RolloutRun, "_evaluated", lambda run, weights: bumpy(run, weights))
     start = dataclasses.replace(residual, input_biases=jnp.zeros(5))
     options = dataclasses.replace(OPTIONS, **options)
-    return bumpy, RolloutRun(WRONG, start, courses(WRONG, bars, options), options, 0, None)
+    return bumpy, RolloutRun(WRONG, start, trajectory_batches(WRONG, bars, options), options, 0, None)
 
 
 def to_its_end(run):
-    with Watch(False, None) as watch:
+    with ProgressMonitor(False, None) as watch:
         watch.begin("", run.steps, 0)
         while not run.finished:
             run.advance(run.steps, watch)
@@ -248,7 +248,7 @@ def test_best_held_out_weights_are_kept(bars):
     errors = history["held_out_error"]
     best = np.argmin(errors[:, 1])
     assert errors[0, 0] == 0 and len(history["learning_rate"]) == errors[-1, 0] == errors[best, 0] + 10
-    along = held_out_courses(WRONG, [unseen])
+    along = held_out_batches(WRONG, [unseen])
     np.testing.assert_allclose(tip_error(model, along), errors[best, 1], rtol=1e-9)
 
 
@@ -275,12 +275,12 @@ def test_what_is_compared_must_be_known(bars):
     ]
     for trajectories, options, words in cases:
         with pytest.raises(DataError, match=words) as caught:
-            courses(WRONG, trajectories, RolloutTraining(**options))
+            trajectory_batches(WRONG, trajectories, RolloutTraining(**options))
         assert "\n" not in str(caught.value)
 
 
 def test_a_motion_is_gone_on_with(bars):
     """From a row of the truth the true bar makes no error, with the history of the rows before."""
-    along = courses(BAR, bars, RolloutTraining(first_row=7))
-    found = module.rolled(BAR, along.parts[0], along.settings, along.dt)
+    along = trajectory_batches(BAR, bars, RolloutTraining(first_row=7))
+    found = module.simulated_batch(BAR, along.parts[0], along.settings, along.dt)
     np.testing.assert_allclose(found, along.parts[0].y, atol=1e-7)

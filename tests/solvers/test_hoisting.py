@@ -7,9 +7,9 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.rods.tendon_friction import TendonFriction
-from knode_cosserat.solvers.ahead import in_two
 from knode_cosserat.solvers.grid import at_places
 from knode_cosserat.solvers.history import rest_record
+from knode_cosserat.solvers.hoisting import split_function
 from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.space import SCHEMES
 
@@ -102,7 +102,7 @@ def test_what_follows_from_the_place_is_not_evaluated_again():
         return jnp.exp(parameter) * jnp.sin(s) * y + jnp.cos(y) * s, jnp.tanh(s)
 
     place, y = jnp.array(0.7), jnp.array([0.2, 0.4])
-    parts = in_two(function, place, y)
+    parts = split_function(function, place, y)
     ahead = parts.first(place)
     assert "sin" in primitives(parts.first, place)
     assert not primitives(parts.then, ahead, place, y) & {"sin", "exp", "tanh"}
@@ -117,7 +117,7 @@ def test_derivatives_are_those_that_the_function_states():
         return s * y
 
     stated.defjvp(lambda primals, tangents: (stated(*primals), 7.0 * tangents[1]))
-    parts = in_two(lambda s, y: stated(jnp.sin(s), y), jnp.array(0.7), jnp.array(1.0))
+    parts = split_function(lambda s, y: stated(jnp.sin(s), y), jnp.array(0.7), jnp.array(1.0))
     ahead = parts.first(jnp.array(0.3))
     slope = jax.grad(lambda y: parts.then(ahead, jnp.array(0.3), y))(1.0)
     assert slope == 7.0
@@ -128,7 +128,7 @@ def test_what_has_effects_happens_whenever_it_is_evaluated(capfd):
         jax.debug.print("seen at {}", s)
         return s + y
 
-    parts = in_two(function, jnp.array(0.0), jnp.array(0.0))
+    parts = split_function(function, jnp.array(0.0), jnp.array(0.0))
     ahead = parts.first(jnp.array(0.5))
     for _ in range(2):
         parts.then(ahead, jnp.array(0.5), jnp.array(1.0))

@@ -30,7 +30,7 @@ from knode_cosserat.trajectory import Trajectory
 POSE = ("p", "h")
 
 
-class Past(NamedTuple):
+class InitialRows(NamedTuple):
     """Rows of trajectories (B) up to the initial row of the simulations."""
 
     time: Float[Any, "B rows"]
@@ -39,28 +39,28 @@ class Past(NamedTuple):
     control: Float[Any, "B rows c"]
 
 
-class Course(NamedTuple):
+class TrajectoryBatch(NamedTuple):
     """Trajectories (B) of one length: controls and target states."""
 
-    past: Past | None
+    past: InitialRows | None
     control: Float[Any, "B T c"]
     #: row 0 is the initial state of the simulations
     y: Float[Any, "B T+1 nodes y"]
 
 
 @dataclasses.dataclass(frozen=True)
-class Courses:
+class TrajectoryBatches:
     """All trajectories, grouped by length, with the settings of their simulation."""
 
-    parts: tuple[Course, ...]
+    parts: tuple[TrajectoryBatch, ...]
     compared: tuple[str, ...]
     settings: Settings
     dt: float
 
 
-def courses(
+def trajectory_batches(
     knowledge: System, trajectories: Sequence[Trajectory], options: RolloutTraining, what: str = ""
-) -> Courses:
+) -> TrajectoryBatches:
     """Return trajectories prepared for simulation and comparison; `what` precedes their number in messages.
 
     Raises:
@@ -73,7 +73,7 @@ def courses(
         samples(knowledge, [_relevant(knowledge, one, compared, first) for one in trajectories])
     except DataError as error:
         raise DataError(f"{what}{error}") from None
-    by_length: dict[int, list[Course]] = {}
+    by_length: dict[int, list[TrajectoryBatch]] = {}
     for k, trajectory in enumerate(trajectories):
         name = f"{what}trajectory {k}"
         if first is None and float(trajectory.time[0]) != 0.0:
@@ -89,15 +89,15 @@ def courses(
         by_length.setdefault(stop, []).append(part)
     joined = [jax.tree.map(lambda *leaves: np.stack(leaves), *parts) for parts in by_length.values()]
     settings = trajectories[0].settings or Settings()
-    return Courses(tuple(joined), compared, settings, trajectories[0].dt)
+    return TrajectoryBatches(tuple(joined), compared, settings, trajectories[0].dt)
 
 
-def _course(trajectory: Trajectory, first: int | None, start: int, stop: int) -> Course:
+def _course(trajectory: Trajectory, first: int | None, start: int, stop: int) -> TrajectoryBatch:
     arrays = (trajectory.time, trajectory.y, trajectory.z, trajectory.control)
     time, y, z, control = (np.asarray(array, dtype=float) for array in arrays)
     before = slice(0, start + 1)
-    past = None if first is None else Past(time[before], y[before], z[before], control[before])
-    return Course(past, control[start + 1 : stop], y[start:stop])
+    past = None if first is None else InitialRows(time[before], y[before], z[before], control[before])
+    return TrajectoryBatch(past, control[start + 1 : stop], y[start:stop])
 
 
 def _checked_names(knowledge: System, given: tuple[str, ...] | None) -> tuple[str, ...]:
@@ -130,7 +130,9 @@ def _relevant(knowledge: System, trajectory: Any, names: tuple[str, ...], first:
 # simulating
 
 
-def rolled(model: System, course: Course, settings: Settings, dt: float) -> Float[Any, "B T+1 nodes y"]:
+def simulated_batch(
+    model: System, course: TrajectoryBatch, settings: Settings, dt: float
+) -> Float[Any, "B T+1 nodes y"]:
     """Return y of all trajectories simulated by the model, one after the other; NaN in unsolved steps."""
 
     def one(given: Any) -> Any:
@@ -150,20 +152,20 @@ def rolled(model: System, course: Course, settings: Settings, dt: float) -> Floa
 
 
 @functools.partial(jax.jit, static_argnames=("settings", "dt"))
-def _tip_errors(model: System, parts: tuple[Course, ...], settings: Settings, dt: float) -> Any:
+def _tip_errors(model: System, parts: tuple[TrajectoryBatch, ...], settings: Settings, dt: float) -> Any:
     errors = []
     for course in parts:
-        found = model.positions(rolled(model, course, settings, dt)[:, :, -1])
+        found = model.positions(simulated_batch(model, course, settings, dt)[:, :, -1])
         distance = jnp.sum((found - model.positions(course.y[:, :, -1])) ** 2, axis=-1)
         errors.append(jnp.sqrt(jnp.mean(distance, axis=-1)))
     return jnp.concatenate(errors)
 
 
-def held_out_courses(knowledge: System, trajectories: Sequence[Trajectory]) -> Courses | None:
+def held_out_batches(knowledge: System, trajectories: Sequence[Trajectory]) -> TrajectoryBatches | None:
     """Return trajectories to simulate from rest and compare at the tip; None if there are none.
 
     Raises:
-        DataError: as for `courses`, or the system has no positions.
+        DataError: as for `trajectory_batches`, or the system has no positions.
     """
     if not trajectories:
         return None
@@ -171,10 +173,10 @@ def held_out_courses(knowledge: System, trajectories: Sequence[Trajectory]) -> C
     places = tuple(name for name in known if name.rstrip("0123456789") == "p")
     if not places:
         raise DataError(f"held-out rollouts need positions; y has {', '.join(known)}")
-    return courses(knowledge, trajectories, RolloutTraining(compared=places), what="held-out ")
+    return trajectory_batches(knowledge, trajectories, RolloutTraining(compared=places), what="held-out ")
 
 
-def tip_error(model: System, courses: Courses) -> float:
+def tip_error(model: System, courses: TrajectoryBatches) -> float:
     """Return the rms tip error (m), averaged over trajectories; infinite if a step is not solved."""
     errors = np.asarray(_tip_errors(model, courses.parts, courses.settings, courses.dt))
     return float(np.mean(errors)) if np.all(np.isfinite(errors)) else float("inf")
@@ -183,7 +185,7 @@ def tip_error(model: System, courses: Courses) -> float:
 # the loss
 
 
-def scales(courses: Courses, layout: Layout) -> tuple[float, ...]:
+def scales(courses: TrajectoryBatches, layout: Layout) -> tuple[float, ...]:
     """Return the scale of each compared field's errors: the rms of its motion."""
     found = []
     for name in courses.compared:
@@ -194,18 +196,18 @@ def scales(courses: Courses, layout: Layout) -> tuple[float, ...]:
     return tuple(found)
 
 
-class Aim(NamedTuple):
+class RolloutTargets(NamedTuple):
     """Targets and scales of the loss."""
 
     knowledge: System
     rest: Any
-    parts: tuple[Course, ...]
+    parts: tuple[TrajectoryBatch, ...]
     scales: Any
 
 
 @functools.partial(jax.jit, static_argnames=("compared", "settings", "dt"))
 def loss_and_slope(
-    weights: Any, aim: Aim, compared: tuple[str, ...], settings: Settings, dt: float
+    weights: Any, aim: RolloutTargets, compared: tuple[str, ...], settings: Settings, dt: float
 ) -> tuple[Float[Any, ""], Any]:
     """Return the rollout loss of a residual's weights and its gradient; NaN if a step is not solved.
 
@@ -217,7 +219,7 @@ def loss_and_slope(
         model = KNODE(aim.knowledge, eqx.combine(weights, aim.rest))
         total, count = jnp.zeros(()), 0
         for course in aim.parts:
-            found = rolled(model, course, settings, dt)[:, 1:]
+            found = simulated_batch(model, course, settings, dt)[:, 1:]
             for i, name in enumerate(compared):
                 pair = (model.y_layout.get(y, name) for y in (found, course.y[:, 1:]))
                 error = _difference(name, *pair) / aim.scales[i]
