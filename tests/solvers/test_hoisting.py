@@ -105,9 +105,9 @@ def test_what_follows_from_the_place_is_not_evaluated_again():
     parts = split_function(function, place, y)
     ahead = parts.first(place)
     assert "sin" in primitives(parts.first, place)
-    assert not primitives(parts.then, ahead, place, y) & {"sin", "exp", "tanh"}
-    assert "cos" in primitives(parts.then, ahead, place, y)
-    for one, other in zip(parts.then(ahead, place, y), function(place, y), strict=True):
+    assert not primitives(parts.remainder, ahead, place, y) & {"sin", "exp", "tanh"}
+    assert "cos" in primitives(parts.remainder, ahead, place, y)
+    for one, other in zip(parts.remainder(ahead, place, y), function(place, y), strict=True):
         np.testing.assert_array_equal(one, other)
 
 
@@ -119,7 +119,7 @@ def test_derivatives_are_those_that_the_function_states():
     stated.defjvp(lambda primals, tangents: (stated(*primals), 7.0 * tangents[1]))
     parts = split_function(lambda s, y: stated(jnp.sin(s), y), jnp.array(0.7), jnp.array(1.0))
     ahead = parts.first(jnp.array(0.3))
-    slope = jax.grad(lambda y: parts.then(ahead, jnp.array(0.3), y))(1.0)
+    slope = jax.grad(lambda y: parts.remainder(ahead, jnp.array(0.3), y))(1.0)
     assert slope == 7.0
 
 
@@ -131,7 +131,7 @@ def test_what_has_effects_happens_whenever_it_is_evaluated(capfd):
     parts = split_function(function, jnp.array(0.0), jnp.array(0.0))
     ahead = parts.first(jnp.array(0.5))
     for _ in range(2):
-        parts.then(ahead, jnp.array(0.5), jnp.array(1.0))
+        parts.remainder(ahead, jnp.array(0.5), jnp.array(1.0))
     jax.effects_barrier()
     assert capfd.readouterr().out.count("seen at 0.5") == 2
 

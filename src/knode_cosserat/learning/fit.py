@@ -21,7 +21,7 @@ from knode_cosserat.learning.knode import KNODE, About
 from knode_cosserat.learning.passive import passive, require_bending
 from knode_cosserat.learning.residual import Residual, network
 from knode_cosserat.learning.samples import Dataset, samples, strand_samples
-from knode_cosserat.learning.structured.solved import residuals_of
+from knode_cosserat.learning.structured.closed_form import residuals_of
 from knode_cosserat.learning.training.checkpoint import Checkpoints, Identity, data_hash
 from knode_cosserat.learning.training.descent import standardised
 from knode_cosserat.learning.training.progress import ProgressMonitor

@@ -25,13 +25,13 @@ class _On(enum.IntEnum):
 
 
 class SplitFunction(NamedTuple):
-    """`function(place, state)` in two parts: `then(first(place), place, state)` gives the same result.
+    """`function(place, state)` in two parts: `remainder(first(place), place, state)` gives the same result.
 
     Terms that depend on neither argument are evaluated once, when the function is split.
     """
 
     first: Callable[[Any], list[Any]]
-    then: Callable[[list[Any], Any, Any], Any]
+    remainder: Callable[[list[Any], Any, Any], Any]
     #: the traced equations of `function`; inputs are a place and the arrays of a state
     traced: ClosedJaxpr
 
@@ -76,7 +76,7 @@ def split_function(function: Callable[[Any, Any], Any], place: Any, state: Any) 
     def first(place: Any) -> list[Any]:
         return evaluated(_On.PLACE, {**everywhere, at_place[0]: place}, handed)
 
-    def then(ahead: list[Any], place: Any, state: Any) -> Any:
+    def remainder(ahead: list[Any], place: Any, state: Any) -> Any:
         inputs = {**everywhere, at_place[0]: place}
         inputs |= dict(zip(given, jax.tree.leaves(state), strict=True)) | dict(
             zip(handed, ahead, strict=True)
@@ -84,7 +84,7 @@ def split_function(function: Callable[[Any, Any], Any], place: Any, state: Any) 
         found = evaluated(_On.STATE, inputs, jaxpr.outvars)
         return jax.tree.unflatten(jax.tree.structure(shape), found)
 
-    return SplitFunction(first, then, closed)
+    return SplitFunction(first, remainder, closed)
 
 
 def _variables(*groups: Iterable[Any]) -> list[Var]:

@@ -33,7 +33,7 @@ class Hoisted(NamedTuple):
     """Terms that do not change during Newton's iteration (`ahead.InTwo`), and the function of the rest."""
 
     #: function of (hoisted terms, s, (y, packed record of history)) that returns y_s and z
-    then: Callable[[Any, Any, Any], Any]
+    remainder: Callable[[Any, Any, Any], Any]
     #: hoisted terms at all places of all strands
     terms: Any
     #: columns of the Jacobian with respect to a strand's y that may be nonzero
@@ -95,7 +95,7 @@ class StepProblem(eqx.Module):
         parts = split_function(at_point, places[0], (jnp.zeros(strand.y_layout.size), record))
         # if y does not enter the equations: one column of zeros
         columns = nonzero_columns(parts.traced, 1).tolist() or [0]
-        hoisted = Hoisted(parts.then, jax.vmap(parts.first)(places), tuple(columns))
+        hoisted = Hoisted(parts.remainder, jax.vmap(parts.first)(places), tuple(columns))
         return dataclasses.replace(self, hoisted=hoisted)
 
     @property
@@ -201,7 +201,7 @@ class StepProblem(eqx.Module):
     def _at_point(self, s: Any, y: Any, history: Any, terms: Any) -> Any:
         if self.hoisted is None:
             return self.point_rates(s, y, history)
-        return self.hoisted.then(terms, s, (y, history))
+        return self.hoisted.remainder(terms, s, (y, history))
 
     def _ends(self, y: Float[Any, "points y"], every: bool) -> tuple[slice, Any]:
         """Return the places at the ends of pieces that the scheme uses (all if `every`), and y there."""

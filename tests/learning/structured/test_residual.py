@@ -12,7 +12,7 @@ from examples.hanging_string import HangingString
 from knode_cosserat.learning.config import StructuredOptions
 from knode_cosserat.learning.explain import explain
 from knode_cosserat.learning.knode import KNODE
-from knode_cosserat.learning.structured.solved import residuals_of
+from knode_cosserat.learning.structured.closed_form import residuals_of
 from knode_cosserat.studies import truths
 from tests.learning.bar import BAR, pulled
 
