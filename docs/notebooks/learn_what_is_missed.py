@@ -43,9 +43,8 @@ print(f"length: {0.4 * (1 + kc.explain(model)[0].coefficient):.6f} m, and truly 
 unseen = kc.controls.random(steps, low=4.0, high=9.0, seed=1, hold=8)
 truth, before, after = (kc.simulate(each, unseen, DT) for each in (robot, knowledge, model))
 for label, found in (("before", before), ("after", after)):
-    print(
-        f"{label:7} tip RMSE {kc.metrics.tip_rmse(found, truth):.1e} m, pose MSE {kc.metrics.pose_mse(found, truth):.1e}e-3"
-    )
+    rmse, mse = kc.metrics.tip_rmse(found, truth), kc.metrics.pose_mse(found, truth)
+    print(f"{label:7} tip RMSE {rmse:.1e} m, pose MSE {mse:.1e}e-3")
 
 # %%
 kc.figures.compare(truth, {"before": before, "after": after})
