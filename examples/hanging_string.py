@@ -10,21 +10,20 @@ import numpy as np
 import typer
 
 import knode_cosserat as kc
+from knode_cosserat.robots import Layout, parameter
 
 
 class HangingString(kc.System):
     """A string pinned at the origin; the control is the position of the other end."""
 
-    y_layout: ClassVar = kc.robots.Layout(
-        ("p", 2, "m", "place"), ("n", 2, "N", "force"), ("q", 2, "m/s", "speed")
-    )
-    z_layout: ClassVar = kc.robots.Layout(("T", 1, "N", "tension"))
-    control_layout: ClassVar = kc.robots.Layout(("hand", 2, "m", "position of the hand"))
+    y_layout: ClassVar = Layout(("p", 2, "m", "place"), ("n", 2, "N", "force"), ("q", 2, "m/s", "speed"))
+    z_layout: ClassVar = Layout(("T", 1, "N", "tension"))
+    control_layout: ClassVar = Layout(("hand", 2, "m", "position of the hand"))
     base_unknowns: ClassVar = ("n",)
-    length: Any = kc.robots.parameter("m", "unstretched length", low=0.01, high=100.0)
-    density: Any = kc.robots.parameter("kg/m", "mass per length", low=1e-6, high=100.0)
-    stiffness: Any = kc.robots.parameter("N", "EA", low=1e-3, high=1e9)
-    friction: Any = kc.robots.parameter("kg/(m s)", "drag of the air", low=0.0, high=100.0, default=0.0)
+    length: Any = parameter("m", "unstretched length", low=0.01, high=100.0)
+    density: Any = parameter("kg/m", "mass per length", low=1e-6, high=100.0)
+    stiffness: Any = parameter("N", "EA", low=1e-3, high=1e9)
+    friction: Any = parameter("kg/(m s)", "drag of the air", low=0.0, high=100.0, default=0.0)
 
     def constitutive(self, s, t, y, y_t, control):  # C z + D z_t = f2
         return jnp.eye(1), jnp.zeros((1, 1)), jnp.linalg.norm(y[2:4])[None]

@@ -107,6 +107,7 @@ def errors():
         for thing in vars(module).values()
         if isinstance(thing, type)
         and issubclass(thing, BaseException)
+        and not issubclass(thing, Warning)
         and thing.__module__.startswith(kc.__name__)
     }
 

@@ -2,6 +2,7 @@
 
 import builtins
 import dataclasses
+import importlib
 import importlib.metadata
 import json
 import math
@@ -12,7 +13,6 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.learning import fit as module
 from knode_cosserat.learning.config import FitConfig, NetworkOptions, RolloutTraining, Training
 from knode_cosserat.learning.fit import fit
 from knode_cosserat.learning.knode import KNODE
@@ -22,6 +22,9 @@ from knode_cosserat.learning.training.progress import WatchError
 from knode_cosserat.learning.training.runs import FitError
 from knode_cosserat.rods.wrapped import Wrapped
 from tests.learning.bar import BAR, WRONG, pulled
+
+#: the package has its function under the same name
+module = importlib.import_module("knode_cosserat.learning.fit")
 
 SMALL = FitConfig.network(hidden=5, epochs=500)
 

@@ -48,6 +48,8 @@ def test_parts_without_a_value_are_none():
 
 
 def test_a_wrong_value_is_refused():
-    with pytest.raises(RobotFileError, match=r"^old.yaml: friction.wobble is -1"):
+    with pytest.raises(
+        RobotFileError, match=r"^old.yaml: friction.wobble must be between 0 and 100 1/m \(got -1"
+    ):
         old(friction="-1.0")
     assert issubclass(RobotFileError, ValueError) and kc.robots.RobotFileError is RobotFileError

@@ -104,7 +104,7 @@ def test_bad_recordings_are_named_in_one_line(tmp_path):
     [
         (("nowhere",), "no recordings found"),
         ((FOLDER, "--train", "beam_load99"), "there is no recording 'beam_load99'"),
-        ((FOLDER, "--load", "beam_run3"), "allowed is NAME=GRAMS"),
+        ((FOLDER, "--load", "beam_run3"), "--load must be NAME=GRAMS"),
         ((FOLDER, "--load", "beam_run3=30"), "there is no recording 'beam_run3'"),
     ],
 )

@@ -265,9 +265,9 @@ def test_the_server_gives_the_page_and_nothing_else(truth):
     [
         ([], "no trajectory is given"),
         (["nothing.nc"], "nothing.nc: no such file"),
-        (["robot.yaml"], "not a trajectory; a robot or model is shown by view --live"),
+        (["robot.yaml"], "not a trajectory. To show a robot or model, type: knode-cosserat view --live"),
         (["truth.nc", "--export", "nowhere/scene.html"], "there is no folder nowhere"),
-        (["truth.nc", "--set", "length=0.4"], "belong to --live"),
+        (["truth.nc", "--set", "length=0.4"], "use them with --live"),
         (["--live", "--export", "a.html"], "exclude each other"),
         (["--live", "a", "b"], "one robot or model"),
         (["truth.nc", "--port", "70000", "--no-open"], "port is 70000"),
