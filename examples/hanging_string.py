@@ -10,7 +10,7 @@ import numpy as np
 import typer
 
 import knode_cosserat as kc
-from knode_cosserat.robots import Layout, parameter
+from knode_cosserat.robots import Layout, Scales, parameter
 
 
 class HangingString(kc.System):
@@ -31,8 +31,7 @@ class HangingString(kc.System):
     def balance(self, s, t, y, y_t, z, z_t, control):  # A y_s + B y_st = f1
         p_s = (1.0 + z / self.stiffness) * y[2:4] / z
         n_s = self.density * (y_t[4:6] + jnp.array([0.0, 9.81])) + self.friction * y[4:6]
-        B = jnp.zeros((6, 6)).at[4:, :2].set(-jnp.eye(2))
-        return jnp.eye(6), B, jnp.concatenate([p_s, n_s, jnp.zeros(2)])
+        return jnp.eye(6), jnp.zeros((6, 6)).at[4:, :2].set(-jnp.eye(2)), jnp.stack([*p_s, *n_s, 0.0, 0.0])
 
     def rest(self, s):  # where iterations start: the parabola of a string that sags a little
         x = s / self.length - 0.5
@@ -44,7 +43,7 @@ class HangingString(kc.System):
 
     def scales(self):  # natural sizes of y, and of what is left at the tip
         sizes = jnp.stack([self.length, 9.81 * self.density * self.length, (9.81 * self.length) ** 0.5])
-        return kc.robots.Scales(jnp.repeat(sizes, 2), jnp.repeat(sizes[0], 2))
+        return Scales(jnp.repeat(sizes, 2), jnp.repeat(sizes[0], 2))
 
 
 def main(out: str = "hanging_string.png", steps: int = 100) -> kc.Trajectory:
