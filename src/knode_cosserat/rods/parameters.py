@@ -389,8 +389,7 @@ def _place_number(value: Any) -> Any:
 
 def _place_numbers(value: Any) -> Any:
     """Return places as a tuple, which can be compared and hashed; `checked` judges anything else."""
-    several = isinstance(value, tuple | list | np.ndarray)
-    return tuple(_place_number(each) for each in value) if several else value
+    return tuple(map(_place_number, value)) if isinstance(value, tuple | list | np.ndarray) else value
 
 
 def _as_matrix(value: Any) -> Any:
