@@ -69,11 +69,16 @@ def every_figure(trajectory, recording):
     }
 
 
+def windows():
+    """Figures that pyplot shows; other tests may have opened some."""
+    return sys.modules["matplotlib.pyplot"].get_fignums() if "matplotlib.pyplot" in sys.modules else []
+
+
 def test_every_figure_is_drawn_without_a_warning_and_no_window_is_needed(trajectory, recording):
+    before = windows()
     for figure in every_figure(trajectory, recording).values():
         assert drawn(figure).startswith(b"\x89PNG")
-    if "matplotlib.pyplot" in sys.modules:
-        assert not sys.modules["matplotlib.pyplot"].get_fignums()
+    assert windows() == before
 
 
 def test_every_axis_says_what_it_shows_in_which_unit(trajectory, recording):
