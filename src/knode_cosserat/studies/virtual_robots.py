@@ -9,7 +9,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.virtual import commands, record_virtual
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.tendon_rod import TendonRod
+from knode_cosserat.solvers.result import SimulationError
 from knode_cosserat.studies.report import Report, as_json, write_texts
 from knode_cosserat.studies.runner import Job, Product, run
 
@@ -34,6 +35,8 @@ TRAIN = {"sine_1p0": "sine:1.0", "sine_3p0": "sine:3.0", "rand_0": "random:0"}
 UNSEEN = {"sine_2p0": "sine:2.0", "rand_1": "random:1"}
 #: part of each recording that is used (s): rest, and motion
 START, END = 0.5, 7.5
+#: most draws of a robot, and the distance of their seeds
+DRAWS, APART = 5, 1000
 #: the robot that all of them are by their data sheet
 NOMINAL = "delrin-tendon-robot"
 
@@ -83,12 +86,36 @@ def recordings_of(truth: Imperfect, signals: Mapping[str, str], seed: int) -> li
     return found
 
 
+class _Recorded(NamedTuple):
+    """A virtual robot, its training and held-out recordings, and the number of draws before it."""
+
+    truth: Imperfect
+    given: list[Measurements]
+    unseen: list[Measurements]
+    redrawn: int
+
+
+def _recorded(seed: int) -> _Recorded:
+    """Return a robot and its recordings; a robot that collapses under the tensions is drawn again.
+
+    Raises:
+        SimulationError: all draws collapse.
+    """
+    for redrawn in range(DRAWS):
+        truth = drawn_robot(seed + APART * redrawn)
+        try:
+            given = recordings_of(truth, TRAIN, seed)
+            return _Recorded(truth, given, recordings_of(truth, UNSEEN, 1000 + seed), redrawn)
+        except SimulationError:
+            if redrawn == DRAWS - 1:
+                raise
+    raise AssertionError("unreachable")
+
+
 def robot_facts(settings: Any) -> Product:
     """Return the identification's result for one robot, and its prediction errors."""
     seed = int(settings["seed"])
-    truth = drawn_robot(seed)
-    given = recordings_of(truth, TRAIN, seed)
-    unseen = recordings_of(truth, UNSEEN, 1000 + seed)
+    truth, given, unseen, redrawn = _recorded(seed)
     found = identify(nominal_robot(), given)
     learned = with_residual(nominal_robot(), given, found)
     outcomes = {}
@@ -103,6 +130,7 @@ def robot_facts(settings: Any) -> Product:
         }
     facts = {
         "seed": seed,
+        "redrawn": redrawn,
         "true_effects": list(truth.effects),
         "true_values": dict(truth.values),
         "identified": found.to_dict(),
