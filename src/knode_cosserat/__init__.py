@@ -2,8 +2,8 @@
 
 The names that a first script needs are here; start with `load_robot`, `simulate` and `Trajectory`. All other
 public names are in the namespaces `robots`, `solvers`, `learning`, `calibration`, `recordings`, `statics`,
-`identification`, `metrics`, `figures`, `viewer`, `controls` and `named_controls`. Events are logged to the
-logger "knode_cosserat", which is quiet unless a handler is added.
+`estimation`, `control`, `identification`, `metrics`, `figures`, `viewer`, `controls` and `named_controls`.
+Events are logged to the logger "knode_cosserat", which is quiet unless a handler is added.
 """
 
 import importlib
@@ -14,7 +14,9 @@ import warnings
 from knode_cosserat import _jax as _jax  # isort: split  (first: it sets JAX up)
 from knode_cosserat import (
     calibration,
+    control,
     controls,
+    estimation,
     figures,
     identification,
     learning,
@@ -55,10 +57,12 @@ __all__ = [
     "calibrate",
     "calibration",
     "catalog",
+    "control",
     "controls",
     "doctor",
     "equilibrium",
     "estimate_states",
+    "estimation",
     "explain",
     "figures",
     "fit",

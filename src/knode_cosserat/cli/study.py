@@ -51,6 +51,29 @@ def simulation(
 
 
 @studies.command(
+    "control", epilog=examples("study control --out results", "study control --quick --out results")
+)
+def closed_loop(
+    out: Out,
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer and shorter runs: about 10 min.")] = False,
+    workers: Workers = None,
+    dask: Dask = None,
+    progress: Progress = None,
+    as_json: Json = False,
+) -> None:
+    """Compare controllers in closed loop, with exact and with wrong models.
+
+    Writes tracking errors of predictive control and of its baselines, and checks of limits, observers,
+    adaptation and times (control.md; control.json: check, value, limit, ok). Times are those of this machine.
+    Resumes an earlier run in the same folder.
+    """
+    prepare(out, workers, dask)
+    from knode_cosserat.studies.control import rerun
+
+    run_study(lambda **how: rerun(out, quick, **how), {"quick": quick}, out, workers, dask, progress, as_json)
+
+
+@studies.command(
     epilog=examples(
         "study imperfections --out results",
         "study imperfections --out results --only 'damping,tip mass' --seeds 1",

@@ -23,9 +23,10 @@ from knode_cosserat.solvers.history import constant_history, resting_history
 from knode_cosserat.solvers.places import Places, places_at, positions_at, quaternions_at
 from knode_cosserat.solvers.run import run_one, usable_cores
 from knode_cosserat.solvers.run_types import FirstStep, InitialCondition, RunSettings
-from knode_cosserat.solvers.sensitivity import tangent_piece
+from knode_cosserat.solvers.sensitivity import TangentState, tangent_piece
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.solvers.tangent import SystemMoves
 
 #: rows of one compiled program with derivatives
 PIECE = 40
@@ -193,7 +194,8 @@ class Misfit:
         if data.static:
             # an equilibrium depends on no history
             d_begun = tuple(np.zeros_like(each) for each in d_begun)
-        parts, carry = [d_first[:, None, :, :ny]], (begun, *d_begun)
+        parts = [d_first[:, None, :, :ny]]
+        carry = TangentState.of(system, settings, begun, *d_begun)
         for k in range(0, steps, PIECE):
             size = min(PIECE, steps - k)
             parts_of = (found.records, found.unknowns, acting, slope)
@@ -219,19 +221,12 @@ class Misfit:
         rows, xi = (_filled(each[:1], PIECE) for each in (first.records, first.unknowns))
         tension = np.broadcast_to(data.initial_tension, (PIECE, len(data.initial_tension)))
         none = (np.zeros((self.model.size, *np.shape(each))) for each in (past.records, past.rate))
+        state = TangentState.of(_system(self.model.robot, x), self.settings, past, *none)
+        no_latency = np.zeros_like(tension)
         after, d_rows = _piece(
-            self.model.robot,
-            x,
-            self.settings,
-            STILL,
-            data.dt,
-            rows,
-            xi,
-            tension,
-            np.zeros_like(tension),
-            (past, *none),
+            self.model.robot, x, self.settings, STILL, data.dt, rows, xi, tension, no_latency, state
         )
-        return np.asarray(d_rows)[:, 0], after[1:]
+        return np.asarray(d_rows)[:, 0], (after.d_records, after.d_rate)
 
 
 def _cells(system: Any) -> LoadCells | None:
@@ -273,22 +268,22 @@ _initial = jax.jit(constant_history, static_argnames="settings")
 @functools.partial(jax.jit, static_argnames="settings")
 def _piece(
     robot: ParametrisedRobot, x: Any, settings: Settings, table: Any, dt: Any, rows: Any, xi: Any,
-    controls: Any, by_latency: Any, carry: Any,
+    controls: Any, by_latency: Any, carry: TangentState,
 ) -> Any:  # fmt: skip
-    """Derivatives of a piece's rows, and the history after it; `by_latency` are those of the controls."""
-    past, d_records, d_rate = carry
+    """Return the state after a piece, and the derivatives of its rows; `by_latency` are those of controls."""
+    directions = jnp.eye(len(x))
+    system, by_x = jax.vmap(lambda d: jax.jvp(robot, (x,), (d,)), out_axes=(None, 0))(directions)
 
     def one(direction: Any, d_records: Any, d_rate: Any) -> Any:
-        system, d_system = jax.jvp(robot, (x,), (direction,))
-        cells = _cells(d_system)
+        cells = _cells(jax.tree.map(lambda leaf: jnp.tensordot(direction, leaf, 1), by_x))
         d_controls = jnp.zeros_like(controls) if cells is None else by_latency * cells.latency
-        return tangent_piece(
-            settings, table, dt, rows, xi, system, controls, past, d_system, d_controls, d_records, d_rate
-        )
+        state = carry._replace(d_records=d_records, d_rate=d_rate)
+        moves, solved = SystemMoves(by_x, direction), (rows, xi)
+        return tangent_piece(settings, table, dt, solved, system, controls, state, moves, d_controls)
 
-    axes = ((None, 0, 0), (0, 0))
-    (past, d_records, d_rate), (d_rows, _) = jax.vmap(one, out_axes=axes)(jnp.eye(len(x)), d_records, d_rate)
-    return (past._replace(t0=past.t0 + PIECE * dt), d_records, d_rate), d_rows
+    each = TangentState(None, None, 0, 0, None)
+    after, (d_rows, _) = jax.vmap(one, out_axes=(each, (0, 0)))(directions, carry.d_records, carry.d_rate)
+    return after._replace(t0=after.t0 + PIECE * dt), d_rows
 
 
 @jax.jit

@@ -38,6 +38,8 @@ class Hoisted(NamedTuple):
     terms: Any
     #: columns of the Jacobian with respect to a strand's y that may be nonzero
     columns: tuple[int, ...]
+    #: the same for a strand's packed record of history
+    history_columns: tuple[int, ...]
 
 
 def no_history(system: System, space: SpaceScheme) -> Float[Any, "places x"]:
@@ -91,11 +93,11 @@ class StepProblem(eqx.Module):
         def at_point(s: Any, state: tuple[Any, Any]) -> Any:
             return self.point_rates(s, *state)
 
-        record = self._history_by_strand(self.history[:1])[0]
+        record = self.history_by_strand(self.history[:1])[0]
         parts = split_function(at_point, places[0], (jnp.zeros(strand.y_layout.size), record))
         # if y does not enter the equations: one column of zeros
-        columns = nonzero_columns(parts.traced, 1).tolist() or [0]
-        hoisted = Hoisted(parts.remainder, jax.vmap(parts.first)(places), tuple(columns))
+        columns, of_history = (tuple(nonzero_columns(parts.traced, k).tolist()) or (0,) for k in (1, 2))
+        hoisted = Hoisted(parts.remainder, jax.vmap(parts.first)(places), columns, of_history)
         return dataclasses.replace(self, hoisted=hoisted)
 
     @property
@@ -103,6 +105,20 @@ class StepProblem(eqx.Module):
         """Columns of the Jacobian with respect to a strand's y that may be nonzero; all if not `ready`."""
         every = np.arange(self.system.strand.y_layout.size)
         return every if self.hoisted is None else np.array(self.hoisted.columns, dtype=int)
+
+    @property
+    def history_columns(self) -> np.ndarray:
+        """Columns with respect to a strand's history that may be nonzero, of a `ready` problem."""
+        assert self.hoisted is not None
+        return np.array(self.hoisted.history_columns, dtype=int)
+
+    def with_data(self, history: Float[Any, "places x"], control: Any) -> StepProblem:
+        """Return the same problem with another history and control."""
+        return dataclasses.replace(self, history=history, control=control, hoisted=None)
+
+    def of_system(self, system: System) -> StepProblem:
+        """Return the same problem of another system."""
+        return dataclasses.replace(self, system=system, hoisted=None)
 
     def with_history(self, history: Float[Any, "places x"]) -> StepProblem:
         """Return the same problem with another history."""
@@ -134,7 +150,7 @@ class StepProblem(eqx.Module):
         """Return y on the far side of the active discontinuities."""
         return self.system.jump(acting, self.t, y, self.control, self._unpack(history))
 
-    def _far(self, y: Float[Any, "points y"]) -> Float[Any, "pieces y"]:
+    def far(self, y: Float[Any, "points y"]) -> Float[Any, "pieces y"]:
         """Return y where pieces start, on the far side of their discontinuities."""
         grid = self.grid
         if not self.system.jumps:
@@ -189,14 +205,22 @@ class StepProblem(eqx.Module):
         f, slopes = self._side_by_side(at_point, lanes, y)
         return self._joined(f), slopes
 
+    def lanes(self, lanes: slice, y: Float[Any, "n y"]) -> tuple[Any, Any, Any]:
+        """Return arclength (m), y and packed history of the strands at places."""
+        return (
+            self._each_strand(self.places[lanes]),
+            self.by_strand(y),
+            self.history_by_strand(self.history[lanes]),
+        )
+
     def _side_by_side(self, function: Any, lanes: slice, y: Any) -> Any:
         """Apply a function of (s, y, history, hoisted terms) at places (last axis of the result)."""
         terms = None if self.hoisted is None else self.hoisted.terms
         s, terms = jax.tree.map(lambda each: self._each_strand(each[lanes]), (self.places, terms))
-        history = self._history_by_strand(self.history[lanes])
+        history = self.history_by_strand(self.history[lanes])
         # places last inside: XLA then vectorises over them
         each = jax.vmap(function, in_axes=(0, -1, -1, 0), out_axes=-1)
-        return each(s, self._by_strand(y).T, history.T, terms)
+        return each(s, self.by_strand(y).T, history.T, terms)
 
     def _at_point(self, s: Any, y: Any, history: Any, terms: Any) -> Any:
         if self.hoisted is None:
@@ -205,9 +229,14 @@ class StepProblem(eqx.Module):
 
     def _ends(self, y: Float[Any, "points y"], every: bool) -> tuple[slice, Any]:
         """Return the places at the ends of pieces that the scheme uses (all if `every`), and y there."""
-        grid, far = self.grid, self._far(y)
+        far = self.far(y)
         if not (every or self.space.implicit):
-            return slice(0, grid.tip), far
+            return slice(0, self.grid.tip), far
+        return self.all_ends(y, far)
+
+    def all_ends(self, y: Float[Any, "points y"], far: Any) -> tuple[slice, Any]:
+        """Return the places at all ends of pieces, and y there, from y on the near and far sides."""
+        grid = self.grid
         return slice(0, grid.ends), jnp.concatenate([far, y[-1:], taken(y, grid.near)])
 
     def lengths(self) -> Float[Any, "pieces 1"]:
@@ -215,7 +244,7 @@ class StepProblem(eqx.Module):
         low, high = self._bounds
         return (high - low)[:, None]
 
-    def _at_ends(self, values: Any) -> tuple[Any, Any]:
+    def at_ends(self, values: Any) -> tuple[Any, Any]:
         """Return values at the starts and at the ends of pieces; 0 at the ends if they were not evaluated."""
         grid = self.grid
         end = taken(values, grid.end_of) if len(values) > grid.tip else jnp.zeros(())
@@ -227,9 +256,9 @@ class StepProblem(eqx.Module):
         Without known stages, only those ends of pieces are evaluated that the scheme uses (`ends` gives all).
         """
         found = self.ends(y, every=False) if known is None else Stages(*map(list, known))
-        rates = [*self._at_ends(found.f[0]), *found.f[1:]]
+        rates = [*self.at_ends(found.f[0]), *found.f[1:]]
         for k in range(len(found.f) - 1, len(formula.stages)):
-            between = self._between(formula.stages[k], found.y[0][: self.grid.tip], y[1:], rates)
+            between = self.between(formula.stages[k], found.y[0][: self.grid.tip], y[1:], rates)
             f, z = self._evaluated(self.grid.stage(k), between)
             rates.append(f)
             for values, new in zip(found, (between, f, z), strict=True):
@@ -242,13 +271,14 @@ class StepProblem(eqx.Module):
         f, z = self._evaluated(lanes, ends)
         return Stages([ends], [f], [z])
 
-    def _between(self, stage: Any, start: Any, end: Any, rates: list[Any]) -> Any:
+    def between(self, stage: Any, start: Any, end: Any, rates: list[Any]) -> Any:
+        """Return y at a stage, from y at both ends of the pieces and earlier rates."""
         moved = sum(x * f for x, f in zip(stage.rates, rates, strict=False) if x)
         return (1.0 - stage.end) * start + stage.end * end + self.lengths() * moved
 
     def reached_by(self, formula: Formula, found: Stages) -> Float[Any, "pieces y"]:
         """Return y at the ends of pieces by a formula, from its stages."""
-        rates = [*self._at_ends(found.f[0]), *found.f[1:]]
+        rates = [*self.at_ends(found.f[0]), *found.f[1:]]
         moved = sum(b * f for b, f in zip(formula.weights, rates, strict=False) if b)
         return found.y[0][: self.grid.tip] + self.lengths() * moved
 
@@ -275,12 +305,12 @@ class StepProblem(eqx.Module):
         grid, formula, used = self.grid, self.space.formula, self.columns
         lanes, ends = self._ends(y, every=False)
         f, slopes = self._linearised(lanes, ends)
-        rates = [*self._at_ends(f)]
+        rates = [*self.at_ends(f)]
         h, eye = self._each_strand(self.lengths()[:, 0]), jnp.eye(slopes.shape[0])[:, used, None]
         start, end = self._slopes_at_ends(slopes)
         by_start, by_end = [start, 0.0], [0.0, end]
         for k, stage in enumerate(formula.stages):
-            between = self._between(stage, ends[: grid.tip], y[1:], rates)
+            between = self.between(stage, ends[: grid.tip], y[1:], rates)
             f, slopes = self._linearised(grid.stage(k), between)
             rates.append(f)
             for ways, part in ((by_start, 1.0 - stage.end), (by_end, stage.end)):
@@ -345,13 +375,15 @@ class StepProblem(eqx.Module):
     def _each_strand(self, values: Shaped[Any, "n ..."]) -> Shaped[Any, "n_strands ..."]:
         return jnp.repeat(values, self.system.strands, axis=0) if self.system.strands > 1 else values
 
-    def _by_strand(self, rows: Float[Any, "n x"]) -> Float[Any, "n_strands x_of_strand"]:
+    def by_strand(self, rows: Float[Any, "n x"]) -> Float[Any, "n_strands x_of_strand"]:
+        """Return rows of y or z split by strand."""
         own = in_strands(self.system, rows)
         return own.reshape(-1, own.shape[-1])
 
     def _joined(self, values: Float[Any, "x_of_strand n_strands"]) -> Float[Any, "n x"]:
         return values.T.reshape(values.shape[-1] // self.system.strands, -1)
 
-    def _history_by_strand(self, records: Float[Any, "n x"]) -> Float[Any, "n_strands own"]:
+    def history_by_strand(self, records: Float[Any, "n x"]) -> Float[Any, "n_strands own"]:
+        """Return packed records of history split by strand."""
         own = records_in_strands(self.system, records)
         return own.reshape(-1, own.shape[-1])

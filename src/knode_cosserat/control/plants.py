@@ -1,0 +1,127 @@
+"""Plants: robots that a loop moves and measures. Simulated ones are here; hardware has its own drivers."""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+from collections import deque
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.estimation.outputs import Output
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.stepper import Stepper
+from knode_cosserat.trajectory import Trajectory
+
+
+@dataclasses.dataclass(frozen=True)
+class Sensor:
+    """Sensor of a simulated plant.
+
+    Attributes:
+        output: the measured output.
+        noise: multiple of the output's standard deviations; 0 for exact measurements.
+        latency: age of a measurement in periods.
+        dropout: probability that a measurement is lost.
+        seed: of the noise.
+    """
+
+    output: Output
+    noise: float = 0.0
+    latency: int = 0
+    dropout: float = 0.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.dropout < 1.0:
+            raise ValueError(f"dropout is {self.dropout}; allowed is 0 to less than 1")
+        if self.latency < 0 or self.noise < 0.0:
+            raise ValueError("latency and noise must not be negative")
+
+
+class Plant(abc.ABC):
+    """A robot that moves by one period at a time."""
+
+    #: period (s)
+    dt: float
+
+    @abc.abstractmethod
+    def start(self) -> Float[np.ndarray, " c"]:
+        """Go to the start, and return the control that acts there."""
+
+    @abc.abstractmethod
+    def measure(self) -> Float[np.ndarray, " p"]:
+        """Return the measurement of this time; NaN if it was lost."""
+
+    @abc.abstractmethod
+    def apply(self, control: Float[np.ndarray, " c"]) -> None:
+        """Move on by one period under a control."""
+
+    def tip(self) -> Float[np.ndarray, "3"]:
+        """Return the true position of the tip (m), for the report; NaN if it is not known."""
+        return np.full(3, np.nan)
+
+
+class SimulatedPlant(Plant):
+    """A simulated robot, which may differ from the controller's model, with a sensor."""
+
+    def __init__(
+        self,
+        robot: System,
+        dt: float,
+        sensor: Sensor,
+        *,
+        substeps: int = 1,
+        initial: Trajectory | None = None,
+    ):
+        """Set up the robot at rest, or at the last row of a trajectory.
+
+        Args:
+            robot: the true robot.
+            dt: period (s).
+            sensor: what is measured, and how well.
+            substeps: steps of the simulation in each period.
+            initial: a motion or equilibrium from which it moves on.
+        """
+        self.robot, self.dt, self.sensor = robot, float(dt), sensor
+        self._substeps, self._initial = substeps, initial
+        self.start()
+
+    def start(self) -> Float[np.ndarray, " c"]:
+        """Go to the start, and return the control that acts there."""
+        self._stepper = Stepper(self.robot, self.dt / self._substeps, initial=self._initial)
+        self._random = np.random.default_rng(self.sensor.seed)
+        self._queue: deque[Any] = deque(maxlen=self.sensor.latency + 1)
+        self._sense()
+        return np.asarray(self._stepper.state.control[-1])
+
+    def apply(self, control: Float[np.ndarray, " c"]) -> None:
+        """Move on by one period under a control."""
+        for _ in range(self._substeps):
+            self._stepper.step(control)
+        self._sense()
+
+    def _sense(self) -> None:
+        state, output = self._stepper.state, self.sensor.output
+        value = np.array(output.value(self.robot, np.asarray(state.y[-1]), np.asarray(state.z[-1])))
+        if self.sensor.noise and len(output.noise) == len(value):
+            value = value + self.sensor.noise * output.noise * self._random.normal(size=len(value))
+        if self._random.uniform() < self.sensor.dropout:
+            value = np.full(len(value), np.nan)
+        self._queue.append(value)
+
+    def measure(self) -> Float[np.ndarray, " p"]:
+        """Return the measurement of this time, or an older one if the sensor has latency."""
+        return np.array(self._queue[0])
+
+    @property
+    def state(self) -> Trajectory:
+        """True state, a trajectory of one row."""
+        return self._stepper.state
+
+    def tip(self) -> Float[np.ndarray, "3"]:
+        """Return the true position of the tip (m)."""
+        y = np.asarray(self._stepper.state.y[-1, -1:])
+        return np.asarray(self.robot.positions(y))[-1]

@@ -1,0 +1,63 @@
+"""Predictions of a model over a horizon, linearised by the plan and by the state's uncertain directions."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Float
+
+from knode_cosserat.estimation.online import (
+    directions_of,
+    errors_along,
+    rollout_with_tangents,
+    split_record,
+)
+
+
+class Prediction(NamedTuple):
+    """Outputs of a predicted motion and their derivatives."""
+
+    #: error of the tracked output from the reference
+    error: Float[Any, "T e"]
+    by_plan: Float[Any, "n T e"]
+    by_state: Float[Any, "m T e"]
+    #: constrained outputs
+    limited: Float[Any, "T q"]
+    limited_by_plan: Float[Any, "n T q"]
+    limited_by_state: Float[Any, "m T q"]
+    #: positions of the tip (m)
+    path: Float[Any, "T 3"]
+    solved: Any
+
+
+@functools.partial(jax.jit, static_argnames=("settings", "target", "limited"))
+def linearised_prediction(  # type: ignore[no-untyped-def]
+    robot, x, past, spread, plan, basis, reference, dt, table, settings, target, limited, parameters
+):
+    """Return the `Prediction` of a plan (knots, c) by its `basis` (T, knots), from a state."""
+    system, directions = directions_of(robot, parameters, x)
+    (count, c), (steps, m) = plan.shape, (len(basis), len(spread.records))
+    of_plan = jnp.einsum("tk,ij->kjti", basis, jnp.eye(c)).reshape(count * c, steps, c)
+
+    def extended(part: Any) -> Any:
+        return jnp.concatenate([jnp.zeros((count * c, *part.shape[1:])), part])
+
+    wide = jax.tree.map(extended, spread)
+    d_controls = jnp.concatenate([of_plan, jnp.zeros((m, steps, c))])
+    found = rollout_with_tangents(
+        system, settings, table, dt, past, basis @ plan, wide, d_controls, directions
+    )
+    error, slopes = errors_along(system, target, found.records, found.d_records, reference)
+    path = system.positions(split_record(system, found.records[:, -1])[0])
+    values, moved = [jnp.zeros((steps, 0))], [jnp.zeros((count * c + m, steps, 0))]
+    for output in limited:
+        zero = jnp.zeros((steps, output.size))
+        value, slope = errors_along(system, output, found.records, found.d_records, zero)
+        values.append(value)
+        moved.append(slope)
+    value, slope = jnp.concatenate(values, axis=-1), jnp.concatenate(moved, axis=-1)
+    n = count * c
+    return Prediction(error, slopes[:n], slopes[n:], value, slope[:n], slope[n:], path, found.solved)

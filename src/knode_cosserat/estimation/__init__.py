@@ -1,0 +1,29 @@
+"""Online estimation: states and parameters of a moving robot from incomplete measurements."""
+
+from knode_cosserat.estimation.adapted import Adapted
+from knode_cosserat.estimation.boundary import BoundaryObserver
+from knode_cosserat.estimation.observer import Estimate, KalmanObserver, ObserverError
+from knode_cosserat.estimation.outputs import (
+    BaseWrench,
+    BodyPoses,
+    BodyPositions,
+    Curvatures,
+    Output,
+    TipPose,
+    TipPosition,
+)
+
+__all__ = [
+    "Adapted",
+    "BaseWrench",
+    "BodyPoses",
+    "BodyPositions",
+    "BoundaryObserver",
+    "Curvatures",
+    "Estimate",
+    "KalmanObserver",
+    "ObserverError",
+    "Output",
+    "TipPose",
+    "TipPosition",
+]

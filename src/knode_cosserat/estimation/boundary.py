@@ -1,0 +1,68 @@
+"""Boundary observer: a model that is pulled to the measured tip by a virtual spring and damper."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.rods.loads import PointWrench
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.stepper import Stepper
+from knode_cosserat.trajectory import Trajectory
+
+
+class BoundaryObserver:
+    """Observer by a virtual wrench at the tip, from the measured position of the tip (Zheng et al. 2023).
+
+    The wrench is a spring and a damper between the measured and the estimated tip. It only dissipates the
+    difference's energy, so that the estimate converges for any gains; it has no covariance.
+    """
+
+    def __init__(
+        self, robot: System, dt: float, *, stiffness: float | None = None, damping: float | None = None,
+        initial: Trajectory | None = None,
+    ):  # fmt: skip
+        """Start at rest, or at the last row of a trajectory.
+
+        Args:
+            robot: the model: a rod with `loads`.
+            dt: period (s).
+            stiffness: of the virtual spring (N/m); by default ten times that of the rod's tip, 30 EI/L³.
+            damping: of the virtual damper (N s/m); by default critical for the rod's mass.
+            initial: a motion or equilibrium from which it moves on.
+        """
+        base: Any = robot
+        if not hasattr(base.nominal, "loads"):
+            raise ValueError(f"robot is a {type(robot).__name__}; allowed is a rod with loads")
+        self._index = len(base.nominal.loads)
+        loads = (*base.nominal.loads, PointWrench())
+        self.robot = robot.replace(loads=loads)
+        length, bending = float(base.nominal.length), float(base.nominal.Kbt[0, 0])
+        mass = float(base.nominal.mass_per_length) * length
+        self.stiffness = 30.0 * bending / length**3 if stiffness is None else float(stiffness)
+        self.damping = np.sqrt(self.stiffness * mass) if damping is None else float(damping)
+        self._stepper = Stepper(self.robot, dt, initial=initial)
+        self._measured: Any = None
+        self._force = np.zeros(3)
+
+    def predict(self, control: Float[np.ndarray, " c"]) -> None:
+        """Advance the estimate by one period under a control and the virtual wrench."""
+        self._stepper.robot = self.robot.replace(**{f"loads.{self._index}.force": self._force})
+        self._stepper.step(control)
+
+    def update(self, measured: Float[np.ndarray, "3"]) -> None:
+        """Set the wrench of the next period from a measured tip (m); a lost measurement (NaN) sets none."""
+        tip, dt = np.asarray(self._stepper.state.tip_position[-1]), self._stepper.dt
+        error = np.asarray(measured, dtype=float)[:3] - tip
+        if not np.all(np.isfinite(error)):
+            self._force, self._measured = np.zeros(3), None
+            return
+        rate = np.zeros(3) if self._measured is None else (error - self._measured) / dt
+        self._force, self._measured = self.stiffness * error + self.damping * rate, error
+
+    @property
+    def state(self) -> Trajectory:
+        """Current estimate, a trajectory of one row."""
+        return self._stepper.state

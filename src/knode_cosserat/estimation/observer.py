@@ -1,0 +1,301 @@
+"""Observers: the state of a moving robot from incomplete measurements, with its covariance."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.errors import KnodeCosseratError
+from knode_cosserat.estimation.adapted import Adapted, AdaptedParameters
+from knode_cosserat.estimation.online import (
+    Spread,
+    measured_error,
+    predicted_step,
+    regular_table,
+    split_record,
+)
+from knode_cosserat.estimation.outputs import Output
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.boundary import NewtonOptions
+from knode_cosserat.solvers.grid import grid_of
+from knode_cosserat.solvers.history import used_places
+from knode_cosserat.solvers.initial import SimulationRun, initial_state
+from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.simulate import check_initial, checked_dt
+from knode_cosserat.trajectory import Trajectory
+
+#: a measurement farther from its prediction than this quantile of its distribution is weighted less
+GATE = 0.9999
+#: periods of uncertain controls before the start
+STARTING = 10
+#: standard deviation of tensions (N), unless given
+TENSION_DEVIATION = 0.05
+
+
+class ObserverError(KnodeCosseratError, RuntimeError):
+    """An observer cannot go on; one line says why."""
+
+    code = "observer"
+
+
+class Estimate(NamedTuple):
+    """State of a robot at one time, by an observer.
+
+    `y` (N, y) and `z` (N, z) are at the nodes; `innovation` is the last measurement's error from its
+    prediction, and `surprise` its square in standard deviations, divided by its number of numbers.
+    """
+
+    time: float
+    y: Float[np.ndarray, "N y"]
+    z: Float[np.ndarray, "N z"]
+    parameters: dict[str, float]
+    deviations: dict[str, float]
+    innovation: Float[np.ndarray, " e"]
+    surprise: float
+
+
+class KalmanObserver:
+    """Extended Kalman filter of a rod, with a covariance of low rank (Verlaan & Heemink 1997).
+
+    The covariance's square root has few columns: tangents of the solver's history, and coordinates of the
+    adapted parameters. They move with the linearised equations of each step, and new ones enter by uncertain
+    controls and by the drift of parameters. The most important ones are kept.
+
+        observer = kc.estimation.KalmanObserver(robot, 0.05, TipPosition(), adapt=["youngs_modulus"])
+        observer.predict(tensions)
+        observer.update(measured)
+        observer.estimate
+    """
+
+    def __init__(
+        self, robot: System, dt: float, output: Output, *, adapt: Sequence[Adapted | str] = (),
+        initial: Trajectory | None = None, columns: int = 14,
+        control_deviation: float | Sequence[float] | None = None, start_deviation: float = 0.0,
+    ):  # fmt: skip
+        """Start at rest, or at the last row of a trajectory.
+
+        Args:
+            robot: the model.
+            dt: time step of measurements and controls (s).
+            output: the measured output, with its noise.
+            adapt: parameters that are estimated with the state.
+            initial: a motion or an equilibrium from which the robot moves on.
+            columns: rank of the covariance.
+            control_deviation: standard deviation of each control (in its unit); by default 0.05 N for
+                tensions, and 1 % of each other control's scale.
+            start_deviation: standard deviation of the controls that acted before the start, in their unit: a
+                wrong initial state is then corrected quickly.
+
+        Raises:
+            ParameterError: a parameter that cannot be adapted.
+            ValueError: arguments of a wrong shape or size.
+        """
+        if columns < 1:
+            raise ValueError(f"columns is {columns}; allowed is at least 1")
+        self.robot, self.dt, self.output = robot, checked_dt(dt), output
+        self.parameters = AdaptedParameters(robot, adapt)
+        self.columns = columns + self.parameters.size
+        self.settings = Settings.of("bdf2", "lobatto2", "paper", NewtonOptions())
+        self.table = regular_table(self.settings, self.dt)
+        self._control_deviation = _deviations(robot, control_deviation)
+        self._start_deviation = float(start_deviation)
+        self._scale = np.asarray(robot.scales().y)
+        self.restart(initial)
+
+    def restart(self, initial: Trajectory | None = None) -> None:
+        """Start again at rest, or at the last row of a trajectory, with the initial uncertainty."""
+        robot, count = self.robot, self.robot.control_size
+        if initial is not None:
+            check_initial(robot, initial, None)
+        run = SimulationRun(robot, np.zeros((1, count)), initial, self.settings, self.dt, None, False)
+        begun = initial_state(run)
+        self.past = begun.start.past
+        self.control = np.asarray(begun.start.control, dtype=float)
+        self.record = np.asarray(begun.record)
+        self.x = np.zeros(self.parameters.size)
+        self.lost = 0
+        used = used_places(robot, self.settings.space)
+        width, n = self.past.records.shape[-1], self.parameters.size
+        rows = np.zeros((self.columns, 2, used, width))
+        coordinates = np.zeros((self.columns, n))
+        coordinates[:n] = np.eye(n)
+        self.spread = Spread(rows, rows[:, 0], coordinates)
+        self._value: Any = None
+        self._slopes = np.zeros((self.columns, len(self.output.noise)))
+        self._innovation, self._surprise = np.full(len(self.output.noise), np.nan), 0.0
+        if self._start_deviation:
+            self._spread_start()
+
+    def _spread_start(self) -> None:
+        """Set the columns to those of a robot at rest under controls that varied before the start."""
+        past, record, control = self.past, self.record, self._control_deviation
+        self._control_deviation = np.full(len(control), self._start_deviation / np.sqrt(STARTING))
+        for _ in range(STARTING):
+            self.predict(self.control)
+        self.past, self.record, self._control_deviation = past, record, control
+
+    @property
+    def time(self) -> float:
+        """Time of the state (s)."""
+        return float(self.past.t0)
+
+    @property
+    def system(self) -> System:
+        """Robot with the adapted parameters."""
+        return self.parameters.of(self.robot, self.x)
+
+    @property
+    def estimate(self) -> Estimate:
+        """Current state, and the parameters with their standard deviations."""
+        y, z = split_record(self.robot, self.record)
+        numbers = self._numbers(self.x)
+        # by the slope of each number
+        step = 1e-6
+        above = self._numbers(self.x + step)
+        spread = np.sqrt(np.sum(np.asarray(self.spread.parameters) ** 2, axis=0)) * (above - numbers) / step
+        labels = self.parameters.labels
+        return Estimate(
+            self.time, y, z, dict(zip(labels, map(float, numbers), strict=True)),
+            dict(zip(labels, map(float, np.abs(spread)), strict=True)), self._innovation, self._surprise,
+        )  # fmt: skip
+
+    def _numbers(self, x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """Return the adapted numbers at coordinates; a matrix by its first one."""
+        parts = self.parameters.numbers(x)
+        return np.concatenate(
+            [np.zeros(0), *(part if np.ndim(part) == 1 else np.ravel(part)[:1] for part in parts)]
+        )
+
+    def predict(self, control: Float[np.ndarray, " c"]) -> None:
+        """Advance the estimate by one time step under a control.
+
+        Raises:
+            ObserverError: the model's equations were not solved; the state is unchanged.
+        """
+        control = np.asarray(control, dtype=float)
+        if control.shape != (self.robot.control_size,) or not np.all(np.isfinite(control)):
+            raise ValueError(
+                f"the control is {control.tolist()}; allowed are {self.robot.control_size} finite numbers"
+            )
+        deviations = self._control_deviation, self.parameters.drift * np.sqrt(self.dt)
+        found = predicted_step(
+            self.robot, self.x, self.past, self.spread, control, deviations, self.dt, self.table,
+            self.settings, self.output, self.parameters,
+        )  # fmt: skip
+        if not bool(found.solved):
+            raise ObserverError(f"the model's step at t = {self.time + self.dt:g} s was not solved")
+        self.past, self.control = found.past, control
+        self.record, self._value = np.asarray(found.record), np.asarray(found.value)
+        matrix = self._compression(found.spread)
+        self.spread = found.spread.combined(matrix)
+        self._slopes = matrix.T @ np.asarray(found.by_column)
+
+    def covers(self, truth: Trajectory, level: float = 0.95) -> bool:
+        """Return True if the true position of the tip lies in the estimate's confidence region.
+
+        Args:
+            truth: the true state, a trajectory of one row.
+            level: probability of the region.
+        """
+        from scipy.stats import chi2
+
+        nodes = grid_of(self.robot).nodes
+        ny = len(self._scale)
+        # the tip's position is linear in y
+        tips = np.array(
+            [self.robot.positions(c[0][nodes[-1:], :ny])[0] for c in np.asarray(self.spread.records)]
+        )
+        apart = (
+            np.asarray(truth.tip_position[-1]) - np.asarray(self.robot.positions(self.record[-1:, :ny]))[0]
+        )
+        # the floor stands for the model's own numerical error
+        covariance = tips.T @ tips + 1e-12 * np.eye(3)
+        return bool(apart @ np.linalg.solve(covariance, apart) <= chi2.ppf(level, 3))
+
+    def wait(self) -> None:
+        """Let a period pass without a prediction: the state is held."""
+        self.past = self.past._replace(t0=np.asarray(self.time + self.dt))
+
+    def _compression(self, spread: Spread) -> Float[np.ndarray, "m k"]:
+        """Return the combinations of columns that keep the most of the covariance."""
+        ny = len(self._scale)
+        records, parameters = (
+            np.asarray(spread.records)[..., :ny] / self._scale,
+            np.asarray(spread.parameters),
+        )
+        flat = np.concatenate([records.reshape(len(records), -1), parameters], axis=1)
+        _, vectors = np.linalg.eigh(flat @ flat.T)
+        return vectors[:, ::-1][:, : self.columns]
+
+    def correction(self, measured: Float[np.ndarray, " p"]) -> tuple[Any, Any]:
+        """Return the correction's coordinates in the columns, and the remaining covariance's square root."""
+        measured = np.asarray(measured, dtype=float)
+        if measured.shape != (self.output.size,):
+            raise ValueError(
+                f"a measurement has shape {measured.shape}; allowed is ({self.output.size},): "
+                f"{', '.join(self.output.labels)}"
+            )
+        error = np.asarray(
+            measured_error(self.robot, self.x, self.record, measured, self.output, self.parameters)
+        )
+        known = np.isfinite(error)
+        self._innovation, count = -error, int(known.sum())
+        self._surprise = 0.0
+        if not count:
+            return np.zeros(self.columns), np.eye(self.columns)
+        H = self._slopes[:, known].T / self.output.noise[known, None]
+        e = error[known] / self.output.noise[known]
+        inside = np.linalg.solve(np.eye(count) + H @ H.T, e)
+        self._surprise = float(e @ inside) / count
+        # a measurement that is too far away counts less
+        most = _largest_usual(count)
+        weight = min(1.0, most / max(self._surprise, 1e-12))
+        A = np.eye(self.columns) + weight * H.T @ H
+        coordinates = -np.linalg.solve(A, weight * H.T @ e)
+        L = np.linalg.cholesky(A)
+        return coordinates, np.linalg.inv(L).T
+
+    def update(self, measured: Float[np.ndarray, " p"]) -> Float[np.ndarray, " m"]:
+        """Correct the estimate by a measurement; return the coordinates of the correction in the columns.
+
+        NaN are numbers that were not measured.
+        """
+        coordinates, remaining = self.correction(measured)
+        self.lost = 0 if np.any(np.isfinite(measured)) else self.lost + 1
+        records, rate, x = self.spread.along(coordinates)
+        used = records.shape[1]
+        past = self.past
+        all_records, all_rates = np.array(past.records), np.array(past.rate)
+        all_records[:, :used] += records
+        all_rates[:used] += rate
+        self.past = past._replace(records=all_records, rate=all_rates)
+        self.x = np.clip(self.x + x, *self.parameters.bounds)
+        self.record = self.record + records[0][grid_of(self.robot).nodes]
+        self.spread = self.spread.combined(remaining)
+        self._slopes = remaining.T @ self._slopes
+        return coordinates
+
+
+@functools.lru_cache
+def _largest_usual(count: int) -> float:
+    """Return the `GATE` quantile of the mean square of so many standard normal numbers."""
+    from scipy.stats import chi2
+
+    return float(chi2.ppf(GATE, count) / count)
+
+
+def _deviations(robot: System, given: Any) -> Float[np.ndarray, " c"]:
+    if given is None:
+        parts = [
+            np.full(field.size, TENSION_DEVIATION if field.name == "tension" else 0.01)
+            for field in robot.control_layout.fields
+        ]
+        return np.concatenate(parts)
+    found = np.broadcast_to(np.asarray(given, dtype=float), (robot.control_size,))
+    if not np.all(found >= 0.0):
+        raise ValueError(f"control_deviation is {given}; allowed is zero or more for each control")
+    return np.array(found)

@@ -1,0 +1,156 @@
+"""A robot's motion step by step with tangents of its uncertain directions, for observers and controllers.
+
+The history of the next step is uncertain in few directions. Each is a tangent of the history, together with
+coordinates of the adapted parameters. Together they are the columns of a square root of the covariance.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.estimation.adapted import AdaptedParameters
+from knode_cosserat.estimation.outputs import Output
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.history import StateHistory
+from knode_cosserat.solvers.sensitivity import TangentState, tangent_piece
+from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.tangent import SystemMoves
+from knode_cosserat.solvers.time_loop import time_loop
+
+
+class Spread(NamedTuple):
+    """Columns of a square root of the covariance of the history and of the adapted parameters."""
+
+    records: Float[Any, "m 2 used x"]
+    rate: Float[Any, "m used x"]
+    parameters: Float[Any, "m n"]
+
+    def combined(self, matrix: Float[np.ndarray, "m k"]) -> Spread:
+        """Return k columns, each a combination of these."""
+        return Spread(*(np.tensordot(matrix.T, np.asarray(part), 1) for part in self))
+
+    def along(self, coordinates: Float[np.ndarray, " m"]) -> tuple[Any, Any, Any]:
+        """Return the change of records, rate and parameters at coordinates of the columns."""
+        return tuple(np.tensordot(coordinates, np.asarray(part), 1) for part in self)  # type: ignore[return-value]
+
+
+class Rollout(NamedTuple):
+    """A simulated motion, and the tangents of its rows (columns, steps, N, x)."""
+
+    past: StateHistory
+    records: Float[Any, "T N x"]
+    d_records: Float[Any, "k T N x"]
+    #: history after the last step, along the columns
+    spread: Spread
+    solved: Any
+
+
+def regular_table(settings: Settings, dt: float) -> Float[np.ndarray, "2 4"]:
+    """Return the coefficients of steps after the first ones."""
+    return np.array([settings.time.coefficients(dt, dt)] * 2)
+
+
+def rollout_with_tangents(
+    system: System, settings: Settings, table: Any, dt: Any, past: StateHistory, controls: Float[Any, "T c"],
+    spread: Spread, d_controls: Float[Any, "k T c"], directions: Any,
+) -> Rollout:  # fmt: skip
+    """Simulate, and return the tangents of all rows along columns of history, parameters and controls.
+
+    `directions` are the tangents of the system by each adapted parameter, stacked; None if there are none.
+    """
+    steps = len(controls)
+    done, after, rows = time_loop(system, settings, table, controls, dt, past, 0, steps)
+    state = TangentState.of(system, settings, past, past.records, past.rate)
+
+    def along(d_records: Any, d_rate: Any, weights: Any, d_controls: Any) -> Any:
+        moves, solved = SystemMoves(directions, weights), (rows.records, rows.unknowns)
+        begun = state._replace(d_records=d_records, d_rate=d_rate)
+        return tangent_piece(settings, table, dt, solved, system, controls, begun, moves, d_controls)
+
+    last, (d_rows, _) = jax.vmap(along)(spread.records, spread.rate, spread.parameters, d_controls)
+    moved = Spread(last.d_records, last.d_rate, spread.parameters)
+    after = after._replace(t0=past.t0 + steps * dt)
+    return Rollout(after, rows.records, d_rows, moved, done == steps)
+
+
+def directions_of(robot: System, parameters: AdaptedParameters, x: Any) -> tuple[System, Any]:
+    """Return the robot at coordinates of its parameters, and its tangents by each, stacked."""
+    system = parameters.of(robot, x)
+    if not parameters.size:
+        return system, None
+    by_x = jax.vmap(lambda d: jax.jvp(lambda x: parameters.of(robot, x), (x,), (d,))[1])
+    return system, by_x(jnp.eye(parameters.size))
+
+
+def split_record(system: System, record: Any) -> tuple[Any, Any]:
+    """Return y and z (…) of records (…, x)."""
+    ny, nz = system.y_layout.size, system.z_layout.size
+    return record[..., :ny], record[..., ny : ny + nz]
+
+
+def errors_along(
+    system: System, output: Output, records: Float[Any, "T N x"], d_records: Float[Any, "k T N x"],
+    references: Float[Any, "T p"],
+) -> tuple[Float[Any, "T e"], Float[Any, "k T e"]]:  # fmt: skip
+    """Return the errors of an output in every row, and their tangents."""
+
+    def error(record: Any, reference: Any) -> Any:
+        return output.error(system, *split_record(system, record), reference)
+
+    def one(record: Any, reference: Any, d_record: Any) -> Any:
+        value, moved = jax.linearize(lambda record: error(record, reference), record)
+        return value, jax.vmap(moved)(d_record)
+
+    return jax.vmap(one, in_axes=(0, 0, 1), out_axes=(0, 1))(records, references, d_records)
+
+
+class Predicted(NamedTuple):
+    """One step of an observer: the next state, and the output there with its columns."""
+
+    past: StateHistory
+    record: Float[Any, "N x"]
+    spread: Spread
+    #: predicted output, and the tangents of its error by every column
+    value: Float[Any, " p"]
+    by_column: Float[Any, "m e"]
+    solved: Any
+
+
+@functools.partial(jax.jit, static_argnames=("settings", "output"))
+def predicted_step(  # type: ignore[no-untyped-def]
+    robot, x, past, spread, control, deviations, dt, table, settings, output, parameters
+):
+    """Return one step under a control, with new columns for its uncertainty and the parameters' drift.
+
+    `deviations` are those of each control (c,) and of the drift of each parameter (n,) in the step.
+    """
+    system, directions = directions_of(robot, parameters, x)
+    of_control, of_drift = deviations
+    m, c, n = len(spread.records), len(of_control), len(of_drift)
+
+    def more(part: Any) -> Any:
+        return jnp.concatenate([part, jnp.zeros((c + n, *part.shape[1:]))])
+
+    drifts = jnp.concatenate([spread.parameters, jnp.zeros((c, n)), jnp.diag(of_drift)])
+    wide = Spread(more(spread.records), more(spread.rate), drifts)
+    d_controls = jnp.concatenate([jnp.zeros((m, c)), jnp.diag(of_control), jnp.zeros((n, c))])
+    found = rollout_with_tangents(
+        system, settings, table, dt, past, control[None], wide, d_controls[:, None], directions
+    )
+    record = found.records[0]
+    value = output.value(system, *split_record(system, record))
+    _, slopes = errors_along(system, output, found.records, found.d_records, value[None])
+    return Predicted(found.past, record, found.spread, value, slopes[:, 0], found.solved)
+
+
+@functools.partial(jax.jit, static_argnames="output")
+def measured_error(robot, x, record, measured, output, parameters):  # type: ignore[no-untyped-def]
+    """Return the error of a state's output from a measurement."""
+    system = parameters.of(robot, x)
+    return output.error(system, *split_record(system, record), measured)

@@ -1,0 +1,137 @@
+"""Closed loops around simulated robots: accuracy, limits, adaptation, and faults.
+
+All loops share one compiled program: the same robot, outputs, horizon and adapted parameters.
+"""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import knode_cosserat as kc
+from knode_cosserat.control import (
+    PID,
+    ControlLimits,
+    KinematicController,
+    PredictiveController,
+    Sensor,
+    SimulatedPlant,
+    circle,
+    run_loop,
+)
+from knode_cosserat.control.qp import QPSolution
+from knode_cosserat.estimation import KalmanObserver, TipPosition
+from knode_cosserat.estimation.online import predicted_step
+
+DT, LENGTH = 0.05, 0.635
+ROBOT = kc.load_robot("delrin-tendon-robot")
+E = float(ROBOT.youngs_modulus)
+LIMITS = ControlLimits(0.0, 10.0, 40.0)
+
+
+def observer(model=ROBOT):
+    return KalmanObserver(model, DT, TipPosition(), adapt=["youngs_modulus"])
+
+
+def controller(model=ROBOT, **options):
+    return PredictiveController(observer(model), TipPosition(), LIMITS, **options)
+
+
+def plant(robot=ROBOT, **sensor):
+    return SimulatedPlant(robot, DT, Sensor(TipPosition(), **sensor))
+
+
+@pytest.fixture(scope="module")
+def wrong_model():
+    """A loop whose model is 30 % too stiff, with noise and lost measurements."""
+    model = ROBOT.replace(youngs_modulus=1.3 * E)
+    return run_loop(controller(model), plant(noise=0.5, dropout=0.05), circle(0.1, 1.5), 7.0)
+
+
+def test_an_exact_model_follows_a_fast_circle():
+    log = run_loop(controller(), plant(), circle(0.1, 1.5), 6.0)
+    assert log.tip_rmse(5.0) <= 1e-3 * LENGTH
+    assert log.fallbacks == 0
+
+
+def test_a_wrong_stiffness_is_found_and_the_circle_followed(wrong_model):
+    assert wrong_model.tip_rmse(5.0) <= 5e-3 * LENGTH
+    assert_allclose(wrong_model.parameters["youngs_modulus"][wrong_model.time > 5.0], E, rtol=0.03)
+
+
+def test_hard_limits_are_never_exceeded(wrong_model):
+    control = wrong_model.control
+    assert control.min() >= 0.0 and control.max() <= 10.0
+    assert np.max(np.abs(np.diff(control, axis=0))) <= 40.0 * DT + 1e-12
+
+
+def test_a_log_reports_and_is_written(wrong_model, tmp_path):
+    facts = wrong_model.summary()
+    assert facts["periods"] == 140 and facts["tip_rmse"] < 5e-3 * LENGTH
+    wrong_model.to_csv(tmp_path / "log.csv")
+    lines = (tmp_path / "log.csv").read_text().splitlines()
+    assert len(lines) == 141 and lines[0].startswith("t (s),reference 0")
+    assert "tip RMSE" in repr(wrong_model)
+
+
+def test_columns_of_the_observer_are_derivatives_of_the_step():
+    """Oracle: differences of steps with other tensions."""
+    own = observer()
+    tension = np.array([6.0, 3.0, 2.0, 4.0])
+    h = 1e-4
+
+    def tip(control):
+        none = np.zeros(4), np.zeros(1)
+        found = predicted_step(
+            own.robot, own.x, own.past, own.spread, control, none, DT, own.table, own.settings, own.output,
+            own.parameters,
+        )  # fmt: skip
+        return np.asarray(found.value)
+
+    found = predicted_step(
+        own.robot, own.x, own.past, own.spread, tension, (np.ones(4), np.zeros(1)), DT, own.table,
+        own.settings, own.output, own.parameters,
+    )  # fmt: skip
+    columns = np.asarray(found.by_column)[own.columns : own.columns + 4]
+    differences = [(tip(tension + h * one) - tip(tension - h * one)) / (2.0 * h) for one in np.eye(4)]
+    assert_allclose(columns, differences, rtol=1e-5, atol=1e-9)
+
+
+def test_a_failed_program_is_replaced_by_the_plan_then_held_then_safe():
+    class Broken:
+        def solve(self, problem):
+            return QPSolution(np.full(len(problem.g), np.nan), False)
+
+    own = controller(solver=Broken())
+    log = run_loop(own, plant(), circle(0.1, 4.0), 1.0)
+    assert log.fallbacks == 20
+    assert [log.status[k] for k in (0, 4, 5, 9, 10, 19)] == [
+        "shifted plan", "shifted plan", "held", "held", "going safe", "going safe",
+    ]  # fmt: skip
+    assert set(log.reason) == {"the quadratic program was not solved"}
+    assert np.all(np.isfinite(log.control))
+
+
+def test_lost_measurements_do_not_stop_the_loop():
+    log = run_loop(controller(), plant(dropout=0.9, seed=3), circle(0.1, 4.0), 3.0)
+    assert np.isnan(log.measured).any() and log.fallbacks == 0
+    assert np.all(np.isfinite(log.control))
+
+
+def test_controllers_without_dynamics_hold_a_slow_circle():
+    for kind in (PID, KinematicController):
+        log = run_loop(kind(ROBOT, DT, LIMITS), plant(), circle(0.05, 60.0), 8.0)
+        assert log.tip_rmse(4.0) < 0.02 * LENGTH, kind.__name__
+
+
+def test_wrong_arguments_are_told_in_one_line():
+    own = controller()
+    with pytest.raises(ValueError, match=r"the controller's period is 0.05 s and the plant's 0.1 s"):
+        run_loop(own, SimulatedPlant(ROBOT, 0.1, Sensor(TipPosition())), circle(0.1, 4.0), 1.0)
+    with pytest.raises(ValueError, match=r"a measurement has shape \(2,\); allowed is \(3,\)"):
+        own.command(0.0, np.zeros(2), circle(0.1, 4.0))
+    with pytest.raises(ValueError, match="knots is 30; allowed are 2 to the horizon"):
+        controller(knots=30)
+    with pytest.raises(kc.KnodeCosseratError, match="no parameter 'stiffness'"):
+        KalmanObserver(ROBOT, DT, TipPosition(), adapt=["stiffness"])
+    with pytest.raises(ValueError, match=r"dropout is 1\.5"):
+        Sensor(TipPosition(), dropout=1.5)
