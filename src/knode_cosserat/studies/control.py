@@ -290,8 +290,8 @@ def as_markdown(cells: Sequence[Mapping[str, Any]], made: Sequence[Mapping[str, 
     return "\n\n".join(
         [
             "# Closed-loop control",
-            f"Simulated robots, exact measurements of the tip, control at {1.0 / DT:.0f} Hz. Tip RMSE in % of "
-            f"the length from {SETTLED:g} to {SECONDS:g} s.",
+            f"Simulated robots, exact measurements of the tip, control at {1.0 / DT:.0f} Hz. Tip RMSE in "
+            f"% of the length from {SETTLED:g} to {SECONDS:g} s.",
             markdown_table(["robot", "controller", *paths], rows),
             markdown_table(["check", "value", "limit", "met"], checked),
         ]
