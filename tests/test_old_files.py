@@ -73,7 +73,7 @@ def test_a_trajectory_with_settings_and_results_of_earlier_versions(tmp_path, mo
     codes = kc.Result
     expected = [codes.CONVERGED, codes.RECOVERED_LOAD_CONTINUATION, codes.CONVERGED, codes.NO_CONVERGENCE]
     assert found.result[1:5].tolist() == expected
-    assert found.begun is None and found.position_error is None
+    assert found.initial_state is None and found.final_state is None and found.position_error is None
     # saved again it is a file of this version
     found.save(tmp_path / "b.nc")
     np.testing.assert_array_equal(kc.load_trajectory(tmp_path / "b.nc").result, found.result)

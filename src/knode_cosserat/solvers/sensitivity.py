@@ -20,101 +20,155 @@ from knode_cosserat.solvers.boundary import factors_of, pivots_of
 from knode_cosserat.solvers.history import StateHistory, advanced, history_of
 from knode_cosserat.solvers.linear import solved_correction
 from knode_cosserat.solvers.problem import StepProblem, row_of
-from knode_cosserat.solvers.run_types import RunSettings
+from knode_cosserat.solvers.run import Equilibria, TimeIntegration
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.time_loop import StepRows, loop_one
+from knode_cosserat.solvers.static_loop import static_one
+from knode_cosserat.solvers.time_loop import StepCoefficients, StepRows, TimeStep, loop_one
 
 
 @functools.lru_cache(maxsize=64)
-def rollout(task: RunSettings) -> Callable[[System, Any, StateHistory], StepRows]:
-    """Return a differentiable function from (system, controls (T, c), past) to the rows of all steps.
+def rollout(task: TimeIntegration) -> Callable[[System, Any, StateHistory], tuple[StepRows, StateHistory]]:
+    """Return a differentiable function from (system, controls (T, c), past) to all rows and the last history.
 
     Cached between calls: JAX recognises functions that it has already traced by identity.
     """
-    settings, table, dt, steps = task.settings, task.table, task.dt, task.steps
+    settings, steps = task.settings, task.steps
 
     @jax.custom_jvp
-    def run(system: System, controls: Any, past: StateHistory) -> StepRows:
-        done, _, rows = loop_one(system, settings, table, controls, dt, past, 0, steps)
-        unsolved = jnp.arange(steps) >= done
-        return StepRows(
-            jnp.where(unsolved[:, None, None], jnp.nan, rows.records),
-            jnp.where(unsolved[:, None], jnp.nan, rows.unknowns),
-            jnp.where(unsolved, jnp.inf, rows.error),
-            rows.corrections,
-            rows.position_error,
-        )
+    def run(system: System, controls: Any, past: StateHistory) -> tuple[StepRows, StateHistory]:
+        done, last, rows = loop_one(system, settings, task.coefficients, controls, past, (0, steps))
+        last = last._replace(t0=past.t0 + steps * task.dt)
+        return _nan_where_unsolved(rows), jax.tree.map(lambda x: jnp.where(done < steps, jnp.nan, x), last)
 
     @run.defjvp
     def tangent(primals: Any, tangents: Any) -> Any:
-        rows = run(*primals)
-        system, controls, past = primals
+        rows, last = run(*primals)
         d_system, d_controls, d_past = tangents
-        d_records, d_unknowns = tangent_time_loop(
-            settings, table, dt, rows.records, rows.unknowns, system, controls, past, d_system, d_controls,
-            d_past.records, d_past.rate,
-        )  # fmt: skip
-        still = np.zeros(steps, dtype=jax.dtypes.float0)
-        none = jnp.zeros_like(rows.error)
-        return rows, StepRows(d_records, d_unknowns, none, still, none)
+        solved = rows.records, rows.unknowns
+        changes = d_system, d_controls, d_past.records, d_past.rate
+        (_, d_records, d_rate), d_solved = tangent_time_loop(
+            settings, task.coefficients, solved, primals, changes
+        )
+        # first guesses and error estimates count as constants
+        d_last = jax.tree.map(jnp.zeros_like, last)
+        d_last = d_last._replace(records=d_records, rate=d_rate, t0=d_past.t0)
+        return (rows, last), (_row_tangents(rows, *d_solved), d_last)
 
     return run
 
 
+@functools.lru_cache(maxsize=64)
+def static_rollout(task: Equilibria) -> Callable[[System, Any, Any], StepRows]:
+    """Return a differentiable function from (system, controls (T, c), y at all points) to all rows."""
+
+    @jax.custom_jvp
+    def run(system: System, controls: Any, y: Any) -> StepRows:
+        _, _, rows = static_one(system, task.settings, controls, y, (0, task.steps))
+        return _nan_where_unsolved(rows)
+
+    @run.defjvp
+    def tangent(primals: Any, tangents: Any) -> Any:
+        rows = run(*primals)
+        solved = rows.records, rows.unknowns
+        d_rows, d_unknowns, _ = static_tangents(task.settings, solved, primals[:2], tangents[:2])
+        return rows, _row_tangents(rows, d_rows, d_unknowns)
+
+    return run
+
+
+def _nan_where_unsolved(rows: StepRows) -> StepRows:
+    unsolved = rows.result < 0
+    return rows._replace(
+        records=jnp.where(unsolved[:, None, None], jnp.nan, rows.records),
+        unknowns=jnp.where(unsolved[:, None], jnp.nan, rows.unknowns),
+        error=jnp.where(unsolved, jnp.inf, rows.error),
+    )
+
+
+def _row_tangents(rows: StepRows, d_records: Any, d_unknowns: Any) -> StepRows:
+    whole, zero = np.zeros(rows.result.shape, dtype=jax.dtypes.float0), jnp.zeros_like(rows.error)
+    return StepRows(d_records, d_unknowns, zero, whole, zero, whole)
+
+
+def _step_tangent(problem_of: Callable[..., StepProblem], at: Any, d_at: Any, row: Any, xi: Any) -> Any:
+    """Return y, records and the tangents of records, row and unknowns of a solved step.
+
+    `problem_of` makes the step's problem from `at`, whose tangent is `d_at`.
+    """
+    problem = problem_of(*at)
+    y = problem.filled(row[:, : problem.system.y_layout.size])
+    factors = factors_of(problem, y, xi)
+
+    def at_solution(*at: Any) -> Any:
+        problem = problem_of(*at)
+        return *problem.residuals(y), problem.base(xi)
+
+    defects, tip, base = jax.jvp(at_solution, at, d_at)[1]
+    dy, dxi = solved_correction(factors, pivots_of(problem.system), defects, tip, base)
+
+    def recorded(y: Any, *at: Any) -> Any:
+        problem = problem_of(*at)
+        records = problem.records(y)
+        return records, row_of(problem.system, y, records)
+
+    (records, _), (d_records, d_row) = jax.jvp(recorded, (y, *at), (dy, *d_at))
+    return y, records, d_records, d_row, dxi
+
+
 @functools.partial(jax.jit, static_argnames="settings")
 def tangent_time_loop(
-    settings: Settings, table: Any, dt: Any, rows: Any, unknowns: Any, system: System, controls: Any,
-    past: StateHistory, d_system: Any, d_controls: Any, d_records: Any, d_rate: Any,
+    settings: Settings, steps: StepCoefficients, solved: tuple[Any, Any],
+    at: tuple[System, Any, StateHistory], changes: tuple[Any, Any, Any, Any],
 ) -> Any:  # fmt: skip
-    """Return tangents of all rows and unknowns, linear in the tangents of system, controls and history."""
-    return tangent_piece(
-        settings, table, dt, rows, unknowns, system, controls, past, d_system, d_controls, d_records, d_rate
-    )[1]
+    """Return the last history with its tangents, and the tangents of all rows and unknowns.
 
-
-def tangent_piece(
-    settings: Settings, table: Any, dt: Any, rows: Any, unknowns: Any, system: System, controls: Any,
-    past: StateHistory, d_system: Any, d_controls: Any, d_records: Any, d_rate: Any,
-) -> Any:  # fmt: skip
-    """Return the history after the last row with its tangents, and the result of `tangent_time_loop`."""
-    ny, pivots = system.y_layout.size, pivots_of(system)
+    They are linear in `changes`: the tangents of system, controls, and the records and rate of the history.
+    `solved` are all rows and unknowns; `at` are system, controls and history before the first step.
+    """
+    (system, controls, past), (d_system, d_controls, d_records, d_rate) = at, changes
 
     def one(carry: Any, now: Any) -> Any:
         past, d_recent, d_rate = carry
         i, row, xi, control, d_control = now
-        coefficients = jnp.where(i == 0, table[0], table[1])
-        t = past.t0 + (i + 1) * dt
-        history = history_of(past.records, past.rate, coefficients, settings)
-        d_history = history_of(d_recent, d_rate, coefficients, settings)
+        step = TimeStep.of(steps, past, i)
+        history = history_of(past.records, past.rate, step.coefficients, settings)
+        d_history = history_of(d_recent, d_rate, step.coefficients, settings)
+        c0 = step.coefficients[0]
 
-        def now_with(system: Any, control: Any, history: Any) -> StepProblem:
-            return StepProblem(system, t, control, coefficients[0], history, settings.space)
+        def problem_of(system: System, control: Any, history: Any) -> StepProblem:
+            return StepProblem(system, step.t, control, c0, history, settings.space)
 
-        problem = now_with(system, control, history)
-        y = problem.filled(row[:, :ny])
-        factors = factors_of(problem, y, xi)
-
-        def at_solution(system: Any, control: Any, history: Any) -> Any:
-            problem = now_with(system, control, history)
-            return *problem.residuals(y), problem.base(xi)
-
-        given, d_given = (system, control, history), (d_system, d_control, d_history)
-        defects, tip, base = jax.jvp(at_solution, given, d_given)[1]
-        dy, dxi = solved_correction(factors, pivots, defects, tip, base)
-
-        def kept_of(system: Any, control: Any, history: Any, y: Any) -> Any:
-            records = now_with(system, control, history).records(y)
-            return records, row_of(system, y, records)
-
-        (records, _), (d_records, d_row) = jax.jvp(kept_of, (*given, y), (*d_given, dy))
-        rate = coefficients[0] * records + history if settings.time.uses_rate else past.rate
-        d_rate = coefficients[0] * d_records + d_history if settings.time.uses_rate else d_rate
+        y, records, d_records, d_row, dxi = _step_tangent(
+            problem_of, (system, control, history), (d_system, d_control, d_history), row, xi
+        )
+        rate = past.rate
+        if settings.uses_rate:
+            rate, d_rate = c0 * records + history, c0 * d_records + d_history
         past = advanced(past, records, rate, y, past.weights)
         return (past, jnp.stack([d_records, d_recent[0]]), d_rate), (d_row, dxi)
 
-    steps = jnp.arange(rows.shape[0])
-    begun = past, d_records, d_rate
-    (past, d_records, d_rate), tangents = jax.lax.scan(
-        one, begun, (steps, rows, unknowns, controls, d_controls)
-    )
-    return (past, d_records, d_rate), tangents
+    numbers = jnp.arange(len(solved[0]))
+    return jax.lax.scan(one, (past, d_records, d_rate), (numbers, *solved, controls, d_controls))
+
+
+@functools.partial(jax.jit, static_argnames="settings")
+def static_tangents(
+    settings: Settings, solved: tuple[Any, Any], at: tuple[System, Any], changes: tuple[Any, Any]
+) -> tuple[Any, Any, Any]:
+    """Return the tangents of rows, unknowns and records at all places of solved equilibria.
+
+    `solved` are all rows and unknowns; `at` are system and controls, and `changes` their tangents.
+    """
+    (system, controls), (d_system, d_controls) = at, changes
+
+    def problem_of(system: System, control: Any) -> StepProblem:
+        return StepProblem.still(system, settings.space, control)
+
+    def one(now: Any) -> Any:
+        row, xi, control, d_control = now
+        _, _, d_records, d_row, dxi = _step_tangent(
+            problem_of, (system, control), (d_system, d_control), row, xi
+        )
+        return d_row, dxi, d_records
+
+    return jax.lax.map(one, (*solved, controls, d_controls))
