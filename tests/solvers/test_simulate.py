@@ -329,6 +329,31 @@ def test_equilibria_in_a_batch(robot):
     np.testing.assert_allclose(found.velocity, 0.0, atol=1e-12)
 
 
+def test_a_list_of_equilibria_is_each_by_itself_in_batches_and_programs_too(robot):
+    tensions = np.array([[7.0, 5.0, 5.0, 7.0], [9.0, 5.0, 5.0, 9.0], [6.0, 6.0, 8.0, 6.0]])
+    found = kc.solvers.equilibria(robot, tensions)
+    assert found.settings.time is None and found.final_state is None and found.all_valid
+    for row, control in enumerate(tensions):
+        np.testing.assert_allclose(found.y[row], kc.equilibrium(robot, control).y[0], atol=1e-8)
+    np.testing.assert_array_equal(found.control, tensions)
+    both = kc.solvers.equilibria(robot, np.stack([tensions, tensions[::-1]]))
+    np.testing.assert_allclose(both[1].y[::-1], found.y, atol=1e-8)
+
+    def tip(pull):
+        return kc.solvers.equilibria(robot, jnp.asarray(tensions).at[:, 0].add(pull)).tip_position[2, 0]
+
+    difference = (tip(1e-3) - tip(-1e-3)) / 2e-3
+    for slope in (jax.jacfwd(tip), jax.grad(tip)):
+        np.testing.assert_allclose(slope(0.0), difference, rtol=1e-5)
+
+
+def test_statics_have_no_time_scheme(robot, sine):
+    for run in (kc.simulate, kc.solvers.Stepper):
+        arguments = (robot, DT) if run is kc.solvers.Stepper else (robot, sine, DT)
+        with pytest.raises(ValueError, match=r"time is 'static'.*equilibri"):
+            run(*arguments, time="static")
+
+
 def test_the_past_keeps_the_newest_first(robot):
     past = resting_history(robot, Settings())
     record = past.records[0] + 1.0
