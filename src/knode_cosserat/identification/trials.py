@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
 from collections.abc import Sequence
 
@@ -106,5 +107,7 @@ def _moved(
         still = equilibrium(robot, initial, space=space, recovery_budget=RECOVERY)
         tension = robot.undelayed(tension, dt, initial)
         if static:
-            return still, equilibria(robot, tension, initial=still, space=space, recovery_budget=RECOVERY)
+            tension = np.concatenate([initial[None], tension])
+            found = equilibria(robot, tension, initial=still, space=space, recovery_budget=RECOVERY)
+            return still, dataclasses.replace(found, time=dt * found.time)
         return still, simulate(robot, tension, dt, initial=still, space=space, recovery_budget=RECOVERY)

@@ -113,10 +113,10 @@ def equilibria(
     settings = Settings.of(None, space, "paper", newton)
     if on_failure not in ("raise", "return"):
         raise ValueError(f'on_failure is {on_failure!r}; allowed is "raise" or "return"')
-    if initial is not None and not isinstance(initial, Trajectory):
-        initial = _guess(robot, initial, np.asarray(controls).reshape(-1, np.shape(controls)[-1])[0])
     system, batch = stacked(robot)
     controls, batch = checked_controls(system, controls, batch)
+    if initial is not None and not isinstance(initial, Trajectory):
+        initial = _guess(robot, initial, controls[(0,) * (np.ndim(controls) - 1)])
     if initial is not None:
         check_initial(system, initial, batch)
     bare = without_range(system)

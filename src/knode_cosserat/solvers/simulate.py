@@ -131,7 +131,11 @@ def marked(trajectory: Trajectory, initial: Trajectory | None) -> Trajectory:
     trained = system.trained_range()
     if trained is None:
         return trajectory
-    outside = trained.outside(system, trajectory.time, trajectory.control, trajectory.z)
+    time, control, z = trajectory.time, trajectory.control, trajectory.z
+    if trajectory.settings is not None and trajectory.settings.time is None:
+        # equilibria are motions of one row
+        time, control, z = time[:1], control[..., None, :], z[..., None, :, :]
+    outside = trained.outside(system, time, control, z).reshape(trajectory.result.shape)
     if initial is not None and initial.extrapolated is not None:
         numeric: Any = jnp if is_traced(outside) else np
         first = numeric.arange(outside.shape[-1]) == 0
