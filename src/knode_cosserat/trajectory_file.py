@@ -13,17 +13,13 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from knode_cosserat._files import package_version, replacing
 from knode_cosserat._registry import provide
 from knode_cosserat.rods.layout import Field, Layout
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.grid import grid_of
-from knode_cosserat.solvers.history import GUESS_STATES, SolverState, StateHistory, repeated_record_history
-from knode_cosserat.solvers.problem import no_history
+from knode_cosserat.solvers.history import GUESS_STATES, SolverState, StateHistory
 from knode_cosserat.solvers.result import EARLIER_RESULTS, Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.trajectory import Trajectory
@@ -70,13 +66,11 @@ _STATE_PARTS = (
     ("_weights", ("history_guess",), "weights of these in the first guess"),
     ("_time", ("history_time",), "time (s), time step (s; NaN: all states are the same), 1 if rate is known"),
 )
-#: in files of earlier versions: c0, c1, c2, d1 and dt of the first step
-_EARLIER_STEP = "initial_history_step"
 #: comment on each control about its interval; attribute for omitted intermediate rows
 _ACTED = "row i acted from row i - 1 to row i; row 0 before the motion"
 _THINNED = "rows_left_out"
-#: names in files of earlier versions, whose initial histories are ignored: they belong to other schemes
-_EARLIER = ("begun", "begun_step")
+#: names in files of earlier versions, whose initial histories are not read: their rows are replayed
+_EARLIER = ("begun", "begun_step", "initial_history_step")
 
 # writing
 
@@ -187,7 +181,7 @@ def _require_names(system: System, source: str) -> None:
     names = [field.name for layout in _layouts(system) for field in layout.fields]
     taken = {"time", "node", "batch", "arclength", "axis", "quaternion", BYTES, SIZES}
     taken |= {name + suffix for name, *_ in _STATES for suffix, *_ in _STATE_PARTS}
-    taken |= {_EARLIER_STEP, *_EARLIER, *(name for name, *_ in (*_ROWS, _ERROR, _OUTSIDE))}
+    taken |= {*_EARLIER, *(name for name, *_ in (*_ROWS, _ERROR, _OUTSIDE))}
     for name in names:
         if name in taken or "/" in name or name.startswith(PARAMETER) or name.endswith("_index"):
             raise TrajectoryFileError(
@@ -245,8 +239,6 @@ def load_trajectory(path: str | Path, *, system: System | None = None) -> Trajec
         numbers[_OUTSIDE[0]] = values_of(path, data, _OUTSIDE[0], rows).astype(bool)
     settings, thinned = _settings(path, data), bool(data.attrs.get(_THINNED, 0))
     states = {attribute: _state(path, data, name) for name, attribute, _ in _STATES}
-    if _EARLIER_STEP in data.variables and settings is not None:
-        states["initial_state"] = _earlier_state(path, data, system, settings, y, time[0])
     return Trajectory(system, settings, time, y, z, control, **numbers, **states, thinned=thinned)
 
 
@@ -271,7 +263,7 @@ def _state_arrays(state: SolverState) -> tuple[np.ndarray, ...]:
 
 
 def _state(path: Path, data: xarray.Dataset, name: str) -> SolverState | None:
-    """Return a solver's state, if the file has it; of earlier versions it is `_earlier_state`."""
+    """Return a solver's state, if the file has it."""
     if name + _STATE_PARTS[-1][0] not in data.variables:
         return None
     batch = tuple(data.sizes[name] for name in ("batch",) if name in data.sizes)
@@ -284,24 +276,6 @@ def _state(path: Path, data: xarray.Dataset, name: str) -> SolverState | None:
     history = StateHistory(states[..., :2, :, :], states[..., 2, :, :], y, weights, t0, error)
     first = float(np.ravel(dt)[0]) if dt.size else np.nan
     return SolverState(history, None if np.isnan(first) else first, bool(np.all(known)))
-
-
-def _earlier_state(
-    path: Path, data: xarray.Dataset, system: System, settings: Settings, y: Any, t0: float
-) -> SolverState | None:
-    """Return the state in row 0 from a file of an earlier version; None for a batch: it is not replayed."""
-    states = np.asarray(data["initial_history"].values)
-    *_, d1, dt = values_of(path, data, _EARLIER_STEP, (*states.shape[:-3], 5)).T
-    shape = (3, *no_history(system, settings.space).shape)
-    if states.shape != shape:
-        return None
-    newest, before, rate = jnp.asarray(values_of(path, data, "initial_history", shape))
-    points = grid_of(system).spread(jnp.asarray(y[0]))
-    history = repeated_record_history(system, settings.space, newest, points, t0)
-    history = history._replace(records=jnp.stack([newest, before]), rate=rate)
-    one = np.array_equal(newest, before)
-    state = SolverState(history, None if one else float(dt), not settings.uses_rate or bool(d1))
-    return jax.tree.map(np.asarray, state)
 
 
 def _read(path: Path) -> xarray.Dataset:

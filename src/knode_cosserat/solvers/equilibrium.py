@@ -15,18 +15,23 @@ from knode_cosserat.rods.trained_range import without_range
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.guess import state_from_positions
-from knode_cosserat.solvers.run import Equilibria, mark_coarse, run_batch, run_one
+from knode_cosserat.solvers.run import (
+    Equilibria,
+    failure,
+    mark_coarse,
+    rows_of,
+    run_batch,
+    run_one,
+    warn_of_coarse_grids,
+)
 from knode_cosserat.solvers.sensitivity import static_rollout
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.simulate import (
     check_initial,
     checked_controls,
-    failure,
     marked,
     refined_trajectory,
-    rows_of,
     stacked,
-    warn_of_coarse_grids,
 )
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.static_loop import unloaded_shape

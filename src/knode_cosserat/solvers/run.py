@@ -7,6 +7,7 @@ import dataclasses
 import logging
 import os
 import time
+import warnings
 from typing import Any, NamedTuple
 
 import jax
@@ -18,8 +19,9 @@ from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.solvers.history import FirstStep, SolverState, StateHistory, coefficient_table
 from knode_cosserat.solvers.recovery import Budget, SolvedStep
 from knode_cosserat.solvers.recovery_methods import StaticRecovery, StepRecovery
-from knode_cosserat.solvers.result import Result
+from knode_cosserat.solvers.result import Result, SimulationError
 from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.space import Euler
 from knode_cosserat.solvers.static_loop import static_many, static_one
 from knode_cosserat.solvers.time_loop import StepCoefficients, StepRows, TimeStep, loop_many, loop_one
 
@@ -182,6 +184,47 @@ def mark_coarse(rows: StepRows, system: System, before: Any = None) -> StepRows:
         coarse = (numeric.cumsum(coarse, axis=-1) > 0) | numeric.asarray(before)[..., None]
     coarse &= rows.result >= 0
     return rows._replace(result=numeric.where(coarse, int(Result.COARSE), rows.result))
+
+
+def warn_of_coarse_grids(system: System, settings: Settings, rows: StepRows) -> None:
+    """Warn of rows with a large discretisation error; not for Euler, which only reproduces the paper."""
+    coarse = np.asarray(rows.result) == Result.COARSE
+    if np.any(coarse) and not isinstance(settings.space, Euler):
+        worst, length = float(np.max(rows.position_error[coarse])), float(np.max(system.length))
+        warnings.warn(
+            f"the grid is too coarse in {np.count_nonzero(coarse)} of {coarse.size} rows: positions are "
+            f"off by up to about {worst:.2g} m ({worst / length:.0%} of the length) with "
+            f"{system.nodes} nodes. "
+            "Use more nodes, or position_tolerance.",
+            stacklevel=4,
+        )
+
+
+def failure(rows: StepRows, causes: str | dict[int, str], times: Any) -> SimulationError:
+    """Return the error of the first step that failed; without times, of an equilibrium.
+
+    `causes` is the likely cause, or that of each robot of a batch.
+    """
+    robot = None if isinstance(causes, str) else next(iter(causes))
+    cause = causes if isinstance(causes, str) else causes[next(iter(causes))]
+    if robot is not None:
+        rows = StepRows(*(leaf[robot] for leaf in rows))
+    i = int(np.argmax(rows.result < 0))
+    number, t = (0, 0.0) if times is None else (i + 1, float(times[i]))
+    return SimulationError(number, t, float(rows.error[i]), Result(int(rows.result[i])), cause, robot)
+
+
+def rows_of(system: System, rows: StepRows) -> dict[str, Any]:
+    """Return a trajectory's arrays of rows, with NaN in unsolved rows."""
+    numeric: Any = jnp if is_traced(rows) else np
+    ny, nz = system.y_layout.size, system.z_layout.size
+    invalid = numeric.asarray(rows.result) < 0
+    records = numeric.where(invalid[..., None, None], numeric.nan, rows.records)
+    return {
+        "y": records[..., :ny], "z": records[..., ny : ny + nz], "result": rows.result,
+        "residual": rows.error, "iterations": rows.corrections,
+        "position_error": numeric.where(invalid, numeric.nan, rows.position_error),
+    }  # fmt: skip
 
 
 def run_batch(

@@ -20,10 +20,18 @@ from knode_cosserat.solvers.damping import warn_if_undamped
 from knode_cosserat.solvers.history import SolverState
 from knode_cosserat.solvers.initial import continued_state, initial_state
 from knode_cosserat.solvers.recovery import natural_time
-from knode_cosserat.solvers.result import Result, SimulationError
-from knode_cosserat.solvers.run import InitialState, TimeIntegration, mark_coarse, run_batch, run_one
+from knode_cosserat.solvers.run import (
+    InitialState,
+    TimeIntegration,
+    failure,
+    mark_coarse,
+    rows_of,
+    run_batch,
+    run_one,
+    warn_of_coarse_grids,
+)
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.space import Euler, SpaceScheme
+from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.time import TimeScheme
 from knode_cosserat.solvers.time_loop import StepRows
 from knode_cosserat.trajectory import Trajectory
@@ -112,8 +120,8 @@ def simulate(
     if is_traced((system, controls, initial)):
         found = _traced(bare, controls, before, settings, dt)
     else:
-        begin, task = _start(bare, controls, before, settings, dt, recovery_budget)
-        found = _plain(bare, controls, begin, task, on_failure, progress)
+        at_start, task = _initial(bare, controls, before, settings, dt, recovery_budget)
+        found = _plain(bare, controls, at_start, task, on_failure, progress)
     return marked(dataclasses.replace(found, system=system), initial)
 
 
@@ -295,29 +303,29 @@ def check_initial(system: System, initial: Trajectory, batch: int | None) -> Non
 # runs
 
 
-def _start(system: Any, controls: Any, initial: Any, settings: Settings, dt: float, budget: Any) -> Any:
+def _initial(system: Any, controls: Any, initial: Any, settings: Settings, dt: float, budget: Any) -> Any:
     """Return the initial state of a run, and its time steps."""
     if initial is None:
         batch = len(controls) if np.ndim(controls) == 3 else None
-        begin = initial_state(system, settings, batch, budget)
+        at_start = initial_state(system, settings, batch, budget)
     else:
-        begin = continued_state(system, initial, settings, dt)
-    first = begin.state.first_step(settings)
-    return begin, TimeIntegration(settings, dt, np.shape(controls)[-2], first, budget)
+        at_start = continued_state(system, initial, settings, dt)
+    first = at_start.state.first_step(settings)
+    return at_start, TimeIntegration(settings, dt, np.shape(controls)[-2], first, budget)
 
 
 def _plain(
-    system: System, controls: Any, begin: InitialState, task: TimeIntegration, on_failure: str, progress: bool
+    system: Any, controls: Any, at_start: InitialState, task: TimeIntegration, on_failure: str, progress: bool
 ) -> Trajectory:
     """Simulate with recovery."""
     run = run_batch if np.ndim(controls) == 3 else run_one
-    rows, history, causes = run(task, system, controls, begin.state.history, begin.control, progress)
+    rows, history, causes = run(task, system, controls, at_start.state.history, at_start.control, progress)
     if on_failure == "raise" and causes:
-        times = float(np.ravel(begin.state.history.t0)[0]) + (1.0 + np.arange(task.steps)) * task.dt
+        times = float(np.ravel(at_start.state.history.t0)[0]) + (1.0 + np.arange(task.steps)) * task.dt
         raise failure(rows, causes, times)
-    rows = mark_coarse(rows, system, begin.coarse)
+    rows = mark_coarse(rows, system, at_start.coarse)
     warn_of_coarse_grids(system, task.settings, rows)
-    return _trajectory(system, controls, begin, task, rows, history)
+    return _trajectory(system, controls, at_start, task, rows, history)
 
 
 @functools.partial(jax.jit, static_argnames=("settings", "dt"))
@@ -326,73 +334,32 @@ def _traced(system, controls, initial, settings, dt):  # type: ignore[no-untyped
 
     A single jitted function, so that a transformation traces it once and not at every call.
     """
-    begin, task = _start(system, controls, initial, settings, dt, None)
+    at_start, task = _initial(system, controls, initial, settings, dt, None)
     run: Any = sensitivity.rollout(task)
     if np.ndim(controls) == 3:
         run = jax.vmap(run, in_axes=(0 if np.ndim(system.length) else None, 0, 0))
-    rows, history = run(system, controls, begin.state.history)
-    return _trajectory(system, controls, begin, task, mark_coarse(rows, system, begin.coarse), history)
-
-
-def warn_of_coarse_grids(system: System, settings: Settings, rows: StepRows) -> None:
-    """Warn of rows with a large discretisation error; not for Euler, which only reproduces the paper."""
-    coarse = np.asarray(rows.result) == Result.COARSE
-    if np.any(coarse) and not isinstance(settings.space, Euler):
-        worst, length = float(np.max(rows.position_error[coarse])), float(np.max(system.length))
-        warnings.warn(
-            f"the grid is too coarse in {np.count_nonzero(coarse)} of {coarse.size} rows: positions are "
-            f"off by up to about {worst:.2g} m ({worst / length:.0%} of the length) with "
-            f"{system.nodes} nodes. "
-            "Use more nodes, or position_tolerance.",
-            stacklevel=4,
-        )
-
-
-def failure(rows: StepRows, causes: str | dict[int, str], times: Any) -> SimulationError:
-    """Return the error of the first step that failed; without times, of an equilibrium.
-
-    `causes` is the likely cause, or that of each robot of a batch.
-    """
-    robot = None if isinstance(causes, str) else next(iter(causes))
-    cause = causes if isinstance(causes, str) else causes[next(iter(causes))]
-    if robot is not None:
-        rows = StepRows(*(leaf[robot] for leaf in rows))
-    i = int(np.argmax(rows.result < 0))
-    number, t = (0, 0.0) if times is None else (i + 1, float(times[i]))
-    return SimulationError(number, t, float(rows.error[i]), Result(int(rows.result[i])), cause, robot)
-
-
-def rows_of(system: System, rows: StepRows) -> dict[str, Any]:
-    """Return a trajectory's arrays of rows, with NaN in unsolved rows."""
-    numeric: Any = jnp if is_traced(rows) else np
-    ny, nz = system.y_layout.size, system.z_layout.size
-    invalid = numeric.asarray(rows.result) < 0
-    records = numeric.where(invalid[..., None, None], numeric.nan, rows.records)
-    return {
-        "y": records[..., :ny], "z": records[..., ny : ny + nz], "result": rows.result,
-        "residual": rows.error, "iterations": rows.corrections,
-        "position_error": numeric.where(invalid, numeric.nan, rows.position_error),
-    }  # fmt: skip
+    rows, history = run(system, controls, at_start.state.history)
+    return _trajectory(system, controls, at_start, task, mark_coarse(rows, system, at_start.coarse), history)
 
 
 def _trajectory(
-    system: System, controls: Any, begin: InitialState, task: TimeIntegration, rows: StepRows, history: Any
+    system: System, controls: Any, at_start: InitialState, task: TimeIntegration, rows: StepRows, history: Any
 ) -> Trajectory:
     """Return the trajectory: the initial row, then the steps."""
     settings, dt = task.settings, task.dt
-    numeric: Any = jnp if is_traced((begin.record, rows)) else np
+    numeric: Any = jnp if is_traced((at_start.record, rows)) else np
     axis, ny = np.ndim(controls) - 2, system.y_layout.size
-    record, zero = numeric.asarray(begin.record), numeric.zeros(np.shape(controls)[:axis])
+    record, zero = numeric.asarray(at_start.record), numeric.zeros(np.shape(controls)[:axis])
     first = {
-        "y": record[..., :ny], "z": record[..., ny : ny + system.z_layout.size], "control": begin.control,
+        "y": record[..., :ny], "z": record[..., ny : ny + system.z_layout.size], "control": at_start.control,
         "result": zero.astype(int), "residual": zero, "iterations": zero.astype(int), "position_error": zero,
     }  # fmt: skip
     every = rows_of(system, rows) | {"control": controls}
-    t0 = begin.state.history.t0
+    t0 = numeric.asarray(at_start.state.history.t0)
     time = (t0[0] if axis else t0) + np.arange(task.steps + 1) * dt
     final = history._replace(t0=numeric.full(np.shape(t0), time[-1]))
     final = SolverState(final, dt, settings.uses_rate)
-    initial, final = jax.tree.map(numeric.asarray, (begin.state, final))
+    initial, final = jax.tree.map(numeric.asarray, (at_start.state, final))
     joined = {
         name: numeric.concatenate([numeric.expand_dims(first[name], axis), values], axis)
         for name, values in every.items()

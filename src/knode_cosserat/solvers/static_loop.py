@@ -16,7 +16,6 @@ from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.time_loop import (
-    BATCH,
     StepRows,
     no_factors,
     no_rows,
@@ -35,8 +34,7 @@ def unloaded_shape(system: System, space: SpaceScheme) -> Float[Any, "points y"]
 
 
 def static_loop(
-    system: System, settings: Settings, controls: Any, y: Float[Any, "points y"], span: tuple[Any, Any],
-    batch: str | None = None,
+    system: System, settings: Settings, controls: Any, y: Float[Any, "points y"], span: tuple[Any, Any]
 ) -> tuple[Any, Float[Any, "points y"], StepRows]:  # fmt: skip
     """Solve the equilibria under controls (T, c) of a span in turn, each from the last, until one fails.
 
@@ -45,7 +43,7 @@ def static_loop(
 
     def solve(y: Any, kept: Kept, i: Any) -> tuple[Any, StepRows, Kept]:
         problem = StepProblem.still(system, settings.space, controls[i]).ready()
-        solution, kept = newton(problem, y, system.unknowns(y[0]), settings.newton, kept, batch)
+        solution, kept = newton(problem, y, system.unknowns(y[0]), settings.newton, kept)
         return solution.y, solved_row(problem, settings.newton, solution, kept.factors)[0], kept
 
     kept = no_factors(system, settings, y, controls[0])
@@ -63,11 +61,8 @@ def static_many(system, settings, controls, y, stop, lockstep):  # type: ignore[
     """Solve a batch as one compiled program: controls (B, T, c), and one system or a batch of them."""
     many = jnp.ndim(system.length) > 0
 
-    def one(system: System, controls: Any, y: Any) -> Any:
-        return static_loop(system, settings, controls, y, (0, stop), BATCH if lockstep else None)
+    def one(given: Any) -> Any:
+        return static_loop(given[0] if many else system, settings, given[-2], given[-1], (0, stop))
 
-    if lockstep:
-        return jax.vmap(one, in_axes=(0 if many else None, 0, 0), axis_name=BATCH)(system, controls, y)
-    if many:
-        return jax.lax.map(lambda each: one(*each), (system, controls, y))
-    return jax.lax.map(lambda each: one(system, *each), (controls, y))
+    given = (system, controls, y) if many else (controls, y)
+    return jax.vmap(one)(given) if lockstep else jax.lax.map(one, given)

@@ -15,9 +15,9 @@ from knode_cosserat.solvers.history import SolverState, StateHistory
 from knode_cosserat.solvers.initial import continued_state, initial_state
 from knode_cosserat.solvers.recovery import Budget
 from knode_cosserat.solvers.result import Result, SimulationError
-from knode_cosserat.solvers.run import LEAST_CAPACITY, TimeIntegration, is_coarse
+from knode_cosserat.solvers.run import LEAST_CAPACITY, TimeIntegration, is_coarse, rows_of
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.simulate import check_initial, checked_dt, marked, rows_of
+from knode_cosserat.solvers.simulate import check_initial, checked_dt, marked
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.time import TimeScheme
 from knode_cosserat.solvers.time_loop import StepRows
@@ -74,19 +74,19 @@ class Stepper:
         settings = Settings.of(time, space, start, newton)
         self.robot, self.dt = robot, checked_dt(dt)
         if initial is None:
-            begin = initial_state(robot, settings, recovery_budget=recovery_budget)
+            at_start = initial_state(robot, settings, recovery_budget=recovery_budget)
         else:
             check_initial(robot, initial, None)
-            begin = continued_state(robot, initial, settings, self.dt)
-        first = begin.state.first_step(settings)
+            at_start = continued_state(robot, initial, settings, self.dt)
+        first = at_start.state.first_step(settings)
         self._task = TimeIntegration(settings, self.dt, 1, first, recovery_budget)
-        self._past, self._t0 = begin.state.history, float(begin.state.history.t0)
-        self._index, self._steps, self._coarse = 0, 0, bool(begin.coarse)
-        self._control = np.asarray(begin.control, dtype=float)
+        self._past, self._t0 = at_start.state.history, float(at_start.state.history.t0)
+        self._index, self._steps, self._coarse = 0, 0, bool(at_start.coarse)
+        self._control = np.asarray(at_start.control, dtype=float)
         # same capacity as in a run of up to 128 steps, so that they share a program
         self._controls = np.zeros((LEAST_CAPACITY, robot.control_size))
-        row = StepRows(np.asarray(begin.record), np.zeros(0), 0.0, 0, 0.0, 0)
-        self._state = self._row(row, self._control, self.time, begin.state)
+        row = StepRows(np.asarray(at_start.record), np.zeros(0), 0.0, 0, 0.0, 0)
+        self._state = self._row(row, self._control, self.time, at_start.state)
 
     def __repr__(self) -> str:
         return f"Stepper of a {robot_text(self.robot)}: t = {self.time:g} s, dt = {self.dt:g} s"

@@ -248,17 +248,17 @@ class RolloutMisfit:
     def _of_one(self, system: System, coordinates: np.ndarray, rollout: _Rollout) -> LinearisedMisfit | None:
         settings, dt, initial, control, places, target = rollout
         if initial is None:
-            begin = initial_state(system, settings)
+            at_start = initial_state(system, settings)
         else:
-            begin = continued_state(system, initial, settings, dt)
-        first = begin.state.first_step(settings)
+            at_start = continued_state(system, initial, settings, dt)
+        first = at_start.state.first_step(settings)
         task = TimeIntegration(settings, dt, len(control), first)
-        found, _, cause = run_one(task, system, control, begin.state.history, begin.control)
+        found, _, cause = run_one(task, system, control, at_start.state.history, at_start.control)
         if cause:
             return None
-        before = None if initial is None else (begin.record, begin.control)
-        past = begin.state.history
-        rows = _Rows(found.records, found.unknowns, past, before, begin.record, control, places, target)
+        before = None if initial is None else (at_start.record, at_start.control)
+        past = at_start.state.history
+        rows = _Rows(found.records, found.unknowns, past, before, at_start.record, control, places, target)
         values, slopes = _differences(
             self.robot, coordinates, rows, task.coefficients, self.unknowns, settings, self.oriented,
             first == "start",
