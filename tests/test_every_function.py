@@ -179,6 +179,7 @@ def predicted(robot: kc.System, it: Made) -> Any:
 FUNCTIONS: dict[str, Callable[[Any, Made], Any]] = {
     "simulate": lambda robot, it: it.motion.y,
     "equilibrium": lambda robot, it: it.rest.y,
+    "equilibria": lambda robot, it: kc.solvers.equilibria(robot, it.controls[:2], initial=it.rest).y,
     "stability": lambda robot, it: kc.statics.stability(it.rest).least,
     "equilibrium_path": followed,
     "configuration": lambda robot, it: kc.statics.configuration(robot, it.controls[0]).jacobian,

@@ -73,10 +73,30 @@ def test_a_trajectory_with_settings_and_results_of_earlier_versions(tmp_path, mo
     codes = kc.Result
     expected = [codes.CONVERGED, codes.RECOVERED_LOAD_CONTINUATION, codes.CONVERGED, codes.NO_CONVERGENCE]
     assert found.result[1:5].tolist() == expected
-    assert found.begun is None and found.position_error is None
+    assert found.initial_state is None and found.final_state is None and found.position_error is None
     # saved again it is a file of this version
     found.save(tmp_path / "b.nc")
     np.testing.assert_array_equal(kc.load_trajectory(tmp_path / "b.nc").result, found.result)
+
+
+def test_a_trajectory_without_a_final_state_goes_on_by_a_replay_of_its_rows(tmp_path):
+    """Before `final_state`, files had the history in row 0, and c0, c1, c2, d1 and dt of the first step."""
+    robot = kc.load_robot("delrin-tendon-robot").replace(nodes=5)
+    before = kc.simulate(robot, kc.controls.sine(1.0, 6, 0.05), 0.05, time="trapezoidal")
+    before.save(tmp_path / "a.nc")
+    data = xarray.load_dataset(tmp_path / "a.nc", engine="h5netcdf", decode_cf=False)
+    states = [name for name in data.variables if name.startswith(("initial_history", "final_history"))]
+    assert len(states) == 10
+    data = data.drop_vars([name for name in states if name != "initial_history"])
+    data["initial_history_step"] = "history_coefficient", np.array([40.0, -40.0, 0.0, -1.0, 0.05])
+    data.to_netcdf(tmp_path / "b.nc", engine="h5netcdf")
+    found = kc.load_trajectory(tmp_path / "b.nc")
+    assert found.final_state is None and found.initial_state is None
+    controls = kc.controls.sine(1.0, 4, 0.05)
+    again, whole = (
+        kc.simulate(robot, controls, 0.05, time="trapezoidal", initial=x) for x in (found, before)
+    )
+    np.testing.assert_allclose(again.y, whole.y, atol=1e-8)
 
 
 def test_a_model_with_settings_of_earlier_versions(tmp_path):

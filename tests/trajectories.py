@@ -10,7 +10,7 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.rods.parameters import parameter
-from knode_cosserat.solvers.history import InitialHistory
+from knode_cosserat.solvers.history import SolverState, StateHistory
 from knode_cosserat.solvers.time import TimeScheme
 from knode_cosserat.trajectory_system import TrajectoryFileError
 
@@ -62,8 +62,9 @@ def assert_same(a, b):
     assert (a.position_error is None) == (b.position_error is None)
     if a.position_error is not None:
         assert np.asarray(a.position_error).tobytes() == np.asarray(b.position_error).tobytes()
-    assert (a.begun is None) == (b.begun is None)
-    for one, other in zip(jax.tree.leaves(a.begun), jax.tree.leaves(b.begun), strict=True):
+    states = [(each.initial_state, each.final_state) for each in (a, b)]
+    assert jax.tree.structure(states[0]) == jax.tree.structure(states[1])
+    for one, other in zip(*map(jax.tree.leaves, states), strict=True):
         assert np.shape(one) == np.shape(other) and np.asarray(one).tobytes() == np.asarray(other).tobytes()
     assert a.settings == b.settings
     assert jax.tree.structure(a.system) == jax.tree.structure(b.system)
@@ -74,9 +75,17 @@ def assert_same(a, b):
 def synthetic(batch=(), steps=4, nodes=5, robot=ROBOT, settings=PAPER, seed=0, places=0):
     """A trajectory of random numbers, and of what a file could spoil: -0, NaN, infinity, a subnormal.
 
-    With `places` it has position errors and an initial history at that number of places.
+    With `places` it has position errors and solver states at that number of places.
     """
     rng = np.random.default_rng(seed)
+
+    def state(dt, known):
+        if not places:
+            return None
+        shapes = (2, places, 25), (places, 25), (3, nodes, 19), (3,), (), (3, places - 1, 25)
+        history = StateHistory(*(rng.normal(size=(*batch, *shape)) for shape in shapes))
+        return SolverState(history, dt, known)
+
     rows = (*batch, steps)
     y = rng.normal(size=(*rows, nodes, robot.y_layout.size))
     y.flat[:4] = [-0.0, np.nan, np.inf, 5e-324]
@@ -91,14 +100,8 @@ def synthetic(batch=(), steps=4, nodes=5, robot=ROBOT, settings=PAPER, seed=0, p
         residual=rng.normal(size=rows),
         iterations=rng.integers(0, 100, size=rows),
         position_error=rng.uniform(size=rows) if places else None,
-        begun=InitialHistory(
-            rng.normal(size=(*batch, 2, places, 25)),
-            rng.normal(size=(*batch, places, 25)),
-            rng.normal(size=(*batch, 4)),
-            rng.uniform(size=batch),
-        )
-        if places
-        else None,
+        initial_state=state(None, True),
+        final_state=state(0.1, False),
     )
 
 

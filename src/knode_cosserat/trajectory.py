@@ -14,7 +14,9 @@ from jaxtyping import Float, Int
 from knode_cosserat._registry import provided
 from knode_cosserat._reprs import count_of, quantity
 from knode_cosserat.rods.system import System, is_traced
+from knode_cosserat.solvers.history import SolverState
 from knode_cosserat.solvers.result import Result, ResultCodes
+from knode_cosserat.solvers.settings import Settings
 
 
 class Trajectory(eqx.Module):
@@ -27,8 +29,8 @@ class Trajectory(eqx.Module):
     """
 
     system: System
-    #: numerical settings (`solvers.settings.Settings`), or None for measured states
-    settings: Any = eqx.field(static=True)
+    #: numerical settings, or None for measured states
+    settings: Settings | None = eqx.field(static=True)
     time: Float[Any, " T"]
     y: Float[Any, "*batch T N y"]
     z: Float[Any, "*batch T N z"]
@@ -41,8 +43,10 @@ class Trajectory(eqx.Module):
     iterations: Int[Any, "*batch T"]
     #: estimated discretisation error of positions along the rod (m), the largest over the nodes; NaN: unknown
     position_error: Any = None
-    #: initial history of a motion (`solvers.history.InitialHistory`); None if unknown
-    begun: Any = None
+    #: state of the solver in row 0 of a motion; None for equilibria, and where it is unknown
+    initial_state: SolverState | None = None
+    #: state of the solver in the last row, from which a motion continues exactly; None as for `initial_state`
+    final_state: SolverState | None = None
     #: True in rows outside the training range of a learned or identified model; None if unknown
     extrapolated: Any = None
     #: True if intermediate rows were left out: the controls held there are not known
@@ -247,13 +251,19 @@ class Trajectory(eqx.Module):
         system = self.system
         if np.ndim(system.length):
             system = _picked(system, index)
-        begun = self.begun
-        if begun is not None and self.y.ndim == 4:
-            begun = _picked(begun, index)
-        elif isinstance(index, slice) and index.indices(len(self.time))[0::2] != (0, 1):
-            begun = None  # the initial history belongs to the first rows at the original step
-        thinned = self.thinned or (self.y.ndim == 3 and index.indices(len(self.time))[2] != 1)
-        return type(self)(system, self.settings, time, **picked, begun=begun, thinned=thinned)
+        initial, final, thinned = self.initial_state, self.final_state, self.thinned
+        if self.y.ndim == 4:
+            initial, final = _picked((initial, final), index)
+        else:
+            rows = range(len(self.time))[index]
+            thinned = thinned or rows.step != 1
+            # a state belongs to its row; rows after the first are replayed at the original step only
+            first, last = (bool(rows) and rows[k] == range(len(self.time))[k] for k in (0, -1))
+            final = final if last else initial if first and len(rows) == 1 else None
+            initial = initial if first and not thinned else None
+        return type(self)(
+            system, self.settings, time, **picked, initial_state=initial, final_state=final, thinned=thinned
+        )
 
     def save(self, path: Any) -> None:
         """Write a labelled netCDF file (see `trajectory_file.save`)."""

@@ -19,7 +19,7 @@ from knode_cosserat._files import package_version, replacing
 from knode_cosserat._registry import provide
 from knode_cosserat.rods.layout import Field, Layout
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.history import InitialHistory
+from knode_cosserat.solvers.history import GUESS_STATES, SolverState, StateHistory
 from knode_cosserat.solvers.result import EARLIER_RESULTS, Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.trajectory import Trajectory
@@ -49,15 +49,28 @@ _ROWS = (
 )
 _ERROR = ("position_error", "m", "estimated discretisation error of positions, the largest over the nodes")
 _OUTSIDE = ("extrapolated", "1", "1 in rows outside the range that the model was trained in")
-#: initial history of a motion: two states, newest first, and the newest one's rate, at the evaluation points
-#: along the rod; and c0, c1, c2, d1 and dt of the first step
-_BEGUN, _BEGUN_STEP = "initial_history", "initial_history_step"
-_BEGUN_ALONG = ("history_state", "history_place", "history_number")
+#: solver states of a motion (`SolverState`): name in the file, attribute, and text
+_STATES = (
+    ("initial_history", "initial_state", "state of the solver in row 0"),
+    ("final_history", "final_state", "state of the solver in the last row"),
+)
+#: further variables of a solver's state: suffix, dimensions, and text; the first has both states and the rate
+_STATE_PARTS = (
+    (
+        "",
+        ("history_state", "history_place", "history_number"),
+        "newest state, the one before it, newest rate",
+    ),
+    ("_error", ("history_state", "history_used", "history_number"), "discretisation errors of these"),
+    ("_guess", ("history_guess", "history_point", "history_y"), "y of earlier states, for the first guess"),
+    ("_weights", ("history_guess",), "weights of these in the first guess"),
+    ("_time", ("history_time",), "time (s), time step (s; NaN: all states are the same), 1 if rate is known"),
+)
 #: comment on each control about its interval; attribute for omitted intermediate rows
 _ACTED = "row i acted from row i - 1 to row i; row 0 before the motion"
 _THINNED = "rows_left_out"
-#: names in files of earlier versions, whose initial histories are ignored: they belong to other schemes
-_EARLIER = ("begun", "begun_step")
+#: names in files of earlier versions, whose initial histories are not read: their rows are replayed
+_EARLIER = ("begun", "begun_step", "initial_history_step")
 
 # writing
 
@@ -119,20 +132,11 @@ def _dataset(trajectory: Trajectory, source: str) -> xarray.Dataset:
         marks = np.asarray(trajectory.extrapolated).astype(np.int8)
         variables[name] = (rows, marks, labels(unit, meaning))
     variables["result"][2].update(_flags(variables["result"][1].dtype))
-    if trajectory.begun is not None:
-        begun = InitialHistory(*map(np.asarray, trajectory.begun))
-        states = np.concatenate([begun.records, np.expand_dims(begun.rate, -3)], axis=-3)
-        step = np.concatenate([begun.coefficients, begun.dt[..., None]], axis=-1)
-        variables[_BEGUN] = (
-            (*batch, *_BEGUN_ALONG),
-            states,
-            {"long_name": "initial history: newest state, the one before it, and the newest one's rate"},
-        )
-        variables[_BEGUN_STEP] = (
-            (*batch, "history_coefficient"),
-            step,
-            {"long_name": "c0, c1, c2, d1 and dt of the first step"},
-        )
+    for name, attribute, text in _STATES:
+        state = getattr(trajectory, attribute)
+        parts = () if state is None else _state_arrays(state)
+        for (suffix, along, meaning), values in zip(_STATE_PARTS, parts, strict=False):
+            variables[name + suffix] = (*batch, *along), values, {"long_name": f"{text}: {meaning}"}
     texts, more = described(system)
     try:
         return xarray.Dataset(variables | more, coordinates, _attributes(trajectory, source) | texts)
@@ -176,7 +180,8 @@ def _require_names(system: System, source: str) -> None:
     """Raise `TrajectoryFileError` unless every field's name can be a variable's name."""
     names = [field.name for layout in _layouts(system) for field in layout.fields]
     taken = {"time", "node", "batch", "arclength", "axis", "quaternion", BYTES, SIZES}
-    taken |= {_BEGUN, _BEGUN_STEP, *_EARLIER, *(name for name, *_ in (*_ROWS, _ERROR, _OUTSIDE))}
+    taken |= {name + suffix for name, *_ in _STATES for suffix, *_ in _STATE_PARTS}
+    taken |= {*_EARLIER, *(name for name, *_ in (*_ROWS, _ERROR, _OUTSIDE))}
     for name in names:
         if name in taken or "/" in name or name.startswith(PARAMETER) or name.endswith("_index"):
             raise TrajectoryFileError(
@@ -232,9 +237,9 @@ def load_trajectory(path: str | Path, *, system: System | None = None) -> Trajec
         numbers[_ERROR[0]] = values_of(path, data, _ERROR[0], rows)
     if _OUTSIDE[0] in data.variables:
         numbers[_OUTSIDE[0]] = values_of(path, data, _OUTSIDE[0], rows).astype(bool)
-    settings, begun = _settings(path, data), _begun(path, data)
-    thinned = bool(data.attrs.get(_THINNED, 0))
-    return Trajectory(system, settings, time, y, z, control, **numbers, begun=begun, thinned=thinned)
+    settings, thinned = _settings(path, data), bool(data.attrs.get(_THINNED, 0))
+    states = {attribute: _state(path, data, name) for name, attribute, _ in _STATES}
+    return Trajectory(system, settings, time, y, z, control, **numbers, **states, thinned=thinned)
 
 
 def _current_codes(codes: np.ndarray, attributes: dict[Any, Any]) -> np.ndarray:
@@ -248,16 +253,29 @@ def _current_codes(codes: np.ndarray, attributes: dict[Any, Any]) -> np.ndarray:
     return current
 
 
-def _begun(path: Path, data: xarray.Dataset) -> InitialHistory | None:
-    """Return the initial history, if the file has it."""
-    if _BEGUN not in data.variables:
+def _state_arrays(state: SolverState) -> tuple[np.ndarray, ...]:
+    """Return the arrays of a solver's state, in the order of `_STATE_PARTS`."""
+    records, rate, y, weights, t0, error = map(np.asarray, state.history)
+    numbers = [np.nan if state.dt is None else state.dt, float(state.rate_known)]
+    time = np.stack([t0, *(np.full(t0.shape, number) for number in numbers)], axis=-1)
+    states = np.concatenate([records, np.expand_dims(rate, -3)], axis=-3)
+    return states, error, y, weights, time
+
+
+def _state(path: Path, data: xarray.Dataset, name: str) -> SolverState | None:
+    """Return a solver's state, if the file has it."""
+    if name + _STATE_PARTS[-1][0] not in data.variables:
         return None
     batch = tuple(data.sizes[name] for name in ("batch",) if name in data.sizes)
-    sizes = tuple(data.sizes.get(name, 0) for name in _BEGUN_ALONG[1:])
-    states = values_of(path, data, _BEGUN, (*batch, 3, *sizes))
-    step = values_of(path, data, _BEGUN_STEP, (*batch, 5))
-    newest, before, rate = np.moveaxis(states, -3, 0)
-    return InitialHistory(np.stack([newest, before], axis=-3), rate, step[..., :4], step[..., 4])
+    fixed = {"history_state": 3, "history_guess": GUESS_STATES, "history_time": 3}
+    states, error, y, weights, time = (
+        values_of(path, data, name + suffix, (*batch, *(fixed.get(x, data.sizes.get(x, 0)) for x in along)))
+        for suffix, along, _ in _STATE_PARTS
+    )
+    t0, dt, known = np.moveaxis(time, -1, 0)
+    history = StateHistory(states[..., :2, :, :], states[..., 2, :, :], y, weights, t0, error)
+    first = float(np.ravel(dt)[0]) if dt.size else np.nan
+    return SolverState(history, None if np.isnan(first) else first, bool(np.all(known)))
 
 
 def _read(path: Path) -> xarray.Dataset:

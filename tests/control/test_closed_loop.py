@@ -82,13 +82,13 @@ def test_columns_of_the_observer_are_derivatives_of_the_step():
     def tip(control):
         none = np.zeros(4), np.zeros(1)
         found = predicted_step(
-            own.robot, own.x, own.past, own.spread, control, none, DT, own.table, own.settings, own.output,
+            own.robot, own.x, own.past, own.spread, control, none, own.coefficients, own.settings, own.output,
             own.parameters,
         )  # fmt: skip
         return np.asarray(found.value)
 
     found = predicted_step(
-        own.robot, own.x, own.past, own.spread, tension, (np.ones(4), np.zeros(1)), DT, own.table,
+        own.robot, own.x, own.past, own.spread, tension, (np.ones(4), np.zeros(1)), own.coefficients,
         own.settings, own.output, own.parameters,
     )  # fmt: skip
     columns = np.asarray(found.by_column)[own.columns : own.columns + 4]

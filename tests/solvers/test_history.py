@@ -12,12 +12,11 @@ from benchmarks.motions import soft_rod
 from examples.hanging_string import HangingString
 from knode_cosserat.solvers.grid import at_places, grid_of
 from knode_cosserat.solvers.history import resting_history, still_records
-from knode_cosserat.solvers.initial import SimulationRun, histories_along, initial_state
+from knode_cosserat.solvers.initial import continued_state
 from knode_cosserat.solvers.problem import StepProblem
-from knode_cosserat.solvers.run_types import RunSettings
+from knode_cosserat.solvers.replay import replay
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SCHEMES
-from knode_cosserat.solvers.time_loop import loop_one
 
 DT = 0.02
 NONE = np.zeros((12, 0))
@@ -75,12 +74,42 @@ def test_a_motion_goes_on_as_if_it_had_not_been_parted(rod, time, tmp_path):
         np.testing.assert_allclose(found.y, one.y[-count - 1 :], atol=2e-8)
 
 
-def test_what_tells_where_a_motion_began_is_no_more_than_that(rod, whole):
+def test_parts_keep_the_states_of_their_own_rows(rod, whole):
     second = gone_on(rod, whole[:5], 4)
-    assert np.all(whole.begun.records[0] == whole.begun.records[1])
-    assert second[:3].begun is second.begun
-    # of rows from the middle on, and of others than each, it would tell wrongly
-    assert second[1:].begun is None and second[::2].begun is None
+    assert whole.initial_state.dt is None and second.initial_state.dt == whole.final_state.dt == DT
+    assert second[:3].initial_state is second.initial_state and second[:3].final_state is None
+    assert second[1:].initial_state is None and second[1:].final_state is second.final_state
+    # one row is where a motion begins and ends; rows further apart cannot be replayed
+    assert second[:1].final_state is second.initial_state
+    assert second[::2].initial_state is None and second[::2].final_state is second.final_state
+
+
+@pytest.mark.parametrize("traced", [False, True])
+@pytest.mark.parametrize("time", ["bdf2", pytest.param("trapezoidal", marks=pytest.mark.campaign)])
+def test_a_whole_motion_goes_on_by_the_state_of_the_solver(rod, time, traced, monkeypatch):
+    """Without a replay, with the error estimate of one run, and in one program too."""
+    monkeypatch.setattr("knode_cosserat.solvers.initial.replay", None)
+    one = kc.simulate(rod, NONE, DT, space="lobatto4", time=time)
+
+    def parted(controls):
+        return gone_on(rod, kc.simulate(rod, controls, DT, space="lobatto4", time=time), 8, time=time)
+
+    found = (jax.jit(parted) if traced else parted)(NONE[:4])
+    np.testing.assert_allclose(found.y, one.y[4:], atol=1e-9)
+    np.testing.assert_allclose(found.position_error[1:], one.position_error[5:], rtol=1e-3)
+
+
+def test_a_row_that_was_changed_moves_the_state_of_the_solver(rod, whole):
+    """A change of rates in the last rows acts as it does in a replay of these rows."""
+    changed = np.array(whole.y)
+    spin = rod.y_layout.slice("w").stop - 1
+    changed[-2:, :, spin] += 0.2 * np.linspace(0.0, 1.0, rod.nodes)
+    kept = dataclasses.replace(whole, y=changed)
+    replayed = dataclasses.replace(kept, final_state=None)
+    straight, moved, wanted = (gone_on(rod, each, 2).y[1:, :, spin] for each in (whole, kept, replayed))
+    assert np.max(np.abs(wanted - straight)) > 1e-3
+    # between nodes the change is interpolated; a replay evaluates the equations there
+    np.testing.assert_allclose(moved, wanted, atol=0.02 * np.max(np.abs(wanted - straight)))
 
 
 def test_the_middle_of_a_motion_is_known_at_its_nodes_only(rod, whole):
@@ -92,18 +121,16 @@ def test_the_middle_of_a_motion_is_known_at_its_nodes_only(rod, whole):
 def test_rows_tell_what_the_last_step_looked_back_on(rod, whole):
     """The past that is found again is the one that the solver had."""
     settings = Settings.of("bdf2", "lobatto4", "paper", kc.solvers.NewtonOptions())
-    begins = initial_state(SimulationRun(rod, NONE, None, settings, DT, None, False))
-    task = RunSettings(settings, DT, len(NONE))
-    _, past, _ = loop_one(rod, settings, task.table, NONE, DT, begins.start.past, 0, len(NONE))
-    again = initial_state(SimulationRun(rod, NONE, whole, settings, DT, None, False))
-    assert again.first == "regular" and again.start.past.t0 == pytest.approx(len(NONE) * DT)
-    np.testing.assert_allclose(again.start.past.records, past.records, atol=2e-8)
+    again = continued_state(rod, dataclasses.replace(whole, final_state=None), settings, DT)
+    assert again.state.first_step(settings) == "regular"
+    assert again.state.history.t0 == pytest.approx(len(NONE) * DT)
+    np.testing.assert_allclose(again.state.history.records, whole.final_state.history.records, atol=2e-8)
 
 
 def test_what_is_at_the_nodes_beside_a_solution_is_carried_over(rod, whole):
     """States that were changed since are taken as they are."""
     changed = dataclasses.replace(whole, z=whole.z + 1e-3)
-    (_, plain), (_, moved) = (histories_along(rod, each) for each in (whole, changed))
+    plain, moved = (replay(each, rod).terms for each in (whole, changed))
     # c1 + c2 of BDF2 is -3/2 of 1/dt, whatever the past
     shift = (moved - plain)[2:, :, rod.y_layout.size :] * DT / -1.5e-3
     np.testing.assert_allclose(shift[:, grid_of(rod).nodes], 1.0, atol=1e-6)

@@ -16,11 +16,13 @@ import knode_cosserat as kc
 from knode_cosserat.rods.surroundings import Plane
 from knode_cosserat.rods.tendon_friction import TendonFriction, Vibration
 from knode_cosserat.solvers.grid import at_places
-from knode_cosserat.solvers.history import EXTRAPOLATIONS, advanced, history_of, padded_rows, resting_history
+from knode_cosserat.solvers.history import EXTRAPOLATIONS, advanced, history_of, resting_history
 from knode_cosserat.solvers.problem import StepProblem
-from knode_cosserat.solvers.recovery import Budget, BudgetError, _continue_load, _Step, _substeps
+from knode_cosserat.solvers.recovery import Budget, BudgetError
+from knode_cosserat.solvers.recovery_methods import StepRecovery
+from knode_cosserat.solvers.run import padded_rows
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.time_loop import loop_many, weights_by
+from knode_cosserat.solvers.time_loop import StepCoefficients, TimeStep, loop_many, weights_by
 
 DT = 0.05
 
@@ -108,7 +110,7 @@ def test_on_request_the_rest_is_marked_invalid(robot):
 
 
 def _step(robot, past, coefficients):
-    return _Step(robot, Settings(), past, coefficients, DT, Budget(60.0))
+    return StepRecovery(robot, Settings(), TimeStep(past, coefficients, DT), DT, Budget(60.0))
 
 
 BDF2 = kc.solvers.BDF2().coefficients(DT, DT)
@@ -117,9 +119,9 @@ BDF2 = kc.solvers.BDF2().coefficients(DT, DT)
 def test_load_continuation_reaches_the_solution_that_newton_finds(robot):
     step = _step(robot, resting_history(robot, Settings()), BDF2)
     control = np.array([30.0, 5.0, 5.0, 30.0])
-    direct = step.solve(control, *step.guesses()[0])
+    direct = step.solve(control, step.guesses()[0])
     assert step.solved(direct)
-    parts = _continue_load(step, np.zeros(4), control)
+    parts = step.continue_load(np.zeros(4), control)
     np.testing.assert_allclose(parts.row.records, direct.row.records, atol=1e-7)
     # by the last linearisation of each, which is near the solution
     np.testing.assert_allclose(parts.row.position_error, direct.row.position_error, rtol=0.05)
@@ -129,16 +131,16 @@ def test_a_divided_step_is_the_same_motion_in_smaller_steps(robot):
     """Two halves by hand, with the coefficients for unequal steps, give the row that dividing gives."""
     past = resting_history(robot, Settings())
     control = np.array([7.0, 5.0, 5.0, 7.0])
-    _, found = _substeps(_step(robot, past, BDF2), (control, control), DT)
+    _, found = _step(robot, past, BDF2).last_method((control, control))
     by_hand = past
     for previous in (DT, DT / 2):
         half = _step(robot, by_hand, kc.solvers.BDF2().coefficients(DT / 2, previous))
-        by_hand = half.solve(control, *half.guesses()[0]).after
-    np.testing.assert_allclose(found.after.records[0], by_hand.records[0], atol=1e-9)
-    np.testing.assert_allclose(found.after.error[0], by_hand.error[0], atol=1e-9)
+        by_hand = half.solve(control, half.guesses()[0]).state
+    np.testing.assert_allclose(found.state.records[0], by_hand.records[0], atol=1e-9)
+    np.testing.assert_allclose(found.state.error[0], by_hand.error[0], atol=1e-9)
     # history of the next whole step is of whole steps
-    np.testing.assert_array_equal(found.after.records[1], past.records[0])
-    np.testing.assert_array_equal(found.after.error[1], past.error[0])
+    np.testing.assert_array_equal(found.state.records[1], past.records[0])
+    np.testing.assert_array_equal(found.state.error[1], past.error[0])
 
 
 def test_recovery_ends_within_its_budget(robot):
@@ -303,10 +305,10 @@ def test_lockstep_as_on_a_gpu_equals_one_after_the_other(robot, sine):
     tensions = np.stack([sine[:16], 1.2 * sine[:16], 0.8 * sine[:16]])
     pasts = jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), past)
     table = np.array([kc.solvers.BDF2().coefficients(DT, DT)] * 2)
-    arguments = (robot, Settings(), table, padded_rows(tensions), DT, pasts, 16, False)
+    arguments = (robot, Settings(), StepCoefficients(table, DT), padded_rows(tensions), pasts, 16)
     one_by_one, together = loop_many(*arguments, lockstep=False), loop_many(*arguments, lockstep=True)
     np.testing.assert_array_equal(one_by_one[0], [16, 16, 16])
-    np.testing.assert_allclose(one_by_one[1].records, together[1].records, atol=1e-8)
+    np.testing.assert_allclose(one_by_one[2].records, together[2].records, atol=1e-8)
 
 
 def test_one_failing_robot_does_not_spoil_the_batch(robot, sine):
@@ -325,6 +327,31 @@ def test_equilibria_in_a_batch(robot):
     assert found.y.shape == (3, 1, 10, 19)
     np.testing.assert_allclose(found[0].tip_position * [-1, 1, 1], found[1].tip_position, atol=1e-9)
     np.testing.assert_allclose(found.velocity, 0.0, atol=1e-12)
+
+
+def test_a_list_of_equilibria_is_each_by_itself_in_batches_and_programs_too(robot):
+    tensions = np.array([[7.0, 5.0, 5.0, 7.0], [9.0, 5.0, 5.0, 9.0], [6.0, 6.0, 8.0, 6.0]])
+    found = kc.solvers.equilibria(robot, tensions)
+    assert found.settings.time is None and found.final_state is None and found.all_valid
+    for row, control in enumerate(tensions):
+        np.testing.assert_allclose(found.y[row], kc.equilibrium(robot, control).y[0], atol=1e-8)
+    np.testing.assert_array_equal(found.control, tensions)
+    both = kc.solvers.equilibria(robot, np.stack([tensions, tensions[::-1]]))
+    np.testing.assert_allclose(both[1].y[::-1], found.y, atol=1e-8)
+
+    def tip(pull):
+        return kc.solvers.equilibria(robot, jnp.asarray(tensions).at[:, 0].add(pull)).tip_position[2, 0]
+
+    difference = (tip(1e-3) - tip(-1e-3)) / 2e-3
+    for slope in (jax.jacfwd(tip), jax.grad(tip)):
+        np.testing.assert_allclose(slope(0.0), difference, rtol=1e-5)
+
+
+def test_statics_have_no_time_scheme(robot, sine):
+    for run in (kc.simulate, kc.solvers.Stepper):
+        arguments = (robot, DT) if run is kc.solvers.Stepper else (robot, sine, DT)
+        with pytest.raises(ValueError, match=r"time is 'static'.*equilibri"):
+            run(*arguments, time="static")
 
 
 def test_the_past_keeps_the_newest_first(robot):

@@ -35,7 +35,7 @@ class Prediction(NamedTuple):
 
 @functools.partial(jax.jit, static_argnames=("settings", "target", "limited"))
 def linearised_prediction(  # type: ignore[no-untyped-def]
-    robot, x, past, spread, plan, basis, reference, dt, table, settings, target, limited, parameters
+    robot, x, past, spread, plan, basis, reference, coefficients, settings, target, limited, parameters
 ):
     """Return the `Prediction` of a plan (knots, c) by its `basis` (T, knots), from a state."""
     system, directions = directions_of(robot, parameters, x)
@@ -48,7 +48,7 @@ def linearised_prediction(  # type: ignore[no-untyped-def]
     wide = jax.tree.map(extended, spread)
     d_controls = jnp.concatenate([of_plan, jnp.zeros((m, steps, c))])
     found = rollout_with_tangents(
-        system, settings, table, dt, past, basis @ plan, wide, d_controls, directions
+        system, settings, coefficients, past, basis @ plan, wide, (directions, d_controls)
     )
     error, slopes = errors_along(system, target, found.records, found.d_records, reference)
     path = system.positions(split_record(system, found.records[:, -1])[0])

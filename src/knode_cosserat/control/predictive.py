@@ -122,8 +122,8 @@ class PredictiveController(Controller):
             )
         own = self.observer
         found = linearised_prediction(
-            own.robot, own.x, own.past, own.spread, self._plan, self.knots.basis, wanted, self.dt, own.table,
-            own.settings, self.target, tuple(each.output for each in self.soft), own.parameters,
+            own.robot, own.x, own.past, own.spread, self._plan, self.knots.basis, wanted,
+            own.coefficients, own.settings, self.target, tuple(each.output for each in self.soft), own.parameters,
         )  # fmt: skip
         if bool(found.solved):
             self._prediction = Prediction(*(np.asarray(part) for part in found))

@@ -15,7 +15,7 @@ from knode_cosserat.estimation.online import (
     Spread,
     measured_error,
     predicted_step,
-    regular_table,
+    regular_coefficients,
     split_record,
 )
 from knode_cosserat.estimation.outputs import Output
@@ -23,7 +23,7 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.history import used_places
-from knode_cosserat.solvers.initial import SimulationRun, initial_state
+from knode_cosserat.solvers.initial import continued_state, initial_state
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.simulate import check_initial, checked_dt
 from knode_cosserat.trajectory import Trajectory
@@ -100,7 +100,7 @@ class KalmanObserver:
         self.parameters = AdaptedParameters(robot, adapt)
         self.columns = columns + self.parameters.size
         self.settings = Settings.of("bdf2", "lobatto2", "paper", NewtonOptions())
-        self.table = regular_table(self.settings, self.dt)
+        self.coefficients = regular_coefficients(self.settings, self.dt)
         self._control_deviation = _deviations(robot, control_deviation)
         self._start_deviation = float(start_deviation)
         self._scale = np.asarray(robot.scales().y)
@@ -108,14 +108,16 @@ class KalmanObserver:
 
     def restart(self, initial: Trajectory | None = None) -> None:
         """Start again at rest, or at the last row of a trajectory, with the initial uncertainty."""
-        robot, count = self.robot, self.robot.control_size
+        robot = self.robot
         if initial is not None:
             check_initial(robot, initial, None)
-        run = SimulationRun(robot, np.zeros((1, count)), initial, self.settings, self.dt, None, False)
-        begun = initial_state(run)
-        self.past = begun.start.past
-        self.control = np.asarray(begun.start.control, dtype=float)
-        self.record = np.asarray(begun.record)
+        if initial is None:
+            at_start = initial_state(robot, self.settings)
+        else:
+            at_start = continued_state(robot, initial, self.settings, self.dt)
+        self.past = at_start.state.history
+        self.control = np.asarray(at_start.control, dtype=float)
+        self.record = np.asarray(at_start.record)
         self.x = np.zeros(self.parameters.size)
         self.lost = 0
         used = used_places(robot, self.settings.space)
@@ -183,7 +185,7 @@ class KalmanObserver:
             )
         deviations = self._control_deviation, self.parameters.drift * np.sqrt(self.dt)
         found = predicted_step(
-            self.robot, self.x, self.past, self.spread, control, deviations, self.dt, self.table,
+            self.robot, self.x, self.past, self.spread, control, deviations, self.coefficients,
             self.settings, self.output, self.parameters,
         )  # fmt: skip
         if not bool(found.solved):

@@ -17,11 +17,11 @@ from jaxtyping import Float
 from knode_cosserat.estimation.adapted import AdaptedParameters
 from knode_cosserat.estimation.outputs import Output
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.history import StateHistory
-from knode_cosserat.solvers.sensitivity import TangentState, tangent_piece
+from knode_cosserat.solvers.history import StateHistory, coefficient_table
+from knode_cosserat.solvers.sensitivity import TangentState, tangent_time_loop
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.tangent import SystemMoves
-from knode_cosserat.solvers.time_loop import time_loop
+from knode_cosserat.solvers.time_loop import StepCoefficients, time_loop
 
 
 class Spread(NamedTuple):
@@ -51,31 +51,32 @@ class Rollout(NamedTuple):
     solved: Any
 
 
-def regular_table(settings: Settings, dt: float) -> Float[np.ndarray, "2 4"]:
+def regular_coefficients(settings: Settings, dt: float) -> StepCoefficients:
     """Return the coefficients of steps after the first ones."""
-    return np.array([settings.time.coefficients(dt, dt)] * 2)
+    return StepCoefficients(coefficient_table(settings, dt, "regular"), dt)
 
 
 def rollout_with_tangents(
-    system: System, settings: Settings, table: Any, dt: Any, past: StateHistory, controls: Float[Any, "T c"],
-    spread: Spread, d_controls: Float[Any, "k T c"], directions: Any,
+    system: System, settings: Settings, coefficients: StepCoefficients, past: StateHistory,
+    controls: Float[Any, "T c"], spread: Spread, changes: tuple[Any, Float[Any, "k T c"]],
 ) -> Rollout:  # fmt: skip
     """Simulate, and return the tangents of all rows along columns of history, parameters and controls.
 
-    `directions` are the tangents of the system by each adapted parameter, stacked; None if there are none.
+    `changes` are the tangents of the system by each adapted parameter, stacked (None if there are none), and
+    those of the controls by each column.
     """
-    steps = len(controls)
-    done, after, rows = time_loop(system, settings, table, controls, dt, past, 0, steps)
-    state = TangentState.of(system, settings, past, past.records, past.rate)
+    steps, (directions, d_controls) = len(controls), changes
+    done, after, rows = time_loop(system, settings, coefficients, controls, past, (0, steps))
+    state = TangentState.of(system, settings.space, past, past.records, past.rate)
 
     def along(d_records: Any, d_rate: Any, weights: Any, d_controls: Any) -> Any:
-        moves, solved = SystemMoves(directions, weights), (rows.records, rows.unknowns)
-        begun = state._replace(d_records=d_records, d_rate=d_rate)
-        return tangent_piece(settings, table, dt, solved, system, controls, begun, moves, d_controls)
+        solved, moved = (rows.records, rows.unknowns), (SystemMoves(directions, weights), d_controls)
+        first = state._replace(d_records=d_records, d_rate=d_rate)
+        return tangent_time_loop(settings, coefficients, solved, (system, controls), moved, first)
 
     last, (d_rows, _) = jax.vmap(along)(spread.records, spread.rate, spread.parameters, d_controls)
     moved = Spread(last.d_records, last.d_rate, spread.parameters)
-    after = after._replace(t0=past.t0 + steps * dt)
+    after = after._replace(t0=past.t0 + steps * coefficients.dt)
     return Rollout(after, rows.records, d_rows, moved, done == steps)
 
 
@@ -124,7 +125,7 @@ class Predicted(NamedTuple):
 
 @functools.partial(jax.jit, static_argnames=("settings", "output"))
 def predicted_step(  # type: ignore[no-untyped-def]
-    robot, x, past, spread, control, deviations, dt, table, settings, output, parameters
+    robot, x, past, spread, control, deviations, coefficients, settings, output, parameters
 ):
     """Return one step under a control, with new columns for its uncertainty and the parameters' drift.
 
@@ -141,7 +142,7 @@ def predicted_step(  # type: ignore[no-untyped-def]
     wide = Spread(more(spread.records), more(spread.rate), drifts)
     d_controls = jnp.concatenate([jnp.zeros((m, c)), jnp.diag(of_control), jnp.zeros((n, c))])
     found = rollout_with_tangents(
-        system, settings, table, dt, past, control[None], wide, d_controls[:, None], directions
+        system, settings, coefficients, past, control[None], wide, (directions, d_controls[:, None])
     )
     record = found.records[0]
     value = output.value(system, *split_record(system, record))

@@ -13,12 +13,11 @@ from knode_cosserat.evaluation.metrics import dtw_distance, pose_mse
 from knode_cosserat.identification.misfit import since_first, turned_from
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.equilibrium import equilibrium
+from knode_cosserat.solvers.equilibrium import equilibria, equilibrium
 from knode_cosserat.solvers.places import places_at, positions_at, quaternions_at
 from knode_cosserat.solvers.result import SimulationError
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.solvers.time import Static
 from knode_cosserat.trajectory import Trajectory
 
 #: seconds that recovery may take before a prediction has failed
@@ -114,15 +113,10 @@ def _moved(robot: System, measured: Measurements, space: str | SpaceScheme, reco
     initial, first = None, measured.tension[0] if measured.static else measured.initial_tension
     if first is not None:
         initial = equilibrium(robot, first, space=space, recovery_budget=recovery)
-    time: Static | str = "bdf2"
     if measured.static:
-        tension, dt, time = measured.tension, 1.0, Static()
-    else:
-        tension = robot.undelayed(measured.tension[:-1], measured.dt, measured.initial_tension)
-        dt = measured.dt
-    moved = simulate(robot, tension, dt, time=time, space=space, initial=initial, recovery_budget=recovery)
-    # the first row of equilibria is where the search began
-    return moved[1:] if measured.static else moved
+        return equilibria(robot, measured.tension, space=space, initial=initial, recovery_budget=recovery)
+    tension = robot.undelayed(measured.tension[:-1], measured.dt, measured.initial_tension)
+    return simulate(robot, tension, measured.dt, space=space, initial=initial, recovery_budget=recovery)
 
 
 def evaluate(

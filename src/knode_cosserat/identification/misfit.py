@@ -19,13 +19,13 @@ from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.load_cells import LoadCells
 from knode_cosserat.rotation import conjugate, quaternion_product
 from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.history import constant_history, resting_history
+from knode_cosserat.solvers.history import constant_history
 from knode_cosserat.solvers.places import Places, places_at, positions_at, quaternions_at
-from knode_cosserat.solvers.run import run_one, usable_cores
-from knode_cosserat.solvers.run_types import FirstStep, InitialCondition, RunSettings
-from knode_cosserat.solvers.sensitivity import TangentState, tangent_piece
+from knode_cosserat.solvers.run import Equilibria, TimeIntegration, run_one, usable_cores
+from knode_cosserat.solvers.sensitivity import TangentState, static_tangents, tangent_time_loop
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.solvers.static_loop import unloaded_shape
 from knode_cosserat.solvers.tangent import SystemMoves
 
 #: rows of one compiled program with derivatives
@@ -34,8 +34,6 @@ PIECE = 40
 RECOVERY = 0.5
 #: a rotation counts as the displacement at this part of the length
 ARM = 0.2
-#: coefficients of steps without rates
-STILL = np.zeros((2, 4))
 
 
 class RecordingData(NamedTuple):
@@ -164,69 +162,66 @@ class Misfit:
         steps = len(data.tension) if rows is None else min(len(data.tension), data.moves + rows)
         system, settings = _system(self.model.robot, x), self.settings
         acting, slope = _acting(system, data)
-        past = _resting(system, settings)
-        # controls have room for a motion: one program for equilibrium and motion
-        still = np.broadcast_to(data.initial_tension, data.tension.shape)
-        first, _ = run_one(
-            RunSettings(settings, data.dt, 1, "still", RECOVERY),
-            system,
-            still,
-            InitialCondition(past, still[0]),
-        )
-        if first.result[0] < 0:
+        still = Equilibria(dataclasses.replace(settings, time=None), 1, RECOVERY)
+        # controls have room for a motion: one program for all equilibria
+        held = np.broadcast_to(data.initial_tension, data.tension.shape)
+        first = run_one(still, system, held, unloaded_shape(system, settings.space), held[0])
+        if first.cause:
             return None
-        count = system.y_layout.size + system.z_layout.size
-        begun = (
-            past
-            if data.static
-            else _initial(system, settings, first.records[0][:, :count], data.initial_tension)
+        ny, count = system.y_layout.size, max(steps, 1)
+        task: TimeIntegration | Equilibria = TimeIntegration(
+            settings, data.dt, count, recovery_budget=RECOVERY
         )
-        kind: FirstStep = "still" if data.static else "start"
-        task = RunSettings(settings, data.dt, max(steps, 1), kind, recovery_budget=RECOVERY)
-        found, _ = run_one(task, system, acting, InitialCondition(begun, data.initial_tension))
-        if found.result.min() < 0:
+        if data.static:
+            task, state = dataclasses.replace(still, steps=count), first.state
+        else:
+            record = first.rows.records[0][:, : ny + system.z_layout.size]
+            state = _initial(system, settings, record, data.initial_tension)
+        found, _, cause = run_one(task, system, acting, state, data.initial_tension)
+        if cause:
             return None
-        ny = system.y_layout.size
-        y = np.concatenate([first.records[:1, :, :ny], found.records[:steps, :, :ny]])
+        y = np.concatenate([first.rows.records[:1, :, :ny], found.records[:steps, :, :ny]])
         if not derivatives:
             return Rollout(np.asarray(_compared(system, y, *self._target(data, steps))), None)
-        d_first, d_begun = self._of_start(x, data, past, first)
-        if data.static:
-            # an equilibrium depends on no history
-            d_begun = tuple(np.zeros_like(each) for each in d_begun)
-        parts = [d_first[:, None, :, :ny]]
-        carry = TangentState.of(system, settings, begun, *d_begun)
-        for k in range(0, steps, PIECE):
-            size = min(PIECE, steps - k)
-            parts_of = (found.records, found.unknowns, acting, slope)
-            rows_, xi, tension, by_latency = (_filled(each[k : k + size], PIECE) for each in parts_of)
-            table = task.table if k == 0 else task.table[[1, 1]]
-            carry, d_rows = _piece(
-                self.model.robot, x, settings, table, data.dt, rows_, xi, tension, by_latency, carry
-            )
-            parts.append(np.asarray(d_rows)[:, :size, :, :ny])
-        d_y = np.concatenate(parts, axis=1)
+        beginning = first.rows.records, first.rows.unknowns, held, np.zeros_like(held)
+        d_first, d_records = self._static_slopes(still, x, beginning, 1)
+        moved = found.records, found.unknowns, acting, slope
+        if not steps:
+            d_rows = d_first[:, :0]
+        elif isinstance(task, Equilibria):
+            d_rows = self._static_slopes(task, x, moved, steps)[0]
+        else:
+            both = np.stack([d_records[:, 0]] * 2, axis=1)
+            carry = TangentState.of(system, settings.space, state, both, np.zeros_like(both[:, 0]))
+            d_rows = self._slopes(task, x, moved, steps, carry)
+        d_y = np.concatenate([d_first, d_rows], axis=1)[..., :ny]
         values, slopes = _with_slopes(system, y, d_y, *self._target(data, steps))
         return Rollout(np.asarray(values), np.asarray(slopes))
 
+    def _slopes(self, task: TimeIntegration, x: Any, rows: Any, count: int, carry: Any) -> np.ndarray:
+        """Derivatives of a motion's rows; `carry` is the state before the first one."""
+        parts, steps = [], task.coefficients
+        for k in range(0, count, PIECE):
+            size = min(PIECE, count - k)
+            piece = tuple(_filled(each[k : k + size], PIECE) for each in rows)
+            carry, d_rows = _piece(self.model.robot, x, task.settings, steps, piece, carry)
+            parts.append(np.asarray(d_rows)[:, :size])
+            steps = steps._replace(table=steps.table[[1, 1]])
+        return np.concatenate(parts, axis=1)
+
+    def _static_slopes(self, task: Equilibria, x: Any, rows: Any, count: int) -> tuple[np.ndarray, Any]:
+        """Derivatives of equilibria, and of their records at all places."""
+        parts, length = [], PIECE if count > 1 else 1
+        for k in range(0, count, length):
+            size = min(length, count - k)
+            piece = tuple(_filled(each[k : k + size], length) for each in rows)
+            found = _static_piece(self.model.robot, x, task.settings, piece)
+            parts.append([np.asarray(each)[:, :size] for each in found])
+        d_rows, d_records = (np.concatenate(each, axis=1) for each in zip(*parts, strict=True))
+        return d_rows, d_records
+
     def _target(self, data: RecordingData, steps: int) -> tuple[Any, ...]:
         return data.places, data.position[: steps + 1], data.rotation[: steps + 1]
-
-    def _of_start(self, x: Any, data: RecordingData, past: Any, first: Any) -> tuple[Any, Any]:
-        """Derivatives of the equilibrium, and of the history that a motion begins with.
-
-        An equilibrium has no history: derivatives of the history are zero before it, and those of a motion
-        at rest after it.
-        """
-        rows, xi = (_filled(each[:1], PIECE) for each in (first.records, first.unknowns))
-        tension = np.broadcast_to(data.initial_tension, (PIECE, len(data.initial_tension)))
-        none = (np.zeros((self.model.size, *np.shape(each))) for each in (past.records, past.rate))
-        state = TangentState.of(_system(self.model.robot, x), self.settings, past, *none)
-        no_latency = np.zeros_like(tension)
-        after, d_rows = _piece(
-            self.model.robot, x, self.settings, STILL, data.dt, rows, xi, tension, no_latency, state
-        )
-        return np.asarray(d_rows)[:, 0], (after.d_records, after.d_rate)
 
 
 def _cells(system: Any) -> LoadCells | None:
@@ -261,29 +256,52 @@ def _system(robot: ParametrisedRobot, x: Any) -> Any:
     return robot(x)
 
 
-_resting = jax.jit(resting_history, static_argnames="settings")
 _initial = jax.jit(constant_history, static_argnames="settings")
+
+
+def _directions(robot: ParametrisedRobot, x: Any, by_latency: Any) -> Any:
+    """Return a system, and its tangents and those of its controls by each coordinate, stacked."""
+
+    def along(direction: Any) -> Any:
+        system, d_system = jax.jvp(robot, (x,), (direction,))
+        cells = _cells(d_system)
+        return system, d_system, jnp.zeros_like(by_latency) if cells is None else by_latency * cells.latency
+
+    return jax.vmap(along, out_axes=(None, 0, 0))(jnp.eye(len(x)))
 
 
 @functools.partial(jax.jit, static_argnames="settings")
 def _piece(
-    robot: ParametrisedRobot, x: Any, settings: Settings, table: Any, dt: Any, rows: Any, xi: Any,
-    controls: Any, by_latency: Any, carry: TangentState,
-) -> Any:  # fmt: skip
-    """Return the state after a piece, and the derivatives of its rows; `by_latency` are those of controls."""
-    directions = jnp.eye(len(x))
-    system, by_x = jax.vmap(lambda d: jax.jvp(robot, (x,), (d,)), out_axes=(None, 0))(directions)
+    robot: ParametrisedRobot, x: Any, settings: Settings, steps: Any, rows: Any, carry: TangentState
+) -> Any:
+    """Return the state after a piece, and derivatives of its rows; `rows` end with controls by latency."""
+    records, xi, controls, by_latency = rows
+    system, directions, d_controls = _directions(robot, x, by_latency)
 
-    def one(direction: Any, d_records: Any, d_rate: Any) -> Any:
-        cells = _cells(jax.tree.map(lambda leaf: jnp.tensordot(direction, leaf, 1), by_x))
-        d_controls = jnp.zeros_like(controls) if cells is None else by_latency * cells.latency
-        state = carry._replace(d_records=d_records, d_rate=d_rate)
-        moves, solved = SystemMoves(by_x, direction), (rows, xi)
-        return tangent_piece(settings, table, dt, solved, system, controls, state, moves, d_controls)
+    def one(weights: Any, d_controls: Any, d_records: Any, d_rate: Any) -> Any:
+        state, moves = carry._replace(d_records=d_records, d_rate=d_rate), SystemMoves(directions, weights)
+        changes = moves, d_controls
+        return tangent_time_loop(settings, steps, (records, xi), (system, controls), changes, state)
 
     each = TangentState(None, None, 0, 0, None)
-    after, (d_rows, _) = jax.vmap(one, out_axes=(each, (0, 0)))(directions, carry.d_records, carry.d_rate)
-    return after._replace(t0=after.t0 + PIECE * dt), d_rows
+    after, (d_rows, _) = jax.vmap(one, out_axes=(each, (0, 0)))(
+        jnp.eye(len(x)), d_controls, carry.d_records, carry.d_rate
+    )
+    return after._replace(t0=after.t0 + PIECE * steps.dt), d_rows
+
+
+@functools.partial(jax.jit, static_argnames="settings")
+def _static_piece(robot: ParametrisedRobot, x: Any, settings: Settings, rows: Any) -> Any:
+    """Return derivatives of a piece's equilibria, and of their records."""
+    records, xi, controls, by_latency = rows
+    system, directions, d_controls = _directions(robot, x, by_latency)
+
+    def one(weights: Any, d_controls: Any) -> Any:
+        changes = SystemMoves(directions, weights), d_controls
+        found = static_tangents(settings, (records, xi), (system, controls), changes)
+        return found[0], found[2]
+
+    return jax.vmap(one)(jnp.eye(len(x)), d_controls)
 
 
 @jax.jit

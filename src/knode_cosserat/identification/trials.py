@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
 from collections.abc import Sequence
 
@@ -11,11 +12,10 @@ from jaxtyping import Float
 from knode_cosserat.identification.misfit import RecordingData
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.trained_range import TrainedRange
-from knode_cosserat.solvers.equilibrium import equilibrium
+from knode_cosserat.solvers.equilibrium import equilibria, equilibrium
 from knode_cosserat.solvers.result import Result, SimulationError
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.solvers.time import Static
 from knode_cosserat.trajectory import Trajectory
 
 #: amplitudes of the recordings' tensions about their initial ones
@@ -101,11 +101,13 @@ def _moved(
     space: str | SpaceScheme, static: bool,
 ) -> tuple[Trajectory, Trajectory]:  # fmt: skip
     """Return the equilibrium under the initial tensions, and the motion, or the equilibria, from there."""
-    time: Static | str = Static() if static else "bdf2"
     with warnings.catch_warnings():
         # this trial is about solvable steps, not about their accuracy
         warnings.filterwarnings("ignore", message="the grid is too coarse")
         still = equilibrium(robot, initial, space=space, recovery_budget=RECOVERY)
         tension = robot.undelayed(tension, dt, initial)
-        found = simulate(robot, tension, dt, time=time, initial=still, space=space, recovery_budget=RECOVERY)
-        return still, found
+        if static:
+            tension = np.concatenate([initial[None], tension])
+            found = equilibria(robot, tension, initial=still, space=space, recovery_budget=RECOVERY)
+            return still, dataclasses.replace(found, time=dt * found.time)
+        return still, simulate(robot, tension, dt, initial=still, space=space, recovery_budget=RECOVERY)

@@ -21,7 +21,7 @@ from knode_cosserat.learning.discontinuities import far_side, slopes_of
 from knode_cosserat.rods.system import System, in_strands, records_in_strands, unpacked_history
 from knode_cosserat.solvers.grid import at_places, grid_of, inside
 from knode_cosserat.solvers.history import coefficient_table, rows_suffice
-from knode_cosserat.solvers.initial import histories_along
+from knode_cosserat.solvers.replay import replay
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
@@ -275,12 +275,12 @@ def _past_of_rows(
     """Return `Samples.history` and `Samples.later` of all segments, row by row."""
     space = settings_of(trajectory).space
     simulated = trajectory.settings is not None
-    known = histories_along(model, trajectory) if model is not None and simulated else None
+    known = replay(trajectory, model) if model is not None and simulated else None
     if known is None:
         past = jax.vmap(lambda each: segment_history(knowledge, space, each))(history)
     else:
-        first, along = known
-        past = jax.vmap(lambda each: in_segments(knowledge, space, each))(along[rows - first])
+        along = known.terms[rows - known.first]
+        past = jax.vmap(lambda each: in_segments(knowledge, space, each))(along)
     return np.asarray(past[0]), np.asarray(past[1])
 
 

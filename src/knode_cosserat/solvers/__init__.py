@@ -9,7 +9,7 @@ from knode_cosserat._lazy import make_lazy
 
 if TYPE_CHECKING:
     from knode_cosserat.solvers.boundary import NewtonOptions
-    from knode_cosserat.solvers.equilibrium import equilibrium
+    from knode_cosserat.solvers.equilibrium import equilibria, equilibrium
     from knode_cosserat.solvers.result import Result, SimulationError
     from knode_cosserat.solvers.settings import Settings
     from knode_cosserat.solvers.simulate import simulate
@@ -30,6 +30,7 @@ __all__ = [
     "SimulationError",
     "Stepper",
     "Trapezoidal",
+    "equilibria",
     "equilibrium",
     "simulate",
 ]
@@ -39,7 +40,7 @@ make_lazy(
     __name__,
     {
         "knode_cosserat.solvers.boundary": "NewtonOptions",
-        "knode_cosserat.solvers.equilibrium": "equilibrium",
+        "knode_cosserat.solvers.equilibrium": "equilibria equilibrium",
         "knode_cosserat.solvers.result": "Result SimulationError",
         "knode_cosserat.solvers.settings": "Settings",
         "knode_cosserat.solvers.simulate": "simulate",

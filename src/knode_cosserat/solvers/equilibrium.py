@@ -1,21 +1,40 @@
-"""Static equilibrium, by the solver of a time step with every rate zero."""
+"""Static equilibrium of a robot or a batch, and of a robot under a list of controls."""
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Sequence
 from typing import Any, Literal
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from knode_cosserat.rods.system import System
+from knode_cosserat.rods.system import System, is_traced
+from knode_cosserat.rods.trained_range import without_range
 from knode_cosserat.solvers.boundary import NewtonOptions
+from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.guess import state_from_positions
+from knode_cosserat.solvers.run import (
+    Equilibria,
+    failure,
+    mark_coarse,
+    rows_of,
+    run_batch,
+    run_one,
+    warn_of_coarse_grids,
+)
+from knode_cosserat.solvers.sensitivity import static_rollout
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.simulate import refined_trajectory, simulate
+from knode_cosserat.solvers.simulate import (
+    check_initial,
+    checked_controls,
+    marked,
+    refined_trajectory,
+    stacked,
+)
 from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.solvers.time import Static
+from knode_cosserat.solvers.static_loop import unloaded_shape
 from knode_cosserat.trajectory import Trajectory
 
 
@@ -45,15 +64,96 @@ def equilibrium(
         on_failure: "raise" a `SimulationError`, or "return" the trajectory with its row marked invalid.
 
     Returns:
-        A `Trajectory` of one row, at time 0; it can be the `initial` of a simulation. If direct iteration
-        fails, three methods follow: a rod between two held ends starts from a hanging curve, the load is
-        applied in parts, and a damped motion is simulated until the robot rests. If there are several
-        equilibria, this is one of them, stable or unstable: see `kc.statics.stability`.
+        A `Trajectory` of one row, at time 0 and without a solver state; it can be the `initial` of a
+        simulation. If direct iteration fails, three methods follow: a rod between two held ends starts from a
+        hanging curve, the load is applied in parts, and a damped motion is simulated until the robot rests.
+        If there are several equilibria, this is one of them, stable or unstable: see `kc.statics.stability`.
 
     Raises:
         SimulationError: no equilibrium was found.
         ValueError: arguments of a wrong shape or name.
     """
+    control = _checked_control(control)
+    if position_tolerance is not None:
+        solve = functools.partial(
+            equilibrium, control=control, space=space, initial=initial, newton=newton,
+            recovery_budget=recovery_budget, on_failure=on_failure,
+        )  # fmt: skip
+        order = Settings.of(None, space, "paper", newton).space.order
+        return refined_trajectory(solve, robot, initial, position_tolerance, order)
+    return equilibria(
+        robot, control[..., None, :], space=space, initial=initial, newton=newton,
+        recovery_budget=recovery_budget, on_failure=on_failure,
+    )  # fmt: skip
+
+
+def equilibria(
+    robot: System | Sequence[System],
+    controls: Any,
+    *,
+    space: str | SpaceScheme = "lobatto2",
+    initial: Any = None,
+    newton: NewtonOptions = NewtonOptions(),
+    recovery_budget: float | None = None,
+    on_failure: Literal["raise", "return"] = "raise",
+) -> Trajectory:
+    """Return the static equilibria under a list of controls, each found from the one before.
+
+    Args:
+        robot: one system, or a sequence of systems that differ in their parameters only.
+        controls: (T, c), or (B, T, c) for a batch.
+        space: see `equilibrium`, as all other arguments; `initial` is the guess of the first equilibrium.
+        initial: see `equilibrium`.
+        newton: see `equilibrium`.
+        recovery_budget: see `equilibrium`.
+        on_failure: see `equilibrium`.
+
+    Returns:
+        A `Trajectory` of T rows. All are at time 0 of the robot's equations; `time` counts them from 0.
+
+    Raises:
+        SimulationError: an equilibrium was not found.
+        ValueError: arguments of a wrong shape or name.
+    """
+    settings = Settings.of(None, space, "paper", newton)
+    if on_failure not in ("raise", "return"):
+        raise ValueError(f'on_failure is {on_failure!r}; allowed is "raise" or "return"')
+    system, batch = stacked(robot)
+    controls, batch = checked_controls(system, controls, batch)
+    if initial is not None and not isinstance(initial, Trajectory):
+        initial = _guess(robot, initial, controls[(0,) * (np.ndim(controls) - 1)])
+    if initial is not None:
+        check_initial(system, initial, batch)
+    bare = without_range(system)
+    y = unloaded_shape(bare, settings.space)
+    before: Any = np.zeros((batch, system.control_size) if batch else system.control_size)
+    if initial is not None:
+        y, before = grid_of(system).spread(jnp.asarray(initial.y[-1])), initial.control[-1]
+    elif batch and y.ndim == 2:
+        y = jnp.broadcast_to(y, (batch, *y.shape))
+    task = Equilibria(settings, np.shape(controls)[-2], recovery_budget)
+    if is_traced((system, controls, y)):
+        rows = _traced(bare, controls, y, task)
+    else:
+        rows, _, causes = (run_batch if batch else run_one)(task, bare, controls, y, before)
+        if on_failure == "raise" and causes:
+            raise failure(rows, causes, None)
+        rows = mark_coarse(rows, system)
+        warn_of_coarse_grids(system, settings, rows)
+    time = np.arange(float(task.steps))
+    return marked(Trajectory(system, settings, time, control=controls, **rows_of(system, rows)), None)
+
+
+@functools.partial(jax.jit, static_argnames="task")
+def _traced(system, controls, y, task):  # type: ignore[no-untyped-def]
+    """Solve inside JAX's transformations: without recovery; unsolved rows become NaN."""
+    run: Any = static_rollout(task)
+    if np.ndim(controls) == 3:
+        run = jax.vmap(run, in_axes=(0 if np.ndim(system.length) else None, 0, 0))
+    return mark_coarse(run(system, controls, y), system)
+
+
+def _checked_control(control: Any) -> Any:
     if not hasattr(control, "ndim"):
         try:
             if control is None:
@@ -63,25 +163,7 @@ def equilibrium(
             raise ValueError(f"control is not numbers ({error}); allowed is (c,), or (B, c)") from None
     if not control.ndim:
         raise ValueError(f"control is one number, {control}; allowed is (c,), or (B, c) for a batch")
-    if position_tolerance is not None:
-        solve = functools.partial(
-            equilibrium, control=control, space=space, initial=initial, newton=newton,
-            recovery_budget=recovery_budget, on_failure=on_failure,
-        )  # fmt: skip
-        order = Settings.of("bdf2", space, "paper", newton).space.order
-        return refined_trajectory(solve, robot, initial, position_tolerance, order)
-    if initial is not None and not isinstance(initial, Trajectory):
-        initial = _guess(robot, initial, control)
-    found = simulate(
-        robot, control[..., None, :], 1.0, time=Static(), space=space, initial=initial, newton=newton,
-        recovery_budget=recovery_budget, on_failure=on_failure,
-    )  # fmt: skip
-    rows = (slice(None), slice(1, 2)) if found.y.ndim == 4 else slice(1, 2)
-    names = ["y", "z", "control", "result", "residual", "iterations", "position_error"]
-    names += [] if found.extrapolated is None else ["extrapolated"]
-    return dataclasses.replace(
-        found, time=np.zeros(1), **{name: getattr(found, name)[rows] for name in names}
-    )
+    return control
 
 
 def _guess(robot: Any, positions: Any, control: Any) -> Trajectory:

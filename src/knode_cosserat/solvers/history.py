@@ -1,14 +1,15 @@
 """History of a motion: the earlier states that a time step needs.
 
 An implicit scheme in time needs y, z and y_s of earlier steps at all places where a step evaluates the
-equations (`grid.Grid`). The history stores them there. A trajectory holds the nodes only. A motion that
-continues from it evaluates the other places again, row by row.
+equations (`grid.Grid`). The history stores them there. The rows of a trajectory hold the nodes only; its
+`final_state` holds the history after the last row.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,6 +31,11 @@ EXTRAPOLATIONS = np.array([[1.0, 0.0, 0.0], [2.0, -1.0, 0.0], [3.0, -3.0, 1.0]])
 SOLVED = 2e-8
 
 
+#: kind of a motion's first step: "start" by the settings, from one state; "regular" like any other, from two
+#: states; "consistent" by BDF1
+FirstStep = Literal["start", "regular", "consistent"]
+
+
 class StateHistory(NamedTuple):
     """The states before a step, newest first."""
 
@@ -45,22 +51,29 @@ class StateHistory(NamedTuple):
     error: Float[Any, "3 used x"]
 
 
-class InitialHistory(NamedTuple):
-    """Initial history: the states before the first step of a motion."""
+class SolverState(eqx.Module):
+    """State of the solver at a row of a motion, from which the motion continues."""
 
-    records: Float[Any, "2 places x"]
-    rate: Float[Any, "places x"]
-    #: coefficients of the first step: c0, c1, c2 (1/s) and d1
-    coefficients: Float[Any, "4"]
-    #: time step (s) between the two states
-    dt: Float[Any, ""]
+    history: StateHistory
+    #: time step (s) between the two states of the history; None if all its states are the same one
+    dt: float | None = eqx.field(static=True, default=None)
+    #: True if the history's rate is that of its newest state
+    rate_known: bool = eqx.field(static=True, default=True)
+
+    def first_step(self, settings: Settings) -> FirstStep:
+        """Return the kind of the step that follows, by these settings."""
+        if settings.uses_rate and not self.rate_known:
+            return "consistent"
+        return "start" if self.dt is None else "regular"
 
 
-def coefficient_table(settings: Settings, dt: float) -> np.ndarray:
-    """Return the coefficients (2, 4) of the first step and of all later steps."""
+def coefficient_table(settings: Settings, dt: float, first: FirstStep = "start") -> np.ndarray:
+    """Return the coefficients (2, 4) of the first step and of all later steps; zeros for statics."""
+    if settings.time is None:
+        return np.zeros((2, 4))
     regular = settings.time.coefficients(dt, dt)
-    first = BDF1().coefficients(dt, dt) if settings.start == "consistent" else regular
-    return np.array([first, regular])
+    by_bdf1 = first == "consistent" or (first == "start" and settings.start == "consistent")
+    return np.array([BDF1().coefficients(dt, dt) if by_bdf1 else regular, regular])
 
 
 def history_of(states: Any, rate: Any, coefficients: Any, settings: Settings) -> Any:
@@ -70,7 +83,7 @@ def history_of(states: Any, rate: Any, coefficients: Any, settings: Settings) ->
     """
     _, c1, c2, d1 = coefficients
     history = c1 * states[0] + c2 * states[1]
-    return history + d1 * rate if settings.time.uses_rate else history
+    return history + d1 * rate if settings.uses_rate else history
 
 
 def advanced(past: StateHistory, records: Any, rate: Any, y: Any, weights: Any) -> StateHistory:
@@ -155,75 +168,3 @@ def still_records(still: StepProblem, row: Any, y: Any) -> Float[Any, "places x"
 def rows_suffice(system: System, space: SpaceScheme) -> bool:
     """True if rows hold every state that steps need: no stages between nodes, no discontinuities, B zero."""
     return not (system.mixed or space.formula.stages or system.cuts)
-
-
-# rows of a trajectory
-
-
-def padded_rows(rows: Any, least: int = 1) -> np.ndarray:
-    """Return rows (…, T, n) padded to a power of two, so that a few more rows need no new program."""
-    rows = np.asarray(rows)
-    count = rows.shape[-2]
-    width = [(0, 0)] * rows.ndim
-    width[-2] = (0, max(least, 2 ** int(np.ceil(np.log2(count)))) - count)
-    return np.pad(rows, width, mode="edge")
-
-
-class ContinuedMotion(NamedTuple):
-    """Rows of a motion with the history of the first."""
-
-    begun: InitialHistory
-    #: coefficients of each step after the first
-    regular: Float[Any, "4"]
-    #: y and z of the nodes
-    rows: Float[Any, "rows nodes x"]
-    #: control of each row; the first is not used
-    controls: Float[Any, "rows c"]
-    #: time of the first row (s)
-    t0: Any
-    #: number of rows; the rest is padding
-    count: Any
-
-
-def history_of_rows(
-    system: System, space: SpaceScheme, rows: Any, coefficients: Any, dt: Any
-) -> InitialHistory:
-    """Return the history at the second of two rows (2, nodes, x) of a system without y_st."""
-    found = jax.vmap(lambda row: at_places(system, space, row))(rows)
-    return InitialHistory(found[::-1], jnp.zeros_like(found[0]), jnp.asarray(coefficients), jnp.asarray(dt))
-
-
-def history_along(system: System, settings: Settings, motion: ContinuedMotion) -> tuple[StateHistory, Any]:
-    """Return the history after a motion's last row, and the history terms (rows - 1, places, x) of each step.
-
-    The equations are evaluated again at every place of each step. If a row was changed after it was solved,
-    its difference from the equations at the nodes is interpolated to the other places.
-    """
-    begun, regular, rows, controls, t0, count = motion
-    ny, dt, space = system.y_layout.size, begun.dt, settings.space
-
-    def one(past: StateHistory, step: Any) -> Any:
-        i, row, control = step
-        coefficients = jnp.where(i == 1, begun.coefficients, jnp.asarray(regular))
-        history = history_of(past.records, past.rate, coefficients, settings)
-        problem = StepProblem(system, t0 + i * dt, control, coefficients[0], history, space)
-        y = problem.filled(row[:, :ny])
-        records = _records_of_row(problem, row, y)
-        after = advanced(past, records, coefficients[0] * records + history, y, past.weights)
-        return jax.tree.map(lambda a, b: jnp.where(i < count, a, b), after, past), history
-
-    steps = jnp.arange(1, len(rows)), rows[1:], controls[1:]
-    y = grid_of(system).spread(rows[0, :, :ny])
-    first = repeated_record_history(system, space, begun.records[0], y, t0)
-    first = first._replace(records=begun.records, rate=begun.rate, weights=jnp.asarray(EXTRAPOLATIONS[1]))
-    past, histories = jax.lax.scan(one, first, steps)
-    return past._replace(t0=t0 + (count - 1) * dt), histories
-
-
-def _records_of_row(problem: StepProblem, row: Any, y: Any) -> Float[Any, "places x"]:
-    """Return records of a step's solution at all places, from its row."""
-    system = problem.system
-    found = problem.records(y)
-    beside = row - row_of(system, y, found)[:, : row.shape[1]]
-    width = found.shape[-1] - row.shape[1]
-    return found + at_places(system, problem.space, jnp.pad(beside, ((0, 0), (0, width))))

@@ -1,104 +1,61 @@
-"""Initial state and history of a simulation: rest, an equilibrium, or the end of another motion."""
+"""Initial state of a run: rest, an equilibrium, or the last row of another trajectory."""
 
 from __future__ import annotations
 
 import functools
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 from knode_cosserat.rods.system import System, is_traced
-from knode_cosserat.solvers import sensitivity
-from knode_cosserat.solvers.grid import at_places, grid_of
+from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.history import (
-    ContinuedMotion,
-    InitialHistory,
+    EXTRAPOLATIONS,
+    SolverState,
     StateHistory,
-    coefficient_table,
     constant_history,
-    history_along,
-    history_of_rows,
-    padded_rows,
-    repeated_record_history,
     rest_record,
     resting_history,
-    rows_suffice,
 )
-from knode_cosserat.solvers.problem import no_history
+from knode_cosserat.solvers.problem import no_history, row_of
+from knode_cosserat.solvers.replay import (
+    at_one_state,
+    carried,
+    history_settings,
+    replay,
+    state_of_rows,
+)
 from knode_cosserat.solvers.result import Result, SimulationError
-from knode_cosserat.solvers.run import is_coarse, run_one
-from knode_cosserat.solvers.run_types import FirstStep, InitialCondition, RunSettings
+from knode_cosserat.solvers.run import Equilibria, InitialState, is_coarse, run_one
+from knode_cosserat.solvers.sensitivity import static_rollout
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.solvers.time import Static
+from knode_cosserat.solvers.static_loop import unloaded_shape
 from knode_cosserat.trajectory import Trajectory
 
-#: an unknown initial rate is ignored if its weight has decayed below this after all available steps
-FORGOTTEN = 1e-9
-#: row 0 is the state at rest if it differs by less than this (natural units)
-AT_REST = 1e-12
 
+def initial_state(
+    system: System, settings: Settings, batch: int | None = None, recovery_budget: float | None = None
+) -> InitialState:
+    """Return the initial state at rest, or in equilibrium under zero control if that is only a guess.
 
-class SimulationRun(NamedTuple):
-    """The checked arguments of one call; `many` is true if the systems themselves are batched."""
-
-    system: System
-    controls: Any
-    initial: Trajectory | None
-    settings: Settings
-    dt: float
-    batch: int | None
-    many: bool
-    #: seconds that recovery may take, or None
-    budget: float | None = None
-
-
-class InitialState(NamedTuple):
-    """Initial state and history of a run."""
-
-    #: y and z at the nodes
-    record: Any
-    start: InitialCondition
-    #: time of the initial state (s)
-    t0: Any
-    #: kind of the first step (`RunSettings.first`)
-    first: FirstStep
-    #: initial history of a motion; None for statics
-    begun: InitialHistory | None
-
-
-def initial_state(run: SimulationRun) -> InitialState:
-    """Return the initial state and history of a run."""
-    system, controls, initial, settings, dt, batch, many, _ = run
-    if initial is not None:
-        return _going_on(system, initial, settings, dt)
-    record, past = (_all_at_rest if many else _at_rest)(system, _of_past(settings))
-    still = isinstance(settings.time, Static)
+    For a batch of `batch` robots, of one system or of as many.
+    """
+    many, made = np.ndim(system.length) > 0, history_settings(settings)
     coarse: Any = False
-    if system.rest_is_guess and not still:
-        record, past, coarse = _settled(run, past)
-    begun = None if still else _begun(past, RunSettings(settings, dt, 1).table[0], dt)
-
-    def for_each(tree: Any) -> Any:
-        return jax.tree.map(lambda x: jnp.broadcast_to(x, (batch, *jnp.shape(x))), tree)
-
+    if system.rest_is_guess:
+        record, coarse = _settled(system, settings, recovery_budget)
+        none = np.zeros(system.control_size)
+        history = (_all_at_one_state if many else at_one_state)(system, made, record, none)
+    else:
+        record, history = (_all_at_rest if many else _at_rest)(system, made)
+    found = record, SolverState(history), coarse
     if batch and not many:
-        record, past, begun, coarse = for_each((record, past, begun, coarse))
-    elif batch and begun is not None:
-        begun = begun._replace(coefficients=for_each(begun.coefficients), dt=for_each(begun.dt))
-    none_yet = np.zeros((*np.shape(controls)[:-2], system.control_size))
-    return InitialState(record, InitialCondition(past, none_yet, coarse), 0.0, "start", begun)
-
-
-# at rest, or in equilibrium
-
-
-def _of_past(settings: Settings) -> Settings:
-    """Return only the settings that affect the history; runs that differ in others share programs."""
-    return Settings(settings.time, settings.space, settings.start)
+        found = jax.tree.map(lambda x: jnp.broadcast_to(x, (batch, *jnp.shape(x))), found)
+    shape = (batch, system.control_size) if batch else (system.control_size,)
+    return InitialState(found[0], np.zeros(shape), *found[1:])
 
 
 @functools.partial(jax.jit, static_argnames="settings")
@@ -108,122 +65,94 @@ def _at_rest(system: System, settings: Settings) -> Any:
 
 @functools.partial(jax.jit, static_argnames="settings")
 def _all_at_rest(system: System, settings: Settings) -> Any:
-    return jax.vmap(lambda each: _at_rest(each, settings))(system)
-
-
-def _settled(run: SimulationRun, past: Any) -> tuple[Any, Any, Any]:
-    """Return the equilibrium under zero control, its history, and a flag: true if its grid is too coarse."""
-    system, many = run.system, run.many
-    task = RunSettings(run.settings, run.dt, 1, "still")
-    none = np.zeros((1, system.control_size))
-    if is_traced((system, past)):
-        find = sensitivity.rollout(task)
-        rows = jax.vmap(find, in_axes=(0, None, 0))(system, none, past) if many else find(system, none, past)
-        found, coarse = rows.records[..., 0, :, :], is_coarse(rows.position_error, system)[..., 0]
-    else:
-        each = range(np.shape(past.t0)[0]) if many else [...]
-        both = [_settled_one(task, _part(system, i), none, _part(past, i), i) for i in each]
-        found, coarse = map(np.stack, zip(*both, strict=True)) if many else both[0]
-    kept = found[..., : system.y_layout.size + system.z_layout.size]
-    history = (_all_pasts if many else _past)(system, _of_past(run.settings), kept, none[0], 0.0)
-    return kept, history, coarse
-
-
-def _settled_one(task: RunSettings, system: System, none: Any, past: Any, i: Any) -> tuple[Any, Any]:
-    """Return the equilibrium of one robot, and a flag for a too coarse grid; raise if there is none."""
-    steps, cause = run_one(task, system, none, InitialCondition(past, none[0]))
-    if steps.result[0] < 0:
-        robot = None if i is ... else i
-        raise SimulationError(0, 0.0, float(steps.error[0]), Result(int(steps.result[0])), cause, robot)
-    return np.asarray(steps.records[0]), steps.result[0] == Result.COARSE
-
-
-def _part(tree: Any, i: Any) -> Any:
-    return tree if i is ... else jax.tree.map(lambda leaf: leaf[i], tree)
-
-
-_past = jax.jit(constant_history, static_argnames="settings")
+    return jax.vmap(lambda one: _at_rest(one, settings))(system)
 
 
 @functools.partial(jax.jit, static_argnames="settings")
-def _all_pasts(system: System, settings: Settings, rows: Any, control: Any, t0: Any) -> Any:
-    return jax.vmap(lambda each, row: constant_history(each, settings, row, control, t0))(system, rows)
+def _all_at_one_state(system: System, settings: Settings, records: Any, control: Any) -> Any:
+    return jax.vmap(lambda one, row: constant_history(one, settings, row, control))(system, records)
 
 
-# continuation of another motion
+def _settled(system: System, settings: Settings, budget: float | None) -> tuple[Any, Any]:
+    """Return y and z of the equilibrium under zero control, and a flag: true if its grid is too coarse."""
+    many, none = np.ndim(system.length) > 0, np.zeros((1, system.control_size))
+    task = Equilibria(Settings(None, settings.space, newton=settings.newton), 1, budget)
+    y = unloaded_shape(system, settings.space)
+    if is_traced((system, y)):
+        find = static_rollout(task)
+        rows = jax.vmap(find, in_axes=(0, None, 0))(system, none, y) if many else find(system, none, y)
+        found, coarse = rows.records[..., 0, :, :], is_coarse(rows.position_error, system)[..., 0]
+    elif many:
+        each = range(len(y))
+        both = [_settled_one(task, jax.tree.map(lambda x, i=i: x[i], system), y[i], i) for i in each]
+        found, coarse = map(np.stack, zip(*both, strict=True))
+    else:
+        found, coarse = _settled_one(task, system, y, None)
+    return found[..., : system.y_layout.size + system.z_layout.size], coarse
 
 
-def _going_on(system: System, initial: Trajectory, settings: Settings, dt: float) -> InitialState:
+def _settled_one(task: Equilibria, system: System, y: Any, robot: int | None) -> tuple[Any, Any]:
+    none = np.zeros((1, system.control_size))
+    rows, _, cause = run_one(task, system, none, y, none[0])
+    if rows.result[0] < 0:
+        raise SimulationError(0, 0.0, float(rows.error[0]), Result(int(rows.result[0])), cause, robot)
+    return rows.records[0], is_coarse(rows.position_error[0], system)
+
+
+# continuation of another trajectory
+
+
+def continued_state(system: System, initial: Trajectory, settings: Settings, dt: float) -> InitialState:
+    """Return the initial state of a motion that continues from a trajectory's last row.
+
+    A trajectory on the same points and stages gives the solver's state, by its own or by a replay of its
+    rows. Other rows are interpolated between nodes. An equilibrium, or a single row, is one state.
+    """
     record = jnp.concatenate([initial.y[-1], initial.z[-1]], axis=-1)
     control, t0 = initial.control[-1], initial.time[-1]
+    state = _last_state(system, initial, settings, dt, record)
+    if state is None:
+        state = SolverState(at_one_state(system, history_settings(settings), record, control, t0))
+    elif state.dt is None or not np.isclose(state.dt, dt) or state.first_step(settings) == "consistent":
+        # one state is all that a step of another length can use
+        history = state.history
+        alone = history._replace(
+            records=jnp.stack([history.records[0]] * 2),
+            weights=jnp.asarray(EXTRAPOLATIONS[0]),
+            error=jnp.stack([history.error[0], *history.error[::2]]),
+        )
+        state = SolverState(alone, None, state.rate_known)
+    state = SolverState(state.history._replace(t0=jnp.asarray(t0, dtype=float)), state.dt, state.rate_known)
+    return InitialState(record, control, state, initial.result[-1] == Result.COARSE)
+
+
+def _last_state(
+    system: System, initial: Trajectory, settings: Settings, dt: float, record: Any
+) -> SolverState | None:
+    """Return the solver's state at a trajectory's last row; None if one state is all that is known."""
     made = initial.settings
-    rests = made is not None and isinstance(made.time, Static)
-    still = isinstance(settings.time, Static)
-    known = None if rests or still else _known(system, initial, settings, dt)
-    first: FirstStep = "start"
-    if still:
-        past = _shape(system, settings.space, record, t0)
-    elif known is None:
-        past = _past(system, _of_past(settings), record, control, t0)
-    else:
-        past, first = known
-    begun = None if still else _begun(past, RunSettings(settings, dt, 1, first).table[0], dt)
-    return InitialState(
-        record, InitialCondition(past, control, initial.result[-1] == Result.COARSE), t0, first, begun
-    )
+    if made is not None and made.time is None:
+        return None
+    if made is None or made.space != settings.space or not _alike(initial.system, system):
+        if len(initial.time) < 2:
+            return None
+        rows = jnp.concatenate([initial.y[-2:], initial.z[-2:]], axis=-1)
+        apart = dt if is_traced(initial.time) else float(initial.time[-1] - initial.time[-2])
+        return state_of_rows(system, settings.space, rows, apart)
+    state = initial.final_state
+    if state is None or state.history.rate.shape != no_history(system, settings.space).shape:
+        known = replay(initial, initial.system, dt)
+        return None if known is None else known.state
+    return SolverState(_moved_to(system, settings.space, state.history, record), state.dt, state.rate_known)
 
 
 @functools.partial(jax.jit, static_argnames="space")
-def _shape(system: System, space: SpaceScheme, record: Any, t0: Any) -> StateHistory:
-    """Return a history of one shape, the start of a search for an equilibrium; interpolated between nodes."""
-    more = no_history(system, space).shape[-1] - record.shape[-1]
-    y = grid_of(system).spread(record[:, : system.y_layout.size])
-    records = at_places(system, space, jnp.pad(record, ((0, 0), (0, more))))
-    return repeated_record_history(system, space, records, y, t0)
-
-
-def _begun(past: StateHistory, coefficients: Any, dt: Any) -> InitialHistory:
-    return InitialHistory(past.records, past.rate, np.asarray(coefficients), np.asarray(dt))
-
-
-def _known(
-    system: System, initial: Trajectory, settings: Settings, dt: float
-) -> tuple[StateHistory, FirstStep] | None:
-    """Return the history from a motion's rows, and the kind of the next step; None if one state is all.
-
-    A motion that was simulated on the same points and stages is evaluated again by its own equations. Other
-    states are interpolated between nodes.
-    """
-    rows: Any = jnp.concatenate([initial.y, initial.z], axis=-1)
-    made = initial.settings
-    moved = made is not None and made.space == settings.space and _alike(initial.system, system)
-    if moved:
-        system, made = initial.system, _of_past(made)
-    else:
-        made = _of_past(settings)
-    again = moved or rows_suffice(system, settings.space)
-    known = (_of_first_rows if again else _of_last_rows)(system, made, initial, rows, dt)
-    if known is None:
-        return None
-    begun, row, rate_known, regular = known
-    count = len(rows) - row
-    controls: Any = initial.control[row:]
-    rows = rows[row:]
-    if not is_traced((rows, controls)):
-        packed = padded_rows(np.reshape(rows, (count, -1)))
-        rows, controls = packed.reshape(-1, *np.shape(rows)[1:]), padded_rows(controls)
-    motion = ContinuedMotion(begun, regular, rows, controls, initial.time[row], count)
-    past, _ = _along(system, made, motion)
-    alone = repeated_record_history(system, made.space, past.records[0], past.y[0], past.t0)
-    # traced times cannot be compared: the rows are assumed to have the same time step as the continuation
-    if not is_traced(begun.dt) and not np.isclose(begun.dt, dt):
-        return alone, "start"
-    if settings.time.uses_rate and not rate_known:
-        # the rate at a first row in motion is unknown; its effect decays over the steps in most schemes
-        forgotten = float(abs(made.time.coefficients(dt, dt).d1)) ** (count - 1)
-        if forgotten >= FORGOTTEN:
-            return alone, "consistent"
-    return past, "regular"
+def _moved_to(system: System, space: SpaceScheme, history: StateHistory, record: Any) -> StateHistory:
+    """Return a history moved to a row that may have been changed since, with unchanged rates."""
+    row = row_of(system, history.y[0], history.records[0])
+    shift = carried(system, space, record - row[:, : record.shape[1]])
+    y = grid_of(system).spread((record - row[:, : record.shape[1]])[:, : system.y_layout.size])
+    return history._replace(records=history.records + shift, y=history.y + y)
 
 
 def _alike(one: System, other: System) -> bool:
@@ -233,78 +162,3 @@ def _alike(one: System, other: System) -> bool:
         return system.cuts, system.nodes, system.strands, system.mixed
 
     return bool(grid(one) == grid(other))
-
-
-class _Known(NamedTuple):
-    """Known history of a motion at one of its rows, a flag for a known rate, and the steps' coefficients."""
-
-    begun: InitialHistory
-    row: int
-    rate: bool
-    regular: np.ndarray
-
-
-def _apart(times: Any, dt: float) -> float:
-    """Return the difference of the last two times; if they are traced, the given time step."""
-    return dt if is_traced(times) else float(times[-1] - times[-2])
-
-
-def _of_first_rows(
-    system: System, made: Settings, initial: Trajectory, rows: Any, dt: float
-) -> _Known | None:
-    """Return the history at a motion's first row, or its second."""
-    time, begun = initial.time, initial.begun
-    if begun is not None and begun.rate.shape == no_history(system, made.space).shape:
-        regular = coefficient_table(made, dt if is_traced(begun) else float(begun.dt))[1]
-        # a single row that was the first of a motion has no earlier state; a traced row cannot be tested
-        if len(time) > 1 or is_traced(begun) or np.any(begun.records[0] != begun.records[1]):
-            return _Known(begun, 0, made.time.uses_rate, regular)
-    if len(time) < 2:
-        return None
-    if is_traced(time) or time[0] != 0.0:
-        return _of_rows(system, made, rows[:2], _apart(time[:2], dt), 1)
-    apart = _apart(time[:2], dt)
-    record, past = _at_rest(system, made)
-    if not is_traced((record, rows)) and not np.allclose(record, rows[0], rtol=0.0, atol=AT_REST):
-        # files of earlier versions do not hold the initial history
-        past = _past(system, made, rows[0], initial.control[0], 0.0)
-    first, regular = coefficient_table(made, apart)
-    return _Known(_begun(past, first, apart), 0, True, regular)
-
-
-def _of_last_rows(system: System, made: Settings, initial: Trajectory, rows: Any, dt: float) -> _Known | None:
-    """Return the history at the last row of states that solve no equations of this system."""
-    time = initial.time
-    if len(time) < 2:
-        return None
-    return _of_rows(system, made, rows[-2:], _apart(time[-2:], dt), len(time) - 1)
-
-
-def _of_rows(system: System, made: Settings, two: Any, apart: float, row: int) -> _Known | None:
-    """Return the history at the second of two rows from their nodes; None with y_st."""
-    if system.mixed:
-        return None
-    regular = coefficient_table(made, apart)[1]
-    return _Known(_between(system, made.space, two, regular, apart), row, False, regular)
-
-
-_between = jax.jit(history_of_rows, static_argnames="space")
-
-
-_along = jax.jit(history_along, static_argnames="settings")
-
-
-def histories_along(system: System, moved: Trajectory) -> tuple[int, Float[Any, "steps places x"]] | None:
-    """Return the first row whose step has a known history, and the history terms of that and all later steps.
-
-    None if the rows do not suffice.
-    """
-    made = _of_past(moved.settings)
-    rows = jnp.concatenate([moved.y, moved.z], axis=-1)
-    known = _of_first_rows(system, made, moved, rows, moved.dt)
-    if known is None:
-        return None
-    row, count = known.row, len(rows) - known.row
-    controls = jnp.asarray(moved.control[row:])
-    motion = ContinuedMotion(known.begun, known.regular, rows[row:], controls, moved.time[row], count)
-    return row + 1, _along(system, made, motion)[1]

@@ -1,11 +1,12 @@
-"""Recovery of a failed step: other guesses, load continuation, easing, shorter steps, in this order.
+"""Recovery of a failed step: other guesses, load continuation, easing, then a method of the kind of problem.
 
 It runs outside the compiled loop, step by step in plain Python. It is rare, and its program is compiled only
-when it is first needed.
+when it is first needed. `recovery_methods` has the methods of time steps and of equilibria.
 """
 
 from __future__ import annotations
 
+import abc
 import dataclasses
 import functools
 import time
@@ -19,29 +20,18 @@ import numpy as np
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import Solution, newton
-from knode_cosserat.solvers.grid import grid_of
-from knode_cosserat.solvers.guess import hanging_curve, natural_reach, state_from_positions
-from knode_cosserat.solvers.history import EXTRAPOLATIONS, StateHistory, history_of
+from knode_cosserat.solvers.history import EXTRAPOLATIONS
 from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.time import BDF1, Static
-from knode_cosserat.solvers.time_loop import StepRows, recorded_step
+from knode_cosserat.solvers.time_loop import StepRows, TimeStep, recorded_step, solved_row
 
-#: smallest substep as a part of a time step, and largest number of substeps tried
-LEAST_SUBSTEP, MOST_SUBSTEPS = 2.0**-14, 400
-#: friction and contact are eased only in substeps below this part of a step: smaller substeps mostly suffice
-EASE_BELOW = 1.0 / 16.0
 #: smallest load step of continuation, as a part of the change of control
 LEAST_PART = 1.0 / 512.0
 #: initial factor by which continuation eases friction and contact
 EASIEST = 1e-3
 #: forces in the control above this multiple of EI/L² suggest a wrong unit
 ABSURD = 1e4
-#: part of the distance that a tip is moved in one step of relaxation
-DRAWN = 0.05
-#: reaches of the initial curves between held ends, as multiples of the natural reach
-REACHES = (1.0, 0.3, 3.0)
 #: default recovery budget: this multiple of the run's own time, or this many seconds, whichever is more
 BUDGET_SHARE, BUDGET_LEAST = 20.0, 5.0
 
@@ -75,43 +65,46 @@ class Budget:
             raise BudgetError
 
 
-class Outcome(NamedTuple):
-    """A recovered step, or the best attempt (`result` < 0)."""
+class SolvedStep(NamedTuple):
+    """A solved step, or the best attempt (`row.result` < 0)."""
 
-    result: Result
-    past: StateHistory
-    record: np.ndarray
-    unknowns: np.ndarray
-    error: float
-    corrections: int
-    position_error: float
-    cause: str
+    #: start of the next step: a `StateHistory`, or y at all points of an equilibrium
+    state: Any
+    row: StepRows
+    #: likely cause of a failure
+    cause: str = ""
 
 
 class Attempt(NamedTuple):
     """Result of one boundary-value problem."""
 
     solution: Solution
-    after: StateHistory
+    #: as in `SolvedStep`
+    state: Any
     row: StepRows
 
 
 @functools.partial(jax.jit, static_argnames="settings")
 def attempt(
-    system: System, settings: Settings, past: StateHistory, coefficients: Any, control: Any, t: Any, y: Any,
-    unknowns: Any,
-    part: Any, from_y: Any,
-) -> Attempt:  # fmt: skip
-    """Solve one boundary-value problem with a long search.
+    system: System, settings: Settings, step: TimeStep | None, control: Any, guess: tuple[Any, Any], tip: Any
+) -> Attempt:
+    """Solve one boundary-value problem, of a time step or of an equilibrium (None), with a long search.
 
-    The tip's boundary conditions are enforced in `part`: the rest of their residual at `from_y` remains.
+    With `tip` = (part, y at all points), the tip's boundary conditions are enforced in part: the rest of
+    their residual at that y remains.
     """
-    history = history_of(past.records, past.rate, coefficients, settings)
-    problem = StepProblem(system, t, control, coefficients[0], history, settings.space).ready()
+    part, from_y = tip
+    if step is None:
+        problem = StepProblem.still(system, settings.space, control).ready()
+    else:
+        problem = step.problem(system, settings, control).ready()
     problem = dataclasses.replace(problem, tip_offset=(1.0 - part) * problem.tip_residual(from_y[-1]))
     patient = dataclasses.replace(settings.newton, max_linearisations=40)
-    solution, kept = newton(problem, y, unknowns, patient)
-    after, row = recorded_step(problem, settings, past, coefficients, solution, kept.factors)
+    solution, kept = newton(problem, *guess, patient)
+    if step is None:
+        row, _, _ = solved_row(problem, settings.newton, solution, kept.factors)
+        return Attempt(solution, solution.y, row)
+    after, row = recorded_step(problem, settings, step, solution, kept.factors)
     return Attempt(solution, after._replace(weights=jnp.asarray(EXTRAPOLATIONS[0])), row)
 
 
@@ -119,272 +112,163 @@ def attempt(
 _COMPILED: set[Any] = set()
 
 
-class _Step:
-    """One time step as boundary-value problems, for one history and one set of coefficients."""
+class Recovery(abc.ABC):
+    """Recovery of one step, as a series of boundary-value problems."""
 
-    def __init__(
-        self,
-        system: System,
-        settings: Settings,
-        past: StateHistory,
-        coefficients: Any,
-        t: float,
-        budget: Budget,
-    ):
-        self.system, self.settings, self.past, self.t = system, settings, past, t
-        self.coefficients, self.budget = np.asarray(coefficients, dtype=float), budget
+    #: the time step; None for an equilibrium
+    step: TimeStep | None = None
+
+    def __init__(self, system: System, settings: Settings, budget: Budget):
+        self.system, self.settings, self.budget = system, settings, budget
         self.corrections = 0
 
+    @property
+    @abc.abstractmethod
+    def state(self) -> Any:
+        """State before the step, as in `SolvedStep`."""
+
+    @abc.abstractmethod
+    def guesses(self) -> list[tuple[Any, Any]]:
+        """Return initial guesses (y, unknowns) from the state before the step."""
+
+    def first_guesses(self, control: Any) -> list[tuple[Any, Any]]:
+        """Return the guesses of the first attempts."""
+        return self.guesses()
+
+    @abc.abstractmethod
+    def last_method(self, controls: tuple[Any, Any]) -> tuple[Result, Attempt] | None:
+        """Return the result of the last method, which may change the problem on the way."""
+
     def solve(
-        self, control: Any, y: Any, unknowns: Any, part: float = 1.0, from_y: Any = None,
-        system: System | None = None,
-    ) -> Attempt:  # fmt: skip
+        self, control: Any, guess: tuple[Any, Any], tip: Any = None, system: System | None = None
+    ) -> Attempt:
+        """Solve the step under a control; `tip` as in `attempt`."""
         began, own = time.perf_counter(), system or self.system
-        found = attempt(
-            own, self.settings, self.past, self.coefficients, control, self.t, y, unknowns, part,
-            y if from_y is None else from_y,
-        )  # fmt: skip
+        tip = (1.0, guess[0]) if tip is None else tip
+        found = attempt(own, self.settings, self.step, control, guess, tip)
         self.corrections += int(found.solution.corrections)
-        program = jax.tree.structure(own), self.settings, np.shape(y)
+        program = jax.tree.structure((own, self.step)), self.settings, np.shape(guess[0])
         if program in _COMPILED:
             self.budget.spend(time.perf_counter() - began)
         _COMPILED.add(program)
         return found
 
-    def hanging(self, control: Any) -> list[tuple[Any, Any]]:
-        """Return initial guesses of an equilibrium between held ends: curves of the rod's length."""
-        found: list[tuple[Any, Any]] = []
-        if not isinstance(self.settings.time, Static):
-            return found
-        for reach in dict.fromkeys(min(1.0, part * natural_reach(self.system)) for part in REACHES):
-            points = hanging_curve(self.system, control, reach)
-            if points is not None:
-                record = state_from_positions(self.system, points, control)
-                y = grid_of(self.system).spread(jnp.asarray(record[:, : self.system.y_layout.size]))
-                found.append((y, self.system.unknowns(y[0])))
-        return found
-
-    def guesses(self) -> list[tuple[Any, Any]]:
-        guesses = [jnp.einsum("p,pny->ny", w, self.past.y) for w in EXTRAPOLATIONS[:2]]
-        return [(y, self.system.unknowns(y[0])) for y in guesses]
-
     def solved(self, found: Attempt) -> bool:
+        """Return True if the attempt is a solution."""
         return bool(found.row.error <= self.settings.newton.acceptable)
 
+    def recover(self, controls: tuple[Any, Any]) -> SolvedStep:
+        """Solve the step by all methods in order. `controls` are the previous step's and this one's."""
+        if self.budget.seconds <= 0.0:
+            return self._given_up(controls[1])
+        best: list[Attempt] = []
+        cause = ""
+        try:
+            found = self._by_all_methods(controls, best)
+            if found is not None:
+                return self._outcome(*found)
+        except BudgetError:
+            cause = f"Recovery was stopped after {self.budget.seconds:.3g} s (recovery_budget)."
+            self.budget = Budget(np.inf)
+        least = min(best, key=lambda each: float(each.solution.error)) if best else None
+        if least is None:
+            least = self.solve(controls[1], self.guesses()[0])
+        result = Result.NO_CONVERGENCE if np.isfinite(least.solution.error) else Result.NOT_FINITE
+        cause = f"{likely_cause(result, self.system, self.settings, controls[1])} {cause}".strip()
+        return self._outcome(result, least)._replace(state=self.state, cause=cause)
 
-def recover(
-    system: System,
-    settings: Settings,
-    past: StateHistory,
-    coefficients: Any,
-    controls: tuple[Any, Any],
-    t: float,
-    dt: float,
-    budget: Budget,
-) -> Outcome:
-    """Solve the step that ends at t. `controls` are the previous step's and this one's."""
-    step = _Step(system, settings, past, coefficients, t, budget)
-    if budget.seconds <= 0.0:
-        return _given_up(step, controls[1])
-    best: list[Attempt] = []
-    cause = ""
-    try:
-        found = _recovered(step, controls, dt, best)
-        if found is not None:
-            return _outcome(*found)
-    except BudgetError:
-        cause = f"Recovery was stopped after {budget.seconds:.3g} s (recovery_budget)."
-        step.budget = Budget(np.inf)
-    least = min(best, key=lambda each: float(each.solution.error)) if best else None
-    if least is None:
-        least = step.solve(controls[1], *step.guesses()[0])
-    result = Result.NO_CONVERGENCE if np.isfinite(least.solution.error) else Result.NOT_FINITE
-    outcome = _outcome(result, step, least, controls[1])._replace(past=past)
-    return outcome._replace(cause=f"{outcome.cause} {cause}".strip())
+    def _given_up(self, control: Any) -> SolvedStep:
+        """Return the outcome of a failed step without recovery; nothing is compiled."""
+        system, result = self.system, Result.NO_CONVERGENCE
+        width = system.y_layout.size * (2 if system.mixed else 1) + system.z_layout.size
+        record, unknowns = np.full((system.nodes, width), np.nan), np.full(system.unknown_count, np.nan)
+        row = StepRows(record, unknowns, np.inf, 0, np.nan, int(result))
+        return SolvedStep(self.state, row, likely_cause(result, system, self.settings, control))
 
+    def _outcome(self, result: Result, found: Attempt) -> SolvedStep:
+        row = StepRows(*map(np.asarray, found.row))
+        return SolvedStep(found.state, row._replace(corrections=self.corrections, result=int(result)))
 
-def _given_up(step: _Step, control: Any) -> Outcome:
-    """Return the outcome of a failed step without recovery; nothing is compiled."""
-    past, system = step.past, step.system
-    record = np.full((system.nodes, past.records.shape[-1]), np.nan)
-    cause = likely_cause(Result.NO_CONVERGENCE, step, control)
-    unknowns = np.full(system.unknown_count, np.nan)
-    return Outcome(Result.NO_CONVERGENCE, past, record, unknowns, np.inf, 0, np.nan, cause)
+    def _by_all_methods(
+        self, controls: tuple[Any, Any], best: list[Attempt]
+    ) -> tuple[Result, Attempt] | None:
+        """Try all methods in order; attempts from direct guesses are added to `best`."""
+        for guess in self.first_guesses(controls[1]):
+            found = self.solve(controls[1], guess)
+            best.append(found)
+            if self.solved(found):
+                return Result.CONVERGED, found
+        continued = self.continue_load(*controls)
+        if continued is not None:
+            return Result.RECOVERED_LOAD_CONTINUATION, continued
+        eased = self.ease(controls[1])
+        if eased is not None:
+            return Result.RECOVERED_EASING, eased
+        return self.last_method(controls)
 
+    def continue_load(self, before: Any, now: Any) -> Attempt | None:
+        """Continue from the previous control to this one in load steps, each from the last solution."""
+        before, now = np.asarray(before, dtype=float), np.asarray(now, dtype=float)
+        if np.array_equal(before, now):
+            return None
 
-def _recovered(
-    step: _Step, controls: tuple[Any, Any], dt: float, best: list[Attempt]
-) -> tuple[Result, _Step, Attempt] | None:
-    """Try all methods in order; attempts from direct guesses are added to `best`."""
-    for guess in (*step.hanging(controls[1]), *step.guesses()):
-        found = step.solve(controls[1], *guess)
-        best.append(found)
-        if step.solved(found):
-            return Result.CONVERGED, step, found
-    continued = _continue_load(step, *controls)
-    if continued is not None:
-        return Result.RECOVERED_LOAD_CONTINUATION, step, continued
-    eased = _ease(step, controls[1])
-    if eased is not None:
-        return Result.RECOVERED_EASING, step, eased
-    if isinstance(step.settings.time, Static):
-        relaxed = _relax(step, controls[1])
-        return None if relaxed is None else (Result.RECOVERED_RELAXATION, step, relaxed)
-    divided = _substeps(step, controls, dt)
-    return None if divided is None else (Result.RECOVERED_STEP_HALVING, *divided)
+        def at_part(part: float, at: Solution) -> Attempt:
+            return self.solve(before + part * (now - before), (at.y, at.unknowns))
 
+        return self._in_parts(lambda guess: self.solve(before, guess), at_part)
 
-def _outcome(result: Result, step: _Step, found: Attempt, control: Any = None) -> Outcome:
-    row = found.row
-    return Outcome(
-        result, found.after, np.asarray(row.records), np.asarray(row.unknowns), float(row.error),
-        step.corrections, float(row.position_error), likely_cause(result, step, control),
-    )  # fmt: skip
-
-
-def _continue_load(step: _Step, before: Any, now: Any) -> Attempt | None:
-    """Continue from the previous control to this one in load steps, each from the last solution."""
-    before, now = np.asarray(before, dtype=float), np.asarray(now, dtype=float)
-    if np.array_equal(before, now):
-        return None
-    for guess in step.guesses():
-        found = step.solve(before, *guess)
-        if not step.solved(found):
-            continue
-        whole = _in_parts(
-            step, found, lambda part, at: step.solve(before + part * (now - before), at.y, at.unknowns)
-        )
-        if whole is not None:
-            return whole
-    return None
-
-
-def _ease(step: _Step, control: Any) -> Attempt | None:
-    """Continue from eased friction and contact to the system's own."""
-    system = step.system
-    if system.eased(EASIEST) is system:
-        return None
-    for guess in step.guesses():
-        found = step.solve(control, *guess, system=system.eased(EASIEST))
-        if not step.solved(found):
-            continue
+    def ease(self, control: Any) -> Attempt | None:
+        """Continue from eased friction and contact to the system's own."""
+        system = self.system
+        easiest = system.eased(EASIEST)
+        if easiest is system:
+            return None
 
         def at_part(part: float, at: Solution) -> Attempt:
             easier = system.eased(EASIEST ** (1.0 - part)) if part < 1.0 else system
-            return step.solve(control, at.y, at.unknowns, system=easier)
+            return self.solve(control, (at.y, at.unknowns), system=easier)
 
-        whole = _in_parts(step, found, at_part)
-        if whole is not None:
-            return whole
-    return None
+        return self._in_parts(lambda guess: self.solve(control, guess, system=easiest), at_part)
 
-
-def _in_parts(step: _Step, found: Attempt, solve: Callable[[float, Solution], Attempt]) -> Attempt | None:
-    """Continue from a solution at part 0 to part 1, with adaptive steps, each from the last solution."""
-    reached, part = 0.0, 0.25
-    while reached < 1.0 and part >= LEAST_PART:
-        target = min(1.0, reached + part)
-        following = solve(target, found.solution)
-        if step.solved(following):
-            found, reached, part = following, target, 2.0 * part
-        else:
-            part /= 4.0
-    return found if reached == 1.0 else None
-
-
-def _substeps(whole: _Step, controls: tuple[Any, Any], dt: float) -> tuple[_Step, Attempt] | None:
-    """Divide the step into substeps: with a constant control first, then with a ramp."""
-    for before in (controls[1], controls[0]):
-        found = _in_substeps(whole, before, controls[1], dt)
-        if found is not None:
-            return found
-    return None
+    def _in_parts(
+        self, first: Callable[[Any], Attempt], solve: Callable[[float, Solution], Attempt]
+    ) -> Attempt | None:
+        """Continue from a solution at part 0 to part 1, with adaptive steps, each from the last solution."""
+        for guess in self.guesses():
+            found = first(guess)
+            reached, part = 0.0, 0.25 if self.solved(found) else 0.0
+            while reached < 1.0 and part >= LEAST_PART:
+                target = min(1.0, reached + part)
+                following = solve(target, found.solution)
+                if self.solved(following):
+                    found, reached, part = following, target, 2.0 * part
+                else:
+                    part /= 4.0
+            if reached == 1.0:
+                return found
+        return None
 
 
-def _in_substeps(whole: _Step, before: Any, now: Any, dt: float) -> tuple[_Step, Attempt] | None:
-    """Solve the step by adaptive substeps, with coefficients for unequal time steps."""
-    settings, past = whole.settings, whole.past
-    before, now = np.asarray(before, dtype=float), np.asarray(now, dtype=float)
-    reached, part, previous = 0.0, 0.5, 1.0
-    scheme = settings.time if settings.start == "paper" else BDF1()
-    for _ in range(MOST_SUBSTEPS):
-        until = min(1.0, reached + part)
-        coefficients = scheme.coefficients((until - reached) * dt, previous * dt)
-        step = _Step(whole.system, settings, past, coefficients, whole.t - (1.0 - until) * dt, whole.budget)
-        found = _one_substep(step, before + until * (now - before), ease=part < EASE_BELOW)
-        if found is None:
-            part /= 4.0
-            if part < LEAST_SUBSTEP:
-                return None
-            continue
-        if until == 1.0:
-            # the history of the next step holds whole steps, not substeps
-            before, after = whole.past, found.after
-            past = after._replace(
-                records=jnp.stack([after.records[0], before.records[0]]),
-                y=jnp.concatenate([after.y[:1], before.y[:-1]]),
-                error=jnp.stack([after.error[0], before.error[0], after.error[2]]),
-            )
-            return step, found._replace(after=past)
-        past, previous, scheme = found.after, until - reached, settings.time
-        reached, part = until, 2.0 * previous
-    return None
-
-
-def _one_substep(step: _Step, control: Any, ease: bool) -> Attempt | None:
-    for guess in step.guesses():
-        found = step.solve(control, *guess)
-        if step.solved(found):
-            return found
-    return _ease(step, control) if ease else None
-
-
-def _relax(step: _Step, control: Any) -> Attempt | None:
-    """Relax by implicit Euler with growing time steps, then solve the static problem; ends in a stable shape.
-
-    The tip's boundary conditions are applied gradually in the first steps.
-    """
-    now, part = step.past, 0.0
-    natural = natural_time(step.system) or 0.1
-    dt, longest = 0.1 * natural, 1e5 * natural
-    at_first = step.guesses()[0][0]
-    for _ in range(80):
-        moving = _Step(step.system, step.settings, now, BDF1().coefficients(dt, dt), 0.0, step.budget)
-        target = min(1.0, part + DRAWN)
-        found = moving.solve(control, *moving.guesses()[0], target, at_first)
-        if not moving.solved(found):
-            dt /= 4.0
-            continue
-        # short steps until the tip's boundary conditions hold
-        now, dt = found.after, 2.0 * dt if part == 1.0 else dt
-        part = target
-        if dt > longest:
-            break
-    y = now.y[0]
-    found = step.solve(control, y, step.system.unknowns(y[0]))
-    return found if step.solved(found) else None
-
-
-def likely_cause(result: Result, step: _Step, control: Any) -> str:
+def likely_cause(result: Result, system: System, settings: Settings, control: Any) -> str:
     """Return a hint at the likely cause and the fix."""
     if result.solved:
         return ""
-    unit = other_unit(step.system, np.asarray(control))
+    unit = other_unit(system, np.asarray(control))
     if unit:
         return unit
-    if not step.system.held and isinstance(step.settings.time, Static):
+    if not system.held and settings.time is None:
         return (
             "Likely cause: nothing holds the robot, which is at rest only where all loads on it cancel out; "
             "hold an end of it, or simulate its motion."
         )
-    nodes = step.system.nodes
     if result is Result.NOT_FINITE:
         return (
-            f"Likely too few nodes for so soft or loaded a rod ({nodes}): use more, or a smaller time step."
+            f"Likely too few nodes for so soft or loaded a rod ({system.nodes}): use more, "
+            "or a smaller time step."
         )
     return (
         "Likely cause: the control changes too much in one step, the rod buckles or snaps, "
-        f"or it has too few nodes ({nodes})."
+        f"or it has too few nodes ({system.nodes})."
     )
 
 

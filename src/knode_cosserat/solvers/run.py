@@ -1,4 +1,4 @@
-"""Execution of compiled time loops: one robot with recovery, or a batch on all cores."""
+"""Runs of compiled loops over time steps or equilibria: one robot with recovery, or a batch on all cores."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import dataclasses
 import logging
 import os
 import time
-from typing import Any
+import warnings
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,12 +16,14 @@ import numpy as np
 from tqdm import tqdm
 
 from knode_cosserat.rods.system import System, is_traced
-from knode_cosserat.solvers.history import StateHistory, padded_rows
-from knode_cosserat.solvers.recovery import Budget, Outcome, recover
-from knode_cosserat.solvers.result import Result
-from knode_cosserat.solvers.run_types import InitialCondition, RunSettings, StepResults
-from knode_cosserat.solvers.time import Static
-from knode_cosserat.solvers.time_loop import StepRows, loop_many, loop_one
+from knode_cosserat.solvers.history import FirstStep, SolverState, StateHistory, coefficient_table
+from knode_cosserat.solvers.recovery import Budget, SolvedStep
+from knode_cosserat.solvers.recovery_methods import StaticRecovery, StepRecovery
+from knode_cosserat.solvers.result import Result, SimulationError
+from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.space import Euler
+from knode_cosserat.solvers.static_loop import static_many, static_one
+from knode_cosserat.solvers.time_loop import StepCoefficients, StepRows, TimeStep, loop_many, loop_one
 
 log = logging.getLogger(__name__)
 
@@ -34,22 +37,96 @@ RESPONSE, FIRST_STEPS = 0.2, 128
 COARSE_SHARE = 0.02
 
 
+class InitialState(NamedTuple):
+    """Initial state of a run of one robot or a batch."""
+
+    #: y and z at the nodes
+    record: Any
+    #: control before the first step
+    control: Any
+    state: SolverState
+    #: true if the grid was too coarse for the state before the first step
+    coarse: Any = False
+
+
+class Run(NamedTuple):
+    """Rows of a run, its last state (`SolvedStep.state`), and the likely cause of a failure."""
+
+    rows: StepRows
+    state: Any
+    cause: str
+
+
+@dataclasses.dataclass(frozen=True)
+class TimeIntegration:
+    """The time steps of a run: settings and sizes shared by all its robots."""
+
+    settings: Settings
+    dt: float
+    steps: int
+    first: FirstStep = "start"
+    #: seconds that recovery may take; None: 20 times the run's own time or 5 s, whichever is more
+    recovery_budget: float | None = None
+
+    @property
+    def coefficients(self) -> StepCoefficients:
+        """Coefficients of the steps."""
+        return StepCoefficients(coefficient_table(self.settings, self.dt, self.first), self.dt)
+
+    def solve(self, system: System, controls: Any, state: StateHistory, span: tuple[int, int]) -> Any:
+        """Solve a span of steps until one fails: number of steps done, the last state, all rows."""
+        return loop_one(system, self.settings, self.coefficients, controls, state, span)
+
+    def solve_many(self, system: System, controls: Any, states: StateHistory, lockstep: bool) -> Any:
+        """Solve all steps of a batch of robots, each until one fails."""
+        return loop_many(
+            system, self.settings, self.coefficients, controls, states, self.steps, lockstep
+        )  # fmt: skip
+
+    def recover(self, system: System, state: Any, controls: Any, i: int, budget: Budget) -> SolvedStep:
+        """Recover step i; `controls` are the previous step's and its own."""
+        coefficients = self.coefficients
+        t = float(state.t0) + (i + 1) * self.dt
+        step = TimeStep(state, coefficients.table[min(i, 1)], t)
+        return StepRecovery(system, self.settings, step, self.dt, budget).recover(controls)
+
+
+@dataclasses.dataclass(frozen=True)
+class Equilibria:
+    """A list of equilibria, each solved from the one before. Its states are y at all points."""
+
+    settings: Settings
+    steps: int
+    recovery_budget: float | None = None
+
+    def solve(self, system: System, controls: Any, state: Any, span: tuple[int, int]) -> Any:
+        """Solve a span of equilibria until one fails: the number done, the last state, all rows."""
+        return static_one(system, self.settings, controls, state, span)
+
+    def solve_many(self, system: System, controls: Any, states: Any, lockstep: bool) -> Any:
+        """Solve the lists of a batch of robots, each until one fails."""
+        return static_many(system, self.settings, controls, states, self.steps, lockstep)
+
+    def recover(self, system: System, state: Any, controls: Any, i: int, budget: Budget) -> SolvedStep:
+        """Recover an equilibrium; `controls` are the previous one's and its own."""
+        return StaticRecovery(system, self.settings, state, budget).recover(controls)
+
+
 def run_one(
-    task: RunSettings, system: System, controls: np.ndarray, start: InitialCondition, progress: bool = False
-) -> tuple[StepResults, str]:
-    """Return all steps of one robot, and the likely cause if a step failed (`result` < 0)."""
-    past, total, piece = start.past, task.steps, FIRST_STEPS
+    task: TimeIntegration | Equilibria, system: System, controls: np.ndarray, state: Any, before: Any,
+    progress: bool = False,
+) -> Run:  # fmt: skip
+    """Solve all steps of one robot, with recovery, from a state and the control before it."""
+    total, piece = task.steps, FIRST_STEPS
     padded = padded_rows(controls, least=LEAST_CAPACITY)
     budget = Budget(task.recovery_budget)
-    rows: StepResults | None = None
+    rows: StepRows | None = None
     done, cause = 0, ""
     with tqdm(total=total, disable=not progress, unit="step", leave=False) as bar:
         while done < total and not cause:
             began = time.perf_counter()
             stop = min(total, done + piece)
-            reached, past, new = loop_one(
-                system, task.settings, task.table, padded, task.dt, past, done, stop
-            )
+            reached, state, new = task.solve(system, padded, state, (done, stop))
             reached = int(reached)
             elapsed = time.perf_counter() - began
             budget.ran(elapsed)
@@ -57,27 +134,35 @@ def run_one(
             piece = max(piece, int((reached - done) * RESPONSE / max(elapsed, 1e-6)))
             rows = _merged(rows, new, done, reached, total)
             if reached < stop:
-                before = controls[reached - 1] if reached else start.control
-                outcome = rescue(task, system, past, (before, controls[reached]), reached, budget)
-                past, cause = outcome.past, outcome.cause
-                log.info("step %d: %s", reached + 1, outcome.result.message)
-                _set_row(rows, reached, outcome)
-                reached += outcome.result.solved
+                pair = (controls[reached - 1] if reached else before), controls[reached]
+                solved = task.recover(system, state, pair, reached, budget)
+                state, cause = solved.state, solved.cause
+                log.info("step %d: %s", reached + 1, Result(int(solved.row.result)).message)
+                for every, value in zip(rows, solved.row, strict=True):
+                    every[reached] = value
+                reached += not cause
             bar.update(reached - done)
             done = reached
     assert rows is not None
-    return mark_coarse(rows, system, task, start), cause
+    return Run(rows, state, cause)
 
 
-def rescue(
-    task: RunSettings, system: System, past: StateHistory, controls: tuple[Any, Any], i: int, budget: Budget
-) -> Outcome:
-    """Recover step i after the compiled loop failed; `controls` are the previous step's and its own."""
-    settings = task.settings
-    if task.first == "still":
-        settings = dataclasses.replace(settings, time=Static())
-    t = float(past.t0) + (i + 1) * task.dt
-    return recover(system, settings, past, task.table[min(i, 1)], controls, t, task.dt, budget)
+def _merged(rows: StepRows | None, new: StepRows, first: int, last: int, total: int) -> StepRows:
+    """Add the rows `first` to `last` of a compiled loop to the existing rows."""
+    if rows is None:
+        return StepRows(*(np.array(leaf[:total]) for leaf in map(np.asarray, new)))
+    for every, leaf in zip(rows, new, strict=True):
+        every[first:last] = np.asarray(leaf)[first:last]
+    return rows
+
+
+def padded_rows(rows: Any, least: int = 1) -> np.ndarray:
+    """Return rows (…, T, n) padded to a power of two, so that a few more rows need no new program."""
+    rows = np.asarray(rows)
+    count = rows.shape[-2]
+    width = [(0, 0)] * rows.ndim
+    width[-2] = (0, max(least, 2 ** int(np.ceil(np.log2(count)))) - count)
+    return np.pad(rows, width, mode="edge")
 
 
 def is_coarse(position_error: Any, system: System) -> Any:
@@ -86,80 +171,114 @@ def is_coarse(position_error: Any, system: System) -> Any:
     return ~(position_error <= COARSE_SHARE * (length[..., None] if np.ndim(length) else length))
 
 
-def mark_coarse(
-    steps: StepResults, system: System, task: RunSettings, start: InitialCondition
-) -> StepResults:
+def mark_coarse(rows: StepRows, system: System, before: Any = None) -> StepRows:
     """Mark solved rows for which the grid is too coarse, and in a motion all rows after such a row.
 
-    The error is propagated by linearised equations. They give its decay along the computed motion, but cannot
-    show that the exact motion diverges from it.
+    `before` is true if the grid was too coarse before a motion; None for equilibria. The error is propagated
+    by linearised equations. They give its decay along the computed motion, but cannot show that the exact
+    motion diverges from it.
     """
-    numeric: Any = jnp if is_traced((steps, system, start.coarse)) else np
-    coarse = is_coarse(steps.position_error, system)
-    if not task.still:
-        before = numeric.asarray(start.coarse)[..., None]
-        coarse = (numeric.cumsum(coarse, axis=-1) > 0) | before
-    coarse &= steps.result >= 0
-    return steps._replace(result=numeric.where(coarse, int(Result.COARSE), steps.result))
+    numeric: Any = jnp if is_traced((rows, system, before)) else np
+    coarse = is_coarse(rows.position_error, system)
+    if before is not None:
+        coarse = (numeric.cumsum(coarse, axis=-1) > 0) | numeric.asarray(before)[..., None]
+    coarse &= rows.result >= 0
+    return rows._replace(result=numeric.where(coarse, int(Result.COARSE), rows.result))
+
+
+def warn_of_coarse_grids(system: System, settings: Settings, rows: StepRows) -> None:
+    """Warn of rows with a large discretisation error; not for Euler, which only reproduces the paper."""
+    coarse = np.asarray(rows.result) == Result.COARSE
+    if np.any(coarse) and not isinstance(settings.space, Euler):
+        worst, length = float(np.max(rows.position_error[coarse])), float(np.max(system.length))
+        warnings.warn(
+            f"the grid is too coarse in {np.count_nonzero(coarse)} of {coarse.size} rows: positions are "
+            f"off by up to about {worst:.2g} m ({worst / length:.0%} of the length) with "
+            f"{system.nodes} nodes. "
+            "Use more nodes, or position_tolerance.",
+            stacklevel=4,
+        )
+
+
+def failure(rows: StepRows, causes: str | dict[int, str], times: Any) -> SimulationError:
+    """Return the error of the first step that failed; without times, of an equilibrium.
+
+    `causes` is the likely cause, or that of each robot of a batch.
+    """
+    robot = None if isinstance(causes, str) else next(iter(causes))
+    cause = causes if isinstance(causes, str) else causes[next(iter(causes))]
+    if robot is not None:
+        rows = StepRows(*(leaf[robot] for leaf in rows))
+    i = int(np.argmax(rows.result < 0))
+    number, t = (0, 0.0) if times is None else (i + 1, float(times[i]))
+    return SimulationError(number, t, float(rows.error[i]), Result(int(rows.result[i])), cause, robot)
+
+
+def rows_of(system: System, rows: StepRows) -> dict[str, Any]:
+    """Return a trajectory's arrays of rows, with NaN in unsolved rows."""
+    numeric: Any = jnp if is_traced(rows) else np
+    ny, nz = system.y_layout.size, system.z_layout.size
+    invalid = numeric.asarray(rows.result) < 0
+    records = numeric.where(invalid[..., None, None], numeric.nan, rows.records)
+    return {
+        "y": records[..., :ny], "z": records[..., ny : ny + nz], "result": rows.result,
+        "residual": rows.error, "iterations": rows.corrections,
+        "position_error": numeric.where(invalid, numeric.nan, rows.position_error),
+    }  # fmt: skip
 
 
 def run_batch(
-    task: RunSettings,
-    system: System,
-    batched: bool,
-    controls: np.ndarray,
-    start: InitialCondition,
-    progress: bool,
-) -> tuple[StepResults, dict[int, str]]:
-    """Return the steps of all robots, and the likely cause for each robot that failed.
+    task: TimeIntegration | Equilibria, system: System, controls: np.ndarray, states: Any, before: Any,
+    progress: bool = False,
+) -> tuple[StepRows, Any, dict[int, str]]:  # fmt: skip
+    """Return the rows and last states of all robots, and the likely cause for each robot that failed.
 
     Robots are solved in chunks, one thread a core. A robot with a failed step is then run by itself, with
     recovery.
     """
-    size = controls.shape[0]
+    size, batched = controls.shape[0], np.ndim(system.length) > 0
     lockstep = jax.default_backend() != "cpu"
     workers = 1 if lockstep else usable_cores()
     chunk = size if lockstep else min(CHUNK, -(-size // workers))
     padded = padded_rows(controls)
 
     def robot(index: Any) -> System:
-        return jax.tree.map(lambda leaf: leaf[index], system) if batched else system
+        return _picked(system, index) if batched else system
 
     with tqdm(total=size, disable=not progress, unit="robot", leave=False) as bar:
 
         def work(first: int) -> Any:
             # the last chunk is padded with its last robot: one shape, one program
             index = np.minimum(np.arange(first, first + chunk), size - 1)
-            past = jax.tree.map(lambda leaf: leaf[index], start.past)
-            done, rows = loop_many(
-                robot(index), task.settings, task.table, padded[index], task.dt, past, task.steps, batched,
-                lockstep,
-            )  # fmt: skip
+            done, lasts, rows = task.solve_many(robot(index), padded[index], _picked(states, index), lockstep)
             count = min(chunk, size - first)
             bar.update(count)
-            return np.asarray(done)[:count], *(np.asarray(leaf)[:count, : task.steps] for leaf in rows)
+            rows = (np.asarray(leaf)[:count, : task.steps] for leaf in rows)
+            return np.asarray(done)[:count], jax.tree.map(lambda x: np.asarray(x)[:count], lasts), *rows
 
         firsts = range(0, size, chunk)
-        program = _program(system, start.past, padded, task.settings, batched, lockstep, chunk)
+        program = _program(system, states, padded, task.settings, batched, lockstep, chunk)
         first = [] if program in _COMPILED else [work(firsts[0])]
         _COMPILED.add(program)
         with concurrent.futures.ThreadPoolExecutor(workers) as pool:
             chunks = first + list(pool.map(work, firsts[len(first) :]))
-    done, *rows = (np.concatenate(parts) for parts in zip(*chunks, strict=True))
-    results = np.zeros((*done.shape, task.steps), dtype=int)
-    steps = mark_coarse(StepResults._make([*rows, results]), system, task, start)
-    causes = {}
-    coarse = np.broadcast_to(start.coarse, size)
+    done, lasts, *leaves = (
+        jax.tree.map(lambda *parts: np.concatenate(parts), *parts) for parts in zip(*chunks, strict=True)
+    )
+    rows, causes = StepRows(*leaves), {}
     for i in np.flatnonzero(done < task.steps):
-        own = InitialCondition(
-            jax.tree.map(lambda leaf, i=i: leaf[i], start.past), start.control[i], coarse[i]
-        )
-        alone, cause = run_one(task, robot(i), controls[i], own)
-        for all_robots, one in zip(steps, alone, strict=True):
-            all_robots[i] = one
-        if alone.result.min() < 0:
-            causes[int(i)] = cause
-    return steps, causes
+        alone = run_one(task, robot(i), controls[i], _picked(states, i), before[i])
+        for every, one in zip(rows, alone.rows, strict=True):
+            every[i] = one
+        for every, one in zip(jax.tree.leaves(lasts), jax.tree.leaves(alone.state), strict=True):
+            every[i] = one
+        if alone.cause:
+            causes[int(i)] = alone.cause
+    return rows, lasts, causes
+
+
+def _picked(tree: Any, index: Any) -> Any:
+    return jax.tree.map(lambda leaf: leaf[index], tree)
 
 
 #: compiled programs of `run_batch`. JAX may crash if one thread writes a program to the disk's cache while
@@ -178,23 +297,3 @@ def usable_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-def _merged(rows: StepResults | None, new: StepRows, first: int, last: int, total: int) -> StepResults:
-    """Add the rows `first` to `last` of a time loop to the existing rows."""
-    if rows is None:
-        leaves = [np.asarray(leaf)[:total] for leaf in new]
-        if last == total:
-            return StepResults._make([*leaves, np.zeros(total, dtype=int)])
-        rows = StepResults._make([*map(np.array, leaves), np.full(total, int(Result.NOT_REACHED))])
-    for old, leaf in zip(rows[:-1], new, strict=True):
-        old[first:last] = np.asarray(leaf)[first:last]
-    rows.result[first:last] = Result.CONVERGED
-    return rows
-
-
-def _set_row(rows: StepResults, i: int, outcome: Outcome) -> None:
-    rows.records[i], rows.unknowns[i] = outcome.record, outcome.unknowns
-    rows.error[i], rows.corrections[i] = outcome.error, outcome.corrections
-    rows.position_error[i] = outcome.position_error
-    rows.result[i] = outcome.result

@@ -20,46 +20,86 @@ from jaxtyping import Float
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.history import StateHistory, history_of, used_places
 from knode_cosserat.solvers.problem import StepProblem, row_of
-from knode_cosserat.solvers.run_types import RunSettings
+from knode_cosserat.solvers.run import Equilibria, TimeIntegration
 from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.solvers.static_loop import static_one
 from knode_cosserat.solvers.tangent import Moves, StepTangent, SystemMoves
-from knode_cosserat.solvers.time_loop import StepRows, loop_one
+from knode_cosserat.solvers.time_loop import StepCoefficients, StepRows, loop_one
+
+
+class TangentState(NamedTuple):
+    """History before a step at the places of the scheme, and its tangents: the carry of the tangent loop."""
+
+    records: Float[Any, "2 used x"]
+    rate: Float[Any, "used x"]
+    d_records: Float[Any, "2 used x"]
+    d_rate: Float[Any, "used x"]
+    #: time of row 0 (s)
+    t0: Any
+
+    @classmethod
+    def of(cls, system: System, space: SpaceScheme, past: StateHistory, d_records: Any, d_rate: Any) -> Self:
+        """Return the state before the first step, from a history and its tangents at all places."""
+        used = used_places(system, space)
+        records, rate, d_records, d_rate = (
+            part[..., :used, :] for part in (past.records, past.rate, d_records, d_rate)
+        )
+        return cls(records, rate, d_records, d_rate, past.t0)
 
 
 @functools.lru_cache(maxsize=64)
-def rollout(task: RunSettings) -> Callable[[System, Any, StateHistory], StepRows]:
-    """Return a differentiable function from (system, controls (T, c), past) to the rows of all steps.
+def rollout(task: TimeIntegration) -> Callable[[System, Any, StateHistory], tuple[StepRows, StateHistory]]:
+    """Return a differentiable function from (system, controls (T, c), past) to all rows and the last history.
 
     Cached between calls: JAX recognises functions that it has already traced by identity.
     """
-    settings, table, dt, steps = task.settings, task.table, task.dt, task.steps
+    settings, steps = task.settings, task.steps
 
     @jax.custom_jvp
-    def run(system: System, controls: Any, past: StateHistory) -> StepRows:
-        done, _, rows = loop_one(system, settings, table, controls, dt, past, 0, steps)
-        unsolved = jnp.arange(steps) >= done
-        return StepRows(
-            jnp.where(unsolved[:, None, None], jnp.nan, rows.records),
-            jnp.where(unsolved[:, None], jnp.nan, rows.unknowns),
-            jnp.where(unsolved, jnp.inf, rows.error),
-            rows.corrections,
-            rows.position_error,
+    def run(system: System, controls: Any, past: StateHistory) -> tuple[StepRows, StateHistory]:
+        done, last, rows = loop_one(system, settings, task.coefficients, controls, past, (0, steps))
+        last = last._replace(t0=past.t0 + steps * task.dt)
+        return _nan_where_unsolved(rows), jax.tree.map(lambda x: jnp.where(done < steps, jnp.nan, x), last)
+
+    def tangent(primals: Any, tangents: Any) -> Any:
+        rows, last = run(*primals)
+        (system, controls, past), solved = primals, (rows.records, rows.unknowns)
+        moves = SystemMoves.of(_system_tangent(tangents[0]))
+        _, d_controls, d_past = jax.tree.map(_instantiated, tangents, is_leaf=_is_zero)
+        state = TangentState.of(system, settings.space, past, d_past.records, d_past.rate)
+        after, d_solved = tangent_time_loop(
+            settings, task.coefficients, solved, (system, controls), (moves, d_controls), state
         )
+        # first guesses, error estimates and the extra stages of these count as constants
+        d_last = jax.tree.map(jnp.zeros_like, last)
+        used = len(after.d_rate)
+        d_last = d_last._replace(
+            records=d_last.records.at[:, :used].set(after.d_records),
+            rate=d_last.rate.at[:used].set(after.d_rate),
+            t0=d_past.t0,
+        )
+        return (rows, last), (_row_tangents(rows, *d_solved), d_last)
+
+    run.defjvp(tangent, symbolic_zeros=True)
+    return run
+
+
+@functools.lru_cache(maxsize=64)
+def static_rollout(task: Equilibria) -> Callable[[System, Any, Any], StepRows]:
+    """Return a differentiable function from (system, controls (T, c), y at all points) to all rows."""
+
+    @jax.custom_jvp
+    def run(system: System, controls: Any, y: Any) -> StepRows:
+        _, _, rows = static_one(system, task.settings, controls, y, (0, task.steps))
+        return _nan_where_unsolved(rows)
 
     def tangent(primals: Any, tangents: Any) -> Any:
         rows = run(*primals)
-        system, controls, past = primals
-        moves = any(
-            not isinstance(each, SymbolicZero) for each in jax.tree.leaves(tangents[0], is_leaf=_is_zero)
-        )
-        d_system, d_controls, d_past = jax.tree.map(_instantiated, tangents, is_leaf=_is_zero)
-        d_records, d_unknowns = tangent_time_loop(
-            settings, table, dt, rows.records, rows.unknowns, system, controls, past,
-            d_system if moves else None, d_controls, d_past.records, d_past.rate,
-        )  # fmt: skip
-        still = np.zeros(steps, dtype=jax.dtypes.float0)
-        none = jnp.zeros_like(rows.error)
-        return rows, StepRows(d_records, d_unknowns, none, still, none)
+        solved, moves = (rows.records, rows.unknowns), SystemMoves.of(_system_tangent(tangents[0]))
+        changes = moves, _instantiated(tangents[1])
+        d_rows, d_unknowns, _ = static_tangents(task.settings, solved, primals[:2], changes)
+        return rows, _row_tangents(rows, d_rows, d_unknowns)
 
     run.defjvp(tangent, symbolic_zeros=True)
     return run
@@ -77,64 +117,88 @@ def _instantiated(tangent: Any) -> Any:
     return numeric.zeros(tangent.shape, tangent.dtype)
 
 
-class TangentState(NamedTuple):
-    """History before a step at the places of the scheme, and its tangents: the carry of the tangent loop."""
+def _system_tangent(tangent: Any) -> Any:
+    """Return the tangent of a system with arrays as leaves, or None if all of them are zero."""
+    leaves = jax.tree.leaves(tangent, is_leaf=_is_zero)
+    if all(_is_zero(leaf) for leaf in leaves):
+        return None
+    return jax.tree.map(_instantiated, tangent, is_leaf=_is_zero)
 
-    records: Float[Any, "2 used x"]
-    rate: Float[Any, "used x"]
-    d_records: Float[Any, "2 used x"]
-    d_rate: Float[Any, "used x"]
-    #: time of row 0 (s)
-    t0: Any
 
-    @classmethod
-    def of(cls, system: System, settings: Settings, past: StateHistory, d_records: Any, d_rate: Any) -> Self:
-        """Return the state before the first step, from a history and its tangents at all places."""
-        used = used_places(system, settings.space)
-        records, rate, d_records, d_rate = (
-            part[..., :used, :] for part in (past.records, past.rate, d_records, d_rate)
-        )
-        return cls(records, rate, d_records, d_rate, past.t0)
+def _nan_where_unsolved(rows: StepRows) -> StepRows:
+    unsolved = rows.result < 0
+    return rows._replace(
+        records=jnp.where(unsolved[:, None, None], jnp.nan, rows.records),
+        unknowns=jnp.where(unsolved[:, None], jnp.nan, rows.unknowns),
+        error=jnp.where(unsolved, jnp.inf, rows.error),
+    )
+
+
+def _row_tangents(rows: StepRows, d_records: Any, d_unknowns: Any) -> StepRows:
+    whole, zero = np.zeros(rows.result.shape, dtype=jax.dtypes.float0), jnp.zeros_like(rows.error)
+    return StepRows(d_records, d_unknowns, zero, whole, zero, whole)
 
 
 @functools.partial(jax.jit, static_argnames="settings")
 def tangent_time_loop(
-    settings: Settings, table: Any, dt: Any, rows: Any, unknowns: Any, system: System, controls: Any,
-    past: StateHistory, d_system: Any, d_controls: Any, d_records: Any, d_rate: Any,
-) -> Any:  # fmt: skip
-    """Return tangents of all rows and unknowns, linear in the tangents of system, controls and history.
+    settings: Settings, steps: StepCoefficients, solved: tuple[Any, Any], at: tuple[System, Any],
+    changes: tuple[SystemMoves, Any], state: TangentState,
+) -> tuple[TangentState, tuple[Any, Any]]:  # fmt: skip
+    """Return the state after the last of some solved rows, and the tangents of all rows and unknowns.
 
-    `d_system` is None if the system does not change.
+    They are linear in `changes`, the tangents of system and controls, and in those of `state`. `solved` are
+    all rows and unknowns; `at` are system and controls.
     """
-    state = TangentState.of(system, settings, past, d_records, d_rate)
-    moves, solved = SystemMoves.of(d_system), (rows, unknowns)
-    return tangent_piece(settings, table, dt, solved, system, controls, state, moves, d_controls)[1]
-
-
-def tangent_piece(
-    settings: Settings, table: Any, dt: Any, solved: tuple[Any, Any], system: System, controls: Any,
-    state: TangentState, moves: SystemMoves, d_controls: Any,
-) -> tuple[TangentState, Any]:  # fmt: skip
-    """Return the state after the last of some solved rows and unknowns, and the tangents of these."""
-    ny = system.y_layout.size
+    (system, controls), (moves, d_controls) = at, changes
 
     def one(state: TangentState, now: Any) -> Any:
         i, row, unknowns, control, d_control = now
-        coefficients = jnp.where(i == 0, table[0], table[1])
-        t, c0 = state.t0 + (i + 1) * dt, coefficients[0]
+        coefficients = jnp.where(i == 0, steps.table[0], steps.table[1])
+        t, c0 = state.t0 + (i + 1) * steps.dt, coefficients[0]
         history = history_of(state.records, state.rate, coefficients, settings)
         d_history = history_of(state.d_records, state.d_rate, coefficients, settings)
         problem = StepProblem(system, t, control, c0, history, settings.space)
-        step = StepTangent(problem, problem.filled(row[:, :ny]), unknowns, moves.directions)
-        d_y, d_unknowns, d_records = step.solved(Moves(d_history, d_control, moves.weights))
-        records = problem.packed(step.found)
+        found = _step_tangent(problem, row, unknowns, moves, (d_history, d_control))
+        records, d_records, d_row, d_unknowns = found
         rate, d_rate = state.rate, state.d_rate
-        if settings.time.uses_rate:
+        if settings.uses_rate:
             rate, d_rate = c0 * records + history, c0 * d_records + d_history
         after = TangentState(
             jnp.stack([records, state.records[0]]), rate, jnp.stack([d_records, state.d_records[0]]), d_rate,
             state.t0,
         )  # fmt: skip
-        return after, (row_of(system, d_y, d_records), d_unknowns)
+        return after, (d_row, d_unknowns)
 
     return jax.lax.scan(one, state, (jnp.arange(len(controls)), *solved, controls, d_controls))
+
+
+def _step_tangent(problem: StepProblem, row: Any, unknowns: Any, moves: SystemMoves, changes: Any) -> Any:
+    """Return the records of a solved row, and the tangents of records, row and unknowns.
+
+    `changes` are the tangents of history and control.
+    """
+    y = problem.filled(row[:, : problem.system.y_layout.size])
+    step = StepTangent(problem, y, unknowns, moves.directions)
+    d_history, d_control = changes
+    d_y, d_unknowns, d_records = step.solved(Moves(d_history, d_control, moves.weights))
+    return problem.packed(step.found), d_records, row_of(problem.system, d_y, d_records), d_unknowns
+
+
+@functools.partial(jax.jit, static_argnames="settings")
+def static_tangents(
+    settings: Settings, solved: tuple[Any, Any], at: tuple[System, Any], changes: tuple[SystemMoves, Any]
+) -> tuple[Any, Any, Any]:
+    """Return the tangents of rows, unknowns and records of solved equilibria, at the places of the scheme.
+
+    `solved` are all rows and unknowns; `at` are system and controls, and `changes` their tangents.
+    """
+    (system, controls), (moves, d_controls) = at, changes
+
+    def one(now: Any) -> Any:
+        row, unknowns, control, d_control = now
+        problem = StepProblem.still(system, settings.space, control)
+        none = jnp.zeros_like(problem.history)
+        _, d_records, d_row, d_unknowns = _step_tangent(problem, row, unknowns, moves, (none, d_control))
+        return d_row, d_unknowns, d_records
+
+    return jax.lax.map(one, (*solved, controls, d_controls))

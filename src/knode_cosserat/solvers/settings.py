@@ -19,24 +19,35 @@ Start = Literal["paper", "consistent"]
 class Settings:
     """Schemes in time and space, the first step, and Newton's options.
 
-    `start` selects the first step of a scheme that needs two earlier states. "paper" sets the state before
-    the first equal to the first; "consistent" makes the first step by BDF1 (keeps order 2).
+    `time` is None for equilibria, which have no rates. `start` selects the first step of a scheme that needs
+    two earlier states. "paper" sets the state before the first equal to the first; "consistent" makes the
+    first step by BDF1 (keeps order 2).
     """
 
-    time: TimeScheme = time_schemes.BDF2()
+    time: TimeScheme | None = time_schemes.BDF2()
     space: SpaceScheme = space_schemes.LOBATTO2
     start: Start = "paper"
     newton: NewtonOptions = NewtonOptions()
 
+    @property
+    def uses_rate(self) -> bool:
+        """True if the time scheme needs y_t of the previous step."""
+        return self.time is not None and self.time.uses_rate
+
     @classmethod
-    def of(cls, time: str | TimeScheme, space: str | SpaceScheme, start: str, newton: NewtonOptions) -> Self:
-        """Return settings from names or schemes. Raises `ValueError` with the accepted names."""
+    def of(
+        cls, time: str | TimeScheme | None, space: str | SpaceScheme, start: str, newton: NewtonOptions
+    ) -> Self:
+        """Return settings from names or schemes; `time` is None for statics.
+
+        Raises `ValueError` with the accepted names.
+        """
         if not isinstance(newton, NewtonOptions):
             raise ValueError(f"newton is {newton!r}; allowed is a NewtonOptions")
         if start not in ("paper", "consistent"):
             raise ValueError(f'start is {start!r}; allowed is "paper" or "consistent"')
         return cls(
-            _scheme("time", time, TimeScheme, time_schemes.SCHEMES),
+            None if time is None else _scheme("time", time, TimeScheme, time_schemes.SCHEMES),
             _scheme("space", space, SpaceScheme, space_schemes.SCHEMES),
             start,  # type: ignore[arg-type]
             newton,
@@ -45,8 +56,8 @@ class Settings:
     def described(self) -> dict[str, Any]:
         """Return the settings as plain data, for a file: schemes by class name and options."""
         return {
-            "time": {"scheme": type(self.time).__name__, **dataclasses.asdict(self.time)},
-            "space": {"scheme": type(self.space).__name__, **dataclasses.asdict(self.space)},
+            "time": _described(self.time),
+            "space": _described(self.space),
             "start": self.start,
             "newton": dataclasses.asdict(self.newton),
         }
@@ -55,15 +66,15 @@ class Settings:
     def from_description(cls, described: Any) -> Self:
         """Return settings from plain data. Raises `KeyError`, `TypeError` or `ValueError` if it is not valid.
 
-        Data of earlier versions is accepted: RK4 becomes the scheme of the same order, and removed options
-        are ignored.
+        Data of earlier versions is accepted: RK4 becomes the scheme of the same order, the scheme Static
+        becomes none, and removed options are ignored.
         """
-        time = _named(TimeScheme, **described["time"])
+        time = described["time"]
         space, newton = dict(described["space"]), dict(described["newton"])
         space["scheme"] = _EARLIER_SCHEMES.get(space["scheme"], space["scheme"])
         newton.pop("across_steps", None)
         return cls(
-            time=time,
+            time=None if time in (None, _EARLIER_STATICS) else _named(TimeScheme, **time),
             space=_named(SpaceScheme, **space),
             start=described["start"],
             newton=NewtonOptions(**newton),
@@ -72,6 +83,12 @@ class Settings:
 
 #: schemes along the rod of earlier versions, and present schemes of the same order
 _EARLIER_SCHEMES = {"RK4": "Lobatto4"}
+#: time scheme of equilibria in earlier versions
+_EARLIER_STATICS = {"scheme": "Static"}
+
+
+def _described(scheme: Any) -> dict[str, Any] | None:
+    return None if scheme is None else {"scheme": type(scheme).__name__, **dataclasses.asdict(scheme)}
 
 
 def _scheme(what: str, given: Any, kind: Any, known: Any) -> Any:

@@ -17,14 +17,23 @@ from knode_cosserat.rods.trained_range import without_range
 from knode_cosserat.solvers import sensitivity
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.damping import warn_if_undamped
-from knode_cosserat.solvers.initial import InitialState, SimulationRun, initial_state
+from knode_cosserat.solvers.history import SolverState
+from knode_cosserat.solvers.initial import continued_state, initial_state
 from knode_cosserat.solvers.recovery import natural_time
-from knode_cosserat.solvers.result import Result, SimulationError
-from knode_cosserat.solvers.run import mark_coarse, run_batch, run_one
-from knode_cosserat.solvers.run_types import RunSettings, StepResults
+from knode_cosserat.solvers.run import (
+    InitialState,
+    TimeIntegration,
+    failure,
+    mark_coarse,
+    rows_of,
+    run_batch,
+    run_one,
+    warn_of_coarse_grids,
+)
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.space import Euler, SpaceScheme
-from knode_cosserat.solvers.time import Static, TimeScheme
+from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.solvers.time import TimeScheme
+from knode_cosserat.solvers.time_loop import StepRows
 from knode_cosserat.trajectory import Trajectory
 
 #: time steps above this (s), and above this multiple of the rod's natural time, suggest milliseconds
@@ -64,9 +73,10 @@ def simulate(
         start: how the first step is made from one state; see `Settings`.
         initial: start from this trajectory's last row. By default the simulation starts from the robot's
             state at rest, or from the equilibrium under zero control if that state is only a guess (such as
-            for a platform on bent legs). With the same time step the motion continues exactly. For rows from
-            the middle of a motion, and for measured rows, states between nodes are interpolated, and a scheme
-            that needs rates (BDF-α, the trapezoidal rule) may make its first step by BDF1.
+            for a platform on bent legs). A simulated motion continues exactly, by its `final_state`, with the
+            same time step. A part of it, `motion[:k]`, has its rows evaluated again first. For a part from
+            the middle, and for measured rows, states between nodes are interpolated, and a scheme that needs
+            rates (BDF-α, the trapezoidal rule) makes its first step by BDF1.
         newton: tolerances and limits of the solve in each step.
         position_tolerance: largest discretisation error (m) of positions along the rod. The number of nodes
             is chosen so that the estimate stays below it in every row; by default it is the robot's.
@@ -87,39 +97,36 @@ def simulate(
     """
     if initial is not None and not isinstance(initial, Trajectory):
         raise ValueError(f"initial is a {type(initial).__name__}; allowed is a Trajectory, or None")
+    if time in (None, "static"):
+        raise ValueError(f"time is {time!r}; equilibria have no time steps: use solvers.equilibria")
     settings = Settings.of(time, space, start, newton)
     if on_failure not in ("raise", "return"):
         raise ValueError(f'on_failure is {on_failure!r}; allowed is "raise" or "return"')
     dt = checked_dt(dt)
-    if not isinstance(settings.time, Static):
-        warn_if_undamped(robot, dt)
+    warn_if_undamped(robot, dt)
     if position_tolerance is not None:
         refine = functools.partial(
             simulate, controls=controls, dt=dt, time=time, space=space, start=start, newton=newton,
             recovery_budget=recovery_budget, on_failure=on_failure, progress=progress,
         )  # fmt: skip
         return refined_trajectory(refine, robot, initial, position_tolerance, settings.space.order)
-    system, batch = _stacked(robot)
-    controls, batch = _checked_controls(system, controls, batch)
-    if not isinstance(settings.time, Static):
-        _warn_of_long_steps(system, dt)
+    system, batch = stacked(robot)
+    controls, batch = checked_controls(system, controls, batch)
+    _warn_of_long_steps(system, dt)
     if initial is not None:
         check_initial(system, initial, batch)
     # ranges are not part of the equations: programs are compiled for systems without them
-    bare, begins = without_range(system), without_range(_unmarked(initial))
-    run = SimulationRun(
-        bare, controls, begins, settings, dt, batch, isinstance(robot, Sequence), recovery_budget
-    )
+    bare, before = without_range(system), without_range(unmarked(initial))
     if is_traced((system, controls, initial)):
-        found = _traced(*run[:7])
-    elif batch:
-        found = _batch(run, on_failure, progress)
+        found = _traced(bare, controls, before, settings, dt)
     else:
-        found = _single(run, on_failure, progress)
+        at_start, task = _initial(bare, controls, before, settings, dt, recovery_budget)
+        found = _plain(bare, controls, at_start, task, on_failure, progress)
     return marked(dataclasses.replace(found, system=system), initial)
 
 
-def _unmarked(initial: Trajectory | None) -> Trajectory | None:
+def unmarked(initial: Trajectory | None) -> Trajectory | None:
+    """Return a trajectory without marks of extrapolation."""
     return None if initial is None else dataclasses.replace(initial, extrapolated=None)
 
 
@@ -132,7 +139,11 @@ def marked(trajectory: Trajectory, initial: Trajectory | None) -> Trajectory:
     trained = system.trained_range()
     if trained is None:
         return trajectory
-    outside = trained.outside(system, trajectory.time, trajectory.control, trajectory.z)
+    time, control, z = trajectory.time, trajectory.control, trajectory.z
+    if trajectory.settings is not None and trajectory.settings.time is None:
+        # equilibria are motions of one row
+        time, control, z = time[:1], control[..., None, :], z[..., None, :, :]
+    outside = trained.outside(system, time, control, z).reshape(trajectory.result.shape)
     if initial is not None and initial.extrapolated is not None:
         numeric: Any = jnp if is_traced(outside) else np
         first = numeric.arange(outside.shape[-1]) == 0
@@ -183,7 +194,8 @@ def _ladder() -> Iterator[int]:
 # checks of the arguments
 
 
-def _stacked(robot: Any) -> tuple[System, int | None]:
+def stacked(robot: Any) -> tuple[System, int | None]:
+    """Return one system of a robot or of a batch of robots, and the number of robots in a batch."""
     if isinstance(robot, System):
         return robot, None
     robots = list(robot) if isinstance(robot, Sequence) else []
@@ -214,7 +226,8 @@ def _warn_of_long_steps(system: System, dt: float) -> None:
         )
 
 
-def _checked_controls(system: System, controls: Any, batch: int | None) -> tuple[Any, int | None]:
+def checked_controls(system: System, controls: Any, batch: int | None) -> tuple[Any, int | None]:
+    """Return controls (steps, c) or (batch, steps, c), and the size of the batch. Raises `ValueError`."""
     names = ", ".join(f"{field.name} ({field.unit})" for field in system.control_layout.fields)
     size = system.control_size
     allowed = f"allowed is (steps, {size}) or (batch, steps, {size}): {names}"
@@ -287,100 +300,68 @@ def check_initial(system: System, initial: Trajectory, batch: int | None) -> Non
         )
 
 
-# the three ways to run
+# runs
 
 
-def _single(run: SimulationRun, on_failure: str, progress: bool) -> Trajectory:
-    system, controls, settings, dt = run.system, run.controls, run.settings, run.dt
-    begins = initial_state(run)
-    task = RunSettings(settings, dt, len(controls), begins.first, run.budget)
-    steps, cause = run_one(task, system, controls, begins.start, progress)
-    if on_failure == "raise" and steps.result.min() < 0:
-        raise _failure(task, float(begins.t0), steps, cause, None)
-    _warn_of_coarse_grids(run, steps)
-    return _trajectory(run, begins, steps)
+def _initial(system: Any, controls: Any, initial: Any, settings: Settings, dt: float, budget: Any) -> Any:
+    """Return the initial state of a run, and its time steps."""
+    if initial is None:
+        batch = len(controls) if np.ndim(controls) == 3 else None
+        at_start = initial_state(system, settings, batch, budget)
+    else:
+        at_start = continued_state(system, initial, settings, dt)
+    first = at_start.state.first_step(settings)
+    return at_start, TimeIntegration(settings, dt, np.shape(controls)[-2], first, budget)
 
 
-def _batch(run: SimulationRun, on_failure: str, progress: bool) -> Trajectory:
-    system, controls, settings, dt, many = run.system, run.controls, run.settings, run.dt, run.many
-    begins = initial_state(run)
-    task = RunSettings(settings, dt, controls.shape[1], recovery_budget=run.budget)
-    steps, causes = run_batch(task, system, many, controls, begins.start, progress)
+def _plain(
+    system: Any, controls: Any, at_start: InitialState, task: TimeIntegration, on_failure: str, progress: bool
+) -> Trajectory:
+    """Simulate with recovery."""
+    run = run_batch if np.ndim(controls) == 3 else run_one
+    rows, history, causes = run(task, system, controls, at_start.state.history, at_start.control, progress)
     if on_failure == "raise" and causes:
-        robot, cause = next(iter(causes.items()))
-        raise _failure(task, 0.0, StepResults(*(leaf[robot] for leaf in steps)), cause, robot)
-    _warn_of_coarse_grids(run, steps)
-    return _trajectory(run, begins, steps)
+        times = float(np.ravel(at_start.state.history.t0)[0]) + (1.0 + np.arange(task.steps)) * task.dt
+        raise failure(rows, causes, times)
+    rows = mark_coarse(rows, system, at_start.coarse)
+    warn_of_coarse_grids(system, task.settings, rows)
+    return _trajectory(system, controls, at_start, task, rows, history)
 
 
-def _warn_of_coarse_grids(run: SimulationRun, steps: StepResults) -> None:
-    """Warn of rows with a large discretisation error; not for Euler, which only reproduces the paper."""
-    coarse = np.asarray(steps.result) == Result.COARSE
-    if np.any(coarse) and not isinstance(run.settings.space, Euler):
-        worst, length = float(np.max(steps.position_error[coarse])), float(np.max(run.system.length))
-        warnings.warn(
-            f"the grid is too coarse in {np.count_nonzero(coarse)} of {coarse.size} rows: positions are "
-            f"off by up to about {worst:.2g} m ({worst / length:.0%} of the length) with "
-            f"{run.system.nodes} nodes. "
-            "Use more nodes, or position_tolerance.",
-            stacklevel=4,
-        )
-
-
-def _failure(
-    task: RunSettings, t0: float, steps: StepResults, cause: str, robot: int | None
-) -> SimulationError:
-    i = int(np.argmax(steps.result < 0))
-    number = 0 if isinstance(task.settings.time, Static) else i + 1
-    return SimulationError(
-        number, t0 + number * task.dt, float(steps.error[i]), Result(int(steps.result[i])), cause, robot
-    )
-
-
-@functools.partial(jax.jit, static_argnums=(3, 4, 5, 6))
-def _traced(system, controls, initial, settings, dt, batch, many):  # type: ignore[no-untyped-def]
+@functools.partial(jax.jit, static_argnames=("settings", "dt"))
+def _traced(system, controls, initial, settings, dt):  # type: ignore[no-untyped-def]
     """Simulate inside JAX's transformations: without recovery; unsolved rows become NaN.
 
     A single jitted function, so that a transformation traces it once and not at every call.
     """
-    run = SimulationRun(system, controls, initial, settings, dt, batch, many)
-    begins = initial_state(run)
-    task = RunSettings(settings, dt, np.shape(controls)[-2], begins.first)
-    one = sensitivity.rollout(task)
-    if batch:
-        rows = jax.vmap(one, in_axes=(0 if many else None, 0, 0))(system, controls, begins.start.past)
-    else:
-        rows = one(system, controls, begins.start.past)
-    result = jnp.where(rows.error <= settings.newton.acceptable, 0, int(Result.NO_CONVERGENCE))
-    return _trajectory(
-        run, begins, mark_coarse(StepResults._make([*rows, result]), system, task, begins.start)
-    )
+    at_start, task = _initial(system, controls, initial, settings, dt, None)
+    run: Any = sensitivity.rollout(task)
+    if np.ndim(controls) == 3:
+        run = jax.vmap(run, in_axes=(0 if np.ndim(system.length) else None, 0, 0))
+    rows, history = run(system, controls, at_start.state.history)
+    return _trajectory(system, controls, at_start, task, mark_coarse(rows, system, at_start.coarse), history)
 
 
-def _trajectory(run: SimulationRun, begins: InitialState, steps: StepResults) -> Trajectory:
-    """Return the trajectory: the initial row, then the steps, with NaN in unsolved rows."""
-    system, controls, settings, dt, batch = run.system, run.controls, run.settings, run.dt, run.batch
-    numeric: Any = jnp if is_traced((begins.record, steps)) else np
-    axis = 1 if batch else 0
-    ny, nz = system.y_layout.size, system.z_layout.size
-    invalid = numeric.asarray(steps.result) < 0
-    records = numeric.where(invalid[..., None, None], numeric.nan, steps.records[..., : ny + nz])
-
-    def joined(first: Any, rest: Any) -> Any:
-        return numeric.concatenate([numeric.expand_dims(first, axis), rest], axis)
-
-    states = joined(numeric.asarray(begins.record)[..., : ny + nz], records)
-    zero = numeric.zeros(states.shape[:axis])
-    return Trajectory(
-        system=system,
-        settings=settings,
-        time=begins.t0 + np.arange(np.shape(controls)[-2] + 1) * dt,
-        y=states[..., :ny],
-        z=states[..., ny:],
-        control=joined(begins.start.control, controls),
-        result=joined(zero.astype(int), steps.result),
-        residual=joined(zero, steps.error),
-        iterations=joined(zero.astype(int), steps.corrections),
-        position_error=joined(zero, numeric.where(invalid, numeric.nan, steps.position_error)),
-        begun=jax.tree.map(numeric.asarray, begins.begun),
-    )
+def _trajectory(
+    system: System, controls: Any, at_start: InitialState, task: TimeIntegration, rows: StepRows, history: Any
+) -> Trajectory:
+    """Return the trajectory: the initial row, then the steps."""
+    settings, dt = task.settings, task.dt
+    numeric: Any = jnp if is_traced((at_start.record, rows)) else np
+    axis, ny = np.ndim(controls) - 2, system.y_layout.size
+    record, zero = numeric.asarray(at_start.record), numeric.zeros(np.shape(controls)[:axis])
+    first = {
+        "y": record[..., :ny], "z": record[..., ny : ny + system.z_layout.size], "control": at_start.control,
+        "result": zero.astype(int), "residual": zero, "iterations": zero.astype(int), "position_error": zero,
+    }  # fmt: skip
+    every = rows_of(system, rows) | {"control": controls}
+    t0 = numeric.asarray(at_start.state.history.t0)
+    time = (t0[0] if axis else t0) + np.arange(task.steps + 1) * dt
+    final = history._replace(t0=numeric.full(np.shape(t0), time[-1]))
+    final = SolverState(final, dt, settings.uses_rate)
+    initial, final = jax.tree.map(numeric.asarray, (at_start.state, final))
+    joined = {
+        name: numeric.concatenate([numeric.expand_dims(first[name], axis), values], axis)
+        for name, values in every.items()
+    }
+    return Trajectory(system, settings, time, **joined, initial_state=initial, final_state=final)

@@ -3,36 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
+import jax
 import numpy as np
 
 from knode_cosserat._reprs import robot_text
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.history import InitialHistory
-from knode_cosserat.solvers.initial import SimulationRun, initial_state
+from knode_cosserat.solvers.history import SolverState, StateHistory
+from knode_cosserat.solvers.initial import continued_state, initial_state
 from knode_cosserat.solvers.recovery import Budget
 from knode_cosserat.solvers.result import Result, SimulationError
-from knode_cosserat.solvers.run import LEAST_CAPACITY, is_coarse, rescue
-from knode_cosserat.solvers.run_types import RunSettings
+from knode_cosserat.solvers.run import LEAST_CAPACITY, TimeIntegration, is_coarse, rows_of
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.simulate import check_initial, checked_dt, marked
 from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.solvers.time import Static, TimeScheme
-from knode_cosserat.solvers.time_loop import loop_one
+from knode_cosserat.solvers.time import TimeScheme
+from knode_cosserat.solvers.time_loop import StepRows
 from knode_cosserat.trajectory import Trajectory
-
-
-class _Solved(NamedTuple):
-    """A solved step: the history of the next step, and the data of its row."""
-
-    past: Any
-    record: np.ndarray
-    result: int
-    residual: float
-    corrections: int
-    position_error: float
 
 
 class _StoppableBudget(Budget):
@@ -80,26 +69,24 @@ class Stepper:
         given: Any = robot
         if not isinstance(given, System) or np.ndim(given.length):
             raise ValueError(f"robot is {type(robot).__name__}; a stepper is of one robot, not of a batch")
+        if time in (None, "static"):
+            raise ValueError(f"time is {time!r}; a stepper moves: see `equilibrium` for shapes at rest")
         settings = Settings.of(time, space, start, newton)
-        if isinstance(settings.time, Static):
-            raise ValueError("time is Static; a stepper moves: see `equilibrium` for shapes at rest")
         self.robot, self.dt = robot, checked_dt(dt)
-        if initial is not None:
+        if initial is None:
+            at_start = initial_state(robot, settings, recovery_budget=recovery_budget)
+        else:
             check_initial(robot, initial, None)
-        count = robot.control_size
-        begins = initial_state(
-            SimulationRun(robot, np.zeros((1, count)), initial, settings, self.dt, None, False)
-        )
-        begun, t0 = begins.start, begins.t0
-        self._task = RunSettings(settings, self.dt, 1, begins.first, recovery_budget)
-        self._settings = settings
-        self._past, self._t0, self._index, self._steps = begun.past, float(t0), 0, 0
-        self._coarse = bool(begun.coarse)
-        self._control = np.asarray(begun.control, dtype=float)
+            at_start = continued_state(robot, initial, settings, self.dt)
+        first = at_start.state.first_step(settings)
+        self._task = TimeIntegration(settings, self.dt, 1, first, recovery_budget)
+        self._past, self._t0 = at_start.state.history, float(at_start.state.history.t0)
+        self._index, self._steps, self._coarse = 0, 0, bool(at_start.coarse)
+        self._control = np.asarray(at_start.control, dtype=float)
         # same capacity as in a run of up to 128 steps, so that they share a program
-        self._controls = np.zeros((LEAST_CAPACITY, count))
-        first = _Solved(begun.past, np.asarray(begins.record), 0, 0.0, 0, 0.0)
-        self._state = self._row(first, self._control, self.time, begins.begun)
+        self._controls = np.zeros((LEAST_CAPACITY, robot.control_size))
+        row = StepRows(np.asarray(at_start.record), np.zeros(0), 0.0, 0, 0.0, 0)
+        self._state = self._row(row, self._control, self.time, at_start.state)
 
     def __repr__(self) -> str:
         return f"Stepper of a {robot_text(self.robot)}: t = {self.time:g} s, dt = {self.dt:g} s"
@@ -128,22 +115,23 @@ class Stepper:
             ValueError: a control of a wrong shape, or one that is not finite.
         """
         control = self._checked(control)
-        solved = self._solve(control, stop)
-        self._past, self._control = solved.past, control
-        self._coarse = solved.result == Result.COARSE
+        row, after = self._solve(control, stop)
+        self._past, self._control = after, control
+        self._coarse = row.result == Result.COARSE
         self._steps, self._index = self._steps + 1, self._index + 1
         if self._index == LEAST_CAPACITY:
             # restart the count at row 1, not at row 0, because the coefficients of row 0 may differ
             self._index = 1
             self._past = self._past._replace(t0=np.asarray(self.time - self.dt))
-        self._state = self._row(solved, control, self.time, self._begun_after(solved))
+        self._state = self._row(row, control, self.time, self._state_after(after, self.time))
         return self._state
 
     def preview(self, control: Any, stop: Callable[[], bool] | None = None) -> Trajectory:
         """Return the row that `step` would return, without changing the state. Raises the same errors."""
         control = self._checked(control)
-        solved = self._solve(control, stop)
-        return self._row(solved, control, self.time + self.dt, self._begun_after(solved))
+        row, after = self._solve(control, stop)
+        time = self.time + self.dt
+        return self._row(row, control, time, self._state_after(after, time))
 
     def _checked(self, control: Any) -> np.ndarray:
         fields = self.robot.control_layout.fields
@@ -163,54 +151,32 @@ class Stepper:
             raise ValueError(f"the control: {beyond}")
         return control
 
-    def _solve(self, control: np.ndarray, stop: Callable[[], bool] | None) -> _Solved:
+    def _solve(self, control: np.ndarray, stop: Callable[[], bool] | None) -> tuple[StepRows, StateHistory]:
         i = self._index
         controls = self._controls.copy()  # the compiled loop may still read the previous array
         controls[i] = control
-        done, past, rows = loop_one(
-            self.robot, self._settings, self._task.table, controls, self.dt, self._past, i, i + 1
-        )
-        cause = ""
-        if int(done) > i:
-            record, error = np.asarray(rows.records)[i], float(rows.error[i])
-            found = _Solved(past, record, 0, error, int(rows.corrections[i]), float(rows.position_error[i]))
-        else:
+        done, after, rows = self._task.solve(self.robot, controls, self._past, (i, i + 1))
+        row, cause = StepRows(*(np.asarray(leaf)[i] for leaf in rows)), ""
+        if int(done) == i:
             budget = _StoppableBudget(self._task.recovery_budget, stop)
-            outcome = rescue(self._task, self.robot, self._past, (self._control, control), i, budget)
-            found = _Solved(
-                outcome.past, outcome.record, int(outcome.result), outcome.error, outcome.corrections,
-                outcome.position_error,
-            )  # fmt: skip
-            cause = outcome.cause
-        result = Result(found.result)
+            pair = self._control, control
+            after, row, cause = self._task.recover(self.robot, self._past, pair, i, budget)
+        result = Result(int(row.result))
         if not result.solved:
-            number = self._steps + 1
-            raise SimulationError(number, self.time + self.dt, found.residual, result, cause)
+            raise SimulationError(self._steps + 1, self.time + self.dt, float(row.error), result, cause)
         # same rule as `mark_coarse`
-        coarse = self._coarse or is_coarse(np.asarray(found.position_error), self.robot)
-        return found._replace(result=int(Result.COARSE)) if coarse else found
+        coarse = self._coarse or is_coarse(np.asarray(row.position_error), self.robot)
+        return row._replace(result=int(Result.COARSE) if coarse else result), after
 
-    def _begun_after(self, solved: _Solved) -> InitialHistory:
-        """Return the initial history of a motion that continues from a step."""
-        past = solved.past
-        return InitialHistory(*map(np.asarray, (past.records, past.rate, self._task.table[1], self.dt)))
+    def _state_after(self, past: StateHistory, time: float) -> SolverState:
+        """Return the solver's state after a step."""
+        return SolverState(past._replace(t0=np.asarray(time)), self.dt, self._task.settings.uses_rate)
 
-    def _row(
-        self, solved: _Solved, control: np.ndarray, time: float, begun: InitialHistory | None
-    ) -> Trajectory:
-        ny, nz = self.robot.y_layout.size, self.robot.z_layout.size
-        record = solved.record[None, :, : ny + nz]
-        row = Trajectory(
-            system=self.robot,
-            settings=self._settings,
-            time=np.array([time]),
-            y=record[..., :ny],
-            z=record[..., ny:],
-            control=control[None],
-            result=np.array([solved.result]),
-            residual=np.array([solved.residual]),
-            iterations=np.array([solved.corrections]),
-            position_error=np.array([solved.position_error]),
-            begun=begun,
-        )
-        return marked(row, None)
+    def _row(self, row: StepRows, control: np.ndarray, time: float, state: SolverState) -> Trajectory:
+        single = StepRows(*(np.asarray(leaf)[None] for leaf in row))
+        state = jax.tree.map(np.asarray, state)
+        found = Trajectory(
+            self.robot, self._task.settings, np.array([time]), control=control[None],
+            **rows_of(self.robot, single), initial_state=state, final_state=state,
+        )  # fmt: skip
+        return marked(found, None)

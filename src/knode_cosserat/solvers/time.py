@@ -97,17 +97,6 @@ class Trapezoidal(BDFAlpha):
     alpha: float = -0.5
 
 
-@dataclasses.dataclass(frozen=True)
-class Static(TimeScheme):
-    """All rates are zero: a step of this scheme is a static equilibrium."""
-
-    order = 0
-
-    def coefficients(self, dt: float, previous_dt: float) -> Coefficients:
-        """Return zeros."""
-        return Coefficients(0.0, 0.0, 0.0, 0.0)
-
-
 SCHEMES: dict[str, TimeScheme] = {
     "bdf1": BDF1(),
     "bdf2": BDF2(),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -10,11 +11,21 @@ import jax.numpy as jnp
 from jaxtyping import Float, Int
 
 from knode_cosserat.rods.system import System, in_strands
-from knode_cosserat.solvers.boundary import Kept, largest_residual, newton, none_kept, pivots_of
-from knode_cosserat.solvers.history import EXTRAPOLATIONS, StateHistory, advanced, history_of
+from knode_cosserat.solvers.boundary import (
+    Kept,
+    NewtonOptions,
+    Solution,
+    largest_residual,
+    newton,
+    none_kept,
+    pivots_of,
+)
+from knode_cosserat.solvers.history import EXTRAPOLATIONS, StateHistory, advanced, history_of, used_places
 from knode_cosserat.solvers.linear import Factors, solved_correction
-from knode_cosserat.solvers.problem import Stages, StepProblem, row_of
+from knode_cosserat.solvers.problem import Stages, StepProblem, no_history, row_of
+from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.space import LOBATTO2
 
 #: extrapolations are weighted by this power of their errors in the newest step
 TRUST = -3
@@ -25,7 +36,7 @@ ROUNDING = 1e-12
 
 
 class StepRows(NamedTuple):
-    """The steps' results, one row a step."""
+    """The steps' results, one row a step; with a batch, one axis more in front."""
 
     records: Float[Any, "steps nodes x"]
     unknowns: Float[Any, "steps k"]
@@ -34,19 +45,44 @@ class StepRows(NamedTuple):
     corrections: Int[Any, " steps"]
     #: estimated discretisation error of positions (m), the largest over the nodes
     position_error: Float[Any, " steps"]
+    #: result codes (`result.Result`)
+    result: Int[Any, " steps"]
+
+
+class StepCoefficients(NamedTuple):
+    """Coefficients of a run's first step and of all later steps, and its time step (s)."""
+
+    table: Float[Any, "2 4"]
+    dt: Any
+
+
+class TimeStep(NamedTuple):
+    """A time step, without its control: the history before it, its coefficients, and the time at its end."""
+
+    past: StateHistory
+    coefficients: Float[Any, "4"]
+    t: Any
+
+    @classmethod
+    def of(cls, steps: StepCoefficients, past: StateHistory, i: Any) -> TimeStep:
+        """Return step i of a run."""
+        return cls(past, jnp.where(i == 0, steps.table[0], steps.table[1]), past.t0 + (i + 1) * steps.dt)
+
+    def problem(self, system: System, settings: Settings, control: Any) -> StepProblem:
+        """Return the boundary-value problem of the step."""
+        history = history_of(self.past.records, self.past.rate, self.coefficients, settings)
+        return StepProblem(system, self.t, control, self.coefficients[0], history, settings.space)
 
 
 def solve_time_step(
-    system: System, settings: Settings, past: StateHistory, coefficients: Any, control: Any, t: Any,
-    kept: Kept, batch: str | None = None,
-) -> Any:  # fmt: skip
+    system: System, settings: Settings, step: TimeStep, control: Any, kept: Kept, batch: str | None = None
+) -> tuple[StateHistory, StepRows, Kept]:
     """Solve one time step: return the next history, the step's row, and the kept factors."""
-    history = history_of(past.records, past.rate, coefficients, settings)
-    problem = StepProblem(system, t, control, coefficients[0], history, settings.space).ready()
+    problem, past = step.problem(system, settings, control).ready(), step.past
     # sum of products instead of a matrix product: XLA fuses it with the next operations
     guess = jnp.sum(past.weights[:, None, None] * past.y, axis=0)
     solution, kept = newton(problem, guess, system.unknowns(guess[0]), settings.newton, kept, batch)
-    after, row = recorded_step(problem, settings, past, coefficients, solution, kept.factors)
+    after, row = recorded_step(problem, settings, step, solution, kept.factors)
     scale = system.scales().y
     extrapolated = jnp.sum(EXTRAPOLATIONS[:, :, None, None] * past.y, axis=1)
     weights = weights_by(jnp.max(jnp.abs(extrapolated - solution.y) / scale, axis=(1, 2)))
@@ -54,21 +90,29 @@ def solve_time_step(
 
 
 def recorded_step(
-    problem: StepProblem,
-    settings: Settings,
-    past: StateHistory,
-    coefficients: Any,
-    solution: Any,
-    factors: Factors,
+    problem: StepProblem, settings: Settings, step: TimeStep, solution: Solution, factors: Factors
 ) -> tuple[StateHistory, StepRows]:
-    """Return the history after a solved step, and its row, with the discretisation error.
+    """Return the history after a solved step, and its row."""
+    past, c0 = step.past, step.coefficients[0]
+    d_history = history_of(past.error[:2], past.error[2], step.coefficients, settings)
+    row, records, error = solved_row(problem, settings.newton, solution, factors, d_history)
+    rate, d_rate = past.rate, past.error[2]
+    if settings.uses_rate:
+        rate, d_rate = c0 * records + problem.history, c0 * error + d_history
+    after = advanced(past, records, rate, solution.y, past.weights)
+    return after._replace(error=jnp.stack([error, past.error[0], d_rate])), row
+
+
+def solved_row(
+    problem: StepProblem, newton: NewtonOptions, solution: Solution, factors: Factors, d_history: Any = None
+) -> tuple[StepRows, Float[Any, "places x"], Any]:
+    """Return the row of a solution, its records at all places, and their discretisation error.
 
     The error e of a step solves the step's linear equations. Their right-hand side is the defect of the check
-    formula, plus the effect of earlier steps' errors through the history.
+    formula, plus the effect of earlier steps' errors through the history; an equilibrium has none.
     """
     system, space, y = problem.system, problem.space, solution.y
-    d_history = history_of(past.error[:2], past.error[2], coefficients, settings)
-    used = d_history.shape[0]
+    used = used_places(system, space)
 
     def scheme(used_history: Any, y: Any) -> tuple[Stages, Any, Any, Any]:
         own = problem.with_history(jnp.concatenate([used_history, problem.history[used:]]))
@@ -76,25 +120,28 @@ def recorded_step(
         reached = own.reached_by(space.formula, found)
         return found, reached, own.tip_residual(y[-1]), own.base(solution.unknowns)
 
-    history = problem.history[:used]
-    (found, reached, tip, _), (_, *moved) = jax.jvp(lambda h: scheme(h, y), (history,), (d_history,))
+    history, moved = problem.history[:used], None
+    if d_history is None:
+        found, reached, tip, base = scheme(history, y)
+        moved = jnp.zeros_like(reached), jnp.zeros_like(tip), jnp.zeros_like(base)
+    else:
+        at = jax.jvp(lambda h: scheme(h, y), (history,), (d_history,))
+        (found, reached, tip, _), (_, *moved) = at
     checked = problem.stages(y, space.check, found)
     defects = problem.reached_by(space.check, checked) - y[1:]
     e, _ = solved_correction(factors, pivots_of(system), defects + moved[0], *moved[1:])
-    records = problem.packed(checked)
-    error = jax.jvp(lambda *at: problem.packed(scheme(*at)[0]), (history, y), (d_history, e))[1]
-    if settings.time.uses_rate:
-        rate, d_rate = coefficients[0] * records + problem.history, coefficients[0] * error + d_history
-    else:
-        rate, d_rate = past.rate, past.error[2]
+    records, error = problem.packed(checked), None
+    if d_history is not None:
+        error = jax.jvp(lambda *at: problem.packed(scheme(*at)[0]), (history, y), (d_history, e))[1]
     # residual of the returned state, evaluated independently of the iteration
     residual = jnp.maximum(solution.error, largest_residual(problem, reached - y[1:], tip))
+    residual = _finite_or_infinite(residual, records)
+    result = jnp.where(residual <= newton.acceptable, int(Result.CONVERGED), int(Result.NO_CONVERGENCE))
     row = StepRows(
-        row_of(system, y, records), solution.unknowns, _finite_or_infinite(residual, records),
-        solution.corrections, position_error(system, e),
+        row_of(system, y, records), solution.unknowns, residual, solution.corrections,
+        position_error(system, e), result,
     )  # fmt: skip
-    after = advanced(past, records, rate, y, past.weights)
-    return after._replace(error=jnp.stack([error, past.error[0], d_rate])), row
+    return row, records, error
 
 
 def position_error(system: System, e: Float[Any, "points y"]) -> Float[Any, ""]:
@@ -117,48 +164,33 @@ def weights_by(misfit: Float[Any, " extrapolations"]) -> Float[Any, " past"]:
     return jnp.sum((trust / jnp.sum(trust))[:, None] * EXTRAPOLATIONS, axis=0)
 
 
-def no_factors(system: System, settings: Settings, past: StateHistory, control: Any) -> Kept:
+def no_factors(system: System, settings: Settings, y: Any, control: Any) -> Kept:
     """Return factors of the right shape that are not usable."""
     problem = StepProblem.still(system, settings.space, control)
-    y = past.y[0]
     return none_kept(problem, y, system.unknowns(y[0]))
 
 
-def _no_rows(system: System, shape: tuple[int, ...], past: StateHistory) -> StepRows:
-    """Return rows of zeros, (steps,) or (robots, steps)."""
+def no_rows(system: System, shape: tuple[int, ...]) -> StepRows:
+    """Return rows of steps that were not reached, (steps,) or (robots, steps)."""
+    numbers = no_history(system, LOBATTO2).shape[-1]
     return StepRows(
-        jnp.zeros((*shape, system.nodes, past.records.shape[-1])),
+        jnp.zeros((*shape, system.nodes, numbers)),
         jnp.zeros((*shape, system.unknown_count)),
         jnp.zeros(shape),
         jnp.zeros(shape, dtype=int),
         jnp.zeros(shape),
+        jnp.full(shape, int(Result.NOT_REACHED)),
     )
 
 
-def _attempt(
-    system: System, settings: Settings, table: Any, past: StateHistory, control: Any, i: Any, dt: Any,
-    kept: Kept, batch: str | None = None,
-) -> tuple[Any, StateHistory, StepRows, Kept]:  # fmt: skip
-    """Try step i: return a failure flag, the next history (unchanged on failure), row and factors."""
-    coefficients = jnp.where(i == 0, table[0], table[1])
-    t = past.t0 + (i + 1) * dt
-    after, row, kept = solve_time_step(system, settings, past, coefficients, control, t, kept, batch)
-    failed = ~(row.error <= settings.newton.acceptable)
-    return failed, _where(failed, past, after), row, kept
+def solve_until_failure(
+    solve: Callable[[Any, Kept, Any], tuple[Any, StepRows, Kept]], first: Any, kept: Kept, rows: StepRows,
+    start: Any, stop: Any,
+) -> tuple[Any, Any, StepRows]:  # fmt: skip
+    """Solve the steps `start` to `stop` (exclusive) in a compiled loop, until one fails.
 
-
-def _where(condition: Any, one: Any, other: Any) -> Any:
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), one, other)
-
-
-def time_loop(
-    system: System, settings: Settings, table: Any, controls: Any, dt: Any, past: StateHistory, start: Any,
-    stop: Any, batch: str | None = None,
-) -> tuple[Any, StateHistory, StepRows]:  # fmt: skip
-    """Solve the steps `start` to `stop` (exclusive; step i uses controls[i] and ends at t0 + (i + 1) dt).
-
-    Stops at a step that does not converge. Returns the number of steps done, the history of the next step,
-    and the rows of all steps tried; the remaining rows are zero.
+    `solve` maps the result of the previous step, kept factors and the step's number to a result, a row and
+    factors. Returns the number of steps done, the result of the last one, and the rows of all steps tried.
     """
 
     def going(state: Any) -> Any:
@@ -166,81 +198,88 @@ def time_loop(
         return (i < stop) & ~failed
 
     def one(state: Any) -> Any:
-        i, _, past, rows, kept = state
-        failed, past, row, kept = _attempt(system, settings, table, past, controls[i], i, dt, kept, batch)
+        i, _, last, kept, rows = state
+        following, row, kept = solve(last, kept, i)
+        failed = row.result < 0
         rows = jax.tree.map(lambda all_rows, value: all_rows.at[i].set(value), rows, row)
-        return jnp.where(failed, i, i + 1), failed, past, rows, kept
+        return jnp.where(failed, i, i + 1), failed, _where(failed, last, following), kept, rows
 
-    kept = no_factors(system, settings, past, controls[0])
-    state = (start, jnp.array(False), past, _no_rows(system, controls.shape[:1], past), kept)
-    done, _, past, rows, _ = jax.lax.while_loop(going, one, state)
-    return done, past, rows
+    state = (start, jnp.array(False), first, kept, rows)
+    done, _, last, _, rows = jax.lax.while_loop(going, one, state)
+    return done, last, rows
+
+
+def _where(condition: Any, one: Any, other: Any) -> Any:
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), one, other)
+
+
+def time_loop(
+    system: System, settings: Settings, steps: StepCoefficients, controls: Any, past: StateHistory,
+    span: tuple[Any, Any], batch: str | None = None,
+) -> tuple[Any, StateHistory, StepRows]:  # fmt: skip
+    """Solve the steps of a span (step i uses controls[i] and ends at t0 + (i + 1) dt) until one fails."""
+
+    def solve(past: StateHistory, kept: Kept, i: Any) -> tuple[StateHistory, StepRows, Kept]:
+        step = TimeStep.of(steps, past, i)
+        return solve_time_step(system, settings, step, controls[i], kept, batch)
+
+    kept = no_factors(system, settings, past.y[0], controls[0])
+    return solve_until_failure(solve, past, kept, no_rows(system, controls.shape[:1]), *span)
 
 
 def loop_in_turn(
-    system: System,
-    settings: Settings,
-    table: Any,
-    controls: Any,
-    dt: Any,
-    pasts: StateHistory,
-    stop: Any,
-    batched: Any,
-) -> tuple[Any, StepRows]:
-    """Solve all steps, one robot after the other; return the numbers of steps done, and all rows.
+    system: System, settings: Settings, steps: StepCoefficients, controls: Any, pasts: StateHistory, stop: Any
+) -> tuple[Any, StateHistory, StepRows]:
+    """Solve all steps, one robot after the other; return the numbers of steps done, histories and rows.
 
     It is a single loop over robots and steps: XLA would copy all rows at every turn of an inner loop.
     """
-    size = controls.shape[0]
+    size, many = controls.shape[0], jnp.ndim(system.length) > 0
 
     def own(tree: Any, robot: Any) -> Any:
         return jax.tree.map(lambda leaf: leaf[robot], tree)
 
     def one(state: Any) -> Any:
-        robot, i, past, done, rows, kept = state
-        this = own(system, robot) if batched else system
-        failed, past, row, kept = _attempt(this, settings, table, past, controls[robot, i], i, dt, kept)
+        robot, i, pasts, done, rows, kept = state
+        this, past = own(system, robot) if many else system, own(pasts, robot)
+        step = TimeStep.of(steps, past, i)
+        after, row, kept = solve_time_step(this, settings, step, controls[robot, i], kept)
+        failed = row.result < 0
         rows = jax.tree.map(lambda all_rows, value: all_rows.at[robot, i].set(value), rows, row)
+        after = _where(failed, past, after)
+        pasts = jax.tree.map(lambda every, value: every.at[robot].set(value), pasts, after)
         done = done.at[robot].set(jnp.where(failed, i, i + 1))
         ended = failed | (i + 1 >= stop)
-        following = jnp.where(ended, robot + 1, robot)
-        past = _where(ended, own(pasts, jnp.minimum(following, size - 1)), past)
-        return (
-            following,
-            jnp.where(ended, 0, i + 1),
-            past,
-            done,
-            rows,
-            kept._replace(usable=kept.usable & ~ended),
-        )
+        following = jnp.where(ended, robot + 1, robot), jnp.where(ended, 0, i + 1)
+        return *following, pasts, done, rows, kept._replace(usable=kept.usable & ~ended)
 
-    kept = no_factors(own(system, 0) if batched else system, settings, own(pasts, 0), controls[0, 0])
+    first = own(system, 0) if many else system
+    kept = no_factors(first, settings, pasts.y[0, 0], controls[0, 0])
     zero = jnp.zeros((), dtype=int)
-    rows = _no_rows(system, controls.shape[:2], pasts)
-    state = (zero, zero, own(pasts, 0), jnp.zeros(size, dtype=int), rows, kept)
-    _, _, _, done, rows, _ = jax.lax.while_loop(lambda state: state[0] < size, one, state)
-    return done, rows
+    state = (zero, zero, pasts, jnp.zeros(size, dtype=int), no_rows(system, controls.shape[:2]), kept)
+    _, _, pasts, done, rows, _ = jax.lax.while_loop(lambda state: state[0] < size, one, state)
+    return done, pasts, rows
 
 
 @functools.partial(jax.jit, static_argnames="settings")
-def loop_one(system, settings, table, controls, dt, past, start, stop):  # type: ignore[no-untyped-def]
+def loop_one(system, settings, steps, controls, past, span):  # type: ignore[no-untyped-def]
     """Run `time_loop` as a compiled program."""
-    return time_loop(system, settings, table, controls, dt, past, start, stop)
+    return time_loop(system, settings, steps, controls, past, span)
 
 
-@functools.partial(jax.jit, static_argnames=("settings", "batched", "lockstep"))
-def loop_many(system, settings, table, controls, dt, pasts, stop, batched, lockstep):  # type: ignore[no-untyped-def]
-    """Simulate a batch as one compiled program: controls (B, T, c), and a batch of systems if `batched`.
+@functools.partial(jax.jit, static_argnames=("settings", "lockstep"))
+def loop_many(system, settings, steps, controls, pasts, stop, lockstep):  # type: ignore[no-untyped-def]
+    """Simulate a batch as one compiled program: controls (B, T, c), and one system or a batch of them.
 
     On a CPU the robots are solved one after the other, each with its own number of corrections; lockstep was
     measured at a third of the speed, because all robots wait for the slowest. On a GPU lockstep is faster.
     """
     if not lockstep:
-        return loop_in_turn(system, settings, table, controls, dt, pasts, stop, batched)
+        return loop_in_turn(system, settings, steps, controls, pasts, stop)
 
-    def one(system: System, control: Any, past: StateHistory) -> tuple[Any, StepRows]:
-        done, _, rows = time_loop(system, settings, table, control, dt, past, 0, stop, BATCH)
-        return done, rows
+    def one(system: System, control: Any, past: StateHistory) -> Any:
+        return time_loop(system, settings, steps, control, past, (0, stop), BATCH)
 
-    robots = jax.vmap(one, in_axes=(0 if batched else None, 0, 0), axis_name=BATCH)
+    many = jnp.ndim(system.length) > 0
+    robots = jax.vmap(one, in_axes=(0 if many else None, 0, 0), axis_name=BATCH)
     return robots(system, controls, pasts)

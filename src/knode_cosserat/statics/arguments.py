@@ -10,12 +10,11 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.solvers.time import Static
 
 
 def static_settings(space: str | SpaceScheme, newton: NewtonOptions) -> Settings:
     """Return the settings of `kc.equilibrium`."""
-    return Settings.of(Static(), space, "paper", newton)
+    return Settings.of(None, space, "paper", newton)
 
 
 def checked_system(robot: Any) -> System:

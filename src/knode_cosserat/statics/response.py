@@ -24,8 +24,6 @@ from knode_cosserat.solvers.settings import Settings
 
 #: function from a system and its last node's y to position (d,) in m and quaternion (scalar first) or None
 Pose = Callable[[System, Any], tuple[Any, Any]]
-#: time at which `kc.equilibrium` solves
-TIME = 1.0
 
 
 def tip_pose(system: System, y: Any) -> tuple[Any, Any]:
@@ -58,7 +56,7 @@ class Response(NamedTuple):
 
 def static_problem(system: System, settings: Settings, control: Any) -> StepProblem:
     """Return the boundary-value problem of `kc.equilibrium`."""
-    return StepProblem.still(system, settings.space, control, TIME)
+    return StepProblem.still(system, settings.space, control)
 
 
 def unloaded_guess(system: System) -> tuple[Any, Any]:

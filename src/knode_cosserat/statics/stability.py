@@ -22,6 +22,7 @@ from knode_cosserat.rods.system import System, in_strands
 from knode_cosserat.solvers.boundary import static_error
 from knode_cosserat.solvers.equilibrium import equilibrium as rests
 from knode_cosserat.solvers.result import Result
+from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import Lobatto4
 from knode_cosserat.statics.stiffness import (
     NEEDED,
@@ -96,7 +97,7 @@ def stability(equilibrium: Trajectory, row: int = -1) -> Stability:
             decided: too few nodes for the loads, or rounding that exceeds the stiffness.
     """
     system, y, z, control = _checked(equilibrium, row)
-    space = equilibrium.settings.space
+    space = (equilibrium.settings or Settings()).space
     if not isinstance(space, Lobatto4):
         one = Trajectory(
             system=system, settings=equilibrium.settings, time=np.zeros(1), y=y[None], z=z[None],
@@ -131,7 +132,8 @@ def _checked(equilibrium: Any, row: Any) -> tuple[System, np.ndarray, np.ndarray
         )
     y, z, control = y[row], np.asarray(equilibrium.z)[row], np.asarray(equilibrium.control)[row]
     record = np.concatenate([y, z] + ([np.zeros_like(y)] if system.mixed else []), axis=1)
-    off = float(static_error(system, equilibrium.settings.space, record, control, jnp.zeros(())))
+    space = (equilibrium.settings or Settings()).space
+    off = float(static_error(system, space, record, control, jnp.zeros(())))
     if not off <= BALANCED:
         raise ValueError(
             f"row {row} is no equilibrium: {off:.2g} of natural size is left when every rate is zero; "

@@ -32,13 +32,13 @@ from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.history import StateHistory, constant_history, resting_history
-from knode_cosserat.solvers.initial import SimulationRun, initial_state
+from knode_cosserat.solvers.initial import continued_state, initial_state
 from knode_cosserat.solvers.places import Places, places_at, positions_at, quaternions_at
-from knode_cosserat.solvers.run import run_one
-from knode_cosserat.solvers.run_types import RunSettings
-from knode_cosserat.solvers.sensitivity import tangent_time_loop
+from knode_cosserat.solvers.run import TimeIntegration, run_one
+from knode_cosserat.solvers.sensitivity import TangentState, static_tangents, tangent_time_loop
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.solvers.tangent import SystemMoves
 from knode_cosserat.trajectory import Trajectory
 
 #: growth factor of the number of rows in preliminary searches
@@ -48,8 +48,6 @@ GROWTH = 2
 FIRST_ROWS = (2, 5, 10, 20, 50, 100)
 
 
-#: coefficients of a step without rates
-STILL = np.zeros((2, 4))
 #: number of parallel rollouts: each keeps one core busy
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
@@ -92,7 +90,7 @@ class _Rows(NamedTuple):
 
 
 @functools.partial(jax.jit, static_argnames=("unknowns", "settings", "oriented", "one_state"))
-def _differences(robot, coordinates, rows, table, dt, unknowns, settings, oriented, one_state):  # type: ignore[no-untyped-def]
+def _differences(robot, coordinates, rows, steps, unknowns, settings, oriented, one_state):  # type: ignore[no-untyped-def]
     """Return differences (M,) of solved rows from measurements, and their derivatives (M, n)."""
     ny = robot.y_layout.size
 
@@ -117,12 +115,11 @@ def _differences(robot, coordinates, rows, table, dt, unknowns, settings, orient
 
     def settled(system: Any, d_system: Any) -> Any:
         """Return the initial history and its tangent, if the initial state is a solved equilibrium."""
-        none, guess = jnp.zeros(system.control_size), resting_history(system, settings)
-        d_none, d_guess = jax.tree.map(jnp.zeros_like, (none[None], guess))
-        d_first, _ = tangent_time_loop(
-            settings, STILL, dt, rows.first[None], system.unknowns(rows.first[0])[None], system, none[None],
-            guess, d_system, d_none, d_guess.records, d_guess.rate,
-        )  # fmt: skip
+        none = jnp.zeros(system.control_size)
+        solved = rows.first[None], system.unknowns(rows.first[0])[None]
+        d_first, _, _ = static_tangents(
+            settings, solved, (system, none[None]), (SystemMoves.of(d_system), jnp.zeros_like(none[None]))
+        )
         d_first = d_first[0, :, : rows.first.shape[1]]
         return jax.jvp(
             lambda system, row: constant_history(system, settings, row, none),
@@ -133,10 +130,11 @@ def _differences(robot, coordinates, rows, table, dt, unknowns, settings, orient
         (system, past), (d_system, d_past) = jax.jvp(start, (coordinates,), (direction,))
         if rows.before is None and system.rest_is_guess:
             past, d_past = settled(system, d_system)
-        d_records, _ = tangent_time_loop(
-            settings, table, dt, rows.records, rows.unknowns, system, rows.control, past, d_system,
-            jnp.zeros_like(rows.control), d_past.records, d_past.rate,
-        )  # fmt: skip
+        changes = SystemMoves.of(d_system), jnp.zeros_like(rows.control)
+        state = TangentState.of(system, settings.space, past, d_past.records, d_past.rate)
+        _, (d_records, _) = tangent_time_loop(
+            settings, steps, (rows.records, rows.unknowns), (system, rows.control), changes, state
+        )
         return jax.jvp(left, (rows.records[..., :ny],), (d_records[..., :ny],))[1]
 
     directions = jnp.eye(coordinates.shape[0])
@@ -251,17 +249,21 @@ class RolloutMisfit:
 
     def _of_one(self, system: System, coordinates: np.ndarray, rollout: _Rollout) -> LinearisedMisfit | None:
         settings, dt, initial, control, places, target = rollout
-        begins = initial_state(SimulationRun(system, control, initial, settings, dt, None, False))
-        task = RunSettings(settings, dt, len(control), begins.first)
-        steps, _ = run_one(task, system, control, begins.start)
-        if steps.result.min() < 0:
+        if initial is None:
+            at_start = initial_state(system, settings)
+        else:
+            at_start = continued_state(system, initial, settings, dt)
+        first = at_start.state.first_step(settings)
+        task = TimeIntegration(settings, dt, len(control), first)
+        found, _, cause = run_one(task, system, control, at_start.state.history, at_start.control)
+        if cause:
             return None
-        before = None if initial is None else (begins.record, np.asarray(initial.control)[-1])
-        past, first = begins.start.past, begins.record
-        rows = _Rows(steps.records, steps.unknowns, past, before, first, control, places, target)
+        before = None if initial is None else (at_start.record, at_start.control)
+        past = at_start.state.history
+        rows = _Rows(found.records, found.unknowns, past, before, at_start.record, control, places, target)
         values, slopes = _differences(
-            self.robot, coordinates, rows, task.table, dt, self.unknowns, settings, self.oriented,
-            begins.first == "start",
+            self.robot, coordinates, rows, task.coefficients, self.unknowns, settings, self.oriented,
+            first == "start",
         )  # fmt: skip
         return LinearisedMisfit(np.asarray(values), np.asarray(slopes))
 

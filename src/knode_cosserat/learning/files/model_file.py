@@ -87,7 +87,7 @@ def _add(classes: dict[str, type], cls: Any) -> None:
 
 for _known in (
     Network, Nothing, Passive, Sizes, Structured, Load, Expansion, Term, Settings, NewtonOptions, space.Euler,
-    space.Lobatto2, space.Lobatto4, time.BDF1, time.BDF2, time.BDFAlpha, time.Trapezoidal, time.Static,
+    space.Lobatto2, space.Lobatto4, time.BDF1, time.BDF2, time.BDFAlpha, time.Trapezoidal,
     TrainedRange,
 ):  # fmt: skip
     register(_known)

@@ -27,6 +27,8 @@ from knode_cosserat.learning.files.container import (
 
 #: classes of earlier versions, and the class of the same order that replaced them
 EARLIER_CLASSES = {"RK4": "Lobatto4"}
+#: classes of earlier versions that became None: the time scheme of equilibria
+EARLIER_NONE = ("Static",)
 #: fields that classes had in earlier versions
 EARLIER_FIELDS = {"Settings": ("elimination",), "NewtonOptions": ("across_steps",)}
 
@@ -96,6 +98,8 @@ class Reader:
     def _object(self, name: str, fields: dict[str, Any], where: str, classes: Classes) -> Any:
         if name not in classes:
             name = EARLIER_CLASSES.get(name, name)
+        if name in EARLIER_NONE and name not in classes:
+            return None
         if name not in classes:
             raise UnknownClassError(f"{where} is of a class {name[:60]!r}, which is not known here", name)
         self._objects += 1

@@ -144,8 +144,8 @@ def simulated_batch(
                 model, settings, past.time, past.y, past.z, past.control, none, zero, iterations=none
             )
         return simulate(
-            model, control, dt, time=settings.time, space=settings.space, start=settings.start,
-            newton=settings.newton, initial=initial,
+            model, control, dt, space=settings.space, start=settings.start, newton=settings.newton,
+            initial=initial, time=settings.time,  # type: ignore[arg-type]  # None is refused there
         ).y  # fmt: skip
 
     return jax.lax.map(one, (course.past, course.control))

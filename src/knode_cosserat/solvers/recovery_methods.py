@@ -1,0 +1,156 @@
+"""Recovery of a time step and of an equilibrium: their guesses, and their last methods."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.grid import grid_of
+from knode_cosserat.solvers.guess import hanging_curve, natural_reach, state_from_positions
+from knode_cosserat.solvers.history import EXTRAPOLATIONS, repeated_record_history
+from knode_cosserat.solvers.problem import StepProblem
+from knode_cosserat.solvers.recovery import Attempt, Budget, Recovery, natural_time
+from knode_cosserat.solvers.result import Result
+from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.time import BDF1
+from knode_cosserat.solvers.time_loop import TimeStep
+
+#: smallest substep as a part of a time step, and largest number of substeps tried
+LEAST_SUBSTEP, MOST_SUBSTEPS = 2.0**-14, 400
+#: friction and contact are eased only in substeps below this part of a step: smaller substeps mostly suffice
+EASE_BELOW = 1.0 / 16.0
+#: part of the distance that a tip is moved in one step of relaxation
+DRAWN = 0.05
+#: reaches of the initial curves between held ends, as multiples of the natural reach
+REACHES = (1.0, 0.3, 3.0)
+
+
+class StepRecovery(Recovery):
+    """Recovery of a time step. Its last method divides the step into substeps."""
+
+    step: TimeStep
+
+    def __init__(self, system: System, settings: Settings, step: TimeStep, dt: float, budget: Budget):
+        super().__init__(system, settings, budget)
+        coefficients, t = (np.asarray(each, dtype=float) for each in step[1:])
+        self.step = TimeStep(step.past, coefficients, t)
+        self.dt = dt
+
+    @property
+    def state(self) -> Any:
+        """History before the step."""
+        return self.step.past
+
+    def guesses(self) -> list[tuple[Any, Any]]:
+        """Return the last state, and its linear extrapolation."""
+        guesses = [jnp.einsum("p,pny->ny", w, self.step.past.y) for w in EXTRAPOLATIONS[:2]]
+        return [(y, self.system.unknowns(y[0])) for y in guesses]
+
+    def last_method(self, controls: tuple[Any, Any]) -> tuple[Result, Attempt] | None:
+        """Divide the step into substeps: with a constant control first, then with a ramp."""
+        for before in (controls[1], controls[0]):
+            found = self._in_substeps(before, controls[1])
+            if found is not None:
+                return Result.RECOVERED_STEP_HALVING, found
+        return None
+
+    def _in_substeps(self, before: Any, now: Any) -> Attempt | None:
+        """Solve the step by adaptive substeps, with coefficients for unequal time steps."""
+        settings, past, dt = self.settings, self.step.past, self.dt
+        before, now = np.asarray(before, dtype=float), np.asarray(now, dtype=float)
+        reached, part, previous = 0.0, 0.5, 1.0
+        assert settings.time is not None
+        scheme = settings.time if settings.start == "paper" else BDF1()
+        for _ in range(MOST_SUBSTEPS):
+            until = min(1.0, reached + part)
+            coefficients = scheme.coefficients((until - reached) * dt, previous * dt)
+            step = TimeStep(past, coefficients, float(self.step.t) - (1.0 - until) * dt)
+            substep = StepRecovery(self.system, settings, step, dt, self.budget)
+            found = substep.direct(before + until * (now - before), ease=part < EASE_BELOW)
+            if found is None:
+                part /= 4.0
+                if part < LEAST_SUBSTEP:
+                    return None
+                continue
+            self.corrections = substep.corrections
+            if until == 1.0:
+                return found._replace(state=self._whole(found.state))
+            past, previous, scheme = found.state, until - reached, settings.time
+            reached, part = until, 2.0 * previous
+        return None
+
+    def direct(self, control: Any, ease: bool) -> Attempt | None:
+        """Return a solution from the guesses, or by easing."""
+        for guess in self.guesses():
+            found = self.solve(control, guess)
+            if self.solved(found):
+                return found
+        return self.ease(control) if ease else None
+
+    def _whole(self, after: Any) -> Any:
+        """Return the history of the next step, which holds whole steps, not substeps."""
+        before = self.step.past
+        return after._replace(
+            records=jnp.stack([after.records[0], before.records[0]]),
+            y=jnp.concatenate([after.y[:1], before.y[:-1]]),
+            error=jnp.stack([after.error[0], before.error[0], after.error[2]]),
+        )
+
+
+class StaticRecovery(Recovery):
+    """Recovery of an equilibrium. Its last method relaxes the robot in a damped motion."""
+
+    def __init__(self, system: System, settings: Settings, y: Any, budget: Budget):
+        super().__init__(system, settings, budget)
+        self._y = jnp.asarray(y)
+
+    @property
+    def state(self) -> Any:
+        """y at all points before the equilibrium."""
+        return self._y
+
+    def guesses(self) -> list[tuple[Any, Any]]:
+        """Return the state before."""
+        return [(self._y, self.system.unknowns(self._y[0]))]
+
+    def first_guesses(self, control: Any) -> list[tuple[Any, Any]]:
+        """Return curves of the rod's length between held ends, then the state before."""
+        found: list[tuple[Any, Any]] = []
+        for reach in dict.fromkeys(min(1.0, part * natural_reach(self.system)) for part in REACHES):
+            points = hanging_curve(self.system, control, reach)
+            if points is not None:
+                record = state_from_positions(self.system, points, control)
+                y = grid_of(self.system).spread(jnp.asarray(record[:, : self.system.y_layout.size]))
+                found.append((y, self.system.unknowns(y[0])))
+        return found + self.guesses()
+
+    def last_method(self, controls: tuple[Any, Any]) -> tuple[Result, Attempt] | None:
+        """Relax by implicit Euler with growing time steps, then solve the equilibrium; it is then stable.
+
+        The tip's boundary conditions are applied gradually in the first steps.
+        """
+        system, part = self.system, 0.0
+        settings = Settings(BDF1(), self.settings.space, newton=self.settings.newton)
+        still = StepProblem.still(system, settings.space, controls[1])
+        past = repeated_record_history(system, settings.space, still.records(self._y), self._y, 0.0)
+        natural = natural_time(system) or 0.1
+        dt, longest = 0.1 * natural, 1e5 * natural
+        for _ in range(80):
+            step = TimeStep(past, BDF1().coefficients(dt, dt), 0.0)
+            moving = StepRecovery(system, settings, step, dt, self.budget)
+            target = min(1.0, part + DRAWN)
+            found = moving.solve(controls[1], moving.guesses()[0], (target, self._y))
+            if not moving.solved(found):
+                dt /= 4.0
+                continue
+            # short steps until the tip's boundary conditions hold
+            past, dt = found.state, 2.0 * dt if part == 1.0 else dt
+            part = target
+            if dt > longest:
+                break
+        y = past.y[0]
+        found = self.solve(controls[1], (y, system.unknowns(y[0])))
+        return (Result.RECOVERED_RELAXATION, found) if self.solved(found) else None
