@@ -15,7 +15,7 @@ from knode_cosserat.rods.rod import Rod
 from knode_cosserat.rods.routed_robot import RoutedTendonRobot
 from knode_cosserat.rods.section import Differences, FunctionSection, Sleeve, Stretch
 from knode_cosserat.rods.slender_rod import SlenderRod
-from knode_cosserat.rods.system import History, Scales, System
+from knode_cosserat.rods.system import Scales, System
 from knode_cosserat.rods.tendon_friction import TendonFriction, Vibration
 from knode_cosserat.rods.tendon_robot import TendonRobot
 
@@ -24,7 +24,6 @@ __all__ = [
     "EarlyAnchors",
     "Field",
     "FunctionSection",
-    "History",
     "Layout",
     "LoadCells",
     "ParallelRobot",

@@ -39,8 +39,10 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.learning.residual import Residual
-from knode_cosserat.rods.system import History, System
+from knode_cosserat.rods.system import System
 from knode_cosserat.rotation import dot, rotation_matrix
+from knode_cosserat.solvers import semi_discrete
+from knode_cosserat.solvers.semi_discrete import History
 
 #: moment of one tendon at its typical tension, for learned numbers of 1, in units of κ/L
 LEVER = 0.1
@@ -90,14 +92,14 @@ class Passive(Residual):
     ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
         """Return y_s and z of the nominal model with stiffness of W, damping D and a reduced moment."""
         changed, left = self._reduced(knowledge, s, y, control)
-        return changed.derivatives(s, t, left, control, history)
+        return semi_discrete.derivatives(changed, s, t, left, control, history)
 
     def strains(
         self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> Float[Any, " z"]:
         """Return z of the nominal model with stiffness of W, damping D and a reduced moment."""
         changed, left = self._reduced(knowledge, s, y, control)
-        return changed.strains(s, t, left, control, history)
+        return semi_discrete.strains(changed, s, t, left, control, history)
 
     def rates(
         self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any,
@@ -105,15 +107,15 @@ class Passive(Residual):
     ) -> Float[Any, " y"]:  # fmt: skip
         """Return y_s of that nominal model at strains z."""
         changed, left = self._reduced(knowledge, s, y, control)
-        return changed.rates(s, t, left, z, control, history)
+        return semi_discrete.rates(changed, s, t, left, z, control, history)
 
-    def left_of_law(
+    def law_residual(
         self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any,
         history: History,
     ) -> Float[Any, " z"]:  # fmt: skip
         """Return the residual of the law of that nominal model at z."""
         changed, left = self._reduced(knowledge, s, y, control)
-        return changed.left_of_law(s, t, left, z, control, history)
+        return semi_discrete.law_residual(changed, s, t, left, z, control, history)
 
     def _reduced(self, knowledge: System, s: Any, y: Any, control: Any) -> tuple[System, Float[Any, " y"]]:
         """Return the changed nominal model at a point, and y with the moment that it carries."""

@@ -14,7 +14,9 @@ from jaxtyping import Float
 from knode_cosserat._reprs import count_of
 from knode_cosserat.learning.config import NetworkOptions
 from knode_cosserat.rods.layout import Field, Layout
-from knode_cosserat.rods.system import History, System
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers import semi_discrete
+from knode_cosserat.solvers.semi_discrete import History
 
 
 class Residual(eqx.Module):
@@ -55,29 +57,31 @@ class Residual(eqx.Module):
         By default it follows z as the nominal model's y_s does, from `derivatives` on.
         """
         y_s, corrected = self.derivatives(knowledge, s, t, y, control, history)
-        z0 = knowledge.strains(s, t, y, control, history)
-        here, there = (knowledge.rates(s, t, y, at, control, history) for at in (z0, z0 + z - corrected))
+        z0 = semi_discrete.strains(knowledge, s, t, y, control, history)
+        here, there = (
+            semi_discrete.rates(knowledge, s, t, y, at, control, history) for at in (z0, z0 + z - corrected)
+        )
         return y_s + there - here
 
-    def left_of_law(
+    def law_residual(
         self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any,
         history: History,
     ) -> Float[Any, " z"]:  # fmt: skip
         """Return the residual of the law at z; by default the nominal model's, at z less its correction."""
         corrected = self.strains(knowledge, s, t, y, control, history)
-        z0 = knowledge.strains(s, t, y, control, history)
-        return knowledge.left_of_law(s, t, y, z0 + z - corrected, control, history)
+        z0 = semi_discrete.strains(knowledge, s, t, y, control, history)
+        return semi_discrete.law_residual(knowledge, s, t, y, z0 + z - corrected, control, history)
 
     @property
     def linear(self) -> bool:
-        """True if `left_of_law` is linear in z wherever the nominal model's is."""
+        """True if `law_residual` is linear in z wherever the nominal model's is."""
         return True
 
     def tip(
-        self, knowledge: System, t: Any, control: Any, y: Float[Any, " y"], history: History
+        self, knowledge: System, t: Any, control: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]
     ) -> Float[Any, " k"]:
         """Return the residual of the tip's boundary conditions; by default the nominal model's."""
-        return knowledge.tip(t, control, y, history)
+        return knowledge.tip(t, control, y, y_t)
 
     def clamped(self) -> Self:
         """Return the nearest residual with allowed weights; training calls it after every update."""
@@ -91,27 +95,27 @@ class Nothing(Residual):
         self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
         """Return y_s and z of the nominal model."""
-        return knowledge.derivatives(s, t, y, control, history)
+        return semi_discrete.derivatives(knowledge, s, t, y, control, history)
 
     def strains(
         self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> Float[Any, " z"]:
         """Return z of the nominal model."""
-        return knowledge.strains(s, t, y, control, history)
+        return semi_discrete.strains(knowledge, s, t, y, control, history)
 
     def rates(
         self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any,
         history: History,
     ) -> Float[Any, " y"]:  # fmt: skip
         """Return y_s of the nominal model at strains z."""
-        return knowledge.rates(s, t, y, z, control, history)
+        return semi_discrete.rates(knowledge, s, t, y, z, control, history)
 
-    def left_of_law(
+    def law_residual(
         self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any,
         history: History,
     ) -> Float[Any, " z"]:  # fmt: skip
         """Return the residual of the nominal model's law at z."""
-        return knowledge.left_of_law(s, t, y, z, control, history)
+        return semi_discrete.law_residual(knowledge, s, t, y, z, control, history)
 
 
 @jax.custom_jvp
@@ -167,7 +171,7 @@ class Network(Residual):
         self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
         """Return the nominal model's y_s and z plus the correction."""
-        y_s, z = knowledge.derivatives(s, t, y, control, history)
+        y_s, z = semi_discrete.derivatives(knowledge, s, t, y, control, history)
         added = self.correction(self.inputs(knowledge, y, z, control, history))
         return y_s + added[: y.shape[0]], z + added[y.shape[0] :]
 
@@ -175,7 +179,7 @@ class Network(Residual):
         self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
     ) -> Float[Any, " z"]:
         """Return the nominal model's z plus the correction."""
-        z = knowledge.strains(s, t, y, control, history)
+        z = semi_discrete.strains(knowledge, s, t, y, control, history)
         return z + self.correction(self.inputs(knowledge, y, z, control, history))[y.shape[0] :]
 
     def rates(
@@ -183,9 +187,12 @@ class Network(Residual):
         history: History,
     ) -> Float[Any, " y"]:  # fmt: skip
         """Return the nominal model's y_s at z less its correction, plus the correction of y_s."""
-        z0 = knowledge.strains(s, t, y, control, history)
+        z0 = semi_discrete.strains(knowledge, s, t, y, control, history)
         added = self.correction(self.inputs(knowledge, y, z0, control, history))
-        return knowledge.rates(s, t, y, z - added[y.shape[0] :], control, history) + added[: y.shape[0]]
+        return (
+            semi_discrete.rates(knowledge, s, t, y, z - added[y.shape[0] :], control, history)
+            + added[: y.shape[0]]
+        )
 
     def clamped(self) -> Self:
         """Return a convex network with its negative weights set to zero; any other unchanged."""

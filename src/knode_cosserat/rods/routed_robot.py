@@ -21,6 +21,7 @@ softens the rod, `anchors` end tendons early, `load_cells` correct measured tens
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, Self
 
 import jax
@@ -29,22 +30,17 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.anchors import EarlyAnchors
+from knode_cosserat.rods.law import Evolution, Fields, InternalState, MaterialLaw
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.load_cells import LoadCells
 from knode_cosserat.rods.parameters import ParameterError, choice, parameter, part
 from knode_cosserat.rods.reels import Reels
-from knode_cosserat.rods.relaxation import Relaxation, dashpot_strain
+from knode_cosserat.rods.relaxation import Relaxation
 from knode_cosserat.rods.rib_spacing import RibSpacing
 from knode_cosserat.rods.rod import Rod
 from knode_cosserat.rods.routing import Helical, Routing, Straight, ends, routes
-from knode_cosserat.rods.system import History, System
 from knode_cosserat.rods.tendon_friction import TendonFriction, Vibration
-from knode_cosserat.rods.tendon_law import (
-    stretches,
-    tendon_balance,
-    tendon_strains,
-    unbent_flexibility,
-)
+from knode_cosserat.rods.tendon_law import Tendons, stretches
 from knode_cosserat.rods.tendon_rod import TendonRod
 from knode_cosserat.rods.trained_range import TrainedRange
 from knode_cosserat.rotation import dot
@@ -344,78 +340,52 @@ class RoutedTendonRobot(TendonRod):
 
     # the equations
 
-    # the law is not of the form C z + D z_t = f2
-    constitutive = System.constitutive
+    def constitutive(
+        self, s: Any, t: Any, y: Float[Any, " y"], y_t: Float[Any, " y"], control: Any
+    ) -> MaterialLaw | InternalState:
+        """Return the law of v and u with the tendons, and of the internal variables."""
+        if self.vibration is None:
+            return self._law(s, y, control)
+        total = jnp.sum(self.base_tension(y, control))
+        softening = self.vibration.softening * total * np.diag([1.0, 1.0, 0.0])
 
-    def strains(
-        self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
-    ) -> Float[Any, " z"]:
-        """Return v and u by the material's law, and f and x by their own laws."""
-        given, shaken = self._law_at(s, y, control, history)
-        v, u = tendon_strains(*given, flexibility=self._unbent_flexibility(s, y, control, history.c0))
-        return jnp.concatenate([v, u, *self._internal(s, u, shaken, control, history)])
+        def law(internal: Fields) -> MaterialLaw:
+            return self._law(s, y, control, internal["x"][0] * softening)
 
-    linear_law = False
+        return InternalState({"x": self.vibration.evolution(total)}, law)
 
-    def left_of_law(self, s, t, y, z, control, history):  # type: ignore[no-untyped-def]
-        """Return the law's residual: rod and tendons less n and m; for f and x, their error."""
-        given, shaken = self._law_at(s, y, control, history)
-        v, u = self.z_layout.get(z, "v"), self.z_layout.get(z, "u")
-        left = tendon_balance(v, u, *given)
-        internal = self._internal(s, u, shaken, control, history)
-        return jnp.concatenate([left, z[6:] - jnp.concatenate(internal)]) if internal else left
-
-    def _internal(self, s: Any, u: Any, shaken: list[Any], control: Any, history: History) -> list[Any]:
-        """Return the internal variables at the curvature u, in the order of z."""
-        found = list(shaken)
-        if self.friction is not None:
-            found.insert(0, self._held(self.friction, s, u, control, history))
-        if self.relaxation is not None:
-            past = self.z_layout.get(history.z, "u_branch")
-            found.append(dashpot_strain(u, past, self.relaxation.time, history.c0))
-        return found
-
-    def _law_at(self, s: Any, y: Any, control: Any, history: History) -> tuple[tuple[Any, ...], list[Any]]:
-        """Return K_v, K_u, a, b, r, r′ and T of the law (see `tendon_law`), and x if there is vibration."""
-        c0, material = history.c0, self.material(s, control)
-        n, m = self.stresses(y)
-        hv, hu = self.z_layout.get(history.z, "v"), self.z_layout.get(history.z, "u")
-        Kse, Bse, Kbt, Bbt = material[:4]
-        more = []
-        if self.vibration is not None:
-            total = jnp.sum(self.base_tension(y, control))
-            x = self.vibration.shaken(total, self.z_layout.get(history.z, "x"), c0)
-            more.append(x)
-            Kbt = Kbt - self.vibration.softening * x[0] * total * np.diag([1.0, 1.0, 0.0])
-        tension = self.tension_at(s, y, control)
-        a = n + dot(Kse, self.v_star) - dot(Bse, hv)
-        b = m - dot(Bbt, hu) if not self.sections else m + dot(Kbt, material.u_star) - dot(Bbt, hu)
+    def _law(self, s: Any, y: Any, control: Any, shaken: Any = None) -> MaterialLaw:
+        """Return the law of v and u, for a loss of bending stiffness by vibration (None: no loss)."""
+        law = self.linear_law(s, y, control)
+        material, tension = self.material(s, control), self.tension_at(s, y, control)
+        v, u = law.strains["v"], law.strains["u"]
+        if shaken is not None:
+            u = u._replace(softening=shaken)
+            if self.sections:
+                u = u._replace(stress=u.stress - dot(shaken, material.u_star))
         if self.rib_spacing is not None:
             # tendons press on the bent rod, including its intrinsic curvature
-            Kbt = self.rib_spacing.softened(s / self.length, self.length, Kbt, jnp.sum(tension))
+            remaining = u.stiffness if shaken is None else u.stiffness - shaken
+            lost = self.rib_spacing.lost(s / self.length, self.length, remaining, jnp.sum(tension))
+            u = u._replace(softening=lost if shaken is None else shaken + lost)
         if self.relaxation is not None:
-            branch = self.relaxation.damping(material.Kbt, c0)
-            b = b - dot(branch, self.z_layout.get(history.z, "u_branch"))
-            Bbt = Bbt + branch
-        return (Kse + c0 * Bse, Kbt + c0 * Bbt, a, b, *self.routes_at(s), tension), more
+            u = u._replace(branch=self.relaxation.branch(material.Kbt))
+        nominal = self._where_it_runs(s, self.base_tension(y, control))
+        friction = None if self.friction is None else self._friction(self.friction, s, material.u_star)
+        return MaterialLaw({"v": v, "u": u}, Tendons(*self.routes_at(s), tension, nominal), friction)
 
-    def _unbent_flexibility(self, s: Any, y: Any, control: Any, c0: Any) -> Float[Any, "6 6"]:
-        """Return the approximate inverse for solving the law, known before y where tensions are controls."""
-        Kse, Bse, Kbt, Bbt = self.material(s, control)[:4]
-        tension = self._where_it_runs(s, self.base_tension(y, control))
-        if self.relaxation is not None:
-            Bbt = Bbt + self.relaxation.damping(Kbt, c0)
-        return unbent_flexibility(Kse + c0 * Bse, Kbt + c0 * Bbt, *self.routes_at(s), tension)
+    def _friction(self, friction: TendonFriction, s: Any, u_star: Any) -> Callable[[Fields, Fields], Any]:
+        def evolutions(strains: Fields, rates: Fields) -> dict[str, Evolution]:
+            return {"f": friction.evolution(self.bending_directions(s), rates["u"], strains["u"] - u_star)}
 
-    def _held(self, friction: TendonFriction, s: Any, u: Any, control: Any, history: History) -> Any:
-        u_t = history.c0 * u + self.z_layout.get(history.z, "u")
-        bent = u - self.material(s, control).u_star
-        past = self.z_layout.get(history.z, "f")
-        return friction.held(self.bending_directions(s), u_t, bent, past, history.c0)
+        return evolutions
 
-    def spatial_rates(self, s, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
+    def balance(
+        self, s: Any, t: Any, y: Float[Any, " y"], y_t: Float[Any, " y"], z: Float[Any, " z"],
+        z_t: Float[Any, " z"], control: Any,
+    ) -> Float[Any, " y"]:  # fmt: skip
         """Return y_s of the rod, of the tension, and of the tendons' path lengths."""
-        rates = [super().spatial_rates(s, y, y_t, z, z_t, control)]
+        rates = [super().balance(s, t, y, y_t, z, z_t, control)]
         v, u = self.z_layout.get(z, "v"), self.z_layout.get(z, "u")
         if self.friction is not None:
             f = self.z_layout.get(z, "f")
@@ -427,9 +397,9 @@ class RoutedTendonRobot(TendonRod):
             rates += [jnp.zeros(self.tendon_count), self._where_it_runs(s, way)]
         return jnp.concatenate(rates)
 
-    def tip(self, t: Any, control: Any, y: Float[Any, " y"], history: History) -> Float[Any, " k"]:
+    def tip(self, t: Any, control: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " k"]:
         """Return the rod's residual; for reels also that tension or slack is zero (Fischer-Burmeister)."""
-        left = super().tip(t, control, y, history)
+        left = super().tip(t, control, y, y_t)
         if self.drive != "reel":
             return left
         T, way = self.y_layout.get(y, "tension"), self.y_layout.get(y, "path")

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.layout import Layout
-from knode_cosserat.rods.system import History, Scales, System
+from knode_cosserat.rods.system import Correction, Scales, System
 
 
 class Wrapped(System):
@@ -86,16 +86,6 @@ class Wrapped(System):
         return self.knowledge.held
 
     @property
-    def linear_law(self) -> bool:  # type: ignore[override]
-        """True if the law of the wrapped system is linear in the strains."""
-        return self.knowledge.linear_law
-
-    @property
-    def law_of_stresses(self) -> bool:
-        """True if the law of the wrapped system is one of stresses."""
-        return self.knowledge.law_of_stresses
-
-    @property
     def has_actuation(self) -> bool:
         """True if the actuation of the wrapped system differs from its control."""
         return self.knowledge.has_actuation
@@ -142,63 +132,36 @@ class Wrapped(System):
         """Return A, B and f1 of the wrapped system."""
         return self.adapted.balance(s, t, y, y_t, z, z_t, control)
 
-    def strains(
-        self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
-    ) -> Float[Any, " z"]:
-        """Return z of the wrapped system."""
-        return self.adapted.strains(s, t, y, control, history)
-
-    def left_of_law(
-        self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
-    ) -> Float[Any, " z"]:
-        """Return the residual of the law of the wrapped system."""
-        return self.adapted.left_of_law(s, t, y, z, control, history)
-
-    def law_matrix(
-        self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
-    ) -> Float[Any, "z z"]:
-        """Return the derivative of the law of the wrapped system."""
-        return self.adapted.law_matrix(s, t, y, z, control, history)
-
-    def rates(
-        self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
-    ) -> Float[Any, " y"]:
-        """Return y_s of the wrapped system with strains z."""
-        return self.adapted.rates(s, t, y, z, control, history)
-
-    def load_matrix(
-        self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
-    ) -> Float[Any, "y y"]:
-        """Return the matrix of y_s in the balance equations of the wrapped system."""
-        return self.adapted.load_matrix(s, t, y, z, control, history)
-
-    def derivatives(
-        self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
-    ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-        """Return y_s and z of the wrapped system."""
-        return self.adapted.derivatives(s, t, y, control, history)
+    @property
+    def correction(self) -> Correction | None:
+        """Learned correction of the wrapped system."""
+        return self.adapted.correction
 
     def jump(
-        self, acting: Float[Any, " cuts"], t: Any, y: Float[Any, " y"], control: Any, history: History
+        self, acting: Float[Any, " cuts"], t: Any, y: Float[Any, " y"], y_t: Float[Any, " y"], control: Any
     ) -> Float[Any, " y"]:
         """Return y on the far side of the active discontinuities, from the wrapped system."""
-        return self.adapted.jump(acting, t, y, control, history)
+        return self.adapted.jump(acting, t, y, y_t, control)
 
     def rest(self, s: Any) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
         """Return the state at rest of the wrapped system."""
         return self.adapted.rest(s)
 
-    def base(self, t: Any, control: Any, unknowns: Float[Any, " k"], history: History) -> Float[Any, " y"]:
+    def base(self, t: Any, control: Any, unknowns: Float[Any, " k"]) -> Float[Any, " y"]:
         """Return y at the base, from the wrapped system."""
-        return self.adapted.base(t, control, unknowns, history)
+        return self.adapted.base(t, control, unknowns)
+
+    def moving_base(self, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " y"]:
+        """Return y at the base with its velocities, from the wrapped system."""
+        return self.adapted.moving_base(y, y_t)
 
     def unknowns(self, y: Float[Any, " y"]) -> Float[Any, " k"]:
         """Return the unknowns in y at the base, from the wrapped system."""
         return self.adapted.unknowns(y)
 
-    def tip(self, t: Any, control: Any, y: Float[Any, " y"], history: History) -> Float[Any, " k"]:
+    def tip(self, t: Any, control: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " k"]:
         """Return the residual of the tip's boundary conditions, from the wrapped system."""
-        return self.adapted.tip(t, control, y, history)
+        return self.adapted.tip(t, control, y, y_t)
 
     def end_poses(self, control: Any) -> tuple[Any, Any]:
         """Return the poses of the held ends, from the wrapped system."""

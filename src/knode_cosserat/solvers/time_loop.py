@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float, Int
 
-from knode_cosserat.rods.system import System, in_strands
+from knode_cosserat.rods.strands import in_strands
+from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import Kept, largest_residual, newton, none_kept, pivots_of
 from knode_cosserat.solvers.history import EXTRAPOLATIONS, StateHistory, advanced, history_of
 from knode_cosserat.solvers.linear import Factors, solved_correction

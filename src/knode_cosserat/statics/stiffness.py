@@ -22,7 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.rods.system import System, in_strands
+from knode_cosserat.rods.strands import in_strands
+from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.grid import grid_of, inside
 from knode_cosserat.solvers.problem import StepProblem, no_history
 from knode_cosserat.solvers.space import Lobatto4

@@ -17,6 +17,7 @@ from knode_cosserat.learning.knode import KNODE, About
 from knode_cosserat.learning.residual import Network, Residual, input_size
 from knode_cosserat.learning.structured.expansion import CURVED, expansion
 from knode_cosserat.learning.structured.residual import Load, Structured, ambient_layout, loaded
+from knode_cosserat.solvers import semi_discrete
 
 # few nodes and tensions that no other test has: what is compiled here was not compiled before
 ROBOT = kc.load_robot("delrin-tendon-robot").replace(nodes=5, youngs_modulus=10e9 / 3)
@@ -90,7 +91,7 @@ class Pull(Residual):
         self.options = (Odd("x"), (1.5, None, True), "text")
 
     def derivatives(self, knowledge, s, t, y, control, history):
-        y_s, z = knowledge.derivatives(s, t, y, control, history)
+        y_s, z = semi_discrete.derivatives(knowledge, s, t, y, control, history)
         where = knowledge.y_layout.slice("n")
         return y_s.at[where].add(self.force), z
 

@@ -41,10 +41,11 @@ from knode_cosserat.learning.residual import Network, Nothing, Residual
 from knode_cosserat.learning.structured.expansion import Expansion, Term
 from knode_cosserat.learning.structured.residual import Load, Structured
 from knode_cosserat.rods import robot_file
-from knode_cosserat.rods.system import History, System, is_traced
+from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.rods.trained_range import TrainedRange
-from knode_cosserat.solvers import space, time
+from knode_cosserat.solvers import semi_discrete, space, time
 from knode_cosserat.solvers.boundary import NewtonOptions
+from knode_cosserat.solvers.semi_discrete import History
 from knode_cosserat.solvers.settings import Settings
 
 TITLE = Title("knode-cosserat model", 1)
@@ -302,8 +303,8 @@ def _require_fit(model: KNODE) -> None:
 
 
 def _equations(model: KNODE, y: Any, control: Any, history: History) -> tuple[Any, Any, Any]:
-    y_s, z = model.derivatives(np.zeros(()), np.zeros(()), y, control, history)
-    return y_s, z, model.tip(np.zeros(()), control, y, history)
+    y_s, z = semi_discrete.derivatives(model, np.zeros(()), np.zeros(()), y, control, history)
+    return y_s, z, semi_discrete.tip(model, np.zeros(()), control, y, history)
 
 
 provide(KNODE, "save", save)

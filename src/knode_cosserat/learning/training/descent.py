@@ -24,8 +24,10 @@ from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import Network, Residual, elu, input_layout
 from knode_cosserat.learning.samples import Dataset, Samples, end_of, predict_segment
 from knode_cosserat.learning.training.losses import Loss, field_sizes, loss_for, value_scales
-from knode_cosserat.rods.system import System, unpacked_history
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.grid import grid_of
+from knode_cosserat.solvers.semi_discrete import unpacked_history
 from knode_cosserat.solvers.space import Euler, SpaceScheme
 
 #: largest number of epochs in one call of the program
@@ -86,7 +88,7 @@ def nominal_predictions(
         if space.implicit:
             history = unpacked_history(knowledge, sample.c0, sample.history[1])
             at = end_of(knowledge, sample.place), sample.t, sample.y_next, sample.control, history
-            _, z_end = knowledge.derivatives(*at)
+            _, z_end = semi_discrete.derivatives(knowledge, *at)
             inputs.append(seen(sample, sample.y_next, z_end, sample.history[1]))
         return inputs, y, z
 
