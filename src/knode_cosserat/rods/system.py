@@ -61,9 +61,17 @@ class Scales(NamedTuple):
 class System(Parametrised):
     """A rod robot: A y_s + B y_st = f1, C z + D z_t = f2 (paper eq. 1, general class).
 
-    A subclass defines the layouts below, `rest`, `tip`, and `constitutive` and `balance`,
-    in the general form, or z and y_s directly. Its numeric parameters are leaves of a JAX pytree: one
-    compiled program serves all their values, batches, and derivatives.
+    A subclass defines its layouts and `base_unknowns`, its `length`, `constitutive` and `balance`, `rest` and
+    `tip`; most define `base` and `scales` too, and `mixed` where B is zero. All other members have defaults:
+
+        ends             moving_base, end_poses, held, rest_is_guess, tip_layout
+        discontinuities  cuts, jumps, jump
+        several rods     strands, strand
+        learning         actuation, observables, velocities, unstressed, law_factors, correction, nominal
+        drawing          positions, quaternions, curves
+
+    Its numeric parameters are leaves of a JAX pytree: one compiled program serves all their values, batches,
+    and derivatives.
     """
 
     y_layout: ClassVar[Layout]
@@ -152,10 +160,6 @@ class System(Parametrised):
         """Return y at s = 0 with the velocities of a base whose pose has the rate in `y_t`."""
         return y
 
-    def unknowns(self, y: Float[Any, " y"]) -> Float[Any, " k"]:
-        """Return the unknowns of y at s = 0: the inverse of `base`."""
-        return y[..., self.y_layout.indices(self.base_unknowns)]
-
     @abc.abstractmethod
     def tip(self, t: Any, control: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " k"]:
         """Return the residuals of the boundary conditions at s = length, as many as there are unknowns."""
@@ -167,11 +171,11 @@ class System(Parametrised):
     @property
     def tip_layout(self) -> Layout:
         """Layout of the tip's residuals; one generic field by default."""
-        return Layout(("tip", self.unknown_count, "", "conditions at the tip"))
+        return Layout(("tip", unknown_count(self), "", "conditions at the tip"))
 
     def scales(self) -> Scales:
         """Return the natural sizes of y and of the tip's residuals; ones by default."""
-        return Scales(jnp.ones(self.y_layout.size), jnp.ones(self.unknown_count))
+        return Scales(jnp.ones(self.y_layout.size), jnp.ones(unknown_count(self)))
 
     def eased(self, part: float) -> Self:
         """Return the system with near-discontinuities (friction, contact) spread over 1/part of their width.
@@ -215,24 +219,9 @@ class System(Parametrised):
     ) -> Float[Any, " o"]:
         """Return the possible arguments of an unmodelled load, beside the control, in the material frame."""
         bent = z - self.unstressed(s, control)
-        return jnp.concatenate([self.turned(y, y), self.turned(y, y_t), bent, z_t])
-
-    def turned(self, y: Float[Any, " y"], vectors: Float[Any, " y"]) -> Float[Any, " y"]:
-        """Return numbers with the layout of y, with vectors of the global frame in the material frame."""
-        parts = []
-        for field in self.y_layout.fields:
-            part = self.y_layout.get(vectors, field.name)
-            if field.frame:
-                part = dot(rotation_matrix(self.y_layout.get(y, field.frame)).T, part)
-            parts.append(part)
-        return jnp.concatenate(parts)
+        return jnp.concatenate([in_material_frame(self, y, y), in_material_frame(self, y, y_t), bent, z_t])
 
     # queries that every system answers
-
-    @property
-    def unknown_count(self) -> int:
-        """Number of unknowns at the base."""
-        return len(self.y_layout.indices(self.base_unknowns))
 
     def undelayed(
         self, measured: Float[np.ndarray, "T c"], dt: float, before: Float[np.ndarray, " c"] | None = None
@@ -277,10 +266,6 @@ class System(Parametrised):
             )
         return self.y_layout.get(y, name)
 
-    def scaled(self, factor: Any) -> Self:
-        """Return the system with its length multiplied by a factor."""
-        return self.replace(length=self.length * factor)
-
     def replace(self, **changes: Any) -> Self:
         """Return a copy with other parameters, by name; derived quantities follow.
 
@@ -304,7 +289,9 @@ class System(Parametrised):
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
         for name in REPLACED.keys() & vars(cls).keys():
-            raise TypeError(f"{cls.__name__} defines `{name}`, which no solver calls; define {REPLACED[name]}")
+            raise TypeError(
+                f"{cls.__name__} defines `{name}`, which no solver calls; define {REPLACED[name]}"
+            )
 
     def __check_init__(self) -> None:
         given: Any = self.nodes
@@ -313,6 +300,32 @@ class System(Parametrised):
                 f"nodes is {self.nodes!r}; allowed is a whole number from {FEWEST_NODES} to {MOST_NODES}"
             )
         check_fields(self)
+
+
+def unknowns_of(system: System, y: Float[Any, "*n y"]) -> Float[Any, "*n k"]:
+    """Return the unknowns of y at s = 0: the inverse of `System.base`."""
+    return y[..., system.y_layout.indices(system.base_unknowns)]
+
+
+def unknown_count(system: System) -> int:
+    """Return the number of unknowns at the base."""
+    return len(system.y_layout.indices(system.base_unknowns))
+
+
+def scaled(system: System, factor: Any) -> System:
+    """Return the system with the length of its nominal robot multiplied by a factor."""
+    return system.replace(length=system.nominal.length * factor)
+
+
+def in_material_frame(system: System, y: Float[Any, " y"], vectors: Float[Any, " y"]) -> Float[Any, " y"]:
+    """Return numbers with the layout of y, with vectors of the global frame in the material frame."""
+    layout, parts = system.y_layout, []
+    for field in layout.fields:
+        part = layout.get(vectors, field.name)
+        if field.frame:
+            part = dot(rotation_matrix(layout.get(y, field.frame)).T, part)
+        parts.append(part)
+    return jnp.concatenate(parts)
 
 
 def _gives(system: System, name: str) -> bool:

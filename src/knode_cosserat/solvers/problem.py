@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Shaped
 
 from knode_cosserat.rods.strands import in_strands
-from knode_cosserat.rods.system import System
+from knode_cosserat.rods.system import System, unknowns_of
 from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.grid import Grid, grid_of, inside, taken
 from knode_cosserat.solvers.hoisting import split_function
@@ -334,7 +334,7 @@ class StepProblem(eqx.Module):
         def corrected(_: Any, y: Any) -> Any:
             defects = self.reached(y) - y[1:]
             # systems with several strands have no discontinuities
-            G = self.linearise(y, self.system.unknowns(y[0])).G
+            G = self.linearise(y, unknowns_of(self.system, y[0])).G
             change = defects if G is None else jnp.sum(G * defects[:, None, :], axis=-1)
             return y.at[1:].add(jnp.where(before, change, 0.0))
 

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from knode_cosserat.errors import KnodeCosseratError
-from knode_cosserat.rods.system import System
+from knode_cosserat.rods.system import System, unknown_count, unknowns_of
 from knode_cosserat.solvers.boundary import Solution, newton
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.guess import hanging_curve, natural_reach, state_from_positions
@@ -161,12 +161,12 @@ class _Step:
             if points is not None:
                 record = state_from_positions(self.system, points, control)
                 y = grid_of(self.system).spread(jnp.asarray(record[:, : self.system.y_layout.size]))
-                found.append((y, self.system.unknowns(y[0])))
+                found.append((y, unknowns_of(self.system, y[0])))
         return found
 
     def guesses(self) -> list[tuple[Any, Any]]:
         guesses = [jnp.einsum("p,pny->ny", w, self.past.y) for w in EXTRAPOLATIONS[:2]]
-        return [(y, self.system.unknowns(y[0])) for y in guesses]
+        return [(y, unknowns_of(self.system, y[0])) for y in guesses]
 
     def solved(self, found: Attempt) -> bool:
         return bool(found.row.error <= self.settings.newton.acceptable)
@@ -208,7 +208,7 @@ def _given_up(step: _Step, control: Any) -> Outcome:
     past, system = step.past, step.system
     record = np.full((system.nodes, past.records.shape[-1]), np.nan)
     cause = likely_cause(Result.NO_CONVERGENCE, step, control)
-    unknowns = np.full(system.unknown_count, np.nan)
+    unknowns = np.full(unknown_count(system), np.nan)
     return Outcome(Result.NO_CONVERGENCE, past, record, unknowns, np.inf, 0, np.nan, cause)
 
 
@@ -361,7 +361,7 @@ def _relax(step: _Step, control: Any) -> Attempt | None:
         if dt > longest:
             break
     y = now.y[0]
-    found = step.solve(control, y, step.system.unknowns(y[0]))
+    found = step.solve(control, y, unknowns_of(step.system, y[0]))
     return found if step.solved(found) else None
 
 

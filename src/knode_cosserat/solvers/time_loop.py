@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Float, Int
 
 from knode_cosserat.rods.strands import in_strands
-from knode_cosserat.rods.system import System
+from knode_cosserat.rods.system import System, unknown_count, unknowns_of
 from knode_cosserat.solvers.boundary import Kept, largest_residual, newton, none_kept, pivots_of
 from knode_cosserat.solvers.history import EXTRAPOLATIONS, StateHistory, advanced, history_of
 from knode_cosserat.solvers.linear import Factors, solved_correction
@@ -46,7 +46,7 @@ def solve_time_step(
     problem = StepProblem(system, t, control, coefficients[0], history, settings.space).ready()
     # sum of products instead of a matrix product: XLA fuses it with the next operations
     guess = jnp.sum(past.weights[:, None, None] * past.y, axis=0)
-    solution, kept = newton(problem, guess, system.unknowns(guess[0]), settings.newton, kept, batch)
+    solution, kept = newton(problem, guess, unknowns_of(system, guess[0]), settings.newton, kept, batch)
     after, row = recorded_step(problem, settings, past, coefficients, solution, kept.factors)
     scale = system.scales().y
     extrapolated = jnp.sum(EXTRAPOLATIONS[:, :, None, None] * past.y, axis=1)
@@ -122,14 +122,14 @@ def no_factors(system: System, settings: Settings, past: StateHistory, control: 
     """Return factors of the right shape that are not usable."""
     problem = StepProblem.still(system, settings.space, control)
     y = past.y[0]
-    return none_kept(problem, y, system.unknowns(y[0]))
+    return none_kept(problem, y, unknowns_of(system, y[0]))
 
 
 def _no_rows(system: System, shape: tuple[int, ...], past: StateHistory) -> StepRows:
     """Return rows of zeros, (steps,) or (robots, steps)."""
     return StepRows(
         jnp.zeros((*shape, system.nodes, past.records.shape[-1])),
-        jnp.zeros((*shape, system.unknown_count)),
+        jnp.zeros((*shape, unknown_count(system))),
         jnp.zeros(shape),
         jnp.zeros(shape, dtype=int),
         jnp.zeros(shape),

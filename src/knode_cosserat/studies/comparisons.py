@@ -79,10 +79,6 @@ class NoKnowledge(System):
         """Return the model's y at the base with its velocities."""
         return self.model.moving_base(y, y_t)
 
-    def unknowns(self, y: Float[Any, " y"]) -> Float[Any, " k"]:
-        """Return the model's unknowns at the base from y."""
-        return self.model.unknowns(y)
-
     def tip(self, t: Any, control: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " k"]:
         """Return the residual of the model's boundary conditions at the tip."""
         return self.model.tip(t, control, y, y_t)

@@ -29,7 +29,7 @@ from knode_cosserat.learning.calibration.unknowns import (
 )
 from knode_cosserat.learning.samples import DataError, samples
 from knode_cosserat.recordings.measurements import Measurements
-from knode_cosserat.rods.system import System
+from knode_cosserat.rods.system import System, unknowns_of
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.history import StateHistory, constant_history, resting_history
 from knode_cosserat.solvers.initial import SimulationRun, initial_state
@@ -119,8 +119,9 @@ def _differences(robot, coordinates, rows, table, dt, unknowns, settings, orient
         """Return the initial history and its tangent, if the initial state is a solved equilibrium."""
         none, guess = jnp.zeros(system.control_size), resting_history(system, settings)
         d_none, d_guess = jax.tree.map(jnp.zeros_like, (none[None], guess))
+        unknowns = unknowns_of(system, rows.first[0])
         d_first, _ = tangent_time_loop(
-            settings, STILL, dt, rows.first[None], system.unknowns(rows.first[0])[None], system, none[None],
+            settings, STILL, dt, rows.first[None], unknowns[None], system, none[None],
             guess, d_system, d_none, d_guess.records, d_guess.rate,
         )  # fmt: skip
         d_first = d_first[0, :, : rows.first.shape[1]]
