@@ -18,7 +18,7 @@ from knode_cosserat.learning.structured.expansion import CURVED, LINEAR, expansi
 from knode_cosserat.learning.structured.residual import Structured
 from knode_cosserat.rotation import cross, quaternion_rate, rotation_matrix
 from knode_cosserat.solvers import semi_discrete
-from knode_cosserat.solvers.semi_discrete import History
+from knode_cosserat.solvers.semi_discrete import History, Point
 from knode_cosserat.viewer import drawing
 
 DT, STEPS = 0.05, 12
@@ -295,9 +295,9 @@ class Pull(Residual):
 
     size: Any
 
-    def derivatives(self, knowledge, s, t, y, control, history):
-        y_s, z = semi_discrete.derivatives(knowledge, s, t, y, control, history)
-        return y_s.at[7].add(self.size), z.at[4].add(self.size * y[10])
+    def derivatives(self, knowledge, point):
+        y_s, z = semi_discrete.derivatives(knowledge, point)
+        return y_s.at[7].add(self.size), z.at[4].add(self.size * point.y[10])
 
 
 @functools.cache
@@ -330,13 +330,11 @@ def test_the_parts_of_a_model_s_equations_agree(name, nominal):
     y = np.concatenate([np.zeros(3), [1.0, 0.1, 0.2, 0.0], 0.1 * rng.normal(size=12)])
     history = History(20.0, *(0.1 * rng.normal(size=size) for size in (19, 6, 19)))
     control = rng.uniform(1.0, 3.0, nominal.control_size)
-    at = (0.1, 0.0, y)
-    y_s, z = semi_discrete.derivatives(model, *at, control, history)
-    np.testing.assert_allclose(semi_discrete.strains(model, *at, control, history), z, rtol=1e-10, atol=1e-12)
-    np.testing.assert_allclose(
-        semi_discrete.rates(model, *at, z, control, history), y_s, rtol=1e-9, atol=1e-10
-    )
-    law = semi_discrete.law(model, *at, control, history)
+    point = Point(0.1, 0.0, y, control, history)
+    y_s, z = semi_discrete.derivatives(model, point)
+    np.testing.assert_allclose(semi_discrete.strains(model, point), z, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(semi_discrete.rates(model, point, z), y_s, rtol=1e-9, atol=1e-10)
+    law = semi_discrete.law(model, point)
     matrix = law.matrix(z)
     size = np.abs(matrix) @ np.abs(z)
     assert np.all(np.abs(law.residual(z)) < 1e-9 * size + 1e-12)

@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from jax.scipy.linalg import block_diag
 
 import knode_cosserat as kc
-from knode_cosserat.solvers.semi_discrete import History, derivatives
+from knode_cosserat.solvers.semi_discrete import History, Point, derivatives
 
 NUMBERS = st.floats(-1, 1, allow_subnormal=False)
 
@@ -53,7 +53,7 @@ def points(draw):
     y[3:7] += 2.0  # quaternions of any length but nearly none
     c0 = draw(st.floats(0, 1000))
     history = History(np.array(c0), c0 * draw(vectors(19)), c0 * z, np.zeros(19))
-    return draw(st.floats(0, 1)), draw(st.floats(0, 1)), y, 10 * draw(vectors(3)), history
+    return Point(draw(st.floats(0, 1)), draw(st.floats(0, 1)), y, 10 * draw(vectors(3)), history)
 
 
 class GeneralRobot(kc.robots.TendonRobot):
@@ -72,18 +72,18 @@ def general(robot):
 
 
 @jax.jit
-def both(robot, *point):
-    return derivatives(robot, *point), derivatives(general(robot), *point)
+def both(robot, point):
+    return derivatives(robot, point), derivatives(general(robot), point)
 
 
 @settings(max_examples=200, deadline=None)
 @given(robots(), points())
 def test_direct_and_general_derivatives_agree(robot, point):
-    (y_s, z), (general_y_s, general_z) = both(robot, *point)
+    (y_s, z), (general_y_s, general_z) = both(robot, point)
     # relative to the largest number: the two sum in different orders. One solves with the inverse by
     # cofactors, whose rounding errors grow with the square of the condition (measured: 9e-18 of it), which
     # counts beyond 100
-    c0 = point[-1].c0
+    c0 = point.history.c0
     stiffness = (
         robot.shear_stiffness + c0 * robot.shear_damping,
         robot.bending_stiffness + c0 * robot.bending_damping,

@@ -7,7 +7,7 @@ import knode_cosserat as kc
 from knode_cosserat.rods.relaxation import Relaxation
 from knode_cosserat.rods.viscoelastic_rod import ViscoelasticRod
 from knode_cosserat.solvers import semi_discrete
-from knode_cosserat.solvers.semi_discrete import History
+from knode_cosserat.solvers.semi_discrete import History, Point
 
 BODY = {
     "length": 0.1, "radius": 0.015, "density": 1070.0, "youngs_modulus": 2.6e5, "nodes": 6,
@@ -48,7 +48,7 @@ def test_its_strains_satisfy_the_law_with_its_branch():
     rng = np.random.default_rng(0)
     y = np.asarray(rod.rest(0.05)[0]) + 0.01 * rng.normal(size=19)
     history = History(100.0, rng.normal(size=19), rng.normal(size=12), np.zeros(19))
-    z = semi_discrete.strains(rod, 0.05, 0.0, y, np.zeros(1), history)
+    z = semi_discrete.strains(rod, Point(0.05, 0.0, y, np.zeros(1), history))
     values, rates = (
         dict(zip(rod.z_layout.names, rod.z_layout.split(x), strict=True)) for x in (z, history.z_t(z))
     )

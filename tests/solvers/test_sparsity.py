@@ -7,7 +7,7 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.solvers.problem import no_history
-from knode_cosserat.solvers.semi_discrete import derivatives, unpacked_history
+from knode_cosserat.solvers.semi_discrete import Point, derivatives, unpacked_history
 from knode_cosserat.solvers.space import LOBATTO2
 from knode_cosserat.solvers.sparsity import nonzero_columns
 
@@ -68,7 +68,8 @@ def fields_that_enter(robot):
     layout = robot.y_layout
 
     def equations(y, x, control):
-        return derivatives(robot, 0.1, 0.0, y, control, unpacked_history(robot, jnp.ones(()), x))
+        history = unpacked_history(robot, jnp.ones(()), x)
+        return derivatives(robot, Point(0.1, 0.0, y, control, history))
 
     x = jnp.zeros(no_history(robot, LOBATTO2).shape[1])
     closed = jax.make_jaxpr(equations)(robot.rest(0.1)[0], x, jnp.zeros(robot.control_size))

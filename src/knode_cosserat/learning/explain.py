@@ -15,7 +15,7 @@ from knode_cosserat.learning.structured.residual import Structured, ambient_layo
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers import semi_discrete
-from knode_cosserat.solvers.semi_discrete import unpacked_history
+from knode_cosserat.solvers.semi_discrete import Point, unpacked_history
 from knode_cosserat.trajectory import Trajectory
 
 
@@ -147,6 +147,6 @@ def _derivatives(system: System, data: Samples) -> Any:
     def one(sample: Samples) -> Any:
         history = unpacked_history(system, sample.c0, sample.history[0])
         s = start_of(system, sample.place)
-        return semi_discrete.derivatives(system, s, sample.t, sample.y, sample.control, history)
+        return semi_discrete.derivatives(system, Point(s, sample.t, sample.y, sample.control, history))
 
     return jax.vmap(one)(data)

@@ -24,7 +24,7 @@ from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.grid import at_places, grid_of, inside
 from knode_cosserat.solvers.history import coefficient_table, rows_suffice
 from knode_cosserat.solvers.initial import histories_along
-from knode_cosserat.solvers.semi_discrete import records_in_strands, unpacked_history
+from knode_cosserat.solvers.semi_discrete import Point, records_in_strands, unpacked_history
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
@@ -102,7 +102,7 @@ def predict_segment(
 
     def derivatives(s: Any, y: Any, record: Any) -> Any:
         history = unpacked_history(system, sample.c0, record)
-        return semi_discrete.derivatives(system, s, sample.t, y, sample.control, history)
+        return semi_discrete.derivatives(system, Point(s, sample.t, y, sample.control, history))
 
     def reached(bounds: tuple[Any, Any], start: Any, end: Any, records: Any) -> Any:
         low, high = bounds

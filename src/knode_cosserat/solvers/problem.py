@@ -18,7 +18,7 @@ from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.grid import Grid, grid_of, inside, taken
 from knode_cosserat.solvers.hoisting import split_function
 from knode_cosserat.solvers.linear import Linearisation, filled_up, matrix_products, quotient
-from knode_cosserat.solvers.semi_discrete import History, records_in_strands, unpacked_history
+from knode_cosserat.solvers.semi_discrete import History, Point, records_in_strands, unpacked_history
 from knode_cosserat.solvers.space import Formula, SpaceScheme
 from knode_cosserat.solvers.sparsity import nonzero_columns
 
@@ -112,7 +112,7 @@ class StepProblem(eqx.Module):
         """
         strand = self.system.strand
         terms = unpacked_history(strand, self.c0, history)
-        return semi_discrete.derivatives(strand, s, self.t, y, self.control, terms)
+        return semi_discrete.derivatives(strand, Point(s, self.t, y, self.control, terms))
 
     def _unpack(self, history: Float[Any, " x"]) -> History:
         return unpacked_history(self.system, self.c0, history)

@@ -12,7 +12,6 @@ correction applies to y_s and z.
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any, NamedTuple
 
 import jax
@@ -44,6 +43,21 @@ class History(NamedTuple):
         return self.c0 * z + self.z
 
 
+class Point(NamedTuple):
+    """A point of the rod in a time step: arclength (m), time (s), y, the control and the history."""
+
+    s: Any
+    t: Any
+    y: Float[Any, " y"]
+    control: Any
+    history: History
+
+    @property
+    def y_t(self) -> Float[Any, " y"]:
+        """Rate of y in time."""
+        return self.history.y_t(self.y)
+
+
 def unpacked_history(system: System, c0: Any, record: Float[Any, " x"]) -> History:
     """Return the history at one point from its packed record: y, z and, if B is not zero, y_s."""
     ny, nz = system.y_layout.size, system.z_layout.size
@@ -63,109 +77,94 @@ def records_in_strands(system: System, records: Any) -> Any:
 # along the rod
 
 
-def derivatives(
-    system: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
-) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
+def derivatives(system: System, point: Point) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
     """Return y_s and z at one point (paper eq. 4, semi-discretised general class)."""
     if system.strands > 1:
-        return _of_strands(system, s, t, y, control, history)
+        return _of_strands(system, point)
     correction = system.correction
     if correction is not None:
-        return correction.residual.derivatives(correction.system, s, t, y, control, history)
-    z = strains(system, s, t, y, control, history)
-    return rates(system, s, t, y, z, control, history), z
+        return correction.residual.derivatives(correction.system, point)
+    z = strains(system, point)
+    return rates(system, point, z), z
 
 
-def _of_strands(
-    system: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
-) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-    strand = system.strand
+def _of_strands(system: System, point: Point) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
+    strand, (s, t, y, control, history) = system.strand, point
     parts = [in_strands(system, part) for part in (y, history.y, history.z, history.y_s)]
 
     def of_strand(y: Any, *terms: Any) -> Any:
-        return derivatives(strand, s, t, y, control, History(history.c0, *terms))
+        return derivatives(strand, Point(s, t, y, control, History(history.c0, *terms)))
 
     y_s, z = jax.vmap(of_strand)(*parts)
     return y_s.reshape(-1), z.reshape(-1)
 
 
-def law(system: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History) -> DiscreteLaw:
+def law(system: System, point: Point) -> DiscreteLaw:
     """Return the law of z at one point."""
     if system.strands > 1:
-        return StatedStrains(_of_strands(system, s, t, y, control, history)[1])
+        return StatedStrains(_of_strands(system, point)[1])
     if system.correction is not None:
-        return _CorrectedLaw(system.correction, (s, t, y, control, history))
-    stated = system.constitutive(s, t, y, history.y_t(y), control)
+        return _CorrectedLaw(system.correction, point)
+    s, t, y, control, history = point
+    stated = system.constitutive(s, t, y, point.y_t, control)
     return discrete_law(stated, system.z_layout, history.c0, history.z)
 
 
-def strains(
-    system: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
-) -> Float[Any, " z"]:
+def strains(system: System, point: Point) -> Float[Any, " z"]:
     """Return z at one point."""
-    return law(system, s, t, y, control, history).strains()
+    return law(system, point).strains()
 
 
-def law_residual(
-    system: System, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
-) -> Float[Any, " z"]:
+def law_residual(system: System, point: Point, z: Float[Any, " z"]) -> Float[Any, " z"]:
     """Return the residual of the law of z, at any z."""
-    return law(system, s, t, y, control, history).residual(z)
+    return law(system, point).residual(z)
 
 
-def law_matrix(
-    system: System, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
-) -> Float[Any, "z z"]:
-    """Return the derivative of `law_residual` by z."""
-    return law(system, s, t, y, control, history).matrix(z)
-
-
-def rates(
-    system: System, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
-) -> Float[Any, " y"]:
+def rates(system: System, point: Point, z: Float[Any, " z"]) -> Float[Any, " y"]:
     """Return y_s at one point, for any z; with several strands, for the z of their law."""
     if system.strands > 1:
-        return _of_strands(system, s, t, y, control, history)[0]
+        return _of_strands(system, point)[0]
     correction = system.correction
     if correction is not None:
-        return correction.residual.rates(correction.system, s, t, y, z, control, history)
-    balance = system.balance(s, t, y, history.y_t(y), z, history.z_t(z), control)
+        return correction.residual.rates(correction.system, point, z)
+    balance = _balance(system, point, z)
     if not isinstance(balance, tuple):
         return balance
     A, B, f1 = balance
-    return jnp.linalg.solve(A + history.c0 * B, f1 - B @ history.y_s)
+    return jnp.linalg.solve(A + point.history.c0 * B, f1 - B @ point.history.y_s)
 
 
-def load_matrix(
-    system: System, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
-) -> Float[Any, "y y"]:
+def load_matrix(system: System, point: Point, z: Float[Any, " z"]) -> Float[Any, "y y"]:
     """Return A + c0 B, whose inverse turns loads into rates."""
     if system.correction is not None:
-        return load_matrix(system.correction.system, s, t, y, z, control, history)
-    balance = system.balance(s, t, y, history.y_t(y), z, history.z_t(z), control)
+        return load_matrix(system.correction.system, point, z)
+    balance = _balance(system, point, z)
     if not isinstance(balance, tuple):
         return jnp.eye(system.y_layout.size)
     A, B, _ = balance
-    return A + history.c0 * B
+    return A + point.history.c0 * B
 
 
-@dataclasses.dataclass(frozen=True)
-class _CorrectedLaw:
+def _balance(system: System, point: Point, z: Float[Any, " z"]) -> Any:
+    s, t, y, control, history = point
+    return system.balance(s, t, y, point.y_t, z, history.z_t(z), control)
+
+
+class _CorrectedLaw(NamedTuple):
     """Law of z with a learned correction."""
 
     correction: Correction
-    point: tuple[Any, ...]
+    point: Point
 
     @property
     def linear(self) -> bool:
-        return bool(law(self.correction.system, *self.point).linear and self.correction.residual.linear)
+        return law(self.correction.system, self.point).linear and bool(self.correction.residual.linear)
 
     def strains(self) -> Float[Any, " z"]:
-        return self.correction.residual.strains(self.correction.system, *self.point)
+        return self.correction.residual.strains(self.correction.system, self.point)
 
     def residual(self, z: Float[Any, " z"]) -> Float[Any, " z"]:
-        s, t, y, control, history = self.point
-        return self.correction.residual.law_residual(self.correction.system, s, t, y, z, control, history)
+        return self.correction.residual.law_residual(self.correction.system, self.point, z)
 
     def matrix(self, z: Float[Any, " z"]) -> Float[Any, "z z"]:
         return jax.jacfwd(self.residual)(z)

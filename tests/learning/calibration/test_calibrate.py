@@ -129,9 +129,9 @@ class Stiffer(Residual):
 
     factor: Any
 
-    def derivatives(self, knowledge, s, t, y, control, history):
-        z = 1.0 + self.factor * (semi_discrete.strains(knowledge, s, t, y, control, history) - 1.0)
-        return semi_discrete.rates(knowledge, s, t, y, z, control, history), z
+    def derivatives(self, knowledge, point):
+        z = 1.0 + self.factor * (semi_discrete.strains(knowledge, point) - 1.0)
+        return semi_discrete.rates(knowledge, point, z), z
 
 
 def test_the_knowledge_of_a_model(swings):

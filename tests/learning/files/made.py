@@ -91,8 +91,8 @@ class Pull(Residual):
         )
         self.options = (Odd("x"), (1.5, None, True), "text")
 
-    def derivatives(self, knowledge, s, t, y, control, history):
-        y_s, z = semi_discrete.derivatives(knowledge, s, t, y, control, history)
+    def derivatives(self, knowledge, point):
+        y_s, z = semi_discrete.derivatives(knowledge, point)
         where = knowledge.y_layout.slice("n")
         return y_s.at[where].add(self.force), z
 

@@ -11,7 +11,7 @@ import pytest
 import knode_cosserat as kc
 from knode_cosserat.rotation import rotation_matrix
 from knode_cosserat.solvers import semi_discrete
-from knode_cosserat.solvers.semi_discrete import History
+from knode_cosserat.solvers.semi_discrete import History, Point
 from knode_cosserat.studies import imperfections, truths
 from knode_cosserat.studies.imperfections_report import as_markdown, figure, missed, ratios, rerun
 
@@ -47,7 +47,7 @@ def at_points(robot, y, control, history):
     """y_s, z and the tip's residuals at every point."""
 
     def one(y, control, history):
-        y_s, z = semi_discrete.derivatives(robot, 0.3, 0.0, y, control, history)
+        y_s, z = semi_discrete.derivatives(robot, Point(0.3, 0.0, y, control, history))
         return y_s, z, semi_discrete.tip(robot, 0.0, control, y, history)
 
     return jax.vmap(one)(y, control, history)
@@ -96,7 +96,8 @@ def test_a_stiffening_rod_has_the_moment_of_its_law_and_its_slope():
     still = History(np.zeros(()), np.zeros(19), np.zeros(6), np.zeros(19))
 
     def bent(moment):
-        return semi_discrete.strains(robot, 0.0, 0.0, jnp.asarray(y).at[10].set(moment), None, still)[3]
+        point = Point(0.0, 0.0, jnp.asarray(y).at[10].set(moment), None, still)
+        return semi_discrete.strains(robot, point)[3]
 
     u = 1.7
     EI = float(ROBOT.Kbt[0, 0])

@@ -45,7 +45,7 @@ from knode_cosserat.rods.system import System, is_traced, unknown_count
 from knode_cosserat.rods.trained_range import TrainedRange
 from knode_cosserat.solvers import semi_discrete, space, time
 from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.semi_discrete import History
+from knode_cosserat.solvers.semi_discrete import History, Point
 from knode_cosserat.solvers.settings import Settings
 
 TITLE = Title("knode-cosserat model", 1)
@@ -303,7 +303,7 @@ def _require_fit(model: KNODE) -> None:
 
 
 def _equations(model: KNODE, y: Any, control: Any, history: History) -> tuple[Any, Any, Any]:
-    y_s, z = semi_discrete.derivatives(model, np.zeros(()), np.zeros(()), y, control, history)
+    y_s, z = semi_discrete.derivatives(model, Point(np.zeros(()), np.zeros(()), y, control, history))
     return y_s, z, semi_discrete.tip(model, np.zeros(()), control, y, history)
 
 

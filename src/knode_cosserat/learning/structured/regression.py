@@ -49,7 +49,7 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.rotation import rotation_matrix
 from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.grid import ON_NODE
-from knode_cosserat.solvers.semi_discrete import unpacked_history
+from knode_cosserat.solvers.semi_discrete import Point, unpacked_history
 from knode_cosserat.solvers.space import SpaceScheme
 
 #: smaller relative values are the solver's tolerance, not a load
@@ -179,8 +179,10 @@ def _law_residual(knowledge: System, data: Samples) -> tuple[Any, Any, Any]:
         z, z_t = sample.z, history.z_t(sample.z)
         inputs = law_inputs(knowledge, s, sample.control, z, z_t)
 
+        point = Point(s, sample.t, sample.y, sample.control, history)
+
         def law(z: Any) -> Any:
-            return semi_discrete.law_residual(knowledge, s, sample.t, sample.y, z, sample.control, history)
+            return semi_discrete.law_residual(knowledge, point, z)
 
         # the derivative along z gives the size of the law's terms
         left, size = jax.jvp(law, (z,), (z,))
@@ -258,22 +260,25 @@ def _points(knowledge: System, residual: Structured, data: Samples, space: Space
 def _near_strains(knowledge: System, residual: Structured, s: Any, data: Samples) -> Any:
     def one(s: Any, sample: Samples) -> Any:
         history = unpacked_history(knowledge, sample.c0, sample.history[1])
-        return residual.strains(knowledge, s, sample.t, sample.y_next, sample.control, history)
+        return residual.strains(knowledge, Point(s, sample.t, sample.y_next, sample.control, history))
 
     return jax.vmap(one)(s, data)
 
 
+def _point(knowledge: System, row: Points) -> Point:
+    history = unpacked_history(knowledge, row.c0, row.history)
+    return Point(row.s, row.t, row.y, row.control, history)
+
+
 @jax.jit
 def _views(knowledge: System, points: Points) -> _Views:
-    def one(point: Points) -> Any:
-        history = unpacked_history(knowledge, point.c0, point.history)
-        y_t, z_t = history.y_t(point.y), history.z_t(point.z)
-        observables = knowledge.observables(point.s, point.y, y_t, point.z, z_t, point.control)
+    def one(row: Points) -> Any:
+        point, z = _point(knowledge, row), row.z
+        z_t = point.history.z_t(z)
+        observables = knowledge.observables(point.s, point.y, point.y_t, z, z_t, point.control)
         matrix = None
         if knowledge.mixed:
-            matrix = semi_discrete.load_matrix(
-                knowledge, point.s, point.t, point.y, point.z, point.control, history
-            )
+            matrix = semi_discrete.load_matrix(knowledge, point, z)
         ambient = ambient_inputs(knowledge, point.control)
         return _Views(jnp.concatenate([observables, ambient]), ambient, matrix)
 
@@ -284,9 +289,8 @@ def _views(knowledge: System, points: Points) -> _Views:
 def _rates(knowledge: System, points: Points) -> Any:
     """Return y_s of the nominal model at the true strains."""
 
-    def one(point: Points) -> Any:
-        history = unpacked_history(knowledge, point.c0, point.history)
-        return semi_discrete.rates(knowledge, point.s, point.t, point.y, point.z, point.control, history)
+    def one(row: Points) -> Any:
+        return semi_discrete.rates(knowledge, _point(knowledge, row), row.z)
 
     return jax.vmap(one)(points)
 
