@@ -90,7 +90,9 @@ _MOVED = {
         "RoutedTendonRobot Scales SlenderRod Stretch TendonRobot ends loads parameter robot_schema routing "
         "surroundings"
     ),
-    "solvers": ("BDF1 BDF2 BDFAlpha Euler History Lobatto2 Lobatto4 NewtonOptions Settings Stepper Trapezoidal"),
+    "solvers": (
+        "BDF1 BDF2 BDFAlpha Euler History Lobatto2 Lobatto4 NewtonOptions Settings Stepper Trapezoidal"
+    ),
     "learning": (
         "CheckpointError ConfigError DataError Ensemble FitError ModelFileError NetworkOptions "
         "PassiveOptions Residual RolloutTraining StructuredOptions Training load_ensemble"

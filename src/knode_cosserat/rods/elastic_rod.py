@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.rods.law import InternalState, MaterialLaw, Viscoelastic
+from knode_cosserat.rods.law import MaterialLaw, Viscoelastic
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parameters import parameter, part
 from knode_cosserat.rods.section import (
@@ -159,9 +159,7 @@ class ElasticRod(System):
         R = rotation_matrix(self.y_layout.get(y, "h"))
         return dot(R.T, self.y_layout.get(y, "n")), dot(R.T, self.y_layout.get(y, "m"))
 
-    def constitutive(
-        self, s: Any, t: Any, y: Float[Any, " y"], y_t: Float[Any, " y"], control: Any
-    ) -> MaterialLaw | InternalState:
+    def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
         """Return the law of v and u; linear by default."""
         return self.linear_law(s, y, control)
 

@@ -183,10 +183,7 @@ class Rod(ElasticRod):
         """Return the actuators' load per length (N/m), global frame; None by default."""
         return None
 
-    def balance(
-        self, s: Any, t: Any, y: Float[Any, " y"], y_t: Float[Any, " y"], z: Float[Any, " z"],
-        z_t: Float[Any, " z"], control: Any,
-    ) -> Float[Any, " y"]:  # fmt: skip
+    def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
         """Return y_s (paper eq. 10, spatial derivatives of the rod)."""
         h, n = self.y_layout.get(y, "h"), self.y_layout.get(y, "n")
         motion = Motion.of(self.y_layout, y, y_t)

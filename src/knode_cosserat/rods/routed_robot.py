@@ -21,10 +21,8 @@ softens the rod, `anchors` end tendons early, `load_cells` correct measured tens
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any, Self
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -38,7 +36,7 @@ from knode_cosserat.rods.reels import Reels
 from knode_cosserat.rods.relaxation import Relaxation
 from knode_cosserat.rods.rib_spacing import RibSpacing
 from knode_cosserat.rods.rod import Rod
-from knode_cosserat.rods.routing import Helical, Routing, Straight, ends, routes
+from knode_cosserat.rods.routing import Helical, Routing, Straight, ends, path_lengths, routes
 from knode_cosserat.rods.tendon_friction import TendonFriction, Vibration
 from knode_cosserat.rods.tendon_law import Tendons, stretches
 from knode_cosserat.rods.tendon_rod import TendonRod
@@ -47,8 +45,6 @@ from knode_cosserat.rotation import dot
 
 #: fraction of the rod's length over which slack and taut are blended, so that Newton's method has a slope
 BLEND = 1e-7
-#: points of Gauss quadrature for the length of a tendon in the unloaded robot
-GAUSS = 24
 
 
 class RoutedTendonRobot(TendonRod):
@@ -299,11 +295,8 @@ class RoutedTendonRobot(TendonRod):
     def law_factors(self, s: Any, control: Any) -> tuple[Any, Any] | None:
         """Return the sections' factors on stiffness and damping, with 1 for the other rows of the law."""
         found = super().law_factors(s, control)
-        if found is None:
-            return None
-        stiffness, damping = found
         others = jnp.ones(self.z_layout.size - 6)
-        return jnp.concatenate([stiffness, others]), jnp.concatenate([damping, others])
+        return found and (jnp.concatenate([found[0], others]), jnp.concatenate([found[1], others]))
 
     def rest(self, s: Any) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
         """Return the rod's state at rest, with zero tension and zero friction."""
@@ -321,28 +314,13 @@ class RoutedTendonRobot(TendonRod):
         return z if self.relaxation is None else z.at[self.z_layout.slice("u_branch")].set(z[3:6])
 
     def _ways(self, s: Any) -> Float[Any, " c"]:
-        """Return the tendons' lengths in the unloaded robot from the base to s, by Gauss quadrature."""
-        nodes, weights = np.polynomial.legendre.leggauss(GAUSS)
-        ways = []
-        for k, routing in enumerate(self.routings):
-            last = jnp.minimum(s, routing.end * self.length)
-            at = 0.5 * (nodes + 1.0) * jnp.asarray(last)[..., None]
-
-            def stretched(place: Any, k: int = k) -> Any:
-                r, r_s = routes((self.routings[k],), place / self.length, self.length)
-                u = self.material(place, np.zeros(self.control_size)).u_star
-                return stretches(jnp.asarray(self.v_star), jnp.asarray(u), jnp.asarray(r), jnp.asarray(r_s))[
-                    0
-                ]
-
-            ways.append(0.5 * last * jnp.sum(weights * jax.vmap(stretched)(at)))
-        return jnp.stack(ways)
+        """Return the tendons' lengths in the unloaded robot from the base to s."""
+        none = np.zeros(self.control_size)
+        return path_lengths(self.routings, s, self.length, lambda at: self.material(at, none).u_star)
 
     # the equations
 
-    def constitutive(
-        self, s: Any, t: Any, y: Float[Any, " y"], y_t: Float[Any, " y"], control: Any
-    ) -> MaterialLaw | InternalState:
+    def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
         """Return the law of v and u with the tendons, and of the internal variables."""
         if self.vibration is None:
             return self._law(s, y, control)
@@ -360,9 +338,7 @@ class RoutedTendonRobot(TendonRod):
         material, tension = self.material(s, control), self.tension_at(s, y, control)
         v, u = law.strains["v"], law.strains["u"]
         if shaken is not None:
-            u = u._replace(softening=shaken)
-            if self.sections:
-                u = u._replace(stress=u.stress - dot(shaken, material.u_star))
+            u = u._replace(softening=shaken, stress=u.stress - dot(shaken, material.u_star))
         if self.rib_spacing is not None:
             # tendons press on the bent rod, including its intrinsic curvature
             remaining = u.stiffness if shaken is None else u.stiffness - shaken
@@ -371,19 +347,15 @@ class RoutedTendonRobot(TendonRod):
         if self.relaxation is not None:
             u = u._replace(branch=self.relaxation.branch(material.Kbt))
         nominal = self._where_it_runs(s, self.base_tension(y, control))
-        friction = None if self.friction is None else self._friction(self.friction, s, material.u_star)
-        return MaterialLaw({"v": v, "u": u}, Tendons(*self.routes_at(s), tension, nominal), friction)
+        tendons = Tendons(*self.routes_at(s), tension, nominal)
 
-    def _friction(self, friction: TendonFriction, s: Any, u_star: Any) -> Callable[[Fields, Fields], Any]:
         def evolutions(strains: Fields, rates: Fields) -> dict[str, Evolution]:
-            return {"f": friction.evolution(self.bending_directions(s), rates["u"], strains["u"] - u_star)}
+            directions, bent = self.bending_directions(s), strains["u"] - material.u_star
+            return {"f": self.friction.evolution(directions, rates["u"], bent)}  # type: ignore[union-attr]
 
-        return evolutions
+        return MaterialLaw({"v": v, "u": u}, tendons, None if self.friction is None else evolutions)
 
-    def balance(
-        self, s: Any, t: Any, y: Float[Any, " y"], y_t: Float[Any, " y"], z: Float[Any, " z"],
-        z_t: Float[Any, " z"], control: Any,
-    ) -> Float[Any, " y"]:  # fmt: skip
+    def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
         """Return y_s of the rod, of the tension, and of the tendons' path lengths."""
         rates = [super().balance(s, t, y, y_t, z, z_t, control)]
         v, u = self.z_layout.get(z, "v"), self.z_layout.get(z, "u")

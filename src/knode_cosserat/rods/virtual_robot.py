@@ -68,9 +68,7 @@ class VirtualRobot(TendonRod):
         T = jnp.asarray(control) * (1.0 - loss)
         return self.tendon_offset * jnp.stack([jnp.sum(T * y), -jnp.sum(T * x), jnp.zeros(())])
 
-    def constitutive(
-        self, s: Any, t: Any, y: Float[Any, " y"], y_t: Float[Any, " y"], control: Any
-    ) -> MaterialLaw:
+    def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
         """Return the law of v and u with the tendons."""
         n, m = self.stresses(y)
         pulled = n - jnp.sum(jnp.asarray(control)) * np.array([0.0, 0.0, 1.0])
@@ -79,10 +77,7 @@ class VirtualRobot(TendonRod):
         u = Viscoelastic(self.stiffness(s), self.bending_damping, m, moment=moment)
         return MaterialLaw({"v": v, "u": u})
 
-    def balance(
-        self, s: Any, t: Any, y: Float[Any, " y"], y_t: Float[Any, " y"], z: Float[Any, " z"],
-        z_t: Float[Any, " z"], control: Any,
-    ) -> Float[Any, " y"]:  # fmt: skip
+    def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
         """Return y_s of a rod without tendons, with the ribs' masses."""
         away = (s / self.length - np.array(RIBS)) * self.length / RIB_WIDTH
         # a Gaussian, with half of the last one beyond the tip

@@ -37,9 +37,7 @@ class ViscoelasticRod(SlenderRod):
         z = super().unstressed(s, control)[:6]
         return jnp.concatenate([z, z])
 
-    def constitutive(
-        self, s: Any, t: Any, y: Float[Any, " y"], y_t: Float[Any, " y"], control: Any
-    ) -> MaterialLaw:
+    def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
         """Return the elastic rod's law with a Maxwell branch for each strain."""
         law = self.linear_law(s, y, control)
         r, time = self.branch_stiffness, self.relaxation_time

@@ -40,9 +40,7 @@ class CurvedMaterial(TendonRobot):
     def extra_moment(self, u: Float[Any, "3"], u_t: Float[Any, "3"]) -> Float[Any, "3"]:
         """μ (N·m), material frame."""
 
-    def constitutive(
-        self, s: Any, t: Any, y: Float[Any, " y"], y_t: Float[Any, " y"], control: Any
-    ) -> MaterialLaw:
+    def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
         """Return the linear law of v, and the law of u with this moment."""
         strains = self.linear_law(s, y, control).strains
         moment = jax.tree_util.Partial(_moment, self)
@@ -110,9 +108,7 @@ class Tapered(TendonRobot):
         part = 1.0 - self.tip_softening * s / self.length
         return derived_robot(TendonRobot, self, youngs_modulus=self.youngs_modulus * part)
 
-    def constitutive(
-        self, s: Any, t: Any, y: Float[Any, " y"], y_t: Float[Any, " y"], control: Any
-    ) -> MaterialLaw:
+    def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
         """Return the constitutive law of a rod with the modulus at s."""
         return self._there(s).linear_law(s, y, control)
 
@@ -156,10 +152,7 @@ class ExternalFriction(TendonRobot):
     least: Any = parameter("rad/s", "angular velocity from which it is full", low=1e-9, high=1e6, default=0.5)
     law: Rubbing = eqx.field(static=True, default="each axis")
 
-    def balance(
-        self, s: Any, t: Any, y: Float[Any, " y"], y_t: Float[Any, " y"], z: Float[Any, " z"],
-        z_t: Float[Any, " z"], control: Any,
-    ) -> Float[Any, " y"]:  # fmt: skip
+    def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
         """Return the rates with this robot's additional effect."""
         y_s = super().balance(s, t, y, y_t, z, z_t, control)
         R = rotation_matrix(self.y_layout.get(y, "h"))
@@ -178,10 +171,7 @@ class Wind(TendonRobot):
         default=(3.0, 0.0, 0.0),
     )  # fmt: skip
 
-    def balance(
-        self, s: Any, t: Any, y: Float[Any, " y"], y_t: Float[Any, " y"], z: Float[Any, " z"],
-        z_t: Float[Any, " z"], control: Any,
-    ) -> Float[Any, " y"]:  # fmt: skip
+    def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
         """Return the rates with this robot's additional effect."""
         y_s = super().balance(s, t, y, y_t, z, z_t, control)
         R, q = rotation_matrix(self.y_layout.get(y, "h")), self.y_layout.get(y, "q")
@@ -195,10 +185,7 @@ class TurningTendons(TendonRobot):
 
     turning: Any = parameter("", "part of the tendons' force that turns", low=0.0, high=1.0, default=1.0)
 
-    def balance(
-        self, s: Any, t: Any, y: Float[Any, " y"], y_t: Float[Any, " y"], z: Float[Any, " z"],
-        z_t: Float[Any, " z"], control: Any,
-    ) -> Float[Any, " y"]:  # fmt: skip
+    def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
         """Return the rates with this robot's additional effect."""
         y_s = super().balance(s, t, y, y_t, z, z_t, control)
         f = self.actuation(control)
@@ -211,10 +198,7 @@ class FadingTendons(TendonRobot):
 
     loss: Any = parameter("1/m", "part of the tension lost per length", low=0.0, high=100.0, default=0.3)
 
-    def balance(
-        self, s: Any, t: Any, y: Float[Any, " y"], y_t: Float[Any, " y"], z: Float[Any, " z"],
-        z_t: Float[Any, " z"], control: Any,
-    ) -> Float[Any, " y"]:  # fmt: skip
+    def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
         """Return y_s under the tension remaining at s."""
         return super().balance(s, t, y, y_t, z, z_t, jnp.asarray(control) * jnp.exp(-self.loss * s))
 
