@@ -2,6 +2,7 @@
 
 from knode_cosserat.rods import ends, loads, routing, surroundings
 from knode_cosserat.rods.anchors import EarlyAnchors
+from knode_cosserat.rods.law import Evolution, InternalState, MaterialLaw, MaxwellBranch, Viscoelastic
 from knode_cosserat.rods.layout import Field, Layout
 from knode_cosserat.rods.load_cells import LoadCells
 from knode_cosserat.rods.parallel_robot import ParallelRobot
@@ -22,10 +23,14 @@ from knode_cosserat.rods.tendon_robot import TendonRobot
 __all__ = [
     "Differences",
     "EarlyAnchors",
+    "Evolution",
     "Field",
     "FunctionSection",
+    "InternalState",
     "Layout",
     "LoadCells",
+    "MaterialLaw",
+    "MaxwellBranch",
     "ParallelRobot",
     "ParameterError",
     "Reels",
@@ -42,6 +47,7 @@ __all__ = [
     "TendonFriction",
     "TendonRobot",
     "Vibration",
+    "Viscoelastic",
     "catalog",
     "ends",
     "load_robot",

@@ -312,7 +312,7 @@ def unknown_count(system: System) -> int:
     return len(system.y_layout.indices(system.base_unknowns))
 
 
-def scaled(system: System, factor: Any) -> System:
+def with_length_factor(system: System, factor: Any) -> System:
     """Return the system with the length of its nominal robot multiplied by a factor."""
     return system.replace(length=system.nominal.length * factor)
 

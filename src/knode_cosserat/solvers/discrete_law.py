@@ -56,7 +56,7 @@ def discrete_law(law: Any, layout: Layout, c0: Any, hz: Float[Any, " z"]) -> Dis
     """Return a law in time (`System.constitutive`) for one time step; `layout` is that of z."""
     if isinstance(law, InternalState):
         internal = {
-            name: advanced(evolution, layout.get(hz, name), c0) for name, evolution in law.evolutions.items()
+            name: evolved(evolution, layout.get(hz, name), c0) for name, evolution in law.evolutions.items()
         }
         return MaterialStep(law.law(internal), layout, c0, hz, internal)
     if isinstance(law, MaterialLaw):
@@ -66,7 +66,7 @@ def discrete_law(law: Any, layout: Layout, c0: Any, hz: Float[Any, " z"]) -> Dis
     return StatedStrains(law)
 
 
-def advanced(evolution: Evolution, h: Any, c0: Any) -> Any:
+def evolved(evolution: Evolution, h: Any, c0: Any) -> Any:
     """Return an internal variable from its rate and history h; in an equilibrium, c0 = 0, its value at rest.
 
     The variable is kept within its bounds.
@@ -194,7 +194,7 @@ class MaterialStep:
         if self.law.internal is not None:
             rates = {name: self._rate(name, value) for name, value in strains.items()}
             for name, evolution in self.law.internal(strains, rates).items():
-                found[name] = advanced(evolution, self.history[name], self.c0)
+                found[name] = evolved(evolution, self.history[name], self.c0)
         return found
 
     def _dashpot(self, branch: MaxwellBranch, strain: Any) -> Any:

@@ -23,7 +23,7 @@ from jaxtyping import Float
 from knode_cosserat.learning.residual import Residual
 from knode_cosserat.learning.structured.expansion import Expansion
 from knode_cosserat.rods.layout import Field, Layout
-from knode_cosserat.rods.system import System, scaled
+from knode_cosserat.rods.system import System, with_length_factor
 from knode_cosserat.rotation import dot, rotation_matrix, small_inverse
 from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.semi_discrete import Point
@@ -122,7 +122,7 @@ class Structured(Residual):
 
     def adapted(self, knowledge: System) -> System:
         """Return the nominal model with corrected length."""
-        return scaled(knowledge, 1.0 + self.stretch)
+        return with_length_factor(knowledge, 1.0 + self.stretch)
 
     def derivatives(self, knowledge: System, point: Point) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
         """Return y_s and z: strains are corrected first, then loads are added to the balance equations."""

@@ -82,15 +82,15 @@ def nominal_predictions(
         history = unpacked_history(knowledge, sample.c0, record)
         return Point(s, sample.t, y, sample.control, history)
 
-    def scaled(point: Point, z: Any) -> Any:
+    def inputs_at(point: Point, z: Any) -> Any:
         return (net.inputs(knowledge, point, z) - net.input_mean) / net.input_scale
 
     def one(sample: Samples) -> Any:
         y, z = predict_segment(knowledge, space, sample)
-        inputs = [scaled(at(start_of(knowledge, sample.place), sample, sample.y, sample.history[0]), z)]
+        inputs = [inputs_at(at(start_of(knowledge, sample.place), sample, sample.y, sample.history[0]), z)]
         if space.implicit:
             end = at(end_of(knowledge, sample.place), sample, sample.y_next, sample.history[1])
-            inputs.append(scaled(end, semi_discrete.strains(knowledge, end)))
+            inputs.append(inputs_at(end, semi_discrete.strains(knowledge, end)))
         return inputs, y, z
 
     inputs, y, z = jax.vmap(one, out_axes=-1)(samples)
