@@ -17,6 +17,7 @@ import numpy as np
 import scipy.linalg
 
 import knode_cosserat as kc
+from knode_cosserat.rods.system import unknowns_of
 from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.space import SCHEMES
 
@@ -27,7 +28,7 @@ STEP = 1e-4
 @functools.partial(jax.jit, static_argnames="space")
 def _tip_response(system: Any, control: Any, y: Any, space: Any) -> Any:
     problem = StepProblem.still(system, space, control)
-    found = problem.linearise(problem.filled(y), system.unknowns(y[0]))
+    found = problem.linearise(problem.filled(y), unknowns_of(system, y[0]))
     last, _ = jax.lax.scan(lambda X, F_j: (F_j @ X, None), found.base, found.F)
     return found.tip @ last
 

@@ -38,7 +38,7 @@ class HangingString(kc.System):
         n = 9.81 * self.density * self.length * jnp.stack([1.0, x])
         return jnp.stack([s, 0.5 * self.length * (x**2 - 0.25), *n, 0.0, 0.0]), jnp.linalg.norm(n)[None]
 
-    def tip(self, t, control, y, history):  # the hand holds it
+    def tip(self, t, control, y, y_t):  # the hand holds it
         return y[:2] - control
 
     def scales(self):  # natural sizes of y, and of what is left at the tip

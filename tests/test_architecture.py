@@ -2,6 +2,7 @@
 
 import ast
 import graphlib
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -121,3 +122,9 @@ def test_packages_depend_in_one_direction() -> None:
         if layer_of(other) > layer_of(name)
     ]
     assert not upwards
+
+
+def test_physics_knows_no_time_scheme() -> None:
+    words = re.compile(r"\bc0\b|history", re.IGNORECASE)
+    found = {name: words.findall(MODULES[name].read_text()) for name in MODULES if name.startswith("rods")}
+    assert not {name: each for name, each in found.items() if each}

@@ -17,6 +17,8 @@ from knode_cosserat.learning.residual import Nothing, Residual, network
 from knode_cosserat.learning.structured.expansion import CURVED, LINEAR, expansion
 from knode_cosserat.learning.structured.residual import Structured
 from knode_cosserat.rotation import cross, quaternion_rate, rotation_matrix
+from knode_cosserat.solvers import semi_discrete
+from knode_cosserat.solvers.semi_discrete import History, Point
 from knode_cosserat.viewer import drawing
 
 DT, STEPS = 0.05, 12
@@ -50,8 +52,8 @@ class Cane(kc.System):
         B = jnp.concatenate([jnp.zeros(3), self.damping * jnp.ones(3)])
         return jnp.diag(K), jnp.diag(B), stress + K * np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 
-    def rates(self, s, t, y, z, control, history):
-        get, y_t, z_t = self.y_layout.get, history.c0 * y + history.y, history.c0 * z + history.z
+    def balance(self, s, t, y, y_t, z, z_t, control):
+        get = self.y_layout.get
         (v, u), (v_t, u_t), R = self.z_layout.split(z), self.z_layout.split(z_t), rotation_matrix(get(y, "h"))
         q, w, q_t, w_t = get(y, "q"), get(y, "w"), get(y_t, "q"), get(y_t, "w")
         push = jnp.concatenate([control, jnp.zeros(1)])
@@ -66,7 +68,7 @@ class Cane(kc.System):
         y = jnp.concatenate([p, np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(12)])
         return y, jnp.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 
-    def tip(self, t, control, y, history):
+    def tip(self, t, control, y, y_t):
         return jnp.concatenate([self.y_layout.get(y, "n"), self.y_layout.get(y, "m")])
 
 
@@ -294,9 +296,9 @@ class Pull(Residual):
 
     size: Any
 
-    def derivatives(self, knowledge, s, t, y, control, history):
-        y_s, z = knowledge.derivatives(s, t, y, control, history)
-        return y_s.at[7].add(self.size), z.at[4].add(self.size * y[10])
+    def derivatives(self, knowledge, point):
+        y_s, z = semi_discrete.derivatives(knowledge, point)
+        return y_s.at[7].add(self.size), z.at[4].add(self.size * point.y[10])
 
 
 @functools.cache
@@ -327,17 +329,17 @@ def test_the_parts_of_a_model_s_equations_agree(name, nominal):
     model = with_network(nominal, 3) if name == "network" else kc.KNODE(nominal, residuals()[name])
     rng = np.random.default_rng(7)
     y = np.concatenate([np.zeros(3), [1.0, 0.1, 0.2, 0.0], 0.1 * rng.normal(size=12)])
-    history = kc.robots.History(20.0, *(0.1 * rng.normal(size=size) for size in (19, 6, 19)))
+    history = History(20.0, *(0.1 * rng.normal(size=size) for size in (19, 6, 19)))
     control = rng.uniform(1.0, 3.0, nominal.control_size)
-    at = (0.1, 0.0, y)
-    y_s, z = model.derivatives(*at, control, history)
-    np.testing.assert_allclose(model.strains(*at, control, history), z, rtol=1e-10, atol=1e-12)
-    np.testing.assert_allclose(model.rates(*at, z, control, history), y_s, rtol=1e-9, atol=1e-10)
-    matrix = model.law_matrix(*at, z, control, history)
+    point = Point(0.1, 0.0, y, control, history)
+    y_s, z = semi_discrete.derivatives(model, point)
+    np.testing.assert_allclose(semi_discrete.strains(model, point), z, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(semi_discrete.rates(model, point, z), y_s, rtol=1e-9, atol=1e-10)
+    law = semi_discrete.law(model, point)
+    matrix = law.matrix(z)
     size = np.abs(matrix) @ np.abs(z)
-    assert np.all(np.abs(model.left_of_law(*at, z, control, history)) < 1e-9 * size + 1e-12)
+    assert np.all(np.abs(law.residual(z)) < 1e-9 * size + 1e-12)
     step = 1e-3 * rng.normal(size=6)
-    moved = model.left_of_law(*at, z + step, control, history)
-    if model.linear_law:
+    moved = law.residual(z + step)
+    if law.linear:
         np.testing.assert_allclose(moved, matrix @ step, rtol=1e-6, atol=1e-9 * np.max(size))
-    assert model.law_of_stresses

@@ -156,7 +156,7 @@ class Hanging(kc.System):
     def rest(self, s):
         raise NotImplementedError
 
-    def tip(self, t, control, y, history):
+    def tip(self, t, control, y, y_t):
         raise NotImplementedError
 
 

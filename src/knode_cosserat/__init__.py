@@ -90,11 +90,13 @@ __all__ = [
 #: names that used to be here, by the namespace that has them now
 _MOVED = {
     "robots": (
-        "Differences Field FunctionSection History Layout ParallelRobot ParameterError RobotFileError Rod "
+        "Differences Field FunctionSection Layout ParallelRobot ParameterError RobotFileError Rod "
         "RoutedTendonRobot Scales SlenderRod Stretch TendonRobot ends loads parameter robot_schema routing "
         "surroundings"
     ),
-    "solvers": ("BDF1 BDF2 BDFAlpha Euler Lobatto2 Lobatto4 NewtonOptions Settings Stepper Trapezoidal"),
+    "solvers": (
+        "BDF1 BDF2 BDFAlpha Euler History Lobatto2 Lobatto4 NewtonOptions Settings Stepper Trapezoidal"
+    ),
     "learning": (
         "CheckpointError ConfigError DataError Ensemble FitError ModelFileError NetworkOptions "
         "PassiveOptions Residual RolloutTraining StructuredOptions Training load_ensemble"

@@ -2,6 +2,7 @@
 
 from knode_cosserat.rods import ends, loads, routing, surroundings
 from knode_cosserat.rods.anchors import EarlyAnchors
+from knode_cosserat.rods.law import Evolution, InternalState, MaterialLaw, MaxwellBranch, Viscoelastic
 from knode_cosserat.rods.layout import Field, Layout
 from knode_cosserat.rods.load_cells import LoadCells
 from knode_cosserat.rods.parallel_robot import ParallelRobot
@@ -15,18 +16,21 @@ from knode_cosserat.rods.rod import Rod
 from knode_cosserat.rods.routed_robot import RoutedTendonRobot
 from knode_cosserat.rods.section import Differences, FunctionSection, Sleeve, Stretch
 from knode_cosserat.rods.slender_rod import SlenderRod
-from knode_cosserat.rods.system import History, Scales, System
+from knode_cosserat.rods.system import Scales, System
 from knode_cosserat.rods.tendon_friction import TendonFriction, Vibration
 from knode_cosserat.rods.tendon_robot import TendonRobot
 
 __all__ = [
     "Differences",
     "EarlyAnchors",
+    "Evolution",
     "Field",
     "FunctionSection",
-    "History",
+    "InternalState",
     "Layout",
     "LoadCells",
+    "MaterialLaw",
+    "MaxwellBranch",
     "ParallelRobot",
     "ParameterError",
     "Reels",
@@ -43,6 +47,7 @@ __all__ = [
     "TendonFriction",
     "TendonRobot",
     "Vibration",
+    "Viscoelastic",
     "catalog",
     "ends",
     "load_robot",

@@ -25,19 +25,17 @@ class Bar(kc.System):
     damping: Any = kc.robots.parameter("N s", "of the material", low=0.0, high=1e3, default=0.0)
     drag: Any = kc.robots.parameter("kg/m2", "of the air, square law", low=0.0, high=100.0, default=0.0)
 
-    def strains(self, s, t, y, control, history):
-        EA, B = self.stiffness, self.damping
-        return (y[1:2] + EA - B * history.z) / (EA + history.c0 * B)
+    def constitutive(self, s, t, y, y_t, control):
+        return self.stiffness * jnp.eye(1), self.damping * jnp.eye(1), y[1:2] + self.stiffness
 
-    def rates(self, s, t, y, z, control, history):
-        y_t, z_t = history.c0 * y + history.y, history.c0 * z + history.z
+    def balance(self, s, t, y, y_t, z, z_t, control):
         q = y[2:]
         return jnp.concatenate([z, self.density * y_t[2:] + self.drag * q * jnp.abs(q), z_t])
 
     def rest(self, s):
         return jnp.stack([jnp.asarray(s, dtype=float), jnp.zeros(()), jnp.zeros(())]), jnp.ones(1)
 
-    def tip(self, t, control, y, history):
+    def tip(self, t, control, y, y_t):
         return control - y[1:2]
 
 

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 import knode_cosserat as kc
 from examples.hanging_string import HangingString
 from knode_cosserat.learning.passive import passive
-from knode_cosserat.rods.system import History
+from knode_cosserat.solvers import semi_discrete
+from knode_cosserat.solvers.semi_discrete import History, Point
 
 ROBOT = kc.load_robot("delrin-tendon-robot").replace(bending_damping=1e-3, nodes=5)
 TENSION = np.array([7.0, 5.0, 3.0, 5.0])
@@ -60,8 +61,10 @@ def test_the_law_has_its_moment():
     s, c0 = 0.4 * float(ROBOT.length), 20.0
     y = np.concatenate([np.zeros(3), [1.0, 0.0, 0.0, 0.0], 0.1 * rng.normal(size=12)])
     history = History(jnp.asarray(c0), jnp.zeros(19), jnp.asarray(0.1 * rng.normal(size=6)), jnp.zeros(19))
-    _, z = kc.KNODE(ROBOT, residual).derivatives(s, 0.0, jnp.asarray(y), jnp.asarray(TENSION), history)
-    left = np.asarray(ROBOT.left_of_law(s, 0.0, y, z, TENSION, history))[3:]
+    _, z = semi_discrete.derivatives(
+        kc.KNODE(ROBOT, residual), Point(s, 0.0, jnp.asarray(y), jnp.asarray(TENSION), history)
+    )
+    left = np.asarray(semi_discrete.law_residual(ROBOT, Point(s, 0.0, y, TENSION, history), z))[3:]
     changed, moment = residual.changed(ROBOT, s, y, TENSION)
     u, u_t = np.asarray(z)[3:], np.asarray(c0 * z + history.z)[3:]
     own = (np.asarray(changed.Kbt) - np.asarray(ROBOT.Kbt)) @ u + np.asarray(moment)
@@ -102,6 +105,7 @@ def test_a_residual_on_a_model_starts_without_effect():
     y = np.concatenate([np.zeros(3), [1.0, 0.1, 0.2, 0.0], rng.normal(size=12)])
     history = History(20.0, *(0.1 * rng.normal(size=size) for size in (19, 6, 19)))
     for found, expected in zip(
-        *(each.derivatives(0.2, 0.0, y, TENSION, history) for each in (both, model)), strict=True
+        *(semi_discrete.derivatives(each, Point(0.2, 0.0, y, TENSION, history)) for each in (both, model)),
+        strict=True,
     ):
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)

@@ -31,8 +31,8 @@ class TipLoaded(kc.robots.TendonRobot):
     tip_force: Any = eqx.field(converter=_vector, default=(0.0, 0.0, 0.0))
     tip_moment: Any = eqx.field(converter=_vector, default=(0.0, 0.0, 0.0))
 
-    def tip(self, t, control, y, history):
-        return super().tip(t, control, y, history) + jnp.concatenate([self.tip_force, self.tip_moment])
+    def tip(self, t, control, y, y_t):
+        return super().tip(t, control, y, y_t) + jnp.concatenate([self.tip_force, self.tip_moment])
 
 
 def rod(*, nodes=21, **changes):
@@ -190,17 +190,17 @@ class Bar(kc.System):
     length: Any = 1.0
     nodes: int = eqx.field(static=True, default=11)
 
-    def derivatives(self, s, t, y, control, history):
-        _, n, q = y
-        c0, h_v = history.c0, history.z[0]
-        v = (n + 1.0 - self.damping * h_v) / (1.0 + c0 * self.damping)
-        n_s = c0 * q + history.y[2] - control[0] * jnp.sin(self.wave_number * s)
-        return jnp.stack([v, n_s, c0 * v + h_v]), v[None]
+    def constitutive(self, s, t, y, y_t, control):
+        return jnp.eye(1), self.damping * jnp.eye(1), y[1:2] + 1.0
+
+    def balance(self, s, t, y, y_t, z, z_t, control):
+        n_s = y_t[2] - control[0] * jnp.sin(self.wave_number * s)
+        return jnp.stack([z[0], n_s, z_t[0]])
 
     def rest(self, s):
         return jnp.stack([s, jnp.zeros(()), jnp.zeros(())]), jnp.ones(1)
 
-    def tip(self, t, control, y, history):
+    def tip(self, t, control, y, y_t):
         return self.y_layout.get(y, "n")
 
     def amplitude(self, load, dt):

@@ -383,7 +383,7 @@ class Pendulum(kc.System):
     def rest(self, s):
         return np.zeros(1), np.zeros(0)
 
-    def tip(self, t, control, y, history):
+    def tip(self, t, control, y, y_t):
         return np.zeros(0)
 
 

@@ -123,17 +123,20 @@ class Bar(kc.System):
     drag: Any = 0.5
     nodes: int = eqx.field(static=True, default=8)
 
-    def derivatives(self, s, t, y, control, history):
-        _, n, q = y
-        c0, h_v = history.c0, history.z[0]
-        v = (1.0 + self.softness * n + self.softening * n**3 - self.damping * h_v) / (1.0 + c0 * self.damping)
-        n_s = self.mass * (c0 * q + history.y[2]) + self.drag * q * jnp.abs(q) - control[0]
-        return jnp.stack([v, n_s, c0 * v + h_v]), v[None]
+    def constitutive(self, s, t, y, y_t, control):
+        n = y[1:2]
+        stretch = 1.0 + self.softness * n + self.softening * n**3
+        return jnp.eye(1), self.damping * jnp.eye(1), stretch
+
+    def balance(self, s, t, y, y_t, z, z_t, control):
+        q = y[2]
+        n_s = self.mass * y_t[2] + self.drag * q * jnp.abs(q) - control[0]
+        return jnp.stack([z[0], n_s, z_t[0]])
 
     def rest(self, s):
         return jnp.stack([s, jnp.zeros(()), jnp.zeros(())]), jnp.ones(1)
 
-    def tip(self, t, control, y, history):
+    def tip(self, t, control, y, y_t):
         return self.y_layout.get(y, "n")
 
 

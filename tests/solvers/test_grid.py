@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import settings as given_settings
 
 import knode_cosserat as kc
+from knode_cosserat.rods.system import unknowns_of
 from knode_cosserat.solvers.grid import Grid, at_places, grid_of, taken
 from knode_cosserat.solvers.history import constant_history, rest_record
 from knode_cosserat.solvers.problem import StepProblem
@@ -204,7 +205,7 @@ def test_pieces_side_by_side_as_one_after_the_other(space, changes):
 
     def everything(nodes):
         y = problem.filled(nodes)
-        return y, problem.reached(y), problem.linearise(y, robot.unknowns(y[0]))
+        return y, problem.reached(y), problem.linearise(y, unknowns_of(robot, y[0]))
 
     y_points, ends, linearisation = jax.jit(everything)(jnp.asarray(y))
     np.testing.assert_array_equal(y_points[grid.nodes], y)

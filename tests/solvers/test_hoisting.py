@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
+from knode_cosserat.rods.system import unknowns_of
 from knode_cosserat.rods.tendon_friction import TendonFriction
 from knode_cosserat.solvers.grid import at_places
 from knode_cosserat.solvers.history import rest_record
@@ -78,7 +79,7 @@ def test_nothing_comes_out_differently(name, space):
 
     def all_of(prepared):
         own = problem.ready() if prepared else problem
-        return own.linearise(y, robot.unknowns(y[0])), own.reached(y), own.records(y)
+        return own.linearise(y, unknowns_of(robot, y[0])), own.reached(y), own.records(y)
 
     scale, own = (np.asarray(system.scales().y) for system in (robot, robot.strand))
     natural = own / own[:, None]

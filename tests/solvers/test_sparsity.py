@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.rods.system import unpacked_history
 from knode_cosserat.solvers.problem import no_history
+from knode_cosserat.solvers.semi_discrete import Point, derivatives, unpacked_history
 from knode_cosserat.solvers.space import LOBATTO2
 from knode_cosserat.solvers.sparsity import nonzero_columns
 
@@ -58,8 +58,8 @@ def test_never_fewer_than_the_derivatives_say(function):
 class Tethered(kc.robots.SlenderRod):
     """A rod that a spring pulls back to its axis: its position enters."""
 
-    def rates(self, s, t, y, z, control, history):
-        y_s = super().rates(s, t, y, z, control, history)
+    def balance(self, s, t, y, y_t, z, z_t, control):
+        y_s = super().balance(s, t, y, y_t, z, z_t, control)
         return self.y_layout.replaced(y_s, ("n",), self.y_layout.get(y_s, "n") + self.y_layout.get(y, "p"))
 
 
@@ -68,7 +68,8 @@ def fields_that_enter(robot):
     layout = robot.y_layout
 
     def equations(y, x, control):
-        return robot.derivatives(0.1, 0.0, y, control, unpacked_history(robot, jnp.ones(()), x))
+        history = unpacked_history(robot, jnp.ones(()), x)
+        return derivatives(robot, Point(0.1, 0.0, y, control, history))
 
     x = jnp.zeros(no_history(robot, LOBATTO2).shape[1])
     closed = jax.make_jaxpr(equations)(robot.rest(0.1)[0], x, jnp.zeros(robot.control_size))

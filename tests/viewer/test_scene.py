@@ -187,7 +187,7 @@ class Flat(kc.System):
     def rest(self, s):
         raise NotImplementedError
 
-    def tip(self, t, control, y, history):
+    def tip(self, t, control, y, y_t):
         raise NotImplementedError
 
 

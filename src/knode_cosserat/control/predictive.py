@@ -120,10 +120,10 @@ class PredictiveController(Controller):
                 f"the reference has {wanted.shape[1]} numbers; the target has {self.target.size}: "
                 f"{', '.join(self.target.labels)}"
             )
-        own = self.observer
+        observer, limited = self.observer, tuple(soft.output for soft in self.soft)
         found = linearised_prediction(
-            own.robot, own.x, own.past, own.spread, self._plan, self.knots.basis, wanted,
-            own.coefficients, own.settings, self.target, tuple(each.output for each in self.soft), own.parameters,
+            observer.robot, observer.x, observer.past, observer.spread, self._plan, self.knots.basis, wanted,
+            observer.coefficients, observer.settings, self.target, limited, observer.parameters,
         )  # fmt: skip
         if bool(found.solved):
             self._prediction = Prediction(*(np.asarray(part) for part in found))

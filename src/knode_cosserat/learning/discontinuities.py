@@ -13,8 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.rods.system import System, unpacked_history
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.grid import ON_NODE, grid_of
+from knode_cosserat.solvers.semi_discrete import unpacked_history
 from knode_cosserat.solvers.settings import Settings
 
 
@@ -39,7 +41,7 @@ def far_side(
 @jax.jit
 def _jump(knowledge, acting, t, c0, y, control, history):  # type: ignore[no-untyped-def]
     def at_node(acting: Any, t: Any, c0: Any, y: Any, control: Any, record: Any) -> Any:
-        return knowledge.jump(acting, t, y, control, unpacked_history(knowledge, c0, record))
+        return semi_discrete.jump(knowledge, acting, t, y, control, unpacked_history(knowledge, c0, record))
 
     at_row = jax.vmap(at_node, in_axes=(0, None, None, 0, None, 0))
     return jax.vmap(at_row, in_axes=(None, 0, 0, 0, 0, 0))(

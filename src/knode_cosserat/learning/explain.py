@@ -13,7 +13,9 @@ from knode_cosserat.learning.samples import Samples, samples, start_of
 from knode_cosserat.learning.structured.expansion import Expansion, Term
 from knode_cosserat.learning.structured.residual import Structured, ambient_layout, loaded, material_layout
 from knode_cosserat.rods.layout import Layout
-from knode_cosserat.rods.system import System, unpacked_history
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers import semi_discrete
+from knode_cosserat.solvers.semi_discrete import Point, unpacked_history
 from knode_cosserat.trajectory import Trajectory
 
 
@@ -145,6 +147,6 @@ def _derivatives(system: System, data: Samples) -> Any:
     def one(sample: Samples) -> Any:
         history = unpacked_history(system, sample.c0, sample.history[0])
         s = start_of(system, sample.place)
-        return system.derivatives(s, sample.t, sample.y, sample.control, history)
+        return semi_discrete.derivatives(system, Point(s, sample.t, sample.y, sample.control, history))
 
     return jax.vmap(one)(data)

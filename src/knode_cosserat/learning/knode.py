@@ -5,13 +5,12 @@ from __future__ import annotations
 from typing import Any, Self
 
 import equinox as eqx
-import jax
 from jaxtyping import Float
 
 from knode_cosserat._registry import provided
 from knode_cosserat._reprs import count_of, quantity, robot_text, wrapped
 from knode_cosserat.learning.residual import Residual
-from knode_cosserat.rods.system import History, System, of_strands
+from knode_cosserat.rods.system import Correction, System
 from knode_cosserat.rods.trained_range import TrainedRange
 from knode_cosserat.rods.wrapped import Wrapped
 
@@ -72,58 +71,18 @@ class KNODE(Wrapped):
         """Nominal model with the residual's parameter changes."""
         return self.residual.adapted(self.knowledge)
 
-    # the equations with the residual; it is the same for all strands
-
-    def derivatives(
-        self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
-    ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-        """Return y_s and z of the nominal model with the residual (paper eq. 7, KNODE model)."""
-        if self.strands > 1:
-            return of_strands(self, s, t, y, control, history)
-        return self.residual.derivatives(self.adapted, s, t, y, control, history)
-
-    def strains(
-        self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
-    ) -> Float[Any, " z"]:
-        """Return z of the nominal model with the residual."""
-        if self.strands > 1:
-            return self.derivatives(s, t, y, control, history)[1]
-        return self.residual.strains(self.adapted, s, t, y, control, history)
-
-    def rates(
-        self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
-    ) -> Float[Any, " y"]:
-        """Return y_s at strains z; with several strands, at the strains of their law."""
-        if self.strands > 1:
-            return self.derivatives(s, t, y, control, history)[0]
-        return self.residual.rates(self.adapted, s, t, y, z, control, history)
-
-    def left_of_law(
-        self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
-    ) -> Float[Any, " z"]:
-        """Return the residual of the law of the strains at z, with the learned one."""
-        if self.strands > 1:
-            return z - self.strains(s, t, y, control, history)
-        return self.residual.left_of_law(self.adapted, s, t, y, z, control, history)
-
     @property
-    def linear_law(self) -> bool:  # type: ignore[override]
-        """True if the law is linear in the strains, with the residual."""
-        return self.knowledge.linear_law and self.residual.linear
-
-    def law_matrix(
-        self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
-    ) -> Float[Any, "z z"]:
-        """Return the derivative of `left_of_law` by z."""
-        return jax.jacfwd(lambda z: self.left_of_law(s, t, y, z, control, history))(z)
+    def correction(self) -> Correction:
+        """The adapted nominal model and its residual (paper eq. 7, KNODE model); several strands share it."""
+        return Correction(self.adapted, self.residual)
 
     # a residual is not of the general form
     constitutive = System.constitutive
     balance = System.balance
 
-    def tip(self, t: Any, control: Any, y: Float[Any, " y"], history: History) -> Float[Any, " k"]:
+    def tip(self, t: Any, control: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " k"]:
         """Return the residual of the tip's boundary conditions, with the learned residual."""
-        return self.residual.tip(self.adapted, t, control, y, history)
+        return self.residual.tip(self.adapted, t, control, y, y_t)
 
     def trained_range(self) -> TrainedRange | None:
         """Return the model's own training range, else the nominal model's."""

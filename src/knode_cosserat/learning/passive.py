@@ -39,8 +39,10 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.learning.residual import Residual
-from knode_cosserat.rods.system import History, System
+from knode_cosserat.rods.system import System
 from knode_cosserat.rotation import dot, rotation_matrix
+from knode_cosserat.solvers import semi_discrete
+from knode_cosserat.solvers.semi_discrete import Point
 
 #: moment of one tendon at its typical tension, for learned numbers of 1, in units of κ/L
 LEVER = 0.1
@@ -85,43 +87,31 @@ class Passive(Residual):
     energy_weights: Float[Any, "units inputs"]
     damping_weights: Float[Any, "units inputs"] | None
 
-    def derivatives(
-        self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
-    ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
+    def derivatives(self, knowledge: System, point: Point) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
         """Return y_s and z of the nominal model with stiffness of W, damping D and a reduced moment."""
-        changed, left = self._reduced(knowledge, s, y, control)
-        return changed.derivatives(s, t, left, control, history)
+        return semi_discrete.derivatives(*self._reduced(knowledge, point))
 
-    def strains(
-        self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
-    ) -> Float[Any, " z"]:
+    def strains(self, knowledge: System, point: Point) -> Float[Any, " z"]:
         """Return z of the nominal model with stiffness of W, damping D and a reduced moment."""
-        changed, left = self._reduced(knowledge, s, y, control)
-        return changed.strains(s, t, left, control, history)
+        return semi_discrete.strains(*self._reduced(knowledge, point))
 
-    def rates(
-        self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any,
-        history: History,
-    ) -> Float[Any, " y"]:  # fmt: skip
+    def rates(self, knowledge: System, point: Point, z: Float[Any, " z"]) -> Float[Any, " y"]:
         """Return y_s of that nominal model at strains z."""
-        changed, left = self._reduced(knowledge, s, y, control)
-        return changed.rates(s, t, left, z, control, history)
+        return semi_discrete.rates(*self._reduced(knowledge, point), z)
 
-    def left_of_law(
-        self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any,
-        history: History,
-    ) -> Float[Any, " z"]:  # fmt: skip
+    def law_residual(self, knowledge: System, point: Point, z: Float[Any, " z"]) -> Float[Any, " z"]:
         """Return the residual of the law of that nominal model at z."""
-        changed, left = self._reduced(knowledge, s, y, control)
-        return changed.left_of_law(s, t, left, z, control, history)
+        return semi_discrete.law_residual(*self._reduced(knowledge, point), z)
 
-    def _reduced(self, knowledge: System, s: Any, y: Any, control: Any) -> tuple[System, Float[Any, " y"]]:
-        """Return the changed nominal model at a point, and y with the moment that it carries."""
+    def _reduced(self, knowledge: System, point: Point) -> tuple[System, Point]:
+        """Return the changed nominal model, and the point with the moment that it carries."""
+        s, _, y, control, _ = point
         changed, moment = self.changed(knowledge, s, y, control)
         layout = knowledge.y_layout
         carried = dot(rotation_matrix(layout.get(y, "h")), moment)
         where = layout.slice("m")
-        return changed, jnp.concatenate([y[: where.start], y[where] - carried, y[where.stop :]])
+        y = jnp.concatenate([y[: where.start], y[where] - carried, y[where.stop :]])
+        return changed, point._replace(y=y)
 
     def changed(
         self, knowledge: System, s: Any, y: Float[Any, " y"], control: Any

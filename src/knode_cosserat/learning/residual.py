@@ -14,7 +14,9 @@ from jaxtyping import Float
 from knode_cosserat._reprs import count_of
 from knode_cosserat.learning.config import NetworkOptions
 from knode_cosserat.rods.layout import Field, Layout
-from knode_cosserat.rods.system import History, System
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers import semi_discrete
+from knode_cosserat.solvers.semi_discrete import Point
 
 
 class Residual(eqx.Module):
@@ -32,52 +34,42 @@ class Residual(eqx.Module):
         return knowledge
 
     @abc.abstractmethod
-    def derivatives(
-        self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
-    ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
+    def derivatives(self, knowledge: System, point: Point) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
         """Return y_s and z of the nominal model plus Δ (paper eq. 6, true dynamics).
 
         `knowledge` is the adapted nominal model.
         """
 
-    def strains(
-        self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
-    ) -> Float[Any, " z"]:
+    def strains(self, knowledge: System, point: Point) -> Float[Any, " z"]:
         """Return z of the adapted nominal model with this residual."""
-        return self.derivatives(knowledge, s, t, y, control, history)[1]
+        return self.derivatives(knowledge, point)[1]
 
-    def rates(
-        self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any,
-        history: History,
-    ) -> Float[Any, " y"]:  # fmt: skip
+    def rates(self, knowledge: System, point: Point, z: Float[Any, " z"]) -> Float[Any, " y"]:
         """Return y_s at strains z, which need not be those of the law.
 
         By default it follows z as the nominal model's y_s does, from `derivatives` on.
         """
-        y_s, corrected = self.derivatives(knowledge, s, t, y, control, history)
-        z0 = knowledge.strains(s, t, y, control, history)
-        here, there = (knowledge.rates(s, t, y, at, control, history) for at in (z0, z0 + z - corrected))
+        y_s, corrected = self.derivatives(knowledge, point)
+        z0 = semi_discrete.strains(knowledge, point)
+        here, there = (semi_discrete.rates(knowledge, point, at) for at in (z0, z0 + z - corrected))
         return y_s + there - here
 
-    def left_of_law(
-        self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any,
-        history: History,
-    ) -> Float[Any, " z"]:  # fmt: skip
+    def law_residual(self, knowledge: System, point: Point, z: Float[Any, " z"]) -> Float[Any, " z"]:
         """Return the residual of the law at z; by default the nominal model's, at z less its correction."""
-        corrected = self.strains(knowledge, s, t, y, control, history)
-        z0 = knowledge.strains(s, t, y, control, history)
-        return knowledge.left_of_law(s, t, y, z0 + z - corrected, control, history)
+        corrected = self.strains(knowledge, point)
+        z0 = semi_discrete.strains(knowledge, point)
+        return semi_discrete.law_residual(knowledge, point, z0 + z - corrected)
 
     @property
     def linear(self) -> bool:
-        """True if `left_of_law` is linear in z wherever the nominal model's is."""
+        """True if `law_residual` is linear in z wherever the nominal model's is."""
         return True
 
     def tip(
-        self, knowledge: System, t: Any, control: Any, y: Float[Any, " y"], history: History
+        self, knowledge: System, t: Any, control: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]
     ) -> Float[Any, " k"]:
         """Return the residual of the tip's boundary conditions; by default the nominal model's."""
-        return knowledge.tip(t, control, y, history)
+        return knowledge.tip(t, control, y, y_t)
 
     def clamped(self) -> Self:
         """Return the nearest residual with allowed weights; training calls it after every update."""
@@ -87,31 +79,21 @@ class Residual(eqx.Module):
 class Nothing(Residual):
     """No residual: the nominal model unchanged."""
 
-    def derivatives(
-        self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
-    ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
+    def derivatives(self, knowledge: System, point: Point) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
         """Return y_s and z of the nominal model."""
-        return knowledge.derivatives(s, t, y, control, history)
+        return semi_discrete.derivatives(knowledge, point)
 
-    def strains(
-        self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
-    ) -> Float[Any, " z"]:
+    def strains(self, knowledge: System, point: Point) -> Float[Any, " z"]:
         """Return z of the nominal model."""
-        return knowledge.strains(s, t, y, control, history)
+        return semi_discrete.strains(knowledge, point)
 
-    def rates(
-        self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any,
-        history: History,
-    ) -> Float[Any, " y"]:  # fmt: skip
+    def rates(self, knowledge: System, point: Point, z: Float[Any, " z"]) -> Float[Any, " y"]:
         """Return y_s of the nominal model at strains z."""
-        return knowledge.rates(s, t, y, z, control, history)
+        return semi_discrete.rates(knowledge, point, z)
 
-    def left_of_law(
-        self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any,
-        history: History,
-    ) -> Float[Any, " z"]:  # fmt: skip
+    def law_residual(self, knowledge: System, point: Point, z: Float[Any, " z"]) -> Float[Any, " z"]:
         """Return the residual of the nominal model's law at z."""
-        return knowledge.left_of_law(s, t, y, z, control, history)
+        return semi_discrete.law_residual(knowledge, point, z)
 
 
 @jax.custom_jvp
@@ -149,43 +131,36 @@ class Network(Residual):
     history: bool = eqx.field(static=True, default=False)
     convex: bool = eqx.field(static=True, default=True)
 
-    def inputs(
-        self, knowledge: System, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
-    ) -> Float[Any, " inputs"]:
+    def inputs(self, knowledge: System, point: Point, z: Float[Any, " z"]) -> Float[Any, " inputs"]:
         """Return the inputs: y, z and the actuation; with history, y, ʰy, z, ʰz and the actuation."""
-        force = knowledge.actuation(control)
+        force = knowledge.actuation(point.control)
         if self.history:
-            return jnp.concatenate([y, history.y, z, history.z, force])
-        return jnp.concatenate([y, z, force])
+            return jnp.concatenate([point.y, point.history.y, z, point.history.z, force])
+        return jnp.concatenate([point.y, z, force])
 
     def correction(self, inputs: Float[Any, " inputs"]) -> Float[Any, " outputs"]:
         """Return f_θ, the correction of [y_s; z]."""
         hidden = self.input_weights @ ((inputs - self.input_mean) / self.input_scale) + self.input_biases
         return self.output_scale * (self.output_weights @ elu(hidden) + self.output_biases)
 
-    def derivatives(
-        self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
-    ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
+    def derivatives(self, knowledge: System, point: Point) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
         """Return the nominal model's y_s and z plus the correction."""
-        y_s, z = knowledge.derivatives(s, t, y, control, history)
-        added = self.correction(self.inputs(knowledge, y, z, control, history))
-        return y_s + added[: y.shape[0]], z + added[y.shape[0] :]
+        y_s, z = semi_discrete.derivatives(knowledge, point)
+        added = self.correction(self.inputs(knowledge, point, z))
+        return y_s + added[: point.y.shape[0]], z + added[point.y.shape[0] :]
 
-    def strains(
-        self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
-    ) -> Float[Any, " z"]:
+    def strains(self, knowledge: System, point: Point) -> Float[Any, " z"]:
         """Return the nominal model's z plus the correction."""
-        z = knowledge.strains(s, t, y, control, history)
-        return z + self.correction(self.inputs(knowledge, y, z, control, history))[y.shape[0] :]
+        z = semi_discrete.strains(knowledge, point)
+        return z + self.correction(self.inputs(knowledge, point, z))[point.y.shape[0] :]
 
-    def rates(
-        self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any,
-        history: History,
-    ) -> Float[Any, " y"]:  # fmt: skip
+    def rates(self, knowledge: System, point: Point, z: Float[Any, " z"]) -> Float[Any, " y"]:
         """Return the nominal model's y_s at z less its correction, plus the correction of y_s."""
-        z0 = knowledge.strains(s, t, y, control, history)
-        added = self.correction(self.inputs(knowledge, y, z0, control, history))
-        return knowledge.rates(s, t, y, z - added[y.shape[0] :], control, history) + added[: y.shape[0]]
+        z0 = semi_discrete.strains(knowledge, point)
+        added = self.correction(self.inputs(knowledge, point, z0))
+        return (
+            semi_discrete.rates(knowledge, point, z - added[point.y.shape[0] :]) + added[: point.y.shape[0]]
+        )
 
     def clamped(self) -> Self:
         """Return a convex network with its negative weights set to zero; any other unchanged."""

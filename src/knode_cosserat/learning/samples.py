@@ -18,10 +18,13 @@ from jaxtyping import Float
 
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.learning.discontinuities import far_side, slopes_of
-from knode_cosserat.rods.system import System, in_strands, records_in_strands, unpacked_history
+from knode_cosserat.rods.strands import in_strands
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.grid import at_places, grid_of, inside
 from knode_cosserat.solvers.history import coefficient_table, rows_suffice
 from knode_cosserat.solvers.replay import replay
+from knode_cosserat.solvers.semi_discrete import Point, records_in_strands, unpacked_history
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
@@ -99,7 +102,7 @@ def predict_segment(
 
     def derivatives(s: Any, y: Any, record: Any) -> Any:
         history = unpacked_history(system, sample.c0, record)
-        return system.derivatives(s, sample.t, y, sample.control, history)
+        return semi_discrete.derivatives(system, Point(s, sample.t, y, sample.control, history))
 
     def reached(bounds: tuple[Any, Any], start: Any, end: Any, records: Any) -> Any:
         low, high = bounds
@@ -129,7 +132,7 @@ def predict_segment(
         history = unpacked_history(system, sample.c0, records[0])
         if system.jumps:
             acting = jnp.asarray(grid.acting)[own]
-            beyond = system.jump(acting, sample.t, y, sample.control, history)
+            beyond = semi_discrete.jump(system, acting, sample.t, y, sample.control, history)
             y = jnp.where(k > 0, beyond, y)
 
         def corrected(_: Any, end: Any) -> Any:

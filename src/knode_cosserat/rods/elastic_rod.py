@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.rods.law import MaterialLaw, Viscoelastic
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parameters import parameter, part
 from knode_cosserat.rods.section import (
@@ -28,8 +29,8 @@ from knode_cosserat.rods.section import (
     differences_at,
     shear_modulus,
 )
-from knode_cosserat.rods.system import History, System
-from knode_cosserat.rotation import dot, inverse, rotation_matrix
+from knode_cosserat.rods.system import System
+from knode_cosserat.rotation import dot, rotation_matrix
 
 
 class ElasticRod(System):
@@ -158,24 +159,17 @@ class ElasticRod(System):
         R = rotation_matrix(self.y_layout.get(y, "h"))
         return dot(R.T, self.y_layout.get(y, "n")), dot(R.T, self.y_layout.get(y, "m"))
 
-    def strains(
-        self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
-    ) -> Float[Any, " z"]:
-        """Return v and u of the linear law (paper eq. 12, constitutive law of the rod)."""
-        c0, material = history.c0, self.material(s, control)
-        n, m = self.stresses(y)
-        hv, hu = self.z_layout.get(history.z, "v"), self.z_layout.get(history.z, "u")
-        Kse, Bse, Kbt, Bbt = material[:4]
-        bent = m if not self.sections else m + dot(Kbt, material.u_star)
-        v = dot(inverse(Kse + c0 * Bse), n + Kse @ self.v_star - dot(Bse, hv))
-        u = dot(inverse(Kbt + c0 * Bbt), bent - dot(Bbt, hu))
-        return jnp.concatenate([v, u])
-
     def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
-        """Return C, D, f2 of the same law, K (z - z*) + B z_t = Rᵀ (n, m)."""
+        """Return the law of v and u; linear by default."""
+        return self.linear_law(s, y, control)
+
+    def linear_law(self, s: Any, y: Float[Any, " y"], control: Any) -> MaterialLaw:
+        """Return the linear law of v and u (paper eq. 12, constitutive law of the rod).
+
+        K (z - z*) + B z_t = Rᵀ (n, m), for each of shear and extension, bending and twisting.
+        """
         material = self.material(s, control)
         n, m = self.stresses(y)
-        zero = jnp.zeros((3, 3))
-        C = jnp.block([[material.Kse, zero], [zero, material.Kbt]])
-        D = jnp.block([[material.Bse, zero], [zero, material.Bbt]])
-        return C, D, jnp.concatenate([n + material.Kse @ self.v_star, m + material.Kbt @ material.u_star])
+        bent = m if not self.sections else m + dot(material.Kbt, material.u_star)
+        v = Viscoelastic(material.Kse, material.Bse, n + material.Kse @ self.v_star)
+        return MaterialLaw({"v": v, "u": Viscoelastic(material.Kbt, material.Bbt, bent)})

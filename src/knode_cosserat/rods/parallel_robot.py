@@ -18,8 +18,8 @@ from jaxtyping import Float
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parameters import ParameterError, parameter
 from knode_cosserat.rods.rod import Rod
-from knode_cosserat.rods.strands import Bundle
-from knode_cosserat.rods.system import History, Scales, System, in_strands, is_traced
+from knode_cosserat.rods.strands import Bundle, in_strands
+from knode_cosserat.rods.system import Scales, System, is_traced
 from knode_cosserat.rotation import cross, dot, rotation_matrix
 
 #: rod parameters that a leg takes from the robot
@@ -228,24 +228,27 @@ class ParallelRobot(Bundle):
         state = jnp.concatenate([p, h, n, m, jnp.zeros((count, 6))], axis=1)
         return state.reshape(-1), jnp.concatenate([v, m / EI], axis=1).reshape(-1)
 
-    def base(self, t: Any, control: Any, unknowns: Float[Any, " k"], history: History) -> Float[Any, " y"]:
-        """Return y at the base: the actuators' positions and velocities along z."""
+    def base(self, t: Any, control: Any, unknowns: Float[Any, " k"]) -> Float[Any, " y"]:
+        """Return y at the base: the actuators' positions along z."""
         count = self.strands
         height = jnp.asarray(control)
-        speed = history.c0 * height + self.legs(history.y)[0][:, 2]
-        zero = jnp.zeros(count)
         p = _on_circle(self.base_radius, self.base_angles) + height[:, None] * np.array([0.0, 0.0, 1.0])
         h = jnp.tile(np.array([1.0, 0.0, 0.0, 0.0]), (count, 1))
-        q = jnp.stack([zero, zero, speed], axis=1)
-        own = in_strands(self, unknowns)
-        return jnp.concatenate([p, h, own, q, jnp.zeros((count, 3))], axis=1).reshape(-1)
+        loads = in_strands(self, unknowns)
+        return jnp.concatenate([p, h, loads, jnp.zeros((count, 6))], axis=1).reshape(-1)
 
-    def tip(self, t: Any, control: Any, y: Float[Any, " y"], history: History) -> Float[Any, " k"]:
+    def moving_base(self, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " y"]:
+        """Return y at the base with the actuators' velocities along z."""
+        legs, speed = in_strands(self, y), self.legs(y_t)[0][:, 2:]
+        q = jnp.concatenate([jnp.zeros((self.strands, 2)), speed], axis=1)
+        return jnp.concatenate([legs[:, :13], q, legs[:, 16:]], axis=1).reshape(-1)
+
+    def tip(self, t: Any, control: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " k"]:
         """Return the residuals of the platform's motion and of the joints with the legs' tips."""
         p, h, n, m, _, _ = self.legs(y)
         R, M = rotation_matrix(h[0]), self.platform_mass
         arms = jax.vmap(lambda joint: dot(R, joint))(self.joints)
-        acceleration, momentum_rate = self._inertial(y, history.c0 * y + history.y)
+        acceleration, momentum_rate = self._inertial(y, y_t)
         force = M * (self.gravity - dot(R, acceleration)) + self.platform_force - jnp.sum(n, axis=0)
         twisting = jnp.sum(m + jax.vmap(cross)(arms, n), axis=0)
         moment = self.platform_moment - dot(R, momentum_rate) - twisting

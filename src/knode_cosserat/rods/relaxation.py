@@ -12,6 +12,9 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
+from jaxtyping import Float
+
+from knode_cosserat.rods.law import MaxwellBranch
 from knode_cosserat.rods.parameters import parameter
 from knode_cosserat.rods.parts import Part
 
@@ -26,16 +29,6 @@ class Relaxation(Part):
     )
     time: Any = parameter("s", "T, relaxation time of the branch", low=1e-6, high=1e6, default=1.0)
 
-    def damping(self, Kbt: Any, c0: Any) -> Any:
-        """Return what the branch adds to the damping of bending and twisting (N·m² s)."""
-        return branch_share(self.stiffness, self.time, c0) * Kbt
-
-
-def branch_share(stiffness: Any, time: Any, c0: Any) -> Any:
-    """Return r T / (1 + c0 T), the branch's damping over K: r (z - z_i) is this times c0 z + ʰz_i."""
-    return stiffness * time / (1.0 + c0 * time)
-
-
-def dashpot_strain(z: Any, past: Any, time: Any, c0: Any) -> Any:
-    """Return z_i, the strain of the dashpot, from its history ʰz_i and the strain z."""
-    return (z - time * past) / (1.0 + c0 * time)
+    def branch(self, Kbt: Float[Any, "3 3"]) -> MaxwellBranch:
+        """Return the branch beside the law of bending and twisting with this stiffness (N m²)."""
+        return MaxwellBranch("u_branch", self.stiffness * Kbt, self.time)

@@ -61,12 +61,12 @@ class RibSpacing(Part):
         spans = np.append(np.diff(ribs) ** 2 / 12.0, 0.0)
         return self.share * jnp.asarray(spans)[jnp.sum(sigma >= ribs[1:])]
 
-    def softened(self, sigma: Any, length: Any, Kbt: Float[Any, "3 3"], total: Any) -> Float[Any, "3 3"]:
-        """Return the stiffness (N m²) at σ of a rod of that length (m), under the sum (N) of all tensions."""
+    def lost(self, sigma: Any, length: Any, Kbt: Float[Any, "3 3"], total: Any) -> Float[Any, "3 3"]:
+        """Return the loss of Kbt (N m²) at σ of a rod of that length (m), under the sum (N) of tensions."""
         stiffness = 0.5 * (Kbt[0, 0] + Kbt[1, 1])
         softening = self.softening + self.softening_at(sigma) * length**2
         lost = 1.0 - pressed(3.0 * softening * total / stiffness)
-        return Kbt - lost * stiffness * np.diag([1.0, 1.0, 0.0])
+        return lost * stiffness * np.diag([1.0, 1.0, 0.0])
 
 
 def pressed(w: Any) -> Any:

@@ -28,7 +28,7 @@ from knode_cosserat.rods.parameters import ParameterError, parameter, part
 from knode_cosserat.rods.parts import prefixed_fields, shares
 from knode_cosserat.rods.section import INWARD, shape_at_rest
 from knode_cosserat.rods.surroundings import Obstacle
-from knode_cosserat.rods.system import History, Scales
+from knode_cosserat.rods.system import Scales
 from knode_cosserat.rotation import cross, dot, quaternion_rate, rotation_matrix
 
 #: first root of cos(x) cosh(x) = -1, the frequency equation of a cantilever
@@ -52,8 +52,8 @@ class PartControls(NamedTuple):
 class Rod(ElasticRod):
     """A round rod with gravity, drag, loads, ends and surroundings.
 
-    A subclass defines its actuators by its own law of strains, `strains` (it then has no `constitutive`), or
-    by their load on the rod, `actuator_force`.
+    A subclass defines its actuators by its own `constitutive` law, or by their load on the rod,
+    `actuator_force`.
     """
 
     mixed: ClassVar[bool] = False
@@ -183,15 +183,8 @@ class Rod(ElasticRod):
         """Return the actuators' load per length (N/m), global frame; None by default."""
         return None
 
-    def rates(
-        self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
-    ) -> Float[Any, " y"]:
-        """Return y_s from y_t = c0 y + ʰy and z_t = c0 z + ʰz (paper eq. 11, rates in time of the rod)."""
-        y_t, z_t = history.c0 * y + history.y, history.c0 * z + history.z
-        return self.spatial_rates(s, y, y_t, z, z_t, control)
-
-    def spatial_rates(self, s, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
-        """Return y_s (paper eq. 10, spatial derivatives of the rod), from y_t, z and z_t."""
+    def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
+        """Return y_s (paper eq. 10, spatial derivatives of the rod)."""
         h, n = self.y_layout.get(y, "h"), self.y_layout.get(y, "n")
         motion = Motion.of(self.y_layout, y, y_t)
         _, R, q, w, q_t, w_t = motion
@@ -248,22 +241,22 @@ class Rod(ElasticRod):
         return any(isinstance(load, PointLoad) and load.at < 1.0 for load in self.loads)
 
     def jump(
-        self, acting: Float[Any, " cuts"], t: Any, y: Float[Any, " y"], control: Any, history: History
+        self, acting: Float[Any, " cuts"], t: Any, y: Float[Any, " y"], y_t: Float[Any, " y"], control: Any
     ) -> Float[Any, " y"]:
         """Return y on the far side of the acting cuts: n and m less the point loads there."""
         places = {cut: k for k, cut in enumerate(self.cuts)}
         weights = {k: acting[places[load.at]] for k, load in self._points() if load.at in places}
-        wrench = self._point_wrench(weights, y, control, history)
+        wrench = self._point_wrench(weights, y, y_t, control)
         change = jnp.concatenate([np.zeros(7), wrench.force, wrench.moment])
         return y - jnp.concatenate([change, np.zeros(self.y_layout.size - 13)])
 
     def _points(self) -> list[tuple[int, PointLoad]]:
         return [(k, load) for k, load in enumerate(self.loads) if isinstance(load, PointLoad)]
 
-    def _point_wrench(self, weights: Any, y: Any, control: Any, history: History) -> Wrench:
+    def _point_wrench(self, weights: Any, y: Any, y_t: Any, control: Any) -> Wrench:
         """Return the sum of the point loads, each times its weight."""
         controls = self._controls(control).loads
-        motion = Motion.of(self.y_layout, y, history.c0 * y + history.y)
+        motion = Motion.of(self.y_layout, y, y_t)
         acting = [(self.loads[k], weight, controls[k]) for k, weight in weights.items()]
         return point_wrench(acting, motion, self.gravity)
 
@@ -297,14 +290,16 @@ class Rod(ElasticRod):
         beyond = jnp.minimum(s + margin, self.length - margin)
         return *shape_at_rest(base.p, base.h, s, curvature, edges), curvature(beyond)
 
-    def base(self, t: Any, control: Any, unknowns: Float[Any, " k"], history: History) -> Float[Any, " y"]:
-        """Return y at s = 0: the pose and velocity of the base's end, with the unknowns."""
+    def base(self, t: Any, control: Any, unknowns: Float[Any, " k"]) -> Float[Any, " y"]:
+        """Return y at s = 0: the pose of the base's end, with the unknowns."""
         held = self.base_end.pose(AT_ORIGIN, self._controls(control).base)
         y = jnp.concatenate([held.p, held.h, np.zeros(self.y_layout.size - 7)])
-        y = self.y_layout.replaced(y, self.base_unknowns, unknowns)
+        return self.y_layout.replaced(y, self.base_unknowns, unknowns)
+
+    def moving_base(self, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " y"]:
+        """Return y at s = 0 with the velocities of the base's pose; a clamped base does not move."""
         if type(self.base_end) is Clamped:
             return y
-        y_t = history.c0 * y + history.y
         q, w = velocities(self._pose(y), self._pose(y_t))
         return jnp.concatenate([y[:13], q, w, y[19:]])
 
@@ -318,12 +313,12 @@ class Rod(ElasticRod):
     def _pose(self, y: Any) -> Pose:
         return Pose(self.y_layout.get(y, "p"), self.y_layout.get(y, "h"))
 
-    def tip(self, t: Any, control: Any, y: Float[Any, " y"], history: History) -> Float[Any, " k"]:
+    def tip(self, t: Any, control: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " k"]:
         """Return the residual of the tip's conditions with the loads there, and of the quaternion's norm."""
         n, m = self.y_layout.get(y, "n"), self.y_layout.get(y, "m")
         at_tip = {k: 1.0 for k, load in self._points() if load.at == 1.0}
         if at_tip:
-            loaded = self._point_wrench(at_tip, y, control, history)
+            loaded = self._point_wrench(at_tip, y, y_t, control)
             n, m = n - loaded.force, m - loaded.moment
         if type(self.tip_end) is Free:
             left = jnp.concatenate([-n, -m])

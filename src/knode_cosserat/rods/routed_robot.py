@@ -23,36 +23,28 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, Self
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.anchors import EarlyAnchors
+from knode_cosserat.rods.law import Evolution, Fields, InternalState, MaterialLaw
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.load_cells import LoadCells
 from knode_cosserat.rods.parameters import ParameterError, choice, parameter, part
 from knode_cosserat.rods.reels import Reels
-from knode_cosserat.rods.relaxation import Relaxation, dashpot_strain
+from knode_cosserat.rods.relaxation import Relaxation
 from knode_cosserat.rods.rib_spacing import RibSpacing
 from knode_cosserat.rods.rod import Rod
-from knode_cosserat.rods.routing import Helical, Routing, Straight, ends, routes
-from knode_cosserat.rods.system import History, System
+from knode_cosserat.rods.routing import Helical, Routing, Straight, ends, path_lengths, routes
 from knode_cosserat.rods.tendon_friction import TendonFriction, Vibration
-from knode_cosserat.rods.tendon_law import (
-    stretches,
-    tendon_balance,
-    tendon_strains,
-    unbent_flexibility,
-)
+from knode_cosserat.rods.tendon_law import Tendons, stretches
 from knode_cosserat.rods.tendon_rod import TendonRod
 from knode_cosserat.rods.trained_range import TrainedRange
 from knode_cosserat.rotation import dot
 
 #: fraction of the rod's length over which slack and taut are blended, so that Newton's method has a slope
 BLEND = 1e-7
-#: points of Gauss quadrature for the length of a tendon in the unloaded robot
-GAUSS = 24
 
 
 class RoutedTendonRobot(TendonRod):
@@ -303,11 +295,8 @@ class RoutedTendonRobot(TendonRod):
     def law_factors(self, s: Any, control: Any) -> tuple[Any, Any] | None:
         """Return the sections' factors on stiffness and damping, with 1 for the other rows of the law."""
         found = super().law_factors(s, control)
-        if found is None:
-            return None
-        stiffness, damping = found
         others = jnp.ones(self.z_layout.size - 6)
-        return jnp.concatenate([stiffness, others]), jnp.concatenate([damping, others])
+        return found and (jnp.concatenate([found[0], others]), jnp.concatenate([found[1], others]))
 
     def rest(self, s: Any) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
         """Return the rod's state at rest, with zero tension and zero friction."""
@@ -325,97 +314,50 @@ class RoutedTendonRobot(TendonRod):
         return z if self.relaxation is None else z.at[self.z_layout.slice("u_branch")].set(z[3:6])
 
     def _ways(self, s: Any) -> Float[Any, " c"]:
-        """Return the tendons' lengths in the unloaded robot from the base to s, by Gauss quadrature."""
-        nodes, weights = np.polynomial.legendre.leggauss(GAUSS)
-        ways = []
-        for k, routing in enumerate(self.routings):
-            last = jnp.minimum(s, routing.end * self.length)
-            at = 0.5 * (nodes + 1.0) * jnp.asarray(last)[..., None]
-
-            def stretched(place: Any, k: int = k) -> Any:
-                r, r_s = routes((self.routings[k],), place / self.length, self.length)
-                u = self.material(place, np.zeros(self.control_size)).u_star
-                return stretches(jnp.asarray(self.v_star), jnp.asarray(u), jnp.asarray(r), jnp.asarray(r_s))[
-                    0
-                ]
-
-            ways.append(0.5 * last * jnp.sum(weights * jax.vmap(stretched)(at)))
-        return jnp.stack(ways)
+        """Return the tendons' lengths in the unloaded robot from the base to s."""
+        none = np.zeros(self.control_size)
+        return path_lengths(self.routings, s, self.length, lambda at: self.material(at, none).u_star)
 
     # the equations
 
-    # the law is not of the form C z + D z_t = f2
-    constitutive = System.constitutive
+    def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
+        """Return the law of v and u with the tendons, and of the internal variables."""
+        if self.vibration is None:
+            return self._law(s, y, control)
+        total = jnp.sum(self.base_tension(y, control))
+        softening = self.vibration.softening * total * np.diag([1.0, 1.0, 0.0])
 
-    def strains(
-        self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
-    ) -> Float[Any, " z"]:
-        """Return v and u by the material's law, and f and x by their own laws."""
-        given, shaken = self._law_at(s, y, control, history)
-        v, u = tendon_strains(*given, flexibility=self._unbent_flexibility(s, y, control, history.c0))
-        return jnp.concatenate([v, u, *self._internal(s, u, shaken, control, history)])
+        def law(internal: Fields) -> MaterialLaw:
+            return self._law(s, y, control, internal["x"][0] * softening)
 
-    linear_law = False
+        return InternalState({"x": self.vibration.evolution(total)}, law)
 
-    def left_of_law(self, s, t, y, z, control, history):  # type: ignore[no-untyped-def]
-        """Return the law's residual: rod and tendons less n and m; for f and x, their error."""
-        given, shaken = self._law_at(s, y, control, history)
-        v, u = self.z_layout.get(z, "v"), self.z_layout.get(z, "u")
-        left = tendon_balance(v, u, *given)
-        internal = self._internal(s, u, shaken, control, history)
-        return jnp.concatenate([left, z[6:] - jnp.concatenate(internal)]) if internal else left
-
-    def _internal(self, s: Any, u: Any, shaken: list[Any], control: Any, history: History) -> list[Any]:
-        """Return the internal variables at the curvature u, in the order of z."""
-        found = list(shaken)
-        if self.friction is not None:
-            found.insert(0, self._held(self.friction, s, u, control, history))
-        if self.relaxation is not None:
-            past = self.z_layout.get(history.z, "u_branch")
-            found.append(dashpot_strain(u, past, self.relaxation.time, history.c0))
-        return found
-
-    def _law_at(self, s: Any, y: Any, control: Any, history: History) -> tuple[tuple[Any, ...], list[Any]]:
-        """Return K_v, K_u, a, b, r, r′ and T of the law (see `tendon_law`), and x if there is vibration."""
-        c0, material = history.c0, self.material(s, control)
-        n, m = self.stresses(y)
-        hv, hu = self.z_layout.get(history.z, "v"), self.z_layout.get(history.z, "u")
-        Kse, Bse, Kbt, Bbt = material[:4]
-        more = []
-        if self.vibration is not None:
-            total = jnp.sum(self.base_tension(y, control))
-            x = self.vibration.shaken(total, self.z_layout.get(history.z, "x"), c0)
-            more.append(x)
-            Kbt = Kbt - self.vibration.softening * x[0] * total * np.diag([1.0, 1.0, 0.0])
-        tension = self.tension_at(s, y, control)
-        a = n + dot(Kse, self.v_star) - dot(Bse, hv)
-        b = m - dot(Bbt, hu) if not self.sections else m + dot(Kbt, material.u_star) - dot(Bbt, hu)
+    def _law(self, s: Any, y: Any, control: Any, shaken: Any = None) -> MaterialLaw:
+        """Return the law of v and u, for a loss of bending stiffness by vibration (None: no loss)."""
+        law = self.linear_law(s, y, control)
+        material, tension = self.material(s, control), self.tension_at(s, y, control)
+        v, u = law.strains["v"], law.strains["u"]
+        if shaken is not None:
+            u = u._replace(softening=shaken, stress=u.stress - dot(shaken, material.u_star))
         if self.rib_spacing is not None:
             # tendons press on the bent rod, including its intrinsic curvature
-            Kbt = self.rib_spacing.softened(s / self.length, self.length, Kbt, jnp.sum(tension))
+            remaining = u.stiffness if shaken is None else u.stiffness - shaken
+            lost = self.rib_spacing.lost(s / self.length, self.length, remaining, jnp.sum(tension))
+            u = u._replace(softening=lost if shaken is None else shaken + lost)
         if self.relaxation is not None:
-            branch = self.relaxation.damping(material.Kbt, c0)
-            b = b - dot(branch, self.z_layout.get(history.z, "u_branch"))
-            Bbt = Bbt + branch
-        return (Kse + c0 * Bse, Kbt + c0 * Bbt, a, b, *self.routes_at(s), tension), more
+            u = u._replace(branch=self.relaxation.branch(material.Kbt))
+        nominal = self._where_it_runs(s, self.base_tension(y, control))
+        tendons = Tendons(*self.routes_at(s), tension, nominal)
 
-    def _unbent_flexibility(self, s: Any, y: Any, control: Any, c0: Any) -> Float[Any, "6 6"]:
-        """Return the approximate inverse for solving the law, known before y where tensions are controls."""
-        Kse, Bse, Kbt, Bbt = self.material(s, control)[:4]
-        tension = self._where_it_runs(s, self.base_tension(y, control))
-        if self.relaxation is not None:
-            Bbt = Bbt + self.relaxation.damping(Kbt, c0)
-        return unbent_flexibility(Kse + c0 * Bse, Kbt + c0 * Bbt, *self.routes_at(s), tension)
+        def evolutions(strains: Fields, rates: Fields) -> dict[str, Evolution]:
+            directions, bent = self.bending_directions(s), strains["u"] - material.u_star
+            return {"f": self.friction.evolution(directions, rates["u"], bent)}  # type: ignore[union-attr]
 
-    def _held(self, friction: TendonFriction, s: Any, u: Any, control: Any, history: History) -> Any:
-        u_t = history.c0 * u + self.z_layout.get(history.z, "u")
-        bent = u - self.material(s, control).u_star
-        past = self.z_layout.get(history.z, "f")
-        return friction.held(self.bending_directions(s), u_t, bent, past, history.c0)
+        return MaterialLaw({"v": v, "u": u}, tendons, None if self.friction is None else evolutions)
 
-    def spatial_rates(self, s, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
+    def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
         """Return y_s of the rod, of the tension, and of the tendons' path lengths."""
-        rates = [super().spatial_rates(s, y, y_t, z, z_t, control)]
+        rates = [super().balance(s, t, y, y_t, z, z_t, control)]
         v, u = self.z_layout.get(z, "v"), self.z_layout.get(z, "u")
         if self.friction is not None:
             f = self.z_layout.get(z, "f")
@@ -427,9 +369,9 @@ class RoutedTendonRobot(TendonRod):
             rates += [jnp.zeros(self.tendon_count), self._where_it_runs(s, way)]
         return jnp.concatenate(rates)
 
-    def tip(self, t: Any, control: Any, y: Float[Any, " y"], history: History) -> Float[Any, " k"]:
+    def tip(self, t: Any, control: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " k"]:
         """Return the rod's residual; for reels also that tension or slack is zero (Fischer-Burmeister)."""
-        left = super().tip(t, control, y, history)
+        left = super().tip(t, control, y, y_t)
         if self.drive != "reel":
             return left
         T, way = self.y_layout.get(y, "tension"), self.y_layout.get(y, "path")

@@ -19,6 +19,11 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.parameters import ParameterError, parameter, place
 from knode_cosserat.rods.parts import Part
+from knode_cosserat.rods.section import ALONG
+from knode_cosserat.rods.tendon_law import stretches
+
+#: points of Gauss quadrature for the length of a tendon in the unloaded robot
+GAUSS = 24
 
 
 class Routing(Part):
@@ -157,6 +162,27 @@ def routes(
 def ends(routings: Sequence[Routing]) -> np.ndarray:
     """Return the fractions of the length (c,) at which the tendons are anchored."""
     return np.array([routing.end for routing in routings], dtype=float)
+
+
+def path_lengths(
+    routings: Sequence[Routing], s: Any, length: Any, curvature: Callable[[Any], Any]
+) -> Float[Any, " c"]:
+    """Return the tendons' lengths (m) in an unstretched rod from the base to s, by Gauss quadrature.
+
+    `curvature` returns u (1/m) at an arclength (m).
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(GAUSS)
+    found = []
+    for routing in routings:
+        last = jnp.minimum(s, routing.end * length)
+        at = 0.5 * (nodes + 1.0) * jnp.asarray(last)[..., None]
+
+        def stretched(place: Any, routing: Routing = routing) -> Any:
+            r, r_s = routes((routing,), place / length, length)
+            return stretches(*map(jnp.asarray, (ALONG, curvature(place), r, r_s)))[0]
+
+        found.append(0.5 * last * jnp.sum(weights * jax.vmap(stretched)(at)))
+    return jnp.stack(found)
 
 
 def _vectors(places: list[tuple[Any, Any]]) -> Any:

@@ -6,10 +6,13 @@ import abc
 import functools
 from typing import Any, ClassVar
 
-from jaxtyping import Float
-
 from knode_cosserat.rods.layout import Field, Layout
-from knode_cosserat.rods.system import History, System, of_strands
+from knode_cosserat.rods.system import System
+
+
+def in_strands(system: System, packed: Any) -> Any:
+    """Return a packed y, z or vector of unknowns (…, n) split by strand: (…, strands, n / strands)."""
+    return packed.reshape(*packed.shape[:-1], system.strands, packed.shape[-1] // system.strands)
 
 
 class Bundle(System):
@@ -47,24 +50,6 @@ class Bundle(System):
     def mixed(self) -> bool:  # type: ignore[override]
         """True if B of the strand is not zero."""
         return self.strand_class.mixed
-
-    def derivatives(
-        self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
-    ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-        """Return y_s and z of all rods at one arclength."""
-        return of_strands(self, s, t, y, control, history)
-
-    def rates(
-        self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
-    ) -> Float[Any, " y"]:
-        """Return y_s of all rods, for the strains of their law; z is ignored."""
-        return self.derivatives(s, t, y, control, history)[0]
-
-    def strains(
-        self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
-    ) -> Float[Any, " z"]:
-        """Return z of all rods."""
-        return self.derivatives(s, t, y, control, history)[1]
 
 
 @functools.lru_cache(maxsize=64)

@@ -2,13 +2,9 @@
 
     A y_s + B y_st = f1,     C z + D z_t = f2
 
-An implicit time scheme, y_t = c0 y + ʰy, turns it into an ordinary differential equation along the rod:
-
-    z   = (C + c0 D)⁻¹ (f2 - D ʰz)
-    y_s = (A + c0 B)⁻¹ (f1 - B ʰy_s)
-
-A system defines the layouts of y and z, these terms (or z and y_s directly), the boundary conditions at base
-and tip, and the unknowns at the base. It does not depend on the nodes in between, time steps or solvers.
+A system defines the layouts of y and z, these terms (or y_s and z directly), the boundary conditions at base
+and tip, and the unknowns at the base. It does not depend on the nodes in between, time steps or solvers: its
+equations receive rates in time, which a solver forms (`solvers.semi_discrete`).
 """
 
 from __future__ import annotations
@@ -23,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.rods.law import InternalState, MaterialLaw
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parameters import (
     ParameterError,
@@ -37,52 +34,21 @@ from knode_cosserat.rotation import dot, rotation_matrix
 #: smallest and largest number of nodes of a rod
 FEWEST_NODES, MOST_NODES = 2, 10_000
 
-
-class History(NamedTuple):
-    """History terms of an implicit time scheme at one point of the rod.
-
-    The scheme is y_t = c0 y + ʰy, z_t = c0 z + ʰz, y_st = c0 y_s + ʰy_s. At rest c0 and all three are zero.
-    """
-
-    c0: Float[Any, ""]
-    y: Float[Any, " y"]
-    z: Float[Any, " z"]
-    y_s: Float[Any, " y"]
+#: methods of earlier versions, which received a time scheme, and the methods that replace them
+REPLACED = {
+    "derivatives": "`constitutive` and `balance`",
+    "left_of_law": "`constitutive`",
+    "rates": "`balance(s, t, y, y_t, z, z_t, control)`",
+    "spatial_rates": "`balance(s, t, y, y_t, z, z_t, control)`",
+    "strains": "`constitutive(s, t, y, y_t, control)`",
+}
 
 
-def unpacked_history(system: System, c0: Any, record: Float[Any, " x"]) -> History:
-    """Return the history at one point from its packed record: y, z and, if B is not zero, y_s."""
-    ny, nz = system.y_layout.size, system.z_layout.size
-    y_s = record[ny + nz :] if system.mixed else jnp.zeros(ny)
-    return History(c0, record[:ny], record[ny : ny + nz], y_s)
+class Correction(NamedTuple):
+    """A learned correction of y_s and z (`learning.residual.Residual`), and the system that it corrects."""
 
-
-def in_strands(system: System, packed: Any) -> Any:
-    """Return a packed y, z or vector of unknowns (…, n) split by strand: (…, strands, n / strands)."""
-    return packed.reshape(*packed.shape[:-1], system.strands, packed.shape[-1] // system.strands)
-
-
-def records_in_strands(system: System, records: Any) -> Any:
-    """Return packed records of history (…, x) split by strand: (…, strands, x of one)."""
-    if system.strands == 1:
-        return in_strands(system, records)
-    ny, nz = system.y_layout.size, system.z_layout.size
-    parts = jnp.split(records, [ny, ny + nz], axis=-1)
-    return jnp.concatenate([in_strands(system, part) for part in parts], axis=-1)
-
-
-def of_strands(
-    system: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
-) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-    """Return y_s and z of a system at one place, from the equations of its strands."""
-    strand = system.strand
-    own = [in_strands(system, part) for part in (y, history.y, history.z, history.y_s)]
-
-    def each(y: Any, *past: Any) -> Any:
-        return strand.derivatives(s, t, y, control, History(history.c0, *past))
-
-    y_s, z = jax.vmap(each)(*own)
-    return y_s.reshape(-1), z.reshape(-1)
+    system: System
+    residual: Any
 
 
 class Scales(NamedTuple):
@@ -95,9 +61,17 @@ class Scales(NamedTuple):
 class System(Parametrised):
     """A rod robot: A y_s + B y_st = f1, C z + D z_t = f2 (paper eq. 1, general class).
 
-    A subclass defines the layouts below, `rest`, `base`, `tip`, and either `constitutive` and `balance`
-    (the general form) or `strains` and `rates` (z and y_s directly). Its numeric parameters are leaves of a
-    JAX pytree: one compiled program serves all their values, batches, and derivatives.
+    A subclass defines its layouts and `base_unknowns`, its `length`, `constitutive` and `balance`, `rest` and
+    `tip`; most define `base` and `scales` too, and `mixed` where B is zero. All other members have defaults:
+
+        ends             moving_base, end_poses, held, rest_is_guess, tip_layout
+        discontinuities  cuts, jumps, jump
+        several rods     strands, strand
+        learning         actuation, observables, velocities, unstressed, law_factors, correction, nominal
+        drawing          positions, quaternions, curves
+
+    Its numeric parameters are leaves of a JAX pytree: one compiled program serves all their values, batches,
+    and derivatives.
     """
 
     y_layout: ClassVar[Layout]
@@ -105,7 +79,7 @@ class System(Parametrised):
     control_layout: ClassVar[Layout]
     #: unknown fields of y at the base; the number of tip conditions is equal
     base_unknowns: ClassVar[tuple[str, ...]]
-    #: True if B is not zero: the history of y_s is then stored
+    #: True if B is not zero: time schemes then store y_s
     mixed: ClassVar[bool] = True
 
     #: True if the state at rest is a guess: a simulation then starts at the equilibrium under zero control
@@ -113,9 +87,6 @@ class System(Parametrised):
 
     #: True if the system is constrained; without constraints an equilibrium needs loads that cancel
     held: ClassVar[bool] = True
-
-    #: True if `left_of_law` is linear in the strains
-    linear_law: ClassVar[bool] = True
 
     #: velocities among the observables, on which drag and friction depend; empty: not specified
     velocities: ClassVar[tuple[str, ...]] = ()
@@ -144,76 +115,32 @@ class System(Parametrised):
 
     # the equations
 
-    def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
-        """Return C (z, z), D (z, z) and f2 (z,) of C z + D z_t = f2, at arclength s (m) and time t (s)."""
-        raise NotImplementedError(f"{type(self).__name__} gives neither `strains` nor `constitutive`")
+    def constitutive(
+        self, s: Any, t: Any, y: Float[Any, " y"], y_t: Float[Any, " y"], control: Any
+    ) -> tuple[Any, Any, Any] | MaterialLaw | InternalState | Float[Any, " z"]:
+        """Return C (z, z), D (z, z) and f2 (z,) of C z + D z_t = f2, at arclength s (m) and time t (s).
 
-    def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
-        """Return A (y, y), B (y, y) and f1 (y,) of A y_s + B y_st = f1, at arclength s (m) and time t (s)."""
-        raise NotImplementedError(f"{type(self).__name__} gives neither `rates` nor `balance`")
-
-    def strains(
-        self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
-    ) -> Float[Any, " z"]:
-        """Return z at one point, semi-discretised in time: (C + c0 D)⁻¹ (f2 - D ʰz)."""
-        c0 = history.c0
-        C, D, f2 = self.constitutive(s, t, y, c0 * y + history.y, control)
-        return jnp.linalg.solve(C + c0 * D, f2 - D @ history.z)
-
-    def left_of_law(
-        self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
-    ) -> Float[Any, " z"]:
-        """Return the residual of the strains' law at z: C z + D z_t - f2, or z less `strains`.
-
-        A system with a nonlinear law of stresses defines it here, and sets `linear_law` to False.
+        A law of another form is a `MaterialLaw`. If z depends on no rate of z, it may be returned itself.
         """
-        c0 = history.c0
-        if not _gives(self, "constitutive"):
-            return z - self.strains(s, t, y, control, history)
-        C, D, f2 = self.constitutive(s, t, y, c0 * y + history.y, control)
-        return C @ z + D @ (c0 * z + history.z) - f2
+        raise NotImplementedError(f"{type(self).__name__} gives no `constitutive`")
+
+    def balance(
+        self, s: Any, t: Any, y: Float[Any, " y"], y_t: Float[Any, " y"], z: Float[Any, " z"],
+        z_t: Float[Any, " z"], control: Any,
+    ) -> tuple[Any, Any, Any] | Float[Any, " y"]:  # fmt: skip
+        """Return A (y, y), B (y, y) and f1 (y,) of A y_s + B y_st = f1, at arclength s (m) and time t (s).
+
+        If B is zero, y_s may be returned itself.
+        """
+        raise NotImplementedError(f"{type(self).__name__} gives no `balance`")
 
     @property
-    def law_of_stresses(self) -> bool:
-        """True if the strains follow from a law of stresses; False if the system gives them directly."""
-        return _gives(self, "left_of_law") or _gives(self, "constitutive")
-
-    def law_matrix(
-        self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
-    ) -> Float[Any, "z z"]:
-        """Return the derivative of `left_of_law` by z: C + c0 D, or the identity without such a law."""
-        if not self.law_of_stresses:
-            return jnp.eye(self.z_layout.size)
-        if not self.linear_law:
-            return jax.jacfwd(lambda z: self.left_of_law(s, t, y, z, control, history))(z)
-        C, D, _ = self.constitutive(s, t, y, history.c0 * y + history.y, control)
-        return C + history.c0 * D
-
-    def rates(
-        self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
-    ) -> Float[Any, " y"]:
-        """Return y_s at one point with strains z, semi-discretised in time: (A + c0 B)⁻¹ (f1 - B ʰy_s)."""
-        c0 = history.c0
-        A, B, f1 = self.balance(s, t, y, c0 * y + history.y, z, c0 * z + history.z, control)
-        return jnp.linalg.solve(A + c0 * B, f1 - B @ history.y_s)
-
-    def load_matrix(
-        self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
-    ) -> Float[Any, "y y"]:
-        """Return A + c0 B, whose inverse turns loads into rates; only needed if B is not zero."""
-        z_t, y_t = history.c0 * z + history.z, history.c0 * y + history.y
-        A, B, _ = self.balance(s, t, y, y_t, z, z_t, control)
-        return A + history.c0 * B
-
-    def derivatives(
-        self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
-    ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-        """Return y_s and z at one point (paper eq. 4, semi-discretised general class)."""
-        z = self.strains(s, t, y, control, history)
-        return self.rates(s, t, y, z, control, history), z
+    def correction(self) -> Correction | None:
+        """Learned correction of y_s and z; None without one."""
+        return None
 
     def jump(
-        self, acting: Float[Any, " cuts"], t: Any, y: Float[Any, " y"], control: Any, history: History
+        self, acting: Float[Any, " cuts"], t: Any, y: Float[Any, " y"], y_t: Float[Any, " y"], control: Any
     ) -> Float[Any, " y"]:
         """Return y on the far side of the acting cuts (ones; zeros elsewhere), from y on the near side."""
         raise NotImplementedError(f"{type(self).__name__} has `jumps`, but gives no `jump`")
@@ -224,21 +151,18 @@ class System(Parametrised):
     def rest(self, s: Any) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
         """Return y and z at arclength s (m) of the unloaded robot at rest: the default initial state."""
 
-    def base(self, t: Any, control: Any, unknowns: Float[Any, " k"], history: History) -> Float[Any, " y"]:
-        """Return y at s = 0: the values at rest, with the unknowns in their places.
-
-        `history` is the history of the first node; it determines the velocity of a moving base.
-        """
+    def base(self, t: Any, control: Any, unknowns: Float[Any, " k"]) -> Float[Any, " y"]:
+        """Return y at s = 0: the values at rest, with the unknowns in their places."""
         fixed, _ = self.rest(jnp.zeros(()))
         return self.y_layout.replaced(jnp.asarray(fixed), self.base_unknowns, unknowns)
 
-    def unknowns(self, y: Float[Any, " y"]) -> Float[Any, " k"]:
-        """Return the unknowns of y at s = 0: the inverse of `base`."""
-        return y[..., self.y_layout.indices(self.base_unknowns)]
+    def moving_base(self, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " y"]:
+        """Return y at s = 0 with the velocities of a base whose pose has the rate in `y_t`."""
+        return y
 
     @abc.abstractmethod
-    def tip(self, t: Any, control: Any, y: Float[Any, " y"], history: History) -> Float[Any, " k"]:
-        """Return the residuals of the boundary conditions at s = length."""
+    def tip(self, t: Any, control: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " k"]:
+        """Return the residuals of the boundary conditions at s = length, as many as there are unknowns."""
 
     def end_poses(self, control: Any) -> tuple[Any, Any]:
         """Return the constrained poses of base and tip under a control; None for a free end."""
@@ -247,11 +171,11 @@ class System(Parametrised):
     @property
     def tip_layout(self) -> Layout:
         """Layout of the tip's residuals; one generic field by default."""
-        return Layout(("tip", self.unknown_count, "", "conditions at the tip"))
+        return Layout(("tip", unknown_count(self), "", "conditions at the tip"))
 
     def scales(self) -> Scales:
         """Return the natural sizes of y and of the tip's residuals; ones by default."""
-        return Scales(jnp.ones(self.y_layout.size), jnp.ones(self.unknown_count))
+        return Scales(jnp.ones(self.y_layout.size), jnp.ones(unknown_count(self)))
 
     def eased(self, part: float) -> Self:
         """Return the system with near-discontinuities (friction, contact) spread over 1/part of their width.
@@ -295,24 +219,9 @@ class System(Parametrised):
     ) -> Float[Any, " o"]:
         """Return the possible arguments of an unmodelled load, beside the control, in the material frame."""
         bent = z - self.unstressed(s, control)
-        return jnp.concatenate([self.turned(y, y), self.turned(y, y_t), bent, z_t])
-
-    def turned(self, y: Float[Any, " y"], vectors: Float[Any, " y"]) -> Float[Any, " y"]:
-        """Return numbers with the layout of y, with vectors of the global frame in the material frame."""
-        parts = []
-        for field in self.y_layout.fields:
-            part = self.y_layout.get(vectors, field.name)
-            if field.frame:
-                part = dot(rotation_matrix(self.y_layout.get(y, field.frame)).T, part)
-            parts.append(part)
-        return jnp.concatenate(parts)
+        return jnp.concatenate([in_material_frame(self, y, y), in_material_frame(self, y, y_t), bent, z_t])
 
     # queries that every system answers
-
-    @property
-    def unknown_count(self) -> int:
-        """Number of unknowns at the base."""
-        return len(self.y_layout.indices(self.base_unknowns))
 
     def undelayed(
         self, measured: Float[np.ndarray, "T c"], dt: float, before: Float[np.ndarray, " c"] | None = None
@@ -357,10 +266,6 @@ class System(Parametrised):
             )
         return self.y_layout.get(y, name)
 
-    def scaled(self, factor: Any) -> Self:
-        """Return the system with its length multiplied by a factor."""
-        return self.replace(length=self.length * factor)
-
     def replace(self, **changes: Any) -> Self:
         """Return a copy with other parameters, by name; derived quantities follow.
 
@@ -381,6 +286,13 @@ class System(Parametrised):
                 raise ParameterError(unknown_parameter(type(self), name, settable))
         return dataclasses.replace(self, **changes)
 
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        for name in REPLACED.keys() & vars(cls).keys():
+            raise TypeError(
+                f"{cls.__name__} defines `{name}`, which no solver calls; define {REPLACED[name]}"
+            )
+
     def __check_init__(self) -> None:
         given: Any = self.nodes
         if not isinstance(given, int) or not FEWEST_NODES <= self.nodes <= MOST_NODES:
@@ -388,6 +300,32 @@ class System(Parametrised):
                 f"nodes is {self.nodes!r}; allowed is a whole number from {FEWEST_NODES} to {MOST_NODES}"
             )
         check_fields(self)
+
+
+def unknowns_of(system: System, y: Float[Any, "*n y"]) -> Float[Any, "*n k"]:
+    """Return the unknowns of y at s = 0: the inverse of `System.base`."""
+    return y[..., system.y_layout.indices(system.base_unknowns)]
+
+
+def unknown_count(system: System) -> int:
+    """Return the number of unknowns at the base."""
+    return len(system.y_layout.indices(system.base_unknowns))
+
+
+def with_length_factor(system: System, factor: Any) -> System:
+    """Return the system with the length of its nominal robot multiplied by a factor."""
+    return system.replace(length=system.nominal.length * factor)
+
+
+def in_material_frame(system: System, y: Float[Any, " y"], vectors: Float[Any, " y"]) -> Float[Any, " y"]:
+    """Return numbers with the layout of y, with vectors of the global frame in the material frame."""
+    layout, parts = system.y_layout, []
+    for field in layout.fields:
+        part = layout.get(vectors, field.name)
+        if field.frame:
+            part = dot(rotation_matrix(layout.get(y, field.frame)).T, part)
+        parts.append(part)
+    return jnp.concatenate(parts)
 
 
 def _gives(system: System, name: str) -> bool:

@@ -16,8 +16,6 @@ up.
 Vibration. Above some total tension of all tendons robots begin to shake, and vibration removes friction: x,
 from 0 to 1, is the removed part. It is an internal variable too, x_t = k_v (Σ Tᵢ - T_v), and reduces the
 rod's bending stiffness by c x Σ Tᵢ.
-
-Rates are c0 times the value plus the time scheme's history (`past`); c0 is 0 at rest.
 """
 
 from __future__ import annotations
@@ -29,6 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.rods.law import Evolution
 from knode_cosserat.rods.parameters import parameter
 from knode_cosserat.rods.parts import Part
 from knode_cosserat.rotation import dot
@@ -56,21 +55,18 @@ class TendonFriction(Part):
         high=1.0, default=0.0,
     )  # fmt: skip
 
-    def held(
-        self, directions: Float[Any, "c 3"], u_t: Float[Any, "3"], bent: Float[Any, "3"],
-        past: Float[Any, " c"], c0: Any,
-    ) -> Float[Any, " c"]:  # fmt: skip
-        """Return fᵢ of tendons that bend the rod in these directions.
+    def evolution(
+        self, directions: Float[Any, "c 3"], u_t: Float[Any, "3"], bent: Float[Any, "3"]
+    ) -> Evolution:
+        """Return the law of fᵢ of tendons that bend the rod in these directions.
 
         Args:
             directions: eᵢ.
             u_t: rate of the curvature (1/(m s)).
             bent: curvature relative to the unloaded rod (1/m), for an equilibrium.
-            past: history of fᵢ.
-            c0: coefficient of the time scheme (1/s).
         """
         along = directions / self.reach
-        return jnp.clip(_grown(dot(along, u_t), past, c0, self.at_rest * dot(along, bent)), -1.0, 1.0)
+        return Evolution(dot(along, u_t), self.at_rest * dot(along, bent), -1.0, 1.0)
 
     def loss_rates(self, u: Float[Any, "3"], f: Float[Any, " c"]) -> Float[Any, " c"]:
         """Return λᵢ_s (1/m) at the curvature u (1/m), with the mobilised fraction f of the friction."""
@@ -95,13 +91,7 @@ class Vibration(Part):
         "m2", "c, loss of bending stiffness by vibration, by tension", low=0.0, high=1.0, default=0.0
     )
 
-    def shaken(self, total: Any, past: Float[Any, " 1"], c0: Any) -> Float[Any, " 1"]:
-        """Return x under a total tension (N) of all tendons: at rest it is 0 or 1."""
-        growth = self.rate * (total - self.tension)
-        return jnp.clip(_grown(growth, past, c0, at_rest=jnp.sign(growth)), 0.0, 1.0)
-
-
-def _grown(rate: Any, past: Any, c0: Any, at_rest: Any) -> Any:
-    """Return an internal variable before clipping."""
-    moving = c0 > 0.0
-    return jnp.where(moving, (rate - past) / jnp.where(moving, c0, 1.0), at_rest)
+    def evolution(self, total: Any) -> Evolution:
+        """Return the law of x under a total tension (N) of all tendons: at rest it is 0 or 1."""
+        growth = jnp.reshape(self.rate * (total - self.tension), (1,))
+        return Evolution(growth, jnp.sign(growth), 0.0, 1.0)

@@ -4,8 +4,8 @@ At one point of the rod, in the material frame, with tendon i at rᵢ(s) = (x, y
 
     K_v v + Σ Tᵢ tᵢ = a,     K_u u + Σ Tᵢ rᵢ × tᵢ = b,     tᵢ = ṗᵢ/|ṗᵢ|,     ṗᵢ = v + u × rᵢ + rᵢ′
 
-K_v = Kse + c0 Bse and K_u = Kbt + c0 Bbt; a and b come from n, m and history (Rucker & Webster 2011, in the
-form that keeps the paper's y and z). For K positive definite and Tᵢ ≥ 0 there is exactly one solution: the
+where K_v and K_u are stiffnesses, and a and b come from n and m (Rucker & Webster 2011, in the form that
+keeps the paper's y and z). For K positive definite and Tᵢ ≥ 0 there is exactly one solution: the
 minimum of the strictly convex energy ½ vᵀK_v v + ½ uᵀK_u u + Σ Tᵢ |ṗᵢ| - aᵀv - bᵀu. Its second derivative is
 
     J = diag(K_v, K_u) + Σ Tᵢ/|ṗᵢ| (WᵢᵀWᵢ - gᵢgᵢᵀ),     Wᵢ = [I, -r̂ᵢ],     gᵢ = Wᵢᵀtᵢ = (tᵢ, rᵢ × tᵢ)
@@ -19,7 +19,7 @@ the relative change of ṗᵢ in a correction.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +27,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Float
 
+from knode_cosserat.rods.law import Elastic, Fields
 from knode_cosserat.rotation import dot, dot_by_rows, inverse, small_inverse
 
 #: largest number of Newton corrections
@@ -117,20 +118,30 @@ def tendon_strains(
     return x[:3], x[3:]
 
 
-def tendon_balance(
-    v: Float[Any, "3"],
-    u: Float[Any, "3"],
-    K_v: Float[Any, "3 3"],
-    K_u: Float[Any, "3 3"],
-    a: Float[Any, "3"],
-    b: Float[Any, "3"],
-    r: Float[Any, "c 3"],
-    r_s: Float[Any, "c 3"],
-    tension: Float[Any, " c"],
-) -> Float[Any, "6"]:
-    """Return the law's residual at any v and u (N, N·m): zero at the result of `tendon_strains`."""
-    x = jnp.concatenate([v, u])
-    return _left(x, _levers(x, r, r_s)[0], K_v, K_u, jnp.concatenate([a, b]), tension)
+class Tendons(NamedTuple):
+    """Tendons beside the rod at one point: they couple its strains v and u (`law.Coupling`)."""
+
+    r: Float[Any, "c 3"]
+    r_s: Float[Any, "c 3"]
+    #: T (N)
+    tension: Float[Any, " c"]
+    #: T without friction: an approximation that is often known before y
+    nominal_tension: Float[Any, " c"]
+
+    def strains(self, elastic: dict[str, Elastic]) -> Fields:
+        """Return v and u of the rod's elastic laws with the tendons."""
+        v, u = elastic["v"], elastic["u"]
+        flexibility = unbent_flexibility(v.stiffness, u.stiffness, self.r, self.r_s, self.nominal_tension)
+        found = tendon_strains(
+            v.softened, u.softened, v.stress, u.stress, self.r, self.r_s, self.tension,
+            flexibility=flexibility,
+        )  # fmt: skip
+        return {"v": found[0], "u": found[1]}
+
+    def stresses(self, strains: Fields) -> Fields:
+        """Return the tendons' part of Rᵀn and Rᵀm."""
+        n, m = tendon_wrench(strains["v"], strains["u"], self.r, self.r_s, self.tension)
+        return {"v": n, "u": m}
 
 
 # x is the concatenation of v and u

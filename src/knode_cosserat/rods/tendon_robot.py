@@ -27,8 +27,3 @@ class TendonRobot(TendonRod):
     def actuator_force(self, control: Float[Any, " c"]) -> Float[Any, "3"]:
         """Return the resultant of the tendons' forces per length (N/m), global frame: their only load."""
         return transverse_force(control[: self.actuator_layout.size], self.tendon_angles)
-
-    def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
-        """Return A = I, B = 0, and f1 = `spatial_rates`."""
-        size = self.y_layout.size
-        return jnp.eye(size), jnp.zeros((size, size)), self.spatial_rates(s, y, y_t, z, z_t, control)

@@ -13,13 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.rods.law import MaterialLaw, Viscoelastic
 from knode_cosserat.rods.parameters import parameter
-from knode_cosserat.rods.system import History, System
 from knode_cosserat.rods.tendon_rod import TendonRod
-from knode_cosserat.rotation import cross, dot, inverse, rotation_matrix
+from knode_cosserat.rotation import cross, dot, rotation_matrix
 
-#: Newton corrections of the material's law with friction, which is weakly nonlinear
-CORRECTIONS = 12
 #: standard deviation of the distribution of a rib's mass along the rod (m)
 RIB_WIDTH = 0.02
 #: the nine ribs, as fractions of the length
@@ -70,52 +68,27 @@ class VirtualRobot(TendonRod):
         T = jnp.asarray(control) * (1.0 - loss)
         return self.tendon_offset * jnp.stack([jnp.sum(T * y), -jnp.sum(T * x), jnp.zeros(())])
 
-    # the law is not of the form C z + D z_t = f2
-    constitutive = System.constitutive
+    def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
+        """Return the law of v and u with the tendons."""
+        n, m = self.stresses(y)
+        pulled = n - jnp.sum(jnp.asarray(control)) * np.array([0.0, 0.0, 1.0])
+        moment = jax.tree_util.Partial(_tendon_moment, self, s, jnp.asarray(control))
+        v = Viscoelastic(self.Kse, self.shear_damping, pulled + self.Kse @ self.v_star)
+        u = Viscoelastic(self.stiffness(s), self.bending_damping, m, moment=moment)
+        return MaterialLaw({"v": v, "u": u})
 
-    def strains(
-        self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
-    ) -> Float[Any, " z"]:
-        """Return v and u; u by a few Newton corrections."""
-        R = rotation_matrix(self.y_layout.get(y, "h"))
-        n, m = self.y_layout.get(y, "n"), self.y_layout.get(y, "m")
-        hv, hu = self.z_layout.split(history.z)
-        d3 = np.array([0.0, 0.0, 1.0])
-        K, B, c0 = self.stiffness(s), self.bending_damping, history.c0
-        pulled = dot(R.T, n) - jnp.sum(jnp.asarray(control)) * d3
-        v = dot(
-            inverse(self.Kse + c0 * self.shear_damping),
-            pulled + self.Kse @ self.v_star - dot(self.shear_damping, hv),
-        )
-
-        def left(u: Any, held: Any) -> Any:
-            K, B, hu, m, control = held
-            u_t = c0 * u + hu
-            return dot(K, u) + dot(B, u_t) + self.tendon_moment(s, u_t, control) - m
-
-        def corrected(u: Any, held: Any) -> Any:
-            return u - dot(inverse(jax.jacfwd(left)(u, held)), left(u, held))
-
-        held = (K, B, hu, dot(R.T, m), jnp.asarray(control))
-        # the iteration is not differentiated: one more correction has the implicit function's derivatives
-        still = jax.lax.stop_gradient(held)
-        # starting without sliding, Newton's method does not overshoot; at rest the law is linear
-        begin = -still[2] / jnp.where(c0 > 0.0, c0, 1.0)
-        u = jax.lax.fori_loop(0, CORRECTIONS, lambda _, u: corrected(u, still), begin)
-        u = corrected(jax.lax.stop_gradient(u), held)
-        return jnp.concatenate([v, u])
-
-    def rates(
-        self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
-    ) -> Float[Any, " y"]:
+    def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
         """Return y_s of a rod without tendons, with the ribs' masses."""
         away = (s / self.length - np.array(RIBS)) * self.length / RIB_WIDTH
         # a Gaussian, with half of the last one beyond the tip
         lump = jnp.exp(-0.5 * away**2) / (RIB_WIDTH * np.sqrt(2.0 * np.pi))
         mass = self.rib_mass * jnp.sum(lump)
-        y_t = history.c0 * y + history.y
-        y_s = super().rates(s, t, y, z, control, history)
+        y_s = super().balance(s, t, y, y_t, z, z_t, control)
         R = rotation_matrix(self.y_layout.get(y, "h"))
         q, w, q_t = self.y_layout.get(y, "q"), self.y_layout.get(y, "w"), self.y_layout.get(y_t, "q")
         more = mass * (dot(R, cross(w, q) + q_t) - self.gravity)
         return y_s.at[self.y_layout.slice("n")].add(more)
+
+
+def _tendon_moment(robot: VirtualRobot, s: Any, control: Any, u: Any, u_t: Any) -> Float[Any, "3"]:
+    return robot.tendon_moment(s, u_t, control)

@@ -3,22 +3,34 @@
 from __future__ import annotations
 
 import abc
+import inspect
 from typing import TYPE_CHECKING, Any, Self
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.rods.layout import Layout
-from knode_cosserat.rods.system import History, Scales, System
+from knode_cosserat.rods.system import System
+
+#: members of `Wrapped.knowledge`: layouts, and queries that no parameter of the equations changes
+FACTS = (
+    "y_layout", "z_layout", "control_layout", "base_unknowns", "mixed", "cuts", "jumps", "rest_is_guess",
+    "held", "has_actuation", "velocities", "strands", "tip_layout", "observable_layout", "end_poses",
+    "actuation", "positions", "curves", "quaternions", "undelayed", "trained_range", "nominal",
+)  # fmt: skip
+#: members of `Wrapped.adapted`: equations and other members that depend on parameters
+EQUATIONS = (
+    "constitutive", "balance", "correction", "jump", "base", "moving_base", "scales", "unstressed",
+    "law_factors", "observables",
+)  # fmt: skip
 
 
 class Wrapped(System):
     """System that delegates its whole interface to another system; a subclass overrides what it changes.
 
-    A subclass has the wrapped system as its field `knowledge`, and defines `around`. Layouts, boundary
-    unknowns and other static members are those of `knowledge`. Equations are those of `adapted`, which is
-    `knowledge` unless the subclass changes its parameters. `adapted` does not exist for a batch.
+    A subclass has the wrapped system as its field `knowledge`, and defines `around`. `FACTS` are those of
+    `knowledge`. `EQUATIONS` are those of `adapted`, which is `knowledge` unless the subclass changes its
+    parameters. `adapted` does not exist for a batch.
     """
 
     if TYPE_CHECKING:  # a field of every subclass
@@ -34,96 +46,9 @@ class Wrapped(System):
         return self.knowledge
 
     @property
-    def nominal(self) -> System:
-        """Robot inside all wrapped systems; `replace` changes its parameters."""
-        return self.knowledge.nominal
-
-    # static members
-
-    @property
-    def y_layout(self) -> Layout:  # type: ignore[override]
-        """Layout of y, from the wrapped system."""
-        return self.knowledge.y_layout
-
-    @property
-    def z_layout(self) -> Layout:  # type: ignore[override]
-        """Layout of z, from the wrapped system."""
-        return self.knowledge.z_layout
-
-    @property
-    def control_layout(self) -> Layout:  # type: ignore[override]
-        """Layout of the control, from the wrapped system."""
-        return self.knowledge.control_layout
-
-    @property
-    def base_unknowns(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Fields of y that are unknown at the base, from the wrapped system."""
-        return self.knowledge.base_unknowns
-
-    @property
-    def mixed(self) -> bool:  # type: ignore[override]
-        """True if the wrapped system has terms in y_st."""
-        return self.knowledge.mixed
-
-    @property
-    def cuts(self) -> tuple[float, ...]:  # type: ignore[override]
-        """Discontinuities of the wrapped system (parts of the length)."""
-        return self.knowledge.cuts
-
-    @property
-    def jumps(self) -> bool:  # type: ignore[override]
-        """True if y jumps at discontinuities of the wrapped system."""
-        return self.knowledge.jumps
-
-    @property
-    def rest_is_guess(self) -> bool:  # type: ignore[override]
-        """True if the wrapped system's state at rest is only a guess."""
-        return self.knowledge.rest_is_guess
-
-    @property
-    def held(self) -> bool:  # type: ignore[override]
-        """True if the wrapped system is held in place."""
-        return self.knowledge.held
-
-    @property
-    def linear_law(self) -> bool:  # type: ignore[override]
-        """True if the law of the wrapped system is linear in the strains."""
-        return self.knowledge.linear_law
-
-    @property
-    def law_of_stresses(self) -> bool:
-        """True if the law of the wrapped system is one of stresses."""
-        return self.knowledge.law_of_stresses
-
-    @property
-    def has_actuation(self) -> bool:
-        """True if the actuation of the wrapped system differs from its control."""
-        return self.knowledge.has_actuation
-
-    @property
-    def velocities(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Names of the observables that are velocities, from the wrapped system."""
-        return self.knowledge.velocities
-
-    @property
-    def strands(self) -> int:
-        """Number of strands of the wrapped system."""
-        return self.knowledge.strands
-
-    @property
     def strand(self) -> System:
         """Strand of the wrapped system, wrapped too."""
         return self if self.strands == 1 else self.around(self.knowledge.strand)
-
-    @property
-    def tip_layout(self) -> Layout:
-        """Layout of the tip's boundary conditions, from the wrapped system."""
-        return self.knowledge.tip_layout
-
-    @property
-    def observable_layout(self) -> Layout:
-        """Layout of the observables, from the wrapped system."""
-        return self.knowledge.observable_layout
 
     @property  # type: ignore[misc]
     def length(self) -> Any:
@@ -132,137 +57,37 @@ class Wrapped(System):
             return jax.vmap(lambda system: system.adapted.length)(self)
         return self.adapted.length
 
-    # equations
-
-    def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
-        """Return C, D and f2 of the wrapped system."""
-        return self.adapted.constitutive(s, t, y, y_t, control)
-
-    def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
-        """Return A, B and f1 of the wrapped system."""
-        return self.adapted.balance(s, t, y, y_t, z, z_t, control)
-
-    def strains(
-        self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
-    ) -> Float[Any, " z"]:
-        """Return z of the wrapped system."""
-        return self.adapted.strains(s, t, y, control, history)
-
-    def left_of_law(
-        self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
-    ) -> Float[Any, " z"]:
-        """Return the residual of the law of the wrapped system."""
-        return self.adapted.left_of_law(s, t, y, z, control, history)
-
-    def law_matrix(
-        self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
-    ) -> Float[Any, "z z"]:
-        """Return the derivative of the law of the wrapped system."""
-        return self.adapted.law_matrix(s, t, y, z, control, history)
-
-    def rates(
-        self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
-    ) -> Float[Any, " y"]:
-        """Return y_s of the wrapped system with strains z."""
-        return self.adapted.rates(s, t, y, z, control, history)
-
-    def load_matrix(
-        self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
-    ) -> Float[Any, "y y"]:
-        """Return the matrix of y_s in the balance equations of the wrapped system."""
-        return self.adapted.load_matrix(s, t, y, z, control, history)
-
-    def derivatives(
-        self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
-    ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-        """Return y_s and z of the wrapped system."""
-        return self.adapted.derivatives(s, t, y, control, history)
-
-    def jump(
-        self, acting: Float[Any, " cuts"], t: Any, y: Float[Any, " y"], control: Any, history: History
-    ) -> Float[Any, " y"]:
-        """Return y on the far side of the active discontinuities, from the wrapped system."""
-        return self.adapted.jump(acting, t, y, control, history)
-
     def rest(self, s: Any) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
         """Return the state at rest of the wrapped system."""
         return self.adapted.rest(s)
 
-    def base(self, t: Any, control: Any, unknowns: Float[Any, " k"], history: History) -> Float[Any, " y"]:
-        """Return y at the base, from the wrapped system."""
-        return self.adapted.base(t, control, unknowns, history)
-
-    def unknowns(self, y: Float[Any, " y"]) -> Float[Any, " k"]:
-        """Return the unknowns in y at the base, from the wrapped system."""
-        return self.adapted.unknowns(y)
-
-    def tip(self, t: Any, control: Any, y: Float[Any, " y"], history: History) -> Float[Any, " k"]:
-        """Return the residual of the tip's boundary conditions, from the wrapped system."""
-        return self.adapted.tip(t, control, y, history)
-
-    def end_poses(self, control: Any) -> tuple[Any, Any]:
-        """Return the poses of the held ends, from the wrapped system."""
-        return self.knowledge.end_poses(control)
-
-    def scales(self) -> Scales:
-        """Return the natural units of y and of the tip's residual, from the wrapped system."""
-        return self.adapted.scales()
-
-    # observables
-
-    def actuation(self, control: Float[Any, " c"]) -> Float[Any, " a"]:
-        """Return the actuation of a control, from the wrapped system."""
-        return self.knowledge.actuation(control)
-
-    def unstressed(self, s: Any, control: Any) -> Float[Any, " z"]:
-        """Return the strains without stress, from the wrapped system."""
-        return self.adapted.unstressed(s, control)
-
-    def law_factors(self, s: Any, control: Any) -> tuple[Any, Any] | None:
-        """Return the factors of strain and rate in the law, from the wrapped system."""
-        return self.adapted.law_factors(s, control)
-
-    def observables(self, s: Any, y: Any, y_t: Any, z: Any, z_t: Any, control: Any) -> Float[Any, " o"]:
-        """Return the observables, from the wrapped system."""
-        return self.adapted.observables(s, y, y_t, z, z_t, control)
-
-    def turned(self, y: Float[Any, " y"], vectors: Float[Any, " y"]) -> Float[Any, " y"]:
-        """Return numbers with the layout of y in the material frame, from the wrapped system."""
-        return self.knowledge.turned(y, vectors)
-
-    def positions(self, y: Any) -> Any:
-        """Return the positions in y, from the wrapped system."""
-        return self.knowledge.positions(y)
-
-    def curves(self, y: Any) -> list[Any]:
-        """Return the centrelines in y, from the wrapped system."""
-        return self.knowledge.curves(y)
-
-    def quaternions(self, y: Any) -> Any:
-        """Return the quaternions in y, from the wrapped system."""
-        return self.knowledge.quaternions(y)
-
-    def undelayed(
-        self, measured: Float[np.ndarray, "T c"], dt: float, before: Float[np.ndarray, " c"] | None = None
-    ) -> Float[np.ndarray, "T c"]:
-        """Return the controls that act, without sensor delay, from the wrapped system."""
-        return self.knowledge.undelayed(measured, dt, before)
-
-    def trained_range(self) -> Any:
-        """Return the training range of the wrapped system; None if it has none."""
-        return self.knowledge.trained_range()
-
-    # other parameters
+    def tip(self, t: Any, control: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " k"]:
+        """Return the residuals of the boundary conditions at the tip, from the wrapped system."""
+        return self.adapted.tip(t, control, y, y_t)
 
     def eased(self, part: float) -> Self:
         """Return the system with eased friction and contact of the wrapped system."""
         easier = self.knowledge.eased(part)
         return self if easier is self.knowledge else self.around(easier)
 
-    def scaled(self, factor: Any) -> Self:
-        """Return the system with its length multiplied by a factor."""
-        return self.around(self.knowledge.scaled(factor))
-
     def replace(self, **changes: Any) -> Self:
         """Return a copy in which the wrapped system has other parameters (or nodes), by name."""
         return self.around(self.knowledge.replace(**changes))
+
+
+def _delegated(name: str, owner: str) -> Any:
+    """Return a method, or a property, that is that of the wrapped system."""
+    stated = inspect.getattr_static(System, name, None)
+    if not inspect.isfunction(stated):
+        return property(lambda self: getattr(getattr(self, owner), name), doc=inspect.getdoc(stated))
+
+    def method(self: Wrapped, *arguments: Any, **options: Any) -> Any:
+        return getattr(getattr(self, owner), name)(*arguments, **options)
+
+    method.__name__, method.__qualname__, method.__doc__ = name, f"Wrapped.{name}", stated.__doc__
+    return method
+
+
+for _owner, _names in (("knowledge", FACTS), ("adapted", EQUATIONS)):
+    for _name in _names:
+        setattr(Wrapped, _name, _delegated(_name, _owner))

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from knode_cosserat.solvers.boundary import NewtonOptions
     from knode_cosserat.solvers.equilibrium import equilibria, equilibrium
     from knode_cosserat.solvers.result import Result, SimulationError
+    from knode_cosserat.solvers.semi_discrete import History
     from knode_cosserat.solvers.settings import Settings
     from knode_cosserat.solvers.simulate import simulate
     from knode_cosserat.solvers.space import Euler, Lobatto2, Lobatto4
@@ -22,6 +23,7 @@ __all__ = [
     "BDF2",
     "BDFAlpha",
     "Euler",
+    "History",
     "Lobatto2",
     "Lobatto4",
     "NewtonOptions",
@@ -42,6 +44,7 @@ make_lazy(
         "knode_cosserat.solvers.boundary": "NewtonOptions",
         "knode_cosserat.solvers.equilibrium": "equilibria equilibrium",
         "knode_cosserat.solvers.result": "Result SimulationError",
+        "knode_cosserat.solvers.semi_discrete": "History",
         "knode_cosserat.solvers.settings": "Settings",
         "knode_cosserat.solvers.simulate": "simulate",
         "knode_cosserat.solvers.space": "Euler Lobatto2 Lobatto4",

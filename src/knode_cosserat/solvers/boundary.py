@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from knode_cosserat.rods.system import Scales, System
+from knode_cosserat.rods.system import Scales, System, unknowns_of
 from knode_cosserat.solvers.linear import Factors, factored, solved_correction
 from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.space import SpaceScheme
@@ -106,7 +106,7 @@ def static_error(system: System, space: SpaceScheme, record: Any, control: Any, 
     """Return the largest residual of a record in natural units, all rates zero."""
     problem = StepProblem.still(system, space, control, t)
     y = problem.filled(record[:, : system.y_layout.size])
-    base = problem.base(system.unknowns(y[0])) - y[0]
+    base = problem.base(unknowns_of(system, y[0])) - y[0]
     error = largest_residual(problem, *problem.residuals(y))
     return jnp.maximum(error, jnp.max(jnp.abs(base) / system.scales().y))
 

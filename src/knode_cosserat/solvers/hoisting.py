@@ -3,6 +3,10 @@
 A step evaluates the equations many times at the same places, under the same control. Terms that depend on
 neither y nor the history (tendon routing, section stiffness, the matrix of a law) are evaluated once, before
 the iteration. They are found in the traced equations, so no system has to declare them.
+
+Processor time of a step with and without it (least of 150 simulations of 200 steps; of 40 with 10 steps for
+the last): 0.082 and 0.082 ms for the paper's robot, 0.117 and 0.128 ms for a `RoutedTendonRobot` with
+friction, 7.1 and 8.7 ms for the six-legged robot. The tendons' law gains, a linear law does not.
 """
 
 from __future__ import annotations

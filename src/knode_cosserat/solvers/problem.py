@@ -12,16 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from knode_cosserat.rods.system import (
-    History,
-    System,
-    in_strands,
-    records_in_strands,
-    unpacked_history,
-)
+from knode_cosserat.rods.strands import in_strands
+from knode_cosserat.rods.system import System, unknowns_of
+from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.grid import Grid, grid_of, inside, taken
 from knode_cosserat.solvers.hoisting import split_function
 from knode_cosserat.solvers.linear import Linearisation, filled_up, matrix_products, quotient
+from knode_cosserat.solvers.semi_discrete import History, Point, records_in_strands, unpacked_history
 from knode_cosserat.solvers.space import Formula, SpaceScheme
 from knode_cosserat.solvers.sparsity import nonzero_columns
 
@@ -130,7 +127,8 @@ class StepProblem(eqx.Module):
         The history terms are one packed record.
         """
         strand = self.system.strand
-        return strand.derivatives(s, self.t, y, self.control, unpacked_history(strand, self.c0, history))
+        terms = unpacked_history(strand, self.c0, history)
+        return semi_discrete.derivatives(strand, Point(s, self.t, y, self.control, terms))
 
     def _unpack(self, history: Float[Any, " x"]) -> History:
         return unpacked_history(self.system, self.c0, history)
@@ -139,16 +137,18 @@ class StepProblem(eqx.Module):
 
     def base(self, unknowns: Float[Any, " k"]) -> Float[Any, " y"]:
         """Return y at the first node, for these unknowns."""
-        return self.system.base(self.t, self.control, unknowns, self._unpack(self.history[0]))
+        return semi_discrete.base(self.system, self.t, self.control, unknowns, self._unpack(self.history[0]))
 
     def tip_residual(self, y: Float[Any, " y"]) -> Float[Any, " k"]:
         """Return the residual of the tip's boundary conditions, from y of the last node."""
-        left = self.system.tip(self.t, self.control, y, self._unpack(self.history[self.grid.tip]))
+        left = semi_discrete.tip(
+            self.system, self.t, self.control, y, self._unpack(self.history[self.grid.tip])
+        )
         return left if self.tip_offset is None else left - self.tip_offset
 
     def jump(self, acting: Any, y: Float[Any, " y"], history: Float[Any, " x"]) -> Float[Any, " y"]:
         """Return y on the far side of the active discontinuities."""
-        return self.system.jump(acting, self.t, y, self.control, self._unpack(history))
+        return semi_discrete.jump(self.system, acting, self.t, y, self.control, self._unpack(history))
 
     def far(self, y: Float[Any, "points y"]) -> Float[Any, "pieces y"]:
         """Return y where pieces start, on the far side of their discontinuities."""
@@ -364,7 +364,7 @@ class StepProblem(eqx.Module):
         def corrected(_: Any, y: Any) -> Any:
             defects = self.reached(y) - y[1:]
             # systems with several strands have no discontinuities
-            G = self.linearise(y, self.system.unknowns(y[0])).G
+            G = self.linearise(y, unknowns_of(self.system, y[0])).G
             change = defects if G is None else jnp.sum(G * defects[:, None, :], axis=-1)
             return y.at[1:].add(jnp.where(before, change, 0.0))
 

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from knode_cosserat.errors import KnodeCosseratError
-from knode_cosserat.rods.system import System
+from knode_cosserat.rods.system import System, unknown_count
 from knode_cosserat.solvers.boundary import Solution, newton
 from knode_cosserat.solvers.history import EXTRAPOLATIONS
 from knode_cosserat.solvers.problem import StepProblem
@@ -181,7 +181,7 @@ class Recovery(abc.ABC):
         """Return the outcome of a failed step without recovery; nothing is compiled."""
         system, result = self.system, Result.NO_CONVERGENCE
         width = system.y_layout.size * (2 if system.mixed else 1) + system.z_layout.size
-        record, unknowns = np.full((system.nodes, width), np.nan), np.full(system.unknown_count, np.nan)
+        record, unknowns = np.full((system.nodes, width), np.nan), np.full(unknown_count(system), np.nan)
         row = StepRows(record, unknowns, np.inf, 0, np.nan, int(result))
         return SolvedStep(self.state, row, likely_cause(result, system, self.settings, control))
 

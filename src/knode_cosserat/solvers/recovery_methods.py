@@ -7,7 +7,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from knode_cosserat.rods.system import System
+from knode_cosserat.rods.system import System, unknowns_of
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.guess import hanging_curve, natural_reach, state_from_positions
 from knode_cosserat.solvers.history import EXTRAPOLATIONS, repeated_record_history
@@ -47,7 +47,7 @@ class StepRecovery(Recovery):
     def guesses(self) -> list[tuple[Any, Any]]:
         """Return the last state, and its linear extrapolation."""
         guesses = [jnp.einsum("p,pny->ny", w, self.step.past.y) for w in EXTRAPOLATIONS[:2]]
-        return [(y, self.system.unknowns(y[0])) for y in guesses]
+        return [(y, unknowns_of(self.system, y[0])) for y in guesses]
 
     def last_method(self, controls: tuple[Any, Any]) -> tuple[Result, Attempt] | None:
         """Divide the step into substeps: with a constant control first, then with a ramp."""
@@ -114,7 +114,7 @@ class StaticRecovery(Recovery):
 
     def guesses(self) -> list[tuple[Any, Any]]:
         """Return the state before."""
-        return [(self._y, self.system.unknowns(self._y[0]))]
+        return [(self._y, unknowns_of(self.system, self._y[0]))]
 
     def first_guesses(self, control: Any) -> list[tuple[Any, Any]]:
         """Return curves of the rod's length between held ends, then the state before."""
@@ -124,7 +124,7 @@ class StaticRecovery(Recovery):
             if points is not None:
                 record = state_from_positions(self.system, points, control)
                 y = grid_of(self.system).spread(jnp.asarray(record[:, : self.system.y_layout.size]))
-                found.append((y, self.system.unknowns(y[0])))
+                found.append((y, unknowns_of(self.system, y[0])))
         return found + self.guesses()
 
     def last_method(self, controls: tuple[Any, Any]) -> tuple[Result, Attempt] | None:
@@ -152,5 +152,5 @@ class StaticRecovery(Recovery):
             if dt > longest:
                 break
         y = past.y[0]
-        found = self.solve(controls[1], (y, system.unknowns(y[0])))
+        found = self.solve(controls[1], (y, unknowns_of(system, y[0])))
         return (Result.RECOVERED_RELAXATION, found) if self.solved(found) else None

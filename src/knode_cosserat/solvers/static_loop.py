@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from knode_cosserat.rods.system import System
+from knode_cosserat.rods.system import System, unknowns_of
 from knode_cosserat.solvers.boundary import Kept, newton
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.problem import StepProblem
@@ -43,7 +43,7 @@ def static_loop(
 
     def solve(y: Any, kept: Kept, i: Any) -> tuple[Any, StepRows, Kept]:
         problem = StepProblem.still(system, settings.space, controls[i]).ready()
-        solution, kept = newton(problem, y, system.unknowns(y[0]), settings.newton, kept)
+        solution, kept = newton(problem, y, unknowns_of(system, y[0]), settings.newton, kept)
         return solution.y, solved_row(problem, settings.newton, solution, kept.factors)[0], kept
 
     kept = no_factors(system, settings, y, controls[0])

@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float, Int
 
-from knode_cosserat.rods.system import System, in_strands
+from knode_cosserat.rods.strands import in_strands
+from knode_cosserat.rods.system import System, unknown_count, unknowns_of
 from knode_cosserat.solvers.boundary import (
     Kept,
     NewtonOptions,
@@ -81,7 +82,7 @@ def solve_time_step(
     problem, past = step.problem(system, settings, control).ready(), step.past
     # sum of products instead of a matrix product: XLA fuses it with the next operations
     guess = jnp.sum(past.weights[:, None, None] * past.y, axis=0)
-    solution, kept = newton(problem, guess, system.unknowns(guess[0]), settings.newton, kept, batch)
+    solution, kept = newton(problem, guess, unknowns_of(system, guess[0]), settings.newton, kept, batch)
     after, row = recorded_step(problem, settings, step, solution, kept.factors)
     scale = system.scales().y
     extrapolated = jnp.sum(EXTRAPOLATIONS[:, :, None, None] * past.y, axis=1)
@@ -167,7 +168,7 @@ def weights_by(misfit: Float[Any, " extrapolations"]) -> Float[Any, " past"]:
 def no_factors(system: System, settings: Settings, y: Any, control: Any) -> Kept:
     """Return factors of the right shape that are not usable."""
     problem = StepProblem.still(system, settings.space, control)
-    return none_kept(problem, y, system.unknowns(y[0]))
+    return none_kept(problem, y, unknowns_of(system, y[0]))
 
 
 def no_rows(system: System, shape: tuple[int, ...]) -> StepRows:
@@ -175,7 +176,7 @@ def no_rows(system: System, shape: tuple[int, ...]) -> StepRows:
     numbers = no_history(system, LOBATTO2).shape[-1]
     return StepRows(
         jnp.zeros((*shape, system.nodes, numbers)),
-        jnp.zeros((*shape, system.unknown_count)),
+        jnp.zeros((*shape, unknown_count(system))),
         jnp.zeros(shape),
         jnp.zeros(shape, dtype=int),
         jnp.zeros(shape),

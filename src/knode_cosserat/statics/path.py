@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from knode_cosserat.rods.system import System
+from knode_cosserat.rods.system import System, unknowns_of
 from knode_cosserat.solvers.boundary import NewtonOptions, factors_of, pivots_of
 from knode_cosserat.solvers.equilibrium import equilibrium
 from knode_cosserat.solvers.linear import solved_correction
@@ -174,13 +174,13 @@ def _corrected(system, settings, ends, start, tangent, plane):  # type: ignore[n
         def residuals(part: Any) -> Any:
             control = ends[0] + part * (ends[1] - ends[0])
             problem = static_problem(system, settings, control)
-            base = problem.base(system.unknowns(y[0])) - y[0]
+            base = problem.base(unknowns_of(system, y[0])) - y[0]
             return *problem.residuals(y), base
 
         (defects, tip, base), moved = jax.jvp(residuals, (part,), (jnp.ones(()),))
         error = jnp.maximum(jnp.max(jnp.abs(defects) / scale), jnp.max(jnp.abs(tip) / system.scales().tip))
         problem = static_problem(system, settings, ends[0] + part * (ends[1] - ends[0]))
-        factors = factors_of(problem, y, system.unknowns(y[0]))
+        factors = factors_of(problem, y, unknowns_of(system, y[0]))
         remove, _ = solved_correction(factors, pivots, defects, tip, base)
         follow, _ = solved_correction(factors, pivots, *moved)
         return jnp.where(jnp.isnan(error), jnp.inf, error), remove, follow

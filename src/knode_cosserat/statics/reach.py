@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from knode_cosserat._reprs import packed_text, quantity, wrapped
-from knode_cosserat.rods.system import System, in_strands
+from knode_cosserat.rods.strands import in_strands
+from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.result import Code, Codes, Result, SimulationError
 from knode_cosserat.solvers.space import SpaceScheme

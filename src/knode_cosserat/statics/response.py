@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from knode_cosserat.rods.system import System
+from knode_cosserat.rods.system import System, unknown_count, unknowns_of
 from knode_cosserat.solvers.boundary import Solution, factors_of, newton, pivots_of
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.history import rest_record
@@ -62,7 +62,7 @@ def static_problem(system: System, settings: Settings, control: Any) -> StepProb
 def unloaded_guess(system: System) -> tuple[Any, Any]:
     """Return the unloaded initial guess of y at all points and of ξ."""
     y = grid_of(system).spread(rest_record(system)[:, : system.y_layout.size])
-    return y, system.unknowns(y[0])
+    return y, unknowns_of(system, y[0])
 
 
 rest_guess = jax.jit(unloaded_guess)
@@ -124,7 +124,7 @@ def respond(system, settings, pose, control, y, unknowns):  # type: ignore[no-un
         return twist(system, pose, found.y[-1], dy[-1])
 
     names = wrench_fields(system)
-    columns = np.eye(system.unknown_count)[system.tip_layout.indices(names) if names else []]
+    columns = np.eye(unknown_count(system))[system.tip_layout.indices(names) if names else []]
     position, quaternion = pose(system, found.y[-1])
     jacobian = jax.vmap(by_control, out_axes=-1)(jnp.eye(system.control_size))
     empty = jnp.zeros((jacobian.shape[0], 0))
@@ -166,5 +166,5 @@ def first_solved(system: System, settings: Settings, pose: Pose, control: Any, g
     if not found.error <= settings.newton.acceptable:
         recovered = equilibrium(system, control, space=settings.space, newton=settings.newton)
         y = _filled(system, settings, control, jnp.asarray(recovered.y[0]))
-        found = respond(system, settings, pose, control, y, system.unknowns(y[0]))
+        found = respond(system, settings, pose, control, y, unknowns_of(system, y[0]))
     return found

@@ -18,7 +18,8 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from knode_cosserat._reprs import count_of
-from knode_cosserat.rods.system import System, in_strands
+from knode_cosserat.rods.strands import in_strands
+from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import static_error
 from knode_cosserat.solvers.equilibrium import equilibrium as rests
 from knode_cosserat.solvers.result import Result

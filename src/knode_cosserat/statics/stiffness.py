@@ -22,7 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.rods.system import System, in_strands
+from knode_cosserat.rods.strands import in_strands
+from knode_cosserat.rods.system import System, unknowns_of
 from knode_cosserat.solvers.grid import grid_of, inside
 from knode_cosserat.solvers.problem import StepProblem, no_history
 from knode_cosserat.solvers.space import Lobatto4
@@ -134,7 +135,7 @@ def _filled(system: System, y: Any, control: Any, history: Any) -> Any:
 @jax.jit
 def _ends(system: System, base: Any, tip: Any, control: Any, history: Any) -> tuple[Any, Any, Any]:
     problem = StepProblem(system, jnp.zeros(()), control, jnp.zeros(()), history, Lobatto4())
-    changes = jax.jacfwd(problem.base)(system.unknowns(base)), jax.jacfwd(problem.tip_residual)(tip)
+    changes = jax.jacfwd(problem.base)(unknowns_of(system, base)), jax.jacfwd(problem.tip_residual)(tip)
     return *changes, problem.tip_residual(tip)
 
 

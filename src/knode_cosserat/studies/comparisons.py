@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from knode_cosserat.evaluation.metrics import PoseHistory, pose_mse, tip_dtw
 from knode_cosserat.rods.layout import Layout
-from knode_cosserat.rods.system import History, Scales, System
+from knode_cosserat.rods.system import Scales, System
 from knode_cosserat.trajectory import Trajectory
 
 
@@ -59,27 +59,29 @@ class NoKnowledge(System):
         """Length of the model (m)."""
         return self.model.length
 
-    def derivatives(
-        self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
-    ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-        """Return zeros for y_s and z."""
-        return jnp.zeros(self.y_layout.size), jnp.zeros(self.z_layout.size)
+    def constitutive(self, s: Any, t: Any, y: Any, y_t: Any, control: Any) -> Float[Any, " z"]:
+        """Return zeros for z."""
+        return jnp.zeros(self.z_layout.size)
+
+    def balance(self, s: Any, t: Any, y: Any, y_t: Any, z: Any, z_t: Any, control: Any) -> Float[Any, " y"]:
+        """Return zeros for y_s."""
+        return jnp.zeros(self.y_layout.size)
 
     def rest(self, s: Any) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
         """Return the model's rest state: an initial state is not physics."""
         return self.model.rest(s)
 
-    def base(self, t: Any, control: Any, unknowns: Float[Any, " k"], history: History) -> Float[Any, " y"]:
+    def base(self, t: Any, control: Any, unknowns: Float[Any, " k"]) -> Float[Any, " y"]:
         """Return the model's y at the base."""
-        return self.model.base(t, control, unknowns, history)
+        return self.model.base(t, control, unknowns)
 
-    def unknowns(self, y: Float[Any, " y"]) -> Float[Any, " k"]:
-        """Return the model's unknowns at the base from y."""
-        return self.model.unknowns(y)
+    def moving_base(self, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " y"]:
+        """Return the model's y at the base with its velocities."""
+        return self.model.moving_base(y, y_t)
 
-    def tip(self, t: Any, control: Any, y: Float[Any, " y"], history: History) -> Float[Any, " k"]:
+    def tip(self, t: Any, control: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " k"]:
         """Return the residual of the model's boundary conditions at the tip."""
-        return self.model.tip(t, control, y, history)
+        return self.model.tip(t, control, y, y_t)
 
     @property
     def tip_layout(self) -> Layout:

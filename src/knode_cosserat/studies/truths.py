@@ -15,18 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.rods.law import MaterialLaw
 from knode_cosserat.rods.loads import square_law_drag
 from knode_cosserat.rods.parameters import parameter
-from knode_cosserat.rods.system import History, System
 from knode_cosserat.rods.tendon_robot import TendonRobot
-from knode_cosserat.rotation import cross, dot, inverse, rotation_matrix
-
-#: Newton corrections of a material's law that is not linear: more than it takes; not solved by then is NaN
-CORRECTIONS = 60
-#: parts of a correction that are tried: steep friction overshoots
-PARTS = 0.5 ** np.arange(8)
-#: a law is solved when no more than this part of its terms is left
-TOLERANCE = 1e-12
+from knode_cosserat.rotation import cross, dot, rotation_matrix
 
 Robot = TypeVar("Robot", bound=TendonRobot)
 
@@ -47,54 +40,15 @@ class CurvedMaterial(TendonRobot):
     def extra_moment(self, u: Float[Any, "3"], u_t: Float[Any, "3"]) -> Float[Any, "3"]:
         """μ (N·m), material frame."""
 
-    def strains(
-        self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
-    ) -> Float[Any, " z"]:
-        """Return v of the linear law and u of this law; NaN if Newton's method fails."""
-        z = super().strains(s, t, y, control, history)
-        v, u_linear = self.z_layout.split(z)
-        hu = self.z_layout.get(history.z, "u")
-        given = (self, history.c0, u_linear, hu)
-        # the search itself is not differentiated: one more correction has the implicit function's derivatives
-        u = _solved(jax.lax.stop_gradient(given))
-        return jnp.concatenate([v, u + _correction(given, u)])
-
-    # a law that is not linear in z has no general form
-    constitutive = System.constitutive
+    def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
+        """Return the linear law of v, and the law of u with this moment."""
+        strains = self.linear_law(s, y, control).strains
+        moment = jax.tree_util.Partial(_moment, self)
+        return MaterialLaw({**strains, "u": strains["u"]._replace(moment=moment)})
 
 
-def _left(given: Any, u: Any) -> Any:
-    """Return the residual of the constitutive law for u (N·m)."""
-    robot, c0, u_linear, hu = given
-    K = robot.Kbt + c0 * robot.bending_damping
-    return dot(K, u - u_linear) + robot.extra_moment(u, c0 * u + hu)
-
-
-def _correction(given: Any, u: Any) -> Any:
-    return -dot(inverse(jax.jacfwd(lambda u: _left(given, u))(u)), _left(given, u))
-
-
-def _solved(given: Any) -> Any:
-    """Return u by Newton's method with a line search; NaN if it does not converge."""
-    robot, c0, u_linear, hu = given
-    own = jnp.abs(dot(robot.Kbt, u_linear)) + c0 * jnp.abs(dot(robot.bending_damping, u_linear))
-    size = jnp.max(own + jnp.abs(dot(robot.bending_damping, hu)))
-
-    def missed(u: Any) -> Any:
-        return ~(jnp.max(jnp.abs(_left(given, u))) <= TOLERANCE * size)
-
-    def going(state: Any) -> Any:
-        u, count = state
-        return missed(u) & (count < CORRECTIONS)
-
-    def corrected(state: Any) -> Any:
-        u, count = state
-        tried = u + PARTS[:, None] * _correction(given, u)
-        left = jax.vmap(lambda u: jnp.sum(_left(given, u) ** 2))(tried)
-        return tried[jnp.argmin(left)], count + 1
-
-    u, _ = jax.lax.while_loop(going, corrected, (u_linear, 0))
-    return jnp.where(missed(u), jnp.nan, u)
+def _moment(robot: CurvedMaterial, u: Any, u_t: Any) -> Float[Any, "3"]:
+    return robot.extra_moment(u, u_t)
 
 
 Stiffness = Literal["linear", "square", "exponential", "levelling", "each axis", "one way", "softening"]
@@ -154,15 +108,9 @@ class Tapered(TendonRobot):
         part = 1.0 - self.tip_softening * s / self.length
         return derived_robot(TendonRobot, self, youngs_modulus=self.youngs_modulus * part)
 
-    def strains(
-        self, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
-    ) -> Float[Any, " z"]:
-        """Return the strains of a rod with the modulus at s."""
-        return self._there(s).strains(s, t, y, control, history)
-
     def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
         """Return the constitutive law of a rod with the modulus at s."""
-        return self._there(s).constitutive(s, t, y, y_t, control)
+        return self._there(s).linear_law(s, y, control)
 
 
 # friction
@@ -204,9 +152,9 @@ class ExternalFriction(TendonRobot):
     least: Any = parameter("rad/s", "angular velocity from which it is full", low=1e-9, high=1e6, default=0.5)
     law: Rubbing = eqx.field(static=True, default="each axis")
 
-    def spatial_rates(self, s, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
+    def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
         """Return the rates with this robot's additional effect."""
-        y_s = super().spatial_rates(s, y, y_t, z, z_t, control)
+        y_s = super().balance(s, t, y, y_t, z, z_t, control)
         R = rotation_matrix(self.y_layout.get(y, "h"))
         moment = self.friction * rubbing(self.law, self.y_layout.get(y, "w"), self.least)
         return y_s.at[self.y_layout.slice("m")].add(dot(R, moment))
@@ -223,9 +171,9 @@ class Wind(TendonRobot):
         default=(3.0, 0.0, 0.0),
     )  # fmt: skip
 
-    def spatial_rates(self, s, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
+    def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
         """Return the rates with this robot's additional effect."""
-        y_s = super().spatial_rates(s, y, y_t, z, z_t, control)
+        y_s = super().balance(s, t, y, y_t, z, z_t, control)
         R, q = rotation_matrix(self.y_layout.get(y, "h")), self.y_layout.get(y, "q")
         relative = q - dot(R.T, jnp.asarray(self.wind))
         more = square_law_drag(self.drag, relative) - square_law_drag(self.drag, q)
@@ -237,9 +185,9 @@ class TurningTendons(TendonRobot):
 
     turning: Any = parameter("", "part of the tendons' force that turns", low=0.0, high=1.0, default=1.0)
 
-    def spatial_rates(self, s, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
+    def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
         """Return the rates with this robot's additional effect."""
-        y_s = super().spatial_rates(s, y, y_t, z, z_t, control)
+        y_s = super().balance(s, t, y, y_t, z, z_t, control)
         f = self.actuation(control)
         turned = dot(rotation_matrix(self.y_layout.get(y, "h")), f)
         return y_s.at[self.y_layout.slice("n")].add(self.turning * (f - turned))
@@ -250,14 +198,8 @@ class FadingTendons(TendonRobot):
 
     loss: Any = parameter("1/m", "part of the tension lost per length", low=0.0, high=100.0, default=0.3)
 
-    def rates(
-        self, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any, history: History
-    ) -> Float[Any, " y"]:
-        """Return the rates under the tension remaining at s."""
-        return super().rates(s, t, y, z, jnp.asarray(control) * jnp.exp(-self.loss * s), history)
-
     def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
-        """Return the balance under the tension remaining at s."""
+        """Return y_s under the tension remaining at s."""
         return super().balance(s, t, y, y_t, z, z_t, jnp.asarray(control) * jnp.exp(-self.loss * s))
 
 
@@ -271,11 +213,11 @@ class LoadedTip(TendonRobot):
     def load_at_tip(self, R: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> tuple[Any, Any]:
         """Force (N) and moment (N·m) on the tip, in the global frame; R turns the material's into it."""
 
-    def tip(self, t: Any, control: Any, y: Float[Any, " y"], history: History) -> Float[Any, " k"]:
+    def tip(self, t: Any, control: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " k"]:
         """Return the boundary condition's residual: n and m at the tip equal the load."""
         R = rotation_matrix(self.y_layout.get(y, "h"))
-        load = self.load_at_tip(R, y, history.c0 * y + history.y)
-        return super().tip(t, control, y, history) + jnp.concatenate(load)
+        load = self.load_at_tip(R, y, y_t)
+        return super().tip(t, control, y, y_t) + jnp.concatenate(load)
 
 
 class TipMass(LoadedTip):

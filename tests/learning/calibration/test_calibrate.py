@@ -19,6 +19,7 @@ from knode_cosserat.learning.calibration.unknowns import (
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import Residual
 from knode_cosserat.learning.samples import DataError
+from knode_cosserat.solvers import semi_discrete
 from tests.learning.bar import BAR, WRONG, Bar, pulled
 from tests.learning.calibration.data import DT, FOUR, ROBOT, noisy, sines
 
@@ -128,9 +129,9 @@ class Stiffer(Residual):
 
     factor: Any
 
-    def derivatives(self, knowledge, s, t, y, control, history):
-        z = 1.0 + self.factor * (knowledge.strains(s, t, y, control, history) - 1.0)
-        return knowledge.rates(s, t, y, z, control, history), z
+    def derivatives(self, knowledge, point):
+        z = 1.0 + self.factor * (semi_discrete.strains(knowledge, point) - 1.0)
+        return semi_discrete.rates(knowledge, point, z), z
 
 
 def test_the_knowledge_of_a_model(swings):
@@ -173,9 +174,9 @@ class Ropes(Bar):
     ropes: Any = kc.robots.parameter("1", "how many", low=0.1, high=100.0, default=1.0)
     colour: Any = kc.robots.parameter("1", "not used", low=0.0, high=1.0, default=0.5)
 
-    def strains(self, s, t, y, control, history):
+    def constitutive(self, s, t, y, y_t, control):
         every = self.replace(stiffness=self.stiffness * self.ropes, damping=self.damping * self.ropes)
-        return Bar.strains(every, s, t, y, control, history)
+        return Bar.constitutive(every, s, t, y, y_t, control)
 
 
 ROPES = Ropes(length=1.0, density=1.0, stiffness=30.0, damping=0.4, nodes=6)

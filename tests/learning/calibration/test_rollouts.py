@@ -15,8 +15,8 @@ class Hanging(Bar):
 
     rest_is_guess: ClassVar = True
 
-    def rates(self, s, t, y, z, control, history):
-        return super().rates(s, t, y, z, control, history).at[1].add(-9.81 * self.density)
+    def balance(self, s, t, y, y_t, z, z_t, control):
+        return super().balance(s, t, y, y_t, z, z_t, control).at[1].add(-9.81 * self.density)
 
 
 @pytest.mark.parametrize("space", [pytest.param("euler", marks=pytest.mark.campaign), "lobatto4"])

@@ -17,6 +17,8 @@ from knode_cosserat.learning.knode import KNODE, About
 from knode_cosserat.learning.residual import Network, Residual, input_size
 from knode_cosserat.learning.structured.expansion import CURVED, expansion
 from knode_cosserat.learning.structured.residual import Load, Structured, ambient_layout, loaded
+from knode_cosserat.rods.system import unknown_count
+from knode_cosserat.solvers import semi_discrete
 
 # few nodes and tensions that no other test has: what is compiled here was not compiled before
 ROBOT = kc.load_robot("delrin-tendon-robot").replace(nodes=5, youngs_modulus=10e9 / 3)
@@ -49,7 +51,7 @@ def structured(knowledge=ROBOT, seed=0):
 
     balanced = loaded(knowledge).size
     load = Load(law(knowledge.observable_layout, balanced), law(ambient_layout(knowledge), balanced))
-    tip = Load(None, law(ambient_layout(knowledge), knowledge.unknown_count))
+    tip = Load(None, law(ambient_layout(knowledge), unknown_count(knowledge)))
     assert y.size > balanced
     return Structured(np.asarray(0.01 * seed), law(z + rates, z.size, u=CURVED), load, tip)
 
@@ -89,8 +91,8 @@ class Pull(Residual):
         )
         self.options = (Odd("x"), (1.5, None, True), "text")
 
-    def derivatives(self, knowledge, s, t, y, control, history):
-        y_s, z = knowledge.derivatives(s, t, y, control, history)
+    def derivatives(self, knowledge, point):
+        y_s, z = semi_discrete.derivatives(knowledge, point)
         where = knowledge.y_layout.slice("n")
         return y_s.at[where].add(self.force), z
 

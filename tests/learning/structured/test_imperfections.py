@@ -10,6 +10,8 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.rotation import rotation_matrix
+from knode_cosserat.solvers import semi_discrete
+from knode_cosserat.solvers.semi_discrete import History, Point
 from knode_cosserat.studies import imperfections, truths
 from knode_cosserat.studies.imperfections_report import as_markdown, figure, missed, ratios, rerun
 
@@ -36,9 +38,7 @@ def points(count=20, seed=0):
     draw = np.random.default_rng(seed)
     y = draw.normal(size=(count, 19)) * np.repeat([0.3, 1.0, 2.0, 0.5, 1.0, 3.0], [3, 4, 3, 3, 3, 3])
     z = draw.normal(size=(count, 6)) * np.repeat([1.0, 20.0], 3)
-    history = kc.robots.History(
-        np.full(count, 30.0), 30.0 * draw.normal(size=(count, 19)), z, np.zeros((count, 19))
-    )
+    history = History(np.full(count, 30.0), 30.0 * draw.normal(size=(count, 19)), z, np.zeros((count, 19)))
     return y, draw.uniform(0.0, 10.0, (count, 4)), history
 
 
@@ -47,8 +47,8 @@ def at_points(robot, y, control, history):
     """y_s, z and the tip's residuals at every point."""
 
     def one(y, control, history):
-        y_s, z = robot.derivatives(0.3, 0.0, y, control, history)
-        return y_s, z, robot.tip(0.0, control, y, history)
+        y_s, z = semi_discrete.derivatives(robot, Point(0.3, 0.0, y, control, history))
+        return y_s, z, semi_discrete.tip(robot, 0.0, control, y, history)
 
     return jax.vmap(one)(y, control, history)
 
@@ -93,10 +93,11 @@ def test_a_stiffening_rod_has_the_moment_of_its_law_and_its_slope():
     robot = truths.derived_robot(truths.Stiffening, ROBOT, law="exponential", curvature=2.0)
     y = np.zeros(19)
     y[3] = 1.0
-    still = kc.robots.History(np.zeros(()), np.zeros(19), np.zeros(6), np.zeros(19))
+    still = History(np.zeros(()), np.zeros(19), np.zeros(6), np.zeros(19))
 
     def bent(moment):
-        return robot.strains(0.0, 0.0, jnp.asarray(y).at[10].set(moment), None, still)[3]
+        point = Point(0.0, 0.0, jnp.asarray(y).at[10].set(moment), None, still)
+        return semi_discrete.strains(robot, point)[3]
 
     u = 1.7
     EI = float(ROBOT.Kbt[0, 0])
@@ -115,12 +116,12 @@ def test_a_body_at_the_tip_hangs_by_its_weight_and_resists_being_moved():
     )
     y = np.zeros(19)
     y[3] = 1.0
-    still = kc.robots.History(np.zeros(()), np.zeros(19), np.zeros(6), np.zeros(19))
-    left = np.asarray(robot.tip(0.0, None, y, still))
+    still = History(np.zeros(()), np.zeros(19), np.zeros(6), np.zeros(19))
+    left = np.asarray(semi_discrete.tip(robot, 0.0, None, y, still))
     np.testing.assert_allclose(left, [0, 0, -0.02 * 9.81, -0.1 * 0.02 * 9.81, 0, 0], atol=1e-15)
     # turned about its own axis ever faster: α = 5 about z, the centre on a lever along y
-    faster = kc.robots.History(np.zeros(()), np.r_[np.zeros(16), 0.0, 0.0, 5.0], np.zeros(6), np.zeros(19))
-    more = np.asarray(robot.tip(0.0, None, y, faster)) - left
+    faster = History(np.zeros(()), np.r_[np.zeros(16), 0.0, 0.0, 5.0], np.zeros(6), np.zeros(19))
+    more = np.asarray(semi_discrete.tip(robot, 0.0, None, y, faster)) - left
     np.testing.assert_allclose(
         more, [0.02 * 5 * 0.1, 0, 0, 0, 0, -1e-4 * 5 - 0.1 * 0.02 * 5 * 0.1], atol=1e-15
     )

@@ -13,6 +13,7 @@ from knode_cosserat.learning.config import StructuredOptions
 from knode_cosserat.learning.explain import explain
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.structured.closed_form import residuals_of
+from knode_cosserat.solvers.semi_discrete import History, Point
 from knode_cosserat.studies import truths
 from tests.learning.bar import BAR, pulled
 
@@ -162,13 +163,11 @@ def test_derivatives_of_an_implicit_law(robot):
     model = learned(robot, recorded(like(robot, truths.Stiffening)))
     trajectory = recorded(robot, 4, (1.0,))[0]
     y = jnp.asarray(trajectory.y[3, 4])
-    history = kc.robots.History(
-        jnp.array(30.0), -30.0 * y, -30.0 * jnp.asarray(trajectory.z[2, 4]), jnp.zeros(19)
-    )
+    history = History(jnp.array(30.0), -30.0 * y, -30.0 * jnp.asarray(trajectory.z[2, 4]), jnp.zeros(19))
 
     @jax.jit
     def strains(y):
-        return model.residual.strains(model.adapted, 0.1, 0.0, y, jnp.zeros(4), history)
+        return model.residual.strains(model.adapted, Point(0.1, 0.0, y, jnp.zeros(4), history))
 
     exact = jax.jit(jax.jacfwd(strains))(y)
     step = 1e-5 * np.asarray(robot.scales().y)

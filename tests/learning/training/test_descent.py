@@ -24,6 +24,7 @@ from knode_cosserat.learning.training.losses import (
     loss_for,
     value_scales,
 )
+from knode_cosserat.solvers import semi_discrete
 from tests.learning.bar import BAR, WRONG, pulled
 
 DT = 0.05
@@ -190,7 +191,7 @@ class Nested(Residual):
     inner: Inner
     parts: tuple
 
-    def derivatives(self, knowledge, s, t, y, control, history):
+    def derivatives(self, knowledge, point):
         raise NotImplementedError
 
 
@@ -311,9 +312,9 @@ class Softer(Residual):
 
     softness: jax.Array
 
-    def derivatives(self, knowledge, s, t, y, control, history):
+    def derivatives(self, knowledge, point):
         softer = dataclasses.replace(knowledge, stiffness=knowledge.stiffness / (1.0 + self.softness))
-        return softer.derivatives(s, t, y, control, history)
+        return semi_discrete.derivatives(softer, point)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.05])

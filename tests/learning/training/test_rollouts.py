@@ -223,7 +223,7 @@ def test_too_many_rejections_stop_it(bars, residual, monkeypatch):
 class Torn(type(BAR)):
     """A bar without a solution: no force balances the pull at its tip."""
 
-    def tip(self, t, control, y, history):
+    def tip(self, t, control, y, y_t):
         return 1.0 + control**2 + y[1:2] ** 2
 
 

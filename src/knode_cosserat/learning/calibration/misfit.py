@@ -30,7 +30,9 @@ from knode_cosserat.learning.samples import (
     rows_are_states,
     samples,
 )
-from knode_cosserat.rods.system import System, unpacked_history
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers import semi_discrete
+from knode_cosserat.solvers.semi_discrete import unpacked_history
 from knode_cosserat.trajectory import Trajectory
 
 #: ten times the solver's tolerance, in natural units: smaller differences are solver errors
@@ -74,7 +76,7 @@ def _differences(robot, coordinates, data, length, unknowns, space):  # type: ig
 
     def of_tip(sample: TipSamples) -> Any:
         history = unpacked_history(system, sample.c0, scaled(sample.history))
-        return system.tip(sample.t, sample.control, sample.y, history)
+        return semi_discrete.tip(system, sample.t, sample.control, sample.y, history)
 
     segments, tips = data
     return jnp.concatenate([jax.vmap(of_segment)(segments).ravel(), jax.vmap(of_tip)(tips).ravel()])

@@ -41,10 +41,11 @@ from knode_cosserat.learning.residual import Network, Nothing, Residual
 from knode_cosserat.learning.structured.expansion import Expansion, Term
 from knode_cosserat.learning.structured.residual import Load, Structured
 from knode_cosserat.rods import robot_file
-from knode_cosserat.rods.system import History, System, is_traced
+from knode_cosserat.rods.system import System, is_traced, unknown_count
 from knode_cosserat.rods.trained_range import TrainedRange
-from knode_cosserat.solvers import space, time
+from knode_cosserat.solvers import semi_discrete, space, time
 from knode_cosserat.solvers.boundary import NewtonOptions
+from knode_cosserat.solvers.semi_discrete import History, Point
 from knode_cosserat.solvers.settings import Settings
 
 TITLE = Title("knode-cosserat model", 1)
@@ -293,7 +294,7 @@ def _require_fit(model: KNODE) -> None:
         line = (str(error).splitlines() or [type(error).__name__])[0]
         reason = re.sub(r"<function \w+ at 0x[0-9a-f]+>", "the equations", line[:300])
         raise ContainerError(f"residual and knowledge do not fit together: {reason}") from None
-    expected = [(ny,), (nz,), (model.unknown_count,)]
+    expected = [(ny,), (nz,), (unknown_count(model),)]
     if shapes != expected or length.shape != () or length.dtype.kind not in "fiu" or not np.isfinite(length):
         raise ContainerError(
             f"residual and knowledge do not fit together: y_s, z, tip have shapes {shapes}; allowed is "
@@ -302,8 +303,8 @@ def _require_fit(model: KNODE) -> None:
 
 
 def _equations(model: KNODE, y: Any, control: Any, history: History) -> tuple[Any, Any, Any]:
-    y_s, z = model.derivatives(np.zeros(()), np.zeros(()), y, control, history)
-    return y_s, z, model.tip(np.zeros(()), control, y, history)
+    y_s, z = semi_discrete.derivatives(model, Point(np.zeros(()), np.zeros(()), y, control, history))
+    return y_s, z, semi_discrete.tip(model, np.zeros(()), control, y, history)
 
 
 provide(KNODE, "save", save)

@@ -45,9 +45,11 @@ from knode_cosserat.learning.structured.sums import (
     mean_of_ends,
 )
 from knode_cosserat.rods.layout import Layout
-from knode_cosserat.rods.system import System, unpacked_history
+from knode_cosserat.rods.system import System
 from knode_cosserat.rotation import rotation_matrix
+from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.grid import ON_NODE
+from knode_cosserat.solvers.semi_discrete import Point, unpacked_history
 from knode_cosserat.solvers.space import SpaceScheme
 
 #: smaller relative values are the solver's tolerance, not a load
@@ -168,17 +170,19 @@ def _floors(layout: Layout, values: Float[Any, "S n"]) -> Float[Any, " n"]:
 
 
 @jax.jit
-def _left_of_law(knowledge: System, data: Samples) -> tuple[Any, Any, Any]:
+def _law_residual(knowledge: System, data: Samples) -> tuple[Any, Any, Any]:
     """Return the residual of the law at the true strains, its natural size, and the inputs of stress."""
 
     def one(sample: Samples) -> Any:
         s = start_of(knowledge, sample.place)
         history = unpacked_history(knowledge, sample.c0, sample.history[0])
-        z, z_t = sample.z, sample.c0 * sample.z + history.z
+        z, z_t = sample.z, history.z_t(sample.z)
         inputs = law_inputs(knowledge, s, sample.control, z, z_t)
 
+        point = Point(s, sample.t, sample.y, sample.control, history)
+
         def law(z: Any) -> Any:
-            return knowledge.left_of_law(s, sample.t, sample.y, z, sample.control, history)
+            return semi_discrete.law_residual(knowledge, point, z)
 
         # the derivative along z gives the size of the law's terms
         left, size = jax.jvp(law, (z,), (z,))
@@ -188,7 +192,7 @@ def _left_of_law(knowledge: System, data: Samples) -> tuple[Any, Any, Any]:
 
 
 def _law(knowledge: System, data: Samples, options: StructuredOptions) -> tuple[list[Offer], list[Target]]:
-    left, size, inputs = (np.asarray(part) for part in _left_of_law(knowledge, data))
+    left, size, inputs = (np.asarray(part) for part in _law_residual(knowledge, data))
     fields = knowledge.z_layout.fields
     layout = Layout(*fields, *((f"{name}_t", *rest) for name, *rest in fields))
     offers = [
@@ -256,20 +260,25 @@ def _points(knowledge: System, residual: Structured, data: Samples, space: Space
 def _near_strains(knowledge: System, residual: Structured, s: Any, data: Samples) -> Any:
     def one(s: Any, sample: Samples) -> Any:
         history = unpacked_history(knowledge, sample.c0, sample.history[1])
-        return residual.strains(knowledge, s, sample.t, sample.y_next, sample.control, history)
+        return residual.strains(knowledge, Point(s, sample.t, sample.y_next, sample.control, history))
 
     return jax.vmap(one)(s, data)
 
 
+def _point(knowledge: System, row: Points) -> Point:
+    history = unpacked_history(knowledge, row.c0, row.history)
+    return Point(row.s, row.t, row.y, row.control, history)
+
+
 @jax.jit
 def _views(knowledge: System, points: Points) -> _Views:
-    def one(point: Points) -> Any:
-        history = unpacked_history(knowledge, point.c0, point.history)
-        y_t, z_t = point.c0 * point.y + history.y, point.c0 * point.z + history.z
-        observables = knowledge.observables(point.s, point.y, y_t, point.z, z_t, point.control)
+    def one(row: Points) -> Any:
+        point, z = _point(knowledge, row), row.z
+        z_t = point.history.z_t(z)
+        observables = knowledge.observables(point.s, point.y, point.y_t, z, z_t, point.control)
         matrix = None
         if knowledge.mixed:
-            matrix = knowledge.load_matrix(point.s, point.t, point.y, point.z, point.control, history)
+            matrix = semi_discrete.load_matrix(knowledge, point, z)
         ambient = ambient_inputs(knowledge, point.control)
         return _Views(jnp.concatenate([observables, ambient]), ambient, matrix)
 
@@ -280,9 +289,8 @@ def _views(knowledge: System, points: Points) -> _Views:
 def _rates(knowledge: System, points: Points) -> Any:
     """Return y_s of the nominal model at the true strains."""
 
-    def one(point: Points) -> Any:
-        history = unpacked_history(knowledge, point.c0, point.history)
-        return knowledge.rates(point.s, point.t, point.y, point.z, point.control, history)
+    def one(row: Points) -> Any:
+        return semi_discrete.rates(knowledge, _point(knowledge, row), row.z)
 
     return jax.vmap(one)(points)
 
@@ -378,8 +386,8 @@ def _at_tip(adapted: System, data: TipSamples) -> tuple[Any, _Views]:
 
     def one(sample: TipSamples) -> Any:
         history = unpacked_history(adapted, sample.c0, sample.history)
-        left = adapted.tip(sample.t, sample.control, sample.y, history)
-        observables = tip_observables(adapted, sample.y, sample.control, history)
+        left = semi_discrete.tip(adapted, sample.t, sample.control, sample.y, history)
+        observables = tip_observables(adapted, sample.y, history.y_t(sample.y), sample.control)
         ambient = ambient_inputs(adapted, sample.control)
         return left, _Views(jnp.concatenate([observables, ambient]), ambient, None)
 

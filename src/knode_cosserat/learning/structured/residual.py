@@ -23,8 +23,10 @@ from jaxtyping import Float
 from knode_cosserat.learning.residual import Residual
 from knode_cosserat.learning.structured.expansion import Expansion
 from knode_cosserat.rods.layout import Field, Layout
-from knode_cosserat.rods.system import History, System
+from knode_cosserat.rods.system import System, with_length_factor
 from knode_cosserat.rotation import dot, rotation_matrix, small_inverse
+from knode_cosserat.solvers import semi_discrete
+from knode_cosserat.solvers.semi_discrete import Point
 
 #: largest number of Newton corrections of a nonlinear law, and the damping factors tried for each
 MOST_CORRECTIONS = 40
@@ -77,8 +79,8 @@ class _Law(NamedTuple):
     def _own(self, z: Float[Any, " z"]) -> Any:
         if self.point is None:
             return dot(self.M, z - self.z0)
-        knowledge, s, t, y, control, history = self.point
-        return knowledge.left_of_law(s, t, y, z, control, history)
+        knowledge, point = self.point
+        return semi_discrete.law_residual(knowledge, point, z)
 
 
 def solved_strains(law: _Law) -> Float[Any, " z"]:
@@ -120,43 +122,38 @@ class Structured(Residual):
 
     def adapted(self, knowledge: System) -> System:
         """Return the nominal model with corrected length."""
-        return knowledge.scaled(1.0 + self.stretch)
+        return with_length_factor(knowledge, 1.0 + self.stretch)
 
-    def derivatives(
-        self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
-    ) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
+    def derivatives(self, knowledge: System, point: Point) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
         """Return y_s and z: strains are corrected first, then loads are added to the balance equations."""
-        z = self.strains(knowledge, s, t, y, control, history)
-        return self.rates(knowledge, s, t, y, z, control, history), z
+        z = self.strains(knowledge, point)
+        return self.rates(knowledge, point, z), z
 
-    def rates(
-        self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any,
-        history: History,
-    ) -> Float[Any, " y"]:  # fmt: skip
+    def rates(self, knowledge: System, point: Point, z: Float[Any, " z"]) -> Float[Any, " y"]:
         """Return y_s at strains z: the nominal model's, with the learned loads."""
-        y_s = knowledge.rates(s, t, y, z, control, history)
+        y_s = semi_discrete.rates(knowledge, point, z)
         if self.load is None:
             return y_s
-        observed = self._observed(self.load, knowledge, s, y, z, control, history)
-        layout = loaded(knowledge)
-        load = self.load(layout, knowledge.y_layout, y, observed, ambient_inputs(knowledge, control))
-        added = jnp.zeros(y.shape[0]).at[knowledge.y_layout.indices(layout.names)].set(load)
+        observed = self._observed(self.load, knowledge, point, z)
+        layout, inputs = loaded(knowledge), ambient_inputs(knowledge, point.control)
+        load = self.load(layout, knowledge.y_layout, point.y, observed, inputs)
+        added = jnp.zeros(point.y.shape[0]).at[knowledge.y_layout.indices(layout.names)].set(load)
         if knowledge.mixed:
-            added = jnp.linalg.solve(knowledge.load_matrix(s, t, y, z, control, history), added)
+            added = jnp.linalg.solve(semi_discrete.load_matrix(knowledge, point, z), added)
         return y_s + added
 
-    def strains(
-        self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], control: Any, history: History
-    ) -> Float[Any, " z"]:
+    def strains(self, knowledge: System, point: Point) -> Float[Any, " z"]:
         """Return z of the corrected law, the nominal one plus σ(z - z*, c0 z + ʰz), from the nominal z0."""
-        z0 = knowledge.strains(s, t, y, control, history)
+        nominal = semi_discrete.law(knowledge, point)
+        z0 = nominal.strains()
         if self.stress is None:
             return z0
-        z_rest, factors = knowledge.unstressed(s, control), factors_at(knowledge, s, control)
-        M = knowledge.law_matrix(s, t, y, z0, control, history)
-        point = None if knowledge.linear_law else (knowledge, s, t, y, control, history)
-        law = _Law(self.stress, M, history.c0, z_rest, z0, history.z, factors, point)
-        if knowledge.linear_law and not self.stress.curved:
+        s, _, _, control, history = point
+        z_rest, factors = knowledge.unstressed(s, control), knowledge.law_factors(s, control)
+        M, linear = nominal.matrix(z0), nominal.linear
+        whole = None if linear else (knowledge, point)
+        law = _Law(self.stress, M, history.c0, z_rest, z0, history.z, factors, whole)
+        if linear and not self.stress.curved:
             # linear: one correction from z0 is exact, and its matrix is the same along the whole rod
             n = jnp.zeros_like(z_rest)
             inverse = small_inverse(jax.jacfwd(law._replace(z0=n, hz=n).left)(n))
@@ -167,15 +164,12 @@ class Structured(Residual):
         inverse = jax.lax.stop_gradient(small_inverse(jax.jacfwd(law.left)(z)))
         return z - dot(inverse, law.left(z))
 
-    def left_of_law(
-        self, knowledge: System, s: Any, t: Any, y: Float[Any, " y"], z: Float[Any, " z"], control: Any,
-        history: History,
-    ) -> Float[Any, " z"]:  # fmt: skip
+    def law_residual(self, knowledge: System, point: Point, z: Float[Any, " z"]) -> Float[Any, " z"]:
         """Return the residual of the nominal law at z, plus the learned stress."""
-        left = knowledge.left_of_law(s, t, y, z, control, history)
+        left = semi_discrete.law_residual(knowledge, point, z)
         if self.stress is None:
             return left
-        return left + self.stress(law_inputs(knowledge, s, control, z, history.c0 * z + history.z))
+        return left + self.stress(law_inputs(knowledge, point.s, point.control, z, point.history.z_t(z)))
 
     @property
     def linear(self) -> bool:
@@ -183,44 +177,37 @@ class Structured(Residual):
         return self.stress is None or not self.stress.curved
 
     def tip(
-        self, knowledge: System, t: Any, control: Any, y: Float[Any, " y"], history: History
+        self, knowledge: System, t: Any, control: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]
     ) -> Float[Any, " k"]:
         """Return the nominal model's conditions at the tip plus the learned tip load."""
-        conditions = knowledge.tip(t, control, y, history)
+        conditions = knowledge.tip(t, control, y, y_t)
         if self.tip_load is None:
             return conditions
-        observed = tip_observables(knowledge, y, control, history)
+        observed = tip_observables(knowledge, y, y_t, control)
         layout, inputs = knowledge.tip_layout, ambient_inputs(knowledge, control)
         return conditions + self.tip_load(layout, knowledge.y_layout, y, observed, inputs)
 
     @staticmethod
-    def _observed(
-        load: Load, knowledge: System, s: Any, y: Any, z: Any, control: Any, history: History
-    ) -> Any:
+    def _observed(load: Load, knowledge: System, point: Point, z: Any) -> Any:
         if load.material is None:
             return None
-        y_t, z_t = history.c0 * y + history.y, history.c0 * z + history.z
-        return knowledge.observables(s, y, y_t, z, z_t, control)
-
-
-def factors_at(knowledge: System, s: Any, control: Any) -> tuple[Any, Any] | None:
-    """Return the local factors of a law of stresses at s; None for a law of strains."""
-    return knowledge.law_factors(s, control) if knowledge.law_of_stresses else None
+        s, _, y, control, history = point
+        return knowledge.observables(s, y, history.y_t(y), z, history.z_t(z), control)
 
 
 def law_inputs(knowledge: System, s: Any, control: Any, z: Any, z_t: Any) -> Float[Any, " 2z"]:
     """Return the inputs of stress: strain and rate, scaled by the local factors of the section."""
-    strain, factors = z - knowledge.unstressed(s, control), factors_at(knowledge, s, control)
+    strain, factors = z - knowledge.unstressed(s, control), knowledge.law_factors(s, control)
     if factors is None:
         return jnp.concatenate([strain, z_t])
     return jnp.concatenate([strain * factors[0], z_t * factors[1]])
 
 
-def tip_observables(knowledge: System, y: Float[Any, " y"], control: Any, history: History) -> Any:
+def tip_observables(knowledge: System, y: Float[Any, " y"], y_t: Any, control: Any) -> Any:
     """Return the observables for a tip load, without the strains there, which it determines itself."""
     s = knowledge.length
     _, z = knowledge.rest(s)
-    return knowledge.observables(s, y, history.c0 * y + history.y, z, jnp.zeros_like(z), control)
+    return knowledge.observables(s, y, y_t, z, jnp.zeros_like(z), control)
 
 
 def loaded(knowledge: System) -> Layout:

@@ -22,10 +22,12 @@ from jaxtyping import Float, Int, UInt32
 from knode_cosserat.learning.config import Training
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import Network, Residual, elu, input_layout
-from knode_cosserat.learning.samples import Dataset, Samples, end_of, predict_segment
+from knode_cosserat.learning.samples import Dataset, Samples, end_of, predict_segment, start_of
 from knode_cosserat.learning.training.losses import Loss, field_sizes, loss_for, value_scales
-from knode_cosserat.rods.system import System, unpacked_history
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.grid import grid_of
+from knode_cosserat.solvers.semi_discrete import Point, unpacked_history
 from knode_cosserat.solvers.space import Euler, SpaceScheme
 
 #: largest number of epochs in one call of the program
@@ -76,18 +78,19 @@ def nominal_predictions(
     """Evaluate the terms that do not depend on a network's weights; for schemes without stages."""
     steps = knowledge.length / (knowledge.nodes - 1) * jnp.asarray(space.formula.weights[:2])
 
-    def seen(sample: Samples, y: Any, z: Any, record: Any) -> Any:
-        inputs = net.inputs(knowledge, y, z, sample.control, unpacked_history(knowledge, sample.c0, record))
-        return (inputs - net.input_mean) / net.input_scale
+    def at(s: Any, sample: Samples, y: Any, record: Any) -> Point:
+        history = unpacked_history(knowledge, sample.c0, record)
+        return Point(s, sample.t, y, sample.control, history)
+
+    def inputs_at(point: Point, z: Any) -> Any:
+        return (net.inputs(knowledge, point, z) - net.input_mean) / net.input_scale
 
     def one(sample: Samples) -> Any:
         y, z = predict_segment(knowledge, space, sample)
-        inputs = [seen(sample, sample.y, z, sample.history[0])]
+        inputs = [inputs_at(at(start_of(knowledge, sample.place), sample, sample.y, sample.history[0]), z)]
         if space.implicit:
-            history = unpacked_history(knowledge, sample.c0, sample.history[1])
-            at = end_of(knowledge, sample.place), sample.t, sample.y_next, sample.control, history
-            _, z_end = knowledge.derivatives(*at)
-            inputs.append(seen(sample, sample.y_next, z_end, sample.history[1]))
+            end = at(end_of(knowledge, sample.place), sample, sample.y_next, sample.history[1])
+            inputs.append(inputs_at(end, semi_discrete.strains(knowledge, end)))
         return inputs, y, z
 
     inputs, y, z = jax.vmap(one, out_axes=-1)(samples)

@@ -14,8 +14,10 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.recordings.findings import RecordingError
-from knode_cosserat.rods.system import History, System
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.history import coefficient_table
+from knode_cosserat.solvers.semi_discrete import History, Point
 from knode_cosserat.solvers.settings import Settings
 
 #: required fields of a rod's state: known from poses, known from the balance, and the strains
@@ -66,7 +68,9 @@ def _loads(robot: System, s: Float[Any, " P"], rows: KnownRows) -> Float[Any, "T
         def slope(j: Any, loads: Any) -> Any:
             # the rates are known, not computed from c0 and the history
             history = History(jnp.zeros(()), y_t[j], z_t[j], jnp.zeros_like(y_t[j]))
-            return robot.rates(s[j], t, y[j].at[where].set(loads), z[j], control, history)[where]
+            return semi_discrete.rates(
+                robot, Point(s[j], t, y[j].at[where].set(loads), control, history), z[j]
+            )[where]
 
         def segment(after: Any, j: Any) -> Any:
             ds = s[j] - s[j + 2]
@@ -94,7 +98,7 @@ def _at_tip(robot: System, t: Any, control: Any, y: Any, history: History) -> An
     where = robot.y_layout.indices(LOADS)
 
     def left(loads: Any) -> Any:
-        return robot.tip(t, control, y.at[where].set(loads), history)
+        return semi_discrete.tip(robot, t, control, y.at[where].set(loads), history)
 
     def corrected(_: Any, loads: Any) -> Any:
         return loads - jnp.linalg.solve(jax.jacfwd(left)(loads), left(loads))
@@ -119,7 +123,7 @@ def _strains(robot: System, rows: KnownRows, coefficients: Float[Any, "4"]) -> F
     def at_nodes(c0: Any, t: Any, control: Any, y: Any, y_t: Any, hz: Any) -> Any:
         def one(s: Any, y: Any, y_t: Any, hz: Any) -> Any:
             history = History(c0, y_t - c0 * y, hz, jnp.zeros_like(y))
-            return robot.strains(s, t, y, control, history)
+            return semi_discrete.strains(robot, Point(s, t, y, control, history))
 
         return jax.vmap(one)(s, y, y_t, hz)
 
@@ -171,7 +175,9 @@ def _semi_discretised(
 
         def segment(after: Any, j: Any) -> Any:
             def corrected(_: Any, loads: Any) -> Any:
-                y_s, _ = robot.derivatives(s[j], t, y[j].at[where].set(loads), control, of(j))
+                y_s, _ = semi_discrete.derivatives(
+                    robot, Point(s[j], t, y[j].at[where].set(loads), control, of(j))
+                )
                 return after - ds * y_s[where]
 
             loads = jax.lax.fori_loop(0, _CORRECTIONS, corrected, after)
@@ -179,7 +185,9 @@ def _semi_discretised(
 
         _, loads = jax.lax.scan(segment, last, jnp.arange(robot.nodes - 2, -1, -1))
         y = y.at[:, where].set(jnp.concatenate([loads[::-1], last[None]]))
-        z = jax.vmap(lambda s, y, j: robot.strains(s, t, y, control, of(j)))(s, y, jnp.arange(robot.nodes))
+        z = jax.vmap(lambda s, y, j: semi_discrete.strains(robot, Point(s, t, y, control, of(j))))(
+            s, y, jnp.arange(robot.nodes)
+        )
         return jnp.concatenate([y, z], axis=1)
 
     def step(past: Any, row: Any) -> Any:

@@ -1,0 +1,109 @@
+"""Constitutive laws at one point of a rod, stated in time: they contain rates, and no time scheme.
+
+A system states its law in one of three forms (`System.constitutive`):
+
+    LinearLaw     C z + D z_t = f2, the general class
+    MaterialLaw   K ε + B ε_t + … = σ for each strain ε of z, and laws of evolution for internal variables
+    an array      z itself, if it depends on no rate of z
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
+
+from jaxtyping import Float
+
+from knode_cosserat.rotation import dot, inverse
+
+#: values of fields of z, by name
+Fields = dict[str, Any]
+
+
+class LinearLaw(NamedTuple):
+    """C z + D z_t = f2 (paper's general class)."""
+
+    C: Float[Any, "z z"]
+    D: Float[Any, "z z"]
+    f2: Float[Any, " z"]
+
+
+class Evolution(NamedTuple):
+    """Law of an internal variable x: x_t = rate while low < x < high."""
+
+    rate: Any
+    #: value in an equilibrium, where no rate determines it
+    at_rest: Any
+    low: float
+    high: float
+
+
+class MaxwellBranch(NamedTuple):
+    """A spring in series with a dashpot, beside a strain's law: it adds r K (ε - x), with T x_t = ε - x."""
+
+    #: field of z with the dashpot's strain x
+    field: str
+    #: r K (N, N m²)
+    stiffness: Float[Any, "3 3"]
+    #: relaxation time T (s)
+    time: Any
+
+
+class Viscoelastic(NamedTuple):
+    """Law of one strain ε: (K - softening) ε + B ε_t + branch + moment(ε, ε_t) = stress."""
+
+    stiffness: Float[Any, "3 3"]
+    damping: Float[Any, "3 3"]
+    stress: Float[Any, "3"]
+    #: loss of stiffness that depends on the state; None: none
+    softening: Any = None
+    branch: MaxwellBranch | None = None
+    #: nonlinear part of ε and ε_t, a pytree (`jax.tree_util.Partial`); None: none
+    moment: Any = None
+
+
+class Elastic(NamedTuple):
+    """Elastic law of one strain ε: (K - softening) ε = stress."""
+
+    stiffness: Float[Any, "3 3"]
+    stress: Float[Any, "3"]
+    softening: Any = None
+
+    @property
+    def softened(self) -> Float[Any, "3 3"]:
+        """Stiffness with the softening."""
+        return self.stiffness if self.softening is None else self.stiffness - self.softening
+
+    def strain(self) -> Float[Any, "3"]:
+        """Return ε."""
+        return dot(inverse(self.softened), self.stress)
+
+    def residual(self, strain: Float[Any, "3"]) -> Float[Any, "3"]:
+        """Return K ε less the stress, at any ε."""
+        return dot(self.softened, strain) - self.stress
+
+
+class Coupling(Protocol):
+    """Nonlinear elastic part that couples the strains, such as tendons beside the rod."""
+
+    def strains(self, elastic: dict[str, Elastic]) -> Fields:
+        """Return the strains of the elastic laws with this part."""
+
+    def stresses(self, strains: Fields) -> Fields:
+        """Return this part's stress for each strain."""
+
+
+class MaterialLaw(NamedTuple):
+    """Laws of the strains of z, with their coupling, and of internal variables that depend on them."""
+
+    strains: dict[str, Viscoelastic]
+    coupling: Coupling | None = None
+    #: evolutions by field of z, from the strains and their rates
+    internal: Callable[[Fields, Fields], dict[str, Evolution]] | None = None
+
+
+class InternalState(NamedTuple):
+    """Internal variables that depend on y and control only, and the law of the strains under their values."""
+
+    evolutions: dict[str, Evolution]
+    law: Callable[[Fields], MaterialLaw]

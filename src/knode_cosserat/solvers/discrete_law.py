@@ -1,0 +1,251 @@
+"""Constitutive laws in a time scheme: z_t = c0 z + ʰz replaces the rates of strains and internal variables.
+
+A viscoelastic law K ε + B ε_t = σ becomes the elastic law (K + c0 B) ε = σ - B ʰε. `rods.law` has the laws in
+time.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.rods.law import (
+    Elastic,
+    Evolution,
+    Fields,
+    InternalState,
+    LinearLaw,
+    MaterialLaw,
+    MaxwellBranch,
+    Viscoelastic,
+)
+from knode_cosserat.rods.layout import Layout
+from knode_cosserat.rotation import dot, inverse
+
+#: largest number of Newton corrections of a strain with a nonlinear moment; the result is then NaN
+CORRECTIONS = 60
+#: fractions of a correction that are tried: full corrections overshoot under steep friction
+PARTS = 0.5 ** np.arange(8)
+#: a strain is solved when the residual is at most this fraction of the law's terms
+TOLERANCE = 1e-12
+
+
+class DiscreteLaw(Protocol):
+    """Law of z at one point, for one time step."""
+
+    @property
+    def linear(self) -> bool:
+        """True if the residual is linear in z."""
+
+    def strains(self) -> Float[Any, " z"]:
+        """Return z."""
+
+    def residual(self, z: Float[Any, " z"]) -> Float[Any, " z"]:
+        """Return the residual of the law at any z."""
+
+    def matrix(self, z: Float[Any, " z"]) -> Float[Any, "z z"]:
+        """Return the derivative of the residual by z."""
+
+
+def discrete_law(law: Any, layout: Layout, c0: Any, hz: Float[Any, " z"]) -> DiscreteLaw:
+    """Return a law in time (`System.constitutive`) for one time step; `layout` is that of z."""
+    if isinstance(law, InternalState):
+        internal = {
+            name: evolved(evolution, layout.get(hz, name), c0) for name, evolution in law.evolutions.items()
+        }
+        return MaterialStep(law.law(internal), layout, c0, hz, internal)
+    if isinstance(law, MaterialLaw):
+        return MaterialStep(law, layout, c0, hz, {})
+    if isinstance(law, tuple):
+        return LinearStep(LinearLaw(*law), c0, hz)
+    return StatedStrains(law)
+
+
+def evolved(evolution: Evolution, h: Any, c0: Any) -> Any:
+    """Return an internal variable from its rate and history h; in an equilibrium, c0 = 0, its value at rest.
+
+    The variable is kept within its bounds.
+    """
+    moving = c0 > 0.0
+    free = jnp.where(moving, (evolution.rate - h) / jnp.where(moving, c0, 1.0), evolution.at_rest)
+    return jnp.clip(free, evolution.low, evolution.high)
+
+
+@dataclasses.dataclass(frozen=True)
+class StatedStrains:
+    """Strains that the system states directly."""
+
+    z: Float[Any, " z"]
+    linear = True
+
+    def strains(self) -> Float[Any, " z"]:
+        """Return z."""
+        return self.z
+
+    def residual(self, z: Float[Any, " z"]) -> Float[Any, " z"]:
+        """Return the difference from the stated strains."""
+        return z - self.z
+
+    def matrix(self, z: Float[Any, " z"]) -> Float[Any, "z z"]:
+        """Return the identity."""
+        return jnp.eye(self.z.shape[0])
+
+
+@dataclasses.dataclass(frozen=True)
+class LinearStep:
+    """C z + D z_t = f2 with z_t = c0 z + ʰz."""
+
+    law: LinearLaw
+    c0: Any
+    hz: Float[Any, " z"]
+    linear = True
+
+    def strains(self) -> Float[Any, " z"]:
+        """Return (C + c0 D)⁻¹ (f2 - D ʰz)."""
+        C, D, f2 = self.law
+        return jnp.linalg.solve(C + self.c0 * D, f2 - D @ self.hz)
+
+    def residual(self, z: Float[Any, " z"]) -> Float[Any, " z"]:
+        """Return C z + D z_t - f2."""
+        C, D, f2 = self.law
+        return C @ z + D @ (self.c0 * z + self.hz) - f2
+
+    def matrix(self, z: Float[Any, " z"]) -> Float[Any, "z z"]:
+        """Return C + c0 D."""
+        return self.law.C + self.c0 * self.law.D
+
+
+class MaterialStep:
+    """Strains by their elastic laws of this step, then internal variables."""
+
+    def __init__(self, law: MaterialLaw, layout: Layout, c0: Any, hz: Any, internal: Fields):
+        self.law, self.layout, self.c0 = law, layout, c0
+        #: history of each field of z
+        self.history: Fields = dict(zip(layout.names, layout.split(hz), strict=True))
+        #: internal variables that do not depend on the strains
+        self.internal = internal
+        self.elastic = {name: self._elastic(name, strain) for name, strain in law.strains.items()}
+
+    @property
+    def linear(self) -> bool:
+        """True without a coupling, nonlinear moments and internal variables with bounds."""
+        moments = any(strain.moment is not None for strain in self.law.strains.values())
+        return not (moments or self.internal or self.law.coupling or self.law.internal)
+
+    def _elastic(self, name: str, strain: Viscoelastic) -> Elastic:
+        """Return (K + c0 B) ε = σ - B ʰε, with the branch's dashpot eliminated."""
+        stiffness = strain.stiffness + self.c0 * strain.damping
+        stress = strain.stress - dot(strain.damping, self.history[name])
+        if strain.branch is not None:
+            # r K (ε - x) = damping (c0 ε + ʰx)
+            time = strain.branch.time
+            damping = time / (1.0 + self.c0 * time) * strain.branch.stiffness
+            stiffness = stiffness + self.c0 * damping
+            stress = stress - dot(damping, self.history[strain.branch.field])
+        return Elastic(stiffness, stress, strain.softening)
+
+    def strains(self) -> Float[Any, " z"]:
+        """Return strains and internal variables in the order of z."""
+        if self.law.coupling is None:
+            strains = {name: self._strain(name) for name in self.elastic}
+        else:
+            strains = self.law.coupling.strains(self.elastic)
+        values = strains | self._internal(strains)
+        return jnp.concatenate([values[name] for name in self.layout.names])
+
+    def residual(self, z: Float[Any, " z"]) -> Float[Any, " z"]:
+        """Return the residual of the elastic laws, and the errors of the internal variables."""
+        values: Fields = dict(zip(self.layout.names, self.layout.split(z), strict=True))
+        strains = {name: values[name] for name in self.elastic}
+        left = {name: elastic.residual(strains[name]) for name, elastic in self.elastic.items()}
+        if self.law.coupling is not None:
+            stresses = self.law.coupling.stresses(strains)
+            left = {name: value + stresses[name] for name, value in left.items()}
+        for name, strain in self.law.strains.items():
+            if strain.moment is not None:
+                left[name] = left[name] + strain.moment(strains[name], self._rate(name, strains[name]))
+        left |= {name: values[name] - value for name, value in self._internal(strains).items()}
+        return jnp.concatenate([left[name] for name in self.layout.names])
+
+    def matrix(self, z: Float[Any, " z"]) -> Float[Any, "z z"]:
+        """Return the derivative of the residual by z."""
+        return jax.jacfwd(self.residual)(jnp.zeros_like(z) if self.linear else z)
+
+    def _rate(self, name: str, value: Any) -> Any:
+        return self.c0 * value + self.history[name]
+
+    def _strain(self, name: str) -> Float[Any, "3"]:
+        strain, elastic = self.law.strains[name], self.elastic[name]
+        if strain.moment is None:
+            return elastic.strain()
+        return nonlinear_strain(NonlinearStrain(elastic, strain.moment, self.c0, self.history[name]))
+
+    def _internal(self, strains: Fields) -> Fields:
+        """Return all internal variables for these strains."""
+        found = dict(self.internal)
+        for name, strain in self.law.strains.items():
+            if strain.branch is not None:
+                found[strain.branch.field] = self._dashpot(strain.branch, strains[name])
+        if self.law.internal is not None:
+            rates = {name: self._rate(name, value) for name, value in strains.items()}
+            for name, evolution in self.law.internal(strains, rates).items():
+                found[name] = evolved(evolution, self.history[name], self.c0)
+        return found
+
+    def _dashpot(self, branch: MaxwellBranch, strain: Any) -> Any:
+        """Return the dashpot's strain x, from T x_t = ε - x."""
+        return (strain - branch.time * self.history[branch.field]) / (1.0 + self.c0 * branch.time)
+
+
+class NonlinearStrain(NamedTuple):
+    """Law of one strain with a nonlinear moment, for one time step."""
+
+    elastic: Elastic
+    moment: Any
+    c0: Any
+    h: Float[Any, "3"]
+
+    def residual(self, strain: Float[Any, "3"]) -> Float[Any, "3"]:
+        """Return the residual of the law."""
+        return self.elastic.residual(strain) + self.moment(strain, self.c0 * strain + self.h)
+
+    def correction(self, strain: Float[Any, "3"]) -> Float[Any, "3"]:
+        """Return Newton's correction."""
+        return -dot(inverse(jax.jacfwd(self.residual)(strain)), self.residual(strain))
+
+
+def nonlinear_strain(law: NonlinearStrain) -> Float[Any, "3"]:
+    """Return the strain of a nonlinear law; NaN if Newton's method fails."""
+    # the search is not differentiated: one more correction has the derivatives of the implicit function
+    strain = _searched(jax.lax.stop_gradient(law))
+    return strain + law.correction(strain)
+
+
+def _searched(law: NonlinearStrain) -> Float[Any, "3"]:
+    """Return the strain by Newton's method with a line search; NaN if it does not converge."""
+    moving = law.c0 > 0.0
+    # without sliding, friction does not make the first corrections overshoot
+    start = jnp.where(moving, -law.h / jnp.where(moving, law.c0, 1.0), law.elastic.strain())
+    elastic = dot(jnp.abs(law.elastic.softened), jnp.abs(start))
+    size = jnp.max(elastic + jnp.abs(law.elastic.stress) + jnp.abs(law.moment(start, jnp.zeros_like(start))))
+
+    def unsolved(strain: Any) -> Any:
+        return ~(jnp.max(jnp.abs(law.residual(strain))) <= TOLERANCE * size)
+
+    def continues(state: Any) -> Any:
+        strain, count = state
+        return unsolved(strain) & (count < CORRECTIONS)
+
+    def corrected(state: Any) -> Any:
+        strain, count = state
+        tried = strain + PARTS[:, None] * law.correction(strain)
+        left = jax.vmap(lambda strain: jnp.sum(law.residual(strain) ** 2))(tried)
+        return tried[jnp.argmin(left)], count + 1
+
+    strain, _ = jax.lax.while_loop(continues, corrected, (start, 0))
+    return jnp.where(unsolved(strain), jnp.nan, strain)
