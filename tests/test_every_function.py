@@ -199,6 +199,8 @@ FUNCTIONS: dict[str, Callable[[Any, Made], Any]] = {
 SLOW = {"stability", "equilibrium_path", "calibrate, rollouts", "fit, passive", "fit, network"}
 #: kinds for which every other function is called each time
 OFTEN = {"model of a model"}
+#: functions called each time for a user's own system only: for the other they compile as long again
+OWN_ONLY = {"estimate_states", "estimate_states, paper", "configuration"}
 #: functions that are called each time for a user's own system
 OWN = {"simulate", "equilibrium", "estimate_states", "fit, structured", "configuration", "evaluate"}
 #: functions that need a capability, and the words of the error that names it
@@ -211,7 +213,7 @@ LACKING = {
 def calls() -> Iterator[Any]:
     for kind in ROBOTS:
         for name in FUNCTIONS:
-            often = (kind in OFTEN and name not in SLOW) or (kind == "own" and name in OWN)
+            often = (kind in OFTEN and name not in SLOW | OWN_ONLY) or (kind == "own" and name in OWN)
             marks = [] if often or (name, kind) in LACKING else [pytest.mark.campaign]
             yield pytest.param(name, kind, marks=marks, id=f"{name}-{kind}")
 
@@ -317,8 +319,15 @@ def residuals() -> dict[str, Residual]:
     }
 
 
-@pytest.mark.parametrize("nominal", [ROBOT, CANE, MODEL], ids=["robot", "own", "model"])
-@pytest.mark.parametrize("name", residuals())
+def models() -> Iterator[Any]:
+    """Residuals with nominal models. Long runs have the curved expansion of all of them, others of one."""
+    for name in residuals():
+        for kind, nominal in (("robot", ROBOT), ("own", CANE), ("model", MODEL)):
+            marks = [pytest.mark.campaign] if name == "curved" and kind != "robot" else []
+            yield pytest.param(name, nominal, marks=marks, id=f"{name}-{kind}")
+
+
+@pytest.mark.parametrize(("name", "nominal"), list(models()))
 def test_the_parts_of_a_model_s_equations_agree(name, nominal):
     """`strains` and `rates` are `derivatives`; the law is zero there, with the derivative it states."""
     if name == "passive" and nominal is CANE:

@@ -315,7 +315,9 @@ def sines(robot):
     ]
 
 
-@pytest.mark.parametrize("imperfection", ["stiffness", "self-weight"])
+@pytest.mark.parametrize(
+    "imperfection", ["stiffness", pytest.param("self-weight", marks=pytest.mark.campaign)]
+)
 def test_losses_of_the_paper(robot, sines, imperfection):
     model = fit(robot.replace(**IMPERFECTIONS[imperfection]), sines, FitConfig.paper())
     last = model.about.facts["segments"]["loss"][-1]

@@ -154,6 +154,7 @@ def test_motion_goes_on_from_a_trajectory(robot, time):
     assert_same(third, whole[40:])
 
 
+@pytest.mark.campaign
 def test_trapezoidal_motion_goes_on_exactly_from_rest_and_by_one_bdf1_step_from_motion(robot):
     """The rate at a trajectory's first row is not kept, and the trapezoidal rule never forgets it."""
     controls = kc.controls.sine(1.5, STEPS, DT)

@@ -53,6 +53,7 @@ def test_both_ways_to_state_the_law_agree():
     np.testing.assert_allclose(C @ z + D @ (history.c0 * z + history.z), f2, atol=1e-8 * np.abs(f2).max())
 
 
+@pytest.mark.campaign
 def test_relaxation_of_a_tendon_robot_is_that_of_the_rod():
     """A robot whose tendons pull with nothing moves under its weight as a rod of the same material."""
     body = {name: value for name, value in BODY.items() if name != "loads"} | {"gravity": (9.81, 0.0, 0.0)}

@@ -58,7 +58,8 @@ def gone_on(rod, before, count, **how):
     return kc.simulate(rod, NONE[:count], DT, space="lobatto4", initial=before, **how)
 
 
-@pytest.mark.parametrize("time", ["bdf2", pytest.param("trapezoidal", marks=pytest.mark.campaign)])
+@pytest.mark.campaign
+@pytest.mark.parametrize("time", ["bdf2", "trapezoidal"])
 def test_a_motion_goes_on_as_if_it_had_not_been_parted(rod, time, tmp_path):
     """From rows, from what itself went on, from part of that, from a file, and from a stepper's state."""
     one = kc.simulate(rod, NONE, DT, space="lobatto4", time=time)
@@ -100,6 +101,7 @@ def test_rows_tell_what_the_last_step_looked_back_on(rod, whole):
     np.testing.assert_allclose(again.start.past.records, past.records, atol=2e-8)
 
 
+@pytest.mark.campaign
 def test_what_is_at_the_nodes_beside_a_solution_is_carried_over(rod, whole):
     """States that were changed since are taken as they are."""
     changed = dataclasses.replace(whole, z=whole.z + 1e-3)

@@ -76,6 +76,7 @@ def run(*arguments):
     return CliRunner().invoke(app, ["study", "recordings", *map(str, arguments)])
 
 
+@pytest.mark.campaign
 def test_the_knowledge_alone(folder, tmp_path):
     """A second run takes what is there; what is written is the same."""
     given = (folder, "--out", tmp_path, "--train", "sine_1p0,rand_0", "--methods", "baseline", "--seconds", 3)
