@@ -63,6 +63,7 @@ def test_papers_robot(run):
 
 
 @CAMPAIGN
+@pytest.mark.sample
 def test_learn_stiffness(run):
     before, after = run("learn_stiffness", steps=40)
     assert before > 0.05 and after < 1e-6 * before
@@ -78,6 +79,7 @@ def test_hit_a_target(run):
 
 
 @CAMPAIGN
+@pytest.mark.sample
 def test_follow_a_path(run):
     found = run("follow_a_path", points=9)
     assert np.all(found.converged) and np.all(found.position_error < 1e-8)

@@ -43,6 +43,7 @@ def test_nominal_numbers_change_nothing(model):
     assert np.allclose(shape(reduced), expected, rtol=0.0, atol=1e-9)
 
 
+@pytest.mark.campaign
 def test_reduced_robots_stand_as_those_with_all_parts(model):
     """What is left out of a robot does nothing there."""
     x = 0.3 * np.ones(model.size)
@@ -101,6 +102,7 @@ def test_load_cells_correct_tensions():
     assert np.allclose(found, shape(ROUTED, true), rtol=0.0, atol=1e-9)
 
 
+@pytest.mark.campaign
 def test_early_anchors_are_ends_of_routings():
     at = 6.0 / 9.0
     early = ROUTED.replace(anchors=EarlyAnchors(at=at, share=(0.0, 1.0, 1.0, 1.0)))
@@ -121,6 +123,7 @@ def test_twisted_tendons_are_helices():
     assert np.allclose(shape(twisted), shape(ROUTED.replace(routing=routing)), rtol=0.0, atol=1e-9)
 
 
+@pytest.mark.campaign
 def test_tendons_whose_routing_is_stated_are_moved_by_effects_of_that():
     """Angles of tendons mean nothing there; those of the routing turn each tendon."""
     routing = tuple(
