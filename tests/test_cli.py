@@ -353,6 +353,7 @@ def program(*arguments, cwd):
     return python("-c", "from knode_cosserat.cli import main; main()", *arguments, cwd=cwd)
 
 
+@pytest.mark.campaign
 def test_the_program_simulates(tmp_path):
     done = program(*simulated("truth.nc", "--json"), cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")

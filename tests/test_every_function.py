@@ -337,15 +337,21 @@ def test_the_parts_of_a_model_s_equations_agree(name, nominal):
     y = np.concatenate([np.zeros(3), [1.0, 0.1, 0.2, 0.0], 0.1 * rng.normal(size=12)])
     history = kc.robots.History(20.0, *(0.1 * rng.normal(size=size) for size in (19, 6, 19)))
     control = rng.uniform(1.0, 3.0, nominal.control_size)
-    at = (0.1, 0.0, y)
-    y_s, z = model.derivatives(*at, control, history)
-    np.testing.assert_allclose(model.strains(*at, control, history), z, rtol=1e-10, atol=1e-12)
-    np.testing.assert_allclose(model.rates(*at, z, control, history), y_s, rtol=1e-9, atol=1e-10)
-    matrix = model.law_matrix(*at, z, control, history)
-    size = np.abs(matrix) @ np.abs(z)
-    assert np.all(np.abs(model.left_of_law(*at, z, control, history)) < 1e-9 * size + 1e-12)
     step = 1e-3 * rng.normal(size=6)
-    moved = model.left_of_law(*at, z + step, control, history)
+
+    @jax.jit  # one program, instead of one for each operation
+    def parts(y, control, history):
+        at = (0.1, 0.0, y)
+        y_s, z = model.derivatives(*at, control, history)
+        strains, rates = model.strains(*at, control, history), model.rates(*at, z, control, history)
+        laws = (model.left_of_law(*at, each, control, history) for each in (z, z + step))
+        return y_s, z, strains, rates, model.law_matrix(*at, z, control, history), *laws
+
+    y_s, z, strains, rates, matrix, law, moved = parts(y, control, history)
+    np.testing.assert_allclose(strains, z, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(rates, y_s, rtol=1e-9, atol=1e-10)
+    size = np.abs(matrix) @ np.abs(z)
+    assert np.all(np.abs(law) < 1e-9 * size + 1e-12)
     if model.linear_law:
         np.testing.assert_allclose(moved, matrix @ step, rtol=1e-6, atol=1e-9 * np.max(size))
     assert model.law_of_stresses

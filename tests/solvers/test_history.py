@@ -90,6 +90,7 @@ def test_the_middle_of_a_motion_is_known_at_its_nodes_only(rod, whole):
     assert 0.0 < near[-1] < 1e-3
 
 
+@pytest.mark.campaign
 def test_rows_tell_what_the_last_step_looked_back_on(rod, whole):
     """The past that is found again is the one that the solver had."""
     settings = Settings.of("bdf2", "lobatto4", "paper", kc.solvers.NewtonOptions())
