@@ -39,7 +39,7 @@ test: $(READY) ## run the tests, but for the long ones (some 5 min on two cores)
 test-all: $(READY) ## run all the tests, the long ones too
 	$(BIN)/python -m pytest -n $(JOBS) $(BY_FILE) $(PYTEST_ARGS)
 
-samples: $(READY) ## run a few of the long tests of docs, examples, notebooks and types (`make test-all` runs all)
+samples: $(READY) ## run a few of the long tests of docs, examples, recordings and types (`make test-all` runs all)
 	$(BIN)/python -m pytest -n $(JOBS) --dist load --quick -m sample
 
 costs: $(READY) ## measure the CPU time of each test file anew, for the order and the time left of `make test`

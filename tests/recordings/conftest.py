@@ -10,7 +10,7 @@ SENSORS = Sensors(swap=3.0)
 
 @pytest.fixture(scope="session")
 def virtual(tmp_path_factory):
-    """The bag of 5 s of a sine of the virtual robot, and what it truly did: once, for it takes long."""
+    """The bag of 5 s of a sine of the virtual robot, and what it truly did: once, for it takes 40 s."""
     path = tmp_path_factory.mktemp("virtual") / "sine.bag"
     return path, record_virtual(path, "sine:1.0", seconds=5.0, seed=3, sensors=SENSORS)
 
