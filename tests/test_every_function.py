@@ -199,8 +199,8 @@ FUNCTIONS: dict[str, Callable[[Any, Made], Any]] = {
 SLOW = {"stability", "equilibrium_path", "calibrate, rollouts", "fit, passive", "fit, network"}
 #: kinds for which every other function is called each time
 OFTEN = {"model of a model"}
-#: functions called each time for a user's own system only: for the other they compile as long again
-OWN_ONLY = {"estimate_states", "estimate_states, paper", "configuration"}
+#: functions that are not called each time for a model of a model: they compile as long again
+LONG_FOR_MODELS = {"estimate_states", "estimate_states, paper", "configuration", "compliance", "workspace"}
 #: functions that are called each time for a user's own system
 OWN = {"simulate", "equilibrium", "estimate_states", "fit, structured", "configuration", "evaluate"}
 #: functions that need a capability, and the words of the error that names it
@@ -213,7 +213,7 @@ LACKING = {
 def calls() -> Iterator[Any]:
     for kind in ROBOTS:
         for name in FUNCTIONS:
-            often = (kind in OFTEN and name not in SLOW | OWN_ONLY) or (kind == "own" and name in OWN)
+            often = (kind in OFTEN and name not in SLOW | LONG_FOR_MODELS) or (kind == "own" and name in OWN)
             marks = [] if often or (name, kind) in LACKING else [pytest.mark.campaign]
             yield pytest.param(name, kind, marks=marks, id=f"{name}-{kind}")
 

@@ -315,9 +315,8 @@ def sines(robot):
     ]
 
 
-@pytest.mark.parametrize(
-    "imperfection", ["stiffness", pytest.param("self-weight", marks=pytest.mark.campaign)]
-)
+@pytest.mark.campaign
+@pytest.mark.parametrize("imperfection", ["stiffness", "self-weight"])
 def test_losses_of_the_paper(robot, sines, imperfection):
     model = fit(robot.replace(**IMPERFECTIONS[imperfection]), sines, FitConfig.paper())
     last = model.about.facts["segments"]["loss"][-1]

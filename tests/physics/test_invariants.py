@@ -176,6 +176,7 @@ def test_batch_of_controls_is_each_by_itself(robot):
         assert_same(batch[i], kc.simulate(robot, many[i], DT), tolerance=1e-12)
 
 
+@pytest.mark.campaign
 def test_batch_of_robots_is_each_by_itself(robot):
     robots = [robot, robot.replace(length=0.4, radius=0.004), robot.replace(youngs_modulus=10e9, drag=0.01)]
     batch = kc.simulate(robots, CONTROLS, DT)

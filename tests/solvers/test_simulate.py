@@ -327,6 +327,7 @@ def test_one_failing_robot_does_not_spoil_the_batch(robot, sine):
     assert caught.value.robot == 1
 
 
+@pytest.mark.campaign
 def test_equilibria_in_a_batch(robot):
     tensions = np.array([[7.0, 5.0, 5.0, 7.0], [5.0, 7.0, 7.0, 5.0], [6.0, 6.0, 6.0, 6.0]])
     found = kc.equilibrium(robot, tensions)
