@@ -10,6 +10,7 @@ import gc
 import os
 import sys
 
+import pytest
 from jaxtyping import install_import_hook
 
 from tests import progress
@@ -37,7 +38,11 @@ def pytest_addoption(parser):
 
 def pytest_configure(config):
     quick = config.option.quick or "not campaign" in config.option.markexpr
-    if quick and "jax" not in sys.modules:
+    if quick:
+        if "jax" in sys.modules:
+            raise pytest.UsageError(
+                "JAX was imported before its flags could be set, by a conftest.py or a plugin"
+            )
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICK}".strip()
     progress.register(config)
 
