@@ -1,6 +1,8 @@
 PYTHON ?= python3
 JOBS ?= 2
 PYTEST_ARGS ?=
+# A file's tests share compiled programs; files start in the order of tests/costs.json, not of their numbers of tests.
+BY_FILE := --dist loadfile --no-loadscope-reorder
 
 BIN := .venv/bin
 # Named after the place too, because an environment is bound to it: a copied checkout has to make its own.
@@ -11,7 +13,7 @@ unexport PYTHONPATH
 unexport PYTHONHOME
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all samples lint types docs pictures notebooks format bench package lock clean distclean
+.PHONY: help env demo test test-all samples costs lint types docs pictures notebooks format bench package lock clean distclean
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' Makefile
@@ -29,14 +31,19 @@ pictures: $(READY) ## run all the examples, and draw their pictures for the docu
 notebooks: $(READY) ## run the notebooks' texts, and write docs/notebooks/*.ipynb
 	$(BIN)/python -m tools.notebooks
 
-test: $(READY) ## run the tests, but for the long ones
-	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile -m "not campaign" $(PYTEST_ARGS)
+env: $(READY) ## make the environment
+
+test: $(READY) ## run the tests, but for the long ones (some 5 min on two cores)
+	$(BIN)/python -m pytest -n $(JOBS) $(BY_FILE) -m "not campaign" $(PYTEST_ARGS)
 
 test-all: $(READY) ## run all the tests, the long ones too
-	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -n $(JOBS) $(BY_FILE) $(PYTEST_ARGS)
 
-samples: $(READY) ## what `make test` leaves out of README, docs, examples, notebooks and first contact
-	$(BIN)/python -m pytest -n $(JOBS) --dist load --quick -m campaign tests/test_docs.py tests/test_examples.py tests/test_notebooks.py tests/test_first_contact.py
+samples: $(READY) ## run a few of the long tests of docs, examples, recordings and types (`make test-all` runs all)
+	$(BIN)/python -m pytest -n $(JOBS) --dist load --quick -m sample
+
+costs: $(READY) ## measure the CPU time of each test file anew, for the order and the time left of `make test`
+	KNODE_COSSERAT_CACHE=build/cold-cache-$(shell date +%s) $(BIN)/python -m pytest -n $(JOBS) $(BY_FILE) -m "not campaign" --write-costs
 
 lint: $(READY) ## check style and formatting
 	$(BIN)/ruff check

@@ -26,9 +26,12 @@ BLOCK = re.compile(r"(<!-- test: long -->\n)?^```(\w*)\n(.*?)^```$", re.MULTILIN
 LONG = "<!-- test: long -->"
 #: pages whose code takes long as a whole: recordings are made and learned from, or many programs compiled
 LONG_PAGES = (
-    "docs/estimation.md", "docs/kinematics.md", "docs/recordings.md", "docs/tutorials/gradients.md",
-    "docs/tutorials/several-rods.md", "docs/your-own-robot.md",
+    "README.md", "docs/estimation.md", "docs/kinematics.md", "docs/recordings.md", "docs/tutorials/fit.md",
+    "docs/tutorials/gradients.md", "docs/tutorials/several-rods.md", "docs/two-sections.md",
+    "docs/which-function.md", "docs/your-own-robot.md",
 )  # fmt: skip
+#: of these, pages that CI runs too
+SAMPLES = ("README.md", "docs/tutorials/fit.md", "docs/which-function.md")
 #: pages whose commands are cheap enough to be run, and checked by what the page says they print
 RUN = ("docs/first-ten-minutes.md",)
 
@@ -100,7 +103,13 @@ def test_its_python_runs(page, folder, capsys):
 
 
 @pytest.mark.campaign
-@pytest.mark.parametrize("page", with_code(long=True))
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, marks=[pytest.mark.sample] if page in SAMPLES else [])
+        for page in with_code(long=True)
+    ],
+)
 def test_its_long_python_runs(page, folder, capsys):
     prepare(page, folder)
     assert run(page, True, capsys.readouterr)

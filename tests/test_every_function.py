@@ -202,6 +202,8 @@ FUNCTIONS: dict[str, Callable[[Any, Made], Any]] = {
 SLOW = {"stability", "equilibrium_path", "calibrate, rollouts", "fit, passive", "fit, network"}
 #: kinds for which every other function is called each time
 OFTEN = {"model of a model"}
+#: functions that are not called each time for a model of a model: they compile as long again
+LONG_FOR_MODELS = {"estimate_states", "estimate_states, paper", "configuration", "compliance", "workspace"}
 #: functions that are called each time for a user's own system
 OWN = {"simulate", "equilibrium", "estimate_states", "fit, structured", "configuration", "evaluate"}
 #: functions that need a capability, and the words of the error that names it
@@ -214,7 +216,7 @@ LACKING = {
 def calls() -> Iterator[Any]:
     for kind in ROBOTS:
         for name in FUNCTIONS:
-            often = (kind in OFTEN and name not in SLOW) or (kind == "own" and name in OWN)
+            often = (kind in OFTEN and name not in SLOW | LONG_FOR_MODELS) or (kind == "own" and name in OWN)
             marks = [] if often or (name, kind) in LACKING else [pytest.mark.campaign]
             yield pytest.param(name, kind, marks=marks, id=f"{name}-{kind}")
 
@@ -320,8 +322,15 @@ def residuals() -> dict[str, Residual]:
     }
 
 
-@pytest.mark.parametrize("nominal", [ROBOT, CANE, MODEL], ids=["robot", "own", "model"])
-@pytest.mark.parametrize("name", residuals())
+def models() -> Iterator[Any]:
+    """Residuals with nominal models. Long runs have the curved expansion of all of them, others of one."""
+    for name in residuals():
+        for kind, nominal in (("robot", ROBOT), ("own", CANE), ("model", MODEL)):
+            marks = [pytest.mark.campaign] if name == "curved" and kind != "robot" else []
+            yield pytest.param(name, nominal, marks=marks, id=f"{name}-{kind}")
+
+
+@pytest.mark.parametrize(("name", "nominal"), list(models()))
 def test_the_parts_of_a_model_s_equations_agree(name, nominal):
     """`strains` and `rates` are `derivatives`; the law is zero there, with the derivative it states."""
     if name == "passive" and nominal is CANE:
@@ -331,15 +340,20 @@ def test_the_parts_of_a_model_s_equations_agree(name, nominal):
     y = np.concatenate([np.zeros(3), [1.0, 0.1, 0.2, 0.0], 0.1 * rng.normal(size=12)])
     history = History(20.0, *(0.1 * rng.normal(size=size) for size in (19, 6, 19)))
     control = rng.uniform(1.0, 3.0, nominal.control_size)
-    point = Point(0.1, 0.0, y, control, history)
-    y_s, z = semi_discrete.derivatives(model, point)
-    np.testing.assert_allclose(semi_discrete.strains(model, point), z, rtol=1e-10, atol=1e-12)
-    np.testing.assert_allclose(semi_discrete.rates(model, point, z), y_s, rtol=1e-9, atol=1e-10)
-    law = semi_discrete.law(model, point)
-    matrix = law.matrix(z)
-    size = np.abs(matrix) @ np.abs(z)
-    assert np.all(np.abs(law.residual(z)) < 1e-9 * size + 1e-12)
     step = 1e-3 * rng.normal(size=6)
-    moved = law.residual(z + step)
-    if law.linear:
+
+    @jax.jit  # one program, instead of one for each operation
+    def parts(y, control, history):
+        point = Point(0.1, 0.0, y, control, history)
+        y_s, z = semi_discrete.derivatives(model, point)
+        strains, rates = semi_discrete.strains(model, point), semi_discrete.rates(model, point, z)
+        law = semi_discrete.law(model, point)
+        return y_s, z, strains, rates, law.matrix(z), *(law.residual(there) for there in (z, z + step))
+
+    y_s, z, strains, rates, matrix, law, moved = parts(y, control, history)
+    np.testing.assert_allclose(strains, z, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(rates, y_s, rtol=1e-9, atol=1e-10)
+    size = np.abs(matrix) @ np.abs(z)
+    assert np.all(np.abs(law) < 1e-9 * size + 1e-12)
+    if semi_discrete.law(model, Point(0.1, 0.0, y, control, history)).linear:
         np.testing.assert_allclose(moved, matrix @ step, rtol=1e-6, atol=1e-9 * np.max(size))

@@ -62,6 +62,8 @@ def test_papers_robot(run):
     np.testing.assert_allclose(chords, 0.635 / 9 * np.cos(angle / 2.0), rtol=1e-3)
 
 
+@CAMPAIGN
+@pytest.mark.sample
 def test_learn_stiffness(run):
     before, after = run("learn_stiffness", steps=40)
     assert before > 0.05 and after < 1e-6 * before
@@ -76,6 +78,8 @@ def test_hit_a_target(run):
     assert tensions[-1, 0] > tensions[-1, 1] > tensions[-1, 2]
 
 
+@CAMPAIGN
+@pytest.mark.sample
 def test_follow_a_path(run):
     found = run("follow_a_path", points=9)
     assert np.all(found.converged) and np.all(found.position_error < 1e-8)
@@ -88,6 +92,7 @@ def test_follow_a_path(run):
     np.testing.assert_allclose(found.control[::-1], np.roll(found.control, 2, axis=1), atol=1e-6)
 
 
+@CAMPAIGN
 def test_where_it_reaches(run):
     found = run("where_it_reaches", count=512)
     assert found.unsolved == 0

@@ -212,6 +212,7 @@ def test_the_shell_completes_robots_and_commands():
 
 
 @pytest.mark.campaign
+@pytest.mark.sample
 def test_a_type_checker_sees_the_types_from_outside(tmp_path):
     """`py.typed` counts: a stranger's program is checked against our signatures."""
     (tmp_path / "user.py").write_text(

@@ -52,6 +52,7 @@ def test_first_steps(tmp_path):
 
 
 @pytest.mark.campaign
+@pytest.mark.sample
 def test_learn_what_is_missed(tmp_path):
     outputs, names = run(source("learn_what_is_missed"), tmp_path, steps=40)
     said = "".join(line for cell in outputs for output in cell for line in output.get("text", []))

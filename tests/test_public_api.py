@@ -21,7 +21,7 @@ NAMESPACES = sorted(name for name in kc.__all__ if isinstance(getattr(kc, name),
 VAGUE = {"What", "Whether", "That", "Those", "How", "Of"}
 #: errors of computations; all others are of arguments
 RUNNING = {kc.SimulationError, kc.estimation.ObserverError}
-ROBOT = kc.load_robot("delrin-tendon-robot").replace(nodes=5)
+ROBOT = kc.load_robot("delrin-tendon-robot")
 
 
 def names_of(space):
@@ -203,7 +203,7 @@ def test_parts_and_batches_and_users_systems_have_texts():
     short(rod, "loads=(AttachedMass)")
     both = jax.tree.map(lambda *leaves: np.stack(leaves), ROBOT, ROBOT.replace(length=0.5))
     short(both, "length=[0.635, 0.5] m")
-    short(jax.tree.map(lambda _: object(), ROBOT), "TendonRobot(nodes=5")
+    short(jax.tree.map(lambda _: object(), ROBOT), "TendonRobot(nodes=10")
     short(Hanging(mass=2.0), "Hanging(nodes=10, mass=2 kg, length=0.5 m)")
     short(Hanging(mass=2.0, anything=Odd()), "anything=Odd")
     short(Hanging(mass=2.0, anything=len), "anything=len")
@@ -211,8 +211,8 @@ def test_parts_and_batches_and_users_systems_have_texts():
 
 def test_models_show_what_they_correct():
     model = kc.KNODE(ROBOT, Nothing())
-    short(model, "KNODE of a TendonRobot, 0.635 m, 5 nodes", "Nothing")
-    short(kc.KNODE(model, Nothing()), "KNODE of a KNODE, 0.635 m, 5 nodes")
+    short(model, "KNODE of a TendonRobot, 0.635 m, 10 nodes", "Nothing")
+    short(kc.KNODE(model, Nothing()), "KNODE of a KNODE, 0.635 m, 10 nodes")
     short(kc.learning.Ensemble([model, model]), "Ensemble of 2 models", "0.635 m")
 
 
@@ -229,7 +229,7 @@ def test_texts_of_traced_objects_do_not_fail(motion):
     def traced(length):
         robot = ROBOT.replace(length=length)
         seen.append(short(robot, "length=traced"))
-        short(kc.KNODE(robot, Nothing()), "KNODE of a TendonRobot, traced, 5 nodes")
+        short(kc.KNODE(robot, Nothing()), "KNODE of a TendonRobot, traced, 10 nodes")
         return robot.length
 
     jax.jit(jax.vmap(traced))(np.array([0.5, 0.6]))

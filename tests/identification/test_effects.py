@@ -40,11 +40,13 @@ def test_nominal_numbers_change_nothing(model):
     assert np.allclose(shape(model.robot(basic)), expected, rtol=0.0, atol=1e-9)
     reduced = model.reduced(x, ("stiffness", "damping"))
     assert reduced.sections == () and reduced.loads == () and reduced.load_cells is None
-    assert np.allclose(shape(reduced), expected, rtol=0.0, atol=1e-9)
 
 
+@pytest.mark.campaign
 def test_reduced_robots_stand_as_those_with_all_parts(model):
     """What is left out of a robot does nothing there."""
+    nominal = model.reduced(np.zeros(model.size), ("stiffness", "damping"))
+    assert np.allclose(shape(nominal), shape(ROUTED), rtol=0.0, atol=1e-9)
     x = 0.3 * np.ones(model.size)
     names = ("stiffness", "damping", "rest curvature", "sleeve", "load cell gains", "base rotation")
     whole = model.robot(np.where(model.mask(names), x, 0.0))
@@ -75,6 +77,18 @@ def test_pressed_is_smooth_and_that_of_a_beam_column():
     assert np.all(np.diff(beyond) < 0.0) and beyond == pytest.approx([-5e-8, -2.5, -25.0])
 
 
+def test_softening_by_tension_bends_the_rod_to_a_smaller_circle():
+    """Closed form: T r/EI, softer by the factor of a beam-column, towards the tendon at 45 degrees."""
+    robot = ROUTED.replace(gravity=(0.0, 0.0, 0.0))
+    tension, c, EI = np.array([2.0, 0.0, 0.0, 0.0]), 1e-3, float(robot.Kbt[0, 0])
+    left = float(pressed(np.asarray(3.0 * c * tension.sum() / EI)))
+    assert left < 0.95
+    bent = kc.equilibrium(robot.replace(rib_spacing=RibSpacing(softening=c)), tension)
+    expected = 2.0 * 0.02 / (EI * left) * np.sqrt(0.5) * np.array([-1.0, 1.0, 0.0])
+    np.testing.assert_allclose(bent.part("u")[-1] - expected, 0.0, atol=1e-9)
+
+
+@pytest.mark.campaign
 def test_softening_by_tension_is_that_of_stiffness():
     """Without gravity a tendon bends the rod to a circle; softer by the factor of a beam-column."""
     # the ribs below are at nodes
@@ -101,6 +115,7 @@ def test_load_cells_correct_tensions():
     assert np.allclose(found, shape(ROUTED, true), rtol=0.0, atol=1e-9)
 
 
+@pytest.mark.campaign
 def test_early_anchors_are_ends_of_routings():
     at = 6.0 / 9.0
     early = ROUTED.replace(anchors=EarlyAnchors(at=at, share=(0.0, 1.0, 1.0, 1.0)))
@@ -111,6 +126,7 @@ def test_early_anchors_are_ends_of_routings():
     assert np.allclose(shape(early), shape(ROUTED.replace(routing=routing)), rtol=0.0, atol=1e-8)
 
 
+@pytest.mark.campaign
 def test_twisted_tendons_are_helices():
     twist = 0.7
     routing = tuple(
@@ -121,6 +137,7 @@ def test_twisted_tendons_are_helices():
     assert np.allclose(shape(twisted), shape(ROUTED.replace(routing=routing)), rtol=0.0, atol=1e-9)
 
 
+@pytest.mark.campaign
 def test_tendons_whose_routing_is_stated_are_moved_by_effects_of_that():
     """Angles of tendons mean nothing there; those of the routing turn each tendon."""
     routing = tuple(
@@ -143,6 +160,7 @@ def test_a_sleeve_is_stiffness_along_the_rod():
     assert found == pytest.approx(1.0 + 2.0 * np.exp(-((s / (0.3 * float(ROUTED.length))) ** 4)), rel=1e-12)
 
 
+@pytest.mark.campaign
 def test_friction_at_rest_holds_the_robot_back():
     """A part of the friction of the way from the unloaded rod: it is bent less, and more by the opposite."""
     robot = ROUTED.replace(friction=TendonFriction(wobble=0.5, reach=0.1))

@@ -99,6 +99,7 @@ def test_a_robots_own_motion_is_predicted_however_bodies_are_mounted():
     assert failed.failed and failed.to_dict()["tip_rmse"] is None and "no prediction" in str(failed)
 
 
+@pytest.mark.campaign
 def test_trials_name_what_fails():
     true = kc.robots.RoutedTendonRobot.like(NOMINAL)
     seen = measured(true, tensions(1.0, 1.0), "own", noise=0.0)
@@ -109,6 +110,7 @@ def test_trials_name_what_fails():
     assert "own at 1 times their amplitude" in failed_trial(weak, [data], "lobatto2")
 
 
+@pytest.mark.campaign
 def test_a_grid_is_too_coarse_or_fine_enough():
     true = kc.robots.RoutedTendonRobot.like(NOMINAL)
     seen = measured(true, tensions(1.0, 1.0), "own", noise=0.0)

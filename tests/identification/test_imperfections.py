@@ -46,6 +46,7 @@ def test_numbers_are_as_far_from_nominal_as_their_priors_are_wide():
         assert np.all((each.x >= low) & (each.x <= high))
 
 
+@pytest.mark.campaign
 def test_a_drawn_robot_comes_back_from_a_file(tmp_path):
     robot = drawn(7).robot
     kc.save_robot(robot, tmp_path / "true.yaml")

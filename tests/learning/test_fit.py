@@ -315,6 +315,7 @@ def sines(robot):
     ]
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize("imperfection", ["stiffness", "self-weight"])
 def test_losses_of_the_paper(robot, sines, imperfection):
     model = fit(robot.replace(**IMPERFECTIONS[imperfection]), sines, FitConfig.paper())

@@ -154,6 +154,7 @@ def test_motion_goes_on_from_a_trajectory(robot, time):
     assert_same(third, whole[40:])
 
 
+@pytest.mark.campaign
 def test_trapezoidal_motion_goes_on_exactly_from_rest_and_by_one_bdf1_step_from_motion(robot):
     """The rate at a trajectory's first row is not kept, and the trapezoidal rule never forgets it."""
     controls = kc.controls.sine(1.5, STEPS, DT)
@@ -175,6 +176,7 @@ def test_batch_of_controls_is_each_by_itself(robot):
         assert_same(batch[i], kc.simulate(robot, many[i], DT), tolerance=1e-12)
 
 
+@pytest.mark.campaign
 def test_batch_of_robots_is_each_by_itself(robot):
     robots = [robot, robot.replace(length=0.4, radius=0.004), robot.replace(youngs_modulus=10e9, drag=0.01)]
     batch = kc.simulate(robots, CONTROLS, DT)

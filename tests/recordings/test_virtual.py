@@ -20,6 +20,8 @@ def grams(signal, seconds=6.0):
     return sent.time, sent.tension / GRAM
 
 
+@pytest.mark.campaign
+@pytest.mark.sample
 def test_what_was_put_in_is_found(virtual):
     path, truth = virtual
     recording = kc.load_recording(path)
@@ -44,12 +46,16 @@ def test_what_was_put_in_is_found(virtual):
     assert np.std(tip.position - np.asarray(truth.tip_position)[row]) < 0.2e-3
 
 
+@pytest.mark.campaign
+@pytest.mark.sample
 def test_a_bag_read_with_another_statement_keeps_that(virtual):
     path, _ = virtual
     config = kc.recordings.RecordingConfig.paper_robot().replace(simulated=False)
     assert kc.load_recording(path, config).simulated is False
 
 
+@pytest.mark.campaign
+@pytest.mark.sample
 def test_the_robot_begins_in_equilibrium_and_rests(virtual):
     _, truth = virtual
     position = np.asarray(truth.position)
@@ -98,6 +104,8 @@ def test_the_lag_is_a_first_order_lag():
     np.testing.assert_allclose(lagged(sent, time, 0.06)[:, 0], expected, atol=1e-12)
 
 
+@pytest.mark.campaign
+@pytest.mark.sample
 def test_sensors_without_noise_tell_the_truth_but_for_axes_and_place(virtual):
     _, truth = virtual
     exact = Sensors(position_noise=0.0, turn_noise=0.0, lost=0.0, tension_noise=0.0, tension_step=0.0)

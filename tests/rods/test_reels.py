@@ -35,6 +35,12 @@ def test_controls_are_angles_and_the_robot_is_that_of_the_lengths():
     np.testing.assert_allclose(by_angle, by_length, rtol=0.0, atol=1e-12)
     # the first pair bends it towards the tendon that is wound up, the second away
     assert by_angle[0, 0] > 0.01 and by_angle[0, 1] < -0.003
+
+
+@pytest.mark.campaign
+def test_springs_in_series_bend_the_robot_less():
+    motors, angles = ROBOT.replace(reels=PAIRS), np.array([0.6, -0.2])
+    by_angle = kc.equilibrium(motors, angles).tip_position
     springs = motors.replace(reels=Reels(motors=(1, -1, 2, -2), radius=(0.02, 0.03), compliance=(1e-3,) * 4))
     soft = kc.equilibrium(springs, angles - np.array([0.1, 0.0])).tip_position
     assert 0.0 < soft[0, 0] < 0.9 * by_angle[0, 0]

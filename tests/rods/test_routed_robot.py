@@ -104,8 +104,9 @@ def test_friction_is_the_same_however_fine_the_time_steps_are():
 
 
 def test_friction_stays_between_none_and_all_and_opposes_motion():
-    robot = kc.robots.RoutedTendonRobot.like(KNOWLEDGE, **RUBBING)
-    along = moved(robot, 160, control="random:1")
+    # of the same parts as above, for the same program
+    robot = kc.robots.RoutedTendonRobot.like(KNOWLEDGE, **RUBBING, sections=(Sleeve(stiffening=1.0),))
+    along = moved(robot, 200, control="random:1")
     f = np.asarray(along.z)[..., 6:10]
     assert np.all(np.abs(f) <= 1.0) and np.abs(f).max() > 0.5
     u = np.asarray(along.z)[..., 3:6]

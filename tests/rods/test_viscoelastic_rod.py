@@ -60,6 +60,7 @@ def test_its_strains_satisfy_the_law_with_its_branch():
         np.testing.assert_allclose(0.3 * rates[f"{name}_branch"], values[name] - inner, atol=1e-9)
 
 
+@pytest.mark.campaign
 def test_relaxation_of_a_tendon_robot_is_that_of_the_rod():
     """A robot whose tendons pull with nothing moves under its weight as a rod of the same material."""
     body = {name: value for name, value in BODY.items() if name != "loads"} | {"gravity": (9.81, 0.0, 0.0)}

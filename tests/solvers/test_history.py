@@ -57,7 +57,8 @@ def gone_on(rod, before, count, **how):
     return kc.simulate(rod, NONE[:count], DT, space="lobatto4", initial=before, **how)
 
 
-@pytest.mark.parametrize("time", ["bdf2", pytest.param("trapezoidal", marks=pytest.mark.campaign)])
+@pytest.mark.campaign
+@pytest.mark.parametrize("time", ["bdf2", "trapezoidal"])
 def test_a_motion_goes_on_as_if_it_had_not_been_parted(rod, time, tmp_path):
     """From rows, from what itself went on, from part of that, from a file, and from a stepper's state."""
     one = kc.simulate(rod, NONE, DT, space="lobatto4", time=time)
@@ -118,6 +119,7 @@ def test_the_middle_of_a_motion_is_known_at_its_nodes_only(rod, whole):
     assert 0.0 < near[-1] < 1e-3
 
 
+@pytest.mark.campaign
 def test_rows_tell_what_the_last_step_looked_back_on(rod, whole):
     """The past that is found again is the one that the solver had."""
     settings = Settings.of("bdf2", "lobatto4", "paper", kc.solvers.NewtonOptions())
@@ -127,6 +129,7 @@ def test_rows_tell_what_the_last_step_looked_back_on(rod, whole):
     np.testing.assert_allclose(again.state.history.records, whole.final_state.history.records, atol=2e-8)
 
 
+@pytest.mark.campaign
 def test_what_is_at_the_nodes_beside_a_solution_is_carried_over(rod, whole):
     """States that were changed since are taken as they are."""
     changed = dataclasses.replace(whole, z=whole.z + 1e-3)

@@ -105,6 +105,7 @@ def test_a_row_of_a_coarse_grid_says_so(robot):
     assert row.result[0] == kc.Result.COARSE and row.all_valid
 
 
+@pytest.mark.campaign
 def test_rows_that_follow_a_coarse_one_are_coarse_too(robot):
     """The estimate decays with the motion, and does not know where the right one would have gone."""
     robot = robot.replace(nodes=3)

@@ -205,7 +205,8 @@ def test_of_reels_the_shape_is_compared_and_not_the_tensions():
 
 def test_of_several_rods_every_shape_is_compared():
     robot = kc.load_robot("six-legged-robot")
-    y = np.asarray(kc.equilibrium(robot, np.zeros(6)).y[0])
+    s = np.linspace(0.0, 1.0, robot.nodes) * float(robot.length)
+    y = np.stack([np.asarray(robot.rest(each)[0]) for each in s])
     bent, turned = y.copy(), y.copy()
     bent[5, 0] += 1e-4
     turned[5, robot.y_layout.slice(robot.y_layout.names[1])] += [0.0, 1e-4, 0.0, 0.0]
@@ -232,6 +233,12 @@ def test_the_equilibrium_that_was_reached_is_given():
     alone = kc.equilibrium(ROBOT, one.control[0])
     for name in ("y", "z"):
         np.testing.assert_allclose(getattr(one, name), getattr(alone, name), atol=1e-6)
+
+
+@pytest.mark.campaign
+def test_the_equilibrium_that_was_reached_is_stable_and_begins_a_motion():
+    position, _ = tip(ROBOT, [3.0, 0.0, 0.0, 0.0])
+    one = kc.inverse_kinematics(ROBOT, position, low=0.0, high=HIGH).equilibrium
     assert kc.statics.stability(one).stable
     assert kc.simulate(ROBOT, one.control, 0.05, initial=one).y.shape[0] == 2
 

@@ -119,6 +119,7 @@ def test_the_default_training_recordings(recordings):
     assert beam.training_names(recordings) == ["beam_gravity_V2_b", "beam_load52_V2_a"]
 
 
+@pytest.mark.campaign
 def test_the_held_out_recording_is_predicted(recordings):
     recordings = [first_part(each) for each in recordings]
     train = [each for each in recordings if each.name != HELD_OUT]

@@ -130,6 +130,7 @@ def test_jobs_are_plain_and_each_has_its_own_name():
         data_efficiency.jobs([0], methods=["beste"])
 
 
+@pytest.mark.campaign
 def test_five_rows_of_one_sine_are_enough_with_the_right_knowledge():
     job = next(job for job in data_efficiency.jobs([0], [5], ["best"]) if job.key == "best-stiffness-1x5")
     cells = job.work(job.settings).facts["cells"]

@@ -76,6 +76,7 @@ def run(*arguments):
     return CliRunner().invoke(app, ["study", "recordings", *map(str, arguments)])
 
 
+@pytest.mark.campaign
 def test_the_knowledge_alone(folder, tmp_path):
     """A second run takes what is there; what is written is the same."""
     given = (folder, "--out", tmp_path, "--train", "sine_1p0,rand_0", "--methods", "baseline", "--seconds", 3)
@@ -104,6 +105,8 @@ def test_the_knowledge_alone(folder, tmp_path):
     assert "of a simulated robot, not of a physical one" in (tmp_path / "table2.md").read_text()
 
 
+@pytest.mark.campaign
+@pytest.mark.sample
 def test_a_folder_describes_its_robot_and_its_topics(folder, tmp_path):
     """robot.yaml and recording.yaml beside the recordings are used, and named, unless others are given."""
     own = tmp_path / "own"
@@ -128,6 +131,7 @@ def test_a_folder_describes_its_robot_and_its_topics(folder, tmp_path):
     assert errors("c", "--robot", "delrin-tendon-robot")[0] != pytest.approx(found, rel=0.1)
 
 
+@pytest.mark.campaign
 def test_the_same_control_twice_is_seen(folder):
     rows = {}
     for name in ("sine_2p0", "sine_2p0_again", "sine_1p0"):

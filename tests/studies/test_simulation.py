@@ -132,6 +132,7 @@ def one_imperfection(monkeypatch):
     monkeypatch.setattr(simulation, "IMPERFECTIONS", {"length": simulation.IMPERFECTIONS["length"]})
 
 
+@pytest.mark.campaign
 def test_what_is_learned_is_tabled_beside_the_papers_and_kept(tmp_path, one_imperfection):
     result = study("--out", tmp_path, "--methods", "best,baseline", "--seeds", 2, "--workers", 1)
     assert result.exit_code == 0, result.stderr

@@ -1,9 +1,11 @@
-"""Trajectories that the tests of the viewer share, and a browser to show them in."""
+"""Trajectories that the tests of the viewer share, and a browser to show them in.
+
+Imported within fixtures: see `tests/recordings/conftest.py`.
+"""
 
 import numpy as np
 import pytest
 
-import knode_cosserat as kc
 from tests.viewer import browser as driver
 
 DT = 0.05
@@ -11,22 +13,30 @@ DT = 0.05
 
 @pytest.fixture(scope="session")
 def robot():
+    import knode_cosserat as kc
+
     return kc.load_robot("delrin-tendon-robot")
 
 
 @pytest.fixture(scope="session")
 def truth(robot):
+    import knode_cosserat as kc
+
     return kc.simulate(robot, kc.controls.sine(1.5, 60, DT), DT)
 
 
 @pytest.fixture(scope="session")
 def prediction(robot):
+    import knode_cosserat as kc
+
     return kc.simulate(robot.replace(length=0.5), kc.controls.sine(1.5, 60, DT), DT)
 
 
 @pytest.fixture(scope="session")
 def failed(truth):
     """Its rows from 40 on are not solved, as a simulation leaves them with `on_failure="return"`."""
+    import knode_cosserat as kc
+
     result = np.array(truth.result)
     result[40:] = int(kc.Result.NOT_REACHED)
     result[40] = int(kc.Result.NO_CONVERGENCE)
@@ -48,6 +58,8 @@ def failed(truth):
 @pytest.fixture(scope="session")
 def coarse(truth):
     """Its rows from 40 on are of too coarse a grid; those from 50 on only continue from such a row."""
+    import knode_cosserat as kc
+
     result = np.array(truth.result)
     result[40:] = int(kc.Result.COARSE)
     error = np.full(len(result), 1e-4)

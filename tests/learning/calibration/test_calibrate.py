@@ -85,6 +85,7 @@ def test_nobody_has_to_say_which_parameter_is_wrong(truth, start):
     assert kc.metrics.tip_dtw(again, kc.simulate(true, controls, DT)[:100]) < 1e-6
 
 
+@pytest.mark.campaign
 def test_a_robot_at_rest_tells_little():
     tension = np.array([6.0, 5.0, 5.0, 5.0])
     still = kc.simulate(ROBOT, np.tile(tension, (29, 1)), DT, initial=kc.equilibrium(ROBOT, tension))
@@ -116,6 +117,7 @@ def test_by_rk4_the_past_between_nodes_is_that_of_the_robot_that_is_found(part):
     assert result.estimates["drag"] == pytest.approx(0.5, rel=1e-7 + 30.0 * part) and not result.unexplained
 
 
+@pytest.mark.campaign
 def test_b_not_zero_and_the_length(string_swing):
     """Rates along the rod belong to the history then, and follow the length."""
     string = string_swing.system

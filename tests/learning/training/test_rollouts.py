@@ -60,7 +60,7 @@ def only_positions(trajectory, after=0):
     return dataclasses.replace(trajectory, y=y, z=z)
 
 
-@pytest.mark.parametrize("first", [None, 4])
+@pytest.mark.parametrize("first", [None, pytest.param(4, marks=pytest.mark.campaign)])
 def test_loss_and_gradient(bars, residual, first):
     """The loss by `simulate` and NumPy; the gradient by finite differences along random directions."""
     options = dataclasses.replace(OPTIONS, first_row=first)
