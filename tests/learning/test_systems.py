@@ -85,6 +85,7 @@ LADEN = kc.robots.SlenderRod(
 )  # fmt: skip
 
 
+@pytest.mark.campaign
 def test_forward_euler_moves_a_rod_with_loads_at_a_node():
     control = pushed(1.0, 1.0, np.zeros(1))[:4]
     moved, fine = (kc.simulate(LADEN, control, DT, space=space) for space in ("euler", "lobatto2"))

@@ -19,7 +19,8 @@ LOADED = kc.robots.SlenderRod(
     length=L, radius=RADIUS, density=1000.0, youngs_modulus=E, gravity=[0.0, 0.0, 0.0], nodes=11,
     loads=(
         PointWrench(at=0.35), PointWrench(at=0.6), DistributedWrench(begin=0.25, end=0.73),
-        AttachedMass(at=0.6), AttachedMass(at=1.0), PointWrench(at=1.0), PointWrench(at=1.0, follows=True),
+        AttachedMass(at=0.6), AttachedMass(at=1.0, offset=[0.0, 0.0, 0.0]), PointWrench(at=1.0),
+        PointWrench(at=1.0, follows=True),
     ),
 )  # fmt: skip
 OFF_NODE, ON_NODE, SPREAD, RIB, TIP_BODY, TIP, FOLLOWER = (f"loads.{k}" for k in range(7))
@@ -281,6 +282,7 @@ def test_a_batch_of_robots_with_different_loads_is_each_by_itself():
         np.testing.assert_allclose(together.y[k], kc.simulate(robot, control, 0.02).y, atol=1e-9)
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize(
     "load",
     [PointWrench(force=[0.2, 0.0, 0.0]), pytest.param(AttachedMass(mass=0.01), marks=pytest.mark.campaign)],

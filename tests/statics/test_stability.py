@@ -7,6 +7,7 @@ import knode_cosserat as kc
 from knode_cosserat.rods.ends import Clamped, Free, Pinned
 from knode_cosserat.rods.loads import PointWrench
 from knode_cosserat.rods.tendon_friction import TendonFriction, Vibration
+from tests.trajectories import synthetic
 
 L, RADIUS, E = 0.5, 2e-3, 2e9
 EI, EA = E * np.pi * RADIUS**4 / 4, E * np.pi * RADIUS**2
@@ -159,6 +160,7 @@ def test_of_a_slender_wire_the_nodes_do_not_change_what_is_least(nodes):
     assert least[0] == pytest.approx(least[1], rel=1e-6) and least[1] == pytest.approx(least[2], rel=0.02)
 
 
+@pytest.mark.campaign
 def test_the_six_legs_of_the_catalogs_robot_are_stable():
     robot = kc.load_robot("six-legged-robot")
     rest, moved = (
@@ -261,7 +263,7 @@ def test_what_is_no_equilibrium_is_refused():
     with pytest.raises(ValueError, match=r"row is 9; allowed is -6 to 5"):
         kc.statics.stability(moved, row=9)
     with pytest.raises(ValueError, match=r"of a batch"):
-        kc.statics.stability(kc.equilibrium(robot, np.zeros((2, 4))))
+        kc.statics.stability(synthetic(batch=(2,)))
 
 
 @pytest.mark.campaign
