@@ -20,7 +20,7 @@ from knode_cosserat.control import (
 )
 from knode_cosserat.control.qp import QPSolution
 from knode_cosserat.estimation import KalmanObserver, TipPosition
-from knode_cosserat.estimation.online import predicted_step
+from knode_cosserat.estimation.online import predicted_step, split_record
 
 DT, LENGTH = 0.05, 0.635
 ROBOT = kc.load_robot("delrin-tendon-robot")
@@ -81,16 +81,10 @@ def test_columns_of_the_observer_are_derivatives_of_the_step():
 
     def tip(control):
         none = np.zeros(4), np.zeros(1)
-        found = predicted_step(
-            own.robot, own.x, own.past, own.spread, control, none, own.coefficients, own.settings, own.output,
-            own.parameters,
-        )  # fmt: skip
-        return np.asarray(found.value)
+        found = predicted_step(own.model, own.belief, control, none, own.output)
+        return np.asarray(TipPosition().value(ROBOT, *split_record(ROBOT, found.record)))
 
-    found = predicted_step(
-        own.robot, own.x, own.past, own.spread, tension, (np.ones(4), np.zeros(1)), own.coefficients,
-        own.settings, own.output, own.parameters,
-    )  # fmt: skip
+    found = predicted_step(own.model, own.belief, tension, (np.ones(4), np.zeros(1)), own.output)
     columns = np.asarray(found.by_column)[own.columns : own.columns + 4]
     differences = [(tip(tension + h * one) - tip(tension - h * one)) / (2.0 * h) for one in np.eye(4)]
     assert_allclose(columns, differences, rtol=1e-5, atol=1e-9)

@@ -9,12 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from knode_cosserat.estimation.online import (
-    directions_of,
-    errors_along,
-    rollout_with_tangents,
-    split_record,
-)
+from knode_cosserat.estimation.online import Belief, OnlineModel, errors_along, split_record
+from knode_cosserat.estimation.outputs import Output
 
 
 class Prediction(NamedTuple):
@@ -33,23 +29,21 @@ class Prediction(NamedTuple):
     solved: Any
 
 
-@functools.partial(jax.jit, static_argnames=("settings", "target", "limited"))
-def linearised_prediction(  # type: ignore[no-untyped-def]
-    robot, x, past, spread, plan, basis, reference, coefficients, settings, target, limited, parameters
-):
-    """Return the `Prediction` of a plan (knots, c) by its `basis` (T, knots), from a state."""
-    system, directions = directions_of(robot, parameters, x)
-    (count, c), (steps, m) = plan.shape, (len(basis), len(spread.records))
+@functools.partial(jax.jit, static_argnames=("target", "limited"))
+def linearised_prediction(
+    model: OnlineModel, belief: Belief, plan: Float[Any, "knots c"], basis: Float[Any, "T knots"],
+    reference: Float[Any, "T p"], target: Output, limited: tuple[Output, ...],
+) -> Prediction:  # fmt: skip
+    """Return the prediction of a plan, whose controls are `basis` times `plan`, from an estimated state."""
+    (count, c), (steps, m) = plan.shape, (len(basis), len(belief.spread.records))
     of_plan = jnp.einsum("tk,ij->kjti", basis, jnp.eye(c)).reshape(count * c, steps, c)
 
     def extended(part: Any) -> Any:
         return jnp.concatenate([jnp.zeros((count * c, *part.shape[1:])), part])
 
-    wide = jax.tree.map(extended, spread)
+    wide = jax.tree.map(extended, belief.spread)
     d_controls = jnp.concatenate([of_plan, jnp.zeros((m, steps, c))])
-    found = rollout_with_tangents(
-        system, settings, coefficients, past, basis @ plan, wide, (directions, d_controls)
-    )
+    system, found = model.rollout(belief._replace(spread=wide), basis @ plan, d_controls)
     error, slopes = errors_along(system, target, found.records, found.d_records, reference)
     path = system.positions(split_record(system, found.records[:, -1])[0])
     values, moved = [jnp.zeros((steps, 0))], [jnp.zeros((count * c + m, steps, 0))]

@@ -122,9 +122,8 @@ class PredictiveController(Controller):
             )
         observer, limited = self.observer, tuple(soft.output for soft in self.soft)
         found = linearised_prediction(
-            observer.robot, observer.x, observer.past, observer.spread, self._plan, self.knots.basis, wanted,
-            observer.coefficients, observer.settings, self.target, limited, observer.parameters,
-        )  # fmt: skip
+            observer.model, observer.belief, self._plan, self.knots.basis, wanted, self.target, limited
+        )
         if bool(found.solved):
             self._prediction = Prediction(*(np.asarray(part) for part in found))
         else:

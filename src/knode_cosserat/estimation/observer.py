@@ -12,19 +12,18 @@ from jaxtyping import Float
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.estimation.adapted import Adapted, AdaptedParameters
 from knode_cosserat.estimation.online import (
+    Belief,
+    OnlineModel,
     Spread,
     measured_error,
     predicted_step,
-    regular_coefficients,
     split_record,
 )
 from knode_cosserat.estimation.outputs import Output
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.history import used_places
 from knode_cosserat.solvers.initial import continued_state, initial_state
-from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.simulate import check_initial, checked_dt
 from knode_cosserat.trajectory import Trajectory
 
@@ -96,37 +95,35 @@ class KalmanObserver:
         """
         if columns < 1:
             raise ValueError(f"columns is {columns}; allowed is at least 1")
-        self.robot, self.dt, self.output = robot, checked_dt(dt), output
+        self.dt, self.output = checked_dt(dt), output
         self.parameters = AdaptedParameters(robot, adapt)
+        self.model = OnlineModel(robot, self.parameters, self.dt)
         self.columns = columns + self.parameters.size
-        self.settings = Settings.of("bdf2", "lobatto2", "paper", NewtonOptions())
-        self.coefficients = regular_coefficients(self.settings, self.dt)
         self._control_deviation = _deviations(robot, control_deviation)
         self._start_deviation = float(start_deviation)
         self._scale = np.asarray(robot.scales().y)
         self.restart(initial)
 
+    @property
+    def robot(self) -> System:
+        """The model, with the parameters that it had at first."""
+        return self.model.robot
+
     def restart(self, initial: Trajectory | None = None) -> None:
         """Start again at rest, or at the last row of a trajectory, with the initial uncertainty."""
-        robot = self.robot
-        if initial is not None:
-            check_initial(robot, initial, None)
+        robot, settings = self.robot, self.model.settings
         if initial is None:
-            at_start = initial_state(robot, self.settings)
+            at_start = initial_state(robot, settings)
         else:
-            at_start = continued_state(robot, initial, self.settings, self.dt)
-        self.past = at_start.state.history
+            check_initial(robot, initial, None)
+            at_start = continued_state(robot, initial, settings, self.dt)
+        past = at_start.state.history
         self.control = np.asarray(at_start.control, dtype=float)
         self.record = np.asarray(at_start.record)
-        self.x = np.zeros(self.parameters.size)
-        self.lost = 0
-        used = used_places(robot, self.settings.space)
-        width, n = self.past.records.shape[-1], self.parameters.size
-        rows = np.zeros((self.columns, 2, used, width))
-        coordinates = np.zeros((self.columns, n))
-        coordinates[:n] = np.eye(n)
-        self.spread = Spread(rows, rows[:, 0], coordinates)
-        self._value: Any = None
+        used, n = used_places(robot, settings.space), self.parameters.size
+        rows = np.zeros((self.columns, 2, used, past.records.shape[-1]))
+        coordinates = np.eye(self.columns, n)
+        self.belief = Belief(np.zeros(n), past, Spread(rows, rows[:, 0], coordinates))
         self._slopes = np.zeros((self.columns, len(self.output.noise)))
         self._innovation, self._surprise = np.full(len(self.output.noise), np.nan), 0.0
         if self._start_deviation:
@@ -134,31 +131,34 @@ class KalmanObserver:
 
     def _spread_start(self) -> None:
         """Set the columns to those of a robot at rest under controls that varied before the start."""
-        past, record, control = self.past, self.record, self._control_deviation
+        past, record, control = self.belief.past, self.record, self._control_deviation
         self._control_deviation = np.full(len(control), self._start_deviation / np.sqrt(STARTING))
         for _ in range(STARTING):
             self.predict(self.control)
-        self.past, self.record, self._control_deviation = past, record, control
+        self.record, self._control_deviation = record, control
+        self.belief = self.belief._replace(past=past)
 
     @property
     def time(self) -> float:
         """Time of the state (s)."""
-        return float(self.past.t0)
+        return float(self.belief.past.t0)
 
     @property
     def system(self) -> System:
         """Robot with the adapted parameters."""
-        return self.parameters.of(self.robot, self.x)
+        return self.model.at(self.belief.x)
 
     @property
     def estimate(self) -> Estimate:
         """Current state, and the parameters with their standard deviations."""
         y, z = split_record(self.robot, self.record)
-        numbers = self._numbers(self.x)
+        numbers = self._numbers(self.belief.x)
         # by the slope of each number
         step = 1e-6
-        above = self._numbers(self.x + step)
-        spread = np.sqrt(np.sum(np.asarray(self.spread.parameters) ** 2, axis=0)) * (above - numbers) / step
+        above = self._numbers(self.belief.x + step)
+        spread = (
+            np.sqrt(np.sum(np.asarray(self.belief.spread.parameters) ** 2, axis=0)) * (above - numbers) / step
+        )
         labels = self.parameters.labels
         return Estimate(
             self.time, y, z, dict(zip(labels, map(float, numbers), strict=True)),
@@ -184,16 +184,12 @@ class KalmanObserver:
                 f"the control is {control.tolist()}; allowed are {self.robot.control_size} finite numbers"
             )
         deviations = self._control_deviation, self.parameters.drift * np.sqrt(self.dt)
-        found = predicted_step(
-            self.robot, self.x, self.past, self.spread, control, deviations, self.coefficients,
-            self.settings, self.output, self.parameters,
-        )  # fmt: skip
+        found = predicted_step(self.model, self.belief, control, deviations, self.output)
         if not bool(found.solved):
             raise ObserverError(f"the model's step at t = {self.time + self.dt:g} s was not solved")
-        self.past, self.control = found.past, control
-        self.record, self._value = np.asarray(found.record), np.asarray(found.value)
+        self.control, self.record = control, np.asarray(found.record)
         matrix = self._compression(found.spread)
-        self.spread = found.spread.combined(matrix)
+        self.belief = Belief(self.belief.x, found.past, found.spread.combined(matrix))
         self._slopes = matrix.T @ np.asarray(found.by_column)
 
     def covers(self, truth: Trajectory, level: float = 0.95) -> bool:
@@ -209,7 +205,7 @@ class KalmanObserver:
         ny = len(self._scale)
         # the tip's position is linear in y
         tips = np.array(
-            [self.robot.positions(c[0][nodes[-1:], :ny])[0] for c in np.asarray(self.spread.records)]
+            [self.robot.positions(c[0][nodes[-1:], :ny])[0] for c in np.asarray(self.belief.spread.records)]
         )
         apart = (
             np.asarray(truth.tip_position[-1]) - np.asarray(self.robot.positions(self.record[-1:, :ny]))[0]
@@ -220,7 +216,8 @@ class KalmanObserver:
 
     def wait(self) -> None:
         """Let a period pass without a prediction: the state is held."""
-        self.past = self.past._replace(t0=np.asarray(self.time + self.dt))
+        past = self.belief.past._replace(t0=np.asarray(self.time + self.dt))
+        self.belief = self.belief._replace(past=past)
 
     def _compression(self, spread: Spread) -> Float[np.ndarray, "m k"]:
         """Return the combinations of columns that keep the most of the covariance."""
@@ -241,9 +238,7 @@ class KalmanObserver:
                 f"a measurement has shape {measured.shape}; allowed is ({self.output.size},): "
                 f"{', '.join(self.output.labels)}"
             )
-        error = np.asarray(
-            measured_error(self.robot, self.x, self.record, measured, self.output, self.parameters)
-        )
+        error = np.asarray(measured_error(self.model, self.belief.x, self.record, measured, self.output))
         known = np.isfinite(error)
         self._innovation, count = -error, int(known.sum())
         self._surprise = 0.0
@@ -267,17 +262,18 @@ class KalmanObserver:
         NaN are numbers that were not measured.
         """
         coordinates, remaining = self.correction(measured)
-        self.lost = 0 if np.any(np.isfinite(measured)) else self.lost + 1
-        records, rate, x = self.spread.along(coordinates)
+        x, past, spread = self.belief
+        records, rate, d_x = spread.along(coordinates)
         used = records.shape[1]
-        past = self.past
         all_records, all_rates = np.array(past.records), np.array(past.rate)
         all_records[:, :used] += records
         all_rates[:used] += rate
-        self.past = past._replace(records=all_records, rate=all_rates)
-        self.x = np.clip(self.x + x, *self.parameters.bounds)
+        self.belief = Belief(
+            np.clip(x + d_x, *self.parameters.bounds),
+            past._replace(records=all_records, rate=all_rates),
+            spread.combined(remaining),
+        )
         self.record = self.record + records[0][grid_of(self.robot).nodes]
-        self.spread = self.spread.combined(remaining)
         self._slopes = remaining.T @ self._slopes
         return coordinates
 

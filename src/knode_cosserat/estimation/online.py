@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +18,7 @@ from jaxtyping import Float
 from knode_cosserat.estimation.adapted import AdaptedParameters
 from knode_cosserat.estimation.outputs import Output
 from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.history import StateHistory, coefficient_table
 from knode_cosserat.solvers.sensitivity import TangentState, tangent_time_loop
 from knode_cosserat.solvers.settings import Settings
@@ -40,6 +42,62 @@ class Spread(NamedTuple):
         return tuple(np.tensordot(coordinates, np.asarray(part), 1) for part in self)  # type: ignore[return-value]
 
 
+class Belief(NamedTuple):
+    """Estimated state of a model: coordinates of its parameters, the solver's history, and their spread."""
+
+    x: Float[Any, " n"]
+    past: StateHistory
+    spread: Spread
+
+
+class OnlineModel(eqx.Module):
+    """A robot with adapted parameters, and the numerical settings of its steps."""
+
+    robot: System
+    parameters: AdaptedParameters
+    coefficients: StepCoefficients
+    settings: Settings = eqx.field(static=True)
+
+    def __init__(self, robot: System, parameters: AdaptedParameters, dt: float):
+        """Set the schemes: the paper's in time, the default along the rod."""
+        self.robot, self.parameters = robot, parameters
+        self.settings = Settings.of("bdf2", "lobatto2", "paper", NewtonOptions())
+        self.coefficients = StepCoefficients(coefficient_table(self.settings, dt, "regular"), dt)
+
+    def at(self, x: Any) -> System:
+        """Return the robot at coordinates of its parameters."""
+        return self.parameters.of(self.robot, x)
+
+    def directions(self, x: Any) -> Any:
+        """Return the robot's tangents by each parameter, stacked; None if there are none."""
+        if not self.parameters.size:
+            return None
+        by_x = jax.vmap(lambda d: jax.jvp(self.at, (x,), (d,))[1])
+        return by_x(jnp.eye(self.parameters.size))
+
+    def rollout(
+        self, belief: Belief, controls: Float[Any, "T c"], d_controls: Float[Any, "k T c"]
+    ) -> tuple[System, Rollout]:
+        """Return the robot, and its motion with the tangents of all rows along columns.
+
+        A column is a direction of the belief's spread, with the tangents of the controls beside it.
+        """
+        system, directions = self.at(belief.x), self.directions(belief.x)
+        settings, steps, past, spread = self.settings, len(controls), belief.past, belief.spread
+        done, after, rows = time_loop(system, settings, self.coefficients, controls, past, (0, steps))
+        state = TangentState.of(system, settings.space, past, past.records, past.rate)
+
+        def along(d_records: Any, d_rate: Any, weights: Any, d_controls: Any) -> Any:
+            solved, moved = (rows.records, rows.unknowns), (SystemMoves(directions, weights), d_controls)
+            first = state._replace(d_records=d_records, d_rate=d_rate)
+            return tangent_time_loop(settings, self.coefficients, solved, (system, controls), moved, first)
+
+        last, (d_rows, _) = jax.vmap(along)(spread.records, spread.rate, spread.parameters, d_controls)
+        moved = Spread(last.d_records, last.d_rate, spread.parameters)
+        after = after._replace(t0=past.t0 + steps * self.coefficients.dt)
+        return system, Rollout(after, rows.records, d_rows, moved, done == steps)
+
+
 class Rollout(NamedTuple):
     """A simulated motion, and the tangents of its rows (columns, steps, N, x)."""
 
@@ -49,44 +107,6 @@ class Rollout(NamedTuple):
     #: history after the last step, along the columns
     spread: Spread
     solved: Any
-
-
-def regular_coefficients(settings: Settings, dt: float) -> StepCoefficients:
-    """Return the coefficients of steps after the first ones."""
-    return StepCoefficients(coefficient_table(settings, dt, "regular"), dt)
-
-
-def rollout_with_tangents(
-    system: System, settings: Settings, coefficients: StepCoefficients, past: StateHistory,
-    controls: Float[Any, "T c"], spread: Spread, changes: tuple[Any, Float[Any, "k T c"]],
-) -> Rollout:  # fmt: skip
-    """Simulate, and return the tangents of all rows along columns of history, parameters and controls.
-
-    `changes` are the tangents of the system by each adapted parameter, stacked (None if there are none), and
-    those of the controls by each column.
-    """
-    steps, (directions, d_controls) = len(controls), changes
-    done, after, rows = time_loop(system, settings, coefficients, controls, past, (0, steps))
-    state = TangentState.of(system, settings.space, past, past.records, past.rate)
-
-    def along(d_records: Any, d_rate: Any, weights: Any, d_controls: Any) -> Any:
-        solved, moved = (rows.records, rows.unknowns), (SystemMoves(directions, weights), d_controls)
-        first = state._replace(d_records=d_records, d_rate=d_rate)
-        return tangent_time_loop(settings, coefficients, solved, (system, controls), moved, first)
-
-    last, (d_rows, _) = jax.vmap(along)(spread.records, spread.rate, spread.parameters, d_controls)
-    moved = Spread(last.d_records, last.d_rate, spread.parameters)
-    after = after._replace(t0=past.t0 + steps * coefficients.dt)
-    return Rollout(after, rows.records, d_rows, moved, done == steps)
-
-
-def directions_of(robot: System, parameters: AdaptedParameters, x: Any) -> tuple[System, Any]:
-    """Return the robot at coordinates of its parameters, and its tangents by each, stacked."""
-    system = parameters.of(robot, x)
-    if not parameters.size:
-        return system, None
-    by_x = jax.vmap(lambda d: jax.jvp(lambda x: parameters.of(robot, x), (x,), (d,))[1])
-    return system, by_x(jnp.eye(parameters.size))
 
 
 def split_record(system: System, record: Any) -> tuple[Any, Any]:
@@ -117,22 +137,21 @@ class Predicted(NamedTuple):
     past: StateHistory
     record: Float[Any, "N x"]
     spread: Spread
-    #: predicted output, and the tangents of its error by every column
-    value: Float[Any, " p"]
+    #: tangents of the output's error by every column
     by_column: Float[Any, "m e"]
     solved: Any
 
 
-@functools.partial(jax.jit, static_argnames=("settings", "output"))
-def predicted_step(  # type: ignore[no-untyped-def]
-    robot, x, past, spread, control, deviations, coefficients, settings, output, parameters
-):
+@functools.partial(jax.jit, static_argnames="output")
+def predicted_step(
+    model: OnlineModel, belief: Belief, control: Any, deviations: tuple[Any, Any], output: Output
+) -> Predicted:
     """Return one step under a control, with new columns for its uncertainty and the parameters' drift.
 
     `deviations` are those of each control (c,) and of the drift of each parameter (n,) in the step.
     """
-    system, directions = directions_of(robot, parameters, x)
     of_control, of_drift = deviations
+    spread = belief.spread
     m, c, n = len(spread.records), len(of_control), len(of_drift)
 
     def more(part: Any) -> Any:
@@ -141,17 +160,15 @@ def predicted_step(  # type: ignore[no-untyped-def]
     drifts = jnp.concatenate([spread.parameters, jnp.zeros((c, n)), jnp.diag(of_drift)])
     wide = Spread(more(spread.records), more(spread.rate), drifts)
     d_controls = jnp.concatenate([jnp.zeros((m, c)), jnp.diag(of_control), jnp.zeros((n, c))])
-    found = rollout_with_tangents(
-        system, settings, coefficients, past, control[None], wide, (directions, d_controls[:, None])
-    )
+    system, found = model.rollout(belief._replace(spread=wide), control[None], d_controls[:, None])
     record = found.records[0]
     value = output.value(system, *split_record(system, record))
     _, slopes = errors_along(system, output, found.records, found.d_records, value[None])
-    return Predicted(found.past, record, found.spread, value, slopes[:, 0], found.solved)
+    return Predicted(found.past, record, found.spread, slopes[:, 0], found.solved)
 
 
 @functools.partial(jax.jit, static_argnames="output")
-def measured_error(robot, x, record, measured, output, parameters):  # type: ignore[no-untyped-def]
+def measured_error(model: OnlineModel, x: Any, record: Any, measured: Any, output: Output) -> Any:
     """Return the error of a state's output from a measurement."""
-    system = parameters.of(robot, x)
+    system = model.at(x)
     return output.error(system, *split_record(system, record), measured)
