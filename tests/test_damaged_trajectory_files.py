@@ -123,16 +123,16 @@ def test_attributes_that_are_not_right(path, name, value, parts):
 
 def test_where_a_motion_began_is_told_whole_or_not_at_all(tmp_path):
     for name, change, parts in (
-        ("initial_history", None, ("'initial_history_step' is missing",)),
+        ("initial_history", None, ("'initial_history_guess' is missing",)),
         ("initial_history", lambda data: data[:2], ("'initial_history' has shape (2, ", "allowed is (3, ")),
-        ("initial_history_step", lambda data: data[:4], ("has shape (4,)", "allowed is (5,)")),
+        ("initial_history_time", lambda data: data[:2], ("has shape (2,)", "allowed is (3,)")),
     ):
         synthetic(places=5).save(tmp_path / "a.nc")
         with xarray.open_dataset(tmp_path / "a.nc", engine="h5netcdf", decode_cf=False) as data:
             kept = data.load()
         values = kept[name].values
         if change is None:
-            kept = kept.drop_vars("initial_history_step")
+            kept = kept.drop_vars("initial_history_guess")
         else:
             changed = change(values)
             dims = [

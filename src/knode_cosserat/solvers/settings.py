@@ -70,11 +70,12 @@ class Settings:
         becomes none, and removed options are ignored.
         """
         time = described["time"]
+        time = None if time in (None, _EARLIER_STATICS) else _named(TimeScheme, **time)
         space, newton = dict(described["space"]), dict(described["newton"])
         space["scheme"] = _EARLIER_SCHEMES.get(space["scheme"], space["scheme"])
         newton.pop("across_steps", None)
         return cls(
-            time=None if time in (None, _EARLIER_STATICS) else _named(TimeScheme, **time),
+            time=time,
             space=_named(SpaceScheme, **space),
             start=described["start"],
             newton=NewtonOptions(**newton),

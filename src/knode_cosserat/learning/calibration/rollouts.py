@@ -29,7 +29,7 @@ from knode_cosserat.learning.calibration.unknowns import (
 )
 from knode_cosserat.learning.samples import DataError, samples
 from knode_cosserat.recordings.measurements import Measurements
-from knode_cosserat.rods.system import System
+from knode_cosserat.rods.system import System, unknowns_of
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.history import StateHistory, constant_history, resting_history
 from knode_cosserat.solvers.initial import continued_state, initial_state
@@ -116,7 +116,7 @@ def _differences(robot, coordinates, rows, steps, unknowns, settings, oriented, 
     def settled(system: Any, d_system: Any) -> Any:
         """Return the initial history and its tangent, if the initial state is a solved equilibrium."""
         none = jnp.zeros(system.control_size)
-        solved = rows.first[None], system.unknowns(rows.first[0])[None]
+        solved = rows.first[None], unknowns_of(system, rows.first[0])[None]
         d_first, _, _ = static_tangents(
             settings, solved, (system, none[None]), (SystemMoves.of(d_system), jnp.zeros_like(none[None]))
         )
