@@ -173,6 +173,12 @@ def run_loop(
             done = clock.perf_counter()
             parameters.append(_parameters_of(controller))
             rows.append((time, measured, tip, command, sent - began, done - moved))
+    return _log_of(rows, parameters, reference, missed)
+
+
+def _log_of(
+    rows: list[tuple[Any, ...]], parameters: list[dict[str, float]], reference: Reference, missed: int
+) -> LoopLog:
     times, measurements, tips, commands, feedback, preparation = zip(*rows, strict=True)
     return LoopLog(
         time=np.array(times),
