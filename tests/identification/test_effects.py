@@ -31,6 +31,7 @@ def shape(robot, tension=TENSION, **more):
     return np.asarray(kc.equilibrium(robot, tension, **more).position[-1])
 
 
+@pytest.mark.campaign
 def test_nominal_numbers_change_nothing(model):
     """The robot with all effects at zero is the nominal one, and so is the one without their parts."""
     x = np.zeros(model.size)
