@@ -27,9 +27,6 @@ QUICK = (
     "--xla_cpu_parallel_codegen_split_count=1"
 )
 
-#: large programs (about 10 MB each) of a test process; the limit of memory maps remains
-PROGRAMS = 300
-
 
 def pytest_addoption(parser):
     parser.addoption("--quick", action="store_true", help="compile quickly rather than well")
@@ -48,16 +45,13 @@ def pytest_configure(config):
 
 
 def pytest_collection_finish():
-    """Save time: fewer garbage collections (a tenth of tracing), and more programs kept than for users.
+    """Collect garbage less often: tracing makes many objects, and a tenth of its time was collections.
 
-    Test files that simulate the same robot share its program.
+    What the tests' modules hold stays anyway, and is not looked at again.
     """
     gc.collect()
     gc.freeze()
     gc.set_threshold(50_000, 20, 50)
-    package = sys.modules.get("knode_cosserat._jax")
-    if package:
-        package.program_budget._programs = PROGRAMS
 
 
 def pytest_collection_modifyitems(config, items):

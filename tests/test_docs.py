@@ -27,11 +27,11 @@ LONG = "<!-- test: long -->"
 #: pages whose code takes long as a whole: recordings are made and learned from, or many programs compiled
 LONG_PAGES = (
     "README.md", "docs/estimation.md", "docs/kinematics.md", "docs/recordings.md", "docs/tutorials/fit.md",
-    "docs/tutorials/gradients.md", "docs/tutorials/several-rods.md", "docs/two-sections.md",
-    "docs/which-function.md", "docs/your-own-robot.md",
+    "docs/tutorials/gradients.md", "docs/tutorials/several-rods.md", "docs/tutorials/simulate.md",
+    "docs/two-sections.md", "docs/which-function.md", "docs/your-own-robot.md",
 )  # fmt: skip
 #: of these, pages that CI runs too
-SAMPLES = ("README.md", "docs/tutorials/fit.md", "docs/which-function.md")
+SAMPLES = ("README.md", "docs/tutorials/fit.md", "docs/tutorials/simulate.md", "docs/which-function.md")
 #: pages whose commands are cheap enough to be run, and checked by what the page says they print
 RUN = ("docs/first-ten-minutes.md",)
 

@@ -55,6 +55,7 @@ def test_the_members_differ_by_as_much_as_they_may_be_wrong(prediction, truth):
     assert error < 4.0 * spread
 
 
+@pytest.mark.campaign
 def test_the_mean_is_compared_like_a_trajectory(prediction, truth):
     baseline = kc.simulate(ROBOT.replace(youngs_modulus=6e9), kc.controls.sine(1.5, 40, DT), DT)
     assert kc.metrics.tip_dtw(prediction, truth) < 0.1 * kc.metrics.tip_dtw(baseline, truth)
@@ -63,6 +64,7 @@ def test_the_mean_is_compared_like_a_trajectory(prediction, truth):
     np.testing.assert_allclose(prediction.time, truth.time)
 
 
+@pytest.mark.campaign
 def test_another_run_gives_the_same_members(ensemble, training):
     wrong = ROBOT.replace(youngs_modulus=6e9)
     again = kc.fit(wrong, training, kc.FitConfig(StructuredOptions(curved=False, resample=True), seed=(3,)))[
@@ -72,6 +74,7 @@ def test_another_run_gives_the_same_members(ensemble, training):
     np.testing.assert_array_equal(kc.simulate(again, tension, DT).y, kc.simulate(ensemble[3], tension, DT).y)
 
 
+@pytest.mark.campaign
 def test_saved_and_loaded(ensemble, prediction, tmp_path):
     ensemble.save(tmp_path / "many")
     again = kc.learning.load_ensemble(tmp_path / "many").predict(kc.controls.sine(1.5, 40, DT), DT)
@@ -102,6 +105,7 @@ def test_coverage_tells_that_members_agree_on_something_wrong():
     assert Prediction(members).coverage(Drawn(np.ones((50, 4, 3)))) == 0.0
 
 
+@pytest.mark.campaign
 def test_wrong_input_is_told(ensemble, prediction, truth):
     with pytest.raises(ValueError, match=r"^one member has no spread; at least two are needed$"):
         Prediction(prediction.members[:1]).coverage(truth)

@@ -69,7 +69,7 @@ def test_tendons_pull_the_rod_to_their_side_like_the_crude_model():
 
 def test_a_quarter_turn_of_the_tendons_is_a_quarter_turn_of_the_robot():
     robot = kc.robots.RoutedTendonRobot.like(KNOWLEDGE, **RUBBING, sections=(Sleeve(stiffening=1.0),))
-    control = kc.controls.parse("random:3", 60, 0.025)
+    control = kc.controls.parse("random:3", 200, 0.025)
     one, other = kc.simulate(robot, control, 0.025), kc.simulate(robot, np.roll(control, 1, axis=1), 0.025)
     turned = Rotation.from_euler("z", 90, degrees=True).apply(one.position.reshape(-1, 3))
     np.testing.assert_allclose(other.position.reshape(-1, 3), turned, atol=1e-8)

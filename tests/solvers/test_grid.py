@@ -174,6 +174,7 @@ def one_piece(problem):
     return reached
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize(
     "space", ["lobatto2", *(pytest.param(name, marks=pytest.mark.campaign) for name in ("lobatto4", "euler"))]
 )

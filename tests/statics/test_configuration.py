@@ -50,6 +50,7 @@ def test_slopes_are_those_of_the_equilibrium(robot):
     np.testing.assert_allclose(found.position, at_rest.tip_position[0], atol=1e-9)
 
 
+@pytest.mark.campaign
 def test_compliance_is_symmetric_and_positive():
     """Held tensions have a potential; the scheme along the rod keeps that up to its error."""
     C = kc.statics.compliance(ROBOT, CONTROL, space="lobatto4")

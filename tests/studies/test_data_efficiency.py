@@ -183,6 +183,7 @@ def test_the_figure_shows_curves_and_failures():
     assert sorted(round(x) for line in crosses for x in line.get_xdata()) == [5, 5, 10, 10]
 
 
+@pytest.mark.campaign
 @pydmd
 @matplotlib
 def test_what_is_there_is_not_computed_again(tmp_path):

@@ -194,6 +194,7 @@ def cluster():
         yield cluster
 
 
+@pytest.mark.campaign
 def test_a_cluster_gives_the_same(tmp_path, work, cluster):
     out = tmp_path / "out"
     assert run(squares(work, tmp_path), out, dask=cluster.scheduler_address) == EXPECTED

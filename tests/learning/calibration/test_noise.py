@@ -64,6 +64,7 @@ def test_the_level_of_an_interval(swings):
     assert widths[1] / widths[0] == pytest.approx(2.576 / 0.6745, rel=2e-2)
 
 
+@pytest.mark.campaign
 def test_what_noise_does_on_average_is_taken_away(swings):
     """Noise in the states hides accelerations, so that a bar seems lighter than it is."""
     unknowns = unknowns_of(BAR, ["stiffness", "density", "damping"])

@@ -153,6 +153,7 @@ def test_it_learns_from_positions_alone(bars):
         assert simulated_error(model, truth) < 0.2 * simulated_error(WRONG, truth)
 
 
+@pytest.mark.campaign
 def test_any_residual_is_fine_tuned(bars):
     """A structured one that may only use linear functions, and so cannot have the square of the drag."""
     config = FitConfig(
