@@ -48,6 +48,10 @@ class Pendulum(kc.System):
         return np.zeros(0)
 
 
+#: tensions (N) under which no step of the paper's robot is solved; 1 MN each is solved, on its grid
+HOPELESS = [1e8, 0.0, 0.0, 1e8]
+
+
 def fails(*parts):
     """A `TrajectoryFileError` of one line that has all the parts, in order."""
     return pytest.raises(TrajectoryFileError, match=r"^(?!.*\n).*" + ".*".join(map(re.escape, parts)))

@@ -3,6 +3,8 @@
 All loops share one compiled program: the same robot, outputs, horizon and adapted parameters.
 """
 
+import time
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -18,9 +20,11 @@ from knode_cosserat.control import (
     circle,
     run_loop,
 )
+from knode_cosserat.control.loop import warm_up
 from knode_cosserat.control.qp import QPSolution
 from knode_cosserat.estimation import KalmanObserver, TipPosition
 from knode_cosserat.estimation.online import predicted_step, split_record
+from knode_cosserat.learning.residual import Nothing
 
 DT, LENGTH = 0.05, 0.635
 ROBOT = kc.load_robot("delrin-tendon-robot")
@@ -109,6 +113,36 @@ def test_lost_measurements_do_not_stop_the_loop():
     log = run_loop(controller(), plant(dropout=0.9, seed=3), circle(0.1, 4.0), 3.0)
     assert np.isnan(log.measured).any() and log.fallbacks == 0
     assert np.all(np.isfinite(log.control))
+
+
+def test_warming_up_leaves_the_observer_where_it_is():
+    own = controller()
+    before = own.observer.belief
+    warm_up(own, plant(), circle(0.1, 4.0))
+    assert own.observer.belief is before and own.observer.time == 0.0
+
+
+def test_a_period_that_begins_late_is_counted():
+    """The plant takes longer than a period, but less than two."""
+
+    class Slow(SimulatedPlant):
+        def apply(self, control):
+            time.sleep(1.3 * DT)
+            super().apply(control)
+
+    slow = Slow(ROBOT, DT, Sensor(TipPosition()))
+    log = run_loop(PID(ROBOT, DT, LIMITS), slow, circle(0.1, 4.0), 0.5, paced=True)
+    assert log.missed == len(log.time) - 1
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("kind", ["model", "model of a model"])
+def test_a_model_controls_a_robot(kind):
+    model = kc.KNODE(ROBOT, Nothing())
+    model = model if kind == "model" else kc.KNODE(model, Nothing())
+    for own in (controller(model), PID(model, DT, LIMITS), KinematicController(model, DT, LIMITS)):
+        log = run_loop(own, plant(), circle(0.05, 6.0), 2.0)
+        assert log.fallbacks == 0 and np.all(np.isfinite(log.control))
 
 
 def test_controllers_without_dynamics_hold_a_slow_circle():

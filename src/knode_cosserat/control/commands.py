@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import abc
+import copy
 import dataclasses
 import enum
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Float
@@ -85,7 +86,10 @@ class ControlLimits:
         return ControlLimits(**arrays)
 
     def applied(self, wanted: Any, before: Any, dt: float) -> Float[np.ndarray, " c"]:
-        """Return the nearest control within the limits, after another one `dt` (s) earlier."""
+        """Return the nearest control within the limits, after another one `dt` (s) earlier.
+
+        A control from outside the range, such as that of a start, comes into it at once.
+        """
         most = np.asarray(self.rate) * dt
         return np.clip(np.clip(wanted, before - most, before + most), self.low, self.high)
 
@@ -99,6 +103,10 @@ class Controller(abc.ABC):
     @abc.abstractmethod
     def reset(self, control: Float[np.ndarray, " c"]) -> None:
         """Start from a control that acts now; compile everything that the loop needs."""
+
+    def copied(self) -> Self:
+        """Return a copy that moves independently of this controller."""
+        return copy.copy(self)
 
     @abc.abstractmethod
     def command(self, time: float, measured: Float[np.ndarray, " p"], reference: Reference) -> Command:

@@ -53,14 +53,15 @@ class LoopLog:
     parameters: dict[str, Float[np.ndarray, " T"]]
     missed: int
 
-    def tip_rmse(self, after: float = 0.0) -> float:
-        """Return the root mean square distance (m) of the tip from a reference of positions.
+    @property
+    def tip_distance(self) -> Float[np.ndarray, " T"]:
+        """Distance (m) of the tip from a reference of positions; free coordinates (NaN) do not count."""
+        apart = self.tip - self.reference[:, :3]
+        return np.sqrt(np.nansum(apart**2, axis=1))
 
-        Coordinates that are free (NaN) do not count.
-        """
-        rows = self.time >= after
-        apart = self.tip[rows] - self.reference[rows][:, :3]
-        return float(np.sqrt(np.mean(np.nansum(apart**2, axis=1))))
+    def tip_rmse(self, after: float = 0.0) -> float:
+        """Return the root mean square of `tip_distance` (m) from a time (s) on."""
+        return float(np.sqrt(np.mean(self.tip_distance[self.time >= after] ** 2)))
 
     @property
     def fallbacks(self) -> int:
@@ -126,8 +127,8 @@ def run_loop(
 ) -> LoopLog:
     """Close the loop for some seconds, and return its log.
 
-    Everything is compiled before the first period. The controller computes the next period's prediction
-    after it has sent its command.
+    Everything is compiled before the first period, by a copy of the controller. The controller computes the
+    next period's prediction after it has sent its command.
 
     Args:
         controller: the controller.
@@ -156,12 +157,10 @@ def run_loop(
         for k in range(steps):
             time = k * controller.dt
             if paced:
-                late = clock.perf_counter() - due
-                missed += late > controller.dt
-                due = clock.perf_counter() if late > controller.dt else due
+                missed += k > 0 and clock.perf_counter() > due
                 while (rest := due - clock.perf_counter()) > 0.0:
                     clock.sleep(max(0.0, rest - 5e-4))
-                due += controller.dt
+                due = max(due, clock.perf_counter() - controller.dt) + controller.dt
             measured, tip = plant.measure(), plant.tip()
             began = clock.perf_counter()
             command: Command = controller.command(time, measured, reference)
@@ -197,7 +196,8 @@ def _log_of(
 
 
 def warm_up(controller: Controller, plant: Plant, reference: Reference, periods: int = 2) -> None:
-    """Compile all programs of a loop by some periods; plant and controller have to be started again."""
+    """Compile all programs of a loop by some periods with a copy of the controller; the plant moves."""
+    controller = controller.copied()
     controller.reset(plant.start())
     controller.prepare(0.0, reference)
     for k in range(periods):

@@ -8,9 +8,10 @@ takes less than a millisecond.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from jaxtyping import Float
@@ -108,6 +109,12 @@ class PredictiveController(Controller):
         self._prediction: Prediction | None = None
         self._reason = "no prediction is prepared"
         self._failures = 0
+
+    def copied(self) -> Self:
+        """Return a copy, with a copy of the observer."""
+        found = super().copied()
+        found.observer = copy.copy(self.observer)
+        return found
 
     # the two phases
 

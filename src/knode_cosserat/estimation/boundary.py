@@ -16,8 +16,9 @@ from knode_cosserat.trajectory import Trajectory
 class BoundaryObserver:
     """Observer by a virtual wrench at the tip, from the measured position of the tip (Zheng et al. 2023).
 
-    The wrench is a spring and a damper between the measured and the estimated tip. It only dissipates the
-    difference's energy, so that the estimate converges for any gains; it has no covariance.
+    The wrench is a spring and a damper between the measured and the estimated tip. It acts one period after
+    the measurement, so that the estimate converges only for gains that are small for the period. There is no
+    covariance.
     """
 
     def __init__(
@@ -30,7 +31,7 @@ class BoundaryObserver:
             robot: the model: a rod with `loads`.
             dt: period (s).
             stiffness: of the virtual spring (N/m); by default ten times that of the rod's tip, 30 EI/L³.
-            damping: of the virtual damper (N s/m); by default critical for the rod's mass.
+            damping: of the virtual damper (N s/m); by default √(k m) with the rod's mass m.
             initial: a motion or equilibrium from which it moves on.
         """
         base: Any = robot

@@ -31,8 +31,8 @@ from knode_cosserat.trajectory import Trajectory
 GATE = 0.9999
 #: periods of uncertain controls before the start
 STARTING = 10
-#: standard deviation of tensions (N), unless given
-TENSION_DEVIATION = 0.05
+#: standard deviations of tensions (N), and of other controls (in their units), unless given
+TENSION_DEVIATION, OTHER_DEVIATION = 0.05, 0.01
 
 
 class ObserverError(KnodeCosseratError, RuntimeError):
@@ -84,8 +84,8 @@ class KalmanObserver:
             adapt: parameters that are estimated with the state.
             initial: a motion or an equilibrium from which the robot moves on.
             columns: rank of the covariance.
-            control_deviation: standard deviation of each control (in its unit); by default 0.05 N for
-                tensions, and 1 % of each other control's scale.
+            control_deviation: standard deviation of each control; by default 0.05 N for tensions, and 0.01 in
+                its own unit for any other control.
             start_deviation: standard deviation of the controls that acted before the start, in their unit: a
                 wrong initial state is then corrected quickly.
 
@@ -230,7 +230,7 @@ class KalmanObserver:
         _, vectors = np.linalg.eigh(flat @ flat.T)
         return vectors[:, ::-1][:, : self.columns]
 
-    def correction(self, measured: Float[np.ndarray, " p"]) -> tuple[Any, Any]:
+    def _correction(self, measured: Float[np.ndarray, " p"]) -> tuple[Any, Any]:
         """Return the correction's coordinates in the columns, and the remaining covariance's square root."""
         measured = np.asarray(measured, dtype=float)
         if measured.shape != (self.output.size,):
@@ -261,7 +261,7 @@ class KalmanObserver:
 
         NaN are numbers that were not measured.
         """
-        coordinates, remaining = self.correction(measured)
+        coordinates, remaining = self._correction(measured)
         x, past, spread = self.belief
         records, rate, d_x = spread.along(coordinates)
         used = records.shape[1]
@@ -289,7 +289,7 @@ def _largest_usual(count: int) -> float:
 def _deviations(robot: System, given: Any) -> Float[np.ndarray, " c"]:
     if given is None:
         parts = [
-            np.full(field.size, TENSION_DEVIATION if field.name == "tension" else 0.01)
+            np.full(field.size, TENSION_DEVIATION if field.name == "tension" else OTHER_DEVIATION)
             for field in robot.control_layout.fields
         ]
         return np.concatenate(parts)

@@ -20,7 +20,7 @@ from knode_cosserat.estimation.outputs import Output
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.history import StateHistory, coefficient_table
-from knode_cosserat.solvers.sensitivity import TangentState, tangent_time_loop
+from knode_cosserat.solvers.sensitivity import BY_COLUMN, TangentState, tangent_time_loop
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.tangent import SystemMoves
 from knode_cosserat.solvers.time_loop import StepCoefficients, time_loop
@@ -85,14 +85,14 @@ class OnlineModel(eqx.Module):
         system, directions = self.at(belief.x), self.directions(belief.x)
         settings, steps, past, spread = self.settings, len(controls), belief.past, belief.spread
         done, after, rows = time_loop(system, settings, self.coefficients, controls, past, (0, steps))
-        state = TangentState.of(system, settings.space, past, past.records, past.rate)
+        state = TangentState.of(system, settings.space, past, spread.records, spread.rate)
 
-        def along(d_records: Any, d_rate: Any, weights: Any, d_controls: Any) -> Any:
+        def along(weights: Any, d_controls: Any, state: TangentState) -> Any:
             solved, moved = (rows.records, rows.unknowns), (SystemMoves(directions, weights), d_controls)
-            first = state._replace(d_records=d_records, d_rate=d_rate)
-            return tangent_time_loop(settings, self.coefficients, solved, (system, controls), moved, first)
+            return tangent_time_loop(settings, self.coefficients, solved, (system, controls), moved, state)
 
-        last, (d_rows, _) = jax.vmap(along)(spread.records, spread.rate, spread.parameters, d_controls)
+        columns = jax.vmap(along, in_axes=(0, 0, BY_COLUMN), out_axes=(BY_COLUMN, (0, 0)))
+        last, (d_rows, _) = columns(spread.parameters, d_controls, state)
         moved = Spread(last.d_records, last.d_rate, spread.parameters)
         after = after._replace(t0=past.t0 + steps * self.coefficients.dt)
         return system, Rollout(after, rows.records, d_rows, moved, done == steps)

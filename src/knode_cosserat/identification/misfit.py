@@ -22,7 +22,12 @@ from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.history import constant_history
 from knode_cosserat.solvers.places import Places, places_at, positions_at, quaternions_at
 from knode_cosserat.solvers.run import Equilibria, TimeIntegration, run_one, usable_cores
-from knode_cosserat.solvers.sensitivity import TangentState, static_tangents, tangent_time_loop
+from knode_cosserat.solvers.sensitivity import (
+    BY_COLUMN,
+    TangentState,
+    static_tangents,
+    tangent_time_loop,
+)
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.static_loop import unloaded_shape
@@ -278,15 +283,12 @@ def _piece(
     records, xi, controls, by_latency = rows
     system, directions, d_controls = _directions(robot, x, by_latency)
 
-    def one(weights: Any, d_controls: Any, d_records: Any, d_rate: Any) -> Any:
-        state, moves = carry._replace(d_records=d_records, d_rate=d_rate), SystemMoves(directions, weights)
-        changes = moves, d_controls
+    def one(weights: Any, d_controls: Any, state: TangentState) -> Any:
+        changes = SystemMoves(directions, weights), d_controls
         return tangent_time_loop(settings, steps, (records, xi), (system, controls), changes, state)
 
-    each = TangentState(None, None, 0, 0, None)
-    after, (d_rows, _) = jax.vmap(one, out_axes=(each, (0, 0)))(
-        jnp.eye(len(x)), d_controls, carry.d_records, carry.d_rate
-    )
+    columns = jax.vmap(one, in_axes=(0, 0, BY_COLUMN), out_axes=(BY_COLUMN, (0, 0)))
+    after, (d_rows, _) = columns(jnp.eye(len(x)), d_controls, carry)
     return after._replace(t0=after.t0 + PIECE * steps.dt), d_rows
 
 

@@ -48,6 +48,10 @@ class TangentState(NamedTuple):
         return cls(records, rate, d_records, d_rate, past.t0)
 
 
+#: axes for `jax.vmap` of a state with many tangents
+BY_COLUMN = TangentState(None, None, 0, 0, None)
+
+
 @functools.lru_cache(maxsize=64)
 def rollout(task: TimeIntegration) -> Callable[[System, Any, StateHistory], tuple[StepRows, StateHistory]]:
     """Return a differentiable function from (system, controls (T, c), past) to all rows and the last history.

@@ -16,6 +16,7 @@ from knode_cosserat.control import (
     PID,
     ControlLimits,
     KinematicController,
+    LoopLog,
     PredictiveController,
     Reference,
     Sensor,
@@ -146,7 +147,7 @@ def tracking(settings: Any) -> Product:
                     "robot": name,
                     "reference": path,
                     "rmse_percent": 100.0 * _rmse(log, path) / float(truth.length),
-                    "offset_percent": 100.0 * _offset(log) / float(truth.length),
+                    "offset_percent": 100.0 * float(log.tip_distance[-1] / truth.length),
                     "fallbacks": log.fallbacks,
                     "parameters": found,
                     "true_modulus": float(truth.youngs_modulus),
@@ -161,19 +162,12 @@ def _fresh(controller: Controller) -> None:
         controller.observer.restart()
 
 
-def _rmse(log: Any, path: str) -> float:
+def _rmse(log: LoopLog, path: str) -> float:
     """Return the RMSE (m) of settled rows; after a jump of the reference, those from `TRANSIT` on."""
     rows = log.time >= SETTLED
     if path == "steps":
         rows &= log.time % HOLD >= TRANSIT
-    apart = (log.tip - log.reference[:, :3])[rows]
-    return float(np.sqrt(np.mean(np.nansum(apart**2, axis=1))))
-
-
-def _offset(log: Any) -> float:
-    """Return the distance (m) of the tip from the reference in the last row."""
-    apart = (log.tip - log.reference[:, :3])[-1]
-    return float(np.sqrt(np.nansum(apart**2)))
+    return float(np.sqrt(np.mean(log.tip_distance[rows] ** 2)))
 
 
 def limits(settings: Any) -> Product:

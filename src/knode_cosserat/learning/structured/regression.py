@@ -178,7 +178,6 @@ def _law_residual(knowledge: System, data: Samples) -> tuple[Any, Any, Any]:
         history = unpacked_history(knowledge, sample.c0, sample.history[0])
         z, z_t = sample.z, history.z_t(sample.z)
         inputs = law_inputs(knowledge, s, sample.control, z, z_t)
-
         point = Point(s, sample.t, sample.y, sample.control, history)
 
         def law(z: Any) -> Any:
