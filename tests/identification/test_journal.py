@@ -35,8 +35,9 @@ class Curve:
             size=(ROWS, BODIES, 3)
         )
         return SimpleNamespace(
-            name=name, dt=0.05, moves=0, static=False, initial_tension=np.zeros(1), tension=np.zeros((59, 1)),
-            places=(), position=position, rotation=np.zeros((ROWS, BODIES, 4)),
+            name=name, dt=0.05, moves=0, static=False, continuous=False, steps=1, places=(),
+            initial_tension=np.zeros(1), tension=np.zeros((59, 1)), position=position,
+            rotation=np.zeros((ROWS, BODIES, 4)),
         )  # fmt: skip
 
     def differences(self, x, rows=None, which=None, derivatives=True):

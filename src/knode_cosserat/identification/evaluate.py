@@ -11,12 +11,12 @@ from jaxtyping import Float
 
 from knode_cosserat.evaluation.metrics import dtw_distance, pose_mse
 from knode_cosserat.identification.misfit import since_first, turned_from
+from knode_cosserat.identification.steps import simulated_rows
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.equilibrium import equilibria, equilibrium
 from knode_cosserat.solvers.places import places_at, positions_at, quaternions_at
 from knode_cosserat.solvers.result import SimulationError
-from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
 
@@ -83,7 +83,7 @@ def coverage(
 
     Args:
         members: at least two models, such as an `Ensemble`.
-        measured: rows as far apart as steps of the simulation.
+        measured: its rows.
         level: probability.
         space: the scheme along the rod.
 
@@ -115,8 +115,10 @@ def _moved(robot: System, measured: Measurements, space: str | SpaceScheme, reco
         initial = equilibrium(robot, first, space=space, recovery_budget=recovery)
     if measured.static:
         return equilibria(robot, measured.tension, space=space, initial=initial, recovery_budget=recovery)
-    tension = robot.undelayed(measured.tension[:-1], measured.dt, measured.initial_tension)
-    return simulate(robot, tension, measured.dt, space=space, initial=initial, recovery_budget=recovery)
+    return simulated_rows(
+        robot, measured.tension[:-1], measured.dt, initial, measured.initial_tension, measured.continuous,
+        space, recovery,
+    )  # fmt: skip
 
 
 def evaluate(
@@ -129,7 +131,7 @@ def evaluate(
 
     Args:
         robot: any robot or model.
-        measured: rows as far apart as steps of the simulation.
+        measured: its rows; with continuous tensions the time steps are shorter (`identification.steps`).
         every: interval of compared rows: 1 for all, 2 for every second.
         last: largest number of compared rows.
         space: the scheme along the rod.

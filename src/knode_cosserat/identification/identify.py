@@ -10,14 +10,14 @@ import numpy as np
 
 from knode_cosserat._yaml import did_you_mean
 from knode_cosserat.errors import KnodeCosseratError
-from knode_cosserat.identification.inputs import SELECTED_DT, coarser, measurements_of, names_of, padded
+from knode_cosserat.identification.inputs import measurements_of, names_of, padded
 from knode_cosserat.identification.intervals import estimates_of
 from knode_cosserat.identification.journal import Journal
 from knode_cosserat.identification.misfit import Misfit, RecordingData, data_of
 from knode_cosserat.identification.model import Model
 from knode_cosserat.identification.result import Estimate, Identified
 from knode_cosserat.identification.search import Point, Search, SearchError
-from knode_cosserat.identification.selection import held_out, selected, sizes, without_idle
+from knode_cosserat.identification.selection import held_out, improved, selected, sizes
 from knode_cosserat.identification.trials import failed_trial, has_coarse_rows, trained_range
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
@@ -57,9 +57,10 @@ def identify(
     it lowers the error of held-out recordings by more than two standard errors of the improvement. The result
     has to pass trials with larger and random tensions; effects are removed until it does.
 
-    If rows are closer than 0.02 s, effects are selected with time steps twice as long; parameters and errors
-    are those of steps from row to row. If the grid is too coarse for the identified robot, its nodes are
-    doubled and the last search is repeated: the result may have more nodes than the nominal robot.
+    Time steps are short enough for vibrations (`identification.steps`), unless tensions are held from row to
+    row. Effects are selected with one step from row to row, and then again with the final steps. If the grid
+    is too coarse for the identified robot, its nodes are doubled and the last search is repeated: the result
+    may have more nodes than the nominal robot.
 
     Args:
         robot: the nominal robot, from ruler, scale and data sheet; a robot with tendons.
@@ -89,10 +90,10 @@ def identify(
     journal = None if checkpoint is None else Journal(checkpoint)
     search = _search(robot, measured, space, tell, journal)
     model, data = search.misfit.model, search.misfit.data
-    is_fine = data[0].dt < SELECTED_DT and not data[0].static
+    is_fine = data[0].steps > 1 and not data[0].static
     far = search
     if is_fine:
-        far = Search(Misfit(model, [coarser(each) for each in data], space), tell, journal=journal)
+        far = Search(Misfit(model, [each._replace(steps=1) for each in data], space), tell, journal=journal)
     steps: list[str] = []
     try:
         if effects is not None:
@@ -105,10 +106,8 @@ def identify(
             point = search.run(point.x, model.mask(names))
         search, point = _refined(search, names, point, measured, steps)
         if effects is None and search is not far:
-            names, point, gone = without_idle(search, names, point)
-            if gone:
-                steps.append(f"without {', '.join(gone)}, by the final steps: {sizes(point)}")
-                tell(steps[-1])
+            names, point, taken = improved(search, names, point, tell, ", by the final steps")
+            steps += taken
     except SearchError as error:
         raise IdentificationError(f"{error}; the data sheet's numbers are too far from the robot") from None
     return _accepted(search, names, point, search.misfit.data, steps, space, tell)

@@ -13,11 +13,8 @@ from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
 from knode_cosserat.trajectory import Trajectory
 
-#: time step of recordings' rows (s); at 0.025 s the errors of the time scheme are several standard
-#: deviations of the estimates (virtual robots 0, 1 and 2 of the study: 3.5 to 17, and 1.4 to 5.3 at 0.0125 s)
+#: time from row to row of recordings (s)
 DT = 0.0125
-#: effects are selected with steps twice as long where rows are closer than this (s)
-SELECTED_DT = 0.02
 
 
 def measurements_of(recordings: Any) -> list[Measurements]:
@@ -64,16 +61,6 @@ def padded(data: Sequence[RecordingData]) -> list[RecordingData]:
             )
         )
     return found
-
-
-def coarser(data: RecordingData) -> RecordingData:
-    """Return every second row; the tension of a step is that at its end."""
-    count = len(data.tension) // 2
-    rows = slice(0, 2 * count + 1, 2)
-    return data._replace(
-        dt=2.0 * data.dt, tension=data.tension[1 : 2 * count : 2], position=data.position[rows],
-        rotation=data.rotation[rows], moves=data.moves // 2,
-    )  # fmt: skip
 
 
 def poses_of_nodes(trajectory: Trajectory, name: str) -> Measurements:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from knode_cosserat.identification.misfit import Misfit
 
 #: first line of every identity: another format has other files
-FORMAT = "search 1"
+FORMAT = "search 2"
 
 
 class Journal:
@@ -62,7 +62,7 @@ def identity(misfit: Misfit, prior: np.ndarray) -> str:
     words = [FORMAT, package_version(), repr(misfit.settings), repr(model.numbers), repr(model.names)]
     arrays = [prior, *jax.tree.leaves(model.robot)]
     for each in misfit.data:
-        words.append(f"{each.name} {each.dt!r} {each.moves} {each.static}")
+        words.append(f"{each.name} {each.dt!r} {each.moves} {each.static} {each.continuous} {each.steps}")
         arrays += [
             each.initial_tension,
             each.tension,

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.identification.model import Model, ParametrisedRobot
+from knode_cosserat.identification.steps import stepped, steps_per_row, time_scheme
 from knode_cosserat.learning.samples import DataError
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.load_cells import LoadCells
@@ -57,6 +58,9 @@ class RecordingData(NamedTuple):
     moves: int
     #: true if each row is a separate equilibrium
     static: bool = False
+    #: true if the tensions are continuous; time steps from row to row
+    continuous: bool = False
+    steps: int = 1
 
 
 def data_of(given: Measurements, model: Model, name: str) -> RecordingData:
@@ -87,7 +91,8 @@ def data_of(given: Measurements, model: Model, name: str) -> RecordingData:
     return RecordingData(
         name, given.dt, np.asarray(initial), tension, places_at(given.fractions, model.nominal.nodes),
         given.position, since_first(given.quaternion),
-        int(moving[0]) if len(moving) and not given.static else 0, given.static,
+        int(moving[0]) if len(moving) and not given.static else 0, given.static, given.continuous,
+        steps_per_row(given.dt, given.continuous),
     )  # fmt: skip
 
 
@@ -136,7 +141,8 @@ class Misfit:
 
     def __init__(self, model: Model, data: Sequence[RecordingData], space: str | SpaceScheme):
         self.model, self.data = model, tuple(data)
-        self.settings = Settings.of("bdf2", space, "paper", NewtonOptions())
+        scheme = time_scheme(self.data[0].continuous)
+        self.settings = Settings.of(scheme, space, "paper", NewtonOptions())
         self._first = True
 
     def differences(
@@ -164,18 +170,19 @@ class Misfit:
 
     def _of_one(self, x: Any, data: RecordingData, rows: int | None, derivatives: bool) -> Rollout | None:
         x = np.asarray(x, dtype=float)
-        steps = len(data.tension) if rows is None else min(len(data.tension), data.moves + rows)
+        seen = len(data.tension) if rows is None else min(len(data.tension), data.moves + rows)
+        steps = seen * data.steps
         system, settings = _system(self.model.robot, x), self.settings
         acting, slope = _acting(system, data)
         still = Equilibria(dataclasses.replace(settings, time=None), 1, RECOVERY)
         # controls have room for a motion: one program for all equilibria
-        held = np.broadcast_to(data.initial_tension, data.tension.shape)
+        held = np.broadcast_to(data.initial_tension, acting.shape)
         first = run_one(still, system, held, unloaded_shape(system, settings.space), held[0])
         if first.cause:
             return None
         ny, count = system.y_layout.size, max(steps, 1)
         task: TimeIntegration | Equilibria = TimeIntegration(
-            settings, data.dt, count, recovery_budget=RECOVERY
+            settings, data.dt / data.steps, count, recovery_budget=RECOVERY
         )
         if data.static:
             task, state = dataclasses.replace(still, steps=count), first.state
@@ -185,9 +192,10 @@ class Misfit:
         found, _, cause = run_one(task, system, acting, state, data.initial_tension)
         if cause:
             return None
-        y = np.concatenate([first.rows.records[:1, :, :ny], found.records[:steps, :, :ny]])
+        compared = slice(data.steps - 1, steps, data.steps)
+        y = np.concatenate([first.rows.records[:1, :, :ny], found.records[compared, :, :ny]])
         if not derivatives:
-            return Rollout(np.asarray(_compared(system, y, *self._target(data, steps))), None)
+            return Rollout(np.asarray(_compared(system, y, *self._target(data, seen))), None)
         beginning = first.rows.records, first.rows.unknowns, held, np.zeros_like(held)
         d_first, d_records = self._static_slopes(still, x, beginning, 1)
         moved = found.records, found.unknowns, acting, slope
@@ -198,9 +206,9 @@ class Misfit:
         else:
             both = np.stack([d_records[:, 0]] * 2, axis=1)
             carry = TangentState.of(system, settings.space, state, both, np.zeros_like(both[:, 0]))
-            d_rows = self._slopes(task, x, moved, steps, carry)
+            d_rows = self._slopes(task, x, moved, steps, carry)[:, compared]
         d_y = np.concatenate([d_first, d_rows], axis=1)[..., :ny]
-        values, slopes = _with_slopes(system, y, d_y, *self._target(data, steps))
+        values, slopes = _with_slopes(system, y, d_y, *self._target(data, seen))
         return Rollout(np.asarray(values), np.asarray(slopes))
 
     def _slopes(self, task: TimeIntegration, x: Any, rows: Any, count: int, carry: Any) -> np.ndarray:
@@ -235,20 +243,22 @@ def _cells(system: Any) -> LoadCells | None:
 
 
 def _acting(system: Any, data: RecordingData) -> tuple[np.ndarray, np.ndarray]:
-    """Return the tensions (T, c) that act by the load cells' latency, and their derivative by it (N/s).
+    """Return the tensions of all steps by the load cells' latency, and their derivative by it (N/s).
 
-    The derivative is over one row: between rows it jumps, and at no latency it is of both sides.
+    The derivative is over one step: between steps it jumps, and at no latency it is of both sides.
     """
-    cells, half = _cells(system), 0.5 * data.dt
+    dt = data.dt / data.steps
+    tension = stepped(data.tension, data.initial_tension, data.steps, data.continuous)
+    cells, half = _cells(system), 0.5 * dt
     if cells is None:
-        return data.tension, np.zeros_like(data.tension)
+        return tension, np.zeros_like(tension)
     late, early, acting = (
         dataclasses.replace(cells, latency=np.asarray(cells.latency) + shift).undelayed(
-            data.tension, data.dt, data.initial_tension
+            tension, dt, data.initial_tension
         )
         for shift in (half, -half, 0.0)
     )
-    return acting, (late - early) / data.dt
+    return acting, (late - early) / dt
 
 
 def _filled(rows: Any, count: int) -> np.ndarray:

@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.identification.misfit import RecordingData
+from knode_cosserat.identification.steps import simulated_rows
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.trained_range import TrainedRange
 from knode_cosserat.solvers.equilibrium import equilibria, equilibrium
 from knode_cosserat.solvers.result import Result, SimulationError
-from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
 
@@ -40,11 +40,11 @@ def failed_trial(robot: System, data: Sequence[RecordingData], space: str | Spac
             tension = each.initial_tension + amplitude * (each.tension - each.initial_tension)
             # a tendon does not push; a motor turns either way
             tension = np.maximum(tension, 0.0) if pulls else tension
-            reason = _failure(robot, tension, each.initial_tension, each.dt, space, each.static)
+            reason = _failure(robot, tension, each, space)
             if reason:
                 return f"tensions of {each.name} at {amplitude:g} times their amplitude: {reason}"
     first = data[0]
-    reason = _failure(robot, _random(data), first.initial_tension, first.dt, space, first.static)
+    reason = _failure(robot, _random(data), first._replace(continuous=False), space)
     return f"random tensions: {reason}" if reason else None
 
 
@@ -55,7 +55,7 @@ def has_coarse_rows(robot: System, data: Sequence[RecordingData], space: str | S
     """
     for each in data:
         try:
-            _, found = _moved(robot, each.tension, each.initial_tension, each.dt, space, each.static)
+            _, found = _moved(robot, each.tension, each, space)
         except SimulationError:
             return False
         if np.mean(np.asarray(found.result) == Result.COARSE) > FEW:
@@ -67,11 +67,7 @@ def trained_range(
     robot: System, data: Sequence[RecordingData], space: str | SpaceScheme
 ) -> TrainedRange | None:
     """Return the range of controls, strains and strain rates of the robot in its recordings."""
-    return TrainedRange.of(
-        part
-        for each in data
-        for part in _moved(robot, each.tension, each.initial_tension, each.dt, space, each.static)
-    )
+    return TrainedRange.of(part for each in data for part in _moved(robot, each.tension, each, space))
 
 
 def _random(data: Sequence[RecordingData]) -> Float[np.ndarray, "T c"]:
@@ -84,11 +80,10 @@ def _random(data: Sequence[RecordingData]) -> Float[np.ndarray, "T c"]:
 
 
 def _failure(
-    robot: System, tension: Float[np.ndarray, "T c"], initial: Float[np.ndarray, " c"], dt: float,
-    space: str | SpaceScheme, static: bool,
-) -> str | None:  # fmt: skip
+    robot: System, tension: Float[np.ndarray, "T c"], like: RecordingData, space: str | SpaceScheme
+) -> str | None:
     try:
-        _, found = _moved(robot, tension, initial, dt, space, static)
+        _, found = _moved(robot, tension, like, space)
     except SimulationError as error:
         return str(error)
     if not np.all(np.isfinite(np.asarray(found.y))):
@@ -97,17 +92,17 @@ def _failure(
 
 
 def _moved(
-    robot: System, tension: Float[np.ndarray, "T c"], initial: Float[np.ndarray, " c"], dt: float,
-    space: str | SpaceScheme, static: bool,
-) -> tuple[Trajectory, Trajectory]:  # fmt: skip
-    """Return the equilibrium under the initial tensions, and the motion, or the equilibria, from there."""
+    robot: System, tension: Float[np.ndarray, "T c"], like: RecordingData, space: str | SpaceScheme
+) -> tuple[Trajectory, Trajectory]:
+    """Return the equilibrium under a recording's initial tensions, and the rows from there."""
+    initial, dt = like.initial_tension, like.dt
     with warnings.catch_warnings():
         # this trial is about solvable steps, not about their accuracy
         warnings.filterwarnings("ignore", message="the grid is too coarse")
         still = equilibrium(robot, initial, space=space, recovery_budget=RECOVERY)
-        tension = robot.undelayed(tension, dt, initial)
-        if static:
-            tension = np.concatenate([initial[None], tension])
+        if like.static:
+            tension = np.concatenate([initial[None], robot.undelayed(tension, dt, initial)])
             found = equilibria(robot, tension, initial=still, space=space, recovery_budget=RECOVERY)
             return still, dataclasses.replace(found, time=dt * found.time)
-        return still, simulate(robot, tension, dt, initial=still, space=space, recovery_budget=RECOVERY)
+        moved = simulated_rows(robot, tension, dt, still, initial, like.continuous, space, RECOVERY)
+        return still, moved

@@ -47,6 +47,8 @@ class Measurements:
     initial_tension: Float[np.ndarray, " tendons"] | None = None
     #: True if each row is a separate equilibrium under its tensions, not part of a motion
     static: bool = False
+    #: True if the tensions are samples of a continuous signal: row i's is then that at the time of row i + 1
+    continuous: bool = False
 
     def __repr__(self) -> str:
         times = f" from {self.time[0]:g} to {self.time[-1]:g} s" if len(self.time) else ""

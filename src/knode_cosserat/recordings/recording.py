@@ -181,6 +181,7 @@ class Recording:
             source=self.source,
             initial_tension=self._initial_tension(driver, float(time[0]) - latency, longest),
             static=self.config.static,
+            continuous=mean and not self.config.static and not self._is_held(driver),
         )
 
     def _initial_tension(self, driver: Tensions, at: float, longest: float) -> Float[np.ndarray, " c"] | None:

@@ -23,6 +23,7 @@ from knode_cosserat.rods.tendon_rod import TendonRod
 from knode_cosserat.rods.virtual_robot import VirtualRobot
 from knode_cosserat.solvers.equilibrium import equilibrium
 from knode_cosserat.solvers.simulate import simulate
+from knode_cosserat.solvers.time import BDFAlpha
 from knode_cosserat.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ REST, SWING, HIGHEST, RESTING, BEFORE_STEP = 500.0, 300.0, 700.0, 1.0, 2.0
 #: period of commands, and hold time of random ones (s)
 COMMANDED, HELD = 0.05, 0.4
 #: the plant's time step (s) and number of nodes, and the time between its stored rows (s)
-PLANT_STEP, PLANT_NODES, KEPT = 0.005, 28, 0.01
+PLANT_STEP, PLANT_NODES, KEPT = 0.0025, 28, 0.01
 LONGEST = 300.0
 
 
@@ -184,7 +185,9 @@ def driven(sent: Pulls, lag: float, robot: TendonRod) -> Trajectory:
     time = np.arange(round((sent.time[-1] + COMMANDED) / PLANT_STEP) + 1) * PLANT_STEP
     tension = lagged(sent, time, lag)
     still = equilibrium(robot, tension[0], space="lobatto4")
-    fine = simulate(robot, tension[1:], PLANT_STEP, space="lobatto4", initial=still)
+    # a robot has no numerical damping
+    scheme = BDFAlpha(-0.45)
+    fine = simulate(robot, tension[1:], PLANT_STEP, time=scheme, space="lobatto4", initial=still)
     rows = fine[:: round(KEPT / PLANT_STEP)]
     return dataclasses.replace(rows, settings=None)
 

@@ -1,0 +1,63 @@
+"""Time steps between the rows of recordings."""
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+import knode_cosserat as kc
+from knode_cosserat.identification.steps import LONGEST, simulated_rows, stepped, steps_per_row
+from knode_cosserat.recordings.load import load_recording
+from knode_cosserat.recordings.virtual import record_virtual
+
+ROBOT = kc.load_robot("delrin-tendon-robot")
+
+
+@given(dt=st.floats(1e-4, 1.0))
+def test_steps_are_short_and_held_tensions_keep_their_rows(dt):
+    assert dt / steps_per_row(dt, True) <= LONGEST * (1.0 + 1e-5)
+    assert steps_per_row(dt, False) == 1
+
+
+@given(count=st.integers(1, 8), rows=st.integers(1, 6))
+def test_the_last_step_of_a_row_has_its_tension_and_lines_stay_lines(count, rows):
+    rng = np.random.default_rng(count)
+    tension = rng.uniform(size=(rows, 3))
+    for continuous in (True, False):
+        assert_allclose(stepped(tension, np.zeros(3), count, continuous)[count - 1 :: count], tension)
+    line = np.arange(1.0, rows + 1)[:, None] * np.ones(3)
+    steps = stepped(line, np.zeros(3), count, True)
+    assert_allclose(steps[:, 0], np.arange(1, rows * count + 1) / count)
+    assert_allclose(stepped(line, np.zeros(3), count, False), np.repeat(line, count, axis=0))
+
+
+def test_rows_of_a_continuous_signal_are_those_of_much_finer_steps():
+    """Oracle: 16 times as many steps. BDF2 from row to row is far from it."""
+    robot = ROBOT.replace(bending_damping=1e-3, youngs_modulus=4e9, nodes=20)
+    dt, count, finer = 0.0125, 120, 16
+    time = dt * np.arange(1, count + 1)
+    phase = np.arange(4) * np.pi / 2.0
+
+    def tension(time):
+        return 5.0 + np.minimum(1.0, time / 0.1)[:, None] * 1.5 * np.sin(9.0 * time[:, None] + phase)
+
+    start = kc.equilibrium(robot, np.full(4, 5.0))
+    fine = dt / finer * np.arange(1, count * finer + 1)
+    exact = kc.simulate(robot, tension(fine), dt / finer, initial=start).tip_position[::finer]
+    errors = [
+        np.max(np.abs(np.asarray(found.tip_position) - np.asarray(exact)))
+        for found in (
+            simulated_rows(robot, tension(time), dt, start, np.full(4, 5.0), continuous, "lobatto2", None)
+            for continuous in (True, False)
+        )
+    ]
+    assert errors[0] < 0.2 * errors[1]
+    assert errors[0] < 2e-3
+
+
+def test_a_recording_says_which_kind_its_tensions_are(tmp_path):
+    record_virtual(tmp_path / "some.bag", "sine:1.0", 1.6, 0, robot=ROBOT)
+    recording = load_recording(tmp_path / "some.bag")
+    assert recording.sampled(0.0125, mean=True, tensions="measured").continuous
+    assert not recording.sampled(0.0125, mean=True, tensions="commanded").continuous
+    assert not recording.sampled(0.0125).continuous
