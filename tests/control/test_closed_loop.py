@@ -11,19 +11,24 @@ from numpy.testing import assert_allclose
 
 import knode_cosserat as kc
 from knode_cosserat.control import (
+    ILQR,
+    LQR,
+    MPPI,
     PID,
     ControlLimits,
     KinematicController,
+    KoopmanController,
     PredictiveController,
     Sensor,
     SimulatedPlant,
     circle,
     run_loop,
 )
+from knode_cosserat.control.baselines.linear_model import realized
 from knode_cosserat.control.loop import warm_up
 from knode_cosserat.control.qp import QPSolution
 from knode_cosserat.estimation import KalmanObserver, TipPosition
-from knode_cosserat.estimation.online import predicted_step, split_record
+from knode_cosserat.estimation.online import predicted_motion, split_record
 from knode_cosserat.learning.residual import Nothing
 
 DT, LENGTH = 0.05, 0.635
@@ -81,15 +86,16 @@ def test_columns_of_the_observer_are_derivatives_of_the_step():
     """Oracle: differences of steps with other tensions."""
     own = observer()
     tension = np.array([6.0, 3.0, 2.0, 4.0])
-    h = 1e-4
+    h, unseen = 1e-4, np.full((1, 3), np.nan)
 
     def tip(control):
         none = np.zeros(4), np.zeros(1)
-        found = predicted_step(own.model, own.belief, control, none, own.output)
+        found = predicted_motion(own.model, own.belief, control[None], unseen, none, own.output)
         return np.asarray(TipPosition().value(ROBOT, *split_record(ROBOT, found.record)))
 
-    found = predicted_step(own.model, own.belief, tension, (np.ones(4), np.zeros(1)), own.output)
-    columns = np.asarray(found.by_column)[own.columns : own.columns + 4]
+    deviations = np.ones(4), np.zeros(1)
+    found = predicted_motion(own.model, own.belief, tension[None], unseen, deviations, own.output)
+    columns = np.asarray(found.by_column)[own.columns : own.columns + 4, 0]
     differences = [(tip(tension + h * one) - tip(tension - h * one)) / (2.0 * h) for one in np.eye(4)]
     assert_allclose(columns, differences, rtol=1e-5, atol=1e-9)
 
@@ -149,6 +155,65 @@ def test_controllers_without_dynamics_hold_a_slow_circle():
     for kind in (PID, KinematicController):
         log = run_loop(kind(ROBOT, DT, LIMITS), plant(), circle(0.05, 60.0), 8.0)
         assert log.tip_rmse(4.0) < 0.02 * LENGTH, kind.__name__
+
+
+@pytest.mark.campaign
+def test_every_baseline_holds_a_slow_circle():
+    """The exact model, so that errors are those of the method: sampling and lifting are rough."""
+    own, target = KalmanObserver(ROBOT, DT, TipPosition()), TipPosition()
+    made = {
+        LQR(own, target, LIMITS): 2e-3,
+        KoopmanController(ROBOT, DT, target, LIMITS): 0.03,
+        ILQR(KalmanObserver(ROBOT, DT, target), target, LIMITS): 5e-3,
+        MPPI(KalmanObserver(ROBOT, DT, target), target, LIMITS): 0.03,
+    }
+    for each, most in made.items():
+        log = run_loop(each, plant(), circle(0.1, 4.0), 6.0)
+        assert log.tip_rmse(4.0) < most * LENGTH, type(each).__name__
+        assert log.control.min() >= 0.0 and log.control.max() <= 10.0
+
+
+def test_a_realized_model_has_the_responses_it_was_made_of():
+    """Oracle: the responses of a known linear system of order three."""
+    rng = np.random.default_rng(0)
+    A = np.diag([0.9, 0.6, -0.3])
+    B, C = rng.normal(size=(3, 2)), rng.normal(size=(2, 3))
+    responses = np.array([C @ np.linalg.matrix_power(A, k) @ B for k in range(40)])
+    found = realized(responses, least=1e-10)
+    assert found[0].shape == (3, 3)
+    again = [found[2] @ np.linalg.matrix_power(found[0], k) @ found[1] for k in range(40)]
+    assert_allclose(again, responses, atol=1e-10)
+
+
+def test_parameters_that_were_learned_from_a_broken_sensor_are_taken_back():
+    """For two seconds the sensor repeats one position; then it is well again."""
+    own, truth = observer(), plant()
+    tension = [5.0 + 2.0 * np.sin(0.3 * k + np.arange(4) * np.pi / 2.0) for k in range(140)]
+    modulus = []
+    for k, control in enumerate(tension):
+        seen = truth.measure()
+        own.update(np.array([0.0, 0.1, -0.6]) if 40 <= k < 80 else seen)
+        modulus.append(own.estimate.parameters["youngs_modulus"] / E)
+        truth.apply(control)
+        own.predict(control)
+    assert abs(modulus[39] - 1.0) < 0.02 and max(abs(each - 1.0) for each in modulus[40:80]) > 0.2
+    assert own.rollbacks >= 1
+    assert abs(modulus[-1] - 1.0) < 0.02
+
+
+def test_a_stiffness_does_not_drift_at_rest():
+    """No movement says nothing new: the deviation of the parameter does not grow."""
+    own = observer()
+    rng = np.random.default_rng(0)
+    tip = plant().measure()
+    for _ in range(100):
+        own.update(tip + 2e-4 * rng.normal(size=3))
+        own.predict(np.zeros(4))
+    assert own.estimate.parameters["youngs_modulus"] == pytest.approx(E, rel=0.02)
+
+
+def test_nothing_is_compiled_in_the_loop(wrong_model):
+    assert wrong_model.compiled == 0
 
 
 def test_wrong_arguments_are_told_in_one_line():

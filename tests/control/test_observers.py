@@ -13,6 +13,7 @@ from knode_cosserat.estimation import (
     BoundaryObserver,
     Curvatures,
     KalmanObserver,
+    MovingHorizonObserver,
     TipPose,
     TipPosition,
 )
@@ -103,24 +104,49 @@ def test_wrong_parameters_are_told_in_one_line(adapted, message):
         AdaptedParameters(ROBOT, adapted)
 
 
-def test_a_wrong_start_is_corrected_from_the_tip_alone(still):
-    """After one second the shape is within 0.5 % of the length, with the sensor's noise."""
-    observer = KalmanObserver(ROBOT, DT, TipPosition(), start_deviation=2.0)
+Window = MovingHorizonObserver
+
+
+def followed(observer, still, count=60):
+    """Return errors of the shape (parts of the length), and whether the regions cover it, in every period."""
     truth = Stepper(ROBOT, DT, initial=still)
     rng = np.random.default_rng(0)
     errors, inside = [], []
-    for k in range(60):
+    for k in range(count):
         measured = np.asarray(truth.state.tip_position[-1]) + 2e-4 * rng.normal(size=3)
         observer.update(measured)
         apart = np.asarray(ROBOT.positions(observer.estimate.y)) - np.asarray(truth.state.position[-1])
         errors.append(np.sqrt(np.mean(np.sum(apart**2, axis=-1))) / 0.635)
         inside.append(observer.covers(truth.state))
         control = TENSION + 0.8 * np.sin(4.0 * k * DT + np.arange(4))
-        truth.step(control)
+        # the tensions that act are those that the observer knows, with its deviation
+        truth.step(control + 0.05 * rng.normal(size=4))
         observer.predict(control)
+    return np.array(errors), np.array(inside)
+
+
+@pytest.mark.parametrize("kind", [KalmanObserver, MovingHorizonObserver])
+def test_a_wrong_start_is_corrected_from_the_tip_alone(kind, still):
+    """After one second the shape is within 0.5 % of the length, with the sensor's noise."""
+    errors, inside = followed(kind(ROBOT, DT, TipPosition(), start_deviation=2.0), still)
     assert errors[0] > 0.02
     assert max(errors[20:]) < 5e-3
     assert np.mean(inside[20:]) > 0.8
+
+
+def test_an_exact_window_is_that_of_least_squares(still):
+    """Oracle: with a linear model the window's estimate is the filter's, whatever its length."""
+    tension = np.asarray(TENSION)
+    kalman, window = (kind(ROBOT, DT, TipPosition(), initial=still) for kind in (KalmanObserver, Window))
+    rng = np.random.default_rng(1)
+    for _ in range(14):
+        measured = np.asarray(still.tip_position[-1]) + 2e-4 * rng.normal(size=3)
+        for each in (kalman, window):
+            each.update(measured)
+            each.predict(tension)
+    apart = np.asarray(window.estimate.y) - np.asarray(kalman.estimate.y)
+    assert np.max(np.abs(apart[:, :3])) < 1e-4
+    assert window.time == pytest.approx(kalman.time)
 
 
 def test_an_unlikely_measurement_counts_less(still):

@@ -1,10 +1,15 @@
 """Closed-loop control: predictive control of any System, baselines, and the loop."""
 
-from knode_cosserat.control.baselines import PID, KinematicController
+from knode_cosserat.control.baselines.iterative import ILQR
+from knode_cosserat.control.baselines.koopman import KoopmanController
+from knode_cosserat.control.baselines.lqr import LQR
+from knode_cosserat.control.baselines.sampling import MPPI
+from knode_cosserat.control.baselines.tip_feedback import PID, KinematicController
 from knode_cosserat.control.commands import Command, Controller, ControlLimits, Status
 from knode_cosserat.control.loop import LoopLog, run_loop
+from knode_cosserat.control.planning import Weights
 from knode_cosserat.control.plants import Plant, Sensor, SimulatedPlant
-from knode_cosserat.control.predictive import PredictiveController, SoftLimit, Weights
+from knode_cosserat.control.predictive import PredictiveController, SoftLimit
 from knode_cosserat.control.qp import DAQP, QPError, QPSolver
 from knode_cosserat.control.references import (
     Reference,
@@ -19,11 +24,15 @@ from knode_cosserat.control.references import (
 
 __all__ = [
     "DAQP",
+    "ILQR",
+    "LQR",
+    "MPPI",
     "PID",
     "Command",
     "ControlLimits",
     "Controller",
     "KinematicController",
+    "KoopmanController",
     "LoopLog",
     "Plant",
     "PredictiveController",

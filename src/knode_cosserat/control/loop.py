@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -38,6 +39,7 @@ class LoopLog:
         preparation: (T,) time of the rest of the controller's work (s).
         parameters: adapted parameters by name, each (T,).
         missed: number of periods whose deadline was missed.
+        compiled: number of programs that were compiled during the loop; each may have delayed a period.
     """
 
     time: Float[np.ndarray, " T"]
@@ -52,6 +54,7 @@ class LoopLog:
     preparation: Float[np.ndarray, " T"]
     parameters: dict[str, Float[np.ndarray, " T"]]
     missed: int
+    compiled: int = 0
 
     @property
     def tip_distance(self) -> Float[np.ndarray, " T"]:
@@ -76,6 +79,7 @@ class LoopLog:
             "tip_rmse": self.tip_rmse(half),
             "fallbacks": self.fallbacks,
             "missed": self.missed,
+            "compiled": self.compiled,
             "violation": float(np.max(self.violation, initial=0.0)),
             "feedback_ms": 1e3 * float(np.median(self.feedback)),
             "feedback_p99_ms": 1e3 * float(np.percentile(self.feedback, 99)),
@@ -105,6 +109,22 @@ class LoopLog:
             f"{self.fallbacks} fallbacks, {self.missed} missed deadlines, feedback "
             f"{1e3 * float(np.median(self.feedback)):.2f} ms (median)"
         )
+
+
+class _Compilations:
+    """Counts the programs that JAX compiles or loads in this process."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        jax.monitoring.register_event_duration_secs_listener(self._heard)
+
+    def _heard(self, event: str, duration_secs: float, **_: Any) -> None:
+        self.count += event == COMPILED
+
+
+#: JAX's event of a compilation, also of one that is read from the cache on disk
+COMPILED = "/jax/core/compile/backend_compile_duration"
+_COMPILATIONS = _Compilations()
 
 
 @contextlib.contextmanager
@@ -151,7 +171,7 @@ def run_loop(
     controller.prepare(0.0, reference)
     rows: list[tuple[Any, ...]] = []
     parameters: list[dict[str, float]] = []
-    missed = 0
+    missed, before = 0, _COMPILATIONS.count
     with _no_garbage_collection():
         due = clock.perf_counter()
         for k in range(steps):
@@ -172,12 +192,13 @@ def run_loop(
             done = clock.perf_counter()
             parameters.append(_parameters_of(controller))
             rows.append((time, measured, tip, command, sent - began, done - moved))
-    return _log_of(rows, parameters, reference, missed)
+    return _log_of(rows, parameters, reference, missed, _COMPILATIONS.count - before)
 
 
 def _log_of(
-    rows: list[tuple[Any, ...]], parameters: list[dict[str, float]], reference: Reference, missed: int
-) -> LoopLog:
+    rows: list[tuple[Any, ...]], parameters: list[dict[str, float]], reference: Reference, missed: int,
+    compiled: int,
+) -> LoopLog:  # fmt: skip
     times, measurements, tips, commands, feedback, preparation = zip(*rows, strict=True)
     return LoopLog(
         time=np.array(times),
@@ -192,6 +213,7 @@ def _log_of(
         preparation=np.array(preparation),
         parameters={name: np.array([row[name] for row in parameters]) for name in parameters[0]},
         missed=missed,
+        compiled=compiled,
     )
 
 

@@ -8,25 +8,21 @@ takes less than a millisecond.
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.control.commands import Command, Controller, ControlLimits, Status
-from knode_cosserat.control.plans import Knots
+from knode_cosserat.control.commands import Command, ControlLimits
+from knode_cosserat.control.planning import PlanController, Weights
 from knode_cosserat.control.prediction import Prediction, linearised_prediction
-from knode_cosserat.control.qp import QPSolver, QuadraticProgram, solver_named
+from knode_cosserat.control.program import SoftRows, Tracking, applied_changes
+from knode_cosserat.control.qp import QPSolver, solver_named
 from knode_cosserat.control.references import Reference
-from knode_cosserat.estimation.observer import KalmanObserver, ObserverError
+from knode_cosserat.estimation.observer import KalmanObserver
 from knode_cosserat.estimation.outputs import Output
-from knode_cosserat.rods.system import System
-
-#: periods in which an old plan goes on, and then the last control is held, before the robot goes safe
-SHIFTS, HOLDS = 5, 5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,22 +40,7 @@ class SoftLimit:
     high: Any = np.inf
 
 
-@dataclasses.dataclass(frozen=True)
-class Weights:
-    """Weights of the cost, beside the tracked errors in units of their `noise`.
-
-    Attributes:
-        change: of the squared change of controls in one period, relative to the range of the controls.
-        effort: of the squared distance from the preferred controls, relative to the range.
-        preferred: preferred controls; None: the safe ones.
-    """
-
-    change: float = 1e-2
-    effort: float = 1e-4
-    preferred: Any = None
-
-
-class PredictiveController(Controller):
+class PredictiveController(PlanController):
     """Model-predictive controller of any robot whose model is a System.
 
     robot = kc.load_robot("delrin-tendon-robot")
@@ -87,46 +68,22 @@ class PredictiveController(Controller):
         Raises:
             ValueError: limits or sizes that are not allowed.
         """
-        self.observer, self.target, self.dt = observer, target, observer.dt
-        self.limits = limits.of(observer.robot)
-        self.knots = Knots.spaced(horizon, knots)
-        self.weights, self.soft, self.solver = weights, tuple(soft), solver_named(solver)
-        self._low, self._high = (
-            np.concatenate([np.zeros(0), *(np.broadcast_to(end, (s.output.size,)) for s, end in pairs)])
-            for pairs in ([(s, s.low) for s in self.soft], [(s, s.high) for s in self.soft])
-        )
-        self.reset(np.asarray(self.limits.safe))
-
-    @property
-    def robot(self) -> System:
-        """The model."""
-        return self.observer.robot
+        self.soft, self.solver = tuple(soft), solver_named(solver)
+        super().__init__(observer, target, limits, horizon, knots, weights)
+        self._tracking = Tracking(self.knots, self.limits, weights, target.noise, self.dt)
+        self._low = _at_samples([(each.low, each.output) for each in self.soft], horizon)
+        self._high = _at_samples([(each.high, each.output) for each in self.soft], horizon)
 
     def reset(self, control: Float[np.ndarray, " c"]) -> None:
         """Forget the plan; the control acts now. The observer keeps its state."""
-        self._plan = np.tile(np.asarray(control, dtype=float), (self.knots.count, 1))
-        self._control = np.array(control, dtype=float)
+        super().reset(control)
         self._prediction: Prediction | None = None
-        self._reason = "no prediction is prepared"
-        self._failures = 0
-
-    def copied(self) -> Self:
-        """Return a copy, with a copy of the observer."""
-        found = super().copied()
-        found.observer = copy.copy(self.observer)
-        return found
 
     # the two phases
 
     def prepare(self, time: float, reference: Reference) -> None:
         """Predict the motion over the horizon that begins at `time`, and linearise it."""
-        times = time + self.dt * (1.0 + np.arange(self.knots.horizon))
-        wanted = reference.at(times)
-        if wanted.shape[1] != self.target.size:
-            raise ValueError(
-                f"the reference has {wanted.shape[1]} numbers; the target has {self.target.size}: "
-                f"{', '.join(self.target.labels)}"
-            )
+        wanted = self.wanted(time, reference)
         observer, limited = self.observer, tuple(soft.output for soft in self.soft)
         found = linearised_prediction(
             observer.model, observer.belief, self._plan, self.knots.basis, wanted, self.target, limited
@@ -144,80 +101,32 @@ class PredictiveController(Controller):
         prediction = self._prediction
         if prediction is None:
             return self.fallback(self._reason)
-        problem = self._problem(prediction, coordinates)
+        error = prediction.error + np.tensordot(coordinates, prediction.by_state, 1)
+        soft = self._soft_rows(prediction, coordinates)
+        problem = self._tracking.program(error, prediction.by_plan, self._plan, self._control, soft)
         found = self.solver.solve(problem)
         if not found.solved:
             return self.fallback("the quadratic program was not solved")
-        plan = self._plan + found.x.reshape(self._plan.shape)
-        # rounding errors of the solver must not exceed hard limits
-        control = self.limits.applied(plan[0], self._control, self.dt)
-        self._plan, self._failures = plan, 0
-        limited = self._limited(prediction, coordinates) + np.tensordot(
-            found.x, prediction.limited_by_plan, 1
-        )
-        beyond = np.maximum(limited - self._high, self._low - limited)
-        violation = max(0.0, float(np.max(beyond, initial=0.0)))
-        return Command(control, Status.OPTIMAL, "", prediction.path, violation)
+        violation = 0.0
+        if soft is not None:
+            limited = soft.value + found.x @ soft.by_plan
+            violation = max(0.0, float(np.max(np.maximum(limited - soft.high, soft.low - limited))))
+        return self.planned(applied_changes(self._plan, found.x), prediction.path, violation)
 
     def advance(self, control: Float[np.ndarray, " c"]) -> None:
         """Take over the control that acts from now on: shift the plan and predict the observer's state."""
-        self._control = np.asarray(control, dtype=float)
-        self._plan = self.knots.shifted(self._plan)
-        self._prediction, self._reason = None, "no prediction is prepared"
-        try:
-            self.observer.predict(self._control)
-        except ObserverError as error:
-            self._reason = str(error)
-            self.observer.wait()
+        self._prediction = None
+        super().advance(control)
 
-    def fallback(self, reason: str) -> Command:
-        """Return a command without a solution: the shifted plan, then the last control, then a safe one."""
-        self._failures += 1
-        if self._failures <= SHIFTS:
-            wanted, status = self._plan[0], Status.SHIFTED
-        elif self._failures <= SHIFTS + HOLDS:
-            wanted, status = self._control, Status.HELD
-        else:
-            wanted, status = np.asarray(self.limits.safe), Status.SAFE
-        return Command(self.limits.applied(wanted, self._control, self.dt), status, reason)
+    def _soft_rows(self, prediction: Prediction, coordinates: Any) -> SoftRows | None:
+        if not self.soft:
+            return None
+        value = prediction.limited + np.tensordot(coordinates, prediction.limited_by_state, 1)
+        slopes = prediction.limited_by_plan.reshape(len(prediction.limited_by_plan), -1)
+        return SoftRows(value.ravel(), slopes, self._low, self._high)
 
-    # the quadratic program
 
-    def _limited(self, prediction: Prediction, coordinates: Any) -> Any:
-        return prediction.limited + np.tensordot(coordinates, prediction.limited_by_state, 1)
-
-    def _problem(self, prediction: Prediction, coordinates: Any) -> QuadraticProgram:
-        knots, limits, c = self.knots, self.limits, len(self._control)
-        error = prediction.error + np.tensordot(coordinates, prediction.by_state, 1)
-        scale = np.where(np.isfinite(error), 1.0 / self.target.noise, 0.0)
-        e = np.where(scale > 0.0, error, 0.0) * scale
-        S = np.where(scale > 0.0, prediction.by_plan, 0.0) * scale
-        S = S.reshape(len(S), -1)
-        # a wanted error of one `noise` counts like a change over the whole range
-        spread = np.asarray(limits.high) - np.asarray(limits.low)
-        changes = np.kron(knots.changes, np.diag(1.0 / spread))
-        first = np.zeros((knots.count, c))
-        first[0] = self._control / spread
-        now = changes @ self._plan.ravel() - first.ravel()
-        w = self.weights
-        preferred = np.asarray(limits.safe if w.preferred is None else w.preferred)
-        away = ((self._plan - preferred) / spread).ravel()
-        effort = np.tile(1.0 / spread, knots.count)
-        H = S @ S.T + w.change * changes.T @ changes + w.effort * np.diag(effort**2)
-        g = S @ e.ravel() + w.change * changes.T @ now + w.effort * effort * away
-        most = np.tile(np.asarray(limits.rate) * self.dt, knots.count)
-        A = np.kron(knots.changes, np.eye(c))
-        moved = A @ self._plan.ravel() - (first * spread).ravel()
-        below, above = -most - moved, most - moved
-        low, high = (
-            np.tile(np.asarray(end), knots.count) - self._plan.ravel() for end in (limits.low, limits.high)
-        )
-        soft = 0
-        if self.soft:
-            limited = self._limited(prediction, coordinates)
-            rows = prediction.limited_by_plan.reshape(len(S), -1).T
-            soft = len(rows)
-            A = np.concatenate([A, rows])
-            below = np.concatenate([below, (self._low - limited).ravel()])
-            above = np.concatenate([above, (self._high - limited).ravel()])
-        return QuadraticProgram(H, g, low, high, A, below, above, soft)
+def _at_samples(ends: Sequence[tuple[Any, Output]], horizon: int) -> Float[np.ndarray, " m"]:
+    """Return ends of soft limits at every sample of the horizon, one sample after the other."""
+    parts = [np.broadcast_to(np.asarray(end, dtype=float), (output.size,)) for end, output in ends]
+    return np.tile(np.concatenate([np.zeros(0), *parts]), horizon)

@@ -12,6 +12,7 @@ from knode_cosserat.estimation.outputs import (
     TipPose,
     TipPosition,
 )
+from knode_cosserat.estimation.window import MovingHorizonObserver
 
 __all__ = [
     "Adapted",
@@ -22,6 +23,7 @@ __all__ = [
     "Curvatures",
     "Estimate",
     "KalmanObserver",
+    "MovingHorizonObserver",
     "ObserverError",
     "Output",
     "TipPose",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Float
@@ -14,12 +14,14 @@ from knode_cosserat.estimation.adapted import Adapted, AdaptedParameters
 from knode_cosserat.estimation.online import (
     Belief,
     OnlineModel,
+    Predicted,
     Spread,
     measured_error,
-    predicted_step,
+    predicted_motion,
     split_record,
 )
 from knode_cosserat.estimation.outputs import Output
+from knode_cosserat.estimation.rollback import Rollback
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.history import used_places
@@ -111,6 +113,8 @@ class KalmanObserver:
 
     def restart(self, initial: Trajectory | None = None) -> None:
         """Start again at rest, or at the last row of a trajectory, with the initial uncertainty."""
+        #: number of times that earlier parameters came back
+        self.rollbacks = 0
         robot, settings = self.robot, self.model.settings
         if initial is None:
             at_start = initial_state(robot, settings)
@@ -120,14 +124,21 @@ class KalmanObserver:
         past = at_start.state.history
         self.control = np.asarray(at_start.control, dtype=float)
         self.record = np.asarray(at_start.record)
+        self._rollback: Rollback | None = None
         used, n = used_places(robot, settings.space), self.parameters.size
         rows = np.zeros((self.columns, 2, used, past.records.shape[-1]))
         coordinates = np.eye(self.columns, n)
         self.belief = Belief(np.zeros(n), past, Spread(rows, rows[:, 0], coordinates))
         self._slopes = np.zeros((self.columns, len(self.output.noise)))
         self._innovation, self._surprise = np.full(len(self.output.noise), np.nan), 0.0
+        # the last predicted output, and its change in one step in units of the noise
+        self._value: Any = None
+        self._moved = 0.0
         if self._start_deviation:
             self._spread_start()
+        if n:
+            self._rollback = Rollback(self.model, self.output, self.belief.x, self.dt)
+            self._rollback.compile(past, len(self.control))
 
     def _spread_start(self) -> None:
         """Set the columns to those of a robot at rest under controls that varied before the start."""
@@ -183,14 +194,36 @@ class KalmanObserver:
             raise ValueError(
                 f"the control is {control.tolist()}; allowed are {self.robot.control_size} finite numbers"
             )
-        deviations = self._control_deviation, self.parameters.drift * np.sqrt(self.dt)
-        found = predicted_step(self.model, self.belief, control, deviations, self.output)
+        nothing = np.full((1, self.output.size), np.nan)
+        found = predicted_motion(
+            self.model, self.belief, control[None], nothing, self._deviations(), self.output
+        )
         if not bool(found.solved):
             raise ObserverError(f"the model's step at t = {self.time + self.dt:g} s was not solved")
-        self.control, self.record = control, np.asarray(found.record)
-        matrix = self._compression(found.spread)
-        self.belief = Belief(self.belief.x, found.past, found.spread.combined(matrix))
-        self._slopes = matrix.T @ np.asarray(found.by_column)
+        if self._rollback is not None:
+            self._rollback.predicted(control, self.belief.past)
+        self.control = control
+        self._accept(found, self.belief.x, np.eye(found.by_column.shape[0]))
+
+    def _deviations(self) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " n"]]:
+        """Return the standard deviations of controls, and of the parameters' drift in one step.
+
+        Parameters drift only while the output moves: a robot at rest says nothing new about them.
+        """
+        moved = self._moved**2 / (1.0 + self._moved**2)
+        return self._control_deviation, moved * self.parameters.drift * np.sqrt(self.dt)
+
+    def _accept(self, found: Predicted, x: Float[np.ndarray, " n"], remaining: Any) -> None:
+        """Take over the end of a motion; `remaining` (m, k) combines its columns to those that are left."""
+        spread = found.spread.combined(remaining)
+        matrix = self._compression(spread)
+        value = np.asarray(found.values[-1])
+        if self._value is not None:
+            change = (value - self._value)[: len(self.output.noise)] / self.output.noise
+            self._moved = float(np.sqrt(np.mean(change**2)))
+        self._value, self.record = value, np.asarray(found.record)
+        self.belief = Belief(x, found.past, spread.combined(matrix))
+        self._slopes = matrix.T @ (remaining.T @ np.asarray(found.by_column)[:, -1])
 
     def covers(self, truth: Trajectory, level: float = 0.95) -> bool:
         """Return True if the true position of the tip lies in the estimate's confidence region.
@@ -216,6 +249,8 @@ class KalmanObserver:
 
     def wait(self) -> None:
         """Let a period pass without a prediction: the state is held."""
+        if self._rollback is not None:
+            self._rollback.forget()
         past = self.belief.past._replace(t0=np.asarray(self.time + self.dt))
         self.belief = self.belief._replace(past=past)
 
@@ -246,15 +281,8 @@ class KalmanObserver:
             return np.zeros(self.columns), np.eye(self.columns)
         H = self._slopes[:, known].T / self.output.noise[known, None]
         e = error[known] / self.output.noise[known]
-        inside = np.linalg.solve(np.eye(count) + H @ H.T, e)
-        self._surprise = float(e @ inside) / count
-        # a measurement that is too far away counts less
-        most = _largest_usual(count)
-        weight = min(1.0, most / max(self._surprise, 1e-12))
-        A = np.eye(self.columns) + weight * H.T @ H
-        coordinates = -np.linalg.solve(A, weight * H.T @ e)
-        L = np.linalg.cholesky(A)
-        return coordinates, np.linalg.inv(L).T
+        self._surprise, weight = surprise(H, e)
+        return correction(np.sqrt(weight) * H, np.sqrt(weight) * e)
 
     def update(self, measured: Float[np.ndarray, " p"]) -> Float[np.ndarray, " m"]:
         """Correct the estimate by a measurement; return the coordinates of the correction in the columns.
@@ -262,20 +290,47 @@ class KalmanObserver:
         NaN are numbers that were not measured.
         """
         coordinates, remaining = self._correction(measured)
-        x, past, spread = self.belief
-        records, rate, d_x = spread.along(coordinates)
-        used = records.shape[1]
-        all_records, all_rates = np.array(past.records), np.array(past.rate)
-        all_records[:, :used] += records
-        all_rates[:used] += rate
-        self.belief = Belief(
-            np.clip(x + d_x, *self.parameters.bounds),
-            past._replace(records=all_records, rate=all_rates),
-            spread.combined(remaining),
-        )
+        records = self.belief.spread.along(coordinates)[0]
+        moved = self.belief.moved(coordinates, self.parameters.bounds)
+        self.belief = moved._replace(spread=moved.spread.combined(remaining))
         self.record = self.record + records[0][grid_of(self.robot).nodes]
         self._slopes = remaining.T @ self._slopes
+        self._roll_back(measured)
         return coordinates
+
+    def _roll_back(self, measured: Float[np.ndarray, " p"]) -> None:
+        """Return to earlier parameters where those predict the last second better."""
+        earlier = None
+        if self._rollback is not None:
+            earlier = self._rollback.measured(measured, np.asarray(self.belief.x))
+        if earlier is not None:
+            self.belief = self.belief._replace(x=earlier)
+            self.rollbacks += 1
+
+    def __copy__(self) -> Self:
+        found = type(self).__new__(type(self))
+        found.__dict__.update(self.__dict__)
+        if self._rollback is not None:
+            found._rollback = self._rollback.copied()
+        return found
+
+
+def surprise(H: Float[np.ndarray, "e m"], error: Float[np.ndarray, " e"]) -> tuple[float, float]:
+    """Return the mean squared error in standard deviations of its prediction, and the weight that it gets.
+
+    Args:
+        H: derivatives of the error by the columns; errors are divided by their noise.
+        error: of a measurement. One that is too far away counts less.
+    """
+    count = len(error)
+    found = float(error @ np.linalg.solve(np.eye(count) + H @ H.T, error)) / count
+    return found, min(1.0, _largest_usual(count) / max(found, 1e-12))
+
+
+def correction(H: Float[np.ndarray, "e m"], error: Float[np.ndarray, " e"]) -> tuple[Any, Any]:
+    """Return the coordinates (m,) of least squares, and a square root (m, m) of the remaining covariance."""
+    A = np.eye(H.shape[1]) + H.T @ H
+    return -np.linalg.solve(A, H.T @ error), np.linalg.inv(np.linalg.cholesky(A)).T
 
 
 @functools.lru_cache

@@ -49,6 +49,16 @@ class Belief(NamedTuple):
     past: StateHistory
     spread: Spread
 
+    def moved(self, coordinates: Float[np.ndarray, " m"], bounds: Float[np.ndarray, "2 n"]) -> Belief:
+        """Return the state moved along the columns of its spread, with parameters within bounds (2, n)."""
+        records, rate, d_x = self.spread.along(coordinates)
+        used = records.shape[1]
+        all_records, all_rates = np.array(self.past.records), np.array(self.past.rate)
+        all_records[:, :used] += records
+        all_rates[:used] += rate
+        x = np.clip(np.asarray(self.x) + d_x, *bounds)
+        return Belief(x, self.past._replace(records=all_records, rate=all_rates), self.spread)
+
 
 class OnlineModel(eqx.Module):
     """A robot with adapted parameters, and the numerical settings of its steps."""
@@ -131,24 +141,39 @@ def errors_along(
     return jax.vmap(one, in_axes=(0, 0, 1), out_axes=(0, 1))(records, references, d_records)
 
 
+def errors_of(
+    system: System, output: Output, records: Float[Any, "T N x"], measured: Float[Any, "T p"]
+) -> Float[Any, "T e"]:
+    """Return the errors of an output in every row."""
+
+    def error(record: Any, measured: Any) -> Any:
+        return output.error(system, *split_record(system, record), measured)
+
+    return jax.vmap(error)(records, measured)
+
+
 class Predicted(NamedTuple):
-    """One step of an observer: the next state, and the output there with its columns."""
+    """Motion of an observer's model over some steps, and the errors of the output with their columns."""
 
     past: StateHistory
     record: Float[Any, "N x"]
     spread: Spread
-    #: tangents of the output's error by every column
-    by_column: Float[Any, "m e"]
+    #: values of the output, their errors (NaN where nothing was measured), and tangents by every column
+    values: Float[Any, "T p"]
+    errors: Float[Any, "T e"]
+    by_column: Float[Any, "m T e"]
     solved: Any
 
 
 @functools.partial(jax.jit, static_argnames="output")
-def predicted_step(
-    model: OnlineModel, belief: Belief, control: Any, deviations: tuple[Any, Any], output: Output
-) -> Predicted:
-    """Return one step under a control, with new columns for its uncertainty and the parameters' drift.
+def predicted_motion(
+    model: OnlineModel, belief: Belief, controls: Any, measured: Any, deviations: tuple[Any, Any],
+    output: Output,
+) -> Predicted:  # fmt: skip
+    """Return a motion under controls (T, c), with new columns for their uncertainty and parameters' drift.
 
-    `deviations` are those of each control (c,) and of the drift of each parameter (n,) in the step.
+    `measured` (T, p) are the measurements after each control; NaN: none. `deviations` are those of each
+    control (c,), the same in all steps, and of the drift of each parameter (n,).
     """
     of_control, of_drift = deviations
     spread = belief.spread
@@ -160,11 +185,30 @@ def predicted_step(
     drifts = jnp.concatenate([spread.parameters, jnp.zeros((c, n)), jnp.diag(of_drift)])
     wide = Spread(more(spread.records), more(spread.rate), drifts)
     d_controls = jnp.concatenate([jnp.zeros((m, c)), jnp.diag(of_control), jnp.zeros((n, c))])
-    system, found = model.rollout(belief._replace(spread=wide), control[None], d_controls[:, None])
-    record = found.records[0]
-    value = output.value(system, *split_record(system, record))
-    _, slopes = errors_along(system, output, found.records, found.d_records, value[None])
-    return Predicted(found.past, record, found.spread, slopes[:, 0], found.solved)
+    d_controls = jnp.repeat(d_controls[:, None], len(controls), axis=1)
+    system, found = model.rollout(belief._replace(spread=wide), controls, d_controls)
+    values = jax.vmap(lambda record: output.value(system, *split_record(system, record)))(found.records)
+    errors = errors_of(system, output, found.records, measured)
+    # where nothing was measured the derivatives are those at the prediction
+    known = jnp.where(jnp.isnan(measured), values, measured)
+    _, slopes = errors_along(system, output, found.records, found.d_records, known)
+    return Predicted(found.past, found.records[-1], found.spread, values, errors, slopes, found.solved)
+
+
+@functools.partial(jax.jit, static_argnames="output")
+def motion_errors(
+    model: OnlineModel, candidates: Float[Any, "k n"], past: StateHistory, controls: Any, measured: Any,
+    output: Output,
+) -> Float[Any, "k T e"]:  # fmt: skip
+    """Return the errors of the motion with each of several parameters; infinite after a failure."""
+
+    def one(x: Any) -> Any:
+        system, steps = model.at(x), len(controls)
+        done, _, rows = time_loop(system, model.settings, model.coefficients, controls, past, (0, steps))
+        errors = errors_of(system, output, rows.records, measured)
+        return jnp.where((jnp.arange(steps) < done)[:, None], errors, jnp.inf)
+
+    return jax.lax.map(one, candidates)
 
 
 @functools.partial(jax.jit, static_argnames="output")

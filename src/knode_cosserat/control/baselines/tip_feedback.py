@@ -1,4 +1,4 @@
-"""Controllers without predictive optimisation, behind the same interface: baselines of comparisons."""
+"""Controllers that act on the measured tip, by the statics of the robot: PID, and inverse kinematics."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.control.baselines.static_map import StaticMap
 from knode_cosserat.control.commands import Command, Controller, ControlLimits, Status
 from knode_cosserat.control.references import Reference
-from knode_cosserat.control.statics_map import StaticMap
 from knode_cosserat.rods.system import System
 
 
-class _OfTip(Controller):
+class TipFeedback(Controller):
     """Base of controllers that act on the measured position of the tip."""
 
     def __init__(self, robot: System, dt: float, limits: ControlLimits):
@@ -42,7 +42,7 @@ class _OfTip(Controller):
         return Command(self._control, Status.HELD, reason)
 
 
-class PID(_OfTip):
+class PID(TipFeedback):
     """PID control of the tip's position, through the static Jacobian of the robot under a preload.
 
     The error is mapped to controls by damped least squares; the integral stops where controls are limited.
@@ -74,7 +74,7 @@ class PID(_OfTip):
         return found
 
 
-class KinematicController(_OfTip):
+class KinematicController(TipFeedback):
     """Inverse kinematics of equilibria as feed-forward, with an integral of the tip's error."""
 
     def __init__(self, robot: System, dt: float, limits: ControlLimits, *, integral: float = 0.5):
