@@ -186,27 +186,28 @@ def test_a_realized_model_has_the_responses_it_was_made_of():
 
 
 def test_parameters_that_were_learned_from_a_broken_sensor_are_taken_back():
-    """For two seconds the sensor repeats one position; then it is well again."""
+    """For two seconds the sensor shows a movement that is a quarter too large; then it is well again."""
     own, truth = observer(), plant()
     tension = [5.0 + 2.0 * np.sin(0.3 * k + np.arange(4) * np.pi / 2.0) for k in range(140)]
     modulus = []
     for k, control in enumerate(tension):
         seen = truth.measure()
-        own.update(np.array([0.0, 0.1, -0.6]) if 40 <= k < 80 else seen)
+        wrong = np.array([1.25, 1.25, 1.0]) if 40 <= k < 80 else 1.0
+        own.update(wrong * seen)
         modulus.append(own.estimate.parameters["youngs_modulus"] / E)
         truth.apply(control)
         own.predict(control)
-    assert abs(modulus[39] - 1.0) < 0.02 and max(abs(each - 1.0) for each in modulus[40:80]) > 0.2
+    assert abs(modulus[39] - 1.0) < 0.02 and max(abs(each - 1.0) for each in modulus[40:80]) > 0.1
     assert own.rollbacks >= 1
     assert abs(modulus[-1] - 1.0) < 0.02
 
 
 def test_a_stiffness_does_not_drift_at_rest():
-    """No movement says nothing new: the deviation of the parameter does not grow."""
+    """Not even when the robot is straight, so that only noise says something about it."""
     own = observer()
     rng = np.random.default_rng(0)
     tip = plant().measure()
-    for _ in range(100):
+    for _ in range(200):
         own.update(tip + 2e-4 * rng.normal(size=3))
         own.predict(np.zeros(4))
     assert own.estimate.parameters["youngs_modulus"] == pytest.approx(E, rel=0.02)

@@ -145,7 +145,7 @@ def test_an_exact_window_is_that_of_least_squares(still):
             each.update(measured)
             each.predict(tension)
     apart = np.asarray(window.estimate.y) - np.asarray(kalman.estimate.y)
-    assert np.max(np.abs(apart[:, :3])) < 1e-4
+    assert np.max(np.abs(apart[:, :3])) < 1e-6
     assert window.time == pytest.approx(kalman.time)
 
 

@@ -7,15 +7,19 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 import knode_cosserat as kc
+from knode_cosserat.cli.control import CONTROLLERS
 from knode_cosserat.control import (
+    PID,
     ControlLimits,
     ReferenceFormatError,
     circle,
+    controller_named,
     figure_eight,
     parse_reference,
     steps,
     table,
 )
+from knode_cosserat.control.named import NAMES
 from knode_cosserat.control.plans import Knots
 from knode_cosserat.control.qp import DAQP, QuadraticProgram
 
@@ -128,3 +132,13 @@ def test_an_infeasible_program_is_not_solved_and_a_soft_row_yields():
     assert not DAQP(time_limit=1.0).solve(hard).solved
     soft = DAQP(time_limit=1.0).solve(hard._replace(soft=1))
     assert soft.solved and soft.x[0] == pytest.approx(1.0, abs=1e-3)
+
+
+def test_the_command_line_has_all_controllers_and_each_is_made_by_its_name():
+    assert set(CONTROLLERS) == set(NAMES)
+    limits = ControlLimits(0.0, 10.0, 40.0)
+    assert isinstance(controller_named("pid", ROBOT, 0.05, limits), PID)
+    with pytest.raises(ValueError, match="there is no controller 'mpc'; there are predictive, "):
+        controller_named("mpc", ROBOT, 0.05, limits)
+    with pytest.raises(ValueError, match="the controller 'pid' adapts no parameters"):
+        controller_named("pid", ROBOT, 0.05, limits, ["youngs_modulus"])

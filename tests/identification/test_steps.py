@@ -7,8 +7,6 @@ from numpy.testing import assert_allclose
 
 import knode_cosserat as kc
 from knode_cosserat.identification.steps import LONGEST, simulated_rows, stepped, steps_per_row
-from knode_cosserat.recordings.load import load_recording
-from knode_cosserat.recordings.virtual import record_virtual
 
 ROBOT = kc.load_robot("delrin-tendon-robot")
 
@@ -52,12 +50,3 @@ def test_rows_of_a_continuous_signal_are_those_of_much_finer_steps():
         )
     ]
     assert errors[0] < 0.2 * errors[1]
-    assert errors[0] < 2e-3
-
-
-def test_a_recording_says_which_kind_its_tensions_are(tmp_path):
-    record_virtual(tmp_path / "some.bag", "sine:1.0", 1.6, 0, robot=ROBOT)
-    recording = load_recording(tmp_path / "some.bag")
-    assert recording.sampled(0.0125, mean=True, tensions="measured").continuous
-    assert not recording.sampled(0.0125, mean=True, tensions="commanded").continuous
-    assert not recording.sampled(0.0125).continuous

@@ -84,6 +84,7 @@ def test_a_table_written_by_hand_says_by_its_titles_that_tensions_are_held(motio
     np.testing.assert_allclose(halves.held_tension[:-1], np.repeat(tensions, 2, axis=0), rtol=1e-12)
     path.write_text(path.read_text().replace("held_", ""))
     lines = kc.load_recording(path).sampled(DT / 2, mean=True)
+    assert lines.continuous and not halves.continuous
     assert np.abs(lines.held_tension[:40] - np.repeat(tensions, 2, axis=0)[:40]).max() > 0.5
 
 

@@ -81,6 +81,7 @@ def test_a_constant_stays_and_a_line_is_taken_at_the_next_row():
     constant = recorded(time, np.tile([5.0, 2.0], (len(time), 1))).sampled(0.05, mean=True)
     np.testing.assert_allclose(constant.tension, np.tile([5.0, 2.0], (len(constant.time), 1)), rtol=1e-12)
     rising = recorded(time, np.stack([time, 9.0 - 2 * time], axis=1)).sampled(0.05, end=3.9, mean=True)
+    assert rising.continuous
     after = rising.time + 0.05
     np.testing.assert_allclose(rising.tension, np.stack([after, 9.0 - 2 * after], axis=1), rtol=1e-12)
 

@@ -12,8 +12,8 @@ from knode_cosserat.cli.arguments import Changes, Json, Robot, load_system, pars
 from knode_cosserat.cli.output import write_output
 from knode_cosserat.cli.program import app, examples
 
-#: controllers by name
-CONTROLLERS = ("predictive", "kinematic", "pid")
+#: names of controllers, as `control.named` has them
+CONTROLLERS = ("predictive", "ilqr", "mppi", "lqr", "koopman", "kinematic", "pid")
 
 
 def _reference(text: str) -> Any:
@@ -91,7 +91,7 @@ def control(
     if out is not None:
         require_writable(out)
     from knode_cosserat import control as kcc
-    from knode_cosserat.estimation import KalmanObserver, TipPosition
+    from knode_cosserat.estimation import TipPosition
 
     model = load_system(str(robot), changes)
     truth = model if plant is None else load_system(plant)
@@ -100,15 +100,7 @@ def control(
     wanted = _reference(reference)
     if method not in CONTROLLERS:
         raise ValueError(f"--method is {method!r}; allowed is {', '.join(CONTROLLERS)}")
-    if adapt and method != "predictive":
-        raise ValueError("--adapt is for --method predictive")
-    controller: Any
-    if method == "predictive":
-        observer = KalmanObserver(model, dt, TipPosition(), adapt=adapt or ())
-        controller = kcc.PredictiveController(observer, TipPosition(), limits)
-    else:
-        kind = kcc.PID if method == "pid" else kcc.KinematicController
-        controller = kind(model, dt, limits)
+    controller = kcc.controller_named(method, model, dt, limits, adapt or ())
     log = kcc.run_loop(
         controller, kcc.SimulatedPlant(truth, dt, kcc.Sensor(TipPosition(), noise)), wanted, seconds
     )

@@ -7,6 +7,7 @@ from knode_cosserat.control.baselines.sampling import MPPI
 from knode_cosserat.control.baselines.tip_feedback import PID, KinematicController
 from knode_cosserat.control.commands import Command, Controller, ControlLimits, Status
 from knode_cosserat.control.loop import LoopLog, run_loop
+from knode_cosserat.control.named import controller_named
 from knode_cosserat.control.planning import Weights
 from knode_cosserat.control.plants import Plant, Sensor, SimulatedPlant
 from knode_cosserat.control.predictive import PredictiveController, SoftLimit
@@ -47,6 +48,7 @@ __all__ = [
     "Weights",
     "circle",
     "constant",
+    "controller_named",
     "figure_eight",
     "parse_reference",
     "run_loop",

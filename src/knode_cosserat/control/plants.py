@@ -74,6 +74,7 @@ class SimulatedPlant(Plant):
         sensor: Sensor,
         *,
         substeps: int = 1,
+        control_noise: float = 0.0,
         initial: Trajectory | None = None,
     ):
         """Set up the robot at rest, or at the last row of a trajectory.
@@ -83,10 +84,14 @@ class SimulatedPlant(Plant):
             dt: period (s).
             sensor: what is measured, and how well.
             substeps: steps of the simulation in each period.
+            control_noise: standard deviation by which acting controls differ from commanded ones, in their
+                unit, independent in each period.
             initial: a motion or equilibrium from which it moves on.
         """
         self.robot, self.dt, self.sensor = robot, float(dt), sensor
-        self._substeps, self._initial = substeps, initial
+        if control_noise < 0.0:
+            raise ValueError(f"control_noise is {control_noise}; allowed is zero or more")
+        self._substeps, self._initial, self._control_noise = substeps, initial, control_noise
         self.start()
 
     def start(self) -> Float[np.ndarray, " c"]:
@@ -99,6 +104,9 @@ class SimulatedPlant(Plant):
 
     def apply(self, control: Float[np.ndarray, " c"]) -> None:
         """Move on by one period under a control."""
+        control = np.asarray(control, dtype=float)
+        if self._control_noise:
+            control = control + self._control_noise * self._random.normal(size=len(control))
         for _ in range(self._substeps):
             self._stepper.step(control)
         self._sense()

@@ -31,8 +31,15 @@ from knode_cosserat.trajectory import Trajectory
 
 #: a measurement farther from its prediction than this quantile of its distribution is weighted less
 GATE = 0.9999
+#: movement of the output that counts as such, in units of the noise
+MOVING = 30.0
+#: time over which movements and errors are judged (s), and an average that is not zero (standard deviations)
+BIASED, SIGNIFICANT = 1.0, 4.0
 #: periods of uncertain controls before the start
 STARTING = 10
+#: error of a position that linearised equations do not describe (m): along the rod a tip moves by a second-
+#: order part of its deviation across it
+NUMERICAL = 5e-6
 #: standard deviations of tensions (N), and of other controls (in their units), unless given
 TENSION_DEVIATION, OTHER_DEVIATION = 0.05, 0.01
 
@@ -131,9 +138,10 @@ class KalmanObserver:
         self.belief = Belief(np.zeros(n), past, Spread(rows, rows[:, 0], coordinates))
         self._slopes = np.zeros((self.columns, len(self.output.noise)))
         self._innovation, self._surprise = np.full(len(self.output.noise), np.nan), 0.0
-        # the last predicted output, and its change in one step in units of the noise
-        self._value: Any = None
-        self._moved = 0.0
+        # the predicted outputs of the last second, in units of the noise
+        self._values = np.zeros((0, len(self.output.noise)))
+        # running mean of the measurement's errors, in standard deviations of their predictions
+        self._bias = np.zeros(len(self.output.noise))
         if self._start_deviation:
             self._spread_start()
         if n:
@@ -206,22 +214,28 @@ class KalmanObserver:
         self._accept(found, self.belief.x, np.eye(found.by_column.shape[0]))
 
     def _deviations(self) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " n"]]:
-        """Return the standard deviations of controls, and of the parameters' drift in one step.
+        """Return the standard deviations of controls, and of the parameters' drift in one step."""
+        return self._control_deviation, self.excitation * self.parameters.drift * np.sqrt(self.dt)
 
-        Parameters drift only while the output moves: a robot at rest says nothing new about them.
+    @property
+    def excitation(self) -> float:
+        """Part (0 to 1) by which parameters are adapted: none at rest, for a robot at rest says nothing new.
+
+        All if the output moves by `MOVING` in a second, or if its errors are not zero on average; none if it
+        moves by less than half of that.
         """
-        moved = self._moved**2 / (1.0 + self._moved**2)
-        return self._control_deviation, moved * self.parameters.drift * np.sqrt(self.dt)
+        ranges = np.ptp(self._values, axis=0) if len(self._values) else np.zeros(1)
+        moved = np.clip(2.0 * np.max(ranges) / MOVING - 1.0, 0.0, 1.0)
+        count = 2.0 * BIASED / self.dt
+        return 1.0 if np.max(np.abs(self._bias)) * np.sqrt(count) > SIGNIFICANT else float(moved)
 
     def _accept(self, found: Predicted, x: Float[np.ndarray, " n"], remaining: Any) -> None:
         """Take over the end of a motion; `remaining` (m, k) combines its columns to those that are left."""
         spread = found.spread.combined(remaining)
         matrix = self._compression(spread)
-        value = np.asarray(found.values[-1])
-        if self._value is not None:
-            change = (value - self._value)[: len(self.output.noise)] / self.output.noise
-            self._moved = float(np.sqrt(np.mean(change**2)))
-        self._value, self.record = value, np.asarray(found.record)
+        value = np.asarray(found.values[-1])[: len(self.output.noise)] / self.output.noise
+        self._values = np.concatenate([self._values, value[None]])[-max(2, round(BIASED / self.dt)) :]
+        self.record = np.asarray(found.record)
         self.belief = Belief(x, found.past, spread.combined(matrix))
         self._slopes = matrix.T @ (remaining.T @ np.asarray(found.by_column)[:, -1])
 
@@ -243,8 +257,7 @@ class KalmanObserver:
         apart = (
             np.asarray(truth.tip_position[-1]) - np.asarray(self.robot.positions(self.record[-1:, :ny]))[0]
         )
-        # the floor stands for the model's own numerical error
-        covariance = tips.T @ tips + 1e-12 * np.eye(3)
+        covariance = tips.T @ tips + NUMERICAL**2 * np.eye(3)
         return bool(apart @ np.linalg.solve(covariance, apart) <= chi2.ppf(level, 3))
 
     def wait(self) -> None:
@@ -282,6 +295,8 @@ class KalmanObserver:
         H = self._slopes[:, known].T / self.output.noise[known, None]
         e = error[known] / self.output.noise[known]
         self._surprise, weight = surprise(H, e)
+        expected = e / np.sqrt(1.0 + np.sum(H * H, axis=1))
+        self._bias[known] += min(1.0, self.dt / BIASED) * (np.clip(expected, -3.0, 3.0) - self._bias[known])
         return correction(np.sqrt(weight) * H, np.sqrt(weight) * e)
 
     def update(self, measured: Float[np.ndarray, " p"]) -> Float[np.ndarray, " m"]:
@@ -291,7 +306,7 @@ class KalmanObserver:
         """
         coordinates, remaining = self._correction(measured)
         records = self.belief.spread.along(coordinates)[0]
-        moved = self.belief.moved(coordinates, self.parameters.bounds)
+        moved = self.belief.moved(coordinates, self.parameters.bounds, self.excitation)
         self.belief = moved._replace(spread=moved.spread.combined(remaining))
         self.record = self.record + records[0][grid_of(self.robot).nodes]
         self._slopes = remaining.T @ self._slopes
@@ -310,6 +325,7 @@ class KalmanObserver:
     def __copy__(self) -> Self:
         found = type(self).__new__(type(self))
         found.__dict__.update(self.__dict__)
+        found._bias = self._bias.copy()
         if self._rollback is not None:
             found._rollback = self._rollback.copied()
         return found

@@ -49,14 +49,19 @@ class Belief(NamedTuple):
     past: StateHistory
     spread: Spread
 
-    def moved(self, coordinates: Float[np.ndarray, " m"], bounds: Float[np.ndarray, "2 n"]) -> Belief:
-        """Return the state moved along the columns of its spread, with parameters within bounds (2, n)."""
+    def moved(
+        self, coordinates: Float[np.ndarray, " m"], bounds: Float[np.ndarray, "2 n"], excitation: float = 1.0
+    ) -> Belief:
+        """Return the state moved along the columns of its spread, with parameters within bounds (2, n).
+
+        Parameters move by the part `excitation` only.
+        """
         records, rate, d_x = self.spread.along(coordinates)
         used = records.shape[1]
         all_records, all_rates = np.array(self.past.records), np.array(self.past.rate)
         all_records[:, :used] += records
         all_rates[:used] += rate
-        x = np.clip(np.asarray(self.x) + d_x, *bounds)
+        x = np.clip(np.asarray(self.x) + excitation * d_x, *bounds)
         return Belief(x, self.past._replace(records=all_records, rate=all_rates), self.spread)
 
 
@@ -172,20 +177,22 @@ def predicted_motion(
 ) -> Predicted:  # fmt: skip
     """Return a motion under controls (T, c), with new columns for their uncertainty and parameters' drift.
 
-    `measured` (T, p) are the measurements after each control; NaN: none. `deviations` are those of each
-    control (c,), the same in all steps, and of the drift of each parameter (n,).
+    The new columns are T c for the controls, step by step, and n for the parameters. `measured` (T, p) are
+    the measurements after each control; NaN: none. `deviations` are those of each control (c,), independent
+    in each step, and of the drift of each parameter (n,).
     """
     of_control, of_drift = deviations
     spread = belief.spread
-    m, c, n = len(spread.records), len(of_control), len(of_drift)
+    (steps, c), m, n = controls.shape, len(spread.records), len(of_drift)
+    count = steps * c
 
     def more(part: Any) -> Any:
-        return jnp.concatenate([part, jnp.zeros((c + n, *part.shape[1:]))])
+        return jnp.concatenate([part, jnp.zeros((count + n, *part.shape[1:]))])
 
-    drifts = jnp.concatenate([spread.parameters, jnp.zeros((c, n)), jnp.diag(of_drift)])
+    drifts = jnp.concatenate([spread.parameters, jnp.zeros((count, n)), jnp.diag(of_drift)])
     wide = Spread(more(spread.records), more(spread.rate), drifts)
-    d_controls = jnp.concatenate([jnp.zeros((m, c)), jnp.diag(of_control), jnp.zeros((n, c))])
-    d_controls = jnp.repeat(d_controls[:, None], len(controls), axis=1)
+    noise = jnp.diag(jnp.tile(of_control, steps)).reshape(count, steps, c)
+    d_controls = jnp.concatenate([jnp.zeros((m, steps, c)), noise, jnp.zeros((n, steps, c))])
     system, found = model.rollout(belief._replace(spread=wide), controls, d_controls)
     values = jax.vmap(lambda record: output.value(system, *split_record(system, record)))(found.records)
     errors = errors_of(system, output, found.records, measured)

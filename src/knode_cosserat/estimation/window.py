@@ -25,7 +25,7 @@ class MovingHorizonObserver(KalmanObserver):
     """
 
     def __init__(
-        self, robot: System, dt: float, output: Output, *, window: int = 10, corrections: int = 1,
+        self, robot: System, dt: float, output: Output, *, window: int = 5, corrections: int = 1,
         **options: Any,
     ):  # fmt: skip
         """Start at rest, or at the last row of a trajectory.
@@ -80,6 +80,7 @@ class MovingHorizonObserver(KalmanObserver):
         """Return a Kalman filter that stands where this observer does."""
         found = KalmanObserver.__new__(KalmanObserver)
         found.__dict__.update(self.__dict__)
+        found._bias = self._bias.copy()
         # the parameters are those of the filter
         self._rollback = None
         return found
@@ -129,12 +130,12 @@ class MovingHorizonObserver(KalmanObserver):
     def _solve(self, arrival: KalmanObserver, measured: Float[np.ndarray, "T p"]) -> None:
         """Set the estimate to the end of the window's most likely motion."""
         controls, deviations = np.array(self._controls), self._deviations()
-        bounds, size = self.parameters.bounds, self.columns
-        total = np.zeros(size + len(deviations[0]) + len(deviations[1]))
+        bounds, size, end = self.parameters.bounds, self.columns, self.columns + controls.size
+        total = np.zeros(end + len(deviations[1]))
         for last in [*[False] * self.corrections, True]:
-            belief = arrival.belief.moved(total[:size], bounds)
-            of_controls, of_drift = total[size:][: len(deviations[0])], total[size + len(deviations[0]) :]
-            belief = belief._replace(x=np.clip(belief.x + deviations[1] * of_drift, *bounds))
+            belief = arrival.belief.moved(total[:size], bounds, self.excitation)
+            of_controls = total[size:end].reshape(controls.shape)
+            belief = belief._replace(x=np.clip(belief.x + deviations[1] * total[end:], *bounds))
             found = predicted_motion(
                 self.model, belief, controls + of_controls * deviations[0], measured, deviations, self.output
             )
@@ -145,8 +146,8 @@ class MovingHorizonObserver(KalmanObserver):
             step, remaining = correction(H, e - H @ total)
             move, total = step - total, step
             if last:
-                end = Belief(belief.x, found.past, found.spread).moved(move, bounds)
-                self._accept(found._replace(past=end.past), end.x, remaining)
+                after = Belief(belief.x, found.past, found.spread).moved(move, bounds, self.excitation)
+                self._accept(found._replace(past=after.past), after.x, remaining)
 
     def _rows(self, found: Predicted) -> tuple[np.ndarray, np.ndarray]:
         """Return derivatives and errors of all measurements, divided by their noise and weighted."""

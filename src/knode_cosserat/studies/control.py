@@ -6,6 +6,7 @@ that the cases also show what adaptation costs where nothing is wrong.
 
 from __future__ import annotations
 
+import time as clock
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,7 @@ from typing import Any
 import numpy as np
 
 from knode_cosserat.control import (
-    PID,
     ControlLimits,
-    KinematicController,
     LoopLog,
     PredictiveController,
     Reference,
@@ -27,7 +26,10 @@ from knode_cosserat.control import (
     steps,
 )
 from knode_cosserat.control.commands import Controller
-from knode_cosserat.estimation import Adapted, KalmanObserver, TipPosition
+from knode_cosserat.control.named import NAMES, controller_named
+from knode_cosserat.control.planning import PlanController
+from knode_cosserat.estimation import Adapted, KalmanObserver, MovingHorizonObserver, TipPosition
+from knode_cosserat.estimation.observer import TENSION_DEVIATION
 from knode_cosserat.evaluation.tables import markdown_table
 from knode_cosserat.rods.loads import AttachedMass
 from knode_cosserat.rods.robot_file import load_robot
@@ -39,6 +41,9 @@ from knode_cosserat.studies.runner import Job, Product, run
 #: the robot, period (s) of control, and limits of the tensions (N, N/s)
 NOMINAL, DT = "delrin-tendon-robot", 0.05
 LOW, HIGH, RATE = 0.0, 10.0, 40.0
+LIMITS = ControlLimits(LOW, HIGH, RATE)
+#: name of the controller that adapts parameters
+ADAPTIVE = "predictive, adaptive"
 #: time (s) that each step is held, and that the robot may take to get there
 HOLD, TRANSIT = 3.0, 1.0
 #: duration of a case, and time from which errors count (s)
@@ -47,6 +52,9 @@ SECONDS, SETTLED = 12.0, 5.0
 MASS, PAYLOADS = 0.03, (0.01, 0.05)
 #: relative errors of the model
 WRONG = 0.3
+#: tensions (N) of the equilibrium in which observers begin, without knowing it; observers by name
+STILL = np.array([4.0, 1.0, 1.0, 2.0])
+OBSERVERS = {"Kalman": KalmanObserver, "moving horizon": MovingHorizonObserver}
 
 
 def references() -> dict[str, Reference]:
@@ -81,20 +89,24 @@ def true_robots() -> dict[str, TendonRod]:
 
 
 def predictive(model: TendonRod, dt: float = DT) -> PredictiveController:
-    """Return the controller of the study."""
-    adapted: list[Adapted | str] = ["youngs_modulus", Adapted("loads.0.mass", MASS)]
-    observer = KalmanObserver(model, dt, TipPosition(), adapt=adapted)
-    return PredictiveController(observer, TipPosition(), ControlLimits(LOW, HIGH, RATE))
+    """Return the controller of the study, which adapts stiffness and a mass at the tip."""
+    found = controller_named(
+        "predictive", model, dt, LIMITS, ["youngs_modulus", Adapted("loads.0.mass", MASS)]
+    )
+    assert isinstance(found, PredictiveController)
+    return found
 
 
-def controllers(model: TendonRod) -> dict[str, Controller]:
-    """Return all controllers by name."""
-    limits = ControlLimits(LOW, HIGH, RATE)
-    return {
-        "predictive": predictive(model),
-        "kinematic": KinematicController(model, DT, limits),
-        "PID": PID(model, DT, limits),
-    }
+def _controller(name: str) -> Controller:
+    """Return a controller of the study by its name."""
+    if name == ADAPTIVE:
+        return predictive(nominal_robot())
+    return controller_named(name, nominal_robot(), DT, LIMITS)
+
+
+#: controllers that are slower than real time: a quick study has only these robots and references for them
+SLOW = ("ilqr", "mppi")
+FEW = ("exact model", "stiffness +30%"), ("circle, 4 s", "circle, 1.5 s")
 
 
 # jobs
@@ -103,10 +115,11 @@ def controllers(model: TendonRod) -> dict[str, Controller]:
 def jobs(quick: bool) -> list[Job]:
     """Return one job for each controller, and one for each further check."""
     made = [
-        Job(f"tracking-{name}", tracking, {"controller": name}) for name in ("predictive", "kinematic", "PID")
+        Job(f"tracking-{name}", tracking, {"controller": name, "few": quick and name in SLOW})
+        for name in (ADAPTIVE, *NAMES)
     ]
     made.append(Job("limits", limits, {"runs": 20 if quick else 1000}))
-    made.append(Job("observer", observers, {}))
+    made.append(Job("observer", observers, {"runs": 6 if quick else 50}))
     made.append(Job("rest", rest, {"seconds": 30.0 if quick else 600.0}))
     made.append(Job("times", times, {"seconds": 20.0 if quick else 600.0}))
     return made
@@ -133,11 +146,16 @@ def rerun(out: Path, quick: bool = False, **how: Any) -> Report:
 
 def tracking(settings: Any) -> Product:
     """Return a controller's tracking errors for all robots and references."""
-    controller = controllers(nominal_robot())[settings["controller"]]
+    controller = _controller(settings["controller"])
     cells = []
+    few = settings["few"]
     for name, truth in true_robots().items():
+        if few and name not in FEW[0]:
+            continue
         plant = SimulatedPlant(truth, DT, Sensor(TipPosition()))
         for path, reference in references().items():
+            if few and path not in FEW[1]:
+                continue
             _fresh(controller)
             log = run_loop(controller, plant, reference, SECONDS)
             found = {name: values[-1] for name, values in log.parameters.items()}
@@ -158,7 +176,7 @@ def tracking(settings: Any) -> Product:
 
 def _fresh(controller: Controller) -> None:
     """Let the observer forget the parameters of the run before."""
-    if isinstance(controller, PredictiveController):
+    if isinstance(controller, PlanController):
         controller.observer.restart()
 
 
@@ -195,26 +213,47 @@ def limits(settings: Any) -> Product:
 
 
 def observers(settings: Any) -> Product:
-    """Return the error of the shape 1 s after a wrong start, from the tip's position alone, and coverage."""
+    """Return errors of the shape 1 s after a wrong start, from the tip's position alone, and coverage."""
     robot = load_robot(NOMINAL)
-    tension = np.array([4.0, 1.0, 1.0, 2.0])
-    start = equilibrium(robot, tension)
-    plant = SimulatedPlant(robot, DT, Sensor(TipPosition(), noise=1.0), initial=start)
-    observer = KalmanObserver(robot, DT, TipPosition(), start_deviation=2.0, adapt=[])
-    plant.start()
-    errors, inside = [], []
-    signal = tension + np.sin(np.arange(60)[:, None] * DT * 4.0 + np.arange(4)) * 0.8
-    for control in signal:
-        observer.update(plant.measure())
+    start = equilibrium(robot, STILL)
+    facts: dict[str, Any] = {}
+    for name, kind in OBSERVERS.items():
+        observer = kind(robot, DT, TipPosition(), start_deviation=2.0)
+        worst, inside, times = [], [], []
+        for seed in range(settings["runs"]):
+            observer.restart()
+            errors, covered, took = _observed(observer, start, seed)
+            worst.append(max(errors[20:25]))
+            inside += covered[20:]
+            times += took[2:]
+        facts[name] = {
+            "shape_error_percent": 100.0 * max(worst),
+            "coverage": float(np.mean(inside)),
+            "step_ms": 1e3 * float(np.median(times)),
+        }
+    return Product(facts, {})
+
+
+def _observed(observer: KalmanObserver, start: Any, seed: int) -> tuple[list[float], list[bool], list[float]]:
+    """Return errors of the shape (parts of the length), whether the regions cover the tip, and times (s)."""
+    robot = observer.robot
+    sensor, noise = Sensor(TipPosition(), noise=1.0, seed=seed), TENSION_DEVIATION
+    plant = SimulatedPlant(robot, DT, sensor, control_noise=noise, initial=start)
+    errors, inside, times = [], [], []
+    for control in STILL + np.sin(np.arange(60)[:, None] * DT * 4.0 + np.arange(4)) * 0.8:
+        measured = plant.measure()
+        began = clock.perf_counter()
+        observer.update(measured)
+        times.append(clock.perf_counter() - began)
         found, truth = observer.estimate, plant.state
         apart = np.asarray(robot.positions(found.y)) - np.asarray(truth.position[-1])
         errors.append(float(np.sqrt(np.mean(np.sum(apart**2, axis=-1)))) / float(robot.length))
         inside.append(observer.covers(truth))
         plant.apply(control)
+        began = clock.perf_counter()
         observer.predict(control)
-    return Product(
-        {"shape_error_percent": 100.0 * max(errors[20:25]), "coverage": float(np.mean(inside[20:]))}, {}
-    )
+        times[-1] += clock.perf_counter() - began
+    return errors, inside, times
 
 
 def rest(settings: Any) -> Product:
@@ -247,7 +286,7 @@ def times(settings: Any) -> Product:
 
 def checks(facts: Mapping[str, Any], cells: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Return the figures of the study with their limits: check, value, limit, ok."""
-    own = [cell for cell in cells if cell["controller"] == "predictive"]
+    own = [cell for cell in cells if cell["controller"] == ADAPTIVE]
 
     def worst(robot: str, field: str = "rmse_percent") -> float:
         return max(cell[field] for cell in own if cell["robot"].startswith(robot))
@@ -268,7 +307,19 @@ def checks(facts: Mapping[str, Any], cells: Sequence[Mapping[str, Any]]) -> list
         ("steady offset, unknown 10 and 50 g at the tip (% of length)", steady, 0.1),
         ("stiffness after 12 s (relative error)", max(modulus), 0.03),
         ("hard limits exceeded (times)", facts["limits"]["exceeded"], 0),
-        ("shape 1 s after a wrong start (% of length)", facts["observer"]["shape_error_percent"], 0.5),
+        *(
+            (f"shape 1 s after a wrong start, {name} (% of length)", found["shape_error_percent"], 0.5)
+            for name, found in facts["observer"].items()
+        ),
+        *(
+            (
+                f"95 % regions, {name}: distance of their coverage from 94 % (%)",
+                abs(100.0 * found["coverage"] - 94.0),
+                4.0,
+            )
+            for name, found in facts["observer"].items()
+        ),
+        *((f"step, {name} (ms)", found["step_ms"], 5.0) for name, found in facts["observer"].items()),
         ("drift of the stiffness at rest (%)", facts["rest"]["drift_percent"], 3.0),
         ("feedback at 20 Hz, p99 (ms)", slow["feedback_p99_ms"], 5.0),
         ("cycle at 20 Hz, p99 (ms)", slow["cycle_p99_ms"], 25.0),
