@@ -64,9 +64,7 @@ def main(out: Path, seconds: float = 8.0) -> tuple[float, float]:
     kc.save_robot(found.robot, out / "found.yaml")
     errors = []
     for label, robot in (("before", knowledge), ("after", found.robot)):
-        still = kc.equilibrium(robot, unseen.initial_tension)
-        tension = robot.undelayed(unseen.held_tension[:-1], DT)
-        prediction = kc.simulate(robot, tension, DT, initial=still)
+        prediction = kc.identification.predict(robot, unseen)
         figures.prediction_against_measurement(prediction, unseen).savefig(out / f"{label}.png", dpi=130)
         errors.append(float(rms_distance(np.asarray(prediction.tip_position), unseen.tip_position)))
     print(f"held-out tip RMSE: {100 * errors[0]:.1f} cm before, {100 * errors[1]:.2f} cm after")

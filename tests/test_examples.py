@@ -205,3 +205,10 @@ def test_their_calls_are_public():
         text = (ROOT / "examples" / f"{name}.py").read_text(encoding="utf-8")
         assert "knode_cosserat._" not in text and "import knode_cosserat as kc\n" in text
         assert all(hasattr(kc, word) for word in ("figures", "simulate"))
+
+
+@CAMPAIGN
+def test_closed_loop(run):
+    logs = run("closed_loop", seconds=6.0)
+    predictive, kinematic = (logs[name].tip_rmse(3.0) for name in ("predictive", "kinematic"))
+    assert predictive < 2e-3 < 2e-2 < kinematic

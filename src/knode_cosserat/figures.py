@@ -3,6 +3,7 @@
 Every function returns a new `matplotlib.figure.Figure`. No window is opened and no global setting changes.
 """
 
+from knode_cosserat.evaluation.control_figures import closed_loop
 from knode_cosserat.evaluation.figures import (
     animate,
     compare,
@@ -22,6 +23,7 @@ from knode_cosserat.evaluation.figures import (
 
 __all__ = [
     "animate",
+    "closed_loop",
     "compare",
     "curves",
     "error",

@@ -80,6 +80,9 @@ def control(
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write one row a period to this CSV file.")
     ] = None,
+    figure: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Draw path, error and controls into this file.")
+    ] = None,
     changes: Changes = None,
     as_json: Json = False,
 ) -> None:
@@ -88,8 +91,9 @@ def control(
     ROBOT is the model that predicts. The controlled robot is simulated; it may be another one (--plant), so
     that the effect of a wrong model is seen. Controls stay within --low, --high and --rate in every period.
     """
-    if out is not None:
-        require_writable(out)
+    for path in (out, figure):
+        if path is not None:
+            require_writable(path)
     from knode_cosserat import control as kcc
     from knode_cosserat.estimation import TipPosition
 
@@ -106,6 +110,10 @@ def control(
     )
     if out is not None:
         log.to_csv(out)
+    if figure is not None:
+        from knode_cosserat.evaluation.control_figures import closed_loop
+
+        closed_loop(log).savefig(figure)
     length = float(model.nominal.length)
     facts = log.summary() | {"tip_rmse_percent": 100.0 * log.tip_rmse(min(5.0, 0.5 * seconds)) / length}
     write_output(as_json, facts, _lines(facts, log), out=out)

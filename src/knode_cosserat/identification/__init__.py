@@ -1,6 +1,7 @@
 """Identification of real robots: a library of effects, selected by recordings that were not searched."""
 
 from knode_cosserat.identification.effects import Effect, Number
+from knode_cosserat.identification.evaluate import Evaluation, evaluate, predict
 from knode_cosserat.identification.fit import fit
 from knode_cosserat.identification.identify import IdentificationError, identify
 from knode_cosserat.identification.library import effects_of
@@ -9,10 +10,13 @@ from knode_cosserat.identification.result import Estimate, Identified
 __all__ = [
     "Effect",
     "Estimate",
+    "Evaluation",
     "IdentificationError",
     "Identified",
     "Number",
     "effects_of",
+    "evaluate",
     "fit",
     "identify",
+    "predict",
 ]

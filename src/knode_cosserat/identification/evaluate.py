@@ -93,7 +93,7 @@ def coverage(
     """
     predicted = []
     for robot in members:
-        moved = _moved(robot, measured, space, RECOVERY)
+        moved = predict(robot, measured, space=space, recovery=RECOVERY)
         places = places_at(measured.fractions, robot.nodes)
         predicted.append(np.asarray(positions_at(robot, np.asarray(moved.y), places)))
     count = len(predicted)
@@ -108,8 +108,24 @@ def coverage(
     return float(np.mean((off <= half[1:])[np.isfinite(off)]))
 
 
-def _moved(robot: System, measured: Measurements, space: str | SpaceScheme, recovery: float) -> Trajectory:
-    """Return rows under the measured controls: a motion from the equilibrium before it, or equilibria."""
+def predict(
+    robot: System, measured: Measurements, *, space: str | SpaceScheme = "lobatto2",
+    recovery: float | None = None,
+) -> Trajectory:  # fmt: skip
+    """Return the motion of a robot under measured tensions, or motor angles, in the rows of the recording.
+
+    It starts in the equilibrium before the first row. Rows of equilibria are separate equilibria. Latencies
+    of load cells are corrected, and continuous tensions are followed by short steps (`identification.steps`).
+
+    Args:
+        robot: any robot or model.
+        measured: the recording's rows; the tensions are known in all of them.
+        space: the scheme along the rod.
+        recovery: seconds that recovery from failed steps may take; None: the usual budget.
+
+    Raises:
+        SimulationError: an equilibrium or a step has no solution.
+    """
     initial, first = None, measured.tension[0] if measured.static else measured.initial_tension
     if first is not None:
         initial = equilibrium(robot, first, space=space, recovery_budget=recovery)
@@ -141,7 +157,7 @@ def evaluate(
         The `Evaluation` over the rows in which all bodies were seen; with `failed` if a step has no solution.
     """
     try:
-        moved = _moved(robot, measured, space, recovery)
+        moved = predict(robot, measured, space=space, recovery=recovery)
     except SimulationError as error:
         return Evaluation(failed=str(error))
     rows = np.arange(len(measured.time))[::every][:last]

@@ -41,8 +41,10 @@ PROMISE = 4.0
 SHRUNK = (0.5, 0.25)
 #: most corrections of a search without one recording
 FOLD = (5, 1e-2)
-#: parts by which a residual has to lower held-out errors on average, and may raise one of them
-LOWERS, RAISES = 0.02, 0.01
+#: part by which a residual has to lower held-out errors on average, and standard errors of that average
+LOWERS, ERRORS = 0.02, 2.0
+#: part by which it may raise one of them
+RAISES = 0.01
 #: part of the measured positions that has to lie within the spread, and that of a normal distribution
 LEVEL, NORMAL = 0.9, 1.645
 #: an uncertainty is at most multiplied by this
@@ -268,7 +270,8 @@ def _verdict(
 ) -> tuple[float, str]:
     """Return the part of the residual that is kept, 0 for none, and why, in words.
 
-    It must raise no held-out error, of tip or bodies, and lower them by more than their scatter.
+    It must raise no held-out error, of tip or bodies, and lower them by more than two standard errors of
+    their mean change, as an effect must.
     """
     best, gain, words = 0.0, 0.0, "not kept: a held-out recording cannot be simulated with it"
     for part, errors in tested.items():
@@ -278,7 +281,7 @@ def _verdict(
         told = ", ".join(f"{100.0 * (ratio - 1.0):+.1f} %" for ratio in ratios[:, 0])
         changes = np.log(ratios).mean(axis=1)
         doubt = np.std(changes, ddof=1) / np.sqrt(len(changes)) if len(changes) > 1 else np.inf
-        enough = np.mean(changes) < -max(LOWERS, doubt) and np.max(ratios) <= 1.0 + RAISES
+        enough = np.mean(changes) < -max(LOWERS, ERRORS * doubt) and np.max(ratios) <= 1.0 + RAISES
         if not best and (part == 1.0 or enough):
             words = f"{'kept' if enough else 'not kept'}: held-out errors of the tip change by {told}"
         if enough and np.mean(changes) < gain:
