@@ -141,7 +141,7 @@ class Misfit:
 
     def __init__(self, model: Model, data: Sequence[RecordingData], space: str | SpaceScheme):
         self.model, self.data = model, tuple(data)
-        scheme = time_scheme(self.data[0].continuous)
+        scheme = time_scheme(self.data[0].dt, self.data[0].continuous)
         self.settings = Settings.of(scheme, space, "paper", NewtonOptions())
         self._first = True
 
