@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from knode_cosserat.identification.model import Model
-from knode_cosserat.identification.search import Point, Problem, Search, SearchError
+from knode_cosserat.identification.search import Point, Problem, Search, SearchError, normal_equations
 
 #: least reduction of the held-out cost by an effect, for each of its parameters
 WORTH = 4.0
@@ -21,6 +21,8 @@ LEAST_LEFT = 1e-3
 MUCH_MORE = 1.3
 #: number of absent effects that are tried in one round
 MOST_TRIES = 3
+#: corrections of a search without one recording
+FOLD = (4, 1e-2)
 #: corrections of a search with other effects, and the part by which the cost falls at its end
 TRIED = (12, 5e-3)
 
@@ -156,17 +158,20 @@ def improved(
     """Return better effects than the given ones, and the end of their common search.
 
     Effects without a significant improvement are removed one by one, and absent effects with the largest
-    expected improvement of held-out recordings are added. The next search decides if a change is kept. An
-    added effect stays, so that the selection ends.
+    expected improvement of held-out recordings are added. The next search decides if a change is kept, and
+    for an addition also searches that leave one recording out each, because a model that is not complete may
+    be linear about one end only. An added effect stays, and a refused one is not tried again, so that the
+    selection ends.
     """
     steps: list[str] = []
     added: set[str] = set()
+    refused: set[str] = set()
     while True:
         names, point, gone = without_idle(search, names, point, added)
         if gone:
             steps.append(f"without {', '.join(gone)}{why}: {sizes(point)}")
             tell(steps[-1])
-        found = _with_another(search, names, point)
+        found = _with_another(search, names, point, refused)
         if found is None:
             return Chosen(names, point, tuple(steps))
         more = [name for name in found[0] if name not in names]
@@ -201,19 +206,51 @@ def sizes(point: Point) -> str:
 
 
 def _with_another(
-    search: Search, names: tuple[str, ...], point: Point
+    search: Search, names: tuple[str, ...], point: Point, refused: set[str]
 ) -> tuple[tuple[str, ...], Point] | None:
-    """Return the effects with the most promising one that keeps its promise; None if there is none."""
+    """Return the effects with the most promising one that keeps its promise; None if there is none.
+
+    Effects that do not are added to `refused`.
+    """
     model = search.misfit.model
-    left = Left.of(point, names, model)
-    for promise, _, more in _promises(point, names, left, model)[:MOST_TRIES]:
+    left, without = Left.of(point, names, model), None
+    for promise, name, more in _promises(point, names, left, model)[:MOST_TRIES]:
         if promise <= 1.0:
             break
+        if name in refused:
+            continue
         there = _searched(search, point, more)
         count = _count(model, set(more) - set(names))
         if there is not None and left.promise(Left.of(there, more, model), count) >= 1.0:
-            return more, there
+            if len(search.misfit.data) == 1:  # nothing else is left out
+                return more, there
+            without = left_out(search, point) if without is None else without
+            if left_out(search, there) < without - WORTH * count:
+                return more, there
+        refused.add(name)
     return None
+
+
+def left_out(search: Search, point: Point) -> float:
+    """Return the cost of recordings that were each left out of a search from a point, as `held_out`.
+
+    It is infinite if a search fails.
+    """
+    total, count = 0.0, len(search.misfit.data)
+    for k in range(count):
+        others = [j for j in range(count) if j != k]
+        try:
+            fold = search.run(point.x, point.free, None, *FOLD, which=others, scale=point.scale[others])
+        except SearchError:
+            return np.inf
+        (rollout,) = search.misfit.differences(fold.x, which=[k], derivatives=False)
+        if rollout is None:
+            return np.inf
+        found = normal_equations([rollout], point.scale[[k]], search.thinned())
+        cost, amount = float(found.cost[0]), float(found.amount[0])
+        # costs are in units of the scale, which another point has its own
+        total += amount * np.log(cost * point.scale[k] ** 2 / amount)
+    return total
 
 
 def _count(model: Model, names: Iterable[str]) -> int:
