@@ -160,9 +160,9 @@ def test_controllers_without_dynamics_hold_a_slow_circle():
 @pytest.mark.campaign
 def test_every_baseline_holds_a_slow_circle():
     """The exact model, so that errors are those of the method: sampling and lifting are rough."""
-    own, target = KalmanObserver(ROBOT, DT, TipPosition()), TipPosition()
+    target = TipPosition()
     made = {
-        LQR(own, target, LIMITS): 2e-3,
+        LQR(ROBOT, DT, target, LIMITS): 2e-3,
         KoopmanController(ROBOT, DT, target, LIMITS): 0.03,
         ILQR(KalmanObserver(ROBOT, DT, target), target, LIMITS): 5e-3,
         MPPI(KalmanObserver(ROBOT, DT, target), target, LIMITS): 0.03,

@@ -1,11 +1,16 @@
 """Time steps between the rows of recordings."""
 
+import dataclasses
+
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 import knode_cosserat as kc
+from knode_cosserat.identification.misfit import Misfit, data_of
+from knode_cosserat.identification.model import Model
 from knode_cosserat.identification.steps import (
     LONGEST,
     MOST,
@@ -15,6 +20,7 @@ from knode_cosserat.identification.steps import (
     time_scheme,
 )
 from knode_cosserat.solvers.time import BDF2
+from tests.identification.recorded import measured, tensions
 
 ROBOT = kc.load_robot("delrin-tendon-robot")
 
@@ -61,3 +67,24 @@ def test_rows_of_a_continuous_signal_are_those_of_much_finer_steps():
         )
     ]
     assert errors[0] < 0.2 * errors[1]
+
+
+@pytest.mark.campaign
+def test_recordings_of_both_kinds_are_simulated_as_each_alone_with_its_derivatives():
+    """Oracle of the derivatives: differences. A trajectory may stand beside recordings (`kc.fit`)."""
+    nominal = ROBOT.replace(nodes=6)
+    seen = measured(kc.robots.RoutedTendonRobot.like(nominal), tensions(0.5, 1.5), "own")
+    held = dataclasses.replace(seen, time=0.5 * seen.time)
+    model = Model(nominal, seen.tension)
+    data = [data_of(each, model, "own") for each in (dataclasses.replace(held, continuous=True), held)]
+    assert [each.steps for each in data] == [2, 1]
+    both = Misfit(model, data, "lobatto2")
+    k = model.slice("damping").start
+    one = 1e-3 * np.eye(model.size)[k]
+    low, here, high = (both.differences(part * one) for part in (-1.0, 0.0, 1.0))
+    for j, each in enumerate(data):
+        (alone,) = Misfit(model, [each], "lobatto2").differences(np.zeros(model.size), derivatives=False)
+        assert_allclose(here[j].values, alone.values, rtol=0, atol=1e-12)
+        slope = (high[j].values - low[j].values) / 2e-3
+        assert_allclose(here[j].derivatives[k], slope, rtol=0, atol=1e-4 * np.abs(slope).max())
+    assert np.abs(here[0].values - here[1].values).max() > 1e-4

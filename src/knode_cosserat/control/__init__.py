@@ -8,9 +8,9 @@ from knode_cosserat.control.baselines.tip_feedback import PID, KinematicControll
 from knode_cosserat.control.commands import Command, Controller, ControlLimits, Status
 from knode_cosserat.control.loop import LoopLog, run_loop
 from knode_cosserat.control.named import controller_named
-from knode_cosserat.control.planning import Weights
 from knode_cosserat.control.plants import Plant, Sensor, SimulatedPlant
 from knode_cosserat.control.predictive import PredictiveController, SoftLimit
+from knode_cosserat.control.program import Weights
 from knode_cosserat.control.qp import DAQP, QPError, QPSolver
 from knode_cosserat.control.references import (
     Reference,

@@ -51,7 +51,7 @@ def controller_named(
     if name in WITH_OBSERVER:
         return WITH_OBSERVER[name](KalmanObserver(robot, dt, target, adapt=adapt), target, limits)
     if name == "lqr":
-        return LQR(KalmanObserver(robot, dt, target), target, limits)
+        return LQR(robot, dt, target, limits)
     if name == "koopman":
         return KoopmanController(robot, dt, target, limits)
     return (PID if name == "pid" else KinematicController)(robot, dt, limits)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
 from typing import Any, Self
 
 import numpy as np
@@ -11,6 +10,7 @@ from jaxtyping import Float
 
 from knode_cosserat.control.commands import Command, Controller, ControlLimits, Status
 from knode_cosserat.control.plans import Knots
+from knode_cosserat.control.program import Tracking, Weights
 from knode_cosserat.control.references import Reference
 from knode_cosserat.estimation.observer import KalmanObserver, ObserverError
 from knode_cosserat.estimation.outputs import Output
@@ -18,21 +18,6 @@ from knode_cosserat.rods.system import System
 
 #: periods in which an old plan goes on, and then the last control is held, before the robot goes safe
 SHIFTS, HOLDS = 5, 5
-
-
-@dataclasses.dataclass(frozen=True)
-class Weights:
-    """Weights of the cost, beside the tracked errors in units of their `noise`.
-
-    Attributes:
-        change: of the squared change of controls in one period, relative to the range of the controls.
-        effort: of the squared distance from the preferred controls, relative to the range.
-        preferred: preferred controls; None: the safe ones.
-    """
-
-    change: float = 1e-2
-    effort: float = 1e-4
-    preferred: Any = None
 
 
 class PlanController(Controller):
@@ -48,7 +33,7 @@ class PlanController(Controller):
         self.observer, self.target, self.dt = observer, target, observer.dt
         self.limits = limits.of(observer.robot)
         self.knots = Knots.spaced(horizon, knots)
-        self.weights = weights
+        self.tracking = Tracking(self.knots, self.limits, weights, target.noise, self.dt)
         self.reset(np.asarray(self.limits.safe))
 
     @property

@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.control.commands import Command, ControlLimits
-from knode_cosserat.control.planning import PlanController, Weights
+from knode_cosserat.control.planning import PlanController
 from knode_cosserat.control.prediction import Prediction, linearised_prediction
-from knode_cosserat.control.program import SoftRows, Tracking, applied_changes
+from knode_cosserat.control.program import SoftRows, Weights, applied_changes
 from knode_cosserat.control.qp import QPSolver, solver_named
 from knode_cosserat.control.references import Reference
 from knode_cosserat.estimation.observer import KalmanObserver
@@ -70,7 +70,6 @@ class PredictiveController(PlanController):
         """
         self.soft, self.solver = tuple(soft), solver_named(solver)
         super().__init__(observer, target, limits, horizon, knots, weights)
-        self._tracking = Tracking(self.knots, self.limits, weights, target.noise, self.dt)
         self._low = _at_samples([(each.low, each.output) for each in self.soft], horizon)
         self._high = _at_samples([(each.high, each.output) for each in self.soft], horizon)
 
@@ -103,7 +102,7 @@ class PredictiveController(PlanController):
             return self.fallback(self._reason)
         error = prediction.error + np.tensordot(coordinates, prediction.by_state, 1)
         soft = self._soft_rows(prediction, coordinates)
-        problem = self._tracking.program(error, prediction.by_plan, self._plan, self._control, soft)
+        problem = self.tracking.program(error, prediction.by_plan, self._plan, self._control, soft)
         found = self.solver.solve(problem)
         if not found.solved:
             return self.fallback("the quadratic program was not solved")

@@ -2,15 +2,30 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.control.commands import ControlLimits
-from knode_cosserat.control.planning import Weights
 from knode_cosserat.control.plans import Knots
 from knode_cosserat.control.qp import QuadraticProgram
+
+
+@dataclasses.dataclass(frozen=True)
+class Weights:
+    """Weights of the cost, beside the tracked errors in units of their `noise`.
+
+    Attributes:
+        change: of the squared change of controls in one period, relative to the range of the controls.
+        effort: of the squared distance from the preferred controls, relative to the range.
+        preferred: preferred controls; None: the safe ones.
+    """
+
+    change: float = 1e-2
+    effort: float = 1e-4
+    preferred: Any = None
 
 
 class SoftRows(NamedTuple):

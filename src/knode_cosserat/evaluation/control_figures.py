@@ -33,15 +33,17 @@ def closed_loop(log: LoopLog) -> Figure:
         path.plot(*wanted.T, label="reference", **REFERENCE)
         path.plot(*tip.T, color=PALETTE[0], label="tip")
         path.set(xlabel="x [m]", ylabel="y [m]", title="path of the tip, from above", aspect="equal")
-        path.legend()
+        path.legend(loc="upper left", bbox_to_anchor=(1.02, 1.0))
         error.semilogy(log.time, 1e3 * np.maximum(log.tip_distance, 1e-6), color=PALETTE[0])
         for each in log.time[fallback]:
             error.axvspan(each, each + log.time[1] - log.time[0], color=PALETTE[1], alpha=0.3, lw=0)
         error.set(xlabel="time [s]", ylabel="distance [mm]", title="distance from the reference")
         for k, column in enumerate(log.control.T):
             control.step(log.time, column, where="post", color=PALETTE[k % len(PALETTE)], label=f"{k + 1}")
-        control.set(xlabel="time [s]", title="controls")
-        control.legend(ncols=4)
+        low, high = float(log.control.min()), float(log.control.max())
+        # room for the legend
+        control.set(xlabel="time [s]", title="controls", ylim=(low, high + 0.25 * (high - low or 1.0)))
+        control.legend(ncols=4, loc="upper left")
         if log.parameters:
             for k, (name, values) in enumerate(log.parameters.items()):
                 unit = np.max(np.abs(values)) or 1.0

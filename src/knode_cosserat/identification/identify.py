@@ -90,9 +90,8 @@ def identify(
     journal = None if checkpoint is None else Journal(checkpoint)
     search = _search(robot, measured, space, tell, journal)
     model, data = search.misfit.model, search.misfit.data
-    is_fine = data[0].steps > 1 and not data[0].static
     far = search
-    if is_fine:
+    if any(each.steps > 1 for each in data):
         far = Search(Misfit(model, [each._replace(steps=1) for each in data], space), tell, journal=journal)
     steps: list[str] = []
     try:
@@ -102,7 +101,7 @@ def identify(
         else:
             names, point, taken = selected(far, tell)
             steps += taken
-        if is_fine:
+        if search is not far:
             point = search.run(point.x, model.mask(names))
         search, point = _refined(search, names, point, measured, steps)
         if effects is None and search is not far:
@@ -201,14 +200,10 @@ def _held_out(search: Search, point: Point) -> tuple[list[float | None], list[np
     errors: list[float | None] = []
     folds = []
     for k in range(count):
-        others = [j for j in range(count) if j != k]
-        try:
-            fold = search.run(point.x, point.free, None, *FOLD, which=others, scale=point.scale[others])
-        except SearchError:
-            errors.append(None)
-            continue
-        errors.append(_errors(search, fold.x, [k])[0])
-        folds.append(fold.x)
+        fold = search.without(point, k, *FOLD)
+        errors.append(None if fold is None else _errors(search, fold.x, [k])[0])
+        if fold is not None:
+            folds.append(fold.x)
     return errors, folds
 
 

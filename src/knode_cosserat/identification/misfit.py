@@ -141,8 +141,8 @@ class Misfit:
 
     def __init__(self, model: Model, data: Sequence[RecordingData], space: str | SpaceScheme):
         self.model, self.data = model, tuple(data)
-        scheme = time_scheme(self.data[0].dt, self.data[0].continuous)
-        self.settings = Settings.of(scheme, space, "paper", NewtonOptions())
+        #: settings of equilibria; those of a motion have the time scheme of its recording
+        self.settings = Settings.of(None, space, "paper", NewtonOptions())
         self._first = True
 
     def differences(
@@ -172,9 +172,10 @@ class Misfit:
         x = np.asarray(x, dtype=float)
         seen = len(data.tension) if rows is None else min(len(data.tension), data.moves + rows)
         steps = seen * data.steps
-        system, settings = _system(self.model.robot, x), self.settings
+        system = _system(self.model.robot, x)
+        settings = dataclasses.replace(self.settings, time=time_scheme(data.dt, data.continuous))
         acting, slope = _acting(system, data)
-        still = Equilibria(dataclasses.replace(settings, time=None), 1, RECOVERY)
+        still = Equilibria(self.settings, 1, RECOVERY)
         # controls have room for a motion: one program for all equilibria
         held = np.broadcast_to(data.initial_tension, acting.shape)
         first = run_one(still, system, held, unloaded_shape(system, settings.space), held[0])

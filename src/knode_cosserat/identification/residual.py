@@ -221,14 +221,10 @@ def _with_widths(misfit: Misfit, widths: dict[str, float], tell: Callable[[str],
 
 def _fold(search: Search, point: Point, k: int, from_: Any = None) -> _Fold:
     """Leave recording k out."""
-    others = [j for j in range(len(search.misfit.data)) if j != k] or [k]
-    begin = point.x if from_ is None else from_
-    try:
-        fold = search.run(begin, point.free, None, *FOLD, which=others, scale=point.scale[others])
-        (found,) = search.misfit.differences(fold.x, which=[k])
-    except SearchError:
-        found = None
-    if found is None:
+    begin = point if from_ is None else dataclasses.replace(point, x=from_)
+    fold = search.without(begin, k, *FOLD)
+    (found,) = [None] if fold is None else search.misfit.differences(fold.x, which=[k])
+    if fold is None or found is None:
         return _Fold(None, PositionErrors(np.inf, np.inf), np.zeros(0))
     return _Fold(fold, _errors(found), _over_spread(found, fold))
 

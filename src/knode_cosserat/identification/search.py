@@ -224,6 +224,17 @@ class Search:
             raise SearchError(str(kept["failed"]))
         return Point.of(kept)
 
+    def without(self, point: Point, k: int, most: int, fall: float) -> Point | None:
+        """Return the end of a search from a point without recording k; None if it fails.
+
+        A recording that is alone is kept.
+        """
+        others = [j for j in range(len(self.misfit.data)) if j != k] or [k]
+        try:
+            return self.run(point.x, point.free, None, most, fall, others, point.scale[others])
+        except SearchError:
+            return None
+
     def _searched(
         self, x: Float[np.ndarray, " n"], free: Bool[np.ndarray, " n"], rows: int | None, most: int,
         fall: float, which: Sequence[int] | None, scale: Float[np.ndarray, " R"] | None,

@@ -236,19 +236,17 @@ def left_out(search: Search, point: Point) -> float:
 
     It is infinite if a search fails.
     """
-    total, count = 0.0, len(search.misfit.data)
-    for k in range(count):
-        others = [j for j in range(count) if j != k]
-        try:
-            fold = search.run(point.x, point.free, None, *FOLD, which=others, scale=point.scale[others])
-        except SearchError:
+    total = 0.0
+    for k in range(len(search.misfit.data)):
+        fold = search.without(point, k, *FOLD)
+        if fold is None:
             return np.inf
         (rollout,) = search.misfit.differences(fold.x, which=[k], derivatives=False)
         if rollout is None:
             return np.inf
         found = normal_equations([rollout], point.scale[[k]], search.thinned())
         cost, amount = float(found.cost[0]), float(found.amount[0])
-        # costs are in units of the scale, which another point has its own
+        # costs are in units of the scale, and each point has its own
         total += amount * np.log(cost * point.scale[k] ** 2 / amount)
     return total
 

@@ -18,12 +18,11 @@ from jaxtyping import Float
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.solvers.time import BDF2, BDFAlpha, TimeScheme
+from knode_cosserat.solvers.time import BDF2, LIGHTLY_DAMPED, TimeScheme
 from knode_cosserat.trajectory import Trajectory
 
-#: longest time step between rows with continuous tensions (s), most steps from row to row, and the scheme
+#: longest time step between rows with continuous tensions (s), and most steps from row to row
 LONGEST, MOST = 0.00625, 2
-CONTINUOUS = BDFAlpha(-0.45)
 
 
 def is_resolved(dt: float, continuous: bool) -> bool:
@@ -37,7 +36,7 @@ def is_resolved(dt: float, continuous: bool) -> bool:
 
 def time_scheme(dt: float, continuous: bool) -> TimeScheme:
     """Return the time scheme for rows `dt` (s) apart with continuous or held tensions."""
-    return CONTINUOUS if is_resolved(dt, continuous) else BDF2()
+    return LIGHTLY_DAMPED if is_resolved(dt, continuous) else BDF2()
 
 
 def steps_per_row(dt: float, continuous: bool) -> int:

@@ -44,7 +44,7 @@ def failed_trial(robot: System, data: Sequence[RecordingData], space: str | Spac
             if reason:
                 return f"tensions of {each.name} at {amplitude:g} times their amplitude: {reason}"
     first = data[0]
-    reason = _failure(robot, _random(data), first._replace(continuous=False), space)
+    reason = _failure(robot, _random(data), first, space)
     return f"random tensions: {reason}" if reason else None
 
 

@@ -23,7 +23,7 @@ from knode_cosserat.rods.tendon_rod import TendonRod
 from knode_cosserat.rods.virtual_robot import VirtualRobot
 from knode_cosserat.solvers.equilibrium import equilibrium
 from knode_cosserat.solvers.simulate import simulate
-from knode_cosserat.solvers.time import BDFAlpha
+from knode_cosserat.solvers.time import LIGHTLY_DAMPED
 from knode_cosserat.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -185,9 +185,7 @@ def driven(sent: Pulls, lag: float, robot: TendonRod) -> Trajectory:
     time = np.arange(round((sent.time[-1] + COMMANDED) / PLANT_STEP) + 1) * PLANT_STEP
     tension = lagged(sent, time, lag)
     still = equilibrium(robot, tension[0], space="lobatto4")
-    # a robot has no numerical damping
-    scheme = BDFAlpha(-0.45)
-    fine = simulate(robot, tension[1:], PLANT_STEP, time=scheme, space="lobatto4", initial=still)
+    fine = simulate(robot, tension[1:], PLANT_STEP, time=LIGHTLY_DAMPED, space="lobatto4", initial=still)
     rows = fine[:: round(KEPT / PLANT_STEP)]
     return dataclasses.replace(rows, settings=None)
 

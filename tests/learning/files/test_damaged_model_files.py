@@ -145,6 +145,17 @@ def test_forged_headers_give_an_error_or_a_model(kind, data):
         assert type(found) is KNODE
 
 
+def test_an_array_in_the_place_of_a_constant_spoils_nothing():
+    """JAX compares models with those that it has seen; an array there has no truth value."""
+
+    def edit(header):
+        header["residual"]["fields"]["history"] = {"$array": 0}
+
+    with fails("residual.history is a ndarray; allowed is a constant"):
+        model_file.decoded_model(forged(BYTES, edit), "model")
+    assert type(model_file.decoded_model(BYTES, "model")) is KNODE
+
+
 @pytest.mark.parametrize(
     ("entry", "parts"),
     [

@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.control.commands import Command, ControlLimits
-from knode_cosserat.control.planning import PlanController, Weights
+from knode_cosserat.control.planning import PlanController
 from knode_cosserat.control.prediction import linearised_prediction
-from knode_cosserat.control.program import Tracking, applied_changes
+from knode_cosserat.control.program import Weights, applied_changes
 from knode_cosserat.control.references import Reference
 from knode_cosserat.estimation.observer import KalmanObserver
 from knode_cosserat.estimation.outputs import Output
@@ -42,7 +42,6 @@ class ILQR(PlanController):
         """
         super().__init__(observer, target, limits, horizon, knots, weights)
         self.iterations = iterations
-        self._tracking = Tracking(self.knots, self.limits, weights, target.noise, self.dt)
 
     def command(self, time: float, measured: Float[np.ndarray, " p"], reference: Reference) -> Command:
         """Return the first control of the plan after some iterations."""
@@ -53,14 +52,14 @@ class ILQR(PlanController):
             self._plan = np.tile(self._control, (self.knots.count, 1))
             return self.fallback("the prediction was not solved")
         plan, path = self._plan, best[2]
-        cost = self._tracking.cost(best[0], plan, self._control)
+        cost = self.tracking.cost(best[0], plan, self._control)
         for _ in range(self.iterations):
-            problem = self._tracking.program(best[0], best[1], plan, self._control)
+            problem = self.tracking.program(best[0], best[1], plan, self._control)
             step = -np.linalg.solve(problem.H, problem.g)
             for part in TRIED:
                 there = np.clip(applied_changes(plan, part * step), self.limits.low, self.limits.high)
                 found = self._linearised(there, wanted)
-                lower = np.inf if found is None else self._tracking.cost(found[0], there, self._control)
+                lower = np.inf if found is None else self.tracking.cost(found[0], there, self._control)
                 if found is not None and lower < cost:
                     plan, path, best, cost = there, found[2], found, lower
                     break

@@ -14,9 +14,8 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.control.commands import Command, Controller, ControlLimits, Status
-from knode_cosserat.control.planning import Weights
 from knode_cosserat.control.plans import Knots
-from knode_cosserat.control.program import Tracking, applied_changes
+from knode_cosserat.control.program import Tracking, Weights, applied_changes
 from knode_cosserat.control.qp import QPSolver, solver_named
 from knode_cosserat.control.references import Reference
 from knode_cosserat.estimation.outputs import Output

@@ -17,6 +17,7 @@ from jaxtyping import Float
 from knode_cosserat.estimation.observer import KalmanObserver
 from knode_cosserat.estimation.online import Belief, OnlineModel, Spread, errors_along
 from knode_cosserat.estimation.outputs import Output
+from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.equilibrium import equilibrium
 
 #: steps of the impulse responses
@@ -46,14 +47,16 @@ def _impulses(model: OnlineModel, belief: Belief, control: Any, output: Output, 
     return values[-1], slopes, found.solved
 
 
-def linear_model(observer: KalmanObserver, control: Float[np.ndarray, " c"], output: Output) -> LinearModel:
-    """Return the linear model of an observer's robot about the equilibrium under a control.
+def linear_model(
+    robot: System, dt: float, control: Float[np.ndarray, " c"], output: Output
+) -> LinearModel:  # fmt: skip
+    """Return the linear model of a robot about the equilibrium under a control.
 
     Raises:
         SimulationError: there is no such equilibrium.
     """
-    robot, count = observer.robot, len(control)
-    own = KalmanObserver(robot, observer.dt, output, initial=equilibrium(robot, control))
+    count = len(control)
+    own = KalmanObserver(robot, dt, output, initial=equilibrium(robot, control))
     past = own.belief.past
     used, size = own.belief.spread.rate.shape[1:]
     rows = np.zeros((count, 2, used, size))

@@ -12,8 +12,8 @@ from knode_cosserat.control.baselines.linear_model import LinearModel, linear_mo
 from knode_cosserat.control.baselines.static_map import PRELOAD
 from knode_cosserat.control.commands import Command, Controller, ControlLimits, Status
 from knode_cosserat.control.references import Reference
-from knode_cosserat.estimation.observer import KalmanObserver
 from knode_cosserat.estimation.outputs import Output
+from knode_cosserat.rods.system import System
 
 
 class LQR(Controller):
@@ -24,13 +24,14 @@ class LQR(Controller):
     """
 
     def __init__(
-        self, observer: KalmanObserver, target: Output, limits: ControlLimits, *, change: float = 1e-2,
+        self, robot: System, dt: float, target: Output, limits: ControlLimits, *, change: float = 1e-2,
         disturbance: float = 0.1,
     ):  # fmt: skip
-        """Linearise the observer's robot about the equilibrium under a quarter of the greatest controls.
+        """Linearise the robot about the equilibrium under a quarter of the greatest controls.
 
         Args:
-            observer: its robot is the model; its estimate is not used.
+            robot: the model.
+            dt: period (s).
             target: the measured and tracked output, a position.
             limits: limits of the controls: the regulator's commands are clipped.
             change: cost of a control over its whole range, relative to an error of one `noise` of the target.
@@ -39,10 +40,10 @@ class LQR(Controller):
         Raises:
             SimulationError: there is no such equilibrium.
         """
-        self.dt, self.target = observer.dt, target
-        self.limits = limits.of(observer.robot)
+        self.dt, self.target = float(dt), target
+        self.limits = limits.of(robot)
         low, high = np.asarray(self.limits.low), np.asarray(self.limits.high)
-        self.model = linear_model(observer, low + PRELOAD * (high - low), target)
+        self.model = linear_model(robot, dt, low + PRELOAD * (high - low), target)
         A, B, C = self.model[:3]
         n, p = len(A), len(C)
         Q = C.T @ C / np.mean(target.noise) ** 2

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.control.commands import Command, ControlLimits
-from knode_cosserat.control.planning import PlanController, Weights
-from knode_cosserat.control.program import Tracking
+from knode_cosserat.control.planning import PlanController
+from knode_cosserat.control.program import Weights
 from knode_cosserat.control.references import Reference
 from knode_cosserat.estimation.observer import KalmanObserver
 from knode_cosserat.estimation.online import OnlineModel, split_record
@@ -61,7 +61,6 @@ class MPPI(PlanController):
         """
         super().__init__(observer, target, limits, horizon, knots, weights)
         self.samples, self.deviation, self.temperature = samples, deviation, temperature
-        self._tracking = Tracking(self.knots, self.limits, weights, target.noise, self.dt)
         self._random = np.random.default_rng(seed)
 
     def command(self, time: float, measured: Float[np.ndarray, " p"], reference: Reference) -> Command:
@@ -80,7 +79,7 @@ class MPPI(PlanController):
             self._plan = np.tile(self._control, (self.knots.count, 1))
             return self.fallback("no sampled plan was solved")
         each = zip(np.asarray(errors)[solved], plans[solved], strict=True)
-        costs = np.array([self._tracking.cost(error, plan, self._control) for error, plan in each])
+        costs = np.array([self.tracking.cost(error, plan, self._control) for error, plan in each])
         scale = max(self.temperature * float(costs.std()), 1e-12)
         share = np.exp(-(costs - costs.min()) / scale)
         return self.planned(np.tensordot(share / share.sum(), plans[solved], 1))

@@ -190,6 +190,7 @@ def _made(cls: Any, values: dict[str, Any], where: str) -> Any:
             )
     if issubclass(cls, tuple):
         return cls._make(values[name] for name in expected)
+    _require_hashable(cls, values, where)
     try:
         if not issubclass(cls, eqx.Module):
             return cls(**{field.name: values[field.name] for field in dataclasses.fields(cls) if field.init})
@@ -203,6 +204,20 @@ def _made(cls: Any, values: dict[str, Any], where: str) -> Any:
     except Exception as error:  # validation in a class may raise any error
         raise ContainerError(f"{where}, a {cls.__name__}, is not possible: {first_line(error)}") from None
     return made
+
+
+def _require_hashable(cls: Any, values: dict[str, Any], where: str) -> None:
+    """Raise `ContainerError` if a static field has a value that programs cannot be looked up by.
+
+    JAX would keep it, and fail when it compares the next model with it.
+    """
+    for field in dataclasses.fields(cls):
+        if field.metadata.get("static"):
+            try:
+                hash(values[field.name])
+            except TypeError:
+                kind = type(values[field.name]).__name__
+                raise ContainerError(f"{where}.{field.name} is a {kind}; allowed is a constant") from None
 
 
 def _defaults(cls: Any) -> dict[str, Any]:
