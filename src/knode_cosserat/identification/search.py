@@ -261,7 +261,9 @@ class Search:
             if cost - lower < fall * cost:
                 break
         scale = scales_of(now, self.length) if fixed is None else fixed
-        blocks = normal_equations(now, scale, self.thinned(), self.blocks(len(now[0].values)))
+        # a short horizon has fewer rows of a recording that rests for less time
+        rows_of_all = min(len(each.values) for each in now)
+        blocks = normal_equations(now, scale, self.thinned(), self.blocks(rows_of_all))
         parts = len(now) * len(self.folds)
         problem = Problem(*(each.reshape(parts, -1, *each.shape[1:]).sum(axis=1) for each in blocks))
         return Point(x, scale, problem, blocks, free, self.prior)
