@@ -46,19 +46,21 @@ class Command(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class ControlLimits:
-    """Hard limits of controls.
+    """Hard limits of controls, and the lag with which motors follow them.
 
     Attributes:
         low: least control.
         high: greatest control.
         rate: greatest change in one second.
         safe: controls that the robot goes to after a fault; None: `low`.
+        lag: time constant of the motors (s); controllers that plan predict with it.
     """
 
     low: Any
     high: Any
     rate: Any = np.inf
     safe: Any = None
+    lag: float = 0.0
 
     def of(self, robot: System) -> ControlLimits:
         """Return limits as arrays (c,) for a robot.
@@ -83,7 +85,9 @@ class ControlLimits:
             raise ValueError(f"rate is {self.rate}; allowed is a positive number")
         if np.any(arrays["safe"] < arrays["low"]) or np.any(arrays["safe"] > arrays["high"]):
             raise ValueError(f"safe is {self.safe}; allowed is from low to high")
-        return ControlLimits(**arrays)
+        if not self.lag >= 0.0:
+            raise ValueError(f"lag is {self.lag}; allowed is zero or more")
+        return ControlLimits(**arrays, lag=float(self.lag))
 
     def applied(self, wanted: Any, before: Any, dt: float) -> Float[np.ndarray, " c"]:
         """Return the nearest control within the limits, after another one `dt` (s) earlier.

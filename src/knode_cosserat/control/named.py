@@ -13,7 +13,7 @@ from knode_cosserat.control.commands import Controller, ControlLimits
 from knode_cosserat.control.predictive import PredictiveController
 from knode_cosserat.estimation.adapted import Adapted
 from knode_cosserat.estimation.observer import KalmanObserver
-from knode_cosserat.estimation.outputs import TipPosition
+from knode_cosserat.estimation.outputs import Output, TipPosition
 from knode_cosserat.rods.system import System
 
 #: controllers with an observer, which may adapt parameters
@@ -25,8 +25,9 @@ NAMES = (*WITH_OBSERVER, "lqr", "koopman", "kinematic", "pid")
 
 
 def controller_named(
-    name: str, robot: System, dt: float, limits: ControlLimits, adapt: Sequence[Adapted | str] = ()
-) -> Controller:
+    name: str, robot: System, dt: float, limits: ControlLimits, adapt: Sequence[Adapted | str] = (),
+    measured: Output | None = None,
+) -> Controller:  # fmt: skip
     """Return a controller of the tip's position with its default settings.
 
     Args:
@@ -35,6 +36,8 @@ def controller_named(
         dt: period (s).
         limits: limits of the controls.
         adapt: parameters that are adapted, by a controller with an observer.
+        measured: the measurement of an observer, with its noise; None: the tip's position. The noise of an
+            identified model's measurement includes the error of its predictions.
 
     Raises:
         ValueError: an unknown name, or parameters for a controller that adapts none.
@@ -49,7 +52,8 @@ def controller_named(
         )
     target = TipPosition()
     if name in WITH_OBSERVER:
-        return WITH_OBSERVER[name](KalmanObserver(robot, dt, target, adapt=adapt), target, limits)
+        observer = KalmanObserver(robot, dt, target if measured is None else measured, adapt=adapt)
+        return WITH_OBSERVER[name](observer, target, limits)
     if name == "lqr":
         return LQR(robot, dt, target, limits)
     if name == "koopman":

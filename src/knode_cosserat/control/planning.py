@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.control.commands import Command, Controller, ControlLimits, Status
+from knode_cosserat.control.lag import lag_weights, remaining_part
 from knode_cosserat.control.plans import Knots
 from knode_cosserat.control.program import Tracking, Weights
 from knode_cosserat.control.references import Reference
@@ -34,6 +35,9 @@ class PlanController(Controller):
         self.limits = limits.of(observer.robot)
         self.knots = Knots.spaced(horizon, knots)
         self.tracking = Tracking(self.knots, self.limits, weights, target.noise, self.dt)
+        self._basis = self.knots.basis
+        if self.limits.lag:
+            self._basis = lag_weights(self._basis, self.limits.lag, self.dt)
         self.reset(np.asarray(self.limits.safe))
 
     @property
@@ -45,6 +49,7 @@ class PlanController(Controller):
         """Forget the plan; the control acts now. The observer keeps its state."""
         self._plan = np.tile(np.asarray(control, dtype=float), (self.knots.count, 1))
         self._control = np.array(control, dtype=float)
+        self._acting = self._control
         self._reason = "no prediction is prepared"
         self._failures = 0
 
@@ -57,13 +62,25 @@ class PlanController(Controller):
     def advance(self, control: Float[np.ndarray, " c"]) -> None:
         """Take over the control that acts from now on: shift the plan and predict the observer's state."""
         self._control = np.asarray(control, dtype=float)
+        remaining = remaining_part(self.limits.lag, self.dt)
+        self._acting = self._control + (self._acting - self._control) * remaining
         self._plan = self.knots.shifted(self._plan)
         self._reason = "no prediction is prepared"
         try:
-            self.observer.predict(self._control)
+            self.observer.predict(self._acting)
         except ObserverError as error:
             self._reason = str(error)
             self.observer.wait()
+
+    def with_acting(self, plan: Float[np.ndarray, "... knots c"]) -> Float[np.ndarray, "... more c"]:
+        """Return a plan with the acting controls as one more knot, if motors lag.
+
+        `_basis` times the result are the acting controls of the horizon.
+        """
+        if not self.limits.lag:
+            return plan
+        acting = np.broadcast_to(self._acting, (*plan.shape[:-2], 1, plan.shape[-1]))
+        return np.concatenate([plan, acting], axis=-2)
 
     def wanted(self, time: float, reference: Reference) -> Float[np.ndarray, "T p"]:
         """Return the reference at the ends of the periods of the horizon that begins at `time` (s).

@@ -28,6 +28,10 @@ class Prediction(NamedTuple):
     path: Float[Any, "T 3"]
     solved: Any
 
+    def of_plan(self, count: int) -> Prediction:
+        """Return the prediction with the derivatives by the first numbers of the plan only."""
+        return self._replace(by_plan=self.by_plan[:count], limited_by_plan=self.limited_by_plan[:count])
+
 
 @functools.partial(jax.jit, static_argnames=("target", "limited"))
 def linearised_prediction(

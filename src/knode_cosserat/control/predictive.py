@@ -85,10 +85,11 @@ class PredictiveController(PlanController):
         wanted = self.wanted(time, reference)
         observer, limited = self.observer, tuple(soft.output for soft in self.soft)
         found = linearised_prediction(
-            observer.model, observer.belief, self._plan, self.knots.basis, wanted, self.target, limited
-        )
+            observer.model, observer.belief, self.with_acting(self._plan), self._basis, wanted, self.target,
+            limited,
+        )  # fmt: skip
         if bool(found.solved):
-            self._prediction = Prediction(*(np.asarray(part) for part in found))
+            self._prediction = Prediction(*(np.asarray(part) for part in found)).of_plan(self._plan.size)
         else:
             self._prediction, self._reason = None, "the prediction was not solved"
             # a constant plan is the easiest to predict

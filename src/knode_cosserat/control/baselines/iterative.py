@@ -73,8 +73,8 @@ class ILQR(PlanController):
         """Return errors, derivatives by the plan, and the path of the tip; None if it was not solved."""
         observer = self.observer
         found = linearised_prediction(
-            observer.model, observer.belief, plan, self.knots.basis, wanted, self.target, ()
-        )
+            observer.model, observer.belief, self.with_acting(plan), self._basis, wanted, self.target, ()
+        ).of_plan(plan.size)
         if not bool(found.solved):
             return None
         return np.asarray(found.error), np.asarray(found.by_plan), np.asarray(found.path)

@@ -72,8 +72,9 @@ class MPPI(PlanController):
         plans = np.clip(np.concatenate([self._plan[None], self._plan + moves]), limits.low, limits.high)
         wanted = self.wanted(time, reference)
         errors, solved = sampled_errors(
-            self.observer.model, belief.x, belief.past, plans, self.knots.basis, wanted, self.target
-        )
+            self.observer.model, belief.x, belief.past, self.with_acting(plans), self._basis, wanted,
+            self.target,
+        )  # fmt: skip
         solved = np.asarray(solved)
         if not solved.any():
             self._plan = np.tile(self._control, (self.knots.count, 1))
