@@ -41,6 +41,27 @@ class Sensor:
             raise ValueError("latency and noise must not be negative")
 
 
+class Readings:
+    """Readings of a sensor in a running loop: values with noise, some lost, delayed by the latency."""
+
+    def __init__(self, sensor: Sensor):
+        self.sensor, self.random = sensor, np.random.default_rng(sensor.seed)
+        self._queue: deque[Any] = deque(maxlen=sensor.latency + 1)
+
+    def add(self, value: Any) -> None:
+        """Take a true value of the output, at the time of a period."""
+        sensor, value = self.sensor, np.array(value)
+        if sensor.noise and len(sensor.output.noise) == len(value):
+            value = value + sensor.noise * sensor.output.noise * self.random.normal(size=len(value))
+        if self.random.uniform() < sensor.dropout:
+            value = np.full(len(value), np.nan)
+        self._queue.append(value)
+
+    def current(self) -> Float[np.ndarray, " p"]:
+        """Return the reading of this time, or an older one if the sensor has latency."""
+        return np.array(self._queue[0])
+
+
 class Plant(abc.ABC):
     """A robot that moves by one period at a time."""
 
@@ -97,8 +118,7 @@ class SimulatedPlant(Plant):
     def start(self) -> Float[np.ndarray, " c"]:
         """Go to the start, and return the control that acts there."""
         self._stepper = Stepper(self.robot, self.dt / self._substeps, initial=self._initial)
-        self._random = np.random.default_rng(self.sensor.seed)
-        self._queue: deque[Any] = deque(maxlen=self.sensor.latency + 1)
+        self._readings = Readings(self.sensor)
         self._sense()
         return np.asarray(self._stepper.state.control[-1])
 
@@ -106,23 +126,18 @@ class SimulatedPlant(Plant):
         """Move on by one period under a control."""
         control = np.asarray(control, dtype=float)
         if self._control_noise:
-            control = control + self._control_noise * self._random.normal(size=len(control))
+            control = control + self._control_noise * self._readings.random.normal(size=len(control))
         for _ in range(self._substeps):
             self._stepper.step(control)
         self._sense()
 
     def _sense(self) -> None:
         state, output = self._stepper.state, self.sensor.output
-        value = np.array(output.value(self.robot, np.asarray(state.y[-1]), np.asarray(state.z[-1])))
-        if self.sensor.noise and len(output.noise) == len(value):
-            value = value + self.sensor.noise * output.noise * self._random.normal(size=len(value))
-        if self._random.uniform() < self.sensor.dropout:
-            value = np.full(len(value), np.nan)
-        self._queue.append(value)
+        self._readings.add(output.value(self.robot, np.asarray(state.y[-1]), np.asarray(state.z[-1])))
 
     def measure(self) -> Float[np.ndarray, " p"]:
         """Return the measurement of this time, or an older one if the sensor has latency."""
-        return np.array(self._queue[0])
+        return self._readings.current()
 
     @property
     def state(self) -> Trajectory:

@@ -35,6 +35,7 @@ from knode_cosserat.rods.loads import AttachedMass
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.tendon_rod import TendonRod
 from knode_cosserat.solvers.equilibrium import equilibrium
+from knode_cosserat.studies import stand_in
 from knode_cosserat.studies.report import Report, as_json, write_texts
 from knode_cosserat.studies.runner import Job, Product, run
 
@@ -118,6 +119,8 @@ def jobs(quick: bool) -> list[Job]:
         Job(f"tracking-{name}", tracking, {"controller": name, "few": quick and name in SLOW})
         for name in (ADAPTIVE, *NAMES)
     ]
+    if stand_in.is_available():
+        made.append(Job("tracking-stand-in", on_stand_in, {"quick": quick}))
     made.append(Job("limits", limits, {"runs": 20 if quick else 1000}))
     made.append(Job("observer", observers, {"runs": 6 if quick else 50}))
     made.append(Job("rest", rest, {"seconds": 30.0 if quick else 600.0}))
@@ -172,6 +175,13 @@ def tracking(settings: Any) -> Product:
                 }
             )
     return Product({"cells": cells}, {})
+
+
+def on_stand_in(settings: Any) -> Product:
+    """Return the tracking errors of all controllers on the PyElastica stand-in, with its identified model."""
+    given = {"robot": NOMINAL, "controllers": [ADAPTIVE, *NAMES], "adaptive": ADAPTIVE}
+    given["few"] = SLOW if settings["quick"] else ()
+    return Product(stand_in.tracked(given, references(), DT, LIMITS, SECONDS, _rmse), {})
 
 
 def _fresh(controller: Controller) -> None:
@@ -325,6 +335,7 @@ def checks(facts: Mapping[str, Any], cells: Sequence[Mapping[str, Any]]) -> list
         ("cycle at 20 Hz, p99 (ms)", slow["cycle_p99_ms"], 25.0),
         ("cycle at 50 Hz, p99 (ms)", fast["cycle_p99_ms"], 12.0),
         ("missed deadlines at 20 Hz", slow["missed"], 0),
+        *stand_in.checks(cells, ADAPTIVE),
     ]  # fmt: skip
     return [
         {"check": name, "value": float(value), "limit": limit, "ok": bool(value <= limit)}
@@ -350,4 +361,5 @@ def as_markdown(cells: Sequence[Mapping[str, Any]], made: Sequence[Mapping[str, 
             markdown_table(["robot", "controller", *paths], rows),
             markdown_table(["check", "value", "limit", "met"], checked),
         ]
+            *([] if any(cell["robot"] == stand_in.ROBOT for cell in cells) else [stand_in.MISSING]),
     ) + "\n"  # fmt: skip
