@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -35,10 +36,32 @@ def _reference(text: str) -> Any:
     return table(rows["t"].to_numpy(), rows[["x", "y", "z"]].to_numpy())
 
 
+def _plant(text: str | None, model: Any, dt: float, sensor: Any) -> Any:
+    """Return the controlled robot by its text; None: the model itself."""
+    from knode_cosserat.control import SimulatedPlant
+
+    if text is None or not text.startswith("elastica:"):
+        return SimulatedPlant(model if text is None else load_system(text), dt, sensor)
+    from knode_cosserat.control.elastica_plant import ElasticaPlant
+    from knode_cosserat.control.elastica_rod import Imperfections
+
+    name, *given = text.removeprefix("elastica:").split(",")
+    known = {field.name: field.type for field in dataclasses.fields(Imperfections)}
+    changes: dict[str, Any] = {}
+    for each in given:
+        key, _, value = each.partition("=")
+        if key not in known:
+            raise ValueError(f"--plant has {each!r}; allowed is NAME=NUMBER with {', '.join(known)}")
+        changes[key] = parse_limits(f"--plant {key}", value, 1)
+    robot: Any = load_system(name)
+    return ElasticaPlant.like(robot, dt, sensor, Imperfections(**changes))
+
+
 @app.command(
     epilog=examples(
         "control delrin-tendon-robot --reference circle:radius=0.1,period=4",
         "control my-model.knode --plant my-robot.yaml --reference path.csv --adapt youngs_modulus",
+        "control found.yaml --plant elastica:my-robot.yaml,friction=0.2 --lag 0.06 --reference path.csv",
     )
 )
 def control(
@@ -53,7 +76,10 @@ def control(
     plant: Annotated[
         str | None,
         typer.Option(
-            metavar="ROBOT", help="Robot that is controlled, simulated.", show_default="the model itself"
+            metavar="ROBOT",
+            help="Robot that is controlled, simulated; elastica:ROBOT,lag=0.1: by PyElastica, with friction "
+            "and lag (an extra).",
+            show_default="the model itself",
         ),
     ] = None,
     method: Annotated[
@@ -68,6 +94,9 @@ def control(
         str, typer.Option(metavar="NUMBERS", help="Greatest control: one number, or one for each.")
     ] = "10",
     rate: Annotated[float, typer.Option(metavar="PER_S", help="Greatest change of a control in 1 s.")] = 40.0,
+    lag: Annotated[
+        float, typer.Option(metavar="S", help="Time constant of the motors that the controller expects (s).")
+    ] = 0.0,
     adapt: Annotated[
         list[str] | None,
         typer.Option(
@@ -77,6 +106,14 @@ def control(
     noise: Annotated[
         float, typer.Option(metavar="FACTOR", help="Noise of the tip sensor, in multiples of 0.2 mm.")
     ] = 0.0,
+    deviation: Annotated[
+        float,
+        typer.Option(
+            "--tip-deviation",
+            metavar="M",
+            help="Standard deviation of the measured tip for the observer (m): noise and error of the model.",
+        ),
+    ] = 2e-4,
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write one row a period to this CSV file.")
     ] = None,
@@ -98,16 +135,15 @@ def control(
     from knode_cosserat.estimation import TipPosition
 
     model = load_system(str(robot), changes)
-    truth = model if plant is None else load_system(plant)
     count = model.control_size
-    limits = kcc.ControlLimits(parse_limits("--low", low, count), parse_limits("--high", high, count), rate)
+    ends = parse_limits("--low", low, count), parse_limits("--high", high, count)
+    limits = kcc.ControlLimits(*ends, rate, lag=lag)
     wanted = _reference(reference)
     if method not in CONTROLLERS:
         raise ValueError(f"--method is {method!r}; allowed is {', '.join(CONTROLLERS)}")
-    controller = kcc.controller_named(method, model, dt, limits, adapt or ())
-    log = kcc.run_loop(
-        controller, kcc.SimulatedPlant(truth, dt, kcc.Sensor(TipPosition(), noise)), wanted, seconds
-    )
+    controller = kcc.controller_named(method, model, dt, limits, adapt or (), TipPosition(sigma=deviation))
+    controlled = _plant(plant, model, dt, kcc.Sensor(TipPosition(), noise))
+    log = kcc.run_loop(controller, controlled, wanted, seconds)
     if out is not None:
         log.to_csv(out)
     if figure is not None:
