@@ -6,9 +6,10 @@ import contextlib
 import dataclasses
 import gc
 import time as clock
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -142,6 +143,110 @@ def _no_garbage_collection() -> Iterator[None]:
         gc.unfreeze()
 
 
+class Period(NamedTuple):
+    """One period of a closed loop: a row of its log."""
+
+    time: float
+    reference: Float[np.ndarray, " p"]
+    measured: Float[np.ndarray, " m"]
+    tip: Float[np.ndarray, "3"]
+    command: Command
+    #: time from the measurement to the command, and time of the controller's other work (s)
+    feedback: float
+    preparation: float
+    parameters: dict[str, float]
+
+
+class Loop:
+    """Closed loop that moves one period at a time.
+
+    Everything is compiled at the start, by a copy of the controller. `reference` may be replaced between two
+    periods: the next prediction follows the new one.
+
+        loop = Loop(controller, plant, reference)
+        row = loop.period()
+    """
+
+    def __init__(
+        self, controller: Controller, plant: Plant, reference: Reference, kept: int | None = None
+    ):  # fmt: skip
+        """Start the plant and the controller; the log has the last `kept` periods, None for all.
+
+        Raises:
+            ValueError: plant and controller have different periods.
+        """
+        if not np.isclose(controller.dt, plant.dt):
+            raise ValueError(f"the controller's period is {controller.dt:g} s and the plant's {plant.dt:g} s")
+        self.controller, self.plant, self.reference = controller, plant, reference
+        #: number of periods that began late, counted by the caller that keeps the time
+        self.missed = 0
+        warm_up(controller, plant, reference)
+        controller.reset(plant.start())
+        controller.prepare(0.0, reference)
+        self._rows: deque[Period] = deque(maxlen=kept)
+        self._count, self._compiled_before = 0, _COMPILATIONS.count
+
+    @property
+    def time(self) -> float:
+        """Time of the next period (s)."""
+        return self._count * self.controller.dt
+
+    def period(self, applied: Callable[[], None] | None = None) -> Period:
+        """Measure, command, move the plant, and prepare the next period.
+
+        Args:
+            applied: called after the plant has moved, while the controller's estimate is still of the
+                measurement's time; its own time is not counted.
+        """
+        controller, plant, reference, time = self.controller, self.plant, self.reference, self.time
+        measured, tip = plant.measure(), plant.tip()
+        began = clock.perf_counter()
+        command: Command = controller.command(time, measured, reference)
+        sent = clock.perf_counter()
+        plant.apply(command.control)
+        if applied is not None:
+            applied()
+        moved = clock.perf_counter()
+        controller.advance(command.control)
+        controller.prepare(time + controller.dt, reference)
+        done = clock.perf_counter()
+        row = Period(
+            time, reference.at(time)[0], measured, tip, command, sent - began, done - moved,
+            _parameters_of(controller),
+        )  # fmt: skip
+        self._rows.append(row)
+        self._count += 1
+        return row
+
+    def log(self) -> LoopLog:
+        """Return the log of the kept periods.
+
+        Raises:
+            ValueError: no period has passed.
+        """
+        rows = list(self._rows)
+        if not rows:
+            raise ValueError("no period has passed; there is nothing in the log")
+        commands = [row.command for row in rows]
+        return LoopLog(
+            time=np.array([row.time for row in rows]),
+            reference=np.array([row.reference for row in rows]),
+            measured=np.array([row.measured for row in rows]),
+            tip=np.array([row.tip for row in rows]),
+            control=np.array([each.control for each in commands]),
+            status=tuple(each.status.value for each in commands),
+            reason=tuple(each.reason for each in commands),
+            violation=np.array([each.violation for each in commands]),
+            feedback=np.array([row.feedback for row in rows]),
+            preparation=np.array([row.preparation for row in rows]),
+            parameters={
+                name: np.array([row.parameters[name] for row in rows]) for name in rows[0].parameters
+            },
+            missed=self.missed,
+            compiled=_COMPILATIONS.count - self._compiled_before,
+        )
+
+
 def run_loop(
     controller: Controller, plant: Plant, reference: Reference, seconds: float, *, paced: bool = False
 ) -> LoopLog:
@@ -161,60 +266,20 @@ def run_loop(
     Raises:
         ValueError: plant and controller have different periods, or a duration below one period.
     """
-    if not np.isclose(controller.dt, plant.dt):
-        raise ValueError(f"the controller's period is {controller.dt:g} s and the plant's {plant.dt:g} s")
     steps = round(seconds / controller.dt)
     if steps < 1:
         raise ValueError(f"seconds is {seconds:g}; allowed is at least one period, {controller.dt:g} s")
-    warm_up(controller, plant, reference)
-    controller.reset(plant.start())
-    controller.prepare(0.0, reference)
-    rows: list[tuple[Any, ...]] = []
-    parameters: list[dict[str, float]] = []
-    missed, before = 0, _COMPILATIONS.count
+    loop = Loop(controller, plant, reference)
     with _no_garbage_collection():
         due = clock.perf_counter()
         for k in range(steps):
-            time = k * controller.dt
             if paced:
-                missed += k > 0 and clock.perf_counter() > due
+                loop.missed += k > 0 and clock.perf_counter() > due
                 while (rest := due - clock.perf_counter()) > 0.0:
                     clock.sleep(max(0.0, rest - 5e-4))
                 due = max(due, clock.perf_counter() - controller.dt) + controller.dt
-            measured, tip = plant.measure(), plant.tip()
-            began = clock.perf_counter()
-            command: Command = controller.command(time, measured, reference)
-            sent = clock.perf_counter()
-            plant.apply(command.control)
-            moved = clock.perf_counter()
-            controller.advance(command.control)
-            controller.prepare(time + controller.dt, reference)
-            done = clock.perf_counter()
-            parameters.append(_parameters_of(controller))
-            rows.append((time, measured, tip, command, sent - began, done - moved))
-    return _log_of(rows, parameters, reference, missed, _COMPILATIONS.count - before)
-
-
-def _log_of(
-    rows: list[tuple[Any, ...]], parameters: list[dict[str, float]], reference: Reference, missed: int,
-    compiled: int,
-) -> LoopLog:  # fmt: skip
-    times, measurements, tips, commands, feedback, preparation = zip(*rows, strict=True)
-    return LoopLog(
-        time=np.array(times),
-        reference=reference.at(times),
-        measured=np.array(measurements),
-        tip=np.array(tips),
-        control=np.array([each.control for each in commands]),
-        status=tuple(each.status.value for each in commands),
-        reason=tuple(each.reason for each in commands),
-        violation=np.array([each.violation for each in commands]),
-        feedback=np.array(feedback),
-        preparation=np.array(preparation),
-        parameters={name: np.array([row[name] for row in parameters]) for name in parameters[0]},
-        missed=missed,
-        compiled=compiled,
-    )
+            loop.period()
+    return loop.log()
 
 
 def warm_up(controller: Controller, plant: Plant, reference: Reference, periods: int = 2) -> None:
