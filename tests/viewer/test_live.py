@@ -15,6 +15,7 @@ import knode_cosserat as kc
 from knode_cosserat.viewer import view_live
 from knode_cosserat.viewer.live import require_websockets, usual_step
 from knode_cosserat.viewer.session import Session
+from tests.viewer.connection import Connection, numbers
 
 websockets = pytest.importorskip("websockets", reason="the live mode is of the extra viz")
 DT = 0.05
@@ -42,12 +43,6 @@ def solve(session, control, sequence, over):
     """Solve as the session's clock does; the message, and whether there is no solution."""
     message, session.stepper, stuck = session.attempt(control, sequence, over)
     return message, stuck
-
-
-def numbers(message):
-    """Head and row of a frame."""
-    values = np.frombuffer(message, np.float32)
-    return values[:6], values[6:]
 
 
 def test_a_frame_is_the_step_in_progress_under_the_newest_control(session, robot):
@@ -85,29 +80,6 @@ def test_what_cannot_be_solved_is_said_and_nothing_moves(session):
     assert session.stepper.state is reached and (count > 1 or reached is before)
     message, stuck = solve(session, fair, 8, over=False)
     assert not stuck and np.all(np.isfinite(numbers(message)[1]))
-
-
-class Connection:
-    """A connection in whose place the test stands: messages to the session, and those it sends."""
-
-    def __init__(self):
-        self.given, self.sent = asyncio.Queue(), asyncio.Queue()
-
-    def __aiter__(self):
-        return self
-
-    async def __anext__(self):
-        return json.dumps(await self.given.get())
-
-    async def send(self, message):
-        await self.sent.put(message)
-
-    async def until(self, true):
-        """The next message for which something is true."""
-        while True:
-            message = await asyncio.wait_for(self.sent.get(), 20)
-            if true(json.loads(message) if isinstance(message, str) else numbers(message)[0].tolist()):
-                return message
 
 
 #: first tension (N) at which the tests' solves end only when they are cancelled

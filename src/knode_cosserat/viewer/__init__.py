@@ -9,8 +9,9 @@ open from a disk. The page has no build step: the browser runs the files in `pag
 Trajectories need no further package. The live mode needs `websockets`, of the extra `viz`.
 """
 
+from knode_cosserat.viewer.closed_loop import control_live
 from knode_cosserat.viewer.document import export_scene
 from knode_cosserat.viewer.live import view_live
 from knode_cosserat.viewer.serve import view
 
-__all__ = ["export_scene", "view", "view_live"]
+__all__ = ["control_live", "export_scene", "view", "view_live"]

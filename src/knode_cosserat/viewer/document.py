@@ -19,8 +19,8 @@ MODULES = {
     **{
         f"viewer/{name}": f"page/{name}.js"
         for name in (
-            "app", "capture", "colours", "data", "hover", "legend", "live", "panels", "plots", "robot",
-            "stage", "triad", "tube", "units", "views",
+            "app", "capture", "colours", "data", "hover", "legend", "link", "live", "loop", "panels", "plots",
+            "readouts", "robot", "stage", "target", "triad", "tube", "units", "views",
         )
     },
 }  # fmt: skip

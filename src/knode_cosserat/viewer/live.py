@@ -5,11 +5,13 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import http
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.result import SimulationError
 from knode_cosserat.solvers.stepper import Stepper
+from knode_cosserat.viewer.connection import PageSession
 from knode_cosserat.viewer.document import document
 from knode_cosserat.viewer.drawing import sliders
 from knode_cosserat.viewer.scene import Point, checked_target, track
@@ -56,7 +58,7 @@ def view_live(
     checked_port(port)
     stepper = Stepper(robot, usual_step(robot) if dt is None else dt, space=space)
     page = live_page(stepper, title, target)
-    asyncio.run(_serve(stepper, page, port, open_browser))
+    asyncio.run(serve_page(page, lambda connection: Session(stepper, connection), port, open_browser))
 
 
 def usual_step(robot: System) -> float:
@@ -95,7 +97,10 @@ def live_page(stepper: Stepper, title: str | None = None, target: Point | None =
     return document(shown, "'self' ws:").encode("utf-8")
 
 
-async def _serve(stepper: Stepper, page: bytes, port: int, open_browser: Opening) -> None:
+async def serve_page(
+    page: bytes, session: Callable[[Any], PageSession], port: int, open_browser: Opening
+) -> None:
+    """Serve a page and the connections of its open copies, each with its session, until cancelled."""
     from websockets.asyncio.server import serve
     from websockets.datastructures import Headers
     from websockets.exceptions import ConnectionClosed
@@ -125,7 +130,7 @@ async def _serve(stepper: Stepper, page: bytes, port: int, open_browser: Opening
             await connection.close(1008, "another origin")
             return
         with contextlib.suppress(ConnectionClosed):
-            await Session(stepper, connection).run()
+            await session(connection).run()
 
     async with serve(connected, HOST, port, process_request=answer, compression=None) as server:
         number = next(iter(server.sockets)).getsockname()[1]

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import base64
 import gzip
+import reprlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -99,10 +100,12 @@ def checked_target(target: Point | None, systems: Sequence[System]) -> list[floa
         return None
     try:
         point = np.array(target, dtype=float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         point = np.empty(0)
     if point.shape != (3,) or not np.all(np.isfinite(point)):
-        raise ValueError(f"target must be a position (x, y, z) of three finite numbers in m (got {target!r})")
+        raise ValueError(
+            f"target must be a position (x, y, z) of three finite numbers in m (got {reprlib.repr(target)})"
+        )
     length = max(float(np.max(system.length)) for system in systems)
     distance = float(np.linalg.norm(point))
     if distance > FARTHEST_TARGET * length:

@@ -17,7 +17,7 @@ import contextlib
 import copy
 import json
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine, Mapping
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -26,13 +26,10 @@ import numpy as np
 from knode_cosserat.solvers.result import SimulationError
 from knode_cosserat.solvers.stepper import Stepper
 from knode_cosserat.trajectory import Trajectory
+from knode_cosserat.viewer.connection import PATIENCE, PageSession, sequence_of
 from knode_cosserat.viewer.drawing import sliders
 from knode_cosserat.viewer.scene import last_row, track
 
-#: time over which the pace is averaged (s)
-PACE = 1.0
-#: time after which the page is told of a solve, and after which a newer control replaces it (s)
-PATIENCE = 0.3
 #: interval at which a solve in progress is checked for cancellation (s)
 CHECK = 0.02
 #: threads for solves: the current one, and those that were dropped and end after their current attempt
@@ -75,54 +72,30 @@ class Stop:
             self._recovering.release()
 
 
-class Session:
-    """Session of one page: its robot, its control and commands, and the clock."""
+class Session(PageSession):
+    """Session of one page with sliders: its robot, its control and commands, and the clock."""
 
     def __init__(self, stepper: Stepper, connection: Any):
-        self.first, self.stepper, self.connection = stepper, copy.copy(stepper), connection
-        self.dt = stepper.dt
+        super().__init__(connection, stepper.dt)
+        self.first, self.stepper = stepper, copy.copy(stepper)
         self.names = list(track(stepper.state, "robot")["arrays"])
         self.control = np.array([slider["start"] for slider in sliders(stepper.robot)])
-        self.sequence, self.paused, self.begin_anew, self.cancelled = 0, False, False, False
-        self.wanted, self.recovering = asyncio.Event(), threading.Lock()
-        self.pace, self.spent = 1.0, 0.0
+        self.cancelled, self.recovering = False, threading.Lock()
+        self.commands["cancel"] = self._cancel
+        self.spent = 0.0
 
-    async def run(self) -> None:
-        """Run until the page is closed."""
-        reading = asyncio.create_task(self._read())
-        moving = asyncio.create_task(self._move())
-        try:
-            done, _ = await asyncio.wait({reading, moving}, return_when=asyncio.FIRST_COMPLETED)
-            for task in done:
-                task.result()
-        finally:
-            reading.cancel()
-            moving.cancel()
+    def _motions(self) -> list[Coroutine[Any, Any, None]]:
+        return [self._move()]
 
-    async def _read(self) -> None:
-        async for text in self.connection:
-            try:
-                self.understand(json.loads(text))
-            except (ValueError, TypeError, KeyError, AttributeError) as error:
-                await self.connection.send(json.dumps({"error": " ".join(str(error).split())}))
+    def take(self, message: Mapping[str, Any]) -> None:
+        """Take over the control of a message."""
+        control = np.array(message["control"], dtype=float)
+        if control.shape != self.control.shape or not np.all(np.isfinite(control)):
+            raise ValueError(f"the control is not {self.control.size} finite numbers")
+        self.control, self.sequence = control, sequence_of(message)
 
-    def understand(self, message: Any) -> None:
-        """Process a message of the page: a control, or a command. `ValueError` for anything else."""
-        command = message.get("command")
-        if command is None:
-            control = np.array(message["control"], dtype=float)
-            if control.shape != self.control.shape or not np.all(np.isfinite(control)):
-                raise ValueError(f"the control is not {self.control.size} finite numbers")
-            self.control, self.sequence = control, int(message["sequence"])
-        elif command in ("pause", "resume"):
-            self.paused = command == "pause"
-        elif command == "reset":
-            self.begin_anew = True
-        elif command == "cancel":
-            self.cancelled = True
-        else:
-            raise ValueError(f"the command is {command!r}; allowed is pause, resume, reset or cancel")
-        self.wanted.set()
+    def _cancel(self) -> None:
+        self.cancelled = True
 
     async def _move(self) -> None:
         """A step ends every dt, and the one in progress is solved again when the control changes."""
@@ -155,13 +128,6 @@ class Session:
                     end = loop.time() + self.dt
         finally:
             worker.shutdown(wait=False, cancel_futures=True)
-
-    def _next_end(self, end: float, now: float) -> float:
-        """Return the end of the next step, and average the pace; later steps do not catch up."""
-        late = now - end
-        weight = min(1.0, self.dt / PACE)
-        self.pace += weight * (min(1.0, self.dt / (self.dt + max(0.0, late - self.dt))) - self.pace)
-        return end + self.dt if late < self.dt else now + self.dt
 
     async def _solved(self, worker: concurrent.futures.Executor, over: bool) -> Solved | None:
         """Solve in a thread under the current control; None if a newer control or a reset replaced it."""

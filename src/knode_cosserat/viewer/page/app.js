@@ -6,6 +6,7 @@ import { Track } from "viewer/data";
 import { Hover } from "viewer/hover";
 import { Legend, Tensions, labelCells, markTimes, warning } from "viewer/legend";
 import { Live } from "viewer/live";
+import { LoopLink, LoopRows, LoopView } from "viewer/loop";
 import { Panels } from "viewer/panels";
 import { RobotModel } from "viewer/robot";
 import { Stage } from "viewer/stage";
@@ -21,7 +22,8 @@ const HINT = 15;
 export async function start(scene) {
   try {
     const tracks = await Promise.all(scene.tracks.map((each) => Track.of(each)));
-    window.viewer = new Viewer(scene, tracks);
+    const rows = scene.loop && (await LoopRows.of(scene.loop, tracks[0].times));
+    window.viewer = new Viewer(scene, tracks, rows);
   } catch (error) {
     say(`The page cannot draw this: ${error.message}`);
     throw error;
@@ -34,7 +36,7 @@ function say(text) {
 }
 
 class Viewer {
-  constructor(scene, tracks) {
+  constructor(scene, tracks, rows) {
     Object.assign(this, { scene, tracks, time: 0, speed: 1, playing: false, frames: 0, told: "" });
     this.parts = { tendons: true, ribs: true, frames: false, path: true };
     $("title").textContent = scene.title;
@@ -45,10 +47,12 @@ class Viewer {
     this.time = this.span[0];
     this.#build();
     this.#overlays();
+    if (rows) this.#loop(rows);
     this.#bar();
     this.#keys();
     this.panels = new Panels(tracks, this.robots, {
       colours: () => this.colours, seek: (time) => this.seek(this.rowTime(time)), coloured: () => (this.stage.dirty = true),
+      target: (time) => (!this.loop ? null : time === undefined ? this.loop.errors : { now: this.loop.error(time) }),
     });
     this.#notes();
     if (scene.live) this.#live();
@@ -105,7 +109,8 @@ class Viewer {
 
   /** The range of tensions (N) that has colours. */
   #tensions() {
-    const sliders = this.scene.live?.sliders.filter((slider) => slider.name.startsWith("tension")) ?? [];
+    const controls = this.scene.loop?.controls ?? this.scene.live?.sliders ?? [];
+    const sliders = controls.filter(({ name }) => name.startsWith("tension"));
     const tensions = [...this.robots.flatMap((robot) => robot.tensions), ...sliders.flatMap(({ low, high }) => [low, high])];
     const high = Math.max(1e-3, ...tensions);
     const low = Math.min(high, ...tensions);
@@ -145,7 +150,7 @@ class Viewer {
   // the bars above and below
 
   #bar() {
-    $("apart").hidden = this.tracks.length < 2;
+    $("apart").hidden = this.tracks.length < 2 || Boolean(this.loop);
     $("apart").onclick = () => {
       this.stage.sideBySide = !this.stage.sideBySide;
       $("apart").setAttribute("aria-pressed", String(this.stage.sideBySide));
@@ -280,12 +285,29 @@ class Viewer {
     this.#seen();
   }
 
+  // a closed loop, live or recorded
+
+  #loop(rows) {
+    document.body.classList.add("loop");
+    $("controls").hidden = false;
+    $("controls").querySelector("h2").textContent = "Closed loop";
+    $("error-panel").querySelector("h2").firstChild.textContent = "Distance ";
+    const moved = this.scene.live && ((target, at) => this.live.aim(target, at));
+    this.loop = new LoopView(this.scene.loop, rows, { stage: this.stage, robots: this.robots, place: $("sliders"), legend: this.legend, moved });
+    if (!moved) return;
+    $("hint").querySelector("span").textContent = "Drag the cross: the robot follows. With Shift: horizontally. Elsewhere, left button: turn. Right button: shift. Wheel: zoom. Space: pause.";
+    for (const name of ["export", "log"]) {
+      $(name).hidden = false;
+      $(name).onclick = () => this.live.command(name);
+    }
+  }
+
   // the live mode
 
   #live() {
     document.body.classList.add("live");
     $("controls").hidden = false;
-    this.live = new Live(this.scene.live, $("sliders"), {
+    const hooks = {
       moved: (row) => this.#arrived(row),
       told: (text, unsolved) => {
         this.told = text;
@@ -296,7 +318,9 @@ class Viewer {
         $("cancel").disabled = seconds === null;
         $("solving").textContent = seconds === null ? "" : `solving… ${seconds.toFixed(1)} s`;
       },
-    });
+    };
+    if (this.loop) this.live = this.loop.linked(new LoopLink(this.scene.target, hooks, (reason) => (this.loop.reason = reason)));
+    else this.live = new Live(this.scene.live, $("sliders"), hooks);
     $("reset").onclick = () => this.live.reset();
     $("cancel").onclick = () => this.live.cancel();
     this.playing = true;
@@ -306,7 +330,12 @@ class Viewer {
 
   #arrived({ since, ...row }) {
     const [track] = this.tracks;
-    track.put(row);
+    let rest = row.row;
+    for (const each of this.tracks) {
+      each.put({ ...row, row: rest.subarray(0, each.width) });
+      rest = rest.subarray(each.width);
+    }
+    this.loop?.put(row.time, rest);
     this.span = [track.times[0], row.time];
     this.time = row.time;
     this.answers ??= since;
@@ -321,11 +350,14 @@ class Viewer {
   }
 
   #plotLive() {
-    if (!this.playing) return;
+    if (!this.playing && this.plotted === this.time) return;
+    this.plotted = this.time;
     this.panels.live(this.time);
     const { pace, step, latency } = this.live;
-    const words = latency === null ? "" : `, ${Math.round(latency)} ms from slider to shape`;
-    if (pace !== undefined) $("pace").textContent = `${pace.toFixed(2)}× real time, ${step.toFixed(1)} ms a step${words}`;
+    const words = latency === null ? "" : `, ${Math.round(latency)} ms from ${this.loop ? "mouse" : "slider"} to shape`;
+    if (pace === undefined) return;
+    const work = this.loop ? "" : `, ${step.toFixed(1)} ms a step`; // a loop has its own words for it
+    $("pace").textContent = `${pace.toFixed(2)}× real time${work}${words}`;
   }
 
   // the clock
@@ -355,6 +387,7 @@ class Viewer {
       const moment = robot.update(this.time, this.range);
       return this.tracks[k].wanted ? warning(this.tracks[k], moment) : "";
     });
+    this.loop?.show(this.time);
     const cells = this.stage.draw(fine);
     say([this.told, ...warnings].filter(Boolean).join(" "));
     if (this.live) {

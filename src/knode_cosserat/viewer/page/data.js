@@ -46,6 +46,11 @@ export class Track {
     return this.times.length;
   }
 
+  /** Number of numbers in a row of all arrays. */
+  get width() {
+    return Object.values(this.arrays).reduce((sum, { width }) => sum + width, 0);
+  }
+
   /**
    * The last row at or before a time. `drawn` is the row to be drawn, `solved` is true if it is the row's solution,
    * `coarse` if the grid is too coarse for it, `error` is its estimated position error (m).

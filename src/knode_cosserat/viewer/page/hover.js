@@ -1,5 +1,4 @@
 // Values of the node under the mouse: its position, its arclength, and the quantity that is plotted there.
-import * as THREE from "three";
 import { robotColour } from "viewer/colours";
 import { position, quantity, short } from "viewer/units";
 
@@ -52,9 +51,9 @@ export class Hover {
     this.robots.forEach((robot, k) => {
       if (!cell.groups.includes(robot.group)) return;
       for (const line of robot.lines) {
-        let before = this.#project(line.points, 0, cell);
+        let before = this.stage.project(line.points, 0, cell);
         for (let node = 1; node < line.count; node++) {
-          const at = this.#project(line.points, node, cell);
+          const at = this.stage.project(line.points, node, cell);
           const { distance, end } = nearness(this.pointer, before, at);
           const reach = Math.max(NEAR, line.radius * at.scale);
           // of lines on each other, the one that is nearer to the eye
@@ -66,16 +65,6 @@ export class Hover {
       }
     });
     return best;
-  }
-
-  /** A node's place in the picture (px), its depth, and the pixels of a metre there. */
-  #project(points, n, { x, y, width, height }) {
-    const { camera } = this.stage;
-    const point = new THREE.Vector3(points[3 * n], points[3 * n + 1], points[3 * n + 2]);
-    const away = point.distanceTo(camera.position);
-    point.project(camera);
-    const scale = height / (2 * Math.tan((0.5 * camera.fov * Math.PI) / 180) * away);
-    return { x: x + 0.5 * (1 + point.x) * width, y: y + 0.5 * (1 - point.y) * height, depth: point.z, scale };
   }
 
   /** Lines of text on a node. */

@@ -1,6 +1,6 @@
 // Names of what is drawn, with a button each to show or hide it, and words for what is not a good solution.
 import { robotColour, TENSION, rampStyle } from "viewer/colours";
-import { distance, position, short } from "viewer/units";
+import { apart, distance, position, short } from "viewer/units";
 
 /** A discretisation error above this part of the length makes a row too coarse: `COARSE_SHARE` of the solver. */
 const COARSE_SHARE = 0.02;
@@ -12,6 +12,7 @@ function element(tag, className, text = "") {
 export class Legend {
   /** `toggle` is called with the number of a robot whose name is clicked. */
   constructor(place, tracks, target, toggle) {
+    this.place = place;
     this.entries = tracks.map((track, k) => {
       const row = element("div", "entry");
       const button = element("button", "");
@@ -29,21 +30,37 @@ export class Legend {
       place.append(row);
       return { track, mark, note };
     });
+    if (!target) return;
+    const row = element("div", "entry target");
+    this.where = element("span", "");
+    row.append(element("i", "cross", "✛"), this.where);
+    place.append(row);
+    this.aim(target);
+  }
+
+  /** The target is at a position (m) now; null stands for a free coordinate. */
+  aim(target) {
     this.target = target;
-    if (target) {
-      const row = element("div", "entry target");
-      row.append(element("i", "cross", "✛"), element("span", "", `target ${position(target)}`));
-      place.append(row);
-    }
+    const text = `target ${position(target)}`;
+    if (this.where.textContent !== text) this.where.textContent = text;
+  }
+
+  /** One more entry, which is no button: a line of a colour. */
+  add(colour, name) {
+    const row = element("div", "entry target");
+    const mark = element("i", "");
+    mark.style.background = colour;
+    row.append(mark, element("span", "", name));
+    this.place.append(row);
+    return mark;
   }
 
   /** Notes beside the names: the state of the drawn row, and the distance of the tip to the target. */
   note(robots) {
     robots.forEach(({ moment, tip }, k) => {
       const words = [];
-      if (this.target && robots[k].track.wanted) {
-        const [a, b] = [tip, this.target];
-        words.push(`tip to target ${distance(Math.hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2]))}`);
+      if (this.target && robots[k].track.wanted && !robots[k].overlay) {
+        words.push(`tip to target ${distance(apart(tip, this.target))}`);
       }
       if (!moment.solved) words.push("not solved");
       else if (moment.coarse) words.push("grid too coarse");

@@ -1,7 +1,7 @@
 // The panels beside the picture: the distance of the tips, and any quantity over time.
 import { QUANTITY, rampStyle } from "viewer/colours";
 import { Plot, dashStyle, errorLines, fieldLines } from "viewer/plots";
-import { distance, length, quantity } from "viewer/units";
+import { apart, distance, length, quantity, rough } from "viewer/units";
 
 const $ = (id) => document.getElementById(id);
 
@@ -9,9 +9,12 @@ const $ = (id) => document.getElementById(id);
 const ROUNDING = 1e-5;
 
 export class Panels {
-  /** `colours` returns the robots' colours, `seek` goes to a time, `coloured` is called when the rods' colours change. */
-  constructor(tracks, robots, { colours, seek, coloured }) {
-    Object.assign(this, { tracks, robots, colours, coloured });
+  /**
+   * `colours` returns the robots' colours, `seek` goes to a time, `coloured` is called when the rods' colours change,
+   * and `target` returns the distances of a moving target, or null.
+   */
+  constructor(tracks, robots, { colours, seek, coloured, target = () => null }) {
+    Object.assign(this, { tracks, robots, colours, coloured, target });
     this.errorPlot = new Plot($("error-plot"), seek);
     this.statePlot = new Plot($("state-plot"), seek);
     const names = new Map();
@@ -116,8 +119,8 @@ export class Panels {
 
   /** Lines anew, after a robot was shown or hidden or the colours changed. */
   renew() {
-    this.errors = errorLines(this.tracks, this.colours());
-    $("error-panel").hidden = this.tracks.length < 2;
+    this.errors = errorLines(this.tracks, this.colours(), this.target());
+    $("error-panel").hidden = this.tracks.length < 2 && !this.target();
     this.errorPlot.show(this.errors, "mm");
     this.plotState();
   }
@@ -126,17 +129,28 @@ export class Panels {
   at(time) {
     this.errorPlot.at(time);
     this.statePlot.at(time);
+    this.#distances(time);
+  }
+
+  #distances(time) {
     const [first, ...others] = this.tracks;
     const a = first.tipAt(time);
+    const target = a && this.target(time);
     const words = others.flatMap((track) => {
       const b = a && track.wanted && track.tipAt(time);
-      return b ? [distance(Math.hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2]))] : [];
+      const between = b && apart(a, b);
+      return b ? [target ? `${track.name} ${rough(between)}` : distance(between)] : [];
     });
-    $("error-now").textContent = `to ${first.name}${words.length ? `: ${words.join(", ")}` : ""}`;
+    if (target?.now !== undefined) words.unshift(`target ${rough(target.now)}`);
+    const text = `to ${first.name}${words.length ? `: ${words.join(", ")}` : ""}`;
+    if ($("error-now").textContent !== text) $("error-now").textContent = text;
   }
 
   /** New numbers of a live robot. */
   live(time) {
+    this.errorPlot.renew(errorLines(this.tracks, this.colours(), this.target()));
+    this.errorPlot.time = time;
+    this.#distances(time);
     this.statePlot.renew(this.stateLines());
     this.statePlot.time = time;
     if ($("colour-rods").checked) this.colourRods();

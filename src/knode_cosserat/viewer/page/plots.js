@@ -133,10 +133,11 @@ export function fieldLines(tracks, colours, name, component, node) {
   return lines;
 }
 
-/** Distances (mm) of the other tips from that of the first trajectory, at their own times. */
-export function errorLines(tracks, colours) {
+/** Distances (mm) of the other tips from that of the first trajectory, at their own times, and of a moving target. */
+export function errorLines(tracks, colours, target = null) {
   const [first, ...others] = tracks;
-  return others.flatMap((track, k) => {
+  const moving = target ? [{ ...target, colour: style("--target"), dash: 2 }] : [];
+  return moving.concat(others.flatMap((track, k) => {
     if (!track.wanted) return [];
     const values = track.times.map((t, row) => {
       const a = track.solved[row] ? track.tip(row) : null;
@@ -144,7 +145,7 @@ export function errorLines(tracks, colours) {
       return b ? 1000 * Math.hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2]) : null;
     });
     return [{ label: track.name, times: track.times, values, colour: colours[k + 1], dash: 0 }];
-  });
+  }));
 }
 
 export const dashStyle = (c) => ["solid", "dashed", "dotted", "dash-dot"][c % 4];

@@ -11,26 +11,36 @@ const ALONG = new THREE.Quaternion().setFromUnitVectors(UP, new THREE.Vector3(0,
 const PLATE = 0.45;
 /** Opacity of a row that is not solved, or on too coarse a grid. */
 const FADED = 0.35;
+/** Opacity of an overlay, and its radius in radii of the robot that it surrounds. */
+const OVERLAY = 0.45;
+const AROUND = 2.6;
 
 export class RobotModel {
   constructor(track, colour, index, size) {
     Object.assign(this, { track, size, index });
+    // an overlay, such as an estimate, surrounds another robot and has only its rods
+    this.overlay = Boolean(track.overlay);
     const { drawing, nodes } = track;
     this.group = new THREE.Group();
     this.colour = new THREE.Color(colour);
     this.material = new THREE.MeshStandardMaterial({
       color: this.colour, emissive: this.colour, emissiveIntensity: 0.22, roughness: 0.5, transparent: true,
       // trajectories that lie on each other do not flicker
-      polygonOffset: true, polygonOffsetFactor: index, polygonOffsetUnits: index,
+      polygonOffset: true, polygonOffsetFactor: index, polygonOffsetUnits: index, depthWrite: !this.overlay,
     });
     this.points = new Float32Array(3 * nodes);
     this.turns = track.orientation ? new Float32Array(4 * nodes) : null;
     this.parts = { rods: [], tendons: [], ribs: [], frames: [], path: [], base: [] };
     this.#rods();
-    if (this.turns && drawing.tendons) this.#tendons(drawing.tendons);
-    this.#ribs(drawing.ribs);
-    if (this.turns) this.#frames();
-    this.#base();
+    this.ribs = [];
+    this.bases = [];
+    this.baseHeight = 0;
+    if (!this.overlay) {
+      if (this.turns && drawing.tendons) this.#tendons(drawing.tendons);
+      this.#ribs(drawing.ribs);
+      if (this.turns) this.#frames();
+      this.#base();
+    }
     this.#path();
     this.lines = [...this.#rodLines(), ...this.#tendonLines()];
   }
@@ -52,12 +62,14 @@ export class RobotModel {
     this.rods = [];
     this.outlines = [];
     // a segment should be seen even of a rod that is very thin
-    const seen = (r) => Math.max(r, 0.0025 * this.size);
+    const seen = (r) => (this.overlay ? AROUND : 1) * Math.max(r, 0.0025 * this.size);
     this.radii = track.drawing.radii.map(seen);
     if (track.curves.length === 0) {
       const tube = new Tube(track.nodes, this.material, { parts, coloured: true });
       this.rods.push({ tube, radii: this.radii, points: this.points });
-      this.#add("rods", tube.mesh);
+      this.#add("rods", tube.mesh, !this.overlay);
+      // drawn first, so that the robot within shines in its own colour
+      if (this.overlay) tube.mesh.renderOrder = -1;
     }
     for (const { shape, array } of track.curves) {
       const count = track.arrays[array].width / 3;
@@ -194,7 +206,7 @@ export class RobotModel {
     for (let row = Math.max(0, track.rows - last); row < track.rows; row++)
       if (track.solved[row]) this.pathRows.push(row);
     const points = new Float32Array(this.pathRows.flatMap((row) => track.tip(row)));
-    if (this.pathRows.length < 2) return;
+    if (this.pathRows.length < 2 || this.overlay) return;
     this.path = new Tube(this.pathRows.length, this.pathMaterial, { parts: 1, sides: 5 });
     this.path.update(points, 0.0016 * this.size);
     this.#add("path", this.path.mesh, false);
@@ -254,7 +266,7 @@ export class RobotModel {
     }
     if (this.axes) this.#orient();
     this.path?.until(Math.max(0, this.pathRows.filter((row) => row <= moment.drawn).length - 1));
-    const opacity = moment.solved && !moment.coarse ? 1 : FADED;
+    const opacity = (moment.solved && !moment.coarse ? 1 : FADED) * (this.overlay ? OVERLAY : 1);
     for (const material of [this.material, this.tendonMaterial]) if (material) material.opacity = opacity;
     if (this.plateMaterial) this.plateMaterial.opacity = PLATE * opacity;
     return moment;

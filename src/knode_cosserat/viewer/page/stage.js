@@ -279,6 +279,22 @@ export class Stage {
     return k < 0 ? null : { ...cells[k], groups: cells.length > 1 ? [this.shown[k]] : this.shown };
   }
 
+  /** The place of point n of points (n × 3) in a part of the picture (px), its depth, and the pixels of a metre there. */
+  project(points, n, { x, y, width, height }) {
+    const { camera } = this;
+    const point = new THREE.Vector3(points[3 * n], points[3 * n + 1], points[3 * n + 2]);
+    const away = point.distanceTo(camera.position);
+    point.project(camera);
+    const scale = height / (2 * Math.tan((0.5 * camera.fov * Math.PI) / 180) * away);
+    return { x: x + 0.5 * (1 + point.x) * width, y: y + 0.5 * (1 - point.y) * height, depth: point.z, scale };
+  }
+
+  /** The ray from the camera through a place (px) in a part of the picture. */
+  ray(px, py, { x, y, width, height }) {
+    const towards = new THREE.Vector3((2 * (px - x)) / width - 1, 1 - (2 * (py - y)) / height, 0.5).unproject(this.camera);
+    return new THREE.Ray(this.camera.position.clone(), towards.sub(this.camera.position).normalize());
+  }
+
   /** When what was asked for is drawn: nothing waits for it in the meantime. */
   async finished() {
     const gl = this.renderer.getContext();

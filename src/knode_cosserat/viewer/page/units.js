@@ -10,12 +10,37 @@ export function short(value) {
 
 /** A number with its unit; none is written for numbers without a unit. */
 export function quantity(value, unit) {
-  return unit && unit !== "1" ? `${short(value)} ${unit}` : short(value);
+  return quantityText(short(value), unit);
 }
+
+/** A number with its standard deviation and its unit, such as "(2.200 ± 0.009)·10⁹ Pa". */
+export function uncertain(value, deviation, unit) {
+  const size = Math.abs(value) || deviation;
+  const power = size >= 1e4 || size < 1e-2 ? 3 * Math.floor(Math.log10(size) / 3 + 1e-9) : 0;
+  if (!Number.isFinite(power) || !(deviation > 0)) return quantity(value, unit);
+  const [x, s] = [value, deviation].map((each) => each / 10 ** power);
+  const digits = Math.min(6, Math.max(0, -Math.floor(Math.log10(s))));
+  const words = `${x.toFixed(digits)} ± ${s.toFixed(digits)}`;
+  const exponent = String(power).replace("-", "⁻").replace(/\d/g, (d) => "⁰¹²³⁴⁵⁶⁷⁸⁹"[d]);
+  return quantityText(power ? `(${words})·10${exponent}` : words, unit);
+}
+
+const quantityText = (text, unit) => (unit && unit !== "1" ? `${text} ${unit}` : text);
 
 /** A distance in mm. Positions are float32: below a micrometre nothing is known. */
 export function distance(metres) {
   return metres < 1e-6 ? "< 0.001 mm" : `${short(1000 * metres)} mm`;
+}
+
+/** The distance (m) of two points; coordinates that are null in the second one are free. */
+export function apart(a, b) {
+  return Math.hypot(...a.map((x, k) => (b[k] === null ? 0 : x - b[k])));
+}
+
+/** A distance in mm with few digits, for one that changes all the time. */
+export function rough(metres) {
+  const size = 1000 * metres;
+  return `${size.toFixed(size >= 100 ? 0 : size >= 10 ? 1 : 2)} mm`;
 }
 
 /** A length in the unit that suits it. */
@@ -25,5 +50,5 @@ export function length(metres) {
 
 /** A position in m, to a tenth of a millimetre. */
 export function position(point) {
-  return `(${point.map((x) => String(+x.toFixed(4))).join(", ")}) m`;
+  return `(${point.map((x) => (x === null ? "free" : String(+x.toFixed(4)))).join(", ")}) m`;
 }
