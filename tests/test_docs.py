@@ -74,6 +74,7 @@ def folder(tmp_path, monkeypatch):
         "knode_cosserat.view", lambda scene, **more: kc.viewer.export_scene(scene, "s.html", **more)
     )
     monkeypatch.setattr("knode_cosserat.viewer.view_live", lambda robot: kc.solvers.Stepper(robot, 0.05))
+    monkeypatch.setattr("knode_cosserat.viewer.control_live", lambda controller, plant: plant.tip())
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     return tmp_path
 

@@ -57,22 +57,47 @@ def _plant(text: str | None, model: Any, dt: float, sensor: Any) -> Any:
     return ElasticaPlant.like(robot, dt, sensor, Imperfections(**changes))
 
 
+def _live(
+    controller: Any, plant: Any, title: str, viewing: tuple[Path | None, int, bool], as_json: bool
+) -> Any:
+    """Show the loop in the browser until Ctrl-C; return the log of the last run, or None.
+
+    `viewing` are the file to export to, the port, and True if the browser is to be opened.
+    """
+    from knode_cosserat import viewer
+
+    export, port, opens = viewing
+
+    def announce(address: str) -> None:
+        write_output(as_json, {"address": address}, [f"the viewer is at {address} (Ctrl-C ends it)"])
+        if opens:
+            viewer.serve.open_page(address)
+
+    return viewer.control_live(
+        controller, plant, title=title, export=export, port=port, open_browser=announce
+    )
+
+
 @app.command(
     epilog=examples(
         "control delrin-tendon-robot --reference circle:radius=0.1,period=4",
         "control my-model.knode --plant my-robot.yaml --reference path.csv --adapt youngs_modulus",
         "control found.yaml --plant elastica:my-robot.yaml,friction=0.2 --lag 0.06 --reference path.csv",
+        "control delrin-tendon-robot --live",
     )
 )
 def control(
     robot: Robot,
     reference: Annotated[
-        str,
+        str | None,
         typer.Option(
             metavar="NAME|CSV",
             help="Wanted tip: circle:radius=0.1,period=4, eight:radius=0.1,period=6, or a CSV table.",
         ),
-    ],
+    ] = None,
+    live: Annotated[
+        bool, typer.Option("--live", help="Open the viewer: the tip follows a target that you drag.")
+    ] = False,
     plant: Annotated[
         str | None,
         typer.Option(
@@ -120,6 +145,17 @@ def control(
     figure: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Draw path, error and controls into this file.")
     ] = None,
+    export: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="With --live: at the end, write the last run as one HTML file."),
+    ] = None,
+    port: Annotated[
+        int,
+        typer.Option(
+            metavar="N", help="With --live: port of the local web server.", show_default="any free port"
+        ),
+    ] = 0,
+    no_open: Annotated[bool, typer.Option("--no-open", help="With --live: do not open the browser.")] = False,
     changes: Changes = None,
     as_json: Json = False,
 ) -> None:
@@ -127,8 +163,13 @@ def control(
 
     ROBOT is the model that predicts. The controlled robot is simulated; it may be another one (--plant), so
     that the effect of a wrong model is seen. Controls stay within --low, --high and --rate in every period.
+    With --live, the target is dragged in the browser, and the report is of the last run, until Ctrl-C.
     """
-    for path in (out, figure):
+    if live == (reference is not None):
+        raise ValueError("give either --reference, or --live to drag the target in the browser")
+    if not live and (export is not None or port or no_open):
+        raise ValueError("--export, --port and --no-open are of the viewer; use them with --live")
+    for path in (out, figure, export):
         if path is not None:
             require_writable(path)
     from knode_cosserat import control as kcc
@@ -138,12 +179,17 @@ def control(
     count = model.control_size
     ends = parse_limits("--low", low, count), parse_limits("--high", high, count)
     limits = kcc.ControlLimits(*ends, rate, lag=lag)
-    wanted = _reference(reference)
     if method not in CONTROLLERS:
         raise ValueError(f"--method is {method!r}; allowed is {', '.join(CONTROLLERS)}")
     controller = kcc.controller_named(method, model, dt, limits, adapt or (), TipPosition(sigma=deviation))
     controlled = _plant(plant, model, dt, kcc.Sensor(TipPosition(), noise))
-    log = kcc.run_loop(controller, controlled, wanted, seconds)
+    if reference is None:
+        title = robot if plant is None else f"{plant}, controlled by {robot}"
+        log = _live(controller, controlled, str(title), (export, port, not no_open), as_json)
+        if log is None:
+            return
+    else:
+        log = kcc.run_loop(controller, controlled, _reference(reference), seconds)
     if out is not None:
         log.to_csv(out)
     if figure is not None:
@@ -152,7 +198,7 @@ def control(
         closed_loop(log).savefig(figure)
     length = float(model.nominal.length)
     facts = log.summary() | {"tip_rmse_percent": 100.0 * log.tip_rmse(min(5.0, 0.5 * seconds)) / length}
-    write_output(as_json, facts, _lines(facts, log), out=out)
+    write_output(as_json, facts, _lines(facts, log), out=out, export=export)
 
 
 def _lines(facts: dict[str, Any], log: Any) -> list[str]:
