@@ -1,10 +1,10 @@
-"""Physical parameters that are adapted while a robot runs."""
+"""Physical parameters, and coefficients of a learned residual, that are adapted while a robot runs."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -18,16 +18,21 @@ from knode_cosserat.rods.system import System
 RELATIVE = 0.3
 #: coordinates stay within so many standard deviations
 WIDEST = 4.0
+#: largest number of coordinates: each costs a tangent in every period
+MOST = 40
 
 
 @dataclasses.dataclass(frozen=True)
 class Adapted:
     """One parameter of a robot that is adapted: a number, the components of a vector, or a matrix as a whole.
 
+    Coefficients of a model's learned residual are adapted one by one, all together ("residual") or those of
+    one part ("residual.damping").
+
     Attributes:
-        name: as in `System.replace`, such as "youngs_modulus" or "loads.0.mass".
+        name: as in `System.replace`, such as "youngs_modulus", "loads.0.mass" or "residual.damping".
         deviation: standard deviation of its initial uncertainty, in its unit; None: 30 % of its value. That
-            of a matrix is a part of its value.
+            of a matrix is a part of its value, that of coefficients 30 % of their root mean square.
         drift: standard deviation of its change in one second, as a part of `deviation`.
     """
 
@@ -43,7 +48,7 @@ class AdaptedParameters(eqx.Module):
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
-    #: True for each that is searched by its logarithm, and for each that is a vector
+    #: True for each that is searched by its logarithm, and for each whose numbers are searched one by one
     logarithmic: tuple[bool, ...] = eqx.field(static=True)
     vector: tuple[bool, ...] = eqx.field(static=True)
     values: tuple[Any, ...]
@@ -57,15 +62,23 @@ class AdaptedParameters(eqx.Module):
         """Look up the parameters.
 
         Raises:
-            ParameterError: a parameter that does not exist, is zero and has no deviation, or has no value.
+            ParameterError: a parameter that does not exist, is zero and has no deviation, or has no value,
+                or more than `MOST` numbers.
         """
-        given = [Adapted(each) if isinstance(each, str) else each for each in adapted]
+        given = [part for each in adapted for part in _parts_of_residual(robot, each)]
         self.names = tuple(each.name for each in given)
         parts = [_part(robot, each) for each in given]
         self.values = tuple(value for value, _, _ in parts)
         self.deviations = tuple(np.asarray(deviation) for _, deviation, _ in parts)
         self.logarithmic = tuple(log for _, _, log in parts)
-        self.vector = tuple(value.ndim == 1 for value in self.values)
+        self.vector = tuple(
+            value.ndim == 1 or name.startswith(RESIDUAL)
+            for value, name in zip(self.values, self.names, strict=True)
+        )
+        if self.size > MOST:
+            raise ParameterError(
+                f"{self.size} numbers are to be adapted ({', '.join(self.names)}); allowed are at most {MOST}"
+            )
         self.drift = np.repeat(np.array([each.drift for each in given], dtype=float), self.sizes)
         ends = [self._ends(robot, k) for k in range(len(given))]
         self.bounds = np.repeat(np.array(ends, dtype=float).reshape(-1, 2), self.sizes, axis=0).T
@@ -105,7 +118,7 @@ class AdaptedParameters(eqx.Module):
         numeric: Any = np if isinstance(x, np.ndarray) else jnp
         for k, size in enumerate(self.sizes):
             value, deviation = self.values[k], self.deviations[k]
-            moved = x[first : first + size] if self.vector[k] else x[first]
+            moved = x[first : first + size].reshape(value.shape) if self.vector[k] else x[first]
             # a logarithm's deviation is relative
             log = self.logarithmic[k]
             found.append(value * numeric.exp(deviation * moved) if log else value + deviation * moved)
@@ -119,7 +132,44 @@ class AdaptedParameters(eqx.Module):
         return robot.replace(**dict(zip(self.names, self.numbers(x), strict=True)))
 
 
+#: beginning of the names of a residual's coefficients
+RESIDUAL = "residual"
+
+
+def _parts_of_residual(robot: System, adapted: Adapted | str) -> list[Adapted]:
+    """Return the parameter, or one for each part of the residual's coefficients if all are wanted.
+
+    Parts that are all zero, and have no deviation, are left out.
+    """
+    given = Adapted(adapted) if isinstance(adapted, str) else adapted
+    if given.name != RESIDUAL:
+        return [given]
+    parts = robot.coefficients() if isinstance(robot, Adaptable) else {}
+    kept = [name for name, value in parts.items() if given.deviation is not None or np.any(value)]
+    if not kept:
+        raise ParameterError("there is no learned residual with coefficients that are not zero")
+    return [dataclasses.replace(given, name=f"{RESIDUAL}.{name}") for name in kept]
+
+
+@runtime_checkable
+class Adaptable(Protocol):
+    """A model whose residual has coefficients, which `replace` changes as "residual.NAME"."""
+
+    def coefficients(self) -> dict[str, Any]:
+        """Return the coefficients by the names of their parts."""
+        ...
+
+
 def _looked_up(robot: System, name: str) -> Any:
+    if name.startswith(f"{RESIDUAL}."):
+        parts = robot.coefficients() if isinstance(robot, Adaptable) else {}
+        part = name.removeprefix(f"{RESIDUAL}.")
+        if part not in parts:
+            raise ParameterError(
+                f"there are no coefficients {name!r}; there are "
+                f"{', '.join(f'{RESIDUAL}.{known}' for known in parts) or 'none: the model has no residual'}"
+            )
+        return parts[part]
     found: Any = robot.nominal
     for part in name.split("."):
         try:
@@ -144,10 +194,13 @@ def _part(robot: System, adapted: Adapted) -> tuple[np.ndarray, float, bool]:
         raise ParameterError(f"{name} is {given!r}; allowed is a parameter with a value")
     if deviation is not None and not deviation > 0.0:
         raise ParameterError(f"the deviation of {name} is {deviation}; allowed is above zero")
-    if value.ndim == 2:
+    if name.startswith(RESIDUAL):
+        usual = RELATIVE * float(np.sqrt(np.mean(value**2)))
+        deviation = usual if deviation is None and usual > 0.0 else deviation
+    elif value.ndim == 2:
         return value, RELATIVE if deviation is None else float(deviation), True
-    if value.ndim == 0 and value > 0.0:
+    elif value.ndim == 0 and value > 0.0:
         return value, RELATIVE if deviation is None else float(deviation / value), True
     if deviation is None:
-        raise ParameterError(f"{name} is {given}: give its deviation, in its unit")
+        raise ParameterError(f"{name} is {value.tolist()}: give its deviation, in its unit")
     return value, float(deviation), False

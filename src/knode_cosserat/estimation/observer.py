@@ -132,6 +132,8 @@ class KalmanObserver:
         self.control = np.asarray(at_start.control, dtype=float)
         self.record = np.asarray(at_start.record)
         self._rollback: Rollback | None = None
+        #: the last measurement, until `predict` has compared parameters by it
+        self._last: np.ndarray | None = None
         used, n = used_places(robot, settings.space), self.parameters.size
         rows = np.zeros((self.columns, 2, used, past.records.shape[-1]))
         coordinates = np.eye(self.columns, n)
@@ -186,9 +188,9 @@ class KalmanObserver:
 
     def _numbers(self, x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         """Return the adapted numbers at coordinates; a matrix by its first one."""
-        parts = self.parameters.numbers(x)
+        parts = zip(self.parameters.numbers(x), self.parameters.vector, strict=True)
         return np.concatenate(
-            [np.zeros(0), *(part if np.ndim(part) == 1 else np.ravel(part)[:1] for part in parts)]
+            [np.zeros(0), *(np.ravel(part) if vector else np.ravel(part)[:1] for part, vector in parts)]
         )
 
     def predict(self, control: Float[np.ndarray, " c"]) -> None:
@@ -202,6 +204,7 @@ class KalmanObserver:
             raise ValueError(
                 f"the control is {control.tolist()}; allowed are {self.robot.control_size} finite numbers"
             )
+        self._roll_back()
         nothing = np.full((1, self.output.size), np.nan)
         found = predicted_motion(
             self.model, self.belief, control[None], nothing, self._deviations(), self.output
@@ -310,13 +313,16 @@ class KalmanObserver:
         self.belief = moved._replace(spread=moved.spread.combined(remaining))
         self.record = self.record + records[0][grid_of(self.robot).nodes]
         self._slopes = remaining.T @ self._slopes
-        self._roll_back(measured)
+        self._last = np.asarray(measured, dtype=float)
         return coordinates
 
-    def _roll_back(self, measured: Float[np.ndarray, " p"]) -> None:
-        """Return to earlier parameters where those predict the last second better."""
-        earlier = None
-        if self._rollback is not None:
+    def _roll_back(self) -> None:
+        """Return to earlier parameters where those predict the last second better.
+
+        It belongs to `predict`, because it takes longer than a controller may wait for a correction.
+        """
+        earlier, measured, self._last = None, self._last, None
+        if self._rollback is not None and measured is not None:
             earlier = self._rollback.measured(measured, np.asarray(self.belief.x))
         if earlier is not None:
             self.belief = self.belief._replace(x=earlier)

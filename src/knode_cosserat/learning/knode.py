@@ -88,6 +88,25 @@ class KNODE(Wrapped):
         """Return the model's own training range, else the nominal model's."""
         return self.trained if self.trained is not None else self.knowledge.trained_range()
 
+    def coefficients(self) -> dict[str, Any]:
+        """Return the numbers in which the residual is linear; `replace` knows them as "residual.NAME"."""
+        return self.residual.coefficients()
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a copy with other parameters of the nominal model, or other coefficients of the residual.
+
+        The latter are named as in `coefficients`, such as `residual.damping`.
+
+        Raises:
+            ParameterError: a name that does not exist, a value that is not allowed.
+        """
+        own = {name: changes.pop(name) for name in list(changes) if name.startswith("residual.")}
+        found = super().replace(**changes) if changes else self
+        if not own:
+            return found
+        numbers = {name.removeprefix("residual."): value for name, value in own.items()}
+        return type(self)(found.knowledge, self.residual.with_coefficients(numbers), self.about, self.trained)
+
     def save(self, path: Any) -> None:
         """Write the model to a file (see `model_file.save`)."""
         provided(type(self), "save")(self, path)

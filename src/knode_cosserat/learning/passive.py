@@ -74,6 +74,7 @@ class Passive(Residual):
     """
 
     fixed: ClassVar[tuple[str, ...]] = ("sizes", "energy_weights", "damping_weights")
+    linear_in: ClassVar[tuple[str, ...]] = PARTS
 
     #: (terms, 3): coefficients of 1, σ and x̄; each a symmetric matrix ((a + b, c), (c, a - b))
     stiffness: Float[Any, "3 3"]

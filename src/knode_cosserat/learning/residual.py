@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+from collections.abc import Mapping
 from typing import Any, ClassVar, Self
 
 import equinox as eqx
@@ -14,6 +15,7 @@ from jaxtyping import Float
 from knode_cosserat._reprs import count_of
 from knode_cosserat.learning.config import NetworkOptions
 from knode_cosserat.rods.layout import Field, Layout
+from knode_cosserat.rods.parameters import ParameterError
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.semi_discrete import Point
@@ -24,6 +26,8 @@ class Residual(eqx.Module):
 
     #: attributes that gradient training does not change (nested modules may have their own)
     fixed: ClassVar[tuple[str, ...]] = ()
+    #: paths of the attributes in which the correction is linear (near zero), such as "load.material.weights"
+    linear_in: ClassVar[tuple[str, ...]] = ()
 
     def __repr__(self) -> str:
         numbers = sum(int(np.size(leaf)) for leaf in jax.tree.leaves(self) if eqx.is_array(leaf))
@@ -75,6 +79,36 @@ class Residual(eqx.Module):
         """Return the nearest residual with allowed weights; training calls it after every update."""
         return self
 
+    def coefficients(self) -> dict[str, Float[Any, "..."]]:
+        """Return the arrays of `linear_in` by their paths; those that do not exist are left out."""
+        found = {path: _at(self, path) for path in self.linear_in}
+        return {path: value for path, value in found.items() if value is not None}
+
+    def with_coefficients(self, changes: Mapping[str, Any]) -> Self:
+        """Return a copy with other coefficients, which may be traced.
+
+        Raises:
+            ParameterError: a path that does not exist, or an array of another shape.
+        """
+        known = self.coefficients()
+        for path, value in changes.items():
+            if path not in known:
+                there = ", ".join(f"residual.{name}" for name in known) or "none"
+                raise ParameterError(f"there are no coefficients 'residual.{path}'; there are {there}")
+            if np.shape(value) != np.shape(known[path]):
+                raise ParameterError(
+                    f"residual.{path} has shape {np.shape(value)}; allowed is {np.shape(known[path])}"
+                )
+        names = list(changes)
+        return eqx.tree_at(lambda own: [_at(own, name) for name in names], self, [*changes.values()])
+
+
+def _at(owner: Any, path: str) -> Any:
+    """Return the attribute at a path with dots; None if it or an owner of it is None."""
+    for name in path.split("."):
+        owner = None if owner is None else getattr(owner, name)
+    return owner
+
 
 class Nothing(Residual):
     """No residual: the nominal model unchanged."""
@@ -118,6 +152,7 @@ class Network(Residual):
     """
 
     fixed: ClassVar[tuple[str, ...]] = ("input_mean", "input_scale", "output_scale")
+    linear_in: ClassVar[tuple[str, ...]] = ("output_weights", "output_biases")
 
     #: (hidden, inputs) and (hidden,)
     input_weights: Float[Any, "hidden inputs"]

@@ -351,7 +351,8 @@ def as_markdown(cells: Sequence[Mapping[str, Any]], made: Sequence[Mapping[str, 
         for controller in dict.fromkeys(cell["controller"] for cell in cells):
             own = {c["reference"]: c for c in cells if c["robot"] == name and c["controller"] == controller}
             if own:
-                rows.append([name, controller, *(f"{own[path]['rmse_percent']:.3g}" for path in paths)])
+                tracked = [f"{own[path]['rmse_percent']:.3g}" if path in own else "not run" for path in paths]
+                rows.append([name, controller, *tracked])
     checked = [[c["check"], f"{c['value']:.3g}", f"{c['limit']:g}", "yes" if c["ok"] else "no"] for c in made]
     return "\n\n".join(
         [
@@ -360,6 +361,6 @@ def as_markdown(cells: Sequence[Mapping[str, Any]], made: Sequence[Mapping[str, 
             f"% of the length from {SETTLED:g} to {SECONDS:g} s; after a step from {TRANSIT:g} s on.",
             markdown_table(["robot", "controller", *paths], rows),
             markdown_table(["check", "value", "limit", "met"], checked),
-        ]
             *([] if any(cell["robot"] == stand_in.ROBOT for cell in cells) else [stand_in.MISSING]),
+        ]
     ) + "\n"  # fmt: skip

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.control.commands import Command, Controller, ControlLimits, Status
+from knode_cosserat.control.lag import lagged
 from knode_cosserat.control.plans import Knots
 from knode_cosserat.control.program import Tracking, Weights, applied_changes
 from knode_cosserat.control.qp import QPSolver, solver_named
@@ -159,7 +160,7 @@ class KoopmanController(Controller):
 def training_motions(
     robot: System, dt: float, target: Output, limits: ControlLimits, seed: int
 ) -> tuple[Float[np.ndarray, "B T p"], Float[np.ndarray, "B T c"]]:
-    """Return outputs and controls of simulated motions under random controls within limits and rates."""
+    """Return outputs and commands of simulated motions under random commands within limits and rates."""
     steps = round(SECONDS / dt)
     rng = np.random.default_rng(seed)
     low, high = np.asarray(limits.low), np.asarray(limits.high)
@@ -172,7 +173,8 @@ def training_motions(
             if k % max(1, round(HELD / dt)) == 0:
                 wanted = low + wide * rng.uniform(size=len(low)) * (high - low)
             control = motion[k] = limits.applied(control + 0.3 * (wanted - control), control, dt)
-    found = simulate(robot, controls, dt)
+    acting = np.array([lagged(each, dt, limits.lag, limits.safe) for each in controls])
+    found = simulate(robot, acting, dt)
     y, z = np.asarray(found.y)[:, :-1], np.asarray(found.z)[:, :-1]
     outputs = [
         [np.asarray(target.value(robot, *state)) for state in zip(ys, zs, strict=True)]

@@ -12,7 +12,7 @@ The geometry (p_s, h_s, q_s, ω_s of a rod) stays exact, and the laws do not dep
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -114,6 +114,11 @@ def solved_strains(law: _Law) -> Float[Any, " z"]:
 
 class Structured(Residual):
     """Structured residual (see the module). Unused parts are None, and cost nothing."""
+
+    linear_in: ClassVar[tuple[str, ...]] = (
+        "stretch", "stress.weights", "load.material.weights", "load.ambient.weights",
+        "tip_load.material.weights", "tip_load.ambient.weights",
+    )  # fmt: skip
 
     stretch: Float[Any, ""]
     stress: Expansion | None
