@@ -18,7 +18,7 @@ from knode_cosserat.estimation import (
     TipPosition,
 )
 from knode_cosserat.estimation.adapted import AdaptedParameters
-from knode_cosserat.rods.loads import AttachedMass
+from knode_cosserat.rods.loads import AttachedMass, PointWrench
 from knode_cosserat.solvers import Stepper
 
 DT = 0.05
@@ -169,3 +169,18 @@ def test_the_boundary_observer_converges_to_a_loaded_robot(still):
     assert np.linalg.norm(np.asarray(observer.state.tip_position[-1]) - tip) < 0.15 * start
     with pytest.raises(ValueError, match="allowed is a rod with loads"):
         BoundaryObserver(kc.load_robot("six-legged-robot"), DT)
+
+
+def test_an_unknown_force_at_the_tip_is_found():
+    """From the noisy position of the tip alone, within 10 % after six seconds of movement."""
+    model, force = ROBOT.replace(loads=(PointWrench(),)), np.array([0.06, -0.04, 0.05])
+    truth = Stepper(model.replace(**{"loads.0.force": force}), DT)
+    observer = KalmanObserver(model, DT, TipPosition(), adapt=[Adapted("loads.0.force", 0.1)])
+    rng = np.random.default_rng(0)
+    for k in range(120):
+        observer.update(np.asarray(truth.state.tip_position[-1]) + 2e-4 * rng.normal(size=3))
+        control = TENSION + 1.5 * np.sin(4.0 * k * DT + np.arange(4))
+        truth.step(control)
+        observer.predict(control)
+    found = np.array(list(observer.estimate.parameters.values()))
+    assert np.linalg.norm(found - force) < 0.1 * np.linalg.norm(force)
