@@ -154,6 +154,30 @@ def test_factors_serve_for_other_residuals():
     assert_solves(tuple(map(np.asarray, found)), equations)
 
 
+@pytest.mark.parametrize(("implicit", "strands"), [(True, 1), (False, 1), (True, 3)])
+def test_many_corrections_at_once_are_each_by_itself(implicit, strands):
+    several = [Equations(10, 1.3, seed, implicit=implicit, strands=strands) for seed in range(4)]
+    first = several[0]
+    factors = jax.jit(factored)(first.linearisation, first.pivots)
+
+    def solved(which):
+        data = (
+            np.stack([getattr(each, name) for each in which], axis=-1) for name in ("defects", "tip", "base")
+        )
+        return jax.jit(solved_correction)(factors, first.pivots, *data)
+
+    together, alone = (
+        solved(several),
+        [
+            jax.jit(solved_correction)(factors, first.pivots, each.defects, each.tip, each.base)
+            for each in several
+        ],
+    )
+    for k, own in enumerate(alone):
+        for found, expected in zip(together, own, strict=True):
+            np.testing.assert_allclose(found[..., k], expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
 def condensed(equations):
     """δy_j = X_j δξ + w_j from base to tip, δξ by the tip's conditions: what the Riccati form replaces."""
     X, w, each = equations.S, np.zeros(len(equations.S)), []

@@ -20,7 +20,7 @@ from knode_cosserat.estimation.outputs import Output
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.history import StateHistory, coefficient_table
-from knode_cosserat.solvers.sensitivity import BY_COLUMN, TangentState, tangent_time_loop
+from knode_cosserat.solvers.sensitivity import TangentState, tangent_time_loop
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.tangent import SystemMoves
 from knode_cosserat.solvers.time_loop import StepCoefficients, time_loop
@@ -100,25 +100,30 @@ class OnlineModel(eqx.Module):
         system, directions = self.at(belief.x), self.directions(belief.x)
         settings, steps, past, spread = self.settings, len(controls), belief.past, belief.spread
         done, after, rows = time_loop(system, settings, self.coefficients, controls, past, (0, steps))
-        state = TangentState.of(system, settings.space, past, spread.records, spread.rate)
-
-        def along(weights: Any, d_controls: Any, state: TangentState) -> Any:
-            solved, moved = (rows.records, rows.unknowns), (SystemMoves(directions, weights), d_controls)
-            return tangent_time_loop(settings, self.coefficients, solved, (system, controls), moved, state)
-
-        columns = jax.vmap(along, in_axes=(0, 0, BY_COLUMN), out_axes=(BY_COLUMN, (0, 0)))
-        last, (d_rows, _) = columns(spread.parameters, d_controls, state)
-        moved = Spread(last.d_records, last.d_rate, spread.parameters)
+        state = TangentState.of(system, settings.space, past, *map(_last, (spread.records, spread.rate)))
+        changes = SystemMoves(directions, _last(spread.parameters)), _last(d_controls)
+        solved = rows.records, rows.unknowns
+        last, (d_rows, _) = tangent_time_loop(
+            settings, self.coefficients, solved, (system, controls), changes, state
+        )
+        moved = Spread(
+            *(jnp.moveaxis(part, -1, 0) for part in (last.d_records, last.d_rate)), spread.parameters
+        )
         after = after._replace(t0=past.t0 + steps * self.coefficients.dt)
         return system, Rollout(after, rows.records, d_rows, moved, done == steps)
 
 
+def _last(columns: Float[Any, "k ..."]) -> Float[Any, "... k"]:
+    """Return an array with its columns in the last axis."""
+    return jnp.moveaxis(jnp.asarray(columns), 0, -1)
+
+
 class Rollout(NamedTuple):
-    """A simulated motion, and the tangents of its rows (columns, steps, N, x)."""
+    """A simulated motion, and the tangents of its rows."""
 
     past: StateHistory
     records: Float[Any, "T N x"]
-    d_records: Float[Any, "k T N x"]
+    d_records: Float[Any, "T N x k"]
     #: history after the last step, along the columns
     spread: Spread
     solved: Any
@@ -131,7 +136,7 @@ def split_record(system: System, record: Any) -> tuple[Any, Any]:
 
 
 def errors_along(
-    system: System, output: Output, records: Float[Any, "T N x"], d_records: Float[Any, "k T N x"],
+    system: System, output: Output, records: Float[Any, "T N x"], d_records: Float[Any, "T N x k"],
     references: Float[Any, "T p"],
 ) -> tuple[Float[Any, "T e"], Float[Any, "k T e"]]:  # fmt: skip
     """Return the errors of an output in every row, and their tangents."""
@@ -141,9 +146,9 @@ def errors_along(
 
     def one(record: Any, reference: Any, d_record: Any) -> Any:
         value, moved = jax.linearize(lambda record: error(record, reference), record)
-        return value, jax.vmap(moved)(d_record)
+        return value, jax.vmap(moved, in_axes=-1)(d_record)
 
-    return jax.vmap(one, in_axes=(0, 0, 1), out_axes=(0, 1))(records, references, d_records)
+    return jax.vmap(one, out_axes=(0, 1))(records, references, d_records)
 
 
 def errors_of(

@@ -24,7 +24,6 @@ from knode_cosserat.solvers.history import constant_history
 from knode_cosserat.solvers.places import Places, places_at, positions_at, quaternions_at
 from knode_cosserat.solvers.run import Equilibria, TimeIntegration, run_one, usable_cores
 from knode_cosserat.solvers.sensitivity import (
-    BY_COLUMN,
     TangentState,
     static_tangents,
     tangent_time_loop,
@@ -201,14 +200,14 @@ class Misfit:
         d_first, d_records = self._static_slopes(still, x, beginning, 1)
         moved = found.records, found.unknowns, acting, slope
         if not steps:
-            d_rows = d_first[:, :0]
+            d_rows = d_first[:0]
         elif isinstance(task, Equilibria):
             d_rows = self._static_slopes(task, x, moved, steps)[0]
         else:
-            both = np.stack([d_records[:, 0]] * 2, axis=1)
-            carry = TangentState.of(system, settings.space, state, both, np.zeros_like(both[:, 0]))
-            d_rows = self._slopes(task, x, moved, steps, carry)[:, compared]
-        d_y = np.concatenate([d_first, d_rows], axis=1)[..., :ny]
+            both = np.stack([d_records[0]] * 2)
+            carry = TangentState.of(system, settings.space, state, both, np.zeros_like(both[0]))
+            d_rows = self._slopes(task, x, moved, steps, carry)[compared]
+        d_y = np.concatenate([d_first, d_rows])[:, :, :ny]
         values, slopes = _with_slopes(system, y, d_y, *self._target(data, seen))
         return Rollout(np.asarray(values), np.asarray(slopes))
 
@@ -219,9 +218,9 @@ class Misfit:
             size = min(PIECE, count - k)
             piece = tuple(_filled(each[k : k + size], PIECE) for each in rows)
             carry, d_rows = _piece(self.model.robot, x, task.settings, steps, piece, carry)
-            parts.append(np.asarray(d_rows)[:, :size])
+            parts.append(np.asarray(d_rows)[:size])
             steps = steps._replace(table=steps.table[[1, 1]])
-        return np.concatenate(parts, axis=1)
+        return np.concatenate(parts)
 
     def _static_slopes(self, task: Equilibria, x: Any, rows: Any, count: int) -> tuple[np.ndarray, Any]:
         """Derivatives of equilibria, and of their records at all places."""
@@ -230,8 +229,8 @@ class Misfit:
             size = min(length, count - k)
             piece = tuple(_filled(each[k : k + size], length) for each in rows)
             found = _static_piece(self.model.robot, x, task.settings, piece)
-            parts.append([np.asarray(each)[:, :size] for each in found])
-        d_rows, d_records = (np.concatenate(each, axis=1) for each in zip(*parts, strict=True))
+            parts.append([np.asarray(each)[:size] for each in found])
+        d_rows, d_records = (np.concatenate(each) for each in zip(*parts, strict=True))
         return d_rows, d_records
 
     def _target(self, data: RecordingData, steps: int) -> tuple[Any, ...]:
@@ -276,14 +275,14 @@ _initial = jax.jit(constant_history, static_argnames="settings")
 
 
 def _directions(robot: ParametrisedRobot, x: Any, by_latency: Any) -> Any:
-    """Return a system, and its tangents and those of its controls by each coordinate, stacked."""
+    """Return a system, its tangents by each coordinate, stacked, and those of its controls (T, c, n)."""
 
     def along(direction: Any) -> Any:
         system, d_system = jax.jvp(robot, (x,), (direction,))
         cells = _cells(d_system)
         return system, d_system, jnp.zeros_like(by_latency) if cells is None else by_latency * cells.latency
 
-    return jax.vmap(along, out_axes=(None, 0, 0))(jnp.eye(len(x)))
+    return jax.vmap(along, out_axes=(None, 0, -1))(jnp.eye(len(x)))
 
 
 @functools.partial(jax.jit, static_argnames="settings")
@@ -293,13 +292,8 @@ def _piece(
     """Return the state after a piece, and derivatives of its rows; `rows` end with controls by latency."""
     records, xi, controls, by_latency = rows
     system, directions, d_controls = _directions(robot, x, by_latency)
-
-    def one(weights: Any, d_controls: Any, state: TangentState) -> Any:
-        changes = SystemMoves(directions, weights), d_controls
-        return tangent_time_loop(settings, steps, (records, xi), (system, controls), changes, state)
-
-    columns = jax.vmap(one, in_axes=(0, 0, BY_COLUMN), out_axes=(BY_COLUMN, (0, 0)))
-    after, (d_rows, _) = columns(jnp.eye(len(x)), d_controls, carry)
+    changes = SystemMoves(directions, jnp.eye(len(x))), d_controls
+    after, (d_rows, _) = tangent_time_loop(settings, steps, (records, xi), (system, controls), changes, carry)
     return after._replace(t0=after.t0 + PIECE * steps.dt), d_rows
 
 
@@ -308,13 +302,9 @@ def _static_piece(robot: ParametrisedRobot, x: Any, settings: Settings, rows: An
     """Return derivatives of a piece's equilibria, and of their records."""
     records, xi, controls, by_latency = rows
     system, directions, d_controls = _directions(robot, x, by_latency)
-
-    def one(weights: Any, d_controls: Any) -> Any:
-        changes = SystemMoves(directions, weights), d_controls
-        found = static_tangents(settings, (records, xi), (system, controls), changes)
-        return found[0], found[2]
-
-    return jax.vmap(one)(jnp.eye(len(x)), d_controls)
+    changes = SystemMoves(directions, jnp.eye(len(x))), d_controls
+    found = static_tangents(settings, (records, xi), (system, controls), changes)
+    return found[0], found[2]
 
 
 @jax.jit
@@ -336,4 +326,4 @@ def _with_slopes(system: Any, y: Any, d_y: Any, places: Places, position: Any, r
     def compared(y: Any) -> Any:
         return _compared(system, y, places, position, rotation)
 
-    return compared(y), jax.vmap(lambda d: jax.jvp(compared, (y,), (d,))[1])(d_y)
+    return compared(y), jax.vmap(lambda d: jax.jvp(compared, (y,), (d,))[1], in_axes=-1)(d_y)

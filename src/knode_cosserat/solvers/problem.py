@@ -46,9 +46,9 @@ def no_history(system: System, space: SpaceScheme) -> Float[Any, "places x"]:
 
 
 def row_of(
-    system: System, y: Float[Any, "points y"], records: Float[Any, "places x"]
-) -> Float[Any, "nodes x"]:
-    """Output row of a solved step: y on the near side of discontinuities, z and y_s on the far side."""
+    system: System, y: Float[Any, "points y ..."], records: Float[Any, "places x ..."]
+) -> Float[Any, "nodes x ..."]:
+    """Return the row of a solved step: y on the near side of discontinuities, z and y_s on the far side."""
     nodes, ny = grid_of(system).nodes, system.y_layout.size
     return jnp.concatenate([taken(y, nodes), taken(records, nodes)[:, ny:]], axis=1)
 

@@ -34,10 +34,10 @@ class Slopes(NamedTuple):
 class Moves(NamedTuple):
     """Tangents of the data of a step: history terms, control, and the system by `SystemMoves`."""
 
-    history: Float[Any, "used x"]
-    control: Float[Any, " c"]
+    history: Float[Any, "used x ..."]
+    control: Float[Any, "c ..."]
     #: weights of the directions of `SystemMoves`
-    weights: Float[Any, " directions"]
+    weights: Float[Any, "directions ..."]
 
 
 class SystemMoves(NamedTuple):
@@ -48,7 +48,7 @@ class SystemMoves(NamedTuple):
 
     #: tangent systems, stacked; None: the system does not change
     directions: Any
-    weights: Float[Any, " directions"]
+    weights: Float[Any, "directions ..."]
 
     @classmethod
     def of(cls, d_system: Any) -> SystemMoves:
@@ -139,22 +139,38 @@ class StepTangent:
         return jax.jvp(values, (self.problem.system,), (d_system,))[1]
 
     def solved(self, moves: Moves) -> tuple[Any, Any, Any]:
-        """Return the tangents of y, of the unknowns, and of the records at the places of the scheme."""
-        problem = self.problem
-        zero = jnp.zeros_like(self.y)
-        reached = problem.reached_by(self.formula, self._chained(zero, moves))
-        tip, base = self._ends(moves)
-        of_system = None
-        if self._by_system is not None:
-            of_system = jax.tree.map(lambda leaf: jnp.tensordot(moves.weights, leaf, 1), self._by_system)
-        if of_system is not None:
-            _, d_reached, d_tip, d_base = of_system
-            reached, tip, base = reached + d_reached, tip + d_tip, base + d_base
-        d_y, d_unknowns = solved_correction(self._factors, pivots_of(problem.system), reached, tip, base)
+        """Return the tangents of y, of the unknowns, and of the records at the places of the scheme.
+
+        Many tangents at once have one more axis everywhere, the last.
+        """
+        many = moves.control.ndim > 1
+
+        def each(function: Callable[..., Any]) -> Callable[..., Any]:
+            return jax.vmap(function, in_axes=-1, out_axes=-1) if many else function
+
+        of_system = each(self._weighted)(moves.weights)
+        reached, tip, base = each(self._sources)(moves, of_system)
+        pivots = pivots_of(self.problem.system)
+        d_y, d_unknowns = solved_correction(self._factors, pivots, reached, tip, base)
+        return d_y, d_unknowns, each(self._records)(d_y, moves, of_system)
+
+    def _weighted(self, weights: Any) -> Any:
+        """Return the tangents by the system, for weights of its directions; None: it does not change."""
+        if self._by_system is None:
+            return None
+        return jax.tree.map(lambda leaf: jnp.tensordot(weights, leaf, 1), self._by_system)
+
+    def _sources(self, moves: Moves, of_system: Any) -> tuple[Any, Any, Any]:
+        """Return the tangents of reached y, tip and base at fixed y and unknowns."""
+        reached = self.problem.reached_by(self.formula, self._chained(jnp.zeros_like(self.y), moves))
+        sources = reached, *self._ends(moves)
+        return sources if of_system is None else jax.tree.map(jnp.add, sources, of_system[1:])
+
+    def _records(self, d_y: Any, moves: Moves, of_system: Any) -> Any:
         found = self._chained(d_y, moves)
         if of_system is not None:
             found = jax.tree.map(jnp.add, found, of_system[0])
-        return d_y, d_unknowns, problem.packed(found)
+        return self.problem.packed(found)
 
 
 def place_slopes(problem: StepProblem, lanes: slice, y: Float[Any, "n y"]) -> Slopes:

@@ -126,19 +126,24 @@ def _differences(robot, coordinates, rows, steps, unknowns, settings, oriented, 
             (system, rows.first), (d_system, d_first),
         )  # fmt: skip
 
-    def along(direction: Any) -> Any:
+    def begun(direction: Any) -> Any:
+        """Return the system and its tangent, and the initial history and the tangents of its states."""
         (system, past), (d_system, d_past) = jax.jvp(start, (coordinates,), (direction,))
         if rows.before is None and system.rest_is_guess:
             past, d_past = settled(system, d_system)
-        changes = SystemMoves.of(d_system), jnp.zeros_like(rows.control)
-        state = TangentState.of(system, settings.space, past, d_past.records, d_past.rate)
-        _, (d_records, _) = tangent_time_loop(
-            settings, steps, (rows.records, rows.unknowns), (system, rows.control), changes, state
-        )
-        return jax.jvp(left, (rows.records[..., :ny],), (d_records[..., :ny],))[1]
+        return system, d_system, past, (d_past.records, d_past.rate)
 
-    directions = jnp.eye(coordinates.shape[0])
-    return left(rows.records[..., :ny]), jax.vmap(along, out_axes=1)(directions)
+    n = coordinates.shape[0]
+    columns = jax.vmap(begun, out_axes=(None, 0, None, -1))
+    system, d_systems, past, d_past = columns(jnp.eye(n))
+    changes = SystemMoves(d_systems, jnp.eye(n)), jnp.zeros((*rows.control.shape, n))
+    state = TangentState.of(system, settings.space, past, *d_past)
+    _, (d_records, _) = tangent_time_loop(
+        settings, steps, (rows.records, rows.unknowns), (system, rows.control), changes, state
+    )
+    y = rows.records[..., :ny]
+    by_column = jax.vmap(lambda d_y: jax.jvp(left, (y,), (d_y,))[1], in_axes=-1, out_axes=1)
+    return left(y), by_column(d_records[:, :, :ny])
 
 
 class RolloutMisfit:
