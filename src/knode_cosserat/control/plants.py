@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+import functools
 from collections import deque
 from typing import Any
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -133,7 +135,7 @@ class SimulatedPlant(Plant):
 
     def _sense(self) -> None:
         state, output = self._stepper.state, self.sensor.output
-        self._readings.add(output.value(self.robot, np.asarray(state.y[-1]), np.asarray(state.z[-1])))
+        self._readings.add(_sensed(self.robot, np.asarray(state.y[-1]), np.asarray(state.z[-1]), output))
 
     def measure(self) -> Float[np.ndarray, " p"]:
         """Return the measurement of this time, or an older one if the sensor has latency."""
@@ -148,3 +150,8 @@ class SimulatedPlant(Plant):
         """Return the true position of the tip (m)."""
         y = np.asarray(self._stepper.state.y[-1, -1:])
         return np.asarray(self.robot.positions(y))[-1]
+
+
+@functools.partial(jax.jit, static_argnames="output")
+def _sensed(robot: System, y: Any, z: Any, output: Output) -> Any:
+    return output.value(robot, y, z)

@@ -209,18 +209,13 @@ def predicted_motion(
 
 @functools.partial(jax.jit, static_argnames="output")
 def motion_errors(
-    model: OnlineModel, candidates: Float[Any, "k n"], past: StateHistory, controls: Any, measured: Any,
-    output: Output,
-) -> Float[Any, "k T e"]:  # fmt: skip
-    """Return the errors of the motion with each of several parameters; infinite after a failure."""
-
-    def one(x: Any) -> Any:
-        system, steps = model.at(x), len(controls)
-        done, _, rows = time_loop(system, model.settings, model.coefficients, controls, past, (0, steps))
-        errors = errors_of(system, output, rows.records, measured)
-        return jnp.where((jnp.arange(steps) < done)[:, None], errors, jnp.inf)
-
-    return jax.lax.map(one, candidates)
+    model: OnlineModel, x: Float[Any, " n"], past: StateHistory, controls: Any, measured: Any, output: Output
+) -> Float[Any, "T e"]:
+    """Return the errors of the motion with these parameters; infinite after a failure."""
+    system, steps = model.at(x), len(controls)
+    done, _, rows = time_loop(system, model.settings, model.coefficients, controls, past, (0, steps))
+    errors = errors_of(system, output, rows.records, measured)
+    return jnp.where((jnp.arange(steps) < done)[:, None], errors, jnp.inf)
 
 
 @functools.partial(jax.jit, static_argnames="output")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections import deque
 from typing import Any
 
@@ -19,17 +20,32 @@ BETTER = 0.5
 LARGEST = 30.0
 
 
-class Rollback:
-    """Compares the present parameters with earlier ones, by simulations of the last second.
+@dataclasses.dataclass(frozen=True)
+class _Comparison:
+    """Comparison of parameters by a past second: candidates (k, n), the newest last, and errors so far."""
 
-    Without it, parameters that were adapted to wrong measurements have to be learned anew afterwards.
+    past: Any
+    controls: Float[np.ndarray, "T c"]
+    measured: Float[np.ndarray, "T p"]
+    candidates: Float[np.ndarray, "k n"]
+    errors: tuple[float, ...] = ()
+
+
+class Rollback:
+    """Compares the present parameters with earlier ones, by simulations of a past second.
+
+    Without it, parameters that were adapted to wrong measurements have to be learned anew afterwards. The
+    simulations of a comparison are spread over the periods that follow, so that none takes much longer.
     """
 
     def __init__(self, model: OnlineModel, output: Output, x: Float[np.ndarray, " n"], dt: float):
         """Keep the first parameters; compile the comparison."""
         self._model, self._output = model, output
         self._steps = max(2, round(WINDOW / dt))
+        #: simulations in one period
+        self._each = -(-(KEPT + 1) // self._steps)
         self._kept = deque([np.array(x)] * KEPT, maxlen=KEPT)
+        self._comparison: _Comparison | None = None
         self._past: Any = None
         self._controls: list[Any] = []
         self._measured: list[Any] = []
@@ -45,7 +61,7 @@ class Rollback:
     def compile(self, past: Any, controls: int) -> None:
         """Compile the comparison for a history and a number of controls."""
         shape = (self._steps, controls), (self._steps, self._output.size)
-        self._errors(past, np.zeros(shape[0]), np.zeros(shape[1]), np.array([*self._kept, self._kept[0]]))
+        self._error(_Comparison(past, np.zeros(shape[0]), np.zeros(shape[1]), np.array(self._kept)), 0)
 
     def predicted(self, control: Float[np.ndarray, " c"], past: Any) -> None:
         """Note a control, and the history before it."""
@@ -56,31 +72,44 @@ class Rollback:
     def measured(
         self, measured: Float[np.ndarray, " p"], x: Float[np.ndarray, " n"]
     ) -> Float[np.ndarray, " n"] | None:
-        """Note a measurement; return earlier parameters if those were better, once in each window."""
-        if len(self._measured) == len(self._controls):
-            return None
-        unseen = len(self._controls) - 1 - len(self._measured)
-        self._measured += [np.full(len(measured), np.nan)] * unseen + [np.asarray(measured, dtype=float)]
-        if len(self._controls) < self._steps:
-            return None
-        candidates = np.array([*self._kept, x])
-        controls, rows = np.array(self._controls[-self._steps :]), np.array(self._measured[-self._steps :])
-        errors = self._errors(self._past, controls, rows, candidates)
-        self.forget()
-        best = int(np.argmin(errors[:-1]))
-        if errors[best] < BETTER * errors[-1]:
-            self._kept.append(candidates[best])
-            return candidates[best]
-        self._kept.append(np.array(x))
-        return None
+        """Note a measurement; return earlier parameters once a comparison has found that they were better."""
+        if len(self._measured) < len(self._controls):
+            unseen = len(self._controls) - 1 - len(self._measured)
+            self._measured += [np.full(len(measured), np.nan)] * unseen
+            self._measured.append(np.asarray(measured, dtype=float))
+        found = self._compared()
+        if len(self._controls) >= self._steps and len(self._measured) == len(self._controls):
+            rows = (np.array(each[: self._steps]) for each in (self._controls, self._measured))
+            self._comparison = _Comparison(self._past, *rows, np.array([*self._kept, x]))
+            self.forget()
+        return found
 
     def forget(self) -> None:
         """Begin a new window."""
         self._past, self._controls, self._measured = None, [], []
 
-    def _errors(self, past: Any, controls: Any, measured: Any, candidates: Any) -> Float[np.ndarray, " k"]:
-        """Return the mean squared error of each candidate, in units of the noise and at least 1."""
-        found = motion_errors(self._model, candidates, past, controls, measured, self._output)
+    def _compared(self) -> Float[np.ndarray, " n"] | None:
+        """Simulate some candidates of the comparison; return the best earlier one after the last of them."""
+        now = self._comparison
+        if now is None:
+            return None
+        first, count = len(now.errors), len(now.candidates)
+        more = [self._error(now, k) for k in range(first, min(first + self._each, count))]
+        errors = (*now.errors, *more)
+        self._comparison = dataclasses.replace(now, errors=errors)
+        if len(errors) < count:
+            return None
+        self._comparison = None
+        best = int(np.argmin(errors[:-1]))
+        better = errors[best] < BETTER * errors[-1]
+        self._kept.append(now.candidates[best if better else -1])
+        return now.candidates[best] if better else None
+
+    def _error(self, now: _Comparison, k: int) -> float:
+        """Return the mean squared error of a candidate, in units of the noise and at least 1."""
+        found = motion_errors(
+            self._model, now.candidates[k], now.past, now.controls, now.measured, self._output
+        )
         square = np.minimum((np.asarray(found) / self._output.noise) ** 2, LARGEST**2)
         known = np.isfinite(square)
-        return 1.0 + np.sum(np.where(known, square, 0.0), axis=(1, 2)) / np.maximum(known.sum(axis=(1, 2)), 1)
+        return 1.0 + float(np.sum(square[known])) / max(int(known.sum()), 1)
