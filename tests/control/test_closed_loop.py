@@ -21,8 +21,10 @@ from knode_cosserat.control import (
     PredictiveController,
     Sensor,
     SimulatedPlant,
+    SoftLimit,
     circle,
     run_loop,
+    steps,
 )
 from knode_cosserat.control.baselines.linear_model import realized
 from knode_cosserat.control.loop import warm_up
@@ -60,6 +62,20 @@ def test_an_exact_model_follows_a_fast_circle():
     log = run_loop(controller(), plant(), circle(0.1, 1.5), 6.0)
     assert log.tip_rmse(5.0) <= 1e-3 * LENGTH
     assert log.fallbacks == 0
+
+
+def test_a_soft_limit_that_the_start_violates_is_reached_and_then_kept():
+    limit = SoftLimit(TipPosition(), low=[-np.inf, 0.3, -np.inf])
+    log = run_loop(controller(soft=[limit]), plant(), circle(0.1, 4.0), 3.0)
+    assert log.fallbacks == 0
+    assert log.violation[0] > 0.1 and np.all(log.violation[20:] < 1e-3)
+    assert np.all(log.tip[20:, 1] > 0.3 - 1e-3)
+
+
+def test_an_unannounced_step_is_reached_and_held():
+    log = run_loop(controller(), plant(), steps([[0.05, 0.0, np.nan], [-0.05, 0.05, np.nan]], 2.0), 4.0)
+    settled = (log.time % 2.0) >= 1.0
+    assert np.max(log.tip_distance[settled]) < 1e-3 * LENGTH
 
 
 def test_a_wrong_stiffness_is_found_and_the_circle_followed(wrong_model):

@@ -21,7 +21,7 @@ from knode_cosserat.control import (
 )
 from knode_cosserat.control.named import NAMES
 from knode_cosserat.control.plans import Knots
-from knode_cosserat.control.qp import DAQP, QuadraticProgram
+from knode_cosserat.control.qp import DAQP, QuadraticProgram, solved_program
 
 ROBOT = kc.load_robot("delrin-tendon-robot")
 
@@ -129,9 +129,43 @@ def test_quadratic_programs_agree_with_scipy():
 def test_an_infeasible_program_is_not_solved_and_a_soft_row_yields():
     one = np.eye(1)
     hard = QuadraticProgram(one, np.zeros(1), -one[0], one[0], one, np.array([2.0]), np.array([3.0]))
-    assert not DAQP(time_limit=1.0).solve(hard).solved
-    soft = DAQP(time_limit=1.0).solve(hard._replace(soft=1))
+    solver = DAQP(time_limit=1.0)
+    assert not solver.solve(hard).solved and not solved_program(solver, hard).solved
+    soft = solved_program(solver, hard._replace(soft=1))
     assert soft.solved and soft.x[0] == pytest.approx(1.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
+def test_soft_rows_are_violated_as_little_as_the_hard_limits_allow(unit):
+    """The oracle is SLSQP. The cost is badly conditioned, as that of a plan may be."""
+    rng, solver = np.random.default_rng(1), DAQP(time_limit=1.0)
+    for _ in range(20):
+        n, rows = 6, 5
+        H = np.diag(10.0 ** rng.uniform(-6.0, 6.0, n))
+        A, low, high = unit * rng.normal(size=(rows, n)), -np.ones(n), np.ones(n)
+        below = unit * rng.uniform(2.0, 6.0, rows)
+        problem = QuadraticProgram(
+            H, rng.normal(size=n), low, high, A, below, np.full(rows, np.inf), soft=rows
+        )
+        found = solved_program(solver, problem)
+        assert found.solved and np.all(np.abs(found.x) <= 1.0 + 1e-6)
+
+        def violation(x, A=A, below=below):
+            return float(np.sum(np.maximum(0.0, (below - A @ x) / unit) ** 2))
+
+        least = min(
+            minimize(violation, start, bounds=list(zip(low, high, strict=True)), method="SLSQP").fun
+            for start in rng.uniform(-1.0, 1.0, (5, n))
+        )
+        assert violation(found.x) <= least + 1e-3 * (1.0 + least)
+
+
+def test_steps_are_not_expected_and_circles_are():
+    held = steps([[0.0, 0.0, 1.0], [0.1, 0.0, 1.0]], 2.0)
+    assert held.expected(1.0, [0.5, 1.5])[:, 0].tolist() == [0.0, 0.0]
+    assert steps([[0.0], [0.1]], 2.0, announced=True).expected(1.0, [0.5, 1.5])[:, 0].tolist() == [0.0, 0.1]
+    moving = circle(0.1, 4.0)
+    assert np.array_equal(moving.expected(5.0, [0.1, 1.0]), moving.at([5.1, 6.0]), equal_nan=True)
 
 
 def test_the_command_line_has_all_controllers_and_each_is_made_by_its_name():

@@ -88,7 +88,7 @@ class PlanController(Controller):
         Raises:
             ValueError: a reference of another size than the target.
         """
-        found = reference.at(time + self.dt * (1.0 + np.arange(self.knots.horizon)))
+        found = reference.expected(time, self.dt * (1.0 + np.arange(self.knots.horizon)))
         if found.shape[1] != self.target.size:
             raise ValueError(
                 f"the reference has {found.shape[1]} numbers; the target has {self.target.size}: "

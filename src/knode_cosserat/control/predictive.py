@@ -19,7 +19,7 @@ from knode_cosserat.control.commands import Command, ControlLimits
 from knode_cosserat.control.planning import PlanController
 from knode_cosserat.control.prediction import Prediction, linearised_prediction
 from knode_cosserat.control.program import SoftRows, Weights, applied_changes
-from knode_cosserat.control.qp import QPSolver, solver_named
+from knode_cosserat.control.qp import QPSolver, soft_violations, solved_program, solver_named
 from knode_cosserat.control.references import Reference
 from knode_cosserat.estimation.observer import KalmanObserver
 from knode_cosserat.estimation.outputs import Output
@@ -104,13 +104,10 @@ class PredictiveController(PlanController):
         error = prediction.error + np.tensordot(coordinates, prediction.by_state, 1)
         soft = self._soft_rows(prediction, coordinates)
         problem = self.tracking.program(error, prediction.by_plan, self._plan, self._control, soft)
-        found = self.solver.solve(problem)
+        found = solved_program(self.solver, problem)
         if not found.solved:
             return self.fallback("the quadratic program was not solved")
-        violation = 0.0
-        if soft is not None:
-            limited = soft.value + found.x @ soft.by_plan
-            violation = max(0.0, float(np.max(np.maximum(limited - soft.high, soft.low - limited))))
+        violation = max(float(np.max(each, initial=0.0)) for each in soft_violations(problem, found.x))
         return self.planned(applied_changes(self._plan, found.x), prediction.path, violation)
 
     def advance(self, control: Float[np.ndarray, " c"]) -> None:

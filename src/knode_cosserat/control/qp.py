@@ -9,10 +9,13 @@ from jaxtyping import Float
 
 from knode_cosserat.errors import KnodeCosseratError
 
-#: DAQP's flag for a soft constraint, and its codes of solved problems
-SOFT, SOLVED = 8, (1, 2)
-#: weight of a soft constraint's violation: DAQP minimises ρ/2 times its square
-SOFTNESS = 1e-6
+#: DAQP's code of solved problems
+SOLVED = 1
+#: weight of the unknowns beside violations of soft rows; both are in units of the unknowns
+SMALL = 1e-6
+#: part of the largest violation by which soft rows yield more than they must, so that rounding errors of the
+#: first program cannot make the second one infeasible
+MORE = 1e-4
 
 
 class QPError(KnodeCosseratError, ValueError):
@@ -22,7 +25,10 @@ class QPError(KnodeCosseratError, ValueError):
 
 
 class QuadraticProgram(NamedTuple):
-    """Minimise ½ xᵀH x + gᵀx for low ≤ x ≤ high and below ≤ A x ≤ above; the last `soft` rows of A yield."""
+    """Minimise ½ xᵀH x + gᵀx for low ≤ x ≤ high and below ≤ A x ≤ above; the last `soft` rows of A yield.
+
+    A solver ignores `soft`; `solved_program` does not.
+    """
 
     H: Float[np.ndarray, "n n"]
     g: Float[np.ndarray, " n"]
@@ -67,14 +73,57 @@ class DAQP:
     def solve(self, problem: QuadraticProgram) -> QPSolution:
         """Return the solution; never raise for an infeasible problem."""
         p = problem
-        n = len(p.g)
-        sense = np.zeros(n + len(p.A), dtype=np.int32)
-        sense[len(sense) - p.soft :] = SOFT
         upper, lower = np.concatenate([p.high, p.above]), np.concatenate([p.low, p.below])
         # H is positive definite only to rounding if some directions hardly matter
         H, A = np.ascontiguousarray(p.H), np.ascontiguousarray(p.A)
-        x, _, flag, _ = self._solve(H, p.g, A, upper, lower, sense, time_limit=self._limit, rho_soft=SOFTNESS)
-        return QPSolution(np.asarray(x), flag in SOLVED and bool(np.all(np.isfinite(x))))
+        x, _, flag, _ = self._solve(H, p.g, A, upper, lower, time_limit=self._limit)
+        return QPSolution(np.asarray(x), flag == SOLVED and bool(np.all(np.isfinite(x))))
+
+
+def solved_program(solver: QPSolver, problem: QuadraticProgram) -> QPSolution:
+    """Return the solution of a program with soft rows: hard limits first, then soft rows, then the cost.
+
+    If not all rows can hold, a first program finds the least sum of squared violations that the hard limits
+    allow. A second one minimises the cost with as much violation, and no more. No weight has to be chosen
+    between violation and cost, and neither program is badly scaled.
+    """
+    found = solver.solve(problem)
+    if found.solved or not problem.soft:
+        return found
+    first = solver.solve(_least_violation(problem))
+    n = len(problem.g)
+    x = first.x[:n]
+    if not first.solved:
+        return QPSolution(x, False)
+    low, high = soft_violations(problem, x)
+    more = MORE * max(low.max(), high.max())
+    below, above = problem.below.copy(), problem.above.copy()
+    below[-problem.soft :] -= low + more
+    above[-problem.soft :] += high + more
+    second = solver.solve(problem._replace(below=below, above=above))
+    return second if second.solved else QPSolution(x, True)
+
+
+def soft_violations(problem: QuadraticProgram, x: Float[np.ndarray, " n"]) -> tuple[Any, Any]:
+    """Return by how much each soft row is below its lower end and above its upper end, at least 0."""
+    soft = slice(len(problem.A) - problem.soft, None)
+    value = problem.A[soft] @ x
+    return np.maximum(0.0, problem.below[soft] - value), np.maximum(0.0, value - problem.above[soft])
+
+
+def _least_violation(problem: QuadraticProgram) -> QuadraticProgram:
+    """Return the program of x and the violations of all soft rows, which minimises the violations."""
+    p, n = problem, len(problem.g)
+    hard = len(p.A) - p.soft
+    # violations in units of the unknowns
+    unit = max(float(np.max(np.linalg.norm(p.A[hard:], axis=1))), np.finfo(float).tiny)
+    A = np.block([[p.A[:hard], np.zeros((hard, p.soft))], [p.A[hard:] / unit, np.eye(p.soft)]])
+    scale = np.concatenate([np.ones(hard), np.full(p.soft, 1.0 / unit)])
+    free = np.full(p.soft, np.inf)
+    return QuadraticProgram(
+        np.diag(np.concatenate([np.full(n, SMALL), np.ones(p.soft)])), np.zeros(n + p.soft),
+        np.concatenate([p.low, -free]), np.concatenate([p.high, free]), A, p.below * scale, p.above * scale,
+    )  # fmt: skip
 
 
 def solver_named(name: Any) -> QPSolver:

@@ -26,11 +26,14 @@ class Reference:
         values: function from times (T,) in s to values (T, p).
         size: p.
         name: for reports.
+        announced: True if controllers know the reference ahead. If not, as for a target that somebody moves,
+            they expect its present value to stay.
     """
 
     values: Callable[[Float[np.ndarray, " T"]], Float[np.ndarray, "T p"]]
     size: int
     name: str
+    announced: bool = True
 
     def at(self, times: Any) -> Float[np.ndarray, "T p"]:
         """Return the values at times (s)."""
@@ -42,6 +45,11 @@ class Reference:
                 f"allowed is ({len(times)}, {self.size})"
             )
         return found
+
+    def expected(self, time: float, later: Any) -> Float[np.ndarray, "T p"]:
+        """Return the values (T, p) that are expected at a time (s), some seconds `later` (T,)."""
+        later = np.atleast_1d(np.asarray(later, dtype=float))
+        return self.at(time + later if self.announced else np.full(len(later), time))
 
 
 def constant(value: Sequence[float]) -> Reference:
@@ -92,8 +100,11 @@ def figure_eight(
     return Reference(values, 3, f"figure of eight of {radius:g} m, period {period:g} s")
 
 
-def steps(points: Sequence[Sequence[float]], hold: float) -> Reference:
-    """Return points (m) that are each held for some time (s), the last one for ever."""
+def steps(points: Sequence[Sequence[float]], hold: float, announced: bool = False) -> Reference:
+    """Return points (m) that are each held for some time (s), the last one for ever.
+
+    A predictive controller leaves a point before an `announced` step, for the mean error is then smaller.
+    """
     _positive(hold=hold)
     table = np.asarray(points, dtype=float)
     if table.ndim != 2:
@@ -103,7 +114,7 @@ def steps(points: Sequence[Sequence[float]], hold: float) -> Reference:
         # a row at a switch belongs to the new point
         return table[np.clip(np.floor(t / hold + 1e-9).astype(int), 0, len(table) - 1)]
 
-    return Reference(values, table.shape[1], f"{len(table)} steps of {hold:g} s")
+    return Reference(values, table.shape[1], f"{len(table)} steps of {hold:g} s", announced)
 
 
 def table(time: Sequence[float], values: Any) -> Reference:

@@ -135,9 +135,9 @@ class KoopmanController(Controller):
             self._offset = self._offset + OFFSET * (measured - self._offset - self._expected)
         self._last, self._now = (measured if self._now is None else self._now), measured
         lifted = self.model.lifted(measured, self._last, self._control)
-        times = time + self.dt * (1.0 + np.arange(self.knots.horizon))
+        later = self.dt * (1.0 + np.arange(self.knots.horizon))
         error = self.model.predicted(lifted, self.knots.controls(self._plan)) + self._offset
-        error = error - reference.at(times)
+        error = error - reference.expected(time, later)
         found = self.solver.solve(self._tracking.program(error, self._slopes, self._plan, self._control))
         if not found.solved:
             return self.fallback("the quadratic program was not solved")

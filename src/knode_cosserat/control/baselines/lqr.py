@@ -78,7 +78,7 @@ class LQR(Controller):
         self._state = self._state + self._filter @ error
         n = len(self.model.A)
         x, offset = self._state[:n], self._state[n:]
-        wanted = reference.at([time + self.dt])[0] - self.model.output - offset
+        wanted = reference.expected(time, self.dt)[0] - self.model.output - offset
         known = np.isfinite(wanted)
         x_steady, u_steady = self._steady(np.where(known, wanted, 0.0), known)
         control = self.model.control + u_steady - self._gain @ (x - x_steady)

@@ -85,7 +85,7 @@ class KinematicController(TipFeedback):
     def command(self, time: float, measured: Float[np.ndarray, " p"], reference: Reference) -> Command:
         """Return the control whose equilibrium is the wanted position, shifted by the integral."""
         total = self._sum + self._integral * self.dt * self._error(time, measured, reference)
-        wanted = reference.at([time + self.dt])[0, :3] + total
+        wanted = reference.expected(time, self.dt)[0, :3] + total
         control = self.map.inverse(wanted, self._control)
         found = self._applied(control)
         if np.allclose(found.control, control):
