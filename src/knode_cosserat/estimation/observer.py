@@ -260,8 +260,11 @@ class KalmanObserver:
         apart = (
             np.asarray(truth.tip_position[-1]) - np.asarray(self.robot.positions(self.record[-1:, :ny]))[0]
         )
-        covariance = tips.T @ tips + NUMERICAL**2 * np.eye(3)
-        return bool(apart @ np.linalg.solve(covariance, apart) <= chi2.ppf(level, 3))
+        own = tips.T @ tips
+        covariance = own + NUMERICAL**2 * np.eye(3)
+        # the tip of an inextensible rod moves on a surface: only its uncertain directions count
+        uncertain = np.trace(np.linalg.solve(covariance, own))
+        return bool(apart @ np.linalg.solve(covariance, apart) <= chi2.ppf(level, uncertain))
 
     def wait(self) -> None:
         """Let a period pass without a prediction: the state is held."""
