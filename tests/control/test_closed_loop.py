@@ -19,6 +19,7 @@ from knode_cosserat.control import (
     KinematicController,
     KoopmanController,
     PredictiveController,
+    ReferenceFormatError,
     Sensor,
     SimulatedPlant,
     SoftLimit,
@@ -27,10 +28,12 @@ from knode_cosserat.control import (
     steps,
 )
 from knode_cosserat.control.baselines.linear_model import realized
+from knode_cosserat.control.checks import distance_out_of_reach
 from knode_cosserat.control.loop import warm_up
 from knode_cosserat.control.qp import QPSolution
 from knode_cosserat.estimation import KalmanObserver, TipPosition
 from knode_cosserat.estimation.online import predicted_motion, split_record
+from knode_cosserat.identification.evaluate import evaluate
 from knode_cosserat.learning.residual import Nothing
 
 DT, LENGTH = 0.05, 0.635
@@ -96,6 +99,30 @@ def test_a_log_reports_and_is_written(wrong_model, tmp_path):
     lines = (tmp_path / "log.csv").read_text().splitlines()
     assert len(lines) == 141 and lines[0].startswith("t (s),reference 0")
     assert "tip RMSE" in repr(wrong_model)
+
+
+def test_a_loop_is_a_recording_of_its_robot(tmp_path):
+    log = run_loop(controller(), plant(), circle(0.1, 1.5), 2.0)
+    log.measurements(simulated=True).save(tmp_path / "loop.csv")
+    rows = kc.load_recording(tmp_path / "loop.csv").sampled(DT)
+    assert evaluate(ROBOT, rows).tip_rmse < 1e-6
+    assert evaluate(ROBOT.replace(youngs_modulus=1.3 * E), rows).tip_rmse > 1e-3
+    with pytest.raises(
+        ValueError, match="a measurement has 3 numbers; allowed are the positions of 2 bodies"
+    ):
+        log.measurements((0.5, 1.0))
+
+
+def test_what_cannot_be_followed_is_told_before_the_loop_starts():
+    with pytest.raises(ReferenceFormatError, match=r"is 100 m from the base.*the robot is 0.635 m long"):
+        run_loop(controller(), plant(), circle(100.0, 4.0), 2.0)
+    within = distance_out_of_reach(ROBOT, LIMITS, circle(0.1, 4.0), 10.0)[0]
+    beyond, time = distance_out_of_reach(ROBOT, LIMITS, circle(0.6, 4.0), 10.0)
+    assert within == 0.0 and 0.1 < beyond < 0.2 and time > 1.0
+    with pytest.raises(
+        ValueError, match=r"horizon is 10000000; its derivatives need .* GB; allowed are at most"
+    ):
+        controller(horizon=10_000_000)
 
 
 def test_columns_of_the_observer_are_derivatives_of_the_step():

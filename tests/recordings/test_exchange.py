@@ -48,13 +48,16 @@ def test_what_would_be_off_by_a_row_is_an_error(motion, tmp_path):
         kc.simulate(motion.system, motion.held_tension, DT)
 
 
-@pytest.mark.parametrize("ending", ["csv", "parquet"])
-def test_a_simulation_goes_through_a_table_without_error(robot, tensions, motion, tmp_path, ending):
+@pytest.mark.parametrize("ending", ["csv", "parquet", "bag", "mcap", "db3"])
+def test_a_simulation_goes_through_a_file_without_error(robot, tensions, motion, tmp_path, ending):
     if ending == "parquet":
         pytest.importorskip("pyarrow")
     seen = kc.recordings.Measurements.of(motion, FRACTIONS)
     seen.save(tmp_path / f"motion.{ending}")
-    loaded = kc.load_recording(tmp_path / f"motion.{ending}")
+    in_words = tmp_path / "motion.yaml"
+    assert in_words.exists() == (ending in ("bag", "mcap", "db3"))
+    config = kc.recordings.RecordingConfig.load(in_words) if in_words.exists() else None
+    loaded = kc.load_recording(tmp_path / f"motion.{ending}", config)
     assert loaded.simulated is True and seen.source in loaded.source
     rows = loaded.sampled(DT)
     np.testing.assert_array_equal(rows.held_tension[:-1], tensions)

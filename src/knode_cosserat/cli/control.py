@@ -13,6 +13,8 @@ from knode_cosserat.cli.arguments import Changes, Json, Robot, load_system, pars
 from knode_cosserat.cli.output import write_output
 from knode_cosserat.cli.program import app, examples
 
+#: distance from the workspace at which a warning is given, as part of the length
+OUT_OF_REACH = 0.01
 #: names of controllers, as `control.named` has them
 CONTROLLERS = ("predictive", "ilqr", "mppi", "lqr", "koopman", "kinematic", "pid")
 
@@ -142,6 +144,13 @@ def control(
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write one row a period to this CSV file.")
     ] = None,
+    recording: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Write the measured tip and the controls as a recording: .csv, .bag, .mcap or .db3.",
+        ),
+    ] = None,
     figure: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Draw path, error and controls into this file.")
     ] = None,
@@ -169,7 +178,7 @@ def control(
         raise ValueError("give either --reference, or --live to drag the target in the browser")
     if not live and (export is not None or port or no_open):
         raise ValueError("--export, --port and --no-open are of the viewer; use them with --live")
-    for path in (out, figure, export):
+    for path in (out, recording, figure, export):
         if path is not None:
             require_writable(path)
     from knode_cosserat import control as kcc
@@ -189,9 +198,13 @@ def control(
         if log is None:
             return
     else:
-        log = kcc.run_loop(controller, controlled, _reference(reference), seconds)
+        wanted = _reference(reference)
+        _warn_out_of_reach(model, limits, wanted, seconds)
+        log = kcc.run_loop(controller, controlled, wanted, seconds)
     if out is not None:
         log.to_csv(out)
+    if recording is not None:
+        log.measurements(simulated=True).save(recording)
     if figure is not None:
         from knode_cosserat.evaluation.control_figures import closed_loop
 
@@ -199,6 +212,20 @@ def control(
     length = float(model.nominal.length)
     facts = log.summary() | {"tip_rmse_percent": 100.0 * log.tip_rmse(min(5.0, 0.5 * seconds)) / length}
     write_output(as_json, facts, _lines(facts, log), out=out, export=export)
+
+
+def _warn_out_of_reach(model: Any, limits: Any, reference: Any, seconds: float) -> None:
+    """Warn before the loop starts if the tip cannot follow the reference."""
+    from knode_cosserat.control.checks import check_within_length, distance_out_of_reach
+
+    check_within_length(model, reference, seconds)
+    apart, time = distance_out_of_reach(model, limits, reference, seconds)
+    if apart > OUT_OF_REACH * float(model.nominal.length):
+        typer.echo(
+            f"warning: the {reference.name} is {apart:.3g} m out of reach at t = {time:.3g} s: no controls "
+            "within the limits bring the tip there at rest",
+            err=True,
+        )
 
 
 def _lines(facts: dict[str, Any], log: Any) -> list[str]:

@@ -7,7 +7,7 @@ import dataclasses
 import gc
 import time as clock
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,9 +16,12 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat._files import replacing
+from knode_cosserat.control.checks import check_within_length
 from knode_cosserat.control.commands import Command, Controller
 from knode_cosserat.control.plants import Plant
 from knode_cosserat.control.references import Reference
+from knode_cosserat.recordings.measurements import Measurements
+from knode_cosserat.rods.system import System
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,6 +44,7 @@ class LoopLog:
         parameters: adapted parameters by name, each (T,).
         missed: number of periods whose deadline was missed.
         compiled: number of programs that were compiled during the loop; each may have delayed a period.
+        initial_control: (c,) control before the first row, if the log begins at the start.
     """
 
     time: Float[np.ndarray, " T"]
@@ -56,6 +60,7 @@ class LoopLog:
     parameters: dict[str, Float[np.ndarray, " T"]]
     missed: int
     compiled: int = 0
+    initial_control: Float[np.ndarray, " c"] | None = None
 
     @property
     def tip_distance(self) -> Float[np.ndarray, " T"]:
@@ -88,6 +93,34 @@ class LoopLog:
             "cycle_p99_ms": 1e3 * float(np.percentile(self.feedback + self.preparation, 99)),
             "parameters": {name: float(values[-1]) for name, values in self.parameters.items()},
         }
+
+    def measurements(
+        self, fractions: Sequence[float] = (1.0,), simulated: bool | None = None
+    ) -> Measurements:  # fmt: skip
+        """Return the loop as a recording, from which a model can be identified or learned.
+
+        It can be saved as a table or a bag: `log.measurements().save("run.mcap")`.
+
+        Args:
+            fractions: places of the bodies whose positions were measured, as fractions of the length.
+            simulated: True if the robot was simulated; None: not stated.
+
+        Raises:
+            ValueError: other numbers than these bodies' positions were measured.
+        """
+        rows, bodies = self.measured.shape[0], len(fractions)
+        if self.measured.shape[1] != 3 * bodies:
+            raise ValueError(
+                f"a measurement has {self.measured.shape[1]} numbers; allowed are the positions of "
+                f"{bodies} {'body' if bodies == 1 else 'bodies'}, {3 * bodies} numbers"
+            )
+        position = self.measured.reshape(rows, bodies, 3)
+        return Measurements(
+            time=self.time, tension=self.control, fractions=np.asarray(fractions, dtype=float),
+            position=position, quaternion=np.full((rows, bodies, 4), np.nan),
+            measured=np.isfinite(position).all(axis=-1), simulated=simulated, source="closed loop",
+            initial_tension=self.initial_control,
+        )  # fmt: skip
 
     def to_csv(self, path: str | Path) -> None:
         """Write one row a period: time, reference, tip, controls, status and times of the computation."""
@@ -181,7 +214,8 @@ class Loop:
         #: number of periods that began late, counted by the caller that keeps the time
         self.missed = 0
         warm_up(controller, plant, reference)
-        controller.reset(plant.start())
+        self._initial = np.array(plant.start())
+        controller.reset(self._initial)
         controller.prepare(0.0, reference)
         self._rows: deque[Period] = deque(maxlen=kept)
         self._count, self._compiled_before = 0, _COMPILATIONS.count
@@ -244,6 +278,7 @@ class Loop:
             },
             missed=self.missed,
             compiled=_COMPILATIONS.count - self._compiled_before,
+            initial_control=self._initial if rows[0].time == 0.0 else None,
         )
 
 
@@ -265,10 +300,14 @@ def run_loop(
 
     Raises:
         ValueError: plant and controller have different periods, or a duration below one period.
+        ReferenceFormatError: the reference is further away than the robot is long.
     """
     steps = round(seconds / controller.dt)
     if steps < 1:
         raise ValueError(f"seconds is {seconds:g}; allowed is at least one period, {controller.dt:g} s")
+    robot = getattr(controller, "robot", None)
+    if isinstance(robot, System):
+        check_within_length(robot, reference)
     loop = Loop(controller, plant, reference)
     with _no_garbage_collection():
         due = clock.perf_counter()

@@ -8,6 +8,7 @@ from typing import Any, Self
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.control.checks import check_memory
 from knode_cosserat.control.commands import Command, Controller, ControlLimits, Status
 from knode_cosserat.control.lag import lag_weights, remaining_part
 from knode_cosserat.control.plans import Knots
@@ -33,6 +34,7 @@ class PlanController(Controller):
     ):  # fmt: skip
         self.observer, self.target, self.dt = observer, target, observer.dt
         self.limits = limits.of(observer.robot)
+        check_memory(observer.robot, horizon, knots * observer.robot.control_size + observer.columns)
         self.knots = Knots.spaced(horizon, knots)
         self.tracking = Tracking(self.knots, self.limits, weights, target.noise, self.dt)
         self._basis = self.knots.basis

@@ -1,4 +1,4 @@
-"""Conversion of trajectories to measurements and of measurements to tables, with held tensions."""
+"""Conversion of trajectories to measurements and of measurements to files, with held tensions."""
 
 from __future__ import annotations
 
@@ -13,13 +13,11 @@ from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.sources import MarkerSource, TensionSource
 from knode_cosserat.recordings.table import HELD
-from knode_cosserat.recordings.write import MocapPoses, Pulls, write_recording
+from knode_cosserat.recordings.write import BAGS, FORMATS, MocapPoses, Pulls, write_recording
 from knode_cosserat.solvers.places import places_at, positions_at, quaternions_at
 
 if TYPE_CHECKING:
     from knode_cosserat.trajectory import Trajectory
-
-TABLES = (".csv", ".parquet")
 
 
 def measurement_fields(trajectory: Trajectory, fractions: Sequence[float]) -> dict[str, Any]:
@@ -48,19 +46,21 @@ def measurement_fields(trajectory: Trajectory, fractions: Sequence[float]) -> di
 
 
 def save(measurements: Measurements, path: str | Path) -> None:
-    """Write measurements as a table with tensions held from each row to the next, as its titles state.
+    """Write measurements as a table or a bag, with tensions held from each row to the next.
 
-    `load_recording(path).sampled(measurements.dt)` gives the same rows. Bridged poses are not written.
-    Bodies are named `tip` and `body_1`, `body_2` and so on.
+    A table's titles state everything: `load_recording(path).sampled(measurements.dt)` gives the same rows.
+    Beside a bag its configuration is written, with the suffix .yaml, for `load_recording(path, config)`.
+    Bridged poses are not written. Bodies are named `tip` and `body_1`, `body_2` and so on.
 
     Raises:
-        RecordingError: the name does not end in .csv or .parquet, or the file cannot be written.
-        ImportError: pyarrow is needed for .parquet, and not installed.
+        RecordingError: the name's ending is not .csv, .parquet, .bag, .mcap or .db3, or a file cannot be
+            written.
+        ImportError: a library for this format is not installed.
     """
     path = Path(path)
-    if path.suffix not in TABLES:
-        raise RecordingError(f"{path}: allowed is a name that ends in {' or '.join(TABLES)}")
-    it = measurements
+    if path.suffix not in FORMATS:
+        raise RecordingError(f"{path}: allowed is a name that ends in {', '.join(FORMATS)}")
+    it, root = measurements, "/" if path.suffix in BAGS else ""
     names = ["tip" if at == 1.0 else f"body_{k + 1}" for k, at in enumerate(it.fractions)]
     poses = {}
     for k, name in enumerate(names):
@@ -71,12 +71,14 @@ def save(measurements: Measurements, path: str | Path) -> None:
     before = it.initial_tension
     config = RecordingConfig(
         markers=tuple(
-            MarkerSource(name, name, float(at), rotation=(1.0, 0.0, 0.0, 0.0))
+            MarkerSource(name, root + name, float(at), rotation=(1.0, 0.0, 0.0, 0.0))
             for name, at in zip(names, it.fractions, strict=True)
         ),
-        tension=TensionSource(HELD, tuple(range(1, it.tension.shape[1] + 1)), held=True),
+        tension=TensionSource(root + HELD, tuple(range(1, it.tension.shape[1] + 1)), held=True),
         simulated=it.simulated,
         description=it.source,
         initial_tension=None if before is None else tuple(before.tolist()),
     )
     write_recording(path, config, poses, Pulls(it.time, it.tension))
+    if root:
+        config.save(path.with_suffix(".yaml"))

@@ -77,7 +77,7 @@ class Measurements:
         return cls(**provided(cls, "of")(trajectory, fractions))
 
     def save(self, path: str | Path) -> None:
-        """Write a table (.csv, .parquet) for `load_recording`; see `exchange.save`."""
+        """Write a table or a bag (.csv, .parquet, .bag, .mcap, .db3); see `exchange.save`."""
         provided(type(self), "save")(self, path)
 
     @property
