@@ -5,7 +5,6 @@ tips, and therefore the value of a measurement of the material.
 """
 
 import numpy as np
-import typer
 
 import knode_cosserat as kc
 
@@ -28,4 +27,4 @@ def main(out: str = "a_thousand_robots.png", robots: int = 1000, steps: int = 60
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    main()

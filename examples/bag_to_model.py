@@ -7,8 +7,6 @@ A virtual robot is recorded, with friction, ribs, a lag and noisy sensors that t
 import tempfile
 from pathlib import Path
 
-import typer
-
 import knode_cosserat as kc
 from knode_cosserat.recordings.virtual import record_virtual
 
@@ -40,4 +38,4 @@ def main(out: str = "bag_to_model.png", seconds: float = 4.0) -> tuple[float, fl
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    main()

@@ -5,7 +5,6 @@ or a magnet bends. No tendon is needed.
 """
 
 import numpy as np
-import typer
 
 import knode_cosserat as kc
 
@@ -24,4 +23,4 @@ def main(out: str = "bend_by_pressure.png", steps: int = 100) -> kc.Trajectory:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    main()

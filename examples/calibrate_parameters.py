@@ -7,7 +7,6 @@ whole simulations needs positions and orientations only.
 import dataclasses
 
 import numpy as np
-import typer
 
 import knode_cosserat as kc
 
@@ -36,4 +35,4 @@ def main(
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    main()

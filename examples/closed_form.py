@@ -6,7 +6,6 @@ Lobatto schemes.
 """
 
 import numpy as np
-import typer
 
 import knode_cosserat as kc
 
@@ -22,9 +21,14 @@ def main(out: str = "closed_form.png", most_nodes: int = 21) -> tuple[list[int],
     errors: dict[str, list[float]] = {"euler": [], "lobatto2": [], "lobatto4": []}
     for n in nodes:
         rod = kc.robots.SlenderRod(
-            length=length, radius=radius, density=1000.0, youngs_modulus=E, gravity=(0.0, 0.0, 0.0),
-            loads=(load,), nodes=n,
-        )  # fmt: skip
+            length=length,
+            radius=radius,
+            density=1000.0,
+            youngs_modulus=E,
+            gravity=(0.0, 0.0, 0.0),
+            loads=(load,),
+            nodes=n,
+        )
         for scheme, found in errors.items():
             tip = kc.equilibrium(rod, np.zeros(0), space=scheme).tip_position[0]
             found.append(float(np.linalg.norm(tip - exact)))
@@ -37,4 +41,4 @@ def main(out: str = "closed_form.png", most_nodes: int = 21) -> tuple[list[int],
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    main()

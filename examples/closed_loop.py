@@ -4,17 +4,14 @@ The controller measures only the tip's position, with noise. Its observer adapts
 the tip while the robot moves. Inverse kinematics with an integral, on the same model, is the comparison.
 """
 
-import typer
-
 import knode_cosserat as kc
-from knode_cosserat.rods.loads import AttachedMass
 
 DT = 0.05
 
 
 def main(out: str = "closed_loop.png", seconds: float = 10.0) -> dict[str, kc.control.LoopLog]:
     """Return the logs of both controllers; errors are those of the second half."""
-    model = kc.load_robot("delrin-tendon-robot").replace(loads=(AttachedMass(mass=0.0),))
+    model = kc.load_robot("delrin-tendon-robot").replace(loads=(kc.robots.loads.AttachedMass(mass=0.0),))
     robot = model.replace(youngs_modulus=0.75 * float(model.youngs_modulus), **{"loads.0.mass": 0.02})
     limits = kc.control.ControlLimits(low=0.0, high=10.0, rate=40.0)  # N, N/s
     adapted = ["youngs_modulus", kc.estimation.Adapted("loads.0.mass", deviation=0.03)]
@@ -32,4 +29,4 @@ def main(out: str = "closed_loop.png", seconds: float = 10.0) -> dict[str, kc.co
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    main()

@@ -5,7 +5,6 @@ does not use it: it has a rod, a rigid body and a force that vanishes.
 """
 
 import numpy as np
-import typer
 from scipy.optimize import brentq
 
 import knode_cosserat as kc
@@ -18,9 +17,10 @@ def known_frequency() -> float:
     rod = DENSITY * np.pi * RADIUS**2  # kg/m
     ratio, EI = MASS / (rod * LENGTH), E * np.pi * RADIUS**4 / 4
     beta = brentq(
-        lambda b: 1 + np.cos(b) * np.cosh(b)
-        + ratio * b * (np.cos(b) * np.sinh(b) - np.sin(b) * np.cosh(b)), 0.1, 1.875
-    )  # fmt: skip
+        lambda b: 1 + np.cos(b) * np.cosh(b) + ratio * b * (np.cos(b) * np.sinh(b) - np.sin(b) * np.cosh(b)),
+        0.1,
+        1.875,
+    )
     return float(beta**2 / LENGTH**2 * np.sqrt(EI / rod) / (2 * np.pi))
 
 
@@ -28,9 +28,14 @@ def main(out: str = "cut_the_thread.png", steps: int = 128, nodes: int = 11) -> 
     """Return the frequencies (Hz): simulated, and from beam theory."""
     thread = kc.robots.loads.PointWrench(force=(0.05, 0.0, 0.0), at=1.0, controlled=True)
     robot = kc.robots.SlenderRod(
-        length=LENGTH, radius=RADIUS, density=DENSITY, youngs_modulus=E, gravity=(0.0, 0.0, 0.0),
-        loads=(kc.robots.loads.AttachedMass(mass=MASS), thread), nodes=nodes,
-    )  # fmt: skip
+        length=LENGTH,
+        radius=RADIUS,
+        density=DENSITY,
+        youngs_modulus=E,
+        gravity=(0.0, 0.0, 0.0),
+        loads=(kc.robots.loads.AttachedMass(mass=MASS), thread),
+        nodes=nodes,
+    )
     held = kc.equilibrium(robot, np.ones(1), space="lobatto4")
     known = known_frequency()
     dt = 1 / (40 * known)
@@ -47,4 +52,4 @@ def main(out: str = "cut_the_thread.png", steps: int = 128, nodes: int = 11) -> 
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    main()

@@ -5,7 +5,6 @@ The paper's robot bends in two directions, so x and y of its tip can be prescrib
 """
 
 import numpy as np
-import typer
 
 import knode_cosserat as kc
 
@@ -26,4 +25,4 @@ def main(out: str = "follow_a_path.png", points: int = 60) -> kc.statics.Inverse
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    main()

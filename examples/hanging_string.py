@@ -7,7 +7,6 @@ from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
-import typer
 
 import knode_cosserat as kc
 from knode_cosserat.robots import Layout, Scales, parameter
@@ -57,4 +56,4 @@ def main(out: str = "hanging_string.png", steps: int = 100) -> kc.Trajectory:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    main()

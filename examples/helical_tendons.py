@@ -5,7 +5,6 @@ right-handed tendons are mirror images, and so are the resulting shapes.
 """
 
 import numpy as np
-import typer
 
 import knode_cosserat as kc
 
@@ -13,10 +12,17 @@ import knode_cosserat as kc
 def wound(turns: float) -> kc.robots.RoutedTendonRobot:
     """Return a soft rod of 30 cm with one tendon, 8 mm from its axis."""
     return kc.robots.RoutedTendonRobot(
-        length=0.3, radius=0.004, density=1100.0, youngs_modulus=5e7, bending_damping=1e-3, nodes=21,
-        gravity=(0.0, 0.0, 0.0), tendon_offset=0.008, tendon_angles=(0.0,),
+        length=0.3,
+        radius=0.004,
+        density=1100.0,
+        youngs_modulus=5e7,
+        bending_damping=1e-3,
+        nodes=21,
+        gravity=(0.0, 0.0, 0.0),
+        tendon_offset=0.008,
+        tendon_angles=(0.0,),
         routing=(kc.robots.routing.Helical(radius=0.008, phase=0.0, turns=turns),),
-    )  # fmt: skip
+    )
 
 
 def main(out: str = "helical_tendons.png", tension: float = 6.0, turns: float = 1.0) -> list[kc.Trajectory]:
@@ -33,4 +39,4 @@ def main(out: str = "helical_tendons.png", tension: float = 6.0, turns: float = 
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    main()

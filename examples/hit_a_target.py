@@ -7,7 +7,6 @@ tensions at once. The tip reaches the target at rest, because all of the last ro
 import jax
 import jax.numpy as jnp
 import numpy as np
-import typer
 from scipy.optimize import minimize
 
 import knode_cosserat as kc
@@ -43,4 +42,4 @@ def main(out: str = "hit_a_target.png", steps: int = 20, iterations: int = 40) -
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    main()

@@ -4,8 +4,6 @@
 stress, and `explain` lists the terms. The model then predicts held-out controls.
 """
 
-import typer
-
 import knode_cosserat as kc
 
 DT = 0.05
@@ -28,4 +26,4 @@ def main(out: str = "learn_stiffness.png", steps: int = 100) -> tuple[float, flo
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    main()

@@ -5,7 +5,6 @@ continuation from easier ones, and its result reports it.
 """
 
 import numpy as np
-import typer
 
 import knode_cosserat as kc
 
@@ -28,4 +27,4 @@ def main(out: str = "over_an_obstacle.png", seconds: float = 6.0, reach: float =
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    main()

@@ -4,8 +4,6 @@ A robot is a file (here from the catalog), its tensions are an array, and the re
 states for every step how it was solved.
 """
 
-import typer
-
 import knode_cosserat as kc
 
 
@@ -22,4 +20,4 @@ def main(out: str = "papers_robot.png", steps: int = 100) -> kc.Trajectory:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    main()

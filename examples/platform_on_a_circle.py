@@ -5,7 +5,6 @@ platform. The dynamic simulation then shows the motion of the platform at that s
 """
 
 import numpy as np
-import typer
 
 import knode_cosserat as kc
 
@@ -31,4 +30,4 @@ def main(
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    main()

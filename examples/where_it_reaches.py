@@ -5,7 +5,6 @@ A limit of the curvature excludes shapes that would break the rod.
 """
 
 import numpy as np
-import typer
 
 import knode_cosserat as kc
 
@@ -23,4 +22,4 @@ def main(out: str = "where_it_reaches.png", count: int = 5000) -> kc.statics.Wor
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    main()

@@ -26,9 +26,17 @@ DT, FINE, RESTING = 0.0125, 0.005, 1.0
 def record(path: Path, signal: str, seconds: float) -> None:
     """Write the sensor data of the simulated robot: rest, then the signal."""
     real = VirtualRobot(
-        length=0.4, radius=0.0025, density=1500, youngs_modulus=1.3e9, bending_damping=4e-3, drag=2e-3,
-        tendon_offset=0.018, tendon_angles=np.arange(3) * 2 * np.pi / 3, rib_mass=4e-4, nodes=19,
-    )  # fmt: skip
+        length=0.4,
+        radius=0.0025,
+        density=1500,
+        youngs_modulus=1.3e9,
+        bending_damping=4e-3,
+        drag=2e-3,
+        tendon_offset=0.018,
+        tendon_angles=np.arange(3) * 2 * np.pi / 3,
+        rib_mass=4e-4,
+        nodes=19,
+    )
     count = round((seconds - RESTING) / 0.05)
     if signal.startswith("sine"):
         pulls = kc.controls.sine(float(signal[5:]), count, 0.05, base=5.0, amplitude=3.0, tendons=3)

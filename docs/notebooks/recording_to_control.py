@@ -1,5 +1,5 @@
 # %% [markdown]
-# # From a recording to a model, and to control
+# # From a recording to a model, and to closed-loop control
 #
 # A **virtual** robot is recorded: a simulation with effects that the model does not have
 # (friction of the tendons, ribs, a stiffer base, motors with a lag, noisy sensors). Its bags have the paper's format
@@ -86,3 +86,20 @@ print(
 # %%
 moved = kc.simulate(found.robot, np.repeat(reached.control, 4, axis=0), 0.05)
 kc.figures.path({"wanted": wanted, "the model in motion": np.asarray(moved.tip_position)[8:, :2]})
+
+# %% [markdown]
+# ## Closed loop
+#
+# Tensions from inverse kinematics are slow, and an error of the model stays. A predictive controller corrects both:
+# it measures the tip, estimates the rod's state, and predicts one second ahead. The robot is a robot with other
+# stiffness and damping than the model, as a robot is after a while; the controller adapts Young's modulus.
+
+# %%
+dt, tip = 0.05, kc.estimation.TipPosition()
+aged = found.robot.replace(youngs_modulus=0.85 * float(found.robot.youngs_modulus))
+observer = kc.estimation.KalmanObserver(found.robot, dt, tip, adapt=["youngs_modulus"])
+controller = kc.control.PredictiveController(observer, tip, kc.control.ControlLimits(0.0, 12.0, 40.0))
+plant = kc.control.SimulatedPlant(aged, dt, kc.control.Sensor(tip, noise=1.0))
+log = kc.control.run_loop(controller, plant, kc.control.circle(0.1, period=3.0), 2.0 * seconds)
+print(log)
+kc.figures.closed_loop(log)

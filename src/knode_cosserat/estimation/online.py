@@ -106,9 +106,8 @@ class OnlineModel(eqx.Module):
         last, (d_rows, _) = tangent_time_loop(
             settings, self.coefficients, solved, (system, controls), changes, state
         )
-        moved = Spread(
-            *(jnp.moveaxis(part, -1, 0) for part in (last.d_records, last.d_rate)), spread.parameters
-        )
+        d_records, d_rate = (jnp.moveaxis(part, -1, 0) for part in (last.d_records, last.d_rate))
+        moved = Spread(d_records, d_rate, spread.parameters)
         after = after._replace(t0=past.t0 + steps * self.coefficients.dt)
         return system, Rollout(after, rows.records, d_rows, moved, done == steps)
 

@@ -79,8 +79,8 @@ class Rollback:
             self._measured.append(np.asarray(measured, dtype=float))
         found = self._compared()
         if len(self._controls) >= self._steps and len(self._measured) == len(self._controls):
-            rows = (np.array(each[: self._steps]) for each in (self._controls, self._measured))
-            self._comparison = _Comparison(self._past, *rows, np.array([*self._kept, x]))
+            controls, rows = (np.array(each[: self._steps]) for each in (self._controls, self._measured))
+            self._comparison = _Comparison(self._past, controls, rows, np.array([*self._kept, x]))
             self.forget()
         return found
 
