@@ -23,7 +23,7 @@ class Weights:
         preferred: preferred controls; None: the safe ones.
     """
 
-    change: float = 1e-2
+    change: float = 10.0
     effort: float = 1e-4
     preferred: Any = None
 
