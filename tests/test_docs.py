@@ -210,6 +210,16 @@ def test_commands_print_what_the_page_shows(page, folder):
 # README's table of figures
 
 
+def test_the_page_on_control_has_the_measured_figures():
+    import json
+
+    from benchmarks.control import RESULTS, table
+
+    measured = table(json.loads((ROOT / RESULTS).read_text(encoding="utf-8")))
+    for part in measured.split("\n\n"):
+        assert part in PAGES["docs/control.md"]
+
+
 def test_the_readme_has_the_measured_figures():
     import json
 
