@@ -1,5 +1,8 @@
 import dataclasses
 import os
+import subprocess
+import sys
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -9,7 +12,9 @@ import xarray
 import knode_cosserat as kc
 from knode_cosserat.trajectory_file import load_trajectory
 from knode_cosserat.trajectory_system import TrajectoryFileError
-from tests.trajectories import ROBOTS, Leapfrog, Pendulum, fails, synthetic
+from tests.trajectories import ROBOTS, Leapfrog, Pendulum, assert_same, fails, synthetic
+
+ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture
@@ -19,8 +24,11 @@ def path(tmp_path):
     return path
 
 
-def edited(path, edit):
+def edited(path, edit, checked=False):
+    """Change a file's content; without a checksum unless `checked`, as files of earlier versions."""
     with h5py.File(path, "a") as file:
+        if not checked:
+            file.attrs["format_version"] = 1
         edit(file)
     return path
 
@@ -67,18 +75,18 @@ def test_damaged_files_give_an_error_or_a_trajectory(path, seed):
 
 
 def test_newer_and_older_versions(path):
-    edited(path, lambda file: file.attrs.__setitem__("format_version", 2))
-    edited(path, lambda file: file.attrs.__setitem__("knode_cosserat_version", "9.1"))
-    with fails("a.nc: format_version is 2; allowed is 1", "knode-cosserat 9.1"):
+    edited(path, lambda file: file.attrs.update(format_version=3, knode_cosserat_version="9.1"))
+    with fails("a.nc: format_version is 3; this knode-cosserat reads 1 to 2", "knode-cosserat 9.1"):
         load_trajectory(path)
     edited(path, lambda file: file.attrs.__delitem__("format_version"))
-    with fails("a.nc: format_version is None; allowed is 1"):
+    with fails("a.nc: format_version is None; this knode-cosserat reads 1 to 2"):
         load_trajectory(path)
 
 
 @pytest.mark.parametrize("name", ["time", "p", "u", "tension", "result", "residual", "iterations"])
 def test_missing_variables(path, name):
     data = xarray.load_dataset(path, decode_cf=False)
+    data.attrs["format_version"] = 1  # without a checksum
     data.drop_vars(name).to_netcdf(path, engine="h5netcdf")
     with fails(f"a.nc: the variable '{name}' is missing"):
         load_trajectory(path)
@@ -86,6 +94,7 @@ def test_missing_variables(path, name):
 
 def test_variables_of_another_shape_or_type(path):
     data = xarray.load_dataset(path, decode_cf=False)
+    data.attrs["format_version"] = 1  # without a checksum
     data.assign(n=(("time", "node", "a"), data["n"].values[..., :2])).to_netcdf(path, engine="h5netcdf")
     with fails("a.nc: the variable 'n' has shape (4, 5, 2); allowed is (4, 5, 3)"):
         load_trajectory(path)
@@ -129,6 +138,7 @@ def test_where_a_motion_began_is_told_whole_or_not_at_all(tmp_path):
     ):
         synthetic(places=5).save(tmp_path / "a.nc")
         with xarray.open_dataset(tmp_path / "a.nc", engine="h5netcdf", decode_cf=False) as data:
+            data.attrs["format_version"] = 1  # without a checksum
             kept = data.load()
         values = kept[name].values
         if change is None:
@@ -152,6 +162,7 @@ def test_robots_of_a_batch_that_are_not_right(tmp_path):
     with fails("a.nc: a robot of the batch is not possible: length must be between 0.001 and 20 m (got -1)"):
         load_trajectory(path)
     data = xarray.load_dataset(path, decode_cf=False)
+    data.attrs["format_version"] = 1  # without a checksum
     data.drop_vars("robot_drag").to_netcdf(path, engine="h5netcdf")
     with fails("a.nc: the variable 'robot_drag' is missing"):
         load_trajectory(path)
@@ -194,3 +205,123 @@ def test_a_crash_leaves_the_old_file(path, monkeypatch):
         synthetic(seed=1).save(path)
     assert path.read_bytes() == before
     assert os.listdir(path.parent) == ["a.nc"]
+
+
+# what loads is what was saved
+
+
+def test_no_change_of_the_content_is_read(path):
+    """Each byte that is flipped is in the data of a variable, or the file is refused, or nothing changed."""
+    expected, content = load_trajectory(path), path.read_bytes()
+    rng, refused = np.random.default_rng(0), 0
+    for place in rng.integers(0, len(content), size=150):
+        changed = bytearray(content)
+        changed[place] ^= 1 << rng.integers(8)
+        path.write_bytes(changed)
+        try:
+            found = load_trajectory(path)
+        except TrajectoryFileError:
+            refused += 1
+            continue
+        assert_same(found, expected)
+    assert refused > 50
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "reason"),
+    [
+        ("time", 9.0, "its times do not increase"),
+        ("time", np.nan, "its times do not increase"),
+        ("result", 77, "it has the result code 77"),
+        ("residual", np.inf, "a solved row has a residual that is not finite"),
+        ("iterations", -1, "a number of iterations is negative"),
+        ("p", np.nan, "a solved row has a state that is not finite"),
+    ],
+)
+def test_rows_that_no_simulation_has(path, name, value, reason):
+    def change(file):
+        file["result"][:] = 0
+        values = file[name][:]
+        values.flat[0] = value
+        file[name][:] = values
+
+    # NaN and infinity are in the first row of the random trajectory
+    clean = load_trajectory(path)
+    dataclasses.replace(clean, y=np.nan_to_num(clean.y, posinf=1.0)).save(path)
+    edited(path, change)
+    with fails("a.nc: not a trajectory that a simulation wrote", reason):
+        load_trajectory(path)
+
+
+def test_nothing_is_read_from_other_files(path, tmp_path):
+    with h5py.File(tmp_path / "secret.h5", "w") as file:
+        file["residual"] = np.full(4, 42.0)
+    (tmp_path / "raw").write_bytes(np.full(4, 42.0).tobytes())
+    os.mkfifo(tmp_path / "pipe")
+    content = path.read_bytes()
+
+    def replaced(make):
+        path.write_bytes(content)
+
+        def edit(file):
+            del file["residual"]
+            make(file)
+
+        edited(path, edit, checked=True)
+
+    for other in ("secret.h5", "pipe"):
+        replaced(
+            lambda file, other=other: file.__setitem__("residual", h5py.ExternalLink(other, "/residual"))
+        )
+        with fails("a.nc: 'residual' is a link; allowed are variables"):
+            load_trajectory(path)
+    replaced(lambda file: file.__setitem__("residual", h5py.SoftLink("/time")))
+    with fails("a.nc: 'residual' is a link; allowed are variables"):
+        load_trajectory(path)
+    external = [(str(tmp_path / "raw"), 0, 32)]
+    replaced(lambda file: file.create_dataset("residual", (4,), "f8", external=external))
+    with fails("a.nc: the data of 'residual' are in another file; not read"):
+        load_trajectory(path)
+    layout = h5py.VirtualLayout((4,), "f8")
+    layout[:] = h5py.VirtualSource(str(tmp_path / "secret.h5"), "residual", (4,))
+    replaced(lambda file: file.create_virtual_dataset("residual", layout))
+    with fails("a.nc: the data of 'residual' are in another file; not read"):
+        load_trajectory(path)
+    replaced(lambda file: file.create_group("residual"))
+    with fails("a.nc: 'residual' is a group; allowed are variables"):
+        load_trajectory(path)
+
+
+def test_variables_of_gigabytes_that_were_never_written_are_not_read(path):
+    def enlarge(file):
+        file.create_dataset("more", (2**30,), "f8", chunks=(2**20,))
+
+    edited(path, enlarge)
+    with fails("a.nc: its variables take 8.59 GB; allowed are 0.1"):
+        load_trajectory(path)
+
+
+def test_a_disk_that_fills_up_leaves_the_old_file_and_nothing_else(tmp_path):
+    """The limit of a file's size stands for the full disk; HDF5 crashed the interpreter there."""
+    script = """
+import resource, signal, sys
+from pathlib import Path
+import knode_cosserat as kc
+from tests.trajectories import synthetic
+path = Path(sys.argv[1])
+synthetic(seed=1).save(path)
+before = path.read_bytes()
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+for most in (0, 1000, len(before) - 1):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (most, resource.RLIM_INFINITY))
+    try:
+        synthetic(seed=2).save(path)
+    except ValueError as error:
+        print(error)
+    assert path.read_bytes() == before and list(path.parent.iterdir()) == [path]
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script, str(tmp_path / "a.nc")], capture_output=True, text=True, cwd=ROOT
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("a.nc: cannot be written: File too large") == 3

@@ -93,6 +93,9 @@ def synthetic(batch=(), steps=4, nodes=5, robot=ROBOT, settings=PAPER, seed=0, p
     rows = (*batch, steps)
     y = rng.normal(size=(*rows, nodes, robot.y_layout.size))
     y.flat[:4] = [-0.0, np.nan, np.inf, 5e-324]
+    result = rng.choice([int(result) for result in kc.Result], size=rows)
+    # a solved row is finite
+    result.flat[:1] = int(kc.Result.NO_CONVERGENCE)
     return kc.Trajectory(
         system=robot,
         settings=settings,
@@ -100,7 +103,7 @@ def synthetic(batch=(), steps=4, nodes=5, robot=ROBOT, settings=PAPER, seed=0, p
         y=y,
         z=rng.normal(size=(*rows, nodes, robot.z_layout.size)),
         control=rng.uniform(size=(*rows, robot.control_size)),
-        result=rng.choice([int(result) for result in kc.Result], size=rows),
+        result=result,
         residual=rng.normal(size=rows),
         iterations=rng.integers(0, 100, size=rows),
         position_error=rng.uniform(size=rows) if places else None,

@@ -5,9 +5,15 @@ from __future__ import annotations
 import contextlib
 import importlib.metadata
 import os
+import re
 import secrets
+import shutil
+import time
 from collections.abc import Iterator
 from pathlib import Path
+
+#: age (s) from which a temporary file counts as abandoned
+ABANDONED = 3600.0
 
 
 @contextlib.contextmanager
@@ -15,21 +21,34 @@ def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; the file written there replaces `path` atomically.
 
     If anything fails, or the process is killed, the old file is unchanged. A symbolic link keeps its target,
-    which is replaced. A path that is not a regular file, such as a pipe or /dev/null, is written directly.
+    which is replaced. The new file has the permissions of the old one. What killed writes of this file left
+    behind is removed. A path that is not a regular file, such as a pipe or /dev/null, is written directly.
     """
     if path.exists() and not path.is_file() and not path.is_dir():
         yield path
         return
     path = Path(os.path.realpath(path))
+    _remove_abandoned(path)
     temporary = path.parent / f".{path.name}.{secrets.token_hex(6)}.tmp"
     try:
         yield temporary
         # synchronise before the rename, or a power failure could leave the name with an empty file
         with temporary.open("r+b") as file:
             os.fsync(file.fileno())
+        if path.exists():
+            shutil.copymode(path, temporary)
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _remove_abandoned(path: Path) -> None:
+    """Remove temporary files of earlier writes that were killed; younger ones may be in use."""
+    pattern = re.compile(re.escape(f".{path.name}.") + r"[0-9a-f]{12}\.tmp")
+    with contextlib.suppress(OSError):
+        for entry in os.scandir(path.parent):
+            if pattern.fullmatch(entry.name) and time.time() - entry.stat().st_mtime > ABANDONED:
+                os.unlink(entry.path)
 
 
 def package_version() -> str:

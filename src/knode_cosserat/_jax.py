@@ -22,18 +22,27 @@ def _machine() -> str:
     return hashlib.sha256(described.encode()).hexdigest()[:12]
 
 
-def cache_directory() -> Path:
-    """Return the directory of compiled programs: $KNODE_COSSERAT_CACHE, or the user's cache directory."""
-    chosen = os.environ.get("KNODE_COSSERAT_CACHE")
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return (Path(chosen) if chosen else home / "knode-cosserat") / _machine()
+def cache_directory() -> Path | None:
+    """Return the directory of compiled programs: $KNODE_COSSERAT_CACHE, or the user's cache directory.
+
+    None for a user without a home: a directory that others may write to is no place for machine code.
+    """
+    chosen, given = os.environ.get("KNODE_COSSERAT_CACHE"), os.environ.get("XDG_CACHE_HOME")
+    if chosen:
+        return Path(chosen) / _machine()
+    try:
+        home = Path(given) if given else Path.home() / ".cache"
+    except RuntimeError:  # neither $HOME nor an entry in the user database, as in some containers
+        return None
+    return home / "knode-cosserat" / _machine()
 
 
 def configure() -> None:
     """Configure JAX once, on import. A cache directory that the user set for JAX is not changed."""
     jax.config.update("jax_enable_x64", True)
-    if getattr(jax.config, "jax_compilation_cache_dir", None) is None:
-        jax.config.update("jax_compilation_cache_dir", str(cache_directory()))
+    directory = cache_directory()
+    if directory is not None and getattr(jax.config, "jax_compilation_cache_dir", None) is None:
+        jax.config.update("jax_compilation_cache_dir", str(directory))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 

@@ -11,6 +11,9 @@ import yaml
 
 from knode_cosserat.errors import KnodeCosseratError
 
+#: largest text, and number of values in it with all aliases written out
+MOST_CHARACTERS, MOST_VALUES = 2_000_000, 200_000
+
 
 class YAMLTextError(KnodeCosseratError, ValueError):
     """A text is not YAML, or not a mapping; the message says why and names no file."""
@@ -24,12 +27,16 @@ def mapping_of(text: str, keys: str) -> dict[Any, Any]:
     Raises:
         YAMLTextError: the text is not YAML, or is not a mapping.
     """
+    if len(text) > MOST_CHARACTERS:
+        raise YAMLTextError(f"the file has {len(text)} characters; allowed are {MOST_CHARACTERS}")
     try:
-        content = yaml.load(text, _Loader)
+        content = _content(text)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = f" line {mark.line + 1}:" if mark else ""
         raise YAMLTextError(f"{line} not YAML: {error.problem}".strip()) from None
+    except YAMLTextError:
+        raise
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise YAMLTextError(f"not YAML: {reason}") from None
@@ -37,6 +44,31 @@ def mapping_of(text: str, keys: str) -> dict[Any, Any]:
         found = "empty" if content is None else shown(content)
         raise YAMLTextError(f"the file is {found}; allowed is a mapping with {keys}")
     return content
+
+
+def _content(text: str) -> Any:
+    """Return the content of a text; what its aliases (*name) repeat is counted before it is constructed."""
+    loader = _Loader(text)
+    try:
+        root = loader.get_single_node()
+        if root is None:
+            return None
+        count = _expanded(root, {})
+        if count > MOST_VALUES:
+            raise YAMLTextError(f"with its aliases it has {count:.3g} values; allowed are {MOST_VALUES}")
+        return loader.construct_document(root)
+    finally:
+        loader.dispose()
+
+
+def _expanded(node: yaml.Node, known: dict[int, float]) -> float:
+    """Return the number of values in a node with all aliases written out; infinite for one within itself."""
+    if id(node) not in known:
+        known[id(node)] = float("inf")
+        parts = node.value if isinstance(node, yaml.CollectionNode) else ()
+        each = (part for pair in parts for part in (pair if isinstance(pair, tuple) else (pair,)))
+        known[id(node)] = 1.0 + sum(_expanded(part, known) for part in each)
+    return known[id(node)]
 
 
 def flow(value: Any) -> str:

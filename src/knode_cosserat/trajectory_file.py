@@ -8,8 +8,8 @@ Reading runs no code from the file.
 
 from __future__ import annotations
 
+import io
 import json
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +23,13 @@ from knode_cosserat.solvers.history import GUESS_STATES, SolverState, StateHisto
 from knode_cosserat.solvers.result import EARLIER_RESULTS, Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.trajectory import Trajectory
+from knode_cosserat.trajectory_integrity import (
+    CHECKSUM,
+    add_checksum,
+    checksum,
+    require_own_data,
+    require_possible,
+)  # fmt: skip
 from knode_cosserat.trajectory_system import (
     BYTES,
     PARAMETER,
@@ -39,7 +46,8 @@ if TYPE_CHECKING:
     import xarray
 
 FORMAT = "knode-cosserat trajectory"
-VERSION = 1
+#: the version that is written, and those that are read; from 2 on files have a checksum
+VERSION, READ = 2, (1, 2)
 
 #: variables with one number in each row: name, unit and meaning
 _ROWS = (
@@ -88,13 +96,18 @@ def save(trajectory: Trajectory, path: str | Path) -> None:
     data = _dataset(trajectory, str(path))
     # by default xarray declares NaN as "missing", but here `result` gives its meaning
     plain = {name: {"_FillValue": None} for name in data.variables}
+    # in memory: HDF5 crashes the interpreter if it cannot write its last blocks, as on a full disk
+    file = io.BytesIO()
+    data.to_netcdf(file, engine="h5netcdf", encoding=plain)
+    with _opened(file) as written:
+        add_checksum(file, checksum(written.load()))
     try:
         with replacing(path) as temporary:
-            data.to_netcdf(temporary, engine="h5netcdf", encoding=plain)
-    except (OSError, RuntimeError) as error:  # HDF5 raises either for a full disk
-        number = error.errno if isinstance(error, OSError) else None
-        reason = os.strerror(number) if number else first_line(error)
-        raise TrajectoryFileError(f"{path}: cannot be written: {reason}") from None
+            temporary.write_bytes(file.getbuffer())
+    except OSError as error:
+        raise TrajectoryFileError(
+            f"{path}: cannot be written: {error.strerror or first_line(error)}"
+        ) from None
 
 
 provide(Trajectory, "save", save)
@@ -239,6 +252,7 @@ def load_trajectory(path: str | Path, *, system: System | None = None) -> Trajec
         numbers[_OUTSIDE[0]] = values_of(path, data, _OUTSIDE[0], rows).astype(bool)
     settings, thinned = _settings(path, data), bool(data.attrs.get(_THINNED, 0))
     states = {attribute: _state(path, data, name) for name, attribute, _ in _STATES}
+    require_possible(path, time, numbers, y)
     return Trajectory(system, settings, time, y, z, control, **numbers, **states, thinned=thinned)
 
 
@@ -278,14 +292,22 @@ def _state(path: Path, data: xarray.Dataset, name: str) -> SolverState | None:
     return SolverState(history, None if np.isnan(first) else first, bool(np.all(known)))
 
 
-def _read(path: Path) -> xarray.Dataset:
+def _opened(file: Any) -> xarray.Dataset:
+    """Return the dataset of a file, with attributes and numbers as they are in the file."""
     import xarray
 
+    return xarray.open_dataset(file, engine="h5netcdf", decode_cf=False, phony_dims="access")
+
+
+def _read(path: Path) -> xarray.Dataset:
     _require_hdf5(path)
     try:
-        with xarray.open_dataset(path, engine="h5netcdf", decode_cf=False, phony_dims="access") as data:
+        require_own_data(path)
+        with _opened(path) as data:
             _require_format(path, data.attrs)
-            return data.load()
+            found = data.load()
+            _require_checksum(path, found)
+            return found
     except TrajectoryFileError:
         raise
     except Exception as error:  # each of three libraries has its own exceptions for a damaged file
@@ -304,13 +326,19 @@ def _require_hdf5(path: Path) -> None:
         raise TrajectoryFileError(f"{path}: not a netCDF-4 file")
 
 
+def _require_checksum(path: Path, data: xarray.Dataset) -> None:
+    """Raise `TrajectoryFileError` if anything in the file was changed after it was written."""
+    if data.attrs["format_version"] >= 2 and data.attrs.get(CHECKSUM) != checksum(data):
+        raise TrajectoryFileError(f"{path}: damaged or changed: its contents do not have its checksum")
+
+
 def _require_format(path: Path, attributes: dict[Any, Any]) -> None:
     if attributes.get("format") != FORMAT:
         raise TrajectoryFileError(f"{path}: not a trajectory of this package: its format is not {FORMAT!r}")
     version = attributes.get("format_version")
-    if version != VERSION:
+    if version not in READ:
         raise TrajectoryFileError(
-            f"{path}: format_version is {version}; allowed is {VERSION}, which this knode-cosserat reads "
+            f"{path}: format_version is {version}; this knode-cosserat reads {READ[0]} to {READ[-1]} "
             f"(the file is from knode-cosserat {attributes.get('knode_cosserat_version', 'unknown')})"
         )
 

@@ -81,6 +81,15 @@ def controller_of_study(name: str) -> Controller:
     return controller_named(name, nominal_robot(), DT, LIMITS)
 
 
-#: controllers that are slower than real time: a quick study has only these robots and references for them
+#: controllers that are slower than real time
 SLOW = ("ilqr", "mppi")
-FEW = ("exact model", "stiffness +30%"), ("circle, 4 s", "circle, 1.5 s")
+#: robots that a quick study has for the controllers that it compares with
+FEW = ("exact model", "stiffness +30%", "unknown 50 g at the tip")
+
+
+def cases_of(name: str, quick: bool) -> tuple[list[str], list[str]]:
+    """Return the names of robots and references of a controller: all, or the few of a quick study."""
+    robots, paths = list(true_robots()), list(references())
+    if not quick or name == ADAPTIVE:
+        return robots, paths
+    return list(FEW), paths[:1] if name in SLOW else paths

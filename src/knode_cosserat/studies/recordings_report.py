@@ -86,8 +86,8 @@ def _said(measured: Mapping[str, Any], simulated: bool | None) -> str:
         return "These recordings are of a physical robot."
     if said == {None}:
         return (
-            "**Whether the robot was a physical or a simulated one, the recordings do not say** "
-            "(`--simulated` or `--physical` does, or `simulated` in their configuration)."
+            "**It is not stated whether these recordings are of a physical or of a simulated robot** "
+            "(state it with `--simulated`, `--physical`, or `simulated` in their configuration)."
         )
     return "**Some of these recordings are of a simulated robot.**"
 

@@ -119,7 +119,7 @@ def tracked(
 
     Args:
         settings: `robot`, the data sheet; `controllers`, names; `adaptive`, the name of the adaptive one;
-            `few`, names of controllers that follow the first two references only.
+            `few`, for some controllers the names of the references that they follow; all by default.
         paths: references by name.
         dt: period (s).
         limits: of the commands.
@@ -141,7 +141,7 @@ def tracked(
     cells = []
     for name in settings["controllers"]:
         controller = controller_of(model, name, dt, limits, settings["adaptive"])
-        followed = list(paths)[:2] if name in settings["few"] else list(paths)
+        followed = settings["few"].get(name, list(paths))
         for path in followed:
             if isinstance(controller, PlanController):
                 controller.observer.restart()

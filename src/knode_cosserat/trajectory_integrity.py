@@ -1,0 +1,104 @@
+"""Integrity of trajectory files: checksum, no data of other files, and rows that a simulation can have."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from knode_cosserat.solvers.result import Result
+from knode_cosserat.trajectory_system import TrajectoryFileError
+
+if TYPE_CHECKING:
+    import xarray
+
+#: attribute with the checksum of all other contents
+CHECKSUM = "checksum"
+#: most bytes that the arrays of a file may take: so many times the file, and these besides. The package does
+#: not compress; other programs may
+EXPANSION, BESIDES = 100, 100_000_000
+
+
+def add_checksum(file: Any, value: str) -> None:
+    """Add a checksum to a file, given by path or in memory."""
+    import h5py
+
+    with h5py.File(file, "r+") as opened:
+        opened.attrs[CHECKSUM] = value
+
+
+def checksum(data: xarray.Dataset) -> str:
+    """Return the SHA-256 of the variables, their dimensions and all attributes, in hexadecimal."""
+    digest = hashlib.sha256()
+
+    def add(value: Any) -> None:
+        array = np.asarray(value)
+        if array.dtype.kind in "fiub":
+            digest.update(f"{array.dtype.str}{array.shape}".encode())
+            digest.update(np.ascontiguousarray(array).tobytes())
+        else:
+            digest.update(json.dumps([str(each) for each in array.ravel()]).encode())
+
+    def add_attributes(attributes: Any) -> None:
+        for name in sorted(attributes, key=str):
+            if name != CHECKSUM:
+                add(name)
+                add(attributes[name])
+
+    for name in sorted(data.variables, key=str):
+        variable = data.variables[name]
+        add([name, *variable.dims])
+        add(variable.values)
+        add_attributes(variable.attrs)
+    add_attributes(data.attrs)
+    return digest.hexdigest()
+
+
+def require_own_data(path: Path) -> None:
+    """Raise `TrajectoryFileError` if a file names data of other files, or expands far beyond its size."""
+    import h5py
+
+    expanded = 0
+    with h5py.File(path, "r") as file:
+        for name in file:
+            link = file.get(name, getlink=True)
+            if not isinstance(link, h5py.HardLink):
+                raise TrajectoryFileError(f"{path}: {name!r} is a link; allowed are variables")
+            each = file[name]
+            if not isinstance(each, h5py.Dataset):
+                raise TrajectoryFileError(f"{path}: {name!r} is a group; allowed are variables")
+            if each.is_virtual or each.external:
+                raise TrajectoryFileError(f"{path}: the data of {name!r} are in another file; not read")
+            expanded += each.size * each.dtype.itemsize
+    most = EXPANSION * path.stat().st_size + BESIDES
+    if expanded > most:
+        raise TrajectoryFileError(
+            f"{path}: its variables take {expanded / 1e9:.3g} GB; allowed are {most / 1e9:.3g} GB for a file "
+            "of this size"
+        )
+
+
+def require_possible(
+    path: Path, time: np.ndarray, numbers: dict[str, np.ndarray], y: np.ndarray
+) -> None:  # fmt: skip
+    """Raise `TrajectoryFileError` if rows contradict each other, as those of no simulation do."""
+
+    def refuse(reason: str) -> None:
+        raise TrajectoryFileError(f"{path}: not a trajectory that a simulation wrote: {reason}")
+
+    if not np.all(np.isfinite(time)) or np.any(np.diff(time) <= 0.0):
+        refuse("its times do not increase")
+    result = numbers["result"]
+    unknown = np.setdiff1d(result, [int(each) for each in Result])
+    if unknown.size:
+        refuse(f"it has the result code {unknown[0]}")
+    solved = result >= 0
+    if not np.all(np.isfinite(y[solved])):
+        refuse("a solved row has a state that is not finite")
+    if not np.all(np.isfinite(numbers["residual"][solved])):
+        refuse("a solved row has a residual that is not finite")
+    if np.any(numbers["iterations"] < 0):
+        refuse("a number of iterations is negative")
