@@ -1,8 +1,11 @@
-"""Numbers in a text: the vectors of command lines and control words."""
+"""Numbers of users: the vectors of command lines and control words, and arrays that must be real numbers."""
 
 from __future__ import annotations
 
 import re
+from typing import Any
+
+import numpy as np
 
 _SEPARATOR = re.compile(r"\s*[,;]\s*|\s+")
 _BRACKETS = {"[": "]", "(": ")"}
@@ -20,3 +23,31 @@ def numbers_in(text: str) -> list[float] | None:
         return [float(word) for word in _SEPARATOR.split(text)]
     except ValueError:
         return None
+
+
+#: what NumPy would turn into numbers, by the kind of its type
+_NO_NUMBERS = {
+    "b": "true or false", "c": "complex", "U": "text", "S": "text", "M": "dates", "m": "durations",
+    "V": "records",
+}  # fmt: skip
+
+
+def real_array(values: Any) -> np.ndarray:
+    """Return values as an array of real numbers.
+
+    Raises:
+        ValueError: they are no numbers, or some are masked; a phrase that follows "they".
+    """
+    if isinstance(values, np.ma.MaskedArray):
+        if np.ma.is_masked(values):
+            raise ValueError(f"{int(np.ma.count_masked(values))} of them are masked")
+        values = values.data
+    array = np.asarray(values)
+    kind = array.dtype.kind
+    if kind == "O":
+        words = next((each for each in array.ravel() if isinstance(each, (str, bytes, bool))), None)
+        if words is not None:
+            raise ValueError(f"one of them is {words!r}")
+    elif kind in _NO_NUMBERS:
+        raise ValueError(f"they are {_NO_NUMBERS[kind]}")
+    return np.asarray(array, dtype=float)

@@ -20,7 +20,7 @@ import numpy as np
 
 from knode_cosserat._csv import Column, CSVTextError, held_rows, read_rows
 from knode_cosserat._files import replacing
-from knode_cosserat._numbers import numbers_in
+from knode_cosserat._numbers import numbers_in, real_array
 from knode_cosserat._reprs import count_of
 from knode_cosserat._signals import (
     ControlsError,
@@ -77,7 +77,10 @@ def save(path: str | Path, tensions: Any, dt: float) -> None:
 
     The file is written completely or not at all.
     """
-    tensions = np.asarray(tensions, dtype=float)
+    try:
+        tensions = real_array(tensions)
+    except (TypeError, ValueError) as error:
+        raise ControlsError(f"tensions are not numbers ({error}); allowed is (steps, tendons)") from None
     if tensions.ndim != 2 or 0 in tensions.shape:
         raise ControlsError(f"tensions have shape {tensions.shape}; allowed is (steps, tendons)")
     checked_tensions(tensions, str(path))

@@ -18,7 +18,12 @@ def write_output(as_json: bool, facts: dict[str, Any], lines: list[str], **writt
         typer.echo(json.dumps(facts | files, allow_nan=False))
         return
     for line in [*lines, *(f"wrote {path}" for path in written.values() if path)]:
-        typer.echo(line)
+        typer.echo(printable(line))
+
+
+def printable(text: str) -> str:
+    """Return a text with control characters written out: names in files may hold a terminal's commands."""
+    return "".join(c if c.isprintable() or c in "\n\t" else repr(c)[1:-1] for c in text)
 
 
 def table(rows: Sequence[Sequence[str]]) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import re
 import sys
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from knode_cosserat.cli.output import printable
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.solvers.result import SimulationError
 
@@ -47,7 +49,7 @@ class _Program(TyperGroup):
             if parser_message is None and not isinstance(error, _EXPECTED):
                 raise
             text = parser_message() if parser_message else str(error)
-            typer.echo("error: " + " ".join(text.split()), err=True)
+            typer.echo("error: " + printable(" ".join(text.split())), err=True)
             sys.exit(1 if isinstance(error, SimulationError) else 2)
         sys.exit(status or 0)
 
@@ -103,7 +105,7 @@ def _is_number(text: str) -> bool:
 
 
 def _print_warning(message: Warning | str, *_: Any, **__: Any) -> None:
-    typer.echo("warning: " + " ".join(str(message).split()), err=True)
+    typer.echo("warning: " + printable(" ".join(str(message).split())), err=True)
 
 
 def _app(**options: Any) -> typer.Typer:
@@ -123,6 +125,9 @@ studies = _app(help="Repeat a study of the paper, or of a folder of recordings."
 
 def main() -> None:
     """Run the program `knode-cosserat`."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a terminal that has no "²" shows \xb2
+            stream.reconfigure(errors="backslashreplace")
     app()
 
 

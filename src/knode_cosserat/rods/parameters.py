@@ -327,7 +327,7 @@ def checked(name: str, value: Any, parameter: Parameter) -> None:
         parameter.shape
     )
     try:
-        array = np.asarray(value)
+        array = np.asarray(value) if not np.ma.is_masked(value) else np.array("masked")
     except (TypeError, ValueError):
         array = np.array("ragged")
     if array.dtype.kind not in "fiu":

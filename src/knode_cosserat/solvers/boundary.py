@@ -28,13 +28,17 @@ from knode_cosserat.solvers.linear import Factors, factored, solved_correction
 from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.space import SpaceScheme
 
+#: largest correction that may be left at a solution, relative to the state and its natural units
+CLOSE = 1e-5
+
 
 @dataclasses.dataclass(frozen=True)
 class NewtonOptions:
     """Tolerances and limits of Newton's method.
 
     Residuals are measured in the system's natural units (`System.scales`). A step is solved when the largest
-    is below `tolerance`, or below `acceptable` where rounding allows no further progress.
+    is below `tolerance`, or below `acceptable` where rounding allows no further progress, and the correction
+    that is left is small.
     """
 
     tolerance: float = 1e-10
@@ -118,6 +122,8 @@ class _Progress(NamedTuple):
     error: Any
     #: length of the correction from it, infinite if there is none by the same linearisation
     size: Any
+    #: the same relative to the state
+    left: Any
     #: damping factor of the next correction
     damping: Any
     #: a new linearisation is needed at the point
@@ -141,7 +147,7 @@ class _Search(NamedTuple):
     point: Float[Any, " n"]
     direction: Float[Any, " n"]
     #: `_Progress`
-    numbers: Float[Any, "10"]
+    numbers: Float[Any, "11"]
 
     @property
     def progress(self) -> _Progress:
@@ -149,7 +155,7 @@ class _Search(NamedTuple):
         return _Progress(*(self.numbers[k] for k in range(len(_Progress._fields))))
 
 
-def _packed(progress: _Progress) -> Float[Any, "10"]:
+def _packed(progress: _Progress) -> Float[Any, "11"]:
     return jnp.stack([jnp.asarray(each, dtype=float) for each in progress])
 
 
@@ -178,7 +184,8 @@ def newton(
         error = largest_of(scales, defects, tip)
         dy, dxi = solved_correction(factors, pivots, defects, tip)
         size = jnp.max(jnp.abs(dy) / scales.y)
-        good = error <= options.tolerance
+        left = jnp.max(jnp.abs(dy) / (scales.y + jnp.abs(y)))
+        good = (error <= options.tolerance) & (left <= CLOSE)
         shorter = (size <= (1.0 - last.damping / 4.0) * last.size) & jnp.isfinite(size)
         accept = good | shorter
         # corrections still to come at this rate
@@ -193,6 +200,7 @@ def newton(
         longer = jnp.where(first, 1.0, jnp.minimum(1.0, 4.0 * last.damping))
         progress = _Progress(
             error=jnp.where(accept, error, last.error), size=jnp.where(accept, size, last.size),
+            left=jnp.where(accept, left, last.left),
             damping=jnp.where(accept, longer, last.damping / 4.0), renew=renew, first=False,
             fresh=jnp.where(accept, first, fresh), old=old, done=good | dead,
             corrections=last.corrections + ~(good | dead | renew), linearisations=last.linearisations,
@@ -234,7 +242,7 @@ def newton(
 
     guess = jnp.concatenate([y.reshape(-1), unknowns])
     begun = _Progress(
-        error=jnp.inf, size=jnp.inf, damping=1.0, renew=~kept.usable, first=False, fresh=False,
+        error=jnp.inf, size=jnp.inf, left=jnp.inf, damping=1.0, renew=~kept.usable, first=False, fresh=False,
         old=kept.usable, done=False, corrections=0, linearisations=0,
     )  # fmt: skip
     search, factors = jax.lax.while_loop(
@@ -243,10 +251,12 @@ def newton(
         (_Search(guess, jnp.zeros_like(guess), _packed(begun)), kept.factors),
     )
     end = search.progress
+    # a small residual is no solution while the correction from it is large
+    error = jnp.where(end.left <= CLOSE, end.error, jnp.maximum(end.error, jnp.minimum(end.left, 1.0)))
     solution = Solution(
-        *unpacked(search.point), end.error, end.corrections.astype(int), end.linearisations.astype(int)
+        *unpacked(search.point), error, end.corrections.astype(int), end.linearisations.astype(int)
     )
-    return solution, Kept(factors, (end.error <= options.acceptable) & ~(end.renew > 0.0))
+    return solution, Kept(factors, (error <= options.acceptable) & ~(end.renew > 0.0))
 
 
 def _where(condition: Any, one: Any, other: Any) -> Any:

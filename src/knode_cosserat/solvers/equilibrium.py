@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from knode_cosserat._numbers import real_array
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.rods.trained_range import without_range
 from knode_cosserat.solvers.boundary import NewtonOptions
@@ -154,11 +155,11 @@ def _traced(system, controls, y, task):  # type: ignore[no-untyped-def]
 
 
 def _checked_control(control: Any) -> Any:
-    if not hasattr(control, "ndim"):
+    if not isinstance(control, jax.Array):
         try:
             if control is None:
                 raise TypeError("None")
-            control = np.asarray(control, dtype=float)
+            control = real_array(control)
         except (TypeError, ValueError) as error:
             raise ValueError(f"control is not numbers ({error}); allowed is (c,), or (B, c)") from None
     if not control.ndim:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import reprlib
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Literal
@@ -12,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from knode_cosserat._numbers import real_array
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.rods.trained_range import without_range
 from knode_cosserat.solvers import sensitivity
@@ -36,6 +38,8 @@ from knode_cosserat.solvers.time import TimeScheme
 from knode_cosserat.solvers.time_loop import StepRows
 from knode_cosserat.trajectory import Trajectory
 
+#: shortest and longest time steps (s): shorter ones are lost in rounding errors of the times
+SHORTEST_STEP, LONGEST_STEP = 1e-9, 1e6
 #: time steps above this (s), and above this multiple of the rod's natural time, suggest milliseconds
 LONG_STEP, LONG_STEPS = 1.0, 100.0
 #: first and largest number of segments for position_tolerance
@@ -208,8 +212,11 @@ def stacked(robot: Any) -> tuple[System, int | None]:
 
 def checked_dt(dt: Any) -> float:
     """Return a valid time step (s). Raises `ValueError` otherwise."""
-    if not isinstance(dt, int | float | np.number) or not 0.0 < dt < np.inf:
-        raise ValueError(f"dt is {dt!r}; allowed is a positive number of seconds")
+    number = isinstance(dt, int | float | np.number) and not isinstance(dt, bool | np.bool_)
+    if not number or not SHORTEST_STEP <= dt <= LONGEST_STEP:
+        raise ValueError(
+            f"dt is {reprlib.repr(dt)}; allowed is a number of seconds, {SHORTEST_STEP:g} to {LONGEST_STEP:g}"
+        )
     return float(dt)
 
 
@@ -233,9 +240,7 @@ def checked_controls(system: System, controls: Any, batch: int | None) -> tuple[
     allowed = f"allowed is (steps, {size}) or (batch, steps, {size}): {names}"
     if not is_traced(controls):
         try:
-            if np.iscomplexobj(controls):
-                raise ValueError("they are complex")
-            controls = np.asarray(controls, dtype=float)
+            controls = real_array(controls)
         except (TypeError, ValueError) as error:
             raise ValueError(f"controls are not numbers ({error}); {allowed}") from None
     shape = np.shape(controls)

@@ -8,6 +8,7 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
+from knode_cosserat._numbers import real_array
 from knode_cosserat._reprs import robot_text
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import NewtonOptions
@@ -137,7 +138,7 @@ class Stepper:
         fields = self.robot.control_layout.fields
         names = ", ".join(f"{field.name} ({field.size}, {field.unit})" for field in fields)
         try:
-            control = np.array(control, dtype=float)
+            control = np.array(real_array(control))
         except (TypeError, ValueError) as error:
             raise ValueError(f"the control is not numbers ({error}); there are {names}") from None
         if control.shape != (self.robot.control_size,):

@@ -109,7 +109,9 @@ async def serve_page(
     own: list[str] = []
 
     def answer(connection: Any, request: Request) -> Response | None:
-        if request.headers.get("Host") not in own:  # a name that somebody made to point here
+        if request.headers.get_all("Host") not in (
+            [name] for name in own
+        ):  # a name that somebody made to point here
             return Response(403, "Forbidden", Headers(), b"")
         path = request.path.split("?")[0]
         if path == "/live":

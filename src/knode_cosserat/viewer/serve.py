@@ -44,6 +44,10 @@ def view(
 
     class Handler(http.server.BaseHTTPRequestHandler):
         def do_GET(self) -> None:
+            # other names that lead here may be a page's of somebody else
+            if self.headers.get_all("Host") not in ([name] for name in own_names(server.server_address[1])):
+                self.send_error(421)
+                return
             found = self.path.split("?")[0] in ("/", "/index.html")
             body = page if found else b"not found"
             self.send_response(200 if found else 404)
@@ -60,6 +64,11 @@ def view(
         announce(f"http://{HOST}:{server.server_address[1]}/", open_browser)
         with contextlib.suppress(KeyboardInterrupt):
             server.serve_forever()
+
+
+def own_names(port: int) -> tuple[str, ...]:
+    """Return the names under which the server answers, as browsers send them."""
+    return f"{HOST}:{port}", f"localhost:{port}"
 
 
 def checked_port(port: int) -> int:
