@@ -41,6 +41,25 @@ class Container:
 #: largest decompressed size of a chunk (bytes): a larger stated size is more likely an error
 LARGEST_CHUNK = 1 << 30
 _PIECE = 1 << 14
+#: most bytes that all chunks of a file may have together: so many times the file, and these besides.
+#: Recorded messages become 2 to 20 times smaller
+RATIO, BESIDES = 200, 1 << 24
+
+
+class Decompression:
+    """Decompression of a file's chunks, whose sizes are limited together."""
+
+    def __init__(self, size: int) -> None:
+        """Start with the size of the file (bytes)."""
+        self.left = RATIO * size + BESIDES
+
+    def records(self, data: bytes | memoryview, compression: str, size: int) -> tuple[bytes, int]:
+        """Return a chunk's records as `decompressed` does; fewer if the file's limit is reached."""
+        if self.left <= 0:
+            return b"", len(data)
+        records, used = decompressed(data, compression, min(size or LARGEST_CHUNK, self.left))
+        self.left -= len(records)
+        return records, used
 
 
 def decompressed(data: bytes | memoryview, compression: str, size: int) -> tuple[bytes, int]:

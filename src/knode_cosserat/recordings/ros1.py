@@ -10,7 +10,7 @@ import struct
 from collections.abc import Collection
 from typing import NamedTuple
 
-from knode_cosserat.recordings.container import Container, decompressed
+from knode_cosserat.recordings.container import Container, Decompression
 from knode_cosserat.recordings.findings import RecordingError
 
 MAGIC = b"#ROSBAG V"
@@ -64,8 +64,9 @@ class _Bag:
         self.messages: dict[int, list[tuple[int, memoryview]]] = {}
         self.lost = 0
         self.index: int | None = None
+        self._decompression = Decompression(len(data))
 
-    def scan(self, view: memoryview, position: int) -> None:
+    def scan(self, view: memoryview, position: int, in_chunk: bool = False) -> None:
         data = view.obj
         assert isinstance(data, bytes)
         while position < len(data):
@@ -82,6 +83,8 @@ class _Bag:
                 self._connection(view, record)
             elif record.kind == BAG and len(record.fields.get(b"index_pos", b"")) == 8:
                 self.index = int.from_bytes(record.fields[b"index_pos"], "little")
+            elif record.kind == CHUNK and in_chunk:  # in the format no chunk has chunks
+                self.lost += record.end - record.begin
             elif record.kind == CHUNK:
                 position = self._chunk(view, record)
 
@@ -119,9 +122,9 @@ class _Bag:
         known = record.begin < record.end <= len(view)
         packed = view[record.begin : record.end if known else len(view)]
         size = int.from_bytes(record.fields.get(b"size", b""), "little")
-        records, used = decompressed(packed, compression, size)
+        records, used = self._decompression.records(packed, compression, size)
         if records:
-            self.scan(memoryview(records), 0)
+            self.scan(memoryview(records), 0, in_chunk=True)
         if not records or len(records) < size:
             self.lost += max(size - len(records), 0) or used
         if known or used == len(packed):

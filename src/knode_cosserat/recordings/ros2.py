@@ -12,7 +12,7 @@ import urllib.parse
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
-from knode_cosserat.recordings.container import Container, decompressed
+from knode_cosserat.recordings.container import Container, Decompression
 from knode_cosserat.recordings.findings import RecordingError
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
@@ -57,7 +57,7 @@ def merged(containers: list[Container]) -> Container:
 
 def read_mcap(data: bytes, wanted: Collection[str], source: str) -> Container:
     """Return the wanted topics' messages, and all topics' names and types. Raises `RecordingError`."""
-    file = _Mcap(wanted)
+    file = _Mcap(wanted, len(data))
     file.scan(memoryview(data), len(MCAP_MAGIC))
     if not file.finished:
         file.container.damage = file.container.damage or "the recorder was stopped or the file was cut"
@@ -69,15 +69,20 @@ def read_mcap(data: bytes, wanted: Collection[str], source: str) -> Container:
 class _Mcap:
     """Content of an MCAP file read so far."""
 
-    def __init__(self, wanted: Collection[str]) -> None:
+    def __init__(self, wanted: Collection[str], size: int) -> None:
         self.container = Container(ros=2)
+        self._decompression = Decompression(size)
         self.wanted = wanted
         self.types: dict[int, str] = {}
         self.channels: dict[int, tuple[str, int]] = {}
         self.finished = False
 
-    def scan(self, view: memoryview, position: int) -> None:
+    def scan(self, view: memoryview, position: int, in_chunk: bool = False) -> None:
         for kind, record in self._records(view, position):
+            if kind == CHUNK and in_chunk:  # in the format no chunk has chunks
+                self.container.lost += len(record)
+                self.container.damage = "the file is damaged"
+                continue
             try:
                 self._take(kind, record)
             except (struct.error, UnicodeDecodeError):
@@ -111,9 +116,9 @@ class _Mcap:
             compression, begin = _string(record, 28)
             length = struct.unpack_from("<Q", record, begin)[0]
             packed = record[begin + 8 : begin + 8 + length]
-            records = decompressed(packed, compression, size)[0] if compression else packed
+            records = self._decompression.records(packed, compression, size)[0] if compression else packed
             self.container.lost += max(0, min(size, length) - len(records))
-            self.scan(memoryview(records), 0)
+            self.scan(memoryview(records), 0, in_chunk=True)
         elif kind == MESSAGE:
             number, _, received = struct.unpack_from("<HIQ", record)
             name, schema = self.channels.get(number, ("", 0))
@@ -145,12 +150,15 @@ def read_sqlite(path: Path, wanted: Collection[str], source: str) -> Container:
     address = f"file:{urllib.parse.quote(str(path))}?mode=ro" + ("" if journal else "&immutable=1")
     try:
         connection = sqlite3.connect(address, uri=True)
+        # no text and no blob is longer than the file
+        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(path.stat().st_size, 1 << 16))
     except sqlite3.Error as error:
         raise RecordingError(f"{source}: cannot be read: {error}") from None
     try:
         _tables(connection, container, wanted)
     except (sqlite3.Error, UnicodeDecodeError, OverflowError) as error:
-        container.damage = f"the file was cut or is damaged ({error})"
+        reason = " ".join(str(error).split())
+        container.damage = f"the file was cut or is damaged ({reason})"
     finally:
         connection.close()
     if not container.topics:
@@ -166,6 +174,13 @@ def _tables(connection: sqlite3.Connection, container: Container, wanted: Collec
     query = "SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name IN ('topics', 'messages')"
     if connection.execute(query).fetchone()[0] != 2:
         return
+    for table in ("topics", "messages"):
+        # generated columns and virtual tables are programs too, and may make gigabytes of nothing
+        stored = connection.execute("SELECT sql FROM sqlite_master WHERE name = ?", (table,)).fetchone()[0]
+        columns = connection.execute(f"PRAGMA table_xinfo({table})")
+        if not str(stored).upper().startswith("CREATE TABLE") or any(column[6] for column in columns):
+            container.damage = f"its table {table} is computed, and not stored"
+            return
     topics = {}
     for number, name, kind in connection.execute("SELECT id, name, type FROM topics"):
         if isinstance(name, str) and isinstance(kind, str):

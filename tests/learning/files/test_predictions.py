@@ -123,6 +123,7 @@ def test_predictions_whose_model_is_damaged(prediction, tmp_path):
     _, path = prediction
     (tmp_path / "a.nc").write_bytes(path.read_bytes())
     with h5py.File(tmp_path / "a.nc", "a") as file:
+        file.attrs["format_version"] = 1  # without a checksum
         file["system_bytes"][-1] ^= 1
     with fails(
         "a.nc: variable 'system_bytes': damaged", "load_trajectory(path, system=…)", error=TrajectoryFileError

@@ -32,6 +32,9 @@ EARLIER_NONE = ("Static",)
 #: fields that classes had in earlier versions
 EARLIER_FIELDS = {"Settings": ("elimination",), "NewtonOptions": ("across_steps",)}
 
+#: deepest nesting of a header: a KNODE of a KNODE of a KNODE has 40
+MOST_NESTED = 200
+
 _FIRST = re.compile(rb"[^\n,]{1,99}, format (\d{1,6}), package ([!-~]{1,40})\n")
 _SECOND = re.compile(rb"([0-9a-f]{64})( (\d{1,12}) (\d{1,12})\n)")
 
@@ -45,6 +48,8 @@ class Reader:
 
     def __init__(self, data: bytes, title: Title) -> None:
         text, arrays = _parts(data, title)
+        if _depth(text) > MOST_NESTED:
+            raise ContainerError(f"its header is nested more than {MOST_NESTED} times")
         try:
             header = json.loads(text)
         except (ValueError, RecursionError) as error:
@@ -110,6 +115,13 @@ class Reader:
         kept = {key: part for key, part in fields.items() if key not in removed}
         values = {key: self._value(part, f"{where}.{key}", classes) for key, part in kept.items()}
         return _made(classes[name], values, where)
+
+
+def _depth(text: bytes) -> int:
+    """Return an upper bound of how deep a JSON text is nested: brackets in its strings count too."""
+    opened = np.isin(np.frombuffer(text, np.uint8), list(b"[{")).astype(int)
+    closed = np.isin(np.frombuffer(text, np.uint8), list(b"]}")).astype(int)
+    return int(np.max(np.cumsum(opened - closed), initial=0))
 
 
 def _parts(data: bytes, title: Title) -> tuple[bytes, bytes]:
