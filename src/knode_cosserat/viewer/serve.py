@@ -45,7 +45,9 @@ def view(
     class Handler(http.server.BaseHTTPRequestHandler):
         def do_GET(self) -> None:
             # other names that lead here may be a page's of somebody else
-            if self.headers.get_all("Host") not in ([name] for name in own_names(server.server_address[1])):
+            if self.headers.get_all("Host", []) not in (
+                [name] for name in own_names(server.server_address[1])
+            ):
                 self.send_error(421)
                 return
             found = self.path.split("?")[0] in ("/", "/index.html")
