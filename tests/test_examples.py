@@ -212,3 +212,17 @@ def test_closed_loop(run):
     logs = run("closed_loop", seconds=6.0)
     predictive, kinematic = (logs[name].tip_rmse(3.0) for name in ("predictive", "kinematic"))
     assert predictive < 2e-3 < 2e-2 < kinematic
+
+
+@CAMPAIGN
+def test_keep_off_a_wall(run):
+    log = run("keep_off_a_wall", seconds=6.0)
+    assert log.fallbacks == 0 and log.tip[:, 0].max() < 0.052
+    free = (log.reference[:, 0] < 0.03) & (log.time > 2.0)
+    assert np.max(log.tip_distance[free]) < 3e-3
+
+
+@CAMPAIGN
+def test_control_a_learned_model(run):
+    logs = run("control_a_learned_model", seconds=6.0)
+    assert 3.0 * logs["learned"].tip_rmse(3.0) < logs["model"].tip_rmse(3.0)

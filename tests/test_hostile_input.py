@@ -36,13 +36,13 @@ TENSIONS = np.full((3, 4), 5.0)
         (TENSIONS + 1j, "they are complex"),
         (TENSIONS.astype("datetime64[s]"), "they are dates"),
         (np.ma.masked_greater(np.arange(12.0).reshape(3, 4), 9.0), "2 of them are masked"),
-        ([[5.0, "5", 5.0, None]], "text"),
+        ([[5.0, "5", 5.0, None]], "one of them is '5'"),
     ],
 )
 def test_what_is_no_number_is_not_taken_as_one(values, why):
     with pytest.raises(ValueError, match="controls are not numbers"):
         kc.simulate(ROBOT, values, 0.05)
-    with pytest.raises((ValueError, TypeError), match=why if why != "text" else ""):
+    with pytest.raises((ValueError, TypeError), match=why):
         real_array(values)
 
 
@@ -52,7 +52,7 @@ def test_a_masked_array_without_masked_values_is_an_array():
 
 @pytest.mark.parametrize("dt", [5e-324, 10**400, -1.0, 0, np.nan, True, "0.05", 1e9])
 def test_time_steps_that_are_none(dt):
-    with pytest.raises(ValueError, match="allowed is a number of seconds, 1e-09 to 1e"):
+    with pytest.raises(ValueError, match="allowed is a positive number of seconds, 1e-09 to 1e"):
         kc.simulate(ROBOT, TENSIONS, dt)
 
 

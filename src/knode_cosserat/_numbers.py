@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import reprlib
 from typing import Any
 
 import numpy as np
@@ -49,5 +50,6 @@ def real_array(values: Any) -> np.ndarray:
         if words is not None:
             raise ValueError(f"one of them is {words!r}")
     elif kind in _NO_NUMBERS:
-        raise ValueError(f"they are {_NO_NUMBERS[kind]}")
+        such = f", {reprlib.repr(array.ravel()[0].item())}" if array.size else ""
+        raise ValueError(f"they are {_NO_NUMBERS[kind]}{such}")
     return np.asarray(array, dtype=float)

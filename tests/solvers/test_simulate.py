@@ -276,7 +276,7 @@ def test_the_first_guess_of_what_stands_still_is_where_it_stands(misfit):
         ({"controls": np.ones((0, 4))}, r"controls have shape \(0, 4\)"),
         ({"controls": [["a"] * 4]}, "controls are not numbers"),
         ({"controls": np.full((3, 4), np.nan)}, r"controls are nan at index \(0, 0\)"),
-        ({"dt": 0.0}, "dt is 0.0; allowed is a number of seconds"),
+        ({"dt": 0.0}, "dt is 0.0; allowed is a positive number of seconds"),
         ({"dt": "fast"}, "dt is 'fast'"),
         ({"time": "lobatto4"}, "time is 'lobatto4'; allowed is \"bdf1\""),
         ({"space": "bdf2"}, 'space is \'bdf2\'; allowed is "lobatto2", "lobatto4", "euler"'),

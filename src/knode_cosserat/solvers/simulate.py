@@ -215,7 +215,8 @@ def checked_dt(dt: Any) -> float:
     number = isinstance(dt, int | float | np.number) and not isinstance(dt, bool | np.bool_)
     if not number or not SHORTEST_STEP <= dt <= LONGEST_STEP:
         raise ValueError(
-            f"dt is {reprlib.repr(dt)}; allowed is a number of seconds, {SHORTEST_STEP:g} to {LONGEST_STEP:g}"
+            f"dt is {reprlib.repr(dt)}; allowed is a positive number of seconds, {SHORTEST_STEP:g} to "
+            f"{LONGEST_STEP:g}"
         )
     return float(dt)
 
