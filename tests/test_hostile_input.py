@@ -20,6 +20,7 @@ from knode_cosserat._yaml import MOST_CHARACTERS, YAMLTextError, mapping_of
 from knode_cosserat.cli import app
 from knode_cosserat.cli.output import printable
 from knode_cosserat.viewer.serve import view
+from tools.attack import attacked, good_files
 
 ROBOT = kc.load_robot("delrin-tendon-robot")
 TENSIONS = np.full((3, 4), 5.0)
@@ -90,6 +91,13 @@ def test_a_terminals_commands_are_printed_as_text():
 # files
 
 
+@pytest.fixture(scope="module")
+def good(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("good")
+    pytest.importorskip("pyarrow")
+    return folder, good_files(folder)
+
+
 def test_a_file_keeps_its_permissions_and_what_killed_writes_left_is_removed(tmp_path):
     path = tmp_path / "it.txt"
     path.write_text("old")
@@ -123,6 +131,25 @@ def test_a_figure_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
     with pytest.raises(OSError, match="No space left"):
         figure.savefig(path)
     assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "trajectory.nc",
+        "robot.yaml",
+        "recording.yaml",
+        "controls.csv",
+        "table.csv",
+        "bag.bag",
+        "bag.mcap",
+        "bag.db3",
+    ],
+)
+def test_damaged_files_are_read_or_refused_in_one_line(name, good):
+    folder, readers = good
+    found = attacked(name, readers[name], folder, 60, seed=3)
+    assert not found.failures and found.read + found.refused == 60 and found.refused > 5
 
 
 # processes

@@ -14,3 +14,7 @@ class KnodeCosseratError(Exception):
 
     #: short, stable name of the class of error, such as "parameter" or "simulation"
     code: ClassVar[str] = "error"
+
+    def __str__(self) -> str:
+        """Return the message in one line: names that come from files may have line breaks."""
+        return " ".join(super().__str__().splitlines())

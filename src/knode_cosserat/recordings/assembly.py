@@ -41,7 +41,7 @@ def assembled(
     zero = _zero(config, times, rows)
     if zero is None:
         raise RecordingError(f"{path}: no poses and no tensions in this recording")
-    seconds = {topic: np.round((times[topic][rows[topic]] - zero) * 1e-9, 6) for topic in found}
+    seconds = {topic: np.round((times[topic][rows[topic]] - zero) * 1e-9, 9) for topic in found}
     findings += [
         Finding(each.severity, each.topic, each.message, tuple((t - zero) * 1e-9 for t in each.times))
         for each in about_clocks
