@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib.metadata
 import os
 import re
@@ -14,6 +15,7 @@ from pathlib import Path
 
 #: age (s) from which a temporary file counts as abandoned
 ABANDONED = 3600.0
+_TEMPORARY = re.compile(r"\..+\.[0-9a-f]{12}\.tmp")
 
 
 @contextlib.contextmanager
@@ -21,14 +23,14 @@ def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; the file written there replaces `path` atomically.
 
     If anything fails, or the process is killed, the old file is unchanged. A symbolic link keeps its target,
-    which is replaced. The new file has the permissions of the old one. What killed writes of this file left
-    behind is removed. A path that is not a regular file, such as a pipe or /dev/null, is written directly.
+    which is replaced. The new file has the permissions of the old one. What killed writes left behind in
+    its folder is removed. A path that is not a regular file, such as a pipe, is written directly.
     """
     if path.exists() and not path.is_file() and not path.is_dir():
         yield path
         return
     path = Path(os.path.realpath(path))
-    _remove_abandoned(path)
+    _remove_abandoned(path.parent)
     temporary = path.parent / f".{path.name}.{secrets.token_hex(6)}.tmp"
     try:
         yield temporary
@@ -42,12 +44,15 @@ def replacing(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def _remove_abandoned(path: Path) -> None:
-    """Remove temporary files of earlier writes that were killed; younger ones may be in use."""
-    pattern = re.compile(re.escape(f".{path.name}.") + r"[0-9a-f]{12}\.tmp")
+@functools.lru_cache(maxsize=1024)
+def _remove_abandoned(folder: Path) -> None:
+    """Remove temporary files of writes into a folder that were killed; younger ones may be in use.
+
+    Once in each process and folder: a study writes thousands of files into one.
+    """
     with contextlib.suppress(OSError):
-        for entry in os.scandir(path.parent):
-            if pattern.fullmatch(entry.name) and time.time() - entry.stat().st_mtime > ABANDONED:
+        for entry in os.scandir(folder):
+            if _TEMPORARY.fullmatch(entry.name) and time.time() - entry.stat().st_mtime > ABANDONED:
                 os.unlink(entry.path)
 
 

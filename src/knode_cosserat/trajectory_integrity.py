@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 CHECKSUM = "checksum"
 #: most bytes that the arrays of a file may take: so many times the file, and these besides. The package does
 #: not compress; other programs may
-EXPANSION, BESIDES = 100, 100_000_000
+EXPANSION, ALLOWANCE = 100, 100_000_000
 
 
 def add_checksum(file: Any, value: str) -> None:
@@ -73,7 +73,7 @@ def require_own_data(path: Path) -> None:
             if each.is_virtual or each.external:
                 raise TrajectoryFileError(f"{path}: the data of {name!r} are in another file; not read")
             expanded += each.size * each.dtype.itemsize
-    most = EXPANSION * path.stat().st_size + BESIDES
+    most = EXPANSION * path.stat().st_size + ALLOWANCE
     if expanded > most:
         raise TrajectoryFileError(
             f"{path}: its variables take {expanded / 1e9:.3g} GB; allowed are {most / 1e9:.3g} GB for a file "
@@ -81,9 +81,7 @@ def require_own_data(path: Path) -> None:
         )
 
 
-def require_possible(
-    path: Path, time: np.ndarray, numbers: dict[str, np.ndarray], y: np.ndarray
-) -> None:  # fmt: skip
+def require_possible(path: Path, time: np.ndarray, numbers: dict[str, np.ndarray], y: np.ndarray) -> None:
     """Raise `TrajectoryFileError` if rows contradict each other, as those of no simulation do."""
 
     def refuse(reason: str) -> None:

@@ -28,10 +28,11 @@ from knode_cosserat.control import (
     steps,
 )
 from knode_cosserat.control.baselines.linear_model import realized
-from knode_cosserat.control.checks import distance_out_of_reach
+from knode_cosserat.control.checks import check_reference, distance_out_of_reach
 from knode_cosserat.control.loop import warm_up
 from knode_cosserat.control.qp import QPSolution
-from knode_cosserat.estimation import KalmanObserver, TipPosition
+from knode_cosserat.control.references import constant
+from knode_cosserat.estimation import Curvatures, KalmanObserver, TipPosition
 from knode_cosserat.estimation.online import predicted_motion, split_record
 from knode_cosserat.identification.evaluate import evaluate
 from knode_cosserat.learning.residual import Nothing
@@ -111,6 +112,27 @@ def test_a_loop_is_a_recording_of_its_robot(tmp_path):
         ValueError, match="a measurement has 3 numbers; allowed are the positions of 2 bodies"
     ):
         log.measurements((0.5, 1.0))
+
+
+def test_a_loop_has_the_estimated_states_as_a_trajectory(tmp_path):
+    robot = plant()
+    log = run_loop(controller(), robot, circle(0.1, 1.5), 2.0)
+    log.estimated.save(tmp_path / "loop.nc")
+    found = kc.load_trajectory(tmp_path / "loop.nc")
+    assert_allclose(found.time, log.time)
+    # an exact model and exact measurements: the estimate is the truth, with the control that led there
+    assert_allclose(found.tip_position, log.tip, rtol=0, atol=1e-5)
+    assert_allclose(found.control[1:], log.control[:-1], rtol=0, atol=1e-12)
+    pid = PID(ROBOT, DT, LIMITS)
+    assert run_loop(pid, robot, circle(0.1, 4.0), 0.5).estimated is None
+
+
+def test_a_reference_of_other_numbers_is_not_taken_for_positions():
+    bent = Curvatures((0.5,))
+    found = PredictiveController(observer(), bent, LIMITS)
+    check_reference(found, constant([3.0, -2.0]), 1.0)
+    with pytest.raises(ReferenceFormatError, match="from the base"):
+        check_reference(controller(), constant([3.0, -2.0, 0.0]), 1.0)
 
 
 def test_what_cannot_be_followed_is_told_before_the_loop_starts():

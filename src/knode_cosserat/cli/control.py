@@ -151,6 +151,12 @@ def control(
             help="Write the measured tip and the controls as a recording: .csv, .bag, .mcap or .db3.",
         ),
     ] = None,
+    states: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Write the estimated states as a trajectory (.nc), to view or plot."
+        ),
+    ] = None,
     figure: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Draw path, error and controls into this file.")
     ] = None,
@@ -178,7 +184,7 @@ def control(
         raise ValueError("give either --reference, or --live to drag the target in the browser")
     if not live and (export is not None or port or no_open):
         raise ValueError("--export, --port and --no-open are of the viewer; use them with --live")
-    for path in (out, recording, figure, export):
+    for path in (out, recording, states, figure, export):
         if path is not None:
             require_writable(path)
     from knode_cosserat import control as kcc
@@ -205,6 +211,12 @@ def control(
         log.to_csv(out)
     if recording is not None:
         log.measurements(simulated=True).save(recording)
+    if states is not None:
+        if log.estimated is None:
+            raise ValueError(
+                f"--states: the method {method} estimates no states; predictive, ilqr and mppi do"
+            )
+        log.estimated.save(states)
     if figure is not None:
         from knode_cosserat.evaluation.control_figures import closed_loop
 

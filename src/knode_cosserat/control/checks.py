@@ -10,19 +10,32 @@ from jaxtyping import Float
 
 from knode_cosserat.control.commands import ControlLimits
 from knode_cosserat.control.references import Reference, ReferenceFormatError
+from knode_cosserat.estimation.outputs import BodyPoses, BodyPositions
 from knode_cosserat.rods.system import System
 from knode_cosserat.statics.workspace import workspace
 
 #: seconds of a reference that are checked, and the time between two of them (s)
 CHECKED, SAMPLING = 60.0, 0.02
+#: distance from the base, in lengths of the rod, which a rod that stretches or a moving base may reach
+STRETCH = 1.5
 #: controls whose equilibria bound the workspace
 SAMPLES = 256
 #: part of the memory that predictions may take
 SHARE = 0.5
 
 
+def check_reference(controller: Any, reference: Reference, seconds: float = CHECKED) -> None:
+    """Raise a `ReferenceFormatError` if a controller of positions cannot reach a reference at all.
+
+    Controllers of other outputs, such as curvatures, are not checked.
+    """
+    robot, target = getattr(controller, "robot", None), getattr(controller, "target", None)
+    if robot is not None and (target is None or isinstance(target, BodyPositions | BodyPoses)):
+        check_within_length(robot, reference, seconds)
+
+
 def check_within_length(robot: System, reference: Reference, seconds: float = CHECKED) -> None:
-    """Raise an error if a reference of tip positions is further from the base than the rod is long.
+    """Raise an error if a reference of tip positions is much further from the base than the rod is long.
 
     Args:
         robot: the model; the check does not apply to robots of several rods.
@@ -30,7 +43,8 @@ def check_within_length(robot: System, reference: Reference, seconds: float = CH
         seconds: checked duration (s).
 
     Raises:
-        ReferenceFormatError: a position that no rod of this length reaches.
+        ReferenceFormatError: a position that no rod of this length reaches, even if it stretches or its base
+            moves.
     """
     length = getattr(robot.nominal, "length", None)
     if length is None or robot.strands > 1 or reference.size < 3:
@@ -38,7 +52,7 @@ def check_within_length(robot: System, reference: Reference, seconds: float = CH
     base, length, times = _base(robot), float(length), np.arange(0.0, seconds, SAMPLING)
     apart = np.sqrt(np.nansum((reference.at(times)[:, :3] - base) ** 2, axis=1))
     k = int(np.argmax(apart))
-    if apart[k] > length:
+    if apart[k] > STRETCH * length:
         raise ReferenceFormatError(
             f"the {reference.name} is {apart[k]:.4g} m from the base at t = {times[k]:.4g} s, and the robot "
             f"is {length:.4g} m long; are the positions in metres, in the robot's frame?"

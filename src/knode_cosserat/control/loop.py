@@ -16,12 +16,13 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat._files import replacing
-from knode_cosserat.control.checks import check_within_length
+from knode_cosserat.control.checks import check_reference
 from knode_cosserat.control.commands import Command, Controller
 from knode_cosserat.control.plants import Plant
 from knode_cosserat.control.references import Reference
+from knode_cosserat.control.states import estimated, joined
 from knode_cosserat.recordings.measurements import Measurements
-from knode_cosserat.rods.system import System
+from knode_cosserat.trajectory import Trajectory
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,6 +46,8 @@ class LoopLog:
         missed: number of periods whose deadline was missed.
         compiled: number of programs that were compiled during the loop; each may have delayed a period.
         initial_control: (c,) control before the first row, if the log begins at the start.
+        estimated: estimated states, a trajectory that can be saved, drawn and viewed; None without an
+            observer. Its robot has the parameters that the model had at first.
     """
 
     time: Float[np.ndarray, " T"]
@@ -61,6 +64,7 @@ class LoopLog:
     missed: int
     compiled: int = 0
     initial_control: Float[np.ndarray, " c"] | None = None
+    estimated: Trajectory | None = None
 
     @property
     def tip_distance(self) -> Float[np.ndarray, " T"]:
@@ -96,7 +100,7 @@ class LoopLog:
 
     def measurements(
         self, fractions: Sequence[float] = (1.0,), simulated: bool | None = None
-    ) -> Measurements:  # fmt: skip
+    ) -> Measurements:
         """Return the loop as a recording, from which a model can be identified or learned.
 
         It can be saved as a table or a bag: `log.measurements().save("run.mcap")`.
@@ -188,6 +192,8 @@ class Period(NamedTuple):
     feedback: float
     preparation: float
     parameters: dict[str, float]
+    #: estimate of the state at this time, a trajectory of one row; None without an observer
+    estimated: Trajectory | None = None
 
 
 class Loop:
@@ -240,13 +246,14 @@ class Loop:
         plant.apply(command.control)
         if applied is not None:
             applied()
+        state = estimated(controller)
         moved = clock.perf_counter()
         controller.advance(command.control)
         controller.prepare(time + controller.dt, reference)
         done = clock.perf_counter()
         row = Period(
             time, reference.at(time)[0], measured, tip, command, sent - began, done - moved,
-            _parameters_of(controller),
+            _parameters_of(controller), state,
         )  # fmt: skip
         self._rows.append(row)
         self._count += 1
@@ -262,6 +269,7 @@ class Loop:
         if not rows:
             raise ValueError("no period has passed; there is nothing in the log")
         commands = [row.command for row in rows]
+        states = [row.estimated for row in rows if row.estimated is not None]
         return LoopLog(
             time=np.array([row.time for row in rows]),
             reference=np.array([row.reference for row in rows]),
@@ -279,6 +287,7 @@ class Loop:
             missed=self.missed,
             compiled=_COMPILATIONS.count - self._compiled_before,
             initial_control=self._initial if rows[0].time == 0.0 else None,
+            estimated=joined(states, [row.time for row in rows]) if states else None,
         )
 
 
@@ -305,9 +314,7 @@ def run_loop(
     steps = round(seconds / controller.dt)
     if steps < 1:
         raise ValueError(f"seconds is {seconds:g}; allowed is at least one period, {controller.dt:g} s")
-    robot = getattr(controller, "robot", None)
-    if isinstance(robot, System):
-        check_within_length(robot, reference)
+    check_reference(controller, reference, seconds)
     loop = Loop(controller, plant, reference)
     with _no_garbage_collection():
         due = clock.perf_counter()

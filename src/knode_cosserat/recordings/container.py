@@ -43,7 +43,7 @@ LARGEST_CHUNK = 1 << 30
 _PIECE = 1 << 14
 #: most bytes that all chunks of a file may have together: so many times the file, and these besides.
 #: Recorded messages become 2 to 20 times smaller
-RATIO, BESIDES = 200, 1 << 24
+RATIO, ALLOWANCE = 200, 1 << 24
 
 
 class Decompression:
@@ -51,7 +51,7 @@ class Decompression:
 
     def __init__(self, size: int) -> None:
         """Start with the size of the file (bytes)."""
-        self.left = RATIO * size + BESIDES
+        self.left = RATIO * size + ALLOWANCE
 
     def records(self, data: bytes | memoryview, compression: str, size: int) -> tuple[bytes, int]:
         """Return a chunk's records as `decompressed` does; fewer if the file's limit is reached."""

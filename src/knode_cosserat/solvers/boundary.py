@@ -29,7 +29,7 @@ from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.space import SpaceScheme
 
 #: largest correction that may be left at a solution, relative to the state and its natural units
-CLOSE = 1e-5
+LARGEST_CORRECTION = 1e-5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -185,7 +185,7 @@ def newton(
         dy, dxi = solved_correction(factors, pivots, defects, tip)
         size = jnp.max(jnp.abs(dy) / scales.y)
         left = jnp.max(jnp.abs(dy) / (scales.y + jnp.abs(y)))
-        good = (error <= options.tolerance) & (left <= CLOSE)
+        good = (error <= options.tolerance) & (left <= LARGEST_CORRECTION)
         shorter = (size <= (1.0 - last.damping / 4.0) * last.size) & jnp.isfinite(size)
         accept = good | shorter
         # corrections still to come at this rate
@@ -252,7 +252,9 @@ def newton(
     )
     end = search.progress
     # a small residual is no solution while the correction from it is large
-    error = jnp.where(end.left <= CLOSE, end.error, jnp.maximum(end.error, jnp.minimum(end.left, 1.0)))
+    error = jnp.where(
+        end.left <= LARGEST_CORRECTION, end.error, jnp.maximum(end.error, jnp.minimum(end.left, 1.0))
+    )
     solution = Solution(
         *unpacked(search.point), error, end.corrections.astype(int), end.linearisations.astype(int)
     )

@@ -15,7 +15,7 @@ from knode_cosserat.viewer.connection import PageSession
 from knode_cosserat.viewer.document import document
 from knode_cosserat.viewer.drawing import sliders
 from knode_cosserat.viewer.scene import Point, checked_target, track
-from knode_cosserat.viewer.serve import HOST, Opening, announce, checked_port
+from knode_cosserat.viewer.serve import HOST, Opening, announce, checked_port, own_names
 from knode_cosserat.viewer.session import Session
 
 if TYPE_CHECKING:
@@ -136,7 +136,7 @@ async def serve_page(
 
     async with serve(connected, HOST, port, process_request=answer, compression=None) as server:
         number = next(iter(server.sockets)).getsockname()[1]
-        own += [f"{HOST}:{number}", f"localhost:{number}"]
+        own += own_names(number)
         announce(f"http://{HOST}:{number}/", open_browser)
         with contextlib.suppress(asyncio.CancelledError):
             await asyncio.get_running_loop().create_future()

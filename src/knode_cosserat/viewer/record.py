@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections import deque
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +14,7 @@ from knode_cosserat._files import replacing
 from knode_cosserat.control.commands import Controller, Status
 from knode_cosserat.control.loop import Period
 from knode_cosserat.control.plants import Plant
+from knode_cosserat.control.states import estimated, joined
 from knode_cosserat.estimation.outputs import BodyPositions
 from knode_cosserat.rods.parameters import parameters_of
 from knode_cosserat.trajectory import Trajectory
@@ -191,37 +191,6 @@ def shapes(plant: Plant, controller: Controller) -> dict[str, Trajectory]:
 def for_loop(tracks: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Mark the second track as an overlay of the first."""
     return [each | {"overlay": k > 0} for k, each in enumerate(tracks)]
-
-
-def estimated(controller: Any) -> Trajectory | None:
-    """Return the state that a controller's observer estimates, a trajectory of one row, or None."""
-    observer = getattr(controller, "observer", None)
-    if observer is None:
-        return None
-    estimate = observer.estimate
-    one = np.zeros(1)
-    return Trajectory(
-        observer.robot, None, np.array([estimate.time]), np.asarray(estimate.y)[None],
-        np.asarray(estimate.z)[None], np.asarray(observer.control, dtype=float)[None],
-        np.zeros(1, dtype=int), one, one,
-    )  # fmt: skip
-
-
-def joined(states: Sequence[Trajectory], times: Sequence[float]) -> Trajectory:
-    """Return a trajectory of rows of one robot, at these times (s)."""
-    y, z, control, result = (
-        np.concatenate([np.asarray(getattr(state, name)) for state in states])
-        for name in ("y", "z", "control", "result")
-    )
-    errors = [
-        np.full(1, np.nan) if state.position_error is None else np.asarray(state.position_error)
-        for state in states
-    ]
-    none = np.zeros(len(times))
-    return Trajectory(
-        states[0].system, states[0].settings, np.array(times), y, z, control, result, none,
-        none.astype(int), position_error=np.concatenate(errors),
-    )  # fmt: skip
 
 
 def _filled(target: Float[np.ndarray, "3"], motion: Trajectory) -> Float[np.ndarray, "3"]:

@@ -126,7 +126,7 @@ def _differences(robot, coordinates, rows, steps, unknowns, settings, oriented, 
             (system, rows.first), (d_system, d_first),
         )  # fmt: skip
 
-    def begun(direction: Any) -> Any:
+    def at_start(direction: Any) -> Any:
         """Return the system and its tangent, and the initial history and the tangents of its states."""
         (system, past), (d_system, d_past) = jax.jvp(start, (coordinates,), (direction,))
         if rows.before is None and system.rest_is_guess:
@@ -134,7 +134,7 @@ def _differences(robot, coordinates, rows, steps, unknowns, settings, oriented, 
         return system, d_system, past, (d_past.records, d_past.rate)
 
     n = coordinates.shape[0]
-    columns = jax.vmap(begun, out_axes=(None, 0, None, -1))
+    columns = jax.vmap(at_start, out_axes=(None, 0, None, -1))
     system, d_systems, past, d_past = columns(jnp.eye(n))
     changes = SystemMoves(d_systems, jnp.eye(n)), jnp.zeros((*rows.control.shape, n))
     state = TangentState.of(system, settings.space, past, *d_past)
