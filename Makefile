@@ -13,7 +13,7 @@ unexport PYTHONPATH
 unexport PYTHONHOME
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo test test-all samples costs lint types docs pictures notebooks format bench attack package lock clean distclean
+.PHONY: help env demo test test-all samples costs lint types docs pictures notebooks format bench attack firmware package lock clean distclean
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' Makefile
@@ -61,6 +61,9 @@ format: $(READY) ## format the code, and fix what can be fixed without a decisio
 
 bench: $(READY) ## run the benchmarks
 	$(BIN)/python -m benchmarks.run
+
+firmware: ## build the firmware of the tension board, and its emulator (needs Debian's arduino-core-avr; see firmware/README.md)
+	@$(MAKE) --no-print-directory -C firmware OUT=$(CURDIR)/build/firmware
 
 attack: $(READY) ## read 20,000 damaged files of all kinds: each is read, or refused in one clear line
 	$(BIN)/python -m tools.attack
