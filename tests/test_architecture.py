@@ -34,6 +34,7 @@ LAYERS = (
     ("metrics", "evaluation.metrics", "evaluation.state_errors"),
     ("recordings", "statics", "estimation"),
     ("control",),
+    ("hardware",),
     ("learning", "calibration"),
     ("identification",),
     ("evaluation", "figures"),

@@ -1,0 +1,32 @@
+"""Drivers of real robots: serial tension boards, Dynamixel motors, drives on a CAN bus.
+
+Optional packages: `pip install 'knode-cosserat[hardware]'`. They are imported on first use.
+"""
+
+from typing import TYPE_CHECKING
+
+from knode_cosserat._lazy import make_lazy
+
+if TYPE_CHECKING:
+    from knode_cosserat.hardware.description import Dimensions, HardwareDescription, load_hardware
+    from knode_cosserat.hardware.driver import Driver, DriverState, HardwareError, Latency, Limits, Reading
+
+__all__ = [
+    "Dimensions",
+    "Driver",
+    "DriverState",
+    "HardwareDescription",
+    "HardwareError",
+    "Latency",
+    "Limits",
+    "Reading",
+    "load_hardware",
+]
+
+make_lazy(
+    __name__,
+    {
+        "knode_cosserat.hardware.description": "Dimensions HardwareDescription load_hardware",
+        "knode_cosserat.hardware.driver": "Driver DriverState HardwareError Latency Limits Reading",
+    },
+)

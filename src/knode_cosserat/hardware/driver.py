@@ -51,7 +51,8 @@ class Latency(NamedTuple):
 
     median: float
     p99: float
-    count: int
+    # hides the method of tuples
+    count: int  # type: ignore[assignment]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -71,8 +71,16 @@ def load_robot(name_or_path: str | Path) -> System:
     Raises:
         RobotFileError: there is no such robot, or its file is invalid.
     """
-    file = _catalog_files().get(str(name_or_path)) or _existing(Path(name_or_path))
-    return parse_robot(_text(file, str(name_or_path)), str(name_or_path))
+    return parse_robot(_text_of(name_or_path), str(name_or_path))
+
+
+def file_mapping(name_or_path: str | Path) -> dict[Any, Any]:
+    """Return the content of a robot's file, from the catalog or by path, as it is written there.
+
+    Raises:
+        RobotFileError: there is no such file, or it is not YAML.
+    """
+    return _mapping(_text_of(name_or_path), str(name_or_path))
 
 
 def save_robot(robot: System, path: str | Path, *, description: str = "") -> None:
@@ -99,6 +107,11 @@ def catalog() -> dict[str, str]:
 def _catalog_files() -> dict[str, Traversable]:
     folder = importlib.resources.files("knode_cosserat.rods") / "catalog"
     return {file.name[:-5]: file for file in folder.iterdir() if file.name.endswith(".yaml")}
+
+
+def _text_of(name_or_path: str | Path) -> str:
+    file = _catalog_files().get(str(name_or_path)) or _existing(Path(name_or_path))
+    return _text(file, str(name_or_path))
 
 
 def _existing(path: Path) -> Path:
@@ -133,11 +146,14 @@ def parse_robot(text: str, source: str) -> System:
             f"{source}: format is {shown(number)}; allowed is {' or '.join(map(str, FORMATS))}, "
             "the formats that this version reads"
         )
-    known = ("format", "kind", "description", "parameters")
+    known = ("format", "kind", "description", "parameters", "hardware")
     _require_keys(file, source, known=known, required=("format", "kind", "parameters"))
     for key in ("kind", "description"):
         if not isinstance(file.get(key, ""), str):
             raise RobotFileError(f"{source}: {key} is {shown(file[key])}; allowed is text")
+    # the machine around the rod, which drivers read
+    if not isinstance(file.get("hardware", {}), dict | None):
+        raise RobotFileError(f"{source}: hardware is {shown(file['hardware'])}; allowed is a mapping")
     kind, values = file["kind"], file["parameters"]
     if kind not in KINDS:
         raise RobotFileError(

@@ -49,6 +49,10 @@ def robot_schema() -> dict[str, Any]:
             "kind": {"enum": list(KINDS), "description": "what robot it is"},
             "description": {"type": "string", "description": "what it is, in one line"},
             "parameters": {"type": "object", "description": "names and values, in SI units and radians"},
+            "hardware": {
+                "type": ["object", "null"],
+                "description": "limits of tensions and dimensions of parts, in SI units, for drivers and CAD",
+            },
         },
         "allOf": [
             _if_kind(name, {"properties": {"parameters": {"$ref": f"#/$defs/{name}"}}}) for name in robots
