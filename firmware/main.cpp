@@ -104,23 +104,26 @@ void start_clock() {
 ISR(ADC_vect) {
     const uint8_t channel = static_cast<uint8_t>(conversions_left & 3);
     sums[channel] = static_cast<uint16_t>(sums[channel] + ADC);
-    if (--conversions_left == 0) return;
+    if (--conversions_left == 0) {
+        // the tick begins with the newest readings
+        for (uint8_t k = 0; k < TENDONS; ++k) {
+            readings[k] = static_cast<int16_t>(sums[k]);
+            sums[k] = 0;
+        }
+        if (ticks_due < 255) ++ticks_due;
+        return;
+    }
     ADMUX = static_cast<uint8_t>(_BV(REFS0) | (conversions_left & 3));
     ADCSRA |= _BV(ADSC);
 }
 
 ISR(TIMER5_COMPA_vect) {
-    if (ticks_due < 255) ++ticks_due;
     if (ticks_due > LATE_TICKS) {
         // the main loop hangs
         PORTA = 0;
         for (uint8_t k = 0; k < TENDONS; ++k) *COMPARE[k] = 0;
     }
     if (conversions_left) return;
-    for (uint8_t k = 0; k < TENDONS; ++k) {
-        readings[k] = static_cast<int16_t>(sums[k]);
-        sums[k] = 0;
-    }
     conversions_left = TENDONS * CONVERSIONS;
     ADMUX = _BV(REFS0);
     ADCSRA |= _BV(ADSC);
@@ -132,8 +135,7 @@ void setup() {
     start_converter();
     start_clock();
     set_sleep_mode(SLEEP_MODE_IDLE);
-    // the first sums are complete after two ticks
-    while (ticks_due < 3) {
+    while (!ticks_due) {
     }
     ticks_due = 0;
     board.start();

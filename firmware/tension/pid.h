@@ -49,7 +49,7 @@ class Pid {
     // ticks over which the derivative is taken
     static const uint8_t SPAN = 4;
     // error (gf/8) from which on friction is compensated fully
-    static const int32_t BAND = 24;
+    static const int32_t BAND = 80;
     // largest drive by the integral, in 1/65536 of a step
     static const int32_t LARGEST = 120L * 65536L;
     int32_t integral_ = 0;

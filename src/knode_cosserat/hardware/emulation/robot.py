@@ -1,0 +1,157 @@
+"""An emulated robot: the real firmware on an emulated chip, around it motors, load cells, tendons and the rod.
+
+Chip and robot move in lock-step; the same commands give the same bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.estimation.outputs import BodyPoses, BodyPositions
+from knode_cosserat.hardware.driver import HardwareError
+from knode_cosserat.hardware.emulation.chip import CLOCK, Chip
+from knode_cosserat.hardware.emulation.motors import (
+    LoadCellParameters,
+    LoadCells,
+    MotorParameters,
+    Motors,
+)
+from knode_cosserat.rods.reels import Reels
+from knode_cosserat.rods.robot_file import load_robot
+from knode_cosserat.rods.routed_robot import RoutedTendonRobot
+from knode_cosserat.solvers.stepper import Stepper
+
+#: steps of the motors in a second, and steps of the motors in each step of the rod. Rod steps of 1/64 s give
+#: the same loop (tests/hardware/test_emulation.py)
+STEPS, ROD_STEPS = 1024, 16
+#: robot of the catalog that is emulated by default
+ROBOT = "delrin-routed-tendon-robot"
+#: compliance of a tendon of 0.6 m with its load cell (m/N)
+COMPLIANCE = 2.0e-4
+
+
+class EmulatedRobot:
+    """A tendon robot with four motors behind the emulated board.
+
+        robot = kc.hardware.emulation.EmulatedRobot()
+        with kc.hardware.SerialBoard(robot.port(), limits) as board:
+            board.arm()
+
+    Between two steps of the rod, its tendons' paths are extrapolated; each step solves for the tensions that
+    belong to the reels' positions.
+    """
+
+    def __init__(
+        self, robot: str | RoutedTendonRobot = ROBOT, *, motors: MotorParameters = MotorParameters(),
+        cells: LoadCellParameters = LoadCellParameters(), compliance: float = COMPLIANCE,
+        slack: float = 0.002, seed: int = 0,
+    ):  # fmt: skip
+        """Set up the robot at rest with slack tendons, and start the chip.
+
+        Args:
+            robot: a routed tendon robot with four tendons, or its name or file.
+            motors: of all tendons.
+            cells: load cells of all tendons.
+            compliance: of each tendon (m/N).
+            slack: of each tendon at the start (m).
+            seed: of the noise.
+
+        Raises:
+            HardwareError: another kind of robot, or the emulator is not installed.
+        """
+        given: Any = load_robot(robot) if isinstance(robot, str) else robot
+        if not isinstance(given, RoutedTendonRobot) or given.tendon_count != 4:
+            raise HardwareError(
+                f"the emulated board drives a routed tendon robot with 4 tendons (got {type(given).__name__}); "
+                f"use {ROBOT}, for example"
+            )
+        reels = Reels(motors=[1.0, 2.0, 3.0, 4.0], compliance=[compliance] * 4)
+        self.robot = given.replace(drive="reel", reels=reels)
+        self._random = np.random.default_rng(seed)
+        self.motors, self.cells = Motors(4, motors), LoadCells(4, cells, self._random)
+        self.motors.rotor -= slack
+        self.motors.position -= slack
+        #: tendons that are torn, or off their reels
+        self.torn = np.zeros(4, dtype=bool)
+        self._compliance = compliance
+        self._stepper = Stepper(self.robot, ROD_STEPS / STEPS)
+        self._stepper.step(self.motors.position)
+        self._fields = {field.name: where for field, where in _places(self.robot)}
+        self._straight = self._path()
+        self._taken, self._rate = np.zeros(4), np.zeros(4)
+        self.tension = np.zeros(4)
+        self.chip, self._count = Chip(), 0
+
+    @property
+    def time(self) -> float:
+        """Time since the chip's start (s)."""
+        return self._count / STEPS
+
+    def advance(self, seconds: float) -> None:
+        """Move chip and robot on by some time (s), rounded to 1/1024 s."""
+        for _ in range(round(seconds * STEPS)):
+            self.step()
+
+    def step(self) -> None:
+        """Move chip and robot on by 1/1024 s."""
+        self.chip.run(CLOCK // STEPS, self.cells.millivolts(self.tension))
+        h = 1.0 / STEPS
+        self.motors.step(np.array(self.chip.drives()), self.tension, h)
+        self._count += 1
+        if self._count % ROD_STEPS:
+            since = (self._count % ROD_STEPS) * h
+            shortened = self._taken + since * self._rate
+            stretch = np.maximum(self.motors.position - shortened, 0.0)
+            self.tension = np.where(self.torn, 0.0, stretch / self._compliance)
+            return
+        # a torn tendon is one that its reel has let out by far
+        self._stepper.step(np.where(self.torn, -0.2, self.motors.position))
+        taken = self._straight - self._path()
+        self._rate = (taken - self._taken) * STEPS / ROD_STEPS
+        self._taken = taken
+        self.tension = np.where(self.torn, 0.0, np.maximum(self._row("tension"), 0.0))
+
+    def _row(self, name: str, node: int = 0) -> Float[np.ndarray, " c"]:
+        return np.asarray(self._stepper.state.y[-1, node, self._fields[name]])
+
+    def _path(self) -> Float[np.ndarray, " c"]:
+        """Return the length of each tendon from base to tip (m)."""
+        return self._row("path", -1) - self._row("path", 0)
+
+    def tip(self) -> Float[np.ndarray, "3"]:
+        """Return the true position of the tip (m)."""
+        return self.positions((1.0,))[0]
+
+    def positions(self, fractions: Sequence[float]) -> Float[np.ndarray, "M 3"]:
+        """Return true positions of places along the rod (m), by their fractions of its length."""
+        return self._output(BodyPositions(tuple(fractions))).reshape(-1, 3)
+
+    def poses(self, fractions: Sequence[float]) -> Float[np.ndarray, "M 7"]:
+        """Return true positions (m) and quaternions (w, x, y, z) of places along the rod."""
+        return self._output(BodyPoses(tuple(fractions))).reshape(-1, 7)
+
+    def _output(self, output: Any) -> Float[np.ndarray, " p"]:
+        state = self._stepper.state
+        y, z = np.asarray(state.y[-1]), np.asarray(state.z[-1])
+        return np.asarray(_evaluated(self.robot, y, z, output))
+
+
+def _places(robot: RoutedTendonRobot) -> list[tuple[Any, slice]]:
+    """Return the fields of y with their places."""
+    places, start = [], 0
+    for field in robot.y_layout.fields:
+        places.append((field, slice(start, start + field.size)))
+        start += field.size
+    return places
+
+
+def _evaluate(robot: Any, y: Any, z: Any, output: Any) -> Any:
+    return output.value(robot, y, z)
+
+
+_evaluated = jax.jit(_evaluate, static_argnames="output")
