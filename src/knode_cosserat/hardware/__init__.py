@@ -10,6 +10,8 @@ from knode_cosserat._lazy import make_lazy
 if TYPE_CHECKING:
     from knode_cosserat.hardware.description import Dimensions, HardwareDescription, load_hardware
     from knode_cosserat.hardware.driver import Driver, DriverState, HardwareError, Latency, Limits, Reading
+    from knode_cosserat.hardware.serial_board import SerialBoard
+    from knode_cosserat.hardware.transport import SerialTransport, Transport
 
 __all__ = [
     "Dimensions",
@@ -20,6 +22,9 @@ __all__ = [
     "Latency",
     "Limits",
     "Reading",
+    "SerialBoard",
+    "SerialTransport",
+    "Transport",
     "load_hardware",
 ]
 
@@ -28,5 +33,7 @@ make_lazy(
     {
         "knode_cosserat.hardware.description": "Dimensions HardwareDescription load_hardware",
         "knode_cosserat.hardware.driver": "Driver DriverState HardwareError Latency Limits Reading",
+        "knode_cosserat.hardware.serial_board": "SerialBoard",
+        "knode_cosserat.hardware.transport": "SerialTransport Transport",
     },
 )

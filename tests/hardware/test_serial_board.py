@@ -1,0 +1,558 @@
+"""The driver of tension boards, against a board in Python behind a pseudo-terminal, and a simulated clock."""
+
+import contextlib
+import math
+import re
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from knode_cosserat.hardware.board_link import BoardLink
+from knode_cosserat.hardware.driver import DriverState, HardwareError, Limits
+from knode_cosserat.hardware.faults import FAULTS, fault_message
+from knode_cosserat.hardware.limits import TensionLimiter
+from knode_cosserat.hardware.lines import GRAM_FORCE, Telemetry, decode_framed, encode_message
+from knode_cosserat.hardware.serial_board import SerialBoard
+from knode_cosserat.hardware.transport import SerialTransport, Transport
+from tests.hardware.fake_board import FakeBoard
+
+pytest.importorskip("serial")
+#: no rate limit that a test would wait for
+FAST = Limits(0.0, 15.0, 1e4, 60.0)
+
+
+@pytest.fixture
+def board():
+    with FakeBoard() as fake:
+        yield fake
+
+
+def driver(fake, limits=FAST, **options):
+    return SerialBoard(fake.port, limits, **options)
+
+
+def eventually(condition, timeout=5.0):
+    end = time.monotonic() + timeout
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.005)
+    return condition()
+
+
+def verbs(fake):
+    return [line[0] for line in list(fake.accepted)]
+
+
+# states
+
+
+def test_a_session(board):
+    robot = driver(board)
+    assert robot.state is DriverState.DISCONNECTED and math.isnan(robot.latency.median)
+    with robot:
+        assert robot.is_framed and robot.tendon_count == 4 and robot.state is DriverState.READY
+        with pytest.raises(HardwareError, match=r"not armed; call arm\(\)"):
+            robot.command([1.0, 1.0, 1.0, 1.0])
+        robot.arm()
+        robot.arm()
+        assert robot.state is DriverState.ARMED and board.state == "armed"
+        sent = robot.command([1.0, 2.0, 0.5, 0.0])
+        assert np.allclose(sent, [1.0, 2.0, 0.5, 0.0], atol=GRAM_FORCE / 2)
+        grams = [round(each / GRAM_FORCE) for each in sent]
+        assert np.allclose(np.array(grams) * GRAM_FORCE, sent, rtol=1e-12)
+        assert eventually(lambda: board.wanted == grams)
+        times = []
+        for _ in range(10):
+            reading = robot.read()
+            times.append(reading.time)
+            assert reading.state is DriverState.ARMED and reading.fault == ""
+        assert np.allclose(reading.tension, sent) and np.allclose(reading.drive, [10 / 255, -20 / 255, 1, -1])
+        assert np.all(np.diff(times) > 0.0) and times[-1] <= time.monotonic()
+        assert robot.latency.count >= 1 and 0.0 < robot.latency.median <= robot.latency.p99
+        robot.disarm()
+        assert robot.state is DriverState.READY and board.wanted == [0, 0, 0, 0]
+        robot.arm()
+    assert (
+        board.state == "ready" and robot.state is DriverState.DISCONNECTED and "disarm" in verbs(board)[-20:]
+    )
+    assert eventually(lambda: not board.framed)  # back to plain lines for other hosts
+    robot.close()
+    with pytest.raises(HardwareError, match="not connected"):
+        robot.read()
+
+
+def test_it_waits_for_the_tare_and_feeds_the_watchdog_meanwhile():
+    with FakeBoard(taring=1.5) as fake, driver(fake, host_timeout=0.2) as robot:
+        assert robot.state is DriverState.READY and verbs(fake).count("keep") >= 5
+
+
+def test_a_board_that_does_not_end_its_tare_is_an_error():
+    with (
+        FakeBoard(taring=60.0) as fake,
+        pytest.raises(HardwareError, match=r"not ready in 0.3 s.*tare_on_start"),
+    ):
+        driver(fake, start_timeout=0.3).connect()
+
+
+def test_a_running_board_without_a_banner_is_found():
+    with FakeBoard(banner=False) as fake, driver(fake) as robot:
+        assert robot.is_framed
+
+
+def test_a_port_without_a_board():
+    with FakeBoard() as fake:
+        fake.silent = True
+        fake._end.set()
+        with pytest.raises(HardwareError, match=r"no answer.*115200 baud") as caught:
+            driver(fake, start_timeout=0.2).connect()
+    assert "\n" not in str(caught.value)
+
+
+def test_a_port_that_is_not_there_or_in_use(board):
+    with pytest.raises(HardwareError, match="no such serial port"):
+        SerialBoard("/dev/ttyNothing").connect()
+    with driver(board), pytest.raises(HardwareError, match="another program uses this port"):
+        driver(board).connect()
+
+
+def test_without_pyserial_the_error_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "serial", None)
+    with pytest.raises(HardwareError, match=r"pip install 'knode-cosserat\[hardware\]'"):
+        SerialTransport("/dev/ttyACM0")
+
+
+# the paper's board
+
+
+def test_the_papers_board_is_commanded_by_plain_lines():
+    with FakeBoard(paper=True) as fake, driver(fake) as robot:
+        assert not robot.is_framed and robot.state is DriverState.READY
+        robot.arm()
+        sent = robot.command([1.0, 0.0, 2.0, 0.0])
+        assert eventually(lambda: fake.wanted == [102, 0, 204, 0]) and robot.state is DriverState.ARMED
+        assert eventually(lambda: np.allclose(robot.read().tension, sent))
+        count = fake.received.count(b"102 0 204 0")
+        robot.wait(0.5)
+        assert fake.received.count(b"102 0 204 0") >= count + 2  # repeated: a silent host is disarmed
+        for call in (robot.tare, lambda: robot.setting("kp"), lambda: robot.jog(0, 0.1)):
+            with pytest.raises(HardwareError, match="needs protocol 2"):
+                call()
+        robot.stop()
+        assert eventually(lambda: fake.wanted == [0, 0, 0, 0]) and robot.state is DriverState.FAULT
+        with pytest.raises(HardwareError, match="stopped"):
+            robot.command([1.0] * 4)
+        robot.reset()
+        robot.arm()
+        robot.disarm()
+        assert robot.state is DriverState.READY
+
+
+def test_plain_lines_can_be_chosen_and_repeats_end_with_the_program(board):
+    with driver(board, protocol=1, host_timeout=0.2) as robot:
+        assert not robot.is_framed
+        robot.arm()
+        robot.command([1.0] * 4)
+        assert eventually(lambda: board.state == "armed")
+        assert eventually(lambda: board.state == "ready")  # no calls: the board disarms itself
+        assert robot.state is DriverState.READY
+        with pytest.raises(HardwareError, match="not armed"):
+            robot.command([1.0] * 4)
+        robot.arm()
+        board.latch("slack:2")
+        assert eventually(lambda: robot.state is DriverState.FAULT)
+        with pytest.raises(HardwareError, match="slack at tendon 2"):
+            robot.arm()
+        robot.reset()
+        robot.arm()
+
+
+def test_arming_a_plain_board_waits_for_its_tare():
+    with FakeBoard(taring=1.5) as fake, driver(fake, protocol=1) as robot:
+        robot.arm()
+        assert fake.state == "armed"
+
+
+# watchdog
+
+
+def test_the_watchdog_is_fed_while_the_program_lives_and_no_longer(board):
+    with driver(board, host_timeout=0.2) as robot:
+        robot.arm()
+        robot.command([2.0] * 4)
+        robot.wait(0.6)
+        assert board.state == "armed" and robot.state is DriverState.ARMED
+        # the program hangs: no calls
+        assert eventually(lambda: board.fault == "watchdog:0")
+        assert eventually(lambda: robot.state is DriverState.FAULT)
+        with pytest.raises(HardwareError, match=r"fault watchdog.*host_timeout.*then reset\(\)"):
+            robot.command([2.0] * 4)
+        with pytest.raises(HardwareError, match="watchdog"):
+            robot.arm()
+        robot.reset()
+        assert robot.state is DriverState.READY
+        robot.arm()
+        assert robot.state is DriverState.ARMED
+
+
+# faults
+
+
+@pytest.mark.parametrize("fault", ["over-tension:3", "slack:1", "sensor-rail:4", "new-fault:2"])
+def test_a_fault_is_named_with_tendon_and_fix(board, fault):
+    name, tendon = fault.split(":")
+    with driver(board) as robot:
+        robot.arm()
+        board.latch(fault)
+        reading = robot.read()
+        while not reading.fault:
+            reading = robot.read()
+        assert reading.fault == fault and reading.state is DriverState.FAULT
+        with pytest.raises(HardwareError, match=rf"fault {name} at tendon {tendon}") as caught:
+            robot.command([1.0] * 4)
+        assert "\n" not in str(caught.value)
+        robot.reset()
+        assert robot.state is DriverState.READY and robot.fault == ""
+
+
+def test_every_fault_of_the_protocol_has_a_fix():
+    from pathlib import Path
+
+    text = (
+        (Path(__file__).parents[2] / "firmware" / "PROTOCOL.md")
+        .read_text()
+        .split("## Faults")[1]
+        .split("##")[0]
+    )
+    names = re.findall(r"^\| `([a-z-]+)` \|", text, re.MULTILINE)
+    assert len(names) == 8 and set(names) <= set(FAULTS)
+    assert all(fault_message(f"{name}:0").endswith("then reset()") for name in names)
+
+
+def test_stop_latches_and_never_raises(board):
+    robot = driver(board)
+    robot.stop()
+    with robot:
+        robot.arm()
+        robot.stop()
+        assert robot.state is DriverState.FAULT and robot.fault == "stopped:0"
+        robot.stop()
+    robot.stop()
+
+
+def test_an_error_in_the_program_stops_the_robot(board):
+    with pytest.raises(ZeroDivisionError), driver(board) as robot:
+        robot.command([robot.arm() or 1.0 / 0.0] * 4)
+    assert board.fault == "stopped:0"
+
+
+def test_the_driver_stops_a_robot_that_measures_too_much(board):
+    with driver(board, measured_high=5.0) as robot:
+        robot.arm()
+        board.measured[2] = 600
+        assert eventually(lambda: board.fault == "stopped:0")
+        with pytest.raises(HardwareError, match=r"measured-tension at tendon 3.*measured_high"):
+            robot.command([1.0] * 4)
+        board.measured[2] = 0
+        robot.reset()
+        robot.arm()
+
+
+def test_a_board_that_restarts_is_found_again(board):
+    with driver(board) as robot:
+        robot.arm()
+        board.restart()
+        assert eventually(lambda: robot.state is DriverState.FAULT)
+        with pytest.raises(HardwareError, match="the board restarted; check the supply"):
+            robot.command([1.0] * 4)
+        robot.reset()
+        assert robot.is_framed and robot.state is DriverState.READY
+        robot.arm()
+
+
+# damage
+
+
+def test_damaged_lines_are_counted_and_do_no_harm(board):
+    with driver(board) as robot:
+        board.damage = 3
+        robot.arm()
+        for _ in range(20):
+            reading = robot.read()
+            assert np.all((reading.tension >= 0.0) & (reading.tension < 16.0))
+            robot.command([1.0] * 4)
+        assert robot.line_counts["damaged"] >= 3 and robot.line_counts["lost telemetry"] >= 3
+        assert robot.setting("kp") == 300
+
+
+def test_commands_that_arrive_damaged_are_sent_again(board):
+    with driver(board) as robot:
+        board.damage_input = 3
+        for value in range(5):
+            assert robot.set_setting("kp", value) == value
+        robot.arm()
+        assert robot.line_counts["refused as checksum"] >= 1
+
+
+def test_a_silent_board_is_an_error(board):
+    with driver(board) as robot:
+        robot.arm()
+        board.silent = True
+        time.sleep(0.1)
+        with contextlib.suppress(HardwareError):
+            robot.read(0.1)
+        with pytest.raises(HardwareError, match=r"no reading in 0\.6 s"):
+            robot.read(0.6)
+        with pytest.raises(HardwareError, match=r"no telemetry for 0\.\d s; check the cable"):
+            robot.command([1.0] * 4)
+        # a board that cannot be supervised is not kept armed
+        assert eventually(lambda: board.fault == "watchdog:0")
+        board.silent = False
+        robot.read()
+
+
+def test_an_unplugged_board_is_disconnected(board):
+    robot = driver(board)
+    robot.connect()
+    robot.arm()
+    board.unplug()
+    assert eventually(lambda: robot.state is DriverState.DISCONNECTED)
+    for call in (
+        robot.read,
+        robot.arm,
+        robot.disarm,
+        lambda: robot.command([1.0] * 4),
+        lambda: robot.wait(0.1),
+    ):
+        with pytest.raises(HardwareError, match=r"the connection is lost.*check the USB cable") as caught:
+            call()
+        assert "\n" not in str(caught.value)
+    robot.stop()
+    robot.close()
+
+
+# limits
+
+
+def test_commands_keep_to_the_limits(board):
+    board.limit = 1000
+    with driver(board, Limits(0.0, 15.0, 50.0, 20.0)) as robot:
+        assert robot.limits.high == pytest.approx(1000 * GRAM_FORCE)
+        robot.arm()
+        first = robot.command([100.0] * 4)
+        assert first.max() <= 50.0 * 0.1 + GRAM_FORCE
+        for _ in range(20):
+            robot.wait(0.05)
+            sent = robot.command([100.0, 100.0, 0.0, 0.0])
+        assert sent.max() <= robot.limits.high and 19.0 < sent.sum() <= 20.0
+
+
+@pytest.mark.parametrize(
+    "wrong", [[1.0, 2.0], [1.0, np.nan, 1.0, 1.0], [np.inf] * 4, "1 2 3 4", [[1.0] * 4], None]
+)
+def test_tensions_that_are_none_are_refused(board, wrong):
+    with driver(board) as robot:
+        robot.arm()
+        with pytest.raises(HardwareError, match="tensions must be"):
+            robot.command(wrong)
+        assert robot.state is DriverState.ARMED
+
+
+@given(
+    st.lists(st.tuples(st.lists(st.floats(-50, 200), min_size=3, max_size=3), st.floats(0, 1)), max_size=20),
+    st.floats(0, 3),
+    st.floats(4, 30),
+    st.floats(0.1, 300),
+    st.floats(9, 60),
+)
+def test_limits_hold_after_any_commands(commands, low, high, rate, total):
+    limiter = TensionLimiter(Limits(low, high, rate, total), 3)
+    limiter.reset(0.0)
+    now, last = 0.0, np.zeros(3)
+    for tension, elapsed in commands:
+        now += elapsed
+        sent = limiter.reduced(np.array(tension), now)
+        assert np.all(sent >= 0.0) and np.all(sent <= high + 1e-9) and sent.sum() <= total + 1e-6
+        assert np.all(np.abs(sent - last) <= rate * min(elapsed + 0.02, 0.1) + 1e-9)
+        last = sent
+    for _ in range(10_000 if commands else 0):
+        now += 0.1
+        sent = limiter.reduced(np.full(3, low + 0.1), now)
+        if np.allclose(sent, low + 0.1):
+            break
+    assert not commands or np.allclose(sent, low + 0.1)
+
+
+@pytest.mark.parametrize(
+    "limits", [Limits(high=-1.0), Limits(rate=0.0), Limits(low=20.0), Limits(low=5.0, total=15.0)]
+)
+def test_limits_that_contradict_each_other_are_refused(limits):
+    with pytest.raises(HardwareError, match="must be"):
+        SerialBoard("port", limits)
+
+
+# settings, jog
+
+
+def test_settings(board):
+    with driver(board) as robot:
+        assert robot.setting("kp") == 300 and robot.set_setting("kp", 200) == 200 == board.settings["kp"]
+        robot.save_settings()
+        assert board.saved
+        with pytest.raises(HardwareError, match=r"refused as name.*did you mean kp"):
+            robot.setting("kpp")
+        with pytest.raises(HardwareError, match="must be a whole number"):
+            robot.set_setting("kp", 1.5)
+
+
+def test_jog_counts_tendons_from_zero(board):
+    with driver(board) as robot:
+        robot.jog(3, -0.2)
+        assert board.accepted[-1] == ("drive", "4", "-51") or ("drive", "4", "-51") in board.accepted
+        with pytest.raises(HardwareError, match="refused as range"):
+            robot.jog(0, 0.9)
+        for tendon, drive, message in (
+            (4, 0.1, "tendon must be"),
+            (0, 1.5, "drive must be"),
+            (0, math.nan, "drive"),
+        ):
+            with pytest.raises(HardwareError, match=message):
+                robot.jog(tendon, drive)
+
+
+# lock-step
+
+
+class Clockwork(Transport):
+    """A framed board whose time passes in `read` only."""
+
+    real_time = False
+
+    def __init__(self):
+        self.time, self.lines, self.state, self.last, self.fed = 0.0, [], "ready", 0, 0.0
+        self.waiting = b"# knode-tension 1.0.0 protocol 2 tendons 4\n"
+        self.fault, self.count, self.due = "", 0, 0.02
+
+    def write(self, data):
+        line = data[:-1]
+        self.lines.append((self.time, line))
+        if line == b"hello 2":
+            from knode_cosserat.hardware.lines import Answer
+
+            self.waiting += encode_message(Answer(0, "hello", ("2", "x", "1", "4", "256", "2300")), True)
+            return
+        if b"*" not in line:
+            return
+        number, verb, *_ = line.rpartition(b"*")[0].decode().split()
+        self.last, self.fed = int(number), self.time
+        if verb in ("arm", "disarm"):
+            from knode_cosserat.hardware.lines import Answer
+
+            self.state = "armed" if verb == "arm" else "ready"
+            self.waiting += encode_message(Answer(self.last, verb), True)
+
+    def read(self, timeout):
+        if not self.waiting:
+            self.time += timeout
+        if self.state == "armed" and self.time - self.fed > 0.06:
+            self.state, self.fault = "fault", "watchdog:0"
+        while self.time >= self.due:
+            self.due += 0.02
+            self.count += 1
+            made = Telemetry((1,) * 4, (0,) * 4, 4, self.count % 65536, self.last, self.state, self.fault)
+            self.waiting += encode_message(made, True)
+        data, self.waiting = self.waiting, b""
+        return data
+
+    def now(self):
+        return self.time
+
+    def close(self):
+        pass
+
+
+def test_lock_step_needs_no_thread_and_keeps_the_watchdog_in_simulated_time():
+    def run():
+        transport = Clockwork()
+        with SerialBoard(transport, FAST) as robot:
+            robot.arm()
+            for k in range(20):
+                robot.command([0.1 * k] * 4)
+                robot.wait(0.1)
+                time.sleep(0.001)
+            robot.read()
+            assert robot.state is DriverState.ARMED
+        return transport
+
+    first, second = run(), run()
+    assert first.lines == second.lines  # the same bytes at the same times
+    times = [at for at, line in first.lines if b"*" in line]
+    assert np.max(np.diff(times)) <= 0.03 and 2.0 < first.time < 3.0
+
+
+def test_lock_step_latency_is_in_simulated_time():
+    transport = Clockwork()
+    with SerialBoard(transport, FAST) as robot:
+        robot.arm()
+        robot.command([1.0] * 4)
+        robot.wait(0.1)
+        assert robot.latency.count == 1 and 0.0 < robot.latency.median <= 0.025 + 1e-9
+
+
+# any bytes
+
+
+class Bytes(Transport):
+    """A transport that delivers given bytes."""
+
+    real_time = False
+
+    def __init__(self, chunks):
+        self.chunks, self.time = list(chunks), 0.0
+
+    def write(self, data):
+        assert data.endswith(b"\n")
+
+    def read(self, timeout):
+        self.time += timeout
+        return self.chunks.pop(0) if self.chunks else b""
+
+    def now(self):
+        return self.time
+
+    def close(self):
+        pass
+
+
+pieces = st.binary(max_size=80) | st.sampled_from(
+    [b"\n", b"0 = hello 2\n", b"1 : 2 armed - 1,2,3\n", b"1,2,3,4,5,6,7,8,9\n",
+     b"# knode-tension 1 protocol 2 tendons 4\n",
+     encode_message(Telemetry((9999,) * 4, (0,) * 4, 4, 1, 2, "armed", ""), True)]
+)  # fmt: skip
+
+
+@settings(deadline=None, max_examples=200)
+@given(st.lists(pieces, max_size=20), st.sampled_from(["unknown", "plain", "framed"]))
+def test_any_bytes_do_no_harm_to_the_reader(chunks, mode):
+    link = BoardLink(Bytes(chunks), 0.25, 20.0)
+    link.mode = mode
+    link.until(lambda: None, 0.005 * (len(chunks) + 1))
+    assert link.error is None
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.lists(pieces, max_size=20), st.sampled_from([1, 2]))
+def test_a_connection_to_any_bytes_is_made_or_an_error(chunks, protocol):
+    robot = SerialBoard(Bytes(chunks), FAST, protocol=protocol, start_timeout=1.0)
+    with contextlib.suppress(HardwareError):
+        robot.connect()
+        robot.arm()
+        robot.command([1.0] * 4)
+    robot.stop()
+    robot.close()
+
+
+def test_telemetry_of_the_description_is_read():
+    line = encode_message(Telemetry((1, 2, 3, 4), (5, 6, 7, 8), 4, 1, 2, "armed", "slack:2"), True)
+    assert decode_framed(line[:-1]).fault == "slack:2"
