@@ -109,7 +109,7 @@ def write_recording(
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class _Stream:
+class WireStream:
     """Numbers in the units and the order of the messages."""
 
     topic: str
@@ -125,7 +125,7 @@ def _on_the_wire(
     poses: Mapping[str, MocapPoses],
     tension: Pulls | None,
     command: Pulls | None,
-) -> list[_Stream]:
+) -> list[WireStream]:
     sources = {marker.name: marker.topic for marker in config.markers}
     if config.base is not None:
         sources["base"] = config.base.topic
@@ -138,7 +138,7 @@ def _on_the_wire(
         parts = [np.asarray(pose.position) / scale]
         if pose.quaternion is not None:
             parts.append(np.asarray(pose.quaternion))
-        streams.append(_Stream(topic, "pose", pose.time, np.concatenate(parts, axis=1)))
+        streams.append(WireStream(topic, "pose", pose.time, np.concatenate(parts, axis=1)))
     for role, source, pulls in (("tension", config.tension, tension), ("command", config.command, command)):
         if pulls is None:
             continue
@@ -147,12 +147,12 @@ def _on_the_wire(
                 f"{path}: {role} of shape {np.shape(pulls.tension)}; the configuration has "
                 f"{len(source.order) if source else 'no'} tendons there"
             )
-        stream = _Stream(source.topic, role, pulls.time, _sent(source, pulls.tension), source)
+        stream = WireStream(source.topic, role, pulls.time, sent_tensions(source, pulls.tension), source)
         streams.append(_saying_so(stream) if config.simulated and path.suffix in BAGS else stream)
     return streams
 
 
-def _saying_so(stream: _Stream) -> _Stream:
+def _saying_so(stream: WireStream) -> WireStream:
     """Return the stream; a log gets a first row of NaN, which stands for the line on the simulation."""
     if not isinstance(stream.source, CommandSource) or stream.source.text is None or len(stream.time) == 0:
         return stream
@@ -161,7 +161,8 @@ def _saying_so(stream: _Stream) -> _Stream:
     return dataclasses.replace(stream, time=time, values=values)
 
 
-def _sent(source: TensionSource, newtons: Any) -> Any:
+def sent_tensions(source: TensionSource, newtons: Any) -> Any:
+    """Return tensions (N), shape (n, tendons), in the unit and the order of a source's messages."""
     sent = np.asarray(newtons)[:, np.array(source.order) - 1] / TENSION_UNITS[source.unit]
     in_text = isinstance(source, CommandSource) and source.text is not None
     return np.round(sent) if in_text and source.unit == "gf" else sent
@@ -170,19 +171,20 @@ def _sent(source: TensionSource, newtons: Any) -> Any:
 # bags
 
 
-def _write_ros1(path: Path, streams: list[_Stream], start: int, delays: Mapping[str, float]) -> None:
+def _write_ros1(path: Path, streams: list[WireStream], start: int, delays: Mapping[str, float]) -> None:
     store = typestore(1)
     from rosbags.rosbag1 import Writer
 
     with replacing(path) as temporary, Writer(temporary) as writer:
         connections = {
-            each.topic: writer.add_connection(each.topic, _type(each, 1), typestore=store) for each in streams
+            each.topic: writer.add_connection(each.topic, message_type(each, 1), typestore=store)
+            for each in streams
         }
         for topic, kind, received, message in _messages(streams, 1, start, delays):
             writer.write(connections[topic], received, store.serialize_ros1(message, kind))
 
 
-def _write_ros2(path: Path, streams: list[_Stream], start: int, delays: Mapping[str, float]) -> None:
+def _write_ros2(path: Path, streams: list[WireStream], start: int, delays: Mapping[str, float]) -> None:
     store = typestore(2)
     from rosbags.rosbag2 import StoragePlugin, Writer
 
@@ -192,7 +194,7 @@ def _write_ros2(path: Path, streams: list[_Stream], start: int, delays: Mapping[
         bag = Path(folder) / "bag"
         with Writer(bag, version=9, storage_plugin=plugin) as writer:
             connections = {
-                each.topic: writer.add_connection(each.topic, _type(each, 2), typestore=store)
+                each.topic: writer.add_connection(each.topic, message_type(each, 2), typestore=store)
                 for each in streams
             }
             for topic, kind, received, message in _messages(streams, 2, start, delays):
@@ -201,12 +203,12 @@ def _write_ros2(path: Path, streams: list[_Stream], start: int, delays: Mapping[
 
 
 def _messages(
-    streams: list[_Stream], ros: int, start: int, delays: Mapping[str, float]
+    streams: list[WireStream], ros: int, start: int, delays: Mapping[str, float]
 ) -> Iterator[tuple[str, str, int, Any]]:
     """Yield topic, type, recording time (ns) and message, in the order of recording."""
 
-    def of(stream: _Stream) -> Iterator[tuple[int, int, str, str, Any]]:
-        kind, make = _type(stream, ros), _maker(stream, ros)
+    def of(stream: WireStream) -> Iterator[tuple[int, int, str, str, Any]]:
+        kind, make = message_type(stream, ros), message_maker(stream, ros)
         delay = round(delays.get(stream.topic, 0.0) * 1e9)
         for row, (time, values) in enumerate(zip(stream.time, stream.values, strict=True)):
             stamp = start * 10**9 + round(float(time) * 1e9)
@@ -216,7 +218,8 @@ def _messages(
         yield topic, kind, received, message
 
 
-def _type(stream: _Stream, ros: int) -> str:
+def message_type(stream: WireStream, ros: int) -> str:
+    """Return the message type of a stream, as ROS 2 writes it, for a ROS version."""
     size = np.shape(stream.values)[1]
     if stream.role == "pose":
         return "geometry_msgs/msg/PoseStamped" if size == 7 else "geometry_msgs/msg/PointStamped"
@@ -225,9 +228,9 @@ def _type(stream: _Stream, ros: int) -> str:
     return _NUMBERS.get(size, _ARRAY)
 
 
-def _maker(stream: _Stream, ros: int) -> Callable[[int, int, Any], Any]:
+def message_maker(stream: WireStream, ros: int) -> Callable[[int, int, Any], Any]:
     """Return a function that makes a message from a stamp (ns), a row's index and its values."""
-    types, kind = typestore(ros).types, _type(stream, ros)
+    types, kind = typestore(ros).types, message_type(stream, ros)
     made = {name.rsplit("/", 1)[1]: types[name] for name in _PARTS}
     frame = "world" if stream.role == "pose" else ""
 
@@ -274,7 +277,7 @@ def _maker(stream: _Stream, ros: int) -> Callable[[int, int, Any], Any]:
 # tables
 
 
-def _write_table(path: Path, config: RecordingConfig, streams: list[_Stream]) -> None:
+def _write_table(path: Path, config: RecordingConfig, streams: list[WireStream]) -> None:
     from knode_cosserat.recordings import table
 
     columns: dict[str, Any] = {}
