@@ -21,6 +21,7 @@ from knode_cosserat.control.commands import Command, Controller
 from knode_cosserat.control.plants import Plant
 from knode_cosserat.control.references import Reference
 from knode_cosserat.control.states import estimated, joined
+from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.trajectory import Trajectory
 
@@ -219,7 +220,7 @@ class Loop:
         self.controller, self.plant, self.reference = controller, plant, reference
         #: number of periods that began late, counted by the caller that keeps the time
         self.missed = 0
-        warm_up(controller, plant, reference)
+        warm_up(controller, plant.rehearsal(), reference)
         self._initial = np.array(plant.start())
         controller.reset(self._initial)
         controller.prepare(0.0, reference)
@@ -284,7 +285,7 @@ class Loop:
             parameters={
                 name: np.array([row.parameters[name] for row in rows]) for name in rows[0].parameters
             },
-            missed=self.missed,
+            missed=self.missed + self.plant.missed,
             compiled=_COMPILATIONS.count - self._compiled_before,
             initial_control=self._initial if rows[0].time == 0.0 else None,
             estimated=joined(states, [row.time for row in rows]) if states else None,
@@ -310,22 +311,33 @@ def run_loop(
     Raises:
         ValueError: plant and controller have different periods, or a duration below one period.
         ReferenceFormatError: the reference is further away than the robot is long.
+        KnodeCosseratError: the plant failed, such as hardware with a fault. The error's attribute `log` is
+            the log of the periods before, None if there are none. Interruptions (Ctrl-C) have it too.
     """
     steps = round(seconds / controller.dt)
     if steps < 1:
         raise ValueError(f"seconds is {seconds:g}; allowed is at least one period, {controller.dt:g} s")
     check_reference(controller, reference, seconds)
     loop = Loop(controller, plant, reference)
-    with _no_garbage_collection():
-        due = clock.perf_counter()
-        for k in range(steps):
-            if paced:
-                loop.missed += k > 0 and clock.perf_counter() > due
-                while (rest := due - clock.perf_counter()) > 0.0:
-                    clock.sleep(max(0.0, rest - 5e-4))
-                due = max(due, clock.perf_counter() - controller.dt) + controller.dt
-            loop.period()
+    try:
+        with _no_garbage_collection():
+            _periods(loop, steps, paced)
+    except (KnodeCosseratError, KeyboardInterrupt) as error:
+        # measurements of a robot are not lost
+        error.log = loop.log() if loop.time > 0.0 else None  # type: ignore[union-attr]
+        raise
     return loop.log()
+
+
+def _periods(loop: Loop, steps: int, paced: bool) -> None:
+    dt, due = loop.controller.dt, clock.perf_counter()
+    for k in range(steps):
+        if paced:
+            loop.missed += k > 0 and clock.perf_counter() > due
+            while (rest := due - clock.perf_counter()) > 0.0:
+                clock.sleep(max(0.0, rest - 5e-4))
+            due = max(due, clock.perf_counter() - dt) + dt
+        loop.period()
 
 
 def warm_up(controller: Controller, plant: Plant, reference: Reference, periods: int = 2) -> None:

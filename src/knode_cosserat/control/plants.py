@@ -69,6 +69,12 @@ class Plant(abc.ABC):
 
     #: period (s)
     dt: float
+    #: number of periods that began late, counted by plants that keep the time
+    missed: int = 0
+
+    def rehearsal(self) -> Plant:
+        """Return the plant that a loop is compiled with before it starts: by default this one; it moves."""
+        return self
 
     @abc.abstractmethod
     def start(self) -> Float[np.ndarray, " c"]:

@@ -8,46 +8,81 @@ from typing import TYPE_CHECKING
 from knode_cosserat._lazy import make_lazy
 
 if TYPE_CHECKING:
+    from knode_cosserat.hardware.calibration import LoadCellFit, fit_load_cell, write_calibration
     from knode_cosserat.hardware.clock import HostClock
     from knode_cosserat.hardware.description import Dimensions, HardwareDescription, load_hardware
     from knode_cosserat.hardware.driver import Driver, DriverState, HardwareError, Latency, Limits, Reading
+    from knode_cosserat.hardware.middleware.commands import CommandGate
+    from knode_cosserat.hardware.middleware.dds import DDSBridge
+    from knode_cosserat.hardware.middleware.loopback import LoopbackLatency, measure_loopback
     from knode_cosserat.hardware.middleware.mocap import MotionCapture, PoseFrame
     from knode_cosserat.hardware.middleware.natnet import NatNet
+    from knode_cosserat.hardware.plant import HardwarePlant
     from knode_cosserat.hardware.recorder import Recorder, record_robot
+    from knode_cosserat.hardware.safety import EmergencyStop, SafeRegion, StoppedError
     from knode_cosserat.hardware.serial_board import SerialBoard
+    from knode_cosserat.hardware.simulated import SimulatedRobot
+    from knode_cosserat.hardware.simulated_cells import MachineParameters
+    from knode_cosserat.hardware.teleoperation import Gamepad, Keyboard, TensionMap, teleoperate
     from knode_cosserat.hardware.transport import SerialTransport, Transport
 
 __all__ = [
+    "CommandGate",
+    "DDSBridge",
     "Dimensions",
     "Driver",
     "DriverState",
+    "EmergencyStop",
+    "Gamepad",
     "HardwareDescription",
     "HardwareError",
+    "HardwarePlant",
     "HostClock",
+    "Keyboard",
     "Latency",
     "Limits",
+    "LoadCellFit",
+    "LoopbackLatency",
+    "MachineParameters",
     "MotionCapture",
     "NatNet",
     "PoseFrame",
     "Reading",
     "Recorder",
+    "SafeRegion",
     "SerialBoard",
     "SerialTransport",
+    "SimulatedRobot",
+    "StoppedError",
+    "TensionMap",
     "Transport",
+    "fit_load_cell",
     "load_hardware",
+    "measure_loopback",
     "record_robot",
+    "teleoperate",
+    "write_calibration",
 ]
 
 make_lazy(
     __name__,
     {
+        "knode_cosserat.hardware.calibration": "LoadCellFit fit_load_cell write_calibration",
         "knode_cosserat.hardware.clock": "HostClock",
         "knode_cosserat.hardware.description": "Dimensions HardwareDescription load_hardware",
         "knode_cosserat.hardware.driver": "Driver DriverState HardwareError Latency Limits Reading",
+        "knode_cosserat.hardware.middleware.commands": "CommandGate",
+        "knode_cosserat.hardware.middleware.dds": "DDSBridge",
+        "knode_cosserat.hardware.middleware.loopback": "LoopbackLatency measure_loopback",
         "knode_cosserat.hardware.middleware.mocap": "MotionCapture PoseFrame",
         "knode_cosserat.hardware.middleware.natnet": "NatNet",
+        "knode_cosserat.hardware.plant": "HardwarePlant",
         "knode_cosserat.hardware.recorder": "Recorder record_robot",
+        "knode_cosserat.hardware.safety": "EmergencyStop SafeRegion StoppedError",
         "knode_cosserat.hardware.serial_board": "SerialBoard",
+        "knode_cosserat.hardware.simulated": "SimulatedRobot",
+        "knode_cosserat.hardware.simulated_cells": "MachineParameters",
+        "knode_cosserat.hardware.teleoperation": "Gamepad Keyboard TensionMap teleoperate",
         "knode_cosserat.hardware.transport": "SerialTransport Transport",
     },
 )

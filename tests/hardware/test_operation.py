@@ -1,0 +1,231 @@
+"""Operation of a robot: emergency stop, closed loops, commissioning."""
+
+import os
+import pty
+import signal
+import threading
+import time
+
+import numpy as np
+import pytest
+
+import knode_cosserat as kc
+from knode_cosserat.hardware.driver import DriverState, HardwareError, Limits
+from knode_cosserat.hardware.plant import HardwarePlant
+from knode_cosserat.hardware.safety import EmergencyStop, SafeRegion, StoppedError
+from knode_cosserat.hardware.simulated import MachineParameters, SimulatedRobot
+
+ROD = kc.load_robot("delrin-tendon-robot").replace(nodes=6)
+DT = 0.06
+
+
+class Stops:
+    """Driver that counts its stops."""
+
+    count = 0
+
+    def stop(self):
+        self.count += 1
+
+
+def eventually(condition):
+    end = time.monotonic() + 5.0
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.005)
+    return condition()
+
+
+# emergency stop
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_stops_the_robot_once(number):
+    before, driver = signal.getsignal(number), Stops()
+    emergency = EmergencyStop(driver)
+
+    def work():
+        with emergency:
+            os.kill(os.getpid(), number)
+            time.sleep(5.0)
+
+    with pytest.raises(StoppedError, match=f"stopped by {number.name}"):
+        work()
+    assert driver.count == 1 and emergency.is_stopped and emergency.reason == number.name
+    assert signal.getsignal(number) == before and signal.set_wakeup_fd(-1) == -1
+
+
+@pytest.mark.parametrize("key", [b" ", b"q", b"\n"])
+def test_a_key_stops_the_robot_and_the_terminal_is_restored(key):
+    import termios
+
+    driver, (master, slave) = Stops(), pty.openpty()
+    before, others = termios.tcgetattr(slave), []
+    with EmergencyStop(driver, terminal=slave, other_keys=others.append) as emergency:
+        assert termios.tcgetattr(slave) != before
+        emergency.check()
+        os.write(master, b"x")
+        assert eventually(lambda: others == [b"x"]) and driver.count == 0
+        os.write(master, key)
+        assert eventually(lambda: driver.count == 1)
+        os.write(master, key)
+        with pytest.raises(StoppedError, match="stopped by a key"):
+            emergency.check()
+    assert driver.count == 1 and termios.tcgetattr(slave) == before
+    os.close(master)
+    os.close(slave)
+
+
+def test_a_lost_terminal_stops_the_robot():
+    driver, (master, slave) = Stops(), pty.openpty()
+    with EmergencyStop(driver, terminal=slave) as emergency:
+        os.close(master)
+        assert eventually(lambda: driver.count == 1)
+        assert emergency.reason == "a lost terminal"
+    os.close(slave)
+
+
+def test_a_stop_comes_at_once_while_the_program_is_busy():
+    driver, times, matrix = Stops(), [], np.random.default_rng(0).normal(size=(1500, 1500))
+    driver.stop = lambda: times.append(time.monotonic())
+
+    def work():
+        with EmergencyStop(driver):
+            threading.Timer(0.05, lambda: os.kill(os.getpid(), signal.SIGTERM)).start()
+            # one call that takes long: Python's handler runs after it
+            np.linalg.svd(matrix)
+            time.sleep(5.0)
+
+    began = time.monotonic()
+    with pytest.raises(StoppedError):
+        work()
+    assert len(times) == 1 and times[0] - began < 0.8 * (time.monotonic() - began)
+
+
+def test_errors_stop_the_robot_and_normal_ends_do_not():
+    driver = Stops()
+    with EmergencyStop(driver):
+        pass
+    assert driver.count == 0
+    with pytest.raises(ZeroDivisionError), EmergencyStop(driver):
+        1 / 0  # noqa: B018
+    assert driver.count == 1
+
+
+def test_it_works_in_other_threads_without_signals():
+    driver, done = Stops(), []
+
+    def work():
+        with EmergencyStop(driver) as emergency:
+            emergency.stop("a test")
+            done.append(emergency.is_stopped)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert done == [True] and driver.count == 1
+
+
+def test_regions():
+    region = SafeRegion(radius=0.2, low=0.1, high=0.7, speed=1.0)
+    inside = np.array([0.1, 0.0, 0.5])
+    assert region.violation(inside) == "" and region.violation(np.full(3, np.nan)) == ""
+    assert "0.3 m from the axis" in region.violation(np.array([0.0, 0.3, 0.5]))
+    assert "height is 0.05 m" in region.violation(np.array([0.0, 0.0, 0.05]))
+    assert "moves at 2 m/s" in region.violation(inside, inside + np.array([0.1, 0.0, 0.0]), 0.05)
+    with pytest.raises(HardwareError, match="above 0"):
+        SafeRegion(radius=0.0)
+
+
+# closed loops
+
+
+@pytest.fixture(scope="module")
+def controller():
+    return kc.control.KinematicController(ROD, DT, kc.control.ControlLimits(0.3, 6.0, 40.0))
+
+
+@pytest.fixture
+def robot():
+    with SimulatedRobot(ROD, Limits(high=8.0), machine=MachineParameters(noise=0.0, offset=0.0)) as found:
+        yield found
+
+
+def plant_of(robot, **more):
+    return HardwarePlant(robot, lambda: (robot.now(), robot.tip()), DT, **more)
+
+
+AIM = kc.control.constant([0.05, 0.0, 0.62])
+
+
+def test_a_loop_moves_the_robot_and_keeps_the_time(robot, controller):
+    plant = plant_of(robot)
+    log = kc.control.run_loop(controller, plant, AIM, 1.5)
+    assert len(log.time) == 25 and log.missed == 0 and plant.reduced == 0
+    assert abs(log.tip[-1, 0] - 0.05) < 0.01 and abs(log.tip[-1, 1]) < 0.005
+    np.testing.assert_array_equal(log.initial_control, np.zeros(4))
+    # nothing moved during the rehearsal
+    assert np.linalg.norm(log.tip[0][:2]) < 1e-6
+    assert len(plant.readings) == 24 and robot.state is DriverState.ARMED
+    stamps = np.array([reading.time for reading in plant.readings])
+    np.testing.assert_allclose(np.diff(stamps), DT, atol=0.021)
+
+
+def test_a_fault_ends_the_loop_and_the_log_is_kept(robot, controller):
+    plant = plant_of(robot)
+    robot.inject("slack:2", after=0.6)
+    with pytest.raises(HardwareError, match="fault slack at tendon 2") as caught:
+        kc.control.run_loop(controller, plant, AIM, 3.0)
+    log = caught.value.log
+    assert len(log.time) == 10 and np.isfinite(log.tip[-1]).all()
+    assert robot.state is DriverState.FAULT
+
+
+def test_a_lost_connection_keeps_the_log_too(robot, controller):
+    robot.inject("lost", after=0.3)
+    with pytest.raises(HardwareError, match="connection is lost") as caught:
+        kc.control.run_loop(controller, plant_of(robot), AIM, 3.0)
+    assert len(caught.value.log.time) == 5
+
+
+def test_leaving_the_region_stops_the_robot(robot, controller):
+    with pytest.raises(HardwareError, match=r"from the axis \(allowed: 0.02 m\); the robot was stopped"):
+        kc.control.run_loop(controller, plant_of(robot, region=SafeRegion(radius=0.02)), AIM, 3.0)
+    assert robot.fault == "stopped:0"
+
+
+def test_a_signal_ends_the_loop_with_its_log(robot, controller):
+    robot.observer = lambda each: each.now() > 0.5 and os.kill(os.getpid(), signal.SIGINT)
+    with pytest.raises(StoppedError) as caught, EmergencyStop(robot) as emergency:
+        kc.control.run_loop(controller, plant_of(robot, emergency=emergency), AIM, 3.0)
+    assert 5 <= len(caught.value.log.time) <= 10 and robot.fault == "stopped:0"
+
+
+def test_old_measurements_are_missing(robot):
+    plant = HardwarePlant(robot, lambda: (robot.now() - 2 * DT, np.ones(3)), DT)
+    plant.start()
+    assert np.isnan(plant.measure()).all() and np.isnan(plant.tip()).all()
+    assert np.isnan(HardwarePlant(robot, None, DT).measure()).all()
+    with pytest.raises(HardwareError, match="must have 3 numbers"):
+        HardwarePlant(robot, lambda: (robot.now(), np.ones(2)), DT).measure()
+    with pytest.raises(HardwareError, match="positive number"):
+        HardwarePlant(robot, None, 0.0)
+
+
+def test_a_late_program_counts_missed_periods(robot):
+    plant = plant_of(robot)
+    plant.start()
+    for late in (0.0, 2.0 * DT, 0.0):
+        plant.measure()
+        plant.apply(np.full(4, 0.5))
+        robot.wait(late)
+    plant.measure()
+    assert plant.missed == 1
+
+
+def test_commands_beyond_the_driver_are_counted(robot):
+    plant = plant_of(robot)
+    plant.start()
+    plant.measure()
+    plant.apply(np.array([20.0, 0.0, 0.0, 0.0]))
+    assert plant.reduced == 1
+    assert plant.start() is not None and robot.state is DriverState.READY and plant.reduced == 0
