@@ -12,11 +12,13 @@ if TYPE_CHECKING:
     from knode_cosserat.hardware.clock import HostClock
     from knode_cosserat.hardware.description import Dimensions, HardwareDescription, load_hardware
     from knode_cosserat.hardware.driver import Driver, DriverState, HardwareError, Latency, Limits, Reading
+    from knode_cosserat.hardware.dynamixel import DynamixelRobot
     from knode_cosserat.hardware.middleware.commands import CommandGate
     from knode_cosserat.hardware.middleware.dds import DDSBridge
     from knode_cosserat.hardware.middleware.loopback import LoopbackLatency, measure_loopback
     from knode_cosserat.hardware.middleware.mocap import MotionCapture, PoseFrame
     from knode_cosserat.hardware.middleware.natnet import NatNet
+    from knode_cosserat.hardware.motor_robot import MotorReel
     from knode_cosserat.hardware.plant import HardwarePlant
     from knode_cosserat.hardware.recorder import Recorder, record_robot
     from knode_cosserat.hardware.safety import EmergencyStop, SafeRegion, StoppedError
@@ -32,6 +34,7 @@ __all__ = [
     "Dimensions",
     "Driver",
     "DriverState",
+    "DynamixelRobot",
     "EmergencyStop",
     "Gamepad",
     "HardwareDescription",
@@ -45,6 +48,7 @@ __all__ = [
     "LoopbackLatency",
     "MachineParameters",
     "MotionCapture",
+    "MotorReel",
     "NatNet",
     "PoseFrame",
     "Reading",
@@ -71,11 +75,13 @@ make_lazy(
         "knode_cosserat.hardware.clock": "HostClock",
         "knode_cosserat.hardware.description": "Dimensions HardwareDescription load_hardware",
         "knode_cosserat.hardware.driver": "Driver DriverState HardwareError Latency Limits Reading",
+        "knode_cosserat.hardware.dynamixel": "DynamixelRobot",
         "knode_cosserat.hardware.middleware.commands": "CommandGate",
         "knode_cosserat.hardware.middleware.dds": "DDSBridge",
         "knode_cosserat.hardware.middleware.loopback": "LoopbackLatency measure_loopback",
         "knode_cosserat.hardware.middleware.mocap": "MotionCapture PoseFrame",
         "knode_cosserat.hardware.middleware.natnet": "NatNet",
+        "knode_cosserat.hardware.motor_robot": "MotorReel",
         "knode_cosserat.hardware.plant": "HardwarePlant",
         "knode_cosserat.hardware.recorder": "Recorder record_robot",
         "knode_cosserat.hardware.safety": "EmergencyStop SafeRegion StoppedError",

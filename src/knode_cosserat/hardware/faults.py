@@ -43,6 +43,23 @@ FAULTS: dict[str, tuple[str, str]] = {
         "the driver measured more than its own limit and stopped the robot",
         "reduce the commanded tension, or raise measured_high",
     ),
+    # motors that are commanded by torque
+    "travel": (
+        "a motor is beyond its travel",
+        "check that the tendon is on its reel and not torn; tare() sets the zero",
+    ),
+    "motor-watchdog": (
+        "the motor received nothing in time",
+        "call command() or read() at least every host_timeout, check the cable",
+    ),
+    "input-voltage": ("the supply is beyond the motor's range", "check voltage and cables of the supply"),
+    "overheating": ("the motor is too hot", "let it cool, and reduce tensions"),
+    "encoder": ("the motor's encoder failed", "start the motor again; replace it if this returns"),
+    "electrical-shock": ("the motor's circuit has a fault or too little power", "check the supply"),
+    "overload": ("the motor was overloaded for long", "reduce tensions, check that the reel turns freely"),
+    "heartbeat": ("a drive sends no heartbeat", "check its power, the CAN cable, its terminator and node id"),
+    "drive-error": ("a drive reports an error", "read its errors with the maker's tool, and mend the cause"),
+    "drive-idle": ("a drive left the closed loop by itself", "check its limits, watchdog and supply"),
 }
 
 
