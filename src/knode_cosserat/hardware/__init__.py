@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from knode_cosserat.hardware.middleware.loopback import LoopbackLatency, measure_loopback
     from knode_cosserat.hardware.middleware.mocap import MotionCapture, PoseFrame
     from knode_cosserat.hardware.middleware.natnet import NatNet
+    from knode_cosserat.hardware.middleware.ros1 import ROS1Node
+    from knode_cosserat.hardware.middleware.simulated_capture import SimulatedCapture
     from knode_cosserat.hardware.motor_robot import MotorReel
     from knode_cosserat.hardware.plant import HardwarePlant
     from knode_cosserat.hardware.recorder import Recorder, record_robot
@@ -51,11 +53,13 @@ __all__ = [
     "MotorReel",
     "NatNet",
     "PoseFrame",
+    "ROS1Node",
     "Reading",
     "Recorder",
     "SafeRegion",
     "SerialBoard",
     "SerialTransport",
+    "SimulatedCapture",
     "SimulatedRobot",
     "StoppedError",
     "TensionMap",
@@ -81,6 +85,8 @@ make_lazy(
         "knode_cosserat.hardware.middleware.loopback": "LoopbackLatency measure_loopback",
         "knode_cosserat.hardware.middleware.mocap": "MotionCapture PoseFrame",
         "knode_cosserat.hardware.middleware.natnet": "NatNet",
+        "knode_cosserat.hardware.middleware.ros1": "ROS1Node",
+        "knode_cosserat.hardware.middleware.simulated_capture": "SimulatedCapture",
         "knode_cosserat.hardware.motor_robot": "MotorReel",
         "knode_cosserat.hardware.plant": "HardwarePlant",
         "knode_cosserat.hardware.recorder": "Recorder record_robot",
