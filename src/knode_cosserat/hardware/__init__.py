@@ -9,6 +9,7 @@ from knode_cosserat._lazy import make_lazy
 
 if TYPE_CHECKING:
     from knode_cosserat.hardware.calibration import LoadCellFit, fit_load_cell, write_calibration
+    from knode_cosserat.hardware.can_robot import CanRobot
     from knode_cosserat.hardware.clock import HostClock
     from knode_cosserat.hardware.description import Dimensions, HardwareDescription, load_hardware
     from knode_cosserat.hardware.driver import Driver, DriverState, HardwareError, Latency, Limits, Reading
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from knode_cosserat.hardware.transport import SerialTransport, Transport
 
 __all__ = [
+    "CanRobot",
     "CommandGate",
     "DDSBridge",
     "Dimensions",
@@ -76,6 +78,7 @@ make_lazy(
     __name__,
     {
         "knode_cosserat.hardware.calibration": "LoadCellFit fit_load_cell write_calibration",
+        "knode_cosserat.hardware.can_robot": "CanRobot",
         "knode_cosserat.hardware.clock": "HostClock",
         "knode_cosserat.hardware.description": "Dimensions HardwareDescription load_hardware",
         "knode_cosserat.hardware.driver": "Driver DriverState HardwareError Latency Limits Reading",
