@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from knode_cosserat.hardware.middleware.natnet import NatNet
     from knode_cosserat.hardware.middleware.ros1 import ROS1Node
     from knode_cosserat.hardware.middleware.simulated_capture import SimulatedCapture
+    from knode_cosserat.hardware.middleware.vrpn import VRPN
     from knode_cosserat.hardware.motor_robot import MotorReel
     from knode_cosserat.hardware.plant import HardwarePlant
     from knode_cosserat.hardware.recorder import Recorder, record_robot
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from knode_cosserat.hardware.transport import SerialTransport, Transport
 
 __all__ = [
+    "VRPN",
     "CanRobot",
     "CommandGate",
     "DDSBridge",
@@ -90,6 +92,7 @@ make_lazy(
         "knode_cosserat.hardware.middleware.natnet": "NatNet",
         "knode_cosserat.hardware.middleware.ros1": "ROS1Node",
         "knode_cosserat.hardware.middleware.simulated_capture": "SimulatedCapture",
+        "knode_cosserat.hardware.middleware.vrpn": "VRPN",
         "knode_cosserat.hardware.motor_robot": "MotorReel",
         "knode_cosserat.hardware.plant": "HardwarePlant",
         "knode_cosserat.hardware.recorder": "Recorder record_robot",
