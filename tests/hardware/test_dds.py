@@ -24,7 +24,7 @@ from knode_cosserat.hardware.middleware.dds import DDSBridge
 from knode_cosserat.hardware.middleware.loopback import measure_loopback
 
 #: each test that opens a domain has another one
-DOMAIN = 100 + os.getpid() % 50
+DOMAIN = 10 + os.getpid() % 80
 
 
 class Robot(Driver):
@@ -304,16 +304,16 @@ def test_sockets_receive_from_this_host_only():
     domain = DOMAIN + 3
     participant = dds.open_participant(domain, loopback=True)
     ports, restricted = range(7400 + 250 * domain, 7400 + 250 * (domain + 1)), []
-    for name in os.listdir("/proc/self/fd"):
-        try:
-            with socket.socket(fileno=os.dup(int(name))) as opened:
-                if opened.family == socket.AF_INET and opened.getsockname()[1] in ports:
-                    restricted.append(opened.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, 16))
-        except OSError:
-            continue
+    for opened in dds._sockets():
+        with opened:
+            if opened.family == socket.AF_INET and opened.getsockname()[1] in ports:
+                restricted.append(opened.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, 16))
     assert len(restricted) >= 2
     assert all(device.rstrip(b"\0") == b"lo" for device in restricted)
-    assert participant is not None
+    # no file is left open
+    count = len(os.listdir("/proc/self/fd"))
+    dds._restrict_sockets(domain)
+    assert len(os.listdir("/proc/self/fd")) == count and participant is not None
 
 
 def test_wrong_values():

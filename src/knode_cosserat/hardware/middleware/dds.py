@@ -6,6 +6,7 @@ import contextlib
 import os
 import socket
 import sys
+from collections.abc import Iterator
 from types import TracebackType
 from typing import Any, Protocol, Self
 
@@ -87,10 +88,19 @@ def _restrict_sockets(domain: int) -> None:
         return
     # ports of a domain by the DDS standard
     ports = range(7400 + 250 * domain, 7400 + 250 * (domain + 1))
-    for name in os.listdir("/proc/self/fd"):
-        with contextlib.suppress(OSError), socket.socket(fileno=os.dup(int(name))) as opened:
+    for opened in _sockets():
+        with contextlib.suppress(OSError), opened:
             if opened.family == socket.AF_INET and opened.getsockname()[1] in ports:
                 opened.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, b"lo")
+
+
+def _sockets() -> Iterator[socket.socket]:
+    """Yield a duplicate of each socket of this process; the caller closes it."""
+    folder = "/proc/self/fd"
+    for name in os.listdir(folder):
+        with contextlib.suppress(OSError):
+            if os.readlink(f"{folder}/{name}").startswith("socket:"):
+                yield socket.socket(fileno=os.dup(int(name)))
 
 
 class DDSBridge:
