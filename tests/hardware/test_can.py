@@ -124,7 +124,7 @@ def bus(request):
 
 
 def driver(fake, limits=FAST, reel=REEL):
-    return CanRobot(fake.channel, "virtual", NODES, limits, reel, gear_ratio=GEAR)
+    return CanRobot(fake.channel, NODES, limits, reel, interface="virtual", gear_ratio=GEAR)
 
 
 def eventually(condition, timeout=5.0):
@@ -309,11 +309,11 @@ def test_other_traffic_is_ignored(bus):
 def test_arguments_are_checked(monkeypatch):
     for nodes in ([], [1, 1], [64], [-1]):
         with pytest.raises(HardwareError, match="node_ids must be different whole numbers"):
-            CanRobot("x", "virtual", nodes)
+            CanRobot("x", nodes)
     with pytest.raises(HardwareError, match="gear_ratio must be"):
-        CanRobot("x", "virtual", [1], gear_ratio=0.0)
+        CanRobot("x", [1], gear_ratio=0.0)
     with pytest.raises(HardwareError, match=r"cannot be opened.*ip link set nothing0 up"):
-        CanRobot("nothing0", "no-such-interface", [1]).connect()
+        CanRobot("nothing0", [1], interface="no-such-interface").connect()
     monkeypatch.setitem(sys.modules, "can", None)
     with pytest.raises(HardwareError, match=r"pip install 'knode-cosserat\[hardware\]'"):
-        CanRobot("x", "virtual", [1]).connect()
+        CanRobot("x", [1], interface="virtual").connect()

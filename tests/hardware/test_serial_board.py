@@ -227,7 +227,7 @@ def test_every_fault_of_the_protocol_has_a_fix():
     )
     names = re.findall(r"^\| `([a-z-]+)` \|", text, re.MULTILINE)
     assert len(names) == 8 and set(names) <= set(FAULTS)
-    assert all(fault_message(f"{name}:0").endswith("then reset()") for name in names)
+    assert all("reset()" in fault_message(f"{name}:0") for name in names)
 
 
 def test_stop_latches_and_never_raises(board):

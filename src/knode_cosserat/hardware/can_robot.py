@@ -44,10 +44,10 @@ class CanRobot(MotorRobot):
 
     Args:
         channel: channel of the adapter, such as "can0".
-        interface: interface of python-can, such as "socketcan" or "slcan".
         node_ids: nodes of the drives, 0 to 63, in the order of the tendons.
         limits: limits of commanded tensions.
         reel: the motors and their reels; its torque constant is that of the output shaft.
+        interface: interface of python-can, such as "socketcan" or "slcan".
         gear_ratio: turns of the motor by turns of the reel.
         bitrate: bits per second, for interfaces that set it.
 
@@ -58,11 +58,11 @@ class CanRobot(MotorRobot):
     def __init__(
         self,
         channel: str,
-        interface: str,
         node_ids: Sequence[int],
         limits: Limits | None = None,
         reel: MotorReel | None = None,
         *,
+        interface: str = "socketcan",
         gear_ratio: float = 1.0,
         bitrate: int = 1_000_000,
     ):

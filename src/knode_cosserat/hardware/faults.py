@@ -32,7 +32,7 @@ FAULTS: dict[str, tuple[str, str]] = {
     "stopped": ("the robot was stopped", "make sure that the robot is safe"),
     "settings": (
         "the board's EEPROM held no valid settings",
-        "check gains and calibration; reset() accepts the program's settings, save_settings() keeps them",
+        "check gains and calibration: reset() accepts those of the program, then tare() and save_settings()",
     ),
     # found by the driver
     "restarted": (
@@ -68,4 +68,5 @@ def fault_message(fault: str) -> str:
     name, _, tendon = fault.partition(":")
     meaning, fix = FAULTS.get(name, ("unknown to this version", "see the board's documentation"))
     place = f" at tendon {tendon} (counted from 1)" if tendon not in ("", "0") else ""
-    return f"fault {name}{place}: {meaning}; {fix}; then reset()"
+    last = "" if "reset()" in fix else "; then reset()"
+    return f"fault {name}{place}: {meaning}; {fix}{last}"
