@@ -10,7 +10,9 @@ from knode_cosserat.cli import app
 ROBOT = "delrin-tendon-robot"
 COMMANDS = ("simulate", "equilibrium", "info", "reach", "workspace", "fit", "evaluate", "plot", "animate",
             "inspect", "study simulation", "study imperfections", "study data", "study estimation",
-            "study beam", "record-virtual", "schema", "doctor", "view")  # fmt: skip
+            "study beam", "record-virtual", "schema", "doctor", "view",
+            "robot connect", "robot tare", "robot calibrate", "robot jog", "robot record", "robot run",
+            "robot steer", "robot commission")  # fmt: skip
 
 
 def run(*arguments):

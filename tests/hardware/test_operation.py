@@ -1,5 +1,6 @@
 """Operation of a robot: emergency stop, closed loops, commissioning."""
 
+import json
 import os
 import pty
 import signal
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
+from knode_cosserat.hardware.commissioning import CHECKLIST, Commissioning, Person
 from knode_cosserat.hardware.driver import DriverState, HardwareError, Limits
 from knode_cosserat.hardware.plant import HardwarePlant
 from knode_cosserat.hardware.safety import EmergencyStop, SafeRegion, StoppedError
@@ -229,3 +231,98 @@ def test_commands_beyond_the_driver_are_counted(robot):
     plant.apply(np.array([20.0, 0.0, 0.0, 0.0]))
     assert plant.reduced == 1
     assert plant.start() is not None and robot.state is DriverState.READY and plant.reduced == 0
+
+
+# commissioning
+
+
+def commissioned(driver, path, answer=True, **more):
+    person = Person("A. Person", lambda statement: answer, lambda motion: bool(answer))
+    commissioning = Commissioning(driver, path, "simulated", person, **more)
+    return commissioning.run(), commissioning
+
+
+def results(report):
+    return {step["name"]: step["result"] for step in report["steps"]}
+
+
+def test_a_sound_robot_passes_every_check(tmp_path):
+    with SimulatedRobot(ROD, machine=MachineParameters(noise=0.01, offset=0.2)) as robot:
+        robot.tare()
+        report, commissioning = commissioned(robot, tmp_path / "report.json")
+    assert report["complete"] and commissioning.is_complete
+    assert set(results(report)) == {step.name for step in CHECKLIST}
+    assert set(results(report).values()) == {"confirmed", "passed"}
+    assert json.loads((tmp_path / "report.json").read_text()) == report
+    steps = {step["name"]: step for step in report["steps"]}
+    assert max(steps["noise"]["values"]["noise"]) < 0.02 and min(steps["directions"]["values"]["rise"]) > 0.15
+    assert steps["watchdog"]["values"]["fault"] == "watchdog:0"
+    assert steps["over-tension"]["values"]["fault"] == "over-tension:1"
+    assert robot.cells.settings["limit"] == 2300
+    assert steps["latency"]["values"]["median"] <= 0.021 and steps["stop"]["person"] == "A. Person"
+
+
+def test_a_failed_check_ends_it_and_the_report_is_resumed(tmp_path):
+    path = tmp_path / "report.json"
+    with SimulatedRobot(ROD, machine=MachineParameters(offset=0.9)) as robot:
+        report, _ = commissioned(robot, path)
+        assert results(report)["noise"] == "failed" and "directions" not in results(report)
+        assert "0.9" in report["steps"][-1]["reason"] and "then tare" in report["steps"][-1]["reason"]
+        robot.tare()
+        first = json.loads(path.read_text())["steps"][0]
+        report, commissioning = commissioned(robot, path)
+        assert report["complete"] and report["steps"][0] == first
+        with pytest.raises(HardwareError, match="another robot"):
+            Commissioning(robot, path, "other", commissioning.person)
+        path.write_text("[1]")
+        with pytest.raises(HardwareError, match="no commissioning report"):
+            Commissioning(robot, path, "simulated", commissioning.person)
+
+
+def test_nothing_moves_without_consent_and_nobody_confirms_for_a_person(tmp_path):
+    with SimulatedRobot(ROD, machine=MachineParameters(offset=0.0)) as robot:
+        report, _ = commissioned(robot, tmp_path / "a.json", answer=False)
+        assert results(report) == {"power-switch": "failed"}
+        measured = [step for step in CHECKLIST if step.measure is not None]
+        report, _ = commissioned(robot, tmp_path / "b.json", answer=False, steps=measured)
+        assert results(report).pop("noise") == "passed"
+        assert set(results(report).values()) == {"passed", "skipped"} and not report["complete"]
+        assert np.max(robot.tension) == 0.0
+        report, _ = commissioned(robot, tmp_path / "c.json", answer=None, steps=CHECKLIST[:6])
+        assert results(report)["power-switch"] == "not confirmed"
+
+
+def test_wrong_wiring_is_found(tmp_path):
+    class Swapped(SimulatedRobot):
+        def jog(self, tendon, drive):
+            super().jog((tendon + 1) % 4, drive)
+
+    class Dead(SimulatedRobot):
+        def jog(self, tendon, drive):
+            self.wait(0.1)
+
+    step = [each for each in CHECKLIST if each.name == "directions"]
+    machine = MachineParameters(noise=0.0, offset=0.0)
+    for kind, message in ((Swapped, "motor 1 changes load cell 2"), (Dead, "motor 1 changes no load cell")):
+        with kind(ROD, machine=machine) as robot:
+            report, _ = commissioned(robot, tmp_path / f"{kind.__name__}.json", steps=step)
+            assert message in report["steps"][0]["reason"]
+
+
+def test_a_robot_without_a_watchdog_fails(tmp_path):
+    with SimulatedRobot(ROD, machine=MachineParameters(noise=0.0, offset=0.0)) as robot:
+        step = [each for each in CHECKLIST if each.name == "watchdog"]
+        report, _ = commissioned(robot, tmp_path / "a.json", steps=step, silence=robot.wait)
+        assert "still armed after 1 s without its host" in report["steps"][0]["reason"]
+        assert robot.state is DriverState.FAULT
+
+
+def test_a_signal_during_a_check_stops_and_is_in_the_report(tmp_path):
+    with SimulatedRobot(ROD, machine=MachineParameters(noise=0.0, offset=0.0)) as robot:
+        step = [each for each in CHECKLIST if each.name == "tracking"]
+        robot.observer = lambda each: each.now() > 0.5 and os.kill(os.getpid(), signal.SIGTERM)
+        with pytest.raises(StoppedError):
+            commissioned(robot, tmp_path / "a.json", steps=step)
+        robot.observer = None
+        assert robot.fault == "stopped:0"
+    assert "stopped by SIGTERM" in json.loads((tmp_path / "a.json").read_text())["steps"][0]["reason"]

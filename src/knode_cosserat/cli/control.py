@@ -19,7 +19,7 @@ OUT_OF_REACH = 0.01
 CONTROLLERS = ("predictive", "ilqr", "mppi", "lqr", "koopman", "kinematic", "pid")
 
 
-def _reference(text: str) -> Any:
+def parsed_reference(text: str) -> Any:
     """Return a reference by its text, or from a CSV file with the columns t, x, y and, if tracked, z."""
     from knode_cosserat.control import ReferenceFormatError, parse_reference, table
 
@@ -204,7 +204,7 @@ def control(
         if log is None:
             return
     else:
-        wanted = _reference(reference)
+        wanted = parsed_reference(reference)
         _warn_out_of_reach(model, limits, wanted, seconds)
         log = kcc.run_loop(controller, controlled, wanted, seconds)
     if out is not None:

@@ -25,7 +25,17 @@ _EXPECTED = (KnodeCosseratError, ValueError, OSError, ImportError, MemoryError, 
 
 #: options that take several numbers
 VECTOR_OPTIONS = frozenset(
-    ["--tension", "--control", "--low", "--high", "--position", "--quaternion", "--seeds", "--set"]
+    [
+        "--tension",
+        "--control",
+        "--low",
+        "--high",
+        "--masses",
+        "--position",
+        "--quaternion",
+        "--seeds",
+        "--set",
+    ]
 )
 #: options that take NAME=VALUE pairs
 _NAMED_OPTIONS = frozenset(["--control"])
@@ -121,6 +131,8 @@ def _app(**options: Any) -> typer.Typer:
 app = _app(cls=_Program, add_completion=True)
 #: the commands under `study`
 studies = _app(help="Repeat a study of the paper, or of a folder of recordings.")
+#: the commands under `robot`
+hardware = _app(help="Operate a real, emulated or simulated robot: connect, calibrate, record, control.")
 
 
 def main() -> None:

@@ -35,9 +35,10 @@ class StoppedError(HardwareError):
 class EmergencyStop:
     """Context in which a key, a signal or a lost terminal stops the robot.
 
-    A thread calls `driver.stop()` at once, also while the program computes; it is called once. Signals then
-    raise `StoppedError` in the program; after a key the driver's commands fail, and `check` raises. The
-    terminal is restored at the end. An error that leaves the context stops the robot too.
+    A thread calls `driver.stop()` at once, also while the program computes; it is called once. The first
+    signal then raises `StoppedError` in the program; later ones do not interrupt its end, except SIGQUIT.
+    After a key the driver's commands fail, and `check` raises. The terminal is restored at the end. An error
+    that leaves the context stops the robot too.
 
         with SerialBoard("/dev/ttyACM0") as robot, EmergencyStop(robot) as emergency:
             robot.arm()
@@ -64,12 +65,17 @@ class EmergencyStop:
         self._thread: threading.Thread | None = None
         self._handlers: dict[int, Any] = {}
         self._mode: Any = None
-        self._leaving = False
+        self._leaving = self._raised = False
 
     @property
     def is_stopped(self) -> bool:
         """True after a stop."""
         return self._stopped
+
+    @property
+    def has_keys(self) -> bool:
+        """True if keys of a terminal stop the robot."""
+        return self._mode is not None
 
     def check(self) -> None:
         """Raise `StoppedError` if the robot was stopped."""
@@ -133,7 +139,8 @@ class EmergencyStop:
             self.stop(signal.Signals(number).name)
         elif not self._stopped:
             self.reason = signal.Signals(number).name
-        if not self._leaving:
+        if number == getattr(signal, "SIGQUIT", None) or not (self._leaving or self._raised):
+            self._raised = True
             raise StoppedError(f"stopped by {signal.Signals(number).name}; the tendons are released")
 
     def _watch(self) -> None:

@@ -1,0 +1,173 @@
+"""Options and safety of the commands that move a robot: consent, emergency stop, motion capture."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from knode_cosserat.cli.arguments import load_system
+from knode_cosserat.cli.output import printable
+
+if TYPE_CHECKING:
+    from knode_cosserat.hardware.driver import Driver
+    from knode_cosserat.hardware.middleware.mocap import MotionCapture
+    from knode_cosserat.hardware.open_driver import OpenedDriver
+    from knode_cosserat.hardware.safety import EmergencyStop
+
+#: simulated robot, without --robot
+ROBOT = "delrin-tendon-robot"
+
+Port = Annotated[
+    str,
+    typer.Option(
+        metavar="PORT",
+        help="Serial port of a tension board (/dev/ttyACM0), simulated, emulated, "
+        "'dynamixel:/dev/ttyUSB0?ids=1,2,3,4' or 'can:can0?ids=1,2,3,4'.",
+    ),
+]
+RobotFile = Annotated[
+    str | None,
+    typer.Option(
+        "--robot", metavar="FILE",
+        help="Robot file with the tension limits of the hardware (section hardware); also the robot that is "
+        "simulated.", show_default="limits of 15 N",
+    ),
+]  # fmt: skip
+Yes = Annotated[bool, typer.Option("--yes", help="Move the robot without asking.")]
+Capture = Annotated[
+    str | None,
+    typer.Option(
+        metavar="SOURCE",
+        help="Motion capture of the tip: natnet:SERVER?tip=1 (OptiTrack, identity of the body).",
+        show_default="the true tip of a simulated robot",
+    ),
+]
+
+
+def has_terminal() -> bool:
+    """Return True if a person can be asked."""
+    return sys.stdin.isatty()
+
+
+def require_consent(motion: str, yes: bool) -> None:
+    """Ask before a motion.
+
+    Raises:
+        ValueError: nobody can be asked.
+        typer.Abort: the person refused.
+    """
+    if yes:
+        return
+    if not has_terminal():
+        raise ValueError(f"this moves the robot ({motion}); confirm it in a terminal, or give --yes")
+    typer.echo(printable(f"This moves the robot: {motion}."), err=True)
+    if not typer.confirm("Move it?", err=True):
+        typer.echo("nothing was moved", err=True)
+        raise typer.Abort
+
+
+def opened(port: str, robot: str | None, simulated: Any = None) -> OpenedDriver:
+    """Return the driver of a port with the limits of a robot file; nothing is opened yet.
+
+    Args:
+        port: the option --port.
+        robot: the option --robot.
+        simulated: robot that is simulated; None: that of --robot.
+    """
+    from knode_cosserat.hardware.description import HardwareDescription, load_hardware
+    from knode_cosserat.hardware.open_driver import open_driver
+
+    hardware = HardwareDescription() if robot is None else load_hardware(robot)
+
+    def model() -> Any:
+        return load_system(robot or ROBOT) if simulated is None else simulated
+
+    return open_driver(port, hardware, model)
+
+
+@contextlib.contextmanager
+def connected(machine: OpenedDriver, yes: bool, motion: str = "") -> Iterator[Driver]:
+    """Ask for consent, connect, and close at the end; an error stops the robot.
+
+    Args:
+        machine: the driver.
+        yes: True if the person need not be asked.
+        motion: what the command moves, beside what connecting moves.
+    """
+    moves = [each for each in (machine.connecting_moves, motion) if each]
+    if moves:
+        require_consent("; then ".join(moves), yes)
+    driver = machine.driver
+    if machine.connecting_moves:
+        with emergency_stop(driver) as emergency, contextlib.ExitStack() as stack:
+            stack.callback(driver.close)
+            driver.connect()
+            emergency.check()
+            stack.pop_all()
+    with driver:
+        yield driver
+
+
+@contextlib.contextmanager
+def emergency_stop(driver: Driver, **more: Any) -> Iterator[EmergencyStop]:
+    """Announce and yield an emergency stop."""
+    from knode_cosserat.hardware.safety import EmergencyStop
+
+    with EmergencyStop(driver, **more) as emergency:
+        keys = "space, Enter, q or Ctrl-C stops" if emergency.has_keys else "Ctrl-C or SIGTERM stops"
+        typer.echo(f"{keys} the robot", err=True)
+        yield emergency
+
+
+@contextlib.contextmanager
+def motion_capture(machine: OpenedDriver, source: str | None) -> Iterator[MotionCapture | None]:
+    """Open motion capture by its word, and yield it; None without one.
+
+    Raises:
+        ValueError: the word is not understood.
+        HardwareError: the source cannot be reached.
+    """
+    if source is None:
+        yield None
+        return
+    kind, _, rest = source.partition(":")
+    server, _, text = rest.partition("?")
+    names = dict(part.partition("=")[::2] for part in text.split(",") if part)
+    if kind != "natnet" or not server or not all(value.isdigit() for value in names.values()) or not names:
+        raise ValueError(
+            f"--capture is {source!r}; allowed is natnet:SERVER?tip=1, with each body's streaming identity"
+        )
+    from knode_cosserat.hardware.middleware.natnet import NatNet
+
+    bodies = {name: int(value) for name, value in names.items()}
+    with NatNet(bodies, server, clock=machine.clock) as capture:
+        yield capture
+
+
+def tip_source(machine: OpenedDriver, capture: MotionCapture | None) -> Any:
+    """Return a function with time (s) and position of the tip (m); None if it is not measured.
+
+    The tip is the last body of motion capture.
+    """
+    if capture is not None:
+
+        def measured() -> Any:
+            frame = capture.poses()
+            return frame.time, frame.position[-1]
+
+        return measured
+    poses = machine.poses
+    if poses is None:
+        return None
+    return lambda: (machine.clock(), poses((1.0,))[-1, :3])
+
+
+def tendon_index(tendon: int, count: int) -> int:
+    """Return the index of a tendon that is counted from 1. Raises `ValueError` if there is none."""
+    if not 1 <= tendon <= count:
+        raise ValueError(f"the tendon must be from 1 to {count} (got {tendon})")
+    return tendon - 1
