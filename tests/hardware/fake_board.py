@@ -21,9 +21,12 @@ from knode_cosserat.hardware.lines import (
 
 
 class FakeBoard:
-    """A board in a thread. `paper` is the paper's board: no banner, no hello, plain telemetry only."""
+    """A board in a thread; its watchdog is slower than a real one, for busy computers.
 
-    def __init__(self, *, paper=False, banner=True, taring=0.0, limit=2300, watchdog=0.06):
+    `paper` is the paper's board: no banner, no hello, plain telemetry only.
+    """
+
+    def __init__(self, *, paper=False, banner=True, taring=0.0, limit=2300, watchdog=0.6):
         self.paper, self.banner, self.limit, self.watchdog = paper, banner and not paper, limit, watchdog
         self.framed, self.state, self.fault = False, "ready" if not taring else "taring", ""
         self.wanted, self.measured = [0] * 4, [0] * 4

@@ -31,7 +31,7 @@ def board():
 
 
 def driver(fake, limits=FAST, **options):
-    return SerialBoard(fake.port, limits, **options)
+    return SerialBoard(fake.port, limits, **{"host_timeout": 1.0, **options})
 
 
 def eventually(condition, timeout=5.0):
@@ -181,7 +181,7 @@ def test_the_watchdog_is_fed_while_the_program_lives_and_no_longer(board):
     with driver(board, host_timeout=0.2) as robot:
         robot.arm()
         robot.command([2.0] * 4)
-        robot.wait(0.6)
+        robot.wait(1.5)
         assert board.state == "armed" and robot.state is DriverState.ARMED
         # the program hangs: no calls
         assert eventually(lambda: board.fault == "watchdog:0")

@@ -11,7 +11,7 @@ FAULTS: dict[str, tuple[str, str]] = {
     "watchdog": (
         "the board received no valid line in time",
         "the program paused longer than host_timeout, or lines were damaged: call command() or wait() often, "
-        "check the cable",
+        "check the cable; on a busy computer raise the setting watchdog",
     ),
     "sensor-rail": (
         "a load cell reads 0 or full scale",
