@@ -4,6 +4,7 @@ import dataclasses
 import importlib.util
 import itertools
 import math
+import re
 import struct
 from collections import Counter
 from pathlib import Path
@@ -370,3 +371,18 @@ def test_equal_robots_give_equal_step_files(folder, tmp_path):
 
 def test_dimensions_are_plain_values():
     assert dataclasses.replace(PART) == PART and hash(PART.rib) == hash(PART.rib)
+
+
+def test_the_page_has_the_pins_of_the_firmware():
+    source = (ROOT / "firmware" / "main.cpp").read_text(encoding="utf-8")
+    (pulse,) = re.findall(r"PWM_PINS\[TENDONS\] = \{([\d, ]+)\}", source)
+    page = (ROOT / "docs" / "build-the-robot.md").read_text(encoding="utf-8")
+    rows = re.findall(
+        r"^\| (\d) \| no\. \d.*?\| D(\d+) \((OC\d\w)\) \| D(\d+), D(\d+) \| A(\d) \|$", page, re.M
+    )
+    # motor k has bits 2 k and 2 k + 1 of port A: pins 22 + 2 k and 23 + 2 k
+    wanted = [
+        (str(k + 1), pin, name, str(22 + 2 * k), str(23 + 2 * k), str(k))
+        for k, (pin, name) in enumerate(zip(pulse.split(", "), ("OC1A", "OC1B", "OC3A", "OC3B"), strict=True))
+    ]
+    assert rows == wanted

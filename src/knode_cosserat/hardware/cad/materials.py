@@ -188,9 +188,10 @@ def _electronics(part: PartDimensions) -> list[Item]:
         Item("strain gauge", count, "BF350-3AA, 350 ohm", "the paper's robot"),
         Item(
             "amplifier", count,
-            "module for one BF350 gauge, supply 5 V, analog output 0 to 5 V, with offset adjustment",
-            "analog inputs of the board",
+            "module for one BF350 gauge, supply 5 V, analog output 0 to 5 V; slack 0.5 V, 1.2 V per kg",
+            "the firmware's default calibration",
         ),
+        Item("resistor", count, "100 kohm, from each analog input to GND", "a torn wire reads 0 V"),
         Item(
             "supply", 1, f"12 V, at least {math.ceil(current):g} A, with a current limit",
             f"{count} stalled motors of {motor.resistance:g} ohm (nominal)",
@@ -198,7 +199,8 @@ def _electronics(part: PartDimensions) -> list[Item]:
         Item("fuse with holder", 1, f"{math.ceil(current):g} A, slow", "supply"),
         Item(
             "emergency-stop switch", 1,
-            f"latching, 2 normally closed contacts; one switches {math.ceil(current):g} A at 12 V DC",
+            f"latching; normally closed contact for {math.ceil(current):g} A at 12 V DC; normally open "
+            "contact for the sense input (optional)",
             "supply",
         ),
     ]  # fmt: skip
