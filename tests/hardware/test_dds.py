@@ -24,7 +24,7 @@ from knode_cosserat.hardware.middleware.dds import DDSBridge
 from knode_cosserat.hardware.middleware.loopback import measure_loopback
 
 #: each test that opens a domain has another one
-DOMAIN = 10 + os.getpid() % 80
+DOMAIN = 10 + os.getpid() % 70
 
 
 class Robot(Driver):
@@ -341,3 +341,11 @@ def test_the_latency_between_two_processes():
     found = measure_loopback(100, domain=DOMAIN + 4)
     # no tight limit: test machines are busy. The study `hardware` states the figures
     assert found.lost == 0 and 0.0 < found.median <= found.p99 < 1.0
+
+
+def test_real_time_priority_is_given_or_refused():
+    try:
+        found = measure_loopback(20, domain=DOMAIN + 5, real_time=True)
+    except HardwareError as error:
+        pytest.skip(str(error))
+    assert found.real_time and found.lost == 0

@@ -16,7 +16,13 @@ import knode_cosserat as kc
 from knode_cosserat.hardware.driver import HardwareError
 from knode_cosserat.hardware.middleware import natnet
 from knode_cosserat.hardware.middleware.mocap import PoseFrame, upright
-from knode_cosserat.hardware.middleware.natnet import NatNet, PacketError, parse_frame, parse_server_info
+from knode_cosserat.hardware.middleware.natnet import (
+    NatNet,
+    NatNetAddress,
+    PacketError,
+    parse_frame,
+    parse_server_info,
+)
 from knode_cosserat.hardware.middleware.simulated_capture import SimulatedCapture
 from knode_cosserat.hardware.simulated import SimulatedRobot
 from tests.hardware.vrpn_server import VRPNServer
@@ -163,9 +169,10 @@ def sender():
         yield opened
 
 
-def capture_on(port, **options):
-    defaults = {"multicast": None, "interface": "127.0.0.1", "port": port, "version": (4, 1), "up": "z"}
-    return NatNet({"tip": 3, "lost": 9, "base": 7}, **(defaults | options))
+def capture_on(port, server=None, multicast=None, **options):
+    address = NatNetAddress(server, multicast, "127.0.0.1", port)
+    defaults = {"version": (4, 1), "up": "z"}
+    return NatNet({"tip": 3, "lost": 9, "base": 7}, address, **(defaults | options))
 
 
 def test_unicast_packets_in_the_order_of_names(sender):
@@ -251,9 +258,9 @@ def test_wrong_values():
         with pytest.raises(HardwareError, match=message):
             capture_on(1, **options)
     with pytest.raises(HardwareError, match="different identities"):
-        NatNet({"a": 1, "b": 1}, version=(4, 1))
+        NatNet({"a": 1, "b": 1}, "localhost")
     with pytest.raises(HardwareError, match="names must be"):
-        NatNet({}, version=(4, 1))
+        NatNet({}, "localhost")
 
 
 # axes

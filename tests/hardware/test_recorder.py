@@ -99,12 +99,14 @@ def test_a_simulated_robot_is_stated(tmp_path, exact):
     assert load_recording(tmp_path / "live.bag").simulated
 
 
-def test_a_lost_body_has_no_message(tmp_path):
+def test_lost_bodies_and_tensions_have_no_message(tmp_path):
     poses, tension, command = made(seconds=1.0, noise=0.0)
     poses["rib 2"].position[40:43] = np.nan
+    tension.tension[7, 2] = np.nan
     recorded(tmp_path / "live.bag", (poses, tension, command))
     recording = load_recording(tmp_path / "live.bag")
     assert [len(body.time) for body in recording.bodies] == [100, 97, 100, 100]
+    assert len(recording.tension.time) == 49
 
 
 KILLED = """

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from knode_cosserat.hardware.middleware.dds import DDSBridge
     from knode_cosserat.hardware.middleware.loopback import LoopbackLatency, measure_loopback
     from knode_cosserat.hardware.middleware.mocap import MotionCapture, PoseFrame
-    from knode_cosserat.hardware.middleware.natnet import NatNet
+    from knode_cosserat.hardware.middleware.natnet import NatNet, NatNetAddress
     from knode_cosserat.hardware.middleware.ros1 import ROS1Node
     from knode_cosserat.hardware.middleware.simulated_capture import SimulatedCapture
     from knode_cosserat.hardware.middleware.vrpn import VRPN
@@ -56,6 +56,7 @@ __all__ = [
     "MotionCapture",
     "MotorReel",
     "NatNet",
+    "NatNetAddress",
     "PoseFrame",
     "ROS1Node",
     "Reading",
@@ -89,7 +90,7 @@ make_lazy(
         "knode_cosserat.hardware.middleware.dds": "DDSBridge",
         "knode_cosserat.hardware.middleware.loopback": "LoopbackLatency measure_loopback",
         "knode_cosserat.hardware.middleware.mocap": "MotionCapture PoseFrame",
-        "knode_cosserat.hardware.middleware.natnet": "NatNet",
+        "knode_cosserat.hardware.middleware.natnet": "NatNet NatNetAddress",
         "knode_cosserat.hardware.middleware.ros1": "ROS1Node",
         "knode_cosserat.hardware.middleware.simulated_capture": "SimulatedCapture",
         "knode_cosserat.hardware.middleware.vrpn": "VRPN",

@@ -95,11 +95,11 @@ class Recorder:
             raise HardwareError(f"{self.path}: cannot be written: {error.strerror}") from None
 
     def add_reading(self, reading: Reading) -> None:
-        """Add the measured tensions of a reading.
+        """Add the measured tensions of a reading; one without a measurement (NaN) has no message.
 
         Raises:
             HardwareError: an earlier message could not be written.
-            RecordingError: the number of tensions is wrong, or one is not finite.
+            RecordingError: the number of tensions is wrong.
         """
         self._add(self.encoder.tension(self.clock.stamp(reading.time), reading.tension))
 

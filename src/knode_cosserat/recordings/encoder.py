@@ -95,11 +95,15 @@ class MessageEncoder:
         return [coder.encode(stamp, row) for coder, row in pairs if np.all(np.isfinite(row))]
 
     def tension(self, stamp: int, tension: Float[np.ndarray, " tendons"]) -> list[Encoded]:
-        """Return the message of measured tensions (N); none if the configuration has no topic for it.
+        """Return the message of measured tensions (N).
+
+        There is none if one is not finite, as without a measurement, or without a topic for tensions.
 
         Raises:
-            RecordingError: the number of tensions is wrong, or one is not finite.
+            RecordingError: the number of tensions is wrong.
         """
+        if not np.all(np.isfinite(tension)):
+            return []
         return self._encoded(self._tension, self.config.tension, stamp, tension)
 
     def command(self, stamp: int, tension: Float[np.ndarray, " tendons"]) -> list[Encoded]:

@@ -57,6 +57,19 @@ class ServerInfo(NamedTuple):
     frequency: int
 
 
+class NatNetAddress(NamedTuple):
+    """Addresses of Motive and of this host."""
+
+    #: host of Motive; None does not ask it, takes packets of any host, and needs a version
+    server: str | None = None
+    #: multicast group; None for unicast packets
+    multicast: str | None = GROUP
+    #: address of this host's network interface
+    interface: str = "0.0.0.0"
+    #: port of the data
+    port: int = DATA_PORT
+
+
 class _Reader:
     """Numbers of a packet, one after the other."""
 
@@ -215,13 +228,11 @@ class NatNet(MotionCapture):
 
     Args:
         bodies: streaming identities of Motive's rigid bodies by name, in the order of poses.
-        server: address of the host of Motive; None does not ask it, and needs `version`.
-        multicast: multicast group; None for unicast packets.
-        interface: address of this host's network interface.
-        port: port of the data.
+        address: host of Motive, or all addresses.
         version: version of the protocol; None asks the server.
         up: axis of Motive that points up.
         latency: time from transmission to arrival (s); from exposure, if the server's clock is not known.
+        clock: monotonic clock (s).
 
     Raises:
         HardwareError: a value is not allowed.
@@ -230,27 +241,23 @@ class NatNet(MotionCapture):
     def __init__(
         self,
         bodies: Mapping[str, int],
-        server: str | None = None,
+        address: str | NatNetAddress,
         *,
-        multicast: str | None = GROUP,
-        interface: str = "0.0.0.0",
-        port: int = DATA_PORT,
         version: tuple[int, int] | None = None,
         up: UpAxis = "y",
         latency: float = 0.0,
         clock: Callable[[], float] = time.monotonic,
     ):
         super().__init__(list(bodies), up=up, latency=latency, clock=clock)
-        if server is None and version is None:
+        self.address = NatNetAddress(address) if isinstance(address, str) else address
+        if self.address.server is None and version is None:
             raise HardwareError("version must be given without a server, such as (4, 1)")
         self._rows = {identity: row for row, identity in enumerate(bodies.values())}
         if len(self._rows) < len(self.names):
             raise HardwareError(f"bodies must have different identities (got {dict(bodies)})")
-        self.server = server
         self.version = None if version is None else _checked_version(version)
         self._frequency = 0
         self._host: str | None = None
-        self._address = (multicast, interface, port)
         self._socket: socket.socket | None = None
 
     def ask_server(self, timeout: float = 1.0, port: int = COMMAND_PORT) -> ServerInfo:
@@ -259,31 +266,33 @@ class NatNet(MotionCapture):
         Raises:
             HardwareError: it does not answer in time (s).
         """
-        assert self.server is not None
+        server = self.address.server
+        if server is None:
+            raise HardwareError("there is no server to ask; give its address")
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as commands:
             commands.settimeout(timeout / 3.0)
             for _ in range(3):
                 try:
-                    commands.sendto(struct.pack("<HH", CONNECT, 0), (self.server, port))
+                    commands.sendto(struct.pack("<HH", CONNECT, 0), (server, port))
                     return parse_server_info(commands.recv(65_535))
                 except PacketError as error:
                     self._ignore(str(error))
                 except OSError:
                     continue
         raise HardwareError(
-            f"{self.server}: no answer of Motive on port {port}; check its address and its streaming panel"
+            f"{server}: no answer of Motive on port {port}; check its address and its streaming panel"
         )
 
     def _connect(self) -> None:
-        if self.server is not None:
+        server, multicast, interface, port = self.address
+        if server is not None:
             try:
-                self._host = socket.gethostbyname(self.server)
+                self._host = socket.gethostbyname(server)
             except OSError:
-                raise HardwareError(f"{self.server}: there is no host of this name") from None
+                raise HardwareError(f"{server}: there is no host of this name") from None
         if self.version is None:
             info = self.ask_server()
             self.version, self._frequency = _checked_version(info.version), info.frequency
-        multicast, interface, port = self._address
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
