@@ -11,8 +11,8 @@ ROBOT = "delrin-tendon-robot"
 COMMANDS = ("simulate", "equilibrium", "info", "reach", "workspace", "fit", "evaluate", "plot", "animate",
             "inspect", "study simulation", "study imperfections", "study data", "study estimation",
             "study beam", "record-virtual", "schema", "doctor", "view",
-            "robot connect", "robot tare", "robot calibrate", "robot jog", "robot record", "robot run",
-            "robot steer", "robot commission")  # fmt: skip
+            "robot connect", "robot reset", "robot tare", "robot calibrate", "robot jog", "robot record",
+            "robot run", "robot steer", "robot commission")  # fmt: skip
 
 
 def run(*arguments):

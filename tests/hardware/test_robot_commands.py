@@ -2,6 +2,7 @@
 
 import json
 import os
+import pty
 import signal
 import subprocess
 import sys
@@ -57,6 +58,17 @@ def test_connect_shows_the_robot(folder):
     assert found["state"] == "ready" and found["tendons"] == 4 and found["limits"]["high"] == 6.0
     result = run("robot", "connect", "--port", "simulated", "--robot", "rod.yaml")
     assert "simulated: ready" in result.stdout and "limits 0.2 to 6 N, 60 N/s, 20 N in total" in result.stdout
+
+
+def test_a_fault_is_explained_and_cleared(folder):
+    words = ("--port", "simulated?fault=slack:2,after=0.01", "--robot", "rod.yaml", "--yes")
+    with FakeBoard() as board:
+        board.latch("slack:2")
+        result = run("robot", "connect", "--port", board.port, "--yes")
+        assert "fault slack at tendon 2" in result.stdout and "knode-cosserat robot reset" in result.stdout
+        found = facts(run("robot", "reset", "--port", board.port, "--yes", "--save", "--json"))
+        assert found["cleared"] == "slack:2" and found["state"] == "ready" and board.saved
+    assert "no fault" in run("robot", "reset", *words).stdout
 
 
 @pytest.mark.parametrize(
@@ -133,6 +145,7 @@ def test_calibrate_on_a_robot_and_from_a_table(folder):
     found = facts(run("robot", "calibrate", "1", "--table", "weights.csv", "--json"))
     assert found["gain"] == pytest.approx(9.80665 / 200)
     assert "either --port" in error(run("robot", "calibrate", "1"))
+    assert "while weighing 3 kg: fault over-tension at tendon 3" in error(run(*words, "--masses", "0,3"))
     with FakeBoard() as board:
         assert "a person hangs the weights" in error(
             run("robot", "calibrate", "1", "--port", board.port, "--yes")
@@ -232,3 +245,44 @@ def test_a_signal_stops_a_real_port(folder, number):
         stderr = process.communicate(timeout=30)[1]
     assert process.returncode == 2 and f"error: stopped by {signal.Signals(number).name}" in stderr
     assert "Traceback" not in stderr and (folder / "a.bag").is_file()
+
+
+def test_keys_steer_and_stop_and_the_terminal_is_restored(folder):
+    import termios
+
+    master, slave = pty.openpty()
+    before = termios.tcgetattr(slave)
+    program = [
+        sys.executable,
+        "-m",
+        "knode_cosserat.cli",
+        "robot",
+        "steer",
+        "--port",
+        "simulated?real_time=1",
+    ]
+    process = subprocess.Popen(
+        [*program, "--robot", "rod.yaml", "--yes"], stdin=slave, stderr=subprocess.PIPE, text=True,
+        start_new_session=True,
+    )  # fmt: skip
+    assert "space, Enter, q or Ctrl-C stops the robot" in process.stderr.readline()
+    os.write(master, b"\x1b[C")
+    time.sleep(0.5)
+    assert process.poll() is None
+    os.write(master, b" ")
+    stderr = process.communicate(timeout=30)[1]
+    assert process.returncode == 2 and "stopped" in stderr and "Traceback" not in stderr
+    assert termios.tcgetattr(slave) == before
+    os.close(master)
+    os.close(slave)
+
+
+def test_the_firmware_passes_its_commissioning(folder):
+    from knode_cosserat.hardware.emulation import missing
+
+    if missing():
+        pytest.skip("the emulator is not installed")
+    words = ("robot", "commission", "--port", "emulated", "--report", "report.json", "--yes", "--json")
+    results = {step["name"]: step["result"] for step in facts(run(*words))["steps"]}
+    names = ("noise", "directions", "stop", "watchdog", "tracking", "over-tension", "latency")
+    assert {name: results[name] for name in names} == dict.fromkeys(names, "passed")

@@ -57,6 +57,8 @@ def connect(port: Port, robot: RobotFile = None, yes: Yes = False, as_json: Json
     Opening the serial port of a tension board resets it: the board tares, and its reels move.
     """
     machine = opened(port, robot)
+    from knode_cosserat.hardware.faults import fault_message
+
     with connected(machine, yes) as driver:
         reading, limits = driver.read(), driver.limits
         facts = {
@@ -64,11 +66,49 @@ def connect(port: Port, robot: RobotFile = None, yes: Yes = False, as_json: Json
             "limits": {"low": limits.low, "high": limits.high, "rate": limits.rate, "total": limits.total},
         }  # fmt: skip
     lines = [
-        f"{machine.name}: {reading.state.value}" + (f", fault {reading.fault}" if reading.fault else ""),
+        f"{machine.name}: {reading.state.value}",
+        *(
+            [fault_message(reading.fault).replace("reset()", "knode-cosserat robot reset")]
+            * bool(reading.fault)
+        ),
         f"tensions {tension_text(reading.tension)}",
         f"limits {limits.low:g} to {limits.high:g} N, {limits.rate:g} N/s, {limits.total:g} N in total",
     ]
     write_output(as_json, facts, lines)
+
+
+@hardware.command(
+    epilog=examples("robot reset --port /dev/ttyACM0", "robot reset --port /dev/ttyACM0 --save")
+)
+def reset(
+    port: Port,
+    save: Annotated[
+        bool, typer.Option("--save", help="Keep the board's settings and zeros in its EEPROM.")
+    ] = False,
+    robot: RobotFile = None,
+    yes: Yes = False,
+    as_json: Json = False,
+) -> None:
+    """Clear a latched fault, and show its meaning. Remove its cause first.
+
+    The fault `settings` of a new board is cleared too: its program's settings are used. --save keeps them.
+    """
+    from knode_cosserat.hardware.faults import fault_message
+
+    machine = opened(port, robot)
+    with connected(machine, yes) as driver:
+        fault = driver.read().fault
+        driver.reset()
+        if save:
+            board: Any = driver
+            if not hasattr(driver, "save_settings"):
+                raise ValueError(f"{machine.name} has no settings to save; leave out --save")
+            board.save_settings()
+        reading = driver.read()
+    meaning = fault_message(fault).partition("; then reset()")[0] if fault else "there was no fault"
+    write_output(
+        as_json, {"cleared": fault, **reading_facts(reading)}, [meaning, f"now {reading.state.value}"]
+    )
 
 
 @hardware.command(epilog=examples("robot tare --port /dev/ttyACM0"))
@@ -187,6 +227,8 @@ def calibrate(
 def _weighed(driver: Driver, index: int, weights: list[float]) -> Any:
     """Return the fit of readings under weights (N), each hung by a person or by the simulation."""
     from knode_cosserat.hardware.calibration import fit_load_cell
+    from knode_cosserat.hardware.driver import HardwareError
+    from knode_cosserat.hardware.faults import fault_message
 
     hang: Any = getattr(driver, "hang", None)
     wait: Any = getattr(driver, "wait", None)
@@ -202,6 +244,8 @@ def _weighed(driver: Driver, index: int, weights: list[float]) -> Any:
         if wait is not None:
             wait(0.1)
         readings.append(float(_mean(driver, READINGS)[index]))
+        if fault := driver.read().fault:
+            raise HardwareError(f"while weighing {weight / GRAVITY:g} kg: {fault_message(fault)}")
     return fit_load_cell(weights, readings)
 
 

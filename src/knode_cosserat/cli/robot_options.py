@@ -106,6 +106,8 @@ def connected(machine: OpenedDriver, yes: bool, motion: str = "") -> Iterator[Dr
         with emergency_stop(driver) as emergency, contextlib.ExitStack() as stack:
             stack.callback(driver.close)
             driver.connect()
+            if machine.prepare is not None:
+                machine.prepare(driver)
             emergency.check()
             stack.pop_all()
     with driver:

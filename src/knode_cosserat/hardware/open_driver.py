@@ -37,6 +37,7 @@ class OpenedDriver:
         poses: returns true positions (m) and quaternions at fractions of the length; None on real robots.
         silence: passes a time (s) without a sign of life.
         simulated: True if the robot is simulated or emulated.
+        prepare: called with the driver after it has connected; None: nothing is to do.
     """
 
     driver: Driver
@@ -46,6 +47,7 @@ class OpenedDriver:
     poses: Callable[[Sequence[float]], Float[np.ndarray, "M 7"]] | None = None
     silence: Callable[[float], Any] = time.sleep
     simulated: bool = False
+    prepare: Callable[[Driver], Any] | None = None
 
 
 def open_driver(port: str, hardware: HardwareDescription, robot: Callable[[], System]) -> OpenedDriver:
@@ -148,8 +150,15 @@ def _emulated(
     return OpenedDriver(
         SerialBoard(port, hardware.tension), "emulated",
         "the emulated board tares: all reels move in and out", port.now, emulated.poses,
-        emulated.advance, True,
+        emulated.advance, True, _accept_settings,
     )  # fmt: skip
+
+
+def _accept_settings(driver: Driver) -> None:
+    """Accept the program's settings on a board whose EEPROM is empty, as an emulated one always is; tare."""
+    if driver.read().fault.startswith("settings"):
+        driver.reset()
+        driver.tare()
 
 
 def _serial(address: str, options: dict[str, str], hardware: HardwareDescription, robot: Any) -> OpenedDriver:

@@ -180,10 +180,14 @@ def _terminal() -> int | None:
         if not sys.stdin.isatty():
             return None
         descriptor = sys.stdin.fileno()
-        # a program in the background would be suspended
-        return descriptor if os.tcgetpgrp(descriptor) == os.getpgrp() else None
     except (OSError, ValueError, AttributeError):
         return None
+    try:
+        # a program in the background would be suspended
+        return descriptor if os.tcgetpgrp(descriptor) == os.getpgrp() else None
+    except OSError:
+        # another terminal than the one that controls this program
+        return descriptor
 
 
 def _without_lines(terminal: int) -> Any:

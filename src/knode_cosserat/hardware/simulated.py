@@ -357,7 +357,7 @@ class SimulatedRobot(Driver):
     def _sense(self) -> None:
         self._measured = self.cells.measured(self.tension + self._hung)
         over = np.flatnonzero(self._measured / GRAM_FORCE > self.cells.settings["limit"])
-        if len(over) and self._armed:
+        if len(over):
             self._latch(f"over-tension:{over[0] + 1}")
 
     def _latch(self, fault: str) -> None:
