@@ -146,10 +146,11 @@ void loop() {
     if (ticks_due) {
         int16_t counts[TENDONS];
         cli();
+        const uint8_t elapsed = ticks_due;
         ticks_due = 0;
         for (uint8_t k = 0; k < TENDONS; ++k) counts[k] = readings[k];
         sei();
-        board.tick(counts);
+        board.tick(counts, elapsed);
         for (uint8_t k = 0; k < TENDONS; ++k) set_motor(k, board.drive(k));
     }
     port.drain();

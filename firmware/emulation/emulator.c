@@ -1,4 +1,5 @@
 // The ATmega2560 in simavr, advanced by exact numbers of cycles: converter inputs in, registers and serial bytes out.
+#include <stdarg.h>
 #include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
@@ -48,7 +49,21 @@ static void on_sleep(avr_t *avr, avr_cycle_count_t cycles) {
     (void)cycles;
 }
 
+// simavr polls the pins of external interrupts, which the program does not use, in every cycle while they are low.
+// A reset starts this again.
+static void stop_polling(avr_t *avr) {
+    for (int k = 0; k < 8; ++k) avr_extint_set_strict_lvl_trig(avr, (uint8_t)k, 0);
+}
+
+static void on_log(avr_t *avr, const int level, const char *format, va_list arguments) {
+    (void)avr;
+    (void)level;
+    (void)format;
+    (void)arguments;
+}
+
 Emulator *emulator_open(const char *elf) {
+    avr_global_logger_set(on_log);
     elf_firmware_t firmware;
     memset(&firmware, 0, sizeof firmware);
     if (elf_read_firmware(elf, &firmware) != 0) return NULL;
@@ -62,10 +77,7 @@ Emulator *emulator_open(const char *elf) {
     self->avr->frequency = 16000000;
     self->avr->sleep = on_sleep;
     self->avr->vcc = self->avr->avcc = self->avr->aref = 5000;
-    // simavr polls pins of external interrupts, which the program does not use, in every cycle while they are low
-    for (int k = 0; k < 8; ++k) {
-        avr_extint_set_strict_lvl_trig(self->avr, (uint8_t)k, 0);
-    }
+    stop_polling(self->avr);
     uint32_t flags = 0;
     avr_ioctl(self->avr, AVR_IOCTL_UART_GET_FLAGS('0'), &flags);
     // no echo on this process's output, and no sleep of the emulator while the chip polls
@@ -122,6 +134,7 @@ void emulator_eeprom(Emulator *self, uint8_t *bytes, uint16_t count, int write) 
 void emulator_reset(Emulator *self) {
     const uint64_t cycle = self->avr->cycle;
     avr_reset(self->avr);
+    stop_polling(self->avr);
     self->avr->cycle = cycle;
     self->in_tail = self->in_head;
     self->out_tail = self->out_head;

@@ -26,8 +26,6 @@ class Port {
 
 class Board {
   public:
-    // loop time in telemetry (ms): 1000 / 256
-    static const int16_t LOOP_MS = 4;
     static const uint16_t TELEMETRY_TICKS = RATE / 50;
 
     explicit Board(Port &port) : port_(port) { memset(&settings_, 0, sizeof settings_); }
@@ -47,7 +45,9 @@ class Board {
 
     // Takes a received byte.
     void receive(char byte) {
-        switch (line_.take(byte)) {
+        const LineBuffer::Status status = line_.take(byte);
+        if (status != LineBuffer::PENDING) sequence_ = 0;
+        switch (status) {
             case LineBuffer::COMPLETE: handle(); break;
             case LineBuffer::TOO_LONG: refuse("long"); break;
             case LineBuffer::NOT_TEXT: refuse("frame"); break;
@@ -55,8 +55,10 @@ class Board {
         }
     }
 
-    // Moves on by a tick with the readings of the load cells (counts).
-    void tick(const int16_t *counts) {
+    // Moves on by a tick with the readings of the load cells (counts). `elapsed` is the number of ticks since the
+    // last call; it is above one if the chip was too slow.
+    void tick(const int16_t *counts, uint8_t elapsed = 1) {
+        if (elapsed > slowest_) slowest_ = elapsed;
         for (uint8_t k = 0; k < TENDONS; ++k) {
             counts_[k] = counts[k];
             tension_[k] = tension_of(counts[k], settings_.zero[k], settings_.gain[k]);
@@ -195,14 +197,12 @@ class Board {
         if (strcmp(text, "stop") == 0) return stop();
         if (strncmp(text, "hello ", 6) == 0) return hello(text + 6, 0);
         if (framed_) return handle_frame();
-        sequence_ = 0;
         if (strcmp(text, "reset") == 0) return reset();
         set_tensions(text);
     }
 
     void handle_frame() {
         char *text = line_.text;
-        sequence_ = 0;
         char *star = strrchr(text, '*');
         if (!star || strlen(star) != 5) return refuse("frame");
         uint16_t sent = 0;
@@ -372,7 +372,9 @@ class Board {
         }
         for (uint8_t k = 0; k < TENDONS; ++k) text.add(int32_t((tension_[k] + (tension_[k] < 0 ? -4 : 4)) / 8)).add(',');
         for (uint8_t k = 0; k < TENDONS; ++k) text.add(int32_t(drive_[k])).add(',');
-        finish(text.add(int32_t(LOOP_MS)), framed_);
+        // the longest time between two ticks since the last telemetry (ms)
+        finish(text.add(int32_t((slowest_ * 1000L + RATE / 2) / RATE)), framed_);
+        slowest_ = 0;
     }
 
     void finish(Text &text, bool sealed) {
@@ -389,7 +391,7 @@ class Board {
     Tare tare_;
     State state_ = BOOT;
     Fault fault_ = NO_FAULT;
-    uint8_t fault_tendon_ = 0, tared_ = 0;
+    uint8_t fault_tendon_ = 0, tared_ = 0, slowest_ = 0;
     bool framed_ = false, counted_ = false;
     uint16_t sequence_ = 0, last_ = 0, telemetry_ = 0, silent_ = 0, since_telemetry_ = 0, jog_left_ = 0;
     int16_t release_left_ = 0;

@@ -127,10 +127,13 @@ class Text {
         char digits[11];
         uint8_t count = 0;
         uint32_t rest = value < 0 ? 0u - static_cast<uint32_t>(value) : static_cast<uint32_t>(value);
+        for (; rest > 0xFFFF; rest /= 10) digits[count++] = static_cast<char>('0' + rest % 10);
+        // divisions of 16 bits take a third of the time
+        uint16_t small = static_cast<uint16_t>(rest);
         do {
-            digits[count++] = static_cast<char>('0' + rest % 10);
-            rest /= 10;
-        } while (rest);
+            digits[count++] = static_cast<char>('0' + small % 10);
+            small /= 10;
+        } while (small);
         if (value < 0) add('-');
         while (count) add(digits[--count]);
         return *this;

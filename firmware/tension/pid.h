@@ -38,7 +38,7 @@ class Pid {
         // all in 1/256 of a drive step: at most 6.4e7 each
         const int32_t ahead = (s.hold * static_cast<int32_t>(wanted) + s.kp * error) / 8;
         const int32_t damping = s.kd * change * (RATE / SPAN) / 8;
-        const int32_t against = 256L * s.friction * clamped(error, -BAND, BAND) / BAND;
+        const int32_t against = (256 / BAND) * s.friction * clamped(error, -BAND, BAND);
         const int32_t drive = (ahead - damping + against + integral_ / 256) / 256;
         const bool saturated = (drive > FULL && error > 0) || (drive < -FULL && error < 0);
         if (!saturated) integral_ = clamped(integral_ + s.ki * error / 8, -LARGEST, LARGEST);
@@ -49,7 +49,7 @@ class Pid {
     // ticks over which the derivative is taken
     static const uint8_t SPAN = 4;
     // error (gf/8) from which on friction is compensated fully
-    static const int32_t BAND = 80;
+    static const int32_t BAND = 64;
     // largest drive by the integral, in 1/65536 of a step
     static const int32_t LARGEST = 120L * 65536L;
     int32_t integral_ = 0;

@@ -116,6 +116,9 @@ class Controller(abc.ABC):
     def command(self, time: float, measured: Float[np.ndarray, " p"], reference: Reference) -> Command:
         """Return the control from this time (s) on, from the measurement of this time."""
 
+    def take_acting(self, measured: Float[np.ndarray, " c"], age: float) -> None:  # noqa: B027
+        """Take over measured controls (c,) of an age (s), which lag behind commands; by default nothing."""
+
     def advance(self, control: Float[np.ndarray, " c"]) -> None:  # noqa: B027
         """Take over the control that acts from now on; by default nothing."""
 

@@ -242,6 +242,8 @@ class Loop:
         controller, plant, reference, time = self.controller, self.plant, self.reference, self.time
         measured, tip = plant.measure(), plant.tip()
         began = clock.perf_counter()
+        if (acting := plant.acting()) is not None:
+            controller.take_acting(*acting)
         command: Command = controller.command(time, measured, reference)
         sent = clock.perf_counter()
         plant.apply(command.control)

@@ -61,6 +61,12 @@ class PlanController(Controller):
         found.observer = copy.copy(self.observer)
         return found
 
+    def take_acting(self, measured: Float[np.ndarray, " c"], age: float) -> None:
+        """Take over measured controls (c,) of an age (s); since then they followed the last command."""
+        if self.limits.lag and np.all(np.isfinite(measured)):
+            remaining = remaining_part(self.limits.lag, age)
+            self._acting = self._control + (np.asarray(measured) - self._control) * remaining
+
     def advance(self, control: Float[np.ndarray, " c"]) -> None:
         """Take over the control that acts from now on: shift the plan and predict the observer's state."""
         self._control = np.asarray(control, dtype=float)

@@ -88,6 +88,10 @@ class Plant(abc.ABC):
     def apply(self, control: Float[np.ndarray, " c"]) -> None:
         """Move on by one period under a control."""
 
+    def acting(self) -> tuple[Float[np.ndarray, " c"], float] | None:
+        """Return the newest measured controls (c,), such as tensions, and their age (s); None: not measured."""
+        return None
+
     def tip(self) -> Float[np.ndarray, "3"]:
         """Return the true position of the tip (m), for the report; NaN if it is not known."""
         return np.full(3, np.nan)

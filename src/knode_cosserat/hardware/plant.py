@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
 from collections.abc import Callable
@@ -21,8 +22,8 @@ Source = Callable[[], tuple[float, Float[np.ndarray, " p"]]]
 TOLERANCE = 0.2
 #: difference of a sent and a commanded tension that counts as a reduction (N): twice a gram-force
 RESOLUTION = 0.02
-#: rest of a period that is enough to read tensions at 50 Hz (s)
-ENOUGH = 0.025
+#: time for which a reading is awaited at the begin of a period (s)
+SOON = 1e-3
 
 
 class HardwarePlant(Plant):
@@ -138,6 +139,13 @@ class HardwarePlant(Plant):
         self.reduced += bool(np.max(np.abs(np.asarray(control) - sent)) > RESOLUTION)
         self._count += 1
 
+    def acting(self) -> tuple[Float[np.ndarray, " c"], float] | None:
+        """Return the measured tensions (N) of the newest reading, and their age (s); None if it is too old."""
+        if not self.readings:
+            return None
+        age = self._clock() - self.readings[-1].time
+        return (self.readings[-1].tension, age) if 0.0 <= age <= self.dt else None
+
     def tip(self) -> Float[np.ndarray, "3"]:
         """Return the last measured position of the tip (m); NaN if there is none."""
         return np.full(3, np.nan) if self._last is None else self._last[1][-3:]
@@ -146,15 +154,15 @@ class HardwarePlant(Plant):
         if math.isnan(self._begin):
             self._begin = self._clock()
             return
-        due = self._begin + self._count * self.dt
-        if due - self._clock() > ENOUGH:
-            self.readings.append(self.driver.read())
-        rest = due - self._clock()
+        rest = self._begin + self._count * self.dt - self._clock()
         if rest > 0.0:
             self._wait(rest)
         elif -rest > TOLERANCE * self.dt:
             self.missed += 1
             self._begin -= rest
+        # a lost reading is no fault; a lost connection is one of the next command
+        with contextlib.suppress(HardwareError):
+            self.readings.append(self.driver.read(timeout=SOON))
 
     def _check(self) -> None:
         if self._emergency is not None:

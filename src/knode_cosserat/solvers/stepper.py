@@ -74,6 +74,8 @@ class Stepper:
             raise ValueError(f"time is {time!r}; a stepper moves: see `equilibrium` for shapes at rest")
         settings = Settings.of(time, space, start, newton)
         self.robot, self.dt = robot, checked_dt(dt)
+        # layouts are put together anew in each call
+        self._layout, self._control_shape = robot.control_layout, (robot.control_size,)
         if initial is None:
             at_start = initial_state(robot, settings, recovery_budget=recovery_budget)
         else:
@@ -135,22 +137,24 @@ class Stepper:
         return self._row(row, control, time, self._state_after(after, time))
 
     def _checked(self, control: Any) -> np.ndarray:
-        fields = self.robot.control_layout.fields
-        names = ", ".join(f"{field.name} ({field.size}, {field.unit})" for field in fields)
         try:
             control = np.array(real_array(control))
         except (TypeError, ValueError) as error:
-            raise ValueError(f"the control is not numbers ({error}); there are {names}") from None
-        if control.shape != (self.robot.control_size,):
+            raise ValueError(f"the control is not numbers ({error}); there are {self._names}") from None
+        if control.shape != self._control_shape:
             raise ValueError(
-                f"the control has shape {control.shape}; allowed is ({self.robot.control_size},): {names}"
+                f"the control has shape {control.shape}; allowed is {self._control_shape}: {self._names}"
             )
         if not np.all(np.isfinite(control)):
             raise ValueError(f"the control is {control.tolist()}; it must be finite")
-        beyond = self.robot.control_layout.beyond(control)
+        beyond = self._layout.beyond(control)
         if beyond:
             raise ValueError(f"the control: {beyond}")
         return control
+
+    @property
+    def _names(self) -> str:
+        return ", ".join(f"{field.name} ({field.size}, {field.unit})" for field in self._layout.fields)
 
     def _solve(self, control: np.ndarray, stop: Callable[[], bool] | None) -> tuple[StepRows, StateHistory]:
         i = self._index

@@ -53,7 +53,7 @@ class Chip:
             HardwareError: the program crashed.
         """
         self.cycle += cycles
-        self._voltages[:] = millivolts  # type: ignore[assignment]
+        self._voltages[:] = list(millivolts)
         if self._library.emulator_run(self._chip, self.cycle, self._voltages):
             raise HardwareError("the firmware crashed in the emulator")
 

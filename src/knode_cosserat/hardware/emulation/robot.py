@@ -26,11 +26,13 @@ from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.routed_robot import RoutedTendonRobot
 from knode_cosserat.solvers.stepper import Stepper
 
-#: steps of the motors in a second, and steps of the motors in each step of the rod. Rod steps of 1/64 s give
-#: the same loop (tests/hardware/test_emulation.py)
-STEPS, ROD_STEPS = 1024, 16
+#: steps of the motors in a second, and steps of the motors in each step of the rod. With half as long steps of
+#: the rod the loop is the same (tests/hardware/test_emulation.py); with 1/64 s it oscillates at 26 Hz
+STEPS, ROD_STEPS = 1024, 8
 #: robot of the catalog that is emulated by default
 ROBOT = "delrin-routed-tendon-robot"
+#: length (m) taken in by each reel for the linearisation: some 4 N in each tendon
+TAUT = 1.0e-3
 #: compliance of a tendon of 0.6 m with its load cell (m/N)
 COMPLIANCE = 2.0e-4
 
@@ -39,11 +41,11 @@ class EmulatedRobot:
     """A tendon robot with four motors behind the emulated board.
 
         robot = kc.hardware.emulation.EmulatedRobot()
-        with kc.hardware.SerialBoard(robot.port(), limits) as board:
+        with kc.hardware.SerialBoard(kc.hardware.emulation.EmulatedPort(robot), limits) as board:
             board.arm()
 
-    Between two steps of the rod, its tendons' paths are extrapolated; each step solves for the tensions that
-    belong to the reels' positions.
+    Each step of the rod solves for the tensions that belong to the reels' positions. Between two steps the
+    tendons' paths are extrapolated, and follow the reels as in a step of a straight rod.
     """
 
     def __init__(
@@ -83,7 +85,9 @@ class EmulatedRobot:
         self._stepper.step(self.motors.position)
         self._fields = {field.name: where for field, where in _places(self.robot)}
         self._straight = self._path()
+        self._follows = self._response()
         self._taken, self._rate = np.zeros(4), np.zeros(4)
+        self._reeled, self._reel_rate = self.motors.position.copy(), np.zeros(4)
         self.tension = np.zeros(4)
         self.chip, self._count = Chip(), 0
 
@@ -105,23 +109,35 @@ class EmulatedRobot:
         self._count += 1
         if self._count % ROD_STEPS:
             since = (self._count % ROD_STEPS) * h
-            shortened = self._taken + since * self._rate
+            reeled = self.motors.position - self._reeled - since * self._reel_rate
+            shortened = self._taken + since * self._rate + self._follows @ reeled
             stretch = np.maximum(self.motors.position - shortened, 0.0)
             self.tension = np.where(self.torn, 0.0, stretch / self._compliance)
             return
         # a torn tendon is one that its reel has let out by far
         self._stepper.step(np.where(self.torn, -0.2, self.motors.position))
-        taken = self._straight - self._path()
+        taken, reeled = self._straight - self._path(), self.motors.position.copy()
         self._rate = (taken - self._taken) * STEPS / ROD_STEPS
-        self._taken = taken
+        self._reel_rate = (reeled - self._reeled) * STEPS / ROD_STEPS
+        self._taken, self._reeled = taken, reeled
         self.tension = np.where(self.torn, 0.0, np.maximum(self._row("tension"), 0.0))
 
-    def _row(self, name: str, node: int = 0) -> Float[np.ndarray, " c"]:
-        return np.asarray(self._stepper.state.y[-1, node, self._fields[name]])
+    def _row(self, name: str, node: int = 0, state: Any = None) -> Float[np.ndarray, " c"]:
+        row = self._stepper.state if state is None else state
+        return np.asarray(row.y[-1, node, self._fields[name]])
 
-    def _path(self) -> Float[np.ndarray, " c"]:
+    def _path(self, state: Any = None) -> Float[np.ndarray, " c"]:
         """Return the length of each tendon from base to tip (m)."""
-        return self._row("path", -1) - self._row("path", 0)
+        return self._row("path", -1, state) - self._row("path", 0, state)
+
+    def _response(self) -> Float[np.ndarray, "c c"]:
+        """Return how much shorter each path becomes within a step if a reel takes in more (m/m)."""
+        rod = Stepper(self.robot, ROD_STEPS / STEPS)
+        for _ in range(20):
+            rod.step(np.full(4, TAUT))
+        taut = self._path(rod.preview(np.full(4, TAUT)))
+        changed = [self._path(rod.preview(TAUT + 0.1 * TAUT * unit)) for unit in np.eye(4)]
+        return (taut - np.array(changed).T) / (0.1 * TAUT)
 
     def tip(self) -> Float[np.ndarray, "3"]:
         """Return the true position of the tip (m)."""
