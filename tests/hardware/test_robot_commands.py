@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.cli import robot_options
+from knode_cosserat.cli import robot_motion, robot_options
 from knode_cosserat.hardware.description import HardwareDescription
 from knode_cosserat.hardware.driver import HardwareError
+from knode_cosserat.hardware.middleware.mocap import PoseFrame
 from knode_cosserat.hardware.open_driver import open_driver
 from knode_cosserat.hardware.simulated import SimulatedRobot
 from tests.commands import run
@@ -286,3 +287,28 @@ def test_the_firmware_passes_its_commissioning(folder):
     results = {step["name"]: step["result"] for step in facts(run(*words))["steps"]}
     names = ("noise", "directions", "stop", "watchdog", "tracking", "over-tension", "latency")
     assert {name: results[name] for name in names} == dict.fromkeys(names, "passed")
+
+
+class Capture:
+    """Motion capture with a base at (1, 2, 0.5) m."""
+
+    names = ("base", "tip")
+
+    def poses(self):
+        position = np.array([[1.0, 2.0, 0.5], [1.1, 2.0, 1.0]])
+        return PoseFrame(3.0, position, np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)))
+
+
+def test_the_measured_tip_is_relative_to_the_clamped_end():
+    opened = open_driver("/dev/ttyACM0", HardwareDescription(), lambda: ROD)
+    stamp, tip = robot_options.tip_source(opened, Capture())()
+    np.testing.assert_allclose(tip, [0.1, 0.0, 0.5 + 0.0635])
+    assert stamp == 3.0 and robot_options.tip_source(opened, None) is None
+    config = robot_motion._recording_config(4, ["base", "rib", "tip"], opened)
+    assert config.base.height == 0.0635 and [each.fraction for each in config.markers] == [0.5, 1.0]
+
+
+@pytest.mark.parametrize("word", ["vicon:a?tip", "natnet:a?tip", "natnet:?tip=1", "natnet:a", "vrpn:a?tip=1"])
+def test_a_wrong_capture_is_one_line(folder, word):
+    words = ("robot", "record", "--port", "simulated", "--controls", "1,1,1,1", "--out", "a.bag", "--yes")
+    assert "allowed is natnet:SERVER?base=1,tip=2" in error(run(*words, "--capture", word))

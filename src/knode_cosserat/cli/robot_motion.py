@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 @hardware.command(
     epilog=examples(
-        "robot record --port /dev/ttyACM0 --controls table.csv --out a.bag --capture 'natnet:10.0.0.2?tip=1'",
+        "robot record --port /dev/ttyACM0 --controls table.csv --out a.bag --capture 'vrpn:10.0.0.2?base,tip'",
         "robot record --port simulated --controls random:0 --seconds 20 --out run.bag --yes",
     )
 )
@@ -81,7 +81,7 @@ def record(
     with contextlib.ExitStack() as stack:
         poses = stack.enter_context(motion_capture(machine, capture))
         names = _body_names(machine, poses)
-        config = _recording_config(count, names, machine.simulated, machine.name)
+        config = _recording_config(count, names, machine)
         driver = stack.enter_context(connected(machine, yes, motion))
         recorder = Recorder(out, config, clock=HostClock(machine.clock))
         config.save(out.with_suffix(".yaml"))
@@ -148,31 +148,32 @@ def _body_names(machine: OpenedDriver, poses: Any) -> list[str]:
     return [] if machine.poses is None else ["tip"]
 
 
-def _recording_config(count: int, names: list[str], simulated: bool, source: str) -> Any:
+def _recording_config(count: int, names: list[str], machine: OpenedDriver) -> Any:
     """Return the topics of a bag: tensions, commands, and bodies at even fractions of the length."""
     from knode_cosserat.recordings.config import RecordingConfig
-    from knode_cosserat.recordings.sources import CommandSource, MarkerSource, TensionSource
+    from knode_cosserat.recordings.sources import BaseSource, CommandSource, MarkerSource, TensionSource
 
     order = tuple(range(1, count + 1))
     # a configuration has one body or more: without motion capture its topic has no messages
-    names = names or ["tip"]
-    rotation = (1.0, 0.0, 0.0, 0.0) if simulated else None
+    markers = [name for name in names if name != "base"] or ["tip"]
+    rotation = (1.0, 0.0, 0.0, 0.0) if machine.simulated else None
     return RecordingConfig(
         markers=tuple(
-            MarkerSource(name, f"/{name}", (k + 1) / len(names), rotation=rotation)
-            for k, name in enumerate(names)
+            MarkerSource(name, f"/{name}", (k + 1) / len(markers), rotation=rotation)
+            for k, name in enumerate(markers)
         ),
         tension=TensionSource("/tension", order),
         command=CommandSource("/command", order),
-        simulated=simulated,
-        description=f"recorded at {source}",
+        base=BaseSource("/base", machine.base_height) if "base" in names else None,
+        simulated=machine.simulated,
+        description=f"recorded at {machine.name}",
     )
 
 
 @hardware.command(
     epilog=examples(
         "robot run found.yaml --port /dev/ttyACM0 --robot my-robot.yaml --reference path.csv "
-        "--capture 'natnet:10.0.0.2?tip=1' --radius 0.15 --out run.csv",
+        "--capture 'natnet:10.0.0.2?base=1,tip=2' --radius 0.15 --out run.csv",
         "robot run delrin-tendon-robot --port simulated --reference circle:radius=0.05,period=4 --yes",
     )
 )
@@ -238,7 +239,7 @@ def run(
             "tendons; they must be equal"
         )
     if machine.poses is None and capture is None:
-        raise ValueError("run needs the tip's position; give --capture natnet:SERVER?tip=1")
+        raise ValueError("run needs the tip's position; give --capture natnet:SERVER?base=1,tip=2")
     limits = _control_limits(machine.driver, high, lag)
     wanted = parsed_reference(reference)
     controller = kcc.controller_named(method, system, dt, limits)

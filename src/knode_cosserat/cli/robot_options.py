@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
 from knode_cosserat.cli.arguments import load_system
@@ -42,7 +43,8 @@ Capture = Annotated[
     str | None,
     typer.Option(
         metavar="SOURCE",
-        help="Motion capture of the tip: natnet:SERVER?tip=1 (OptiTrack, identity of the body).",
+        help="Motion capture: 'natnet:SERVER?base=1,tip=2' (OptiTrack, identities of the bodies) or "
+        "'vrpn:SERVER?base,tip'; without a base, its origin must be the clamped end.",
         show_default="the true tip of a simulated robot",
     ),
 ]
@@ -138,28 +140,41 @@ def motion_capture(machine: OpenedDriver, source: str | None) -> Iterator[Motion
         return
     kind, _, rest = source.partition(":")
     server, _, text = rest.partition("?")
-    names = dict(part.partition("=")[::2] for part in text.split(",") if part)
-    if kind != "natnet" or not server or not all(value.isdigit() for value in names.values()) or not names:
+    names = {name.strip(): value for name, _, value in (part.partition("=") for part in text.split(","))}
+    known = {"natnet": all(value.isdigit() for value in names.values()), "vrpn": not any(names.values())}
+    if not known.get(kind) or not server or not all(names):
         raise ValueError(
-            f"--capture is {source!r}; allowed is natnet:SERVER?tip=1, with each body's streaming identity"
+            f"--capture is {source!r}; allowed is natnet:SERVER?base=1,tip=2, with each body's streaming "
+            "identity, or vrpn:SERVER?base,tip"
         )
-    from knode_cosserat.hardware.middleware.natnet import NatNet
+    # recorders have the base first, and the tip is the last
+    ordered = sorted(names, key=lambda name: name != "base")
+    made: MotionCapture
+    if kind == "natnet":
+        from knode_cosserat.hardware.middleware.natnet import NatNet
 
-    bodies = {name: int(value) for name, value in names.items()}
-    with NatNet(bodies, server, clock=machine.clock) as capture:
+        made = NatNet({name: int(names[name]) for name in ordered}, server, clock=machine.clock)
+    else:
+        from knode_cosserat.hardware.middleware.vrpn import VRPN
+
+        made = VRPN(ordered, server, clock=machine.clock)
+    with made as capture:
         yield capture
 
 
 def tip_source(machine: OpenedDriver, capture: MotionCapture | None) -> Any:
     """Return a function with time (s) and position of the tip (m); None if it is not measured.
 
-    The tip is the last body of motion capture.
+    The tip is the last body of motion capture. With a body named base, the position is relative to the
+    clamped end below it; otherwise motion capture's origin must be at the clamped end.
     """
     if capture is not None:
+        above = np.array([0.0, 0.0, machine.base_height])
 
         def measured() -> Any:
             frame = capture.poses()
-            return frame.time, frame.position[-1]
+            origin = frame.position[0] - above if capture.names[0] == "base" else 0.0
+            return frame.time, frame.position[-1] - origin
 
         return measured
     poses = machine.poses

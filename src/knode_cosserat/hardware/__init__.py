@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from knode_cosserat.hardware.calibration import LoadCellFit, fit_load_cell, write_calibration
     from knode_cosserat.hardware.can_robot import CanRobot
     from knode_cosserat.hardware.clock import HostClock
+    from knode_cosserat.hardware.commissioning import Commissioning, Person
     from knode_cosserat.hardware.description import Dimensions, HardwareDescription, load_hardware
     from knode_cosserat.hardware.driver import Driver, DriverState, HardwareError, Latency, Limits, Reading
     from knode_cosserat.hardware.dynamixel import DynamixelRobot
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from knode_cosserat.hardware.middleware.simulated_capture import SimulatedCapture
     from knode_cosserat.hardware.middleware.vrpn import VRPN
     from knode_cosserat.hardware.motor_robot import MotorReel
+    from knode_cosserat.hardware.open_driver import OpenedDriver, open_driver
     from knode_cosserat.hardware.plant import HardwarePlant
     from knode_cosserat.hardware.recorder import Recorder, record_robot
     from knode_cosserat.hardware.safety import EmergencyStop, SafeRegion, StoppedError
@@ -36,6 +38,7 @@ __all__ = [
     "VRPN",
     "CanRobot",
     "CommandGate",
+    "Commissioning",
     "DDSBridge",
     "Dimensions",
     "Driver",
@@ -57,6 +60,8 @@ __all__ = [
     "MotorReel",
     "NatNet",
     "NatNetAddress",
+    "OpenedDriver",
+    "Person",
     "PoseFrame",
     "ROS1Node",
     "Reading",
@@ -72,6 +77,7 @@ __all__ = [
     "fit_load_cell",
     "load_hardware",
     "measure_loopback",
+    "open_driver",
     "record_robot",
     "teleoperate",
     "write_calibration",
@@ -83,6 +89,7 @@ make_lazy(
         "knode_cosserat.hardware.calibration": "LoadCellFit fit_load_cell write_calibration",
         "knode_cosserat.hardware.can_robot": "CanRobot",
         "knode_cosserat.hardware.clock": "HostClock",
+        "knode_cosserat.hardware.commissioning": "Commissioning Person",
         "knode_cosserat.hardware.description": "Dimensions HardwareDescription load_hardware",
         "knode_cosserat.hardware.driver": "Driver DriverState HardwareError Latency Limits Reading",
         "knode_cosserat.hardware.dynamixel": "DynamixelRobot",
@@ -95,6 +102,7 @@ make_lazy(
         "knode_cosserat.hardware.middleware.simulated_capture": "SimulatedCapture",
         "knode_cosserat.hardware.middleware.vrpn": "VRPN",
         "knode_cosserat.hardware.motor_robot": "MotorReel",
+        "knode_cosserat.hardware.open_driver": "OpenedDriver open_driver",
         "knode_cosserat.hardware.plant": "HardwarePlant",
         "knode_cosserat.hardware.recorder": "Recorder record_robot",
         "knode_cosserat.hardware.safety": "EmergencyStop SafeRegion StoppedError",

@@ -38,6 +38,7 @@ class OpenedDriver:
         silence: passes a time (s) without a sign of life.
         simulated: True if the robot is simulated or emulated.
         prepare: called with the driver after it has connected; None: nothing is to do.
+        base_height: height of the base's motion-capture body above the rod's clamped end (m).
     """
 
     driver: Driver
@@ -48,6 +49,7 @@ class OpenedDriver:
     silence: Callable[[float], Any] = time.sleep
     simulated: bool = False
     prepare: Callable[[Driver], Any] | None = None
+    base_height: float = 0.0
 
 
 def open_driver(port: str, hardware: HardwareDescription, robot: Callable[[], System]) -> OpenedDriver:
@@ -81,7 +83,8 @@ def open_driver(port: str, hardware: HardwareDescription, robot: Callable[[], Sy
         "simulated": _simulated, "emulated": _emulated, "serial": _serial,
         "dynamixel": _dynamixel, "can": _can,
     }  # fmt: skip
-    return makers[kind](address, options, hardware, robot)
+    opened = makers[kind](address, options, hardware, robot)
+    return dataclasses.replace(opened, base_height=hardware.dimensions.base_height)
 
 
 def _options(port: str, text: str, known: tuple[str, ...]) -> dict[str, str]:
