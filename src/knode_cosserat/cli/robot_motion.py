@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 @hardware.command(
     epilog=examples(
-        "robot record --port /dev/ttyACM0 --controls table.csv --out a.bag --capture 'vrpn:10.0.0.2?base,tip'",
+        "robot record --port /dev/ttyACM0 --controls a.csv --out a.bag --capture 'vrpn:10.0.0.2?base,tip'",
         "robot record --port simulated --controls random:0 --seconds 20 --out run.bag --yes",
     )
 )
