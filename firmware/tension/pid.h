@@ -24,7 +24,7 @@ class Pid {
     static const int16_t FULL = 255;
 
     void reset(int16_t measured) {
-        integral_ = 0;
+        integral_ = slow_ = 0;
         for (uint8_t k = 0; k < SPAN; ++k) before_[k] = measured;
         at_ = 0;
     }
@@ -37,8 +37,10 @@ class Pid {
         at_ = static_cast<uint8_t>((at_ + 1) % SPAN);
         // all in 1/256 of a drive step: at most 6.4e7 each
         const int32_t ahead = (s.hold * static_cast<int32_t>(wanted) + s.kp * error) / 8;
-        const int32_t damping = s.kd * change * (RATE / SPAN) / 8;
-        const int32_t against = (256 / BAND) * s.friction * clamped(error, -BAND, BAND);
+        // only fast changes are damped: slow ones, when the rod bends, would lag
+        slow_ += change - slow_ / WASHOUT;
+        const int32_t damping = s.kd * (change - slow_ / WASHOUT) * (RATE / SPAN) / 8;
+        const int32_t against = 256L * s.friction * clamped(error, -BAND, BAND) / BAND;
         const int32_t drive = (ahead - damping + against + integral_ / 256) / 256;
         const bool saturated = (drive > FULL && error > 0) || (drive < -FULL && error < 0);
         if (!saturated) integral_ = clamped(integral_ + s.ki * error / 8, -LARGEST, LARGEST);
@@ -48,11 +50,13 @@ class Pid {
   private:
     // ticks over which the derivative is taken
     static const uint8_t SPAN = 4;
+    // ticks of the washout of the derivative (125 ms)
+    static const int32_t WASHOUT = 32;
     // error (gf/8) from which on friction is compensated fully
-    static const int32_t BAND = 64;
+    static const int32_t BAND = 96;
     // largest drive by the integral, in 1/65536 of a step
     static const int32_t LARGEST = 120L * 65536L;
-    int32_t integral_ = 0;
+    int32_t integral_ = 0, slow_ = 0;
     int16_t before_[SPAN] = {0, 0, 0, 0};
     uint8_t at_ = 0;
 };

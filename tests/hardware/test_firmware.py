@@ -67,7 +67,13 @@ def test_host_and_chip_do_the_same() -> None:
     for k in range(60):
         readings = np.clip(ZERO + random.integers(-100, 4600, 4), 20, 8160)
         lines += [f"t {random.integers(1, 9)} {' '.join(map(str, readings))}", frame(3 + k, "keep")]
-    lines += [frame(100, "set gain1 32000"), frame(101, "set kp 4000"), frame(102, "get zero3"), "r stop", REST]
+    lines += [
+        frame(100, "set gain1 32000"),
+        frame(101, "set kp 4000"),
+        frame(102, "get zero3"),
+        "r stop",
+        REST,
+    ]
     # PID at the ends of its range, where 16-bit products would wrap
     extremes = [0, 1, -1, 8 * 2300, 8 * 3500, 32000, -32000, 16000, -16000]
     lines += ["s", "r reset", *(f"p {a} {b}" for a in (0, 8 * 2300) for b in extremes), "r hello 2"]

@@ -73,6 +73,26 @@ def closed_loop(
     run_study(lambda **how: rerun(out, quick, **how), {"quick": quick}, out, workers, dask, progress, as_json)
 
 
+@studies.command(epilog=examples("study hardware --quick --out results"))
+def hardware(
+    out: Out,
+    quick: Annotated[bool, typer.Option("--quick", help="Shorter runs: less than 10 min.")] = False,
+    workers: Workers = None,
+    dask: Dask = None,
+    progress: Progress = None,
+    as_json: Json = False,
+) -> None:
+    """Try the firmware on an emulated board: tensions, faults, fuzzing, and the whole closed loop.
+
+    Writes hardware.md and hardware.json (check, value, limit, ok). It needs the firmware's tools, as
+    firmware/README.md lists them. Resumes an earlier run in the same folder.
+    """
+    prepare(out, workers, dask)
+    from knode_cosserat.studies.hardware import rerun
+
+    run_study(lambda **how: rerun(out, quick, **how), {"quick": quick}, out, workers, dask, progress, as_json)
+
+
 @studies.command(
     epilog=examples(
         "study imperfections --out results",

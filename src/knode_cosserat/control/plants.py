@@ -89,7 +89,7 @@ class Plant(abc.ABC):
         """Move on by one period under a control."""
 
     def acting(self) -> tuple[Float[np.ndarray, " c"], float] | None:
-        """Return the newest measured controls (c,), such as tensions, and their age (s); None: not measured."""
+        """Return the newest measured controls (c,) and their age (s); None if they are not measured."""
         return None
 
     def tip(self) -> Float[np.ndarray, "3"]:

@@ -98,7 +98,9 @@ class LoadCells:
 
     def millivolts(self, tension: Float[np.ndarray, " c"]) -> list[int]:
         """Return the voltages (mV) of one conversion."""
-        volts = self.offset + self.sensitivity * tension + self._noise * self._random.normal(size=len(tension))
+        volts = (
+            self.offset + self.sensitivity * tension + self._noise * self._random.normal(size=len(tension))
+        )
         self._last = np.where(np.isnan(self.stuck), volts, self.stuck)
         return [int(value) for value in np.clip(np.rint(1e3 * self._last), 0, 5000)]
 

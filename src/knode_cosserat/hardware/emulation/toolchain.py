@@ -12,9 +12,7 @@ from pathlib import Path
 from knode_cosserat.hardware.driver import HardwareError
 
 #: Debian packages that the build needs
-PACKAGES = (
-    "make g++ arduino-core-avr gcc-avr avr-libc binutils-avr libsimavr-dev libelf-dev"
-)
+PACKAGES = "make g++ arduino-core-avr gcc-avr avr-libc binutils-avr libsimavr-dev libelf-dev"
 #: where Debian's packages put what the build needs
 NEEDED = ("/usr/share/arduino/hardware/arduino/avr/cores/arduino", "/usr/include/simavr/sim_avr.h")
 

@@ -1,0 +1,345 @@
+"""Study of the firmware and the closed loop on the emulated robot, with limits for each figure."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import subprocess
+import tempfile
+import time as clock
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.control.commands import ControlLimits
+from knode_cosserat.control.lag import identified_lag
+from knode_cosserat.control.loop import run_loop
+from knode_cosserat.control.named import controller_named
+from knode_cosserat.control.references import circle, figure_eight
+from knode_cosserat.estimation.outputs import TipPosition
+from knode_cosserat.evaluation.tables import markdown_table
+from knode_cosserat.hardware.driver import DriverState, HardwareError, Limits
+from knode_cosserat.hardware.emulation.port import EmulatedPort
+from knode_cosserat.hardware.emulation.robot import ROBOT, EmulatedRobot
+from knode_cosserat.hardware.emulation.toolchain import built, firmware_folder, missing
+from knode_cosserat.hardware.plant import HardwarePlant
+from knode_cosserat.hardware.serial_board import SerialBoard
+from knode_cosserat.rods.load_cells import LoadCells
+from knode_cosserat.rods.robot_file import load_robot
+from knode_cosserat.studies.report import Report, as_json, write_texts
+from knode_cosserat.studies.runner import Job, Product, run
+from knode_cosserat.studies.stand_in import DAMPING, NOISE, OFFSETS
+
+GRAM_FORCE = 9.80665e-3
+#: period of the loop (s), and its tension limits (N, N/s)
+DT, LOW, HIGH, RATE = 0.05, 0.5, 12.0, 40.0
+#: limits of the driver: wider than those of the controller
+DRIVER = Limits(0.0, 15.0, 1e4, 60.0)
+#: tip RMSE of the PyElastica stand-in in the study `control` (% of length), and the part by which this may be worse
+STAND_IN, FACTOR = 0.18, 1.5
+#: part of the host's bits that the cable flips in the closed loop
+BIT_ERRORS = 1e-5
+
+
+def jobs(quick: bool) -> list[Job]:
+    """Return the study's jobs."""
+    made = [
+        Job("build", build, {}),
+        Job("fuzz", fuzz, {"frames": 1_000_000}),
+        Job("steps", steps, {}),
+        Job("watchdog", watchdog, {"runs": 5 if quick else 50}),
+        Job("faults", faults, {"runs": 20 if quick else 200}),
+        Job("repeat", repeat, {}),
+        Job("loop", loop, {"seconds": 60.0 if quick else 600.0}),
+    ]
+    if importlib.util.find_spec("cyclonedds"):
+        made.append(Job("dds", dds, {"messages": 2000}))
+    return made
+
+
+def rerun(out: Path, quick: bool = False, **how: Any) -> Report:
+    """Run the study, and write hardware.json and hardware.md; interrupted runs are continued.
+
+    Args:
+        out: the folder.
+        quick: shorter runs.
+        how: `workers`, `dask`, `progress` as `runner.run` has them.
+
+    Raises:
+        HardwareError: the tools to build the firmware are missing.
+    """
+    if reason := missing():
+        raise HardwareError(f"the study needs the firmware's tools: {reason}")
+    made = checks(run(jobs(quick), out, **how))
+    texts = {"hardware.json": as_json(made), "hardware.md": as_markdown(made)}
+    return Report(made, write_texts(out, texts), [])
+
+
+def checks(facts: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the figures of the study with their limits: check, value, limit, ok."""
+    found, fastest = facts["steps"], facts["loop"]
+    listed = [
+        ("build of the firmware (s)", facts["build"]["seconds"], 60.0),
+        ("flash (bytes)", facts["build"]["flash"], 253_952),
+        ("RAM before the stack (bytes)", facts["build"]["ram"], 8192),
+        ("unsafe outputs in 1,000,000 fuzzed frames", facts["fuzz"]["unsafe"], 0),
+        ("tension steps: time to stay within 5 % (s)", found["settling"], 0.1),
+        ("tension steps: overshoot (% of the step)", found["overshoot"], 10.0),
+        ("tension left 100 ms after the last line (gf)", facts["watchdog"]["left"], 20.0),
+        ("injected faults that were not caught", facts["faults"]["missed"], 0),
+        ("faults after which the robot did not work again", facts["faults"]["dead"], 0),
+        ("bits that differ between two runs", facts["repeat"]["different"], 0),
+        ("closed loop: tip RMSE, worst reference (% of length)", fastest["rmse"], FACTOR * STAND_IN),
+        ("closed loop: periods above the tension limit", fastest["unsafe"], 0),
+        ("closed loop: faults", fastest["faults"], 0),
+    ]
+    if "dds" in facts:
+        listed.append(("DDS on this host: p99 (ms)", facts["dds"]["p99"], 1.0))
+    made = [
+        {"check": name, "value": value, "limit": limit, "ok": bool(value <= limit)}
+        for name, value, limit in listed
+    ]
+    for name, value, limit in (
+        ("control loop on the chip (1/s)", found["rate"], 200.0),
+        ("emulation relative to real time", facts["repeat"]["speed"], 3.0),
+    ):
+        made.append({"check": name, "value": value, "limit": limit, "ok": bool(value >= limit)})
+    return made
+
+
+def as_markdown(made: Sequence[Mapping[str, Any]]) -> str:
+    """Return the table of the study."""
+    rows = [[each["check"], f"{each['value']:.3g}", f"{each['limit']:.3g}", "yes" if each["ok"] else "no"]
+            for each in made]  # fmt: skip
+    table = markdown_table(["check", "value", "limit", "met"], rows)
+    return f"# Firmware and closed loop, emulated\n\nNothing ran on physical hardware.\n\n{table}\n"
+
+
+def build(settings: Any) -> Product:
+    """Build the firmware anew; report time and sizes."""
+    with tempfile.TemporaryDirectory() as folder:
+        began = clock.perf_counter()
+        subprocess.run(
+            ["make", "-s", "-C", str(firmware_folder()), f"OUT={folder}", "all"],
+            check=True, capture_output=True,
+        )  # fmt: skip
+        seconds = clock.perf_counter() - began
+    shown = subprocess.run(
+        ["avr-size", "-C", "--mcu=atmega2560", built() / "tension.elf"],
+        check=True, capture_output=True, text=True,
+    ).stdout  # fmt: skip
+    flash, ram = (int(each) for each in re.findall(r":\s+(\d+) bytes", shown))
+    return Product({"seconds": seconds, "flash": flash, "ram": ram}, {})
+
+
+def fuzz(settings: Any) -> Product:
+    """Send fuzzed frames to the board's logic on this computer."""
+    from knode_cosserat.hardware.emulation.logic import HostBoard
+
+    each = settings["frames"] // 10
+    found = [HostBoard().fuzz(seed, each) for seed in range(10)]
+    return Product({"unsafe": sum(f.unsafe for f in found), "armed": sum(f.armed for f in found)}, {})
+
+
+def connected(robot: EmulatedRobot, damage: Any = None) -> SerialBoard:
+    """Return a tared board in front of an emulated robot."""
+    board = SerialBoard(EmulatedPort(robot, damage), DRIVER, measured_high=40.0)
+    board.connect()
+    board.reset()
+    board.tare()
+    return board
+
+
+def tensions(board: SerialBoard, robot: EmulatedRobot, grams: Any, seconds: float) -> Float[Any, "T c"]:
+    """Return true tensions (gf) in steps of 1/256 s after a command (gf)."""
+    board.command(np.asarray(grams, dtype=float) * GRAM_FORCE)
+    rows = []
+    for _ in range(round(256 * seconds)):
+        board.wait(1.0 / 256.0)
+        rows.append(robot.tension / GRAM_FORCE)
+    return np.array(rows)
+
+
+def steps(settings: Any) -> Product:
+    """Measure the response of all tensions to steps, and the rate of the control loop."""
+    robot = EmulatedRobot()
+    board = connected(robot)
+    board.arm()
+    tensions(board, robot, [200.0] * 4, 1.0)
+    settling, overshoot, before = 0.0, 0.0, 200.0
+    for after in (300.0, 600.0, 1000.0, 800.0, 600.0):
+        rows = tensions(board, robot, [after] * 4, 0.6)
+        outside = np.flatnonzero(np.any(np.abs(rows - after) > 0.05 * after, axis=1))
+        settling = max(settling, (outside[-1] + 1) / 256 if len(outside) else 0.0)
+        beyond = np.max((rows - after) * np.sign(after - before))
+        overshoot = max(overshoot, 100.0 * float(beyond) / abs(after - before))
+        before = after
+    telemetry = [board.read() for _ in range(20)]
+    rate = 256.0 if len(telemetry) == 20 and not board.line_counts["lost telemetry"] else 0.0
+    return Product({"settling": settling, "overshoot": overshoot, "rate": rate}, {})
+
+
+def watchdog(settings: Any) -> Product:
+    """Measure the tension that is left 100 ms after the host's last line, after random tensions."""
+    robot, random, left = EmulatedRobot(), np.random.default_rng(1), 0.0
+    board = connected(robot)
+    for _ in range(settings["runs"]):
+        board.arm()
+        tensions(board, robot, [random.uniform(100.0, 800.0)] * 4, 0.5)
+        board.command(robot.tension)
+        robot.advance(0.1)
+        left = max(left, float(np.max(robot.tension)) / GRAM_FORCE)
+        robot.advance(0.6)
+        board.wait(0.05)
+        board.reset()
+    return Product({"left": left}, {})
+
+
+def faults(settings: Any) -> Product:
+    """Inject faults at random; each must be caught, and the robot work again after it was mended."""
+    robot, random = EmulatedRobot(), np.random.default_rng(2)
+    board = connected(robot)
+    kinds = ("sensor-rail", "sensor-stuck", "over-tension", "watchdog", "stopped", "restarted")
+    missed: list[str] = []
+    dead: list[str] = []
+    for k in range(settings["runs"]):
+        kind, tendon = kinds[k % len(kinds)], int(random.integers(0, 4))
+        board.arm()
+        tensions(board, robot, random.uniform(150.0, 500.0, 4), 0.4)
+        offset = robot.cells.offset.copy()
+        _inject(robot, board, kind, tendon, random)
+        caught = _is_caught(robot, board)
+        if not caught or not board.fault.startswith(kind):
+            missed.append(f"{kind} ({board.fault or 'none'})")
+        robot.cells.stuck[:] = np.nan
+        robot.cells.offset[:] = offset
+        board.wait(0.7)
+        try:
+            board.reset()
+            if board.fault:
+                board.reset()
+            board.tare()
+        except HardwareError as error:
+            dead.append(f"{kind}: {error}")
+            robot = EmulatedRobot()
+            board = connected(robot)
+    return Product({"missed": len(missed), "dead": len(dead), "listed": missed + dead}, {})
+
+
+def _inject(robot: EmulatedRobot, board: SerialBoard, kind: str, tendon: int, random: Any) -> None:
+    if kind == "sensor-rail":
+        robot.cells.stuck[tendon] = random.choice([0.0, 5.0])
+    elif kind == "sensor-stuck":
+        robot.cells.freeze(tendon)
+    elif kind == "over-tension":
+        robot.cells.offset[tendon] += 3.2
+    elif kind == "watchdog":
+        robot.advance(0.15)
+    elif kind == "stopped":
+        board.stop()
+    else:
+        robot.chip.reset()
+
+
+def _is_caught(robot: EmulatedRobot, board: SerialBoard) -> bool:
+    """Return True if the driver refuses commands within 3 s, and no motor reels in afterwards."""
+    try:
+        for k in range(60):
+            board.command(np.full(4, 3.0 + 0.2 * k))
+            board.wait(DT)
+    except HardwareError:
+        robot.advance(0.05)
+        return max(robot.chip.drives()) <= 0.0
+    return False
+
+
+def repeat(settings: Any) -> Product:
+    """Compare two runs of the same commands bit by bit, and measure the speed of the emulation."""
+
+    def moved() -> tuple[bytes, float]:
+        robot = EmulatedRobot(seed=3)
+        board = connected(robot)
+        board.arm()
+        began, start = clock.perf_counter(), robot.time
+        rows = [tensions(board, robot, grams, 0.5) for grams in ([300.0] * 4, [400.0, 300.0, 200.0, 300.0])]
+        speed = (robot.time - start) / (clock.perf_counter() - began)
+        return np.concatenate(rows).tobytes() + robot.tip().tobytes(), speed
+
+    moved()
+    (first, _), (second, speed) = moved(), moved()
+    different = sum(int(a ^ b).bit_count() for a, b in zip(first, second, strict=True))
+    return Product({"different": different, "speed": speed}, {})
+
+
+def loop(settings: Any) -> Product:
+    """Close the whole loop: controller, driver, serial line with bit errors, firmware, motors, rod."""
+    random = np.random.default_rng(4)
+
+    def damaged(data: bytes) -> bytes:
+        flips = random.random((len(data), 8)) < BIT_ERRORS
+        masks = (flips * (1 << np.arange(8))).sum(axis=1)
+        return bytes(byte ^ int(mask) for byte, mask in zip(data, masks, strict=True))
+
+    truth: Any = load_robot(ROBOT)
+    truth = truth.replace(bending_damping=DAMPING)
+    robot = EmulatedRobot(truth)
+    board = connected(robot, damaged)
+    lag = measured_lag(board, robot)
+    model = truth.replace(load_cells=LoadCells(gain=np.ones(4), offset=np.zeros(4)))
+    limits = ControlLimits(LOW, HIGH, RATE, lag=lag)
+    controller = controller_named("predictive", model, DT, limits, [OFFSETS], TipPosition(sigma=5e-4))
+    errors, unsafe, failed, missing_rows = {}, 0, 0, 0
+    for name, path in {"circle": circle(0.1, period=4.0), "eight": figure_eight(0.1, period=6.0)}.items():
+        plant = HardwarePlant(board, lambda: _measured(robot, random), DT, clock=lambda: robot.time)
+        try:
+            log = run_loop(controller, plant, path, settings["seconds"])
+        except HardwareError as error:
+            failed += 1
+            log = getattr(error, "log", None)
+            board.wait(0.7)
+            board.reset()
+            if log is None:
+                continue
+        errors[name] = 100.0 * log.tip_rmse(6.0) / float(truth.length)
+        unsafe += int(np.sum(log.control > HIGH + 0.02))
+        missing_rows += log.fallbacks
+        if board.state is DriverState.ARMED:
+            board.disarm()
+    worst = max(errors.values(), default=float("inf"))
+    facts = {
+        "rmse": worst if np.isfinite(worst) else 1e9, "errors": errors, "lag": lag, "unsafe": unsafe,
+        "faults": failed, "fallbacks": missing_rows, "damaged_lines": dict(board.line_counts),
+    }  # fmt: skip
+    return Product(facts, {})
+
+
+def measured_lag(board: SerialBoard, robot: EmulatedRobot) -> float:
+    """Return the time constant (s) of the tensions, from a motion by two opposed pairs."""
+    board.arm()
+    commanded, measured = [], []
+    for k in range(120):
+        phase = 2.0 * np.pi * k * DT / 4.0
+        turn = np.array([np.cos(phase), np.sin(phase), -np.cos(phase), -np.sin(phase)])
+        commanded.append(board.command(3.0 + 2.0 * min(k * DT, 1.0) * turn))
+        board.wait(DT)
+        measured.append(board.read().tension)
+    board.disarm()
+    return identified_lag(np.array(commanded[40:]), np.array(measured[40:]), DT, measured[39])
+
+
+def _measured(robot: EmulatedRobot, random: np.random.Generator) -> tuple[float, Float[Any, "3"]]:
+    return robot.time, robot.tip() + NOISE * random.normal(size=3)
+
+
+def dds(settings: Any) -> Product:
+    """Measure the latency of DDS between two processes; with real-time priority where it is allowed."""
+    from knode_cosserat.hardware.middleware.loopback import measure_loopback
+
+    try:
+        found = measure_loopback(settings["messages"], real_time=True)
+    except HardwareError:
+        found = measure_loopback(settings["messages"])
+    return Product({"p99": 1e3 * found.p99, "median": 1e3 * found.median, "real_time": found.real_time}, {})
