@@ -46,6 +46,13 @@ def tensions(board: SerialBoard, robot: EmulatedRobot, grams: list[float], secon
     return np.array(rows)
 
 
+def pull(board: SerialBoard) -> None:
+    """Pull harder and harder for 3 s."""
+    for k in range(60):
+        board.command(np.full(4, 3.0 + 0.2 * k))
+        board.wait(0.05)
+
+
 def test_tension_steps_settle(robot: EmulatedRobot) -> None:
     with board_of(robot) as board:
         board.arm()
@@ -97,9 +104,7 @@ def test_faults_of_the_robot_are_caught(robot: EmulatedRobot, fault: str) -> Non
     else:
         robot.chip.reset()
     with pytest.raises(HardwareError):
-        for k in range(60):
-            board.command(np.full(4, 3.0 + 0.2 * k))
-            board.wait(0.05)
+        pull(board)
     assert board.fault == names[fault]
     robot.advance(0.7)
     assert robot.chip.drives() == [0.0] * 4

@@ -209,8 +209,7 @@ def test_the_drive_has_the_sign_of_the_error(wanted: int, measured: int) -> None
 
 
 def test_the_board_has_room() -> None:
-    shown = subprocess.run(
-        ["avr-size", "-C", "--mcu=atmega2560", built() / "tension.elf"], capture_output=True, text=True, check=True
-    ).stdout  # fmt: skip
+    command = ["avr-size", "-C", "--mcu=atmega2560", str(built() / "tension.elf")]
+    shown = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     flash, ram = (int(each) for each in re.findall(r":\s+(\d+) bytes", shown))
     assert flash < 65536 and ram < 4096

@@ -140,7 +140,7 @@ class HardwarePlant(Plant):
         self._count += 1
 
     def acting(self) -> tuple[Float[np.ndarray, " c"], float] | None:
-        """Return the measured tensions (N) of the newest reading, and their age (s); None if it is too old."""
+        """Return the tensions (N) of the newest reading and their age (s); None if it is too old."""
         if not self.readings:
             return None
         age = self._clock() - self.readings[-1].time

@@ -106,6 +106,12 @@ class SerialBoard(Driver):
         """Latency of the last commands; NaN before the first, and in plain mode."""
         return self._link.latencies.summary() if self._link else self._last_latency
 
+    @property
+    def loop_time(self) -> float:
+        """Longest time between two steps of the board's control (s), of the last telemetry; NaN without."""
+        telemetry = self._link.telemetry if self._link else None
+        return float("nan") if telemetry is None else 1e-3 * telemetry.loop_time
+
     # connection
 
     def connect(self) -> None:

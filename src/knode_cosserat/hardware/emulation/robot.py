@@ -1,4 +1,4 @@
-"""An emulated robot: the real firmware on an emulated chip, around it motors, load cells, tendons and the rod.
+"""An emulated robot: the real firmware on an emulated chip, with motors, load cells, tendons and the rod.
 
 Chip and robot move in lock-step; the same commands give the same bits.
 """
@@ -26,8 +26,8 @@ from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.routed_robot import RoutedTendonRobot
 from knode_cosserat.solvers.stepper import Stepper
 
-#: steps of the motors in a second, and steps of the motors in each step of the rod. With half as long steps of
-#: the rod the loop is the same (tests/hardware/test_emulation.py); with 1/64 s it oscillates at 26 Hz
+#: steps of the motors in a second, and steps of the motors in each step of the rod. With steps of the rod half as
+#: long the loop is the same (tests/hardware/test_emulation.py); with 1/64 s it oscillates at 26 Hz
 STEPS, ROD_STEPS = 1024, 8
 #: robot of the catalog that is emulated by default
 ROBOT = "delrin-routed-tendon-robot"
@@ -49,16 +49,16 @@ class EmulatedRobot:
     """
 
     def __init__(
-        self, robot: str | RoutedTendonRobot = ROBOT, *, motors: MotorParameters = MotorParameters(),
-        cells: LoadCellParameters = LoadCellParameters(), compliance: float = COMPLIANCE,
+        self, robot: str | RoutedTendonRobot = ROBOT, *, motors: MotorParameters | None = None,
+        cells: LoadCellParameters | None = None, compliance: float = COMPLIANCE,
         slack: float = 0.002, seed: int = 0,
     ):  # fmt: skip
         """Set up the robot at rest with slack tendons, and start the chip.
 
         Args:
             robot: a routed tendon robot with four tendons, or its name or file.
-            motors: of all tendons.
-            cells: load cells of all tendons.
+            motors: of all tendons; None: a nominal JGA25-371.
+            cells: load cells of all tendons; None: nominal ones.
             compliance: of each tendon (m/N).
             slack: of each tendon at the start (m).
             seed: of the noise.
@@ -69,13 +69,14 @@ class EmulatedRobot:
         given: Any = load_robot(robot) if isinstance(robot, str) else robot
         if not isinstance(given, RoutedTendonRobot) or given.tendon_count != 4:
             raise HardwareError(
-                f"the emulated board drives a routed tendon robot with 4 tendons (got {type(given).__name__}); "
-                f"use {ROBOT}, for example"
+                "the emulated board drives a routed tendon robot with 4 tendons (got "
+                f"{type(given).__name__}); use {ROBOT}, for example"
             )
         reels = Reels(motors=[1.0, 2.0, 3.0, 4.0], compliance=[compliance] * 4)
         self.robot = given.replace(drive="reel", reels=reels)
         self._random = np.random.default_rng(seed)
-        self.motors, self.cells = Motors(4, motors), LoadCells(4, cells, self._random)
+        self.motors = Motors(4, motors or MotorParameters())
+        self.cells = LoadCells(4, cells or LoadCellParameters(), self._random)
         self.motors.rotor -= slack
         self.motors.position -= slack
         #: tendons that are torn, or off their reels
