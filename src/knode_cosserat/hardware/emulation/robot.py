@@ -26,7 +26,7 @@ from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.routed_robot import RoutedTendonRobot
 from knode_cosserat.solvers.stepper import Stepper
 
-#: steps of the motors in a second, and steps of the motors in each step of the rod. With steps of the rod half as
+#: steps of the motors in a second, and in each step of the rod. With steps of the rod half as
 #: long the loop is the same (tests/hardware/test_emulation.py); with 1/64 s it oscillates at 26 Hz
 STEPS, ROD_STEPS = 1024, 8
 #: robot of the catalog that is emulated by default
