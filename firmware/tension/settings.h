@@ -53,10 +53,10 @@ struct SettingRow {
 // ki follows slow commands better, but swings together with the rod (tried: 400).
 const SettingRow ROWS[] = {
     {"kp", TENSION_INDEX(kp), 0, 4000, 24},
-    {"ki", TENSION_INDEX(ki), 0, 4000, 160},
+    {"ki", TENSION_INDEX(ki), 0, 4000, 120},
     {"kd", TENSION_INDEX(kd), 0, 1000, 1},
     {"hold", TENSION_INDEX(hold), 0, 1000, 15},
-    {"friction", TENSION_INDEX(friction), 0, 120, 20},
+    {"friction", TENSION_INDEX(friction), 0, 120, 18},
     {"limit", TENSION_INDEX(limit), 50, 3500, 2300},
     {"watchdog", TENSION_INDEX(watchdog), 20, 500, 60},
     {"silence", TENSION_INDEX(silence), 100, 2000, 500},

@@ -156,7 +156,7 @@ def test_two_runs_are_the_same_bits() -> None:
 
 def test_the_step_of_the_rod_does_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
     tips = []
-    for count in (8, 4):
+    for count in (4, 2):
         monkeypatch.setattr(emulated, "ROD_STEPS", count)
         robot = EmulatedRobot()
         with board_of(robot) as board:

@@ -28,7 +28,7 @@ from knode_cosserat.solvers.stepper import Stepper
 
 #: steps of the motors in a second, and in each step of the rod. With steps of the rod half as
 #: long the loop is the same (tests/hardware/test_emulation.py); with 1/64 s it oscillates at 26 Hz
-STEPS, ROD_STEPS = 1024, 8
+STEPS, ROD_STEPS = 512, 4
 #: robot of the catalog that is emulated by default
 ROBOT = "delrin-routed-tendon-robot"
 #: length (m) taken in by each reel for the linearisation: some 4 N in each tendon
@@ -98,12 +98,12 @@ class EmulatedRobot:
         return self._count / STEPS
 
     def advance(self, seconds: float) -> None:
-        """Move chip and robot on by some time (s), rounded to 1/1024 s."""
+        """Move chip and robot on by some time (s), rounded to 1/512 s."""
         for _ in range(round(seconds * STEPS)):
             self.step()
 
     def step(self) -> None:
-        """Move chip and robot on by 1/1024 s."""
+        """Move chip and robot on by 1/512 s."""
         self.chip.run(CLOCK // STEPS, self.cells.millivolts(self.tension))
         h = 1.0 / STEPS
         self.motors.step(np.array(self.chip.drives()), self.tension, h)
