@@ -20,7 +20,12 @@ NAMESPACES = sorted(name for name in kc.__all__ if isinstance(getattr(kc, name),
 #: first words of a docstring that says nothing on its own
 VAGUE = {"What", "Whether", "That", "Those", "How", "Of"}
 #: errors of computations; all others are of arguments
-RUNNING = {kc.SimulationError, kc.estimation.ObserverError}
+RUNNING = {
+    kc.SimulationError,
+    kc.estimation.ObserverError,
+    kc.hardware.HardwareError,
+    kc.hardware.StoppedError,
+}
 ROBOT = kc.load_robot("delrin-tendon-robot")
 
 

@@ -2,8 +2,9 @@
 
 The names that a first script needs are here; start with `load_robot`, `simulate` and `Trajectory`. All other
 public names are in the namespaces `robots`, `solvers`, `learning`, `calibration`, `recordings`, `statics`,
-`estimation`, `control`, `identification`, `metrics`, `figures`, `viewer`, `controls` and `named_controls`.
-Events are logged to the logger "knode_cosserat", which is quiet unless a handler is added.
+`estimation`, `control`, `hardware`, `identification`, `metrics`, `figures`, `viewer`, `controls` and
+`named_controls`. Events are logged to the logger "knode_cosserat", which is quiet unless a handler is
+added.
 """
 
 import importlib
@@ -18,6 +19,7 @@ from knode_cosserat import (
     controls,
     estimation,
     figures,
+    hardware,
     identification,
     learning,
     metrics,
@@ -29,7 +31,7 @@ from knode_cosserat import (
     viewer,
 )
 from knode_cosserat.calibration import calibrate
-from knode_cosserat.diagnosis import Diagnosis, doctor
+from knode_cosserat.diagnosis import doctor
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.identification import fit, identify
 from knode_cosserat.learning import KNODE, FitConfig, explain, load_model
@@ -46,7 +48,6 @@ logging.getLogger(__name__).addHandler(logging.NullHandler())
 
 __all__ = [
     "KNODE",
-    "Diagnosis",
     "FitConfig",
     "KnodeCosseratError",
     "Result",
@@ -66,6 +67,7 @@ __all__ = [
     "explain",
     "figures",
     "fit",
+    "hardware",
     "identification",
     "identify",
     "inverse_kinematics",
@@ -110,6 +112,7 @@ _MOVED = {
     "identification": "IdentificationError Identified",
     "metrics": "StateError node_error pose_mse state_errors tip_dtw tip_rmse",
     "viewer": "export_scene view_live",
+    "diagnosis": "Diagnosis",
 }
 _NAMESPACES = {name: place for place, names in _MOVED.items() for name in names.split()}
 
