@@ -28,8 +28,10 @@ class Monitor {
 
     // Checks a reading (counts, gf/8) under the drive of the last tick.
     Fault step(const Settings &s, int16_t count, int16_t tension, int16_t wanted, int16_t drive) {
-        if (!confirmed(rail_, count <= RAIL || count >= TOP - RAIL)) return SENSOR_RAIL;
-        if (!confirmed(over_, tension / 8 > s.limit)) return OVER_TENSION;
+        const bool at_rail = count <= RAIL || count >= TOP - RAIL;
+        if (!confirmed(rail_, at_rail)) return SENSOR_RAIL;
+        // the first reading of a broken cell may be the mean of conversions before and after
+        if (!confirmed(over_, tension / 8 > s.limit)) return at_rail ? SENSOR_RAIL : OVER_TENSION;
         const int16_t effort = static_cast<int16_t>(drive - s.hold * static_cast<int32_t>(tension) / 2048);
         const int16_t moves = static_cast<int16_t>(s.friction + MOVES);
         const bool reels_in = effort > moves, reels_out = effort < -moves && tension / 8 > s.slack;

@@ -166,9 +166,11 @@ def test_every_fault_releases_and_latches() -> None:
     checked(session, "watchdog", last)
     for rail in (-ZERO / PER_GRAM, 3692):
         session = armed(100, 100, 100, 100)
+        # the first reading is halfway
+        session.tick(1, 100, 0.5 * (100 + rail), 100, 100)
         last = session.tick(3, 100, rail, 100, 100)
-        assert last[3] == "-255" or last[1] == "sensor-rail"
-        assert last[1] in ("sensor-rail", "over-tension")
+        assert last[1] == "sensor-rail"
+        assert max(map(int, last[2:6])) <= 0
     session = armed(1000, 0, 0, 0)
     checked(session, "sensor-stuck", session.tick(200, 300, 0, 0, 0))
     session = armed(1000, 0, 0, 0)
