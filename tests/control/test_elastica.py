@@ -41,12 +41,12 @@ def test_a_planning_controller_predicts_with_the_lag():
 
     class Lagging(kc.control.SimulatedPlant):
         def start(self):
-            self.acting = super().start()
-            return self.acting
+            self.pulled = super().start()
+            return self.pulled
 
         def apply(self, control):
-            self.acting = lagged(np.asarray(control)[None], dt, lag, self.acting)[0]
-            super().apply(self.acting)
+            self.pulled = lagged(np.asarray(control)[None], dt, lag, self.pulled)[0]
+            super().apply(self.pulled)
 
     plant, errors = Lagging(ROBOT, dt, sensor), {}
     for known in (True, False):
