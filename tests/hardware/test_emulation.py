@@ -9,12 +9,12 @@ import knode_cosserat as kc
 from knode_cosserat.hardware.driver import DriverState, HardwareError, Limits
 from knode_cosserat.hardware.emulation import EmulatedPort, EmulatedRobot, PseudoTerminal, missing
 from knode_cosserat.hardware.emulation import robot as emulated
+from knode_cosserat.hardware.lines import GRAM_FORCE
 from knode_cosserat.hardware.serial_board import SerialBoard
 
 if missing():
     pytest.skip(f"the firmware cannot be built here: {missing()}", allow_module_level=True)
 
-GRAM_FORCE = 9.80665e-3
 LIMITS = Limits(0.0, 15.0, 1e4, 60.0)
 
 

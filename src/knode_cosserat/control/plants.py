@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-import functools
 from collections import deque
 from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.estimation.outputs import Output
+from knode_cosserat.estimation.outputs import Output, final_output
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.stepper import Stepper
 from knode_cosserat.trajectory import Trajectory
@@ -144,8 +142,7 @@ class SimulatedPlant(Plant):
         self._sense()
 
     def _sense(self) -> None:
-        state, output = self._stepper.state, self.sensor.output
-        self._readings.add(_sensed(self.robot, np.asarray(state.y[-1]), np.asarray(state.z[-1]), output))
+        self._readings.add(final_output(self.robot, self._stepper.state, self.sensor.output))
 
     def measure(self) -> Float[np.ndarray, " p"]:
         """Return the measurement of this time, or an older one if the sensor has latency."""
@@ -160,8 +157,3 @@ class SimulatedPlant(Plant):
         """Return the true position of the tip (m)."""
         y = np.asarray(self._stepper.state.y[-1, -1:])
         return np.asarray(self.robot.positions(y))[-1]
-
-
-@functools.partial(jax.jit, static_argnames="output")
-def _sensed(robot: System, y: Any, z: Any, output: Output) -> Any:
-    return output.value(robot, y, z)

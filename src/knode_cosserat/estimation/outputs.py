@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+import functools
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -13,6 +15,7 @@ from jaxtyping import Float
 from knode_cosserat.rods.system import System
 from knode_cosserat.rotation import conjugate, quaternion_product
 from knode_cosserat.solvers.places import places_at, positions_at, quaternions_at
+from knode_cosserat.trajectory import Trajectory
 
 
 @dataclasses.dataclass(frozen=True)
@@ -198,3 +201,13 @@ class BaseWrench(Output):
     def value(self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"]) -> Float[Any, " p"]:
         """Return the internal force and moment at the base."""
         return jnp.concatenate([system.y_layout.get(y[0], "n"), system.y_layout.get(y[0], "m")])
+
+
+def final_output(system: System, trajectory: Trajectory, output: Output) -> Float[np.ndarray, " p"]:
+    """Return an output (p,) at the last row of a trajectory, by one compiled program for each output."""
+    return np.asarray(_value(system, np.asarray(trajectory.y[-1]), np.asarray(trajectory.z[-1]), output))
+
+
+@functools.partial(jax.jit, static_argnames="output")
+def _value(system: System, y: Any, z: Any, output: Output) -> Any:
+    return output.value(system, y, z)

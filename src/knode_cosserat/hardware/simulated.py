@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-import functools
 import time
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat._yaml import did_you_mean
-from knode_cosserat.estimation.outputs import BodyPoses, BodyPositions
 from knode_cosserat.hardware.driver import Driver, DriverState, HardwareError, Latency, Limits, Reading
 from knode_cosserat.hardware.faults import FAULTS, fault_message
 from knode_cosserat.hardware.limits import LatencyWindow, TensionLimiter
 from knode_cosserat.hardware.lines import GRAM_FORCE
 from knode_cosserat.hardware.simulated_cells import MachineParameters, SimulatedLoadCells
+from knode_cosserat.hardware.true_shape import TrueShape
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.result import SimulationError
 from knode_cosserat.solvers.stepper import Stepper
+from knode_cosserat.trajectory import Trajectory
 
 #: time between readings (s), longest silence of the host while armed (s), duration of a tare (s)
 STEP, SILENCE, TARE = 0.02, 0.31, 0.5
@@ -30,7 +28,7 @@ JOG = 3.0
 LATE = 1.0
 
 
-class SimulatedRobot(Driver):
+class SimulatedRobot(TrueShape, Driver):
     """A simulated tendon robot with motors, load cells and faults, in real time or in lock-step.
 
     In lock-step the simulated time moves on only by `wait`, `read`, `tare`, `jog` and `advance`, so that a
@@ -278,22 +276,10 @@ class SimulatedRobot(Driver):
 
     # true state
 
-    def tip(self) -> Float[np.ndarray, "3"]:
-        """Return the true position of the tip (m)."""
-        return self.positions((1.0,))[0]
-
-    def positions(self, fractions: Sequence[float]) -> Float[np.ndarray, "M 3"]:
-        """Return true positions of places along the rod (m), by their fractions of its length."""
-        return self._output(BodyPositions(tuple(fractions))).reshape(-1, 3)
-
-    def poses(self, fractions: Sequence[float]) -> Float[np.ndarray, "M 7"]:
-        """Return true positions (m) and quaternions (w, x, y, z) of places along the rod."""
-        return self._output(BodyPoses(tuple(fractions))).reshape(-1, 7)
-
-    def _output(self, output: Any) -> Float[np.ndarray, " p"]:
+    def true_state(self) -> Trajectory:
+        """Return the state at this time, a trajectory of one row."""
         self._touch()
-        state = self._require().state
-        return np.asarray(_evaluated(self.robot, np.asarray(state.y[-1]), np.asarray(state.z[-1]), output))
+        return self._require().state
 
     # steps
 
@@ -366,8 +352,3 @@ class SimulatedRobot(Driver):
             self._lost = True
         elif not self._fault:
             self._fault = fault if ":" in fault else f"{fault}:0"
-
-
-@functools.partial(jax.jit, static_argnames="output")
-def _evaluated(robot: System, y: Any, z: Any, output: Any) -> Any:
-    return output.value(robot, y, z)

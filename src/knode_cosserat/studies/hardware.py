@@ -26,6 +26,7 @@ from knode_cosserat.hardware.driver import DriverState, HardwareError, Limits
 from knode_cosserat.hardware.emulation.port import EmulatedPort
 from knode_cosserat.hardware.emulation.robot import ROBOT, EmulatedRobot
 from knode_cosserat.hardware.emulation.toolchain import built, firmware_folder, missing
+from knode_cosserat.hardware.lines import GRAM_FORCE
 from knode_cosserat.hardware.plant import HardwarePlant
 from knode_cosserat.hardware.serial_board import SerialBoard
 from knode_cosserat.rods.load_cells import LoadCells
@@ -34,7 +35,6 @@ from knode_cosserat.studies.report import Report, as_json, write_texts
 from knode_cosserat.studies.runner import Job, Product, run
 from knode_cosserat.studies.stand_in import DAMPING, NOISE, OFFSETS
 
-GRAM_FORCE = 9.80665e-3
 #: period of the loop (s), and its tension limits (N, N/s)
 DT, LOW, HIGH, RATE = 0.05, 0.5, 12.0, 40.0
 #: limits of the driver: wider than those of the controller

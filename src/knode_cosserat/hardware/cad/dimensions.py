@@ -18,11 +18,12 @@ from knode_cosserat.hardware.cad.checks import (
 )
 from knode_cosserat.hardware.cad.shapes import HEAD, MIN_WALL, PLAY, TENDON, PartError, on_circle
 from knode_cosserat.hardware.description import Dimensions, HardwareDescription, load_hardware
+from knode_cosserat.hardware.lines import GRAM_FORCE
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.system import System
 
 #: over-tension limit of the board: 2300 grams-force (N)
-BOARD_LIMIT = 2300 * 9.80665e-3
+BOARD_LIMIT = 2300 * GRAM_FORCE
 #: thicknesses of aluminium bar in stock (mm)
 STOCK = (1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
 #: Young's modulus of aluminium (MPa), and the greatest strain allowed at a gauge

@@ -7,8 +7,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-#: gravitational force of a gram (N)
-GRAM_FORCE = 9.80665e-3
+from knode_cosserat.hardware.lines import GRAM_FORCE
 
 
 @dataclasses.dataclass(frozen=True)

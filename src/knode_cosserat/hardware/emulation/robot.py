@@ -5,14 +5,11 @@ Chip and robot move in lock-step; the same commands give the same bits.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.estimation.outputs import BodyPoses, BodyPositions
 from knode_cosserat.hardware.driver import HardwareError
 from knode_cosserat.hardware.emulation.chip import CLOCK, Chip
 from knode_cosserat.hardware.emulation.motors import (
@@ -21,10 +18,12 @@ from knode_cosserat.hardware.emulation.motors import (
     MotorParameters,
     Motors,
 )
+from knode_cosserat.hardware.true_shape import TrueShape
 from knode_cosserat.rods.reels import Reels
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.routed_robot import RoutedTendonRobot
 from knode_cosserat.solvers.stepper import Stepper
+from knode_cosserat.trajectory import Trajectory
 
 #: steps of the motors in a second, and in each step of the rod. With steps of the rod half as
 #: long the loop is the same (tests/hardware/test_emulation.py); with 1/64 s it oscillates at 26 Hz
@@ -37,7 +36,7 @@ TAUT = 1.0e-3
 COMPLIANCE = 2.0e-4
 
 
-class EmulatedRobot:
+class EmulatedRobot(TrueShape):
     """A tendon robot with four motors behind the emulated board.
 
         robot = kc.hardware.emulation.EmulatedRobot()
@@ -140,22 +139,9 @@ class EmulatedRobot:
         changed = [self._path(rod.preview(TAUT + 0.1 * TAUT * unit)) for unit in np.eye(4)]
         return (taut - np.array(changed).T) / (0.1 * TAUT)
 
-    def tip(self) -> Float[np.ndarray, "3"]:
-        """Return the true position of the tip (m)."""
-        return self.positions((1.0,))[0]
-
-    def positions(self, fractions: Sequence[float]) -> Float[np.ndarray, "M 3"]:
-        """Return true positions of places along the rod (m), by their fractions of its length."""
-        return self._output(BodyPositions(tuple(fractions))).reshape(-1, 3)
-
-    def poses(self, fractions: Sequence[float]) -> Float[np.ndarray, "M 7"]:
-        """Return true positions (m) and quaternions (w, x, y, z) of places along the rod."""
-        return self._output(BodyPoses(tuple(fractions))).reshape(-1, 7)
-
-    def _output(self, output: Any) -> Float[np.ndarray, " p"]:
-        state = self._stepper.state
-        y, z = np.asarray(state.y[-1]), np.asarray(state.z[-1])
-        return np.asarray(_evaluated(self.robot, y, z, output))
+    def true_state(self) -> Trajectory:
+        """Return the state at the last step of the rod, a trajectory of one row."""
+        return self._stepper.state
 
 
 def _places(robot: RoutedTendonRobot) -> list[tuple[Any, slice]]:
@@ -165,10 +151,3 @@ def _places(robot: RoutedTendonRobot) -> list[tuple[Any, slice]]:
         places.append((field, slice(start, start + field.size)))
         start += field.size
     return places
-
-
-def _evaluate(robot: Any, y: Any, z: Any, output: Any) -> Any:
-    return output.value(robot, y, z)
-
-
-_evaluated = jax.jit(_evaluate, static_argnames="output")
