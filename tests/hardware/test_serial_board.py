@@ -7,7 +7,7 @@ import time
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from knode_cosserat.hardware.board_link import BoardLink
@@ -366,6 +366,7 @@ def test_tensions_that_are_none_are_refused(board, wrong):
     st.floats(0.1, 300),
     st.floats(9, 60),
 )
+@example([([0.0] * 3, 0.0), ([0.0, 6.0, 6.0], 1.0), ([0.0] * 3, 0.0)], 2.0, 6.0, 74.0, 13.92)
 def test_limits_hold_after_any_commands(commands, low, high, rate, total):
     limiter = TensionLimiter(Limits(low, high, rate, total), 3)
     limiter.reset(0.0)

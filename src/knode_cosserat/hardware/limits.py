@@ -63,9 +63,10 @@ class TensionLimiter:
             target = target - above * (excess / above.sum())
         change = np.clip(target - self._last, -step, step)
         rise, fall = np.maximum(change, 0.0), np.minimum(change, 0.0)
-        room = limits.total - self._last.sum() - fall.sum()
+        # rounding makes the room of a full sum slightly negative
+        room = max(limits.total - self._last.sum() - fall.sum(), 0.0)
         if rise.sum() > room:
-            rise *= max(room, 0.0) / rise.sum()
+            rise *= room / rise.sum()
         self._last = np.maximum(self._last + rise + fall, 0.0)
         self._time = now
         result: Float[np.ndarray, " c"] = self._last.copy()
