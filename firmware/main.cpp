@@ -17,6 +17,8 @@ volatile uint16_t *const COMPARE[TENDONS] = {&OCR1A, &OCR1B, &OCR3A, &OCR3B};
 const uint16_t TOP_OF_PWM = 3999;
 // conversions of a channel in a tick: 4 · 8 conversions take 3.3 of 3.9 ms
 const uint8_t CONVERSIONS = 8;
+// contact of the emergency stop on pin 18 (port D, bit 3): normally closed, to GND
+const uint8_t CONTACT_PIN = 18, CONTACT_BIT = 3;
 // ticks without the main loop after which the motors are stopped (100 ms)
 const uint8_t LATE_TICKS = 26;
 
@@ -55,6 +57,8 @@ class SerialPort : public Port {
         return true;
     }
     void save(const Stored &stored) override { eeprom_update_block(&stored, nullptr, sizeof stored); }
+    // an open contact leaves the pin to its pull-up
+    bool is_contact_open() override { return PIND & _BV(CONTACT_BIT); }
     void drain() {
         while (tail_ != head_ && Serial.availableForWrite() > 0) {
             Serial.write(queue_[tail_]);
@@ -131,6 +135,7 @@ ISR(TIMER5_COMPA_vect) {
 
 void setup() {
     start_motors();
+    pinMode(CONTACT_PIN, INPUT_PULLUP);
     Serial.begin(115200);
     start_converter();
     start_clock();

@@ -32,10 +32,8 @@ def box(ax, low, high, title, colour="#f4f6f9", at=None):
     ax.text(x, y, title, ha="center", va="center", fontsize=10, weight="bold", linespacing=1.3)
 
 
-def wire(ax, points, colour, dashed=False):
-    ax.plot(
-        *zip(*points, strict=True), color=colour, lw=1.7, ls="--" if dashed else "-", solid_capstyle="round"
-    )
+def wire(ax, points, colour):
+    ax.plot(*zip(*points, strict=True), color=colour, lw=1.7, solid_capstyle="round")
 
 
 def pin(ax, x, y, name, side):
@@ -77,7 +75,7 @@ def draw_power(ax):
     """Supply, fuse, and the switch that cuts the motors' supply."""
     box(ax, (520, 20), (640, 80), "supply\n12 V DC", "#fdecea")
     box(ax, (700, 28), (770, 62), "fuse", "#fdecea")
-    box(ax, (830, 14), (985, 76), "emergency stop\nnormally closed", "#fbd5d1")
+    box(ax, (830, 14), (985, 76), "emergency stop\n2 normally closed", "#fbd5d1")
     wire(ax, [(640, 45), (700, 45)], POWER)
     wire(ax, [(770, 45), (830, 45)], POWER)
     wire(ax, [(985, 45), (1030, 45), (1030, 582)], POWER)
@@ -90,8 +88,8 @@ def draw_power(ax):
         ax.plot([x], [y], "o", ms=5.5, color=colour)
     # sense contact
     pin(ax, MEGA[1], 128, "D18", "right")
-    wire(ax, [(MEGA[1], 128), (905, 128), (905, 76)], SIGNAL, dashed=True)
-    ax.text(445, 119, "optional: normally open contact to GND, low = pressed", fontsize=8.5, color=SIGNAL)
+    wire(ax, [(MEGA[1], 128), (905, 128), (905, 76)], SIGNAL)
+    ax.text(445, 119, "second contact, to GND; 1 kohm to 5 V: low = released", fontsize=8.5, color=SIGNAL)
 
 
 def draw_board(ax):

@@ -7,6 +7,7 @@
 #include <simavr/avr_adc.h>
 #include <simavr/avr_eeprom.h>
 #include <simavr/avr_extint.h>
+#include <simavr/avr_ioport.h>
 #include <simavr/avr_uart.h>
 #include <simavr/sim_avr.h>
 #include <simavr/sim_elf.h>
@@ -17,12 +18,12 @@
 
 typedef struct {
     avr_t *avr;
-    avr_irq_t *to_chip, *analog[CHANNELS];
+    avr_irq_t *to_chip, *contact, *analog[CHANNELS];
     uint8_t out[QUEUE], in[QUEUE];
     uint32_t out_head, out_tail, in_head, in_tail;
     uint64_t next_byte;
     uint32_t millivolts[CHANNELS];
-    int failed;
+    int failed, open;
 } Emulator;
 
 // The byte time of 115200 baud (10 bits), in cycles of 16 MHz.
@@ -53,6 +54,16 @@ static void on_sleep(avr_t *avr, avr_cycle_count_t cycles) {
 // A reset starts this again.
 static void stop_polling(avr_t *avr) {
     for (int k = 0; k < 8; ++k) avr_extint_set_strict_lvl_trig(avr, (uint8_t)k, 0);
+}
+
+// Drives pin 18 (port D, bit 3): a closed contact pulls it down, an open one leaves it to the chip's pull-up.
+static void drive_contact(Emulator *self) {
+    avr_ioport_external_t external = {.name = 'D', .mask = self->open ? 0 : 1u << 3, .value = 0};
+    avr_ioctl(self->avr, AVR_IOCTL_IOPORT_SET_EXTERNAL('D'), &external);
+    avr_ioport_state_t state;
+    memset(&state, 0, sizeof state);
+    avr_ioctl(self->avr, AVR_IOCTL_IOPORT_GETSTATE('D'), &state);
+    avr_raise_irq(self->contact, self->open ? (state.port >> 3) & 1 : 0);
 }
 
 static void on_log(avr_t *avr, const int level, const char *format, va_list arguments) {
@@ -88,6 +99,8 @@ Emulator *emulator_open(const char *elf) {
     for (int k = 0; k < CHANNELS; ++k)
         self->analog[k] = avr_io_getirq(self->avr, AVR_IOCTL_ADC_GETIRQ, ADC_IRQ_ADC0 + k);
     self->to_chip = avr_io_getirq(self->avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_INPUT);
+    self->contact = avr_io_getirq(self->avr, AVR_IOCTL_IOPORT_GETIRQ('D'), IOPORT_IRQ_PIN3);
+    drive_contact(self);
     return self;
 }
 
@@ -122,6 +135,12 @@ uint32_t emulator_receive(Emulator *self, uint8_t *bytes, uint32_t size) {
     return count;
 }
 
+// Opens or closes the contact of the emergency stop.
+void emulator_contact(Emulator *self, int open) {
+    self->open = open;
+    drive_contact(self);
+}
+
 uint8_t emulator_register(const Emulator *self, uint16_t address) { return self->avr->data[address]; }
 
 // Reads (`write` 0) or writes EEPROM.
@@ -136,6 +155,7 @@ void emulator_reset(Emulator *self) {
     avr_reset(self->avr);
     stop_polling(self->avr);
     self->avr->cycle = cycle;
+    drive_contact(self);
     self->in_tail = self->in_head;
     self->out_tail = self->out_head;
 }

@@ -22,6 +22,8 @@ class Port {
     virtual void send(const char *bytes, uint8_t length) = 0;
     virtual bool load(Stored &stored) = 0;
     virtual void save(const Stored &stored) = 0;
+    // True if the contact of the emergency stop is open: the switch is pressed, or a wire is broken.
+    virtual bool is_contact_open() = 0;
 };
 
 class Board {
@@ -39,6 +41,7 @@ class Board {
         Text text;
         finish(text.add("# knode-tension " TENSION_VERSION " protocol 2 tendons ").add(int32_t(TENDONS)), false);
         if (!valid) latch(BAD_SETTINGS, 0);
+        else if (is_pressed()) latch(EMERGENCY_STOP, 0);
         else if (settings_.tare_on_start) begin_tare();
         else state_ = READY;
     }
@@ -63,6 +66,7 @@ class Board {
             counts_[k] = counts[k];
             tension_[k] = tension_of(counts[k], settings_.zero[k], settings_.gain[k]);
         }
+        check_emergency_stop();
         check_host();
         check_sensors();
         move();
@@ -170,6 +174,16 @@ class Board {
         if (framed_) text.add(int32_t(0)).add(' ');
         text.add("! fault ").add(FAULT_NAMES[fault]).add(':').add(int32_t(tendon));
         finish(text, framed_);
+    }
+
+    bool is_pressed() { return settings_.estop && port_.is_contact_open(); }
+
+    // Motors stop at once and are not released: after an emergency stop nothing moves by itself.
+    void check_emergency_stop() {
+        if (!is_pressed()) return;
+        latch(EMERGENCY_STOP, 0);
+        stop_motors();
+        state_ = FAULT;
     }
 
     void check_host() {
@@ -334,6 +348,7 @@ class Board {
 
     void reset() {
         if (state_ != FAULT) return refuse("state");
+        if (is_pressed()) return refuse(FAULT_NAMES[EMERGENCY_STOP]);
         fault_ = NO_FAULT;
         fault_tendon_ = 0;
         for (uint8_t k = 0; k < TENDONS; ++k) monitor_[k].reset();

@@ -7,10 +7,11 @@
 namespace tension {
 
 enum Fault : uint8_t {
-    NO_FAULT, OVER_TENSION, WATCHDOG, SENSOR_RAIL, SENSOR_STUCK, SLACK, TARE_TIMEOUT, STOPPED, BAD_SETTINGS
+    NO_FAULT, OVER_TENSION, WATCHDOG, SENSOR_RAIL, SENSOR_STUCK, SLACK, TARE_TIMEOUT, STOPPED, BAD_SETTINGS,
+    EMERGENCY_STOP
 };
 const char *const FAULT_NAMES[] = {"-",     "over-tension", "watchdog", "sensor-rail", "sensor-stuck",
-                                   "slack", "tare-timeout", "stopped",  "settings"};
+                                   "slack", "tare-timeout", "stopped",  "settings",    "emergency-stop"};
 
 class Monitor {
   public:

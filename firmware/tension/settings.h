@@ -36,6 +36,8 @@ struct Settings {
     int16_t tare_drive, tare_time, tare_rise;
     // 1: tare after power-on
     int16_t tare_on_start;
+    // 1: the contact of the emergency stop is watched
+    int16_t estop;
     // time without a change, or without tension, until a sensor or tendon counts as broken (ms)
     int16_t stuck_time, slack_time;
     // calibration of each load cell: 1/4096 gf per count, and counts of a slack tendon
@@ -67,6 +69,8 @@ const SettingRow ROWS[] = {
     {"tare_time", TENSION_INDEX(tare_time), 500, 20000, 5000},
     {"tare_rise", TENSION_INDEX(tare_rise), 10, 500, 40},
     {"tare_on_start", TENSION_INDEX(tare_on_start), 0, 1, 1},
+    // on by default: lost settings must not turn off an emergency stop
+    {"estop", TENSION_INDEX(estop), 0, 1, 1},
     {"stuck_time", TENSION_INDEX(stuck_time), 50, 2000, 250},
     {"slack_time", TENSION_INDEX(slack_time), 100, 5000, 1000},
     {"gain1", TENSION_INDEX(gain), 100, 32000, 2048},
@@ -101,7 +105,7 @@ struct Stored {
     Settings settings;
     uint16_t check;
 };
-const uint16_t STORED_VERSION = 1;
+const uint16_t STORED_VERSION = 2;
 
 inline uint16_t check_of(const Stored &stored) {
     uint16_t crc = CRC_START;

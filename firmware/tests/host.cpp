@@ -31,7 +31,7 @@ struct Random {
 };
 
 const char *const WORDS[] = {"tension", "arm",  "disarm", "stop", "reset", "tare", "keep", "get", "set", "save",
-                             "defaults", "hello", "drive", "kp", "limit", "zero1", "gain2", "watchdog", "-1", "0",
+                             "defaults", "hello", "drive", "kp", "estop", "limit", "zero1", "gain2", "watchdog", "-1", "0",
                              "100", "2300", "2301", "65535", "99999", "123456", "*", "1", "2", "3", "-80", "80"};
 
 // A line that is often almost right.
@@ -65,8 +65,9 @@ std::string frame(Random &random, uint16_t &sequence) {
     return body + (random.below(50) ? "\n" : "");
 }
 
-// True if the motors do what the state allows.
-bool is_safe(const Board &board) {
+// True if the motors do what the state allows. `open`: the contact of the emergency stop has been open for a tick.
+bool is_safe(const Board &board, bool open = false) {
+    if (open && board.settings().estop && (board.state() != FAULT || board.fault() == NO_FAULT)) return false;
     for (uint8_t k = 0; k < TENDONS; ++k) {
         const int16_t drive = board.drive(k);
         if (drive < -255 || drive > 255) return false;
@@ -118,6 +119,7 @@ uint64_t host_fuzz(uint64_t seed, uint64_t frames, uint64_t *armed) {
     uint16_t sequence = 0;
     int16_t counts[TENDONS] = {800, 800, 800, 800};
     uint64_t unsafe = 0;
+    bool open = false;
     for (uint64_t k = 0; k < frames; ++k) {
         std::string line = frame(random, sequence);
         if (random.below(64) == 0) line = random.below(2) ? "hello 2\n" : random.below(2) ? "hello 1\n" : "stop\n";
@@ -127,6 +129,7 @@ uint64_t host_fuzz(uint64_t seed, uint64_t frames, uint64_t *armed) {
             snprintf(text, sizeof text, "*%04X", crc16(body.data(), static_cast<uint8_t>(body.size())));
             line = board.is_framed() ? body + text + "\n" : "reset\n";
         }
+        script.set_contact(open = open ? random.below(8) : random.below(2000) == 0);
         for (const char byte : line) board.receive(byte);
         bool bad = !is_safe(board);
         for (uint32_t ticks = random.below(4); ticks > 0; --ticks) {
@@ -138,7 +141,7 @@ uint64_t host_fuzz(uint64_t seed, uint64_t frames, uint64_t *armed) {
             }
             board.tick(counts);
             if (board.state() == ARMED) ++*armed;
-            bad = bad || !is_safe(board);
+            bad = bad || !is_safe(board, open);
         }
         unsafe += bad;
     }

@@ -2,6 +2,7 @@
 //   s            start (again)
 //   r TEXT       the board receives the line TEXT
 //   t N a b c d  N ticks with the readings a to d (counts); prints state, fault, drives and tensions (gf/8)
+//   o N          opens (1) or closes (0) the contact of the emergency stop
 //   p W M …      steps of a PID: wanted and measured tensions (gf/8); prints the drives
 #pragma once
 #ifdef __AVR__
@@ -30,6 +31,8 @@ class Script : public Port {
         return true;
     }
     void save(const Stored &stored) override { stored_ = stored; }
+    bool is_contact_open() override { return open_; }
+    void set_contact(bool open) { open_ = open; }
 
     void run(char *line) {
         char *rest = line + (line[0] && line[1] ? 2 : 1);
@@ -42,6 +45,8 @@ class Script : public Port {
             board_.receive('\n');
         } else if (line[0] == 't') {
             tick(Words(rest));
+        } else if (line[0] == 'o') {
+            set_contact(*rest == '1');
         } else if (line[0] == 'p') {
             steer(Words(rest));
         }
@@ -75,6 +80,7 @@ class Script : public Port {
     }
 
     Print print_;
+    bool open_ = false;
     Stored stored_ = {};
     Board board_;
     Pid pid_;

@@ -31,7 +31,7 @@ class FakeBoard:
         self.framed, self.state, self.fault = False, "ready" if not taring else "taring", ""
         self.wanted, self.measured = [0] * 4, [0] * 4
         self.received, self.accepted, self.last = [], [], None
-        self.settings = {"kp": 300, "limit": limit, "jog": 80}
+        self.settings = {"kp": 300, "limit": limit, "jog": 80, "estop": 1}
         self.saved = False
         #: part of telemetry lines with one damaged byte, and of commands that the board reads damaged
         self.damage, self.damage_input = 0, 0

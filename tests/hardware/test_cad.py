@@ -380,6 +380,7 @@ def test_the_page_has_the_pins_of_the_firmware():
     rows = re.findall(
         r"^\| (\d) \| no\. \d.*?\| D(\d+) \((OC\d\w)\) \| D(\d+), D(\d+) \| A(\d) \|$", page, re.M
     )
+    assert re.findall(r"CONTACT_PIN = (\d+)", source) == ["18"] and "from D18 to GND" in page
     # motor k has bits 2 k and 2 k + 1 of port A: pins 22 + 2 k and 23 + 2 k
     wanted = [
         (str(k + 1), pin, name, str(22 + 2 * k), str(23 + 2 * k), str(k))

@@ -9,6 +9,7 @@ import knode_cosserat as kc
 from knode_cosserat.hardware.driver import DriverState, HardwareError, Limits
 from knode_cosserat.hardware.emulation import EmulatedPort, EmulatedRobot, PseudoTerminal, missing
 from knode_cosserat.hardware.emulation import robot as emulated
+from knode_cosserat.hardware.emulation.robot import Switch
 from knode_cosserat.hardware.lines import GRAM_FORCE
 from knode_cosserat.hardware.serial_board import SerialBoard
 
@@ -112,6 +113,75 @@ def test_faults_of_the_robot_are_caught(robot: EmulatedRobot, fault: str) -> Non
         # without power the gears hold
         assert np.all(robot.tension < 0.5)
     board.close()
+
+
+@pytest.mark.parametrize("switch", ["pressed", "broken"])
+def test_the_emergency_stop_stops_the_motors(robot: EmulatedRobot, switch: Switch) -> None:
+    board = board_of(robot)
+    board.arm()
+    tensions(board, robot, [400.0] * 4, 0.4)
+    board.command(np.full(4, 8.0))
+    robot.advance(1 / 64)
+    assert max(robot.chip.drives()) > 0.1, "the motors drive"
+    robot.switch = switch
+    # one tick, and the conversions before it
+    robot.advance(2 / 256)
+    assert robot.chip.drives() == [0.0] * 4
+    for _ in range(100):
+        robot.step()
+        assert robot.chip.drives() == [0.0] * 4, "nothing reels out by itself"
+    with pytest.raises(HardwareError, match="emergency stop"):
+        pull(board)
+    assert board.fault == "emergency-stop:0"
+    with pytest.raises(HardwareError, match="release the emergency stop first"):
+        board.reset()
+    robot.switch = "released"
+    board.wait(0.5)
+    assert board.fault == "emergency-stop:0" and robot.chip.drives() == [0.0] * 4
+    board.reset()
+    # disarmed; and the paper's plain lines
+    robot.switch = switch
+    board.wait(0.05)
+    assert board.fault == "emergency-stop:0"
+    with pytest.raises(HardwareError, match="emergency stop"):
+        board.arm()
+    robot.switch = "released"
+    board.reset()
+    board.arm()
+    tensions(board, robot, [200.0] * 4, 0.3)
+    assert np.min(robot.tension) > 100 * GRAM_FORCE, "works again"
+    board.close()
+
+
+def test_an_emergency_stop_at_the_start_and_a_board_without_one(robot: EmulatedRobot) -> None:
+    board = board_of(robot)
+    board.save_settings()
+    board.close()
+    robot.switch = "broken"
+    plain = SerialBoard(EmulatedPort(robot), LIMITS, protocol=1)
+    plain.connect()
+    with pytest.raises(HardwareError, match="emergency stop"):
+        plain.arm()
+    with pytest.raises(HardwareError, match="emergency stop"):
+        plain.reset()
+    assert plain.fault == "emergency-stop:0"
+    plain.close()
+    board = SerialBoard(EmulatedPort(robot), LIMITS)
+    board.connect()
+    assert board.fault == "emergency-stop:0" and robot.chip.drives() == [0.0] * 4, "no tare"
+    board.set_setting("estop", 0)
+    board.reset()
+    board.set_setting("tare_on_start", 0)
+    board.save_settings()
+    board.close()
+    plain = SerialBoard(EmulatedPort(robot), LIMITS, protocol=1)
+    plain.connect()
+    plain.arm()
+    tensions(plain, robot, [200.0] * 4, 0.3)
+    assert np.min(robot.tension) > 100 * GRAM_FORCE
+    plain.close()
+    with pytest.raises(HardwareError, match="released, pressed, broken"):
+        robot.switch = "on"  # type: ignore[assignment]
 
 
 def test_a_bad_cable_neither_moves_wrongly_nor_stops_the_loop(robot: EmulatedRobot) -> None:

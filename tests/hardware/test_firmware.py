@@ -79,6 +79,7 @@ def test_host_and_chip_do_the_same() -> None:
     lines += ["s", "r reset", *(f"p {a} {b}" for a in (0, 8 * 2300) for b in extremes), "r hello 2"]
     # sequence numbers wrap
     lines += [frame(n, "keep") for n in (40000, 65535, 0, 1, 65535, 32769, 1, 2)]
+    lines += ["o 1", REST, frame(3, "reset"), "o 0", frame(4, "reset"), REST]
     lines += [f"t 2 {counts(2400, 0, 0, 0)}", f"t 3 {counts(2400, 0, 0, 0)}", f"t 200 {counts(0, 0, 0, 0)}"]
     host = HostBoard()
     assert [host.run(line) for line in lines] == run_on_chip(lines)
@@ -183,6 +184,76 @@ def test_every_fault_releases_and_latches() -> None:
     checked(session, "tare-timeout", session.tick(1400, 0, 0, 0, 0))
     board = HostBoard()
     assert "! fault settings:0" in board.run("s")
+
+
+@pytest.mark.parametrize("state", ["ready", "armed", "taring", "releasing", "boot"])
+@pytest.mark.parametrize("framed", [True, False])
+def test_the_emergency_stop_stops_within_one_tick_and_latches(state: str, framed: bool) -> None:
+    session = Session(framed)
+    board = session.board
+
+    def told(text: str) -> str:
+        return session.say(text) if framed else board.run(f"r {text}")
+
+    if state == "taring" and not framed:
+        pytest.skip("plain boards tare at their start only")
+    if state in ("armed", "releasing"):
+        if framed:
+            session.say("arm")
+        told("tension 500 500 500 500" if framed else "500 500 500 500")
+        assert int(board.run(f"t 9 {counts(50, 50, 50, 50)}").split()[-8]) > 0, "a motor drives"
+    if state == "releasing":
+        told("disarm" if framed else "hello 1")
+    if state == "taring":
+        session.say("tare")
+        board.run(f"t 9 {counts(0, 0, 0, 0)}")
+    if state == "boot":
+        told("save" if framed else "hello 2")
+        if not framed:
+            session.say("save")
+    board.run("o 1")
+    found = board.run("s") if state == "boot" else board.run(f"t 1 {counts(50, 50, 50, 50)}")
+    assert "! fault emergency-stop:0" in found
+    for wait in (1, 200):
+        last = board.run(f"t {wait} {counts(50, 50, 50, 50)}").splitlines()[-1].split()
+        assert last[:6] == ["fault", "emergency-stop", "0", "0", "0", "0"]
+    if state == "boot" and framed:
+        board.run("r hello 2")
+    assert "! emergency-stop" in told("reset"), "latched while the contact is open"
+    board.run("o 0")
+    last = board.run(f"t 200 {counts(50, 50, 50, 50)}").splitlines()[-1].split()
+    assert last[:6] == ["fault", "emergency-stop", "0", "0", "0", "0"], "closing is no reset"
+    assert "! " not in told("reset")
+    assert board.run(f"t 1 {counts(0, 0, 0, 0)}").splitlines()[-1].startswith("ready -")
+
+
+def test_the_emergency_stop_ends_the_release_of_another_fault() -> None:
+    session = Session()
+    session.say("arm")
+    assert int(session.tick(3, 2400, 100, 100, 100)[2]) < 0, "reels out"
+    session.board.run("o 1")
+    assert session.tick(1, 2000, 100, 100, 100)[:6] == ["fault", "over-tension", "0", "0", "0", "0"]
+    assert "! emergency-stop" in session.say("reset")
+    session.board.run("o 0")
+    assert "= reset" in session.say("reset")
+
+
+def test_a_board_without_an_emergency_stop_is_usable_after_a_setting() -> None:
+    session = Session()
+    session.board.run("o 1")
+    assert session.tick(1, 0, 0, 0, 0)[1] == "emergency-stop", "on by default"
+    assert "= set estop 0" in session.say("set estop 0") and "= reset" in session.say("reset")
+    session.say("set tare_on_start 0")
+    session.say("save")
+    assert "fault" not in session.board.run("s")
+    # the paper's host: plain lines only
+    assert session.board.run("r 100 100 100 100") == ""
+    assert session.board.run(f"t 1 {counts(0, 0, 0, 0)}").splitlines()[-1].startswith("armed -")
+    session.board.run("r hello 2")
+    session.number = 0
+    session.tick(200, 0, 0, 0, 0)
+    session.say("defaults")
+    assert session.tick(1, 0, 0, 0, 0)[:2] == ["fault", "emergency-stop"], "default settings watch it"
 
 
 def test_settings_survive_a_restart_and_damage_is_noticed() -> None:

@@ -69,6 +69,11 @@ def test_a_fault_is_explained_and_cleared(folder):
         assert "fault slack at tendon 2" in result.stdout and "knode-cosserat robot reset" in result.stdout
         found = facts(run("robot", "reset", "--port", board.port, "--yes", "--save", "--json"))
         assert found["cleared"] == "slack:2" and found["state"] == "ready" and board.saved
+        assert board.settings["estop"] == 1
+        run("robot", "reset", "--port", board.port, "--yes", "--no-estop")
+        assert board.settings["estop"] == 0
+    result = run("robot", "reset", *words, "--no-estop")
+    assert "the setting 'estop' is unknown" in error(result)
     assert "no fault" in run("robot", "reset", *words).stdout
 
 

@@ -226,7 +226,7 @@ def test_every_fault_of_the_protocol_has_a_fix():
         .split("##")[0]
     )
     names = re.findall(r"^\| `([a-z-]+)` \|", text, re.MULTILINE)
-    assert len(names) == 8 and set(names) <= set(FAULTS)
+    assert len(names) == 9 and set(names) <= set(FAULTS)
     assert all("reset()" in fault_message(f"{name}:0") for name in names)
 
 

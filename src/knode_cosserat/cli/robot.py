@@ -78,13 +78,21 @@ def connect(port: Port, robot: RobotFile = None, yes: Yes = False, as_json: Json
 
 
 @hardware.command(
-    epilog=examples("robot reset --port /dev/ttyACM0", "robot reset --port /dev/ttyACM0 --save")
+    epilog=examples("robot reset --port /dev/ttyACM0", "robot reset --port /dev/ttyACM0 --no-estop --save")
 )
 def reset(
     port: Port,
     save: Annotated[
         bool, typer.Option("--save", help="Keep the board's settings and zeros in its EEPROM.")
     ] = False,
+    estop: Annotated[
+        bool | None,
+        typer.Option(
+            "--estop/--no-estop",
+            help="Watch the contact of the emergency stop, or not: none is wired.",
+            show_default="as it is",
+        ),
+    ] = None,
     robot: RobotFile = None,
     yes: Yes = False,
     as_json: Json = False,
@@ -98,11 +106,13 @@ def reset(
     machine = opened(port, robot)
     with connected(machine, yes) as driver:
         fault = driver.read().fault
+        board: Any = driver
+        if (save or estop is not None) and not hasattr(driver, "save_settings"):
+            raise ValueError(f"{machine.name} has no settings; leave out --save, --estop and --no-estop")
+        if estop is not None:
+            board.set_setting("estop", int(estop))
         driver.reset()
         if save:
-            board: Any = driver
-            if not hasattr(driver, "save_settings"):
-                raise ValueError(f"{machine.name} has no settings to save; leave out --save")
             board.save_settings()
         reading = driver.read()
     meaning = fault_message(fault).partition("; then reset()")[0] if fault else "there was no fault"

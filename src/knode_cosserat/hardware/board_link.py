@@ -44,6 +44,7 @@ REASONS = {
     "range": "a value is outside the board's range",
     "state": "not possible in the board's present state",
     "name": "the board has no setting of this name",
+    "emergency-stop": "release the emergency stop first; without one, turn off the setting estop",
     "busy": "the board is busy; try again",
 }
 #: reasons for which a line is sent again

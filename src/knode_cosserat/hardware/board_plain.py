@@ -46,11 +46,17 @@ def release(link: BoardLink, tendons: int) -> None:
 
 
 def reset(link: BoardLink) -> None:
-    """Ask the board to clear its fault, after its release of the tendons."""
+    """Ask the board to clear its fault, after its release of the tendons.
+
+    Raises:
+        HardwareError: the emergency stop is pressed.
+    """
     for _ in range(2):
         link.last_refusal = ""
         link.send_plain("reset")
         if link.until(lambda: link.last_refusal, 0.2) != "state":
             break
         link.until(lambda: None, 0.6)
+    if link.last_refusal == "emergency-stop":
+        raise HardwareError(fault_message("emergency-stop:0"))
     link.host_fault = link.plain_fault = ""

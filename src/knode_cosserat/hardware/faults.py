@@ -34,6 +34,10 @@ FAULTS: dict[str, tuple[str, str]] = {
         "the board's EEPROM held no valid settings",
         "check gains and calibration: reset() accepts those of the program, then tare() and save_settings()",
     ),
+    "emergency-stop": (
+        "the emergency stop is pressed, or its wire is broken; motors stand, tendons may be tensioned",
+        "release the switch; without one, join D18 and GND, or turn off the setting estop",
+    ),
     # found by the driver
     "restarted": (
         "the board restarted",

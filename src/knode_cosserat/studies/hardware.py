@@ -206,7 +206,10 @@ def faults(settings: Any) -> Product:
     """Inject faults at random; each must be caught, and the robot work again after it was mended."""
     robot, random = EmulatedRobot(), np.random.default_rng(2)
     board = connected(robot)
-    kinds = ("sensor-rail", "sensor-stuck", "over-tension", "watchdog", "stopped", "restarted")
+    kinds = (
+        *("sensor-rail", "sensor-stuck", "over-tension", "watchdog", "stopped", "restarted"),
+        "emergency-stop",
+    )
     missed: list[str] = []
     dead: list[str] = []
     for k in range(settings["runs"]):
@@ -220,6 +223,7 @@ def faults(settings: Any) -> Product:
             missed.append(f"{kind} ({board.fault or 'none'})")
         robot.cells.stuck[:] = np.nan
         robot.cells.offset[:] = offset
+        robot.switch = "released"
         board.wait(0.7)
         try:
             board.reset()
@@ -244,6 +248,8 @@ def _inject(robot: EmulatedRobot, board: SerialBoard, kind: str, tendon: int, ra
         robot.advance(0.15)
     elif kind == "stopped":
         board.stop()
+    elif kind == "emergency-stop":
+        robot.switch = random.choice(["pressed", "broken"])
     else:
         robot.chip.reset()
 

@@ -199,8 +199,10 @@ def _electronics(part: PartDimensions) -> list[Item]:
         Item("fuse with holder", 1, f"{math.ceil(current):g} A, slow", "supply"),
         Item(
             "emergency-stop switch", 1,
-            f"latching; normally closed contact for {math.ceil(current):g} A at 12 V DC; normally open "
-            "contact for the sense input (optional)",
-            "supply",
+            f"latching; two normally closed contacts: {math.ceil(current):g} A at 12 V DC, and a signal "
+            "contact (5 mA) for D18",
+            "supply; firmware",
         ),
+        Item("pull-up resistor", 1, "1 kohm, from D18 to 5 V: wets the contact", "emergency stop"),
+        Item("capacitor", 1, "100 nF, from D18 to GND, at the board", "emergency stop"),
     ]  # fmt: skip

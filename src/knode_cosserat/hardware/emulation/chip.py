@@ -35,6 +35,7 @@ class Chip:
         library.emulator_receive.restype = ctypes.c_uint32
         library.emulator_register.argtypes = [ctypes.c_void_p, ctypes.c_uint16]
         library.emulator_register.restype = ctypes.c_uint8
+        library.emulator_contact.argtypes = [ctypes.c_void_p, ctypes.c_int]
         library.emulator_eeprom.argtypes = [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_uint16, ctypes.c_int]
         library.emulator_reset.argtypes = [ctypes.c_void_p]
         library.emulator_close.argtypes = [ctypes.c_void_p]
@@ -82,6 +83,10 @@ class Chip:
             direction = port >> (2 * tendon) & 3
             drives.append(size if direction == 1 else -size if direction == 2 else 0.0)
         return drives
+
+    def set_contact(self, is_open: bool) -> None:
+        """Open or close the contact of the emergency stop at pin D18; it is closed at the start."""
+        self._library.emulator_contact(self._chip, int(is_open))
 
     def eeprom(self, count: int = 4096) -> bytes:
         """Return the first bytes of EEPROM."""

@@ -48,14 +48,18 @@ class Motors:
         self.current, self.speed = np.zeros(count), np.zeros(count)
         self.rotor, self.position = np.zeros(count), np.zeros(count)
 
-    def step(self, drive: Float[np.ndarray, " c"], tension: Float[np.ndarray, " c"], h: float) -> None:
-        """Move on by `h` (s) under duty cycles and tensions (N)."""
+    def step(
+        self, drive: Float[np.ndarray, " c"], tension: Float[np.ndarray, " c"], h: float, powered: bool = True
+    ) -> None:
+        """Move on by `h` (s) under duty cycles and tensions (N). Without power the motors turn freely."""
         p = self.parameters
         back_emf, force_per_current = p.voltage / p.speed, p.force * p.resistance / p.voltage
         # current at the end of the step: a - b v
         divisor = 1.0 + h * p.resistance / p.inductance
         a = (self.current + h / p.inductance * p.voltage * drive) / divisor
         b = h / p.inductance * back_emf / divisor
+        if not powered:
+            a, b = np.zeros_like(a), 0.0
         inertia = p.mass / h + force_per_current * b
         free = (p.mass / h * self.speed + force_per_current * a - tension) / inertia
         self.speed = np.sign(free) * np.maximum(np.abs(free) - p.friction / inertia, 0.0)

@@ -5,7 +5,7 @@ Chip and robot move in lock-step; the same commands give the same bits.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 from jaxtyping import Float
@@ -32,6 +32,9 @@ STEPS, ROD_STEPS = 512, 4
 ROBOT = "delrin-routed-tendon-robot"
 #: length (m) taken in by each reel for the linearisation: some 4 N in each tendon
 TAUT = 1.0e-3
+#: emergency stop: released, pressed (the contact opens and the motors lose their supply), or its wire to the
+#: board is broken
+Switch = Literal["released", "pressed", "broken"]
 #: compliance of a tendon of 0.6 m with its load cell (m/N)
 COMPLIANCE = 2.0e-4
 
@@ -90,11 +93,24 @@ class EmulatedRobot(TrueShape):
         self._reeled, self._reel_rate = self.motors.position.copy(), np.zeros(4)
         self.tension = np.zeros(4)
         self.chip, self._count = Chip(), 0
+        self._switch: Switch = "released"
 
     @property
     def time(self) -> float:
         """Time since the chip's start (s)."""
         return self._count / STEPS
+
+    @property
+    def switch(self) -> Switch:
+        """Emergency stop: "released", "pressed" (cuts the motors' supply too), or "broken" (its wire)."""
+        return self._switch
+
+    @switch.setter
+    def switch(self, value: Switch) -> None:
+        if value not in get_args(Switch):
+            raise HardwareError(f"switch must be one of {', '.join(get_args(Switch))} (got {value!r})")
+        self._switch = value
+        self.chip.set_contact(value != "released")
 
     def advance(self, seconds: float) -> None:
         """Move chip and robot on by some time (s), rounded to 1/512 s."""
@@ -105,7 +121,7 @@ class EmulatedRobot(TrueShape):
         """Move chip and robot on by 1/512 s."""
         self.chip.run(CLOCK // STEPS, self.cells.millivolts(self.tension))
         h = 1.0 / STEPS
-        self.motors.step(np.array(self.chip.drives()), self.tension, h)
+        self.motors.step(np.array(self.chip.drives()), self.tension, h, self._switch != "pressed")
         self._count += 1
         if self._count % ROD_STEPS:
             since = (self._count % ROD_STEPS) * h
