@@ -271,6 +271,17 @@ def test_a_board_that_restarts_is_found_again(board):
         robot.arm()
 
 
+def test_a_board_that_restarts_within_a_line_is_found_too(board):
+    with driver(board) as robot:
+        robot.arm()
+        # the banner follows a line that was cut off
+        board.write(b"7 : 3 arm")
+        board.restart()
+        assert eventually(lambda: robot.fault == "restarted:0")
+        robot.reset()
+        assert robot.is_framed and robot.state is DriverState.READY
+
+
 # damage
 
 

@@ -47,6 +47,8 @@ REASONS = {
     "emergency-stop": "release the emergency stop first; without one, turn off the setting estop",
     "busy": "the board is busy; try again",
 }
+#: plain telemetry lines in a row from which on a framed board must have restarted
+PLAIN_LINES = 3
 #: reasons for which a line is sent again
 DAMAGED = ("checksum", "frame")
 T = TypeVar("T")
@@ -91,7 +93,7 @@ class BoardLink:
         self._timed: deque[tuple[int, float]] = deque(maxlen=256)
         self._round_trips: deque[float] = deque(maxlen=100)
         self._splitter = LineSplitter()
-        self._number = 0
+        self._number = self._plain_lines = 0
         self._called = transport.now()
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
@@ -305,8 +307,16 @@ class BoardLink:
             message = decoder(line)
             if message is None:
                 self.counts["damaged"] += 1
+                if self.mode == "framed":
+                    self._look_for_plain(line)
             else:
                 self._take(message, now)
+
+    def _look_for_plain(self, line: bytes) -> None:
+        """Notice a board that restarted, and whose banner was damaged or follows a line that was cut off."""
+        self._plain_lines += isinstance(decode_plain(line), Telemetry)
+        if self._plain_lines >= PLAIN_LINES:
+            self.host_fault, self.plain_line = "restarted:0", b""
 
     def _take(self, message: Message, now: float) -> None:
         match message:
@@ -337,7 +347,7 @@ class BoardLink:
         last = self.telemetry
         if last is not None and last.number is not None and message.number is not None:
             self.counts["lost telemetry"] += (message.number - last.number - 1) % 65536
-        self.telemetry, self.arrival = message, now
+        self.telemetry, self.arrival, self._plain_lines = message, now, 0
         self.arrivals += 1
         while self._timed and message.acknowledged is not None:
             number, sent = self._timed[0]

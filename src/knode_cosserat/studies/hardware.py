@@ -12,37 +12,34 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
-from knode_cosserat import controls
-from knode_cosserat.control.commands import ControlLimits
-from knode_cosserat.control.lag import identified_lag
 from knode_cosserat.control.loop import run_loop
-from knode_cosserat.control.named import controller_named
 from knode_cosserat.control.references import circle, figure_eight
-from knode_cosserat.estimation.outputs import TipPosition
 from knode_cosserat.evaluation.tables import markdown_table
-from knode_cosserat.hardware.driver import DriverState, HardwareError, Limits
-from knode_cosserat.hardware.emulation.port import EmulatedPort
-from knode_cosserat.hardware.emulation.robot import ROBOT, EmulatedRobot
+from knode_cosserat.hardware.driver import DriverState, HardwareError
+from knode_cosserat.hardware.emulation.robot import EmulatedRobot
 from knode_cosserat.hardware.emulation.toolchain import built, firmware_folder, missing
 from knode_cosserat.hardware.lines import GRAM_FORCE
 from knode_cosserat.hardware.plant import HardwarePlant
-from knode_cosserat.hardware.serial_board import SerialBoard
-from knode_cosserat.rods.load_cells import LoadCells
-from knode_cosserat.rods.robot_file import load_robot
+from knode_cosserat.studies.hardware_faults import faults, loop_faults
+from knode_cosserat.studies.hardware_rig import (
+    DT,
+    HIGH,
+    Cable,
+    connected,
+    loop_controller,
+    measured_lag,
+    measured_tip,
+    tensions,
+    true_robot,
+)
 from knode_cosserat.studies.report import Report, as_json, write_texts
 from knode_cosserat.studies.runner import Job, Product, run
-from knode_cosserat.studies.stand_in import DAMPING, NOISE, OFFSETS
 
-#: period of the loop (s), and its tension limits (N, N/s)
-DT, LOW, HIGH, RATE = 0.05, 0.5, 12.0, 40.0
-#: limits of the driver: wider than those of the controller
-DRIVER = Limits(0.0, 15.0, 1e4, 60.0)
 #: tip RMSE of the PyElastica stand-in in the study `control` (% of length), and the allowed multiple of it
 STAND_IN, FACTOR = 0.18, 1.5
-#: part of the host's bits that the cable flips in the closed loop
-BIT_ERRORS = 1e-5
+#: jobs that measure a speed
+ALONE = ("repeat", "dds")
 
 
 def jobs(quick: bool) -> list[Job]:
@@ -54,6 +51,7 @@ def jobs(quick: bool) -> list[Job]:
         Job("watchdog", watchdog, {"runs": 5 if quick else 50}),
         Job("faults", faults, {"runs": 20 if quick else 200}),
         Job("repeat", repeat, {}),
+        Job("loop-faults", loop_faults, {"runs": 8 if quick else 40}),
         Job("loop", loop, {"seconds": 60.0 if quick else 600.0}),
     ]
     if importlib.util.find_spec("cyclonedds"):
@@ -74,14 +72,21 @@ def rerun(out: Path, quick: bool = False, **how: Any) -> Report:
     """
     if reason := missing():
         raise HardwareError(f"the study needs the firmware's tools: {reason}")
-    made = checks(run(jobs(quick), out, **how))
+    made = checks(facts_of(jobs(quick), out, **how))
     texts = {"hardware.json": as_json(made), "hardware.md": as_markdown(made)}
     return Report(made, write_texts(out, texts), [])
 
 
+def facts_of(jobs: Sequence[Job], out: Path, **how: Any) -> dict[str, dict[str, Any]]:
+    """Return the facts of all jobs. Those of `ALONE` run at the end in this process, beside no other job."""
+    facts = run([job for job in jobs if job.key not in ALONE], out, **how)
+    how |= {"workers": 1, "dask": None}
+    return facts | run([job for job in jobs if job.key in ALONE], out, **how)
+
+
 def checks(facts: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the figures of the study with their limits: check, value, limit, ok."""
-    found, fastest = facts["steps"], facts["loop"]
+    found, fastest, injected = facts["steps"], facts["loop"], facts["loop-faults"]
     listed = [
         ("build of the firmware (s)", facts["build"]["seconds"], 60.0),
         ("flash (bytes)", facts["build"]["flash"], 253_952),
@@ -96,6 +101,9 @@ def checks(facts: Mapping[str, Any]) -> list[dict[str, Any]]:
         ("closed loop: tip RMSE, worst reference (% of length)", fastest["rmse"], FACTOR * STAND_IN),
         ("closed loop: periods above the tension limit", fastest["unsafe"], 0),
         ("closed loop: faults", fastest["faults"], 0),
+        ("faults within the closed loop that were not caught", injected["missed"], 0),
+        ("faults within the closed loop that were not recovered from", injected["dead"], 0),
+        ("closed loop with faults: unsafe periods", injected["unsafe"], 0),
     ]
     if "dds" in facts:
         listed.append(("DDS on this host: p99 (ms)", facts["dds"]["p99"], 1.0))
@@ -145,25 +153,6 @@ def fuzz(settings: Any) -> Product:
     return Product({"unsafe": sum(f.unsafe for f in found), "armed": sum(f.armed for f in found)}, {})
 
 
-def connected(robot: EmulatedRobot, damage: Any = None) -> SerialBoard:
-    """Return a tared board in front of an emulated robot."""
-    board = SerialBoard(EmulatedPort(robot, damage), DRIVER, measured_high=40.0)
-    board.connect()
-    board.reset()
-    board.tare()
-    return board
-
-
-def tensions(board: SerialBoard, robot: EmulatedRobot, grams: Any, seconds: float) -> Float[Any, "T c"]:
-    """Return true tensions (gf) in steps of 1/256 s after a command (gf)."""
-    board.command(np.asarray(grams, dtype=float) * GRAM_FORCE)
-    rows = []
-    for _ in range(round(256 * seconds)):
-        board.wait(1.0 / 256.0)
-        rows.append(robot.tension / GRAM_FORCE)
-    return np.array(rows)
-
-
 def steps(settings: Any) -> Product:
     """Measure the response of all tensions to steps, and the rate of the control loop."""
     robot = EmulatedRobot()
@@ -202,70 +191,6 @@ def watchdog(settings: Any) -> Product:
     return Product({"left": left}, {})
 
 
-def faults(settings: Any) -> Product:
-    """Inject faults at random; each must be caught, and the robot work again after it was mended."""
-    robot, random = EmulatedRobot(), np.random.default_rng(2)
-    board = connected(robot)
-    kinds = (
-        *("sensor-rail", "sensor-stuck", "over-tension", "watchdog", "stopped", "restarted"),
-        "emergency-stop",
-    )
-    missed: list[str] = []
-    dead: list[str] = []
-    for k in range(settings["runs"]):
-        kind, tendon = kinds[k % len(kinds)], int(random.integers(0, 4))
-        board.arm()
-        tensions(board, robot, random.uniform(150.0, 500.0, 4), 0.4)
-        offset = robot.cells.offset.copy()
-        _inject(robot, board, kind, tendon, random)
-        caught = _is_caught(robot, board)
-        if not caught or not board.fault.startswith(kind):
-            missed.append(f"{kind} ({board.fault or 'none'})")
-        robot.cells.stuck[:] = np.nan
-        robot.cells.offset[:] = offset
-        robot.switch = "released"
-        board.wait(0.7)
-        try:
-            board.reset()
-            if board.fault:
-                board.reset()
-            board.tare()
-        except HardwareError as error:
-            dead.append(f"{kind}: {error}")
-            robot = EmulatedRobot()
-            board = connected(robot)
-    return Product({"missed": len(missed), "dead": len(dead), "listed": missed + dead}, {})
-
-
-def _inject(robot: EmulatedRobot, board: SerialBoard, kind: str, tendon: int, random: Any) -> None:
-    if kind == "sensor-rail":
-        robot.cells.stuck[tendon] = random.choice([0.0, 5.0])
-    elif kind == "sensor-stuck":
-        robot.cells.freeze(tendon)
-    elif kind == "over-tension":
-        robot.cells.offset[tendon] += 3.2
-    elif kind == "watchdog":
-        robot.advance(0.15)
-    elif kind == "stopped":
-        board.stop()
-    elif kind == "emergency-stop":
-        robot.switch = random.choice(["pressed", "broken"])
-    else:
-        robot.chip.reset()
-
-
-def _is_caught(robot: EmulatedRobot, board: SerialBoard) -> bool:
-    """Return True if the driver refuses commands within 3 s, and no motor reels in afterwards."""
-    try:
-        for k in range(60):
-            board.command(np.full(4, 3.0 + 0.2 * k))
-            board.wait(DT)
-    except HardwareError:
-        robot.advance(0.05)
-        return max(robot.chip.drives()) <= 0.0
-    return False
-
-
 def repeat(settings: Any) -> Product:
     """Compare two runs of the same commands bit by bit, and measure the speed of the emulation."""
 
@@ -288,23 +213,14 @@ def repeat(settings: Any) -> Product:
 def loop(settings: Any) -> Product:
     """Close the whole loop: controller, driver, serial line with bit errors, firmware, motors, rod."""
     random = np.random.default_rng(4)
-
-    def damaged(data: bytes) -> bytes:
-        flips = random.random((len(data), 8)) < BIT_ERRORS
-        masks = (flips * (1 << np.arange(8))).sum(axis=1)
-        return bytes(byte ^ int(mask) for byte, mask in zip(data, masks, strict=True))
-
-    truth: Any = load_robot(ROBOT)
-    truth = truth.replace(bending_damping=DAMPING)
-    robot = EmulatedRobot(truth)
-    board = connected(robot, damaged)
+    robot = EmulatedRobot(true_robot())
+    board = connected(robot, Cable(random))
     lag = measured_lag(board)
-    model = truth.replace(load_cells=LoadCells(gain=np.ones(4), offset=np.zeros(4)))
-    limits = ControlLimits(LOW, HIGH, RATE, lag=lag)
-    controller = controller_named("predictive", model, DT, limits, [OFFSETS], TipPosition(sigma=5e-4))
+    controller = loop_controller(lag)
+    length = float(robot.robot.length)
     errors, unsafe, failed, missing_rows = {}, 0, 0, 0
     for name, path in {"circle": circle(0.1, period=4.0), "eight": figure_eight(0.1, period=6.0)}.items():
-        plant = HardwarePlant(board, lambda: _measured(robot, random), DT, clock=lambda: robot.time)
+        plant = HardwarePlant(board, lambda: measured_tip(robot, random), DT, clock=lambda: robot.time)
         try:
             log = run_loop(controller, plant, path, settings["seconds"])
         except HardwareError as error:
@@ -315,7 +231,7 @@ def loop(settings: Any) -> Product:
             if kept is None:
                 continue
             log = kept
-        errors[name] = 100.0 * log.tip_rmse(6.0) / float(truth.length)
+        errors[name] = 100.0 * log.tip_rmse(6.0) / length
         unsafe += int(np.sum(log.control > HIGH + 0.02))
         missing_rows += log.fallbacks
         if board.state is DriverState.ARMED:
@@ -326,23 +242,6 @@ def loop(settings: Any) -> Product:
         "faults": failed, "fallbacks": missing_rows, "damaged_lines": dict(board.line_counts),
     }  # fmt: skip
     return Product(facts, {})
-
-
-def measured_lag(board: SerialBoard) -> float:
-    """Return the time constant (s) of the tensions, from random steps of 0.4 s."""
-    commands = controls.random(150, low=1.0, high=6.0, seed=5, hold=8)
-    board.arm()
-    commanded, measured = [], []
-    for command in commands:
-        commanded.append(board.command(command))
-        board.wait(DT)
-        measured.append(board.read().tension)
-    board.disarm()
-    return identified_lag(np.array(commanded[8:]), np.array(measured[8:]), DT, measured[7])
-
-
-def _measured(robot: EmulatedRobot, random: np.random.Generator) -> tuple[float, Float[Any, "3"]]:
-    return robot.time, robot.tip() + NOISE * random.normal(size=3)
 
 
 def dds(settings: Any) -> Product:
