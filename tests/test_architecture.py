@@ -21,6 +21,7 @@ LAYERS = (
         "_jax",
         "_lazy",
         "_numbers",
+        "_processes",
         "_programs",
         "_registry",
         "_reprs",
@@ -38,7 +39,7 @@ LAYERS = (
     ("learning", "calibration"),
     ("identification",),
     ("evaluation", "figures"),
-    ("viewer", "diagnosis"),
+    ("viewer", "diagnosis", "sweeps"),
     # the public names: `import knode_cosserat`
     ("",),
     ("studies",),

@@ -12,7 +12,7 @@ import jax
 from knode_cosserat._programs import limit_programs
 
 
-def _machine() -> str:
+def machine_name() -> str:
     """Return a short name of the CPU model: a program compiled for one may be illegal on another."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
@@ -29,12 +29,12 @@ def cache_directory() -> Path | None:
     """
     chosen, given = os.environ.get("KNODE_COSSERAT_CACHE"), os.environ.get("XDG_CACHE_HOME")
     if chosen:
-        return Path(chosen) / _machine()
+        return Path(chosen) / machine_name()
     try:
         home = Path(given) if given else Path.home() / ".cache"
     except RuntimeError:  # neither $HOME nor an entry in the user database, as in some containers
         return None
-    return home / "knode-cosserat" / _machine()
+    return home / "knode-cosserat" / machine_name()
 
 
 def configure() -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import knode_cosserat as kc
+from knode_cosserat import _processes
 from knode_cosserat.studies import runner
 from knode_cosserat.studies.runner import Job, StudyError, run
 
@@ -171,7 +172,7 @@ if __name__ == "__main__":
 
 
 def test_without_a_scheduler_there_is_one_line(tmp_path, work, monkeypatch):
-    monkeypatch.setattr(runner, "PATIENCE", 0.3)
+    monkeypatch.setattr(_processes, "PATIENCE", 0.3)
     with pytest.raises(StudyError, match=r"no Dask scheduler answers at 'tcp://127\.0\.0\.1:1'"):
         run(squares(work, tmp_path), tmp_path, dask="tcp://127.0.0.1:1")
     with pytest.raises(StudyError, match="no Dask scheduler answers at 'nonsense://1'"):

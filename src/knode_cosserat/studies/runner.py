@@ -16,7 +16,6 @@ import json
 import multiprocessing
 import os
 import platform
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -26,14 +25,13 @@ from tqdm import tqdm
 
 import knode_cosserat
 from knode_cosserat._files import package_version, replacing
+from knode_cosserat._processes import dask_client, end_with_parent
 from knode_cosserat.errors import KnodeCosseratError
 
 #: packages whose versions may change a figure
 PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "equinox", "optax")
 #: cores for each process, if it is not said how many; measured on two cores: 44 s in one process, 68 s in two
 CORES = 4
-#: time limits for a Dask cluster to answer, and to have a worker (s)
-PATIENCE = 60
 
 
 class StudyError(KnodeCosseratError, ValueError):
@@ -195,7 +193,7 @@ def _ran(jobs: Sequence[Job], workers: int, dask: str | None) -> Iterator[tuple[
 def _in_processes(jobs: Sequence[Job], workers: int) -> Iterator[tuple[Job, _Done]]:
     # spawned: JAX has threads, and a fork of it deadlocks
     pool = concurrent.futures.ProcessPoolExecutor(
-        workers, multiprocessing.get_context("spawn"), initializer=_end_with_parent
+        workers, multiprocessing.get_context("spawn"), initializer=end_with_parent
     )
     try:
         futures = {pool.submit(_do, job.work, job.settings): job for job in jobs}
@@ -211,33 +209,11 @@ def _in_processes(jobs: Sequence[Job], workers: int) -> Iterator[tuple[Job, _Don
         pool.shutdown(cancel_futures=True)
 
 
-def _end_with_parent() -> None:
-    """End this worker with its parent: a worker that waits for jobs does not notice the parent's end."""
-    parent = multiprocessing.parent_process()
-
-    def watch() -> None:
-        if parent is not None:
-            parent.join()
-            os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
 def _on_dask(jobs: Sequence[Job], address: str) -> Iterator[tuple[Job, _Done]]:
-    try:
-        from distributed import Client, as_completed
-    except ImportError:
-        raise ImportError("a Dask cluster needs dask: pip install 'knode-cosserat[dask]'") from None
-    try:
-        # not the default for whatever else in this process can use Dask, such as writing files
-        client = Client(address, timeout=PATIENCE, set_as_default=False)
-    except (OSError, ValueError) as error:
-        raise StudyError(f"no Dask scheduler answers at {address!r}: {error}") from None
+    client = dask_client(address, StudyError)
+    from distributed import as_completed
+
     with client:
-        try:
-            client.wait_for_workers(1, timeout=PATIENCE)
-        except TimeoutError:
-            raise StudyError(f"the Dask cluster at {address!r} has no workers") from None
         futures = {client.submit(_do, job.work, job.settings, pure=False): job for job in jobs}
         for future in as_completed(futures, loop=client.loop):
             yield futures[future], future.result()

@@ -1,0 +1,303 @@
+"""Solution of the cases of a shard: compiled chunks, of which only the stored quantities are kept.
+
+Results do not depend on the number of threads or processes: chunks have a fixed size, and every chunk is one
+call of one compiled program. Recovery has no limit of time, for the same reason.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from knode_cosserat.rods.system import System
+from knode_cosserat.rods.trained_range import without_range
+from knode_cosserat.solvers.history import SolverState, rest_record
+from knode_cosserat.solvers.initial import initial_state
+from knode_cosserat.solvers.recovery import Budget, likely_cause
+from knode_cosserat.solvers.replay import at_one_state, history_settings
+from knode_cosserat.solvers.result import Result, SimulationError
+from knode_cosserat.solvers.run import (
+    COARSE_SHARE,
+    LEAST_CAPACITY,
+    InitialState,
+    TimeIntegration,
+    padded_rows,
+    usable_cores,
+)
+from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.time_loop import StepCoefficients, loop_many
+from knode_cosserat.sweeps.plan import Cases, Plan
+
+#: robots that one call of the program solves: on a CPU one after the other, on a GPU in lockstep
+CHUNK, LOCKSTEP_CHUNK = 16, 1024
+#: quantities that are functions of y
+_OF_Y = ("tip_position", "tip_quaternion", "position")
+
+
+class Start(NamedTuple):
+    """Initial states of a chunk: y and z at the nodes, and the histories of the first step."""
+
+    record: Any
+    history: Any
+
+
+class Settled(NamedTuple):
+    """Initial states of a chunk that had to be solved for; see `_settled`."""
+
+    start: Start | None
+    #: true where the grid was too coarse
+    coarse: Any
+    #: by case, the reasons of equilibria that were not found
+    reasons: dict[int, str]
+
+
+@functools.partial(jax.jit, static_argnames=("settings", "steps", "store", "lockstep"))
+def solve_chunk(  # type: ignore[no-untyped-def]
+    robot, values, initial, controls, coefficients, *, settings, steps, store, lockstep
+):
+    """Return results and stored quantities of a chunk of cases, as one compiled program.
+
+    Args:
+        robot: the robot whose parameters are replaced.
+        values: parameters (cases, …) by name.
+        initial: initial state of the cases; None for rest.
+        controls: (cases, steps, c).
+        coefficients: of the time steps.
+        settings: numerical settings.
+        steps: number of steps.
+        store: names of the stored quantities.
+        lockstep: solve all robots side by side.
+    """
+    systems = jax.vmap(lambda own: robot.replace(**own))(values) if values else robot
+    if initial is None:
+        at = initial_state(systems, settings, len(controls))
+        initial = Start(at.record, at.state.history)
+    done, _, rows = loop_many(systems, settings, coefficients, controls, initial.history, steps, lockstep)
+    ny, nz = robot.y_layout.size, robot.z_layout.size
+    records = jnp.concatenate([initial.record[:, None, :, : ny + nz], rows.records[..., : ny + nz]], axis=1)
+    solved = jnp.concatenate([jnp.zeros((len(controls), 1), dtype=int), rows.result], axis=1)
+    errors = jnp.concatenate([jnp.zeros((len(controls), 1)), rows.position_error], axis=1)
+    records = jnp.where((solved < 0)[..., None, None], jnp.nan, records)
+    found = stored_of(systems, records, store)
+    length = jnp.broadcast_to(jnp.asarray(systems.length), (len(controls),))
+    return done, solved, jnp.where(solved < 0, jnp.nan, errors), length, found
+
+
+def stored_of(systems: System, records: Any, store: tuple[str, ...]) -> dict[str, Any]:
+    """Return stored quantities of records (cases, rows, nodes, y and z) of one system or of as many."""
+    ny = systems.y_layout.size
+    y, z = records[..., :ny], records[..., ny:]
+    known = {
+        "tip_position": lambda one, y: one.positions(y[:, -1]),
+        "tip_quaternion": lambda one, y: one.quaternions(y[:, -1]),
+        "position": lambda one, y: one.positions(y),
+    }
+    axes = (0 if jnp.ndim(systems.length) else None, 0)
+    found = {name: jax.vmap(known[name], in_axes=axes)(systems, y) for name in store if name in known}
+    return found | {name: each for name, each in (("y", y), ("z", z)) if name in store}
+
+
+class Solver:
+    """Solver of a plan's shards."""
+
+    def __init__(self, plan: Plan, threads: int | None = None):
+        """Prepare a plan; by default with one thread for each core that this process may use."""
+        self.plan = plan
+        self.lockstep = jax.default_backend() != "cpu"
+        self.threads = 1 if self.lockstep else threads or usable_cores()
+        self.chunk = LOCKSTEP_CHUNK if self.lockstep else CHUNK
+        self._compiled: set[int] = set()
+
+    def shard(self, number: int) -> dict[str, Any]:
+        """Return the columns of a shard, by name."""
+        plan = self.plan
+        robot, _, _ = plan.span(number)
+        cases = plan.cases(number)
+        size = len(cases.case)
+        firsts = range(0, size, self.chunk)
+
+        def work(first: int) -> Any:
+            return self._chunk(robot, cases, first)
+
+        # JAX may crash if one thread stores a program on disk while another compiles it
+        begun = [] if robot in self._compiled else [work(firsts[0])]
+        self._compiled.add(robot)
+        if self.threads == 1:
+            parts = begun + [work(first) for first in firsts[len(begun) :]]
+        else:
+            with concurrent.futures.ThreadPoolExecutor(self.threads) as pool:
+                parts = begun + list(pool.map(work, firsts[len(begun) :]))
+        columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        if "controls" in plan.sweep.store:
+            columns["controls"] = cases.controls
+        single = plan.sweep.precision == "single"
+        for name in plan.sweep.store:
+            columns[name] = columns[name].astype(np.float32 if single else np.float64, copy=False)
+        keys = {
+            "case": cases.case,
+            "robot": np.full(size, robot, dtype=np.int32),
+            "word": cases.word.astype(np.int32),
+            "seed": cases.seed,
+        }
+        return keys | cases.values | columns
+
+    def _chunk(self, robot: int, cases: Cases, first: int) -> dict[str, Any]:
+        """Return result, position error, reason and stored quantities of a chunk of cases."""
+        plan, size = self.plan, len(cases.case)
+        count = min(self.chunk, size - first)
+        # the last chunk is filled with its last case: one shape, one program
+        index = np.minimum(np.arange(first, first + self.chunk), size - 1)
+        bare, settings, steps = _bare(plan, robot), plan.settings, plan.sweep.steps
+        values = {name: each[index] for name, each in plan.robot_values(robot, cases.values).items()}
+        settled = _settled(plan, robot, values, self.chunk)
+        task = TimeIntegration(settings, plan.sweep.dt, steps)
+        coefficients = StepCoefficients(*map(jnp.asarray, task.coefficients))
+        found = solve_chunk(
+            bare, values, settled.start, cases.controls[index], coefficients, settings=settings, steps=steps,
+            store=plan.sweep.store, lockstep=self.lockstep,
+        )  # fmt: skip
+        done, result, error, length, stored = jax.tree.map(lambda leaf: np.array(leaf[:count]), found)
+        columns = {"result": result, "position_error": error} | stored
+        reasons = [""] * count
+        for k in range(count):
+            cause = cases.refused.get(first + k) or settled.reasons.get(k)
+            if cause:
+                _mark_unsolved(columns, k, 0)
+                reasons[k] = cause
+            elif done[k] < steps:
+                own = {name: each[k] for name, each in values.items()}
+                system = bare.replace(**own) if own else bare
+                reasons[k] = self._failed(system, task, cases.controls[first + k], columns, k)
+        _mark_coarse(columns, length, settled.coarse[:count])
+        return columns | {"reason": np.array(reasons, dtype=object)}
+
+    def _failed(
+        self, system: System, task: TimeIntegration, controls: Any, columns: dict[str, Any], k: int
+    ) -> str:
+        """Return the reason of a failed case, after recovery if it is wanted; write its rows."""
+        plan, result, cause = self.plan, columns["result"], ""
+        if plan.sweep.recovery:
+            cause = _recover(system, task, controls, plan.sweep.store, columns, k)
+            if not cause:
+                return ""
+        step = int(np.argmax(result[k] < 0))
+        code = Result(int(result[k, step]))
+        cause = cause or likely_cause(code, system, plan.settings, controls[step - 1])
+        return f"step {step} (t = {step * plan.sweep.dt:g} s): {code.message}. {cause}".strip()
+
+
+def _mark_coarse(columns: dict[str, Any], length: Any, before: Any) -> None:
+    """Mark solved rows from the first one on for which the grid is too coarse, as `run.mark_coarse` does."""
+    result = columns["result"]
+    coarse = ~(columns["position_error"] <= COARSE_SHARE * length[:, None]) & (result >= 0)
+    coarse[:, 1:] |= before[:, None]
+    coarse = (np.cumsum(coarse, axis=1) > 0) & (result >= 0)
+    columns["result"] = np.where(coarse, int(Result.COARSE), result).astype(np.int8)
+
+
+@functools.lru_cache(maxsize=64)
+def _bare(plan: Plan, robot: int) -> System:
+    """Return a robot without the range of its training data, as the solvers' programs expect."""
+    return without_range(plan.systems[robot])
+
+
+def _mark_unsolved(columns: dict[str, Any], k: int, first: int) -> None:
+    """Mark the rows of a case from one on as not solved."""
+    for name, each in columns.items():
+        if name == "result":
+            each[k, first:] = int(Result.NOT_REACHED)
+        elif name != "controls":
+            each[k, first:] = np.nan
+
+
+# initial states of robots whose rest is an equilibrium
+
+
+def _settled(plan: Plan, robot: int, values: dict[str, Any], size: int) -> Settled:
+    """Return the initial states of a chunk.
+
+    A robot such as a platform on bent legs starts from its equilibrium under zero control. All others start
+    from rest, which the chunk's program evaluates.
+    """
+    system, settings = _bare(plan, robot), plan.settings
+    if not system.rest_is_guess:
+        return Settled(None, np.zeros(size, dtype=bool), {})
+    found: list[InitialState | None] = []
+    reasons: dict[int, str] = {}
+    for k in range(size if values else 1):
+        one = system.replace(**{name: each[k] for name, each in values.items()}) if values else system
+        try:
+            found.append(initial_state(one, settings, None, np.inf if plan.sweep.recovery else 0.0))
+        except SimulationError as error:
+            found.append(None)
+            reasons[k] = str(error)
+    # a failed case is marked as such: any state of the right shape serves
+    good = next((each for each in found if each is not None), None) or _guessed(system, settings)
+    every = [each or good for each in found]
+    if not values:
+        every, reasons = every * size, dict.fromkeys(range(size), reasons[0]) if reasons else {}
+    pairs = [Start(each.record, each.state.history) for each in every]
+    start = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *pairs)
+    coarse = np.array([bool(each.coarse) for each in every])
+    return Settled(start, coarse, reasons)
+
+
+def _guessed(system: System, settings: Settings) -> InitialState:
+    """Return the state at rest, though it is no equilibrium."""
+    record, none = rest_record(system), np.zeros(system.control_size)
+    history = at_one_state(system, history_settings(settings), record, none)
+    return InitialState(record, none, SolverState(history), False)
+
+
+# recovery
+
+
+def _recover(
+    system: System, task: TimeIntegration, controls: Any, store: tuple[str, ...], columns: dict[str, Any],
+    k: int,
+) -> str:  # fmt: skip
+    """Solve a case by itself, with recovery of failed steps; write its rows and return the likely cause.
+
+    As `solvers.run.run_one`, but without times: an unlimited budget, and no division into pieces.
+    """
+    at = initial_state(system, task.settings, None, np.inf)
+    padded = padded_rows(controls, least=LEAST_CAPACITY)
+    budget, state, rows, cause, done = Budget(np.inf), at.state.history, None, "", 0
+    while done < task.steps and not cause:
+        reached, state, new = task.solve(system, padded, state, (done, task.steps))
+        reached = int(reached)
+        leaves = [np.array(leaf[: task.steps]) for leaf in new]
+        if rows is None:
+            rows = type(new)(*leaves)
+        for every, leaf in zip(rows, leaves, strict=True):
+            every[done:reached] = leaf[done:reached]
+        done = reached
+        if reached < task.steps:
+            pair = (controls[reached - 1] if reached else at.control), controls[reached]
+            solved = task.recover(system, state, pair, reached, budget)
+            state, cause = solved.state, solved.cause
+            for every, value in zip(rows, solved.row, strict=True):
+                every[reached] = value
+            done += not cause
+    assert rows is not None
+    if cause:
+        rows.result[done + 1 :] = int(Result.NOT_REACHED)
+    size = system.y_layout.size + system.z_layout.size
+    invalid = rows.result < 0
+    records = np.concatenate([np.asarray(at.record)[None, :, :size], rows.records[..., :size]])
+    records[1:][invalid] = np.nan
+    columns["result"][k, 1:] = rows.result
+    columns["position_error"][k, 1:] = np.where(invalid, np.nan, rows.position_error)
+    for name, each in _stored_one(system, records, store).items():
+        columns[name][k] = np.asarray(each)
+    return cause
+
+
+@functools.partial(jax.jit, static_argnames="store")
+def _stored_one(system, records, store):  # type: ignore[no-untyped-def]
+    return {name: each[0] for name, each in stored_of(system, records[None], store).items()}
