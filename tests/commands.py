@@ -9,7 +9,7 @@ from knode_cosserat.cli import app
 
 ROBOT = "delrin-tendon-robot"
 COMMANDS = ("simulate", "equilibrium", "info", "reach", "workspace", "fit", "evaluate", "plot", "animate",
-            "inspect", "study simulation", "study imperfections", "study data", "study estimation",
+            "inspect", "sweep", "study simulation", "study imperfections", "study data", "study estimation",
             "study beam", "record-virtual", "schema", "doctor", "view",
             "robot connect", "robot reset", "robot tare", "robot calibrate", "robot jog", "robot record",
             "robot run", "robot steer", "robot commission")  # fmt: skip

@@ -10,6 +10,6 @@ from knode_cosserat.cli.program import app, main
 from knode_cosserat.cli import robots, view, kinematics, learn, identify, control  # noqa: F401  isort: skip
 from knode_cosserat.cli import compare, inspect, record, robot, robot_motion  # noqa: F401  isort: skip
 from knode_cosserat.cli import study, study_measured, health  # noqa: F401  isort: skip
-from knode_cosserat.cli import parts  # noqa: F401  isort: skip
+from knode_cosserat.cli import parts, sweep  # noqa: F401  isort: skip
 
 __all__ = ["app", "main"]

@@ -313,13 +313,18 @@ def _kept_log(out: Path | None) -> Iterator[None]:
 @hardware.command(
     epilog=examples(
         "robot steer --port /dev/ttyACM0 --device /dev/input/js0",
-        "robot steer --port 'simulated?real_time=1'",
+        "robot steer --port 'simulated?real_time=1' --device sliders",
     )
 )
 def steer(
     port: Port,
     device: Annotated[
-        str, typer.Option(metavar="DEVICE", help="Gamepad (/dev/input/js0), or keyboard: arrows, + and -.")
+        str,
+        typer.Option(
+            metavar="DEVICE",
+            help="Gamepad (/dev/input/js0), keyboard (arrows, + and -), or sliders: a window with one for each "
+            "tendon.",
+        ),
     ] = "keyboard",
     seconds: Annotated[
         float | None, typer.Option(metavar="S", help="Duration (s).", show_default="until the stop")
@@ -332,32 +337,53 @@ def steer(
     yes: Yes = False,
     as_json: Json = False,
 ) -> None:
-    """Steer a robot by a gamepad or by the arrow keys: two directions of bending, and co-contraction."""
+    """Steer a robot by a gamepad, by the arrow keys, or by sliders.
+
+    Gamepad and keys bend in two directions, and co-contract. Sliders set each tension, in a window with a
+    button that stops; without a display the keys are used.
+    """
     from dataclasses import replace
 
-    from knode_cosserat.hardware.teleoperation import Gamepad, Keyboard, TensionMap, teleoperate
+    from knode_cosserat.hardware.teleoperation import TensionMap, teleoperate
 
     machine = opened(port, robot)
     driver = machine.driver
     mapping = TensionMap.of(driver.limits, driver.tendon_count)
     if high is not None:
         mapping = replace(mapping, high=min(high, mapping.high))
-    keys = Keyboard() if device == "keyboard" else None
-    inputs = Gamepad(device) if keys is None else keys
+    inputs = _input_device(device, mapping, driver.tendon_count, machine.name)
+    window = inputs if device == "sliders" and hasattr(inputs, "show") else None
+    others = getattr(inputs, "press", None)
     last: list[Any] = [np.zeros(driver.tendon_count)]
 
     def shown(wish: Any, sent: Any, reading: Any) -> None:
         last[0] = sent
+        if window is not None:
+            window.show(wish, sent, reading)
 
     with contextlib.closing(inputs):
         motion = f"the rod bends by {device}, tensions up to {mapping.high:.3g} N"
-        others = None if keys is None else keys.press
         with connected(machine, yes, motion), emergency_stop(driver, other_keys=others) as emergency:
-            if keys is not None and not emergency.has_keys:
+            if others is not None and not emergency.has_keys:
                 raise ValueError("the keyboard needs a terminal; give --device /dev/input/js0 for a gamepad")
             count = teleoperate(
-                driver, inputs, mapping, emergency,
+                driver, inputs, mapping if window is None else window, emergency,
                 seconds=float("inf") if seconds is None else seconds, shown=shown,
             )  # fmt: skip
     facts = {"commands": count, "tension": [round(float(value), 4) for value in last[0]]}
     write_output(as_json, facts, [f"{count} commands; the last tensions were {tension_text(last[0])}"])
+
+
+def _input_device(device: str, mapping: Any, tendons: int, title: str) -> Any:
+    """Return gamepad, keyboard or window of sliders; the keyboard, with a line, if there is no display."""
+    from knode_cosserat.hardware.driver import HardwareError
+    from knode_cosserat.hardware.sliders import SliderWindow
+    from knode_cosserat.hardware.teleoperation import Gamepad, Keyboard
+
+    if device == "sliders":
+        try:
+            return SliderWindow(tendons, mapping.low, mapping.high, f"knode-cosserat: {title}")
+        except HardwareError as error:
+            typer.echo(f"{error}; steering by keys: arrows, + and -", err=True)
+            return Keyboard()
+    return Keyboard() if device == "keyboard" else Gamepad(device)

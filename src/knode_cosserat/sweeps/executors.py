@@ -9,6 +9,7 @@ import abc
 import concurrent.futures
 import contextlib
 import dataclasses
+import math
 import multiprocessing
 import os
 import time
@@ -213,7 +214,7 @@ class Slurm(Executor):
             for number in [each for each in missing if shard_path(folder, each).exists()]:
                 missing.remove(number)
                 about = read_about(shard_path(folder, number))
-                yield Done(number, about["cases"], about["failed"], time.perf_counter() - began)
+                yield Done(number, about["cases"], about["failed"], time.perf_counter() - began, math.nan)
             if missing and all(states):
                 raise SweepError(
                     f"all jobs ended and {len(missing)} shards are missing; see {folder / 'jobs'}; the same "

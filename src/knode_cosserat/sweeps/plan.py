@@ -276,16 +276,8 @@ def _check_variation(system: System, name: str, variation: Range | tuple[Any, ..
         if used:
             _require_numbers_only(name, variation)
             return
-        try:
-            value = variation.low if isinstance(variation, Range) else variation[0]
-            system.replace(**{name: value})
-        except (KnodeCosseratError, ValueError) as error:
-            raise SweepError(f"vary: {error}") from None
-        raise SweepError(
-            f"vary: {name} is no number; allowed is a parameter of the robot, or a name in braces of the "
-            "controls. Give robots with other settings as a list, each with set"
-        )
-    if _is_static(system, name):
+        _require_field(system, name)
+    if stated is None or _is_static(system, name):
         raise SweepError(
             f"vary: {name} cannot vary within a robot, because it shapes its program; give a list of robots, "
             f"each with set: {{{name}: VALUE}}"
@@ -299,6 +291,16 @@ def _check_variation(system: System, name: str, variation: Range | tuple[Any, ..
             system.replace(**{name: value})
         except (KnodeCosseratError, ValueError) as error:
             raise SweepError(f"vary: {error}") from None
+
+
+def _require_field(system: System, name: str) -> None:
+    """Raise `SweepError` unless a robot has a field of this name, such as `nodes`."""
+    if name in {field.name for field in dataclasses.fields(system.nominal)}:
+        return
+    try:
+        system.replace(**{name: 0.0})
+    except (KnodeCosseratError, ValueError) as error:
+        raise SweepError(f"vary: {error}") from None
 
 
 def _require_numbers_only(name: str, variation: Range | tuple[Any, ...]) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from tqdm import tqdm
 
 from knode_cosserat.sweeps.data import SweepData
@@ -23,7 +24,7 @@ from knode_cosserat.sweeps.folder import (
 )
 from knode_cosserat.sweeps.plan import Plan
 from knode_cosserat.sweeps.shard_file import require_pyarrow
-from knode_cosserat.sweeps.work import Work
+from knode_cosserat.sweeps.work import Done, Work
 
 
 def run_sweep(
@@ -56,20 +57,19 @@ def run_sweep(
     open_folder(plan, folder)
     missing = [number for number in range(plan.shard_count) if not is_complete(plan, folder, number)]
     work = Work(plan, str(folder.absolute()), made_by())
-    solved = 0
+    solved: list[Done] = []
     try:
-        for cases in _solved(work, missing, executor, progress):
-            solved += cases
+        solved.extend(_solved(work, missing, executor, progress))
     finally:
+        counts = {"missing_shards": len(missing), "solved_cases": sum(done.cases for done in solved)}
         seconds = round(time.perf_counter() - began, 3)
-        counts = {"missing_shards": len(missing), "solved_cases": solved}
-        log_run(folder, executor=executor.label, **counts, seconds=seconds)
+        log_run(folder, executor=executor.label, **counts, seconds=seconds, **_medians(solved))
     remove_temporaries(folder, started)
     return SweepData.open(folder)
 
 
-def _solved(work: Work, missing: list[int], executor: Executor, progress: bool) -> Iterator[int]:
-    """Solve missing shards; yield the number of cases of each."""
+def _solved(work: Work, missing: list[int], executor: Executor, progress: bool) -> Iterator[Done]:
+    """Solve missing shards; yield each when it is stored."""
     plan = work.plan
     total = plan.sweep.case_count
     present = total - sum(plan.rows(number) for number in missing)
@@ -81,4 +81,13 @@ def _solved(work: Work, missing: list[int], executor: Executor, progress: bool) 
                 failed += done.failed
                 bar.update(done.cases)
                 bar.set_postfix_str(f"{failed} failed")
-                yield done.cases
+                yield done
+
+
+def _medians(solved: list[Done]) -> dict[str, float]:
+    """Return the median times of a case: of its worker, and of all cores (s)."""
+    if not solved:
+        return {}
+    times = np.median([(done.seconds / done.cases, done.cpu_seconds / done.cases) for done in solved], axis=0)
+    found = {"case_seconds": float(times[0]), "case_cpu_seconds": float(times[1])}
+    return {name: each for name, each in found.items() if np.isfinite(each)}

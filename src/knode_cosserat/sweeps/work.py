@@ -23,7 +23,9 @@ class Done(NamedTuple):
     shard: int
     cases: int
     failed: int
+    #: time, and time of all cores, in s
     seconds: float
+    cpu_seconds: float
     #: content of its file if the worker was not to write it
     content: bytes | None = None
 
@@ -53,14 +55,15 @@ class Work:
                     f"the workers have another {name} than this process: {own.get(name)}, not "
                     f"{self.made_by.get(name)}"
                 )
-        began = time.perf_counter()
+        began, cpu = time.perf_counter(), time.process_time()
         columns = self._solver().shard(number)
         failed = int(np.count_nonzero(np.any(columns["result"] < 0, axis=1)))
         content = shard_bytes(columns, self._about(number, len(columns["case"]), failed))
         if self.folder is not None:
             write_shard(shard_path(Path(self.folder), number), content)
-        seconds = time.perf_counter() - began
-        return Done(number, len(columns["case"]), failed, seconds, content if self.folder is None else None)
+        seconds, cpu = time.perf_counter() - began, time.process_time() - cpu
+        kept = content if self.folder is None else None
+        return Done(number, len(columns["case"]), failed, seconds, cpu, kept)
 
     def _about(self, number: int, cases: int, failed: int) -> dict[str, object]:
         """Return the metadata of a shard."""
