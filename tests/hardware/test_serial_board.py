@@ -15,6 +15,7 @@ from knode_cosserat.hardware.driver import DriverState, HardwareError, Limits
 from knode_cosserat.hardware.faults import FAULTS, fault_message
 from knode_cosserat.hardware.limits import TensionLimiter
 from knode_cosserat.hardware.lines import GRAM_FORCE, Telemetry, decode_framed, encode_message
+from knode_cosserat.hardware.plant import HardwarePlant
 from knode_cosserat.hardware.serial_board import SerialBoard
 from knode_cosserat.hardware.transport import SerialTransport, Transport
 from tests.hardware.fake_board import FakeBoard
@@ -278,6 +279,13 @@ def test_a_board_that_restarts_within_a_line_is_found_too(board):
         board.write(b"7 : 3 arm")
         board.restart()
         assert eventually(lambda: robot.fault == "restarted:0")
+        # it sends no readings: a closed loop must not wait for one before it stops the robot
+        plant = HardwarePlant(robot, None, 0.05)
+        began = time.monotonic()
+        with pytest.raises(HardwareError, match="the board restarted"):
+            plant.measure()
+        assert time.monotonic() - began < 0.9 and b"stop" in board.received
+        board.fault, board.state = "", "ready"
         robot.reset()
         assert robot.is_framed and robot.state is DriverState.READY
 

@@ -322,8 +322,8 @@ def steer(
         str,
         typer.Option(
             metavar="DEVICE",
-            help="Gamepad (/dev/input/js0), keyboard (arrows, + and -), or sliders: a window with one for each "
-            "tendon.",
+            help="Gamepad (/dev/input/js0), keyboard (arrows, + and -), or sliders: a window with one for "
+            "each tendon.",
         ),
     ] = "keyboard",
     seconds: Annotated[

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from knode_cosserat.hardware.serial_board import SerialBoard
     from knode_cosserat.hardware.simulated import SimulatedRobot
     from knode_cosserat.hardware.simulated_cells import MachineParameters
+    from knode_cosserat.hardware.sliders import SliderWindow
     from knode_cosserat.hardware.teleoperation import Gamepad, Keyboard, TensionMap, teleoperate
     from knode_cosserat.hardware.transport import SerialTransport, Transport
 
@@ -71,6 +72,7 @@ __all__ = [
     "SerialTransport",
     "SimulatedCapture",
     "SimulatedRobot",
+    "SliderWindow",
     "StoppedError",
     "TensionMap",
     "Transport",
@@ -109,6 +111,7 @@ make_lazy(
         "knode_cosserat.hardware.serial_board": "SerialBoard",
         "knode_cosserat.hardware.simulated": "SimulatedRobot",
         "knode_cosserat.hardware.simulated_cells": "MachineParameters",
+        "knode_cosserat.hardware.sliders": "SliderWindow",
         "knode_cosserat.hardware.teleoperation": "Gamepad Keyboard TensionMap teleoperate",
         "knode_cosserat.hardware.transport": "SerialTransport Transport",
     },

@@ -168,7 +168,10 @@ class HardwarePlant(Plant):
         if self._emergency is not None:
             self._emergency.check()
         if self.driver.state is DriverState.FAULT:
-            raise HardwareError(fault_message(self.driver.read().fault))
+            # before the fault is read: a board that restarted sends no readings
+            self.driver.stop()
+            fault = getattr(self.driver, "fault", "") or self.driver.read().fault
+            raise HardwareError(fault_message(fault))
 
 
 class _Rehearsal(Plant):

@@ -1,4 +1,4 @@
-"""Teleoperation: tensions from a gamepad or from the keyboard's arrows."""
+"""Teleoperation: tensions from a gamepad, from the keyboard's arrows, or from another device."""
 
 from __future__ import annotations
 
@@ -41,11 +41,18 @@ class Wish(NamedTuple):
 class InputDevice(Protocol):
     """Device that a person moves the robot with."""
 
-    def wish(self) -> Wish:
+    def wish(self) -> Any:
         """Return the present wish. Raises `HardwareError` if the device is lost or its stop is pressed."""
 
     def close(self) -> None:
         """Close the device."""
+
+
+class WishMap(Protocol):
+    """Map from a device's wishes to tensions: `TensionMap` for a `Wish`, a `SliderWindow` for its own."""
+
+    def tensions(self, wish: Any) -> Float[np.ndarray, " c"]:
+        """Return the tensions (N) of a wish."""
 
 
 class Gamepad:
@@ -189,18 +196,18 @@ class TensionMap:
 def teleoperate(
     driver: Driver,
     device: InputDevice,
-    mapping: TensionMap,
+    mapping: WishMap,
     emergency: EmergencyStop,
     *,
     seconds: float = np.inf,
     dt: float = 0.04,
-    shown: Callable[[Wish, Sequence[float], Reading], Any] | None = None,
+    shown: Callable[[Any, Sequence[float], Reading], Any] | None = None,
 ) -> int:
     """Move a robot by an input device until a time or a stop, and return the number of commands.
 
     Args:
         driver: a connected driver; it is armed, and disarmed at the end.
-        device: gamepad or keyboard.
+        device: gamepad, keyboard or window of sliders.
         mapping: map from wishes to tensions.
         emergency: emergency stop around it.
         seconds: duration (s).

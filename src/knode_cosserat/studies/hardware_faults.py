@@ -45,8 +45,9 @@ REACTION = {
     "emergency-stop": 2 / 256, "sensor-rail": 6 / 256, "over-tension": 6 / 256, "restarted": 2 / 256,
     "stopped": 4 / 256, "watchdog": 0.1,
 }  # fmt: skip
-#: over-tension limit of the board (N), and the time in which it releases the tendons after a fault (s)
-BOARD_LIMIT, RELEASE = 2300 * GRAM_FORCE, 0.55
+#: over-tension limit of the board (N), and the time after a fault in which it releases tendons (s): 0.5 s,
+#: which begin anew with the driver's stop in the next period
+BOARD_LIMIT, RELEASE = 2300 * GRAM_FORCE, 0.5 + 2 * DT
 #: times of faults after the begin of the loop (s), and the longest time until one is caught
 EARLIEST, LATEST, CAUGHT = 2.0, 4.0, 3.0
 #: tip RMSE in the last 0.5 s before a fault from which on the loop does not follow (% of length): the
@@ -262,7 +263,7 @@ def _trial(rig: _Rig, controller: Controller, kind: str) -> dict[str, Any]:
     mend(robot)
     try:
         # still watched: nothing may move before the reset
-        board.wait(0.7)
+        board.wait(1.0)
         robot.forget()
         if fault:
             recover(board)
