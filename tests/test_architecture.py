@@ -39,7 +39,7 @@ LAYERS = (
     ("learning", "calibration"),
     ("identification",),
     ("evaluation", "figures"),
-    ("viewer", "diagnosis", "sweeps"),
+    ("viewer", "diagnosis", "sweeps", "envs"),
     # the public names: `import knode_cosserat`
     ("",),
     ("studies",),

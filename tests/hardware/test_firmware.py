@@ -139,7 +139,7 @@ def test_an_old_host_still_works() -> None:
     assert re.fullmatch(r">(\d+,){4}(-?\d+,){4}4", found[0])
     assert "! arguments" in board.run("r 1 2 3") and "! range" in board.run("r 1 2 3 9000")
     # half a second of silence stops the motors; the next command goes on
-    assert board.run(f"t 140 {counts(50, 50, 50, 50)}").splitlines()[-1].startswith("releasing -")
+    assert board.run(f"t 140 {counts(100, 100, 100, 100)}").splitlines()[-1].startswith("releasing -")
     assert board.run(f"t 140 {counts(0, 0, 0, 0)}").splitlines()[-1].startswith("ready -")
     board.run("r 100 100 100 100")
     assert board.run(f"t 1 {counts(0, 0, 0, 0)}").splitlines()[-1].startswith("armed -")

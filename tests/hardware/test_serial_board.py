@@ -386,6 +386,7 @@ def test_tensions_that_are_none_are_refused(board, wrong):
     st.floats(9, 60),
 )
 @example([([0.0] * 3, 0.0), ([0.0, 6.0, 6.0], 1.0), ([0.0] * 3, 0.0)], 2.0, 6.0, 74.0, 13.92)
+@example([([0.0] * 3, 0.0)], 3.0, 4.0, 1.0, 9.0)
 def test_limits_hold_after_any_commands(commands, low, high, rate, total):
     limiter = TensionLimiter(Limits(low, high, rate, total), 3)
     limiter.reset(0.0)
@@ -396,12 +397,13 @@ def test_limits_hold_after_any_commands(commands, low, high, rate, total):
         assert np.all(sent >= 0.0) and np.all(sent <= high + 1e-9) and sent.sum() <= total + 1e-6
         assert np.all(np.abs(sent - last) <= rate * min(elapsed + 0.02, 0.1) + 1e-9)
         last = sent
+    reachable = min(low + 0.1, total / 3)
     for _ in range(10_000 if commands else 0):
         now += 0.1
-        sent = limiter.reduced(np.full(3, low + 0.1), now)
-        if np.allclose(sent, low + 0.1):
+        sent = limiter.reduced(np.full(3, reachable), now)
+        if np.allclose(sent, reachable):
             break
-    assert not commands or np.allclose(sent, low + 0.1)
+    assert not commands or np.allclose(sent, reachable)
 
 
 @pytest.mark.parametrize(

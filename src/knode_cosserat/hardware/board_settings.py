@@ -8,7 +8,7 @@ from knode_cosserat.hardware.driver import HardwareError
 
 #: names of settings, for the hints of errors; a newer board may have more
 SETTINGS = (
-    *("kp", "ki", "kd", "hold", "friction", "limit", "watchdog", "silence", "release", "jog"),
+    *("kp", "ki", "kd", "hold", "friction", "smooth", "limit", "watchdog", "silence", "release", "jog"),
     *("tare_drive", "tare_time", "tare_rise", "tare_on_start", "estop"),
     *(f"{name}{k}" for name in ("gain", "zero") for k in range(1, 5)),
 )

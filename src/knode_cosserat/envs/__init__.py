@@ -1,0 +1,22 @@
+"""Environments for learning controllers: tasks of robots as pure functions, and for Gymnasium and others."""
+
+from __future__ import annotations
+
+from knode_cosserat._lazy import make_lazy
+
+make_lazy(
+    __name__,
+    {
+        "knode_cosserat.envs.environment": "Environment make",
+        "knode_cosserat.envs.errors": "TaskError",
+        "knode_cosserat.envs.randomisation": "Factor Randomisation Uniform",
+        "knode_cosserat.envs.spec": "Ending",
+        "knode_cosserat.envs.dynamics": "EpisodeState Transition",
+        "knode_cosserat.envs.tasks": "TASKS",
+        "knode_cosserat.envs.tasks.base": "Outcome Task Tip",
+        "knode_cosserat.envs.tasks.survey": "Survey",
+        "knode_cosserat.envs.tasks.following": "Adaptation Follow Payload",
+        "knode_cosserat.envs.tasks.obstacles": "Gate Pillar",
+        "knode_cosserat.envs.tasks.reaching": "Reach",
+    },
+)

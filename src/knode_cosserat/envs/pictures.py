@@ -1,0 +1,51 @@
+"""Pictures of an episode: the robot, its target and obstacles, seen from the side and from below."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8
+
+from knode_cosserat.envs.dynamics import EpisodeState
+from knode_cosserat.envs.environment import Environment
+from knode_cosserat.evaluation.figures import require_matplotlib
+
+#: size (inches) and resolution of a picture
+SIZE, DPI = (7.0, 3.5), 80
+
+
+def picture(environment: Environment, state: EpisodeState) -> UInt8[np.ndarray, "h w 3"]:
+    """Return a picture of an episode; it needs matplotlib, the extra `viz`."""
+    require_matplotlib()
+    from matplotlib.figure import Figure
+    from matplotlib.image import imread
+
+    system = environment.system(state)
+    points = np.asarray(system.positions(state.history.y[0]))
+    goal, t = state.goal, float(state.count) * environment.dt
+    target = np.asarray(environment.task.target(goal, t))[:3]
+    span = 1.1 * float(np.max(environment.robot.nominal.length))
+    figure = Figure(figsize=SIZE, dpi=DPI, layout="constrained")
+    for axes, (a, b) in zip(figure.subplots(1, 2), ((0, 2), (0, 1)), strict=True):
+        axes.plot(points[:, a], points[:, b], color="C0", lw=2.5)
+        for obstacle in getattr(system.nominal, "surroundings", ()):
+            _draw_ball(axes, obstacle, a, b)
+        axes.plot(target[a], target[b], "x", color="C3", ms=9, mew=2)
+        axes.set(xlim=(-span, span), aspect="equal", xlabel=f"{'xyz'[a]} (m)", ylabel=f"{'xyz'[b]} (m)")
+        axes.set_ylim((-span, span))
+    figure.suptitle(f"{environment.task.name}, t = {t:.2f} s")
+    data = io.BytesIO()
+    figure.savefig(data, format="png")
+    data.seek(0)
+    return (255 * imread(data)[:, :, :3]).round().astype(np.uint8)
+
+
+def _draw_ball(axes: Any, obstacle: Any, a: int, b: int) -> None:
+    from matplotlib.patches import Circle
+
+    centre = getattr(obstacle, "center", None)
+    if centre is not None:
+        where = np.asarray(centre)
+        axes.add_patch(Circle((where[a], where[b]), float(obstacle.radius), color="0.6"))
