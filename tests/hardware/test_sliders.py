@@ -30,8 +30,9 @@ def display():
     command = ["Xvfb", "-displayfd", str(write), "-screen", "0", "900x700x24", "-nolisten", "tcp"]
     with subprocess.Popen(command, pass_fds=[write], stderr=subprocess.DEVNULL) as server:
         os.close(write)
-        name = os.read(read, 20).decode().strip()
-        os.close(read)
+        with os.fdopen(read) as pipe:
+            # the whole line: the server ends if it cannot write the last byte
+            name = pipe.readline().strip()
         yield f":{name}"
         server.terminate()
 
