@@ -9,6 +9,7 @@ import abc
 import concurrent.futures
 import contextlib
 import dataclasses
+import itertools
 import math
 import multiprocessing
 import os
@@ -151,7 +152,7 @@ class Dask(Executor):
             def submit(number: int) -> Any:
                 return client.submit(Work.solve, remote, number, pure=False)
 
-            begun = [submit(number) for number, _ in zip(rest, range(2 * threads), strict=False)]
+            begun = [submit(number) for number in itertools.islice(rest, 2 * threads)]
             working = as_completed(begun, loop=client.loop)
             for future in working:
                 done = _result(future)

@@ -170,6 +170,8 @@ class Plan:
             if (robot, w) in self.fixed:
                 controls[own] = self.fixed[robot, w]
                 continue
+            if not len(own):
+                continue
             found = signals(system, text, sweep.steps, sweep.dt, picked, len(own))
             controls[own] = found.controls
             refused |= {int(own[k]): reason for k, reason in found.refused.items()}

@@ -1,0 +1,71 @@
+"""Points by index: parts of a sequence are the sequence, and points have the samplers' properties."""
+
+import warnings
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import qmc
+
+from knode_cosserat.sweeps.errors import SweepError
+from knode_cosserat.sweeps.sampling import SAMPLERS, case_seeds, permuted, unit_points
+
+POINTS = [name for name in SAMPLERS if name != "grid"]
+
+
+@pytest.mark.parametrize("sampler", POINTS)
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**40), st.integers(1, 6), st.integers(1, 200), st.data())
+def test_parts_of_a_sequence_are_the_sequence(sampler, seed, dimensions, samples, data):
+    first = data.draw(st.integers(0, samples - 1))
+    last = data.draw(st.integers(first, samples))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        whole = unit_points(sampler, (0, samples), dimensions, samples, seed)
+        part = unit_points(sampler, (first, last), dimensions, samples, seed)
+    assert whole.shape == (samples, dimensions)
+    assert np.all((whole >= 0.0) & (whole < 1.0))
+    np.testing.assert_array_equal(part, whole[first:last])
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(1, 3000), st.integers(0, 2**32))
+def test_a_keyed_permutation_has_each_number_once(size, key):
+    np.testing.assert_array_equal(np.sort(permuted(np.arange(size), size, (key, 0))), np.arange(size))
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(1, 400), st.integers(1, 4), st.integers(0, 2**32))
+def test_a_latin_hypercube_has_one_point_in_each_stratum(samples, dimensions, seed):
+    points = unit_points("latin-hypercube", (0, samples), dimensions, samples, seed)
+    for column in points.T:
+        np.testing.assert_array_equal(np.sort(np.floor(column * samples)), np.arange(samples))
+
+
+def test_permutations_of_variables_are_not_correlated():
+    """Of 2,000 points in 4 variables; independent ones have |r| below 4/√2000 = 0.09 (4 standard errors)."""
+    r = np.corrcoef(unit_points("latin-hypercube", (0, 2000), 4, 2000, 5).T)
+    assert np.max(np.abs(r - np.eye(4))) < 0.09
+
+
+def test_sobol_points_have_the_discrepancy_of_scipys():
+    """Random points have some ten times the discrepancy of 256 Sobol points in two variables."""
+    sobol, random = (unit_points(name, (0, 256), 2, 256, 1) for name in ("sobol", "random"))
+    own = qmc.Sobol(2, seed=np.random.default_rng(7)).random(256)
+    assert qmc.discrepancy(sobol) < 1.5 * qmc.discrepancy(own)
+    assert qmc.discrepancy(sobol) < 0.3 * qmc.discrepancy(random)
+
+
+def test_seeds_of_cases_are_their_own():
+    seeds = case_seeds(3, np.arange(10_000))
+    # 10,000 of 2³¹ numbers: 0.02 equal pairs are expected
+    assert len(np.unique(seeds)) >= 9_998
+    assert np.all((seeds >= 0) & (seeds < 2**31))
+    np.testing.assert_array_equal(case_seeds(3, np.arange(50, 60)), seeds[50:60])
+    assert np.count_nonzero(case_seeds(4, np.arange(100)) == seeds[:100]) == 0
+
+
+def test_too_many_varied_numbers_for_sobol_are_refused():
+    with pytest.raises(SweepError, match="allowed is up to 21201"):
+        unit_points("sobol", (0, 1), 30_000, 1, 0)
