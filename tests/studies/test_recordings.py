@@ -232,3 +232,16 @@ def test_no_folder_and_a_recording_that_is_none(tmp_path):
         (tmp_path / f"{name}.bag").write_bytes(b"nonsense")
     broken = run(tmp_path, "--out", tmp_path / "out", "--methods", "baseline")
     assert broken.exit_code != 0 and ".bag" in broken.output and "Traceback" not in broken.output
+
+
+def test_configurations_beside_recordings_are_used_if_they_are_the_same(tmp_path):
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.bag").write_bytes(b"")
+        PAPER.save(tmp_path / f"{name}.yaml")
+    assert study.described_in(tmp_path) == {"config": tmp_path / "a.yaml"}
+    PAPER.replace(simulated=True).save(tmp_path / "b.yaml")
+    assert study.described_in(tmp_path) == {}
+    (tmp_path / "b.yaml").unlink()
+    assert study.described_in(tmp_path) == {}
+    PAPER.save(tmp_path / "recording.yaml")
+    assert study.described_in(tmp_path) == {"config": tmp_path / "recording.yaml"}

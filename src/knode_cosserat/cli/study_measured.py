@@ -44,7 +44,8 @@ def recordings(
         typer.Option(
             metavar="YAML",
             help="Meaning of the recordings' topics or columns.",
-            show_default="recording.yaml in BAGDIR; else the paper's robot for bags, titles for tables",
+            show_default="recording.yaml in BAGDIR, or NAME.yaml of robot record; else the paper's robot for "
+            "bags, titles for tables",
         ),
     ] = None,
     start: Annotated[

@@ -85,9 +85,18 @@ def recordings_in(folder: Path) -> dict[str, Path]:
 
 
 def described_in(folder: Path) -> dict[str, Path]:
-    """Return the files in a folder that describe its recordings: "robot" and "config", if there."""
+    """Return the files in a folder that describe its recordings: "robot" and "config", if there.
+
+    Without recording.yaml, the configuration that `robot record` wrote beside each recording is used, if it
+    is the same for all.
+    """
     usual = {"robot": folder / OWN_ROBOT, "config": folder / OWN_CONFIG}
-    return {what: path for what, path in usual.items() if path.is_file()}
+    found = {what: path for what, path in usual.items() if path.is_file()}
+    beside = [path.with_suffix(".yaml") for path in recordings_in(folder).values()]
+    texts = {path.read_bytes() if path.is_file() else None for path in beside}
+    if "config" not in found and len(texts) == 1 and None not in texts:
+        found["config"] = beside[0]
+    return found
 
 
 def recording_split(names: Sequence[str], train: Sequence[str] | None) -> tuple[list[str], list[str]]:
