@@ -56,10 +56,19 @@ class Settled(NamedTuple):
     reasons: dict[int, str]
 
 
-@functools.partial(jax.jit, static_argnames=("settings", "steps", "store", "lockstep"))
-def solve_chunk(  # type: ignore[no-untyped-def]
-    robot, values, initial, controls, coefficients, *, settings, steps, store, lockstep
-):
+class Form(NamedTuple):
+    """Settings that determine the program of a chunk, beside shapes."""
+
+    settings: Settings
+    steps: int
+    #: names of the stored quantities
+    store: tuple[str, ...]
+    #: solve all robots side by side
+    lockstep: bool
+
+
+@functools.partial(jax.jit, static_argnames="form")
+def solve_chunk(robot, values, initial, controls, coefficients, form):  # type: ignore[no-untyped-def]
     """Return results and stored quantities of a chunk of cases, as one compiled program.
 
     Args:
@@ -68,11 +77,9 @@ def solve_chunk(  # type: ignore[no-untyped-def]
         initial: initial state of the cases; None for rest.
         controls: (cases, steps, c).
         coefficients: of the time steps.
-        settings: numerical settings.
-        steps: number of steps.
-        store: names of the stored quantities.
-        lockstep: solve all robots side by side.
+        form: settings of the program.
     """
+    settings, steps, store, lockstep = form
     systems = jax.vmap(lambda own: robot.replace(**own))(values) if values else robot
     if initial is None:
         at = initial_state(systems, settings, len(controls))
@@ -157,10 +164,8 @@ class Solver:
         settled = _settled(plan, robot, values, self.chunk)
         task = TimeIntegration(settings, plan.sweep.dt, steps)
         coefficients = StepCoefficients(*map(jnp.asarray, task.coefficients))
-        found = solve_chunk(
-            bare, values, settled.start, cases.controls[index], coefficients, settings=settings, steps=steps,
-            store=plan.sweep.store, lockstep=self.lockstep,
-        )  # fmt: skip
+        form = Form(settings, steps, plan.sweep.store, self.lockstep)
+        found = solve_chunk(bare, values, settled.start, cases.controls[index], coefficients, form)
         done, result, error, length, stored = jax.tree.map(lambda leaf: np.array(leaf[:count]), found)
         columns = {"result": result, "position_error": error} | stored
         reasons = [""] * count
