@@ -1,0 +1,87 @@
+"""The emulated robot recorded twice at once: `study recordings` gives the same table from both bags."""
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from knode_cosserat.hardware.emulation import missing
+from knode_cosserat.recordings import load_recording
+from tests.hardware import test_ros1
+from tests.hardware.test_ros1 import RosBag, equal, ros
+
+pytestmark = [
+    pytest.mark.campaign,
+    pytest.mark.skipif(bool(missing()), reason=f"the firmware cannot be built here: {missing()}"),
+]
+__all__ = ["ros"]
+PROGRAM = Path(__file__).with_name("record_emulated.py")
+#: two to learn from, and one that is predicted
+MOTIONS = ("sine_1p0", "rand_0", "sine_2p0")
+WITH_ROS = not test_ros1.MISSING and test_ros1.HAS_ROSPY
+
+
+def table(folder, out):
+    """Cells of `study recordings` with quick settings, run as a command: each time in a new process."""
+    words = [
+        "--train",
+        "sine_1p0,rand_0",
+        "--methods",
+        "baseline,calibrated",
+        "--seconds",
+        "3",
+        "--workers",
+        "1",
+    ]
+    command = [sys.executable, "-m", "knode_cosserat.cli", "study", "recordings", str(folder), *words]
+    done = subprocess.run([*command, "--out", str(out)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return json.loads((out / "table2.json").read_text())
+
+
+def record(motion, own, other, environment=None):
+    program = [sys.executable, str(PROGRAM), motion, str(own), str(other)]
+    subprocess.run(program, env=environment, check=True, timeout=300.0)
+
+
+def same_study(tmp_path, own, other):
+    for motion in MOTIONS:
+        one, two = load_recording(own / f"{motion}.bag"), load_recording(other / f"{motion}.bag")
+        assert one.simulated and equal(two, one)
+    first, second = table(own, tmp_path / "of-own"), table(other, tmp_path / "of-other")
+    assert first == second
+    predicted = {cell["method"]: cell["tip_rmse"] for cell in first if cell["recording"] == "sine_2p0"}
+    assert predicted["calibrated"] < 0.5 * predicted["baseline"]
+
+
+@pytest.mark.skipif(not WITH_ROS, reason="ROS 1 is not installed: apt-get install " + test_ros1.ros1.PACKAGES)
+def test_the_study_of_what_rosbag_recorded_and_replayed(tmp_path, ros):
+    own, live, replayed = (tmp_path / name for name in ("own", "live", "replayed"))
+    for folder in (own, live, replayed):
+        folder.mkdir()
+    for motion in MOTIONS:
+        recorded = RosBag(live / f"{motion}.bag", ros)
+        record(motion, own / f"{motion}.bag", "ros", ros)
+        recorded.stop()
+        again = RosBag(replayed / f"{motion}.bag", ros)
+        time.sleep(2.0)
+        play = ["rosbag", "play", "--quiet", "--delay=2", "--rate=4", "--wait-for-subscribers"]
+        subprocess.run(
+            [*play, str(recorded.path)], env=ros, check=True, timeout=120.0, stdout=subprocess.DEVNULL
+        )
+        again.stop()
+        assert equal(load_recording(recorded.path), load_recording(again.path))
+    same_study(tmp_path, own, replayed)
+
+
+@pytest.mark.skipif(WITH_ROS, reason="with ROS 1 rosbag records")
+def test_the_study_of_what_rosbags_wrote(tmp_path):
+    own, other = tmp_path / "own", tmp_path / "other"
+    for folder in (own, other):
+        folder.mkdir()
+    for motion in MOTIONS:
+        record(motion, own / f"{motion}.bag", other / f"{motion}.bag")
+    same_study(tmp_path, own, other)
