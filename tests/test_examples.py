@@ -37,7 +37,8 @@ def test_an_example_is_short_says_its_idea_and_has_a_picture(name):
     idea, empty, why, *_ = module.__doc__.splitlines()
     assert idea.endswith((".", "?")) or "." in idea
     assert len(idea) <= 110 and not empty and why
-    assert len(lines) <= 60
+    # a design has bounds, a check of its gradient and held-out cases
+    assert len(lines) <= (110 if name.startswith("design_") else 60)
     parameters = inspect.signature(module.main).parameters
     assert parameters["out"].default == f"{name}.png"
     assert all(each.default is not inspect.Parameter.empty for each in parameters.values())
@@ -226,3 +227,29 @@ def test_keep_off_a_wall(run):
 def test_control_a_learned_model(run):
     logs = run("control_a_learned_model", seconds=6.0)
     assert 3.0 * logs["learned"].tip_rmse(3.0) < logs["model"].tip_rmse(3.0)
+
+
+@CAMPAIGN
+def test_design_routing(run):
+    missed, wrong = run("design_routing", iterations=30)
+    # central differences with steps of 1e-5 have errors of some 1e-9
+    assert wrong < 1e-6
+    assert missed["after"].mean() < 0.25 * missed["before"].mean()
+    assert missed["held-out"].mean() < 0.25 * missed["before"].mean()
+
+
+@CAMPAIGN
+def test_design_pareto(run):
+    from examples import design_pareto
+
+    study = run("design_pareto", generations=4, size=8)
+    assert len(study.trials) == 32
+    sag = [sag for _, sag in sorted({tuple(trial.values) for trial in study.best_trials})]
+    assert np.all(np.diff(sag) > 0.0)  # more reach costs more sag
+    # small deflections of a cantilever: payload g L³ / 3EI
+    design = {"length": 200.0, "radius": 2.5, "base_offset": 10.0, "end_offset": 10.0}
+    (values,), fine = design_pareto.objectives([design])
+    EI = 40e9 * np.pi * 0.0025**4 / 4
+    assert fine.all() and values[1] == pytest.approx(1e3 * 0.03 * 9.81 * 0.2**3 / (3 * EI), rel=5e-3)
+    # a straight tendon bends the rod evenly: T r L² / 2EI
+    assert values[0] == pytest.approx(1e3 * 15.0 * 0.01 * 0.2**2 / (2 * EI), rel=2e-2)
