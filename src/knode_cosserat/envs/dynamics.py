@@ -184,7 +184,7 @@ def _commanded(spec: Spec, arrays: Arrays, state: EpisodeState, action: Any) -> 
         wanted = jnp.clip(wanted, before - most, before + most)
     command = jnp.where(valid, jnp.clip(wanted, arrays.low, arrays.high), before)
     commands = jnp.concatenate([command[None], state.commands[:-1]])
-    history = state.history._replace(t0=state.count * spec.dt)
+    history = state.history._replace(t0=jnp.asarray(state.count * spec.dt, dtype=float))
     state = state._replace(commands=commands, history=history)
     system = None if spec.is_shared else system_of(spec, arrays, state)
     return _Move(system, state, commands[state.delay], valid)
@@ -240,11 +240,3 @@ def step_many(
     )  # fmt: skip
     rows = jax.tree.map(lambda leaf: leaf[:, 0], rows)
     return jax.vmap(lambda *each: _arrived(spec, arrays, *each))(moves, histories, rows)
-
-
-def step(
-    spec: Spec, arrays: Arrays, state: EpisodeState, action: Float[Any, " c"]
-) -> tuple[EpisodeState, Transition]:
-    """Return the state after one period, and the transition."""
-    many = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], (state, action))
-    return jax.tree.map(lambda leaf: leaf[0], step_many(spec, arrays, *many))

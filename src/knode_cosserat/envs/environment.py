@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import functools
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -13,7 +13,7 @@ from knode_cosserat._reprs import robot_text
 from knode_cosserat._yaml import did_you_mean
 from knode_cosserat.control.commands import ControlLimits
 from knode_cosserat.control.references import Reference
-from knode_cosserat.envs import dynamics
+from knode_cosserat.envs import dynamics, programs
 from knode_cosserat.envs.dynamics import EpisodeState, Transition
 from knode_cosserat.envs.errors import TaskError
 from knode_cosserat.envs.randomisation import Randomisation
@@ -23,33 +23,8 @@ from knode_cosserat.envs.tasks.base import Task
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.system import System
 
-if TYPE_CHECKING:
-    from knode_cosserat.envs.single import SingleEnv
-    from knode_cosserat.envs.stable_baselines import StableBaselinesEnv
-    from knode_cosserat.envs.vector import RobotVectorEnv
-
 #: robot of an environment by default
 ROBOT = "delrin-tendon-robot"
-
-
-@functools.partial(jax.jit, static_argnames="spec")
-def _reset(spec: Any, arrays: Any, key: Any) -> Any:
-    return dynamics.reset(spec, arrays, key)
-
-
-@functools.partial(jax.jit, static_argnames="spec")
-def _reset_many(spec: Any, arrays: Any, keys: Any) -> Any:
-    return jax.vmap(lambda key: dynamics.reset(spec, arrays, key))(keys)
-
-
-@functools.partial(jax.jit, static_argnames="spec")
-def _step(spec: Any, arrays: Any, state: Any, action: Any) -> Any:
-    return dynamics.step(spec, arrays, state, action)
-
-
-@functools.partial(jax.jit, static_argnames="spec")
-def _step_many(spec: Any, arrays: Any, states: Any, actions: Any) -> Any:
-    return dynamics.step_many(spec, arrays, states, actions)
 
 
 class Environment:
@@ -59,7 +34,7 @@ class Environment:
         state, observation = environment.reset(jax.random.PRNGKey(0))
         state, transition = environment.step(state, action)
 
-    Gymnasium's and Stable-Baselines3's classes come from `single`, `vector` and `stable_baselines`.
+    `SingleEnv`, `VectorEnv` and `StableBaselinesEnv` wrap it for Gymnasium and Stable-Baselines3.
     """
 
     def __init__(
@@ -86,6 +61,8 @@ class Environment:
             ParameterError: a randomised parameter that does not exist.
         """
         chosen = task.randomisation() if randomisation is None else randomisation
+        if not isinstance(chosen, Randomisation):
+            raise TaskError(f"randomisation is {type(chosen).__name__}; allowed is a Randomisation, or None")
         if not bodies or bodies[-1] != 1.0:
             raise TaskError(f"bodies is {bodies!r}; the last one must be 1.0, the tip")
         self.task, self.robot, self.randomisation = task, robot, chosen
@@ -123,12 +100,12 @@ class Environment:
 
     def reset(self, key: Any) -> tuple[EpisodeState, Float[Any, " o"]]:
         """Return the state and the observation at the start of an episode that a JAX key determines."""
-        found: tuple[EpisodeState, Any] = _reset(self.spec, self.arrays, key)
-        return found
+        states, observations = self.reset_many(jnp.asarray(key)[None])
+        return jax.tree.map(lambda leaf: leaf[0], states), observations[0]
 
     def reset_many(self, keys: Any) -> tuple[EpisodeState, Float[Any, "B o"]]:
         """Return the states and observations (B, o) at the starts of episodes, for keys (B, 2)."""
-        found: tuple[EpisodeState, Any] = _reset_many(self.spec, self.arrays, keys)
+        found: tuple[EpisodeState, Any] = programs.reset(self.spec, self.arrays, keys)
         return found
 
     def step(self, state: EpisodeState, action: Float[Any, " c"]) -> tuple[EpisodeState, Transition]:
@@ -136,12 +113,15 @@ class Environment:
 
         An unsolved step truncates the episode with its reason in `ending`; the state is then the one before.
         """
-        found: tuple[EpisodeState, Transition] = _step(self.spec, self.arrays, state, action)
+        many = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], (state, action))
+        found: tuple[EpisodeState, Transition] = jax.tree.map(lambda leaf: leaf[0], self.step_many(*many))
         return found
 
     def step_many(self, states: EpisodeState, actions: Float[Any, "B c"]) -> tuple[EpisodeState, Transition]:
         """Return the states of many episodes after one period under actions (B, c), and the transitions."""
-        found: tuple[EpisodeState, Transition] = _step_many(self.spec, self.arrays, states, actions)
+        # the program overwrites its states
+        kept = jax.tree.map(jnp.array, states)
+        found: tuple[EpisodeState, Transition] = programs.step(self.spec, self.arrays, kept, actions)
         return found
 
     def system(self, state: EpisodeState) -> System:
@@ -151,31 +131,6 @@ class Environment:
     def reference(self, state: EpisodeState) -> Reference:
         """Return the target of an episode as a reference of a controller."""
         return self.task.reference(state.goal, self.arrays.survey)
-
-    # classes of other packages
-
-    def single(self) -> SingleEnv:
-        """Return a `gymnasium.Env`; it needs the extra `rl`."""
-        from knode_cosserat.envs.single import SingleEnv
-
-        return SingleEnv(self)
-
-    def vector(self, count: int, autoreset: str = "next-step") -> RobotVectorEnv:
-        """Return a Gymnasium `VectorEnv` of `count` episodes on all cores; it needs the extra `rl`.
-
-        Args:
-            count: number of episodes at once.
-            autoreset: "next-step", "same-step" or "disabled", as in `gymnasium.vector.AutoresetMode`.
-        """
-        from knode_cosserat.envs.vector import RobotVectorEnv
-
-        return RobotVectorEnv(self, count, autoreset)
-
-    def stable_baselines(self, count: int) -> StableBaselinesEnv:
-        """Return a Stable-Baselines3 `VecEnv` of `count` episodes; it needs the extra `sb3`."""
-        from knode_cosserat.envs.stable_baselines import StableBaselinesEnv
-
-        return StableBaselinesEnv(self, count)
 
     def __repr__(self) -> str:
         return (

@@ -71,9 +71,10 @@ class EpisodePlant(Plant):
 def reference_controller(
     environment: Environment, state: EpisodeState, name: str = "predictive"
 ) -> Controller:
-    """Return a controller of the nominal robot with the obstacles of an episode."""
+    """Return a controller whose model has the middle of all parameters, and the obstacles of an episode."""
     arrays, spec = environment.arrays, environment.spec
-    robot: System = spec.task.placed(arrays.robot, state.goal)
+    middle = {name: 0.5 * (arrays.least[name] + arrays.greatest[name]) for name in spec.names}
+    robot: System = spec.task.placed(arrays.robot.replace(**middle), state.goal)
     noise = max(float(arrays.noise), LEAST_NOISE)
     adapt = [each for each in spec.task.adapted if name in WITH_OBSERVER and each in spec.names]
     return controller_named(name, robot, spec.dt, environment.limits, adapt, TipPosition(sigma=noise))
@@ -84,8 +85,8 @@ def controller_scores(
 ) -> Float[np.ndarray, " n"]:
     """Return the mean reward of a controller in the episode of each key (n, 2).
 
-    It knows the nominal robot and the target, measures the tip, and adapts the parameters that the task
-    names. An episode that ends early counts zero for the rest of its time.
+    It knows the middle of the parameters and the target, and measures the tip. It adapts the parameters that
+    the task names. An episode that ends early counts zero for the rest of its time.
     """
     scores = []
     for key in np.asarray(keys):

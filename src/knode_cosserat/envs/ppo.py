@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
+import optax  # type: ignore[import-untyped]
 from jaxtyping import Float
 
 from knode_cosserat.envs.environment import Environment
@@ -75,7 +75,7 @@ class Progress(NamedTuple):
 
 
 class Weights(NamedTuple):
-    """What is optimised: the networks, and the logarithm of the actions' deviation."""
+    """Optimised numbers: the networks, and the logarithm of the actions' deviation."""
 
     policy: Layers
     value: Layers

@@ -11,15 +11,15 @@ from stable_baselines3.common.vec_env import VecEnv
 from knode_cosserat.envs.environment import Environment
 from knode_cosserat.envs.single import spaces
 from knode_cosserat.envs.spec import Ending
-from knode_cosserat.envs.vector import RobotVectorEnv
+from knode_cosserat.envs.vector import VectorEnv
 
 
-class StableBaselinesEnv(VecEnv):
+class StableBaselinesEnv(VecEnv):  # type: ignore[misc,unused-ignore]
     """Many episodes of an environment as a `VecEnv`: an episode that ends is restarted in the same step."""
 
     def __init__(self, environment: Environment, count: int):
         """Set up `count` episodes, and compile everything."""
-        self._vector = RobotVectorEnv(environment, count, "same-step")
+        self._vector = VectorEnv(environment, count, "same-step")
         self.environment = environment
         self._actions: Any = None
         self._next_seed: int | None = None

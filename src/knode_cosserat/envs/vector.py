@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import concurrent.futures
-import functools
 from typing import Any
 
 import gymnasium
 import jax
 import numpy as np
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from knode_cosserat.envs import dynamics
+from knode_cosserat.envs import dynamics, programs
 from knode_cosserat.envs.environment import Environment, checked_action
 from knode_cosserat.envs.errors import TaskError
 from knode_cosserat.envs.single import spaces
@@ -21,19 +20,6 @@ from knode_cosserat.solvers.run import usable_cores
 
 #: number of episodes that one call resets: one program for any number
 RESET_AT_ONCE = 8
-
-
-@functools.partial(jax.jit, static_argnames="spec", donate_argnames="states")
-def _stepped(spec: Any, arrays: Any, states: Any, actions: Any) -> Any:
-    return dynamics.step_many(spec, arrays, states, actions)
-
-
-@functools.partial(jax.jit, static_argnames="spec", donate_argnames="states")
-def _restarted(spec: Any, arrays: Any, states: Any, where: Any, keys: Any) -> Any:
-    """Return states with new episodes at some places, and their observations."""
-    fresh, observations = jax.vmap(lambda key: dynamics.reset(spec, arrays, key))(keys)
-    # places beyond the end are not written: they only fill up the number
-    return jax.tree.map(lambda all, new: all.at[where].set(new, mode="drop"), states, fresh), observations
 
 
 class Episodes:
@@ -73,7 +59,7 @@ class Episodes:
                 places[: len(some)] = where[some] - part * self._size
                 used = np.zeros((RESET_AT_ONCE, 2), dtype=np.uint32)
                 used[: len(some)] = keys[some]
-                self._parts[part], seen = _restarted(
+                self._parts[part], seen = programs.restart(
                     self.environment.spec, self.environment.arrays, self._parts[part], places, used
                 )
                 every[some] = np.asarray(seen)[: len(some)]
@@ -85,7 +71,7 @@ class Episodes:
         spec, arrays = self.environment.spec, self.environment.arrays
 
         def work(part: int) -> Any:
-            self._parts[part], found = _stepped(spec, arrays, self._parts[part], filled[part])
+            self._parts[part], found = programs.step(spec, arrays, self._parts[part], filled[part])
             return jax.tree.map(np.asarray, found)
 
         found = list(self._pool.map(work, range(len(self._parts))))
@@ -96,10 +82,10 @@ class Episodes:
         environment = self.environment
         states, _ = environment.reset_many(np.zeros((self._size, 2), dtype=np.uint32))
         actions = np.zeros((self._size, environment.action_size))
-        states, _ = _stepped(environment.spec, environment.arrays, states, actions)
+        states, _ = programs.step(environment.spec, environment.arrays, states, actions)
         places = np.full(RESET_AT_ONCE, self._size)
         keys = np.zeros((RESET_AT_ONCE, 2), dtype=np.uint32)
-        jax.block_until_ready(_restarted(environment.spec, environment.arrays, states, places, keys))
+        jax.block_until_ready(programs.restart(environment.spec, environment.arrays, states, places, keys))
 
     def goals(self) -> Any:
         """Return the goals of all episodes, with a leading axis."""
@@ -114,7 +100,7 @@ class Episodes:
         return np.concatenate(parts)[: self.count]
 
 
-class RobotVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """Many episodes of an environment as Gymnasium's `VectorEnv`.
 
     The information of a step has arrays of all episodes: the task's `error` (m), the `tip` (m), the `control`
