@@ -15,7 +15,7 @@ def main(out: str = "learn_stiffness.png", steps: int = 100) -> tuple[float, flo
     model = robot.replace(youngs_modulus=10e9)
     data = [kc.simulate(robot, kc.controls.sine(period, 30, DT), DT) for period in (0.5, 1.0)]
     learned = kc.fit(model, data)
-    print("what it adds:", *kc.explain(learned), sep="\n  ")
+    print("what it adds:", *kc.learning.explain(learned), sep="\n  ")
 
     unseen = kc.controls.random(steps, seed=3, hold=10)
     truth, before, after = (kc.simulate(each, unseen, DT) for each in (robot, model, learned))

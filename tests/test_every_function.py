@@ -128,7 +128,7 @@ def structured(robot: kc.System, it: Made) -> Any:
     model = kc.fit(robot, [it.motion])
     # nothing is missing: the motion is the robot's own
     assert abs(float(model.residual.stretch)) < 1e-6
-    assert all(abs(each.coefficient) < 1e-2 for each in kc.explain(model) if each.part == "stress")
+    assert all(abs(each.coefficient) < 1e-2 for each in kc.learning.explain(model) if each.part == "stress")
     return model.residual.stretch
 
 
@@ -290,7 +290,7 @@ def test_what_is_missing_is_named():
     with pytest.raises(kc.robots.RobotFileError, match="KNODE"):
         kc.save_robot(MODEL, "a.yaml")
     with pytest.raises(TypeError, match="allowed is a KNODE"):
-        kc.explain(CANE)
+        kc.learning.explain(CANE)
 
 
 class Pull(Residual):

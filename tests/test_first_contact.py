@@ -65,7 +65,7 @@ WRONG = {
     "a metric of an array": (lambda t: kc.metrics.pose_mse(np.zeros((3, 3)), t), "ndarray", "a Trajectory"),
     "trajectories of two lengths": (lambda t: kc.metrics.tip_rmse(t, t[:3]), "6 rows.*3", "the same number"),
     "errors of a number": (lambda t: kc.metrics.state_errors(t, 3), "int", "a Trajectory"),
-    "to explain a robot": (lambda t: kc.explain(ROBOT), "TendonRobot", "a KNODE"),
+    "to explain a robot": (lambda t: kc.learning.explain(ROBOT), "TendonRobot", "a KNODE"),
     "a missing trajectory": (lambda t: kc.load_trajectory("nope.nc"), "nope.nc", "no such file"),
     "a trajectory of text": (lambda t: kc.load_trajectory(__file__), "test_first_contact", "netCDF"),
     "a missing model": (lambda t: kc.load_model("nope"), "nope", "no such file"),
@@ -158,7 +158,7 @@ def test_one_load_does_for_a_list_of_one():
 
 
 def test_the_doctor_finds_this_installation_well():
-    found = kc.doctor()
+    found = kc.diagnosis.doctor()
     assert found.well and {check.name for check in found.checks} == {
         "precision", "cache", "simulation", "balance",
     }  # fmt: skip
@@ -167,7 +167,7 @@ def test_the_doctor_finds_this_installation_well():
 
 def test_the_doctor_says_what_is_wrong(monkeypatch):
     monkeypatch.setattr("knode_cosserat.diagnosis.simulate", lambda *_: 1 / 0)
-    found = kc.doctor()
+    found = kc.diagnosis.doctor()
     assert not found.well and "ZeroDivisionError" in str(found)
     done = CliRunner().invoke(app, ["doctor"])
     assert done.exit_code == 1 and "FAILED" in done.output

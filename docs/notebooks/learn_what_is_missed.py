@@ -29,9 +29,9 @@ model = kc.fit(knowledge, data)
 # wrong modulus. `fit` does not know which parameters are wrong.
 
 # %%
-for finding in kc.explain(model):
+for finding in kc.learning.explain(model):
     print(finding)
-print(f"length: {0.4 * (1 + kc.explain(model)[0].coefficient):.6f} m, and truly {robot.length} m")
+print(f"length: {0.4 * (1 + kc.learning.explain(model)[0].coefficient):.6f} m, and truly {robot.length} m")
 
 # %% [markdown]
 # ## Test on held-out controls

@@ -2,9 +2,9 @@
 
 The names that a first script needs are here; start with `load_robot`, `simulate` and `Trajectory`. All other
 public names are in the namespaces `robots`, `solvers`, `learning`, `calibration`, `recordings`, `statics`,
-`estimation`, `control`, `hardware`, `identification`, `metrics`, `figures`, `viewer`, `controls` and
-`named_controls`. Events are logged to the logger "knode_cosserat", which is quiet unless a handler is
-added.
+`estimation`, `control`, `hardware`, `identification`, `metrics`, `figures`, `viewer`, `controls`,
+`named_controls`, `envs` and `sweeps`. Events are logged to the logger "knode_cosserat", which is quiet unless
+a handler is added.
 """
 
 import importlib
@@ -17,6 +17,7 @@ from knode_cosserat import (
     calibration,
     control,
     controls,
+    envs,
     estimation,
     figures,
     hardware,
@@ -28,13 +29,13 @@ from knode_cosserat import (
     robots,
     solvers,
     statics,
+    sweeps,
     viewer,
 )
 from knode_cosserat.calibration import calibrate
-from knode_cosserat.diagnosis import doctor
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.identification import fit, identify
-from knode_cosserat.learning import KNODE, FitConfig, explain, load_model
+from knode_cosserat.learning import KNODE, FitConfig, load_model
 from knode_cosserat.recordings import estimate_states, load_recording
 from knode_cosserat.robots import System, catalog, load_robot, save_robot
 from knode_cosserat.solvers import Result, SimulationError, equilibrium, simulate
@@ -60,11 +61,10 @@ __all__ = [
     "catalog",
     "control",
     "controls",
-    "doctor",
+    "envs",
     "equilibrium",
     "estimate_states",
     "estimation",
-    "explain",
     "figures",
     "fit",
     "hardware",
@@ -84,6 +84,7 @@ __all__ = [
     "simulate",
     "solvers",
     "statics",
+    "sweeps",
     "view",
     "viewer",
     "workspace",
@@ -101,7 +102,7 @@ _MOVED = {
     ),
     "learning": (
         "CheckpointError ConfigError DataError Ensemble FitError ModelFileError NetworkOptions "
-        "PassiveOptions Residual RolloutTraining StructuredOptions Training load_ensemble"
+        "PassiveOptions Residual RolloutTraining StructuredOptions Training explain load_ensemble"
     ),
     "calibration": "Calibration CalibrationError",
     "recordings": "Measurements Recording RecordingConfig RecordingError estimate_parts",
@@ -112,7 +113,7 @@ _MOVED = {
     "identification": "IdentificationError Identified",
     "metrics": "StateError node_error pose_mse state_errors tip_dtw tip_rmse",
     "viewer": "export_scene view_live",
-    "diagnosis": "Diagnosis",
+    "diagnosis": "Diagnosis doctor",
 }
 _NAMESPACES = {name: place for place, names in _MOVED.items() for name in names.split()}
 

@@ -293,7 +293,7 @@ def test_a_wrong_modulus_is_learned_from_one_trajectory():
     )
     assert after < before / 1000
     # the legs are alike: one law is learned for all, and it is Young's modulus that was wrong
-    found = {(each.target, each.function): each.coefficient for each in kc.explain(model)}
+    found = {(each.target, each.function): each.coefficient for each in kc.learning.explain(model)}
     assert found["u_x", "u_x"] == pytest.approx(0.3 * EI, rel=1e-6)
 
 

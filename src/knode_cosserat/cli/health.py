@@ -15,8 +15,8 @@ def doctor(as_json: Json = False) -> None:
 
     Prints versions, devices, cache and precision. The exit status is 1 if a check fails.
     """
-    import knode_cosserat as kc
+    from knode_cosserat.diagnosis import doctor as check
 
-    diagnosis = kc.doctor()
+    diagnosis = check()
     write_output(as_json, diagnosis.to_dict(), str(diagnosis).splitlines())
     raise typer.Exit(0 if diagnosis.well else 1)

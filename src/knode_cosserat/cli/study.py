@@ -73,6 +73,28 @@ def closed_loop(
     run_study(lambda **how: rerun(out, quick, **how), {"quick": quick}, out, workers, dask, progress, as_json)
 
 
+@studies.command(epilog=examples("study environments --quick --out results"))
+def environments(
+    out: Out,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Shorter trainings and sweeps: less than 10 min.")
+    ] = False,
+    workers: Workers = None,
+    dask: Dask = None,
+    progress: Progress = None,
+    as_json: Json = False,
+) -> None:
+    """Measure environments and sweeps: rates, checks, predictive control, and a policy that PPO learns.
+
+    Writes environments.md and environments.json (check, value, limit, ok), and the policies. It needs the
+    extras rl and sweep. Resumes an earlier run in the same folder.
+    """
+    prepare(out, workers, dask)
+    from knode_cosserat.studies.environments import rerun
+
+    run_study(lambda **how: rerun(out, quick, **how), {"quick": quick}, out, workers, dask, progress, as_json)
+
+
 @studies.command(epilog=examples("study hardware --quick --out results"))
 def hardware(
     out: Out,

@@ -1,0 +1,264 @@
+"""Study of environments and sweeps: rates, checks, and learned policies against predictive control."""
+
+from __future__ import annotations
+
+import importlib.util
+import statistics
+import tempfile
+import time as clock
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from knode_cosserat import controls
+from knode_cosserat.control.elastica_plant import ElasticaPlant
+from knode_cosserat.control.loop import _COMPILATIONS, run_loop
+from knode_cosserat.control.plants import Sensor
+from knode_cosserat.envs.environment import Environment, make
+from knode_cosserat.envs.errors import TaskError
+from knode_cosserat.envs.plant import PolicyController, controller_scores, policy_scores
+from knode_cosserat.envs.policy import Policy
+from knode_cosserat.envs.ppo import Training
+from knode_cosserat.envs.randomisation import Factor, Randomisation
+from knode_cosserat.envs.tasks import TASKS
+from knode_cosserat.estimation.outputs import BodyPositions
+from knode_cosserat.evaluation.tables import markdown_table
+from knode_cosserat.rods.robot_file import load_robot
+from knode_cosserat.rods.tendon_rod import TendonRod
+from knode_cosserat.solvers.simulate import simulate
+from knode_cosserat.studies import stand_in
+from knode_cosserat.studies.environments_sweep import measure_sweep
+from knode_cosserat.studies.report import Report, as_json, write_texts
+from knode_cosserat.studies.runner import Job, Product, run
+
+#: robot whose stand-in PyElastica simulates
+REAL = "delrin-routed-tendon-robot"
+#: episodes at once, and periods, of the rate; a rate is the median of so many rounds
+EPISODES, PERIODS, ROUNDS = 1024, 40, 5
+#: part of the reference score that a policy must reach
+ENOUGH = 0.9
+
+
+def jobs(quick: bool) -> list[Job]:
+    """Return the study's jobs."""
+    made = [
+        Job("rate", rate, {"episodes": EPISODES}),
+        *(Job(f"task-{name}", task, {"task": name, "episodes": 2 if quick else 20}) for name in TASKS),
+        Job("ppo", ppo, {"seconds": 150.0 if quick else 900.0, "episodes": 2 if quick else 20}),
+        Job("sweep", sweep, {"rollouts": 4096 if quick else 1_000_000}),
+    ]
+    if not quick and stand_in.is_available():
+        made.append(Job("stand-in", real, {"seconds": 900.0, "episodes": 5}))
+    return made
+
+
+def rerun(out: Path, quick: bool = False, **how: Any) -> Report:
+    """Run the study, and write environments.json and environments.md; interrupted runs are continued.
+
+    Args:
+        out: the folder.
+        quick: shorter trainings and sweeps, and no stand-in.
+        how: `workers`, `dask`, `progress` as `runner.run` has them.
+
+    Raises:
+        TaskError: Gymnasium is missing.
+    """
+    if importlib.util.find_spec("gymnasium") is None:
+        raise TaskError("the study needs Gymnasium: pip install 'knode-cosserat[rl]'")
+    facts = run(jobs(quick), out, **how)
+    made = checks(facts)
+    texts = {"environments.json": as_json(made), "environments.md": as_markdown(made, facts)}
+    return Report(made, write_texts(out, texts), [])
+
+
+def checks(facts: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the figures of the study with their limits: check, value, limit, ok."""
+    found, learned, swept = facts["rate"], facts["ppo"], facts["sweep"]
+    tasks = [facts[f"task-{name}"] for name in TASKS]
+    least = [
+        (f"steps/s of {EPISODES} episodes", found["rate"], 60_000.0),
+        ("the same, relative to a batch of simulations", found["ratio"], 0.6),
+        ("PPO on follow: score relative to predictive control", learned["ratio"], ENOUGH),
+        ("sweep: parallel efficiency, by core time", swept["parallel_efficiency"]["cores"], 0.9),
+    ]
+    most = [
+        ("programs compiled after the first reset", found["compiled"], 0),
+        ("bits that differ between two runs of one seed", found["different"], 0),
+        ("tasks that Gymnasium's check refuses", sum(bool(each["refused"]) for each in tasks), 0),
+        ("PPO on follow: time until then (s)", learned["until"], 900.0),
+        ("sweep: 10^6 rollouts of 20 steps (s)", swept["seconds_for_a_million"], 900.0),
+        ("sweep: files that differ after five kills", int(not swept["identical"]), 0),
+    ]
+    made = [
+        {"check": name, "value": value, "limit": limit, "ok": bool(value >= limit)}
+        for name, value, limit in least
+    ]
+    made += [
+        {"check": name, "value": value, "limit": limit, "ok": bool(value <= limit)}
+        for name, value, limit in most
+    ]
+    if "stand-in" in facts:
+        # a published figure; nothing is asked of it
+        gap = facts["stand-in"]["gap"]
+        made.append(
+            {
+                "check": "policy on the stand-in: lost part of its score",
+                "value": gap,
+                "limit": 1.0,
+                "ok": True,
+            }
+        )
+    return made
+
+
+def as_markdown(made: Sequence[Mapping[str, Any]], facts: Mapping[str, Any]) -> str:
+    """Return the tables of the study."""
+    rows = [[each["check"], f"{each['value']:.4g}", f"{each['limit']:.4g}", "yes" if each["ok"] else "no"]
+            for each in made]  # fmt: skip
+    scores = [[name, f"{facts[f'task-{name}']['score']:.3f}"] for name in TASKS]
+    curve = [
+        [f"{steps:,}", f"{seconds:.0f}", f"{reward:.3f}"] for steps, seconds, reward in facts["ppo"]["curve"]
+    ]
+    parts = [
+        "# Environments and sweeps\n",
+        markdown_table(["check", "value", "limit", "met"], rows),
+        "\n## Predictive control: mean reward of an episode\n",
+        markdown_table(["task", "score"], scores),
+        "\n## PPO on follow: mean reward with exploration\n",
+        markdown_table(["steps", "seconds", "reward"], curve),
+    ]
+    return "\n".join(parts) + "\n"
+
+
+def rate(settings: Any) -> Product:
+    """Measure the rate of steps against a batch of simulations of the same motions; count compilations."""
+    from knode_cosserat.envs.vector import VectorEnv
+
+    count = settings["episodes"]
+    environment, robot = make("follow"), load_robot("delrin-tendon-robot")
+    vector, random = VectorEnv(environment, count), np.random.default_rng(0)
+    period, scale = random.uniform(0.8, 3.0, count), random.uniform(0.8, 1.2, count)
+    tension = np.stack([
+        a * controls.sine(p, PERIODS, environment.dt) for p, a in zip(period, scale, strict=True)
+    ])  # fmt: skip
+    actions = 2.0 * tension / 10.0 - 1.0
+
+    def stepped(seed: int) -> tuple[float, bytes]:
+        vector.reset(seed=seed)
+        began = clock.perf_counter()
+        for k in range(PERIODS):
+            seen = vector.step(actions[:, k])[0]
+        return clock.perf_counter() - began, seen.tobytes()
+
+    before = _COMPILATIONS.count
+    first, second = stepped(1)[1], stepped(1)[1]
+    compiled = _COMPILATIONS.count - before
+    simulate(robot, tension, environment.dt)
+    pairs = []
+    for _ in range(ROUNDS):
+        began = clock.perf_counter()
+        simulate(robot, tension, environment.dt)
+        pairs.append((stepped(1)[0], clock.perf_counter() - began))
+    steps = count * PERIODS
+    ours, raw = (statistics.median(each) for each in zip(*((a, b - a) for a, b in pairs), strict=True))
+    different = sum((a ^ b).bit_count() for a, b in zip(first, second, strict=True))
+    vector.close()
+    return Product(
+        {
+            "rate": steps / ours, "raw": steps / raw, "ratio": raw / ours, "compiled": compiled,
+            "different": different,
+        },
+        {},
+    )  # fmt: skip
+
+
+def task(settings: Any) -> Product:
+    """Check a task by Gymnasium's checker, and score the predictive controller."""
+    from gymnasium.utils.env_checker import check_env
+
+    from knode_cosserat.envs.single import SingleEnv
+
+    environment, refused = make(settings["task"]), ""
+    try:
+        check_env(SingleEnv(environment), skip_render_check=True)
+    except Exception as error:
+        refused = str(error) or type(error).__name__
+    scores = controller_scores(environment, keys(settings["episodes"]))
+    return Product({"score": float(scores.mean()), "scores": scores.tolist(), "refused": refused}, {})
+
+
+def keys(count: int) -> np.ndarray:
+    """Return the keys of the episodes on which everything is scored; no training has them."""
+    return np.asarray(jax.random.split(jax.random.PRNGKey(2024), count))
+
+
+def ppo(settings: Any) -> Product:
+    """Train a policy on follow, and compare its score with that of the predictive controller."""
+    environment = make("follow")
+    reference = float(controller_scores(environment, keys(settings["episodes"])).mean())
+    training = Training(environment)
+    held_out, until = keys(64), float("inf")
+
+    def report(progress: Any) -> None:
+        nonlocal until
+        if not np.isfinite(until) and len(training.history) % 10 == 0:
+            score = float(policy_scores(environment, training.policy, held_out).mean())
+            until = progress.seconds if score >= ENOUGH * reference else until
+
+    history = training.run(settings["seconds"], report)
+    score = float(policy_scores(environment, training.policy, held_out).mean())
+    curve = [list(history[k]) for k in np.unique(np.linspace(0, len(history) - 1, 12).astype(int))]
+    facts = {
+        "reference": reference, "score": score, "ratio": score / reference,
+        "until": until if np.isfinite(until) else 1e9, "curve": curve,
+    }  # fmt: skip
+    return Product(facts, {"follow.npz": saved(training.policy)})
+
+
+def saved(policy: Policy) -> bytes:
+    """Return the file of a policy."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "policy.npz"
+        policy.save(path)
+        return path.read_bytes()
+
+
+def real(settings: Any) -> Product:
+    """Train a policy for a robot whose stand-in PyElastica simulates, and report what it loses there."""
+    randomisation = Randomisation(
+        {"youngs_modulus": Factor(0.8, 1.2), "bending_damping": Factor(0.5, 3.0)}, delay=(0, 2), noise=5e-4
+    )
+    environment = make("follow", REAL, randomisation=randomisation)
+    training = Training(environment)
+    training.run(settings["seconds"])
+    chosen = keys(settings["episodes"])
+    own = policy_scores(environment, training.policy, chosen)
+    there = np.array([_on_stand_in(environment, training.policy, key) for key in chosen])
+    facts = {
+        "score": float(own.mean()),
+        "real": float(there.mean()),
+        "gap": float(1.0 - there.mean() / own.mean()),
+    }
+    return Product(facts, {"follow-real.npz": saved(training.policy)})
+
+
+def _on_stand_in(environment: Environment, policy: Policy, key: Any) -> float:
+    """Return the mean reward of a policy on PyElastica's robot, for the goal of a key."""
+    state, _ = environment.reset(key)
+    robot = environment.robot
+    assert isinstance(robot, TendonRod)
+    sensor = Sensor(BodyPositions(environment.spec.output.fractions, sigma=5e-4), noise=1.0)
+    plant = ElasticaPlant.like(robot, environment.dt, sensor)
+    controller = PolicyController(environment, policy, state.goal)
+    log = run_loop(controller, plant, environment.reference(state), environment.steps * environment.dt)
+    error = log.tip_distance / (environment.task.scale * float(robot.length))
+    return float(np.mean(np.exp(-error)))
+
+
+def sweep(settings: Any) -> Product:
+    """Measure a sweep, five times killed and undisturbed."""
+    with tempfile.TemporaryDirectory() as folder:
+        return Product(measure_sweep(folder, settings["rollouts"]), {})
