@@ -125,6 +125,8 @@ def __dir__() -> list[str]:
 if not typing.TYPE_CHECKING:  # a type checker is to report names that do not exist
 
     def __getattr__(name: str) -> typing.Any:
+        if name in _MOVED:
+            return importlib.import_module(f"{__name__}.{name}")
         place = _NAMESPACES.get(name)
         if place is None:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
