@@ -10,7 +10,7 @@ from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.findings import SEVERITIES, Finding, RecordingError
 from knode_cosserat.recordings.frame import bodies_in_robot_frame
 from knode_cosserat.recordings.messages import Stream
-from knode_cosserat.recordings.plausibility import implausible_units
+from knode_cosserat.recordings.plausibility import implausible_times, implausible_units
 from knode_cosserat.recordings.recording import Recording
 
 
@@ -57,6 +57,8 @@ def assembled(
     )
     findings += about_poses + about_tensions + about_frame
     findings += implausible_units(in_frame, None if config.motors else tension, command, rest)
+    if not config.static:
+        findings += implausible_times(in_frame)
     if config.simulated:
         findings.append(Finding("note", "", "the robot was itself a simulation, and not a physical one"))
     description = f"{name}: {config.description}" if config.description else name

@@ -89,7 +89,7 @@ def read_beam(path: Path, load: float | None = None) -> BeamRecording:
     """
     load = load_of(path.stem) if load is None else load
     try:
-        _, table = read_csv(path.read_bytes(), str(path))
+        table = read_csv(path.read_bytes(), str(path)).numbers
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
     missing = [name for name in COLUMNS if name not in table.columns]

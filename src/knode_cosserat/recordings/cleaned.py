@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from knode_cosserat.recordings import cleaning
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.findings import Finding, RecordingError, Severity
+from knode_cosserat.recordings.plausibility import implausible_tensions
 from knode_cosserat.recordings.recording import Body, Tensions, bridge, period
 from knode_cosserat.recordings.sources import (
     MOTOR_UNITS,
@@ -156,6 +157,11 @@ def _tensions(
     _drop(findings, source.topic, time[~good], "tension is", "tensions are", "not finite", "warning")
     time, newtons = time[good], newtons[good]
     measured = kind == "measured" and isinstance(source, TensionSource) and not source.held
+    if isinstance(source, TensionSource):
+        wrong = implausible_tensions(newtons)
+        _about_implausible(findings, source.topic, time, newtons, wrong, "left out" if measured else "kept")
+        if measured:
+            time, newtons = time[~wrong], newtons[~wrong]
     if measured and 0.0 < period(time) <= LONGEST_SPIKE:
         spikes = np.zeros(len(time), dtype=bool)
         longest = min(2, int(LONGEST_SPIKE / period(time)))
@@ -173,6 +179,22 @@ def _tensions(
         )
         time, newtons = time[~spikes], newtons[~spikes]
     return Tensions(source.topic, time, newtons) if len(time) else None
+
+
+def _about_implausible(
+    findings: list[Finding], topic: str, time: np.ndarray, newtons: np.ndarray, wrong: np.ndarray, fate: str
+) -> None:
+    """Add a finding on implausible tensions; held ones are kept, because they last until the next row."""
+    if not wrong.any():
+        return
+    usual, worst = float(np.median(np.abs(newtons))), newtons[wrong].ravel()
+    most = float(worst[np.argmax(np.abs(worst))])
+    what = (
+        f"{_count(int(wrong.sum()), 'row has', 'rows have')} a tension that is not plausible, {most:.4g} N "
+        f"among tensions of {usual:.3g} N; {fate}"
+    )
+    severity: Severity = "warning" if fate == "left out" else "problem"
+    findings.append(Finding(severity, topic, what, tuple(time[wrong][:1000].tolist())))
 
 
 def _drop(

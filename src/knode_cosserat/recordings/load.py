@@ -7,19 +7,23 @@ from __future__ import annotations
 
 import gzip
 import importlib.resources
+import io
 import zlib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from knode_cosserat.recordings import ros1, ros2
 from knode_cosserat.recordings.config import RecordingConfig
-from knode_cosserat.recordings.container import Container
+from knode_cosserat.recordings.container import ALLOWANCE, RATIO, Container
 from knode_cosserat.recordings.findings import Finding, RecordingError
 from knode_cosserat.recordings.messages import SIMULATED, Role, Stream, decoded_messages
 from knode_cosserat.recordings.recording import Recording
+
+if TYPE_CHECKING:
+    from knode_cosserat.recordings.table import Table
 
 GZIP_MAGIC = b"\x1f\x8b"
 #: file name of the package's own recording
@@ -52,13 +56,11 @@ def load_recording(path: str | Path, config: RecordingConfig | None = None) -> R
         or _named_bag(path)
     ):
         return _from_bag(path, begin, config or RecordingConfig.paper_robot())
-    from knode_cosserat.recordings import table
+    from knode_cosserat.recordings import parquet, table
 
-    if begin.startswith(table.PARQUET_MAGIC):
-        said, numbers = table.read_parquet(path)
-    else:
-        said, numbers = table.read_csv(_bytes(path), str(path))
-    return _from_table(path.name, str(path), (said, numbers), config)
+    is_parquet = begin.startswith(parquet.MAGIC)
+    content = parquet.read_parquet(path) if is_parquet else table.read_csv(_bytes(path), str(path))
+    return _from_table(path.name, str(path), content, config)
 
 
 def load_example() -> Recording:
@@ -87,11 +89,23 @@ def _beginning(path: Path) -> bytes:
 def _bytes(path: Path) -> bytes:
     try:
         data = path.read_bytes()
-        return gzip.decompress(data) if data.startswith(GZIP_MAGIC) else data
+        return _gunzipped(data, path) if data.startswith(GZIP_MAGIC) else data
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
         raise RecordingError(f"{path}: cannot be decompressed: {error}") from None
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def _gunzipped(data: bytes, path: Path) -> bytes:
+    most = RATIO * len(data) + ALLOWANCE
+    with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
+        found = file.read(most + 1)
+    if len(found) > most:
+        raise RecordingError(
+            f"{path}: it has more than {most} bytes when decompressed; allowed are {RATIO} times the file "
+            f"and {ALLOWANCE}"
+        )
+    return found
 
 
 def _named_bag(path: Path) -> bool:
@@ -164,15 +178,13 @@ def _said_damage(container: Container, streams: Iterable[Stream]) -> Finding:
 # tables
 
 
-def _from_table(
-    name: str, path: str, content: tuple[dict[str, str], Any], config: RecordingConfig | None
-) -> Recording:
+def _from_table(name: str, path: str, content: Table, config: RecordingConfig | None) -> Recording:
     from knode_cosserat.recordings import assembly, table
 
-    said, numbers = content
+    said, numbers, findings = content
     simulated = table.said_simulated(said, path)
     config = config or table.configured(said, list(numbers.columns), path)
-    found = table.streams(numbers, config, path)
+    found, about_times = table.streams(numbers, config, path)
     if config.simulated is None:
         config = config.replace(simulated=simulated)
-    return assembly.assembled(path, said.get("source", name), config, found, [])
+    return assembly.assembled(path, said.get("source", name), config, found, [*findings, *about_times])

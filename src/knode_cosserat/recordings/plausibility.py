@@ -1,14 +1,15 @@
-"""Plausibility check of the units of tensions and positions."""
+"""Plausibility check of times, of the units of tensions and positions, and of single tensions."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from knode_cosserat.recordings.findings import Finding
 from knode_cosserat.recordings.frame import rest_positions
-from knode_cosserat.recordings.recording import Body, Tensions
+from knode_cosserat.recordings.recording import Body, Tensions, period
 
 #: plausible range of a tendon robot's tensions (N)
 SLACK, STRONG = 0.12, 120.0
@@ -16,6 +17,10 @@ SLACK, STRONG = 0.12, 120.0
 SHORT, LONG = 0.02, 20.0
 #: largest plausible ratio of measured to commanded tensions, or the inverse
 FACTOR = 20.0
+#: smallest implausible time between poses (s): motion capture at 1 to 1,000 Hz whose times are in ms
+SLOW = 1.0
+#: largest share of rows with implausible tensions; more of them are no accidents
+RARE = 0.05
 
 
 def implausible_units(
@@ -60,3 +65,35 @@ def implausible_units(
         )
         findings.append(Finding("problem", "", what))
     return findings
+
+
+def implausible_times(bodies: Sequence[Body]) -> list[Finding]:
+    """Return a finding on poses that are too far apart for a motion, with the likely error."""
+    time = min((body.time for body in bodies), key=period)
+    step = period(time)
+    if not SLOW <= step < np.inf:
+        return []
+    hours = (time[-1] - time[0]) / 3600.0
+    what = (
+        f"poses are {step:.3g} s apart, and the recording takes {hours:.2g} h: are the times in ms? "
+        "(Rows of shapes at rest need static: true.)"
+    )
+    return [Finding("problem", "", what)]
+
+
+def implausible_tensions(newtons: Float[np.ndarray, "n tendons"]) -> Bool[np.ndarray, " n"]:
+    """Return a mask of rows with a tension that no tendon has, among tensions that are plausible.
+
+    It is below zero by more than the usual tension, because a tendon cannot push, or above `STRONG` and more
+    than `FACTOR` times the usual one. The usual tension is the median of those that are not zero.
+    """
+    none = np.zeros(len(newtons), dtype=bool)
+    size = np.abs(newtons)
+    if not np.any(size > 0.0):
+        return none
+    usual = float(np.median(size[size > 0.0]))
+    if not SLACK <= usual <= STRONG or np.median(newtons[size > 0.0]) < 0.0:
+        return none
+    wrong = (newtons < -usual) | (newtons > max(STRONG, FACTOR * usual))
+    rows = np.any(wrong, axis=1)
+    return rows if np.mean(rows) <= max(RARE, 1.0 / len(rows)) else none

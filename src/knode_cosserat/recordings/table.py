@@ -20,19 +20,20 @@ orientation. A row has the measurements at its time: cells of slower sensors sta
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
-from pathlib import Path
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd  # type: ignore[import-untyped]
 from jaxtyping import Float
 
 from knode_cosserat._yaml import shown
+from knode_cosserat.recordings.clocks import FAR
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.config_values import PLACE
-from knode_cosserat.recordings.findings import RecordingError
+from knode_cosserat.recordings.findings import Finding, RecordingError
 from knode_cosserat.recordings.messages import Stream
+from knode_cosserat.recordings.plausibility import SLOW
 from knode_cosserat.recordings.sources import CommandSource, MarkerSource, TableSource, TensionSource
 
 TIME = "time [s]"
@@ -45,67 +46,62 @@ ALLOWED = (
     "they were measured, NAME_qw, NAME_qx, NAME_qy, NAME_qz, and command_1 [N], …; tensions that are held "
     "from a row to the next are held_tension_1 [N], … instead"
 )
-PARQUET_MAGIC = b"PAR1"
 _QUATERNION = ("qw", "qx", "qy", "qz")
 #: largest plausible time (s)
 _LATEST = 9e9
 
 
-def read_csv(data: bytes, path: str) -> tuple[dict[str, str], pd.DataFrame]:
+class Table(NamedTuple):
+    """Metadata of a table, its columns of numbers, and findings from reading it."""
+
+    said: dict[str, str]
+    numbers: pd.DataFrame
+    findings: tuple[Finding, ...] = ()
+
+
+def read_csv(data: bytes, path: str) -> Table:
     """Return a CSV file's metadata and its columns of numbers. Raises `RecordingError`."""
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
         raise RecordingError(f"{path}: not a recording: no bag, and no CSV text: it is not UTF-8") from None
-    return _comments(text), _numbers(_cells(text, path), path)
+    lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    said, first = _comments(lines)
+    return Table(said, numbers_of(_cells(text, path), path), _about_comments(lines, first))
 
 
-def read_parquet(path: Path) -> tuple[dict[str, str], pd.DataFrame]:
-    """Return a Parquet file's metadata and its columns of numbers.
-
-    Raises:
-        RecordingError: the file cannot be read, or a column has no numbers.
-        ImportError: pyarrow is not installed.
-    """
-    pyarrow = _pyarrow()
-    try:
-        table = pyarrow.parquet.read_table(path)
-        said = {key.decode(): value.decode() for key, value in (table.schema.metadata or {}).items()}
-        frame = pd.DataFrame({name: table.column(i).to_numpy() for i, name in enumerate(table.column_names)})
-    except (pyarrow.ArrowException, OSError, ValueError) as error:
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise RecordingError(f"{path}: not a Parquet table: {reason}") from None
-    if len(frame) == 0:
-        raise RecordingError(f"{path}: no rows")
-    return said, _numbers(frame, str(path))
-
-
-def write_parquet(path: Path, table: pd.DataFrame, said: Mapping[str, str]) -> None:
-    """Write columns and metadata as Parquet. Raises `ImportError` if pyarrow is not installed."""
-    pyarrow = _pyarrow()
-    written = pyarrow.Table.from_pandas(table, preserve_index=False)
-    pyarrow.parquet.write_table(written.replace_schema_metadata(dict(said)), path)
-
-
-def _pyarrow() -> Any:
-    try:
-        import pyarrow  # type: ignore[import-not-found, import-untyped, unused-ignore]
-        import pyarrow.parquet  # type: ignore[import-not-found, import-untyped, unused-ignore]
-    except ImportError:
-        raise ImportError("Parquet files need pyarrow: pip install 'knode-cosserat[parquet]'") from None
-    return pyarrow
-
-
-def _comments(text: str) -> dict[str, str]:
-    """Return the metadata from the lines `# key: value` before the header."""
-    said = {}
-    for line in text.splitlines():
-        if not line.startswith("#"):
-            break
+def _comments(lines: Sequence[str]) -> tuple[dict[str, str], int]:
+    """Return the metadata from the lines `# key: value` before the header, and the header's index."""
+    said: dict[str, str] = {}
+    for index, line in enumerate(lines):
+        if line.strip() and not line.startswith("#"):
+            return said, index
         key, colon, value = line.removeprefix("#").partition(":")
         if colon:
             said[key.strip()] = value.strip()
-    return said
+    return said, len(lines)
+
+
+def _about_comments(lines: Sequence[str], header: int) -> tuple[Finding, ...]:
+    """Return findings on text after a `#`, from the header on: nothing of it is read."""
+    marked = [k for k in range(header, len(lines)) if "#" in lines[k]]
+    whole = [k + 1 for k in marked if lines[k].startswith("#")]
+    ends = [k + 1 for k in marked if not lines[k].startswith("#")]
+    findings = []
+    after = "with # after the header"
+    if whole:
+        what = f"{numbered(whole, f'line begins {after}', f'lines begin {after}')}; left out"
+        findings.append(Finding("warning", "", what))
+    if ends:
+        what = f"{numbered(ends, 'line has a #', 'lines have a #')}; the text after it is left out"
+        findings.append(Finding("warning", "", what))
+    return tuple(findings)
+
+
+def numbered(numbers: Sequence[int], one: str, several: str) -> str:
+    """Return a count of lines or rows, and the first of their numbers."""
+    listed = ", ".join(map(str, numbers[:3])) + (", …" if len(numbers) > 3 else "")
+    return f"{len(numbers)} {one if len(numbers) == 1 else several} ({listed})"
 
 
 def _cells(text: str, path: str) -> pd.DataFrame:
@@ -123,7 +119,7 @@ def _cells(text: str, path: str) -> pd.DataFrame:
     return table
 
 
-def _numbers(table: pd.DataFrame, path: str) -> pd.DataFrame:
+def numbers_of(table: pd.DataFrame, path: str) -> pd.DataFrame:
     """Return all cells as numbers, NaN where they are empty."""
     numbers = table.apply(pd.to_numeric, errors="coerce")
     values = numbers.to_numpy(dtype=float, na_value=np.nan)
@@ -235,8 +231,14 @@ def tension_titles(topic: str, unit: str, count: int) -> list[str]:
     return [f"{topic}_{k + 1} [{unit}]" for k in range(count)]
 
 
-def streams(table: pd.DataFrame, config: RecordingConfig, path: str) -> dict[str, Stream]:
-    """Return the measured rows of each topic. Raises `RecordingError` if a column is missing."""
+def streams(
+    table: pd.DataFrame, config: RecordingConfig, path: str
+) -> tuple[dict[str, Stream], list[Finding]]:
+    """Return the measured rows of each topic, and findings on rows that have no time.
+
+    Raises:
+        RecordingError: a column is missing, or the times are not plausible seconds.
+    """
     columns, called = list(table.columns), config.table or TableSource()
     if called.rate is not None:
         time = np.arange(len(table)) / called.rate
@@ -244,9 +246,7 @@ def streams(table: pd.DataFrame, config: RecordingConfig, path: str) -> dict[str
         raise RecordingError(f"{path}: the columns are {', '.join(columns)}; required is {TIME}, once")
     else:
         time = table[TIME].to_numpy()
-    if np.any(np.abs(time) > _LATEST):
-        row = int(np.argmax(np.abs(time) > _LATEST))
-        raise RecordingError(f"{path}: row {row + 1}: {TIME} is {time[row]:g}; allowed is up to {_LATEST:g}")
+    check_seconds(time, path)
     wanted: dict[str, list[str]] = {}
     for source in (*config.markers, config.base):
         if source is not None:
@@ -274,7 +274,37 @@ def streams(table: pd.DataFrame, config: RecordingConfig, path: str) -> dict[str
                 f"{path}: the column {missing[0]} is {wrong}; the columns are {', '.join(columns)}"
             )
         found[topic] = _stream(topic, time, table[titles].to_numpy())
-    return found
+    return found, _about_times(time)
+
+
+def check_seconds(time: Float[np.ndarray, " n"], path: str) -> None:
+    """Raise `RecordingError` for times that are too late, or too far apart, to be seconds."""
+    late = np.abs(time) > _LATEST
+    if late.any():
+        row = int(np.argmax(late))
+        hint = _likely_unit(abs(time[row]), _LATEST)
+        raise RecordingError(
+            f"{path}: row {row + 1}: {TIME} is {time[row]:g}; allowed is up to {_LATEST:g}. {hint}"
+        )
+    known = np.sort(time[np.isfinite(time)])
+    step = float(np.median(np.diff(known))) if len(known) > 1 else 0.0
+    if step > FAR:
+        raise RecordingError(
+            f"{path}: its rows are {step:g} s apart; allowed is up to {FAR:g} s. {_likely_unit(step, SLOW)}"
+        )
+
+
+def _likely_unit(time: float, most: float) -> str:
+    """Return the question for the unit in which a time becomes at most so many seconds."""
+    unit = next((unit for unit, size in (("ms", 1e-3), ("µs", 1e-6)) if time * size <= most), "ns")
+    return f"Are the times in {unit}?"
+
+
+def _about_times(time: Float[np.ndarray, " n"]) -> list[Finding]:
+    """Return a finding on rows without a time."""
+    rows = (np.flatnonzero(~np.isfinite(time)) + 1).tolist()
+    what = f"{numbered(rows, 'row has no time', 'rows have no time')}; left out"
+    return [Finding("warning", "", what)] if rows else []
 
 
 def _called(titles: tuple[str, ...] | None, topic: str) -> list[str]:

@@ -278,7 +278,7 @@ def message_maker(stream: WireStream, ros: int) -> Callable[[int, int, Any], Any
 
 
 def _write_table(path: Path, config: RecordingConfig, streams: list[WireStream]) -> None:
-    from knode_cosserat.recordings import table
+    from knode_cosserat.recordings import parquet, table
 
     columns: dict[str, Any] = {}
     for stream in streams:
@@ -305,4 +305,4 @@ def _write_table(path: Path, config: RecordingConfig, streams: list[WireStream])
             comments = "".join(f"# {key}: {value}\n" for key, value in said.items())
             temporary.write_text(comments + frame.to_csv(index=False, lineterminator="\n"), encoding="utf-8")
         else:
-            table.write_parquet(temporary, frame, said)
+            parquet.write_parquet(temporary, frame, said)
