@@ -65,7 +65,7 @@ bench: $(READY) ## run the benchmarks
 firmware: ## build the firmware of the tension board, and its emulator (needs Debian's arduino-core-avr; see firmware/README.md)
 	@$(MAKE) --no-print-directory -C firmware OUT=$(CURDIR)/build/firmware
 
-attack: $(READY) ## read 20,000 damaged files of all kinds: each is read, or refused in one clear line
+attack: $(READY) ## damaged files, kills, disk faults, extreme robots, a flood of the live server (an hour; see tools/attack)
 	$(BIN)/python -m tools.attack
 
 package: $(READY) ## build wheel and sdist into dist/, and use the wheel in an environment of its own

@@ -1,16 +1,14 @@
-"""Damaged files through every reader: `make attack`, or `python -m tools.attack [--files N] [--seed N]`.
+"""Damaged files through every reader.
 
 Each file is a good one with random bytes changed, removed, inserted or repeated. It has to be read, or
-refused by an error of the package in one line, within seconds. The table counts what was tried, read,
-refused, and what failed; files that failed are kept.
+refused by an error of the package in one line, within seconds. Files that failed are kept.
 """
 
-import argparse
+from __future__ import annotations
+
 import collections
 import random
-import resource
-import sys
-import tempfile
+import shutil
 import time
 import traceback
 import warnings
@@ -18,16 +16,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
-import knode_cosserat as kc
 from knode_cosserat.errors import KnodeCosseratError
+from tools.attack.samples import samples
 
 #: longest time that a file may take (s)
 PATIENCE = 5.0
 #: what is written over a place: lengths, numbers and brackets that readers may believe
 WORDS = (b"\xff\xff\xff\xff", b"\0\0\0\0", b"nan ", b"1e99", b"-1\n\n", b"[[[[", b"*a: ", b"9999")
-DT = 0.05
 
 
 class Outcome(NamedTuple):
@@ -41,26 +36,14 @@ class Outcome(NamedTuple):
 
 
 def good_files(folder: Path) -> dict[str, Callable[[Path], Any]]:
-    """Write a good file of each kind, and return the reader of each by the file's name."""
-    robot = kc.load_robot("delrin-tendon-robot")
-    motion = kc.simulate(robot, kc.controls.sine(1.0, 10, DT), DT)
-    motion.save(folder / "trajectory.nc")
-    kc.robots.save_robot(kc.load_robot("delrin-routed-tendon-robot"), folder / "robot.yaml")
-    kc.recordings.RecordingConfig.paper_robot().save(folder / "recording.yaml")
-    kc.controls.save(folder / "controls.csv", np.full((5, 4), 5.0), DT)
-    measured = kc.recordings.Measurements.of(motion)
-    tables, bags = ("table.csv", "table.parquet"), ("bag.bag", "bag.mcap", "bag.db3")
-    for name in (*tables, *bags):
-        measured.save(folder / name)
-    config = kc.recordings.RecordingConfig.load(folder / "bag.yaml")
-    readers: dict[str, Callable[[Path], Any]] = {
-        "trajectory.nc": kc.load_trajectory,
-        "robot.yaml": kc.load_robot,
-        "recording.yaml": kc.recordings.RecordingConfig.load,
-        "controls.csv": lambda path: kc.controls.load(path, DT),
-    }
-    readers |= dict.fromkeys(tables, lambda path: kc.load_recording(path).sampled(DT))
-    return readers | dict.fromkeys(bags, lambda path: kc.load_recording(path, config).sampled(DT))
+    """Write a good file of each kind that has a reader, and return the readers by the files' names."""
+    readers = {}
+    for name, sample in samples().items():
+        if name != "figure.png":
+            sample.write(folder / name, 0)
+            sample.read(folder / name)
+            readers[name] = sample.read
+    return readers
 
 
 def damaged(content: bytes, chance: random.Random) -> bytes:
@@ -87,7 +70,11 @@ def damaged(content: bytes, chance: random.Random) -> bytes:
 def attacked(name: str, reader: Callable[[Path], Any], folder: Path, count: int, seed: int) -> Outcome:
     """Return what a reader does with so many damaged files; those that fail are kept in the folder."""
     content, chance = (folder / name).read_bytes(), random.Random(f"{seed} {name}")
-    path = folder / f"damaged{Path(name).suffix}"
+    path = folder / "damaged" / name
+    path.parent.mkdir(exist_ok=True)
+    beside = (folder / name).with_suffix(".yaml")
+    if beside.exists() and beside.name != name:
+        shutil.copy(beside, path.parent)
     outcomes: collections.Counter[str] = collections.Counter()
     failures, longest = [], 0.0
     for k in range(count):
@@ -112,30 +99,3 @@ def attacked(name: str, reader: Callable[[Path], Any], folder: Path, count: int,
             kept.write_bytes(path.read_bytes())
             failures.append(f"{kept}: {failure}")
     return Outcome(name, outcomes["read"], outcomes["refused"], failures, longest)
-
-
-def main() -> None:
-    """Attack every reader, and print the table; the exit status is 1 if one failed."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--files", type=int, default=20_000)
-    parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args()
-    folder = Path(tempfile.mkdtemp(prefix="attack-"))
-    readers = good_files(folder)
-    failures: list[str] = []
-    print("| file | tried | read | refused in one line | failed | longest (s) |")
-    print("| --- | --- | --- | --- | --- | --- |")
-    for name, reader in readers.items():
-        count = -(-given.files // len(readers))
-        found = attacked(name, reader, folder, count, given.seed)
-        failures += found.failures
-        cells = name, count, found.read, found.refused, len(found.failures), f"{found.longest:.2f}"
-        print(f"| {' | '.join(map(str, cells))} |", flush=True)
-    print(f"largest memory: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024} MB")
-    for each in failures:
-        print(each)
-    sys.exit(1 if failures else 0)
-
-
-if __name__ == "__main__":
-    main()
