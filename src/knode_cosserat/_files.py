@@ -31,7 +31,7 @@ def replacing(path: Path) -> Iterator[Path]:
         return
     path = Path(os.path.realpath(path))
     _remove_abandoned(path.parent)
-    temporary = path.parent / f".{path.name}.{secrets.token_hex(6)}.tmp"
+    temporary = _temporary(path)
     try:
         yield temporary
         # synchronise before the rename, or a power failure could leave the name with an empty file
@@ -44,16 +44,34 @@ def replacing(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+@contextlib.contextmanager
+def temporary_folder(path: Path) -> Iterator[Path]:
+    """Yield a new folder beside `path`, which is removed at the end; later writes remove it after a kill."""
+    folder = _temporary(path)
+    folder.mkdir()
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _temporary(path: Path) -> Path:
+    return path.parent / f".{path.name}.{secrets.token_hex(6)}.tmp"
+
+
 @functools.lru_cache(maxsize=1024)
 def _remove_abandoned(folder: Path) -> None:
-    """Remove temporary files of writes into a folder that were killed; younger ones may be in use.
+    """Remove temporary files and folders of killed writes into a folder; younger ones may be in use.
 
     Once in each process and folder: a study writes thousands of files into one.
     """
     with contextlib.suppress(OSError):
         for entry in os.scandir(folder):
             if _TEMPORARY.fullmatch(entry.name) and time.time() - entry.stat().st_mtime > ABANDONED:
-                os.unlink(entry.path)
+                if entry.is_dir(follow_symlinks=False):
+                    shutil.rmtree(entry.path, ignore_errors=True)
+                else:
+                    os.unlink(entry.path)
 
 
 def package_version() -> str:

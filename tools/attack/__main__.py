@@ -1,8 +1,8 @@
 """Run the attacks and print their tables: `python -m tools.attack [PART …] [--share 0.1] [--seed N]`.
 
-Parts: files (20,000 damaged files), kills (200), disk (100 faults), cases (3,000 extreme robots), flood (1,000
-pages at the live server), long (10,000 simulations), live (a session of an hour). `make attack` runs all but the
-last two within an hour; these take hours, and `python -m tools.attack long live` runs them.
+Parts: files (20,000 damaged files), kills (200), disk (100 faults), cases (3,000 extreme robots), flood
+(1,000 pages at the live server), long (10,000 simulations), live (a session of an hour). `make attack` runs
+all but the last two within an hour; these take hours: `python -m tools.attack long live`.
 """
 
 from __future__ import annotations

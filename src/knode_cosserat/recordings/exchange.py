@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from knode_cosserat._files import replacing
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.measurements import Measurements
@@ -79,6 +80,14 @@ def save(measurements: Measurements, path: str | Path) -> None:
         description=it.source,
         initial_tension=None if before is None else tuple(before.tolist()),
     )
-    write_recording(path, config, poses, Pulls(it.time, it.tension))
-    if root:
-        config.save(path.with_suffix(".yaml"))
+    pulls = Pulls(it.time, it.tension)
+    if not root:
+        write_recording(path, config, poses, pulls)
+        return
+    # the configuration takes its name last: neither file is changed if the bag cannot be written
+    try:
+        with replacing(path.with_suffix(".yaml")) as beside:
+            config.save(beside)
+            write_recording(path, config, poses, pulls)
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be written: {error.strerror}") from None

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import heapq
-import tempfile
+import sqlite3
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat._files import replacing
+from knode_cosserat._files import replacing, temporary_folder
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.config_values import PLACE
 from knode_cosserat.recordings.findings import RecordingError
@@ -104,8 +104,9 @@ def write_recording(
             _write_ros2(path, streams, start, delays or {})
         else:
             _write_table(path, config, streams)
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be written: {error.strerror}") from None
+    except (OSError, sqlite3.Error) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise RecordingError(f"{path}: cannot be written: {reason}") from None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -190,16 +191,15 @@ def _write_ros2(path: Path, streams: list[WireStream], start: int, delays: Mappi
 
     plugin = StoragePlugin.MCAP if path.suffix == ".mcap" else StoragePlugin.SQLITE3
     # rosbags writes a folder with a description; the data file alone is complete
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
-        bag = Path(folder) / "bag"
-        with Writer(bag, version=9, storage_plugin=plugin) as writer:
+    with replacing(path) as temporary, temporary_folder(path) as folder:
+        with Writer(folder / "bag", version=9, storage_plugin=plugin) as writer:
             connections = {
                 each.topic: writer.add_connection(each.topic, message_type(each, 2), typestore=store)
                 for each in streams
             }
             for topic, kind, received, message in _messages(streams, 2, start, delays):
                 writer.write(connections[topic], received, store.serialize_cdr(message, kind))
-        (bag / f"bag{path.suffix}").replace(path)
+        (folder / "bag" / f"bag{path.suffix}").replace(temporary)
 
 
 def _messages(

@@ -15,6 +15,10 @@ PACE = 1.0
 PATIENCE = 0.3
 #: longest message of a page (characters)
 LONGEST = 4096
+#: shortest time between two values that are taken over (s); of those in between the newest counts
+SHORTEST = 1.0 / 60.0
+#: most messages of a page in a second: the page itself sends 60 or fewer; another program is cut off
+MOST_PER_SECOND = 250
 #: largest number of a message: a page gets it back as float32
 MOST_MESSAGES = 2**24
 
@@ -27,6 +31,9 @@ class PageSession(abc.ABC):
         self.sequence, self.paused, self.begin_anew = 0, False, False
         self.pace = 1.0
         self.wanted = asyncio.Event()
+        #: newest message that is no command and was not processed yet
+        self._newest: str | bytes | None = None
+        self._unread = asyncio.Event()
         #: commands of the page by name
         self.commands: dict[str, Callable[[], None]] = {
             "pause": lambda: self._pause(True), "resume": lambda: self._pause(False), "reset": self._reset,
@@ -34,7 +41,7 @@ class PageSession(abc.ABC):
 
     async def run(self) -> None:
         """Run until the page is closed."""
-        tasks = [asyncio.create_task(each) for each in (self._read(), *self._motions())]
+        tasks = [asyncio.create_task(each) for each in (self._read(), self._take_newest(), *self._motions())]
         try:
             done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             for task in done:
@@ -52,11 +59,39 @@ class PageSession(abc.ABC):
         """Take over a value from a message that is no command. `ValueError` or `KeyError` if it has none."""
 
     async def _read(self) -> None:
+        """Read all messages at once: a page that sends many must not hold up the others."""
+        clock, count, since = asyncio.get_running_loop(), 0, float("-inf")
         async for text in self.connection:
-            try:
-                self.understand(_parsed(text))
-            except (ValueError, TypeError, OverflowError) as error:
-                await self.connection.send(json.dumps({"error": " ".join(str(error).split())}))
+            count += 1
+            if clock.time() - since > 1.0:
+                count, since = 1, clock.time()
+            if count > MOST_PER_SECOND:
+                await self.connection.close(1008, f"more than {MOST_PER_SECOND} messages in a second")
+                return
+            if _is_command(text):
+                await self._process(self._newest)  # in the order in which they came
+                self._newest = None
+                await self._process(text)
+            else:
+                self._newest = text
+                self._unread.set()
+
+    async def _take_newest(self) -> None:
+        """Take over the newest value, not more often than every `SHORTEST`."""
+        while True:
+            await self._unread.wait()
+            self._unread.clear()
+            text, self._newest = self._newest, None
+            await self._process(text)
+            await asyncio.sleep(SHORTEST)
+
+    async def _process(self, text: str | bytes | None) -> None:
+        if text is None:
+            return
+        try:
+            self.understand(_parsed(text))
+        except (ValueError, TypeError, OverflowError) as error:
+            await self.connection.send(json.dumps({"error": " ".join(str(error).split())}))
 
     def understand(self, message: Any) -> None:
         """Process a message of the page: a value, or a command. `ValueError` for anything else."""
@@ -98,6 +133,11 @@ def sequence_of(message: Mapping[str, Any]) -> int:
             f"sequence must be a whole number below {MOST_MESSAGES} (got {reprlib.repr(number)})"
         )
     return number
+
+
+def _is_command(text: str | bytes) -> bool:
+    """True if a message may be a command, which is never dropped."""
+    return isinstance(text, str) and '"command"' in text
 
 
 def _parsed(text: Any) -> Any:

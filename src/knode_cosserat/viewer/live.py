@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import gc
 import http
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -23,6 +24,10 @@ if TYPE_CHECKING:
 
 #: default time step (s)
 USUAL = 0.05
+#: most pages that are open at once: each solves its own steps; others are answered 503
+MOST_PAGES = 4
+#: connections that are accepted at once: the open pages are served in between
+BACKLOG = 8
 
 
 def view_live(
@@ -58,7 +63,12 @@ def view_live(
     checked_port(port)
     stepper = Stepper(robot, usual_step(robot) if dt is None else dt, space=space)
     page = live_page(stepper, title, target)
-    asyncio.run(serve_page(page, lambda connection: Session(stepper, connection), port, open_browser))
+    gc.collect()
+    gc.freeze()  # a collection of everything that is loaded takes 0.1 to 0.3 s
+    try:
+        asyncio.run(serve_page(page, lambda connection: Session(stepper, connection), port, open_browser))
+    finally:
+        gc.unfreeze()
 
 
 def usual_step(robot: System) -> float:
@@ -107,6 +117,12 @@ async def serve_page(
     from websockets.http11 import Request, Response
 
     own: list[str] = []
+    opened: set[Any] = set()
+
+    def full() -> Response:
+        text = f"{MOST_PAGES} pages of this robot are open; close one, then load this page again\n"
+        headers = Headers({"Content-Type": "text/plain", "Connection": "close"})
+        return Response(503, "Service Unavailable", headers, text.encode())
 
     def answer(connection: Any, request: Request) -> Response | None:
         if request.headers.get_all("Host") not in (
@@ -115,9 +131,14 @@ async def serve_page(
             return Response(403, "Forbidden", Headers(), b"")
         path = request.path.split("?")[0]
         if path == "/live":
-            return None
+            # another page of the browser must not reach it
+            if request.headers.get("Origin") not in [f"http://{host}" for host in own]:
+                return Response(403, "Forbidden", Headers(), b"another origin\n")
+            return full() if len(opened) >= MOST_PAGES else None
         if path not in ("/", "/index.html"):
             return connection.respond(http.HTTPStatus.NOT_FOUND, "not found\n")
+        if len(opened) >= MOST_PAGES:
+            return full()
         headers = Headers({
             "Content-Type": "text/html; charset=utf-8", "Content-Length": str(len(page)),
             "Cache-Control": "no-store", "Connection": "close",
@@ -125,16 +146,19 @@ async def serve_page(
         return Response(200, "OK", headers, page)
 
     async def connected(connection: ServerConnection) -> None:
-        # another page of the browser must not reach it
-        if connection.request is None or connection.request.headers.get("Origin") not in [
-            f"http://{host}" for host in own
-        ]:
-            await connection.close(1008, "another origin")
+        if len(opened) >= MOST_PAGES:  # several came together
+            await connection.close(1013, "too many pages")
             return
-        with contextlib.suppress(ConnectionClosed):
-            await session(connection).run()
+        opened.add(connection)
+        try:
+            with contextlib.suppress(ConnectionClosed):
+                await session(connection).run()
+        finally:
+            opened.discard(connection)
 
-    async with serve(connected, HOST, port, process_request=answer, compression=None) as server:
+    async with serve(
+        connected, HOST, port, process_request=answer, compression=None, backlog=BACKLOG
+    ) as server:
         number = next(iter(server.sockets)).getsockname()[1]
         own += own_names(number)
         announce(f"http://{HOST}:{number}/", open_browser)
