@@ -11,7 +11,7 @@ from __future__ import annotations
 import collections
 import warnings
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -125,7 +125,7 @@ class Checked(NamedTuple):
 def checked(case: Case) -> Checked:
     """Simulate a case on both grids and compare."""
     robot = case.robot
-    options = {"recovery_budget": 1.0, "on_failure": "return"}
+    options: Any = {"recovery_budget": 1.0, "on_failure": "return"}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         moved = kc.simulate(robot, case.tensions, case.dt, **options)

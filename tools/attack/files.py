@@ -1,7 +1,8 @@
 """Damaged files through every reader.
 
 Each file is a good one with random bytes changed, removed, inserted or repeated. It has to be read, or
-refused by an error of the package in one line, within seconds. Files that failed are kept.
+refused by an error of the package in one line, within seconds. Kinds with checksums have to be read as they
+were written, or refused. Files that failed are kept.
 """
 
 from __future__ import annotations
@@ -17,12 +18,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from knode_cosserat.errors import KnodeCosseratError
-from tools.attack.samples import samples
+from tools.attack.samples import fingerprint, samples
 
 #: longest time that a file may take (s)
 PATIENCE = 5.0
 #: what is written over a place: lengths, numbers and brackets that readers may believe
 WORDS = (b"\xff\xff\xff\xff", b"\0\0\0\0", b"nan ", b"1e99", b"-1\n\n", b"[[[[", b"*a: ", b"9999")
+
+
+#: kinds with a checksum of their numbers
+CHECKSUMMED = ("trajectory.nc", "model.model", "member.checkpoint", "policy.npz", "shard.parquet")
 
 
 class Outcome(NamedTuple):
@@ -75,6 +80,7 @@ def attacked(name: str, reader: Callable[[Path], Any], folder: Path, count: int,
     beside = (folder / name).with_suffix(".yaml")
     if beside.exists() and beside.name != name:
         shutil.copy(beside, path.parent)
+    known = fingerprint(reader(folder / name)) if name in CHECKSUMMED else None
     outcomes: collections.Counter[str] = collections.Counter()
     failures, longest = [], 0.0
     for k in range(count):
@@ -83,8 +89,10 @@ def attacked(name: str, reader: Callable[[Path], Any], folder: Path, count: int,
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                reader(path)
+                found = reader(path)
             outcomes["read"] += 1
+            if known is not None and fingerprint(found) != known:
+                failure = "read with other numbers"
         except KnodeCosseratError as error:
             outcomes["refused"] += 1
             failure = "more than one line" if "\n" in str(error) else ""

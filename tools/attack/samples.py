@@ -105,12 +105,14 @@ def _of_learning() -> dict[str, Sample]:
 
     robot = kc.load_robot(ROBOT)
 
+    network_of: Any = Network
+
     def model(version: int) -> kc.KNODE:
         generator = np.random.default_rng(version)
         inputs, outputs = input_size(robot, False), robot.y_layout.size + robot.z_layout.size
         shapes = ((3, inputs), (3,), (outputs, 3), (outputs,), (inputs,))
         arrays = [1e-2 * generator.normal(size=shape) for shape in shapes]
-        return kc.KNODE(robot, Network(*arrays, np.ones(inputs), np.full(outputs, 1e-2)))
+        return kc.KNODE(robot, network_of(*arrays, np.ones(inputs), np.full(outputs, 1e-2)))
 
     @functools.cache
     def checkpoints(folder: Path) -> Any:
