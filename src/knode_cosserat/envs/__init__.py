@@ -1,4 +1,7 @@
-"""Environments for learning controllers: tasks of robots as pure functions, and for Gymnasium and others."""
+"""Environments for learning controllers: tasks of robots as pure functions, and for Gymnasium and others.
+
+`SingleEnv` and `VectorEnv` need Gymnasium (extra `rl`); `StableBaselinesEnv` needs the extra `sb3`.
+"""
 
 from __future__ import annotations
 
@@ -26,3 +29,33 @@ make_lazy(
         "knode_cosserat.envs.tasks.reaching": "Reach",
     },
 )
+
+__all__ = [
+    "TASKS",
+    "Adaptation",
+    "Ending",
+    "Environment",
+    "EpisodePlant",
+    "EpisodeState",
+    "Factor",
+    "Follow",
+    "Gate",
+    "Outcome",
+    "PPOSettings",
+    "Payload",
+    "Pillar",
+    "Policy",
+    "PolicyController",
+    "Randomisation",
+    "Reach",
+    "Survey",
+    "Task",
+    "TaskError",
+    "Tip",
+    "Training",
+    "Transition",
+    "Uniform",
+    "controller_scores",
+    "make",
+    "policy_scores",
+]

@@ -18,9 +18,9 @@ import optax  # type: ignore[import-untyped]
 from jaxtyping import Float
 
 from knode_cosserat.envs.environment import Environment
+from knode_cosserat.envs.episodes import Episodes
 from knode_cosserat.envs.errors import TaskError
 from knode_cosserat.envs.policy import Layers, Policy, evaluated, network
-from knode_cosserat.envs.vector import Episodes
 
 
 @dataclasses.dataclass(frozen=True)

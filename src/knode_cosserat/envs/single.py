@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-import gymnasium
+try:
+    import gymnasium
+except ImportError:
+    raise ImportError("this needs gymnasium: pip install 'knode-cosserat[rl]'") from None
 import jax
 import numpy as np
 

@@ -6,7 +6,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.vec_env import VecEnv
+
+try:
+    from stable_baselines3.common.vec_env import VecEnv
+except ImportError:
+    raise ImportError("this needs stable_baselines3: pip install 'knode-cosserat[sb3]'") from None
 
 from knode_cosserat.envs.environment import Environment
 from knode_cosserat.envs.single import spaces
