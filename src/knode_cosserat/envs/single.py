@@ -6,8 +6,10 @@ from typing import Any
 
 try:
     import gymnasium
-except ImportError:
-    raise ImportError("this needs gymnasium: pip install 'knode-cosserat[rl]'") from None
+except ModuleNotFoundError as missing:
+    raise ModuleNotFoundError(
+        "this needs gymnasium: pip install 'knode-cosserat[rl]'", name=missing.name
+    ) from None
 import jax
 import numpy as np
 

@@ -9,8 +9,10 @@ import numpy as np
 
 try:
     from stable_baselines3.common.vec_env import VecEnv
-except ImportError:
-    raise ImportError("this needs stable_baselines3: pip install 'knode-cosserat[sb3]'") from None
+except ModuleNotFoundError as missing:
+    raise ModuleNotFoundError(
+        "this needs stable_baselines3: pip install 'knode-cosserat[sb3]'", name=missing.name
+    ) from None
 
 from knode_cosserat.envs.environment import Environment
 from knode_cosserat.envs.single import spaces
