@@ -199,9 +199,9 @@ PACKAGES = {
         (
             (0, "semi-implicit Euler", 2e-3), (1, "semi-implicit Euler", 4e-3),
             (1, "semi-implicit Euler", 2e-3), (1, "semi-implicit Euler", 1.5e-3),
-            (1, "semi-implicit Euler", 1e-3), (1, "tsit5 adaptive", 3e-2),
-            (1, "tsit5 adaptive", 1e-2), (1, "tsit5", 4e-3), (2, "tsit5 adaptive", 1e-3),
-            (3, "tsit5 adaptive", 1e-3), (4, "tsit5 adaptive", 1e-4),
+            (1, "semi-implicit Euler", 1e-3), (1, "tsit5 adaptive", 3e-2), (1, "tsit5 adaptive", 1e-2),
+            (1, "tsit5", 4e-3), (2, "tsit5 adaptive", 1e-3), (3, "tsit5 adaptive", 1e-3),
+            (4, "tsit5 adaptive", 1e-4),
         ),
     ),
 }  # fmt: skip
