@@ -354,7 +354,7 @@ TARGET = (
 
 @pytest.fixture(scope="module")
 def address(loop):
-    from knode_cosserat.viewer.live import serve_page
+    from knode_cosserat.viewer.page_server import serve_page
 
     found, known = [], threading.Event()
 

@@ -11,8 +11,9 @@ from knode_cosserat.control.commands import Controller
 from knode_cosserat.control.loop import LoopLog
 from knode_cosserat.control.plants import Plant
 from knode_cosserat.viewer.document import document
-from knode_cosserat.viewer.live import require_websockets, serve_page
+from knode_cosserat.viewer.live import require_websockets
 from knode_cosserat.viewer.loop_session import FollowedTarget, LoopSession
+from knode_cosserat.viewer.page_server import serve_page
 from knode_cosserat.viewer.scene import Point
 from knode_cosserat.viewer.serve import Opening, checked_port
 

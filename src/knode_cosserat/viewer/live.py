@@ -5,29 +5,23 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import gc
-import http
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+import sys
+from collections.abc import Iterator
 
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.result import SimulationError
 from knode_cosserat.solvers.stepper import Stepper
-from knode_cosserat.viewer.connection import PageSession
 from knode_cosserat.viewer.document import document
 from knode_cosserat.viewer.drawing import sliders
+from knode_cosserat.viewer.page_server import serve_page
 from knode_cosserat.viewer.scene import Point, checked_target, track
-from knode_cosserat.viewer.serve import HOST, Opening, announce, checked_port, own_names
+from knode_cosserat.viewer.serve import Opening, checked_port
 from knode_cosserat.viewer.session import Session
-
-if TYPE_CHECKING:
-    from websockets.asyncio.server import ServerConnection
 
 #: default time step (s)
 USUAL = 0.05
-#: most pages that are open at once: each solves its own steps; others are answered 503
-MOST_PAGES = 4
-#: connections that are accepted at once: the open pages are served in between
-BACKLOG = 8
+#: time after which a waiting thread gets its turn (s); 5 ms is Python's default
+SWITCH = 5e-4
 
 
 def view_live(
@@ -63,11 +57,21 @@ def view_live(
     checked_port(port)
     stepper = Stepper(robot, usual_step(robot) if dt is None else dt, space=space)
     page = live_page(stepper, title, target)
+    with prompt_threads():
+        asyncio.run(serve_page(page, lambda connection: Session(stepper, connection), port, open_browser))
+
+
+@contextlib.contextmanager
+def prompt_threads() -> Iterator[None]:
+    """Let threads wait for each other for less time: a solve takes turns with the server ten times or so."""
+    before = sys.getswitchinterval()
     gc.collect()
     gc.freeze()  # a collection of everything that is loaded takes 0.1 to 0.3 s
+    sys.setswitchinterval(SWITCH)
     try:
-        asyncio.run(serve_page(page, lambda connection: Session(stepper, connection), port, open_browser))
+        yield
     finally:
+        sys.setswitchinterval(before)
         gc.unfreeze()
 
 
@@ -105,62 +109,3 @@ def live_page(stepper: Stepper, title: str | None = None, target: Point | None =
         "live": {"sliders": given, "dt": stepper.dt},
     }
     return document(shown, "'self' ws:").encode("utf-8")
-
-
-async def serve_page(
-    page: bytes, session: Callable[[Any], PageSession], port: int, open_browser: Opening
-) -> None:
-    """Serve a page and the connections of its open copies, each with its session, until cancelled."""
-    from websockets.asyncio.server import serve
-    from websockets.datastructures import Headers
-    from websockets.exceptions import ConnectionClosed
-    from websockets.http11 import Request, Response
-
-    own: list[str] = []
-    opened: set[Any] = set()
-
-    def full() -> Response:
-        text = f"{MOST_PAGES} pages of this robot are open; close one, then load this page again\n"
-        headers = Headers({"Content-Type": "text/plain", "Connection": "close"})
-        return Response(503, "Service Unavailable", headers, text.encode())
-
-    def answer(connection: Any, request: Request) -> Response | None:
-        if request.headers.get_all("Host") not in (
-            [name] for name in own
-        ):  # a name that somebody made to point here
-            return Response(403, "Forbidden", Headers(), b"")
-        path = request.path.split("?")[0]
-        if path == "/live":
-            # another page of the browser must not reach it
-            if request.headers.get("Origin") not in [f"http://{host}" for host in own]:
-                return Response(403, "Forbidden", Headers(), b"another origin\n")
-            return full() if len(opened) >= MOST_PAGES else None
-        if path not in ("/", "/index.html"):
-            return connection.respond(http.HTTPStatus.NOT_FOUND, "not found\n")
-        if len(opened) >= MOST_PAGES:
-            return full()
-        headers = Headers({
-            "Content-Type": "text/html; charset=utf-8", "Content-Length": str(len(page)),
-            "Cache-Control": "no-store", "Connection": "close",
-        })  # fmt: skip
-        return Response(200, "OK", headers, page)
-
-    async def connected(connection: ServerConnection) -> None:
-        if len(opened) >= MOST_PAGES:  # several came together
-            await connection.close(1013, "too many pages")
-            return
-        opened.add(connection)
-        try:
-            with contextlib.suppress(ConnectionClosed):
-                await session(connection).run()
-        finally:
-            opened.discard(connection)
-
-    async with serve(
-        connected, HOST, port, process_request=answer, compression=None, backlog=BACKLOG
-    ) as server:
-        number = next(iter(server.sockets)).getsockname()[1]
-        own += own_names(number)
-        announce(f"http://{HOST}:{number}/", open_browser)
-        with contextlib.suppress(asyncio.CancelledError):
-            await asyncio.get_running_loop().create_future()
