@@ -44,6 +44,9 @@ def test_files_that_are_no_policies_are_refused(policy, tmp_path):
     policy._replace(deviation=np.zeros_like(policy.deviation)).save(path)
     with pytest.raises(envs.TaskError, match="not positive"):
         envs.Policy.load(path)
+    np.savez_compressed(path, header=np.zeros(10_000_000))
+    with pytest.raises(envs.TaskError, match="unpacked it is larger"):
+        envs.Policy.load(path)
     np.savez(path, header=np.array([{"version": 1}], dtype=object))
     with pytest.raises(envs.TaskError, match="is no policy"):
         envs.Policy.load(path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import zipfile
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -17,8 +18,8 @@ from knode_cosserat.envs.errors import TaskError
 
 #: version of the files
 VERSION = 1
-#: greatest size of a file (bytes), and greatest number of layers
-LARGEST_FILE, MOST_LAYERS = 100_000_000, 20
+#: greatest size of a file (bytes), unpacked too, and greatest number of layers
+LARGEST_FILE, MOST_LAYERS = 50_000_000, 20
 #: normalised observations are clipped here
 CLIP = 10.0
 
@@ -80,6 +81,9 @@ class Policy(NamedTuple):
         try:
             if path.stat().st_size > LARGEST_FILE:
                 raise ValueError(f"it is larger than {LARGEST_FILE} bytes")
+            with zipfile.ZipFile(path) as packed:
+                if sum(entry.file_size for entry in packed.infolist()) > LARGEST_FILE:
+                    raise ValueError(f"unpacked it is larger than {LARGEST_FILE} bytes")
             with np.load(path, allow_pickle=False) as file:
                 header = json.loads(str(file["header"]))
                 if header.get("version") != VERSION:
