@@ -15,7 +15,10 @@ make_lazy(
         "knode_cosserat.envs.randomisation": "Factor Randomisation Uniform",
         "knode_cosserat.envs.spec": "Ending",
         "knode_cosserat.envs.policy": "Policy",
-        "knode_cosserat.envs.plant": "EpisodePlant PolicyController controller_scores policy_scores",
+        "knode_cosserat.envs.plant": "EpisodePlant",
+        "knode_cosserat.envs.policy_controller": "PolicyController",
+        "knode_cosserat.envs.scores": "controller_scores policy_scores",
+        "knode_cosserat.envs.registration": "register",
         "knode_cosserat.envs.single": "SingleEnv",
         "knode_cosserat.envs.vector": "VectorEnv",
         "knode_cosserat.envs.stable_baselines": "StableBaselinesEnv",
@@ -58,4 +61,5 @@ __all__ = [
     "controller_scores",
     "make",
     "policy_scores",
+    "register",
 ]

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from knode_cosserat.envs.spec import MEASURED, PREVIEW, Arrays, Ending, Spec
+from knode_cosserat.envs.spec import MEASURED, PREVIEW, Arrays, Ending, Spec, commanded, scaled
 from knode_cosserat.envs.tasks.base import Tip
 from knode_cosserat.rods.system import System
 from knode_cosserat.rotation import dot, rotation_matrix
@@ -121,7 +121,7 @@ def observed(spec: Spec, arrays: Arrays, state: Any) -> Float[Any, " o"]:
     length, origin = arrays.robot.nominal.length, arrays.survey.origin
     bodies = state.measured.reshape(MEASURED, -1, 3)
     measured = (bodies - origin) / length
-    control = 2.0 * (state.commands[0] - arrays.low) / (arrays.high - arrays.low) - 1.0
+    control = scaled(arrays, state.commands[0])
     times = (state.count + np.asarray(PREVIEW)) * spec.dt
     targets = jax.vmap(lambda t: spec.task.target(state.goal, t))(times)
     places = (targets[:, :3] - origin) / length
@@ -171,18 +171,12 @@ class _Move(NamedTuple):
     valid: Any
 
 
-def _commanded(spec: Spec, arrays: Arrays, state: EpisodeState, action: Any) -> _Move:
+def _moved_by(spec: Spec, arrays: Arrays, state: EpisodeState, action: Any) -> _Move:
     """Return the command of an action, and the acting control after its delay."""
     before, action = state.commands[0], jnp.asarray(action, dtype=float)
     valid = jnp.all(jnp.isfinite(action))
-    most = arrays.rate * spec.dt
-    part = jnp.clip(jnp.where(valid, action, 0.0), -1.0, 1.0)
-    if spec.actions == "increment":
-        wanted = before + part * most
-    else:
-        wanted = arrays.low + 0.5 * (part + 1.0) * (arrays.high - arrays.low)
-        wanted = jnp.clip(wanted, before - most, before + most)
-    command = jnp.where(valid, jnp.clip(wanted, arrays.low, arrays.high), before)
+    command = commanded(spec, arrays, before, jnp.where(valid, action, 0.0))
+    command = jnp.where(valid, command, before)
     commands = jnp.concatenate([command[None], state.commands[:-1]])
     history = state.history._replace(t0=jnp.asarray(state.count * spec.dt, dtype=float))
     state = state._replace(commands=commands, history=history)
@@ -196,7 +190,7 @@ def _arrived(
     """Return the state after a solved step, and its outcome; without a solution the state before it."""
     state, system = move.state, arrays.robot if spec.is_shared else move.system
     solved, ny = row.result >= 0, system.y_layout.size
-    coarse = solved & is_coarse(row.position_error, system)
+    coarse = solved & is_coarse(row.position_error, system.length)
     record = jnp.where(solved, row.records, 0.0)
     y, z = record[:, :ny], record[:, ny : ny + system.z_layout.size]
     key, noise_key = jax.random.split(state.key)
@@ -230,7 +224,7 @@ def step_many(
     spec: Spec, arrays: Arrays, states: EpisodeState, actions: Float[Any, "B c"]
 ) -> tuple[EpisodeState, Transition]:
     """Return the states after one period of many episodes, and their transitions, all with a leading axis."""
-    moves = jax.vmap(lambda state, action: _commanded(spec, arrays, state, action))(states, actions)
+    moves = jax.vmap(lambda state, action: _moved_by(spec, arrays, state, action))(states, actions)
     systems = arrays.robot if spec.is_shared else moves.system
     steps = StepCoefficients(coefficient_table(spec.settings, spec.dt), spec.dt)
     lockstep = jax.default_backend() != "cpu"

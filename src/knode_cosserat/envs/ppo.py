@@ -138,7 +138,7 @@ def advantages(
     reward: Float[np.ndarray, "T B"], value: Float[np.ndarray, "T B"], following: Float[np.ndarray, "T B"],
     ended: np.ndarray, discount: float, trace: float,
 ) -> Float[np.ndarray, "T B"]:  # fmt: skip
-    """Return generalised advantage estimates (Schulman et al. 2016, eq. 16).
+    """Return generalised advantage estimates (Schulman et al. 2016, equation (16)).
 
     Args:
         reward: of each period.

@@ -10,6 +10,7 @@ import numpy as np
 
 from knode_cosserat.envs.errors import TaskError
 from knode_cosserat.rods.parameters import ParameterError
+from knode_cosserat.rods.paths import value_at
 from knode_cosserat.rods.system import System
 
 #: longest delay of commands, in periods
@@ -91,7 +92,7 @@ class Randomisation:
         low: dict[str, np.ndarray] = {}
         high: dict[str, np.ndarray] = {}
         for name, each in self.parameters.items():
-            value = value_of(robot, name)
+            value = value_at(robot.nominal, name)
             if value is None:
                 raise ParameterError(
                     f"{name} is not set for this robot, so it cannot be varied; set it with replace first"
@@ -100,20 +101,3 @@ class Randomisation:
         for ends in (low, high):
             robot.replace(**ends)
         return low, high
-
-
-def value_of(robot: System, name: str) -> Any:
-    """Return a parameter by its name in `System.replace`.
-
-    Raises:
-        ParameterError: it does not exist.
-    """
-    at: Any = robot.nominal
-    for part in name.split("."):
-        try:
-            at = at[int(part)] if part.isdigit() else getattr(at, part)
-        except (AttributeError, IndexError, TypeError):
-            # the message of `replace` lists the names that exist
-            robot.replace(**{name: 0.0})
-            raise ParameterError(f"{name} is no parameter of this robot") from None
-    return at

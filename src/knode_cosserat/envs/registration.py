@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-#: names of the tasks; importing them would import JAX
-NAMES = ("follow", "reach", "pillar", "gate", "payload", "adaptation")
+from knode_cosserat.envs.tasks import TASKS
 
 
 def register() -> None:
-    """Register an environment for each task; Gymnasium calls this by its entry point `gymnasium.envs`."""
+    """Register an environment for each task in Gymnasium's registry; it needs the extra `rl`.
+
+    An entry point of Gymnasium would do it at each `import gymnasium`, and import JAX with it.
+    """
     import gymnasium
 
-    for name in NAMES:
+    for name in TASKS:
         gymnasium.register(
             id=f"knode_cosserat/{name.capitalize()}-v0",
             entry_point="knode_cosserat.envs.single:made",

@@ -111,6 +111,24 @@ class Arrays(NamedTuple):
     rest: tuple[StateHistory, Any] | None
 
 
+def scaled(arrays: Arrays, control: Float[Any, "... c"]) -> Float[Any, "... c"]:
+    """Return controls as numbers from -1 to 1 within their limits."""
+    return 2.0 * (control - arrays.low) / (arrays.high - arrays.low) - 1.0
+
+
+def commanded(
+    spec: Spec, arrays: Arrays, before: Float[Any, " c"], action: Float[Any, " c"]
+) -> Float[Any, " c"]:
+    """Return the command of an action after another command, within limits and rate."""
+    most, part = arrays.rate * spec.dt, jnp.clip(action, -1.0, 1.0)
+    if spec.actions == "increment":
+        wanted = before + part * most
+    else:
+        wanted = arrays.low + 0.5 * (part + 1.0) * (arrays.high - arrays.low)
+        wanted = jnp.clip(wanted, before - most, before + most)
+    return jnp.clip(wanted, arrays.low, arrays.high)
+
+
 def checked_limits(robot: System, limits: ControlLimits | None) -> ControlLimits:
     """Return limits as arrays; those of tensions by default.
 

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.parameters import ParameterError, parameters_of
+from knode_cosserat.rods.paths import value_at
 from knode_cosserat.rods.system import System
 
 #: relative standard deviation of a positive parameter by default
@@ -170,13 +171,7 @@ def _looked_up(robot: System, name: str) -> Any:
                 f"{', '.join(f'{RESIDUAL}.{known}' for known in parts) or 'none: the model has no residual'}"
             )
         return parts[part]
-    found: Any = robot.nominal
-    for part in name.split("."):
-        try:
-            found = found[int(part)] if part.isdigit() else getattr(found, part)
-        except (AttributeError, IndexError):
-            raise ParameterError(f"{type(robot.nominal).__name__} has no parameter {name!r}") from None
-    return found
+    return value_at(robot.nominal, name)
 
 
 def _part(robot: System, adapted: Adapted) -> tuple[np.ndarray, float, bool]:

@@ -300,23 +300,6 @@ def _stated(cls: type, what: str) -> dict[str, Any]:
     return {name: each for name, each in stated.items() if each is not None}
 
 
-def with_value(owner: Any, path: str, value: Any, name: str) -> Any:
-    """Return a part, or a tuple of parts, with another value at a path such as `0.mass`."""
-    first, _, rest = path.partition(".")
-    several = isinstance(owner, tuple)
-    stated = dataclasses.fields(owner) if dataclasses.is_dataclass(owner) else ()
-    known = [str(k) for k in range(len(owner))] if several else [field.name for field in stated]
-    if first not in known:
-        raise ParameterError(
-            f"there is no parameter {name!r}: no {first!r} among {', '.join(known) or 'nothing'}"
-        )
-    inner = owner[int(first)] if several else getattr(owner, first)
-    changed = with_value(inner, rest, value, name) if rest else value
-    if several:
-        return tuple(changed if k == int(first) else each for k, each in enumerate(owner))
-    return dataclasses.replace(owner, **{first: changed})
-
-
 def checked(name: str, value: Any, parameter: Parameter) -> None:
     """Raise `ParameterError` unless the value is allowed. Tracers have no values and are not checked."""
     if value is None and parameter.optional:

@@ -27,8 +27,8 @@ from knode_cosserat.rods.parameters import (
     check_fields,
     parameters_of,
     unknown_parameter,
-    with_value,
 )
+from knode_cosserat.rods.paths import with_value
 from knode_cosserat.rotation import dot, rotation_matrix
 
 #: smallest and largest number of nodes of a rod

@@ -114,10 +114,15 @@ class Equilibria:
 
 def run_one(
     task: TimeIntegration | Equilibria, system: System, controls: np.ndarray, state: Any, before: Any,
-    progress: bool = False,
+    progress: bool = False, response: float = RESPONSE,
 ) -> Run:  # fmt: skip
-    """Solve all steps of one robot, with recovery, from a state and the control before it."""
-    total, piece = task.steps, FIRST_STEPS
+    """Solve all steps of one robot, with recovery, from a state and the control before it.
+
+    The compiled loop returns about every `response` seconds, to check for signals. Pieces change the result
+    within the tolerance: if it has to be the same bits in each run, `response` is infinite, one piece.
+    """
+    total = task.steps
+    piece = FIRST_STEPS if np.isfinite(response) else total
     padded = padded_rows(controls, least=LEAST_CAPACITY)
     budget = Budget(task.recovery_budget)
     rows: StepRows | None = None
@@ -130,8 +135,9 @@ def run_one(
             reached = int(reached)
             elapsed = time.perf_counter() - began
             budget.ran(elapsed)
-            # short enough to respond to an interruption, long enough to cost nothing
-            piece = max(piece, int((reached - done) * RESPONSE / max(elapsed, 1e-6)))
+            if np.isfinite(response):
+                # short enough to respond to an interruption, long enough to cost nothing
+                piece = max(piece, int((reached - done) * response / max(elapsed, 1e-6)))
             rows = _merged(rows, new, done, reached, total)
             if reached < stop:
                 pair = (controls[reached - 1] if reached else before), controls[reached]
@@ -165,9 +171,8 @@ def padded_rows(rows: Any, least: int = 1) -> np.ndarray:
     return np.pad(rows, width, mode="edge")
 
 
-def is_coarse(position_error: Any, system: System) -> Any:
+def is_coarse(position_error: Any, length: Any) -> Any:
     """Return true where a position error is above `COARSE_SHARE` of the length, or NaN."""
-    length = system.length
     return ~(position_error <= COARSE_SHARE * (length[..., None] if np.ndim(length) else length))
 
 
@@ -178,12 +183,17 @@ def mark_coarse(rows: StepRows, system: System, before: Any = None) -> StepRows:
     by linearised equations. They give its decay along the computed motion, but cannot show that the exact
     motion diverges from it.
     """
-    numeric: Any = jnp if is_traced((rows, system, before)) else np
-    coarse = is_coarse(rows.position_error, system)
+    return rows._replace(result=coarse_results(rows.result, rows.position_error, system.length, before))
+
+
+def coarse_results(result: Any, position_error: Any, length: Any, before: Any = None) -> Any:
+    """Return the results of rows after the rule of `mark_coarse`, from their position errors (m)."""
+    numeric: Any = jnp if is_traced((result, position_error, length, before)) else np
+    coarse = is_coarse(position_error, length)
     if before is not None:
         coarse = (numeric.cumsum(coarse, axis=-1) > 0) | numeric.asarray(before)[..., None]
-    coarse &= rows.result >= 0
-    return rows._replace(result=numeric.where(coarse, int(Result.COARSE), rows.result))
+    coarse &= result >= 0
+    return numeric.where(coarse, int(Result.COARSE), result)
 
 
 def warn_of_coarse_grids(system: System, settings: Settings, rows: StepRows) -> None:

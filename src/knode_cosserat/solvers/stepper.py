@@ -170,7 +170,7 @@ class Stepper:
         if not result.solved:
             raise SimulationError(self._steps + 1, self.time + self.dt, float(row.error), result, cause)
         # same rule as `mark_coarse`
-        coarse = self._coarse or is_coarse(np.asarray(row.position_error), self.robot)
+        coarse = self._coarse or is_coarse(np.asarray(row.position_error), self.robot.length)
         return row._replace(result=int(Result.COARSE) if coarse else result), after
 
     def _state_after(self, past: StateHistory, time: float) -> SolverState:

@@ -31,7 +31,7 @@ from knode_cosserat.studies.control_cases import (
     true_robots,
 )  # fmt: skip
 from knode_cosserat.studies.control_checks import force, limits, observers, rest, smoother, times
-from knode_cosserat.studies.report import Report, as_json, write_texts
+from knode_cosserat.studies.report import Report, as_json, check_row, checks_table, write_texts
 from knode_cosserat.studies.runner import Job, Product, run
 
 
@@ -177,10 +177,7 @@ def checks(facts: Mapping[str, Any], cells: Sequence[Mapping[str, Any]]) -> list
         ("missed deadlines at 20 Hz", slow["missed"], 0),
         *stand_in.checks(cells, ADAPTIVE),
     ]  # fmt: skip
-    return [
-        {"check": name, "value": float(value), "limit": limit, "ok": bool(value <= limit)}
-        for name, value, limit in listed
-    ]
+    return [check_row(name, float(value), limit) for name, value, limit in listed]
 
 
 def as_markdown(cells: Sequence[Mapping[str, Any]], made: Sequence[Mapping[str, Any]]) -> str:
@@ -193,14 +190,13 @@ def as_markdown(cells: Sequence[Mapping[str, Any]], made: Sequence[Mapping[str, 
             if own:
                 tracked = [f"{own[path]['rmse_percent']:.3g}" if path in own else "not run" for path in paths]
                 rows.append([name, controller, *tracked])
-    checked = [[c["check"], f"{c['value']:.3g}", f"{c['limit']:g}", "yes" if c["ok"] else "no"] for c in made]
     return "\n\n".join(
         [
             "# Closed-loop control",
             f"Simulated robots, exact measurements of the tip, control at {1.0 / DT:.0f} Hz. Tip RMSE in "
             f"% of the length from {SETTLED:g} to {SECONDS:g} s; after a step from {TRANSIT:g} s on.",
             markdown_table(["robot", "controller", *paths], rows),
-            markdown_table(["check", "value", "limit", "met"], checked),
+            checks_table(made),
             *([] if any(cell["robot"] == stand_in.ROBOT for cell in cells) else [stand_in.MISSING]),
         ]
     ) + "\n"  # fmt: skip

@@ -15,7 +15,6 @@ import numpy as np
 
 from knode_cosserat.control.loop import run_loop
 from knode_cosserat.control.references import circle, figure_eight
-from knode_cosserat.evaluation.tables import markdown_table
 from knode_cosserat.hardware.driver import DriverState, HardwareError
 from knode_cosserat.hardware.emulation.robot import EmulatedRobot
 from knode_cosserat.hardware.emulation.toolchain import built, firmware_folder, missing
@@ -33,7 +32,7 @@ from knode_cosserat.studies.hardware_rig import (
     tensions,
     true_robot,
 )
-from knode_cosserat.studies.report import Report, as_json, write_texts
+from knode_cosserat.studies.report import Report, as_json, check_row, checks_table, write_texts
 from knode_cosserat.studies.runner import Job, Product, run
 
 #: tip RMSE of the PyElastica stand-in in the study `control` (% of length), and the allowed multiple of it
@@ -107,24 +106,16 @@ def checks(facts: Mapping[str, Any]) -> list[dict[str, Any]]:
     ]
     if "dds" in facts:
         listed.append(("DDS on this host: p99 (ms)", facts["dds"]["p99"], 1.0))
-    made = [
-        {"check": name, "value": value, "limit": limit, "ok": bool(value <= limit)}
-        for name, value, limit in listed
+    return [check_row(*each) for each in listed] + [
+        check_row("control loop on the chip (1/s)", found["rate"], 200.0, least=True),
+        check_row("emulation relative to real time", facts["repeat"]["speed"], 3.0, least=True),
     ]
-    for name, value, limit in (
-        ("control loop on the chip (1/s)", found["rate"], 200.0),
-        ("emulation relative to real time", facts["repeat"]["speed"], 3.0),
-    ):
-        made.append({"check": name, "value": value, "limit": limit, "ok": bool(value >= limit)})
-    return made
 
 
 def as_markdown(made: Sequence[Mapping[str, Any]]) -> str:
     """Return the table of the study."""
-    rows = [[each["check"], f"{each['value']:.3g}", f"{each['limit']:.3g}", "yes" if each["ok"] else "no"]
-            for each in made]  # fmt: skip
-    table = markdown_table(["check", "value", "limit", "met"], rows)
-    return f"# Firmware and closed loop, emulated\n\nNothing ran on physical hardware.\n\n{table}\n"
+    said = "Nothing ran on physical hardware."
+    return f"# Firmware and closed loop, emulated\n\n{said}\n\n{checks_table(made)}\n"
 
 
 def build(settings: Any) -> Product:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from knode_cosserat._files import replacing
+from knode_cosserat.evaluation.tables import markdown_table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -24,6 +25,25 @@ class Report(NamedTuple):
 def as_json(cells: Sequence[Mapping[str, Any]]) -> str:
     """Return a JSON list with one cell per line."""
     return "[\n" + ",\n".join(json.dumps(cell, allow_nan=False) for cell in cells) + "\n]\n"
+
+
+def check_row(name: str, value: float, limit: float, least: bool = False) -> dict[str, Any]:
+    """Return a checked figure: check, value, limit, ok. `limit` is the greatest value, or the least one."""
+    return {
+        "check": name,
+        "value": value,
+        "limit": limit,
+        "ok": bool(value >= limit if least else value <= limit),
+    }
+
+
+def checks_table(made: Sequence[Mapping[str, Any]]) -> str:
+    """Return the table of checked figures in Markdown."""
+    rows = [
+        [each["check"], f"{each['value']:.3g}", f"{each['limit']:g}", "yes" if each["ok"] else "no"]
+        for each in made
+    ]
+    return markdown_table(["check", "value", "limit", "met"], rows)
 
 
 def write_texts(out: Path, texts: Mapping[str, str]) -> list[Path]:

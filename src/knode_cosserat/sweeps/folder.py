@@ -27,9 +27,10 @@ from knode_cosserat._files import package_version, replacing
 from knode_cosserat._jax import machine_name
 from knode_cosserat._yaml import shown
 from knode_cosserat.rods.parameters import Parameter
+from knode_cosserat.rods.paths import parameter_at
 from knode_cosserat.sweeps.columns import columns_of
 from knode_cosserat.sweeps.errors import SweepError
-from knode_cosserat.sweeps.plan import Plan, control_titles, parameter_of, robot_text
+from knode_cosserat.sweeps.plan import Plan, control_titles, robot_text
 from knode_cosserat.sweeps.shard_file import VERSION, read_shard
 
 #: folder of this package
@@ -89,7 +90,7 @@ def manifest_of(plan: Plan) -> dict[str, Any]:
     """Return the manifest of a plan, as plain data."""
     sweep = plan.sweep
     first = plan.systems[0]
-    stated: dict[str, Parameter | None] = {name: parameter_of(first, name) for name in sweep.vary}
+    stated: dict[str, Parameter | None] = {name: parameter_at(first.nominal, name) for name in sweep.vary}
     units = {name: each.unit for name, each in stated.items() if each}
     return {
         "format": FORMAT,

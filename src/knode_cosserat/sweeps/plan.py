@@ -21,7 +21,7 @@ import numpy as np
 from knode_cosserat import named_controls
 from knode_cosserat._yaml import did_you_mean
 from knode_cosserat.errors import KnodeCosseratError
-from knode_cosserat.rods.parameters import Parameter, parameters_of
+from knode_cosserat.rods.paths import owner_at, parameter_at
 from knode_cosserat.rods.robot_file import format_robot, load_robot
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import NewtonOptions
@@ -202,7 +202,9 @@ class Plan:
 
     def robot_values(self, robot: int, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return those of the varied numbers that are parameters of a robot."""
-        return {name: each for name, each in values.items() if parameter_of(self.systems[robot], name)}
+        return {
+            name: each for name, each in values.items() if parameter_at(self.systems[robot].nominal, name)
+        }
 
 
 def _listed(values: tuple[Any, ...], index: np.ndarray) -> np.ndarray:
@@ -247,33 +249,16 @@ def _load(name: str) -> System:
     return load_robot(name)
 
 
-def parameter_of(system: System, name: str) -> Parameter | None:
-    """Return the specification of a parameter, also of a part's; None if there is none."""
-    owner: Any = system.nominal
-    *parts, last = name.split(".")
-    for part in parts:
-        if isinstance(owner, tuple):
-            owner = owner[int(part)] if part.isdecimal() and int(part) < len(owner) else None
-        else:
-            owner = getattr(owner, part, None)
-    if not dataclasses.is_dataclass(owner):
-        return None
-    return parameters_of(type(owner)).get(last)
-
-
 def _is_static(system: System, name: str) -> bool:
     """True if a parameter is part of a program, not of its data: a place or a choice."""
-    owner: Any = system.nominal
-    *parts, last = name.split(".")
-    for part in parts:
-        owner = owner[int(part)] if isinstance(owner, tuple) else getattr(owner, part)
+    owner, last = owner_at(system.nominal, name)
     fields = {field.name: field for field in dataclasses.fields(owner)}
     return bool(fields[last].metadata.get("static", False))
 
 
 def _check_variation(system: System, name: str, variation: Range | tuple[Any, ...], used: bool) -> None:
     """Raise `SweepError` unless a robot has a parameter and allows its values."""
-    stated = parameter_of(system, name)
+    stated = parameter_at(system.nominal, name)
     if stated is None:
         if used:
             _require_numbers_only(name, variation)

@@ -7,6 +7,7 @@ call of one compiled program. Recovery has no limit of time, for the same reason
 from __future__ import annotations
 
 import concurrent.futures
+import dataclasses
 import functools
 from typing import Any, NamedTuple
 
@@ -18,15 +19,14 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.rods.trained_range import without_range
 from knode_cosserat.solvers.history import SolverState, rest_record
 from knode_cosserat.solvers.initial import initial_state
-from knode_cosserat.solvers.recovery import Budget, likely_cause
+from knode_cosserat.solvers.recovery import likely_cause
 from knode_cosserat.solvers.replay import at_one_state, history_settings
 from knode_cosserat.solvers.result import Result, SimulationError
 from knode_cosserat.solvers.run import (
-    COARSE_SHARE,
-    LEAST_CAPACITY,
     InitialState,
     TimeIntegration,
-    padded_rows,
+    coarse_results,
+    run_one,
     usable_cores,
 )
 from knode_cosserat.solvers.settings import Settings
@@ -197,12 +197,10 @@ class Solver:
 
 
 def _mark_coarse(columns: dict[str, Any], length: Any, before: Any) -> None:
-    """Mark solved rows from the first one on for which the grid is too coarse, as `run.mark_coarse` does."""
-    result = columns["result"]
-    coarse = ~(columns["position_error"] <= COARSE_SHARE * length[:, None]) & (result >= 0)
-    coarse[:, 1:] |= before[:, None]
-    coarse = (np.cumsum(coarse, axis=1) > 0) & (result >= 0)
-    columns["result"] = np.where(coarse, int(Result.COARSE), result).astype(np.int8)
+    """Mark solved rows from the first one on for which the grid is too coarse; the initial row is not one."""
+    result, error = columns["result"], columns["position_error"][:, 1:]
+    marked = coarse_results(result[:, 1:], error, length, before)
+    columns["result"] = np.concatenate([result[:, :1], marked], axis=1).astype(np.int8)
 
 
 @functools.lru_cache(maxsize=64)
@@ -268,30 +266,11 @@ def _recover(
 ) -> str:  # fmt: skip
     """Solve a case by itself, with recovery of failed steps; write its rows and return the likely cause.
 
-    As `solvers.run.run_one`, but without times: an unlimited budget, and no division into pieces.
+    Neither the recovery nor the pieces of the run depend on times.
     """
+    task = dataclasses.replace(task, recovery_budget=np.inf)
     at = initial_state(system, task.settings, None, np.inf)
-    padded = padded_rows(controls, least=LEAST_CAPACITY)
-    budget, state, rows, cause, done = Budget(np.inf), at.state.history, None, "", 0
-    while done < task.steps and not cause:
-        reached, state, new = task.solve(system, padded, state, (done, task.steps))
-        reached = int(reached)
-        leaves = [np.array(leaf[: task.steps]) for leaf in new]
-        if rows is None:
-            rows = type(new)(*leaves)
-        for every, leaf in zip(rows, leaves, strict=True):
-            every[done:reached] = leaf[done:reached]
-        done = reached
-        if reached < task.steps:
-            pair = (controls[reached - 1] if reached else at.control), controls[reached]
-            solved = task.recover(system, state, pair, reached, budget)
-            state, cause = solved.state, solved.cause
-            for every, value in zip(rows, solved.row, strict=True):
-                every[reached] = value
-            done += not cause
-    assert rows is not None
-    if cause:
-        rows.result[done + 1 :] = int(Result.NOT_REACHED)
+    rows, _, cause = run_one(task, system, controls, at.state.history, at.control, response=np.inf)
     size = system.y_layout.size + system.z_layout.size
     invalid = rows.result < 0
     records = np.concatenate([np.asarray(at.record)[None, :, :size], rows.records[..., :size]])

@@ -16,7 +16,7 @@ from knode_cosserat.control.loop import Period
 from knode_cosserat.control.plants import Plant
 from knode_cosserat.control.states import estimated, joined
 from knode_cosserat.estimation.outputs import BodyPositions
-from knode_cosserat.rods.parameters import parameters_of
+from knode_cosserat.rods.paths import parameter_at
 from knode_cosserat.trajectory import Trajectory
 from knode_cosserat.viewer.document import document
 from knode_cosserat.viewer.drawing import sliders
@@ -96,12 +96,8 @@ def _parameters_of(observer: Any) -> list[dict[str, str]]:
 
 def _unit_of(robot: Any, label: str) -> str:
     """Return the unit of an adapted parameter, such as "loads.0.mass" or "gravity[0]"; "" if unknown."""
-    *owners, name = label.partition("[")[0].split(".")
-    found = robot.nominal
-    for part in owners:
-        found = found[int(part)] if part.isdigit() else getattr(found, part)
-    known = parameters_of(type(found))
-    return known[name].unit if name in known else ""
+    stated = parameter_at(robot.nominal, label.partition("[")[0])
+    return "" if stated is None else stated.unit
 
 
 def _soft_box(controller: Any) -> list[list[float | None]] | None:
