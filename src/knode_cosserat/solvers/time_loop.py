@@ -233,7 +233,8 @@ def loop_in_turn(
 ) -> tuple[Any, StateHistory, StepRows]:
     """Solve all steps, one robot after the other; return the numbers of steps done, histories and rows.
 
-    It is a single loop over robots and steps: XLA would copy all rows at every turn of an inner loop.
+    It is a single loop over robots and steps: XLA would copy all rows at every turn of an inner loop. First
+    and last histories are different arrays, one only read and one only written, for the same reason.
     """
     size, many = controls.shape[0], jnp.ndim(system.length) > 0
 
@@ -241,25 +242,26 @@ def loop_in_turn(
         return jax.tree.map(lambda leaf: leaf[robot], tree)
 
     def one(state: Any) -> Any:
-        robot, i, pasts, done, rows, kept = state
-        this, past = own(system, robot) if many else system, own(pasts, robot)
+        robot, i, past, lasts, done, rows, kept = state
+        this, past = own(system, robot) if many else system, _where(i == 0, own(pasts, robot), past)
         step = TimeStep.of(steps, past, i)
         after, row, kept = solve_time_step(this, settings, step, controls[robot, i], kept)
         failed = row.result < 0
         rows = jax.tree.map(lambda all_rows, value: all_rows.at[robot, i].set(value), rows, row)
         after = _where(failed, past, after)
-        pasts = jax.tree.map(lambda every, value: every.at[robot].set(value), pasts, after)
+        lasts = jax.tree.map(lambda every, value: every.at[robot].set(value), lasts, after)
         done = done.at[robot].set(jnp.where(failed, i, i + 1))
         ended = failed | (i + 1 >= stop)
         following = jnp.where(ended, robot + 1, robot), jnp.where(ended, 0, i + 1)
-        return *following, pasts, done, rows, kept._replace(usable=kept.usable & ~ended)
+        return *following, after, lasts, done, rows, kept._replace(usable=kept.usable & ~ended)
 
     first = own(system, 0) if many else system
     kept = no_factors(first, settings, pasts.y[0, 0], controls[0, 0])
-    zero = jnp.zeros((), dtype=int)
-    state = (zero, zero, pasts, jnp.zeros(size, dtype=int), no_rows(system, controls.shape[:2]), kept)
-    _, _, pasts, done, rows, _ = jax.lax.while_loop(lambda state: state[0] < size, one, state)
-    return done, pasts, rows
+    zero, past = jnp.zeros((), dtype=int), own(pasts, 0)
+    lasts = jax.tree.map(jnp.zeros_like, pasts)
+    state = (zero, zero, past, lasts, jnp.zeros(size, dtype=int), no_rows(system, controls.shape[:2]), kept)
+    _, _, _, lasts, done, rows, _ = jax.lax.while_loop(lambda state: state[0] < size, one, state)
+    return done, lasts, rows
 
 
 @functools.partial(jax.jit, static_argnames="settings")
