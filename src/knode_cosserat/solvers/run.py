@@ -28,7 +28,7 @@ from knode_cosserat.solvers.time_loop import StepCoefficients, StepRows, TimeSte
 log = logging.getLogger(__name__)
 
 #: number of robots that one thread solves at a time
-CHUNK = 16
+CHUNK = 64
 #: smallest number of steps for which a run of one robot is compiled, so that short runs share a program
 LEAST_CAPACITY = 128
 #: seconds between two checks for signals, and number of steps before the first check
