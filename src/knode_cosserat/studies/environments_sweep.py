@@ -180,7 +180,10 @@ def _killed(folder: Path, sweep: Sweep, kills: int, seed: int = 0) -> int:
     places = sorted(generator.randrange(plan.shard_count) for _ in range(kills))
     count = 0
     for place in places:
-        process = subprocess.Popen(_command(folder, sweep, 2), stdout=subprocess.DEVNULL)
+        # what outlives a killed process complains of its death
+        process = subprocess.Popen(
+            _command(folder, sweep, 2), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
         until = time.monotonic() + PATIENCE
         while process.poll() is None and len(list((folder / SHARDS).glob("*.parquet"))) < place:
             if time.monotonic() > until:
