@@ -144,3 +144,14 @@ def test_the_predictive_controller_and_a_trained_policy_follow(robot):
     training = envs.Training(environment, steps=500_000)
     training.run(seconds=400.0)
     assert envs.policy_scores(environment, training.policy, keys).mean() > 0.9 * reference
+
+
+def test_an_episode_is_animated(environment, policy, tmp_path):
+    image = pytest.importorskip("PIL.Image", reason="needs Pillow, the extra viz")
+    path = envs.animate_episode(environment, policy, jax.random.PRNGKey(3), tmp_path / "episode.gif")
+    with image.open(path) as moving:
+        # one picture more than periods; pictures that are equal are merged
+        assert 2 <= moving.n_frames <= environment.steps + 1
+        assert moving.info["duration"] == round(1000 * environment.dt)
+    with pytest.raises(ValueError, match="allowed for a motion"):
+        envs.animate_episode(environment, policy, jax.random.PRNGKey(3), tmp_path / "episode.avi")

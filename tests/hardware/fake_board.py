@@ -1,5 +1,6 @@
 """A tension board in Python behind a pseudo-terminal: plain and framed lines, faults, damage, silence."""
 
+import collections
 import contextlib
 import os
 import pty
@@ -33,10 +34,10 @@ class FakeBoard:
         self.received, self.accepted, self.last = [], [], None
         self.settings = {"kp": 300, "limit": limit, "jog": 80, "estop": 1}
         self.saved = False
-        #: part of telemetry lines with one damaged byte, and of commands that the board reads damaged
+        #: part of lines of each kind with one damaged byte, and of commands that the board reads damaged
         self.damage, self.damage_input = 0, 0
         self.silent = False
-        self._taring, self._number, self._count = taring, 0, 0
+        self._taring, self._number, self._count = taring, 0, collections.Counter()
         self._master, slave = pty.openpty()
         tty.setraw(slave)
         self.port = os.ttyname(slave)
@@ -82,8 +83,9 @@ class FakeBoard:
         if self.silent:
             return
         line = bytearray(encode_message(message, self.framed))
-        self._count += 1
-        if self.damage and self._count % self.damage == 0:
+        # each kind is counted for itself, or the answers of a repeated request could all be damaged
+        self._count[type(message)] += 1
+        if self.damage and self._count[type(message)] % self.damage == 0:
             line[len(line) // 2] ^= 0x15
         self.write(bytes(line))
 

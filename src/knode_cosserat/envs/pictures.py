@@ -1,15 +1,20 @@
-"""Pictures of an episode: the robot, its target and obstacles, seen from the side and from below."""
+"""Pictures and animations of an episode: robot, target and obstacles, from the side and from below."""
 
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import UInt8
 
 from knode_cosserat.envs.dynamics import EpisodeState
 from knode_cosserat.envs.environment import Environment
+from knode_cosserat.envs.policy import Policy
+from knode_cosserat.evaluation.animation import write_frames
 from knode_cosserat.evaluation.figures import require_matplotlib
 
 #: size (inches) and resolution of a picture
@@ -40,6 +45,35 @@ def picture(environment: Environment, state: EpisodeState) -> UInt8[np.ndarray, 
     figure.savefig(data, format="png")
     data.seek(0)
     return (255 * imread(data)[:, :, :3]).round().astype(np.uint8)
+
+
+def animate_episode(environment: Environment, policy: Policy, key: Any, path: str | Path) -> Path:
+    """Write a GIF or MP4 of a policy's episode in real time, and return its path.
+
+    Args:
+        environment: the environment.
+        policy: what acts.
+        key: of the episode.
+        path: a name that ends in .gif or .mp4.
+
+    Raises:
+        ImportError: matplotlib is missing, the extra `viz`.
+        ValueError: another name.
+    """
+    require_matplotlib()
+    from PIL import Image
+
+    def frames() -> Iterator[Image.Image]:
+        state, observation = environment.reset(jnp.asarray(key))
+        yield Image.fromarray(picture(environment, state))
+        for _ in range(environment.steps):
+            state, found = environment.step(state, policy.action(observation))
+            yield Image.fromarray(picture(environment, state))
+            if bool(found.terminated | found.truncated):
+                return
+            observation = found.observation
+
+    return write_frames(frames(), Path(path), environment.dt)
 
 
 def _draw_ball(axes: Any, obstacle: Any, a: int, b: int) -> None:

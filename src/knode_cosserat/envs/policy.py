@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat._files import replacing
+from knode_cosserat._limits import LimitSettingError, excess
 from knode_cosserat.envs.errors import TaskError
 
 #: version of the files
@@ -79,11 +80,12 @@ class Policy(NamedTuple):
         """
         path = Path(path)
         try:
-            if path.stat().st_size > LARGEST_FILE:
-                raise ValueError(f"it is larger than {LARGEST_FILE} bytes")
+            if reason := excess(path.stat().st_size, LARGEST_FILE, "bytes"):
+                raise ValueError(reason)
             with zipfile.ZipFile(path) as packed:
-                if sum(entry.file_size for entry in packed.infolist()) > LARGEST_FILE:
-                    raise ValueError(f"unpacked it is larger than {LARGEST_FILE} bytes")
+                size = sum(entry.file_size for entry in packed.infolist())
+                if reason := excess(size, LARGEST_FILE, "bytes"):
+                    raise ValueError(f"unpacked it is larger than allowed: {reason}")
             with np.load(path, allow_pickle=False) as file:
                 header = json.loads(str(file["header"]))
                 if header.get("version") != VERSION:
@@ -91,10 +93,14 @@ class Policy(NamedTuple):
                         f"its version is {header.get('version')!r}; this package reads {VERSION}"
                     )
                 count = header["layers"]
-                if not isinstance(count, int) or not 1 <= count <= MOST_LAYERS:
+                if not isinstance(count, int) or count < 1:
                     raise ValueError(f"it has {count!r} layers")
+                if reason := excess(count, MOST_LAYERS, "layers"):
+                    raise ValueError(reason)
                 layers = tuple((file[f"weights{k}"], file[f"bias{k}"]) for k in range(count))
                 found = cls(layers, file["mean"], file["deviation"])
+        except LimitSettingError:
+            raise
         except OSError as error:
             raise TaskError(f"the policy {path} cannot be read: {error.strerror or error}") from None
         except Exception as error:  # a damaged archive fails in many ways

@@ -78,8 +78,15 @@ def animate(
     seconds, delay = _timing(given, path, fps, speed)
     with style():
         frames = _frames(given, seconds, view, width_of(columns), dpi)
-        with replacing(path) as temporary:
-            (_write_gif if path.suffix == ".gif" else _write_mp4)(frames, temporary, delay)
+        return write_frames(frames, path, delay)
+
+
+def write_frames(frames: Iterator[Image], path: Path, delay: float) -> Path:
+    """Write pictures, each shown for `delay` (s), as the format of the path's suffix; return the path."""
+    if path.suffix not in ENDINGS:
+        raise ValueError(f"{path}: allowed for a motion is a name that ends in {', '.join(ENDINGS)}")
+    with replacing(path) as temporary:
+        (_write_gif if path.suffix == ".gif" else _write_mp4)(frames, temporary, delay)
     return path
 
 

@@ -20,6 +20,7 @@ from knode_cosserat.control.loop import _COMPILATIONS, run_loop
 from knode_cosserat.control.plants import Sensor
 from knode_cosserat.envs.environment import Environment, make
 from knode_cosserat.envs.errors import TaskError
+from knode_cosserat.envs.pictures import animate_episode
 from knode_cosserat.envs.policy import Policy
 from knode_cosserat.envs.policy_controller import PolicyController
 from knode_cosserat.envs.ppo import Training
@@ -28,13 +29,15 @@ from knode_cosserat.envs.scores import controller_scores, policy_scores
 from knode_cosserat.envs.tasks import TASKS
 from knode_cosserat.envs.tasks.base import Tip
 from knode_cosserat.estimation.outputs import BodyPositions
+from knode_cosserat.evaluation.drawing import new_figure
+from knode_cosserat.evaluation.style import PALETTE, style, width_of
 from knode_cosserat.evaluation.tables import markdown_table
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.tendon_rod import TendonRod
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.studies import stand_in
 from knode_cosserat.studies.environments_sweep import measure_sweep
-from knode_cosserat.studies.report import Report, as_json, check_row, checks_table, write_texts
+from knode_cosserat.studies.report import Report, as_json, check_row, checks_table, write_figures, write_texts
 from knode_cosserat.studies.runner import Job, Product, run
 
 #: robot whose stand-in PyElastica simulates
@@ -59,7 +62,10 @@ def jobs(quick: bool) -> list[Job]:
 
 
 def rerun(out: Path, quick: bool = False, **how: Any) -> Report:
-    """Run the study, and write environments.json and environments.md; interrupted runs are continued.
+    """Run the study, and write environments.json, environments.md, and what PPO has learned.
+
+    The learned policy is written as follow.npz, with a figure of its rewards and an animation if there is
+    matplotlib. Interrupted runs are continued.
 
     Args:
         out: the folder.
@@ -74,7 +80,13 @@ def rerun(out: Path, quick: bool = False, **how: Any) -> Report:
     facts = run(jobs(quick), out, **how)
     made = checks(facts)
     texts = {"environments.json": as_json(made), "environments.md": as_markdown(made, facts)}
-    return Report(made, write_texts(out, texts), [])
+    figures = {"ppo": curve_figure(facts["ppo"])} if has_matplotlib() else {}
+    return Report(made, write_texts(out, texts), write_figures(out, figures))
+
+
+def has_matplotlib() -> bool:
+    """Return whether figures can be drawn."""
+    return importlib.util.find_spec("matplotlib") is not None
 
 
 def checks(facts: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -106,8 +118,11 @@ def checks(facts: Mapping[str, Any]) -> list[dict[str, Any]]:
 def as_markdown(made: Sequence[Mapping[str, Any]], facts: Mapping[str, Any]) -> str:
     """Return the tables of the study."""
     scores = [[name, f"{facts[f'task-{name}']['score']:.3f}"] for name in TASKS]
+    history = facts["ppo"]["curve"]
+    shown = np.unique(np.linspace(0, len(history) - 1, 12).astype(int))
     curve = [
-        [f"{steps:,}", f"{seconds:.0f}", f"{reward:.3f}"] for steps, seconds, reward in facts["ppo"]["curve"]
+        [f"{steps:,}", f"{seconds:.0f}", f"{reward:.3f}"]
+        for steps, seconds, reward in (history[k] for k in shown)
     ]
     parts = [
         "# Environments and sweeps\n",
@@ -200,12 +215,35 @@ def ppo(settings: Any) -> Product:
 
     history = training.run(settings["seconds"], report)
     score = float(policy_scores(environment, training.policy, held_out).mean())
-    curve = [list(history[k]) for k in np.unique(np.linspace(0, len(history) - 1, 12).astype(int))]
+    curve = [list(history[k]) for k in np.unique(np.linspace(0, len(history) - 1, 200).astype(int))]
     facts = {
         "reference": reference, "score": score, "ratio": score / reference,
         "until": until if np.isfinite(until) else 1e9, "curve": curve,
     }  # fmt: skip
-    return Product(facts, {"follow.npz": saved(training.policy)})
+    files = {"follow.npz": saved(training.policy)}
+    if has_matplotlib():
+        files["follow.gif"] = animated(environment, training.policy, held_out[0])
+    return Product(facts, files)
+
+
+def curve_figure(facts: Mapping[str, Any]) -> Any:
+    """Return the figure of PPO's mean reward over time, with the score of predictive control."""
+    with style():
+        figure = new_figure(width_of(1), 2.4)
+        axes = figure.subplots()
+        steps, seconds, reward = np.array(facts["curve"]).T
+        axes.plot(seconds, reward, color=PALETTE[0], label="PPO while it explores")
+        axes.plot(seconds[-1], facts["score"], "o", color=PALETTE[0], label="its policy, held-out episodes")
+        axes.axhline(facts["reference"], color="0.3", ls="--", label="predictive control")
+        axes.set(xlabel=f"time (s), {steps[-1]:,.0f} periods in all", ylabel="mean reward", ylim=(0.0, 1.05))
+        axes.legend(loc="lower right")
+    return figure
+
+
+def animated(environment: Environment, policy: Policy, key: Any) -> bytes:
+    """Return the GIF of a policy's episode."""
+    with tempfile.TemporaryDirectory() as folder:
+        return animate_episode(environment, policy, key, Path(folder) / "episode.gif").read_bytes()
 
 
 def saved(policy: Policy) -> bytes:
