@@ -20,6 +20,7 @@ LAYERS = (
         "_files",
         "_jax",
         "_lazy",
+        "_limits",
         "_numbers",
         "_processes",
         "_programs",

@@ -10,10 +10,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat._limits import MORE, allowed, excess
 from knode_cosserat.errors import KnodeCosseratError
 
 Rows = Float[np.ndarray, "rows columns"]
 Times = Float[np.ndarray, " rows"]
+
+#: limits of a file: bytes, lines (5.5 h at 1 kHz), columns
+LARGEST_FILE, MOST_LINES, MOST_COLUMNS = 1_000_000_000, 20_000_000, 1_000
 
 #: tolerance for equal times, as a fraction of a step: i dt is rounded, and so are times in files
 SAME_TIME = 1e-4
@@ -39,6 +43,11 @@ class Column(NamedTuple):
     allowed: str = "a finite number"
 
 
+def size_excess(path: Path) -> str:
+    """Return the reason to refuse a file by its size, before it is read; empty if the limit allows it."""
+    return excess(path.stat().st_size, LARGEST_FILE, "bytes")
+
+
 def read_rows(
     path: Path, header: str, columns_of: Callable[[str, list[str]], list[Column]]
 ) -> tuple[Times, Rows, list[int]]:
@@ -53,6 +62,8 @@ def read_rows(
         CSVTextError: the file is invalid; the message names file, line and column.
     """
     try:
+        if reason := size_excess(path):
+            raise CSVTextError(f"{path}: {reason}")
         with path.open(encoding="utf-8-sig", newline="") as file:
             return _rows(path, csv.reader(file), header, columns_of)
     except FileNotFoundError:
@@ -70,11 +81,16 @@ def _rows(
     titles = next(filled, None)
     if titles is None:
         raise CSVTextError(f"{path}: the file is empty; allowed is {header}, then rows of numbers")
+    if reason := excess(len(titles), MOST_COLUMNS, "columns"):
+        raise CSVTextError(f"{path}: {reason}")
     columns = columns_of(f"{path}: line {reader.line_num}", [title.strip() for title in titles])
     order = np.argsort([column.place for column in columns])
+    most = allowed(MOST_LINES)
     rows: list[list[float]] = []
     for cells in filled:
         where = f"{path}: line {reader.line_num}"
+        if reader.line_num > most:
+            raise CSVTextError(f"{path}: it has more than {most} lines; {MORE}")
         if len(cells) != len(columns):
             raise CSVTextError(f"{where} has {len(cells)} cells; allowed is {len(columns)}, like the header")
         row = [_value(where, column, cell) for column, cell in zip(columns, cells, strict=True)]
@@ -102,9 +118,11 @@ def held_rows(path: str | Path, time: Times, dt: float) -> np.ndarray:
     """Return the index of the row held at the first time + i dt, up to the last. Raises `CSVTextError`."""
     length = float(time[-1]) - float(time[0])
     count = length / float(dt) + SAME_TIME
-    if not count < MOST_STEPS:
+    most = allowed(MOST_STEPS)
+    if not count < most:
         raise CSVTextError(
-            f"{path}: dt is {dt!r}; allowed is one of which the file's {length:g} s are at most {MOST_STEPS}"
+            f"{path}: dt is {dt!r}; allowed is one of which the file's {length:g} s are at most {most}; "
+            f"{MORE}"
         )
     at = time[0] + (np.arange(int(count) + 1) + SAME_TIME) * dt
     return np.searchsorted(time, at, side="right") - 1

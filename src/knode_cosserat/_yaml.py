@@ -9,6 +9,7 @@ from typing import Any
 
 import yaml
 
+from knode_cosserat._limits import MORE, LimitSettingError, allowed
 from knode_cosserat.errors import KnodeCosseratError
 
 #: largest text, and number of values in it with all aliases written out
@@ -27,15 +28,16 @@ def mapping_of(text: str, keys: str) -> dict[Any, Any]:
     Raises:
         YAMLTextError: the text is not YAML, or is not a mapping.
     """
-    if len(text) > MOST_CHARACTERS:
-        raise YAMLTextError(f"the file has {len(text)} characters; allowed are {MOST_CHARACTERS}")
+    most = allowed(MOST_CHARACTERS)
+    if len(text) > most:
+        raise YAMLTextError(f"the file has {len(text)} characters; allowed are {most}; {MORE}")
     try:
         content = _content(text)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = f" line {mark.line + 1}:" if mark else ""
         raise YAMLTextError(f"{line} not YAML: {error.problem}".strip()) from None
-    except YAMLTextError:
+    except (YAMLTextError, LimitSettingError):
         raise
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
@@ -53,9 +55,9 @@ def _content(text: str) -> Any:
         root = loader.get_single_node()
         if root is None:
             return None
-        count = _expanded(root, {})
-        if count > MOST_VALUES:
-            raise YAMLTextError(f"with its aliases it has {count:.3g} values; allowed are {MOST_VALUES}")
+        count, most = _expanded(root, {}), allowed(MOST_VALUES)
+        if count > most:
+            raise YAMLTextError(f"with its aliases it has {count:.3g} values; allowed are {most}; {MORE}")
         return loader.construct_document(root)
     finally:
         loader.dispose()

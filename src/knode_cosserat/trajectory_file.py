@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from knode_cosserat._files import package_version, replacing
+from knode_cosserat._limits import LimitSettingError
 from knode_cosserat._registry import provide
 from knode_cosserat.rods.layout import Field, Layout
 from knode_cosserat.rods.system import System
@@ -308,7 +309,7 @@ def _read(path: Path) -> xarray.Dataset:
             found = data.load()
             _require_checksum(path, found)
             return found
-    except TrajectoryFileError:
+    except (TrajectoryFileError, LimitSettingError):
         raise
     except Exception as error:  # each of three libraries has its own exceptions for a damaged file
         raise TrajectoryFileError(f"{path}: truncated or damaged: {first_line(error)}") from error

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from knode_cosserat._limits import MORE, allowed
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.trajectory_system import TrajectoryFileError
 
@@ -73,11 +74,11 @@ def require_own_data(path: Path) -> None:
             if each.is_virtual or each.external:
                 raise TrajectoryFileError(f"{path}: the data of {name!r} are in another file; not read")
             expanded += each.size * each.dtype.itemsize
-    most = EXPANSION * path.stat().st_size + ALLOWANCE
+    most = allowed(EXPANSION) * path.stat().st_size + allowed(ALLOWANCE)
     if expanded > most:
         raise TrajectoryFileError(
             f"{path}: its variables take {expanded / 1e9:.3g} GB; allowed are {most / 1e9:.3g} GB for a file "
-            "of this size"
+            f"of this size; {MORE}"
         )
 
 

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
+from knode_cosserat._csv import size_excess
 from knode_cosserat.cli.arguments import Changes, Json, Robot, load_system, parse_limits, require_writable
 from knode_cosserat.cli.output import write_output
 from knode_cosserat.cli.program import app, examples
@@ -27,6 +28,8 @@ def parsed_reference(text: str) -> Any:
         return parse_reference(text)
     import pandas as pd  # type: ignore[import-untyped]
 
+    if reason := size_excess(Path(text)):
+        raise ReferenceFormatError(f"{text}: {reason}")
     rows = pd.read_csv(text)
     missing = [name for name in ("t", "x", "y") if name not in rows]
     if missing:

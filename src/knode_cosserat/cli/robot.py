@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
+from knode_cosserat._csv import size_excess
 from knode_cosserat.cli.arguments import Json, figures, parse_numbers, require_writable
 from knode_cosserat.cli.output import write_output
 from knode_cosserat.cli.program import app, examples, hardware
@@ -263,6 +264,8 @@ def _columns(path: Path) -> tuple[Any, Any]:
     """Return weights (N) and readings of a CSV table with the columns mass and reading."""
     import pandas as pd  # type: ignore[import-untyped]
 
+    if reason := size_excess(path):
+        raise ValueError(f"{path}: {reason}")
     try:
         rows = pd.read_csv(path)
     except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError):

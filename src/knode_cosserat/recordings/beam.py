@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat._csv import size_excess
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.table import read_csv
 
@@ -89,6 +90,8 @@ def read_beam(path: Path, load: float | None = None) -> BeamRecording:
     """
     load = load_of(path.stem) if load is None else load
     try:
+        if reason := size_excess(path):
+            raise RecordingError(f"{path}: {reason}")
         table = read_csv(path.read_bytes(), str(path)).numbers
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat._limits import LimitSettingError, excess
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.pickles import LARGEST_FILE, read_pickled_array
 
@@ -78,12 +79,13 @@ def _from_npz(path: Path) -> CableData:
     parts: dict[str, Any] = {}
     try:
         with zipfile.ZipFile(path) as archive:
-            if sum(each.file_size for each in archive.infolist()) > 4 * LARGEST_FILE:
-                raise RecordingError(f"{path}: more than {4 * LARGEST_FILE} bytes")
+            size = sum(each.file_size for each in archive.infolist())
+            if reason := excess(size, 4 * LARGEST_FILE, "bytes when unpacked"):
+                raise RecordingError(f"{path}: {reason}")
         with np.load(path, allow_pickle=False) as arrays:
             parts = {name: np.asarray(arrays[name]) for name in arrays.files}
     except (ValueError, OSError, zipfile.BadZipFile, EOFError) as error:
-        if isinstance(error, RecordingError):
+        if isinstance(error, RecordingError | LimitSettingError):
             raise
         raise RecordingError(f"{path}: cannot be read ({' '.join(str(error).split())[:120]})") from None
 

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+from knode_cosserat._limits import allowed
 
 
 @dataclasses.dataclass
@@ -30,6 +34,8 @@ class Container:
     lost: int = 0
     #: description of the damage to the file; empty: none
     damage: str = ""
+    #: true if its chunks expand beyond a limit, so that a part was not read
+    is_limited: bool = False
 
     def topic(self, name: str, kind: str, digest: str = "") -> Topic | None:
         """Return the topic of that name, created if new; None if it exists with another type."""
@@ -40,7 +46,10 @@ class Container:
 
 #: largest decompressed size of a chunk (bytes): a larger stated size is more likely an error
 LARGEST_CHUNK = 1 << 30
-_PIECE = 1 << 14
+#: bytes that are decompressed at a time, and bytes of output that are requested at a time
+_PIECE, _OUTPUT = 1 << 14, 1 << 24
+#: damage of a file whose chunks expand beyond a limit
+EXPANDED = "its chunks expand beyond the limit for a file of this size"
 #: most bytes that all chunks of a file may have together: so many times the file, and these besides.
 #: Recorded messages become 2 to 20 times smaller
 RATIO, ALLOWANCE = 200, 1 << 24
@@ -51,46 +60,70 @@ class Decompression:
 
     def __init__(self, size: int) -> None:
         """Start with the size of the file (bytes)."""
-        self.left = RATIO * size + ALLOWANCE
+        self._remaining = allowed(RATIO) * size + allowed(ALLOWANCE)
+        self._largest = allowed(LARGEST_CHUNK)
+        #: true if a limit was reached: records may be missing
+        self.is_limited = False
 
     def records(self, data: bytes | memoryview, compression: str, size: int) -> tuple[bytes, int]:
-        """Return a chunk's records as `decompressed` does; fewer if the file's limit is reached."""
-        if self.left <= 0:
+        """Return a chunk's records as `decompressed` does; fewer if a limit is reached.
+
+        Args:
+            data: compressed bytes; other bytes may follow them.
+            compression: name of the compression.
+            size: decompressed size (bytes); zero if unknown.
+        """
+        most = min(self._largest, self._remaining)
+        if most <= 0:
+            self.is_limited = True
             return b"", len(data)
-        records, used = decompressed(data, compression, min(size or LARGEST_CHUNK, self.left))
-        self.left -= len(records)
+        records, used = decompressed(data, compression, min(size or most, most))
+        self._remaining -= len(records)
+        self.is_limited |= len(records) == most != size
         return records, used
 
 
-def decompressed(data: bytes | memoryview, compression: str, size: int) -> tuple[bytes, int]:
+def decompressed(data: bytes | memoryview, compression: str, most: int) -> tuple[bytes, int]:
     """Return a chunk's records, as far as they are readable, and the number of compressed bytes used.
 
     Args:
         data: compressed bytes; other bytes may follow them.
         compression: name of the compression: bz2, lz4 or zstd.
-        size: decompressed size (bytes); zero if unknown.
+        most: largest number of decompressed bytes that are returned.
 
     Raises:
         ImportError: the library for this compression is not installed.
     """
-    size = min(size or LARGEST_CHUNK, LARGEST_CHUNK)
     decompressor = _decompressor(compression)
     parts: list[bytes] = []
     have = used = 0
     # in pieces, so that the data before a damaged byte are recovered
-    while decompressor is not None and used < len(data) and have < size:
+    while decompressor is not None and used < len(data) and have < most:
         piece = bytes(data[used : used + _PIECE])
         try:
-            parts.append(decompressor.decompress(piece, size - have))
+            for part in _outputs(decompressor, piece, most - have):
+                parts.append(part)
+                have += len(part)
         # each of the three libraries has its own errors
         except Exception:
             break
-        have += len(parts[-1])
         used += len(piece)
         if decompressor.eof:
             used -= len(decompressor.unused_data or b"")
             break
     return b"".join(parts), used
+
+
+def _outputs(decompressor: Any, piece: bytes, most: int) -> Iterator[bytes]:
+    """Yield a piece's output in parts: a library may allocate all bytes that it is asked for."""
+    while most > 0:
+        wanted = min(most, _OUTPUT)
+        part = decompressor.decompress(piece, wanted)
+        yield part
+        if decompressor.eof or len(part) < wanted:
+            return
+        most -= len(part)
+        piece = b""
 
 
 def _decompressor(compression: str):  # type: ignore[no-untyped-def]

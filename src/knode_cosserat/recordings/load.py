@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from knode_cosserat import _csv
+from knode_cosserat._limits import MORE, allowed, excess
 from knode_cosserat.recordings import ros1, ros2
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.container import ALLOWANCE, RATIO, Container
@@ -26,6 +28,8 @@ if TYPE_CHECKING:
     from knode_cosserat.recordings.table import Table
 
 GZIP_MAGIC = b"\x1f\x8b"
+#: bytes that are decompressed at a time
+_PIECE = 1 << 20
 #: file name of the package's own recording
 EXAMPLE = "sine_1p0.csv"
 
@@ -58,8 +62,10 @@ def load_recording(path: str | Path, config: RecordingConfig | None = None) -> R
         return _from_bag(path, begin, config or RecordingConfig.paper_robot())
     from knode_cosserat.recordings import parquet, table
 
-    is_parquet = begin.startswith(parquet.MAGIC)
-    content = parquet.read_parquet(path) if is_parquet else table.read_csv(_bytes(path), str(path))
+    if begin.startswith(parquet.MAGIC):
+        content = parquet.read_parquet(path)
+    else:
+        content = table.read_csv(_bytes(path, _csv.LARGEST_FILE), str(path))
     return _from_table(path.name, str(path), content, config)
 
 
@@ -86,26 +92,36 @@ def _beginning(path: Path) -> bytes:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
 
 
-def _bytes(path: Path) -> bytes:
+def _bytes(path: Path, limit: int | None = None) -> bytes:
+    """Return a file's content, decompressed; `limit` is of the bytes before and after decompression."""
     try:
+        if limit is not None and (reason := excess(path.stat().st_size, limit, "bytes")):
+            raise RecordingError(f"{path}: {reason}")
         data = path.read_bytes()
-        return _gunzipped(data, path) if data.startswith(GZIP_MAGIC) else data
+        return _gunzipped(data, path, limit) if data.startswith(GZIP_MAGIC) else data
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
         raise RecordingError(f"{path}: cannot be decompressed: {error}") from None
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
 
 
-def _gunzipped(data: bytes, path: Path) -> bytes:
-    most = RATIO * len(data) + ALLOWANCE
+def _gunzipped(data: bytes, path: Path, limit: int | None) -> bytes:
+    ratio, allowance = allowed(RATIO), allowed(ALLOWANCE)
+    most, words = ratio * len(data) + allowance, f"{ratio} times the file and {allowance}"
+    if limit is not None and allowed(limit) < most:
+        most = allowed(limit)
+        words = str(most)
+    parts, size = [], 0
     with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
-        found = file.read(most + 1)
-    if len(found) > most:
+        # in pieces, because all bytes that are asked for would be allocated
+        while size <= most and (part := file.read(_PIECE)):
+            parts.append(part)
+            size += len(part)
+    if size > most:
         raise RecordingError(
-            f"{path}: it has more than {most} bytes when decompressed; allowed are {RATIO} times the file "
-            f"and {ALLOWANCE}"
+            f"{path}: it has more than {most} bytes when decompressed; allowed are {words}; {MORE}"
         )
-    return found
+    return b"".join(parts)
 
 
 def _named_bag(path: Path) -> bool:
@@ -172,7 +188,8 @@ def _said_damage(container: Container, streams: Iterable[Stream]) -> Finding:
         else 0.0
     )
     lost = f", {container.lost} bytes could not be read" if container.lost else ""
-    return Finding("warning", "", f"{container.damage}: recovered up to {reached:.3f} s{lost}")
+    more = f"; {MORE}" if container.is_limited else ""
+    return Finding("warning", "", f"{container.damage}: recovered up to {reached:.3f} s{lost}{more}")
 
 
 # tables

@@ -14,6 +14,7 @@ from typing import Any
 
 import pandas as pd  # type: ignore[import-untyped]
 
+from knode_cosserat._limits import MORE, LimitSettingError, allowed, excess
 from knode_cosserat._yaml import shown
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.table import Table, numbers_of
@@ -28,6 +29,10 @@ RATIO, ALLOWANCE = 100, 100_000_000
 MOST_ENTRIES, LONGEST_TEXT = 100_000, 10_000_000
 _NUMBERS = ("BOOLEAN", "INT32", "INT64", "FLOAT", "DOUBLE")
 _PLAIN = ("NONE", "INT", "NULL", "UNKNOWN", "UNDEFINED")
+#: largest limit that pyarrow takes for the metadata
+_INT32 = 2**31 - 1
+#: words of pyarrow about a text or a list in the metadata that exceeds its limit
+TOO_LARGE = "Exceeded size limit"
 
 
 def read_parquet(path: Path) -> Table:
@@ -40,12 +45,12 @@ def read_parquet(path: Path) -> Table:
     pyarrow = _pyarrow()
     try:
         size = path.stat().st_size
-        _require(size <= LARGEST_FILE, path, f"it has {size} bytes; allowed are {LARGEST_FILE}")
+        _require_limit(size, LARGEST_FILE, "bytes", path)
         with pyarrow.parquet.ParquetFile(
             path,
             memory_map=False,
-            thrift_string_size_limit=LONGEST_TEXT,
-            thrift_container_size_limit=MOST_ENTRIES,
+            thrift_string_size_limit=min(allowed(LONGEST_TEXT), _INT32),
+            thrift_container_size_limit=min(allowed(MOST_ENTRIES), _INT32),
         ) as file:
             _check_limits(file.metadata, path, size)
             table = file.read()
@@ -53,11 +58,12 @@ def read_parquet(path: Path) -> Table:
         for field in table.schema:
             _check_type(pyarrow, field, path)
         frame = pd.DataFrame({name: table.column(i).to_numpy() for i, name in enumerate(table.column_names)})
-    except RecordingError:
+    except (RecordingError, LimitSettingError):
         raise
     except (pyarrow.ArrowException, OSError, ValueError, IndexError) as error:
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise RecordingError(f"{path}: not a Parquet table: {reason}") from None
+        more = f"; {MORE}" if TOO_LARGE in reason else ""
+        raise RecordingError(f"{path}: not a Parquet table: {reason}{more}") from None
     _require(len(frame) > 0, path, "no rows")
     return Table(said, numbers_of(frame, str(path)))
 
@@ -83,10 +89,15 @@ def _require(fair: bool, path: Path, what: str) -> None:
         raise RecordingError(f"{path}: {what}")
 
 
+def _require_limit(number: int, limit: int, unit: str, path: Path) -> None:
+    reason = excess(number, limit, unit)
+    _require(not reason, path, reason)
+
+
 def _check_limits(metadata: Any, path: Path, size: int) -> None:
     """Raise `RecordingError` if the columns are no plain numbers, or what they expand to is too large."""
     columns, groups = metadata.num_columns, [metadata.row_group(k) for k in range(metadata.num_row_groups)]
-    _require(columns <= MOST_COLUMNS, path, f"it has {columns} columns; allowed are {MOST_COLUMNS}")
+    _require_limit(columns, MOST_COLUMNS, "columns", path)
     for k in range(columns):
         column = metadata.schema.column(k)
         flat = column.max_repetition_level == 0 and column.path == column.name
@@ -95,17 +106,17 @@ def _check_limits(metadata: Any, path: Path, size: int) -> None:
         what = f"the column {shown(column.path)} has {kind.lower() if flat else 'lists'}; allowed are numbers"
         _require(flat and numbers, path, what)
     rows = max(metadata.num_rows, sum(group.num_rows for group in groups))
-    _require(rows <= MOST_ROWS, path, f"it has {rows} rows; allowed are {MOST_ROWS}")
-    most = RATIO * size + ALLOWANCE
-    allowed = f"allowed are {RATIO} times the file and {ALLOWANCE}"
-    _require(8 * rows * columns <= most, path, f"its columns have {8 * rows * columns} bytes; {allowed}")
+    _require_limit(rows, MOST_ROWS, "rows", path)
+    ratio, allowance = allowed(RATIO), allowed(ALLOWANCE)
+    most, words = ratio * size + allowance, f"allowed are {ratio} times the file and {allowance}; {MORE}"
+    _require(8 * rows * columns <= most, path, f"its columns have {8 * rows * columns} bytes; {words}")
     expanded = 0
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         for group in groups:
             for k in range(columns):
                 for page in _page_sizes(data, group.column(k)):
                     expanded += page
-                    _require(expanded <= most, path, f"its pages expand to {expanded} bytes; {allowed}")
+                    _require(expanded <= most, path, f"its pages expand to {expanded} bytes; {words}")
 
 
 def _check_type(pyarrow: Any, field: Any, path: Path) -> None:
@@ -195,11 +206,12 @@ class _Header:
             raise ValueError("a page's header is damaged")
 
     def _skip_many(self, kinds: list[int], count: int, depth: int) -> None:
-        if count > MOST_ENTRIES:
-            raise ValueError("a page's header is too long")
-        for kind in kinds * count:
-            # a boolean in a list has a byte; as a field it has none
-            self._skip(_BYTE if kind in (_TRUE, _FALSE) else kind, depth + 1)
+        if count > allowed(MOST_ENTRIES):
+            raise ValueError(f"a page's header has {count} entries; {MORE}")
+        for _ in range(count):
+            for kind in kinds:
+                # a boolean in a list has a byte; as a field it has none
+                self._skip(_BYTE if kind in (_TRUE, _FALSE) else kind, depth + 1)
 
     def _byte(self) -> int:
         if not 0 <= self.at < len(self._data):

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat._limits import MORE, LimitSettingError, allowed, excess
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.recordings.findings import RecordingError
 
@@ -40,6 +41,12 @@ class _RefusedError(KnodeCosseratError):
     """Error for content that is not an array of numbers."""
 
     code = "pickle"
+
+
+class _TooManyError(_RefusedError):
+    """Error for more numbers than a limit allows."""
+
+    code = "pickle-size"
 
 
 class _Format:
@@ -141,17 +148,19 @@ def read_pickled_array(path: str | Path) -> Float[np.ndarray, "..."]:
         OSError: the file cannot be read.
     """
     path = Path(path)
-    size = path.stat().st_size
-    if size > LARGEST_FILE:
-        raise RecordingError(f"{path}: {size} bytes; at most {LARGEST_FILE} are read")
+    if reason := excess(path.stat().st_size, LARGEST_FILE, "bytes"):
+        raise RecordingError(f"{path}: {reason}")
     data = path.read_bytes()
     accepted = "accepted are NumPy arrays of numbers, and lists of them"
     try:
         _scan(data)
-        values = _numbers(_Reader(io.BytesIO(data)).load(), [MOST_NUMBERS], DEEPEST)
+        values = _numbers(_Reader(io.BytesIO(data)).load(), [allowed(MOST_NUMBERS)], DEEPEST)
         return np.asarray(values, dtype=float)
+    except LimitSettingError:
+        raise
     except _RefusedError as error:
-        raise RecordingError(f"{path}: the pickle holds {error}; {accepted}") from None
+        more = f"; {MORE}" if isinstance(error, _TooManyError) else ""
+        raise RecordingError(f"{path}: the pickle holds {error}; {accepted}{more}") from None
     # the unpickler raises various errors on a damaged program
     except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__
@@ -174,8 +183,10 @@ def _filled(raw: Any, kind: Any, shape: Any, order: Any) -> np.ndarray[Any, Any]
         raise _RefusedError("an array of objects")
     if isinstance(shape, int):
         shape = (shape,)
-    if not isinstance(shape, tuple) or not all(isinstance(n, int) and 0 <= n <= MOST_NUMBERS for n in shape):
+    if not isinstance(shape, tuple) or not all(isinstance(n, int) and n >= 0 for n in shape):
         raise _RefusedError("an array with an impossible shape")
+    if max(shape, default=0) > allowed(MOST_NUMBERS):
+        raise _TooManyError("too many numbers")
     count = 1
     for n in shape:
         count *= n
@@ -203,5 +214,5 @@ def _numbers(given: Any, left: list[int], depth: int) -> Any:
     else:
         raise _RefusedError(f"a {type(given).__name__.strip('_').lower()}")
     if left[0] < 0:
-        raise _RefusedError("too many numbers")
+        raise _TooManyError("too many numbers")
     return float(given) if values is None else values.astype(float)

@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float
 
+from knode_cosserat._limits import MORE, allowed
 from knode_cosserat._registry import provided
 from knode_cosserat._reprs import count_of, wrapped
 from knode_cosserat.recordings.config import RecordingConfig
@@ -227,12 +228,13 @@ class Recording:
         if not (dt > 0.0 and math.isfinite(dt)):
             raise RecordingError(f"dt is {dt}; allowed is a time step above 0 s")
         rows = math.floor((last - start) / dt + _SAME / dt) + 1 if last - start > -_SAME else 0
-        if not 0 < rows <= MOST_ROWS:
+        most = allowed(MOST_ROWS)
+        if not 0 < rows <= most:
             raise RecordingError(
                 f"{self.source}: no rows of {dt:g} s from {start:g} s on; everything is known from 0 to "
                 f"{self.end:g} s"
                 if rows <= 0
-                else f"{self.source}: {rows} rows of {dt:g} s; allowed is up to {MOST_ROWS}"
+                else f"{self.source}: {rows} rows of {dt:g} s; allowed is up to {most}; {MORE}"
             )
         return np.round(start + dt * np.arange(rows), 9)
 

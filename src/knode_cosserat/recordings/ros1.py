@@ -10,7 +10,8 @@ import struct
 from collections.abc import Collection
 from typing import NamedTuple
 
-from knode_cosserat.recordings.container import Container, Decompression
+from knode_cosserat._limits import MORE
+from knode_cosserat.recordings.container import EXPANDED, Container, Decompression
 from knode_cosserat.recordings.findings import RecordingError
 
 MAGIC = b"#ROSBAG V"
@@ -50,7 +51,8 @@ def read_ros1(data: bytes, wanted: Collection[str], source: str) -> Container:
     bag.scan(memoryview(data), begin)
     container = bag.gathered()
     if not container.topics:
-        raise RecordingError(f"{source}: no topic in this bag can be read; it has {len(data)} bytes")
+        more = f"; {MORE}" if container.is_limited else ""
+        raise RecordingError(f"{source}: no topic in this bag can be read; it has {len(data)} bytes{more}")
     return container
 
 
@@ -132,14 +134,16 @@ class _Bag:
         return _next_record(view.obj, record.begin + used)  # type: ignore[arg-type]
 
     def gathered(self) -> Container:
-        container = Container(ros=1, lost=self.lost)
+        container = Container(ros=1, lost=self.lost, is_limited=self._decompression.is_limited)
         for number, (name, kind, digest) in self.connections.items():
             topic = container.topic(name, kind, digest)
             if topic is not None and name in self.wanted:
                 for received, raw in self.messages.get(number, ()):
                     topic.received.append(received)
                     topic.raw.append(raw)
-        if self.index == 0:
+        if container.is_limited:
+            container.damage = EXPANDED
+        elif self.index == 0:
             container.damage = "the recorder was stopped before it had finished the file"
         elif self.index is not None and self.index > self.size:
             container.damage = "the file was cut"

@@ -12,7 +12,8 @@ import urllib.parse
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
-from knode_cosserat.recordings.container import Container, Decompression
+from knode_cosserat._limits import MORE
+from knode_cosserat.recordings.container import EXPANDED, Container, Decompression
 from knode_cosserat.recordings.findings import RecordingError
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
@@ -43,6 +44,7 @@ def merged(containers: list[Container]) -> Container:
     whole = containers[0]
     for each in containers[1:]:
         whole.lost += each.lost
+        whole.is_limited |= each.is_limited
         whole.damage = whole.damage or each.damage
         for topic in each.topics.values():
             known = whole.topic(topic.name, topic.type, topic.digest)
@@ -59,11 +61,13 @@ def read_mcap(data: bytes, wanted: Collection[str], source: str) -> Container:
     """Return the wanted topics' messages, and all topics' names and types. Raises `RecordingError`."""
     file = _Mcap(wanted, len(data))
     file.scan(memoryview(data), len(MCAP_MAGIC))
-    if not file.finished:
-        file.container.damage = file.container.damage or "the recorder was stopped or the file was cut"
-    if not file.container.topics:
-        raise RecordingError(f"{source}: no topic in this MCAP file can be read; it has {len(data)} bytes")
-    return file.container
+    container = file.gathered()
+    if not container.topics:
+        more = f"; {MORE}" if container.is_limited else ""
+        raise RecordingError(
+            f"{source}: no topic in this MCAP file can be read; it has {len(data)} bytes{more}"
+        )
+    return container
 
 
 class _Mcap:
@@ -88,6 +92,14 @@ class _Mcap:
             except (struct.error, UnicodeDecodeError):
                 self.container.lost += len(record)
                 self.container.damage = "the file is damaged"
+
+    def gathered(self) -> Container:
+        self.container.is_limited = self._decompression.is_limited
+        if self.container.is_limited:
+            self.container.damage = EXPANDED
+        elif not self.finished:
+            self.container.damage = self.container.damage or "the recorder was stopped or the file was cut"
+        return self.container
 
     def _records(self, view: memoryview, position: int) -> Iterator[tuple[int, memoryview]]:
         while position + 9 <= len(view):

@@ -20,6 +20,7 @@ orientation. A row has the measurements at its time: cells of slower sensors sta
 from __future__ import annotations
 
 import io
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -27,6 +28,8 @@ import numpy as np
 import pandas as pd  # type: ignore[import-untyped]
 from jaxtyping import Float
 
+from knode_cosserat import _csv
+from knode_cosserat._limits import excess
 from knode_cosserat._yaml import shown
 from knode_cosserat.recordings.clocks import FAR
 from knode_cosserat.recordings.config import RecordingConfig
@@ -61,13 +64,25 @@ class Table(NamedTuple):
 
 def read_csv(data: bytes, path: str) -> Table:
     """Return a CSV file's metadata and its columns of numbers. Raises `RecordingError`."""
+    newlines = data.count(b"\n") + data.count(b"\r") - data.count(b"\r\n")
+    _require(excess(len(data), _csv.LARGEST_FILE, "bytes"), path)
+    _require(excess(newlines, _csv.MOST_LINES, "lines"), path)
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
         raise RecordingError(f"{path}: not a recording: no bag, and no CSV text: it is not UTF-8") from None
     lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
     said, first = _comments(lines)
+    # a quoted cell can have line breaks, so that the header may not be one of the lines
+    columns = 1 + max((line.count(",") for line in itertools.islice(lines, first, None)), default=0)
+    _require(excess(columns, _csv.MOST_COLUMNS, "columns"), path)
     return Table(said, numbers_of(_cells(text, path), path), _about_comments(lines, first))
+
+
+def _require(reason: str, path: str) -> None:
+    """Raise `RecordingError` if there is a reason to refuse a file."""
+    if reason:
+        raise RecordingError(f"{path}: {reason}")
 
 
 def _comments(lines: Sequence[str]) -> tuple[dict[str, str], int]:

@@ -26,6 +26,7 @@ import jax
 import numpy as np
 
 from knode_cosserat._files import package_version, replacing
+from knode_cosserat._limits import MORE, allowed
 from knode_cosserat.errors import KnodeCosseratError
 
 #: largest number of bytes of the header and of the arrays, as a limit for hostile files
@@ -144,8 +145,9 @@ class Writer:
                 f"class of {known.__module__}: call it otherwise"
             )
         self._objects += 1
-        if self._objects > MOST_OBJECTS:
-            raise ContainerError(f"{where} is one object too many; allowed is {MOST_OBJECTS}")
+        most = allowed(MOST_OBJECTS)
+        if self._objects > most:
+            raise ContainerError(f"{where} is one object too many; allowed is {most}; {MORE}")
         fields = {
             name: self._value(getattr(value, name), f"{where}.{name}", classes, others)
             for name in fields_of(cls)
@@ -170,14 +172,15 @@ class Writer:
             raise ContainerError("it is nested too deep") from None
         except ValueError as error:
             raise ContainerError(f"it has a number that cannot be written: {first_line(error)}") from None
-        if len(text) > MOST_HEADER:
+        most = allowed(MOST_HEADER)
+        if len(text) > most:
             raise ContainerError(
-                f"what is not in arrays takes {len(text)} bytes; allowed is {MOST_HEADER}: "
-                "keep long lists of numbers as arrays"
+                f"what is not in arrays takes {len(text)} bytes; allowed is {most}: "
+                f"keep long lists of numbers as arrays; {MORE}"
             )
-        total = sum(array.nbytes for array in self._arrays)
-        if total > MOST_ARRAYS:
-            raise ContainerError(f"the arrays take {total} bytes; allowed is {MOST_ARRAYS}")
+        total, most = sum(array.nbytes for array in self._arrays), allowed(MOST_ARRAYS)
+        if total > most:
+            raise ContainerError(f"the arrays take {total} bytes; allowed is {most}; {MORE}")
         body = b"".join([text, *(array.tobytes() for array in self._arrays)])
         version = re.sub(r"[^!-~]", "?", package_version())[:40] or "unknown"
         first = f"{title.name}, format {title.version}, package {version}\n".encode("ascii")
@@ -226,9 +229,9 @@ def read(path: Path) -> bytes:
         if not path.is_file():
             what = "this is a folder; allowed is a file" if path.is_dir() else "no such file"
             raise ContainerError(what if path.is_dir() or not path.exists() else "not a file")
-        size = path.stat().st_size
-        if size > MOST_HEADER + MOST_ARRAYS + 300:
-            raise ContainerError(f"it has {size} bytes; allowed is {MOST_HEADER + MOST_ARRAYS}")
+        size, most = path.stat().st_size, allowed(MOST_HEADER) + allowed(MOST_ARRAYS)
+        if size > most + 300:
+            raise ContainerError(f"it has {size} bytes; allowed is {most}; {MORE}")
         return path.read_bytes()
     except OSError as error:
         raise ContainerError(f"cannot be read: {error.strerror}") from None

@@ -24,6 +24,7 @@ import jax
 import numpy as np
 
 from knode_cosserat import trajectory_system
+from knode_cosserat._limits import MORE, allowed
 from knode_cosserat._registry import provide
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.learning.files import container
@@ -233,8 +234,9 @@ def _knowledge(reader: Reader, described: dict[str, Any], classes: Classes, give
         return _model(reader, reader.entry("model", dict, described), classes, given)
     if "robot" in described:
         text = reader.entry("robot", str, described)
-        if len(text) > MOST_TEXT:
-            raise ContainerError(f"its robot file has {len(text)} characters; allowed is {MOST_TEXT}")
+        most = allowed(MOST_TEXT)
+        if len(text) > most:
+            raise ContainerError(f"its robot file has {len(text)} characters; allowed is {most}; {MORE}")
         try:
             robot = robot_file.parse_robot(text, "its robot file")
         except robot_file.RobotFileError as error:

@@ -11,6 +11,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
+from knode_cosserat._limits import MORE, allowed
 from knode_cosserat.learning.files.container import (
     MOST_ARRAYS,
     MOST_HEADER,
@@ -58,7 +59,7 @@ class Reader:
             raise ContainerError(f"its header is a {type(header).__name__}; allowed is a mapping")
         self.header: dict[str, Any] = header
         self._arrays = _unpacked(self.entry("arrays", list), arrays)
-        self._objects = 0
+        self._objects, self._most_objects = 0, allowed(MOST_OBJECTS)
 
     def entry(self, name: str, kind: type, mapping: Any = None) -> Any:
         """Return an entry of the header, or of a mapping in it, checked for its type."""
@@ -108,8 +109,8 @@ class Reader:
         if name not in classes:
             raise UnknownClassError(f"{where} is of a class {name[:60]!r}, which is not known here", name)
         self._objects += 1
-        if self._objects > MOST_OBJECTS:
-            raise ContainerError(f"it has more than {MOST_OBJECTS} objects")
+        if self._objects > self._most_objects:
+            raise ContainerError(f"it has more than {self._most_objects} objects; {MORE}")
         # not read: values of removed fields may be of classes that no longer exist
         removed = set(EARLIER_FIELDS.get(name, ())) - set(fields_of(classes[name]))
         kept = {key: part for key, part in fields.items() if key not in removed}
@@ -150,8 +151,9 @@ def _parts(data: bytes, title: Title) -> tuple[bytes, bytes]:
     body = data[start:]
     if len(body) > header + arrays or checksum(first[0], second[2], body) != second[1]:
         raise ContainerError("damaged: its content does not have the checksum that it states")
-    if header > MOST_HEADER:
-        raise ContainerError(f"its header takes {header} bytes; allowed is {MOST_HEADER}")
+    most = allowed(MOST_HEADER)
+    if header > most:
+        raise ContainerError(f"its header takes {header} bytes; allowed is {most}; {MORE}")
     return body[:header], body[header:]
 
 
@@ -183,7 +185,7 @@ def _is_array(entry: Any) -> bool:
     if not (isinstance(kind, str) and kind in TYPES and len(shape) <= 32):
         return False
     whole = all(type(size) is int and size >= 0 for size in shape)
-    return whole and math.prod(max(size, 1) for size in shape) <= MOST_ARRAYS
+    return whole and math.prod(max(size, 1) for size in shape) <= allowed(MOST_ARRAYS)
 
 
 def _is_item(part: Any) -> bool:

@@ -1,0 +1,447 @@
+"""Limits of files: a refusal names the setting, and the setting allows the same file."""
+
+import bz2
+import gzip
+import pickle
+import struct
+import zipfile
+from typing import NamedTuple
+
+import h5py
+import hypothesis.strategies as st
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given
+
+from knode_cosserat import _csv, _limits, _yaml, controls, trajectory_integrity
+from knode_cosserat._limits import MORE, VARIABLE, LimitSettingError, allowed, excess
+from knode_cosserat.cli.control import parsed_reference
+from knode_cosserat.envs import policy
+from knode_cosserat.errors import KnodeCosseratError
+from knode_cosserat.learning.files import container, unpacking
+from knode_cosserat.recordings import cables, load, parquet, pickles, recording, ros1, ros2
+from knode_cosserat.recordings import container as chunks
+from knode_cosserat.recordings.beam import read_beam
+
+TITLE = container.Title("test", 1)
+ROWS = "".join(f"{k / 20},5,0.1,0,{0.4 + k / 1e3}\n" for k in range(20))
+TABLE = f"time [s],tension_1 [N],tip_x [m],tip_y [m],tip_z [m]\n{ROWS}".encode()
+MARKERS = np.random.default_rng(0).normal(size=(9, 5, 3))
+
+
+@pytest.fixture(autouse=True)
+def unset(monkeypatch):
+    monkeypatch.delenv(VARIABLE, raising=False)
+
+
+# readers: each returns a function that reads a file above a limit, but not above ten times the limit
+
+READERS = {}
+
+
+def reader(function):
+    READERS[function.__name__] = function
+    return function
+
+
+@reader
+def yaml_characters(folder, patch):
+    patch.setattr(_yaml, "MOST_CHARACTERS", 10)
+    return lambda: _yaml.mapping_of("a: 12345678", "a")
+
+
+@reader
+def yaml_aliases(folder, patch):
+    patch.setattr(_yaml, "MOST_VALUES", 5)
+    return lambda: _yaml.mapping_of("a: &a [1, 2]\nb: *a", "a")
+
+
+def tensions(folder):
+    path = folder / "tensions.csv"
+    controls.save(path, np.full((30, 4), 5.0), 0.05)
+    return path
+
+
+@reader
+def controls_size(folder, patch):
+    path = tensions(folder)
+    patch.setattr(_csv, "LARGEST_FILE", path.stat().st_size - 1)
+    return lambda: controls.load(path)
+
+
+@reader
+def controls_lines(folder, patch):
+    patch.setattr(_csv, "MOST_LINES", 30)
+    return lambda: controls.load(tensions(folder))
+
+
+@reader
+def controls_columns(folder, patch):
+    patch.setattr(_csv, "MOST_COLUMNS", 4)
+    return lambda: controls.load(tensions(folder))
+
+
+@reader
+def controls_steps(folder, patch):
+    patch.setattr(_csv, "MOST_STEPS", 100)
+    return lambda: controls.load(tensions(folder), 0.005)
+
+
+def table(folder, data=TABLE, name="it.csv"):
+    path = folder / name
+    path.write_bytes(data)
+    return path
+
+
+@reader
+def table_size(folder, patch):
+    patch.setattr(_csv, "LARGEST_FILE", len(TABLE) - 1)
+    return lambda: load.load_recording(table(folder))
+
+
+@reader
+def table_lines(folder, patch):
+    patch.setattr(_csv, "MOST_LINES", 20)
+    return lambda: load.load_recording(table(folder))
+
+
+@reader
+def table_columns(folder, patch):
+    patch.setattr(_csv, "MOST_COLUMNS", 4)
+    return lambda: load.load_recording(table(folder))
+
+
+@reader
+def table_size_when_decompressed(folder, patch):
+    packed = gzip.compress(TABLE)
+    patch.setattr(_csv, "LARGEST_FILE", len(packed) + 1)
+    return lambda: load.load_recording(table(folder, packed, "it.csv.gz"))
+
+
+@reader
+def gzip_expansion(folder, patch):
+    patch.setattr(load, "RATIO", 1)
+    patch.setattr(load, "ALLOWANCE", 0)
+    return lambda: load.load_recording(table(folder, gzip.compress(TABLE), "it.csv.gz"))
+
+
+@reader
+def rows_of_a_recording(folder, patch):
+    patch.setattr(recording, "MOST_ROWS", 15)
+    return lambda: load.load_recording(table(folder)).sampled(0.05)
+
+
+@reader
+def reference_size(folder, patch):
+    patch.setattr(_csv, "LARGEST_FILE", 20)
+    path = table(folder, b"t,x,y\n0,0.1,0.1\n1,0.1,0.2\n")
+    return lambda: parsed_reference(str(path))
+
+
+@reader
+def beam_size(folder, patch):
+    rows = np.column_stack([0.01 * np.arange(60), np.zeros((60, 18))])
+    rows[30:, 1::3] -= 1.0
+    titles = ["time_s", *(f"m{k}_{axis}_m" for k in range(6) for axis in "xyz")]
+    path = folder / "beam_load52.csv"
+    pd.DataFrame(rows, columns=titles).to_csv(path, index=False)
+    patch.setattr(_csv, "LARGEST_FILE", path.stat().st_size - 1)
+    return lambda: read_beam(path)
+
+
+def columns_file(folder):
+    pytest.importorskip("pyarrow")
+    path = folder / "it.parquet"
+    parquet.write_parquet(path, pd.DataFrame({f"c{k}": np.arange(50.0) for k in range(5)}), {})
+    return path
+
+
+@reader
+def parquet_size(folder, patch):
+    path = columns_file(folder)
+    patch.setattr(parquet, "LARGEST_FILE", path.stat().st_size - 1)
+    return lambda: parquet.read_parquet(path)
+
+
+@reader
+def parquet_columns(folder, patch):
+    patch.setattr(parquet, "MOST_COLUMNS", 4)
+    return lambda: parquet.read_parquet(columns_file(folder))
+
+
+@reader
+def parquet_rows(folder, patch):
+    patch.setattr(parquet, "MOST_ROWS", 49)
+    return lambda: parquet.read_parquet(columns_file(folder))
+
+
+@reader
+def parquet_expansion(folder, patch):
+    patch.setattr(parquet, "RATIO", 0)
+    patch.setattr(parquet, "ALLOWANCE", 8 * 50 * 5 - 1)
+    return lambda: parquet.read_parquet(columns_file(folder))
+
+
+@reader
+def parquet_entries_of_metadata(folder, patch):
+    patch.setattr(parquet, "MOST_ENTRIES", 5)
+    return lambda: parquet.read_parquet(columns_file(folder))
+
+
+@reader
+def parquet_texts_of_metadata(folder, patch):
+    patch.setattr(parquet, "LONGEST_TEXT", 400)
+    return lambda: parquet.read_parquet(columns_file(folder))
+
+
+@reader
+def pickle_size(folder, patch):
+    path = table(folder, pickle.dumps(MARKERS))
+    patch.setattr(pickles, "LARGEST_FILE", path.stat().st_size - 1)
+    return lambda: pickles.read_pickled_array(path)
+
+
+@reader
+def pickle_numbers(folder, patch):
+    patch.setattr(pickles, "MOST_NUMBERS", MARKERS.size - 1)
+    return lambda: pickles.read_pickled_array(table(folder, pickle.dumps(MARKERS)))
+
+
+@reader
+def archive_of_cables(folder, patch):
+    np.savez(folder / "cable.npz", train=MARKERS[None], eval=MARKERS[None])
+    patch.setattr(cables, "LARGEST_FILE", MARKERS.nbytes // 2)
+    return lambda: cables.load_cables(folder)
+
+
+def saved_policy(folder, compress=False):
+    path = folder / "policy.npz"
+    layers = ((np.zeros((3, 500)), np.ones(500)), (np.zeros((500, 1)), np.ones(1)))
+    policy.Policy(layers, np.zeros(3), np.ones(3)).save(path)
+    if compress:
+        with zipfile.ZipFile(path) as packed:
+            content = {each: packed.read(each) for each in packed.namelist()}
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as packed:
+            for name, data in content.items():
+                packed.writestr(name, data)
+    return path
+
+
+@reader
+def policy_size(folder, patch):
+    path = saved_policy(folder)
+    patch.setattr(policy, "LARGEST_FILE", path.stat().st_size - 1)
+    return lambda: policy.Policy.load(path)
+
+
+@reader
+def policy_size_when_unpacked(folder, patch):
+    path = saved_policy(folder, compress=True)
+    with zipfile.ZipFile(path) as packed:
+        size = sum(entry.file_size for entry in packed.infolist())
+    patch.setattr(policy, "LARGEST_FILE", size - 1)
+    return lambda: policy.Policy.load(path)
+
+
+@reader
+def policy_layers(folder, patch):
+    patch.setattr(policy, "MOST_LAYERS", 1)
+    return lambda: policy.Policy.load(saved_policy(folder))
+
+
+class Thing(NamedTuple):
+    """An object of a file."""
+
+    x: int
+
+
+def contained():
+    writer = container.Writer()
+    things = writer.value([Thing(k) for k in range(5)], "things", {"Thing": Thing})
+    values = writer.value(np.arange(9.0), "values", {})
+    return writer.file(TITLE, {"things": things, "values": values})
+
+
+@reader
+def model_size(folder, patch):
+    patch.setattr(container, "MOST_HEADER", 0)
+    patch.setattr(container, "MOST_ARRAYS", 100)
+    path = table(folder, bytes(500), "model")
+    return lambda: container.read(path)
+
+
+@reader
+def model_header(folder, patch):
+    data = contained()
+    patch.setattr(unpacking, "MOST_HEADER", 100)
+    return lambda: unpacking.Reader(data, TITLE)
+
+
+@reader
+def model_objects(folder, patch):
+    data = contained()
+    patch.setattr(unpacking, "MOST_OBJECTS", 4)
+
+    def read():
+        opened = unpacking.Reader(data, TITLE)
+        return opened.value(opened.header["things"], "things", {"Thing": Thing})
+
+    return read
+
+
+@reader
+def objects_of_a_written_model(folder, patch):
+    patch.setattr(container, "MOST_OBJECTS", 4)
+    return contained
+
+
+@reader
+def header_of_a_written_model(folder, patch):
+    patch.setattr(container, "MOST_HEADER", 100)
+    return contained
+
+
+@reader
+def arrays_of_a_written_model(folder, patch):
+    patch.setattr(container, "MOST_ARRAYS", 71)
+    return contained
+
+
+@reader
+def trajectory_expansion(folder, patch):
+    path = folder / "it.nc"
+    with h5py.File(path, "w") as file:
+        file.create_dataset("y", (1000,), "f8", chunks=(100,))
+    patch.setattr(trajectory_integrity, "EXPANSION", 0)
+    patch.setattr(trajectory_integrity, "ALLOWANCE", 7999)
+    return lambda: trajectory_integrity.require_own_data(path)
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_a_refusal_names_the_setting_and_the_setting_allows_the_file(name, tmp_path, monkeypatch):
+    read = READERS[name](tmp_path, monkeypatch)
+    with pytest.raises(KnodeCosseratError) as refused:
+        read()
+    message = str(refused.value)
+    assert message.endswith(MORE) and VARIABLE in MORE and "\n" not in message
+    monkeypatch.setenv(VARIABLE, "10")
+    read()
+    monkeypatch.setenv(VARIABLE, "ten")
+    with pytest.raises(LimitSettingError, match=f"^{VARIABLE} must be a finite number above 0 "):
+        read()
+
+
+# bags, of which the part within the limit is read
+
+
+def mcap(count):
+    """An MCAP file with messages in a chunk that is compressed by bz2."""
+
+    def record(kind, body):
+        return bytes([kind]) + struct.pack("<Q", len(body)) + body
+
+    def text(word):
+        return struct.pack("<I", len(word)) + word
+
+    schema = record(ros2.SCHEMA, struct.pack("<H", 1) + text(b"std_msgs/msg/Float64MultiArray") + text(b""))
+    channel = record(ros2.CHANNEL, struct.pack("<HH", 1, 1) + text(b"/a") + text(b"cdr"))
+    message = record(ros2.MESSAGE, struct.pack("<HIQQ", 1, 0, 5, 5) + bytes(1000))
+    records = schema + channel + count * message
+    packed = bz2.compress(records)
+    chunk = struct.pack("<QQQI", 0, 0, len(records), 0) + text(b"bz2") + struct.pack("<Q", len(packed))
+    return ros2.MCAP_MAGIC + record(ros2.CHUNK, chunk + packed) + record(ros2.DATA_END, bytes(4))
+
+
+def test_a_bag_within_the_limit_is_read_and_the_rest_is_a_finding(monkeypatch):
+    data = mcap(100)
+    monkeypatch.setattr(chunks, "RATIO", 0)
+    monkeypatch.setattr(chunks, "ALLOWANCE", 20_000)
+    bag = ros2.read_mcap(data, {"/a"}, "it.mcap")
+    assert bag.is_limited and 15 <= len(bag.topics["/a"].raw) < 20
+    finding = load._said_damage(bag, [])
+    assert finding.message.startswith(chunks.EXPANDED) and finding.message.endswith(MORE)
+    monkeypatch.setattr(chunks, "ALLOWANCE", 50)
+    with pytest.raises(KnodeCosseratError, match=f"no topic in this MCAP file can be read.*{MORE}$"):
+        ros2.read_mcap(data, {"/a"}, "it.mcap")
+    monkeypatch.setenv(VARIABLE, "1e4")
+    bag = ros2.read_mcap(data, {"/a"}, "it.mcap")
+    assert not bag.is_limited and not bag.damage and len(bag.topics["/a"].raw) == 100
+    assert ros2.merged([bag, chunks.Container(2, is_limited=True)]).is_limited
+
+
+def test_a_ros_1_bag_beyond_the_limit_says_so(monkeypatch):
+    monkeypatch.setattr(chunks, "LARGEST_CHUNK", 10)
+    packed = bz2.compress(bytes(1000))
+    fields = (b"op=" + bytes([ros1.CHUNK]), b"compression=bz2", b"size=" + struct.pack("<I", 1000))
+    header = b"".join(struct.pack("<I", len(field)) + field for field in fields)
+    bag = struct.pack("<I", len(header)) + header + struct.pack("<I", len(packed)) + packed
+    with pytest.raises(KnodeCosseratError, match=f"no topic in this bag can be read.*{MORE}$"):
+        ros1.read_ros1(ros1.VERSION + bag, (), "it.bag")
+
+
+def packed_by(compression, data):
+    if compression == "bz2":
+        return bz2.compress(data)
+    if compression == "lz4":
+        return pytest.importorskip("lz4.frame").compress(data)
+    try:
+        from compression import zstd
+    except ImportError:
+        zstd = pytest.importorskip("backports.zstd")
+    return zstd.compress(data)
+
+
+@pytest.mark.parametrize("compression", ["bz2", "lz4", "zstd"])
+@pytest.mark.parametrize("output", [1, 1000, 4096, 1 << 24])
+def test_chunks_are_complete_when_their_output_comes_in_parts(monkeypatch, compression, output):
+    random = np.random.default_rng(0)
+    for data in (bytes(20_000), random.bytes(20_000), b"ab" * 10_000 + random.bytes(1)):
+        packed = packed_by(compression, data)
+        monkeypatch.setattr(chunks, "_OUTPUT", output)
+        for size in (0, len(data)):
+            file = chunks.Decompression(len(packed))
+            assert file.records(packed + b"more", compression, size) == (data, len(packed))
+            assert not file.is_limited
+
+
+# the setting
+
+
+@pytest.mark.parametrize("text", ["ten", "0", "-1", "nan", "inf", "1e999", "10\n20", "x" * 1000])
+def test_a_wrong_setting_is_refused_in_one_line(monkeypatch, text):
+    monkeypatch.setenv(VARIABLE, text)
+    with pytest.raises(LimitSettingError) as refused:
+        allowed(5)
+    message = str(refused.value)
+    assert message.startswith(f"{VARIABLE} must be a finite number above 0 (got ") and len(message) < 200
+    assert "\n" not in message and isinstance(refused.value, ValueError)
+
+
+def test_the_default_and_an_empty_setting_change_nothing(monkeypatch):
+    assert allowed(1_000_000_000) == 1_000_000_000
+    monkeypatch.setenv(VARIABLE, "")
+    assert allowed(7) == 7 and excess(7, 7, "bytes") == ""
+    assert excess(8, 7, "bytes") == f"it has 8 bytes; allowed are 7; {MORE}"
+
+
+numbers, factors = st.integers(0, 2**40), st.floats(1e-9, 1e300)
+
+
+@given(numbers, numbers, factors, factors)
+def test_limits_grow_with_the_factor_and_are_integers_of_64_bits(one, other, factor, larger):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(VARIABLE, repr(factor))
+        low, high = sorted((one, other))
+        found = allowed(low)
+        assert type(found) is int and 0 <= found <= allowed(high) <= _limits._LARGEST
+        assert found == int(min(low * factor, _limits._LARGEST))
+        assert bool(excess(one, other, "rows")) == (one > allowed(other))
+        patch.setenv(VARIABLE, repr(max(factor, larger)))
+        assert found <= allowed(low)
+
+
+def test_the_setting_changes_no_byte_of_a_file(monkeypatch):
+    data = contained()
+    monkeypatch.setenv(VARIABLE, "3")
+    assert contained() == data
