@@ -57,7 +57,7 @@ def jobs(quick: bool) -> list[Job]:
         Job("sweep", sweep, {"rollouts": 4096 if quick else 1_000_000}),
     ]
     if not quick and stand_in.is_available():
-        made.append(Job("stand-in", real, {"seconds": 900.0, "episodes": 5}))
+        made.append(Job("stand-in", real, {"seconds": 300.0, "episodes": 5}))
     return made
 
 
