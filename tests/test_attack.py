@@ -30,9 +30,13 @@ def test_every_sample_is_read_as_it_was_written(tmp_path):
         assert len(found) == 2, name
 
 
-def test_a_full_disk_leaves_all_files_as_they_were(tmp_path):
-    rows = faults(tmp_path, len(samples()), seed=1)
-    assert failures(rows) == [] and sum(row.tried for row in rows) == len(samples())
+@pytest.mark.parametrize(
+    "names", [("trajectory.nc", "figure.png", "bag.db3"), pytest.param((), marks=pytest.mark.campaign)]
+)
+def test_a_full_disk_leaves_all_files_as_they_were(names, tmp_path):
+    count = len(names or samples())
+    rows = faults(tmp_path, count, seed=1, names=names)
+    assert failures(rows) == [] and sum(row.tried for row in rows) == count
 
 
 def test_killed_writes_leave_a_whole_file(tmp_path):

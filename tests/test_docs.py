@@ -26,10 +26,11 @@ BLOCK = re.compile(r"(<!-- test: long -->\n)?^```(\w*)\n(.*?)^```$", re.MULTILIN
 LONG = "<!-- test: long -->"
 #: pages whose code takes long as a whole: recordings are made and learned from, or many programs compiled
 LONG_PAGES = (
-    "README.md", "docs/design.md", "docs/environments.md", "docs/estimation.md", "docs/kinematics.md",
-    "docs/recordings.md", "docs/tutorials/fit.md", "docs/tutorials/control.md",
-    "docs/tutorials/gradients.md", "docs/tutorials/several-rods.md", "docs/tutorials/simulate.md",
-    "docs/two-sections.md", "docs/which-function.md", "docs/your-own-robot.md",
+    "README.md", "docs/control.md", "docs/design.md", "docs/environments.md", "docs/estimation.md",
+    "docs/hardware.md", "docs/kinematics.md", "docs/recordings.md", "docs/tutorials/fit.md",
+    "docs/tutorials/control.md", "docs/tutorials/gradients.md", "docs/tutorials/several-rods.md",
+    "docs/tutorials/simulate.md", "docs/two-sections.md", "docs/which-function.md",
+    "docs/your-own-robot.md",
 )  # fmt: skip
 #: of these, pages that CI runs too
 SAMPLES = ("README.md", "docs/tutorials/fit.md", "docs/tutorials/simulate.md", "docs/which-function.md")

@@ -33,6 +33,7 @@ def test_lag_weights_are_those_of_the_lag():
     assert_allclose(weights, np.stack([1.0 - remaining, remaining], axis=1), rtol=1e-12)
 
 
+@pytest.mark.campaign
 def test_a_planning_controller_predicts_with_the_lag():
     """Oracle: a plant whose tensions follow the commands by the same lag."""
     lag, dt = 0.08, 0.05

@@ -15,7 +15,7 @@ import resource
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -98,9 +98,9 @@ def attempts(name: str, folder: Path, count: int, seed: int) -> None:
     print(json.dumps(outcomes))
 
 
-def faults(folder: Path, count: int, seed: int) -> list[Row]:
-    """Let so many writes fail, of all kinds of files."""
-    names, rows = list(samples()), []
+def faults(folder: Path, count: int, seed: int, names: Sequence[str] = ()) -> list[Row]:
+    """Let so many writes fail, of all kinds of files or of some."""
+    names, rows = names or list(samples()), []
     for k, name in enumerate(names):
         own = count // len(names) + (k < count % len(names))
         if not own:
