@@ -34,6 +34,7 @@ from knode_cosserat.evaluation.drawing import new_figure
 from knode_cosserat.evaluation.style import PALETTE, style, width_of
 from knode_cosserat.evaluation.tables import markdown_table
 from knode_cosserat.rods.robot_file import load_robot
+from knode_cosserat.rods.routed_robot import RoutedTendonRobot
 from knode_cosserat.rods.tendon_rod import TendonRod
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.studies import stand_in
@@ -258,9 +259,10 @@ def real(settings: Any) -> Product:
     randomisation = Randomisation(
         {"youngs_modulus": Factor(0.7, 1.3), "bending_damping": Factor(0.2, 2.0)}, delay=(0, 2), noise=5e-4
     )
-    environment = make("follow", randomisation=randomisation)
-    nominal = environment.robot
+    nominal = load_robot("delrin-tendon-robot")
     assert isinstance(nominal, TendonRod)
+    # the tendons of the stand-in are routed ones, not those of the model of the paper
+    environment = make("follow", RoutedTendonRobot.like(nominal), randomisation=randomisation)
     rod = stand_in.true_rod(nominal)
     training = Training(environment)
     training.run(settings["seconds"])
