@@ -11,6 +11,7 @@ import xarray
 
 import knode_cosserat as kc
 from knode_cosserat.trajectory_file import load_trajectory
+from knode_cosserat.trajectory_integrity import SEAL, seal
 from knode_cosserat.trajectory_system import TrajectoryFileError
 from tests.trajectories import ROBOTS, Leapfrog, Pendulum, assert_same, fails, synthetic
 
@@ -325,3 +326,15 @@ for most in (0, 1000, len(before) - 1):
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("a.nc: cannot be written: File too large") == 3
+
+
+def test_bytes_are_checked_before_hdf5_reads_them(path):
+    """A damaged internal list made HDF5 loop for ever; a file without the bytes' checksum is still read."""
+    content = path.read_bytes()
+    end = content.rindex(SEAL)
+    assert content[end:] == seal(content[:end])
+    path.write_bytes(content[:-1])
+    with fails("its bytes do not have their checksum"):
+        load_trajectory(path)
+    path.write_bytes(content[:end])
+    assert_same(load_trajectory(path), synthetic())

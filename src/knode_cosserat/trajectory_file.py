@@ -30,6 +30,8 @@ from knode_cosserat.trajectory_integrity import (
     checksum,
     require_own_data,
     require_possible,
+    require_seal,
+    seal,
 )  # fmt: skip
 from knode_cosserat.trajectory_system import (
     BYTES,
@@ -104,7 +106,7 @@ def save(trajectory: Trajectory, path: str | Path) -> None:
         add_checksum(file, checksum(written.load()))
     try:
         with replacing(path) as temporary:
-            temporary.write_bytes(file.getbuffer())
+            temporary.write_bytes(file.getvalue() + seal(file.getvalue()))
     except OSError as error:
         raise TrajectoryFileError(
             f"{path}: cannot be written: {error.strerror or first_line(error)}"
@@ -303,6 +305,7 @@ def _opened(file: Any) -> xarray.Dataset:
 def _read(path: Path) -> xarray.Dataset:
     _require_hdf5(path)
     try:
+        require_seal(path)
         require_own_data(path)
         with _opened(path) as data:
             _require_format(path, data.attrs)

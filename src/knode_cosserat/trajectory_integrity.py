@@ -22,6 +22,26 @@ CHECKSUM = "checksum"
 #: not compress; other programs may
 EXPANSION, ALLOWANCE = 100, 100_000_000
 
+#: what stands before the checksum of all bytes at the end of a file. HDF5 ignores bytes after its own, and
+#: drops them when another program changes the file
+SEAL = b"\nknode-cosserat SHA-256 "
+
+
+def seal(content: bytes) -> bytes:
+    """Return the checksum of a file's bytes, as it stands at the file's end."""
+    return SEAL + hashlib.sha256(content).hexdigest().encode()
+
+
+def require_seal(path: Path) -> None:
+    """Raise `TrajectoryFileError` if the bytes of a file do not have the checksum at its end, if it has one.
+
+    It is checked before HDF5 reads the file: damage of its internal lists can make HDF5 loop for ever.
+    """
+    content = path.read_bytes()
+    end = content.rfind(SEAL, -len(seal(b"")))
+    if end >= 0 and seal(content[:end]) != content[end:]:
+        raise TrajectoryFileError(f"{path}: truncated or damaged: its bytes do not have their checksum")
+
 
 def add_checksum(file: Any, value: str) -> None:
     """Add a checksum to a file, given by path or in memory."""
