@@ -33,7 +33,7 @@ notebooks: $(READY) ## run the notebooks' texts, and write docs/notebooks/*.ipyn
 
 env: $(READY) ## make the environment
 
-test: $(READY) ## run the tests, but for the long ones (some 10 min on two cores)
+test: $(READY) ## run the tests, but for the long ones (some 20 min on two cores)
 	$(BIN)/python -m pytest -n $(JOBS) $(BY_FILE) -m "not campaign" $(PYTEST_ARGS)
 
 test-all: $(READY) ## run all the tests, the long ones too

@@ -1,9 +1,7 @@
 """Limits of files: a refusal names the setting, and the setting allows the same file."""
 
-import bz2
 import gzip
 import pickle
-import struct
 import zipfile
 from typing import NamedTuple
 
@@ -20,8 +18,7 @@ from knode_cosserat.cli.control import parsed_reference
 from knode_cosserat.envs import policy
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.learning.files import container, unpacking
-from knode_cosserat.recordings import cables, load, parquet, pickles, recording, ros1, ros2
-from knode_cosserat.recordings import container as chunks
+from knode_cosserat.recordings import cables, load, parquet, pickles, recording
 from knode_cosserat.recordings.beam import read_beam
 
 TITLE = container.Title("test", 1)
@@ -330,79 +327,6 @@ def test_a_refusal_names_the_setting_and_the_setting_allows_the_file(name, tmp_p
     monkeypatch.setenv(VARIABLE, "ten")
     with pytest.raises(LimitSettingError, match=f"^{VARIABLE} must be a finite number above 0 "):
         read()
-
-
-# bags, of which the part within the limit is read
-
-
-def mcap(count):
-    """An MCAP file with messages in a chunk that is compressed by bz2."""
-
-    def record(kind, body):
-        return bytes([kind]) + struct.pack("<Q", len(body)) + body
-
-    def text(word):
-        return struct.pack("<I", len(word)) + word
-
-    schema = record(ros2.SCHEMA, struct.pack("<H", 1) + text(b"std_msgs/msg/Float64MultiArray") + text(b""))
-    channel = record(ros2.CHANNEL, struct.pack("<HH", 1, 1) + text(b"/a") + text(b"cdr"))
-    message = record(ros2.MESSAGE, struct.pack("<HIQQ", 1, 0, 5, 5) + bytes(1000))
-    records = schema + channel + count * message
-    packed = bz2.compress(records)
-    chunk = struct.pack("<QQQI", 0, 0, len(records), 0) + text(b"bz2") + struct.pack("<Q", len(packed))
-    return ros2.MCAP_MAGIC + record(ros2.CHUNK, chunk + packed) + record(ros2.DATA_END, bytes(4))
-
-
-def test_a_bag_within_the_limit_is_read_and_the_rest_is_a_finding(monkeypatch):
-    data = mcap(100)
-    monkeypatch.setattr(chunks, "RATIO", 0)
-    monkeypatch.setattr(chunks, "ALLOWANCE", 20_000)
-    bag = ros2.read_mcap(data, {"/a"}, "it.mcap")
-    assert bag.is_limited and 15 <= len(bag.topics["/a"].raw) < 20
-    finding = load._said_damage(bag, [])
-    assert finding.message.startswith(chunks.EXPANDED) and finding.message.endswith(MORE)
-    monkeypatch.setattr(chunks, "ALLOWANCE", 50)
-    with pytest.raises(KnodeCosseratError, match=f"no topic in this MCAP file can be read.*{MORE}$"):
-        ros2.read_mcap(data, {"/a"}, "it.mcap")
-    monkeypatch.setenv(VARIABLE, "1e4")
-    bag = ros2.read_mcap(data, {"/a"}, "it.mcap")
-    assert not bag.is_limited and not bag.damage and len(bag.topics["/a"].raw) == 100
-    assert ros2.merged([bag, chunks.Container(2, is_limited=True)]).is_limited
-
-
-def test_a_ros_1_bag_beyond_the_limit_says_so(monkeypatch):
-    monkeypatch.setattr(chunks, "LARGEST_CHUNK", 10)
-    packed = bz2.compress(bytes(1000))
-    fields = (b"op=" + bytes([ros1.CHUNK]), b"compression=bz2", b"size=" + struct.pack("<I", 1000))
-    header = b"".join(struct.pack("<I", len(field)) + field for field in fields)
-    bag = struct.pack("<I", len(header)) + header + struct.pack("<I", len(packed)) + packed
-    with pytest.raises(KnodeCosseratError, match=f"no topic in this bag can be read.*{MORE}$"):
-        ros1.read_ros1(ros1.VERSION + bag, (), "it.bag")
-
-
-def packed_by(compression, data):
-    if compression == "bz2":
-        return bz2.compress(data)
-    if compression == "lz4":
-        return pytest.importorskip("lz4.frame").compress(data)
-    try:
-        from compression import zstd
-    except ImportError:
-        zstd = pytest.importorskip("backports.zstd")
-    return zstd.compress(data)
-
-
-@pytest.mark.parametrize("compression", ["bz2", "lz4", "zstd"])
-@pytest.mark.parametrize("output", [1, 1000, 4096, 1 << 24])
-def test_chunks_are_complete_when_their_output_comes_in_parts(monkeypatch, compression, output):
-    random = np.random.default_rng(0)
-    for data in (bytes(20_000), random.bytes(20_000), b"ab" * 10_000 + random.bytes(1)):
-        packed = packed_by(compression, data)
-        monkeypatch.setattr(chunks, "_OUTPUT", output)
-        for size in (0, len(data)):
-            file = chunks.Decompression(len(packed))
-            assert file.records(packed + b"more", compression, size) == (data, len(packed))
-            assert not file.is_limited
 
 
 # the setting

@@ -104,9 +104,10 @@ def save(trajectory: Trajectory, path: str | Path) -> None:
     data.to_netcdf(file, engine="h5netcdf", encoding=plain)
     with _opened(file) as written:
         add_checksum(file, checksum(written.load()))
+    content = file.getvalue()
     try:
         with replacing(path) as temporary:
-            temporary.write_bytes(file.getvalue() + seal(file.getvalue()))
+            temporary.write_bytes(content + seal(content))
     except OSError as error:
         raise TrajectoryFileError(
             f"{path}: cannot be written: {error.strerror or first_line(error)}"

@@ -59,6 +59,9 @@ class ElasticaPlant(Plant):
     ) -> Self:  # fmt: skip
         """Return a plant with the dimensions, material, masses and tendons of a robot.
 
+        Its tendons are routed ones: with exact numbers its model is `RoutedTendonRobot.like(robot)`. The
+        paper's tendons (`TendonRobot`) bend a rod more.
+
         Args:
             robot: a robot with tendons beside its rod.
             dt: period (s).
