@@ -77,3 +77,17 @@ def test_the_owner_of_a_live_page_is_answered_during_a_flood():
     from tools.attack.flood import flooded
 
     assert failures(flooded(20.0)) == []
+
+
+def test_without_names_the_usual_parts_run(monkeypatch, capsys):
+    from tools.attack import __main__ as command
+
+    ran = []
+    for name in command.PARTS:
+        monkeypatch.setitem(command.PARTS, name, lambda *_given, name=name: ran.append(name) or [])
+    with pytest.raises(SystemExit) as ended:
+        command.main([])
+    assert (ended.value.code, ran) == (0, list(command.USUAL))
+    with pytest.raises(SystemExit):
+        command.main(["flod"])
+    assert "unknown part 'flod'" in capsys.readouterr().err

@@ -11,7 +11,7 @@ import argparse
 import resource
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from tools.attack import attacked, good_files
@@ -81,17 +81,21 @@ PARTS: dict[str, Callable[[Path, float, int], list[Row]]] = {
 USUAL = ("files", "kills", "disk", "cases", "flood")
 
 
-def main() -> None:
-    """Run parts; the exit status is 1 if anything failed."""
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run parts, the usual ones if none is named; the exit status is 1 if anything failed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("parts", nargs="*", choices=[*PARTS, []], default=list(USUAL))
+    parser.add_argument("parts", nargs="*", metavar="PART", help=", ".join(PARTS))
     parser.add_argument("--share", type=float, default=1.0, help="share of the full numbers")
     parser.add_argument("--seed", type=int, default=0)
-    given = parser.parse_args()
+    given = parser.parse_args(arguments)
+    parts = given.parts or USUAL
+    unknown = sorted(set(parts) - set(PARTS))
+    if unknown:
+        parser.error(f"unknown part {unknown[0]!r}; parts are {', '.join(PARTS)}")
     folder = Path(tempfile.mkdtemp(prefix="attack-"))
     printed_title()
     rows = []
-    for part in given.parts:
+    for part in parts:
         own = folder / part
         own.mkdir()
         rows += PARTS[part](own, given.share, given.seed)
