@@ -10,6 +10,7 @@ import pytest
 import xarray
 
 import knode_cosserat as kc
+from knode_cosserat import trajectory_integrity
 from knode_cosserat.trajectory_file import load_trajectory
 from knode_cosserat.trajectory_integrity import SEAL, seal
 from knode_cosserat.trajectory_system import TrajectoryFileError
@@ -338,3 +339,31 @@ def test_bytes_are_checked_before_hdf5_reads_them(path):
         load_trajectory(path)
     path.write_bytes(content[:end])
     assert_same(load_trajectory(path), synthetic())
+
+
+def without_seal(path):
+    """Remove the checksum of a file's bytes, and return the rest."""
+    content = path.read_bytes()
+    path.write_bytes(content[: content.rindex(SEAL)])
+    return bytearray(path.read_bytes())
+
+
+def test_hdf5_may_loop_for_ever_on_a_file_without_a_checksum(path, monkeypatch):
+    """Free space of size 0 in a heap of HDF5: it looks there for the next entry again and again."""
+    content = without_seal(path)
+    entry = content.index(b"GCOL") + 16
+    content[entry : entry + 16] = bytes(16)
+    path.write_bytes(content)
+    monkeypatch.setattr(trajectory_integrity, "PATIENCE", 1.0)
+    with fails("HDF5 does not come to an end with it"):
+        load_trajectory(path)
+
+
+def test_hdf5_may_crash_on_a_file_without_a_checksum(path, tmp_path, monkeypatch):
+    """A crash cannot be had with every version of HDF5: another script stands for it."""
+    without_seal(path)
+    script = tmp_path / "crash.py"
+    script.write_text("import os, signal\nprint('reads', flush=True)\nos.kill(os.getpid(), signal.SIGSEGV)\n")
+    monkeypatch.setattr(trajectory_integrity, "PROBE", script)
+    with fails("HDF5 crashes when it reads it"):
+        load_trajectory(path)

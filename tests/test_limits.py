@@ -1,6 +1,7 @@
 """Limits of files: a refusal names the setting, and the setting allows the same file."""
 
 import gzip
+import json
 import pickle
 import zipfile
 from typing import NamedTuple
@@ -12,7 +13,7 @@ import pandas as pd
 import pytest
 from hypothesis import given
 
-from knode_cosserat import _csv, _limits, _yaml, controls, trajectory_integrity
+from knode_cosserat import _csv, _limits, _parquet, _yaml, controls, trajectory_integrity
 from knode_cosserat._limits import MORE, VARIABLE, LimitSettingError, allowed, excess
 from knode_cosserat.cli.control import parsed_reference
 from knode_cosserat.envs import policy
@@ -20,6 +21,9 @@ from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.learning.files import container, unpacking
 from knode_cosserat.recordings import cables, load, parquet, pickles, recording
 from knode_cosserat.recordings.beam import read_beam
+from knode_cosserat.recordings.config import RecordingConfig
+from knode_cosserat.sweeps import manifest as manifests
+from knode_cosserat.sweeps import shard_file
 
 TITLE = container.Title("test", 1)
 ROWS = "".join(f"{k / 20},5,0.1,0,{0.4 + k / 1e3}\n" for k in range(20))
@@ -46,6 +50,13 @@ def reader(function):
 def yaml_characters(folder, patch):
     patch.setattr(_yaml, "MOST_CHARACTERS", 10)
     return lambda: _yaml.mapping_of("a: 12345678", "a")
+
+
+@reader
+def yaml_bytes(folder, patch):
+    patch.setattr(_yaml, "MOST_CHARACTERS", 3)
+    path = table(folder, b"a: 1234567890", "it.yaml")
+    return lambda: _yaml.read_yaml(path)
 
 
 @reader
@@ -147,6 +158,69 @@ def beam_size(folder, patch):
     return lambda: read_beam(path)
 
 
+@reader
+def bag_size(folder, patch):
+    path = folder / "it.bag"
+    load.load_example().sampled(0.05).save(path)
+    config = RecordingConfig.load(path.with_suffix(".yaml"))
+    patch.setattr(load, "LARGEST_BAG", path.stat().st_size - 1)
+    return lambda: load.load_recording(path, config)
+
+
+@reader
+def sqlite_bag_size(folder, patch):
+    path = folder / "it.db3"
+    load.load_example().sampled(0.05).save(path)
+    config = RecordingConfig.load(path.with_suffix(".yaml"))
+    patch.setattr(load, "LARGEST_BAG", path.stat().st_size - 1)
+    return lambda: load.load_recording(path, config)
+
+
+def shard(folder):
+    pytest.importorskip("pyarrow")
+    path = folder / "000000.parquet"
+    columns = {"case": np.arange(50), "reason": np.array(["none"] * 50, dtype=object)}
+    path.write_bytes(shard_file.shard_bytes(columns, {}))
+    return path
+
+
+@reader
+def shard_size(folder, patch):
+    path = shard(folder)
+    patch.setattr(_parquet, "LARGEST_FILE", path.stat().st_size - 1)
+    return lambda: shard_file.read_shard(path)
+
+
+@reader
+def shard_expansion(folder, patch):
+    path = shard(folder)
+    patch.setattr(_parquet, "RATIO", 0)
+    patch.setattr(_parquet, "ALLOWANCE", 799)
+    return lambda: shard_file.read_shard(path)
+
+
+@reader
+def shard_texts(folder, patch):
+    pytest.importorskip("pyarrow")
+    path = folder / "000000.parquet"
+    path.write_bytes(shard_file.shard_bytes({"reason": np.array(["x" * 100] * 50, dtype=object)}, {}))
+    patch.setattr(_parquet, "RATIO", 0)
+    patch.setattr(_parquet, "ALLOWANCE", 4_999)
+    return lambda: shard_file.read_shard(path)
+
+
+@reader
+def manifest_size(folder, patch):
+    manifest = {
+        "format": manifests.FORMAT, "version": 2, "identity": "", "sweep": {}, "cases": 1, "shards": 1,
+        "shard_cases": 1, "robots": [{"columns": {}}],
+    }  # fmt: skip
+    text = json.dumps(manifest | {"checksum": manifests._checksum(manifest)})
+    (folder / "sweep.json").write_text(text)
+    patch.setattr(manifests, "LARGEST_MANIFEST", len(text) - 1)
+    return lambda: manifests.read_manifest(folder)
+
+
 def columns_file(folder):
     pytest.importorskip("pyarrow")
     path = folder / "it.parquet"
@@ -157,38 +231,38 @@ def columns_file(folder):
 @reader
 def parquet_size(folder, patch):
     path = columns_file(folder)
-    patch.setattr(parquet, "LARGEST_FILE", path.stat().st_size - 1)
+    patch.setattr(_parquet, "LARGEST_FILE", path.stat().st_size - 1)
     return lambda: parquet.read_parquet(path)
 
 
 @reader
 def parquet_columns(folder, patch):
-    patch.setattr(parquet, "MOST_COLUMNS", 4)
+    patch.setattr(_parquet, "MOST_COLUMNS", 4)
     return lambda: parquet.read_parquet(columns_file(folder))
 
 
 @reader
 def parquet_rows(folder, patch):
-    patch.setattr(parquet, "MOST_ROWS", 49)
+    patch.setattr(_parquet, "MOST_ROWS", 49)
     return lambda: parquet.read_parquet(columns_file(folder))
 
 
 @reader
 def parquet_expansion(folder, patch):
-    patch.setattr(parquet, "RATIO", 0)
-    patch.setattr(parquet, "ALLOWANCE", 8 * 50 * 5 - 1)
+    patch.setattr(_parquet, "RATIO", 0)
+    patch.setattr(_parquet, "ALLOWANCE", 8 * 50 * 5 - 1)
     return lambda: parquet.read_parquet(columns_file(folder))
 
 
 @reader
 def parquet_entries_of_metadata(folder, patch):
-    patch.setattr(parquet, "MOST_ENTRIES", 5)
+    patch.setattr(_parquet, "MOST_ENTRIES", 5)
     return lambda: parquet.read_parquet(columns_file(folder))
 
 
 @reader
 def parquet_texts_of_metadata(folder, patch):
-    patch.setattr(parquet, "LONGEST_TEXT", 400)
+    patch.setattr(_parquet, "LONGEST_TEXT", 400)
     return lambda: parquet.read_parquet(columns_file(folder))
 
 

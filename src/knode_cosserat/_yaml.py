@@ -5,11 +5,13 @@ from __future__ import annotations
 import difflib
 import re
 import reprlib
+from pathlib import Path
 from typing import Any
 
 import yaml
 
 from knode_cosserat._limits import MORE, LimitSettingError, allowed
+from knode_cosserat._reading import ReadError, read_text
 from knode_cosserat.errors import KnodeCosseratError
 
 #: largest text, and number of values in it with all aliases written out
@@ -20,6 +22,15 @@ class YAMLTextError(KnodeCosseratError, ValueError):
     """A text is not YAML, or not a mapping; the message says why and names no file."""
 
     code = "yaml"
+
+
+def read_yaml(path: str | Path) -> str:
+    """Return the text of a YAML file that is not too large, in UTF-8. Raises `YAMLTextError`."""
+    try:
+        # a character has up to four bytes
+        return read_text(path, 4 * MOST_CHARACTERS, "utf-8-sig")
+    except ReadError as error:
+        raise YAMLTextError(str(error)) from None
 
 
 def mapping_of(text: str, keys: str) -> dict[Any, Any]:

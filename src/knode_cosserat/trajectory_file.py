@@ -17,6 +17,7 @@ import numpy as np
 
 from knode_cosserat._files import package_version, replacing
 from knode_cosserat._limits import LimitSettingError
+from knode_cosserat._reading import json_value
 from knode_cosserat._registry import provide
 from knode_cosserat.rods.layout import Field, Layout
 from knode_cosserat.rods.system import System
@@ -30,7 +31,7 @@ from knode_cosserat.trajectory_integrity import (
     checksum,
     require_own_data,
     require_possible,
-    require_seal,
+    require_sound,
     seal,
 )  # fmt: skip
 from knode_cosserat.trajectory_system import (
@@ -306,7 +307,7 @@ def _opened(file: Any) -> xarray.Dataset:
 def _read(path: Path) -> xarray.Dataset:
     _require_hdf5(path)
     try:
-        require_seal(path)
+        require_sound(path)
         require_own_data(path)
         with _opened(path) as data:
             _require_format(path, data.attrs)
@@ -360,7 +361,7 @@ def _settings_text(settings: Settings | None, source: str) -> str:
 
 def _settings(path: Path, data: xarray.Dataset) -> Settings | None:
     try:
-        description = json.loads(data.attrs["settings"])
+        description = json_value(data.attrs["settings"])
         return None if description is None else Settings.from_description(description)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise TrajectoryFileError(

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from knode_cosserat._limits import MORE, allowed
+from knode_cosserat._reading import ReadError, read_bytes
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.trajectory_system import TrajectoryFileError
 
@@ -22,6 +25,12 @@ CHECKSUM = "checksum"
 #: not compress; other programs may
 EXPANSION, ALLOWANCE = 100, 100_000_000
 
+#: largest file (bytes)
+LARGEST_FILE = 8 << 30
+#: time (s) that HDF5 may take for a file without the checksum of its bytes; more at this speed (bytes/s)
+PATIENCE, SPEED = 3.0, 2e7
+#: script that reads a file in a process of its own
+PROBE = Path(__file__).with_name("_hdf5_probe.py")
 #: what stands before the checksum of all bytes at the end of a file. HDF5 ignores bytes after its own, and
 #: drops them when another program changes the file
 SEAL = b"\nknode-cosserat SHA-256 "
@@ -32,15 +41,42 @@ def seal(content: bytes) -> bytes:
     return SEAL + hashlib.sha256(content).hexdigest().encode()
 
 
-def require_seal(path: Path) -> None:
-    """Raise `TrajectoryFileError` if the bytes of a file do not have the checksum at its end, if it has one.
+def require_sound(path: Path) -> None:
+    """Raise `TrajectoryFileError` if the bytes of a file do not have the checksum at its end.
 
-    It is checked before HDF5 reads the file: damage of its internal lists can make HDF5 loop for ever.
+    It is checked before HDF5 reads the file: damage of its internal lists can make HDF5 loop for ever. A file
+    without the checksum (of an earlier version, or changed by another program) is read in a process of its
+    own first.
     """
-    content = path.read_bytes()
+    try:
+        content = read_bytes(path, LARGEST_FILE)
+    except ReadError as error:
+        raise TrajectoryFileError(f"{path}: {error}") from None
     end = content.rfind(SEAL, -len(seal(b"")))
-    if end >= 0 and seal(content[:end]) != content[end:]:
+    if end < 0:
+        _require_end(path, len(content))
+    elif seal(content[:end]) != content[end:]:
         raise TrajectoryFileError(f"{path}: truncated or damaged: its bytes do not have their checksum")
+
+
+def _require_end(path: Path, size: int) -> None:
+    """Raise `TrajectoryFileError` if HDF5 does not end with a file, or crashes."""
+    # -P: the script's folder is no place of modules
+    command = [sys.executable, "-P", str(PROBE), str(path)]
+    with subprocess.Popen(
+        [*command, str(_most_expanded(size))], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE
+    ) as child:
+        try:
+            # the time begins when the libraries are there
+            assert child.stdout is not None
+            child.stdout.readline()
+            child.wait(PATIENCE + size / SPEED)
+        except subprocess.TimeoutExpired:
+            raise TrajectoryFileError(f"{path}: damaged: HDF5 does not come to an end with it") from None
+        finally:
+            child.kill()
+    if child.returncode < 0:
+        raise TrajectoryFileError(f"{path}: damaged: HDF5 crashes when it reads it")
 
 
 def add_checksum(file: Any, value: str) -> None:
@@ -94,12 +130,16 @@ def require_own_data(path: Path) -> None:
             if each.is_virtual or each.external:
                 raise TrajectoryFileError(f"{path}: the data of {name!r} are in another file; not read")
             expanded += each.size * each.dtype.itemsize
-    most = allowed(EXPANSION) * path.stat().st_size + allowed(ALLOWANCE)
+    most = _most_expanded(path.stat().st_size)
     if expanded > most:
         raise TrajectoryFileError(
             f"{path}: its variables take {expanded / 1e9:.3g} GB; allowed are {most / 1e9:.3g} GB for a file "
             f"of this size; {MORE}"
         )
+
+
+def _most_expanded(size: int) -> int:
+    return allowed(EXPANSION) * size + allowed(ALLOWANCE)
 
 
 def require_possible(path: Path, time: np.ndarray, numbers: dict[str, np.ndarray], y: np.ndarray) -> None:

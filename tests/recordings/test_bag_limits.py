@@ -1,6 +1,9 @@
 """Limits of what a bag expands to: the part within them is read, and the rest is a finding."""
 
 import bz2
+import contextlib
+import itertools
+import sqlite3
 import struct
 
 import numpy as np
@@ -85,3 +88,54 @@ def test_chunks_are_complete_when_their_output_comes_in_parts(monkeypatch, compr
             file = chunks.Decompression(len(packed))
             assert file.records(packed + b"more", compression, size) == (data, len(packed))
             assert not file.is_limited
+
+
+def test_pages_that_name_each_other_end(tmp_path):
+    """Each of twelve pages of a SQLite file names the next one some 50 times: more than 10^20 rows."""
+    path, page_size = tmp_path / "it.db3", 512
+    with contextlib.closing(sqlite3.connect(path)) as opened:
+        opened.execute(f"PRAGMA page_size={page_size}")
+        opened.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT)")
+        opened.execute("CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp, data BLOB)")
+        opened.execute("INSERT INTO topics VALUES(1, '/a', 'std_msgs/msg/String')")
+        rows = ((time,) for time in range(40_000))
+        opened.executemany("INSERT INTO messages(topic_id, timestamp, data) VALUES(1, ?, x'')", rows)
+        opened.commit()
+        query = "SELECT rootpage FROM sqlite_master WHERE name = 'messages'"
+        root = opened.execute(query).fetchone()[0]
+    whole = ros2.read_sqlite(path, {"/a"}, str(path))
+    assert (len(whole.topics["/a"].raw), whole.damage) == (40_000, "")
+
+    content = bytearray(path.read_bytes())
+    view, count = memoryview(content), len(content) // page_size
+    pages = {k + 1: view[k * page_size : (k + 1) * page_size] for k in range(count)}
+
+    def children(page):
+        """Return where an inner page names its children; none of a page with rows."""
+        count = struct.unpack(">H", page[3:5])[0] if page[0] == 5 else 0
+        return [8, *struct.unpack(f">{count}H", page[12 : 12 + 2 * count])] if count else []
+
+    inner = [k for k in pages if k > root and len(children(pages[k])) > 20][:11]
+    for number, named in itertools.pairwise([root, *inner]):
+        for place in children(pages[number]):
+            pages[number][place : place + 4] = struct.pack(">I", named)
+    path.write_bytes(content)
+    found = ros2.read_sqlite(path, {"/a"}, str(path))
+    assert found.damage.endswith("(its pages stand for more rows than it can hold)")
+    assert len(found.topics["/a"].raw) < 1_000_000
+
+
+def test_messages_with_more_bytes_than_the_file(tmp_path):
+    """Damaged pages can also let many rows share one large message."""
+    path = tmp_path / "it.db3"
+    with contextlib.closing(sqlite3.connect(path)) as opened:
+        opened.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT)")
+        opened.execute("CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp, data BLOB)")
+        opened.execute("INSERT INTO topics VALUES(1, '/a', 'std_msgs/msg/String')")
+        opened.execute("INSERT INTO messages VALUES(1, 1, 1, zeroblob(500))")
+        opened.execute("INSERT INTO messages VALUES(2, 1, 2, zeroblob(500))")
+        opened.commit()
+        container = chunks.Container(ros=2)
+        ros2._tables(opened, container, {"/a"}, 999)
+    assert container.damage == "its messages have more bytes than the file"
+    assert len(container.topics["/a"].raw) == 1

@@ -1,6 +1,7 @@
 """Sweeps in a folder: results of `simulate`, resumed after kills to the same bytes, and damaged folders."""
 
 import dataclasses
+import hashlib
 import json
 import os
 import random
@@ -17,7 +18,7 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.sweeps import Dask, Local, Plan, Range, Slurm, Sweep, SweepError, load_sweep, run_sweep
-from knode_cosserat.sweeps.shard_file import KEY, read_shard, require_pyarrow, shard_bytes
+from knode_cosserat.sweeps.shard_file import KEY, OWN, read_shard, require_pyarrow, shard_bytes
 from knode_cosserat.sweeps.work import ShardJob, Work
 from tests.commands import run, succeeded, told
 
@@ -287,6 +288,8 @@ def rewritten(path, **changes):
     pyarrow = require_pyarrow()
     table = pyarrow.parquet.read_table(path)
     about = json.loads(table.schema.metadata[KEY]) | changes
+    # as earlier versions wrote it
+    del about[OWN]
     pyarrow.parquet.write_table(table.replace_schema_metadata({KEY: json.dumps(about).encode()}), path)
 
 
@@ -328,19 +331,39 @@ def test_damaged_shards_are_told_and_solved_again(whole, copied):
     assert content(copied) == content(whole.folder)
 
 
+def signed(manifest):
+    """Return a manifest's text with the checksum of its other keys."""
+    digest = hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()
+    return json.dumps(manifest | {"checksum": digest})
+
+
 def test_another_description_in_the_same_folder_is_refused(copied):
     with pytest.raises(SweepError, match="another sweep is here: its steps is 4; allowed is the same"):
         run_sweep(described(steps=5), copied)
     manifest = json.loads((copied / "sweep.json").read_text())
+    del manifest["checksum"]
     for changes, message in (
         ({"made_by": manifest["made_by"] | {"jax": "0.1"}}, "begun with jax 0.1, and this is"),
-        ({"version": 9}, "the sweep has the version 9; allowed is 1"),
+        ({"version": 9}, "the sweep has the version 9; allowed is 1 or 2"),
         ({"format": "other"}, "not the manifest of a sweep"),
-        ({"cases": "many"}, "damaged"),
+        ({"cases": "many"}, "must be whole numbers above 0"),
+        ({"shard_cases": 0}, "must be whole numbers above 0"),
+        ({"shards": 10**15}, "contradict each other"),
+        ({"robots": [None] * len(manifest["robots"])}, "a robot has no columns"),
+        ({"sweep": []}, "allowed are the keys"),
     ):
-        (copied / "sweep.json").write_text(json.dumps(manifest | changes))
+        (copied / "sweep.json").write_text(signed(manifest | changes))
         with pytest.raises(SweepError, match=message):
             run_sweep(described(), copied)
+    (copied / "sweep.json").write_text(signed(manifest).replace('"seed": 0', '"seed": 1'))
+    with pytest.raises(SweepError, match="damaged or changed: its contents do not have its checksum"):
+        load_sweep(copied)
+    # as earlier versions wrote it
+    (copied / "sweep.json").write_text(json.dumps(manifest | {"version": 1}))
+    assert load_sweep(copied).manifest["cases"] == manifest["cases"]
+    (copied / "sweep.json").write_text("[" * 100_000)
+    with pytest.raises(SweepError, match="damaged: not JSON that is read: it is nested too deeply"):
+        load_sweep(copied)
     (copied / "sweep.json").write_text("{")
     with pytest.raises(SweepError, match="damaged: not JSON"):
         load_sweep(copied)

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from knode_cosserat.errors import KnodeCosseratError
+from knode_cosserat.trajectory_integrity import SEAL
 from tools.attack.samples import fingerprint, samples
 
 #: longest time that a file may take (s)
@@ -26,8 +27,12 @@ PATIENCE = 5.0
 WORDS = (b"\xff\xff\xff\xff", b"\0\0\0\0", b"nan ", b"1e99", b"-1\n\n", b"[[[[", b"*a: ", b"9999")
 
 
+#: a trajectory without the checksum of its bytes, as earlier versions wrote it: with one of its contents only
+OLD = "old-trajectory.nc"
 #: kinds with a checksum of their numbers
-CHECKSUMMED = ("trajectory.nc", "model.model", "member.checkpoint", "policy.npz", "shard.parquet")
+CHECKSUMMED = (
+    "trajectory.nc", OLD, "model.model", "member.checkpoint", "policy.npz", "shard.parquet", "sweep.json",
+)  # fmt: skip
 
 
 class Outcome(NamedTuple):
@@ -48,7 +53,9 @@ def good_files(folder: Path) -> dict[str, Callable[[Path], Any]]:
             sample.write(folder / name, 0)
             sample.read(folder / name)
             readers[name] = sample.read
-    return readers
+    content = (folder / "trajectory.nc").read_bytes()
+    (folder / OLD).write_bytes(content[: content.rindex(SEAL)])
+    return readers | {OLD: readers["trajectory.nc"]}
 
 
 def damaged(content: bytes, chance: random.Random) -> bytes:

@@ -137,6 +137,7 @@ def _of_learning() -> dict[str, Sample]:
 
 
 def _of_sweeps() -> dict[str, Sample]:
+    from knode_cosserat.sweeps.manifest import FORMAT, VERSIONS, read_manifest, write_manifest
     from knode_cosserat.sweeps.shard_file import read_shard, shard_bytes, write_shard
 
     def write(path: Path, version: int) -> None:
@@ -147,4 +148,14 @@ def _of_sweeps() -> dict[str, Sample]:
         }
         write_shard(path, shard_bytes(columns, {"sweep": "attack"}))
 
-    return {"shard.parquet": Sample(write, read_shard)}
+    def write_description(path: Path, version: int) -> None:
+        manifest = {
+            "format": FORMAT, "version": VERSIONS[-1], "identity": f"{version}", "sweep": {"steps": 10},
+            "cases": 50, "shards": 5, "shard_cases": 10, "robots": [{"label": "robot", "columns": {}}],
+        }  # fmt: skip
+        write_manifest(path.parent, manifest)
+
+    return {
+        "shard.parquet": Sample(write, read_shard),
+        "sweep.json": Sample(write_description, lambda path: read_manifest(path.parent)),
+    }

@@ -11,12 +11,15 @@ from pathlib import Path
 from typing import Any
 
 from knode_cosserat._files import package_version, replacing
+from knode_cosserat._reading import json_value, read_bytes
 from knode_cosserat.hardware.commissioning_steps import CHECKLIST, CheckError, CheckStep, Machine
 from knode_cosserat.hardware.driver import Driver, DriverState, HardwareError
 from knode_cosserat.hardware.safety import EmergencyStop, StoppedError
 
 #: version of report files
 FORMAT = 1
+#: largest report that is read (bytes)
+LARGEST_REPORT = 10_000_000
 #: results of steps that are not repeated
 DONE = ("confirmed", "passed", "not possible")
 
@@ -149,7 +152,7 @@ class Commissioning:
         if not self.path.exists():
             return {}
         try:
-            report = json.loads(self.path.read_text(encoding="utf-8"))
+            report = json_value(read_bytes(self.path, LARGEST_REPORT))
             robot, form, steps = report["robot"], report["format"], report["steps"]
             found = {
                 step["name"]: {key: step[key] for key in step if key not in ("name", "text")}

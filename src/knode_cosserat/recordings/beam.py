@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat._csv import size_excess
+from knode_cosserat import _csv
+from knode_cosserat._reading import ReadError, read_bytes
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.table import read_csv
 
@@ -90,11 +91,9 @@ def read_beam(path: Path, load: float | None = None) -> BeamRecording:
     """
     load = load_of(path.stem) if load is None else load
     try:
-        if reason := size_excess(path):
-            raise RecordingError(f"{path}: {reason}")
-        table = read_csv(path.read_bytes(), str(path)).numbers
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
+        table = read_csv(read_bytes(path, _csv.LARGEST_FILE), str(path)).numbers
+    except ReadError as error:
+        raise RecordingError(f"{path}: {error}") from None
     missing = [name for name in COLUMNS if name not in table.columns]
     if missing:
         raise RecordingError(

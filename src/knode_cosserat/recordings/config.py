@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, Literal, Self
 
 from knode_cosserat._files import replacing
-from knode_cosserat._yaml import YAMLTextError, did_you_mean, flow, mapping_of, shown
+from knode_cosserat._yaml import YAMLTextError, did_you_mean, flow, mapping_of, read_yaml, shown
 from knode_cosserat.recordings.config_values import (
     Vector,
     checked_choice,
@@ -210,14 +210,7 @@ class RecordingConfig:
             RecordingError: the file cannot be read, or a key or value is invalid; the message names both.
         """
         try:
-            text = Path(path).read_text(encoding="utf-8-sig")
-            return cls.from_dict(mapping_of(text, "format, markers and tension"))
-        except FileNotFoundError:
-            raise RecordingError(f"{path}: no such file") from None
-        except OSError as error:
-            raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
-        except UnicodeDecodeError:
-            raise RecordingError(f"{path}: not YAML: it is not UTF-8 text") from None
+            return cls.from_dict(mapping_of(read_yaml(path), "format, markers and tension"))
         except (YAMLTextError, RecordingError) as error:
             raise RecordingError(f"{path}: {error}") from None
 

@@ -23,7 +23,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat._limits import MORE, LimitSettingError, allowed, excess
+from knode_cosserat._limits import MORE, LimitSettingError, allowed
+from knode_cosserat._reading import ReadError, read_bytes
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.recordings.findings import RecordingError
 
@@ -144,13 +145,13 @@ def read_pickled_array(path: str | Path) -> Float[np.ndarray, "..."]:
     form one array, in any protocol.
 
     Raises:
-        RecordingError: the file is not such a pickle; the message is one line with the reason.
-        OSError: the file cannot be read.
+        RecordingError: the file cannot be read, or is not such a pickle; one line with the reason.
     """
     path = Path(path)
-    if reason := excess(path.stat().st_size, LARGEST_FILE, "bytes"):
-        raise RecordingError(f"{path}: {reason}")
-    data = path.read_bytes()
+    try:
+        data = read_bytes(path, LARGEST_FILE)
+    except ReadError as error:
+        raise RecordingError(f"{path}: {error}") from None
     accepted = "accepted are NumPy arrays of numbers, and lists of them"
     try:
         _scan(data)

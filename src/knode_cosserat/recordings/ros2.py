@@ -18,6 +18,11 @@ from knode_cosserat.recordings.findings import RecordingError
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 SQLITE_MAGIC = b"SQLite format 3\x00"
+#: most steps of SQLite's machine: so many for each byte of the file, and these besides. A row takes five,
+#: and at least eleven bytes; damaged pages that name each other can stand for any number of rows
+STEPS_PER_BYTE, MOST_STEPS = 1, 1_000_000
+#: steps between two checks of that
+_PACE = 100_000
 #: record types of MCAP
 SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 0x03, 0x04, 0x05, 0x06, 0x0F
 _KINDS = range(0x01, 0x10)
@@ -166,10 +171,15 @@ def read_sqlite(path: Path, wanted: Collection[str], source: str) -> Container:
         connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(path.stat().st_size, 1 << 16))
     except sqlite3.Error as error:
         raise RecordingError(f"{source}: cannot be read: {error}") from None
+    size = path.stat().st_size
+    steps = iter(range((STEPS_PER_BYTE * size + MOST_STEPS) // _PACE))
+    connection.set_progress_handler(lambda: next(steps, None) is None, _PACE)
     try:
-        _tables(connection, container, wanted)
+        _tables(connection, container, wanted, size)
     except (sqlite3.Error, UnicodeDecodeError, OverflowError) as error:
         reason = " ".join(str(error).split())
+        if next(steps, None) is None:
+            reason = "its pages stand for more rows than it can hold"
         container.damage = f"the file was cut or is damaged ({reason})"
     finally:
         connection.close()
@@ -179,7 +189,7 @@ def read_sqlite(path: Path, wanted: Collection[str], source: str) -> Container:
     return container
 
 
-def _tables(connection: sqlite3.Connection, container: Container, wanted: Collection[str]) -> None:
+def _tables(connection: sqlite3.Connection, container: Container, wanted: Collection[str], size: int) -> None:
     # without this SQLite does not open a file that is shorter than its first page states
     connection.execute("PRAGMA writable_schema = ON")
     # views are refused: reading a file must not run queries stored in it
@@ -202,6 +212,10 @@ def _tables(connection: sqlite3.Connection, container: Container, wanted: Collec
         "SELECT topic_id, timestamp, data FROM messages ORDER BY id"
     ):
         topic = topics.get(number)
+        size -= len(raw) if isinstance(raw, bytes) else 0
+        if size < 0:
+            container.damage = "its messages have more bytes than the file"
+            return
         if (
             topic is not None
             and topic.name in wanted

@@ -26,7 +26,7 @@ import jax
 import numpy as np
 
 from knode_cosserat._files import replacing
-from knode_cosserat._yaml import YAMLTextError, did_you_mean, flow, mapping_of, shown
+from knode_cosserat._yaml import YAMLTextError, did_you_mean, flow, mapping_of, read_yaml, shown
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.rods.old_keys import upgraded
 from knode_cosserat.rods.parallel_robot import ParallelRobot
@@ -127,11 +127,9 @@ def _existing(path: Path) -> Path:
 
 def _text(file: Traversable, source: str) -> str:
     try:
-        return file.read_text(encoding="utf-8")
-    except OSError as error:
-        raise RobotFileError(f"{source}: cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise RobotFileError(f"{source}: not YAML: it is not UTF-8 text") from None
+        return read_yaml(file) if isinstance(file, Path) else file.read_text(encoding="utf-8")
+    except YAMLTextError as error:
+        raise RobotFileError(f"{source}: {error}") from None
 
 
 # text to robot

@@ -26,10 +26,13 @@ from tqdm import tqdm
 import knode_cosserat
 from knode_cosserat._files import package_version, replacing
 from knode_cosserat._processes import dask_client, end_with_parent
+from knode_cosserat._reading import json_value, read_bytes
 from knode_cosserat.errors import KnodeCosseratError
 
 #: packages whose versions may change a figure
 PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "equinox", "optax")
+#: largest record of a job that is read (bytes); another one is computed again
+LARGEST_RECORD = 100_000_000
 #: cores for each process, if it is not said how many; measured on two cores: 44 s in one process, 68 s in two
 CORES = 4
 
@@ -119,7 +122,7 @@ def _mark(job: Job) -> str:
 def _kept(job: Job, out: Path) -> dict[str, Any] | None:
     """Return the stored result of a job if it is complete and its mark is current, else None."""
     try:
-        record = json.loads((out / "jobs" / f"{job.key}.json").read_text(encoding="utf-8"))
+        record = json_value(read_bytes(out / "jobs" / f"{job.key}.json", LARGEST_RECORD))
         if record["mark"] != _mark(job):
             return None
         for name, checksum in record["files"].items():

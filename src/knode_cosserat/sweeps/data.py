@@ -12,7 +12,8 @@ import numpy as np
 from knode_cosserat._reprs import count_of, quantity, wrapped
 from knode_cosserat.solvers.result import ResultCodes
 from knode_cosserat.sweeps.errors import SweepError
-from knode_cosserat.sweeps.folder import read_manifest, shard_path
+from knode_cosserat.sweeps.folder import shard_numbers, shard_path
+from knode_cosserat.sweeps.manifest import read_manifest
 from knode_cosserat.sweeps.shard_file import read_about, read_shard
 
 #: most failed cases that a text lists
@@ -45,8 +46,7 @@ class SweepData:
         """Return the data in a folder. Raises `SweepError`."""
         folder = Path(folder)
         manifest = read_manifest(folder)
-        numbers = range(manifest["shards"])
-        return cls(folder, manifest, tuple(k for k in numbers if shard_path(folder, k).exists()))
+        return cls(folder, manifest, shard_numbers(folder, manifest["shards"]))
 
     # extent
 

@@ -10,7 +10,7 @@ from typing import Any, Literal, Self
 import numpy as np
 
 from knode_cosserat._reprs import quantity
-from knode_cosserat._yaml import YAMLTextError, did_you_mean, mapping_of, shown
+from knode_cosserat._yaml import YAMLTextError, did_you_mean, mapping_of, read_yaml, shown
 from knode_cosserat.rods.system import System
 from knode_cosserat.sweeps.errors import SweepError
 from knode_cosserat.sweeps.sampling import MOST_SOBOL, SAMPLERS
@@ -271,12 +271,7 @@ class Sweep:
 def read_mapping(path: str | Path) -> dict[Any, Any]:
     """Return the mapping in a YAML file. Raises `SweepError`."""
     try:
-        text = Path(path).read_text(encoding="utf-8")
-        return mapping_of(text, "robots, controls, steps and dt")
-    except OSError as error:
-        raise SweepError(f"{path}: cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise SweepError(f"{path}: not YAML: it is not UTF-8 text") from None
+        return mapping_of(read_yaml(path), "robots, controls, steps and dt")
     except YAMLTextError as error:
         raise SweepError(f"{path}: {error}") from None
 

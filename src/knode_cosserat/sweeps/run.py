@@ -17,11 +17,11 @@ from knode_cosserat.sweeps.executors import Executor, Local
 from knode_cosserat.sweeps.folder import (
     is_complete,
     log_run,
-    made_by,
     now,
     open_folder,
     remove_temporaries,
 )
+from knode_cosserat.sweeps.manifest import made_by
 from knode_cosserat.sweeps.plan import Plan
 from knode_cosserat.sweeps.shard_file import require_pyarrow
 from knode_cosserat.sweeps.work import Done, Work

@@ -7,19 +7,24 @@ with an array in each row, such as the tip's positions, is a list of fixed size;
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from knode_cosserat._files import replacing
+from knode_cosserat._parquet import most_expanded, opened, require_expansion
+from knode_cosserat._reading import ReadError, json_value
 from knode_cosserat.sweeps.errors import SweepError
 
 #: key of the metadata, and version of the format
 KEY, VERSION = b"knode-cosserat sweep", 1
+#: key of the checksum of all other metadata, and columns of text
+OWN, TEXTS = "own_checksum", ("reason",)
 #: compression: level 1 of zstd with split bytes takes a tenth off doubles at 300 MB/s
 COMPRESSION, LEVEL = "zstd", 1
 
@@ -39,13 +44,14 @@ def shard_bytes(columns: Mapping[str, Any], about: Mapping[str, Any]) -> bytes:
         shapes[name] = list(np.shape(values)[1:])
         arrays[name] = _arrow(pyarrow, values)
     stated = {**about, "version": VERSION, "shapes": shapes, "checksum": checksum(columns)}
+    stated[OWN] = _own(stated)
     table = pyarrow.table(arrays).replace_schema_metadata({KEY: json.dumps(stated, sort_keys=True).encode()})
     floating = [name for name, values in columns.items() if np.asarray(values).dtype.kind == "f"]
     paths = [name if not shapes[name] else f"{name}.list.element" for name in floating]
     sink = pyarrow.BufferOutputStream()
     pyarrow.parquet.write_table(
         table, sink, compression=COMPRESSION, compression_level=LEVEL, use_byte_stream_split=paths,
-        use_dictionary=["reason"], write_statistics=[n for n in columns if not shapes[n]],
+        use_dictionary=list(TEXTS), write_statistics=[n for n in columns if not shapes[n]],
         row_group_size=len(table) or 1, store_schema=True,
     )  # fmt: skip
     return bytes(sink.getvalue())
@@ -74,40 +80,61 @@ def read_shard(path: Path, names: Sequence[str] | None = None, *, verify: bool =
     Raises:
         SweepError: the file cannot be read, has another version, or was changed.
     """
-    pyarrow = require_pyarrow()
-    about = read_about(path)
-    try:
-        # not memory-mapped: a file that is cut off while it is read would end the process
-        table = pyarrow.parquet.ParquetFile(path, memory_map=False).read(columns=None if verify else names)
-        columns = {
-            name: _numpy(table.column(name), about["shapes"][name], len(table)) for name in table.column_names
-        }
-    except (pyarrow.ArrowException, OSError, ValueError, KeyError, TypeError) as error:
-        raise SweepError(f"{path}: damaged: {_reason(error)}") from None
+    with _opened(path) as file:
+        about = _about(file, path)
+        require_expansion(file.metadata, path)
+        table = file.read(columns=None if verify else names)
+        try:
+            columns = {
+                name: _numpy(table.column(name), about["shapes"][name], path) for name in table.column_names
+            }
+        except (KeyError, TypeError, AttributeError) as error:
+            raise SweepError(f"{path}: damaged: {_reason(error)}") from None
     if verify and checksum(columns) != about["checksum"]:
         raise SweepError(f"{path}: damaged: the checksum of its columns is not the stated one")
+    missing = set(names or ()) - set(columns)
+    if missing:
+        raise SweepError(f"{path}: damaged: it has no column {min(missing)}")
     return Shard(columns if names is None else {name: columns[name] for name in names}, about)
 
 
 def read_about(path: Path) -> dict[str, Any]:
     """Return the metadata of a shard. Raises `SweepError`."""
-    pyarrow = require_pyarrow()
+    with _opened(path) as file:
+        return _about(file, path)
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    require_pyarrow()
+    if not path.exists():
+        raise SweepError(f"{path}: there is no such shard; the sweep is not complete")
     try:
-        metadata = pyarrow.parquet.read_schema(path, memory_map=False).metadata or {}
-    except FileNotFoundError:
-        raise SweepError(f"{path}: there is no such shard; the sweep is not complete") from None
-    except (pyarrow.ArrowException, OSError, ValueError) as error:
-        raise SweepError(f"{path}: damaged: {_reason(error)}") from None
+        # a text that many rows have is stored once, and must not be written out for each
+        with opened(path, read_dictionary=TEXTS) as file:
+            yield file
+    except ReadError as error:
+        raise SweepError(f"{path}: damaged: {error}") from None
+
+
+def _about(file: Any, path: Path) -> dict[str, Any]:
     try:
-        about = dict(json.loads(metadata[KEY]))
-    except (KeyError, ValueError):
+        about = dict(json_value(file.schema_arrow.metadata[KEY]))
+    except (KeyError, TypeError, ValueError):
         raise SweepError(f"{path}: no shard of a sweep: its metadata are missing or damaged") from None
     if about.get("version") != VERSION:
         raise SweepError(
             f"{path}: the shard has the version {about.get('version')!r}; allowed is {VERSION}, which this "
             "version of the package reads and writes. Nothing was changed"
         )
+    # shards of earlier versions have none
+    if about.pop(OWN, None) not in (None, _own(about)):
+        raise SweepError(f"{path}: damaged: the checksum of its metadata is not the stated one")
     return about
+
+
+def _own(about: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
 
 
 def checksum(columns: Mapping[str, Any]) -> str:
@@ -134,10 +161,19 @@ def _arrow(pyarrow: Any, values: Any) -> Any:
     return pyarrow.FixedSizeListArray.from_arrays(pyarrow.array(array.reshape(-1)), size)
 
 
-def _numpy(column: Any, shape: Sequence[int], rows: int) -> Any:
+def _numpy(column: Any, shape: Sequence[int], path: Path) -> Any:
+    """Return a column (rows, *shape) as an array."""
+    rows = len(column)
     column = column.combine_chunks()
     if hasattr(column, "chunks"):
         column = column.chunk(0)
+    if hasattr(column, "dictionary"):
+        texts = column.dictionary.to_numpy(zero_copy_only=False)
+        found = texts[column.indices.to_numpy(zero_copy_only=False)]
+        total, (most, words) = sum(map(len, found)), most_expanded(path)
+        if total > most:
+            raise ReadError(f"its texts have {total} characters; {words}")
+        return found
     if not shape:
         return column.to_numpy(zero_copy_only=False)
     return column.flatten().to_numpy(zero_copy_only=False).reshape(rows, *shape)

@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from knode_cosserat.sweeps.errors import SweepError
-from knode_cosserat.sweeps.folder import is_complete, machine, made_by, shard_path
+from knode_cosserat.sweeps.folder import is_complete, shard_path
+from knode_cosserat.sweeps.manifest import machine, made_by
 from knode_cosserat.sweeps.plan import Plan
 from knode_cosserat.sweeps.shard_file import shard_bytes, write_shard
 from knode_cosserat.sweeps.solve import Solver

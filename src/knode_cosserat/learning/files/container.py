@@ -27,11 +27,14 @@ import numpy as np
 
 from knode_cosserat._files import package_version, replacing
 from knode_cosserat._limits import MORE, allowed
+from knode_cosserat._reading import ReadError, read_bytes
 from knode_cosserat.errors import KnodeCosseratError
 
 #: largest number of bytes of the header and of the arrays, as a limit for hostile files
 MOST_HEADER = 4 * 2**20
 MOST_ARRAYS = 2**30
+#: largest number of bytes before the header
+MOST_TITLE = 300
 #: largest number of objects in one file, because each takes time to be traced
 MOST_OBJECTS = 5_000
 
@@ -229,12 +232,11 @@ def read(path: Path) -> bytes:
         if not path.is_file():
             what = "this is a folder; allowed is a file" if path.is_dir() else "no such file"
             raise ContainerError(what if path.is_dir() or not path.exists() else "not a file")
-        size, most = path.stat().st_size, allowed(MOST_HEADER) + allowed(MOST_ARRAYS)
-        if size > most + 300:
-            raise ContainerError(f"it has {size} bytes; allowed is {most}; {MORE}")
-        return path.read_bytes()
+        return read_bytes(path, MOST_HEADER + MOST_ARRAYS + MOST_TITLE)
     except OSError as error:
         raise ContainerError(f"cannot be read: {error.strerror}") from None
+    except ReadError as error:
+        raise ContainerError(str(error)) from None
 
 
 def first_line(error: BaseException) -> str:

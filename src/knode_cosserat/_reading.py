@@ -1,0 +1,65 @@
+"""Files that are read whole: their size is limited before they are read. JSON texts, of any nesting."""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+from pathlib import Path
+from typing import Any
+
+from knode_cosserat._limits import MORE, allowed, excess
+from knode_cosserat.errors import KnodeCosseratError
+
+#: bytes that are read at a time from a pipe, which states no size
+_PIECE = 1 << 20
+
+
+class ReadError(KnodeCosseratError, ValueError):
+    """A file or text cannot be read; the message is one line with the reason, and names no file."""
+
+    code = "read"
+
+
+def read_bytes(path: str | Path, limit: int) -> bytes:
+    """Return the content of a file or pipe of at most so many bytes.
+
+    Raises:
+        ReadError: there is no such file, it cannot be read, or it is larger.
+    """
+    try:
+        with open(path, "rb") as file:
+            status = os.fstat(file.fileno())
+            if reason := excess(status.st_size, limit, "bytes"):
+                raise ReadError(reason)
+            if stat.S_ISREG(status.st_mode):
+                return file.read()
+            most, parts, size = allowed(limit), [], 0
+            while size <= most and (part := file.read(_PIECE)):
+                parts.append(part)
+                size += len(part)
+    except FileNotFoundError:
+        raise ReadError("no such file") from None
+    except OSError as error:
+        raise ReadError(f"cannot be read: {error.strerror}") from None
+    if size > most:
+        raise ReadError(f"it has more than {most} bytes; allowed are {most}; {MORE}")
+    return b"".join(parts)
+
+
+def read_text(path: str | Path, limit: int, encoding: str = "utf-8") -> str:
+    """Return the text of a file of at most so many bytes. Raises `ReadError`."""
+    try:
+        return read_bytes(path, limit).decode(encoding)
+    except UnicodeDecodeError:
+        raise ReadError("it is not UTF-8 text") from None
+
+
+def json_value(text: str | bytes) -> Any:
+    """Return the value of a JSON text. Raises `ReadError`."""
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ReadError("not JSON that is read: it is nested too deeply") from None
+    except ValueError:
+        raise ReadError("not JSON") from None

@@ -1,0 +1,88 @@
+"""Shards that are small and stand for much, and shards whose metadata were changed."""
+
+import numpy as np
+import pytest
+
+from knode_cosserat import _parquet
+from knode_cosserat.sweeps.errors import SweepError
+from knode_cosserat.sweeps.shard_file import KEY, checksum, read_about, read_shard, shard_bytes
+
+pyarrow = pytest.importorskip("pyarrow")
+pyarrow_parquet = pytest.importorskip("pyarrow.parquet")
+
+
+def columns(rows=50, reason="no solution"):
+    return {
+        "case": np.arange(rows),
+        "tip": np.random.default_rng(0).normal(size=(rows, 4, 3)),
+        "reason": np.array([reason] * rows, dtype=object),
+    }
+
+
+def written(folder, given):
+    path = folder / "000000.parquet"
+    path.write_bytes(shard_bytes(given, {"failed": 1}))
+    return path
+
+
+def test_a_shard_is_read_as_it_was_written(tmp_path):
+    given = columns()
+    shard = read_shard(written(tmp_path, given))
+    assert checksum(shard.columns) == checksum(given) and shard.about["failed"] == 1
+    path = written(tmp_path, given)
+    assert set(read_shard(path, ["tip"], verify=False).columns) == {"tip"}
+    with pytest.raises(SweepError, match="damaged: it has no column z"):
+        read_shard(path, ["z"], verify=False)
+    pyarrow_parquet.write_table(pyarrow_parquet.read_table(path).drop_columns("reason"), path)
+    with pytest.raises(SweepError, match="damaged: it has no column reason"):
+        read_about(path)
+
+
+def test_a_long_text_that_all_rows_share_is_refused(tmp_path):
+    """Two hundred thousand rows with a text of 10,000 characters: 2 GB in a file of 2 MB."""
+    given = {"case": np.arange(200_000), "reason": np.array(["x" * 10_000] * 200_000, dtype=object)}
+    path = tmp_path / "000000.parquet"
+    metadata = pyarrow_parquet.read_schema(written(tmp_path, columns())).metadata
+    reason = pyarrow.DictionaryArray.from_arrays(np.zeros(200_000, np.int32), ["x" * 10_000])
+    table = pyarrow.table({"case": given["case"], "reason": reason}).replace_schema_metadata(metadata)
+    pyarrow_parquet.write_table(table, path, compression="zstd")
+    assert path.stat().st_size < 2_000_000
+    with pytest.raises(SweepError, match="its texts have 2000000000 characters; allowed are 100 times"):
+        read_shard(path)
+
+
+def test_runs_of_one_value_are_refused(tmp_path):
+    """Fifteen million numbers in lists of 300."""
+    path = tmp_path / "000000.parquet"
+    metadata = pyarrow_parquet.read_schema(written(tmp_path, columns())).metadata
+    lists = pyarrow.FixedSizeListArray.from_arrays(pyarrow.array(np.zeros(15_000_000)), 300)
+    table = pyarrow.table({"tip": lists, "reason": [""] * len(lists)}).replace_schema_metadata(metadata)
+    pyarrow_parquet.write_table(table, path, compression="zstd")
+    assert path.stat().st_size < 100_000
+    with pytest.raises(SweepError, match="its columns have 120400000 bytes; allowed are 100 times"):
+        read_shard(path)
+
+
+def test_changed_metadata_are_found(tmp_path):
+    path = written(tmp_path, columns())
+    table = pyarrow_parquet.read_table(path)
+    for old, new in ((b'"failed": 1', b'"failed": 0'), (b'"version": 1', b'"version": 1, "more": 0')):
+        text = table.schema.metadata[KEY]
+        assert old in text
+        pyarrow_parquet.write_table(table.replace_schema_metadata({KEY: text.replace(old, new)}), path)
+        with pytest.raises(SweepError, match="the checksum of its metadata is not the stated one"):
+            read_about(path)
+    pyarrow_parquet.write_table(table.replace_schema_metadata({KEY: b"[" * 100_000}), path)
+    with pytest.raises(SweepError, match="its metadata are missing or damaged"):
+        read_about(path)
+
+
+def test_the_number_of_values_of_each_page_is_read(tmp_path):
+    path = written(tmp_path, columns(5_000))
+    metadata = pyarrow_parquet.read_metadata(path)
+    data = path.read_bytes()
+    for k, values in enumerate((5_000, 60_000, 5_000)):
+        chunk = metadata.row_group(0).column(k)
+        pages = list(_parquet._pages(data, chunk))
+        dictionary = 1 if chunk.has_dictionary_page else 0
+        assert sum(page.values for page in pages) == values + dictionary
