@@ -16,6 +16,7 @@ ROOT = Path(knode_cosserat.__file__).parent
 LAYERS = (
     (
         "errors",
+        "_arrays",
         "_csv",
         "_files",
         "_hdf5_probe",

@@ -45,10 +45,10 @@ def test_files_that_are_no_policies_are_refused(policy, tmp_path):
     with pytest.raises(envs.TaskError, match="not positive"):
         envs.Policy.load(path)
     np.savez_compressed(path, header=np.zeros(10_000_000))
-    with pytest.raises(envs.TaskError, match="unpacked it is larger"):
+    with pytest.raises(envs.TaskError, match="it has 80000128 bytes when unpacked"):
         envs.Policy.load(path)
     np.savez(path, header=np.array([{"version": 1}], dtype=object))
-    with pytest.raises(envs.TaskError, match="is no policy"):
+    with pytest.raises(envs.TaskError, match="cannot be read: an array has objects"):
         envs.Policy.load(path)
 
 

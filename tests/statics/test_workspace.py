@@ -1,6 +1,8 @@
 """Poses of many equilibria: each is `kc.equilibrium`'s, and none is wrong in silence."""
 
 import csv
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -89,6 +91,35 @@ def test_files_hold_what_was_found(found, tmp_path):
     assert float(rows[7]["tension_4 [N]"]) == found.controls[7, 3]
     with pytest.raises(ValueError, match=r"a\.txt: allowed is a name that ends in \.nc, \.csv, \.npz"):
         found.save(tmp_path / "a.txt")
+
+
+def test_a_full_disk_leaves_the_old_files(tmp_path):
+    """The limit of a file's size stands for the full disk, on which HDF5 ended the process."""
+    script = """
+import os, resource, signal
+import numpy as np
+from pathlib import Path
+import knode_cosserat as kc
+from knode_cosserat.statics.workspace import Workspace
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+robot, count = kc.load_robot("delrin-tendon-robot"), 40
+one = lambda *shape: np.random.default_rng(0).normal(size=(count, *shape))
+found = Workspace(robot, one(4), one(3), one(4), np.zeros(count, int), one(), one(6))
+names = "a.nc", "a.csv", "a.npz"
+for name in names:
+    found.save(name)
+before = [Path(name).read_bytes() for name in names]
+for most in (0, 1000, 3000):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (most, resource.RLIM_INFINITY))
+    for name in names:
+        try:
+            found.save(name)
+        except OSError as error:
+            print(error.strerror)
+assert [Path(name).read_bytes() for name in names] == before and sorted(os.listdir()) == sorted(names)
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 0 and done.stdout == 9 * "File too large\n", done.stderr
 
 
 @pytest.mark.parametrize(

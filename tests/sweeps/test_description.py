@@ -165,5 +165,5 @@ def test_files_that_are_no_descriptions(tmp_path):
     path.write_bytes(b"\xff\xfe")
     with pytest.raises(SweepError, match="not UTF-8"):
         Sweep.load(path)
-    with pytest.raises(SweepError, match="none.yaml: no such file"):
+    with pytest.raises(SweepError, match=r"none\.yaml: no such file"):
         Sweep.load(tmp_path / "none.yaml")

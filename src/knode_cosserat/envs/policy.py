@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import zipfile
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -13,8 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat._arrays import read_arrays
 from knode_cosserat._files import replacing
 from knode_cosserat._limits import LimitSettingError, excess
+from knode_cosserat._reading import ReadError, json_value
 from knode_cosserat.envs.errors import TaskError
 
 #: version of the files
@@ -80,30 +81,24 @@ class Policy(NamedTuple):
         """
         path = Path(path)
         try:
-            if reason := excess(path.stat().st_size, LARGEST_FILE, "bytes"):
+            file = read_arrays(path, LARGEST_FILE)
+            header = json_value(str(file["header"]))
+            if header.get("version") != VERSION:
+                raise ValueError(f"its version is {header.get('version')!r}; this package reads {VERSION}")
+            count = header["layers"]
+            if not isinstance(count, int) or count < 1:
+                raise ValueError(f"it has {count!r} layers")
+            if reason := excess(count, MOST_LAYERS, "layers"):
                 raise ValueError(reason)
-            with zipfile.ZipFile(path) as packed:
-                size = sum(entry.file_size for entry in packed.infolist())
-                if reason := excess(size, LARGEST_FILE, "bytes"):
-                    raise ValueError(f"unpacked it is larger than allowed: {reason}")
-            with np.load(path, allow_pickle=False) as file:
-                header = json.loads(str(file["header"]))
-                if header.get("version") != VERSION:
-                    raise ValueError(
-                        f"its version is {header.get('version')!r}; this package reads {VERSION}"
-                    )
-                count = header["layers"]
-                if not isinstance(count, int) or count < 1:
-                    raise ValueError(f"it has {count!r} layers")
-                if reason := excess(count, MOST_LAYERS, "layers"):
-                    raise ValueError(reason)
-                layers = tuple((file[f"weights{k}"], file[f"bias{k}"]) for k in range(count))
-                found = cls(layers, file["mean"], file["deviation"])
+            layers = tuple((file[f"weights{k}"], file[f"bias{k}"]) for k in range(count))
+            found = cls(layers, file["mean"], file["deviation"])
         except LimitSettingError:
             raise
-        except OSError as error:
-            raise TaskError(f"the policy {path} cannot be read: {error.strerror or error}") from None
-        except Exception as error:  # a damaged archive fails in many ways
+        except ReadError as error:
+            raise TaskError(f"the policy {path} cannot be read: {error}") from None
+        except KeyError as error:
+            raise TaskError(f"{path} is no policy: it has no {error.args[0]}") from None
+        except (ValueError, TypeError, AttributeError) as error:
             raise TaskError(f"{path} is no policy: {error}") from None
         found._check(path)
         return found

@@ -9,20 +9,23 @@ as missing.
 from __future__ import annotations
 
 import hashlib
-import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
 
+from knode_cosserat._arrays import read_arrays
 from knode_cosserat._files import package_version, replacing
+from knode_cosserat._reading import ReadError
 
 if TYPE_CHECKING:
     from knode_cosserat.identification.misfit import Misfit
 
 #: first line of every identity: another format has other files
 FORMAT = "search 2"
+#: largest file (bytes)
+LARGEST_FILE = 100_000_000
 
 
 class Journal:
@@ -42,9 +45,8 @@ class Journal:
     def load(self, key: str) -> dict[str, np.ndarray] | None:
         """Return the arrays of a finished search; None if there is none."""
         try:
-            with self._path(key).open("rb") as file, np.load(file, allow_pickle=False) as stored:
-                return {name: stored[name] for name in stored.files}
-        except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile):
+            return read_arrays(self._path(key), LARGEST_FILE)
+        except ReadError:
             return None
 
     def save(self, key: str, arrays: dict[str, Any]) -> None:

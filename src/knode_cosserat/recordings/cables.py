@@ -8,14 +8,14 @@ frames, as a NumPy array or a list of arrays. `NAME.npz` holds the same in one f
 from __future__ import annotations
 
 import re
-import zipfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat._limits import LimitSettingError, excess
+from knode_cosserat._arrays import read_arrays
+from knode_cosserat._reading import ReadError
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.pickles import LARGEST_FILE, read_pickled_array
 
@@ -76,18 +76,10 @@ def _from_folder(folder: Path) -> CableData:
 
 
 def _from_npz(path: Path) -> CableData:
-    parts: dict[str, Any] = {}
     try:
-        with zipfile.ZipFile(path) as archive:
-            size = sum(each.file_size for each in archive.infolist())
-            if reason := excess(size, 4 * LARGEST_FILE, "bytes when unpacked"):
-                raise RecordingError(f"{path}: {reason}")
-        with np.load(path, allow_pickle=False) as arrays:
-            parts = {name: np.asarray(arrays[name]) for name in arrays.files}
-    except (ValueError, OSError, zipfile.BadZipFile, EOFError) as error:
-        if isinstance(error, RecordingError | LimitSettingError):
-            raise
-        raise RecordingError(f"{path}: cannot be read ({' '.join(str(error).split())[:120]})") from None
+        parts: dict[str, Any] = dict(read_arrays(path, 4 * LARGEST_FILE))
+    except ReadError as error:
+        raise RecordingError(f"{path}: {error}") from None
 
     def motions(part: str) -> tuple[CableMotion, ...]:
         if part not in parts or np.ndim(parts[part]) != 4:

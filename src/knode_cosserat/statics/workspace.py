@@ -5,6 +5,7 @@ from __future__ import annotations
 import concurrent.futures
 import csv
 import dataclasses
+import io
 from pathlib import Path
 from typing import Any
 
@@ -105,7 +106,7 @@ class Workspace:
         with replacing(path) as temporary:
             {".nc": self._netcdf, ".csv": self._table, ".npz": _numpy}[path.suffix](temporary, known)
 
-    def _netcdf(self, path: Any, arrays: dict[str, np.ndarray]) -> None:
+    def _netcdf(self, path: Path, arrays: dict[str, np.ndarray]) -> None:
         import xarray
 
         said = {
@@ -124,7 +125,10 @@ class Workspace:
             )
             for name, array in arrays.items()
         }
-        xarray.Dataset(variables).to_netcdf(path, engine="h5netcdf")
+        # in memory: HDF5 crashes the interpreter if it cannot write its last blocks, as on a full disk
+        content = io.BytesIO()
+        xarray.Dataset(variables).to_netcdf(content, engine="h5netcdf")
+        path.write_bytes(content.getvalue())
 
     def _table(self, path: Any, arrays: dict[str, np.ndarray]) -> None:
         """Write controls with names and units, as in files of controls; other columns numbered from 0."""
