@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from knode_cosserat._arrays import read_arrays
-from knode_cosserat._reading import ReadError
+from knode_cosserat._files.arrays import read_arrays
+from knode_cosserat._files.reading import ReadError
 
 PLAIN = {
     "a": np.arange(6.0).reshape(2, 3),

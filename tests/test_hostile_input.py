@@ -14,9 +14,9 @@ import pytest
 import typer.testing
 
 import knode_cosserat as kc
-from knode_cosserat._files import ABANDONED, replacing
+from knode_cosserat._files.writing import ABANDONED, replacing
+from knode_cosserat._files.yaml_text import MOST_CHARACTERS, YAMLTextError, mapping_of
 from knode_cosserat._numbers import real_array
-from knode_cosserat._yaml import MOST_CHARACTERS, YAMLTextError, mapping_of
 from knode_cosserat.cli import app
 from knode_cosserat.cli.output import printable
 from knode_cosserat.viewer.serve import view

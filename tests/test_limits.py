@@ -13,8 +13,9 @@ import pandas as pd
 import pytest
 from hypothesis import given
 
-from knode_cosserat import _csv, _limits, _parquet, _yaml, controls, trajectory_integrity
-from knode_cosserat._limits import MORE, VARIABLE, LimitSettingError, allowed, excess
+from knode_cosserat import controls, trajectory_integrity
+from knode_cosserat._files import csv_rows, limits, parquet_file, yaml_text
+from knode_cosserat._files.limits import MORE, VARIABLE, LimitSettingError, allowed, excess
 from knode_cosserat.cli.control import parsed_reference
 from knode_cosserat.envs import policy
 from knode_cosserat.errors import KnodeCosseratError
@@ -48,21 +49,21 @@ def reader(function):
 
 @reader
 def yaml_characters(folder, patch):
-    patch.setattr(_yaml, "MOST_CHARACTERS", 10)
-    return lambda: _yaml.mapping_of("a: 12345678", "a")
+    patch.setattr(yaml_text, "MOST_CHARACTERS", 10)
+    return lambda: yaml_text.mapping_of("a: 12345678", "a")
 
 
 @reader
 def yaml_bytes(folder, patch):
-    patch.setattr(_yaml, "MOST_CHARACTERS", 3)
+    patch.setattr(yaml_text, "MOST_CHARACTERS", 3)
     path = table(folder, b"a: 1234567890", "it.yaml")
-    return lambda: _yaml.read_yaml(path)
+    return lambda: yaml_text.read_yaml(path)
 
 
 @reader
 def yaml_aliases(folder, patch):
-    patch.setattr(_yaml, "MOST_VALUES", 5)
-    return lambda: _yaml.mapping_of("a: &a [1, 2]\nb: *a", "a")
+    patch.setattr(yaml_text, "MOST_VALUES", 5)
+    return lambda: yaml_text.mapping_of("a: &a [1, 2]\nb: *a", "a")
 
 
 def tensions(folder):
@@ -74,25 +75,25 @@ def tensions(folder):
 @reader
 def controls_size(folder, patch):
     path = tensions(folder)
-    patch.setattr(_csv, "LARGEST_FILE", path.stat().st_size - 1)
+    patch.setattr(csv_rows, "LARGEST_FILE", path.stat().st_size - 1)
     return lambda: controls.load(path)
 
 
 @reader
 def controls_lines(folder, patch):
-    patch.setattr(_csv, "MOST_LINES", 30)
+    patch.setattr(csv_rows, "MOST_LINES", 30)
     return lambda: controls.load(tensions(folder))
 
 
 @reader
 def controls_columns(folder, patch):
-    patch.setattr(_csv, "MOST_COLUMNS", 4)
+    patch.setattr(csv_rows, "MOST_COLUMNS", 4)
     return lambda: controls.load(tensions(folder))
 
 
 @reader
 def controls_steps(folder, patch):
-    patch.setattr(_csv, "MOST_STEPS", 100)
+    patch.setattr(csv_rows, "MOST_STEPS", 100)
     return lambda: controls.load(tensions(folder), 0.005)
 
 
@@ -104,26 +105,26 @@ def table(folder, data=TABLE, name="it.csv"):
 
 @reader
 def table_size(folder, patch):
-    patch.setattr(_csv, "LARGEST_FILE", len(TABLE) - 1)
+    patch.setattr(csv_rows, "LARGEST_FILE", len(TABLE) - 1)
     return lambda: load.load_recording(table(folder))
 
 
 @reader
 def table_lines(folder, patch):
-    patch.setattr(_csv, "MOST_LINES", 20)
+    patch.setattr(csv_rows, "MOST_LINES", 20)
     return lambda: load.load_recording(table(folder))
 
 
 @reader
 def table_columns(folder, patch):
-    patch.setattr(_csv, "MOST_COLUMNS", 4)
+    patch.setattr(csv_rows, "MOST_COLUMNS", 4)
     return lambda: load.load_recording(table(folder))
 
 
 @reader
 def table_size_when_decompressed(folder, patch):
     packed = gzip.compress(TABLE)
-    patch.setattr(_csv, "LARGEST_FILE", len(packed) + 1)
+    patch.setattr(csv_rows, "LARGEST_FILE", len(packed) + 1)
     return lambda: load.load_recording(table(folder, packed, "it.csv.gz"))
 
 
@@ -142,7 +143,7 @@ def rows_of_a_recording(folder, patch):
 
 @reader
 def reference_size(folder, patch):
-    patch.setattr(_csv, "LARGEST_FILE", 20)
+    patch.setattr(csv_rows, "LARGEST_FILE", 20)
     path = table(folder, b"t,x,y\n0,0.1,0.1\n1,0.1,0.2\n")
     return lambda: parsed_reference(str(path))
 
@@ -154,7 +155,7 @@ def beam_size(folder, patch):
     titles = ["time_s", *(f"m{k}_{axis}_m" for k in range(6) for axis in "xyz")]
     path = folder / "beam_load52.csv"
     pd.DataFrame(rows, columns=titles).to_csv(path, index=False)
-    patch.setattr(_csv, "LARGEST_FILE", path.stat().st_size - 1)
+    patch.setattr(csv_rows, "LARGEST_FILE", path.stat().st_size - 1)
     return lambda: read_beam(path)
 
 
@@ -187,15 +188,15 @@ def shard(folder):
 @reader
 def shard_size(folder, patch):
     path = shard(folder)
-    patch.setattr(_parquet, "LARGEST_FILE", path.stat().st_size - 1)
+    patch.setattr(parquet_file, "LARGEST_FILE", path.stat().st_size - 1)
     return lambda: shard_file.read_shard(path)
 
 
 @reader
 def shard_expansion(folder, patch):
     path = shard(folder)
-    patch.setattr(_parquet, "RATIO", 0)
-    patch.setattr(_parquet, "ALLOWANCE", 799)
+    patch.setattr(parquet_file, "RATIO", 0)
+    patch.setattr(parquet_file, "ALLOWANCE", 799)
     return lambda: shard_file.read_shard(path)
 
 
@@ -204,8 +205,8 @@ def shard_texts(folder, patch):
     pytest.importorskip("pyarrow")
     path = folder / "000000.parquet"
     path.write_bytes(shard_file.shard_bytes({"reason": np.array(["x" * 100] * 50, dtype=object)}, {}))
-    patch.setattr(_parquet, "RATIO", 0)
-    patch.setattr(_parquet, "ALLOWANCE", 4_999)
+    patch.setattr(parquet_file, "RATIO", 0)
+    patch.setattr(parquet_file, "ALLOWANCE", 4_999)
     return lambda: shard_file.read_shard(path)
 
 
@@ -231,38 +232,38 @@ def columns_file(folder):
 @reader
 def parquet_size(folder, patch):
     path = columns_file(folder)
-    patch.setattr(_parquet, "LARGEST_FILE", path.stat().st_size - 1)
+    patch.setattr(parquet_file, "LARGEST_FILE", path.stat().st_size - 1)
     return lambda: parquet.read_parquet(path)
 
 
 @reader
 def parquet_columns(folder, patch):
-    patch.setattr(_parquet, "MOST_COLUMNS", 4)
+    patch.setattr(parquet_file, "MOST_COLUMNS", 4)
     return lambda: parquet.read_parquet(columns_file(folder))
 
 
 @reader
 def parquet_rows(folder, patch):
-    patch.setattr(_parquet, "MOST_ROWS", 49)
+    patch.setattr(parquet_file, "MOST_ROWS", 49)
     return lambda: parquet.read_parquet(columns_file(folder))
 
 
 @reader
 def parquet_expansion(folder, patch):
-    patch.setattr(_parquet, "RATIO", 0)
-    patch.setattr(_parquet, "ALLOWANCE", 8 * 50 * 5 - 1)
+    patch.setattr(parquet_file, "RATIO", 0)
+    patch.setattr(parquet_file, "ALLOWANCE", 8 * 50 * 5 - 1)
     return lambda: parquet.read_parquet(columns_file(folder))
 
 
 @reader
 def parquet_entries_of_metadata(folder, patch):
-    patch.setattr(_parquet, "MOST_ENTRIES", 5)
+    patch.setattr(parquet_file, "MOST_ENTRIES", 5)
     return lambda: parquet.read_parquet(columns_file(folder))
 
 
 @reader
 def parquet_texts_of_metadata(folder, patch):
-    patch.setattr(_parquet, "LONGEST_TEXT", 400)
+    patch.setattr(parquet_file, "LONGEST_TEXT", 400)
     return lambda: parquet.read_parquet(columns_file(folder))
 
 
@@ -432,8 +433,8 @@ def test_limits_grow_with_the_factor_and_are_integers_of_64_bits(one, other, fac
         patch.setenv(VARIABLE, repr(factor))
         low, high = sorted((one, other))
         found = allowed(low)
-        assert type(found) is int and 0 <= found <= allowed(high) <= _limits._LARGEST
-        assert found == int(min(low * factor, _limits._LARGEST))
+        assert type(found) is int and 0 <= found <= allowed(high) <= limits._LARGEST
+        assert found == int(min(low * factor, limits._LARGEST))
         assert bool(excess(one, other, "rows")) == (one > allowed(other))
         patch.setenv(VARIABLE, repr(max(factor, larger)))
         assert found <= allowed(low)

@@ -4,8 +4,8 @@ import os
 
 import pytest
 
-from knode_cosserat import _reading
-from knode_cosserat._reading import ReadError, json_value, read_bytes, read_text
+from knode_cosserat._files import reading
+from knode_cosserat._files.reading import ReadError, json_value, read_bytes, read_text
 
 
 def pipe_of(content):
@@ -18,7 +18,7 @@ def pipe_of(content):
 
 @pytest.mark.skipif(not os.path.isdir("/dev/fd"), reason="pipes have no paths on this system")
 def test_a_pipe_is_read_up_to_the_limit(monkeypatch):
-    monkeypatch.setattr(_reading, "_PIECE", 4)
+    monkeypatch.setattr(reading, "_PIECE", 4)
     path, number = pipe_of(b"a" * 20)
     assert read_bytes(path, 20) == b"a" * 20
     os.close(number)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat._csv import SAME_TIME
+from knode_cosserat._files.csv_rows import SAME_TIME
 from knode_cosserat.errors import KnodeCosseratError
 
 Tensions = Float[np.ndarray, "steps tendons"]

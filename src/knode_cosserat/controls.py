@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from knode_cosserat._csv import Column, CSVTextError, held_rows, read_rows
-from knode_cosserat._files import replacing
+from knode_cosserat._files.csv_rows import Column, CSVTextError, held_rows, read_rows
+from knode_cosserat._files.writing import replacing
 from knode_cosserat._numbers import numbers_in, real_array
 from knode_cosserat._reprs import count_of
 from knode_cosserat._signals import (

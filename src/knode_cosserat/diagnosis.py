@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from knode_cosserat._files import package_version
+from knode_cosserat._files.writing import package_version
 from knode_cosserat._reprs import count_of
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.solvers.equilibrium import equilibrium

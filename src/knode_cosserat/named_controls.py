@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat import controls
-from knode_cosserat._csv import SAME_TIME, Column, CSVTextError, held_rows, read_rows
+from knode_cosserat._files.csv_rows import SAME_TIME, Column, CSVTextError, held_rows, read_rows
+from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat._signals import require_effect
-from knode_cosserat._yaml import did_you_mean
 from knode_cosserat.controls import ControlsError
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.system import System

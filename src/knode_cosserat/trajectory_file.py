@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from knode_cosserat._files import package_version, replacing
-from knode_cosserat._limits import LimitSettingError
-from knode_cosserat._reading import json_value
+from knode_cosserat._files.limits import LimitSettingError
+from knode_cosserat._files.reading import json_value
+from knode_cosserat._files.writing import package_version, replacing
 from knode_cosserat._registry import provide
 from knode_cosserat.rods.layout import Field, Layout
 from knode_cosserat.rods.system import System

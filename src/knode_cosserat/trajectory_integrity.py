@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from knode_cosserat._limits import MORE, allowed
-from knode_cosserat._reading import ReadError, read_bytes
+from knode_cosserat._files.limits import MORE, allowed
+from knode_cosserat._files.reading import ReadError, read_bytes
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.trajectory_system import TrajectoryFileError
 
@@ -30,7 +30,7 @@ LARGEST_FILE = 8 << 30
 #: time (s) that HDF5 may take for a file without the checksum of its bytes; more at this speed (bytes/s)
 PATIENCE, SPEED = 3.0, 2e7
 #: script that reads a file in a process of its own
-PROBE = Path(__file__).with_name("_hdf5_probe.py")
+PROBE = Path(__file__).parent / "_files" / "hdf5_probe.py"
 #: what stands before the checksum of all bytes at the end of a file. HDF5 ignores bytes after its own, and
 #: drops them when another program changes the file
 SEAL = b"\nknode-cosserat SHA-256 "

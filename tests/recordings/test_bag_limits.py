@@ -9,7 +9,7 @@ import struct
 import numpy as np
 import pytest
 
-from knode_cosserat._limits import MORE, VARIABLE
+from knode_cosserat._files.limits import MORE, VARIABLE
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.recordings import container as chunks
 from knode_cosserat.recordings import load, ros1, ros2

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from knode_cosserat import _parquet
+from knode_cosserat._files import parquet_file
 from knode_cosserat.recordings import RecordingError, load_recording, parquet
 
 pyarrow = pytest.importorskip("pyarrow")
@@ -51,7 +51,7 @@ def test_page_sizes_are_those_that_pyarrow_states(tmp_path):
     for group in range(metadata.num_row_groups):
         for k in range(metadata.num_columns):
             chunk = metadata.row_group(group).column(k)
-            pages = [page.expanded for page in _parquet._pages(data, chunk)]
+            pages = [page.expanded for page in parquet_file._pages(data, chunk)]
             # its total counts the headers too
             assert 0 < sum(pages) <= chunk.total_uncompressed_size <= sum(pages) + 200 * len(pages)
 
@@ -90,8 +90,8 @@ def test_a_page_that_expands_to_much_is_refused(tmp_path, monkeypatch):
         use_dictionary=False,
         compression="zstd",
     )
-    monkeypatch.setattr(_parquet, "RATIO", 1)
-    monkeypatch.setattr(_parquet, "ALLOWANCE", 8 * 20_000 * len(TITLES) - path.stat().st_size)
+    monkeypatch.setattr(parquet_file, "RATIO", 1)
+    monkeypatch.setattr(parquet_file, "ALLOWANCE", 8 * 20_000 * len(TITLES) - path.stat().st_size)
     with pytest.raises(RecordingError, match=r"its pages expand to \d+ bytes; allowed are 1 times the file"):
         load_recording(path)
 
@@ -100,8 +100,8 @@ def test_a_large_file_is_not_opened(tmp_path):
     path = tmp_path / "it.parquet"
     with path.open("wb") as file:
         file.write(parquet.MAGIC)
-        file.truncate(_parquet.LARGEST_FILE + 1)
-    with pytest.raises(RecordingError, match=f"bytes; allowed are {_parquet.LARGEST_FILE}"):
+        file.truncate(parquet_file.LARGEST_FILE + 1)
+    with pytest.raises(RecordingError, match=f"bytes; allowed are {parquet_file.LARGEST_FILE}"):
         load_recording(path)
 
 

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import knode_cosserat as kc
-from knode_cosserat._yaml import mapping_of
+from knode_cosserat._files.yaml_text import mapping_of
 from knode_cosserat.recordings.virtual import virtual_robot
 from knode_cosserat.rods.robot_file import KINDS, RobotFileError, format_robot, parse_robot
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from knode_cosserat import _parquet
+from knode_cosserat._files import parquet_file
 from knode_cosserat.sweeps.errors import SweepError
 from knode_cosserat.sweeps.shard_file import KEY, checksum, read_about, read_shard, shard_bytes
 
@@ -83,6 +83,6 @@ def test_the_number_of_values_of_each_page_is_read(tmp_path):
     data = path.read_bytes()
     for k, values in enumerate((5_000, 60_000, 5_000)):
         chunk = metadata.row_group(0).column(k)
-        pages = list(_parquet._pages(data, chunk))
+        pages = list(parquet_file._pages(data, chunk))
         dictionary = 1 if chunk.has_dictionary_page else 0
         assert sum(page.values for page in pages) == values + dictionary

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from knode_cosserat._csv import size_excess
+from knode_cosserat._files.csv_rows import size_excess
 from knode_cosserat.cli.arguments import Json, figures, parse_numbers, require_writable
 from knode_cosserat.cli.output import write_output
 from knode_cosserat.cli.program import app, examples, hardware

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat._files import replacing
+from knode_cosserat._files.writing import replacing
 from knode_cosserat.control.checks import check_reference
 from knode_cosserat.control.commands import Command, Controller
 from knode_cosserat.control.plants import Plant

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat._reprs import robot_text
-from knode_cosserat._yaml import did_you_mean
 from knode_cosserat.control.commands import ControlLimits
 from knode_cosserat.control.references import Reference
 from knode_cosserat.envs import dynamics, programs

@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat._arrays import read_arrays
-from knode_cosserat._files import replacing
-from knode_cosserat._limits import LimitSettingError, excess
-from knode_cosserat._reading import ReadError, json_value
+from knode_cosserat._files.arrays import read_arrays
+from knode_cosserat._files.limits import LimitSettingError, excess
+from knode_cosserat._files.reading import ReadError, json_value
+from knode_cosserat._files.writing import replacing
 from knode_cosserat.envs.errors import TaskError
 
 #: version of the files

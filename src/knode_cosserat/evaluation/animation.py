@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from knode_cosserat._files import replacing
+from knode_cosserat._files.writing import replacing
 from knode_cosserat.evaluation.drawing import legend_above
 from knode_cosserat.evaluation.style import PALETTE, style, width_of
 from knode_cosserat.evaluation.views import View, by_label, checked_view, curves_of, flat_height, valid_rows

@@ -10,7 +10,7 @@ from typing import Any
 import matplotlib
 from matplotlib.figure import Figure
 
-from knode_cosserat._files import replacing
+from knode_cosserat._files.writing import replacing
 from knode_cosserat.evaluation.style import style
 
 

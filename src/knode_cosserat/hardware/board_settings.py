@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from knode_cosserat._yaml import did_you_mean
+from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat.hardware.board_link import BoardLink
 from knode_cosserat.hardware.driver import HardwareError
 

@@ -10,8 +10,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from knode_cosserat._files import package_version, replacing
-from knode_cosserat._reading import json_value, read_bytes
+from knode_cosserat._files.reading import json_value, read_bytes
+from knode_cosserat._files.writing import package_version, replacing
 from knode_cosserat.hardware.commissioning_steps import CHECKLIST, CheckError, CheckStep, Machine
 from knode_cosserat.hardware.driver import Driver, DriverState, HardwareError
 from knode_cosserat.hardware.safety import EmergencyStop, StoppedError

@@ -17,7 +17,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from knode_cosserat._yaml import did_you_mean, mapping_of, shown
+from knode_cosserat._files.yaml_text import did_you_mean, mapping_of, shown
 from knode_cosserat.hardware.driver import HardwareError, Limits
 from knode_cosserat.rods.robot_file import RobotFileError, file_mapping
 

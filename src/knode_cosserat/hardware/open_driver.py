@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat._numbers import numbers_in
-from knode_cosserat._yaml import did_you_mean
 from knode_cosserat.hardware.description import HardwareDescription
 from knode_cosserat.hardware.driver import Driver, HardwareError
 from knode_cosserat.hardware.motor_robot import MotorReel

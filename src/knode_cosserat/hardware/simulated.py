@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat._yaml import did_you_mean
+from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat.hardware.driver import Driver, DriverState, HardwareError, Latency, Limits, Reading
 from knode_cosserat.hardware.faults import FAULTS, fault_message
 from knode_cosserat.hardware.limits import LatencyWindow, TensionLimiter

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat._yaml import did_you_mean
+from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat.hardware.driver import HardwareError
 from knode_cosserat.hardware.lines import GRAM_FORCE
 

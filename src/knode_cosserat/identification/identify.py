@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from knode_cosserat._yaml import did_you_mean
+from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.identification.inputs import measurements_of, names_of, padded
 from knode_cosserat.identification.intervals import estimates_of

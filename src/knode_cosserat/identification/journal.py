@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from knode_cosserat._arrays import read_arrays
-from knode_cosserat._files import package_version, replacing
-from knode_cosserat._reading import ReadError
+from knode_cosserat._files.arrays import read_arrays
+from knode_cosserat._files.reading import ReadError
+from knode_cosserat._files.writing import package_version, replacing
 
 if TYPE_CHECKING:
     from knode_cosserat.identification.misfit import Misfit

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from knode_cosserat._files import package_version
+from knode_cosserat._files.writing import package_version
 from knode_cosserat.learning.config import FitConfig, NetworkOptions, PassiveOptions
 from knode_cosserat.learning.ensemble import Ensemble
 from knode_cosserat.learning.knode import KNODE, About

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat import _csv
-from knode_cosserat._reading import ReadError, read_bytes
+from knode_cosserat._files import csv_rows
+from knode_cosserat._files.reading import ReadError, read_bytes
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.table import read_csv
 
@@ -91,7 +91,7 @@ def read_beam(path: Path, load: float | None = None) -> BeamRecording:
     """
     load = load_of(path.stem) if load is None else load
     try:
-        table = read_csv(read_bytes(path, _csv.LARGEST_FILE), str(path)).numbers
+        table = read_csv(read_bytes(path, csv_rows.LARGEST_FILE), str(path)).numbers
     except ReadError as error:
         raise RecordingError(f"{path}: {error}") from None
     missing = [name for name in COLUMNS if name not in table.columns]

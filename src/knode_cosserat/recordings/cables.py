@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat._arrays import read_arrays
-from knode_cosserat._reading import ReadError
+from knode_cosserat._files.arrays import read_arrays
+from knode_cosserat._files.reading import ReadError
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.pickles import LARGEST_FILE, read_pickled_array
 

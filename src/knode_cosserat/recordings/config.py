@@ -22,8 +22,8 @@ import math
 from pathlib import Path
 from typing import Any, Literal, Self
 
-from knode_cosserat._files import replacing
-from knode_cosserat._yaml import YAMLTextError, did_you_mean, flow, mapping_of, read_yaml, shown
+from knode_cosserat._files.writing import replacing
+from knode_cosserat._files.yaml_text import YAMLTextError, did_you_mean, flow, mapping_of, read_yaml, shown
 from knode_cosserat.recordings.config_values import (
     Vector,
     checked_choice,

@@ -6,7 +6,7 @@ import fractions
 import math
 from typing import Any
 
-from knode_cosserat._yaml import shown
+from knode_cosserat._files.yaml_text import shown
 from knode_cosserat.recordings.findings import RecordingError
 
 Vector = tuple[float, ...]

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Iterator
 from typing import Any
 
-from knode_cosserat._limits import allowed
+from knode_cosserat._files.limits import allowed
 
 
 @dataclasses.dataclass

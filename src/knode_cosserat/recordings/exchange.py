@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from knode_cosserat._files import replacing
+from knode_cosserat._files.writing import replacing
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.measurements import Measurements

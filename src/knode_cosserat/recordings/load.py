@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from knode_cosserat import _csv
-from knode_cosserat._limits import MORE, allowed, excess
-from knode_cosserat._reading import ReadError, read_bytes
+from knode_cosserat._files import csv_rows
+from knode_cosserat._files.limits import MORE, allowed, excess
+from knode_cosserat._files.reading import ReadError, read_bytes
 from knode_cosserat.recordings import ros1, ros2
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.container import ALLOWANCE, RATIO, Container
@@ -68,7 +68,7 @@ def load_recording(path: str | Path, config: RecordingConfig | None = None) -> R
     if begin.startswith(parquet.MAGIC):
         content = parquet.read_parquet(path)
     else:
-        content = table.read_csv(_bytes(path, _csv.LARGEST_FILE), str(path))
+        content = table.read_csv(_bytes(path, csv_rows.LARGEST_FILE), str(path))
     return _from_table(path.name, str(path), content, config)
 
 

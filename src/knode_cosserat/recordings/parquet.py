@@ -8,9 +8,9 @@ from typing import Any
 
 import pandas as pd  # type: ignore[import-untyped]
 
-from knode_cosserat import _parquet
-from knode_cosserat._reading import ReadError
-from knode_cosserat._yaml import shown
+from knode_cosserat._files import parquet_file
+from knode_cosserat._files.reading import ReadError
+from knode_cosserat._files.yaml_text import shown
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.table import Table, numbers_of
 
@@ -28,10 +28,10 @@ def read_parquet(path: Path) -> Table:
     """
     pyarrow = _pyarrow()
     try:
-        with _parquet.opened(path) as file:
+        with parquet_file.opened(path) as file:
             for k in range(file.metadata.num_columns):
                 _check_column(file.metadata.schema.column(k), path)
-            _parquet.require_expansion(file.metadata, path)
+            parquet_file.require_expansion(file.metadata, path)
             table = file.read()
             said = {key.decode(): value.decode() for key, value in (table.schema.metadata or {}).items()}
     except ReadError as error:

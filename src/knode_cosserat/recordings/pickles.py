@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat._limits import MORE, LimitSettingError, allowed
-from knode_cosserat._reading import ReadError, read_bytes
+from knode_cosserat._files.limits import MORE, LimitSettingError, allowed
+from knode_cosserat._files.reading import ReadError, read_bytes
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.recordings.findings import RecordingError
 

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float
 
-from knode_cosserat._limits import MORE, allowed
+from knode_cosserat._files.limits import MORE, allowed
 from knode_cosserat._registry import provided
 from knode_cosserat._reprs import count_of, wrapped
 from knode_cosserat.recordings.config import RecordingConfig

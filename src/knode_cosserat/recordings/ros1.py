@@ -10,7 +10,7 @@ import struct
 from collections.abc import Collection
 from typing import NamedTuple
 
-from knode_cosserat._limits import MORE
+from knode_cosserat._files.limits import MORE
 from knode_cosserat.recordings.container import EXPANDED, Container, Decompression
 from knode_cosserat.recordings.findings import RecordingError
 

@@ -12,7 +12,7 @@ import urllib.parse
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
-from knode_cosserat._limits import MORE
+from knode_cosserat._files.limits import MORE
 from knode_cosserat.recordings.container import EXPANDED, Container, Decompression
 from knode_cosserat.recordings.findings import RecordingError
 

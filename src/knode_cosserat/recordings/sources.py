@@ -6,7 +6,7 @@ import dataclasses
 import math
 from typing import Any, Literal
 
-from knode_cosserat._yaml import shown
+from knode_cosserat._files.yaml_text import shown
 from knode_cosserat.recordings.config_values import (
     PLACE,
     Vector,

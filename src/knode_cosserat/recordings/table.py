@@ -28,9 +28,9 @@ import numpy as np
 import pandas as pd  # type: ignore[import-untyped]
 from jaxtyping import Float
 
-from knode_cosserat import _csv
-from knode_cosserat._limits import excess
-from knode_cosserat._yaml import shown
+from knode_cosserat._files import csv_rows
+from knode_cosserat._files.limits import excess
+from knode_cosserat._files.yaml_text import shown
 from knode_cosserat.recordings.clocks import FAR
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.config_values import PLACE
@@ -65,8 +65,8 @@ class Table(NamedTuple):
 def read_csv(data: bytes, path: str) -> Table:
     """Return a CSV file's metadata and its columns of numbers. Raises `RecordingError`."""
     newlines = data.count(b"\n") + data.count(b"\r") - data.count(b"\r\n")
-    _require(excess(len(data), _csv.LARGEST_FILE, "bytes"), path)
-    _require(excess(newlines, _csv.MOST_LINES, "lines"), path)
+    _require(excess(len(data), csv_rows.LARGEST_FILE, "bytes"), path)
+    _require(excess(newlines, csv_rows.MOST_LINES, "lines"), path)
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -75,7 +75,7 @@ def read_csv(data: bytes, path: str) -> Table:
     said, first = _comments(lines)
     # a quoted cell can have line breaks, so that the header may not be one of the lines
     columns = 1 + max((line.count(",") for line in itertools.islice(lines, first, None)), default=0)
-    _require(excess(columns, _csv.MOST_COLUMNS, "columns"), path)
+    _require(excess(columns, csv_rows.MOST_COLUMNS, "columns"), path)
     return Table(said, numbers_of(_cells(text, path), path), _about_comments(lines, first))
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat._files import replacing, temporary_folder
+from knode_cosserat._files.writing import replacing, temporary_folder
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.config_values import PLACE
 from knode_cosserat.recordings.findings import RecordingError

@@ -17,8 +17,8 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from knode_cosserat._files.yaml_text import did_you_mean, shown
 from knode_cosserat._reprs import object_text
-from knode_cosserat._yaml import did_you_mean, shown
 from knode_cosserat.errors import KnodeCosseratError
 
 #: smallest length of a direction or quaternion: the square of a much smaller length underflows

@@ -25,8 +25,8 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from knode_cosserat._files import replacing
-from knode_cosserat._yaml import YAMLTextError, did_you_mean, flow, mapping_of, read_yaml, shown
+from knode_cosserat._files.writing import replacing
+from knode_cosserat._files.yaml_text import YAMLTextError, did_you_mean, flow, mapping_of, read_yaml, shown
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.rods.old_keys import upgraded
 from knode_cosserat.rods.parallel_robot import ParallelRobot

@@ -13,7 +13,7 @@ import numpy as np
 from tqdm import tqdm
 
 from knode_cosserat import named_controls
-from knode_cosserat._files import replacing
+from knode_cosserat._files.writing import replacing
 from knode_cosserat._reprs import quantity, robot_text, wrapped
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import NewtonOptions

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from knode_cosserat._files import replacing
+from knode_cosserat._files.writing import replacing
 from knode_cosserat.evaluation.tables import markdown_table
 
 if TYPE_CHECKING:

@@ -24,9 +24,9 @@ from typing import Any, NamedTuple
 from tqdm import tqdm
 
 import knode_cosserat
-from knode_cosserat._files import package_version, replacing
+from knode_cosserat._files.reading import json_value, read_bytes
+from knode_cosserat._files.writing import package_version, replacing
 from knode_cosserat._processes import dask_client, end_with_parent
-from knode_cosserat._reading import json_value, read_bytes
 from knode_cosserat.errors import KnodeCosseratError
 
 #: packages whose versions may change a figure

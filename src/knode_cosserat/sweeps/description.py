@@ -9,8 +9,8 @@ from typing import Any, Literal, Self
 
 import numpy as np
 
+from knode_cosserat._files.yaml_text import YAMLTextError, did_you_mean, mapping_of, read_yaml, shown
 from knode_cosserat._reprs import quantity
-from knode_cosserat._yaml import YAMLTextError, did_you_mean, mapping_of, read_yaml, shown
 from knode_cosserat.rods.system import System
 from knode_cosserat.sweeps.errors import SweepError
 from knode_cosserat.sweeps.sampling import MOST_SOBOL, SAMPLERS

@@ -15,11 +15,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from knode_cosserat._files import package_version, replacing
+from knode_cosserat._files.limits import excess
+from knode_cosserat._files.reading import ReadError, json_value, read_bytes
+from knode_cosserat._files.writing import package_version, replacing
+from knode_cosserat._files.yaml_text import shown
 from knode_cosserat._jax import machine_name
-from knode_cosserat._limits import excess
-from knode_cosserat._reading import ReadError, json_value, read_bytes
-from knode_cosserat._yaml import shown
 from knode_cosserat.rods.parameters import Parameter
 from knode_cosserat.rods.paths import parameter_at
 from knode_cosserat.sweeps.columns import columns_of
@@ -38,7 +38,7 @@ LARGEST_MANIFEST = 64_000_000
 #: packages whose versions may change a result in its last bits
 PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "equinox", "pyarrow")
 #: parts of this package that results depend on
-_SOURCES = ("rods", "solvers", "learning", "identification", "sweeps")
+_SOURCES = ("_files", "rods", "solvers", "learning", "identification", "sweeps")
 
 
 @functools.cache

@@ -19,7 +19,7 @@ import jax
 import numpy as np
 
 from knode_cosserat import named_controls
-from knode_cosserat._yaml import did_you_mean
+from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.rods.paths import owner_at, parameter_at
 from knode_cosserat.rods.robot_file import format_robot, load_robot

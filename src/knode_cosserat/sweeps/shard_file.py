@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from knode_cosserat._files import replacing
-from knode_cosserat._parquet import most_expanded, opened, require_expansion
-from knode_cosserat._reading import ReadError, json_value
+from knode_cosserat._files.parquet_file import most_expanded, opened, require_expansion
+from knode_cosserat._files.reading import ReadError, json_value
+from knode_cosserat._files.writing import replacing
 from knode_cosserat.sweeps.errors import SweepError
 
 #: key of the metadata, and version of the format

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from knode_cosserat import controls, named_controls
-from knode_cosserat._csv import SAME_TIME
+from knode_cosserat._files.csv_rows import SAME_TIME
 from knode_cosserat._numbers import numbers_in
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.system import System

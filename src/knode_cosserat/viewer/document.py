@@ -8,7 +8,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from knode_cosserat._files import replacing
+from knode_cosserat._files.writing import replacing
 from knode_cosserat.viewer.scene import Given, Point, scene
 
 _HERE = Path(__file__).parent

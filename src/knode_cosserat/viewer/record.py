@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat._files import replacing
+from knode_cosserat._files.writing import replacing
 from knode_cosserat.control.commands import Controller, Status
 from knode_cosserat.control.loop import Period
 from knode_cosserat.control.plants import Plant

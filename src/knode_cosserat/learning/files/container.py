@@ -25,9 +25,9 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from knode_cosserat._files import package_version, replacing
-from knode_cosserat._limits import MORE, allowed
-from knode_cosserat._reading import ReadError, read_bytes
+from knode_cosserat._files.limits import MORE, allowed
+from knode_cosserat._files.reading import ReadError, read_bytes
+from knode_cosserat._files.writing import package_version, replacing
 from knode_cosserat.errors import KnodeCosseratError
 
 #: largest number of bytes of the header and of the arrays, as a limit for hostile files

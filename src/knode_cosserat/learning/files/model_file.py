@@ -24,7 +24,7 @@ import jax
 import numpy as np
 
 from knode_cosserat import trajectory_system
-from knode_cosserat._limits import MORE, allowed
+from knode_cosserat._files.limits import MORE, allowed
 from knode_cosserat._registry import provide
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.learning.files import container

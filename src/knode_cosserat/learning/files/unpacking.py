@@ -11,7 +11,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from knode_cosserat._limits import MORE, allowed
+from knode_cosserat._files.limits import MORE, allowed
 from knode_cosserat.learning.files.container import (
     MOST_ARRAYS,
     MOST_HEADER,

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat._limits import MORE, allowed, excess
+from knode_cosserat._files.limits import MORE, allowed, excess
 from knode_cosserat.errors import KnodeCosseratError
 
 Rows = Float[np.ndarray, "rows columns"]

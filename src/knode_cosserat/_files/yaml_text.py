@@ -10,8 +10,8 @@ from typing import Any
 
 import yaml
 
-from knode_cosserat._limits import MORE, LimitSettingError, allowed
-from knode_cosserat._reading import ReadError, read_text
+from knode_cosserat._files.limits import MORE, LimitSettingError, allowed
+from knode_cosserat._files.reading import ReadError, read_text
 from knode_cosserat.errors import KnodeCosseratError
 
 #: largest text, and number of values in it with all aliases written out

@@ -13,8 +13,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from knode_cosserat._limits import MORE, allowed, excess
-from knode_cosserat._reading import ReadError
+from knode_cosserat._files.limits import MORE, allowed, excess
+from knode_cosserat._files.reading import ReadError
 from knode_cosserat.errors import KnodeCosseratError
 
 #: limits of a file: bytes, columns, rows (5.5 h at 1 kHz)
@@ -122,14 +122,14 @@ _DEEPEST = 8
 
 
 class _Page(NamedTuple):
-    """What the header of a page states: its expanded size (bytes), and its number of values."""
+    """Expanded size (bytes) of a page, and its number of values, from its header."""
 
     expanded: int
     values: int
 
 
 def _pages(data: Any, chunk: Any) -> Iterator[_Page]:
-    """Yield what the header of each page of a column states.
+    """Yield sizes from the header of each page of a column.
 
     Raises:
         ValueError: a header cannot be read.

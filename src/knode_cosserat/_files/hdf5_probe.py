@@ -1,6 +1,6 @@
 """Script: reads an HDF5 file in a process of its own, which may loop for ever or crash on a damaged one.
 
-`python _hdf5_probe.py FILE BYTES` prints a line when it begins. Links and variables of more than BYTES are
+`python hdf5_probe.py FILE BYTES` prints a line when it begins. Links and variables of more than BYTES are
 left out; other errors are found again by who reads the file. It imports nothing of the package, so that it
 starts fast.
 """

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from knode_cosserat._limits import excess
-from knode_cosserat._reading import ReadError, read_bytes
+from knode_cosserat._files.limits import excess
+from knode_cosserat._files.reading import ReadError, read_bytes
 from knode_cosserat.errors import KnodeCosseratError
 
 

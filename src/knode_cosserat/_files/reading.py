@@ -8,7 +8,7 @@ import stat
 from pathlib import Path
 from typing import Any
 
-from knode_cosserat._limits import MORE, allowed, excess
+from knode_cosserat._files.limits import MORE, allowed, excess
 from knode_cosserat.errors import KnodeCosseratError
 
 #: bytes that are read at a time from a pipe, which states no size

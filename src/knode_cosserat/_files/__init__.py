@@ -1,0 +1,1 @@
+"""Files: writing whole or not at all, and reading within limits."""
