@@ -1,7 +1,7 @@
 """Long runs: different simulations in one process, and a live session, with bounded memory and maps.
 
 `python -m tools.attack.long_run --simulations 10000` or `--seconds 480`, and `--live 300` for a live session.
-Every simulation is of another random robot. Each 25 of them have another shape (node count, scheme along
+Every simulation is of another random robot. Each 100 of them have another shape (node count, scheme along
 the rod, class of robot) and so need programs of their own; after all shapes it returns to released ones.
 """
 
@@ -30,7 +30,7 @@ SPACES = ("lobatto2", "euler", "lobatto4")
 #: node counts; with the robots and schemes these are 1,266 shapes
 NODES = range(10, 221)
 #: robots of each shape
-ALIKE = 25
+ALIKE = 100
 #: largest growth of a live session's memory (MB per hour), after its first minute
 MOST_GROWTH = 100.0
 
