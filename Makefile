@@ -13,7 +13,7 @@ unexport PYTHONPATH
 unexport PYTHONHOME
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo test test-all samples costs lint types docs pictures notebooks format bench attack firmware package lock clean distclean
+.PHONY: help env demo test test-slow test-all samples costs lint types docs pictures notebooks format bench attack firmware package lock clean distclean
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' Makefile
@@ -33,8 +33,11 @@ notebooks: $(READY) ## run the notebooks' texts, and write docs/notebooks/*.ipyn
 
 env: $(READY) ## make the environment
 
-test: $(READY) ## run the tests, but for the long ones (some 20 min on two cores)
-	$(BIN)/python -m pytest -n $(JOBS) $(BY_FILE) -m "not campaign" $(PYTEST_ARGS)
+test: $(READY) ## run the tests, but for the slow and the long ones (some 6 min on two cores)
+	$(BIN)/python -m pytest -n $(JOBS) $(BY_FILE) -m "not slow and not campaign" $(PYTEST_ARGS)
+
+test-slow: $(READY) ## run the tests of more than some seconds each, as CI does after `make test` (some 12 min)
+	$(BIN)/python -m pytest -n $(JOBS) $(BY_FILE) -m "slow and not campaign" $(PYTEST_ARGS)
 
 test-all: $(READY) ## run all the tests, the long ones too
 	$(BIN)/python -m pytest -n $(JOBS) $(BY_FILE) $(PYTEST_ARGS)

@@ -1,8 +1,8 @@
 """Progress, time left, and the CPU time of each test file.
 
-`costs.json` has the CPU time (s) of each file in a run of `make test` that compiles everything. It serves two
-purposes: the costliest files start first, so that all processes finish together, and the time left is
-estimated from the share of the cost that is done. `pytest --write-costs` writes it anew.
+`costs.json` has the CPU time (s) of each file, and of each slow test by itself, in a run that compiles
+everything. It serves two purposes: the costliest files start first, so that all processes finish together,
+and the time left is estimated from the share of the cost that is done. `pytest --write-costs` writes it anew.
 """
 
 import json
@@ -29,12 +29,14 @@ def file_of(nodeid):
 
 
 def weights(nodeids, costs):
-    """Cost (s) of each test: the cost of its file in equal parts."""
-    counts = Counter(map(file_of, nodeids))
-    return {
-        each: costs.get(file_of(each), UNKNOWN * counts[file_of(each)]) / counts[file_of(each)]
-        for each in nodeids
-    }
+    """Cost (s) of each test: its own, or the cost of its file in equal parts."""
+    counts = Counter(file_of(each) for each in nodeids if each not in costs)
+
+    def cost(nodeid):
+        count = counts[file_of(nodeid)]
+        return costs[nodeid] if nodeid in costs else costs.get(file_of(nodeid), UNKNOWN * count) / count
+
+    return {each: cost(each) for each in nodeids}
 
 
 def cpu_time():
@@ -54,7 +56,8 @@ class Recorder:
         try:
             return (yield)
         finally:
-            self.costs[file_of(item.nodeid)] += cpu_time() - started
+            alone = item.get_closest_marker("slow") is not None
+            self.costs[item.nodeid if alone else file_of(item.nodeid)] += cpu_time() - started
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_sessionfinish(self):

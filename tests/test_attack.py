@@ -30,6 +30,7 @@ def test_every_sample_is_read_as_it_was_written(tmp_path):
         assert len(found) == 2, name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "names", [("trajectory.nc", "figure.png", "bag.db3"), pytest.param((), marks=pytest.mark.campaign)]
 )
@@ -39,6 +40,7 @@ def test_a_full_disk_leaves_all_files_as_they_were(names, tmp_path):
     assert failures(rows) == [] and sum(row.tried for row in rows) == count
 
 
+@pytest.mark.slow
 def test_killed_writes_leave_a_whole_file(tmp_path):
     row = killed_writes("bag.db3", tmp_path, 2, seed=1)
     assert row.failures == [] and row.tried == 2
@@ -56,6 +58,7 @@ def test_a_folder_of_a_killed_write_is_removed(tmp_path):
     assert [each.name for each in tmp_path.iterdir()] == ["it.db3"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seeds", [(1, 5, 9, 17), pytest.param(range(600), marks=pytest.mark.campaign)])
 def test_converged_rows_agree_with_an_independent_residual_and_a_finer_grid(seeds):
     for seed in seeds:

@@ -133,6 +133,7 @@ def test_a_failure_may_be_allowed_and_is_not_hidden(tmp_path, unsolvable):
 # equilibrium
 
 
+@pytest.mark.slow
 def test_equilibrium_tells_the_shape_and_what_holds_it(tmp_path):
     facts = told("equilibrium", ROBOT, "--tension", "7,5,5,7", "--out", tmp_path / "rest.nc")
     robot = kc.load_robot(ROBOT)

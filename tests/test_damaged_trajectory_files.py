@@ -303,6 +303,7 @@ def test_variables_of_gigabytes_that_were_never_written_are_not_read(path):
         load_trajectory(path)
 
 
+@pytest.mark.slow
 def test_a_disk_that_fills_up_leaves_the_old_file_and_nothing_else(tmp_path):
     """The limit of a file's size stands for the full disk; HDF5 crashed the interpreter there."""
     script = """

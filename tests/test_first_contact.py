@@ -185,6 +185,7 @@ def test_it_is_quiet_unless_it_is_listened_to():
     assert done.returncode == 0 and done.stdout == done.stderr == ""
 
 
+@pytest.mark.slow
 def test_recovered_steps_are_told_to_the_logger(caplog):
     pulled = np.zeros((3, 4))
     pulled[1:, 0] = 8.0

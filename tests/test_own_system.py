@@ -25,6 +25,7 @@ def catenary_tensions(hand: np.ndarray, weight: float = 0.981) -> tuple[float, f
     return weight * a, -weight * a * np.sinh(low / a)
 
 
+@pytest.mark.slow
 def test_it_hangs_as_a_catenary(string):
     errors = []
     for nodes in (11, 21, 41):

@@ -50,6 +50,7 @@ def listening():
         jax.monitoring.unregister_event_duration_listener(budget.compiled)
 
 
+@pytest.mark.slow
 def test_maps_stay_below_the_limit(monkeypatch):
     process = Process(monkeypatch, 600)
     budget = ProgramBudget(30_000, programs=10**6, count=process.count)
@@ -64,6 +65,7 @@ def test_maps_stay_below_the_limit(monkeypatch):
     assert process.counts < 300
 
 
+@pytest.mark.slow
 def test_small_programs_are_counted_too(monkeypatch):
     process = Process(monkeypatch, 600)
     budget = ProgramBudget(30_000, count=process.count)
@@ -74,6 +76,7 @@ def test_small_programs_are_counted_too(monkeypatch):
     assert budget.releases == 6
 
 
+@pytest.mark.slow
 def test_without_memory_maps_large_programs_are_counted(monkeypatch):
     process = Process(monkeypatch)
     budget = ProgramBudget(30_000, programs=100, count=lambda: 0)
@@ -109,6 +112,7 @@ def test_budget_is_half_of_the_limit_or_chosen(monkeypatch, tmp_path):
         default_maps()
 
 
+@pytest.mark.slow
 @on_linux
 def test_real_programs_are_released(listening):
     # programs of earlier tests go first: the process's own budget could release them in between
@@ -129,6 +133,7 @@ def test_real_programs_are_released(listening):
     np.testing.assert_array_equal(kept[0](np.ones(3)), [2.0, 6.0, 12.0])
 
 
+@pytest.mark.slow
 def test_results_are_the_same_after_a_release(listening):
     robot = kc.load_robot("delrin-tendon-robot").replace(nodes=4)
     controls = np.full((3, 4), [1.0, 0.0, 0.0, 0.0])
@@ -145,6 +150,7 @@ def test_results_are_the_same_after_a_release(listening):
     np.testing.assert_array_equal(kc.simulate(robot, controls, 0.05).y, before.y)
 
 
+@pytest.mark.slow
 def test_programs_are_released_while_others_run(listening):
     """Threads compile, differentiate and run a longer program; each compilation releases all programs."""
     budget = listening(ProgramBudget(0, programs=10**6, count=lambda: 1))

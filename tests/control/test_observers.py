@@ -125,6 +125,7 @@ def followed(observer, still, count=60):
     return np.array(errors), np.array(inside)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [KalmanObserver, MovingHorizonObserver])
 def test_a_wrong_start_is_corrected_from_the_tip_alone(kind, still):
     """After one second the shape is within 0.5 % of the length, with the sensor's noise."""
@@ -171,6 +172,7 @@ def test_the_boundary_observer_converges_to_a_loaded_robot(still):
         BoundaryObserver(kc.load_robot("six-legged-robot"), DT)
 
 
+@pytest.mark.slow
 def test_an_unknown_force_at_the_tip_is_found():
     """From the noisy position of the tip alone, within 10 % after six seconds of movement."""
     model, force = ROBOT.replace(loads=(PointWrench(),)), np.array([0.06, -0.04, 0.05])

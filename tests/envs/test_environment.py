@@ -19,6 +19,7 @@ def actions(environment, tension):
     return 2.0 * tension / 10.0 - 1.0
 
 
+@pytest.mark.slow
 def test_an_episode_moves_as_its_robot_is_simulated(environment, keys):
     states, _ = environment.reset_many(keys)
     first, wanted = states, tensions(6)

@@ -146,6 +146,7 @@ def test_the_predictive_controller_and_a_trained_policy_follow(robot):
     assert envs.policy_scores(environment, training.policy, keys).mean() > 0.9 * reference
 
 
+@pytest.mark.slow
 def test_an_episode_is_animated(environment, policy, tmp_path):
     image = pytest.importorskip("PIL.Image", reason="needs Pillow, the extra viz")
     path = envs.animate_episode(environment, policy, jax.random.PRNGKey(3), tmp_path / "episode.gif")

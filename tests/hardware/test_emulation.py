@@ -54,6 +54,7 @@ def pull(board: SerialBoard) -> None:
         board.wait(0.05)
 
 
+@pytest.mark.slow
 def test_tension_steps_settle(robot: EmulatedRobot) -> None:
     with board_of(robot) as board:
         board.arm()
@@ -184,6 +185,7 @@ def test_an_emergency_stop_at_the_start_and_a_board_without_one(robot: EmulatedR
         robot.switch = "on"  # type: ignore[assignment]
 
 
+@pytest.mark.slow
 def test_a_bad_cable_neither_moves_wrongly_nor_stops_the_loop(robot: EmulatedRobot) -> None:
     random = np.random.default_rng(0)
 
@@ -213,6 +215,7 @@ def test_a_bad_cable_neither_moves_wrongly_nor_stops_the_loop(robot: EmulatedRob
     board.close()
 
 
+@pytest.mark.slow
 def test_two_runs_are_the_same_bits() -> None:
     def run() -> tuple[bytes, bytes]:
         robot = EmulatedRobot(seed=7)
@@ -224,6 +227,7 @@ def test_two_runs_are_the_same_bits() -> None:
     assert run() == run()
 
 
+@pytest.mark.slow
 def test_the_step_of_the_rod_does_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
     tips = []
     for count in (4, 2):

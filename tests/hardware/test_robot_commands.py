@@ -182,6 +182,7 @@ def test_a_fault_while_recording_keeps_the_bag(folder):
     assert recording.sampled(0.05).time[-1] > 0.3
 
 
+@pytest.mark.slow
 def test_run_closes_the_loop(folder):
     words = ("robot", "run", "rod.yaml", "--port", "simulated", "--robot", "rod.yaml", "--yes", "--json")
     aim = ("--reference", "circle:radius=0.03,period=3", "--method", "kinematic", "--dt", "0.06")
@@ -283,6 +284,7 @@ def test_keys_steer_and_stop_and_the_terminal_is_restored(folder):
     os.close(slave)
 
 
+@pytest.mark.slow
 def test_the_firmware_passes_its_commissioning(folder):
     from knode_cosserat.hardware.emulation import missing
 

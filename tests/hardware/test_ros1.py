@@ -133,6 +133,7 @@ def equal(one, other):
     return one.simulated == other.simulated
 
 
+@pytest.mark.slow
 @needs_ros
 def test_rosbag_records_what_the_driver_records(tmp_path, ros):
     recorded = RosBag(tmp_path / "recorded.bag", ros)

@@ -107,6 +107,7 @@ def test_softening_by_tension_is_that_of_stiffness():
     assert np.allclose(shape(spans, tension), shape(softer, tension), rtol=0.0, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_load_cells_correct_tensions():
     gain, offset = np.array([1.1, 0.9, 1.0, 1.0]), np.array([0.2, 0.0, -0.1, -9.0])
     cells = LoadCells(gain=gain, offset=offset)

@@ -23,6 +23,7 @@ def drawn(seed, size=1.0):
     return EMPTY.with_numbers(jnp.asarray(size * rng.normal(size=EMPTY.size))).clamped()
 
 
+@pytest.mark.slow
 @given(st.integers(0, 2**31), st.floats(0.01, 30.0))
 @settings(deadline=None, max_examples=30)
 def test_it_takes_up_energy_over_every_closed_cycle(seed, size):

@@ -141,6 +141,7 @@ def test_damped_motion_ends_in_equilibrium(robot):
 # the same in pieces, and side by side
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("time", ["bdf1", "bdf2", pytest.param("bdf-alpha", marks=pytest.mark.campaign)])
 def test_motion_goes_on_from_a_trajectory(robot, time):
     whole = kc.simulate(robot, CONTROLS, DT, time=time)

@@ -15,6 +15,7 @@ def of(family, *long):
     return [pytest.param(key, marks=LONG if key in long else ()) for key in family]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("key", of(beams.STATICS, "tendon", "catenary"))
 def test_statics_by_order_4(key):
     errors = [beams.STATICS[key].error(nodes, "lobatto4") for nodes in GRID]
@@ -34,6 +35,7 @@ DEFAULT = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("key", of(DEFAULT, "tendon", "catenary", *beams.BUCKLING, *motions.MOTIONS))
 def test_default_scheme_at_20_nodes_is_within_1_percent(key):
     """One program for all cases of `beams.rod` at rest, one for its motion."""

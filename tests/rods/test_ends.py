@@ -81,6 +81,7 @@ def test_a_free_rod_falls():
     assert 1.9 < np.log2(lag[0] / lag[1]) < 2.1
 
 
+@pytest.mark.slow
 def test_a_free_rod_that_spins_keeps_its_momenta():
     drift = []
     for steps in (60, 120):

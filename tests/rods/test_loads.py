@@ -61,6 +61,7 @@ def test_a_moment_at_a_place_bends_to_a_circle_up_to_it():
     np.testing.assert_allclose(found.tip_position[0], at_load + beyond, atol=2e-7 * L)
 
 
+@pytest.mark.slow
 def test_the_diagrams_of_force_and_moment_of_large_loads_are_exact():
     one, other = np.array([3.0, 1.0, -2.0]) * EI / L**2, np.array([-1.0, 2.0, 0.5]) * EI / L**2
     found = rest(OFF_NODE__force=one, ON_NODE__force=other)

@@ -25,6 +25,7 @@ def test_a_pair_is_wound_up_on_one_side_and_let_out_on_the_other():
     assert np.asarray(own.lengths(np.array([2e-3, 3e-3]))) == pytest.approx([2e-3, 2e-3])
 
 
+@pytest.mark.slow
 def test_controls_are_angles_and_the_robot_is_that_of_the_lengths():
     motors = ROBOT.replace(reels=PAIRS)
     assert motors.control_layout.names == ("motor",) and motors.control_size == 2

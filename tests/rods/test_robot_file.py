@@ -367,7 +367,7 @@ def test_files_that_cannot_be_read(tmp_path):
     with fails(f"{tmp_path}: cannot be read"):
         load_robot(tmp_path)
     (tmp_path / "binary.yaml").write_bytes(b"\x89HDF\xff\xfe")
-    with fails("binary.yaml: not YAML"):
+    with fails("binary.yaml: it is not UTF-8 text"):
         load_robot(tmp_path / "binary.yaml")
 
 

@@ -67,6 +67,7 @@ def test_tendons_pull_the_rod_to_their_side_like_the_crude_model():
         assert np.dot(crude, real) > 0.99 * np.linalg.norm(crude) * np.linalg.norm(real)
 
 
+@pytest.mark.slow
 def test_a_quarter_turn_of_the_tendons_is_a_quarter_turn_of_the_robot():
     robot = kc.robots.RoutedTendonRobot.like(KNOWLEDGE, **RUBBING, sections=(Sleeve(stiffening=1.0),))
     control = kc.controls.parse("random:3", 200, 0.025)

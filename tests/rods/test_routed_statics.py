@@ -77,6 +77,7 @@ def field(found, name, row=-1):
     return np.asarray(found.part(name))[row]
 
 
+@pytest.mark.slow
 def test_a_taut_reel_is_the_tension_that_it_has():
     taken_in = np.array([0.004, 0.001, -0.002, 0.0005])
     for compliance in (0.0, 2e-4):
@@ -95,6 +96,7 @@ def test_a_taut_reel_is_the_tension_that_it_has():
         assert np.all(missing[~taut] > 1e-8)
 
 
+@pytest.mark.slow
 def test_a_slack_tendon_does_nothing_until_it_is_pulled_in_again():
     give = np.linspace(0.0, -0.02, 30)
     pull = np.concatenate([give, give[::-1], np.linspace(0.0, 0.004, 30)])

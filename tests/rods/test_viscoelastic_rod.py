@@ -20,11 +20,13 @@ def bent(rod, force=0.05):
     return kc.equilibrium(rod, [force]).tip_position[0, 0]
 
 
+@pytest.mark.slow
 def test_at_rest_it_is_elastic():
     elastic = bent(kc.robots.SlenderRod(**BODY))
     assert bent(ViscoelasticRod(**BODY, branch_stiffness=2.0)) == pytest.approx(elastic, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_without_its_branch_it_is_a_slender_rod():
     control = np.full((20, 1), 0.05)
     plain = kc.simulate(kc.robots.SlenderRod(**BODY), control, 5e-3)

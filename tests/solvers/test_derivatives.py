@@ -78,6 +78,7 @@ def robot_loss(nodes, **options):
     return loss
 
 
+@pytest.mark.slow
 def test_gradient_of_the_robot():
     at = {**PARAMETERS, "tension": kc.controls.random(100, seed=5)}
     loss = robot_loss(nodes=10)

@@ -35,6 +35,7 @@ def sagging(distance, points=9):
     return np.stack([distance * x, 0.0 * x, -4.0 * sag * x * (1.0 - x)], axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lengths", [1, 10, 30, 50])
 @pytest.mark.parametrize("distance", [0.2, 0.7, 0.999])
 def test_cables_hang_between_grippers_at_any_distance(lengths, distance):
@@ -66,6 +67,7 @@ def test_positions_that_are_none_are_refused_in_one_line():
         kc.equilibrium(platform, np.zeros(6), initial=sagging(0.7))
 
 
+@pytest.mark.slow
 def test_position_tolerance_adds_nodes():
     robot = kc.load_robot("delrin-tendon-robot")
     bent = kc.equilibrium(robot, [30.0, 5.0, 5.0, 5.0], position_tolerance=1e-3)

@@ -33,6 +33,7 @@ def whole(rod):
     return kc.simulate(rod, NONE, DT, space="lobatto4")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dt", [1e-2, 1e-3])
 def test_what_is_in_equilibrium_stays_there_however_short_the_steps(rod, dt):
     """With strains of the past interpolated between nodes this rod crept by 1.7 mm, or 22 mm."""
@@ -75,6 +76,7 @@ def test_a_motion_goes_on_as_if_it_had_not_been_parted(rod, time, tmp_path):
         np.testing.assert_allclose(found.y, one.y[-count - 1 :], atol=2e-8)
 
 
+@pytest.mark.slow
 def test_parts_keep_the_states_of_their_own_rows(rod, whole):
     second = gone_on(rod, whole[:5], 4)
     assert whole.initial_state.dt is None and second.initial_state.dt == whole.final_state.dt == DT
@@ -85,6 +87,7 @@ def test_parts_keep_the_states_of_their_own_rows(rod, whole):
     assert second[::2].initial_state is None and second[::2].final_state is second.final_state
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("traced", [False, True])
 @pytest.mark.parametrize("time", ["bdf2", pytest.param("trapezoidal", marks=pytest.mark.campaign)])
 def test_a_whole_motion_goes_on_by_the_state_of_the_solver(rod, time, traced, monkeypatch):
@@ -100,6 +103,7 @@ def test_a_whole_motion_goes_on_by_the_state_of_the_solver(rod, time, traced, mo
     np.testing.assert_allclose(found.position_error[1:], one.position_error[5:], rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_row_that_was_changed_moves_the_state_of_the_solver(rod, whole):
     """A change of rates in the last rows acts as it does in a replay of these rows."""
     changed = np.array(whole.y)
@@ -113,6 +117,7 @@ def test_a_row_that_was_changed_moves_the_state_of_the_solver(rod, whole):
     np.testing.assert_allclose(moved, wanted, atol=0.02 * np.max(np.abs(wanted - straight)))
 
 
+@pytest.mark.slow
 def test_the_middle_of_a_motion_is_known_at_its_nodes_only(rod, whole):
     """What between them is not is forgotten, like the initial state of any damped motion."""
     near = np.max(np.abs(gone_on(rod, whole[6:9], 4).y - whole.y[8:]), axis=(1, 2))

@@ -43,6 +43,7 @@ def errors():
     return np.array(found)
 
 
+@pytest.mark.slow
 def test_a_body_between_nodes_has_no_error_of_second_order(errors):
     orders = np.log2(errors[:-1] / errors[1:])
     lines, by_y, by_z = errors.T

@@ -92,6 +92,7 @@ def test_a_control_that_jumps_asks_for_a_new_linearisation(robot):
     np.testing.assert_allclose(found.position[20:], anew.position, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_what_is_kept_is_not_seen_in_a_motion(robot, sine):
     """Solved to the tolerance, by old linearisations as by ones that are made anew in every step."""
     found = kc.simulate(robot, sine[:60], 0.01)
@@ -142,6 +143,7 @@ def line(nodes):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("space", ["lobatto2", pytest.param("lobatto4", marks=pytest.mark.campaign)])
 def test_an_equilibrium_under_strong_tension(space):
     """Solutions grow and decay by e in a segment: forward Euler turned decay into growth."""
@@ -154,6 +156,7 @@ def test_an_equilibrium_under_strong_tension(space):
     np.testing.assert_allclose(still.tip_position[0], expected, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_a_motion_from_such_an_equilibrium_stays_there():
     robot = line(41)
     still = kc.equilibrium(robot, np.zeros(0))
@@ -168,6 +171,7 @@ def jitted(robot):
     return jax.jit(lambda tau: kc.simulate(robot, tau, DT))
 
 
+@pytest.mark.slow
 def test_under_transformations_unsolved_rows_are_nan(jitted):
     found = jitted(np.tile([5000.0, 0.0, 0.0, 5000.0], (100, 1)))
     first = int(np.argmax(np.asarray(found.result) < 0))
@@ -195,6 +199,7 @@ def test_lockstep_as_on_a_gpu_equals_one_after_the_other(robot, sine):
     np.testing.assert_allclose(one_by_one[2].records, together[2].records, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_one_failing_robot_does_not_spoil_the_batch(robot, sine):
     tensions = np.stack([sine[:16], np.tile(HOPELESS, (16, 1)), 0.9 * sine[:16]])
     found = kc.simulate(robot, tensions, DT, on_failure="return")
@@ -214,6 +219,7 @@ def test_equilibria_in_a_batch(robot):
     np.testing.assert_allclose(found.velocity, 0.0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_list_of_equilibria_is_each_by_itself_in_batches_and_programs_too(robot):
     tensions = np.array([[7.0, 5.0, 5.0, 7.0], [9.0, 5.0, 5.0, 9.0], [6.0, 6.0, 8.0, 6.0]])
     found = kc.solvers.equilibria(robot, tensions)

@@ -128,6 +128,7 @@ CASES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_the_default_has_order_2_along_the_rod(case):
     """With a discontinuity between two nodes, at rest and in motion, damped or not."""

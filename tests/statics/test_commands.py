@@ -23,6 +23,7 @@ def told(*arguments):
     return json.loads(ran.stdout)
 
 
+@pytest.mark.slow
 def test_reach_tells_tensions_that_reach():
     tip = kc.equilibrium(kc.load_robot(ROBOT), [4.0, 1.0, 0.0, 0.0]).tip_position[0]
     facts = told("reach", ROBOT, "--position", *tip)

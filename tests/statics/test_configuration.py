@@ -31,6 +31,7 @@ def test_a_cantilever_is_compliant_as_a_beam():
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "robot", [ROBOT, pytest.param(ROUTED, marks=pytest.mark.campaign)], ids=["crude", "routed"]
 )
@@ -69,6 +70,7 @@ def test_asymmetry_is_of_the_order_of_the_scheme():
     assert asymmetry[1] < asymmetry[0] / 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", [0.5, 0.98, 1.02, 2.0, 4.0])
 def test_an_upright_column_is_unstable_beyond_greenhills_load(part):
     """A heavy column buckles at ρA g L³/EI = 7.837, and is straight in equilibrium beyond that too."""
@@ -103,6 +105,7 @@ def test_manipulability_is_that_of_the_jacobian():
     np.testing.assert_allclose(turned.singular_values, np.linalg.svd(J[3:])[1], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_rod_without_controls_has_a_compliance():
     """L³/3EI of a slender cantilever; there is nothing that moves it."""
     length, radius, E = 0.3, 1e-3, 70e9

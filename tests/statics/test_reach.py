@@ -26,6 +26,7 @@ def learned():
     return kc.fit(ROBOT.replace(youngs_modulus=10e9), [truth], kc.FitConfig(seed=0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "robot", [ROBOT, pytest.param(ROUTED, marks=pytest.mark.campaign)], ids=["crude", "routed"]
 )
@@ -169,6 +170,7 @@ def test_the_pose_may_be_any_function_of_the_last_node():
     np.testing.assert_allclose(found.control, [4.0, 1.0, 0.0, 0.0], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_no_equilibrium_to_begin_with_is_said():
     held = {"low": 1e160, "high": 1e160}
     found = kc.inverse_kinematics(ROBOT, [0.0, 0.0, 0.5], **held, starts=1)

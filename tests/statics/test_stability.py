@@ -64,6 +64,7 @@ def test_the_least_eigenvalue_crosses_zero_at_the_load_whatever_the_nodes():
     assert errors[0] < 1e-4 * exact and errors[1] < errors[0] / 8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", [0.5, 0.98, 1.02, 4.0])
 @pytest.mark.parametrize("space", [pytest.param("euler", marks=pytest.mark.campaign), "lobatto4"])
 def test_an_upright_column_falls_beyond_greenhills_load_by_either_scheme(part, space):

@@ -61,6 +61,7 @@ def test_limits_of_strain_leave_samples_out(found):
         found.within(curvature=1.0)
 
 
+@pytest.mark.slow
 def test_what_has_no_equilibrium_is_nan_and_counted():
     """Tensions so large that the equations overflow, among others."""
     controls = np.array([[1.0, 0.0, 0.0, 0.0], [1e160, 0.0, 0.0, 0.0], [0.0, 2.0, 0.0, 0.0]])

@@ -162,6 +162,7 @@ def test_the_whole_table(folder, tmp_path):
     assert "recordings are of a physical robot" in (tmp_path / "table2.md").read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solved", [0, 3])
 def test_a_model_that_fails_is_reported_soon(folder, monkeypatch, solved):
     """Nothing is tried to save one that fails everywhere, nor after recovery has not helped once."""

@@ -38,6 +38,7 @@ def baseline(tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 def test_the_baseline_is_the_papers(baseline):
     cells = json.loads((baseline / "table1.json").read_text())
     assert len(cells) == 8 and all(set(cell) == KEYS for cell in cells)

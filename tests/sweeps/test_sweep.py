@@ -58,6 +58,7 @@ def content(folder):
 # results
 
 
+@pytest.mark.slow
 def test_cases_are_simulations(whole):
     """A sweep has other programs than `simulate`, so that results may differ by rounding."""
     plan = Plan.of(described())
@@ -109,6 +110,7 @@ def test_the_data_say_what_they_are(whole):
         assert len(table.column(name)) == 16
 
 
+@pytest.mark.slow
 def test_recovery_solves_more_cases(tmp_path):
     robot = {"robot": ROBOT["robot"], "set": {"nodes": 5, "bending_damping": 1e-6}}
     sweep = described(robots=robot, vary={"height": [1.0, 300.0, 3e4]})
@@ -141,11 +143,13 @@ def test_a_platform_starts_from_its_equilibrium(tmp_path):
 # any executor, any interruption: the same bytes
 
 
+@pytest.mark.slow
 def test_two_processes_give_the_same_bytes(whole, tmp_path):
     run_sweep(described(), tmp_path / "two", executor=Local(2))
     assert content(tmp_path / "two") == content(whole.folder)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cluster", ["debug", "local"])
 def test_jobs_of_submitit_give_the_same_bytes(whole, tmp_path, cluster):
     pytest.importorskip("submitit")
@@ -181,6 +185,7 @@ exec "$@"
 """
 
 
+@pytest.mark.slow
 def test_slurm_with_a_fake_scheduler_gives_the_same_bytes(whole, tmp_path, monkeypatch):
     pytest.importorskip("submitit")
     tools = tmp_path / "bin"
@@ -229,6 +234,7 @@ def shard_count(folder):
     return len(list((Path(folder) / "shards").glob("*.parquet")))
 
 
+@pytest.mark.slow
 def test_killed_again_and_again_it_ends_with_the_same_bytes(whole, tmp_path):
     """Killed as soon as a further shard is there: in the midst of the next one, or while it is written."""
     folder, generator = tmp_path / "killed", random.Random(0)
@@ -374,6 +380,7 @@ def test_another_description_in_the_same_folder_is_refused(copied):
         run_sweep(described(), copied)
 
 
+@pytest.mark.slow
 def test_a_disk_that_fills_up_loses_nothing(whole, copied, tmp_path):
     """The limit of a file's size stands for the full disk."""
     (copied / "shards" / "000002.parquet").unlink()

@@ -79,6 +79,7 @@ def is_frame(said):
     return not isinstance(said, dict)
 
 
+@pytest.mark.slow
 def test_a_dragged_target_moves_the_reference_and_the_robot_follows(followed):
     async def talk(connection, session):
         connection.given.put_nowait({"target": NEAR, "sequence": 3})
@@ -371,6 +372,7 @@ def address(loop):
     return found[0]
 
 
+@pytest.mark.slow
 def test_the_target_is_dragged_and_the_robot_follows(browser, address, loop, tmp_path):
     loop.position = loop.start
     browser.size(1280, 860)

@@ -324,6 +324,7 @@ def test_the_page_says_what_cannot_be_solved_and_goes_on_after_it(browser, addre
     assert browser.wait(lambda: browser.run("viewer.tip()") != tip)
 
 
+@pytest.mark.slow
 def test_no_more_pages_are_served_than_can_be_solved(robot, address):
     from websockets.asyncio.client import connect
 

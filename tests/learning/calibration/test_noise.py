@@ -83,6 +83,7 @@ def test_what_noise_does_on_average_is_taken_away(swings):
     assert np.all(np.abs(np.mean(corrected, axis=0)) < 4.0 * spread)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("time", "space"), [("bdf2", "lobatto4"), ("trapezoidal", "euler"), ("string", "euler")]
 )
@@ -121,6 +122,7 @@ def test_rollouts_need_positions_and_orientations_only(training):
     assert set(result.remainder) == {"position", "orientation"}
 
 
+@pytest.mark.slow
 def test_rollouts_go_on_from_where_data_begin(swings):
     result = calibrate(WRONG, [swing[6:] for swing in swings], ["stiffness", "drag"], by="rollouts")
     assert result.estimates["stiffness"] == pytest.approx(20.0, rel=1e-7)

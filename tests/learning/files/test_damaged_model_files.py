@@ -59,7 +59,7 @@ def test_files_that_are_something_else(tmp_path):
             load_model(tmp_path / "other")
     with (tmp_path / "sparse").open("wb") as file:
         file.truncate(2**42)
-    with fails("sparse: it has 4398046511104 bytes; allowed is"):
+    with fails("sparse: it has 4398046511104 bytes; allowed are"):
         load_model(tmp_path / "sparse")
 
 

@@ -60,6 +60,7 @@ def only_positions(trajectory, after=0):
     return dataclasses.replace(trajectory, y=y, z=z)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", [None, pytest.param(4, marks=pytest.mark.campaign)])
 def test_loss_and_gradient(bars, residual, first):
     """The loss by `simulate` and NumPy; the gradient by finite differences along random directions."""
@@ -139,6 +140,7 @@ def simulated_error(model, trajectory):
     return float(np.sqrt(np.mean((found.part("p") - trajectory.part("p")) ** 2)))
 
 
+@pytest.mark.slow
 def test_it_learns_from_positions_alone(bars):
     """Nothing is known of forces, velocities and strains, and there is no stage before."""
     # of half as many rows what is learned, and so the error, is a matter of rounding
