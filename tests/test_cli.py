@@ -167,6 +167,7 @@ def test_equilibrium_estimates_its_error_and_warns_of_a_coarse_grid():
     assert "tip: (0.28029, 0, 0.551513) m" in paper and "COARSE GRID: " in paper
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "given",
     [

@@ -100,6 +100,7 @@ def prepare(page, folder):
             your_own_robot.record(folder / "afternoon" / f"{name}.csv", signal, 6.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", with_code(long=False))
 def test_its_python_runs(page, folder, capsys):
     assert run(page, False, capsys.readouterr)

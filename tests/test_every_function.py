@@ -217,7 +217,8 @@ def calls() -> Iterator[Any]:
     for kind in ROBOTS:
         for name in FUNCTIONS:
             often = (kind in OFTEN and name not in SLOW | LONG_FOR_MODELS) or (kind == "own" and name in OWN)
-            marks = [] if often or (name, kind) in LACKING else [pytest.mark.campaign]
+            quick = (name, kind) in LACKING or (often and name == "equilibrium")
+            marks = [] if quick else [pytest.mark.slow if often else pytest.mark.campaign]
             yield pytest.param(name, kind, marks=marks, id=f"{name}-{kind}")
 
 
@@ -326,7 +327,8 @@ def models() -> Iterator[Any]:
     """Residuals with nominal models. Long runs have the curved expansion of all of them, others of one."""
     for name in residuals():
         for kind, nominal in (("robot", ROBOT), ("own", CANE), ("model", MODEL)):
-            marks = [pytest.mark.campaign] if name == "curved" and kind != "robot" else []
+            long = name == "curved" and kind != "robot"
+            marks = [pytest.mark.campaign] if long else [pytest.mark.slow] if name == "curved" else []
             yield pytest.param(name, nominal, marks=marks, id=f"{name}-{kind}")
 
 

@@ -134,6 +134,7 @@ def test_a_wrong_call_says_what_it_got_and_what_it_takes(wrong, moved):
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 500
 
 
+@pytest.mark.slow
 def test_tensions_that_are_no_newtons_are_suspected():
     with pytest.raises(kc.SimulationError, match=r"tension is .* N, .* is it meant in another unit\?"):
         kc.simulate(ROBOT, 1e5 * TENSIONS, 0.05)

@@ -35,6 +35,7 @@ def test_missing_and_inaccurate_packages_are_reported():
     assert missing.startswith("| soromox | missing: No module named 'soromox' |")
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:bending_damping is 0")
 def test_the_rod_swings_about_its_sag_at_its_own_frequency():
     tips = matched.ours(6, 0.01, "trapezoidal")()[:, 0]

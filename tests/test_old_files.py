@@ -34,6 +34,7 @@ def test_a_trajectory():
     np.testing.assert_allclose(found.control[-1], TOLD["tension"])
 
 
+@pytest.mark.slow
 def test_a_model_predicts_what_it_did():
     model = kc.load_model(FILES / "model-1.model")
     before = kc.load_trajectory(FILES / "prediction-1.nc")
@@ -79,6 +80,7 @@ def test_a_trajectory_with_settings_and_results_of_earlier_versions(tmp_path, mo
     np.testing.assert_array_equal(kc.load_trajectory(tmp_path / "b.nc").result, found.result)
 
 
+@pytest.mark.slow
 def test_a_trajectory_without_a_final_state_goes_on_by_a_replay_of_its_rows(tmp_path):
     """Before `final_state`, files had the history in row 0, and c0, c1, c2, d1 and dt of the first step."""
     robot = kc.load_robot("delrin-tendon-robot").replace(nodes=5)

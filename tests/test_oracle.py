@@ -39,6 +39,7 @@ def oracle():
     }
 
 
+@pytest.mark.slow
 def test_the_transcription_converges_nearly_always(oracle):
     # where it does not it says nothing, so it must not be the reason for agreement
     valid = [result.valid_rows for result in oracle.values()]

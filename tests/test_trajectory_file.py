@@ -43,6 +43,7 @@ def test_trajectories_come_back_the_same(tmp_path, trajectory):
     assert os.listdir(tmp_path) == ["a.nc"]
 
 
+@pytest.mark.slow
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2), st.integers(1, 6), st.integers(2, 12), st.integers(0, 2**32))
 def test_trajectories_of_any_size_come_back_the_same(tmp_path_factory, batch, steps, nodes, seed):

@@ -78,6 +78,7 @@ def test_a_soft_limit_that_the_start_violates_is_reached_and_then_kept():
     assert np.all(log.tip[20:, 1] > 0.3 - 1e-3)
 
 
+@pytest.mark.slow
 def test_an_unannounced_step_is_reached_and_held():
     log = run_loop(controller(), plant(), steps([[0.05, 0.0, np.nan], [-0.05, 0.05, np.nan]], 2.0), 4.0)
     settled = (log.time % 2.0) >= 1.0
@@ -90,6 +91,7 @@ def test_a_wrong_stiffness_is_found_and_the_circle_followed(wrong_model):
     assert_allclose(wrong_model.parameters["youngs_modulus"][wrong_model.time > 5.0], E, rtol=0.03)
 
 
+@pytest.mark.slow
 def test_hard_limits_are_never_exceeded(wrong_model):
     control = wrong_model.control
     assert control.min() >= 0.0 and control.max() <= 10.0
@@ -199,6 +201,7 @@ def test_warming_up_leaves_the_observer_where_it_is():
     assert own.observer.belief is before and own.observer.time == 0.0
 
 
+@pytest.mark.slow
 def test_a_period_that_begins_late_is_counted():
     """The plant takes longer than a period, but less than two."""
 

@@ -63,6 +63,8 @@ elastica = pytest.importorskip("elastica", reason="the stand-in robot needs the 
 from knode_cosserat.control.elastica_plant import ElasticaPlant, record_elastica  # noqa: E402
 from knode_cosserat.control.elastica_rod import PERFECT, ElasticaRod, Imperfections  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def perfect():
@@ -74,7 +76,6 @@ def rubbing():
     return ElasticaRod(ROBOT, Imperfections())
 
 
-@pytest.mark.slow
 def test_a_static_tip_is_that_of_our_equations(perfect):
     """Two implementations of the same physics: the tip within 0.2 % of the length."""
     tension = np.array([9.0, 1.0, 0.0, 5.0])
@@ -85,7 +86,6 @@ def test_a_static_tip_is_that_of_our_equations(perfect):
     assert_allclose(perfect.quaternions([1.0])[0], np.asarray(found.quaternion[-1, -1]), atol=0.01)
 
 
-@pytest.mark.slow
 def test_the_loop_is_that_of_pyelastica(perfect):
     """Without tendons and damping the compiled loop takes the steps of PyElastica's own `PositionVerlet`.
 

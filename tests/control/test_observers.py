@@ -135,6 +135,7 @@ def test_a_wrong_start_is_corrected_from_the_tip_alone(kind, still):
     assert np.mean(inside[20:]) > 0.8
 
 
+@pytest.mark.slow
 def test_an_exact_window_is_that_of_least_squares(still):
     """Oracle: with a linear model the window's estimate is the filter's, whatever its length."""
     tension = np.asarray(TENSION)

@@ -62,6 +62,7 @@ def test_drawn_parameters_are_in_their_ranges_and_change_at_their_time(environme
     assert set(np.asarray(states.delay).tolist()) == {0, 1, 2}
 
 
+@pytest.mark.slow
 def test_the_same_key_gives_the_same_bits(environment, keys):
     def played():
         states, seen = environment.reset_many(keys)
@@ -125,6 +126,7 @@ def test_commands_keep_their_limits_and_rate(environment, keys):
         before = control
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [

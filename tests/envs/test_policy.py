@@ -103,6 +103,7 @@ def test_settings_of_a_training_that_are_not_allowed(environment):
         envs.Training(environment, steps=10)
 
 
+@pytest.mark.slow
 def test_scores_are_mean_rewards(environment, policy, keys):
     scores = envs.policy_scores(environment, policy, keys)
     states, seen = environment.reset_many(keys)
@@ -114,6 +115,7 @@ def test_scores_are_mean_rewards(environment, policy, keys):
     np.testing.assert_allclose(scores, total / environment.steps, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_policy_commands_a_plant_as_it_commands_the_environment(environment, policy, keys):
     """The controller sees measurements only, and gives the commands of an episode without noise and delay."""
     state, seen = jax.tree.map(lambda leaf: leaf[0], environment.reset_many(keys))

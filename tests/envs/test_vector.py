@@ -18,6 +18,7 @@ def again(vector, mode):
     return other
 
 
+@pytest.mark.slow
 def test_nothing_is_compiled_after_the_start(vector):
     vector.reset(seed=0)
     before = _COMPILATIONS.count
@@ -86,6 +87,7 @@ def test_wrong_numbers_and_modes_are_refused(environment, count, mode):
         envs.VectorEnv(environment, count, mode)
 
 
+@pytest.mark.slow
 def test_gymnasium_finds_nothing_to_complain_about(environment):
     check_env(envs.SingleEnv(environment), skip_render_check=True)
 

@@ -13,6 +13,8 @@ from knode_cosserat.hardware.emulation.robot import Switch
 from knode_cosserat.hardware.lines import GRAM_FORCE
 from knode_cosserat.hardware.serial_board import SerialBoard
 
+pytestmark = pytest.mark.slow
+
 if missing():
     pytest.skip(f"the firmware cannot be built here: {missing()}", allow_module_level=True)
 
@@ -54,7 +56,6 @@ def pull(board: SerialBoard) -> None:
         board.wait(0.05)
 
 
-@pytest.mark.slow
 def test_tension_steps_settle(robot: EmulatedRobot) -> None:
     with board_of(robot) as board:
         board.arm()
@@ -185,7 +186,6 @@ def test_an_emergency_stop_at_the_start_and_a_board_without_one(robot: EmulatedR
         robot.switch = "on"  # type: ignore[assignment]
 
 
-@pytest.mark.slow
 def test_a_bad_cable_neither_moves_wrongly_nor_stops_the_loop(robot: EmulatedRobot) -> None:
     random = np.random.default_rng(0)
 
@@ -215,7 +215,6 @@ def test_a_bad_cable_neither_moves_wrongly_nor_stops_the_loop(robot: EmulatedRob
     board.close()
 
 
-@pytest.mark.slow
 def test_two_runs_are_the_same_bits() -> None:
     def run() -> tuple[bytes, bytes]:
         robot = EmulatedRobot(seed=7)
@@ -227,7 +226,6 @@ def test_two_runs_are_the_same_bits() -> None:
     assert run() == run()
 
 
-@pytest.mark.slow
 def test_the_step_of_the_rod_does_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
     tips = []
     for count in (4, 2):

@@ -86,6 +86,7 @@ def test_a_lost_terminal_stops_the_robot():
     os.close(slave)
 
 
+@pytest.mark.slow
 def test_a_stop_comes_at_once_while_the_program_is_busy():
     driver, times, matrix = Stops(), [], np.random.default_rng(0).normal(size=(1500, 1500))
     driver.stop = lambda: times.append(time.monotonic())
@@ -159,6 +160,7 @@ def plant_of(robot, **more):
 AIM = kc.control.constant([0.05, 0.0, 0.62])
 
 
+@pytest.mark.slow
 def test_a_loop_moves_the_robot_and_keeps_the_time(robot, controller):
     plant = plant_of(robot)
     log = kc.control.run_loop(controller, plant, AIM, 1.5)

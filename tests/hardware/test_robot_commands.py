@@ -54,6 +54,7 @@ def answering(monkeypatch, *answers):
     return left
 
 
+@pytest.mark.slow
 def test_connect_shows_the_robot(folder):
     found = facts(run("robot", "connect", "--port", "simulated", "--robot", "rod.yaml", "--json"))
     assert found["state"] == "ready" and found["tendons"] == 4 and found["limits"]["high"] == 6.0
@@ -193,6 +194,7 @@ def test_run_closes_the_loop(folder):
     assert "--capture" in error(run("robot", "run", "rod.yaml", "--port", "/dev/ttyNONE9", *aim, "--yes"))
 
 
+@pytest.mark.slow
 def test_a_fault_while_running_keeps_the_log(folder):
     result = run(
         "robot", "run", "rod.yaml", "--port", "simulated?fault=over-tension:1,after=0.6", "--robot",

@@ -192,6 +192,7 @@ with SimulatedRobot(kc.load_robot("delrin-tendon-robot"), real_time=True) as rob
 """
 
 
+@pytest.mark.slow
 @needs_ros
 def test_commands_are_checked(ros):
     run = subprocess.run(

@@ -78,6 +78,7 @@ def test_pressed_is_smooth_and_that_of_a_beam_column():
     assert np.all(np.diff(beyond) < 0.0) and beyond == pytest.approx([-5e-8, -2.5, -25.0])
 
 
+@pytest.mark.slow
 def test_softening_by_tension_bends_the_rod_to_a_smaller_circle():
     """Closed form: T r/EI, softer by the factor of a beam-column, towards the tendon at 45 degrees."""
     robot = ROUTED.replace(gravity=(0.0, 0.0, 0.0))
@@ -174,6 +175,7 @@ def test_friction_at_rest_holds_the_robot_back():
     assert bent[0.0] == pytest.approx(np.linalg.norm(shape(ROUTED)[-1, :2]), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_its_parts_come_back_from_a_file(model, tmp_path):
     x = 0.3 * np.ones(model.size)
     robot = model.reduced(x, model.names)

@@ -121,6 +121,7 @@ def test_a_grid_is_too_coarse_or_fine_enough():
     assert has_coarse_rows(soft, data, "lobatto2")
 
 
+@pytest.mark.slow
 def test_bad_input_says_what_is_wrong():
     rod = kc.robots.SlenderRod(length=0.5, radius=0.003, density=1000.0, youngs_modulus=1e9)
     seen = measured(kc.robots.RoutedTendonRobot.like(NOMINAL), tensions(1.0, 1.0), "own", noise=0.0)

@@ -81,6 +81,7 @@ def test_rows_beyond_are_marked_and_said(model, seen, predicted):
     assert f"first at {first:g} s" in predicted.extrapolation
 
 
+@pytest.mark.slow
 def test_marks_survive_slices_files_continuing_batches_and_equilibria(
     model, ensemble, beyond, predicted, tmp_path
 ):

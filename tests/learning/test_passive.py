@@ -74,6 +74,7 @@ def test_the_law_has_its_moment():
     assert np.abs(own).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_zeros_change_nothing_and_numbers_come_back():
     tension = kc.controls.sine(1.0, 10, 0.05)
     plain = kc.simulate(ROBOT, tension, 0.05)

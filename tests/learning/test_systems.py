@@ -99,6 +99,7 @@ def laden(request):
     return kc.simulate(LADEN, control, DT, space=request.param)
 
 
+@pytest.mark.slow
 def test_samples_begin_beyond_what_acts_at_their_node(laden):
     data = samples(LADEN, [laden])
     y = np.asarray(data.segments.y).reshape(-1, 10, 19)

@@ -135,6 +135,7 @@ def bent(load, nodes=21, space="lobatto4"):
     return np.array([tip[0], LENGTH - tip[2]]) / LENGTH
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("load", ELASTICA)
 def test_elastica(load):
     # at 20 segments order 4 is better than the five digits that are published

@@ -133,6 +133,7 @@ def finely_stepped(robot):
     return motion(robot, 1024, time="bdf2")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("time", "order", "start"),
     # Before a robot's first state at rest was the same state: the paper's start is then as good as another.

@@ -72,6 +72,7 @@ def test_the_example_is_in_the_robots_frame(example):
     assert np.linalg.norm(example.tip_position, axis=1).max() < 0.637
 
 
+@pytest.mark.slow
 def test_the_papers_knowledge_misses_the_example_by_what_the_specification_says(example):
     # 60.9 by recordings.md, which does not say how tensions and poses were put on one clock: that moves the
     # figure by 0.5 (scanned: either clock, hold or interpolation, up to a row earlier or later)

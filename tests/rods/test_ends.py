@@ -96,6 +96,7 @@ def test_a_free_rod_that_spins_keeps_its_momenta():
     assert np.all(drift[1] < 1e-2) and np.all(drift[1] < 0.35 * drift[0] + 1e-7), drift
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", ["linear", "square"])
 def test_a_falling_rod_reaches_its_terminal_velocity(law):
     rhoA = float(LOOSE.mass_per_length)
@@ -156,6 +157,7 @@ HELD = kc.robots.SlenderRod(
 )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_where_the_base_is_moves_and_turns_everything():
     g = np.array([3.0, -4.0, -6.0])
     turn, shift = Rotation.from_rotvec([0.4, -1.1, 0.7]), np.array([0.3, -0.2, 0.5])
@@ -217,6 +219,7 @@ BEAM = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tip", [Clamped(), pytest.param(Pinned(), marks=pytest.mark.campaign)])
 def test_beams_held_at_both_ends(tip):
     w = 1e-3 * BEAM_EI

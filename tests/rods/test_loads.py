@@ -108,6 +108,7 @@ def test_a_load_between_nodes_keeps_order_four():
     assert errors[-1] < 2e-5 * L
 
 
+@pytest.mark.slow
 def test_a_force_that_follows_is_the_dead_force_seen_from_the_tip():
     force = np.array([1.2, 0.0, -0.4]) * EI / L**2
     following = rest(FOLLOWER__force=force)

@@ -54,6 +54,7 @@ def smooth(seed, steps=100):
 # symmetry
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("displacement", [0.0, 0.15])
 def test_equal_displacements_lift_the_platform_without_tilting_it(displacement):
     found, y = still(ROBOT, [displacement] * 6)
@@ -246,6 +247,7 @@ def swung():
     return kc.simulate(ROBOT, smooth(0), DT)
 
 
+@pytest.mark.slow
 def test_a_simulation_begins_in_equilibrium_and_stays_there():
     resting = kc.simulate(ROBOT, np.zeros((3, 6)), DT)
     found, _ = still(ROBOT, np.zeros(6))

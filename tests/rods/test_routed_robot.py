@@ -104,6 +104,7 @@ def test_friction_is_the_same_however_fine_the_time_steps_are():
     assert errors[0] > 1.6 * errors[1] > 2.5 * errors[2]
 
 
+@pytest.mark.slow
 def test_friction_stays_between_none_and_all_and_opposes_motion():
     # of the same parts as above, for the same program
     robot = kc.robots.RoutedTendonRobot.like(KNOWLEDGE, **RUBBING, sections=(Sleeve(stiffening=1.0),))

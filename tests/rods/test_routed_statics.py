@@ -111,6 +111,7 @@ def test_a_slack_tendon_does_nothing_until_it_is_pulled_in_again():
     assert np.linalg.norm(found.tip_position[-1] - [0, 0, L]) > 0.05
 
 
+@pytest.mark.slow
 def test_a_tendon_that_gives_takes_more_pulling():
     taken_in = np.array([0.003, -0.05, -0.05, -0.05])
     T = [

@@ -76,6 +76,7 @@ def test_a_cone_bends_as_the_integral_of_its_stiffness():
     assert rest(cone).tip_position[0, 0] == pytest.approx(expected, rel=2e-5)
 
 
+@pytest.mark.slow
 def test_stiffness_along_the_rod_and_by_control():
     M = 0.5 * EI / L
     robot = changed({"stiffness_gain": 0.5}, stiffness_0=[2.0, 0.0], stiffness_1=[3.0, 2.0])
@@ -271,6 +272,7 @@ def test_nothing_is_left_of_no_section(given, said):
     kc.robots.Stretch(radius=[1.0, -3.9, 4.0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gain", [0.2, -0.2])
 def test_a_control_leaves_some_stiffness(gain):
     rod = kc.robots.SlenderRod(

@@ -125,6 +125,7 @@ def test_the_law_agrees_with_rucker_and_webster(case, tensions):
     assert np.linalg.norm(found[:3] - [0.0, 0.0, L]) > 5e-3
 
 
+@pytest.mark.slow
 def test_a_soft_rod_that_its_tendons_compress():
     tensions = np.array([4.0, 3.0, 3.5, 3.0])
     routings = [Straight(0.006 * np.cos(a), 0.006 * np.sin(a)) for a in QUARTERS]

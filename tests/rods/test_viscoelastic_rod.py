@@ -34,6 +34,7 @@ def test_without_its_branch_it_is_a_slender_rod():
     np.testing.assert_allclose(rod.tip_position, plain.tip_position, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_under_a_lasting_force_it_creeps_from_the_stiff_shape_to_that_at_rest():
     rod = ViscoelasticRod(**BODY, branch_stiffness=1.0, relaxation_time=5.0)
     stiff = bent(kc.robots.SlenderRod(**{**BODY, "youngs_modulus": 2 * BODY["youngs_modulus"]}))

@@ -54,12 +54,14 @@ def test_a_body_between_nodes_has_no_error_of_second_order(errors):
     assert lines[1] > 1e-3 and by_z[1] < 0.02 * lines[1] and by_y[1] < 0.05 * lines[1]
 
 
+@pytest.mark.slow
 def test_nodes_are_as_they_are():
     rest = solved(9)
     places = places_at(np.linspace(0.0, 1.0, 9), 9)
     np.testing.assert_allclose(positions_at(rest.system, rest.y, places), rest.position, atol=1e-15)
 
 
+@pytest.mark.slow
 def test_it_is_differentiable():
     rest = solved(9)
     places, y = places_at(FRACTIONS, 9), np.asarray(rest.y)

@@ -96,6 +96,7 @@ def share_solved(cases: list[Case], title: str) -> float:
     return float(share)
 
 
+@pytest.mark.slow
 def test_a_sample_of_random_cases():
     assert share_solved([draw(seed, nodes=(10, 25)) for seed in range(60)], "sample") >= 0.98
 

@@ -179,6 +179,7 @@ def test_under_transformations_unsolved_rows_are_nan(jitted):
     assert np.all(np.isnan(found.y[first:])) and np.all(np.isfinite(found.y[:first]))
 
 
+@pytest.mark.slow
 def test_jit_equals_plain(jitted, sine, truth):
     found = jitted(sine)
     np.testing.assert_allclose(found.y, truth.y, atol=1e-9)
@@ -299,6 +300,7 @@ def test_bad_input_is_one_clear_line(robot, change, message):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
 def test_batches_that_do_not_fit(robot, sine):
     with pytest.raises(ValueError, match="2 robots but 3 controls"):
         kc.simulate([robot, robot], np.stack([sine] * 3), DT)

@@ -154,6 +154,7 @@ def assert_effective(case, space, segments):
     assert np.all((ratio > 0.3) & (ratio < 3.0)), ratio
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_the_estimated_error_of_positions(case):
     for segments in (6, 12):

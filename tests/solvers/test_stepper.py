@@ -98,6 +98,7 @@ def test_a_step_without_a_solution_is_said_and_leaves_the_robot_where_it_is(robo
     np.testing.assert_array_equal(stepper.step(sine[2]).y, other.step(sine[2]).y)
 
 
+@pytest.mark.slow
 def test_a_row_of_a_coarse_grid_says_so(robot):
     stepper = kc.solvers.Stepper(robot.replace(nodes=3), DT)
     row = stepper.step([60.0, 0.0, 0.0, 60.0])

@@ -33,6 +33,7 @@ def test_reach_tells_tensions_that_reach():
     assert text.startswith("reached; ") and "at the lower limit: 3, 4" in text
 
 
+@pytest.mark.slow
 def test_reach_says_what_it_cannot():
     facts = told("reach", ROBOT, "--position", 0, 0, 2, "--high", "1,2,3,4")
     assert facts["result"] == "unreachable" and not facts["converged"]

@@ -57,6 +57,7 @@ def test_a_model_that_was_learned_is_led_as_well():
         np.testing.assert_allclose(tip(model, found.control)[0], position, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_pose_and_orientation_alone_are_reached():
     control = np.array([4.0, 1.0, 0.5, 2.0])
     position, quaternion = tip(ROBOT, control)
@@ -163,6 +164,7 @@ def middle(system, y):
     return 0.5 * system.positions(y), system.quaternions(y)
 
 
+@pytest.mark.slow
 def test_the_pose_may_be_any_function_of_the_last_node():
     position, _ = tip(ROBOT, [4.0, 1.0, 0.0, 0.0])
     found = kc.inverse_kinematics(ROBOT, 0.5 * position, low=0.0, high=HIGH, pose=middle)

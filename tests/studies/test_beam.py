@@ -148,6 +148,7 @@ def test_the_command_writes_errors_table_and_figure(tmp_path):
     assert (tmp_path / "figures" / "beam.png").exists()
 
 
+@pytest.mark.slow
 def test_the_held_beam_is_at_its_height():
     rod = beam_rod(dataclasses.replace(NOMINAL, tilt=0.1), 0.052, COARSE.nodes)
     held = held_beam(rod, 0.052, -1e-3)

@@ -50,6 +50,7 @@ def test_the_baseline_is_the_papers(baseline):
         assert (cell["tip_dtw"], cell["pose_mse"]) == pytest.approx(paper, abs=0.005)
 
 
+@pytest.mark.slow
 def test_what_is_written_is_complete(baseline):
     figures = {path.name for path in (baseline / "figures").iterdir()}
     shapes = {

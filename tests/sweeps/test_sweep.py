@@ -77,6 +77,7 @@ def test_cases_are_simulations(whole):
     assert whole.unit("length") == "m" and whole.unit("tip_position") == "m"
 
 
+@pytest.mark.slow
 def test_failed_cases_are_kept_with_their_reasons(whole):
     failed = {each.case: each for each in whole.failed()}
     assert len(failed) == whole.failed_count == 24

@@ -198,7 +198,10 @@ def test_the_exported_file_and_the_log_are_the_run(followed, tmp_path):
         give({"command": "resume"})
         await connection.until(lambda head: is_frame(head) and head[1] > 0.5)
         give({"command": "pause"})
-        await asyncio.sleep(2 * DT)
+        # the period that has begun ends
+        count = -1
+        while count != (count := len(followed.loop.log().time)):
+            await asyncio.sleep(5 * DT)
         files = []
         for command in ("export", "log"):
             give({"command": command})

@@ -23,6 +23,8 @@ from knode_cosserat.solvers import semi_discrete
 from tests.learning.bar import BAR, WRONG, Bar, pulled
 from tests.learning.calibration.data import DT, FOUR, ROBOT, noisy, sines
 
+pytestmark = pytest.mark.slow
+
 # what is found in data without noise
 
 

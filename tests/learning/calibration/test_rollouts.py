@@ -19,6 +19,7 @@ class Hanging(Bar):
         return super().balance(s, t, y, y_t, z, z_t, control).at[1].add(-9.81 * self.density)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("space", [pytest.param("euler", marks=pytest.mark.campaign), "lobatto4"])
 def test_where_a_robot_begins_depends_on_its_parameters_too(space):
     bar = Hanging(**{name: getattr(BAR, name) for name in BAR.parameters()}, nodes=6)

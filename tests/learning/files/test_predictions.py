@@ -36,6 +36,7 @@ def assert_same_states(a, b):
     assert a.settings == b.settings
 
 
+@pytest.mark.slow
 def test_a_prediction_comes_back_with_its_model(prediction):
     trajectory, path = prediction
     found = kc.load_trajectory(path)

@@ -49,6 +49,7 @@ def left(model, knowledge, truth, controls=UNSEEN, dt=DT, **options):
     return kc.metrics.tip_dtw(ours, true) / kc.metrics.tip_dtw(base, true)
 
 
+@pytest.mark.slow
 def test_a_wrong_length_is_a_stretch_and_nothing_else(robot):
     knowledge = robot.replace(length=0.4)
     model = learned(knowledge, recorded(robot))

@@ -83,6 +83,7 @@ def interrupted(monkeypatch):
     return after
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("every", [1, 7, 40, 1000])
 def test_interrupted_and_resumed(bars, tmp_path, interrupted, monkeypatch, every):
     expected = fit(WRONG, bars, CONFIG)
@@ -100,6 +101,7 @@ def test_interrupted_and_resumed(bars, tmp_path, interrupted, monkeypatch, every
     assert_same(fit(WRONG, bars, CONFIG, checkpoint=tmp_path, checkpoint_every=every), expected)
 
 
+@pytest.mark.slow
 def test_resumed_with_early_stopping(bars, tmp_path, interrupted, monkeypatch):
     """The best weights so far, and what was seen of the held-out rollouts, are kept too."""
     training = Training(epochs=400, learning_rate=0.02, schedule="constant", stop_after=40, check_every=10)

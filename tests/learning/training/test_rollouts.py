@@ -93,6 +93,7 @@ def _moved(residual, ways, step):
     return jax.tree.map(lambda a, b: b if a is None else a, weights, rest, is_leaf=lambda x: x is None)
 
 
+@pytest.mark.slow
 def test_one_program_for_trajectories_of_one_length(bars, residual):
     """Two lengths are two parts, each trajectory counting one; more of the same length trace nothing anew."""
     both = trajectory_batches(WRONG, [bars[0], bars[1][:5], bars[1]], RolloutTraining())
@@ -118,6 +119,7 @@ def test_a_quaternion_is_compared_up_to_its_sign_and_length():
     )
 
 
+@pytest.mark.slow
 def test_held_out_error_is_that_of_simulate(bars, residual):
     model = KNODE(WRONG, residual)
     shorter = pulled(0.7)[:9]
@@ -230,6 +232,7 @@ class Torn(type(BAR)):
         return 1.0 + control**2 + y[1:2] ** 2
 
 
+@pytest.mark.slow
 def test_a_model_that_cannot_be_simulated(bars):
     config = FitConfig(NetworkOptions(hidden=5, convex=False), None, OPTIONS)
     with pytest.raises(
