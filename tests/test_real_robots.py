@@ -65,7 +65,7 @@ def test_three_cables_are_read():
     assert np.all(unused.tension.min(axis=1) == 0.0) and np.all(unused.position[:, 0, 2] > 0.05)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_three_cables_are_predicted():
     unused = cables("held_out.csv")
     robots = [kc.load_robot(CABLES / f"{name}.yaml") for name in ("nominal", "identified")]
