@@ -201,6 +201,7 @@ def test_constant_controls_are_given_by_their_numbers(tmp_path):
         np.testing.assert_array_equal(kc.load_trajectory(out).control[1:], [[7, 5, 5, 7]] * 2)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("always:bending_damping is 0")
 def test_undamped_motion_gives_a_warning(tmp_path):
     result = run(*simulated(tmp_path / "a.nc", "--set", "bending_damping=0", "--json"))

@@ -37,6 +37,8 @@ from knode_cosserat.estimation.online import predicted_motion, split_record
 from knode_cosserat.identification.evaluate import evaluate
 from knode_cosserat.learning.residual import Nothing
 
+pytestmark = pytest.mark.slow
+
 DT, LENGTH = 0.05, 0.635
 ROBOT = kc.load_robot("delrin-tendon-robot")
 E = float(ROBOT.youngs_modulus)
@@ -62,14 +64,12 @@ def wrong_model():
     return run_loop(controller(model), plant(noise=0.5, dropout=0.05), circle(0.1, 1.5), 7.0)
 
 
-@pytest.mark.slow
 def test_an_exact_model_follows_a_fast_circle():
     log = run_loop(controller(), plant(), circle(0.1, 1.5), 6.0)
     assert log.tip_rmse(5.0) <= 1e-3 * LENGTH
     assert log.fallbacks == 0
 
 
-@pytest.mark.slow
 def test_a_soft_limit_that_the_start_violates_is_reached_and_then_kept():
     limit = SoftLimit(TipPosition(), low=[-np.inf, 0.3, -np.inf])
     log = run_loop(controller(soft=[limit]), plant(), circle(0.1, 4.0), 3.0)
@@ -78,20 +78,17 @@ def test_a_soft_limit_that_the_start_violates_is_reached_and_then_kept():
     assert np.all(log.tip[20:, 1] > 0.3 - 1e-3)
 
 
-@pytest.mark.slow
 def test_an_unannounced_step_is_reached_and_held():
     log = run_loop(controller(), plant(), steps([[0.05, 0.0, np.nan], [-0.05, 0.05, np.nan]], 2.0), 4.0)
     settled = (log.time % 2.0) >= 1.0
     assert np.max(log.tip_distance[settled]) < 1e-3 * LENGTH
 
 
-@pytest.mark.slow
 def test_a_wrong_stiffness_is_found_and_the_circle_followed(wrong_model):
     assert wrong_model.tip_rmse(5.0) <= 5e-3 * LENGTH
     assert_allclose(wrong_model.parameters["youngs_modulus"][wrong_model.time > 5.0], E, rtol=0.03)
 
 
-@pytest.mark.slow
 def test_hard_limits_are_never_exceeded(wrong_model):
     control = wrong_model.control
     assert control.min() >= 0.0 and control.max() <= 10.0
@@ -107,7 +104,6 @@ def test_a_log_reports_and_is_written(wrong_model, tmp_path):
     assert "tip RMSE" in repr(wrong_model)
 
 
-@pytest.mark.slow
 def test_a_loop_is_a_recording_of_its_robot(tmp_path):
     log = run_loop(controller(), plant(), circle(0.1, 1.5), 2.0)
     log.measurements(simulated=True).save(tmp_path / "loop.csv")
@@ -120,7 +116,6 @@ def test_a_loop_is_a_recording_of_its_robot(tmp_path):
         log.measurements((0.5, 1.0))
 
 
-@pytest.mark.slow
 def test_a_loop_has_the_estimated_states_as_a_trajectory(tmp_path):
     robot = plant()
     log = run_loop(controller(), robot, circle(0.1, 1.5), 2.0)
@@ -142,7 +137,6 @@ def test_a_reference_of_other_numbers_is_not_taken_for_positions():
         check_reference(controller(), constant([3.0, -2.0, 0.0]), 1.0)
 
 
-@pytest.mark.slow
 def test_what_cannot_be_followed_is_told_before_the_loop_starts():
     with pytest.raises(ReferenceFormatError, match=r"is 100 m from the base.*the robot is 0.635 m long"):
         run_loop(controller(), plant(), circle(100.0, 4.0), 2.0)
@@ -201,7 +195,6 @@ def test_warming_up_leaves_the_observer_where_it_is():
     assert own.observer.belief is before and own.observer.time == 0.0
 
 
-@pytest.mark.slow
 def test_a_period_that_begins_late_is_counted():
     """The plant takes longer than a period, but less than two."""
 

@@ -21,6 +21,8 @@ from knode_cosserat.estimation.adapted import AdaptedParameters
 from knode_cosserat.rods.loads import AttachedMass, PointWrench
 from knode_cosserat.solvers import Stepper
 
+pytestmark = pytest.mark.slow
+
 DT = 0.05
 ROBOT = kc.load_robot("delrin-tendon-robot")
 TENSION = np.array([4.0, 1.0, 1.0, 2.0])
@@ -125,7 +127,6 @@ def followed(observer, still, count=60):
     return np.array(errors), np.array(inside)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", [KalmanObserver, MovingHorizonObserver])
 def test_a_wrong_start_is_corrected_from_the_tip_alone(kind, still):
     """After one second the shape is within 0.5 % of the length, with the sensor's noise."""
@@ -135,7 +136,6 @@ def test_a_wrong_start_is_corrected_from_the_tip_alone(kind, still):
     assert np.mean(inside[20:]) > 0.8
 
 
-@pytest.mark.slow
 def test_an_exact_window_is_that_of_least_squares(still):
     """Oracle: with a linear model the window's estimate is the filter's, whatever its length."""
     tension = np.asarray(TENSION)
@@ -173,7 +173,6 @@ def test_the_boundary_observer_converges_to_a_loaded_robot(still):
         BoundaryObserver(kc.load_robot("six-legged-robot"), DT)
 
 
-@pytest.mark.slow
 def test_an_unknown_force_at_the_tip_is_found():
     """From the noisy position of the tip alone, within 10 % after six seconds of movement."""
     model, force = ROBOT.replace(loads=(PointWrench(),)), np.array([0.06, -0.04, 0.05])

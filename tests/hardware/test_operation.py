@@ -17,6 +17,8 @@ from knode_cosserat.hardware.plant import HardwarePlant
 from knode_cosserat.hardware.safety import EmergencyStop, SafeRegion, StoppedError
 from knode_cosserat.hardware.simulated import MachineParameters, SimulatedRobot
 
+pytestmark = pytest.mark.slow
+
 ROD = kc.load_robot("delrin-tendon-robot").replace(nodes=6)
 DT = 0.06
 
@@ -86,7 +88,6 @@ def test_a_lost_terminal_stops_the_robot():
     os.close(slave)
 
 
-@pytest.mark.slow
 def test_a_stop_comes_at_once_while_the_program_is_busy():
     driver, times, matrix = Stops(), [], np.random.default_rng(0).normal(size=(1500, 1500))
     driver.stop = lambda: times.append(time.monotonic())
@@ -160,7 +161,6 @@ def plant_of(robot, **more):
 AIM = kc.control.constant([0.05, 0.0, 0.62])
 
 
-@pytest.mark.slow
 def test_a_loop_moves_the_robot_and_keeps_the_time(robot, controller):
     plant = plant_of(robot)
     log = kc.control.run_loop(controller, plant, AIM, 1.5)

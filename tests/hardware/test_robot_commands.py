@@ -21,6 +21,8 @@ from knode_cosserat.hardware.simulated import SimulatedRobot
 from tests.commands import run
 from tests.hardware.fake_board import FakeBoard
 
+pytestmark = pytest.mark.slow
+
 ROD = kc.load_robot("delrin-tendon-robot").replace(nodes=6)
 
 
@@ -54,7 +56,6 @@ def answering(monkeypatch, *answers):
     return left
 
 
-@pytest.mark.slow
 def test_connect_shows_the_robot(folder):
     found = facts(run("robot", "connect", "--port", "simulated", "--robot", "rod.yaml", "--json"))
     assert found["state"] == "ready" and found["tendons"] == 4 and found["limits"]["high"] == 6.0
@@ -183,7 +184,6 @@ def test_a_fault_while_recording_keeps_the_bag(folder):
     assert recording.sampled(0.05).time[-1] > 0.3
 
 
-@pytest.mark.slow
 def test_run_closes_the_loop(folder):
     words = ("robot", "run", "rod.yaml", "--port", "simulated", "--robot", "rod.yaml", "--yes", "--json")
     aim = ("--reference", "circle:radius=0.03,period=3", "--method", "kinematic", "--dt", "0.06")
@@ -194,7 +194,6 @@ def test_run_closes_the_loop(folder):
     assert "--capture" in error(run("robot", "run", "rod.yaml", "--port", "/dev/ttyNONE9", *aim, "--yes"))
 
 
-@pytest.mark.slow
 def test_a_fault_while_running_keeps_the_log(folder):
     result = run(
         "robot", "run", "rod.yaml", "--port", "simulated?fault=over-tension:1,after=0.6", "--robot",
@@ -286,7 +285,6 @@ def test_keys_steer_and_stop_and_the_terminal_is_restored(folder):
     os.close(slave)
 
 
-@pytest.mark.slow
 def test_the_firmware_passes_its_commissioning(folder):
     from knode_cosserat.hardware.emulation import missing
 

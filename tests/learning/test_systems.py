@@ -119,6 +119,7 @@ def test_samples_begin_beyond_what_acts_at_their_node(laden):
     np.testing.assert_allclose(-jump[1:, layout.slice("n")], expected, atol=0.02)
 
 
+@pytest.mark.slow
 def test_slopes_do_not_go_over_what_acts(laden):
     data = samples(LADEN, [laden])
     n = LADEN.y_layout.slice("n")

@@ -142,6 +142,7 @@ def test_elastica(load):
     np.testing.assert_allclose(bent(load), elastica(load), rtol=0, atol=5e-6)
 
 
+@pytest.mark.slow
 def test_elastica_in_another_direction():
     # the force along -y instead of x, of a rod whose x and y are alike
     tip = shape(rod(tip_force=(0.0, -2 * FORCE, 0.0)))[-1]

@@ -188,6 +188,7 @@ def test_batch_of_robots_is_each_by_itself(robot):
 # energy
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damping", [{"bending_damping": 0.03}, {"bending_damping": 0.003, "drag": 0.05}])
 def test_damping_only_takes_energy(robot, damping):
     free = robot.replace(gravity=(0.0, 0.0, 0.0), **damping)

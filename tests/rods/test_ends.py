@@ -112,6 +112,7 @@ def test_a_falling_rod_reaches_its_terminal_velocity(law):
     np.testing.assert_allclose(speed, expected, atol=0.05 * wanted)
 
 
+@pytest.mark.slow
 def test_a_rod_on_a_plane_is_carried_by_it():
     k, δ = 2e4, 1e-4
     plane = {

@@ -121,6 +121,7 @@ def test_a_force_that_follows_is_the_dead_force_seen_from_the_tip():
         np.testing.assert_allclose(field(dead, name), field(following, name), atol=1e-8 * size)
 
 
+@pytest.mark.slow
 def test_a_load_on_a_part_of_the_rod_is_carried_by_the_base():
     f = np.array([4.0, -2.0, 1.0]) * EI / L**3
     n = field(rest(SPREAD__force=f), "n")

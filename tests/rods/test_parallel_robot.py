@@ -255,6 +255,7 @@ def test_a_simulation_begins_in_equilibrium_and_stays_there():
     np.testing.assert_allclose(resting.position[-1], resting.position[0], atol=1e-8)
 
 
+@pytest.mark.slow
 def test_the_actuators_move_as_they_are_told():
     base = ROBOT.leg_positions(swung().y[:, 0])
     np.testing.assert_allclose(base[1:, :, 2], smooth(0), atol=1e-12)

@@ -36,6 +36,7 @@ def test_a_robot_without_tendons_is_refused(empty):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tension", [0.5, 3.0])
 def test_one_tendon_bends_the_rod_evenly(tension):
     robot = kc.robots.RoutedTendonRobot.like(KNOWLEDGE, **NO_LOADS)

@@ -156,6 +156,7 @@ def test_what_is_learned_is_tabled_beside_the_papers_and_kept(tmp_path, one_impe
     assert kc.load_trajectory(tmp_path / "trajectories/length-best-sine.nc").y.shape == truth.y.shape
 
 
+@pytest.mark.slow
 def test_what_fails_is_recorded_and_shown(tmp_path, one_imperfection, monkeypatch):
     true = simulation.simulate
 

@@ -94,6 +94,7 @@ def test_failed_cases_are_kept_with_their_reasons(whole):
     assert np.all(result[solved] >= 0) and np.all(np.isfinite(tip[solved]))
 
 
+@pytest.mark.slow
 def test_the_data_say_what_they_are(whole):
     text = repr(whole)
     assert "48 of 48 cases (complete), 24 failed" in text and "length 0.5 to 0.7 m" in text

@@ -193,6 +193,7 @@ def kept(bars, tmp_path):
     return tmp_path / "segments-0.checkpoint"
 
 
+@pytest.mark.slow
 def test_another_fit_is_refused(bars, kept):
     other = dataclasses.replace(CONFIG.segments, learning_rate=0.02)
     for arguments, words in (
