@@ -61,6 +61,8 @@ def require_sound(path: Path) -> None:
 
 def _require_end(path: Path, size: int) -> None:
     """Raise `TrajectoryFileError` if HDF5 does not end with a file, or crashes."""
+    if not sys.executable or getattr(sys, "frozen", False):
+        return  # within another program there is no interpreter to start
     # -P: the script's folder is no place of modules
     command = [sys.executable, "-P", str(PROBE), str(path)]
     with subprocess.Popen(
