@@ -64,6 +64,7 @@ def wrong_model():
     return run_loop(controller(model), plant(noise=0.5, dropout=0.05), circle(0.1, 1.5), 7.0)
 
 
+@pytest.mark.campaign
 def test_an_exact_model_follows_a_fast_circle():
     log = run_loop(controller(), plant(), circle(0.1, 1.5), 6.0)
     assert log.tip_rmse(5.0) <= 1e-3 * LENGTH

@@ -46,7 +46,7 @@ def test_a_coefficient_of_another_shape_is_refused():
         MODEL.replace(**{"residual.damping": np.zeros(4)})
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_a_change_of_the_robot_is_found_in_the_residuals_coefficients():
     """The robot's residual stiffness changes; the observer adapts the model's coefficients to it."""
     true = np.zeros((3, 3))

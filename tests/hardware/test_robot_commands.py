@@ -285,6 +285,7 @@ def test_keys_steer_and_stop_and_the_terminal_is_restored(folder):
     os.close(slave)
 
 
+@pytest.mark.campaign
 def test_the_firmware_passes_its_commissioning(folder):
     from knode_cosserat.hardware.emulation import missing
 

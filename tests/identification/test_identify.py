@@ -87,7 +87,7 @@ def test_named_effects_and_their_intervals(tmp_path):
     assert outside.extrapolated > 0.3 and "of the rows extrapolated" in str(outside)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_a_robots_own_motion_is_predicted_however_bodies_are_mounted():
     true = kc.robots.RoutedTendonRobot.like(NOMINAL)
     seen = measured(true, tensions(1.0, 1.0), "own", noise=0.0)

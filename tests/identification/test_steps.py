@@ -46,7 +46,7 @@ def test_the_last_step_of_a_row_has_its_tension_and_lines_stay_lines(count, rows
     assert_allclose(stepped(line, np.zeros(3), count, False), np.repeat(line, count, axis=0))
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_rows_of_a_continuous_signal_are_those_of_much_finer_steps():
     """Oracle: 16 times as many steps. BDF2 from row to row is far from it."""
     robot = ROBOT.replace(bending_damping=1e-3, youngs_modulus=4e9, nodes=20)

@@ -33,7 +33,7 @@ def test_every_limit_is_checked(facts):
     assert "| gate" in text and "no" in text
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_the_rate_counts_steps_and_repeats_bit_for_bit():
     found = environments.rate({"episodes": 8}).facts
     assert found["compiled"] == 0 and found["different"] == 0
