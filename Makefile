@@ -33,7 +33,7 @@ notebooks: $(READY) ## run the notebooks' texts, and write docs/notebooks/*.ipyn
 
 env: $(READY) ## make the environment
 
-test: $(READY) ## run the tests, but for the slow and the long ones (some 6 min on two cores)
+test: $(READY) ## run the tests, but for the slow and the long ones (some 7 min on two cores)
 	$(BIN)/python -m pytest -n $(JOBS) $(BY_FILE) -m "not slow and not campaign" $(PYTEST_ARGS)
 
 test-slow: $(READY) ## run the tests of more than some seconds each, as CI does after `make test` (some 12 min)

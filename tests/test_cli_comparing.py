@@ -5,6 +5,8 @@ import pytest
 import knode_cosserat as kc
 from tests.commands import ROBOT, run, simulated, succeeded, told
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def truth(tmp_path_factory):

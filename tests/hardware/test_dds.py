@@ -23,6 +23,8 @@ from knode_cosserat.hardware.middleware import dds, idl
 from knode_cosserat.hardware.middleware.dds import DDSBridge
 from knode_cosserat.hardware.middleware.loopback import measure_loopback
 
+pytestmark = pytest.mark.slow
+
 #: each test that opens a domain has another one
 DOMAIN = 10 + os.getpid() % 70
 

@@ -69,6 +69,7 @@ def test_pose_and_orientation_alone_are_reached():
     assert turned.position_error == 0.0
 
 
+@pytest.mark.slow
 def test_least_tension_beyond_the_lower_limits_is_taken():
     """The crude model feels the resultant alone: of two opposite tendons one is at its lower limit."""
     low = np.array([1.0, 2.0, 0.5, 1.5])
@@ -84,6 +85,7 @@ def test_least_tension_beyond_the_lower_limits_is_taken():
     np.testing.assert_array_equal(found.control[2:], low[2:])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", [(0.5, 0.2, 0.6), (0.1, 0.1, 0.9), (0.3, 0.0, 0.2)])
 def test_what_cannot_be_reached_gives_the_nearest(target):
     """First-order optimal: the distance has no slope but into limits that are active."""

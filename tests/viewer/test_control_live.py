@@ -24,6 +24,8 @@ from knode_cosserat.viewer.record import STATUSES
 from tests.commands import run
 from tests.viewer.connection import Connection, numbers
 
+pytestmark = pytest.mark.slow
+
 DT, LIMITS = 0.05, ControlLimits(0.0, 10.0, 40.0)
 #: (m) reached without a limit; and one that is out of reach
 NEAR, FAR = [0.08, 0.04, None], [0.3, 0.1, 0.9]
@@ -79,7 +81,6 @@ def is_frame(said):
     return not isinstance(said, dict)
 
 
-@pytest.mark.slow
 def test_a_dragged_target_moves_the_reference_and_the_robot_follows(followed):
     async def talk(connection, session):
         connection.given.put_nowait({"target": NEAR, "sequence": 3})
@@ -375,7 +376,6 @@ def address(loop):
     return found[0]
 
 
-@pytest.mark.slow
 def test_the_target_is_dragged_and_the_robot_follows(browser, address, loop, tmp_path):
     loop.position = loop.start
     browser.size(1280, 860)

@@ -14,6 +14,8 @@ from knode_cosserat.learning.structured.residual import Structured
 from knode_cosserat.trajectory_system import TrajectoryFileError
 from tests.learning.files.made import MODELS, ROBOT, STRING, TENSIONS, Pull, assert_same, fails, network
 
+pytestmark = pytest.mark.slow
+
 # trajectories
 
 
@@ -36,7 +38,6 @@ def assert_same_states(a, b):
     assert a.settings == b.settings
 
 
-@pytest.mark.slow
 def test_a_prediction_comes_back_with_its_model(prediction):
     trajectory, path = prediction
     found = kc.load_trajectory(path)
