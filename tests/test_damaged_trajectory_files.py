@@ -356,7 +356,7 @@ def test_hdf5_may_loop_for_ever_on_a_file_without_a_checksum(path, monkeypatch):
     content[entry : entry + 16] = bytes(16)
     path.write_bytes(content)
     monkeypatch.setattr(trajectory_integrity, "PATIENCE", 1.0)
-    with fails("HDF5 does not come to an end with it"):
+    with fails("HDF5 hangs when it reads it"):
         load_trajectory(path)
 
 

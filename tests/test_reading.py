@@ -5,7 +5,8 @@ import os
 import pytest
 
 from knode_cosserat._files import reading
-from knode_cosserat._files.reading import ReadError, json_value, read_bytes, read_text
+from knode_cosserat._files.json_text import parse_json
+from knode_cosserat._files.reading import ReadError, read_bytes, read_text
 
 
 def pipe_of(content):
@@ -56,4 +57,4 @@ def test_reasons_are_one_line(tmp_path):
 )
 def test_json(text, reason):
     with pytest.raises(ReadError, match=reason):
-        json_value(text)
+        parse_json(text)

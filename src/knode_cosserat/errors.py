@@ -18,3 +18,9 @@ class KnodeCosseratError(Exception):
     def __str__(self) -> str:
         """Return the message in one line: names that come from files may have line breaks."""
         return " ".join(super().__str__().splitlines())
+
+
+def first_line(error: BaseException) -> str:
+    """Return the first line of an error's message (300 characters at most), or the name of its class."""
+    lines = str(error).strip().splitlines()
+    return lines[0][:300] if lines else type(error).__name__

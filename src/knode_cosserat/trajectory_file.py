@@ -8,17 +8,18 @@ Reading runs no code from the file.
 
 from __future__ import annotations
 
-import io
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from knode_cosserat._files.json_text import parse_json
 from knode_cosserat._files.limits import LimitSettingError
-from knode_cosserat._files.reading import json_value
+from knode_cosserat._files.netcdf import netcdf_in_memory
 from knode_cosserat._files.writing import package_version, replacing
 from knode_cosserat._registry import provide
+from knode_cosserat.errors import first_line
 from knode_cosserat.rods.layout import Field, Layout
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.history import GUESS_STATES, SolverState, StateHistory
@@ -31,7 +32,7 @@ from knode_cosserat.trajectory_integrity import (
     checksum,
     require_own_data,
     require_possible,
-    require_sound,
+    require_readable,
     seal,
 )  # fmt: skip
 from knode_cosserat.trajectory_system import (
@@ -40,7 +41,6 @@ from knode_cosserat.trajectory_system import (
     SIZES,
     TrajectoryFileError,
     described,
-    first_line,
     labels,
     system_of,
     values_of,
@@ -100,9 +100,7 @@ def save(trajectory: Trajectory, path: str | Path) -> None:
     data = _dataset(trajectory, str(path))
     # by default xarray declares NaN as "missing", but here `result` gives its meaning
     plain = {name: {"_FillValue": None} for name in data.variables}
-    # in memory: HDF5 crashes the interpreter if it cannot write its last blocks, as on a full disk
-    file = io.BytesIO()
-    data.to_netcdf(file, engine="h5netcdf", encoding=plain)
+    file = netcdf_in_memory(data, encoding=plain)
     with _opened(file) as written:
         add_checksum(file, checksum(written.load()))
     content = file.getvalue()
@@ -305,9 +303,8 @@ def _opened(file: Any) -> xarray.Dataset:
 
 
 def _read(path: Path) -> xarray.Dataset:
-    _require_hdf5(path)
     try:
-        require_sound(path)
+        require_readable(path)
         require_own_data(path)
         with _opened(path) as data:
             _require_format(path, data.attrs)
@@ -318,18 +315,6 @@ def _read(path: Path) -> xarray.Dataset:
         raise
     except Exception as error:  # each of three libraries has its own exceptions for a damaged file
         raise TrajectoryFileError(f"{path}: truncated or damaged: {first_line(error)}") from error
-
-
-def _require_hdf5(path: Path) -> None:
-    try:
-        with path.open("rb") as file:
-            start = file.read(8)
-    except OSError as error:
-        missing = isinstance(error, FileNotFoundError)
-        reason = "no such file" if missing else f"cannot be read: {error.strerror}"
-        raise TrajectoryFileError(f"{path}: {reason}") from None
-    if start != b"\x89HDF\r\n\x1a\n":
-        raise TrajectoryFileError(f"{path}: not a netCDF-4 file")
 
 
 def _require_checksum(path: Path, data: xarray.Dataset) -> None:
@@ -361,7 +346,7 @@ def _settings_text(settings: Settings | None, source: str) -> str:
 
 def _settings(path: Path, data: xarray.Dataset) -> Settings | None:
     try:
-        description = json_value(data.attrs["settings"])
+        description = parse_json(data.attrs["settings"])
         return None if description is None else Settings.from_description(description)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise TrajectoryFileError(

@@ -25,6 +25,8 @@ CHECKSUM = "checksum"
 #: not compress; other programs may
 EXPANSION, ALLOWANCE = 100, 100_000_000
 
+#: first bytes of an HDF5 file
+HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 #: largest file (bytes)
 LARGEST_FILE = 8 << 30
 #: time (s) that HDF5 may take for a file without the checksum of its bytes; more at this speed (bytes/s)
@@ -41,26 +43,28 @@ def seal(content: bytes) -> bytes:
     return SEAL + hashlib.sha256(content).hexdigest().encode()
 
 
-def require_sound(path: Path) -> None:
-    """Raise `TrajectoryFileError` if the bytes of a file do not have the checksum at its end.
+def require_readable(path: Path) -> None:
+    """Raise `TrajectoryFileError` if a file is not HDF5, or its bytes do not have the checksum at its end.
 
-    It is checked before HDF5 reads the file: damage of its internal lists can make HDF5 loop for ever. A file
-    without the checksum (of an earlier version, or changed by another program) is read in a process of its
-    own first.
+    The checksum is checked before HDF5 reads the file: damage of its internal lists can make HDF5 loop for
+    ever. A file without the checksum (of an earlier version, or changed by another program) is read in a
+    process of its own first.
     """
     try:
         content = read_bytes(path, LARGEST_FILE)
     except ReadError as error:
         raise TrajectoryFileError(f"{path}: {error}") from None
+    if not content.startswith(HDF5_MAGIC):
+        raise TrajectoryFileError(f"{path}: not a netCDF-4 file")
     end = content.rfind(SEAL, -len(seal(b"")))
     if end < 0:
-        _require_end(path, len(content))
+        _require_hdf5_reads(path, len(content))
     elif seal(content[:end]) != content[end:]:
         raise TrajectoryFileError(f"{path}: truncated or damaged: its bytes do not have their checksum")
 
 
-def _require_end(path: Path, size: int) -> None:
-    """Raise `TrajectoryFileError` if HDF5 does not end with a file, or crashes."""
+def _require_hdf5_reads(path: Path, size: int) -> None:
+    """Raise `TrajectoryFileError` if HDF5 hangs or crashes on a file."""
     if not sys.executable or getattr(sys, "frozen", False):
         return  # within another program there is no interpreter to start
     # -P: the script's folder is no place of modules
@@ -74,7 +78,7 @@ def _require_end(path: Path, size: int) -> None:
             child.stdout.readline()
             child.wait(PATIENCE + size / SPEED)
         except subprocess.TimeoutExpired:
-            raise TrajectoryFileError(f"{path}: damaged: HDF5 does not come to an end with it") from None
+            raise TrajectoryFileError(f"{path}: damaged: HDF5 hangs when it reads it") from None
         finally:
             child.kill()
     if child.returncode < 0:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import numpy as np
 
-from knode_cosserat.errors import KnodeCosseratError
+from knode_cosserat.errors import KnodeCosseratError, first_line
 from knode_cosserat.rods import robot_file
 from knode_cosserat.rods.parameters import Parameter, ParameterError, parameters_of, slots_of
 from knode_cosserat.rods.system import System
@@ -191,9 +191,3 @@ def values_of(path: Path, data: xarray.Dataset, name: str, shape: tuple[int, ...
             f"{path}: the variable {name!r} has shape {values.shape}; allowed is {shape}"
         )
     return values
-
-
-def first_line(error: Exception) -> str:
-    """Return the first line of an error's message, or the name of its class."""
-    lines = str(error).splitlines()
-    return lines[0] if lines else type(error).__name__

@@ -121,7 +121,7 @@ def test_pages_that_name_each_other_end(tmp_path):
             pages[number][place : place + 4] = struct.pack(">I", named)
     path.write_bytes(content)
     found = ros2.read_sqlite(path, {"/a"}, str(path))
-    assert found.damage.endswith("(its pages stand for more rows than it can hold)")
+    assert found.damage.endswith("(its pages repeat more rows than it can hold)")
     assert len(found.topics["/a"].raw) < 1_000_000
 
 

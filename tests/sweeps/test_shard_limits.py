@@ -1,14 +1,20 @@
-"""Shards that are small and stand for much, and shards whose metadata were changed."""
+"""Limits of shards and manifests, and metadata that were changed."""
+
+import json
 
 import numpy as np
 import pytest
 
 from knode_cosserat._files import parquet_file
+from knode_cosserat.sweeps import manifest as manifests
 from knode_cosserat.sweeps.errors import SweepError
 from knode_cosserat.sweeps.shard_file import KEY, checksum, read_about, read_shard, shard_bytes
+from tests.limits import Readers, assert_limited, limit_size
 
 pyarrow = pytest.importorskip("pyarrow")
 pyarrow_parquet = pytest.importorskip("pyarrow.parquet")
+
+READERS = Readers()
 
 
 def columns(rows=50, reason="no solution"):
@@ -86,3 +92,54 @@ def test_the_number_of_values_of_each_page_is_read(tmp_path):
         pages = list(parquet_file._pages(data, chunk))
         dictionary = 1 if chunk.has_dictionary_page else 0
         assert sum(page.values for page in pages) == values + dictionary
+
+
+# the setting of the limits
+
+
+def shard(folder):
+    path = folder / "000000.parquet"
+    columns = {"case": np.arange(50), "reason": np.array(["none"] * 50, dtype=object)}
+    path.write_bytes(shard_bytes(columns, {}))
+    return path
+
+
+@READERS
+def shard_size(folder, patch):
+    path = shard(folder)
+    limit_size(patch, parquet_file, path)
+    return lambda: read_shard(path)
+
+
+@READERS
+def shard_expansion(folder, patch):
+    path = shard(folder)
+    patch.setattr(parquet_file, "RATIO", 0)
+    patch.setattr(parquet_file, "ALLOWANCE", 799)
+    return lambda: read_shard(path)
+
+
+@READERS
+def shard_texts(folder, patch):
+    path = folder / "000000.parquet"
+    path.write_bytes(shard_bytes({"reason": np.array(["x" * 100] * 50, dtype=object)}, {}))
+    patch.setattr(parquet_file, "RATIO", 0)
+    patch.setattr(parquet_file, "ALLOWANCE", 4_999)
+    return lambda: read_shard(path)
+
+
+@READERS
+def manifest_size(folder, patch):
+    manifest = {
+        "format": manifests.FORMAT, "version": 2, "identity": "", "sweep": {}, "cases": 1, "shards": 1,
+        "shard_cases": 1, "robots": [{"columns": {}}],
+    }  # fmt: skip
+    text = json.dumps(manifest | {"checksum": manifests.json_checksum(manifest)})
+    (folder / "sweep.json").write_text(text)
+    patch.setattr(manifests, "LARGEST_MANIFEST", len(text) - 1)
+    return lambda: manifests.read_manifest(folder)
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_a_refusal_names_the_setting_and_the_setting_allows_the_file(name, tmp_path, monkeypatch):
+    assert_limited(READERS[name], tmp_path, monkeypatch)

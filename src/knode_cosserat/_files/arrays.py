@@ -11,7 +11,7 @@ import numpy as np
 
 from knode_cosserat._files.limits import excess
 from knode_cosserat._files.reading import ReadError, read_bytes
-from knode_cosserat.errors import KnodeCosseratError
+from knode_cosserat.errors import KnodeCosseratError, first_line
 
 
 def read_arrays(path: str | Path, limit: int) -> dict[str, np.ndarray]:
@@ -30,8 +30,7 @@ def read_arrays(path: str | Path, limit: int) -> dict[str, np.ndarray]:
     except KnodeCosseratError:
         raise
     except Exception as error:  # a damaged archive fails in many ways
-        reason = " ".join(str(error).split())[:120] or type(error).__name__
-        raise ReadError(f"not an archive of arrays: {reason}") from None
+        raise ReadError(f"not an archive of arrays: {first_line(error)}") from None
 
 
 def _array(content: bytes) -> np.ndarray:

@@ -1,7 +1,7 @@
-"""Script: reads an HDF5 file in a process of its own, which may loop for ever or crash on a damaged one.
+"""Script that reads an HDF5 file in a process of its own: HDF5 can hang or crash on a damaged one.
 
 `python hdf5_probe.py FILE BYTES` prints a line when it begins. Links and variables of more than BYTES are
-left out; other errors are found again by who reads the file. It imports nothing of the package, so that it
+left out; other errors are left to the reader of the file. It imports nothing of the package, so that it
 starts fast.
 """
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 from knode_cosserat._files.limits import MORE, allowed, excess
 from knode_cosserat._files.reading import ReadError
-from knode_cosserat.errors import KnodeCosseratError
+from knode_cosserat.errors import KnodeCosseratError, first_line
 
 #: limits of a file: bytes, columns, rows (5.5 h at 1 kHz)
 LARGEST_FILE, MOST_COLUMNS, MOST_ROWS = 2 << 30, 1_000, 20_000_000
@@ -31,15 +31,15 @@ TOO_LARGE = "Exceeded size limit"
 
 
 @contextlib.contextmanager
-def opened(path: Path, **options: Any) -> Iterator[Any]:
-    """Yield a file as pyarrow's `ParquetFile`, for reading columns whose size the limits allow.
+def open_parquet(path: Path, **options: Any) -> Iterator[Any]:
+    """Yield pyarrow's `ParquetFile` of a file whose size, columns and metadata are within the limits.
 
     Args:
         path: the file.
         **options: further ones of `ParquetFile`.
 
     Raises:
-        ReadError: the file cannot be read, then or while it is open, or a limit is exceeded.
+        ReadError: the file cannot be read, also by the body of the `with` statement, or a limit is exceeded.
         ImportError: pyarrow is not installed.
     """
     import pyarrow  # type: ignore[import-not-found, import-untyped, unused-ignore]
@@ -67,20 +67,19 @@ def opened(path: Path, **options: Any) -> Iterator[Any]:
         text = name.decode(errors="replace") if isinstance(name, bytes) else str(name)
         raise ReadError(f"it has no column {text}") from None
     except (pyarrow.ArrowException, OSError, ValueError, IndexError) as error:
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        more = f"; {MORE}" if TOO_LARGE in reason else ""
-        raise ReadError(f"not a Parquet table: {reason}{more}") from None
+        more = f"; {MORE}" if TOO_LARGE in str(error) else ""
+        raise ReadError(f"not a Parquet table: {first_line(error)}{more}") from None
 
 
-def require_expansion(metadata: Any, path: Path) -> None:
-    """Raise `ReadError` if what the columns expand to is too large."""
+def require_limited_expansion(metadata: Any, path: Path) -> None:
+    """Raise `ReadError` if the expanded columns or pages exceed the limit."""
     groups = [metadata.row_group(k) for k in range(metadata.num_row_groups)]
     rows = max(metadata.num_rows, sum(group.num_rows for group in groups))
     _require_limit(rows, MOST_ROWS, "rows")
     chunks = [group.column(k) for group in groups for k in range(metadata.num_columns)]
     # a list has several values in a row
     values = max(rows * metadata.num_columns, sum(chunk.num_values for chunk in chunks))
-    most, words = most_expanded(path)
+    most, words = expansion_limit(path)
     _require(8 * values <= most, f"its columns have {8 * values} bytes; {words}")
     expanded = values = 0
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
@@ -92,8 +91,8 @@ def require_expansion(metadata: Any, path: Path) -> None:
                 _require(8 * values <= most, f"its pages have {values} values; {words}")
 
 
-def most_expanded(path: Path) -> tuple[int, str]:
-    """Return the most bytes that a file may expand to, and these in words."""
+def expansion_limit(path: Path) -> tuple[int, str]:
+    """Return the largest expanded size of a file (bytes), and the limit as text."""
     ratio, allowance = allowed(RATIO), allowed(ALLOWANCE)
     words = f"allowed are {ratio} times the file and {allowance}; {MORE}"
     return ratio * path.stat().st_size + allowance, words

@@ -1,12 +1,10 @@
-"""Files that are read whole: their size is limited before they are read. JSON texts, of any nesting."""
+"""Reading of whole files, whose size is limited."""
 
 from __future__ import annotations
 
-import json
 import os
 import stat
 from pathlib import Path
-from typing import Any
 
 from knode_cosserat._files.limits import MORE, allowed, excess
 from knode_cosserat.errors import KnodeCosseratError
@@ -22,7 +20,7 @@ class ReadError(KnodeCosseratError, ValueError):
 
 
 def read_bytes(path: str | Path, limit: int) -> bytes:
-    """Return the content of a file or pipe of at most so many bytes.
+    """Return the content of a file or pipe; `limit` is the largest number of bytes.
 
     Raises:
         ReadError: there is no such file, it cannot be read, or it is larger.
@@ -48,18 +46,8 @@ def read_bytes(path: str | Path, limit: int) -> bytes:
 
 
 def read_text(path: str | Path, limit: int, encoding: str = "utf-8") -> str:
-    """Return the text of a file of at most so many bytes. Raises `ReadError`."""
+    """Return the text of a file; `limit` is the largest number of bytes. Raises `ReadError`."""
     try:
         return read_bytes(path, limit).decode(encoding)
     except UnicodeDecodeError:
         raise ReadError("it is not UTF-8 text") from None
-
-
-def json_value(text: str | bytes) -> Any:
-    """Return the value of a JSON text. Raises `ReadError`."""
-    try:
-        return json.loads(text)
-    except RecursionError:
-        raise ReadError("not JSON that is read: it is nested too deeply") from None
-    except ValueError:
-        raise ReadError("not JSON") from None

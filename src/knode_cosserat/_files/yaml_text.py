@@ -12,7 +12,7 @@ import yaml
 
 from knode_cosserat._files.limits import MORE, LimitSettingError, allowed
 from knode_cosserat._files.reading import ReadError, read_text
-from knode_cosserat.errors import KnodeCosseratError
+from knode_cosserat.errors import KnodeCosseratError, first_line
 
 #: largest text, and number of values in it with all aliases written out
 MOST_CHARACTERS, MOST_VALUES = 2_000_000, 200_000
@@ -51,8 +51,7 @@ def mapping_of(text: str, keys: str) -> dict[Any, Any]:
     except (YAMLTextError, LimitSettingError):
         raise
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise YAMLTextError(f"not YAML: {reason}") from None
+        raise YAMLTextError(f"not YAML: {first_line(error)}") from None
     if not isinstance(content, dict):
         found = "empty" if content is None else shown(content)
         raise YAMLTextError(f"the file is {found}; allowed is a mapping with {keys}")

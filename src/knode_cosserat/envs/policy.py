@@ -13,8 +13,9 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat._files.arrays import read_arrays
+from knode_cosserat._files.json_text import parse_json
 from knode_cosserat._files.limits import LimitSettingError, excess
-from knode_cosserat._files.reading import ReadError, json_value
+from knode_cosserat._files.reading import ReadError
 from knode_cosserat._files.writing import replacing
 from knode_cosserat.envs.errors import TaskError
 
@@ -82,7 +83,7 @@ class Policy(NamedTuple):
         path = Path(path)
         try:
             file = read_arrays(path, LARGEST_FILE)
-            header = json_value(str(file["header"]))
+            header = parse_json(str(file["header"]))
             if header.get("version") != VERSION:
                 raise ValueError(f"its version is {header.get('version')!r}; this package reads {VERSION}")
             count = header["layers"]

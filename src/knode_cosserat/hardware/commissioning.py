@@ -10,7 +10,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from knode_cosserat._files.reading import json_value, read_bytes
+from knode_cosserat._files.json_text import parse_json
+from knode_cosserat._files.reading import read_bytes
 from knode_cosserat._files.writing import package_version, replacing
 from knode_cosserat.hardware.commissioning_steps import CHECKLIST, CheckError, CheckStep, Machine
 from knode_cosserat.hardware.driver import Driver, DriverState, HardwareError
@@ -152,7 +153,7 @@ class Commissioning:
         if not self.path.exists():
             return {}
         try:
-            report = json_value(read_bytes(self.path, LARGEST_REPORT))
+            report = parse_json(read_bytes(self.path, LARGEST_REPORT))
             robot, form, steps = report["robot"], report["format"], report["steps"]
             found = {
                 step["name"]: {key: step[key] for key in step if key not in ("name", "text")}

@@ -28,10 +28,10 @@ def read_parquet(path: Path) -> Table:
     """
     pyarrow = _pyarrow()
     try:
-        with parquet_file.opened(path) as file:
+        with parquet_file.open_parquet(path) as file:
             for k in range(file.metadata.num_columns):
                 _check_column(file.metadata.schema.column(k), path)
-            parquet_file.require_expansion(file.metadata, path)
+            parquet_file.require_limited_expansion(file.metadata, path)
             table = file.read()
             said = {key.decode(): value.decode() for key, value in (table.schema.metadata or {}).items()}
     except ReadError as error:

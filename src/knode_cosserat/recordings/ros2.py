@@ -19,7 +19,7 @@ from knode_cosserat.recordings.findings import RecordingError
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 SQLITE_MAGIC = b"SQLite format 3\x00"
 #: most steps of SQLite's machine: so many for each byte of the file, and these besides. A row takes five,
-#: and at least eleven bytes; damaged pages that name each other can stand for any number of rows
+#: and at least eleven bytes; damaged pages that refer to each other can repeat rows without end
 STEPS_PER_BYTE, MOST_STEPS = 1, 1_000_000
 #: steps between two checks of that
 _PACE = 100_000
@@ -179,7 +179,7 @@ def read_sqlite(path: Path, wanted: Collection[str], source: str) -> Container:
     except (sqlite3.Error, UnicodeDecodeError, OverflowError) as error:
         reason = " ".join(str(error).split())
         if next(steps, None) is None:
-            reason = "its pages stand for more rows than it can hold"
+            reason = "its pages repeat more rows than it can hold"
         container.damage = f"the file was cut or is damaged ({reason})"
     finally:
         connection.close()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import concurrent.futures
 import csv
 import dataclasses
-import io
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 from knode_cosserat import named_controls
+from knode_cosserat._files.netcdf import netcdf_in_memory
 from knode_cosserat._files.writing import replacing
 from knode_cosserat._reprs import quantity, robot_text, wrapped
 from knode_cosserat.rods.system import System
@@ -125,10 +125,7 @@ class Workspace:
             )
             for name, array in arrays.items()
         }
-        # in memory: HDF5 crashes the interpreter if it cannot write its last blocks, as on a full disk
-        content = io.BytesIO()
-        xarray.Dataset(variables).to_netcdf(content, engine="h5netcdf")
-        path.write_bytes(content.getvalue())
+        path.write_bytes(netcdf_in_memory(xarray.Dataset(variables)).getvalue())
 
     def _table(self, path: Any, arrays: dict[str, np.ndarray]) -> None:
         """Write controls with names and units, as in files of controls; other columns numbered from 0."""

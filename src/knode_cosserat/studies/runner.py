@@ -24,7 +24,8 @@ from typing import Any, NamedTuple
 from tqdm import tqdm
 
 import knode_cosserat
-from knode_cosserat._files.reading import json_value, read_bytes
+from knode_cosserat._files.json_text import json_checksum, parse_json
+from knode_cosserat._files.reading import read_bytes
 from knode_cosserat._files.writing import package_version, replacing
 from knode_cosserat._processes import dask_client, end_with_parent
 from knode_cosserat.errors import KnodeCosseratError
@@ -115,14 +116,13 @@ def made_by() -> dict[str, str]:
 
 def _mark(job: Job) -> str:
     named = f"{job.work.__module__}.{job.work.__qualname__}"
-    text = json.dumps([job.key, named, job.settings, made_by()], sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()
+    return json_checksum([job.key, named, job.settings, made_by()])
 
 
 def _kept(job: Job, out: Path) -> dict[str, Any] | None:
     """Return the stored result of a job if it is complete and its mark is current, else None."""
     try:
-        record = json_value(read_bytes(out / "jobs" / f"{job.key}.json", LARGEST_RECORD))
+        record = parse_json(read_bytes(out / "jobs" / f"{job.key}.json", LARGEST_RECORD))
         if record["mark"] != _mark(job):
             return None
         for name, checksum in record["files"].items():

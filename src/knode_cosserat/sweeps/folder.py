@@ -41,7 +41,7 @@ def shard_path(folder: Path, number: int) -> Path:
 
 
 def shard_numbers(folder: Path, count: int) -> tuple[int, ...]:
-    """Return the numbers of the shards that are there, of so many that a sweep has."""
+    """Return the numbers of the existing shards, of those below a count."""
     stems = (path.stem for path in (folder / SHARDS).glob("*.parquet"))
     numbers = (int(stem) for stem in stems if stem.isdecimal() and len(stem) < 16)
     return tuple(sorted(k for k in numbers if k < count and shard_path(folder, k).exists()))

@@ -15,8 +15,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from knode_cosserat._files.json_text import json_checksum, parse_json
 from knode_cosserat._files.limits import excess
-from knode_cosserat._files.reading import ReadError, json_value, read_bytes
+from knode_cosserat._files.reading import ReadError, read_bytes
 from knode_cosserat._files.writing import package_version, replacing
 from knode_cosserat._files.yaml_text import shown
 from knode_cosserat._jax import machine_name
@@ -108,7 +109,7 @@ def manifest_of(plan: Plan) -> dict[str, Any]:
 def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
     """Write a manifest into a folder. Raises `SweepError`."""
     path = folder / MANIFEST
-    text = json.dumps({**manifest, CHECKSUM: _checksum(manifest)}, indent=1)
+    text = json.dumps({**manifest, CHECKSUM: json_checksum(manifest)}, indent=1)
     if reason := excess(len(text), LARGEST_MANIFEST, "bytes"):
         raise SweepError(f"{path}: its description is too long: {reason}")
     try:
@@ -127,7 +128,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         missing = f"{folder}: no sweep is here: there is no {MANIFEST}"
         raise SweepError(f"{path}: {error}" if path.exists() else missing) from None
     try:
-        manifest = json_value(text)
+        manifest = parse_json(text)
     except ReadError as error:
         raise SweepError(f"{path}: damaged: {error}") from None
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
@@ -139,14 +140,10 @@ def read_manifest(folder: Path) -> dict[str, Any]:
             f"{path}: the sweep has the version {shown(version)}; allowed is {known}, which this version of "
             "the package reads. Nothing was changed"
         )
-    if stated != _checksum(manifest) and not (stated is None and version == 1):
+    if stated != json_checksum(manifest) and not (stated is None and version == 1):
         raise SweepError(f"{path}: damaged or changed: its contents do not have its checksum")
     _require_consistent(manifest, path)
     return manifest
-
-
-def _checksum(manifest: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()
 
 
 def _require_consistent(manifest: Mapping[str, Any], path: Path) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
-import json
 import os
 import re
 from collections.abc import Mapping
@@ -19,6 +18,7 @@ import jax
 import numpy as np
 
 from knode_cosserat import named_controls
+from knode_cosserat._files.json_text import json_checksum
 from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.rods.paths import owner_at, parameter_at
@@ -331,8 +331,7 @@ def _identity(sweep: Sweep, systems: tuple[System, ...], fixed: Mapping[tuple[in
     described = {key: value for key, value in sweep.described().items() if key != "robots"}
     controls = [hashlib.sha256(each.tobytes()).hexdigest() for each in fixed.values()]
     robots = [system_checksum(each) for each in systems]
-    text = json.dumps([described, controls, robots], sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()
+    return json_checksum([described, controls, robots])
 
 
 def system_checksum(system: System) -> str:

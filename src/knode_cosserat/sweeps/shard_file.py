@@ -16,15 +16,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from knode_cosserat._files.parquet_file import most_expanded, opened, require_expansion
-from knode_cosserat._files.reading import ReadError, json_value
+from knode_cosserat._files.json_text import json_checksum, parse_json
+from knode_cosserat._files.parquet_file import expansion_limit, open_parquet, require_limited_expansion
+from knode_cosserat._files.reading import ReadError
 from knode_cosserat._files.writing import replacing
+from knode_cosserat.errors import first_line
 from knode_cosserat.sweeps.errors import SweepError
 
 #: key of the metadata, and version of the format
 KEY, VERSION = b"knode-cosserat sweep", 1
 #: key of the checksum of all other metadata, and columns of text
-OWN, TEXTS = "own_checksum", ("reason",)
+METADATA_CHECKSUM, TEXTS = "own_checksum", ("reason",)
 #: compression: level 1 of zstd with split bytes takes a tenth off doubles at 300 MB/s
 COMPRESSION, LEVEL = "zstd", 1
 
@@ -44,7 +46,7 @@ def shard_bytes(columns: Mapping[str, Any], about: Mapping[str, Any]) -> bytes:
         shapes[name] = list(np.shape(values)[1:])
         arrays[name] = _arrow(pyarrow, values)
     stated = {**about, "version": VERSION, "shapes": shapes, "checksum": checksum(columns)}
-    stated[OWN] = _own(stated)
+    stated[METADATA_CHECKSUM] = json_checksum(stated)
     table = pyarrow.table(arrays).replace_schema_metadata({KEY: json.dumps(stated, sort_keys=True).encode()})
     floating = [name for name, values in columns.items() if np.asarray(values).dtype.kind == "f"]
     paths = [name if not shapes[name] else f"{name}.list.element" for name in floating]
@@ -80,16 +82,16 @@ def read_shard(path: Path, names: Sequence[str] | None = None, *, verify: bool =
     Raises:
         SweepError: the file cannot be read, has another version, or was changed.
     """
-    with _opened(path) as file:
-        about = _about(file, path)
-        require_expansion(file.metadata, path)
+    with _open_shard(path) as file:
+        about = _metadata(file, path)
+        require_limited_expansion(file.metadata, path)
         table = file.read(columns=None if verify else names)
         try:
             columns = {
                 name: _numpy(table.column(name), about["shapes"][name], path) for name in table.column_names
             }
         except (KeyError, TypeError, AttributeError) as error:
-            raise SweepError(f"{path}: damaged: {_reason(error)}") from None
+            raise SweepError(f"{path}: damaged: {first_line(error)}") from None
     if verify and checksum(columns) != about["checksum"]:
         raise SweepError(f"{path}: damaged: the checksum of its columns is not the stated one")
     missing = set(names or ()) - set(columns)
@@ -100,26 +102,26 @@ def read_shard(path: Path, names: Sequence[str] | None = None, *, verify: bool =
 
 def read_about(path: Path) -> dict[str, Any]:
     """Return the metadata of a shard. Raises `SweepError`."""
-    with _opened(path) as file:
-        return _about(file, path)
+    with _open_shard(path) as file:
+        return _metadata(file, path)
 
 
 @contextlib.contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def _open_shard(path: Path) -> Iterator[Any]:
     require_pyarrow()
     if not path.exists():
         raise SweepError(f"{path}: there is no such shard; the sweep is not complete")
     try:
         # a text that many rows have is stored once, and must not be written out for each
-        with opened(path, read_dictionary=TEXTS) as file:
+        with open_parquet(path, read_dictionary=TEXTS) as file:
             yield file
     except ReadError as error:
         raise SweepError(f"{path}: damaged: {error}") from None
 
 
-def _about(file: Any, path: Path) -> dict[str, Any]:
+def _metadata(file: Any, path: Path) -> dict[str, Any]:
     try:
-        about = dict(json_value(file.schema_arrow.metadata[KEY]))
+        about = dict(parse_json(file.schema_arrow.metadata[KEY]))
     except (KeyError, TypeError, ValueError):
         raise SweepError(f"{path}: no shard of a sweep: its metadata are missing or damaged") from None
     if about.get("version") != VERSION:
@@ -128,13 +130,9 @@ def _about(file: Any, path: Path) -> dict[str, Any]:
             "version of the package reads and writes. Nothing was changed"
         )
     # shards of earlier versions have none
-    if about.pop(OWN, None) not in (None, _own(about)):
+    if about.pop(METADATA_CHECKSUM, None) not in (None, json_checksum(about)):
         raise SweepError(f"{path}: damaged: the checksum of its metadata is not the stated one")
     return about
-
-
-def _own(about: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
 
 
 def checksum(columns: Mapping[str, Any]) -> str:
@@ -170,17 +168,13 @@ def _numpy(column: Any, shape: Sequence[int], path: Path) -> Any:
     if hasattr(column, "dictionary"):
         texts = column.dictionary.to_numpy(zero_copy_only=False)
         found = texts[column.indices.to_numpy(zero_copy_only=False)]
-        total, (most, words) = sum(map(len, found)), most_expanded(path)
+        total, (most, words) = sum(map(len, found)), expansion_limit(path)
         if total > most:
             raise ReadError(f"its texts have {total} characters; {words}")
         return found
     if not shape:
         return column.to_numpy(zero_copy_only=False)
     return column.flatten().to_numpy(zero_copy_only=False).reshape(rows, *shape)
-
-
-def _reason(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
 def require_pyarrow() -> Any:

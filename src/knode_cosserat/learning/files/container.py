@@ -28,7 +28,7 @@ import numpy as np
 from knode_cosserat._files.limits import MORE, allowed
 from knode_cosserat._files.reading import ReadError, read_bytes
 from knode_cosserat._files.writing import package_version, replacing
-from knode_cosserat.errors import KnodeCosseratError
+from knode_cosserat.errors import KnodeCosseratError, first_line
 
 #: largest number of bytes of the header and of the arrays, as a limit for hostile files
 MOST_HEADER = 4 * 2**20
@@ -237,9 +237,3 @@ def read(path: Path) -> bytes:
         raise ContainerError(f"cannot be read: {error.strerror}") from None
     except ReadError as error:
         raise ContainerError(str(error)) from None
-
-
-def first_line(error: BaseException) -> str:
-    """Return the first line of an error's message, or the name of its class."""
-    lines = str(error).splitlines()
-    return lines[0][:300] if lines else type(error).__name__

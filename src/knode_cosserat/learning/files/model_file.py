@@ -26,7 +26,7 @@ import numpy as np
 from knode_cosserat import trajectory_system
 from knode_cosserat._files.limits import MORE, allowed
 from knode_cosserat._registry import provide
-from knode_cosserat.errors import KnodeCosseratError
+from knode_cosserat.errors import KnodeCosseratError, first_line
 from knode_cosserat.learning.files import container
 from knode_cosserat.learning.files.container import (
     Classes,
@@ -293,8 +293,7 @@ def _require_fit(model: KNODE) -> None:
         found = jax.eval_shape(_equations, model, np.zeros(ny), np.zeros(model.control_size), history)
         shapes = [part.shape for part in found]
     except Exception as error:  # a residual may raise any error if arrays do not fit
-        line = (str(error).splitlines() or [type(error).__name__])[0]
-        reason = re.sub(r"<function \w+ at 0x[0-9a-f]+>", "the equations", line[:300])
+        reason = re.sub(r"<function \w+ at 0x[0-9a-f]+>", "the equations", first_line(error))
         raise ContainerError(f"residual and knowledge do not fit together: {reason}") from None
     expected = [(ny,), (nz,), (unknown_count(model),)]
     if shapes != expected or length.shape != () or length.dtype.kind not in "fiu" or not np.isfinite(length):

@@ -12,6 +12,7 @@ import equinox as eqx
 import numpy as np
 
 from knode_cosserat._files.limits import MORE, allowed
+from knode_cosserat.errors import first_line
 from knode_cosserat.learning.files.container import (
     MOST_ARRAYS,
     MOST_HEADER,
@@ -23,7 +24,6 @@ from knode_cosserat.learning.files.container import (
     UnknownClassError,
     checksum,
     fields_of,
-    first_line,
 )
 
 #: classes of earlier versions, and the class of the same order that replaced them
