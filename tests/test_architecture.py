@@ -21,6 +21,7 @@ LAYERS = (
         "_lazy",
         "_numbers",
         "_processes",
+        "_program_cache",
         "_programs",
         "_registry",
         "_reprs",

@@ -9,6 +9,7 @@ import urllib.error
 import urllib.request
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 import typer.testing
@@ -220,3 +221,32 @@ def test_rows_of_an_undamped_rod_do_not_depend_on_how_many_follow():
     for count in (2, 3, 7):
         part = kc.simulate(undamped, control[:count], 1e-3)
         np.testing.assert_allclose(part.tip_position, whole.tip_position[: count + 1], rtol=0, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_rows_of_an_undamped_rod_are_the_same_under_jit_and_step_by_step():
+    undamped = ROBOT.replace(bending_damping=0.0)
+    control = np.tile([8.0, 5.0, 5.0, 5.0], (12, 1))
+    whole = kc.simulate(undamped, control, 1e-3)
+
+    def tip_and_result(control):
+        found = kc.simulate(undamped, control, 1e-3)
+        return found.tip_position, found.result
+
+    tip, result = jax.jit(tip_and_result)(control)
+    np.testing.assert_allclose(tip, whole.tip_position, rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(result, whole.result)
+    stepper = kc.solvers.Stepper(undamped, 1e-3)
+    steps = [stepper.step(each).tip_position for each in control]
+    np.testing.assert_allclose(steps, whole.tip_position[1:], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("encoding", ["latin-1", "ascii"])
+def test_output_that_a_terminal_cannot_show_is_escaped(encoding):
+    done = subprocess.run(
+        [sys.executable, "-m", "knode_cosserat.cli", "info", "delrin-tendon-robot"],
+        env={**os.environ, "PYTHONIOENCODING": encoding, "PYTHONUTF8": "0"},
+        capture_output=True,
+    )
+    assert done.returncode == 0 and done.stderr == b""
+    assert b"tension_4" in done.stdout.decode(encoding).encode(encoding)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import jax
 
+from knode_cosserat._program_cache import install
 from knode_cosserat._programs import limit_programs
 
 
@@ -42,6 +43,7 @@ def configure() -> None:
     jax.config.update("jax_enable_x64", True)
     directory = cache_directory()
     if directory is not None and getattr(jax.config, "jax_compilation_cache_dir", None) is None:
+        install(directory)
         jax.config.update("jax_compilation_cache_dir", str(directory))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)

@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from knode_cosserat._files.writing import package_version
+from knode_cosserat._program_cache import SUFFIX
 from knode_cosserat._reprs import count_of
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.solvers.equilibrium import equilibrium
@@ -100,7 +101,8 @@ def doctor() -> Diagnosis:
     versions |= {name: _version(name) for name in (*NEEDED, *OPTIONAL)}
     cache = Path(getattr(jax.config, "jax_compilation_cache_dir", None) or "")
     checks = [_precision(), _cache(cache), *_simulated()]
-    programs = sum(1 for _ in cache.glob("*-cache")) if cache.is_dir() else 0
+    # files of this package, and of JAX in a directory that the user set for it
+    programs = sum(1 for end in (SUFFIX, "-cache") for _ in cache.glob(f"*{end}"))
     return Diagnosis(
         versions, f"{platform.system()} {platform.machine()}", usable_cores(),
         [f"{device.device_kind} ({device.platform})" for device in jax.devices()], str(cache), programs,

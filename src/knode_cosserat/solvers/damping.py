@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Sequence
 from typing import Any
 
+import jax
 import numpy as np
 
 from knode_cosserat.rods.system import System, is_traced
@@ -31,11 +32,13 @@ def warn_if_undamped(robot: Any, dt: float) -> None:
     for system in robot if isinstance(robot, Sequence) else [robot]:
         if not isinstance(system, System) or is_traced(system):
             continue
-        strand = system.strand
-        if not getattr(strand, "is_undamped", False):
-            continue
-        frequency = float(np.min(strand.bending_frequency))  # type: ignore[attr-defined]
-        stiffness = float(np.max(np.asarray(strand.Kbt)[..., 0, 0]))  # type: ignore[attr-defined]
+        # the numbers of this robot are known, also inside a `jit` of the caller
+        with jax.ensure_compile_time_eval():
+            strand = system.strand
+            if not getattr(strand, "is_undamped", False):
+                continue
+            frequency = float(np.min(strand.bending_frequency))  # type: ignore[attr-defined]
+            stiffness = float(np.max(np.asarray(strand.Kbt)[..., 0, 0]))  # type: ignore[attr-defined]
         damping = LOSS_FACTOR * stiffness / (2.0 * np.pi * frequency)
         warnings.warn(
             "bending_damping is 0 and nothing else damps the motion: vibrations do not decay, and "
