@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 from jaxtyping import Float
@@ -12,6 +12,8 @@ from knode_cosserat._files.csv_rows import SAME_TIME
 from knode_cosserat.errors import KnodeCosseratError
 
 Tensions = Float[np.ndarray, "steps tendons"]
+#: time in each step at which a signal is evaluated
+Sampled = Literal["middle", "end"]
 
 
 class ControlsError(KnodeCosseratError, ValueError):
@@ -32,43 +34,44 @@ def constant(tension: float, steps: int, *, tendons: int = 4) -> Tensions:
 
 
 def sine(
-    period: float, steps: int, dt: float, *, base: float = 6.0, amplitude: float = 1.0, tendons: int = 4
-) -> Tensions:
+    period: float, steps: int, dt: float, *, base: float = 6.0, amplitude: float = 1.0, tendons: int = 4,
+    sampled: Sampled = "middle",
+) -> Tensions:  # fmt: skip
     """Return τ_k = base + amplitude sin(2πt/period + 2πk/tendons) in N, k = 0, 1, …; period in s."""
     require_numbers(base=base, amplitude=amplitude)
     require_counts(tendons=tendons)
     phase = 2 * np.pi * np.arange(tendons) / tendons
-    t = _times(steps, dt)
+    t = step_times(steps, dt, sampled)
     _require_period(period, float(t[-1]))
     return checked_tensions(base + amplitude * np.sin(2 * np.pi * t[:, None] / period + phase), "sine")
 
 
 def step(
     height: float, steps: int, dt: float, *, base: float = 5.0, at: float = 1.5,
-    tendons: Sequence[int] = (0, 3), count: int = 4,
+    tendons: Sequence[int] = (0, 3), count: int = 4, sampled: Sampled = "middle",
 ) -> Tensions:  # fmt: skip
     """Return `base` (N) in `count` tendons, and base + height in the named tendons from t = at (s)."""
     require_numbers(at=at)
-    t = _times(steps, dt)
+    t = step_times(steps, dt, sampled)
     return _raised("step", height, t >= at - SAME_TIME * dt, base, tendons, count)
 
 
 def ramp(
     height: float, steps: int, dt: float, *, base: float = 5.0, start: float = 0.0, end: float | None = None,
-    tendons: Sequence[int] = (0, 3), count: int = 4,
+    tendons: Sequence[int] = (0, 3), count: int = 4, sampled: Sampled = "middle",
 ) -> Tensions:  # fmt: skip
     """Return `base` (N) in `count` tendons, with a linear rise by `height` (N) in the named tendons.
 
-    The rise is from `start` to `end` (s), by default the end of the last step. The tension is constant after.
+    The rise is from `start` to `end` (s), by default until the last step. The tension is constant after.
     """
-    t = _times(steps, dt)
+    t = step_times(steps, dt, sampled)
     if end is None:
         end = float(t[-1])
         require_numbers(start=start)
         if end <= start:
             raise ControlsError(
-                f"ramp: start is {start!r} s; allowed is a time before the end of the last step, {end:g} s; "
-                f"use {int(np.ceil(start / dt - SAME_TIME)) + 1} steps or more, or an earlier start"
+                f"ramp: start is {start!r} s; allowed is a time before the last step, {end:g} s; "
+                f"use {steps_until(start, dt, sampled) + 1} steps or more, or an earlier start"
             )
     require_numbers(start=start, end=end)
     if end <= start:
@@ -102,11 +105,22 @@ def _raised(
     return checked_tensions(tensions, signal)
 
 
-def _times(steps: int, dt: float) -> np.ndarray:
-    """Return the ends of the steps (s)."""
+def step_times(steps: int, dt: float, sampled: Sampled = "middle") -> np.ndarray:
+    """Return the times (s) at which a signal is evaluated: the middles of steps of dt (s), or their ends."""
     require_counts(steps=steps)
     require_positive("dt", dt)
-    return np.arange(1, steps + 1) * dt
+    if sampled not in get_args(Sampled):
+        raise ControlsError(f'sampled is {sampled!r}; allowed is "middle" or "end"')
+    return (np.arange(1, steps + 1) - _EARLIER[sampled]) * dt
+
+
+#: parts of a step from the time at which a signal is evaluated to its end
+_EARLIER = {"middle": 0.5, "end": 0.0}
+
+
+def steps_until(t: float, dt: float, sampled: Sampled) -> int:
+    """Return the number of steps of dt (s) of which the last is evaluated at time t (s) or later."""
+    return int(np.ceil(t / dt + _EARLIER[sampled] - SAME_TIME))
 
 
 def checked_tensions(tensions: Tensions, signal: str) -> Tensions:
@@ -152,16 +166,18 @@ def _is_number(value: Any) -> bool:
 
 
 def require_effect(
-    signal: str, arguments: dict[str, Any], values: Float[np.ndarray, "steps ..."], steps: int, dt: float
-) -> None:
+    signal: str, arguments: dict[str, Any], values: Float[np.ndarray, "steps ..."], steps: int, dt: float,
+    sampled: Sampled = "middle",
+) -> None:  # fmt: skip
     """Raise `ControlsError` if a signal does nothing during a run: a step or ramp after the end, for example.
 
     Args:
         signal: "sine", "step" or "ramp".
         arguments: its arguments by name. A height or amplitude of 0 is taken as intended.
-        values: the signal at the ends of the steps.
+        values: the signal in all steps.
         steps: number of time steps.
         dt: time step (s).
+        sampled: time in each step at which it was evaluated.
     """
     size = abs(arguments["amplitude" if signal == "sine" else "height"])
     if size == 0.0 or np.any(np.ptp(values, axis=0) > 1e-9 * size):
@@ -174,9 +190,11 @@ def require_effect(
         )
     option = "at" if signal == "step" else "start"
     begin = arguments[option]
-    if begin <= dt:  # a step that acts from the first time step on is constant, too
+    if (
+        begin <= (1.0 - _EARLIER[sampled]) * dt
+    ):  # a step that acts from the first time step on is constant, too
         return
-    needed = int(np.ceil(begin / dt - SAME_TIME)) + (signal == "ramp")
+    needed = steps_until(begin, dt, sampled) + (signal == "ramp")
     raise ControlsError(
         f"the {signal} starts at {begin:g} s, after the end of the run ({steps} steps of {dt:g} s: "
         f"{steps * dt:g} s); use {needed} steps or more, or {option}=0"

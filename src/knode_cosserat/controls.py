@@ -1,7 +1,8 @@
 """Tendon tensions over time, as arrays (steps, tendons) in N: the studies' signals, and CSV files.
 
 `simulate` applies row i (from 0) from time i dt to (i + 1) dt. Signals that are functions of time are
-evaluated at the end of that step, t = (i + 1) dt, as in the paper's studies. Tendons are numbered from 0 in
+evaluated at the middle of that step, so that what is held is the signal on average; with `sampled="end"` at
+its end, t = (i + 1) dt, as in the paper's studies. Tendons are numbered from 0 in
 arguments, from 1 in files.
 """
 
@@ -24,6 +25,7 @@ from knode_cosserat._numbers import numbers_in, real_array
 from knode_cosserat._reprs import count_of
 from knode_cosserat._signals import (
     ControlsError,
+    Sampled,
     Tensions,
     checked_tensions,
     constant,
@@ -211,7 +213,9 @@ SPECIFICATIONS = (
 )
 
 
-def parse(specification: str, steps: int | None, dt: float, *, tendons: int = 4) -> Tensions:
+def parse(
+    specification: str, steps: int | None, dt: float, *, tendons: int = 4, sampled: Sampled = "middle"
+) -> Tensions:
     """Return tensions from one word, as on the command line.
 
     `sine:1.5`, `step:1.5`, `ramp:2`, `random:0`, `constant:5`: the signal and its first number (period in s,
@@ -224,6 +228,7 @@ def parse(specification: str, steps: int | None, dt: float, *, tendons: int = 4)
         steps: number of steps; None, for a file only: all steps of the file.
         dt: time step (s).
         tendons: number of tendons of the robot.
+        sampled: time in each step at which a signal is evaluated, "middle" or "end".
 
     Raises:
         ControlsError: the specification is not understood, the file is invalid or too short, or the signal
@@ -247,7 +252,7 @@ def parse(specification: str, steps: int | None, dt: float, *, tendons: int = 4)
         )
     count = _required_steps(specification, steps)
     try:
-        return _from_signal(name, rest, count, dt, tendons)
+        return _from_signal(name, rest, count, (dt, sampled), tendons)
     except ControlsError as error:
         raise ControlsError(f"controls {specification!r}: {error}") from None
 
@@ -299,7 +304,7 @@ def _from_file(path: str, steps: int | None, dt: float, tendons: int) -> Tension
     return tensions[:steps]
 
 
-def _from_signal(name: str, text: str, steps: int, dt: float, tendons: int) -> Tensions:
+def _from_signal(name: str, text: str, steps: int, times: tuple[float, Sampled], tendons: int) -> Tensions:
     signal = _SIGNALS[name]
     first, *others = text.split(",")
     if not first.strip():
@@ -314,7 +319,7 @@ def _from_signal(name: str, text: str, steps: int, dt: float, tendons: int) -> T
             raise ControlsError(f"{other!r} is not understood; allowed after the {signal.main} is {allowed}")
         arguments[key] = _read_as(signal.options[key], key, value)
     if "dt" in inspect.signature(signal.make).parameters:
-        arguments["dt"] = dt
+        arguments |= {"dt": times[0], "sampled": times[1]}
     if not set(arguments.get("tendons", ())) <= set(range(tendons)):
         given = "+".join(str(k + 1) for k in arguments["tendons"])
         raise ControlsError(
@@ -323,7 +328,7 @@ def _from_signal(name: str, text: str, steps: int, dt: float, tendons: int) -> T
     tensions = signal.make(steps=steps, **arguments, **{signal.tendon_count: tendons})
     if name in ("sine", "step", "ramp") and steps > 1:
         stated = {**_defaults(signal.make), **arguments}
-        require_effect(name, stated, tensions, steps, dt)
+        require_effect(name, stated, tensions, steps, *times)
     return tensions
 
 

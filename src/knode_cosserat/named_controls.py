@@ -75,7 +75,7 @@ def parse(robot: System, specification: str, steps: int | None, dt: float) -> Ar
     if held is not None:
         return np.tile(held, (steps, 1))
     words = [] if specification.strip() == "none" else specification.split(";")
-    return parse_signals(layout, words, np.arange(1, steps + 1) * dt)
+    return parse_signals(layout, words, controls.step_times(steps, dt))
 
 
 def parse_signals(layout: Layout, words: list[str], t: Float[np.ndarray, " steps"]) -> Array:
@@ -129,9 +129,7 @@ def _columns(layout: Layout, name: str) -> list[int]:
 def _ramp(t: Any, height: float, *, base: float = 0.0, start: float = 0.0, end: float | None = None) -> Any:
     last = float(t[-1]) if end is None else end
     if last <= start and end is None:
-        raise ControlsError(
-            f"ramp: start is {start!r} s; allowed is a time before the end of the last step, {last:g} s"
-        )
+        raise ControlsError(f"ramp: start is {start!r} s; allowed is a time before the last step, {last:g} s")
     if last <= start:
         raise ControlsError(f"ramp: end is {last!r} s; allowed is a time after its start, {start!r} s")
     return base + height * np.clip((t - start) / (last - start), 0.0, 1.0)

@@ -43,12 +43,17 @@ class Trajectory(eqx.Module):
     iterations: Int[Any, "*batch T"]
     #: estimated discretisation error of positions along the rod (m), the largest over the nodes; NaN: unknown
     position_error: Any = None
+    #: estimated error of positions (m) by the time steps, the largest over the nodes; NaN or None: unknown
+    time_error: Any = None
     #: state of the solver in row 0 of a motion; None for equilibria, and where it is unknown
     initial_state: SolverState | None = None
     #: state of the solver in the last row, from which a motion continues exactly; None as for `initial_state`
     final_state: SolverState | None = None
     #: True in rows outside the training range of a learned or identified model; None if unknown
     extrapolated: Any = None
+    #: states y, z (and y_s, where rows have it) at the stages of the time scheme before each row, which its
+    #: history needs: (*batch, T, stages - 1, N, x); None for schemes of one stage, and where they are unknown
+    stages: Any = None
     #: True if intermediate rows were left out: the controls held there are not known
     thinned: bool = eqx.field(static=True, default=False)
 
@@ -201,10 +206,13 @@ class Trajectory(eqx.Module):
             rows += f" from {float(self.time[0]):g} to {float(self.time[-1]):g} s"
         lines = [f"Trajectory of a {type(self.system).__name__}: {batch}{rows}: {results}"]
         lines += self._tip_text()
-        if self.position_error is not None and np.any(np.isfinite(self.position_error)):
-            lines.append(
-                f"largest position error, by estimate: {1e3 * np.nanmax(self.position_error):.2g} mm"
-            )
+        errors = [
+            f"{where} {1e3 * np.nanmax(error):.2g} mm"
+            for where, error in (("along the rod", self.position_error), ("in time", self.time_error))
+            if error is not None and np.any(np.isfinite(error))
+        ]
+        if errors:
+            lines.append(f"largest position error, by estimate: {', '.join(errors)}")
         if self.extrapolation:
             lines.append(f"EXTRAPOLATION: {self.extrapolation}")
         return "\n".join(lines)
@@ -244,7 +252,9 @@ class Trajectory(eqx.Module):
             raise TypeError(f"index a batch by a slice or a robot's number, not by {index!r}")
         fields: tuple[str, ...] = ("y", "z", "control", "result", "residual", "iterations")
         fields += tuple(
-            name for name in ("position_error", "extrapolated") if getattr(self, name) is not None
+            name
+            for name in ("position_error", "time_error", "extrapolated", "stages")
+            if getattr(self, name) is not None
         )
         picked: dict[str, Any] = {name: getattr(self, name)[index] for name in fields}
         time = self.time if self.y.ndim == 4 else self.time[index]

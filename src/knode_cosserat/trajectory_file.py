@@ -60,7 +60,17 @@ _ROWS = (
     ("iterations", "1", "Newton corrections"),
 )
 _ERROR = ("position_error", "m", "estimated discretisation error of positions, the largest over the nodes")
+_TIME_ERROR = (
+    "time_error",
+    "m",
+    "estimated error of positions by the time steps, the largest over the nodes",
+)
 _OUTSIDE = ("extrapolated", "1", "1 in rows outside the range that the model was trained in")
+_STAGES = (
+    "stages",
+    ("stage", "node", "stage_number"),
+    "states at the stages of the time scheme before each row",
+)
 #: solver states of a motion (`SolverState`): name in the file, attribute, and text
 _STATES = (
     ("initial_history", "initial_state", "state of the solver in row 0"),
@@ -74,6 +84,7 @@ _STATE_PARTS = (
         "newest state, the one before it, newest rate",
     ),
     ("_error", ("history_state", "history_used", "history_number"), "discretisation errors of these"),
+    ("_time_error", ("history_record", "history_used", "history_number"), "errors in time of both states"),
     ("_guess", ("history_guess", "history_point", "history_y"), "y of earlier states, for the first guess"),
     ("_weights", ("history_guess",), "weights of these in the first guess"),
     ("_time", ("history_time",), "time (s), time step (s; NaN: all states are the same), 1 if rate is known"),
@@ -140,13 +151,16 @@ def _dataset(trajectory: Trajectory, source: str) -> xarray.Dataset:
             variables[field.name] = ((*rows, *along, component), values, said)
     for name, unit, meaning in _ROWS:
         variables[name] = (rows, np.asarray(getattr(trajectory, name)), labels(unit, meaning))
-    if trajectory.position_error is not None:
-        name, unit, meaning = _ERROR
-        variables[name] = (rows, np.asarray(trajectory.position_error), labels(unit, meaning))
+    for name, unit, meaning in (_ERROR, _TIME_ERROR):
+        if getattr(trajectory, name) is not None:
+            variables[name] = (rows, np.asarray(getattr(trajectory, name)), labels(unit, meaning))
     if trajectory.extrapolated is not None:
         name, unit, meaning = _OUTSIDE
         marks = np.asarray(trajectory.extrapolated).astype(np.int8)
         variables[name] = (rows, marks, labels(unit, meaning))
+    if trajectory.stages is not None:
+        name, along, text = _STAGES
+        variables[name] = (*rows, *along), np.asarray(trajectory.stages), {"long_name": text}
     variables["result"][2].update(_flags(variables["result"][1].dtype))
     for name, attribute, text in _STATES:
         state = getattr(trajectory, attribute)
@@ -197,7 +211,7 @@ def _require_names(system: System, source: str) -> None:
     names = [field.name for layout in _layouts(system) for field in layout.fields]
     taken = {"time", "node", "batch", "arclength", "axis", "quaternion", BYTES, SIZES}
     taken |= {name + suffix for name, *_ in _STATES for suffix, *_ in _STATE_PARTS}
-    taken |= {*_EARLIER, *(name for name, *_ in (*_ROWS, _ERROR, _OUTSIDE))}
+    taken |= {*_EARLIER, *(name for name, *_ in (*_ROWS, _ERROR, _TIME_ERROR, _OUTSIDE, _STAGES))}
     for name in names:
         if name in taken or "/" in name or name.startswith(PARAMETER) or name.endswith("_index"):
             raise TrajectoryFileError(
@@ -249,10 +263,14 @@ def load_trajectory(path: str | Path, *, system: System | None = None) -> Trajec
     y, z, control = packed
     numbers = {name: values_of(path, data, name, rows) for name, *_ in _ROWS}
     numbers["result"] = _current_codes(numbers["result"], data["result"].attrs)
-    if _ERROR[0] in data.variables:
-        numbers[_ERROR[0]] = values_of(path, data, _ERROR[0], rows)
+    for name, *_ in (_ERROR, _TIME_ERROR):
+        if name in data.variables:
+            numbers[name] = values_of(path, data, name, rows)
     if _OUTSIDE[0] in data.variables:
         numbers[_OUTSIDE[0]] = values_of(path, data, _OUTSIDE[0], rows).astype(bool)
+    if _STAGES[0] in data.variables:
+        shape = (*rows, *(data.sizes.get(name, 0) for name in _STAGES[1]))
+        numbers[_STAGES[0]] = values_of(path, data, _STAGES[0], shape)
     settings, thinned = _settings(path, data), bool(data.attrs.get(_THINNED, 0))
     states = {attribute: _state(path, data, name) for name, attribute, _ in _STATES}
     require_possible(path, time, numbers, y)
@@ -272,11 +290,11 @@ def _current_codes(codes: np.ndarray, attributes: dict[Any, Any]) -> np.ndarray:
 
 def _state_arrays(state: SolverState) -> tuple[np.ndarray, ...]:
     """Return the arrays of a solver's state, in the order of `_STATE_PARTS`."""
-    records, rate, y, weights, t0, error = map(np.asarray, state.history)
+    records, rate, y, weights, t0, error, time_error = map(np.asarray, state.history)
     numbers = [np.nan if state.dt is None else state.dt, float(state.rate_known)]
     time = np.stack([t0, *(np.full(t0.shape, number) for number in numbers)], axis=-1)
     states = np.concatenate([records, np.expand_dims(rate, -3)], axis=-3)
-    return states, error, y, weights, time
+    return states, error, time_error, y, weights, time
 
 
 def _state(path: Path, data: xarray.Dataset, name: str) -> SolverState | None:
@@ -284,13 +302,23 @@ def _state(path: Path, data: xarray.Dataset, name: str) -> SolverState | None:
     if name + _STATE_PARTS[-1][0] not in data.variables:
         return None
     batch = tuple(data.sizes[name] for name in ("batch",) if name in data.sizes)
-    fixed = {"history_state": 3, "history_guess": GUESS_STATES, "history_time": 3}
-    states, error, y, weights, time = (
-        values_of(path, data, name + suffix, (*batch, *(fixed.get(x, data.sizes.get(x, 0)) for x in along)))
+    fixed = {"history_state": 3, "history_record": 2, "history_guess": GUESS_STATES, "history_time": 3}
+    parts = {
+        suffix: values_of(
+            path, data, name + suffix, (*batch, *(fixed.get(x, data.sizes.get(x, 0)) for x in along))
+        )
         for suffix, along, _ in _STATE_PARTS
+        if name + suffix in data.variables
+    }
+    states, error, y, weights, time = (
+        parts[suffix] for suffix in ("", "_error", "_guess", "_weights", "_time")
     )
+    # files of earlier versions have no errors in time
+    unknown = np.full((*error.shape[:-3], 2, *error.shape[-2:]), np.nan)
     t0, dt, known = np.moveaxis(time, -1, 0)
-    history = StateHistory(states[..., :2, :, :], states[..., 2, :, :], y, weights, t0, error)
+    history = StateHistory(
+        states[..., :2, :, :], states[..., 2, :, :], y, weights, t0, error, parts.get("_time_error", unknown)
+    )
     first = float(np.ravel(dt)[0]) if dt.size else np.nan
     return SolverState(history, None if np.isnan(first) else first, bool(np.all(known)))
 

@@ -286,7 +286,8 @@ def _simulated(system: System | Ensemble, reference: Trajectory, rows: int | Non
         raise ValueError("allowed is a trajectory of one robot, with two rows or more")
     it = reference.settings or kc.solvers.Settings()
     options: Any = {
-        "time": it.time, "space": it.space, "start": it.start, "newton": it.newton, "progress": progress,
+        "time": it.time, "space": it.space, "start": it.start, "newton": it.newton, "between": it.between,
+        "progress": progress,
     }  # fmt: skip
     controls, dt = reference.control[1:], reference.dt
     if isinstance(system, Ensemble):

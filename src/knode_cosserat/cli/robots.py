@@ -82,8 +82,8 @@ def simulate(
         float | None, typer.Option(metavar="S", help="Time step (s).", show_default="0.05, or the file's")
     ] = None,
     time: Annotated[
-        str, typer.Option(metavar="SCHEME", help="Time integration: bdf1, bdf2, bdf-alpha or trapezoidal.")
-    ] = "bdf2",
+        str, typer.Option(metavar="SCHEME", help="Time scheme: sdirk2, bdf1, bdf2, bdf-alpha or trapezoidal.")
+    ] = "sdirk2",
     space: Space = "lobatto2",
     changes: Changes = None,
     nodes: Nodes = None,
@@ -116,13 +116,15 @@ def simulate(
     if drawing:
         drawing.overview(trajectory).savefig(figure)
     summary = motion_summary(trajectory)
-    error = error_text(summary["largest_position_error"], float(system.length))
+    errors = [
+        error_text(summary[f"largest_{name}_error"], float(system.length)) for name in ("position", "time")
+    ]
     facts = {"robot": robot, "steps": len(sequence), "dt": dt, "computing_time": round(seconds, 4), **summary}
     results = ", ".join(f"{count} {result}" for result, count in summary["results"].items())
     lines = [
         f"simulated {robot}: {len(sequence)} steps of {dt:g} s, computed in {seconds:.2f} s",
         f"steps: {results}; largest scaled residual {summary['largest_residual']:.1e}",
-        f"largest estimated position error: {error}",
+        f"largest estimated position error: along the rod {errors[0]}; in time {errors[1]}",
         f"final tip position: {vector_text(summary['tip_position'])} m",
     ]
     if kc.Result.COARSE in np.asarray(trajectory.result):

@@ -32,7 +32,8 @@ def motion_summary(trajectory: Trajectory) -> dict[str, Any]:
         "all_solved": bool(valid.all()),
         "first_failure": failure,
         "largest_residual": float(np.asarray(trajectory.residual)[valid].max()),
-        "largest_position_error": _largest_error(trajectory),
+        "largest_position_error": _largest_error(trajectory.position_error, trajectory.valid),
+        "largest_time_error": _largest_error(trajectory.time_error, trajectory.valid),
         "extrapolated": _extrapolated(trajectory),
         "tip_position": np.asarray(trajectory.tip_position)[valid][-1].tolist(),
     }
@@ -44,11 +45,11 @@ def _extrapolated(trajectory: Trajectory) -> int | None:
     return None if rows is None else int(np.count_nonzero(rows))
 
 
-def _largest_error(trajectory: Trajectory) -> float | None:
-    """Return the largest estimated position error (m) of the solved rows; None where it is unknown."""
-    if trajectory.position_error is None:
+def _largest_error(errors: Any, valid: Any) -> float | None:
+    """Return the largest estimated error of positions (m) of the solved rows; None where it is unknown."""
+    if errors is None:
         return None
-    largest = float(np.asarray(trajectory.position_error)[np.asarray(trajectory.valid)].max())
+    largest = float(np.asarray(errors)[np.asarray(valid)].max())
     return largest if np.isfinite(largest) else None
 
 
@@ -68,7 +69,7 @@ def equilibrium_summary(rest: Trajectory) -> dict[str, Any]:
         "tip_position": position[-1].tolist(),
         "tip_inclination": float(2 * np.arctan2(np.hypot(x, y), np.hypot(w, z))),
         "residual": float(rest.residual[0]),
-        "position_error": _largest_error(rest),
+        "position_error": _largest_error(rest.position_error, rest.valid),
         "extrapolated": _extrapolated(rest),
         "result": Result(int(rest.result[0])).message,
     }

@@ -17,7 +17,7 @@ from knode_cosserat.envs.spec import MEASURED, PREVIEW, Arrays, Ending, Spec, co
 from knode_cosserat.envs.tasks.base import Tip
 from knode_cosserat.rods.system import System
 from knode_cosserat.rotation import dot, rotation_matrix
-from knode_cosserat.solvers.history import StateHistory, coefficient_table, rest_record, resting_history
+from knode_cosserat.solvers.history import StateHistory, rest_record, resting_history
 from knode_cosserat.solvers.run import is_coarse
 from knode_cosserat.solvers.time_loop import StepCoefficients, StepRows, loop_many
 
@@ -226,7 +226,7 @@ def step_many(
     """Return the states after one period of many episodes, and their transitions, all with a leading axis."""
     moves = jax.vmap(lambda state, action: _moved_by(spec, arrays, state, action))(states, actions)
     systems = arrays.robot if spec.is_shared else moves.system
-    steps = StepCoefficients(coefficient_table(spec.settings, spec.dt), spec.dt)
+    steps = StepCoefficients.of(spec.settings, spec.dt, "regular")
     lockstep = jax.default_backend() != "cpu"
     acting = moves.acting[:, None]
     _, histories, rows = loop_many(

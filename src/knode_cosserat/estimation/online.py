@@ -18,8 +18,7 @@ from jaxtyping import Float
 from knode_cosserat.estimation.adapted import AdaptedParameters
 from knode_cosserat.estimation.outputs import Output
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.history import StateHistory, coefficient_table
+from knode_cosserat.solvers.history import StateHistory
 from knode_cosserat.solvers.sensitivity import TangentState, tangent_time_loop
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.tangent import SystemMoves
@@ -74,10 +73,10 @@ class OnlineModel(eqx.Module):
     settings: Settings = eqx.field(static=True)
 
     def __init__(self, robot: System, parameters: AdaptedParameters, dt: float):
-        """Set the schemes: the paper's in time, the default along the rod."""
+        """Set the default schemes: a plant holds its controls, as these do."""
         self.robot, self.parameters = robot, parameters
-        self.settings = Settings.of("bdf2", "lobatto2", "paper", NewtonOptions())
-        self.coefficients = StepCoefficients(coefficient_table(self.settings, dt, "regular"), dt)
+        self.settings = Settings()
+        self.coefficients = StepCoefficients.of(self.settings, dt, "regular")
 
     def at(self, x: Any) -> System:
         """Return the robot at coordinates of its parameters."""
@@ -102,10 +101,10 @@ class OnlineModel(eqx.Module):
         done, after, rows = time_loop(system, settings, self.coefficients, controls, past, (0, steps))
         state = TangentState.of(system, settings.space, past, *map(_last, (spread.records, spread.rate)))
         changes = SystemMoves(directions, _last(spread.parameters)), _last(d_controls)
-        solved = rows.records, rows.unknowns
-        last, (d_rows, _) = tangent_time_loop(
-            settings, self.coefficients, solved, (system, controls), changes, state
+        last, (d_solves, _) = tangent_time_loop(
+            settings, self.coefficients, rows.every_stage, (system, controls), changes, state
         )
+        d_rows = d_solves[settings.stages - 1 :: settings.stages]
         d_records, d_rate = (jnp.moveaxis(part, -1, 0) for part in (last.d_records, last.d_rate))
         moved = Spread(d_records, d_rate, spread.parameters)
         after = after._replace(t0=past.t0 + steps * self.coefficients.dt)

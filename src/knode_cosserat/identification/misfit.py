@@ -198,7 +198,7 @@ class Misfit:
             return Rollout(np.asarray(_compared(system, y, *self._target(data, seen))), None)
         beginning = first.rows.records, first.rows.unknowns, held, np.zeros_like(held)
         d_first, d_records = self._static_slopes(still, x, beginning, 1)
-        moved = found.records, found.unknowns, acting, slope
+        moved = *found.every_stage, acting, slope
         if not steps:
             d_rows = d_first[:0]
         elif isinstance(task, Equilibria):
@@ -213,12 +213,15 @@ class Misfit:
 
     def _slopes(self, task: TimeIntegration, x: Any, rows: Any, count: int, carry: Any) -> np.ndarray:
         """Derivatives of a motion's rows; `carry` is the state before the first one."""
-        parts, steps = [], task.coefficients
+        parts, steps, stages = [], task.coefficients, task.settings.stages
         for k in range(0, count, PIECE):
             size = min(PIECE, count - k)
-            piece = tuple(_filled(each[k : k + size], PIECE) for each in rows)
+            piece = tuple(
+                _filled(each[k * m : (k + size) * m], PIECE * m)
+                for each, m in zip(rows, (stages, stages, 1, 1), strict=True)
+            )
             carry, d_rows = _piece(self.model.robot, x, task.settings, steps, piece, carry)
-            parts.append(np.asarray(d_rows)[:size])
+            parts.append(np.asarray(d_rows)[stages - 1 : size * stages : stages])
             steps = steps._replace(table=steps.table[[1, 1]])
         return np.concatenate(parts)
 

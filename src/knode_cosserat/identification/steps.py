@@ -2,10 +2,9 @@
 
 The parameters of a robot are those of its equations only if the error of the time scheme is small. Between
 rows 12.5 ms apart, BDF2 changes the phase and the damping of a vibration of 5 Hz by more than any sensor's
-noise. Where the tensions are samples of a continuous signal and rows are 12.5 ms apart at most, simulations
-therefore take shorter steps than from row to row, under tensions that are interpolated linearly, and by a
-scheme with little numerical damping. Rows with held tensions, such as those of a simulated trajectory, are
-simulated step by step by BDF2.
+noise. Where the tensions are samples of a continuous signal, simulations therefore take steps of 6.25 ms at
+most, under tensions that are interpolated linearly, and by a scheme with little numerical damping. Rows with
+held tensions, such as those of a simulated trajectory, are simulated from row to row like that trajectory.
 """
 
 from __future__ import annotations
@@ -18,24 +17,26 @@ from jaxtyping import Float
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.solvers.time import BDF2, LIGHTLY_DAMPED, TimeScheme
+from knode_cosserat.solvers.time import BDF2, LIGHTLY_DAMPED, TWO_STAGES, TimeScheme
 from knode_cosserat.trajectory import Trajectory
 
 #: longest time step between rows with continuous tensions (s), and most steps from row to row
-LONGEST, MOST = 0.00625, 2
+LONGEST, MOST = 0.00625, 16
 
 
 def is_resolved(dt: float, continuous: bool) -> bool:
     """Return True if rows `dt` (s) apart are close enough to follow vibrations between them.
 
-    Rows farther apart are for slow or strongly damped robots. They are simulated from row to row by BDF2,
-    which damps the vibrations that such rows cannot show.
+    Rows farther apart, more than 0.1 s, are for slow or strongly damped robots. They are simulated from row
+    to row by BDF2, which damps the vibrations that such rows cannot show.
     """
     return continuous and dt <= MOST * LONGEST * (1.0 + 1e-6)
 
 
 def time_scheme(dt: float, continuous: bool) -> TimeScheme:
     """Return the time scheme for rows `dt` (s) apart with continuous or held tensions."""
+    if not continuous:
+        return TWO_STAGES
     return LIGHTLY_DAMPED if is_resolved(dt, continuous) else BDF2()
 
 
@@ -87,7 +88,7 @@ def simulated_rows(
     tension = stepped(tension, tension[0] if initial is None else initial, count, continuous)
     acting = robot.undelayed(tension, dt / count, initial)
     found = simulate(
-        robot, acting, dt / count, time=time_scheme(dt, continuous), space=space, initial=start,
-        recovery_budget=recovery,
+        robot, acting, dt / count, time=time_scheme(dt, continuous), start="paper", space=space,
+        initial=start, recovery_budget=recovery,
     )  # fmt: skip
     return found[::count] if count > 1 else found

@@ -23,9 +23,9 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.grid import at_places, grid_of, inside
 from knode_cosserat.solvers.history import coefficient_table, rows_suffice
-from knode_cosserat.solvers.replay import replay
+from knode_cosserat.solvers.replay import replay, replayed_settings
 from knode_cosserat.solvers.semi_discrete import Point, records_in_strands, unpacked_history
-from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.settings import MEASURED, Settings
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
 
@@ -220,24 +220,32 @@ def strand_samples(knowledge: System, data: Dataset) -> Dataset:
 
 
 def settings_of(trajectory: Trajectory) -> Settings:
-    """Return the settings of a trajectory; the defaults if it was not simulated."""
-    return trajectory.settings or Settings()
+    """Return the settings of a trajectory; those of measured rows if it was not simulated."""
+    return trajectory.settings or MEASURED
 
 
 def _of_one(
     knowledge: System, trajectory: Trajectory, k: int, ends: np.ndarray, model: System | None
 ) -> tuple[Samples, TipSamples, np.ndarray]:
-    settings, dt = settings_of(trajectory), trajectory.dt
+    settings, dt = replayed_settings(trajectory), trajectory.dt
     y, z, control = (np.asarray(a, dtype=float) for a in (trajectory.y, trajectory.z, trajectory.control))
     time = np.asarray(trajectory.time, dtype=float)
     slope, doubt = slopes_of(settings, y)
-    record = np.concatenate([y, z, slope / knowledge.length] if knowledge.mixed else [y, z], axis=-1)
-    c0, history = histories(settings, dt, record)
+
+    def recorded(y: np.ndarray, z: np.ndarray, slope: np.ndarray) -> np.ndarray:
+        return np.concatenate([y, z, slope / knowledge.length] if knowledge.mixed else [y, z], axis=-1)
+
+    record, stages = recorded(y, z, slope), np.zeros((len(time), 0))
+    if settings.stages > 1:
+        between = np.moveaxis(np.nan_to_num(np.asarray(trajectory.stages, dtype=float)), 1, 0)
+        parts = [(each[..., : y.shape[-1]], each[..., y.shape[-1] :][..., : z.shape[-1]]) for each in between]
+        stages = np.stack([recorded(*part, slopes_of(settings, part[0])[0]) for part in parts], axis=1)
+    c0, history = histories(settings, dt, record, stages)
     beyond = far_side(knowledge, time, c0, y, control, history)
     if knowledge.cuts:
         slope, doubt = slopes_of(settings, y, beyond, knowledge.cuts)
     # earlier rows equal the first row if that is the start of a motion, and are unknown otherwise
-    first = 1 if time[0] == 0.0 else 2
+    first = 1 if time[0] == 0.0 or settings.stages > 1 else 2
     rows = np.arange(first, len(time))
     history, c0 = history[rows], c0[rows]
     stages, later = _past_of_rows(knowledge, trajectory, rows, history, model)
@@ -300,15 +308,18 @@ def in_segments(knowledge: System, space: SpaceScheme, records: Float[Any, "plac
     return found[:, 0], found[:, 1:]
 
 
-def histories(settings: Settings, dt: float, record: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def histories(
+    settings: Settings, dt: float, record: np.ndarray, stages: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return c0 (T,) and ʰ (T, N, x) of every row, by the trajectory's own scheme; zero in row 0."""
-    table = coefficient_table(settings, dt)
-    rate = np.zeros_like(record[0])
+    table = coefficient_table(settings, dt).reshape(2, settings.stages, 4)
+    rate, newest = np.zeros_like(record[0]), [record[0]] * 2
     c0, history = np.zeros(len(record)), np.zeros_like(record)
     for i in range(1, len(record)):
-        c0[i], c1, c2, d1 = table[0] if i == 1 else table[1]
-        history[i] = c1 * record[i - 1] + c2 * record[max(i - 2, 0)] + d1 * rate
-        rate = c0[i] * record[i] + history[i]
+        for coefficients, now in zip(table[min(i - 1, 1)], [*stages[i], record[i]], strict=True):
+            c0[i], c1, c2, d1 = coefficients
+            history[i] = c1 * newest[0] + c2 * newest[1] + d1 * rate
+            rate, newest = c0[i] * now + history[i], [now, newest[0]]
     return c0, history
 
 

@@ -142,13 +142,17 @@ def commands(signal: str, seconds: float) -> Pulls:
         turns = np.stack([np.cos(phase), np.sin(phase), -np.cos(phase), -np.sin(phase)], axis=1)
         grams[moving] += SWING * turns
     elif count and name == "step" and plain is not None:
-        newtons = controls.step(plain, count, COMMANDED, base=REST * GRAM, at=0.0, tendons=(2, 3))
+        newtons = controls.step(
+            plain, count, COMMANDED, base=REST * GRAM, at=0.0, tendons=(2, 3), sampled="end"
+        )
         grams[moving] = newtons / GRAM
     elif count and name == "random" and number.isdecimal():
         hold = round(HELD / COMMANDED)
         grams[moving] = controls.random(count, low=REST, high=REST + HIGHEST, seed=int(number), hold=hold)
     else:
-        newtons = controls.parse(signal, None if Path(signal).exists() else max(count, 1), COMMANDED)
+        newtons = controls.parse(
+            signal, None if Path(signal).exists() else max(count, 1), COMMANDED, sampled="end"
+        )
         used = newtons[:count]
         grams[len(time) - count : len(time) - count + len(used)] = used / GRAM
         grams[len(time) - count + len(used) :] = grams[len(time) - count + len(used) - 1]
@@ -185,7 +189,9 @@ def driven(sent: Pulls, lag: float, robot: TendonRod) -> Trajectory:
     time = np.arange(round((sent.time[-1] + COMMANDED) / PLANT_STEP) + 1) * PLANT_STEP
     tension = lagged(sent, time, lag)
     still = equilibrium(robot, tension[0], space="lobatto4")
-    fine = simulate(robot, tension[1:], PLANT_STEP, time=LIGHTLY_DAMPED, space="lobatto4", initial=still)
+    fine = simulate(
+        robot, tension[1:], PLANT_STEP, time=LIGHTLY_DAMPED, start="paper", space="lobatto4", initial=still
+    )
     rows = fine[:: round(KEPT / PLANT_STEP)]
     return dataclasses.replace(rows, settings=None)
 

@@ -16,11 +16,12 @@ if TYPE_CHECKING:
     from knode_cosserat.solvers.simulate import simulate
     from knode_cosserat.solvers.space import Euler, Lobatto2, Lobatto4
     from knode_cosserat.solvers.stepper import Stepper
-    from knode_cosserat.solvers.time import BDF1, BDF2, BDFAlpha, Trapezoidal
+    from knode_cosserat.solvers.time import BDF1, BDF2, SDIRK2, BDFAlpha, Trapezoidal
 
 __all__ = [
     "BDF1",
     "BDF2",
+    "SDIRK2",
     "BDFAlpha",
     "Euler",
     "History",
@@ -49,6 +50,6 @@ make_lazy(
         "knode_cosserat.solvers.simulate": "simulate",
         "knode_cosserat.solvers.space": "Euler Lobatto2 Lobatto4",
         "knode_cosserat.solvers.stepper": "Stepper",
-        "knode_cosserat.solvers.time": "BDF1 BDF2 BDFAlpha Trapezoidal",
+        "knode_cosserat.solvers.time": "BDF1 BDF2 SDIRK2 BDFAlpha Trapezoidal",
     },
 )

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.rods.system import System
+from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.solvers.grid import at_places, grid_of
 from knode_cosserat.solvers.problem import StepProblem, row_of
 from knode_cosserat.solvers.settings import Settings
@@ -31,6 +31,8 @@ EXTRAPOLATIONS = np.array([[1.0, 0.0, 0.0], [2.0, -1.0, 0.0], [3.0, -3.0, 1.0]])
 SOLVED = 2e-8
 
 
+#: units of controls that cannot jump
+MOVED = ("m", "rad")
 #: kind of a motion's first step: "start" by the settings, from one state; "regular" like any other, from two
 #: states; "consistent" by BDF1
 FirstStep = Literal["start", "regular", "consistent"]
@@ -49,6 +51,8 @@ class StateHistory(NamedTuple):
     t0: Float[Any, ""]
     #: estimated discretisation errors of both records and of the rate, at the places of the scheme
     error: Float[Any, "3 used x"]
+    #: estimated errors of both records by the time scheme, at these places; NaN: lost
+    time_error: Float[Any, "2 used x"]
 
 
 class SolverState(eqx.Module):
@@ -68,12 +72,38 @@ class SolverState(eqx.Module):
 
 
 def coefficient_table(settings: Settings, dt: float, first: FirstStep = "start") -> np.ndarray:
-    """Return the coefficients (2, 4) of the first step and of all later steps; zeros for statics."""
+    """Return the coefficients (2, 4) of the first step and of all later steps; zeros for statics.
+
+    With several stages (2, stages, 4).
+    """
     if settings.time is None:
         return np.zeros((2, 4))
+    if settings.stages > 1:
+        return np.array([settings.time.stages(dt)] * 2)
     regular = settings.time.coefficients(dt, dt)
     by_bdf1 = first == "consistent" or (first == "start" and settings.start == "consistent")
     return np.array([BDF1().coefficients(dt, dt) if by_bdf1 else regular, regular])
+
+
+def at_stages(system: System, settings: Settings, controls: Any, before: Any, sudden: bool) -> Any:
+    """Return controls (…, T, c) or, if some change within a step, (…, T, stages * c) at all its stages.
+
+    `before` (…, 1, c) precedes the first one. Displacements and rotations cannot jump, and are linear from
+    row to row; all others only if `settings.between` says so. In a motion from one state, the first value of
+    these is held: it begins suddenly.
+    """
+    moved = np.array(
+        [field.unit in MOVED for field in system.control_layout.fields for _ in range(field.size)]
+    )
+    linear = moved | (settings.between == "linear")
+    if settings.time is None or settings.stages == 1 or not linear.any():
+        return controls
+    numeric: Any = jnp if is_traced((controls, before)) else np
+    first = controls[..., :1, :]
+    earlier = numeric.where(moved | (not sudden), before, first), controls[..., :-1, :]
+    earlier = numeric.where(linear, numeric.concatenate(earlier, axis=-2), controls)
+    parts = [earlier + end * (controls - earlier) for end in settings.time.ends]
+    return numeric.concatenate(parts, axis=-1)
 
 
 def history_of(states: Any, rate: Any, coefficients: Any, settings: Settings) -> Any:
@@ -143,6 +173,7 @@ def repeated_record_history(
         jnp.asarray(EXTRAPOLATIONS[0]),
         jnp.asarray(t0, dtype=float),
         jnp.zeros((3, used, records.shape[-1])),
+        jnp.zeros((2, used, records.shape[-1])),
     )
 
 

@@ -24,7 +24,7 @@ from knode_cosserat.solvers.history import EXTRAPOLATIONS
 from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.time_loop import StepRows, TimeStep, recorded_step, solved_row
+from knode_cosserat.solvers.time_loop import StepRows, TimeStep, no_stages, recorded_step, solved_row
 
 #: smallest load step of continuation, as a part of the change of control
 LEAST_PART = 1.0 / 512.0
@@ -182,7 +182,9 @@ class Recovery(abc.ABC):
         system, result = self.system, Result.NO_CONVERGENCE
         width = system.y_layout.size * (2 if system.mixed else 1) + system.z_layout.size
         record, unknowns = np.full((system.nodes, width), np.nan), np.full(unknown_count(system), np.nan)
-        row = StepRows(record, unknowns, np.inf, 0, np.nan, int(result))
+        row = StepRows(
+            record, unknowns, np.inf, 0, np.nan, int(result), np.nan, *map(np.asarray, no_stages(system))
+        )
         return SolvedStep(self.state, row, likely_cause(result, system, self.settings, control))
 
     def _outcome(self, result: Result, found: Attempt) -> SolvedStep:

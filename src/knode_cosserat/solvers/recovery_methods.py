@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax.numpy as jnp
@@ -12,11 +13,11 @@ from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.guess import hanging_curve, natural_reach, state_from_positions
 from knode_cosserat.solvers.history import EXTRAPOLATIONS, repeated_record_history
 from knode_cosserat.solvers.problem import StepProblem
-from knode_cosserat.solvers.recovery import Attempt, Budget, Recovery, natural_time
+from knode_cosserat.solvers.recovery import Attempt, Budget, Recovery, SolvedStep, natural_time
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.time import BDF1
-from knode_cosserat.solvers.time_loop import TimeStep
+from knode_cosserat.solvers.time import BDF1, BDF2
+from knode_cosserat.solvers.time_loop import StepRows, TimeStep, joined_stages, stage_controls
 
 #: smallest substep as a part of a time step, and largest number of substeps tried
 LEAST_SUBSTEP, MOST_SUBSTEPS = 2.0**-14, 400
@@ -98,6 +99,55 @@ class StepRecovery(Recovery):
             y=jnp.concatenate([after.y[:1], before.y[:-1]]),
             error=jnp.stack([after.error[0], before.error[0], after.error[2]]),
         )
+
+
+class _Substeps(StepRecovery):
+    """Recovery of a step of several stages by substeps of one stage, its last method."""
+
+    def first_guesses(self, control: Any) -> list[tuple[Any, Any]]:
+        """Return none: a whole step of one stage would be another scheme's."""
+        return []
+
+    def continue_load(self, before: Any, now: Any) -> None:
+        """Return None, as for `first_guesses`."""
+
+    def ease(self, control: Any) -> None:
+        """Return None, as for `first_guesses`."""
+
+
+def recovered_stages(
+    system: System, settings: Settings, step: TimeStep, dt: float, budget: Budget, controls: tuple[Any, Any]
+) -> SolvedStep:
+    """Recover a step of several stages: each stage, or all of them by substeps of a multistep scheme."""
+    before, now = (np.asarray(stage_controls(system, settings, jnp.asarray(each))) for each in controls)
+    last, past, found = before[-1], step.past, []
+    for coefficients, t, own in zip(step.coefficients, step.t, now, strict=True):
+        stage = _Stage(system, settings, TimeStep(past, coefficients, t), dt, budget)
+        solved = stage.recover((last, own))
+        if solved.row.result < 0:
+            break
+        found.append(solved.row)
+        past, last = solved.state, own
+    else:
+        rows = StepRows(*map(np.stack, zip(*found, strict=True)))
+        row = StepRows(*map(np.asarray, joined_stages(rows)))
+        past = past._replace(time_error=jnp.full_like(past.time_error, jnp.nan))
+        return SolvedStep(past, row._replace(result=max(int(each.result) for each in found)))
+    whole = TimeStep(step.past, BDF1().coefficients(dt, dt), step.t[-1])
+    one_stage = dataclasses.replace(settings, time=BDF2(), start="consistent")
+    solved = _Substeps(system, one_stage, whole, dt, budget).recover((before[-1], now[-1]))
+    lost = solved.state._replace(time_error=jnp.full_like(solved.state.time_error, jnp.nan))
+    row, count = solved.row, settings.stages - 1
+    # between the ends of such a step no stages are known
+    stages, unknowns = (np.repeat(each[None], count, axis=0) for each in (row.records, row.unknowns))
+    return solved._replace(state=lost, row=row._replace(stages=stages, stage_unknowns=unknowns))
+
+
+class _Stage(StepRecovery):
+    """Recovery of one stage, which cannot be divided."""
+
+    def last_method(self, controls: tuple[Any, Any]) -> None:
+        """Return None: the whole step is divided instead."""
 
 
 class StaticRecovery(Recovery):

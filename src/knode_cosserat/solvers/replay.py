@@ -6,6 +6,7 @@ an earlier version. Rows hold the nodes only; the equations give the other place
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from typing import Any, NamedTuple
 
@@ -21,7 +22,7 @@ from knode_cosserat.solvers.history import (
     SolverState,
     StateHistory,
     advanced,
-    coefficient_table,
+    at_stages,
     constant_history,
     history_of,
     repeated_record_history,
@@ -30,8 +31,9 @@ from knode_cosserat.solvers.history import (
 )
 from knode_cosserat.solvers.problem import StepProblem, no_history, row_of
 from knode_cosserat.solvers.run import padded_rows
-from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.settings import MEASURED, Settings
 from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.solvers.time_loop import StepCoefficients
 from knode_cosserat.trajectory import Trajectory
 
 #: row 0 is the state at rest if it differs by less than this (natural units)
@@ -57,7 +59,7 @@ def replay(trajectory: Trajectory, system: System, dt: float | None = None) -> R
 
     `dt` is the time step (s) of rows whose times are traced.
     """
-    made, time = history_settings(trajectory.settings or Settings()), trajectory.time
+    made, time = replayed_settings(trajectory), trajectory.time
     if len(time) < 2:
         return None
     apart = (trajectory.initial_state and trajectory.initial_state.dt) or dt
@@ -70,20 +72,41 @@ def replay(trajectory: Trajectory, system: System, dt: float | None = None) -> R
     row, state = known
     rows: Any = jnp.concatenate([trajectory.y, trajectory.z], axis=-1)[row:]
     controls: Any = trajectory.control[row:]
+    if made.stages > 1:
+        between: Any = trajectory.stages[row + 1 :, :, :, : rows.shape[-1]]
+        every = jnp.concatenate([between, rows[1:, None]], axis=1)
+        rows = jnp.concatenate([rows[:1], every.reshape(-1, *rows.shape[1:])])
+        acting = at_stages(system, made, controls[1:], controls[:1], state.dt is None)
+        repeats = 1 if acting.shape[1] > controls.shape[1] else made.stages
+        acting = jnp.repeat(acting.reshape(-1, controls.shape[1]), repeats, axis=0)
+        controls = jnp.concatenate([controls[:1], acting])
     count = len(rows)
     if not is_traced((rows, controls)):
         packed = padded_rows(np.reshape(rows, (count, -1)))
         rows, controls = packed.reshape(-1, *np.shape(rows)[1:]), padded_rows(controls)
-    table = coefficient_table(made, apart, state.first_step(made))
+    steps = StepCoefficients.of(made, apart, state.first_step(made))
     past = state.history._replace(t0=jnp.asarray(time[row], dtype=float))
-    history, terms = _along(system, made, past, (rows, controls, count), (table, apart))
+    history, terms = _along(system, made, past, (rows, controls, count), steps)
     rate_known = state.rate_known and made.uses_rate
-    return Replay(row + 1, terms[: count - 1], SolverState(history, apart, rate_known))
+    return Replay(
+        row + 1, terms[made.stages - 1 : count - 1 : made.stages], SolverState(history, apart, rate_known)
+    )
 
 
 def history_settings(settings: Settings) -> Settings:
     """Return only the settings that affect the history; runs that differ in others share programs."""
-    return Settings(settings.time, settings.space, settings.start)
+    return Settings(settings.time, settings.space, settings.start, between=settings.between)
+
+
+def replayed_settings(trajectory: Trajectory) -> Settings:
+    """Return the settings that affect the history of a motion's rows.
+
+    Without the stages of its scheme the rows are like measured ones.
+    """
+    made = history_settings(trajectory.settings or MEASURED)
+    if made.stages > 1 and trajectory.stages is None:
+        return dataclasses.replace(MEASURED, space=made.space)
+    return made
 
 
 def _known_row(
@@ -124,22 +147,24 @@ def _along(
     settings: Settings,
     past: StateHistory,
     motion: tuple[Any, Any, Any],
-    steps: tuple[Any, Any],
+    steps: StepCoefficients,
 ) -> tuple[StateHistory, Float[Any, "steps places x"]]:
     """Return the history after a motion's last row, and the history terms of each step.
 
-    `motion` are rows, controls and the number of rows without padding; `steps` are the coefficients of the
-    first step and of all later steps, and the time step. If a row was changed after it was solved, its
-    difference from the equations at the nodes is interpolated to the other places.
+    `motion` are rows, controls and the number of rows without padding, the stages between them included. If
+    a row was changed after it was solved, its difference from the equations at the nodes is interpolated to
+    the other places.
     """
-    (rows, controls, count), (table, dt) = motion, steps
-    ny, t0 = system.y_layout.size, past.t0
+    rows, controls, count = motion
+    ny, t0, stages = system.y_layout.size, past.t0, settings.stages
 
     def one(past: StateHistory, step: Any) -> Any:
         i, row, control = step
-        coefficients = jnp.where(i == 1, *jnp.asarray(table))
+        coefficients, t = steps.at(t0, (i - 1) // stages)
+        if stages > 1:
+            coefficients, t = coefficients[(i - 1) % stages], t[(i - 1) % stages]
         history = history_of(past.records, past.rate, coefficients, settings)
-        problem = StepProblem(system, t0 + i * dt, control, coefficients[0], history, settings.space)
+        problem = StepProblem(system, t, control, coefficients[0], history, settings.space)
         y = problem.filled(row[:, :ny])
         records = problem.records(y)
         records = records + carried(
@@ -150,7 +175,7 @@ def _along(
 
     first = past._replace(weights=jnp.asarray(EXTRAPOLATIONS[1]))
     past, terms = jax.lax.scan(one, first, (jnp.arange(1, len(rows)), rows[1:], controls[1:]))
-    return past._replace(t0=t0 + (count - 1) * dt), terms
+    return past._replace(t0=t0 + (count - 1) // stages * steps.dt), terms
 
 
 def carried(system: System, space: SpaceScheme, change: Float[Any, "nodes x"]) -> Float[Any, "places more"]:

@@ -16,9 +16,9 @@ import numpy as np
 from tqdm import tqdm
 
 from knode_cosserat.rods.system import System, is_traced
-from knode_cosserat.solvers.history import FirstStep, SolverState, StateHistory, coefficient_table
+from knode_cosserat.solvers.history import FirstStep, SolverState, StateHistory
 from knode_cosserat.solvers.recovery import Budget, SolvedStep
-from knode_cosserat.solvers.recovery_methods import StaticRecovery, StepRecovery
+from knode_cosserat.solvers.recovery_methods import StaticRecovery, StepRecovery, recovered_stages
 from knode_cosserat.solvers.result import Result, SimulationError
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import Euler
@@ -71,7 +71,7 @@ class TimeIntegration:
     @property
     def coefficients(self) -> StepCoefficients:
         """Coefficients of the steps."""
-        return StepCoefficients(coefficient_table(self.settings, self.dt, self.first), self.dt)
+        return StepCoefficients.of(self.settings, self.dt, self.first)
 
     def solve(self, system: System, controls: Any, state: StateHistory, span: tuple[int, int]) -> Any:
         """Solve a span of steps until one fails: number of steps done, the last state, all rows."""
@@ -85,9 +85,9 @@ class TimeIntegration:
 
     def recover(self, system: System, state: Any, controls: Any, i: int, budget: Budget) -> SolvedStep:
         """Recover step i; `controls` are the previous step's and its own."""
-        coefficients = self.coefficients
-        t = float(state.t0) + (i + 1) * self.dt
-        step = TimeStep(state, coefficients.table[min(i, 1)], t)
+        step = TimeStep(state, *map(np.asarray, self.coefficients.at(state.t0, i)))
+        if self.settings.stages > 1:
+            return recovered_stages(system, self.settings, step, self.dt, budget, controls)
         return StepRecovery(system, self.settings, step, self.dt, budget).recover(controls)
 
 
@@ -224,17 +224,29 @@ def failure(rows: StepRows, causes: str | dict[int, str], times: Any) -> Simulat
     return SimulationError(number, t, float(rows.error[i]), Result(int(rows.result[i])), cause, robot)
 
 
+def time_error_of(system: System, rows: StepRows) -> Any:
+    """Return the estimated errors in time (m); NaN if there is none, or if it is more than the length."""
+    numeric: Any = jnp if is_traced(rows) else np
+    length = system.length[..., None] if np.ndim(system.length) else system.length
+    known = (numeric.asarray(rows.result) >= 0) & (rows.time_error <= length)
+    return numeric.where(known, rows.time_error, numeric.nan)
+
+
 def rows_of(system: System, rows: StepRows) -> dict[str, Any]:
     """Return a trajectory's arrays of rows, with NaN in unsolved rows."""
     numeric: Any = jnp if is_traced(rows) else np
     ny, nz = system.y_layout.size, system.z_layout.size
     invalid = numeric.asarray(rows.result) < 0
     records = numeric.where(invalid[..., None, None], numeric.nan, rows.records)
-    return {
+    found = {
         "y": records[..., :ny], "z": records[..., ny : ny + nz], "result": rows.result,
         "residual": rows.error, "iterations": rows.corrections,
         "position_error": numeric.where(invalid, numeric.nan, rows.position_error),
+        "time_error": time_error_of(system, rows),
     }  # fmt: skip
+    if rows.stages.shape[-3]:
+        found["stages"] = numeric.where(invalid[..., None, None, None], numeric.nan, rows.stages)
+    return found
 
 
 def run_batch(

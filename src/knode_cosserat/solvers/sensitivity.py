@@ -69,7 +69,7 @@ def rollout(task: TimeIntegration) -> Callable[[System, Any, StateHistory], tupl
 
     def tangent(primals: Any, tangents: Any) -> Any:
         rows, last = run(*primals)
-        (system, controls, past), solved = primals, (rows.records, rows.unknowns)
+        (system, controls, past), solved = primals, rows.every_stage
         moves = SystemMoves.of(_system_tangent(tangents[0]))
         _, d_controls, d_past = jax.tree.map(_instantiated, tangents, is_leaf=_is_zero)
         state = TangentState.of(system, settings.space, past, d_past.records, d_past.rate)
@@ -84,7 +84,10 @@ def rollout(task: TimeIntegration) -> Callable[[System, Any, StateHistory], tupl
             rate=d_last.rate.at[:used].set(after.d_rate),
             t0=d_past.t0,
         )
-        return (rows, last), (_row_tangents(rows, *d_solved), d_last)
+        d_records, d_unknowns = (d.reshape(steps, settings.stages, *d.shape[1:]) for d in d_solved)
+        d_rows = _row_tangents(rows, d_records[:, -1], d_unknowns[:, -1])
+        d_rows = d_rows._replace(stages=d_records[:, :-1], stage_unknowns=d_unknowns[:, :-1])
+        return (rows, last), (d_rows, d_last)
 
     run.defjvp(tangent, symbolic_zeros=True)
     return run
@@ -141,7 +144,8 @@ def _nan_where_unsolved(rows: StepRows) -> StepRows:
 
 def _row_tangents(rows: StepRows, d_records: Any, d_unknowns: Any) -> StepRows:
     whole, zero = np.zeros(rows.result.shape, dtype=jax.dtypes.float0), jnp.zeros_like(rows.error)
-    return StepRows(d_records, d_unknowns, zero, whole, zero, whole)
+    none = jax.tree.map(jnp.zeros_like, (rows.stages, rows.stage_unknowns))
+    return StepRows(d_records, d_unknowns, zero, whole, zero, whole, zero, *none)
 
 
 @functools.partial(jax.jit, static_argnames="settings")
@@ -152,15 +156,23 @@ def tangent_time_loop(
     """Return the state after the last of some solved rows, and the tangents of all rows and unknowns.
 
     They are linear in `changes`, the tangents of system and controls, and in those of `state`. `solved` are
-    all rows and unknowns; `at` are system and controls. Many tangents at once are columns: weights, controls,
-    state and results have one more axis, the last. This is faster than `jax.vmap` over them.
+    all rows and unknowns, and with several stages those of every stage, like the result; `at` are system and
+    controls. Many tangents at once are columns: weights, controls, state and results have one more axis, the
+    last. This is faster than `jax.vmap` over them.
     """
     (system, controls), (moves, d_controls) = at, changes
+    stages, count = settings.stages, len(controls)
+    coefficients, t = jax.vmap(functools.partial(steps.at, state.t0))(jnp.arange(count))
+    controls, d_controls = (
+        each.reshape(count * stages, system.control_size, *each.shape[2:])
+        if each.shape[1] > system.control_size
+        else jnp.repeat(each, stages, axis=0)
+        for each in (controls, d_controls)
+    )
 
     def one(state: TangentState, now: Any) -> Any:
-        i, row, unknowns, control, d_control = now
-        coefficients = jnp.where(i == 0, steps.table[0], steps.table[1])
-        t, c0 = state.t0 + (i + 1) * steps.dt, coefficients[0]
+        coefficients, t, row, unknowns, control, d_control = now
+        c0 = coefficients[0]
         history = history_of(state.records, state.rate, coefficients, settings)
         d_history = history_of(state.d_records, state.d_rate, coefficients, settings)
         problem = StepProblem(system, t, control, c0, history, settings.space)
@@ -175,7 +187,8 @@ def tangent_time_loop(
         )  # fmt: skip
         return after, (d_row, d_unknowns)
 
-    return jax.lax.scan(one, state, (jnp.arange(len(controls)), *solved, controls, d_controls))
+    solves = coefficients.reshape(-1, 4), t.reshape(-1), *solved, controls, d_controls
+    return jax.lax.scan(one, state, solves)
 
 
 def _step_tangent(problem: StepProblem, row: Any, unknowns: Any, moves: SystemMoves, changes: Any) -> Any:

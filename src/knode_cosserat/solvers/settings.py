@@ -13,6 +13,7 @@ from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.time import TimeScheme
 
 Start = Literal["paper", "consistent"]
+Between = Literal["held", "linear"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,24 +21,32 @@ class Settings:
     """Schemes in time and space, the first step, and Newton's options.
 
     `time` is None for equilibria, which have no rates. `start` selects the first step of a scheme that needs
-    two earlier states. "paper" sets the state before the first equal to the first; "consistent" makes the
-    first step by BDF1 (keeps order 2).
+    two earlier states. "consistent" makes the first step by BDF1 (keeps order 2); "paper" sets the state
+    before the first equal to the first, which delays a motion that begins suddenly by half a step.
     """
 
-    time: TimeScheme | None = time_schemes.BDF2()
+    time: TimeScheme | None = time_schemes.TWO_STAGES
     space: SpaceScheme = space_schemes.LOBATTO2
-    start: Start = "paper"
+    start: Start = "consistent"
     newton: NewtonOptions = NewtonOptions()
+    #: controls are constant from row to row, or linear (`history.at_stages`)
+    between: Between = "held"
 
     @property
     def uses_rate(self) -> bool:
         """True if the time scheme needs y_t of the previous step."""
         return self.time is not None and self.time.uses_rate
 
+    @property
+    def stages(self) -> int:
+        """Number of boundary-value problems that are solved in a step."""
+        return 1 if self.time is None else len(self.time.ends)
+
     @classmethod
     def of(
-        cls, time: str | TimeScheme | None, space: str | SpaceScheme, start: str, newton: NewtonOptions
-    ) -> Self:
+        cls, time: str | TimeScheme | None, space: str | SpaceScheme, start: str, newton: NewtonOptions,
+        between: str = "held",
+    ) -> Self:  # fmt: skip
         """Return settings from names or schemes; `time` is None for statics.
 
         Raises `ValueError` with the accepted names.
@@ -46,11 +55,14 @@ class Settings:
             raise ValueError(f"newton is {newton!r}; allowed is a NewtonOptions")
         if start not in ("paper", "consistent"):
             raise ValueError(f'start is {start!r}; allowed is "paper" or "consistent"')
+        if between not in ("held", "linear"):
+            raise ValueError(f'between is {between!r}; allowed is "held" or "linear"')
         return cls(
             None if time is None else _scheme("time", time, TimeScheme, time_schemes.SCHEMES),
             _scheme("space", space, SpaceScheme, space_schemes.SCHEMES),
             start,  # type: ignore[arg-type]
             newton,
+            between,  # type: ignore[arg-type]
         )
 
     def described(self) -> dict[str, Any]:
@@ -60,6 +72,7 @@ class Settings:
             "space": _described(self.space),
             "start": self.start,
             "newton": dataclasses.asdict(self.newton),
+            "between": self.between,
         }
 
     @classmethod
@@ -79,8 +92,12 @@ class Settings:
             space=_named(SpaceScheme, **space),
             start=described["start"],
             newton=NewtonOptions(**newton),
+            between=described.get("between", "held"),
         )
 
+
+#: for rows that were not simulated: rates are differences of the rows (paper eq. 2, backward differentiation)
+MEASURED = Settings(time_schemes.BDF2(), start="paper")
 
 #: schemes along the rod of earlier versions, and present schemes of the same order
 _EARLIER_SCHEMES = {"RK4": "Lobatto4"}

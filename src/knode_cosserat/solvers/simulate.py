@@ -18,10 +18,9 @@ from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.rods.trained_range import without_range
 from knode_cosserat.solvers import sensitivity
 from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.damping import warn_if_undamped
-from knode_cosserat.solvers.history import SolverState
+from knode_cosserat.solvers.damping import warn_if_undamped, warn_of_long_steps
+from knode_cosserat.solvers.history import SolverState, at_stages
 from knode_cosserat.solvers.initial import continued_state, initial_state
-from knode_cosserat.solvers.recovery import natural_time
 from knode_cosserat.solvers.run import (
     InitialState,
     TimeIntegration,
@@ -40,8 +39,6 @@ from knode_cosserat.trajectory import Trajectory
 
 #: shortest and longest time steps (s): shorter ones are lost in rounding errors of the times
 SHORTEST_STEP, LONGEST_STEP = 1e-9, 1e6
-#: time steps above this (s), and above this multiple of the rod's natural time, suggest milliseconds
-LONG_STEP, LONG_STEPS = 1.0, 100.0
 #: first and largest number of segments for position_tolerance
 FIRST_SEGMENTS, MOST_SEGMENTS = 8, 512
 #: negative tensions up to this part of the largest tension may be measurement noise
@@ -55,9 +52,10 @@ def simulate(
     controls: Any,
     dt: float,
     *,
-    time: str | TimeScheme = "bdf2",
+    time: str | TimeScheme = "sdirk2",
     space: str | SpaceScheme = "lobatto2",
-    start: Literal["paper", "consistent"] = "paper",
+    start: Literal["paper", "consistent"] = "consistent",
+    between: Literal["held", "linear"] = "held",
     initial: Trajectory | None = None,
     newton: NewtonOptions = NewtonOptions(),
     position_tolerance: float | None = None,
@@ -70,11 +68,17 @@ def simulate(
     Args:
         robot: one system, or a sequence of systems that differ in their parameters only.
         controls: (T, c), or (B, T, c) for a batch; for a tendon robot the tensions in N. Control i is held
-            from row i to row i + 1.
+            from row i to row i + 1; see `between`.
         dt: time step (s).
-        time: "bdf1", "bdf2", "bdf-alpha", "trapezoidal", or a scheme.
+        time: "sdirk2", or "bdf1", "bdf2", "bdf-alpha", "trapezoidal", or a scheme. Multistep schemes evaluate
+            controls at the end of a step, so that one that is held acts half a step late: they are of order 2
+            for controls that are continuous in time, of which control i is the value at row i + 1.
         space: "lobatto2" (order 2), "lobatto4" (order 4), "euler" (order 1, the paper's), or a scheme.
-        start: how the first step is made from one state; see `Settings`.
+        start: how a multistep scheme makes its first step from one state; see `Settings`.
+        between: "held": controls are constant from row to row, as a robot's controller sets them;
+            displacements and rotations (controls in m or rad) cannot jump, and are linear from row to row.
+            "linear": so are all others. Linear controls reach control i at row i + 1. A motion from rest or
+            from an equilibrium begins suddenly: the first control of the others is held.
         initial: start from this trajectory's last row. By default the simulation starts from the robot's
             state at rest, or from the equilibrium under zero control if that state is only a guess (such as
             for a platform on bent legs). A simulated motion continues exactly, by its `final_state`, with the
@@ -103,20 +107,20 @@ def simulate(
         raise ValueError(f"initial is a {type(initial).__name__}; allowed is a Trajectory, or None")
     if time in (None, "static"):
         raise ValueError(f"time is {time!r}; equilibria have no time steps: use solvers.equilibria")
-    settings = Settings.of(time, space, start, newton)
+    settings = Settings.of(time, space, start, newton, between)
     if on_failure not in ("raise", "return"):
         raise ValueError(f'on_failure is {on_failure!r}; allowed is "raise" or "return"')
     dt = checked_dt(dt)
     warn_if_undamped(robot, dt)
+    warn_of_long_steps(robot, dt)
     if position_tolerance is not None:
         refine = functools.partial(
             simulate, controls=controls, dt=dt, time=time, space=space, start=start, newton=newton,
-            recovery_budget=recovery_budget, on_failure=on_failure, progress=progress,
+            between=between, recovery_budget=recovery_budget, on_failure=on_failure, progress=progress,
         )  # fmt: skip
         return refined_trajectory(refine, robot, initial, position_tolerance, settings.space.order)
     system, batch = stacked(robot)
     controls, batch = checked_controls(system, controls, batch)
-    _warn_of_long_steps(system, dt)
     if initial is not None:
         check_initial(system, initial, batch)
     # ranges are not part of the equations: programs are compiled for systems without them
@@ -124,8 +128,8 @@ def simulate(
     if is_traced((system, controls, initial)):
         found = _traced(bare, controls, before, settings, dt)
     else:
-        at_start, task = _initial(bare, controls, before, settings, dt, recovery_budget)
-        found = _plain(bare, controls, at_start, task, on_failure, progress)
+        at_start, task, acting = _initial(bare, controls, before, settings, dt, recovery_budget)
+        found = _plain(bare, acting, at_start, task, on_failure, progress)
     return marked(dataclasses.replace(found, system=system), initial)
 
 
@@ -221,19 +225,6 @@ def checked_dt(dt: Any) -> float:
     return float(dt)
 
 
-def _warn_of_long_steps(system: System, dt: float) -> None:
-    """Warn if a time step looks like milliseconds: seconds long, and far above the rod's natural time."""
-    if dt < LONG_STEP or is_traced(system):
-        return
-    natural = natural_time(system)
-    if natural is not None and dt > LONG_STEPS * natural:
-        warnings.warn(
-            f"dt is {dt:g} s, {dt / natural:.2g} times this rod's natural time ({natural:.2g} s): "
-            "is it meant in seconds?",
-            stacklevel=3,
-        )
-
-
 def checked_controls(system: System, controls: Any, batch: int | None) -> tuple[Any, int | None]:
     """Return controls (steps, c) or (batch, steps, c), and the size of the batch. Raises `ValueError`."""
     names = ", ".join(f"{field.name} ({field.unit})" for field in system.control_layout.fields)
@@ -310,14 +301,15 @@ def check_initial(system: System, initial: Trajectory, batch: int | None) -> Non
 
 
 def _initial(system: Any, controls: Any, initial: Any, settings: Settings, dt: float, budget: Any) -> Any:
-    """Return the initial state of a run, and its time steps."""
+    """Return the initial state of a run, its time steps, and the controls of their stages."""
     if initial is None:
         batch = len(controls) if np.ndim(controls) == 3 else None
         at_start = initial_state(system, settings, batch, budget)
     else:
         at_start = continued_state(system, initial, settings, dt)
     first = at_start.state.first_step(settings)
-    return at_start, TimeIntegration(settings, dt, np.shape(controls)[-2], first, budget)
+    acting = at_stages(system, settings, controls, at_start.control[..., None, :], at_start.state.dt is None)
+    return at_start, TimeIntegration(settings, dt, np.shape(controls)[-2], first, budget), acting
 
 
 def _plain(
@@ -340,7 +332,7 @@ def _traced(system, controls, initial, settings, dt):  # type: ignore[no-untyped
 
     A single jitted function, so that a transformation traces it once and not at every call.
     """
-    at_start, task = _initial(system, controls, initial, settings, dt, None)
+    at_start, task, controls = _initial(system, controls, initial, settings, dt, None)
     run: Any = sensitivity.rollout(task)
     if np.ndim(controls) == 3:
         run = jax.vmap(run, in_axes=(0 if np.ndim(system.length) else None, 0, 0))
@@ -359,8 +351,11 @@ def _trajectory(
     first = {
         "y": record[..., :ny], "z": record[..., ny : ny + system.z_layout.size], "control": at_start.control,
         "result": zero.astype(int), "residual": zero, "iterations": zero.astype(int), "position_error": zero,
+        "time_error": zero,
     }  # fmt: skip
-    every = rows_of(system, rows) | {"control": controls}
+    every = rows_of(system, rows) | {"control": controls[..., np.shape(controls)[-1] - system.control_size :]}
+    if "stages" in every:
+        first["stages"] = numeric.full(every["stages"][..., 0, :, :, :].shape, np.nan)
     t0 = numeric.asarray(at_start.state.history.t0)
     time = (t0[0] if axis else t0) + np.arange(task.steps + 1) * dt
     final = history._replace(t0=numeric.full(np.shape(t0), time[-1]))

@@ -12,7 +12,7 @@ from knode_cosserat._numbers import real_array
 from knode_cosserat._reprs import robot_text
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.history import SolverState, StateHistory
+from knode_cosserat.solvers.history import SolverState, StateHistory, at_stages
 from knode_cosserat.solvers.initial import continued_state, initial_state
 from knode_cosserat.solvers.recovery import Budget
 from knode_cosserat.solvers.result import Result, SimulationError
@@ -54,9 +54,9 @@ class Stepper:
         robot: System,
         dt: float,
         *,
-        time: str | TimeScheme = "bdf2",
+        time: str | TimeScheme = "sdirk2",
         space: str | SpaceScheme = "lobatto2",
-        start: Literal["paper", "consistent"] = "paper",
+        start: Literal["paper", "consistent"] = "consistent",
         initial: Trajectory | None = None,
         newton: NewtonOptions = NewtonOptions(),
         recovery_budget: float | None = None,
@@ -86,9 +86,9 @@ class Stepper:
         self._past, self._t0 = at_start.state.history, float(at_start.state.history.t0)
         self._index, self._steps, self._coarse = 0, 0, bool(at_start.coarse)
         self._control = np.asarray(at_start.control, dtype=float)
-        # same capacity as in a run of up to 128 steps, so that they share a program
-        self._controls = np.zeros((LEAST_CAPACITY, robot.control_size))
-        row = StepRows(np.asarray(at_start.record), np.zeros(0), 0.0, 0, 0.0, 0)
+        self._begun = at_start.state.dt is not None
+        stages = np.full((settings.stages - 1, *np.shape(at_start.record)), np.nan)
+        row = StepRows(np.asarray(at_start.record), np.zeros(0), 0.0, 0, 0.0, 0, 0.0, stages, np.zeros(0))
         self._state = self._row(row, self._control, self.time, at_start.state)
 
     def __repr__(self) -> str:
@@ -119,7 +119,7 @@ class Stepper:
         """
         control = self._checked(control)
         row, after = self._solve(control, stop)
-        self._past, self._control = after, control
+        self._past, self._control, self._begun = after, control, True
         self._coarse = row.result == Result.COARSE
         self._steps, self._index = self._steps + 1, self._index + 1
         if self._index == LEAST_CAPACITY:
@@ -157,8 +157,10 @@ class Stepper:
         return ", ".join(f"{field.name} ({field.size}, {field.unit})" for field in self._layout.fields)
 
     def _solve(self, control: np.ndarray, stop: Callable[[], bool] | None) -> tuple[StepRows, StateHistory]:
-        i = self._index
-        controls = self._controls.copy()  # the compiled loop may still read the previous array
+        i, settings = self._index, self._task.settings
+        control = at_stages(self.robot, settings, control[None], self._control[None], not self._begun)[0]
+        # same capacity as in a run of up to 128 steps, so that they share a program
+        controls = np.zeros((LEAST_CAPACITY, len(control)))
         controls[i] = control
         done, after, rows = self._task.solve(self.robot, controls, self._past, (i, i + 1))
         row, cause = StepRows(*(np.asarray(leaf)[i] for leaf in rows)), ""

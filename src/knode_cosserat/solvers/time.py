@@ -3,13 +3,16 @@
     y_t,n = c0 y_n + ʰy,     ʰy = c1 y_{n-1} + c2 y_{n-2} + d1 y_t,{n-1}
 
 A scheme is defined by its coefficients. Consecutive steps may differ in length, so that a step can be halved.
+A one-step scheme of several stages solves one such problem a stage; the earlier states are then those of the
+stage before and of the last row.
 """
 
 from __future__ import annotations
 
 import abc
 import dataclasses
-from typing import NamedTuple
+import math
+from typing import ClassVar, NamedTuple
 
 
 class Coefficients(NamedTuple):
@@ -27,6 +30,8 @@ class TimeScheme(abc.ABC):
 
     #: true if y_t of the previous step enters, and so must be stored; if false, unresolved modes are damped
     uses_rate = False
+    #: ends of the stages as parts of a step; multistep schemes have one stage
+    ends: ClassVar[tuple[float, ...]] = (1.0,)
 
     @property
     @abc.abstractmethod
@@ -35,7 +40,15 @@ class TimeScheme(abc.ABC):
 
     @abc.abstractmethod
     def coefficients(self, dt: float, previous_dt: float) -> Coefficients:
-        """Return c and d of a step of dt after previous_dt (s) (paper eq. 2, backward differentiation)."""
+        """Return c and d of a step of dt after previous_dt (s) (paper eq. 2, backward differentiation).
+
+        For a scheme of several stages they are those of a scheme of one stage and of the same order, for rows
+        whose stages are not known.
+        """
+
+    def stages(self, dt: float) -> tuple[Coefficients, ...]:
+        """Return c and d of each stage of a step of dt (s) after an equal one."""
+        return (self.coefficients(dt, dt),)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,10 +110,43 @@ class Trapezoidal(BDFAlpha):
     alpha: float = -0.5
 
 
+@dataclasses.dataclass(frozen=True)
+class SDIRK2(TimeScheme):
+    """The singly diagonally implicit Runge-Kutta scheme of two stages, L-stable and stiffly accurate.
+
+    Order 2 for controls that are held in each step, because no step remembers the one before (Alexander 1977,
+    γ = 1 - √½). Both stages have the same c0.
+    """
+
+    order = 2
+    #: γ, and the end of the step
+    ends: ClassVar[tuple[float, ...]] = (1.0 - math.sqrt(0.5), 1.0)
+
+    @property
+    def defect(self) -> float:
+        """Error that a step of y' = J y adds, as a multiple of (γ dt J)² (difference of Y between stages)."""
+        gamma = self.ends[0]
+        return (3.0 * gamma**2 - 2.0 * gamma**3 - 1.0 / 6.0) / (gamma**2 * (1.0 - gamma))
+
+    def coefficients(self, dt: float, previous_dt: float) -> Coefficients:
+        """Return those of BDF2, for rows whose stages are not known."""
+        return BDF2().coefficients(dt, previous_dt)
+
+    def stages(self, dt: float) -> tuple[Coefficients, ...]:
+        """Return the coefficients of both stages of a step of dt (s)."""
+        gamma = self.ends[0]
+        c0 = 1.0 / (gamma * dt)
+        second = c0 * (1.0 - gamma) / gamma
+        return Coefficients(c0, -c0, 0.0, 0.0), Coefficients(c0, -second, second - c0, 0.0)
+
+
 #: for comparisons with real motions: near the trapezoidal rule, and stiff modes still decay by 18 % in a step
 LIGHTLY_DAMPED = BDFAlpha(-0.45)
+#: the scheme by default
+TWO_STAGES = SDIRK2()
 
 SCHEMES: dict[str, TimeScheme] = {
+    "sdirk2": TWO_STAGES,
     "bdf1": BDF1(),
     "bdf2": BDF2(),
     "bdf-alpha": BDFAlpha(),

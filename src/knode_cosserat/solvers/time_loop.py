@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float, Int
 
 from knode_cosserat.rods.strands import in_strands
@@ -21,12 +22,22 @@ from knode_cosserat.solvers.boundary import (
     none_kept,
     pivots_of,
 )
-from knode_cosserat.solvers.history import EXTRAPOLATIONS, StateHistory, advanced, history_of, used_places
+from knode_cosserat.solvers.history import (
+    EXTRAPOLATIONS,
+    GUESS_STATES,
+    FirstStep,
+    StateHistory,
+    advanced,
+    coefficient_table,
+    history_of,
+    used_places,
+)
 from knode_cosserat.solvers.linear import Factors, solved_correction
 from knode_cosserat.solvers.problem import Stages, StepProblem, no_history, row_of
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import LOBATTO2
+from knode_cosserat.solvers.time import SDIRK2
 
 #: extrapolations are weighted by this power of their errors in the newest step
 TRUST = -3
@@ -37,7 +48,10 @@ ROUNDING = 1e-12
 
 
 class StepRows(NamedTuple):
-    """The steps' results, one row a step; with a batch, one axis more in front."""
+    """The steps' results, one row a step; with a batch, one axis more in front.
+
+    A row is that of the step's last stage; `stages` and `stage_unknowns` are those of the stages before it.
+    """
 
     records: Float[Any, "steps nodes x"]
     unknowns: Float[Any, "steps k"]
@@ -48,17 +62,46 @@ class StepRows(NamedTuple):
     position_error: Float[Any, " steps"]
     #: result codes (`result.Result`)
     result: Int[Any, " steps"]
+    #: estimated error of positions (m) by the time scheme, the largest over the nodes; NaN: no estimate
+    time_error: Float[Any, " steps"]
+    stages: Float[Any, "steps stages nodes x"]
+    stage_unknowns: Float[Any, "steps stages k"]
+
+    @property
+    def every_stage(self) -> tuple[Float[Any, "solves nodes x"], Float[Any, "solves k"]]:
+        """Records and unknowns of all stages of all steps in turn, those of the rows among them."""
+        pairs = (self.stages, self.records), (self.stage_unknowns, self.unknowns)
+        joined = [jnp.concatenate([stages, last[:, None]], axis=1) for stages, last in pairs]
+        records, unknowns = (part.reshape(-1, *part.shape[2:]) for part in joined)
+        return records, unknowns
 
 
 class StepCoefficients(NamedTuple):
-    """Coefficients of a run's first step and of all later steps, and its time step (s)."""
+    """Coefficients of a run's first step and of all later steps, its time step (s), and the ends of stages.
+
+    A scheme of several stages has coefficients (2, stages, 4) and as many ends, as parts of a step.
+    """
 
     table: Float[Any, "2 4"]
     dt: Any
+    ends: Any = 1.0
+
+    @classmethod
+    def of(cls, settings: Settings, dt: float, first: FirstStep = "start") -> StepCoefficients:
+        """Return the coefficients of a run with steps of dt (s)."""
+        ends = np.array(settings.time.ends) if settings.time and settings.stages > 1 else 1.0
+        return cls(coefficient_table(settings, dt, first), dt, ends)
+
+    def at(self, t0: Any, i: Any) -> tuple[Any, Any]:
+        """Return the coefficients of step i, and the times (s) at its end or at those of its stages."""
+        return jnp.where(i == 0, self.table[0], self.table[1]), t0 + (i + self.ends) * self.dt
 
 
 class TimeStep(NamedTuple):
-    """A time step, without its control: the history before it, its coefficients, and the time at its end."""
+    """A time step, without its control: the history before it, its coefficients, and the time at its end.
+
+    With several stages, coefficients (stages, 4) and times (stages,).
+    """
 
     past: StateHistory
     coefficients: Float[Any, "4"]
@@ -67,7 +110,7 @@ class TimeStep(NamedTuple):
     @classmethod
     def of(cls, steps: StepCoefficients, past: StateHistory, i: Any) -> TimeStep:
         """Return step i of a run."""
-        return cls(past, jnp.where(i == 0, steps.table[0], steps.table[1]), past.t0 + (i + 1) * steps.dt)
+        return cls(past, *steps.at(past.t0, i))
 
     def problem(self, system: System, settings: Settings, control: Any) -> StepProblem:
         """Return the boundary-value problem of the step."""
@@ -78,15 +121,75 @@ class TimeStep(NamedTuple):
 def solve_time_step(
     system: System, settings: Settings, step: TimeStep, control: Any, kept: Kept, batch: str | None = None
 ) -> tuple[StateHistory, StepRows, Kept]:
-    """Solve one time step: return the next history, the step's row, and the kept factors."""
+    """Solve one time step: return the next history, the step's row, and the kept factors.
+
+    The control (c,) is held during all stages, or is (stages * c,), one after the other.
+    """
+    if settings.stages == 1:
+        return solve_stage(system, settings, step, control, kept, EXTRAPOLATIONS, EXTRAPOLATIONS, batch)
+    own = stage_controls(system, settings, control)
+    guesses = stage_extrapolations(settings)
+
+    def solve(state: tuple[StateHistory, Kept], stage: Any) -> Any:
+        past, kept = state
+        coefficients, t, control, *guesses = stage
+        one = TimeStep(past, coefficients, t)
+        past, row, kept = solve_stage(system, settings, one, control, kept, *guesses, batch)
+        return (past, kept), row
+
+    stages = step.coefficients, step.t, own, guesses, jnp.roll(guesses, -1, axis=0)
+    (past, kept), rows = jax.lax.scan(solve, (step.past, kept), stages)
+    return past, joined_stages(rows), kept
+
+
+def stage_controls(system: System, settings: Settings, control: Any) -> Float[Any, "stages c"]:
+    """Return the control of each stage of a step; see `solve_time_step`."""
+    size = system.control_size
+    own = control[None] if control.shape[0] == size else control.reshape(settings.stages, size)
+    return jnp.broadcast_to(own, (settings.stages, size))
+
+
+def joined_stages(rows: StepRows) -> StepRows:
+    """Return the row of a step from those of its stages: the last, with the worst result of all."""
+    last = jax.tree.map(lambda leaf: leaf[-1], rows)
+    return last._replace(
+        error=jnp.max(rows.error), corrections=jnp.sum(rows.corrections), result=jnp.min(rows.result),
+        stages=rows.records[:-1], stage_unknowns=rows.unknowns[:-1],
+    )  # fmt: skip
+
+
+def stage_extrapolations(settings: Settings) -> Float[Any, "stages past past"]:
+    """Return for each stage the constant, linear and quadratic extrapolations from the last three states."""
+    assert settings.time is not None
+    ends = np.array(settings.time.ends)
+    times = np.concatenate([ends - 2.0, ends - 1.0, ends])
+    found = np.zeros((len(ends), *EXTRAPOLATIONS.shape))
+    for k in range(len(ends)):
+        now = 2 * len(ends) + k
+        for order in range(GUESS_STATES):
+            nodes = times[now - 1 - order : now][::-1] - times[now]
+            found[k, order, : order + 1] = np.linalg.solve(
+                np.vander(nodes, increasing=True).T, np.eye(order + 1)[0]
+            )
+    return jnp.asarray(found)
+
+
+def solve_stage(
+    system: System, settings: Settings, step: TimeStep, control: Any, kept: Kept, extrapolations: Any,
+    following: Any, batch: str | None,
+) -> tuple[StateHistory, StepRows, Kept]:  # fmt: skip
+    """Solve one stage of a time step; `extrapolations` are its own and `following` those of the next."""
     problem, past = step.problem(system, settings, control).ready(), step.past
     # sum of products instead of a matrix product: XLA fuses it with the next operations
     guess = jnp.sum(past.weights[:, None, None] * past.y, axis=0)
     solution, kept = newton(problem, guess, unknowns_of(system, guess[0]), settings.newton, kept, batch)
     after, row = recorded_step(problem, settings, step, solution, kept.factors)
+    if settings.stages > 1:
+        time_error, largest = time_errors(problem, settings, step, solution, kept.factors, after)
+        after, row = after._replace(time_error=time_error), row._replace(time_error=largest)
     scale = system.scales().y
-    extrapolated = jnp.sum(EXTRAPOLATIONS[:, :, None, None] * past.y, axis=1)
-    weights = weights_by(jnp.max(jnp.abs(extrapolated - solution.y) / scale, axis=(1, 2)))
+    extrapolated = jnp.sum(extrapolations[:, :, None, None] * past.y, axis=1)
+    weights = weights_by(jnp.max(jnp.abs(extrapolated - solution.y) / scale, axis=(1, 2)), following)
     return after._replace(weights=weights), row, kept
 
 
@@ -140,9 +243,54 @@ def solved_row(
     result = jnp.where(residual <= newton.acceptable, int(Result.CONVERGED), int(Result.NO_CONVERGENCE))
     row = StepRows(
         row_of(system, y, records), solution.unknowns, residual, solution.corrections,
-        position_error(system, e), result,
+        position_error(system, e), result, jnp.array(jnp.nan), *no_stages(system),
     )  # fmt: skip
     return row, records, error
+
+
+def time_errors(
+    problem: StepProblem, settings: Settings, step: TimeStep, solution: Solution, factors: Factors,
+    after: StateHistory,
+) -> tuple[Any, Any]:  # fmt: skip
+    """Return the errors of the states after a stage by the time scheme, and the largest of positions (m).
+
+    They are carried along by the step's linear equations, like those of the grid. A step of y' = J y + … adds
+    a multiple of dt³ J² y'. The difference of the rates at both stages is one of dt J y'; the equations of
+    the step multiply it once more by J, and damp the share of vibrations that a step does not resolve.
+    """
+    scheme, past, used = settings.time, step.past.time_error, step.past.time_error.shape[1]
+    assert isinstance(scheme, SDIRK2)
+    c0, system = problem.c0, problem.system
+    carried = history_of(past, jnp.zeros_like(past[0]), step.coefficients, settings)
+
+    def moved(d_history: Any) -> tuple[Any, Any]:
+        """Return the changes of y and of the records when the history changes."""
+
+        def ends(history: Any) -> Any:
+            own = problem.with_history(jnp.concatenate([history, problem.history[used:]]))
+            found = own.stages(solution.y, problem.space.formula, own.ends(solution.y))
+            return (
+                own.reached_by(problem.space.formula, found), own.tip_residual(solution.y[-1]),
+                own.base(solution.unknowns),
+            )  # fmt: skip
+
+        def packed(history: Any, y: Any) -> Any:
+            own = problem.with_history(jnp.concatenate([history, problem.history[used:]]))
+            return own.packed(own.stages(y, problem.space.formula, own.ends(y)))
+
+        history = problem.history[:used]
+        e, _ = solved_correction(factors, pivots_of(system), *jax.jvp(ends, (history,), (d_history,))[1])
+        return e, jax.jvp(packed, (history, solution.y), (d_history, e))[1]
+
+    def last() -> tuple[Any, Any]:
+        newest, (stage, row) = after.records[0, :used], step.past.records[:, :used]
+        difference = newest + problem.history[:used] / c0 - (stage - row)
+        _, once = moved(-c0 * difference)
+        return moved(carried - c0 * scheme.defect * (once - difference))
+
+    is_last = step.coefficients[2] != 0.0
+    e, records = jax.lax.cond(is_last, last, lambda: moved(carried))
+    return jnp.stack([records, past[0]]), position_error(system, e)
 
 
 def position_error(system: System, e: Float[Any, "points y"]) -> Float[Any, ""]:
@@ -159,19 +307,26 @@ def _finite_or_infinite(error: Any, records: Any) -> Any:
     return jnp.where(jnp.all(jnp.isfinite(records)), error, jnp.inf)
 
 
-def weights_by(misfit: Float[Any, " extrapolations"]) -> Float[Any, " past"]:
-    """Return the weights of earlier states in the first guess, from the errors of the extrapolations."""
+def weights_by(misfit: Float[Any, " extrapolations"], following: Any = EXTRAPOLATIONS) -> Float[Any, " past"]:
+    """Return the weights of earlier states in the next first guess, from the errors of the extrapolations."""
     trust = jnp.maximum(misfit / jnp.maximum(jnp.min(misfit), ROUNDING), 1.0) ** TRUST
-    return jnp.sum((trust / jnp.sum(trust))[:, None] * EXTRAPOLATIONS, axis=0)
+    return jnp.sum((trust / jnp.sum(trust))[:, None] * following, axis=0)
 
 
 def no_factors(system: System, settings: Settings, y: Any, control: Any) -> Kept:
     """Return factors of the right shape that are not usable."""
-    problem = StepProblem.still(system, settings.space, control)
+    problem = StepProblem.still(system, settings.space, control[: system.control_size])
     return none_kept(problem, y, unknowns_of(system, y[0]))
 
 
-def no_rows(system: System, shape: tuple[int, ...]) -> StepRows:
+def no_stages(system: System, count: int = 1, shape: tuple[int, ...] = ()) -> tuple[Any, Any]:
+    """Return empty records and unknowns of the stages before the last of `count`, for rows of this shape."""
+    numbers = no_history(system, LOBATTO2).shape[-1]
+    shape = (*shape, count - 1)
+    return jnp.zeros((*shape, system.nodes, numbers)), jnp.zeros((*shape, unknown_count(system)))
+
+
+def no_rows(system: System, shape: tuple[int, ...], stages: int = 1) -> StepRows:
     """Return rows of steps that were not reached, (steps,) or (robots, steps)."""
     numbers = no_history(system, LOBATTO2).shape[-1]
     return StepRows(
@@ -181,6 +336,8 @@ def no_rows(system: System, shape: tuple[int, ...]) -> StepRows:
         jnp.zeros(shape, dtype=int),
         jnp.zeros(shape),
         jnp.full(shape, int(Result.NOT_REACHED)),
+        jnp.full(shape, jnp.nan),
+        *no_stages(system, stages, shape),
     )
 
 
@@ -225,7 +382,8 @@ def time_loop(
         return solve_time_step(system, settings, step, controls[i], kept, batch)
 
     kept = no_factors(system, settings, past.y[0], controls[0])
-    return solve_until_failure(solve, past, kept, no_rows(system, controls.shape[:1]), *span)
+    rows = no_rows(system, controls.shape[:1], settings.stages)
+    return solve_until_failure(solve, past, kept, rows, *span)
 
 
 def loop_in_turn(
@@ -259,7 +417,8 @@ def loop_in_turn(
     kept = no_factors(first, settings, pasts.y[0, 0], controls[0, 0])
     zero, past = jnp.zeros((), dtype=int), own(pasts, 0)
     lasts = jax.tree.map(jnp.zeros_like, pasts)
-    state = (zero, zero, past, lasts, jnp.zeros(size, dtype=int), no_rows(system, controls.shape[:2]), kept)
+    rows = no_rows(system, controls.shape[:2], settings.stages)
+    state = (zero, zero, past, lasts, jnp.zeros(size, dtype=int), rows, kept)
     _, _, _, lasts, done, rows, _ = jax.lax.while_loop(lambda state: state[0] < size, one, state)
     return done, lasts, rows
 

@@ -158,7 +158,9 @@ def predict_markers(
     """
     rod = beam_rod(beam, recording.load, numerics.nodes)
     held = held_beam(rod, recording.load, held_deflection(beam, recording))
-    motion = simulate(rod, np.zeros((steps, 1)), numerics.dt, time=TIME, initial=held, on_failure="return")
+    motion = simulate(
+        rod, np.zeros((steps, 1)), numerics.dt, time=TIME, start="paper", initial=held, on_failure="return"
+    )
     moved = markers_of(motion)
     drop, times = tip_drop(moved), np.arange(steps + 1) * numerics.dt
     row = int(np.argmax(drop > THRESHOLD))

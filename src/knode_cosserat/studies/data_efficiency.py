@@ -122,7 +122,7 @@ def _predictors(imperfect: System, training: Sequence[Trajectory], settings: Any
     dt, steps, method = settings["dt"], settings["steps"], settings["method"]
     if method == LINEAR:
         linear = linear_predictor(imperfect, training)
-        return {0: lambda control: linear(controls.parse(control, steps, dt))}
+        return {0: lambda control: linear(controls.parse(control, steps, dt, sampled="end"))}
     learned = {**INFORMED, **ALONE}[method](imperfect, training, settings["seeds"])
 
     def predictor(system: System | str) -> Predictor:
@@ -141,4 +141,5 @@ def _predictors(imperfect: System, training: Sequence[Trajectory], settings: Any
 
 def _moved(system: System, control: str, rows: int, dt: float) -> Trajectory:
     """Return the first rows of a simulation from rest: as many as controls, as in the paper."""
-    return simulate(system, controls.parse(control, rows, dt), dt, space="euler")[:rows]
+    tensions = controls.parse(control, rows, dt, sampled="end")
+    return simulate(system, tensions, dt, time="bdf2", start="paper", space="euler")[:rows]

@@ -151,4 +151,5 @@ def _outcome(system: System | str, truth: Trajectory, control: str, settings: An
 
 def _moved(system: System, control: str, rows: int, dt: float) -> Trajectory:
     """Return the first rows of a simulation from rest: as many as controls, as in the paper."""
-    return simulate(system, controls.parse(control, rows, dt), dt, space="euler")[:rows]
+    tensions = controls.parse(control, rows, dt, sampled="end")
+    return simulate(system, tensions, dt, time="bdf2", start="paper", space="euler")[:rows]

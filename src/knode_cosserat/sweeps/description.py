@@ -127,7 +127,7 @@ class Sweep:
     seeds: Any = ()
     store: Any = ("tip_position",)
     precision: Literal["double", "single"] = "double"
-    time: str = "bdf2"
+    time: str = "sdirk2"
     space: str = "lobatto2"
     recovery: bool = False
     shard: int | None = None

@@ -213,7 +213,7 @@ def _listed(values: tuple[Any, ...], index: np.ndarray) -> np.ndarray:
 
 def _settings(sweep: Sweep) -> Settings:
     try:
-        settings = Settings.of(sweep.time, sweep.space, "paper", NewtonOptions())
+        settings = Settings.of(sweep.time, sweep.space, "consistent", NewtonOptions())
     except ValueError as error:
         raise SweepError(str(error)) from None
     if settings.time is None:

@@ -58,7 +58,7 @@ def signals(
         one = named_controls.parse(robot, word, steps, dt)
         return Signals(np.broadcast_to(one, (count, *one.shape)), {})
     own = {name: numbers[name] for name in names}
-    found = _at_once(layout, word, np.arange(1, steps + 1) * dt, own, count)
+    found = _at_once(layout, word, controls.step_times(steps, dt), own, count)
     if found is None:
         found = np.full((count, steps, layout.size), np.nan)
     refused: dict[int, str] = {}

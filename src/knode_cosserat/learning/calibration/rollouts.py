@@ -31,12 +31,12 @@ from knode_cosserat.learning.samples import DataError, samples
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.system import System, unknowns_of
 from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.history import StateHistory, constant_history, resting_history
+from knode_cosserat.solvers.history import StateHistory, at_stages, constant_history, resting_history
 from knode_cosserat.solvers.initial import continued_state, initial_state
 from knode_cosserat.solvers.places import Places, places_at, positions_at, quaternions_at
 from knode_cosserat.solvers.run import TimeIntegration, run_one
 from knode_cosserat.solvers.sensitivity import TangentState, static_tangents, tangent_time_loop
-from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.settings import MEASURED, Settings
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.tangent import SystemMoves
 from knode_cosserat.trajectory import Trajectory
@@ -77,8 +77,9 @@ def _seen(robot: System, oriented: bool, y: Any, places: Places) -> Any:
 class _Rows(NamedTuple):
     """Solved rows of a rollout, their initial state and history, and the measurements."""
 
-    records: Float[Any, "T N x"]
-    unknowns: Float[Any, "T k"]
+    #: of every stage of every step
+    records: Float[Any, "solves N x"]
+    unknowns: Float[Any, "solves k"]
     past: StateHistory
     #: last row and control of the initial rows, if there are any
     before: Any
@@ -141,9 +142,10 @@ def _differences(robot, coordinates, rows, steps, unknowns, settings, oriented, 
     _, (d_records, _) = tangent_time_loop(
         settings, steps, (rows.records, rows.unknowns), (system, rows.control), changes, state
     )
-    y = rows.records[..., :ny]
+    own = slice(settings.stages - 1, None, settings.stages)
+    y = rows.records[own, :, :ny]
     by_column = jax.vmap(lambda d_y: jax.jvp(left, (y,), (d_y,))[1], in_axes=-1, out_axes=1)
-    return left(y), by_column(d_records[:, :, :ny])
+    return left(y), by_column(d_records[own, :, :ny])
 
 
 class RolloutMisfit:
@@ -260,12 +262,13 @@ class RolloutMisfit:
             at_start = continued_state(system, initial, settings, dt)
         first = at_start.state.first_step(settings)
         task = TimeIntegration(settings, dt, len(control), first)
-        found, _, cause = run_one(task, system, control, at_start.state.history, at_start.control)
+        acting = at_stages(system, settings, control, at_start.control, at_start.state.dt is None)
+        found, _, cause = run_one(task, system, acting, at_start.state.history, at_start.control)
         if cause:
             return None
         before = None if initial is None else (at_start.record, at_start.control)
         past = at_start.state.history
-        rows = _Rows(found.records, found.unknowns, past, before, at_start.record, control, places, target)
+        rows = _Rows(*found.every_stage, past, before, at_start.record, acting, places, target)
         values, slopes = _differences(
             self.robot, coordinates, rows, task.coefficients, self.unknowns, settings, self.oriented,
             first == "start",
@@ -315,7 +318,7 @@ def _of_trajectory(robot: System, oriented: bool, trajectory: Trajectory) -> _Ro
     begins = _first_row(trajectory)
     control, y = (np.asarray(values, dtype=float)[begins:] for values in (trajectory.control, trajectory.y))
     initial = None if _from_rest(trajectory) else trajectory[:begins]
-    settings = trajectory.settings or Settings()
+    settings = trajectory.settings or MEASURED
     # the base is left out: its pose is given
     places = Places(np.arange(robot.nodes - 1), np.ones(robot.nodes - 1))
     target = np.asarray(_seen(robot, oriented, y, places))

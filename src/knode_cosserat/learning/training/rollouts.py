@@ -19,7 +19,7 @@ from jaxtyping import Float
 
 from knode_cosserat.learning.config import RolloutTraining
 from knode_cosserat.learning.knode import KNODE
-from knode_cosserat.learning.samples import DataError, samples
+from knode_cosserat.learning.samples import DataError, samples, settings_of
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.settings import Settings
@@ -88,7 +88,7 @@ def trajectory_batches(
         part = _course(trajectory, first, start, stop)
         by_length.setdefault(stop, []).append(part)
     joined = [jax.tree.map(lambda *leaves: np.stack(leaves), *parts) for parts in by_length.values()]
-    settings = trajectories[0].settings or Settings()
+    settings = settings_of(trajectories[0])
     return TrajectoryBatches(tuple(joined), compared, settings, trajectories[0].dt)
 
 
@@ -145,7 +145,7 @@ def simulated_batch(
             )
         return simulate(
             model, control, dt, space=settings.space, start=settings.start, newton=settings.newton,
-            initial=initial, time=settings.time,  # type: ignore[arg-type]  # None is refused there
+            between=settings.between, initial=initial, time=settings.time,  # type: ignore[arg-type]  # None is refused there
         ).y  # fmt: skip
 
     return jax.lax.map(one, (course.past, course.control))

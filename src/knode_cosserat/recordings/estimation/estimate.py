@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Literal, get_args
 
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.settings import MEASURED
 from knode_cosserat.solvers.space import Euler
 from knode_cosserat.trajectory import Trajectory
 
@@ -128,7 +129,7 @@ def applied_controls(part: RecordingPart) -> Float[np.ndarray, "T c"]:
 def _estimated(part: RecordingPart, robot: System, method: str) -> Trajectory:
     control, settings = applied_controls(part), None
     if method == "paper":
-        settings = Settings(space=Euler())
+        settings = dataclasses.replace(MEASURED, space=Euler())
         y, z = paper.paper_states(part, robot, control, settings)
     else:
         y, z = _best(part, robot, control)
@@ -195,6 +196,6 @@ def completed(
     y = balance.loads_of(robot, rod.s, rows)[:, rod.nodes]
     at_nodes = rows._replace(y=y, y_t=rows.y_t[:, rod.nodes], z=z[:, rod.nodes], z_t=rows.z_t[:, rod.nodes])
     dt = float(np.mean(np.diff(time)))
-    by_law = balance.strains_of(robot, at_nodes, Settings(), round(dt, 9)).copy()
+    by_law = balance.strains_of(robot, at_nodes, MEASURED, round(dt, 9)).copy()
     by_law[..., robot.z_layout.slice("u")] = it.shape.u[:, rod.nodes]
     return y, by_law

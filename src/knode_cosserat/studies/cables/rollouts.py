@@ -110,8 +110,8 @@ class Rollouts:
             prepared, _ = self.model.prepared(p, markers)
             robot = self.model.robot(p, prepared.base, prepared.tip)
             found = simulate(
-                robot, prepared.controls, DT, initial=self.model.initial(robot, prepared), space=self.space,
-                recovery_budget=RECOVERY, on_failure="return",
+                robot, prepared.controls, DT, time="bdf2", initial=self.model.initial(robot, prepared),
+                space=self.space, recovery_budget=RECOVERY, on_failure="return",
             )  # fmt: skip
         except (ValueError, RuntimeError, ArithmeticError) as error:
             return CablePrediction(None, None, " ".join(str(error).split()))
@@ -193,7 +193,7 @@ class Rollouts:
             p = cable_parameters(x)
             robot = self.model.robot(p, prepared.base, prepared.tip)
             initial = self.model.initial(robot, prepared)
-            found = simulate(robot, prepared.controls, DT, initial=initial, space=self.space)
+            found = simulate(robot, prepared.controls, DT, time="bdf2", initial=initial, space=self.space)
             seen = self.model.free_markers(found.y[1:], prepared.beside, p.stretch)
             return seen, found.y[-2:], found.z[-2:]
 
