@@ -28,8 +28,8 @@ def inspect(
         Path,
         typer.Argument(
             metavar="RECORDING",
-            help="ROS 1 or ROS 2 bag (a file or a folder), CSV or Parquet table, or export of motion capture: "
-            "CSV of Motive or Nexus, TRC, C3D.",
+            help="ROS 1 or ROS 2 bag (a file or a folder), CSV or Parquet table, or export of motion "
+            "capture: CSV of Motive or Nexus, TRC, C3D.",
         ),
     ],
     config: Annotated[
@@ -37,7 +37,7 @@ def inspect(
         typer.Option(
             metavar="YAML",
             help="Meaning of the recording's topics or columns.",
-            show_default="the paper's robot for bags; titles and comments for tables; otherwise one is proposed",
+            show_default="the paper's robot for bags; titles and comments for tables; or a proposal",
         ),
     ] = None,
     plot: Annotated[Path | None, Picture] = None,

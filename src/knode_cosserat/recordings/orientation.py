@@ -63,8 +63,8 @@ def misread_orientation(
     if errors[words] > min(BETTER * as_read, EXPLAINED * bend):
         return None
     what = (
-        f"its rotation contradicts its positions by {np.degrees(as_read):.0f} degrees; read as {words} it agrees "
-        f"to {np.degrees(errors[words]):.0f} degrees: are its quaternions in this order?"
+        f"its rotation contradicts its positions by {np.degrees(as_read):.0f} degrees; read as {words} it "
+        f"agrees to {np.degrees(errors[words]):.0f} degrees: are its quaternions in this order?"
     )
     return Finding("problem", placed.topic, what)
 

@@ -200,8 +200,8 @@ def _bodies(table: Table, titles: Sequence[str], path: str) -> list[_Body]:
             break
     if not found:
         raise RecordingError(
-            f"{path}: the columns are {', '.join(columns)}; none look like a body's position x, y, z, so that no "
-            "map can be proposed: write `columns: {time: …, tensions: […], tip: [x, y, z]}` in a YAML file"
+            f"{path}: the columns are {', '.join(columns)}; none look like a body's position x, y, z; "
+            "no map can be proposed. Write `columns: {time: …, tensions: […], tip: [x, y, z]}` in a YAML file"
         )
     return list(found.values())
 

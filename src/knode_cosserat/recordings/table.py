@@ -276,7 +276,8 @@ def _times(table: pd.DataFrame, called: TableSource, mapped: ColumnMap, path: st
     if mapped.time is None and columns.count(TIME) != 1:
         raise RecordingError(
             f"{path}: the columns are {', '.join(columns)}; required is {TIME}, once (the configuration "
-            "names another title by `columns: {time: …}`, and the rate of rows without times by `table: {rate: …}`)"
+            "names another title by `columns: {time: …}`, and the rate of rows without times by "
+            "`table: {rate: …}`)"
         )
     time = columns_of(table, [_place(title, columns, path)], path)[:, 0]
     return time * TIME_UNITS[mapped.time_unit or stated_time_unit(title) or "s"]

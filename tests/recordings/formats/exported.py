@@ -57,7 +57,9 @@ def motive(
 
     def add(kind, name, number, measure, letters, values):
         for letter, column in zip(letters, np.asarray(values).T, strict=True):
-            for row, cell in zip((kinds, names, ids, measures, axes), (kind, name, number, measure, letter), strict=True):
+            for row, cell in zip(
+                (kinds, names, ids, measures, axes), (kind, name, number, measure, letter), strict=True
+            ):
                 row.append(cell)
             columns.append(column)
 
@@ -102,7 +104,18 @@ def motive(
     return ("\r\n".join(lines) + "\r\n").encode()
 
 
-def nexus(time, *, rate=100, first=1, delimiter=",", decimal=".", blank_lines=0, lost=(), forces=None, cells_after=True):
+def nexus(
+    time,
+    *,
+    rate=100,
+    first=1,
+    delimiter=",",
+    decimal=".",
+    blank_lines=0,
+    lost=(),
+    forces=None,
+    cells_after=True,
+):
     """CSV of Nexus: devices (four cells at ten times the rate) and trajectories of markers, z up, in mm."""
 
     def row(cells):
@@ -114,7 +127,9 @@ def nexus(time, *, rate=100, first=1, delimiter=",", decimal=".", blank_lines=0,
         lines += [row(["Frame", "Sub Frame", "T1", "T2", "T3", "T4"]), row(["", "", "N", "N", "N", "N"])]
         for k in range(10 * len(time)):
             values = forces(time[0] + k / (10.0 * rate))
-            lines.append(row([str(first + k // 10), str(k % 10), *map(_number, values)]).replace(".", decimal))
+            lines.append(
+                row([str(first + k // 10), str(k % 10), *map(_number, values)]).replace(".", decimal)
+            )
         lines.append("")
     names = [f"Robot:{name}" for name in BODIES]
     lines += ["Trajectories", str(rate), row(["", "", *(cell for name in names for cell in (name, "", ""))])]
@@ -134,7 +149,12 @@ def tracker(time, *, kind="Objects", rate=100, quaternion=False, unit="deg"):
     letters = ["RX", "RY", "RZ", *(["RW"] if quaternion else []), "TX", "TY", "TZ"]
     names = [cell for name in BODIES for cell in (f"Global Angle {name}:{name}", *[""] * (len(letters) - 1))]
     units = [*([""] * 4 if quaternion else [unit] * 3), "mm", "mm", "mm"]
-    lines = [kind, str(rate), ",".join(["", "", *names]), ",".join(["Frame", "Sub Frame", *letters * len(BODIES)])]
+    lines = [
+        kind,
+        str(rate),
+        ",".join(["", "", *names]),
+        ",".join(["Frame", "Sub Frame", *letters * len(BODIES)]),
+    ]
     lines.append(",".join(["", "", *units * len(BODIES)]))
     poses = [laboratory(time, fraction) for fraction in BODIES.values()]
     for k in range(len(time)):
@@ -152,7 +172,9 @@ def trc(time, *, unit="mm", blank_line=True, lost=(), axes=True, tabs_after=True
     tail = "\t\t" if tabs_after else "\t"
     out = io.StringIO()
     out.write("PathFileType\t4\t(X/Y/Z)\tC:\\data\\take.trc\n")
-    out.write("DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames\n")
+    out.write(
+        "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames\n"
+    )
     out.write(f"100.00\t100.00\t{len(time)}\t{len(BODIES)}\t{unit}\t100.00\t1\t{len(time)}\n")
     out.write("Frame#\tTime\t" + "".join(f"{name}{tail}\t" for name in BODIES).rstrip("\t") + "\n")
     if axes:
@@ -188,11 +210,21 @@ def c3d(
 
     def group(number, name):
         body = struct.pack("B", 0)
-        return struct.pack("bb", len(name), -number) + name.encode() + struct.pack(f"{endian}h", 2 + len(body)) + body
+        return (
+            struct.pack("bb", len(name), -number)
+            + name.encode()
+            + struct.pack(f"{endian}h", 2 + len(body))
+            + body
+        )
 
     def parameter(number, name, kind, sizes, data):
         body = struct.pack("bB", kind, len(sizes)) + bytes(sizes) + data + struct.pack("B", 0)
-        return struct.pack("bb", len(name), number) + name.encode() + struct.pack(f"{endian}h", 2 + len(body)) + body
+        return (
+            struct.pack("bb", len(name), number)
+            + name.encode()
+            + struct.pack(f"{endian}h", 2 + len(body))
+            + body
+        )
 
     def texts(words):
         width = max(map(len, words))

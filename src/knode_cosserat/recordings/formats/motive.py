@@ -1,6 +1,6 @@
 """Exports of OptiTrack Motive as CSV (format versions from 1.2 on): rigid bodies, markers, bones.
 
-    Format Version,1.23,Take Name,Take 1,…,Rotation Type,Quaternion,Length Units,Meters,Coordinate Space,Global
+    Format Version,1.23,Take Name,Take 1,…,Rotation Type,Quaternion,Length Units,Meters,…
 
     ,,Rigid Body,Rigid Body,…,Marker,…
     ,,Tip,Tip,…,Tip:Marker1,…
@@ -10,8 +10,8 @@
     0,0.000000,0.01,…
 
 The rows of kinds and names come first, those of identities and parents may be absent, and the second column
-may say which row it is. Quaternions have the scalar last. Euler angles are in degrees, about the moving axes in
-the order of `Rotation Type`. Cells are empty where a body is lost. Motive's frame has y up.
+may say which row it is. Quaternions have the scalar last. Euler angles are in degrees, about the moving axes
+in the order of `Rotation Type`. Cells are empty where a body is lost. Motive's frame has y up.
 """
 
 from __future__ import annotations
