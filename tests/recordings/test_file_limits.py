@@ -53,8 +53,8 @@ def table_size_when_decompressed(folder, patch):
 
 @READERS
 def gzip_expansion(folder, patch):
-    patch.setattr(load, "RATIO", 1)
-    patch.setattr(load, "ALLOWANCE", 0)
+    patch.setattr(content, "RATIO", 1)
+    patch.setattr(content, "ALLOWANCE", 0)
     return lambda: load.load_recording(table(folder, gzip.compress(TABLE), "it.csv.gz"))
 
 

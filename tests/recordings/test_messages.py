@@ -300,7 +300,7 @@ def same(recording, rows=slice(None)):
 
 
 def array(ros=2, lost=(), short=()):
-    """The base, the tip and another body in one message; the tip lost in some rows, a body absent in others."""
+    """The base, the tip and another body in one message; the tip lost in some rows, or a body absent."""
     it = Messages(ros)
     for row, (at, place, wxyz) in enumerate(zip(TIME, POSITION, QUATERNION, strict=True)):
         where = np.full(3, math.nan) if row in lost else place

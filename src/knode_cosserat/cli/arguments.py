@@ -264,8 +264,11 @@ def coarse_grid_in_output() -> Iterator[None]:
         yield
 
 
-def load_recordings(paths: Sequence[Path], config: Path | None) -> list[Recording]:
-    """Return the recordings in files, read by a configuration file if there is one."""
+def load_recordings(paths: Sequence[Path], config: Path | None, *, proposals: bool = True) -> list[Recording]:
+    """Return the recordings in files, read by a configuration file if there is one.
+
+    With `proposals` an error about other columns or topics names the command that proposes a configuration.
+    """
     from knode_cosserat.recordings.config import RecordingConfig
     from knode_cosserat.recordings.findings import RecordingError
     from knode_cosserat.recordings.load import load_recording
@@ -284,9 +287,8 @@ def load_recordings(paths: Sequence[Path], config: Path | None) -> list[Recordin
             recordings.append(load_recording(path, meaning))
         except RecordingError as error:
             columns = config is None and ("the columns are" in str(error) or "is missing" in str(error))
-            hint = (
-                f"; or describe its own names in a YAML file with --config ({command_line('inspect', path)} "
-                "proposes one)"
+            hint = "; or describe its own names in a YAML file with --config" + (
+                f" ({command_line('inspect', path)} proposes one)" if proposals else ""
             )
             raise ValueError(f"{error}{hint if columns else ''}") from None
     return recordings

@@ -74,7 +74,7 @@ def _loaded(path: Path, config: Path | None) -> tuple[Recording, str]:
 
     remarks: tuple[str, ...] = ()
     try:
-        (loaded,) = load_recordings([path], config)
+        (loaded,) = load_recordings([path], config, proposals=False)
         # exports of motion capture are read by a proposal, which states the axis that points up
         if config is not None or loaded.config.up is None:
             return loaded, ""

@@ -80,8 +80,10 @@ def _check_numbers(source: Any) -> None:
         if len(set(names)) < len(names) or not names:
             raise RecordingError(f"names is {shown(list(names))}; allowed is each name once")
         set_field(source, "names", names)
-        if source.order is None:
+        if source.order == ():
             set_field(source, "order", tuple(range(1, len(names) + 1)))
+    if source.order == ():
+        raise RecordingError("the key order is missing; required is topic, order or names")
     set_field(source, "order", checked_order(source.order))
     if source.names is not None and len(source.names) != len(source.order):
         raise RecordingError(
@@ -99,7 +101,7 @@ class TensionSource:
     Attributes:
         topic: topic of the tensions. With `{}` in it each tendon has its own topic: the place stands for the
             tendons' names, or without names for 1, 2, 3, …
-        order: tendon of each number in a message; tendons count from 1. None: that of `names`.
+        order: tendon of each number in a message; tendons count from 1. Empty: that of `names`.
         unit: "N" or "gf" (grams-force).
         held: True if a tension acts unchanged until the next one, as commands do; otherwise it is a sample
             at that instant, and tensions are interpolated linearly.
@@ -108,7 +110,7 @@ class TensionSource:
     """
 
     topic: str
-    order: tuple[int, ...] | None = None  # type: ignore[assignment]  # never None once it is checked
+    order: tuple[int, ...] = ()
     unit: Literal["N", "gf"] = "N"
     held: bool | None = None
     names: tuple[str, ...] | None = None
@@ -159,7 +161,7 @@ class MotorSource:
     """
 
     topic: str
-    order: tuple[int, ...] | None = None  # type: ignore[assignment]  # never None once it is checked
+    order: tuple[int, ...] = ()
     unit: Literal["rad", "deg", "m", "mm"] = "rad"
     latency: float = 0.0
     names: tuple[str, ...] | None = None
@@ -223,7 +225,8 @@ class ColumnMap:
 
     def __post_init__(self) -> None:
         if self.time is not None:
-            time = str(self.time) if type(self.time) is int else self.time
+            time: Any = self.time
+            time = str(time) if type(time) is int else time
             set_field(self, "time", checked_text(time, "time").strip())
         if self.time_unit is not None:
             checked_choice(self.time_unit, "time_unit", TIME_UNITS)

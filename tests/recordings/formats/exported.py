@@ -20,7 +20,7 @@ def times(rate=100.0, seconds=2.0):
 
 
 def bent(time, fraction=1.0):
-    """Position (m, clamped end at zero, z up) and rotation of an arc that begins to bend after half a second."""
+    """Position (m, clamped end at zero, z up) and rotation of an arc that bends after half a second."""
     running = np.clip(time - 0.5, 0.0, None)
     angle = 0.9 * fraction * np.sin(2.0 * np.pi * 0.7 * running)
     plane = 1.3 * running
@@ -195,7 +195,7 @@ def c3d(
     time, *, unit="mm", order="<", floats=True, screen=("+X", "+Z"), lost=(), forces=None, rate=100.0, per_frame=2,
     first=1, up="z", labels=None, leave_out=(),
 ):  # fmt: skip
-    """C3D: header, parameters and data of markers, and of four analog channels at `per_frame` times the rate."""
+    """C3D of markers, and of four analog channels with `per_frame` samples a frame."""
     processor = {"<": 84, ">": 86, "dec": 85}[order]
     endian = "<" if order == "dec" else order
     scale = {"mm": 1e3, "m": 1.0, "cm": 100.0}[unit]
