@@ -12,7 +12,8 @@ import pytest
 from knode_cosserat._files.limits import MORE, VARIABLE
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.recordings import container as chunks
-from knode_cosserat.recordings import load, ros1, ros2
+from knode_cosserat.recordings import load
+from knode_cosserat.recordings.formats import ros1, ros2
 
 
 @pytest.fixture(autouse=True)

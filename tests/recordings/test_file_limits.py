@@ -8,9 +8,10 @@ import pandas as pd
 import pytest
 
 from knode_cosserat._files import csv_rows, parquet_file
-from knode_cosserat.recordings import cables, load, parquet, pickles, recording
+from knode_cosserat.recordings import cables, content, load, pickles, recording
 from knode_cosserat.recordings.beam import read_beam
 from knode_cosserat.recordings.config import RecordingConfig
+from knode_cosserat.recordings.formats import parquet
 from tests.limits import Readers, assert_limited, limit_size
 
 READERS = Readers()
@@ -52,8 +53,8 @@ def table_size_when_decompressed(folder, patch):
 
 @READERS
 def gzip_expansion(folder, patch):
-    patch.setattr(load, "RATIO", 1)
-    patch.setattr(load, "ALLOWANCE", 0)
+    patch.setattr(content, "RATIO", 1)
+    patch.setattr(content, "ALLOWANCE", 0)
     return lambda: load.load_recording(table(folder, gzip.compress(TABLE), "it.csv.gz"))
 
 
@@ -79,7 +80,7 @@ def bag_size(folder, patch):
     path = folder / "it.bag"
     load.load_example().sampled(0.05).save(path)
     config = RecordingConfig.load(path.with_suffix(".yaml"))
-    patch.setattr(load, "LARGEST_BAG", path.stat().st_size - 1)
+    patch.setattr(content, "LARGEST_BAG", path.stat().st_size - 1)
     return lambda: load.load_recording(path, config)
 
 
@@ -88,7 +89,7 @@ def sqlite_bag_size(folder, patch):
     path = folder / "it.db3"
     load.load_example().sampled(0.05).save(path)
     config = RecordingConfig.load(path.with_suffix(".yaml"))
-    patch.setattr(load, "LARGEST_BAG", path.stat().st_size - 1)
+    patch.setattr(content, "LARGEST_BAG", path.stat().st_size - 1)
     return lambda: load.load_recording(path, config)
 
 

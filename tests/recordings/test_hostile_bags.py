@@ -11,9 +11,9 @@ from knode_cosserat.learning.files.container import ContainerError
 from knode_cosserat.learning.files.unpacking import MOST_NESTED, _depth
 from knode_cosserat.recordings.container import ALLOWANCE, RATIO, Decompression
 from knode_cosserat.recordings.findings import RecordingError
-from knode_cosserat.recordings.ros1 import CHUNK as CHUNK_1
-from knode_cosserat.recordings.ros1 import VERSION, read_ros1
-from knode_cosserat.recordings.ros2 import CHUNK, MCAP_MAGIC, read_mcap, read_sqlite
+from knode_cosserat.recordings.formats.ros1 import CHUNK as CHUNK_1
+from knode_cosserat.recordings.formats.ros1 import VERSION, read_ros1
+from knode_cosserat.recordings.formats.ros2 import CHUNK, MCAP_MAGIC, read_mcap, read_sqlite
 
 LEVELS = 3000
 

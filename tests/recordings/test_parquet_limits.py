@@ -8,7 +8,8 @@ import pandas as pd
 import pytest
 
 from knode_cosserat._files import parquet_file
-from knode_cosserat.recordings import RecordingError, load_recording, parquet
+from knode_cosserat.recordings import RecordingError, load_recording
+from knode_cosserat.recordings.formats import parquet
 
 pyarrow = pytest.importorskip("pyarrow")
 pyarrow_parquet = pytest.importorskip("pyarrow.parquet")
@@ -124,7 +125,8 @@ BOUNDED = """
 import resource
 import sys
 from pathlib import Path
-from knode_cosserat.recordings import RecordingError, parquet
+from knode_cosserat.recordings import RecordingError
+from knode_cosserat.recordings.formats import parquet
 parquet._pyarrow()
 pages = int(Path("/proc/self/statm").read_text().split()[0])
 limit = pages * resource.getpagesize() + 1_500_000_000

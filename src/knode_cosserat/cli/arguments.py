@@ -264,8 +264,11 @@ def coarse_grid_in_output() -> Iterator[None]:
         yield
 
 
-def load_recordings(paths: Sequence[Path], config: Path | None) -> list[Recording]:
-    """Return the recordings in files, read by a configuration file if there is one."""
+def load_recordings(paths: Sequence[Path], config: Path | None, *, proposals: bool = True) -> list[Recording]:
+    """Return the recordings in files, read by a configuration file if there is one.
+
+    With `proposals` an error about other columns or topics names the command that proposes a configuration.
+    """
     from knode_cosserat.recordings.config import RecordingConfig
     from knode_cosserat.recordings.findings import RecordingError
     from knode_cosserat.recordings.load import load_recording
@@ -275,7 +278,8 @@ def load_recordings(paths: Sequence[Path], config: Path | None) -> list[Recordin
     for path in paths:
         if is_trajectory(str(path)):
             raise ValueError(
-                f"{path}: this is a trajectory; allowed is a recording (.bag, .mcap, .db3, .csv, .parquet). "
+                f"{path}: this is a trajectory; allowed is a recording (.bag, .mcap, .db3, .csv, .parquet, "
+                f".trc, .c3d). "
                 f"To draw a trajectory, type: {command_line('plot', path, '--out', path.stem + '.png')}. "
                 f"To learn a model from it, type: {command_line('fit', 'ROBOT', path, '--out', 'model')}"
             )
@@ -283,8 +287,10 @@ def load_recordings(paths: Sequence[Path], config: Path | None) -> list[Recordin
             recordings.append(load_recording(path, meaning))
         except RecordingError as error:
             columns = config is None and ("the columns are" in str(error) or "is missing" in str(error))
-            hint = "; or describe its own names in a YAML file with --config" if columns else ""
-            raise ValueError(f"{error}{hint}") from None
+            hint = "; or describe its own names in a YAML file with --config" + (
+                f" ({command_line('inspect', path)} proposes one)" if proposals else ""
+            )
+            raise ValueError(f"{error}{hint if columns else ''}") from None
     return recordings
 
 

@@ -12,6 +12,7 @@ from knode_cosserat.cli.output import table, write_output
 from knode_cosserat.cli.program import app, examples
 
 if TYPE_CHECKING:
+    from knode_cosserat.recordings import Recording
     from knode_cosserat.recordings.quality import Health, StreamHealth
 
 
@@ -26,7 +27,9 @@ def inspect(
     recording: Annotated[
         Path,
         typer.Argument(
-            metavar="RECORDING", help="ROS 1 or ROS 2 bag (a file or a folder), or CSV or Parquet table."
+            metavar="RECORDING",
+            help="ROS 1 or ROS 2 bag (a file or a folder), CSV or Parquet table, or export of motion "
+            "capture: CSV of Motive or Nexus, TRC, C3D.",
         ),
     ],
     config: Annotated[
@@ -34,7 +37,7 @@ def inspect(
         typer.Option(
             metavar="YAML",
             help="Meaning of the recording's topics or columns.",
-            show_default="the paper's robot for bags; titles and comments for tables",
+            show_default="the paper's robot for bags; titles and comments for tables; or a proposal",
         ),
     ] = None,
     plot: Annotated[Path | None, Picture] = None,
@@ -43,19 +46,51 @@ def inspect(
     """Report the quality of a recording.
 
     Sampling rates, gaps, swapped axes, noise, and the delay and error of measured tensions relative to
-    commands. Lists the defects found and their corrections.
+    commands. Lists the defects found and their corrections. For a recording with other topics or columns
+    than those known, it proposes a configuration, and reads the recording with it.
     """
     require_writable(figure=plot)
     if plot:
         figures()
-    (loaded,) = load_recordings([recording], config)
+    loaded, proposed = _loaded(recording, config)
     report = loaded.health()
     if plot:
         from knode_cosserat.evaluation import recording_figures
 
         recording_figures.health(loaded, report).savefig(plot)
     written = {"plot": plot} if plot or as_json else {}
-    write_output(as_json, {"recording": str(recording), **report.to_dict()}, _lines(report), **written)
+    content = {"recording": str(recording), **report.to_dict()}
+    lines = _lines(report)
+    if proposed:
+        content["proposed_config"] = proposed
+        lines += ["", "proposed configuration, for a file of --config:", "", *proposed.splitlines()]
+    write_output(as_json, content, lines, **written)
+
+
+def _loaded(path: Path, config: Path | None) -> tuple[Recording, str]:
+    """Return the recording, and the YAML text of a configuration if one is proposed; else empty text."""
+    from knode_cosserat.recordings import load_recording, proposed_config
+    from knode_cosserat.recordings.findings import RecordingError
+
+    remarks: tuple[str, ...] = ()
+    try:
+        (loaded,) = load_recordings([path], config, proposals=False)
+        # exports of motion capture are read by a proposal, which states the axis that points up
+        if config is not None or loaded.config.up is None:
+            return loaded, ""
+        remarks = proposed_config(path)[1]
+    except ValueError:
+        if config is not None:
+            raise
+        try:
+            meaning, remarks = proposed_config(path)
+        except RecordingError:
+            meaning = None
+        if meaning is None:
+            raise
+        loaded = load_recording(path, meaning)
+    comments = [f"# {remark}" for remark in remarks]
+    return loaded, "\n".join([*comments, loaded.config.to_yaml(brief=True)])
 
 
 def _lines(report: Health) -> list[str]:

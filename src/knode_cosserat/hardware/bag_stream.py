@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from knode_cosserat.recordings.encoder import BagTopic
+from knode_cosserat.recordings.formats.ros1 import BAG, CHUNK, CHUNK_INFO, CONNECTION, INDEX, MESSAGE, VERSION
 from knode_cosserat.recordings.messages import typestore
-from knode_cosserat.recordings.ros1 import BAG, CHUNK, CHUNK_INFO, CONNECTION, INDEX, MESSAGE, VERSION
 
 #: size of the bag's first record (bytes), which is written again at the end
 FIRST_SIZE = 4096

@@ -6,11 +6,12 @@ from knode_cosserat._registry import provide
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.estimation.estimate import estimate_parts, estimate_states
 from knode_cosserat.recordings.findings import Finding, RecordingError
-from knode_cosserat.recordings.load import load_example, load_recording
+from knode_cosserat.recordings.load import load_example, load_recording, proposed_config
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Body, Recording, Tensions
 from knode_cosserat.recordings.sources import (
     BaseSource,
+    ColumnMap,
     CommandSource,
     MarkerSource,
     MotorSource,
@@ -21,6 +22,7 @@ from knode_cosserat.recordings.sources import (
 __all__ = [
     "BaseSource",
     "Body",
+    "ColumnMap",
     "CommandSource",
     "Finding",
     "MarkerSource",
@@ -36,6 +38,7 @@ __all__ = [
     "estimate_states",
     "load_example",
     "load_recording",
+    "proposed_config",
 ]
 
 

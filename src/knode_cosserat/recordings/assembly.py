@@ -30,6 +30,7 @@ def assembled(
         RecordingError: a required stream has no usable data.
     """
     for stream in found.values():
+        findings.extend(stream.remarks)
         if stream.broken:
             what = f"{stream.broken} messages could not be understood, and are left out"
             findings.append(Finding("warning", stream.topic, what))

@@ -17,7 +17,8 @@ from jaxtyping import Float
 from knode_cosserat._files import csv_rows
 from knode_cosserat._files.reading import ReadError, read_bytes
 from knode_cosserat.recordings.findings import RecordingError
-from knode_cosserat.recordings.table import read_csv
+from knode_cosserat.recordings.formats.csv_table import read_csv
+from knode_cosserat.recordings.table import columns_of
 
 #: markers on the tip, and on the base
 TIP, BASE = (0, 1, 2), (3, 4, 5)
@@ -100,7 +101,8 @@ def read_beam(path: Path, load: float | None = None) -> BeamRecording:
             f"{path}: the column {missing[0]} is missing; needed are time_s and mK_x_m, mK_y_m, mK_z_m "
             "of the markers 0 to 5"
         )
-    values = table[list(COLUMNS)].to_numpy(dtype=float)
+    titles = list(table.columns)
+    values = columns_of(table, [titles.index(name) for name in COLUMNS], str(path))
     time, markers = values[:, 0], values[:, 1:].reshape(-1, len(TIP + BASE), 3)
     if not np.all(np.diff(time) > 0.0):
         raise RecordingError(f"{path}: time_s does not grow from row to row")

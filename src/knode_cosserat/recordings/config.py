@@ -11,7 +11,14 @@ The same settings serve bags and tables. In a table, a topic is the prefix of th
 `tip` has the columns `tip_x [m]`, `tip_y [m]`, `tip_z [m]` and, for its orientation, `tip_qw` to `tip_qz`.
 The topic `tension` has `tension_1 [N]`, `tension_2 [N]` and so on. A robot with motor-driven tendons has
 `motors` in place of `tension`: the measured motor angles. `table` gives the column titles of other
-conventions, and the rate of a table without a time column.
+conventions, and the rate of a table without a time column. `columns` names the columns one by one:
+
+    format: 1
+    columns: {time: Time (ms), tensions: [T1, T2, T3], tip: [X, Y, Z]}
+
+All keys but time, time_unit, tensions, commands and motors are bodies: titles of the position, or of
+position and orientation (scalar first). Markers, tensions and commands that have only to be named follow from
+the columns; several bodies need their fractions in `markers`.
 """
 
 from __future__ import annotations
@@ -34,8 +41,10 @@ from knode_cosserat.recordings.config_values import (
 )  # fmt: skip
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.sources import (
+    MAPPED,
     POSITION_UNITS,
     BaseSource,
+    ColumnMap,
     CommandSource,
     MarkerSource,
     MotorSource,
@@ -45,6 +54,15 @@ from knode_cosserat.recordings.sources import (
 )
 
 FORMAT = 1
+#: axes of motion capture that point up, with the rotation vector (rad) that turns them to z
+UP: dict[str, Vector] = {
+    "z": (0.0, 0.0, 0.0),
+    "y": (math.pi / 2, 0.0, 0.0),
+    "x": (0.0, -math.pi / 2, 0.0),
+    "-z": (math.pi, 0.0, 0.0),
+    "-y": (-math.pi / 2, 0.0, 0.0),
+    "-x": (0.0, math.pi / 2, 0.0),
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,13 +75,18 @@ class RecordingConfig:
         motors: measured motor angles in place of tensions, or None.
         command: commanded tensions, or None.
         base: body that locates the clamped end; None: `origin` locates it.
-        tensions: default choice of the tensions that drive the robot, "measured" or "commanded".
+        tensions: default choice of the tensions that drive the robot, "measured" or "commanded"; "none" for
+            a recording of poses only.
         position_unit: "m" or "mm".
-        origin: position of the clamped end in motion capture's frame (m), used without a base.
-        rotation: rotation from motion capture's frame to the robot's frame, whose z points up the straight
-            rod; a quaternion, scalar first.
+        up: axis of motion capture's frame that points up: "z", "y", "x", "-x", "-y" or "-z". Poses are turned
+            so that z points up before `rotation` applies. None: the file's own, or z.
+        origin: position of the clamped end (m), used without a base; in the turned frame, that is, with
+            `up` and `rotation` applied.
+        rotation: rotation from motion capture's frame (with z up) to the robot's frame, whose z points up
+            the straight rod; a quaternion, scalar first.
         clock: "header": measurement times from the messages' headers; "received": recording times.
         table: titles of a table's columns; None: this package's convention.
+        columns: titles of a table's columns, one by one; they take precedence over `table`.
         static: True if each row is a separate equilibrium, not part of a motion.
         repeats: "drop": a frame that repeats the previous pose exactly is not a measurement, because some
             motion capture repeats the last pose of a lost body; "keep": every frame is a measurement.
@@ -84,8 +107,10 @@ class RecordingConfig:
     command: CommandSource | None = None
     base: BaseSource | None = None
     table: TableSource | None = None
-    tensions: Literal["measured", "commanded"] = "measured"
+    columns: ColumnMap | None = None
+    tensions: Literal["measured", "commanded", "none"] = "measured"
     position_unit: Literal["m", "mm"] = "m"
+    up: str | None = None
     origin: Vector = (0.0, 0.0, 0.0)
     rotation: Vector = (1.0, 0.0, 0.0, 0.0)
     clock: Literal["header", "received"] = "header"
@@ -104,8 +129,10 @@ class RecordingConfig:
             value = getattr(self, name)
             if value is not None and type(value) is not kind:
                 raise RecordingError(f"{name} is {shown(value)}; allowed is a {kind.__name__}, or nothing")
-        checked_choice(self.tensions, "tensions", ("measured", "commanded"))
+        checked_choice(self.tensions, "tensions", ("measured", "commanded", "none"))
         checked_choice(self.position_unit, "position_unit", POSITION_UNITS)
+        if self.up is not None:
+            checked_choice(self.up, "up", UP)
         checked_choice(self.clock, "clock", ("header", "received"))
         checked_choice(self.repeats, "repeats", ("keep", "drop"))
         if not isinstance(self.static, bool):
@@ -126,7 +153,10 @@ class RecordingConfig:
         if self.tension and self.motors:
             raise RecordingError("tension and motors are both there; allowed is one of them")
         if self.measured is None and self.tensions == "measured":
-            raise RecordingError("tension is missing; required where tensions is measured, or motors")
+            raise RecordingError(
+                "tension is missing; required where tensions is measured, or motors (a recording of poses "
+                "only has `tensions: none`)"
+            )
         if self.command is None and self.tensions == "commanded":
             raise RecordingError("command is missing; required where tensions is commanded")
         if self.motors and self.command:
@@ -145,6 +175,14 @@ class RecordingConfig:
         twice = next((topic for topic in topics if topics.count(topic) > 1), None)
         if twice is not None:
             raise RecordingError(f"the topic {twice} is there twice; allowed is one use of each topic")
+        bodies = [name for name, _ in self.columns.bodies] if self.columns else []
+        known = [source.topic for source in (*self.markers, self.base) if source]
+        unknown = next((name for name in bodies if name not in known), None)
+        if unknown is not None:
+            raise RecordingError(
+                f"columns are of {unknown}, and no marker has this topic; allowed is "
+                f"{', '.join(known)}{did_you_mean(unknown, known)}"
+            )
 
     @property
     def measured(self) -> TensionSource | MotorSource | None:
@@ -155,8 +193,7 @@ class RecordingConfig:
     def tendons(self) -> int:
         """Number of tendons or motors."""
         source = self.measured or self.command
-        assert source is not None
-        return len(source.order)
+        return len(source.order) if source else 0
 
     @classmethod
     def paper_robot(cls) -> Self:
@@ -216,17 +253,24 @@ class RecordingConfig:
 
     def save(self, path: str | Path) -> None:
         """Write the settings to a YAML file; `load` reads them back equal. Raises `RecordingError`."""
+        try:
+            with replacing(Path(path)) as temporary:
+                temporary.write_text(self.to_yaml(), encoding="utf-8")
+        except OSError as error:
+            raise RecordingError(f"{path}: cannot be written: {error.strerror}") from None
+
+    def to_yaml(self, *, brief: bool = False) -> str:
+        """Return the settings as the text of a YAML file; `brief` leaves out those with default values."""
+        defaults = {field.name: _plain(field.default) for field in dataclasses.fields(self)}
         lines = [f"format: {FORMAT}"]
         for name, value in self.to_dict().items():
             if name == "markers":
                 lines += ["markers:", *(f"  - {flow(marker)}" for marker in value)]
-            else:
+            elif name == "columns":
+                lines += ["columns:", *(f"  {flow(key)}: {flow(titles)}" for key, titles in value.items())]
+            elif not brief or value != defaults[name]:
                 lines.append(f"{name}: {flow(value)}")
-        try:
-            with replacing(Path(path)) as temporary:
-                temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
-        except OSError as error:
-            raise RecordingError(f"{path}: cannot be written: {error.strerror}") from None
+        return "\n".join(lines) + "\n"
 
     def to_dict(self) -> dict[str, Any]:
         """Return the settings as plain values for JSON and YAML, without unset ones."""
@@ -243,12 +287,14 @@ class RecordingConfig:
         number = values.pop("format", FORMAT)
         if number != FORMAT or isinstance(number, bool):
             raise RecordingError(f"format is {shown(number)}; allowed is {FORMAT}")
+        if values.get("columns") is not None:
+            values = _with_mapped_sources(values)
         for name, kind in _PARTS.items():
-            if values.get(name) is not None:
+            if values.get(name) is not None and not isinstance(values[name], kind):
                 values[name] = _part(kind, values[name], name)
         if isinstance(values.get("markers"), list):
             values["markers"] = tuple(
-                _part(MarkerSource, marker, f"markers, number {k + 1}")
+                _part(MarkerSource, _with_topic(marker), f"markers, number {k + 1}")
                 for k, marker in enumerate(values["markers"])
             )
         return _made(cls, values)
@@ -256,7 +302,7 @@ class RecordingConfig:
 
 _PARTS: dict[str, type] = {
     "tension": TensionSource, "motors": MotorSource, "command": CommandSource, "base": BaseSource,
-    "table": TableSource,
+    "table": TableSource, "columns": ColumnMap,
 }  # fmt: skip
 
 
@@ -271,6 +317,50 @@ def _part(kind: type, values: Any, where: str) -> Any:
         return _made(kind, values)
     except RecordingError as error:
         raise RecordingError(f"{where}: {error}") from None
+
+
+def _with_topic(marker: Any) -> Any:
+    """Return a marker's settings; without a topic it is called like the marker."""
+    if isinstance(marker, dict) and "topic" not in marker and "name" in marker:
+        return {**marker, "topic": marker["name"]}
+    return marker
+
+
+def _with_mapped_sources(values: dict[Any, Any]) -> dict[Any, Any]:
+    """Return settings with the sources that follow from their map of columns. Raises `RecordingError`."""
+    if not isinstance(values["columns"], dict):
+        raise RecordingError(
+            f"columns is {shown(values['columns'])}; allowed is a mapping with time, tensions and the names "
+            "of bodies"
+        )
+    try:
+        columns = ColumnMap.from_dict(values["columns"])
+    except RecordingError as error:
+        raise RecordingError(f"columns: {error}") from None
+    values = {**values, "columns": columns}
+    for name, part in (("tensions", "tension"), ("commands", "command"), ("motors", "motors")):
+        titles, stated = getattr(columns, name), values.get(part) or {}
+        if titles is not None and isinstance(stated, dict):
+            default = {"topic": MAPPED[name], "order": list(range(1, len(titles) + 1))}
+            values[part] = default | stated
+    if columns.commands and not columns.tensions and not columns.motors:
+        values.setdefault("tensions", "commanded")
+    if not any(values.get(part) for part in ("tension", "command", "motors")):
+        values.setdefault("tensions", "none")
+    base = values.get("base")
+    if isinstance(base, dict):
+        values["base"] = {"topic": "base"} | base
+    elif base is None and "base" in dict(columns.bodies):
+        values["base"] = {"topic": "base"}
+    bodies = [name for name, _ in columns.bodies if name != "base"]
+    if not values.get("markers") and len(bodies) == 1:
+        values["markers"] = [{"name": bodies[0], "fraction": 1.0}]
+    elif not values.get("markers"):
+        raise RecordingError(
+            f"markers is missing; required with the columns of {len(bodies)} bodies: "
+            "markers: [{name: …, fraction: …}, …], from base to tip"
+        )
+    return values
 
 
 def _made(kind: Any, values: dict[Any, Any]) -> Any:
@@ -292,6 +382,8 @@ def _require_known(key: Any, known: list[str]) -> None:
 
 
 def _plain(value: Any) -> Any:
+    if isinstance(value, ColumnMap):
+        return value.to_dict()
     if dataclasses.is_dataclass(value):
         named = {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
         if not isinstance(value, RecordingConfig):

@@ -92,6 +92,17 @@ def checked_interval(value: Any, name: str, *, open_ended: bool) -> tuple[float 
     return ends[0], ends[1]
 
 
+def checked_column_titles(value: Any, name: str, counts: tuple[int, ...] | None = None) -> tuple[str, ...]:
+    """Return titles, or numbers, of columns as text; `RecordingError` for another count of them."""
+    given = tuple(value) if isinstance(value, list | tuple) else ()
+    fair = all(isinstance(each, str | int) and not isinstance(each, bool) for each in given)
+    titles = tuple(str(each).strip() for each in given)
+    if not given or not fair or len(set(titles)) < len(titles) or (counts and len(given) not in counts):
+        words = f"{' or '.join(map(str, counts))} titles" if counts else "a list of titles"
+        raise RecordingError(f"{name} is {shown(value)}; allowed is {words} of columns, each once")
+    return titles
+
+
 def checked_titles(value: Any, name: str, count: int) -> tuple[str, ...]:
     """Return titles of columns, each with a place for a number or a topic."""
     given = tuple(value) if isinstance(value, list | tuple) else ()

@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from knode_cosserat.recordings.config import RecordingConfig
+from knode_cosserat.recordings.config import UP, RecordingConfig
 from knode_cosserat.recordings.findings import Finding
+from knode_cosserat.recordings.orientation import misread_orientation
 from knode_cosserat.recordings.recording import Body
 from knode_cosserat.recordings.sources import POSITION_UNITS
 
@@ -52,8 +53,10 @@ def bodies_in_robot_frame(
     The input bodies have their recorded positions and orientations.
     """
     findings: list[Finding] = []
-    turn = Rotation.from_quat(config.rotation, scalar_first=True)
+    upright = Rotation.from_rotvec(UP[config.up or "z"])
+    turn = Rotation.from_quat(config.rotation, scalar_first=True) * upright
     scale = POSITION_UNITS[config.position_unit]
+    recorded = [body.quaternion for body in bodies]
     bodies = [_turned(body, turn, scale) for body in bodies]
     origin = np.array(config.origin)
     if base is not None and config.base is not None:
@@ -69,7 +72,10 @@ def bodies_in_robot_frame(
     rest = given or rest_of(bodies)
     findings += _judged(bodies, rest)
     placed_bodies = []
-    for body, marker in zip(bodies, config.markers, strict=True):
+    for body, marker, quaternion in zip(bodies, config.markers, recorded, strict=True):
+        if quaternion is not None and not config.static:
+            misread = misread_orientation(quaternion, turn, body, rest_mask(body.time, rest))
+            findings += [misread] if misread else []
         placed_body, found = _of_the_rod(body, marker.rotation, rest)
         placed_bodies.append(placed_body)
         findings += found

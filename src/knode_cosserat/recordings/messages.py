@@ -2,24 +2,33 @@
 
 Messages are decoded with the definitions of rosbags. Definitions in a bag are not used, because rosbags
 turns definitions into Python code.
+
+A topic may name a part of its messages: `/poses[2]` is the third pose of a PoseArray, `/tf[tip]` the frame
+`tip` of transforms. In a topic of tensions, `{}` stands for the tendons' names or numbers, of which each has
+its own topic.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
+import math
+import re
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat.recordings.config_values import PLACE
-from knode_cosserat.recordings.container import Topic
-from knode_cosserat.recordings.findings import RecordingError
-from knode_cosserat.recordings.sources import CommandSource
+from knode_cosserat.recordings.container import Container, Topic
+from knode_cosserat.recordings.findings import Finding, RecordingError
+from knode_cosserat.recordings.sources import MotorSource, TensionSource
 
 Role = Literal["pose", "tension", "command"]
+#: stamp and recording time (ns), and the numbers
+_Row = tuple[int, int, Any]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -35,6 +44,8 @@ class Stream:
     values: Float[np.ndarray, "n size"]
     #: number of messages that could not be decoded
     broken: int = 0
+    #: findings on the order of its numbers
+    remarks: tuple[Finding, ...] = ()
 
 
 def _xyz(v: Any) -> tuple[float, ...]:
@@ -45,23 +56,38 @@ def _wxyz(q: Any) -> tuple[float, ...]:
     return q.w, q.x, q.y, q.z
 
 
-def _transform(m: Any) -> tuple[float, ...]:
-    return *_xyz(m.transform.translation), *_wxyz(m.transform.rotation)
+def _pose(pose: Any) -> tuple[float, ...]:
+    return *_xyz(pose.position), *_wxyz(pose.orientation)
 
 
 #: reader of a pose, by message type
 POSES: dict[str, Callable[[Any], Any]] = {
-    "geometry_msgs/msg/PoseStamped": lambda m: (*_xyz(m.pose.position), *_wxyz(m.pose.orientation)),
-    "geometry_msgs/msg/TransformStamped": _transform,
+    "geometry_msgs/msg/PoseStamped": lambda m: _pose(m.pose),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": lambda m: _pose(m.pose.pose),
+    "nav_msgs/msg/Odometry": lambda m: _pose(m.pose.pose),
+    "geometry_msgs/msg/Pose": _pose,
+    "geometry_msgs/msg/TransformStamped": lambda m: (
+        *_xyz(m.transform.translation),
+        *_wxyz(m.transform.rotation),
+    ),
     "geometry_msgs/msg/PointStamped": lambda m: _xyz(m.point),
 }
-#: reader of the numbers in the order of the fields, by message type
+#: message type of several poses, which have numbers; and of transforms between named frames
+POSE_ARRAY, TRANSFORMS = "geometry_msgs/msg/PoseArray", ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+#: topic of transforms that do not change
+STATIC = "/tf_static"
+#: message type of named joints
+JOINTS = "sensor_msgs/msg/JointState"
+#: reader of the numbers in the order of the fields, by message type. A wrench is a load cell's: its force
+#: in whatever direction
 NUMBERS: dict[str, Callable[[Any], Any]] = {
     "geometry_msgs/msg/QuaternionStamped": lambda m: (*_xyz(m.quaternion), m.quaternion.w),
     "geometry_msgs/msg/Vector3Stamped": lambda m: _xyz(m.vector),
+    "geometry_msgs/msg/WrenchStamped": lambda m: (math.hypot(*_xyz(m.wrench.force)),),
     "std_msgs/msg/Float64MultiArray": lambda m: m.data,
     "std_msgs/msg/Float32MultiArray": lambda m: m.data,
-    "sensor_msgs/msg/JointState": lambda m: m.effort,
+    **{f"std_msgs/msg/{kind}": lambda m: (m.data,) for kind in ("Float64", "Float32", "Int16", "Int32")},
+    JOINTS: lambda m: m.effort,
 }
 #: line of a log that marks a recording of a simulated robot
 SIMULATED = "Simulated: the robot of this recording is a simulation, and not a physical one"
@@ -77,55 +103,314 @@ TEXTS: dict[str, Callable[[Any], str]] = {
 def typestore(ros: int) -> Any:
     """Return the standard message types of ROS 1 or 2. Raises `ImportError` without rosbags."""
     try:
-        from rosbags.typesys import Stores, get_typestore
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     except ImportError:
         raise ImportError("bags need rosbags: pip install 'knode-cosserat[ros]'") from None
-    return get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_HUMBLE)
+    store = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_HUMBLE)
+    for kind in TRANSFORMS:
+        if kind not in store.types:
+            store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", kind))
+    return store
 
 
-def decoded_messages(
-    topic: Topic, ros: int, role: Role, command: CommandSource | None, source: str
-) -> Stream:
-    """Return the numbers in a topic's messages; messages that cannot be decoded are left out and counted.
+def topic_and_part(name: str) -> tuple[str, str]:
+    """Return the topic of a name such as /poses[2], and the part of its messages, empty for all of it."""
+    topic, bracket, part = name.partition("[")
+    return (topic, part[:-1].strip()) if bracket and part.endswith("]") else (name, "")
+
+
+def topics_of(source: Any) -> list[str]:
+    """Return the topics of a bag that a source of a configuration is read from."""
+    if isinstance(source, TensionSource | MotorSource) and PLACE in source.topic:
+        words = source.names or [str(k + 1) for k in range(len(source.order))]
+        return [source.topic.replace(PLACE, word) for word in words]
+    return [topic_and_part(source.topic)[0]]
+
+
+def decoded(container: Container, source: Any, role: Role, path: str) -> Stream:
+    """Return the numbers of a source of a configuration; messages that cannot be decoded are counted.
+
+    Args:
+        container: the messages of all topics.
+        source: the topic's entry in the configuration.
+        role: role of its numbers.
+        path: the file's name in error messages.
 
     Raises:
-        RecordingError: the topic's message type is not allowed for this role.
+        RecordingError: a topic's message type is not allowed for this role, or has no such part.
     """
-    text = command.text if role == "command" and command is not None else None
-    readers = _readers(role, text)
-    where = f"{source}: topic {topic.name}"
-    if topic.type not in readers:
-        raise RecordingError(
-            f"{where}: its messages are {_short(topic.type)}; allowed for a {role}"
-            f"{' in text' if text else ''} is {', '.join(map(_short, readers))}"
-        )
+    names = topics_of(source)
+    if len(names) > 1 or PLACE in source.topic:
+        each = [_simple(container.topics[name], container.ros, NUMBERS, role, path) for name in names]
+        return _merged(source.topic, each, is_held=role == "command" or bool(getattr(source, "held", None)))
+    topic, part = container.topics[names[0]], topic_and_part(source.topic)[1]
+    if role == "pose":
+        stream = _poses(container, topic, part, path)
+    elif role == "command" and source.text is not None:
+        kinds = {kind: functools.partial(_spoken, read, source.text) for kind, read in TEXTS.items()}
+        stream = _simple(topic, container.ros, kinds, "command in text", path)
+    elif topic.type == JOINTS:
+        stream = _joints(topic, container.ros, source, path)
+    else:
+        stream = _simple(topic, container.ros, NUMBERS, role, path)
+    return dataclasses.replace(stream, topic=source.topic)
+
+
+def messages_of(topic: Topic, ros: int) -> Iterator[tuple[int, Any]]:
+    """Yield the recording time (ns) and the message, None for bytes that cannot be decoded."""
     store = typestore(ros)
-    if ros == 1 and topic.digest not in ("", "*", store.generate_msgdef(topic.type)[1]):
-        raise RecordingError(
-            f"{where}: its {_short(topic.type)} is not the type that ROS defines by this name"
-        )
-    read, deserialize = readers[topic.type], store.deserialize_ros1 if ros == 1 else store.deserialize_cdr
-    rows: list[tuple[int, int, Any]] = []
-    broken = 0
+    deserialize = store.deserialize_ros1 if ros == 1 else store.deserialize_cdr
     for received, raw in zip(topic.received, topic.raw, strict=True):
         # rosbags raises various errors on damaged bytes
         try:
             message = deserialize(raw, topic.type)
-            found = read(message)
+        except Exception:
+            message = None
+        yield received, message
+
+
+def _simple(topic: Topic, ros: int, readers: Mapping[str, Any], role: str, path: str) -> Stream:
+    """Return the numbers of a topic with one row a message."""
+    _require_type(topic, ros, readers, role, path)
+    read = readers[topic.type]
+    rows: list[_Row] = []
+    broken = 0
+    for received, message in messages_of(topic, ros):
+        # text with other words than numbers, too
+        try:
+            values = read(message)
         except Exception:
             broken += 1
             continue
-        if found is not None:
-            rows.append((_stamp(message), received, found))
+        if values is not None:
+            rows.append((_stamp(message), received, values))
     return _stream(topic.name, rows, broken)
 
 
-def _readers(role: Role, text: str | None) -> dict[str, Callable[[Any], Any]]:
-    if role == "pose":
-        return POSES
-    if text is None:
-        return NUMBERS
-    return {kind: functools.partial(_spoken, read, text) for kind, read in TEXTS.items()}
+def _require_type(topic: Topic, ros: int, kinds: Collection[str], role: str, path: str) -> None:
+    where = f"{path}: topic {topic.name}"
+    if topic.type not in kinds:
+        raise RecordingError(
+            f"{where}: its messages are {_short(topic.type)}; allowed for a {role} is "
+            f"{', '.join(map(_short, kinds))}"
+        )
+    if ros == 1 and topic.digest not in ("", "*", typestore(1).generate_msgdef(topic.type)[1]):
+        raise RecordingError(
+            f"{where}: its {_short(topic.type)} is not the type that ROS defines by this name"
+        )
+
+
+# poses
+
+
+def _poses(container: Container, topic: Topic, part: str, path: str) -> Stream:
+    kinds = (*POSES, POSE_ARRAY, *TRANSFORMS)
+    _require_type(topic, container.ros, kinds, "pose", path)
+    if topic.type in POSES:
+        if part:
+            raise RecordingError(
+                f"{path}: topic {topic.name}: a {_short(topic.type)} has no part [{part}]; allowed is "
+                f"{topic.name}"
+            )
+        return _simple(topic, container.ros, POSES, "pose", path)
+    if topic.type == POSE_ARRAY:
+        return _element(topic, container.ros, part, path)
+    return _frame(container, topic, part, path)
+
+
+def _element(topic: Topic, ros: int, part: str, path: str) -> Stream:
+    """Return one pose of each PoseArray."""
+    messages = list(messages_of(topic, ros))
+    most = max((len(message.poses) for _, message in messages if message is not None), default=0)
+    parts = [str(k) for k in range(most)]
+    number = int(_required_part(part, parts, topic.name, path)) if most else 0
+    rows: list[_Row] = []
+    for received, message in messages:
+        # a source that leaves lost bodies out changes the numbers of the others: such a message is not used
+        if message is not None and len(message.poses) == most:
+            rows.append((_stamp(message), received, _pose(message.poses[number])))
+    return _stream(topic.name, rows, len(messages) - len(rows))
+
+
+def _required_part(part: str, parts: Sequence[str], topic: str, path: str) -> str:
+    """Return the named part of a topic's messages; the only one if none is named."""
+    if not part and len(parts) == 1:
+        return parts[0]
+    if part not in parts:
+        words = ", ".join(f"{topic}[{each}]" for each in parts[:20])
+        what = f"has no part [{part}]" if part else f"has {len(parts)} bodies"
+        raise RecordingError(f"{path}: topic {topic} {what}; allowed is {words or 'no part'}")
+    return part
+
+
+def _frame(container: Container, topic: Topic, part: str, path: str) -> Stream:
+    """Return the pose of a frame in the frame at the root of its tree."""
+    edges: dict[str, tuple[str, list[_Row]]] = {}
+    broken = 0
+    # transforms that do not change come from a topic of their own
+    for source in {topic.name: topic, STATIC: container.topics.get(STATIC, topic)}.values():
+        for received, message in messages_of(source, container.ros):
+            if message is None:
+                broken += 1
+                continue
+            for each in message.transforms:
+                child, parent = each.child_frame_id.strip("/"), each.header.frame_id.strip("/")
+                pose = POSES["geometry_msgs/msg/TransformStamped"](each)
+                size = math.hypot(*pose[3:])
+                if not (math.isfinite(math.fsum(pose)) and 0.5 < size < 2.0):
+                    broken += 1
+                    continue
+                if edges.setdefault(child, (parent, []))[0] != parent:
+                    raise RecordingError(
+                        f"{path}: topic {topic.name}: the frame {child} has two parents, "
+                        f"{edges[child][0]} and {parent}; allowed is one"
+                    )
+                edges[child][1].append((_stamp(each), received, pose))
+    name = _required_part(part.strip("/"), sorted(edges), topic.name, path)
+    stream, parent = _stream(topic.name, edges[name][1], broken), edges[name][0]
+    above = [name]
+    while parent in edges:
+        if parent in above:
+            raise RecordingError(f"{path}: topic {topic.name}: the frames {', '.join(above)} are in a circle")
+        above.append(parent)
+        stream = _seen_from(_stream(topic.name, edges[parent][1], 0), stream)
+        parent = edges[parent][0]
+    return stream
+
+
+def _seen_from(parent: Stream, child: Stream) -> Stream:
+    """Return a child's poses in the frame that its parent is given in, at the child's times."""
+    from scipy.spatial.transform import Rotation, Slerp
+
+    stamped = bool(np.all(child.stamped >= 0) and np.all(parent.stamped >= 0))
+    at = child.stamped if stamped else child.received
+    known, first = np.unique(parent.stamped if stamped else parent.received, return_index=True)
+    poses, turned = parent.values[first], Rotation.from_quat(parent.values[first, 3:], scalar_first=True)
+    if len(known) > 1:
+        inside = np.clip(at, known[0], known[-1])
+        # ns since 1970 have more digits than a float
+        seconds, grid = (inside - known[0]) * 1e-9, (known - known[0]) * 1e-9
+        position = np.stack([np.interp(seconds, grid, each) for each in poses[:, :3].T], axis=1)
+        rotation = Slerp(grid, turned)(seconds)
+    else:
+        position, rotation = poses[:1, :3], turned[0]
+    place = position + rotation.apply(child.values[:, :3])
+    turn = rotation * Rotation.from_quat(child.values[:, 3:], scalar_first=True)
+    return dataclasses.replace(child, values=np.concatenate([place, turn.as_quat(scalar_first=True)], axis=1))
+
+
+# numbers
+
+
+def _joints(topic: Topic, ros: int, source: TensionSource | MotorSource, path: str) -> Stream:
+    """Return the efforts, or the angles of motors, of named joints, in the order of the source."""
+    _require_type(topic, ros, (JOINTS,), "tension", path)
+    rows: list[tuple[int, int, list[str], Any]] = []
+    broken = 0
+    for received, message in messages_of(topic, ros):
+        values = (
+            () if message is None else message.position if isinstance(source, MotorSource) else message.effort
+        )
+        names = [] if message is None else list(message.name)
+        if message is None or (names and len(names) != len(values)):
+            broken += 1
+        else:
+            rows.append((_stamp(message), received, names, values))
+    reference, remark = _joint_names(
+        source, [names for _, _, names, _ in rows], f"{path}: topic {topic.name}"
+    )
+    if not reference:
+        return _stream(topic.name, [(stamp, received, values) for stamp, received, _, values in rows], broken)
+    chosen: list[_Row] = []
+    for stamp, received, names, values in rows:
+        by_name = dict(zip(names, values, strict=True))
+        # messages about other joints only are not about tendons
+        if any(name in by_name for name in reference):
+            chosen.append((stamp, received, [by_name.get(name, math.nan) for name in reference]))
+    stream = _stream(topic.name, chosen, broken)
+    return dataclasses.replace(stream, remarks=(Finding("note", topic.name, remark),) if remark else ())
+
+
+def _joint_names(
+    source: TensionSource | MotorSource, seen: Sequence[list[str]], where: str
+) -> tuple[list[str], str]:
+    """Return the joints in the order of the source's numbers, and a remark; no names if messages have none.
+
+    Numbers in the names (tendon_1, tendon_2, …) say which tendon a joint is. An order that differs from
+    the tendons' own says which tendon each joint of a message is; it must not contradict the names.
+    """
+    if source.names:
+        there = sorted({name for names in seen for name in names})
+        missing = [name for name in source.names if name not in there]
+        if missing and seen:
+            raise RecordingError(
+                f"{where}: no joint is called {missing[0]}; its joints are {', '.join(there) or 'not named'}"
+                f"{did_you_mean(missing[0], there)}"
+            )
+        return list(source.names), ""
+    first = next((names for names in seen if len(names) == len(source.order)), [])
+    if not first:
+        return [], ""
+    if len(set(first)) < len(first):
+        raise RecordingError(
+            f"{where}: the joints {', '.join(first)} have the same names; allowed is each once"
+        )
+    listed = ", ".join(first)
+    found = [re.fullmatch(r"(.*?)(\d+)(\D*)", name) for name in first]
+    numbers = [int(match[2]) for match in found if match]
+    stems = {(match[1], match[3]) for match in found if match}
+    lowest = min(numbers, default=0)
+    if len(stems) != 1 or sorted(numbers) != list(range(lowest, lowest + len(first))) or lowest > 1:
+        return first, f"its joints {listed} are taken in this order; `names` in the configuration states it"
+    by_name, counted = [number - lowest + 1 for number in numbers], list(range(1, len(first) + 1))
+    if by_name in (list(source.order), counted):
+        return first, ""
+    if list(source.order) == counted:
+        return sorted(
+            first, key=lambda name: by_name[first.index(name)]
+        ), f"its joints {listed} are matched by name"
+    raise RecordingError(
+        f"{where}: its joints are {listed}, and the configuration's order is {list(source.order)}; allowed "
+        "is one that agrees with the names, or `names` with the joint of each number in the order"
+    )
+
+
+def _merged(topic: str, parts: Sequence[Stream], *, is_held: bool) -> Stream:
+    """Return one row of all tendons at each time of the topic with most messages.
+
+    Tensions that are held have their last value there; others are interpolated linearly. A row beyond the
+    first or last message of another topic is NaN.
+    """
+    stamped = all(np.all(part.stamped >= 0) for part in parts)
+    clocks = [part.stamped if stamped else part.received for part in parts]
+    columns = []
+    longest = max(parts, key=lambda part: len(part.received))
+    at = longest.stamped if stamped else longest.received
+    if is_held:
+        at = np.unique(np.concatenate(clocks))
+    for part, clock in zip(parts, clocks, strict=True):
+        known, first = np.unique(clock, return_index=True)
+        if not len(known):
+            columns.append(np.full(len(at), math.nan))
+            continue
+        value = part.values[first, 0]
+        if is_held:
+            last = np.searchsorted(known, at, side="right") - 1
+            columns.append(np.where(last >= 0, value[np.maximum(last, 0)], math.nan))
+        else:
+            # messages of one instant are sent one after the other: half a period is no extrapolation
+            reach = 0.5 * float(np.median(np.diff(known))) if len(known) > 1 else 0.0
+            inside = (at >= known[0] - reach) & (at <= known[-1] + reach)
+            line = np.interp((at - known[0]) * 1e-9, (known - known[0]) * 1e-9, value)
+            columns.append(np.where(inside, line, math.nan))
+    received = at if is_held or not stamped else longest.received
+    return Stream(
+        topic,
+        at if stamped else np.full(len(at), -1, dtype=np.int64),
+        received,
+        np.stack(columns, axis=1),
+        sum(part.broken for part in parts),
+    )
 
 
 def _spoken(read: Callable[[Any], str], text: str, message: Any) -> tuple[float, ...] | None:
@@ -138,7 +423,7 @@ def _spoken(read: Callable[[Any], str], text: str, message: Any) -> tuple[float,
     return tuple(map(float, said[len(before) : len(said) - len(after)].replace(",", " ").split()))
 
 
-def _stream(topic: str, rows: list[tuple[int, int, Any]], broken: int) -> Stream:
+def _stream(topic: str, rows: Sequence[_Row], broken: int) -> Stream:
     """Return rows as arrays; rows whose size differs from most are counted as broken."""
     counts = [len(values) for _, _, values in rows]
     size = max(set(counts), key=counts.count) if counts else 0

@@ -127,7 +127,7 @@ class Recording:
         dt: float = 0.05,
         start: float | None = None,
         end: float | None = None,
-        tensions: Literal["measured", "commanded"] | None = None,
+        tensions: Literal["measured", "commanded", "none"] | None = None,
         *,
         mean: bool = False,
     ) -> Measurements:
@@ -142,7 +142,7 @@ class Recording:
             dt: time from row to row (s); a recording of equilibria keeps its own rows.
             start: time of the first row (s); None: start of the configuration's `trim` or of the recording.
             end: latest time of the last row (s); None: end of the `trim` or of the first stream to end.
-            tensions: "measured" or "commanded"; None: the configuration's choice.
+            tensions: "measured", "commanded" or "none"; None: the configuration's choice.
             mean: True to average the tensions over dt. Held tensions are averaged from each row to the
                 next. Other tensions are interpolated linearly and averaged about the next row, because
                 an implicit time step is driven by the tension at its end. Rows that reach into a gap too
@@ -202,8 +202,11 @@ class Recording:
         return report
 
     def _driver(self, kind: str) -> Tensions:
-        if kind not in ("measured", "commanded"):
-            raise RecordingError(f"tensions is {kind!r}; allowed is measured or commanded")
+        if kind not in ("measured", "commanded", "none"):
+            raise RecordingError(f"tensions is {kind!r}; allowed is measured, commanded or none")
+        if kind == "none":
+            time = self.bodies[0].time
+            return Tensions("", time, np.zeros((len(time), 0)))
         driver = self.tension if kind == "measured" else self.command
         if driver is None:
             raise RecordingError(f"{self.source}: there are no {kind} tensions")

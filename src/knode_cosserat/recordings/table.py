@@ -19,8 +19,7 @@ orientation. A row has the measurements at its time: cells of slower sensors sta
 
 from __future__ import annotations
 
-import io
-import itertools
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -28,16 +27,21 @@ import numpy as np
 import pandas as pd  # type: ignore[import-untyped]
 from jaxtyping import Float
 
-from knode_cosserat._files import csv_rows
-from knode_cosserat._files.limits import excess
-from knode_cosserat._files.yaml_text import shown
+from knode_cosserat._files.yaml_text import did_you_mean, shown
 from knode_cosserat.recordings.clocks import FAR
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.config_values import PLACE
 from knode_cosserat.recordings.findings import Finding, RecordingError
 from knode_cosserat.recordings.messages import Stream
 from knode_cosserat.recordings.plausibility import SLOW
-from knode_cosserat.recordings.sources import CommandSource, MarkerSource, TableSource, TensionSource
+from knode_cosserat.recordings.sources import (
+    TIME_UNITS,
+    ColumnMap,
+    CommandSource,
+    MarkerSource,
+    TableSource,
+    TensionSource,
+)
 
 TIME = "time [s]"
 #: default prefixes of the columns of tensions
@@ -55,65 +59,22 @@ _LATEST = 9e9
 
 
 class Table(NamedTuple):
-    """Metadata of a table, its columns of numbers, and findings from reading it."""
+    """Content of a table.
+
+    Attributes:
+        said: metadata.
+        numbers: columns by title. A column that is not of numbers is text.
+        findings: findings from reading it.
+        bodies: bodies of an export of motion capture, whose format states names, units and axes; its columns
+            have this package's titles and units. Empty for other tables.
+        up: axis of the file that points up.
+    """
 
     said: dict[str, str]
     numbers: pd.DataFrame
     findings: tuple[Finding, ...] = ()
-
-
-def read_csv(data: bytes, path: str) -> Table:
-    """Return a CSV file's metadata and its columns of numbers. The caller limits the number of bytes.
-
-    Raises:
-        RecordingError: the bytes are no table of numbers, or have too many lines or columns.
-    """
-    newlines = data.count(b"\n") + data.count(b"\r") - data.count(b"\r\n")
-    _require(excess(newlines, csv_rows.MOST_LINES, "lines"), path)
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise RecordingError(f"{path}: not a recording: no bag, and no CSV text: it is not UTF-8") from None
-    lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
-    said, first = _comments(lines)
-    # a quoted cell can have line breaks, so that the header may not be one of the lines
-    columns = 1 + max((line.count(",") for line in itertools.islice(lines, first, None)), default=0)
-    _require(excess(columns, csv_rows.MOST_COLUMNS, "columns"), path)
-    return Table(said, numbers_of(_cells(text, path), path), _about_comments(lines, first))
-
-
-def _require(reason: str, path: str) -> None:
-    """Raise `RecordingError` if there is a reason to refuse a file."""
-    if reason:
-        raise RecordingError(f"{path}: {reason}")
-
-
-def _comments(lines: Sequence[str]) -> tuple[dict[str, str], int]:
-    """Return the metadata from the lines `# key: value` before the header, and the header's index."""
-    said: dict[str, str] = {}
-    for index, line in enumerate(lines):
-        if line.strip() and not line.startswith("#"):
-            return said, index
-        key, colon, value = line.removeprefix("#").partition(":")
-        if colon:
-            said[key.strip()] = value.strip()
-    return said, len(lines)
-
-
-def _about_comments(lines: Sequence[str], header: int) -> tuple[Finding, ...]:
-    """Return findings on text after a `#`, from the header on: nothing of it is read."""
-    marked = [k for k in range(header, len(lines)) if "#" in lines[k]]
-    whole = [k + 1 for k in marked if lines[k].startswith("#")]
-    ends = [k + 1 for k in marked if not lines[k].startswith("#")]
-    findings = []
-    after = "with # after the header"
-    if whole:
-        what = f"{numbered(whole, f'line begins {after}', f'lines begin {after}')}; left out"
-        findings.append(Finding("warning", "", what))
-    if ends:
-        what = f"{numbered(ends, 'line has a #', 'lines have a #')}; the text after it is left out"
-        findings.append(Finding("warning", "", what))
-    return tuple(findings)
+    bodies: tuple[str, ...] = ()
+    up: str = "z"
 
 
 def numbered(numbers: Sequence[int], one: str, several: str) -> str:
@@ -122,36 +83,36 @@ def numbered(numbers: Sequence[int], one: str, several: str) -> str:
     return f"{len(numbers)} {one if len(numbers) == 1 else several} ({listed})"
 
 
-def _cells(text: str, path: str) -> pd.DataFrame:
-    """Return the cells as text, with the header's titles."""
-    try:
-        cells = pd.read_csv(io.StringIO(text), comment="#", header=None, dtype=str, skipinitialspace=True)
-    except pd.errors.EmptyDataError:
-        raise RecordingError(f"{path}: the file is empty; allowed is a header {ALLOWED}") from None
-    except (pd.errors.ParserError, ValueError) as error:
-        reason = (str(error).strip().splitlines() or ["it cannot be parsed"])[-1]
-        raise RecordingError(f"{path}: not a CSV table: {reason}") from None
-    table = cells.iloc[1:].set_axis(cells.iloc[0].fillna("").str.strip(), axis="columns")
-    if table.empty:
-        raise RecordingError(f"{path}: no rows after the header")
-    return table
-
-
-def numbers_of(table: pd.DataFrame, path: str) -> pd.DataFrame:
-    """Return all cells as numbers, NaN where they are empty."""
+def numbers_of(table: pd.DataFrame) -> pd.DataFrame:
+    """Return the columns as numbers, NaN where they are empty; a column with other text stays text."""
     numbers = table.apply(pd.to_numeric, errors="coerce")
     values = numbers.to_numpy(dtype=float, na_value=np.nan)
-    said = ~table.isna().to_numpy()
-    wrong = said & ~np.isfinite(values)
-    for row, column in np.argwhere(wrong):
-        given = table.iat[row, column]
-        # common spellings of a missing number
-        if str(given).strip().lower() not in ("nan", "none", "null", "na", "n/a", "-nan", ""):
+    is_text = (~table.isna().to_numpy() & ~np.isfinite(values)).any(axis=0)
+    columns = []
+    for k, text in enumerate(is_text):
+        cells = table.iloc[:, k].reset_index(drop=True)
+        wrong = text and not _is_missing(cells[~np.isfinite(values[:, k])]).all()
+        columns.append(cells if wrong else pd.Series(values[:, k]))
+    return pd.concat(columns, axis=1).set_axis(list(map(str, table.columns)), axis="columns")
+
+
+def _is_missing(cells: pd.Series) -> pd.Series:
+    """Return a mask of the common spellings of a missing number."""
+    return cells.astype(str).str.strip().str.lower().isin(("nan", "none", "null", "na", "n/a", "-nan", ""))
+
+
+def columns_of(table: pd.DataFrame, places: Sequence[int], path: str) -> Float[np.ndarray, "n places"]:
+    """Return columns of numbers by their places. Raises `RecordingError` for one that has text."""
+    for place in places:
+        cells = table.iloc[:, place]
+        if cells.dtype.kind not in "fiub":
+            given = pd.to_numeric(cells, errors="coerce").to_numpy(dtype=float, na_value=np.nan)
+            row = int(np.argmax(~np.isfinite(given) & ~_is_missing(cells).to_numpy()))
             raise RecordingError(
-                f"{path}: row {row + 1}: {table.columns[column]} is {shown(given)}; "
+                f"{path}: row {row + 1}: {table.columns[place]} is {shown(str(cells.iloc[row]).strip())}; "
                 "allowed is a finite number"
             )
-    return pd.DataFrame(values, columns=list(map(str, table.columns)))
+    return table.iloc[:, list(places)].to_numpy(dtype=float)
 
 
 # meaning of the columns
@@ -258,13 +219,10 @@ def streams(
         RecordingError: a column is missing, or the times are not plausible seconds.
     """
     columns, called = list(table.columns), config.table or TableSource()
-    if called.rate is not None:
-        time = np.arange(len(table)) / called.rate
-    elif columns.count(TIME) != 1:
-        raise RecordingError(f"{path}: the columns are {', '.join(columns)}; required is {TIME}, once")
-    else:
-        time = table[TIME].to_numpy()
+    mapped = config.columns or ColumnMap()
+    time = _times(table, called, mapped, path)
     check_seconds(time, path)
+    bodies = dict(mapped.bodies)
     wanted: dict[str, list[str]] = {}
     for source in (*config.markers, config.base):
         if source is not None:
@@ -272,27 +230,71 @@ def streams(
                 source.topic, config.position_unit
             )
             turned = _called(called.quaternion, source.topic) or quaternion_titles(source.topic)
-            wanted[source.topic] = titles + (turned if turned[0] in columns else [])
-    for tendons in (config.measured, config.command):
+            usual = titles + (turned if turned[0] in columns else [])
+            wanted[source.topic] = list(bodies.get(source.topic, usual))
+    roles = (
+        (config.tension, mapped.tensions), (config.motors, mapped.motors), (config.command, mapped.commands)
+    )  # fmt: skip
+    for tendons, named in roles:
         if tendons is not None:
             count = len(tendons.order)
             titles = tension_titles(tendons.topic, tendons.unit, count)
             if called.motor is not None:
                 titles = [called.motor.replace(PLACE, str(k + 1)) for k in range(count)]
-            wanted[tendons.topic] = titles
+            if named is not None and len(named) != count:
+                raise RecordingError(
+                    f"{path}: {len(named)} columns are mapped and order has {count} tendons; allowed is the "
+                    "same number"
+                )
+            wanted[tendons.topic] = list(named or titles)
     optional = _optional(config)
     found = {}
     for topic, titles in wanted.items():
-        missing = [title for title in titles if columns.count(title) != 1]
-        if missing and topic in optional and len(missing) == len(titles):
+        if topic in optional and not any(title in columns for title in titles):
             continue
-        if missing:
-            wrong = "missing" if missing[0] not in columns else "there twice"
-            raise RecordingError(
-                f"{path}: the column {missing[0]} is {wrong}; the columns are {', '.join(columns)}"
-            )
-        found[topic] = _stream(topic, time, table[titles].to_numpy())
+        places = [_place(title, columns, path) for title in titles]
+        found[topic] = _stream(topic, time, columns_of(table, places, path))
     return found, _about_times(time)
+
+
+def _place(title: str, columns: Sequence[str], path: str) -> int:
+    """Return the index of a title; a number that is no title counts from 1. Raises `RecordingError`."""
+    if columns.count(title) == 1:
+        return columns.index(title)
+    if title not in columns and title.isdecimal() and 1 <= int(title) <= len(columns):
+        return int(title) - 1
+    wrong = "there twice" if title in columns else "missing"
+    hint = "; name it by its number, counted from 1" if title in columns else did_you_mean(title, columns)
+    raise RecordingError(f"{path}: the column {title} is {wrong}; the columns are {', '.join(columns)}{hint}")
+
+
+def _times(table: pd.DataFrame, called: TableSource, mapped: ColumnMap, path: str) -> Float[np.ndarray, " n"]:
+    """Return the rows' times (s). Raises `RecordingError`."""
+    columns, title = list(table.columns), mapped.time or TIME
+    if called.rate is not None and mapped.time is None:
+        return np.arange(len(table)) / called.rate
+    if mapped.time is None and columns.count(TIME) != 1:
+        raise RecordingError(
+            f"{path}: the columns are {', '.join(columns)}; required is {TIME}, once (the configuration "
+            "names another title by `columns: {time: …}`, and the rate of rows without times by "
+            "`table: {rate: …}`)"
+        )
+    time = columns_of(table, [_place(title, columns, path)], path)[:, 0]
+    return time * TIME_UNITS[mapped.time_unit or stated_time_unit(title) or "s"]
+
+
+#: spellings of units of time in titles
+_SPELLINGS = {
+    "ms": ("ms", "msec", "millis", "milliseconds"),
+    "us": ("us", "µs", "μs", "usec", "micros", "microseconds"),
+    "ns": ("ns", "nsec", "nanos", "nanoseconds"),
+}
+
+
+def stated_time_unit(title: str) -> str:
+    """Return the unit that the title of a time states, such as t [ms] or time_ns; empty without one."""
+    words = set(re.findall(r"[a-zµμ]+", title.lower())[1:])
+    return next((unit for unit, spellings in _SPELLINGS.items() if words & set(spellings)), "")
 
 
 def check_seconds(time: Float[np.ndarray, " n"], path: str) -> None:

@@ -278,7 +278,8 @@ def message_maker(stream: WireStream, ros: int) -> Callable[[int, int, Any], Any
 
 
 def _write_table(path: Path, config: RecordingConfig, streams: list[WireStream]) -> None:
-    from knode_cosserat.recordings import parquet, table
+    from knode_cosserat.recordings import table
+    from knode_cosserat.recordings.formats import parquet
 
     columns: dict[str, Any] = {}
     for stream in streams:

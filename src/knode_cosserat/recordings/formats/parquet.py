@@ -12,6 +12,7 @@ from knode_cosserat._files import parquet_file
 from knode_cosserat._files.reading import ReadError
 from knode_cosserat._files.yaml_text import shown
 from knode_cosserat.recordings.findings import RecordingError
+from knode_cosserat.recordings.formats import RecordingFormat, register
 from knode_cosserat.recordings.table import Table, numbers_of
 
 MAGIC = b"PAR1"
@@ -40,7 +41,7 @@ def read_parquet(path: Path) -> Table:
         _check_type(pyarrow, field, path)
     frame = pd.DataFrame({name: table.column(i).to_numpy() for i, name in enumerate(table.column_names)})
     _require(len(frame) > 0, path, "no rows")
-    return Table(said, numbers_of(frame, str(path)))
+    return Table(said, numbers_of(frame))
 
 
 def write_parquet(path: Path, table: pd.DataFrame, said: Mapping[str, str]) -> None:
@@ -78,3 +79,12 @@ def _check_type(pyarrow: Any, field: Any, path: Path) -> None:
     numbers = (types.is_integer, types.is_floating, types.is_boolean, types.is_null)
     what = f"the column {shown(field.name)} has {kind}; allowed are numbers"
     _require(any(is_kind(kind) for is_kind in numbers), path, what)
+
+
+register(
+    RecordingFormat(
+        "Parquet table",
+        recognise=lambda head: head.startswith(MAGIC),
+        read=lambda path, wanted: read_parquet(path),
+    )
+)

@@ -11,8 +11,10 @@ from collections.abc import Collection
 from typing import NamedTuple
 
 from knode_cosserat._files.limits import MORE
+from knode_cosserat.recordings import content
 from knode_cosserat.recordings.container import EXPANDED, Container, Decompression
 from knode_cosserat.recordings.findings import RecordingError
+from knode_cosserat.recordings.formats import RecordingFormat, register
 
 MAGIC = b"#ROSBAG V"
 VERSION = b"#ROSBAG V2.0\n"
@@ -201,3 +203,13 @@ def _next_record(data: bytes, position: int) -> int:
                 return begin
         mark = data.find(_KIND_FIELD, mark + 1)
     return len(data)
+
+
+register(
+    RecordingFormat(
+        "ROS 1 bag",
+        recognise=lambda head: head.startswith(MAGIC),
+        read=lambda path, wanted: read_ros1(content.file_bytes(path, content.LARGEST_BAG), wanted, str(path)),
+        suffixes=(".bag", ".bag.active"),
+    )
+)

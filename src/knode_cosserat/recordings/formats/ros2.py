@@ -1,7 +1,8 @@
 """Reader of ROS 2 bags: MCAP files, SQLite files (.db3) and folders of these, as far as they are readable.
 
 Neither the summary at an MCAP file's end nor a folder's metadata.yaml is needed: a recorder that was killed
-has not written them.
+has not written them. Messages, and whole files, may be compressed by zstd (rosbag2's `compression_mode`):
+compressed messages are recognised by their first bytes, which no encoded message has.
 """
 
 from __future__ import annotations
@@ -12,12 +13,17 @@ import urllib.parse
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
-from knode_cosserat._files.limits import MORE
+from knode_cosserat._files.limits import MORE, excess
+from knode_cosserat.recordings import content
 from knode_cosserat.recordings.container import EXPANDED, Container, Decompression
 from knode_cosserat.recordings.findings import RecordingError
+from knode_cosserat.recordings.formats import RecordingFormat, register
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 SQLITE_MAGIC = b"SQLite format 3\x00"
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+#: storage files of a bag's folder, and the end of their names when compressed as a whole
+_STORAGE, _PACKED = (".mcap", ".db3"), ".zstd"
 #: most steps of SQLite's machine: so many for each byte of the file, and these besides. A row takes five,
 #: and at least eleven bytes; damaged pages that refer to each other can repeat rows without end
 STEPS_PER_BYTE, MOST_STEPS = 1, 1_000_000
@@ -32,16 +38,35 @@ def storage_files(folder: Path) -> list[Path]:
     """Return the files of a bag's folder, in the order of recording.
 
     Raises:
-        RecordingError: the folder holds no files of a bag, or compressed ones.
+        RecordingError: the folder holds no files of a bag.
     """
-    files = [path for path in folder.iterdir() if path.suffix in (".mcap", ".db3")]
-    packed = next((path for path in folder.iterdir() if path.suffix == ".zstd"), None)
-    if packed is not None:
-        raise RecordingError(f"{packed}: a compressed file of a bag; allowed is one unpacked by zstd -d")
+    files = [path for path in folder.iterdir() if path.name.removesuffix(_PACKED).endswith(_STORAGE)]
     if not files:
         raise RecordingError(f"{folder}: this folder holds no bag; allowed is one with .mcap or .db3 files")
     # the recorder numbers them: _0, _1 … _10
     return sorted(files, key=lambda path: (len(path.name), path.name))
+
+
+def read_folder(folder: Path, wanted: Collection[str]) -> Container:
+    """Return the wanted topics' messages in all files of a folder. Raises `RecordingError`."""
+    return merged([_read_file(path, wanted) for path in storage_files(folder)])
+
+
+def _read_file(path: Path, wanted: Collection[str]) -> Container:
+    head = content.beginning(path)
+    if head.startswith(ZSTD_MAGIC):
+        packed = content.file_bytes(path, content.LARGEST_BAG)
+        decompression = Decompression(len(packed))
+        data = decompression.records(packed, "zstd", 0)[0]
+        if decompression.is_limited:
+            raise RecordingError(f"{path}: {EXPANDED}; {MORE}")
+        is_sqlite = data.startswith(SQLITE_MAGIC)
+        return (read_sqlite_bytes if is_sqlite else read_mcap)(data, wanted, str(path))
+    if head.startswith(SQLITE_MAGIC) or (path.suffix == ".db3" and not head.startswith(MCAP_MAGIC)):
+        if reason := excess(path.stat().st_size, content.LARGEST_BAG, "bytes"):
+            raise RecordingError(f"{path}: {reason}")
+        return read_sqlite(path, wanted, str(path))
+    return read_mcap(content.file_bytes(path, content.LARGEST_BAG), wanted, str(path))
 
 
 def merged(containers: list[Container]) -> Container:
@@ -144,7 +169,7 @@ class _Mcap:
             )
             if topic is not None:
                 topic.received.append(received)
-                topic.raw.append(record[22:])
+                topic.raw.append(_unpacked(record[22:], self._decompression))
 
 
 def _string(record: memoryview, position: int) -> tuple[str, int]:
@@ -156,22 +181,42 @@ def _string(record: memoryview, position: int) -> tuple[str, int]:
     return bytes(record[position + 4 : end]).decode("utf-8"), end
 
 
+def _unpacked(raw: bytes | memoryview, decompression: Decompression) -> bytes | memoryview:
+    """Return a message's bytes, decompressed; a damaged one comes back cut, and cannot be decoded later."""
+    return decompression.records(raw, "zstd", 0)[0] if raw[:4] == ZSTD_MAGIC else raw
+
+
 # SQLite
 
 
 def read_sqlite(path: Path, wanted: Collection[str], source: str) -> Container:
     """Return the wanted topics' messages, and all topics' names and types. Raises `RecordingError`."""
-    container = Container(ros=2)
     # without a journal beside it the file is only read; with one, SQLite has to look into both
     journal = path.with_name(path.name + "-wal").exists()
     address = f"file:{urllib.parse.quote(str(path))}?mode=ro" + ("" if journal else "&immutable=1")
     try:
         connection = sqlite3.connect(address, uri=True)
-        # no text and no blob is longer than the file
-        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(path.stat().st_size, 1 << 16))
     except sqlite3.Error as error:
         raise RecordingError(f"{source}: cannot be read: {error}") from None
-    size = path.stat().st_size
+    return _read_connection(connection, path.stat().st_size, wanted, source)
+
+
+def read_sqlite_bytes(data: bytes, wanted: Collection[str], source: str) -> Container:
+    """Return the same as `read_sqlite`, from the bytes of a file. Raises `RecordingError`."""
+    connection = sqlite3.connect(":memory:")
+    try:
+        connection.deserialize(data)
+    except sqlite3.Error as error:
+        raise RecordingError(f"{source}: cannot be read: {error}") from None
+    return _read_connection(connection, len(data), wanted, source)
+
+
+def _read_connection(
+    connection: sqlite3.Connection, size: int, wanted: Collection[str], source: str
+) -> Container:
+    container = Container(ros=2)
+    # no text and no blob is longer than the file
+    connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(size, 1 << 16))
     steps = iter(range((STEPS_PER_BYTE * size + MOST_STEPS) // _PACE))
     connection.set_progress_handler(lambda: next(steps, None) is None, _PACE)
     try:
@@ -207,6 +252,7 @@ def _tables(connection: sqlite3.Connection, container: Container, wanted: Collec
     for number, name, kind in connection.execute("SELECT id, name, type FROM topics"):
         if isinstance(name, str) and isinstance(kind, str):
             topics[number] = container.topic(name, kind)
+    decompression = Decompression(size)
     # in the order of writing, so that the messages before a damaged page are the beginning
     for number, received, raw in connection.execute(
         "SELECT topic_id, timestamp, data FROM messages ORDER BY id"
@@ -223,4 +269,17 @@ def _tables(connection: sqlite3.Connection, container: Container, wanted: Collec
             and isinstance(raw, bytes)
         ):
             topic.received.append(received)
-            topic.raw.append(raw)
+            topic.raw.append(_unpacked(raw, decompression))
+    if decompression.is_limited:
+        container.is_limited, container.damage = True, EXPANDED
+
+
+register(
+    RecordingFormat(
+        "ROS 2 bag",
+        recognise=lambda head: head.startswith((MCAP_MAGIC, SQLITE_MAGIC)),
+        read=_read_file,
+        suffixes=(*_STORAGE, *(f"{suffix}{_PACKED}" for suffix in _STORAGE)),
+    )
+)
+register(RecordingFormat("folder of a ROS 2 bag", lambda head: False, read_folder, is_folder=True))

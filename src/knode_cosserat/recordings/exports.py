@@ -1,0 +1,180 @@
+"""Exports of motion capture as tables: bodies and channels, in m and scalar first, under the usual titles."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd  # type: ignore[import-untyped]
+from jaxtyping import Float
+
+from knode_cosserat._files import csv_rows
+from knode_cosserat._files.limits import excess
+from knode_cosserat.recordings import content
+from knode_cosserat.recordings.findings import Finding, RecordingError
+from knode_cosserat.recordings.table import (
+    TIME,
+    Table,
+    columns_of,
+    numbers_of,
+    position_titles,
+    quaternion_titles,
+)
+
+#: units of length in m
+LENGTHS = {
+    "m": 1.0, "meters": 1.0, "metres": 1.0, "cm": 1e-2, "centimeters": 1e-2, "centimetres": 1e-2, "mm": 1e-3,
+    "millimeters": 1e-3, "millimetres": 1e-3, "in": 0.0254, "inches": 0.0254, "ft": 0.3048, "feet": 0.3048,
+}  # fmt: skip
+#: largest number of columns: unlabelled markers that come and go have three each
+MOST_COLUMNS = 20_000
+#: beginnings of the names of markers that the motion capture did not recognise
+_UNKNOWN = ("unlabeled", "unlabelled", "*", "_")
+
+
+class Track(NamedTuple):
+    """Poses of a body or marker in an export."""
+
+    name: str
+    #: (n, 3) m; NaN where it is lost
+    position: Float[np.ndarray, "n 3"]
+    #: (n, 4) scalar first; None for a marker
+    quaternion: Float[np.ndarray, "n 4"] | None = None
+    #: kind in the file, such as rigid body
+    kind: str = "marker"
+
+
+class Channels(NamedTuple):
+    """Analog channels: their times (s), and values by title."""
+
+    time: Float[np.ndarray, " n"]
+    values: Mapping[str, Float[np.ndarray, " n"]]
+
+
+def export_table(
+    path: Path,
+    time: Float[np.ndarray, " n"],
+    tracks: Sequence[Track],
+    *,
+    up: str,
+    channels: Iterable[Channels] = (),
+    findings: Iterable[Finding] = (),
+    source: str = "",
+) -> Table:
+    """Return the table of an export. Bodies with orientations come before markers.
+
+    Args:
+        path: the file.
+        time: times of the rows (s).
+        tracks: bodies and markers; names that are there twice get the kind or a number.
+        up: axis of the file that points up.
+        channels: analog channels, with times of their own.
+        findings: findings from reading.
+        source: name of the take, for the recording's source.
+
+    Raises:
+        RecordingError: no body is there, or too many.
+    """
+    if not tracks:
+        raise RecordingError(f"{path}: it has no bodies and no markers with positions")
+    if reason := excess(3 * len(tracks), MOST_COLUMNS, "columns"):
+        raise RecordingError(f"{path}: {reason}")
+    columns: dict[str, np.ndarray] = {TIME: time}
+    found, names = list(findings), []
+    for track in sorted(tracks, key=lambda track: track.quaternion is None):
+        spellings = [track.name, f"{track.name} ({track.kind})"]
+        numbered = (f"{track.name} ({k})" for k in itertools.count(2))
+        name = next(each for each in itertools.chain(spellings, numbered) if f"{each}_x [m]" not in columns)
+        names.append((name, track.quaternion is not None))
+        position = np.array(track.position, dtype=float)
+        # no measured coordinate is exactly zero three times over
+        nowhere = np.all(position == 0.0, axis=1)
+        if nowhere.any():
+            frames = "frame is" if nowhere.sum() == 1 else "frames are"
+            found.append(
+                Finding("warning", name, f"{int(nowhere.sum())} {frames} at exactly 0, 0, 0; left out")
+            )
+            position[nowhere] = np.nan
+        columns |= dict(zip(position_titles(name, "m"), position.T, strict=True))
+        if track.quaternion is not None:
+            turned = np.where(nowhere[:, None], np.nan, track.quaternion)
+            columns |= dict(zip(quaternion_titles(name), turned.T, strict=True))
+    parts = [pd.DataFrame(columns)]
+    # channels have rows of their own: cells of other rows are empty
+    parts += [pd.DataFrame({TIME: each.time, **each.values}) for each in channels if len(each.values)]
+    table = (
+        pd.concat(parts).sort_values(TIME, kind="stable", ignore_index=True) if len(parts) > 1 else parts[0]
+    )
+    oriented = [name for name, has_orientation in names if has_orientation]
+    known = [name for name, _ in names if not name.rpartition(":")[2].lower().startswith(_UNKNOWN)]
+    bodies = oriented or known or [name for name, _ in names]
+    said = {"source": f"{path.name}: {source}"} if source else {}
+    return Table(said, table, tuple(found), tuple(bodies), up)
+
+
+def length_unit(word: str, path: Path, default: str, findings: list[Finding]) -> float:
+    """Return a unit of length in m; a finding states that the default is taken for a missing one.
+
+    Raises:
+        RecordingError: the unit is unknown.
+    """
+    if not word.strip():
+        findings.append(
+            Finding("warning", "", f"no unit of length is stated; positions are taken to be in {default}")
+        )
+        word = default
+    if word.strip().lower() not in LENGTHS:
+        raise RecordingError(
+            f"{path}: the unit of length is {word.strip()!r}; allowed is m, cm, mm, in or ft"
+        )
+    return LENGTHS[word.strip().lower()]
+
+
+def text_lines(path: Path) -> list[str]:
+    """Return the lines of a text file. Raises `RecordingError`."""
+    data = content.file_bytes(path, csv_rows.LARGEST_FILE)
+    newlines = data.count(b"\n") + data.count(b"\r") - data.count(b"\r\n")
+    if reason := excess(newlines, csv_rows.MOST_LINES, "lines"):
+        raise RecordingError(f"{path}: {reason}")
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        # exporting programs write names and units in the code page of Windows
+        text = data.decode("latin-1")
+    return text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+
+
+class Cells:
+    """Rows of numbers of an export's section.
+
+    Args:
+        lines: the lines; blank ones are left out.
+        titles: titles of the columns, for errors.
+        delimiter: delimiter of the cells.
+        path: the file.
+
+    Raises:
+        RecordingError: there are no rows, or one has more cells than titles.
+    """
+
+    def __init__(self, lines: Sequence[str], titles: Sequence[str], delimiter: str, path: Path) -> None:
+        from knode_cosserat.recordings.formats.csv_table import cells_of
+
+        if reason := excess(len(titles), MOST_COLUMNS, "columns"):
+            raise RecordingError(f"{path}: {reason}")
+        rows = [line for line in lines if line.strip(f"{delimiter} \t")]
+        if not rows:
+            raise RecordingError(f"{path}: no rows after the header")
+        # cells that are empty at the end of a line may be left out
+        rows[0] += delimiter * (len(titles) - 1 - rows[0].count(delimiter))
+        cells = cells_of("\n".join(rows), delimiter, str(path))
+        titles = [*titles, *(f"column {k + 1}" for k in range(len(titles), cells.shape[1]))]
+        self._table = numbers_of(cells.set_axis(titles[: cells.shape[1]], axis="columns"))
+        self._path = path
+
+    def __getitem__(self, places: Sequence[int]) -> Float[np.ndarray, "n places"]:
+        """Return columns; NaN where a cell is empty. Raises `RecordingError` for other text."""
+        return columns_of(self._table, places, str(self._path))

@@ -1,0 +1,69 @@
+"""Formats of recordings: a module of this package defines one, and registers it.
+
+    register(RecordingFormat("Motive CSV", recognise=…, read=…))
+
+A module that is added to this package is found by itself. The content of a file decides its format. The name
+decides only if the first bytes are damaged.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import pkgutil
+from collections.abc import Callable, Collection
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from knode_cosserat.recordings.container import Container
+from knode_cosserat.recordings.content import beginning
+
+if TYPE_CHECKING:
+    from knode_cosserat.recordings.table import Table
+
+
+class RecordingFormat(NamedTuple):
+    """Format of recordings.
+
+    Attributes:
+        name: name in messages.
+        recognise: True for the first bytes (up to 4096, decompressed) of a file of this format.
+        read: function from the path and the wanted topics to the messages of a bag, or to a table. Tables
+            have all columns. Raises `RecordingError`.
+        suffixes: ends of names that stand for the format if the first bytes are damaged.
+        is_folder: True if the recording is a folder.
+        is_fallback: True if any other file is of this format.
+    """
+
+    name: str
+    recognise: Callable[[bytes], bool]
+    read: Callable[[Path, Collection[str]], Container | Table]
+    suffixes: tuple[str, ...] = ()
+    is_folder: bool = False
+    is_fallback: bool = False
+
+
+_registered: list[RecordingFormat] = []
+
+
+def register(kind: RecordingFormat) -> None:
+    """Add a format."""
+    _registered.append(kind)
+
+
+@functools.cache
+def formats() -> tuple[RecordingFormat, ...]:
+    """Return all formats, after an import of the modules that define them."""
+    for module in pkgutil.iter_modules(__path__):
+        importlib.import_module(f"{__name__}.{module.name}")
+    return tuple(sorted(_registered, key=lambda kind: kind.is_fallback))
+
+
+def format_of(path: Path) -> RecordingFormat:
+    """Return the format of a file or folder. Raises `RecordingError` if it cannot be read."""
+    head = beginning(path)
+    if path.is_dir():
+        return next(kind for kind in formats() if kind.is_folder)
+    by_content = [kind for kind in formats() if not kind.is_fallback and kind.recognise(head)]
+    by_name = [kind for kind in formats() if kind.suffixes and path.name.lower().endswith(kind.suffixes)]
+    return next(iter([*by_content, *by_name, *(kind for kind in formats() if kind.is_fallback)]))
