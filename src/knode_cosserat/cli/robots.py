@@ -185,11 +185,13 @@ def equilibrium(
         lines.append(f"internal moment at the base: {vector_text(facts['base_moment'])} N m")
     if facts["unstable"]:
         lines.append("UNSTABLE: a small disturbance moves the robot away from this shape")
+    if rest.result[0] == kc.Result.OTHER_TURNS:
+        lines.append(f"OTHER TURNS: {facts['result']}")
     if rest.extrapolation:
         lines.append("EXTRAPOLATION: controls or strains are outside the model's training range")
     if rest.result[0] == kc.Result.COARSE:
         lines.append(COARSE)
-    elif facts["result"] != "converged":
+    elif facts["result"] != "converged" and rest.result[0] not in (kc.Result.UNSTABLE, kc.Result.OTHER_TURNS):
         lines.append(f"solved with recovery: {facts['result']}")
     write_output(as_json, facts, lines, out=out)
 
@@ -258,6 +260,8 @@ def _unstable(rest: Any, space: str) -> bool | None:
     """Return True if an equilibrium is unstable, by its energy or its compliance; None if unknown."""
     import knode_cosserat as kc
 
+    if rest.result[0] == kc.Result.UNSTABLE:
+        return True
     try:
         return not kc.statics.stability(rest).stable
     except ValueError:

@@ -21,9 +21,8 @@ from knode_cosserat.solvers.run import (
     failure,
     mark_coarse,
     rows_of,
-    run_batch,
-    run_one,
     warn_of_coarse_grids,
+    warn_of_results,
 )
 from knode_cosserat.solvers.sensitivity import static_rollout
 from knode_cosserat.solvers.settings import Settings
@@ -36,6 +35,7 @@ from knode_cosserat.solvers.simulate import (
 )
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.static_loop import unloaded_shape
+from knode_cosserat.solvers.static_run import static_batch, static_run
 from knode_cosserat.trajectory import Trajectory
 
 
@@ -126,21 +126,22 @@ def equilibria(
     if initial is not None:
         check_initial(system, initial, batch)
     bare = without_range(system)
-    y = unloaded_shape(bare, settings.space)
-    before: Any = np.zeros((batch, system.control_size) if batch else system.control_size)
+    y = before = None
     if initial is not None:
         y, before = grid_of(system).spread(jnp.asarray(initial.y[-1])), initial.control[-1]
-    elif batch and y.ndim == 2:
-        y = jnp.broadcast_to(y, (batch, *y.shape))
     task = Equilibria(settings, np.shape(controls)[-2], recovery_budget)
     if is_traced((system, controls, y)):
-        rows = _traced(bare, controls, y, task)
+        rest = unloaded_shape(bare, settings.space) if y is None else y
+        if batch and rest.ndim == 2:
+            rest = jnp.broadcast_to(rest, (batch, *rest.shape))
+        rows = _traced(bare, controls, rest, task)
     else:
-        rows, _, causes = (run_batch if batch else run_one)(task, bare, controls, y, before)
+        rows, _, causes = (static_batch if batch else static_run)(task, bare, controls, y, before)
         if on_failure == "raise" and causes:
             raise failure(rows, causes, None)
         rows = mark_coarse(rows, system)
         warn_of_coarse_grids(system, settings, rows)
+        warn_of_results(rows)
     time = np.arange(float(task.steps))
     return marked(Trajectory(system, settings, time, control=controls, **rows_of(system, rows)), None)
 

@@ -2,19 +2,83 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
+from knode_cosserat.rods.ends import AXES, Clamped, Pinned, Pose
+from knode_cosserat.rods.rod import Rod
 from knode_cosserat.rods.section import ALONG
 from knode_cosserat.rods.system import System
-from knode_cosserat.rotation import turned
+from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.history import rest_record
 
 #: fewest positions that define a curve, and number of positions along a curve between held ends
 FEWEST, POINTS = 2, 65
+#: reaches of the curves between held ends, as multiples of the natural reach
+REACHES = (1.0, 0.3, 3.0)
+
+
+class HeldEnd(NamedTuple):
+    """Pose of a held end under a control."""
+
+    p: Float[np.ndarray, "3"]
+    #: orientation (quaternion, scalar first); None for a pinned end
+    h: Float[np.ndarray, "4"] | None
+    #: rotation vector (rad) by which the control turns the end, with all its turns
+    turn: Float[np.ndarray, "3"]
+
+    @property
+    def tangent(self) -> Float[np.ndarray, "3"] | None:
+        """Direction of the rod at the end; None for a pinned end."""
+        return None if self.h is None else rotations(self.h).apply(ALONG)
+
+    @property
+    def spin(self) -> float:
+        """Rotation (rad) of the end about the rod's direction, with all its turns."""
+        # along a turn about a constant axis, the component along the tangent is constant
+        return 0.0 if self.h is None else float(self.turn @ self.tangent)
+
+
+def held_ends(system: System, control: Any) -> tuple[HeldEnd | None, HeldEnd | None]:
+    """Return the poses in which base and tip are held under a control; None for an end that is free."""
+    columns, control = turn_columns(system), np.asarray(control, dtype=float)
+    turns = np.where(columns < 0, 0.0, np.append(control, 0.0)[columns])
+    found: list[HeldEnd | None] = []
+    for pose, pinned, turn in zip(*_poses(system, jnp.asarray(control)), turns, strict=True):
+        held = pose or pinned
+        found.append(held and HeldEnd(*(None if x is None else np.asarray(x) for x in held), turn))
+    return found[0], found[1]
+
+
+@jax.jit
+def _poses(system: System, control: Any) -> Any:
+    """Return the poses of clamped ends and of pinned ends."""
+    rod, pinned = system.nominal, [None, None]
+    for k, end in enumerate((rod.base_end, rod.tip_end) if isinstance(rod, Rod) else ()):
+        if isinstance(end, Pinned):
+            p, h = rod.y_layout.split(rod.rest(k * jnp.asarray(rod.length))[0])[:2]
+            pinned[k] = Pose(end.pose(Pose(p, h), control[:0]).p, None)
+    return system.end_poses(control), tuple(pinned)
+
+
+def turn_columns(system: System) -> Int[np.ndarray, "2 3"]:
+    """Return the indices in a control of the rotations of base and tip about x, y, z; -1 if not driven."""
+    layout, rod, found = system.control_layout, system.nominal, np.full((2, 3), -1)
+    for end, prefix in enumerate(("base", "tip") if isinstance(rod, Rod) else ()):
+        for k, axis in enumerate(AXES[3:]):
+            if f"{prefix}_{axis}" in layout.names:
+                found[end, k] = layout.slice(f"{prefix}_{axis}").start
+    return found
+
+
+def are_clamped(system: System) -> bool:
+    """True if the orientation of both ends is prescribed."""
+    rod = system.nominal
+    return isinstance(rod, Rod) and all(isinstance(end, Clamped) for end in (rod.base_end, rod.tip_end))
 
 
 def state_from_positions(
@@ -23,9 +87,10 @@ def state_from_positions(
     """Return y and z at the nodes of a rod whose centreline goes through these positions.
 
     The positions are assumed evenly spaced along the rod, from base to tip, and are joined by a spline. The
-    base frame is transported along it without twist; the twist of a held tip is spread evenly. Moments
-    follow from the material's law; forces are zero. Accepts systems of one rod with positions p,
-    orientations h and curvatures u.
+    frames follow the rod's twist at rest. A held tip determines the twist up to whole turns: the nearest to
+    rest is taken, plus the turns by the control. What the tip adds is spread evenly. Moments follow from the
+    material's law; forces are zero. Accepts systems of one rod with positions p, orientations h and
+    curvatures u.
 
     Raises:
         ValueError: the positions are no curve, or the system is not accepted.
@@ -46,18 +111,56 @@ def state_from_positions(
     record = np.array(rest_record(system))
     s = np.linspace(0.0, 1.0, system.nodes)
     p, tangent = _curve(positions, s)
-    base, tip = system.end_poses(np.asarray(control))
-    h = _carried(record[0, y_layout.slice("h")] if base is None else np.asarray(base.h), tangent)
-    if tip is not None:
-        h = _twisted(h, np.asarray(tip.h))
+    base, tip = held_ends(system, control)
+    u_rest = _unstressed(system, s * float(system.length), control)
+    h = _carried(record[0, y_layout.slice("h")] if base is None or base.h is None else base.h, tangent)
+    spin = (0.0 if tip is None else tip.spin) - (0.0 if base is None else base.spin)
+    h = _twisted(h, None if tip is None else tip.h, u_rest[:, 2] * float(system.length), spin)
     u = _curvatures(h, float(system.length) / (system.nodes - 1))
     ny = y_layout.size
     record[:, y_layout.slice("p")], record[:, y_layout.slice("h")] = p, h
     u_rows = slice(ny + z_layout.slice("u").start, ny + z_layout.slice("u").stop)
     record[:, u_rows] = u
     if "m" in y_layout.names and hasattr(system, "material"):
-        record[:, y_layout.slice("m")] = _moments(system, control, h, u)
+        Kbt = np.asarray(materials(system, s * float(system.length), control).Kbt)
+        record[:, y_layout.slice("m")] = rotations(h).apply(np.einsum("kij,kj->ki", Kbt, u - u_rest))
     return record
+
+
+def curve_guesses(system: System, control: Any) -> list[Float[Any, "points y"]]:
+    """Return y at all points on curves of the rod's length between its held ends; none if an end is free."""
+    found = []
+    for reach in dict.fromkeys(min(1.0, part * natural_reach(system)) for part in REACHES):
+        points = hanging_curve(system, control, reach)
+        if points is not None:
+            record = state_from_positions(system, points, control)
+            found.append(grid_of(system).spread(jnp.asarray(record[:, : system.y_layout.size])))
+    return found
+
+
+@jax.jit
+def materials(system: Any, s: Any, control: Any) -> Any:
+    """Return section and material at places (m) along a rod."""
+    return jax.vmap(lambda s: system.material(s, control))(s)
+
+
+@jax.jit
+def _unstressed_rows(system: System, s: Any, control: Any) -> Any:
+    return jax.vmap(lambda s: system.unstressed(s, control))(s)
+
+
+def _unstressed(system: System, s: Any, control: Any) -> Float[np.ndarray, "nodes 3"]:
+    """Return the curvatures u (1/m) of the unstressed material at places along the rod."""
+    rows = _unstressed_rows(system, jnp.asarray(s), jnp.asarray(control))
+    return np.asarray(rows)[:, system.z_layout.slice("u")]
+
+
+def rotations(h: Any) -> Any:
+    """Return SciPy's rotations of quaternions, scalar first."""
+    # imported here: it would double this package's import time
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_quat(np.roll(h, -1, axis=-1))
 
 
 def _curve(positions: Any, s: Any) -> tuple[Any, Any]:
@@ -75,7 +178,7 @@ def _carried(base: Any, tangents: Any) -> Any:
     """Return twist-free orientations (quaternions, scalar first) along tangents, starting at the base's."""
     from scipy.spatial.transform import Rotation
 
-    frame = Rotation.from_quat(np.roll(base, -1))
+    frame = rotations(base)
     found = []
     for tangent in tangents:
         axis = frame.apply([0.0, 0.0, 1.0])
@@ -88,26 +191,33 @@ def _carried(base: Any, tangents: Any) -> Any:
             turn = across * (np.arctan2(size, along) / size if size > 0.0 else 0.0)
         frame = Rotation.from_rotvec(turn) * frame
         found.append(np.roll(frame.as_quat(), 1))
-    h = np.array(found)
-    for k in range(1, len(h)):  # choose the sign nearest to the previous quaternion
-        h[k] *= 1.0 if np.dot(h[k], h[k - 1]) >= 0.0 else -1.0
-    return h
+    return continuous(np.array(found))
 
 
-def _twisted(h: Any, tip: Any) -> Any:
-    """Return orientations twisted evenly about their tangents; the last one is nearest to the tip's."""
+def continuous(h: Float[np.ndarray, "nodes 4"]) -> Float[np.ndarray, "nodes 4"]:
+    """Return quaternions, each with the sign nearest to the one before."""
+    signs = np.where(np.sum(h[1:] * h[:-1], axis=1) < 0.0, -1.0, 1.0)
+    return h * np.cumprod(np.concatenate([[1.0], signs]))[:, None]
+
+
+def _twisted(h: Any, tip: Any, rate: Any, spin: float) -> Any:
+    """Return orientations twisted about their tangents as at rest, and then evenly to meet the tip's.
+
+    `rate` is the twist at rest (rad over the whole length) at the nodes. Of the windings that meet the tip's
+    orientation, the nearest to the twist at rest plus the `spin` (rad) of the ends is taken.
+    """
     from scipy.spatial.transform import Rotation
 
-    frames = Rotation.from_quat(np.roll(h, -1, axis=1))
-    over = (frames[-1].inv() * Rotation.from_quat(np.roll(tip, -1))).as_quat()
-    angle = 2.0 * np.arctan2(over[2], over[3])
-    angle = (angle + np.pi) % (2.0 * np.pi) - np.pi
+    frames, part = rotations(h), 1.0 / (len(h) - 1)
+    twist = np.concatenate([[0.0], np.cumsum((rate[1:] + rate[:-1]) * part / 2.0)])
+    wanted = twist[-1] + spin
+    if tip is not None:
+        over = (frames[-1].inv() * rotations(tip)).as_quat()
+        angle = 2.0 * np.arctan2(over[2], over[3])
+        wanted = angle + 2.0 * np.pi * np.round((wanted - angle) / (2.0 * np.pi))
     turns = np.zeros((len(h), 3))
-    turns[:, 2] = np.linspace(0.0, angle, len(h))
-    found = np.roll((frames * Rotation.from_rotvec(turns)).as_quat(), 1, axis=1)
-    for k in range(1, len(found)):
-        found[k] *= 1.0 if np.dot(found[k], found[k - 1]) >= 0.0 else -1.0
-    return found
+    turns[:, 2] = twist + np.linspace(0.0, wanted - twist[-1], len(h))
+    return continuous(np.roll((frames * Rotation.from_rotvec(turns)).as_quat(), 1, axis=1))
 
 
 def natural_reach(system: System) -> float:
@@ -130,12 +240,19 @@ def hanging_curve(system: System, control: Any, reach: float) -> Float[np.ndarra
     the length): far for a stiff rod, hardly for a floppy one. If the ends are farther apart than the
     length, the curve is longer than the rod.
     """
-    base, tip = system.end_poses(np.asarray(control))
+    base, tip = held_ends(system, control)
     if base is None or tip is None:
         return None
     length = float(system.length)
-    ends = [(np.asarray(each.p), np.asarray(turned(jnp.asarray(each.h), ALONG))) for each in (base, tip)]
-    down = _sagging(system, ends[1][0] - ends[0][0], ends[0][1])
+    chord = tip.p - base.p
+    down = _sagging(system, chord, base)
+    # a pinned end points along the side of a triangle of the rod's length
+    along = chord / length
+    aside = np.sqrt(max(0.0, 1.0 - along @ along)) * down
+    ends = [
+        (end.p, along + sign * aside if end.tangent is None else end.tangent)
+        for end, sign in ((base, 1.0), (tip, -1.0))
+    ]
     x = np.linspace(0.0, 1.0, POINTS)[:, None]
     bump = 16.0 * x * x * (1.0 - x) ** 2
 
@@ -156,9 +273,14 @@ def hanging_curve(system: System, control: Any, reach: float) -> Float[np.ndarra
     return _evenly(found)
 
 
-def _sagging(system: System, chord: Any, tangent: Any) -> Any:
-    """Return a unit vector normal to the chord: along gravity, else along the first tangent, else any."""
-    for way in (getattr(system, "gravity", np.zeros(3)), tangent, np.eye(3)[0], np.eye(3)[1]):
+def _sagging(system: System, chord: Any, base: HeldEnd) -> Any:
+    """Return a unit vector normal to the chord: along gravity, else where the rod bends easily, else any."""
+    ways = [getattr(system.nominal, "gravity", np.zeros(3))]
+    if base.h is not None and hasattr(system.nominal, "Kbt"):
+        # bending about an axis moves the rod across it
+        axis = np.linalg.eigh(np.asarray(system.nominal.Kbt)[:2, :2])[1][:, 0]
+        ways.append(rotations(base.h).apply(np.cross([*axis, 0.0], ALONG)))
+    for way in (*ways, *([] if base.tangent is None else [base.tangent]), *np.eye(3)):
         way = np.asarray(way, dtype=float)
         across = way - chord * np.dot(way, chord) / max(np.dot(chord, chord), 1e-300)
         if np.linalg.norm(across) > 1e-6 * float(np.linalg.norm(way)):
@@ -184,20 +306,6 @@ def _evenly(points: Any) -> Any:
 
 def _curvatures(h: Any, ds: float) -> Any:
     """Return curvatures (1/m), in the material frame, from orientations at the nodes."""
-    from scipy.spatial.transform import Rotation
-
-    frames = Rotation.from_quat(np.roll(h, -1, axis=1))
+    frames = rotations(h)
     between = (frames[:-1].inv() * frames[1:]).as_rotvec() / ds
     return np.concatenate([between[:1], 0.5 * (between[:-1] + between[1:]), between[-1:]])
-
-
-def _moments(system: Any, control: Any, h: Any, u: Any) -> Any:
-    from scipy.spatial.transform import Rotation
-
-    s = np.linspace(0.0, 1.0, system.nodes) * float(system.length)
-    control = jnp.asarray(control)
-    found = []
-    for place, frame, own in zip(s, Rotation.from_quat(np.roll(h, -1, axis=1)), u, strict=True):
-        material = system.material(place, control)
-        found.append(frame.apply(np.asarray(material.Kbt) @ (own - np.asarray(material.u_star))))
-    return np.array(found)

@@ -28,11 +28,12 @@ from knode_cosserat.solvers.replay import (
     state_of_rows,
 )
 from knode_cosserat.solvers.result import Result, SimulationError
-from knode_cosserat.solvers.run import Equilibria, InitialState, is_coarse, run_one
+from knode_cosserat.solvers.run import Equilibria, InitialState, is_coarse, warn_of_results
 from knode_cosserat.solvers.sensitivity import static_rollout
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.static_loop import unloaded_shape
+from knode_cosserat.solvers.static_run import static_run
 from knode_cosserat.trajectory import Trajectory
 
 
@@ -77,25 +78,24 @@ def _settled(system: System, settings: Settings, budget: float | None) -> tuple[
     """Return y and z of the equilibrium under zero control, and a flag: true if its grid is too coarse."""
     many, none = np.ndim(system.length) > 0, np.zeros((1, system.control_size))
     task = Equilibria(Settings(None, settings.space, newton=settings.newton), 1, budget)
-    y = unloaded_shape(system, settings.space)
-    if is_traced((system, y)):
-        find = static_rollout(task)
+    if is_traced(system):
+        find, y = static_rollout(task), unloaded_shape(system, settings.space)
         rows = jax.vmap(find, in_axes=(0, None, 0))(system, none, y) if many else find(system, none, y)
         found, coarse = rows.records[..., 0, :, :], is_coarse(rows.position_error, system.length)[..., 0]
     elif many:
-        each = range(len(y))
-        both = [_settled_one(task, jax.tree.map(lambda x, i=i: x[i], system), y[i], i) for i in each]
+        each = range(np.shape(system.length)[0])
+        both = [_settled_one(task, jax.tree.map(lambda x, i=i: x[i], system), i) for i in each]
         found, coarse = map(np.stack, zip(*both, strict=True))
     else:
-        found, coarse = _settled_one(task, system, y, None)
+        found, coarse = _settled_one(task, system, None)
     return found[..., : system.y_layout.size + system.z_layout.size], coarse
 
 
-def _settled_one(task: Equilibria, system: System, y: Any, robot: int | None) -> tuple[Any, Any]:
-    none = np.zeros((1, system.control_size))
-    rows, _, cause = run_one(task, system, none, y, none[0])
+def _settled_one(task: Equilibria, system: System, robot: int | None) -> tuple[Any, Any]:
+    rows, _, cause = static_run(task, system, np.zeros((1, system.control_size)))
     if rows.result[0] < 0:
         raise SimulationError(0, 0.0, float(rows.error[0]), Result(int(rows.result[0])), cause, robot)
+    warn_of_results(rows)
     return rows.records[0], is_coarse(rows.position_error[0], system.length)
 
 

@@ -9,8 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from knode_cosserat.rods.system import System, unknowns_of
-from knode_cosserat.solvers.grid import grid_of
-from knode_cosserat.solvers.guess import hanging_curve, natural_reach, state_from_positions
+from knode_cosserat.solvers.guess import curve_guesses
 from knode_cosserat.solvers.history import EXTRAPOLATIONS, repeated_record_history
 from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.recovery import Attempt, Budget, Recovery, SolvedStep, natural_time
@@ -25,8 +24,6 @@ LEAST_SUBSTEP, MOST_SUBSTEPS = 2.0**-14, 400
 EASE_BELOW = 1.0 / 16.0
 #: part of the distance that a tip is moved in one step of relaxation
 DRAWN = 0.05
-#: reaches of the initial curves between held ends, as multiples of the natural reach
-REACHES = (1.0, 0.3, 3.0)
 
 
 class StepRecovery(Recovery):
@@ -168,14 +165,8 @@ class StaticRecovery(Recovery):
 
     def first_guesses(self, control: Any) -> list[tuple[Any, Any]]:
         """Return curves of the rod's length between held ends, then the state before."""
-        found: list[tuple[Any, Any]] = []
-        for reach in dict.fromkeys(min(1.0, part * natural_reach(self.system)) for part in REACHES):
-            points = hanging_curve(self.system, control, reach)
-            if points is not None:
-                record = state_from_positions(self.system, points, control)
-                y = grid_of(self.system).spread(jnp.asarray(record[:, : self.system.y_layout.size]))
-                found.append((y, unknowns_of(self.system, y[0])))
-        return found + self.guesses()
+        curves = curve_guesses(self.system, control)
+        return [(y, unknowns_of(self.system, y[0])) for y in curves] + self.guesses()
 
     def last_method(self, controls: tuple[Any, Any]) -> tuple[Result, Attempt] | None:
         """Relax by implicit Euler with growing time steps, then solve the equilibrium; it is then stable.

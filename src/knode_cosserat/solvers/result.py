@@ -23,7 +23,8 @@ class Code(enum.IntEnum):
 class Result(Code):
     """Outcome of a step. Zero and above: solved to tolerance. Below zero: not solved, the state is invalid.
 
-    COARSE is also solved, but its estimated discretisation error is more than 2 % of the length.
+    COARSE is also solved, but its estimated discretisation error is more than 2 % of the length. UNSTABLE is
+    an equilibrium that a small disturbance destroys. OTHER_TURNS has another winding than the control's.
     """
 
     CONVERGED = 0
@@ -32,6 +33,8 @@ class Result(Code):
     RECOVERED_STEP_HALVING = 3
     RECOVERED_RELAXATION = 4
     RECOVERED_EASING = 6
+    UNSTABLE = 7
+    OTHER_TURNS = 8
     NO_CONVERGENCE = -1
     NOT_FINITE = -2
     NOT_REACHED = -3
@@ -54,6 +57,8 @@ _MESSAGES = {
     Result.RECOVERED_STEP_HALVING: "converged by several smaller time steps",
     Result.RECOVERED_RELAXATION: "converged after a damped motion towards rest: it may have snapped",
     Result.RECOVERED_EASING: "converged by continuation from smoother friction or contact",
+    Result.UNSTABLE: "in equilibrium, but unstable: a small disturbance moves the robot away from this shape",
+    Result.OTHER_TURNS: "in equilibrium, but with another number of turns than the control asks for",
     Result.NO_CONVERGENCE: "no solution found",
     Result.NOT_FINITE: "the equations overflow or are undefined there",
     Result.NOT_REACHED: "not simulated: an earlier step failed",

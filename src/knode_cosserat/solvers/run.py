@@ -210,6 +210,19 @@ def warn_of_coarse_grids(system: System, settings: Settings, rows: StepRows) -> 
         )
 
 
+def warn_of_results(rows: StepRows) -> None:
+    """Warn of equilibria that are unstable, or have another winding than the control asks for."""
+    for result, advice in (
+        (Result.UNSTABLE, "give positions near the shape that you expect as initial"),
+        (Result.OTHER_TURNS, "turn the ends in smaller steps, each from the last equilibrium as initial"),
+    ):
+        count = np.count_nonzero(np.asarray(rows.result) == result)
+        if count:
+            warnings.warn(
+                f"{count} of {np.size(rows.result)} equilibria: {result.message}; {advice}", stacklevel=4
+            )
+
+
 def failure(rows: StepRows, causes: str | dict[int, str], times: Any) -> SimulationError:
     """Return the error of the first step that failed; without times, of an equilibrium.
 

@@ -1,0 +1,226 @@
+"""Equilibria of one robot in turn, with the winding and the stability of rods that are held at both ends.
+
+An orientation is known up to whole turns: an end turned by more than about a radian at once loses some. And
+a straight rod between ends nearer than its length is in equilibrium, but unstable. Large rotations are
+therefore made in parts, turns between two equilibria are counted, and equilibria found without a guess are
+tested.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.energy import RodEnergy, is_tested
+from knode_cosserat.solvers.grid import grid_of
+from knode_cosserat.solvers.guess import (
+    are_clamped,
+    continuous,
+    curve_guesses,
+    held_ends,
+    rotations,
+    turn_columns,
+)
+from knode_cosserat.solvers.result import Result
+from knode_cosserat.solvers.run import LEAST_CAPACITY, Equilibria, Run, padded_rows, run_batch, run_one
+from knode_cosserat.solvers.static_loop import unloaded_shape
+from knode_cosserat.solvers.time_loop import StepRows
+
+#: largest rotation (rad) of an end from one equilibrium to the next
+LARGEST_TURN = 1.0
+#: number of times that a change of control is divided where turns are lost, and parts of each division
+DIVISIONS, PARTS = 8, 4
+#: where tangents of two shapes are more opposite than this cosine, the turns between them are not determined
+OPPOSITE = -0.9
+#: chord over length of the unloaded rod from which it counts as straight
+STRAIGHT = 0.999
+#: part of the length by which a chord is shorter before a rod counts as compressed
+COMPRESSED = 1e-9
+
+
+def static_run(task: Equilibria, system: System, controls: Any, y: Any = None, before: Any = None) -> Run:
+    """Solve the equilibria under controls (T, c) in turn, with recovery, from y at all points.
+
+    `before` is the control of y. Without y, the equilibria start from the unloaded shape. They are then
+    tested for stability. An unstable shape of a compressed rod is replaced by a stable one, if one is found.
+    """
+    walk, controls = _Walk(task, system), np.asarray(controls)
+    return walk.from_rest(controls) if y is None else walk.along(controls, y, before)
+
+
+def static_batch(task: Equilibria, system: System, controls: Any, y: Any = None, before: Any = None) -> Any:
+    """Solve the equilibria of a batch as `run_batch`, and those robots by themselves that need `static_run`.
+
+    There are controls (B, T, c) for one system, or for as many of them.
+    """
+    controls, many, size = np.asarray(controls), np.ndim(system.length) > 0, len(controls)
+    guess = unloaded_shape(system, task.settings.space) if y is None else y
+    guess = guess if guess.ndim == 3 else jnp.broadcast_to(guess, (size, *guess.shape))
+    last = np.broadcast_to(0.0 if before is None else before, (size, controls.shape[-1]))
+    rows, lasts, causes = run_batch(task, system, controls, guess, last)
+    for i in range(size):
+        robot = jax.tree.map(lambda leaf, i=i: leaf[i], system) if many else system
+        walk = _Walk(task, robot)
+        solved = np.flatnonzero(rows.result[i] >= 0)
+        in_parts = len(walk.path(controls[i], last[i])[0]) > len(controls[i])
+        if in_parts or (
+            y is None and any(walk.is_unstable(rows.records[i, k], controls[i, k]) for k in solved)
+        ):
+            alone = static_run(task, robot, controls[i], y, before)
+            for every, one in zip(rows, alone.rows, strict=True):
+                every[i] = one
+            causes.pop(i, None)
+            if alone.cause:
+                causes[i] = alone.cause
+    return rows, lasts, causes
+
+
+class _Walk:
+    """Equilibria of one robot, each from the one before."""
+
+    def __init__(self, task: Equilibria, system: System):
+        self.task, self.system, self.grid = task, system, grid_of(system)
+        #: chord of the unloaded shape (m) while unstable shapes are replaced
+        self.chord = 0.0
+
+    def from_rest(self, controls: np.ndarray) -> Run:
+        """Start from the unloaded shape, or from a curve between ends nearer than the length; test all."""
+        y, before = unloaded_shape(self.system, self.task.settings.space), np.zeros_like(controls[0])
+        if "p" in self.system.y_layout.names and self.system.strands == 1:
+            p = np.asarray(y)[:, self.system.y_layout.slice("p")]
+            self.chord = float(np.linalg.norm(p[-1] - p[0]))
+        guess = None
+        if self.chord > STRAIGHT * float(self.system.length) and self._compressed(controls[0]):
+            guess = self._best(controls[0], curve_guesses(self.system, controls[0]))[0]
+        if guess is None:
+            run = self.along(controls, y, before, fits=False)
+        else:
+            run = self.along(controls, guess, controls[0])
+        for k in np.flatnonzero((run.rows.result >= 0) & (run.rows.result != Result.OTHER_TURNS)):
+            if self.is_unstable(run.rows.records[k], controls[k]):
+                run.rows.result[k] = Result.UNSTABLE
+        return run
+
+    def along(self, controls: np.ndarray, y: Any, before: Any, fits: bool = True) -> Run:
+        """Solve the equilibria from y, which meets the conditions of both ends if it `fits`."""
+        path, wanted = self.path(controls, before, fits)
+        # one row for each control of the path that is done
+        rows: list[StepRows] = []
+        last = np.asarray(y)[self.grid.nodes] if fits else None
+        divisions, missing, cause = 0, 0, ""
+        while len(rows) < len(path):
+            task = dataclasses.replace(self.task, steps=len(path) - len(rows))
+            run = run_one(task, self.system, path[len(rows) :], y, path[len(rows) - 1] if rows else before)
+            y, cause = run.state, run.cause
+            for row in map(StepRows._make, zip(*run.rows, strict=True)):
+                control, solved = path[len(rows)], row.result >= 0
+                turns = self._turns(last, row.records) if solved and last is not None else 0
+                if turns and rows and divisions < DIVISIONS:
+                    # again from the row before, in smaller parts
+                    parts = np.linspace(path[len(rows) - 1], control, PARTS + 1)[1:-1]
+                    path = np.insert(path, len(rows), parts, axis=0)
+                    wanted = wanted + (PARTS - 1) * (wanted >= len(rows))
+                    divisions, y = divisions + 1, self._points(last)
+                    break
+                missing += turns
+                stable = self._stable(row, control) if solved and self._compressed(control) else row
+                last = stable.records
+                rows.append(stable._replace(result=int(Result.OTHER_TURNS)) if solved and missing else stable)
+                if stable is not row:
+                    y = self._points(last)
+                    break
+        leaves = (np.stack(leaf)[wanted] for leaf in zip(*rows, strict=True))
+        return Run(StepRows(*leaves), y, cause)
+
+    def path(self, controls: np.ndarray, before: Any, fits: bool = True) -> tuple[np.ndarray, np.ndarray]:
+        """Return controls (P, c) from `before` on, with ends turned in parts, and the indices of `controls`.
+
+        If an end is turned in parts, the path begins with `before`, unless y already fits it.
+        """
+        every = np.concatenate([np.asarray(before)[None], controls])
+        counts = np.ones(len(controls), dtype=int)
+        for columns in turn_columns(self.system) if are_clamped(self.system) else ():
+            columns = columns[columns >= 0]
+            angles = np.linalg.norm(np.diff(every[:, columns], axis=0), axis=1)
+            counts = np.maximum(counts, np.ceil(angles / LARGEST_TURN - 1e-9).astype(int))
+        first = [] if fits or np.all(counts == 1) else [every[:1]]
+        parts = [np.linspace(*pair, n + 1)[1:] for *pair, n in zip(every[:-1], controls, counts, strict=True)]
+        return np.concatenate([*first, *parts]), np.cumsum(counts) - 1 + len(first)
+
+    def is_unstable(self, records: Any, control: Any) -> bool:
+        """True if an equilibrium is unstable; false where that is not tested."""
+        y = records[:, : self.system.y_layout.size]
+        return is_tested(self.system) and RodEnergy(self.system, y, control).mode() is not None
+
+    def _compressed(self, control: Any) -> bool:
+        """True if the ends are held nearer to each other than in the unloaded shape."""
+        if not self.chord:
+            return False
+        base, tip = held_ends(self.system, control)
+        if base is None or tip is None:
+            return False
+        return float(np.linalg.norm(tip.p - base.p)) < self.chord - COMPRESSED * float(self.system.length)
+
+    def _points(self, records: Any) -> Any:
+        """Return y at all points from records at the nodes."""
+        return self.grid.spread(jnp.asarray(records[:, : self.system.y_layout.size]))
+
+    def _turns(self, before: Any, after: Any) -> int:
+        """Return the number of turns by which two shapes differ beyond the rotation of the ends.
+
+        The frames of the first are rotated to the tangents of the other. The angle between frames is then
+        counted along the rod, and compared with its value at the tip within half a turn.
+        """
+        if not are_clamped(self.system):
+            return 0
+        h = self.system.y_layout.slice("h")
+        one, other = (rotations(continuous(records[:, h])) for records in (before, after))
+        t, r = one.apply([0.0, 0.0, 1.0]), other.apply([0.0, 0.0, 1.0])
+        cosine = np.sum(t * r, axis=1)
+        if np.min(cosine) < OPPOSITE:
+            return 0
+        # the shortest rotation from one tangent to the other
+        swing = np.concatenate([1.0 + cosine[:, None], np.cross(t, r)], axis=1)
+        over = ((rotations(swing) * one).inv() * other).as_quat()
+        angle = np.unwrap(2.0 * np.arctan2(over[:, 2], over[:, 3]))
+        return int(np.round((angle[-1] - angle[0]) / (2.0 * np.pi)))
+
+    # stable equilibria of compressed rods
+
+    def _best(self, control: Any, guesses: list[Any]) -> tuple[Any, StepRows | None]:
+        """Return the first guess with a stable equilibrium near it, or else with any, and the equilibrium."""
+        best: tuple[Any, StepRows | None] = None, None
+        padded = padded_rows(np.asarray(control)[None], least=LEAST_CAPACITY)
+        for guess in guesses:
+            rows = self.task.solve(self.system, padded, guess, (0, 1))[2]
+            row = StepRows(*(np.asarray(leaf)[0] for leaf in rows))
+            if row.result < 0 or self._turns(np.asarray(guess)[self.grid.nodes], row.records):
+                continue
+            if not self.is_unstable(row.records, control):
+                return guess, row
+            if best[0] is None:
+                best = guess, row
+        return best
+
+    def _stable(self, row: StepRows, control: Any) -> StepRows:
+        """Return a stable equilibrium below an unstable one; if there is none, or it is stable, the same."""
+        if not is_tested(self.system):
+            return row
+        y, layout = np.array(row.records[:, : self.system.y_layout.size]), self.system.y_layout
+        energy = RodEnergy(self.system, y, control)
+        mode = energy.mode()
+        if mode is None:
+            return row
+        for name, values in energy.stable_shape(mode).items():
+            y[:, layout.slice(name)] = values
+        found = self._best(control, [self._points(y)])[1]
+        if found is not None and not self.is_unstable(found.records, control):
+            return found
+        # no more attempts
+        self.chord = 0.0
+        return row
