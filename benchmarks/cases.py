@@ -18,6 +18,8 @@ from typing import Any
 
 DT = 0.05
 STEPS = 100
+#: the paper's scheme in time, which the transcription has: speeds are compared at the same method
+PAPER: dict[str, Any] = {"time": "bdf2", "start": "paper"}
 
 
 def one_core() -> None:
@@ -55,15 +57,15 @@ def steps() -> dict[str, Any]:
 
     robot, yardstick = kc.load_robot("delrin-tendon-robot"), paper.PaperRobot()
     controls = {
-        "sine": kc.controls.sine(1.5, STEPS, DT),
-        "step": kc.controls.step(1.5, STEPS, DT),
+        "sine": kc.controls.sine(1.5, STEPS, DT, sampled="end"),
+        "step": kc.controls.step(1.5, STEPS, DT, sampled="end"),
         "random": kc.controls.random(STEPS, seed=0),
     }
     found: dict[str, Any] = {}
     for name, tensions in controls.items():
         both = medians(
             {
-                "package": lambda tensions=tensions: kc.simulate(robot, tensions, DT),
+                "package": lambda tensions=tensions: kc.simulate(robot, tensions, DT, **PAPER),
                 "transcription": lambda tensions=tensions: paper.simulate(
                     yardstick, tensions, DT, retry=False
                 ),
@@ -74,9 +76,11 @@ def steps() -> dict[str, Any]:
         found[name] = {**both, "ratio": both["transcription"] / both["package"]}
     robots = {nodes: robot.replace(nodes=nodes) for nodes in (10, 40, 100)}
     sizes = {
-        f"{nodes} nodes": functools.partial(kc.simulate, sized, controls["sine"], DT)
+        f"{nodes} nodes": functools.partial(kc.simulate, sized, controls["sine"], DT, **PAPER)
         for nodes, sized in robots.items()
     }
+    # two solves a step, and an estimate of the error in time
+    sizes["default scheme in time"] = functools.partial(kc.simulate, robot, controls["sine"], DT)
     found["nodes"] = medians(sizes, rounds=25)
     return found
 
@@ -90,8 +94,10 @@ def batch() -> dict[str, Any]:
     robot = kc.load_robot("delrin-tendon-robot")
     generator = np.random.default_rng(0)
     periods, scale = generator.uniform(0.8, 3.0, 1024), generator.uniform(0.8, 1.2, 1024)
-    tensions = np.stack([a * kc.controls.sine(p, STEPS, DT) for p, a in zip(periods, scale, strict=True)])
-    taken = medians({"batch": lambda: kc.simulate(robot, tensions, DT)}, rounds=3)["batch"]
+    tensions = np.stack(
+        [a * kc.controls.sine(p, STEPS, DT, sampled="end") for p, a in zip(periods, scale, strict=True)]
+    )
+    taken = medians({"batch": lambda: kc.simulate(robot, tensions, DT, **PAPER)}, rounds=3)["batch"]
     return {"robots": 1024, "steps": STEPS, "seconds": taken, "robot_steps_per_second": 1024 * STEPS / taken}
 
 
@@ -103,10 +109,10 @@ def gradient() -> dict[str, Any]:
 
     import knode_cosserat as kc
 
-    robot, tensions = kc.load_robot("delrin-tendon-robot"), kc.controls.sine(1.5, STEPS, DT)
+    robot, tensions = kc.load_robot("delrin-tendon-robot"), kc.controls.sine(1.5, STEPS, DT, sampled="end")
 
     def loss(youngs_modulus: Any, tensions: Any) -> Any:
-        tip = kc.simulate(robot.replace(youngs_modulus=youngs_modulus), tensions, DT).tip_position
+        tip = kc.simulate(robot.replace(youngs_modulus=youngs_modulus), tensions, DT, **PAPER).tip_position
         return jnp.sum(tip**2)
 
     at = (float(robot.youngs_modulus), tensions)
@@ -131,12 +137,12 @@ def tangents(steps: int = 20, columns: int = 32) -> dict[str, Any]:
 
     import knode_cosserat as kc
 
-    robot, tensions = kc.load_robot("delrin-tendon-robot"), kc.controls.sine(1.5, steps, DT)
+    robot, tensions = kc.load_robot("delrin-tendon-robot"), kc.controls.sine(1.5, steps, DT, sampled="end")
     block = np.eye(columns // 4)[np.arange(steps) * (columns // 4) // steps]
 
     def tip(changes: Any) -> Any:
         moved = tensions + block @ changes.reshape(-1, 4)
-        return kc.simulate(robot, moved, DT).tip_position
+        return kc.simulate(robot, moved, DT, **PAPER).tip_position
 
     slopes, none = jax.jit(jax.jacfwd(tip)), jnp.zeros(columns)
     taken = medians({"tangents": lambda: jax.block_until_ready(slopes(none))}, rounds=25)
@@ -150,13 +156,13 @@ def schemes() -> dict[str, Any]:
 
     import knode_cosserat as kc
 
-    robot, tensions = kc.load_robot("delrin-tendon-robot"), kc.controls.sine(1.5, STEPS, DT)
-    finest = kc.simulate(robot.replace(nodes=97), tensions, DT, space="lobatto4").tip_position
+    robot, tensions = kc.load_robot("delrin-tendon-robot"), kc.controls.sine(1.5, STEPS, DT, sampled="end")
+    finest = kc.simulate(robot.replace(nodes=97), tensions, DT, space="lobatto4", **PAPER).tip_position
     cases = {"default": (10, "lobatto2"), "euler": (10, "euler"), "fine_euler": (400, "euler")}
 
     def run(name: str) -> kc.Trajectory:
         nodes, space = cases[name]
-        return kc.simulate(robot.replace(nodes=nodes), tensions, DT, space=space)
+        return kc.simulate(robot.replace(nodes=nodes), tensions, DT, space=space, **PAPER)
 
     times = medians({name: functools.partial(run, name) for name in cases}, rounds=9, repeats=10)
     off = {name: float(np.linalg.norm(run(name).tip_position - finest, axis=1).max()) for name in cases}
@@ -170,10 +176,10 @@ def first_call() -> dict[str, Any]:
 
     imported = time.perf_counter() - begin
     robot = kc.load_robot("delrin-tendon-robot")
-    tensions = kc.controls.sine(1.5, STEPS, DT)
-    call = seconds(lambda: kc.simulate(robot, tensions, DT))
+    tensions = kc.controls.sine(1.5, STEPS, DT, sampled="end")
+    call = seconds(lambda: kc.simulate(robot, tensions, DT, **PAPER))
     ribs = kc.load_robot("delrin-routed-tendon-robot")
-    family = seconds(lambda: kc.simulate(ribs, tensions, DT))
+    family = seconds(lambda: kc.simulate(ribs, tensions, DT, **PAPER))
     return {"import": imported, "first_call": call, "ribs": family}
 
 
@@ -182,7 +188,7 @@ def memory() -> dict[str, Any]:
     import knode_cosserat as kc
 
     robot = kc.load_robot("delrin-tendon-robot")
-    kc.simulate(robot, kc.controls.sine(1.5, 1000, DT), DT)
+    kc.simulate(robot, kc.controls.sine(1.5, 1000, DT, sampled="end"), DT, **PAPER)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return {"megabytes": peak / (1024 if sys.platform != "darwin" else 1024**2)}
 

@@ -11,14 +11,17 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from benchmarks.cases import DT, STEPS, medians, one_core, seconds
+from benchmarks.cases import DT, PAPER, STEPS, medians, one_core, seconds
 
 
 def _knowledge_and_data(**wrong: Any) -> Any:
     import knode_cosserat as kc
 
     robot = kc.load_robot("delrin-tendon-robot")
-    data = [kc.simulate(robot, kc.controls.sine(period, 30, DT), DT)[:30] for period in (0.5, 1.0)]
+    data = [
+        kc.simulate(robot, kc.controls.sine(period, 30, DT, sampled="end"), DT, **PAPER)[:30]
+        for period in (0.5, 1.0)
+    ]
     return robot.replace(**wrong), data
 
 
@@ -52,7 +55,7 @@ def learned_steps() -> dict[str, Any]:
     one_core()
     import knode_cosserat as kc
 
-    tensions = kc.controls.sine(1.5, STEPS, DT)
+    tensions = kc.controls.sine(1.5, STEPS, DT, sampled="end")
     wrong = {
         "self-weight": {"gravity": (0.0, 0.0, 0.0)},
         "length": {"length": 0.4},
@@ -65,7 +68,10 @@ def learned_steps() -> dict[str, Any]:
         models[name] = kc.fit(knowledge.replace(**change), data)
     models["paper"] = kc.fit(knowledge.replace(**wrong["stiffness"]), data, kc.FitConfig.paper(0))
     times = medians(
-        {name: lambda model=model: kc.simulate(model, tensions, DT) for name, model in models.items()},
+        {
+            name: lambda model=model: kc.simulate(model, tensions, DT, **PAPER)
+            for name, model in models.items()
+        },
         rounds=15,
         repeats=10,
     )

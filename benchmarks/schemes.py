@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 import knode_cosserat as kc
-from benchmarks.cases import DT, STEPS, medians
+from benchmarks.cases import DT, PAPER, STEPS, medians
 from knode_cosserat.solvers.space import Euler, Formula, Lobatto2, Lobatto4, SpaceScheme, Stage
 
 #: nodes of each scheme, and of the reference
@@ -51,12 +51,12 @@ class Measured(NamedTuple):
 
 def measured() -> list[Measured]:
     """Return times and errors of all schemes on all grids."""
-    robot, tensions = kc.load_robot("delrin-tendon-robot"), kc.controls.sine(1.5, STEPS, DT)
-    finest = kc.simulate(robot.replace(nodes=FINEST), tensions, DT, space=Lobatto4()).tip_position
+    robot, tensions = kc.load_robot("delrin-tendon-robot"), kc.controls.sine(1.5, STEPS, DT, sampled="end")
+    finest = kc.simulate(robot.replace(nodes=FINEST), tensions, DT, space=Lobatto4(), **PAPER).tip_position
     cases = {f"{name} {nodes}": (name, nodes) for name in SCHEMES for nodes in NODES}
 
     def run(name: str, nodes: int) -> kc.Trajectory:
-        return kc.simulate(robot.replace(nodes=nodes), tensions, DT, space=SCHEMES[name])
+        return kc.simulate(robot.replace(nodes=nodes), tensions, DT, space=SCHEMES[name], **PAPER)
 
     times = medians({key: functools.partial(run, *case) for key, case in cases.items()}, rounds=15)
     found = []

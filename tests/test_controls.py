@@ -31,7 +31,7 @@ def written(tmp_path, text):
 
 @pytest.mark.parametrize("period", [0.5, 1.0, 1.5])
 def test_sine_is_the_papers(period):
-    tensions = controls.sine(period, 100, DT)
+    tensions = controls.sine(period, 100, DT, sampled="end")
     for i in range(1, 101):
         for k in range(4):
             expected = 6 + np.sin(2 * np.pi * i * 0.05 / period + k * np.pi / 2)
@@ -48,7 +48,7 @@ def test_sine_of_any_number_of_tendons(tendons, period, base, part, steps):
 
 
 def test_step_is_the_papers():
-    tensions = controls.step(1.5, 100, DT)
+    tensions = controls.step(1.5, 100, DT, sampled="end")
     assert np.all(tensions[:, 1:3] == 5.0)
     # t = i dt >= 1.5 from i = 30 on, which is row 29
     assert np.all(tensions[:29] == 5.0)
@@ -57,21 +57,43 @@ def test_step_is_the_papers():
 
 @given(st.integers(1, 400), st.sampled_from([0.1, 0.05, 0.02, 0.01, 1 / 30, 1e-3, 0.007]))
 def test_step_does_not_depend_on_rounding(first, dt):
-    raised = controls.step(1.0, 400, dt, at=first * dt)[:, 0] > 5.0
-    assert np.argmax(raised) == first - 1
-    assert raised[first - 1 :].all()
+    for sampled, row in (("end", first - 1), ("middle", first)):
+        raised = controls.step(1.0, 401, dt, at=first * dt, sampled=sampled)[:, 0] > 5.0
+        assert np.argmax(raised) == row
+        assert raised[row:].all()
 
 
 def test_step_of_other_tendons():
     tensions = controls.step(-2.0, 4, 0.5, base=3.0, at=1.0, tendons=[1], count=3)
-    assert tensions.tolist() == [[3, 3, 3], [3, 1, 3], [3, 1, 3], [3, 1, 3]]
+    # held from 1 s on, which is row 2
+    assert tensions.tolist() == [[3, 3, 3], [3, 3, 3], [3, 1, 3], [3, 1, 3]]
 
 
 def test_ramp():
-    tensions = controls.ramp(2.0, 8, 0.5, start=1.0, end=3.0, tendons=(2,))
+    tensions = controls.ramp(2.0, 8, 0.5, start=1.0, end=3.0, tendons=(2,), sampled="end")
     assert tensions[:, 2] == pytest.approx([5, 5, 5.5, 6, 6.5, 7, 7, 7])
     assert np.all(tensions[:, [0, 1, 3]] == 5.0)
-    assert controls.ramp(2.0, 8, 0.5)[:, 0] == pytest.approx(5 + np.arange(1, 9) / 4)
+    assert controls.ramp(2.0, 8, 0.5, sampled="end")[:, 0] == pytest.approx(5 + np.arange(1, 9) / 4)
+
+
+@pytest.mark.parametrize("dt", [0.5, 0.1])
+def test_what_is_held_is_the_signal_on_average(dt):
+    """Integrals of the held rows against those of the signals, in closed form."""
+    steps = round(3.0 / dt)
+    line, wave = controls.ramp(2.0, steps, dt, end=3.0), controls.sine(4.0, steps, dt, tendons=1)
+    jump = controls.step(2.0, steps, dt, at=1.0)
+    assert dt * np.sum(line[:, 0] - 5.0) == pytest.approx(2.0 * 3.0 / 2.0)
+    assert dt * np.sum(jump[:, 0] - 5.0) == pytest.approx(2.0 * 2.0)
+    # the middle rule multiplies the integral of a sine by x / sin x
+    x = np.pi * dt / 4.0
+    assert dt * np.sum(wave - 6.0) == pytest.approx(4.0 / (2.0 * np.pi) * x / np.sin(x))
+    late = controls.ramp(2.0, steps, dt, end=3.0, sampled="end")
+    assert dt * np.sum(late[:, 0] - line[:, 0]) == pytest.approx(2.0 * dt / 2.0)
+
+
+def test_other_times_of_a_step_are_refused():
+    with fails("sampled is 'start'", '"middle" or "end"'):
+        controls.sine(1.0, 10, DT, sampled="start")
 
 
 def test_random_is_uniform_and_repeatable():
@@ -106,7 +128,7 @@ def test_constant():
         (lambda: controls.sine(-1.5, 10, DT), ["period is -1.5", "above 0"]),
         (lambda: controls.sine(np.nan, 10, DT), ["period is nan"]),
         (lambda: controls.sine("1.5", 10, DT), ["period is '1.5'"]),
-        (lambda: controls.sine(1e-320, 10, DT), ["period is 1e-320", "above 2.2"]),
+        (lambda: controls.sine(1e-320, 10, DT), ["period is 1e-320", "above 2.1"]),
         (lambda: controls.sine(1.5, 0, DT), ["steps is 0", "whole number from 1 on"]),
         (lambda: controls.sine(1.5, 10.0, DT), ["steps is 10.0", "whole number"]),
         (lambda: controls.sine(1.5, 10, 0.0), ["dt is 0.0", "above 0"]),
@@ -359,9 +381,9 @@ def test_a_signal_needs_a_number_of_steps():
     ("specification", "parts"),
     [
         ("step:1e5", ["the step starts at 1.5 s, after the end of the run (10 steps of 0.05 s: 0.5 s)",
-                      "use 30 steps or more, or at=0"]),
+                      "use 31 steps or more, or at=0"]),
         ("step:1,at=0.51", ["starts at 0.51 s", "use 11 steps or more"]),
-        ("ramp:1,start=2", ["start is 2.0 s", "before the end of the last step, 0.5 s", "use 41 steps"]),
+        ("ramp:1,start=2", ["start is 2.0 s", "before the last step, 0.475 s", "use 41 steps"]),
         ("ramp:1,start=2,end=3", ["the ramp starts at 2 s", "use 41 steps or more, or start=0"]),
         ("sine:0.05", ["the sine has the same value at every time step", "period is 0.05 s"]),
     ],
@@ -373,7 +395,7 @@ def test_a_signal_without_effect_during_the_run_is_refused(specification, parts)
 
 @pytest.mark.parametrize(
     ("specification", "steps"),
-    [("step:1e5", 30), ("step:1,at=0.51", 11), ("ramp:1,start=2", 41), ("ramp:1,start=2,end=3", 41)],
+    [("step:1e5", 31), ("step:1,at=0.51", 11), ("ramp:1,start=2", 41), ("ramp:1,start=2,end=3", 41)],
 )
 def test_the_suggested_number_of_steps_is_the_least(specification, steps):
     assert np.ptp(controls.parse(specification, steps, DT), axis=0).max() > 0.0

@@ -101,7 +101,7 @@ def test_all_numbers_of_a_field_and_one_of_them_are_given_twice():
 def test_a_signal_without_effect_during_the_run_is_refused():
     with fails("base_z=step:1,at=2", "the step starts at 2 s, after the end of the run", "use 40 steps"):
         named_controls.parse(ROD, "base_z=step:1,at=2", 10, DT)
-    with fails("ramp: start is 2.0 s", "before the end of the last step"):
+    with fails("ramp: start is 2.0 s", "before the last step"):
         named_controls.parse(ROD, "base_z=ramp:1,start=2", 10, DT)
     with fails("base_z=sine:0.1", "the sine has the same value at every time step"):
         named_controls.parse(ROD, "base_z=sine:0.1", 10, DT)

@@ -11,7 +11,8 @@ TRUE = {("self-weight", "step"): (1.27, 0.09)}
 
 
 def moved(robot, control):
-    return kc.simulate(robot, kc.controls.parse(CONTROLS[control], ROWS, DT), DT, space="euler")[:ROWS]
+    tensions = kc.controls.parse(CONTROLS[control], ROWS, DT, sampled="end")
+    return kc.simulate(robot, tensions, DT, time="bdf2", start="paper", space="euler")[:ROWS]
 
 
 @pytest.fixture(scope="module")

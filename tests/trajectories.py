@@ -86,7 +86,15 @@ def synthetic(batch=(), steps=4, nodes=5, robot=ROBOT, settings=PAPER, seed=0, p
     def state(dt, known):
         if not places:
             return None
-        shapes = (2, places, 25), (places, 25), (3, nodes, 19), (3,), (), (3, places - 1, 25), (2, places - 1, 25)
+        shapes = (
+            (2, places, 25),
+            (places, 25),
+            (3, nodes, 19),
+            (3,),
+            (),
+            (3, places - 1, 25),
+            (2, places - 1, 25),
+        )
         history = StateHistory(*(rng.normal(size=(*batch, *shape)) for shape in shapes))
         return SolverState(history, dt, known)
 

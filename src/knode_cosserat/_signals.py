@@ -71,7 +71,7 @@ def ramp(
         if end <= start:
             raise ControlsError(
                 f"ramp: start is {start!r} s; allowed is a time before the last step, {end:g} s; "
-                f"use {steps_until(start, dt, sampled) + 1} steps or more, or an earlier start"
+                f"use {steps_until(start, dt, sampled, after=True)} steps or more, or an earlier start"
             )
     require_numbers(start=start, end=end)
     if end <= start:
@@ -118,9 +118,13 @@ def step_times(steps: int, dt: float, sampled: Sampled = "middle") -> np.ndarray
 _EARLIER = {"middle": 0.5, "end": 0.0}
 
 
-def steps_until(t: float, dt: float, sampled: Sampled) -> int:
-    """Return the number of steps of dt (s) of which the last is evaluated at time t (s) or later."""
-    return int(np.ceil(t / dt + _EARLIER[sampled] - SAME_TIME))
+def steps_until(t: float, dt: float, sampled: Sampled, after: bool = False) -> int:
+    """Return the number of steps of dt (s) of which the last is evaluated at time t (s), or later.
+
+    With `after`, only later.
+    """
+    steps = t / dt + _EARLIER[sampled]
+    return int(np.floor(steps + SAME_TIME)) + 1 if after else int(np.ceil(steps - SAME_TIME))
 
 
 def checked_tensions(tensions: Tensions, signal: str) -> Tensions:
@@ -194,7 +198,7 @@ def require_effect(
         begin <= (1.0 - _EARLIER[sampled]) * dt
     ):  # a step that acts from the first time step on is constant, too
         return
-    needed = steps_until(begin, dt, sampled) + (signal == "ramp")
+    needed = steps_until(begin, dt, sampled, after=signal == "ramp")
     raise ControlsError(
         f"the {signal} starts at {begin:g} s, after the end of the run ({steps} steps of {dt:g} s: "
         f"{steps * dt:g} s); use {needed} steps or more, or {option}=0"

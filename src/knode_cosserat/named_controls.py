@@ -17,7 +17,7 @@ from jaxtyping import Float
 from knode_cosserat import controls
 from knode_cosserat._files.csv_rows import SAME_TIME, Column, CSVTextError, held_rows, read_rows
 from knode_cosserat._files.yaml_text import did_you_mean
-from knode_cosserat._signals import require_effect
+from knode_cosserat._signals import Sampled, require_effect, step_times
 from knode_cosserat.controls import ControlsError
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.system import System
@@ -75,12 +75,18 @@ def parse(robot: System, specification: str, steps: int | None, dt: float) -> Ar
     if held is not None:
         return np.tile(held, (steps, 1))
     words = [] if specification.strip() == "none" else specification.split(";")
-    return parse_signals(layout, words, controls.step_times(steps, dt))
+    return parse_signals(layout, words, {each: step_times(steps, dt, each) for each in ("middle", "end")})
 
 
-def parse_signals(layout: Layout, words: list[str], t: Float[np.ndarray, " steps"]) -> Array:
-    """Return controls (steps, c) at the times t (s) from words `NAME=SIGNAL`; see `parse`."""
-    found = np.zeros((len(t), layout.size))
+def parse_signals(
+    layout: Layout, words: list[str], times: dict[Sampled, Float[np.ndarray, " steps"]]
+) -> Array:
+    """Return controls (steps, c) from words `NAME=SIGNAL`; see `parse`.
+
+    Signals are evaluated at the times (s) in the "middle" of steps, and displacements and rotations at their
+    "end": `simulate` changes these gradually until then.
+    """
+    found = np.zeros((len(times["middle"]), layout.size))
     given: dict[int, str] = {}
     for entry in words:
         name, equals, word = (part.strip() for part in entry.partition("="))
@@ -92,10 +98,12 @@ def parse_signals(layout: Layout, words: list[str], t: Float[np.ndarray, " steps
                 f"or a CSV file; names are {', '.join(known) or 'none'}"
                 + (f"; did you mean {known[0]}={name}?" if meant else "")
             )
+        columns = _columns(layout, name)
+        sampled: Sampled = "end" if layout.moving[columns[0]] else "middle"
         # a very short period, for example, overflows: the check below refuses it without a NumPy warning
         try:
             with np.errstate(all="ignore"):
-                values = _signal(word, t)
+                values = _signal(word, times[sampled], sampled)
         except ControlsError as error:
             raise ControlsError(f"controls {entry.strip()!r}: {error}") from None
         if not np.all(np.isfinite(values)):
@@ -103,7 +111,6 @@ def parse_signals(layout: Layout, words: list[str], t: Float[np.ndarray, " steps
                 f"controls {entry.strip()!r}: a value is {values[~np.isfinite(values)][0]}; "
                 "allowed is a signal of finite numbers"
             )
-        columns = _columns(layout, name)
         for column in columns:
             if column in given:
                 raise ControlsError(
@@ -157,7 +164,7 @@ _SIGNALS: dict[str, tuple[Callable[..., Any], tuple[str, ...]]] = {
 }
 
 
-def _signal(word: str, t: Float[np.ndarray, " steps"]) -> Float[np.ndarray, " steps"]:
+def _signal(word: str, t: Float[np.ndarray, " steps"], sampled: Sampled) -> Float[np.ndarray, " steps"]:
     name, _, rest = word.partition(":")
     if name not in _SIGNALS:
         raise ControlsError(
@@ -177,7 +184,7 @@ def _signal(word: str, t: Float[np.ndarray, " steps"]) -> Float[np.ndarray, " st
     if len(t) > 1 and name != "constant" and np.all(np.isfinite(found)):
         main = "period" if name == "sine" else "height"
         known = function.__kwdefaults__ or {}
-        require_effect(name, {**known, main: value, **given}, found, len(t), float(t[0]))
+        require_effect(name, {**known, main: value, **given}, found, len(t), float(t[1] - t[0]), sampled)
     return found
 
 

@@ -293,7 +293,7 @@ def _control(system: System, tension: str | None, control: str | None) -> Any:
         values = zip(names[layout.slice("tension")], _tensions(tension, tensions[0]), strict=True)
         # first, so that a tension that --control repeats is refused
         words = [f"{name}=constant:{value!r}" for name, value in values] + words
-    return named_controls.parse_signals(layout, words, np.ones(1))[0]
+    return named_controls.parse_signals(layout, words, {"middle": np.ones(1), "end": np.ones(1)})[0]
 
 
 def _control_words(control: str, names: list[str]) -> list[str]:

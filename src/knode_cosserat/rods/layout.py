@@ -9,6 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+#: units of displacements and rotations
+MOVING = ("m", "rad")
+
 
 class Field(NamedTuple):
     """A named part of y or z: its size, unit and meaning.
@@ -42,6 +45,13 @@ class Layout:
     def size(self) -> int:
         """Size of a packed vector."""
         return sum(field.size for field in self.fields)
+
+    @property
+    def moving(self) -> np.ndarray:
+        """True for each number that is a displacement or rotation (in m or rad), which cannot jump."""
+        return np.array(
+            [field.unit in MOVING for field in self.fields for _ in range(field.size)], dtype=bool
+        )
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -28,7 +28,7 @@ class LongStepWarning(UserWarning):
 
 
 def _robots_of_users(robot: Any) -> Iterator[System]:
-    """Yield the robots of a call that was not made by this package itself; its command line counts as a user."""
+    """Yield the robots of a call that was not made by this package itself; its command line is a user."""
     caller = sys._getframe(3).f_globals.get("__name__", "")
     if caller.startswith("knode_cosserat.") and not caller.startswith("knode_cosserat.cli."):
         return
@@ -44,9 +44,10 @@ def warn_of_long_steps(robot: Any, dt: float) -> None:
             natural = natural_time(system)
         if natural is None or dt <= SLOWEST * natural:
             continue
+        period = SLOWEST * natural
         warnings.warn(
-            f"dt is {dt:g} s, longer than this robot's slowest vibration, of some {SLOWEST * natural:.2g} s: "
-            f"rows are nearly equilibria and do not show how it moves. Use dt = {SLOWEST * natural / 20:.1g} s "
+            f"dt is {dt:g} s, longer than this robot's slowest vibration, of some {period:.2g} s: "
+            f"rows are nearly equilibria and do not show how it moves. Use dt = {period / 20:.1g} s "
             "or less (is dt in seconds?), or `equilibria` if the motion does not matter.",
             LongStepWarning,
             stacklevel=3,

@@ -31,8 +31,6 @@ EXTRAPOLATIONS = np.array([[1.0, 0.0, 0.0], [2.0, -1.0, 0.0], [3.0, -3.0, 1.0]])
 SOLVED = 2e-8
 
 
-#: units of controls that cannot jump
-MOVED = ("m", "rad")
 #: kind of a motion's first step: "start" by the settings, from one state; "regular" like any other, from two
 #: states; "consistent" by BDF1
 FirstStep = Literal["start", "regular", "consistent"]
@@ -92,9 +90,7 @@ def at_stages(system: System, settings: Settings, controls: Any, before: Any, su
     row to row; all others only if `settings.between` says so. In a motion from one state, the first value of
     these is held: it begins suddenly.
     """
-    moved = np.array(
-        [field.unit in MOVED for field in system.control_layout.fields for _ in range(field.size)]
-    )
+    moved = system.control_layout.moving
     linear = moved | (settings.between == "linear")
     if settings.time is None or settings.stages == 1 or not linear.any():
         return controls

@@ -173,7 +173,9 @@ def _along(
         after = advanced(past, records, coefficients[0] * records + history, y, past.weights)
         return jax.tree.map(lambda a, b: jnp.where(i < count, a, b), after, past), history
 
-    first = past._replace(weights=jnp.asarray(EXTRAPOLATIONS[1]))
+    # errors in time are not evaluated again
+    lost = jnp.full_like(past.time_error, jnp.nan)
+    first = past._replace(time_error=lost, weights=jnp.asarray(EXTRAPOLATIONS[1]))
     past, terms = jax.lax.scan(one, first, (jnp.arange(1, len(rows)), rows[1:], controls[1:]))
     return past._replace(t0=t0 + (count - 1) // stages * steps.dt), terms
 

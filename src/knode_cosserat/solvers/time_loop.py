@@ -126,18 +126,20 @@ def solve_time_step(
     The control (c,) is held during all stages, or is (stages * c,), one after the other.
     """
     if settings.stages == 1:
-        return solve_stage(system, settings, step, control, kept, EXTRAPOLATIONS, EXTRAPOLATIONS, batch)
+        guesses = EXTRAPOLATIONS, EXTRAPOLATIONS
+        return solve_stage(system, settings, step, control, kept, guesses, batch)
     own = stage_controls(system, settings, control)
-    guesses = stage_extrapolations(settings)
+    own_guesses = stage_extrapolations(settings)
+    pairs = own_guesses, jnp.roll(own_guesses, -1, axis=0)
 
     def solve(state: tuple[StateHistory, Kept], stage: Any) -> Any:
         past, kept = state
-        coefficients, t, control, *guesses = stage
+        coefficients, t, control, guesses = stage
         one = TimeStep(past, coefficients, t)
-        past, row, kept = solve_stage(system, settings, one, control, kept, *guesses, batch)
+        past, row, kept = solve_stage(system, settings, one, control, kept, guesses, batch)
         return (past, kept), row
 
-    stages = step.coefficients, step.t, own, guesses, jnp.roll(guesses, -1, axis=0)
+    stages = step.coefficients, step.t, own, pairs
     (past, kept), rows = jax.lax.scan(solve, (step.past, kept), stages)
     return past, joined_stages(rows), kept
 
@@ -175,10 +177,11 @@ def stage_extrapolations(settings: Settings) -> Float[Any, "stages past past"]:
 
 
 def solve_stage(
-    system: System, settings: Settings, step: TimeStep, control: Any, kept: Kept, extrapolations: Any,
-    following: Any, batch: str | None,
+    system: System, settings: Settings, step: TimeStep, control: Any, kept: Kept, guesses: tuple[Any, Any],
+    batch: str | None,
 ) -> tuple[StateHistory, StepRows, Kept]:  # fmt: skip
-    """Solve one stage of a time step; `extrapolations` are its own and `following` those of the next."""
+    """Solve one stage of a time step; `guesses` are the extrapolations to it and to the next stage."""
+    extrapolations, following = guesses
     problem, past = step.problem(system, settings, control).ready(), step.past
     # sum of products instead of a matrix product: XLA fuses it with the next operations
     guess = jnp.sum(past.weights[:, None, None] * past.y, axis=0)

@@ -17,6 +17,7 @@ import numpy as np
 from knode_cosserat import controls, named_controls
 from knode_cosserat._files.csv_rows import SAME_TIME
 from knode_cosserat._numbers import numbers_in
+from knode_cosserat._signals import step_times
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.system import System
 from knode_cosserat.sweeps.errors import SweepError
@@ -58,7 +59,8 @@ def signals(
         one = named_controls.parse(robot, word, steps, dt)
         return Signals(np.broadcast_to(one, (count, *one.shape)), {})
     own = {name: numbers[name] for name in names}
-    found = _at_once(layout, word, controls.step_times(steps, dt), own, count)
+    times = step_times(steps, dt), step_times(steps, dt, "end")
+    found = _at_once(layout, word, times, own, count)
     if found is None:
         found = np.full((count, steps, layout.size), np.nan)
     refused: dict[int, str] = {}
@@ -84,12 +86,17 @@ def _allowed(layout: Layout, found: Array) -> Array:
     return ok
 
 
-def _at_once(layout: Layout, word: str, t: Array, numbers: Mapping[str, Array], count: int) -> Array | None:
-    """Return the controls of all cases (cases, steps, c); None for a word that is not a usual signal."""
+def _at_once(
+    layout: Layout, word: str, times: tuple[Array, Array], numbers: Mapping[str, Array], count: int
+) -> Array | None:
+    """Return the controls of all cases (cases, steps, c); None for a word that is not a usual signal.
+
+    `times` (s) are those of held controls, and of displacements and rotations, as in `named_controls`.
+    """
     with np.errstate(all="ignore"):
         if layout.names == ("tension",):
-            return _tensions(layout.size, word, t, numbers, count)
-        found = np.zeros((count, len(t), layout.size))
+            return _tensions(layout.size, word, times[0], numbers, count)
+        found = np.zeros((count, len(times[0]), layout.size))
         known, given = named_controls.labels(layout), set()
         for entry in word.split(";"):
             name, _, rest = (part.strip() for part in entry.partition("="))
@@ -98,6 +105,7 @@ def _at_once(layout: Layout, word: str, t: Array, numbers: Mapping[str, Array], 
                 return None
             given.add(name)
             columns = layout.slice(name) if name in layout.names else known.index(name)
+            t = times[int(np.max(layout.moving[columns]))]
             signal = _NAMED[rest.partition(":")[0]].make(t, *values)
             found[:, :, columns] = signal if name not in layout.names else signal[:, :, None]
         if len({name.rpartition("_")[0] for name in given if name not in layout.names} & given):

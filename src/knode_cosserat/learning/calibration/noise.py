@@ -163,7 +163,9 @@ def _by_states(
     own = jax.tree.map(per_row, tuple(past))
     history = np.array(jax.vmap(jax.vmap(lambda *each: back(each)[0]))(*own))
     history[:, :, -1] += tip_history[:, tips]
-    _, in_time = histories(settings, trajectory.dt, np.eye(count))
+    # states at stages were never measured: they have no noise
+    no_stages = np.zeros((count, settings.stages - 1, count))
+    _, in_time = histories(settings, trajectory.dt, np.eye(count), no_stages)
     records = np.einsum("rt,nrjx->ntjx", in_time[rows], history)
     if robot.mixed:
         along = slopes_of(settings, np.eye(nodes)[None])[0][0] / misfit.length
