@@ -19,6 +19,7 @@ from knode_cosserat.learning.calibration.misfit import LinearisedMisfit, Segment
 from knode_cosserat.learning.calibration.search import Misfit, SearchResult
 from knode_cosserat.learning.discontinuities import slopes_of
 from knode_cosserat.learning.samples import histories, segment_history
+from knode_cosserat.solvers.replay import replayed_settings
 from knode_cosserat.trajectory import Trajectory
 
 #: relative accuracy of the numbers of states
