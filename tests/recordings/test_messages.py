@@ -540,10 +540,11 @@ def test_a_bag_with_other_topics_gets_a_proposal(tmp_path):
         ("/tip", 1.0),
     ]
     assert (found.base.topic, found.tension.topic) == ("/mocap/base_plate/pose", "/joint_states")
-    assert found.tension.names == ("tendon_2", "tendon_1", "tendon_4", "tendon_3")
+    assert found.tension.names == ("tendon_1", "tendon_2", "tendon_3", "tendon_4")
     assert any("places on the rod (fractions) are guessed" in each for each in remarks)
     recording = load_recording(path, found)
     np.testing.assert_allclose(recording.bodies[1].position, POSITION, atol=1e-9)
+    np.testing.assert_allclose(measured(recording), PULLS, atol=1e-12)
     # inspect writes it, and its text is a configuration
     text = succeeded("inspect", path).partition("--config:\n")[2]
     (tmp_path / "it.yaml").write_text(text)

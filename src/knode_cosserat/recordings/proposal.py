@@ -15,13 +15,13 @@ from knode_cosserat.recordings.config import UP, RecordingConfig
 from knode_cosserat.recordings.container import Container
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.messages import (
-    JOINTS,
     NUMBERS,
     POSE_ARRAY,
     POSES,
     STATIC,
     TRANSFORMS,
     decoded,
+    joint_names,
     messages_of,
 )
 from knode_cosserat.recordings.sources import (
@@ -89,7 +89,7 @@ def config_of_bag(container: Container, path: str) -> tuple[RecordingConfig, tup
         elif topic.type == POSE_ARRAY or (topic.type in TRANSFORMS and topic.name != STATIC):
             for part in _parts(container, topic.name):
                 names[f"{topic.name}[{part}]"] = part if topic.type in TRANSFORMS else f"body {part}"
-    bodies = []
+    bodies: list[_Body] = []
     for name, word in names.items():
         stream = decoded(container, MarkerSource(word, name, 1.0), "pose", path)
         if len(stream.values):
@@ -112,8 +112,10 @@ def config_of_bag(container: Container, path: str) -> tuple[RecordingConfig, tup
         if count == 1 and (numbered := re.fullmatch(r"(.*?)(\d+)(\D*)", topic.name)):
             singles.setdefault((numbered[1], numbered[3]), []).append(numbered[2])
         elif count:
-            joints = tuple(first.name) if topic.type == JOINTS else ()
-            found.setdefault(_role(topic.name), (topic.name, joints or ("",) * count))
+            order = tuple(range(1, count + 1))
+            named = [list(getattr(first, "name", ()))]
+            joints = joint_names(TensionSource(topic.name, order), named, path)[0]
+            found.setdefault(_role(topic.name), (topic.name, tuple(joints) or ("",) * count))
             if joints:
                 remarks.append(f"tendons 1 to {count} are taken to be the joints {', '.join(joints)}")
     for (before, after), numbers in singles.items():
