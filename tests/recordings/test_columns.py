@@ -69,21 +69,27 @@ FILES = {
         f'columns: {{time: "Time / s", tensions: {T6}, tip: [x, y, z]}}\n',
     ),
     "no titles": (
-        table(columns(), header=False), "columns: {time: 1, tensions: [2, 3, 4, 5, 6, 7], tip: [8, 9, 10]}\n",
+        table(columns(), header=False),
+        "columns: {time: 1, tensions: [2, 3, 4, 5, 6, 7], tip: [8, 9, 10]}\n",
     ),
     "no titles, semicolons and decimal commas": (
         table(columns(), ";", ",", header=False),
         "columns: {time: 1, tensions: [2, 3, 4, 5, 6, 7], tip: [8, 9, 10]}\n",
     ),
     "nanoseconds since 1970": (
-        table({"stamp": [f"{1_760_000_000_000_000_000 + round(at * 1e9)}" for at in TIME], **columns(time="")}),
+        table(
+            {"stamp": [f"{1_760_000_000_000_000_000 + round(at * 1e9)}" for at in TIME], **columns(time="")}
+        ),
         f"columns: {{time: stamp, time_unit: ns, tensions: {T6}, tip: [x, y, z]}}\n",
     ),
     "columns with text, and a line of units": (
-        table({"mode": ["-"] + ["run"] * len(TIME)} | {
-            name: [unit, *values]
-            for (name, values), unit in zip(columns().items(), ["s", *["N"] * 6, *["m"] * 3], strict=True)
-        }),
+        table(
+            {"mode": ["-"] + ["run"] * len(TIME)}
+            | {
+                name: [unit, *values]
+                for (name, values), unit in zip(columns().items(), ["s", *["N"] * 6, *["m"] * 3], strict=True)
+            }
+        ),
         f"columns: {{time: time, tensions: {T6}, tip: [x, y, z]}}\n",
     ),
     "a title that is there twice, and an empty last column": (
@@ -91,9 +97,10 @@ FILES = {
         f"columns: {{time: time, tensions: {T6}, tip: [8, y, z]}}\n",
     ),
     "rows without times": (
-        table(columns(time="")), f"columns: {{tensions: {T6}, tip: [x, y, z]}}\ntable: {{rate: 50}}\n",
+        table(columns(time="")),
+        f"columns: {{tensions: {T6}, tip: [x, y, z]}}\ntable: {{rate: 50}}\n",
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -240,16 +247,28 @@ TITLES = {
         columns("Time [ms]", "tension {} (N)", ("pos_x [mm]", "pos_y [mm]", "pos_z [mm]"), 1e3, 1e3),
         ("Time [ms]", [f"tension {k} (N)" for k in range(1, 7)], ["pos_x [mm]", "pos_y [mm]", "pos_z [mm]"]),
     ),
-    "capitals": (columns("t", "F{}", ("TIP_X", "TIP_Y", "TIP_Z")), ("t", [f"F{k}" for k in range(1, 7)], ["TIP_X", "TIP_Y", "TIP_Z"])),
+    "capitals": (
+        columns("t", "F{}", ("TIP_X", "TIP_Y", "TIP_Z")),
+        ("t", [f"F{k}" for k in range(1, 7)], ["TIP_X", "TIP_Y", "TIP_Z"]),
+    ),
     "of ROS": (
-        columns("%time", "field.effort{}", ("field.pose.position.x", "field.pose.position.y", "field.pose.position.z"), clock=1.0),
-        ("%time", [f"field.effort{k}" for k in range(1, 7)], [f"field.pose.position.{axis}" for axis in "xyz"]),
+        columns(
+            "%time",
+            "field.effort{}",
+            ("field.pose.position.x", "field.pose.position.y", "field.pose.position.z"),
+            clock=1.0,
+        ),
+        (
+            "%time",
+            [f"field.effort{k}" for k in range(1, 7)],
+            [f"field.pose.position.{axis}" for axis in "xyz"],
+        ),
     ),
     "with an orientation": (
         columns(turned=("qw", "qx", "qy", "qz")),
         ("time", ["T1", "T2", "T3", "T4", "T5", "T6"], ["x", "y", "z", "qw", "qx", "qy", "qz"]),
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", TITLES)

@@ -84,7 +84,7 @@ def test_a_short_file_is_enough(tmp_path):
         ("unit: N", "unit: lb", "tension: unit is 'lb'; allowed is N or gf"),
         ("order: [1, 2]", "order: [0, 1]", "tension: order is [0, 1]; allowed is the tendons 1, 2, 3"),
         ("order: [1, 2]", "order: 2", "tension: order is 2; allowed"),
-        ("order: [1, 2]", "orders: [1, 2]", "'orders' is unknown; allowed is topic, order, unit, held, names; did"),
+        ("order: [1, 2]", "orders: [1, 2]", "'orders' is unknown; allowed is topic, order, unit, held, na"),
         ("order: [1, 2], ", "", "tension: the key order is missing; required is topic, order"),
         ("fraction: 1", "fraction: 1.5", "number 1: fraction is 1.5; allowed is a number from 0 to 1"),
         ("fraction: 1", "fraction: 1/0", "fraction is '1/0'; allowed"),

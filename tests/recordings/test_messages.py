@@ -13,8 +13,10 @@ from knode_cosserat.recordings import (
     RecordingError,
     TensionSource,
     load_recording,
+    proposed_config,
 )
 from knode_cosserat.recordings.messages import typestore
+from tests.commands import succeeded
 from tests.recordings.formats.exported import bent, times
 
 rosbag1 = pytest.importorskip("rosbags.rosbag1")
@@ -76,9 +78,13 @@ class Messages:
 
     def joints(self, at, names, effort, position=()):
         return self.make(
-            "sensor_msgs/msg/JointState", header=self.header(at), name=list(names),
-            position=np.array(position, dtype=float), velocity=np.zeros(0), effort=np.array(effort, dtype=float),
-        )  # fmt: skip
+            "sensor_msgs/msg/JointState",
+            header=self.header(at),
+            name=list(names),
+            position=np.array(position, dtype=float),
+            velocity=np.zeros(0),
+            effort=np.array(effort, dtype=float),
+        )
 
 
 def write(path, entries, ros=2, mode=None, plugin="MCAP"):
@@ -151,7 +157,7 @@ def test_joints_are_matched_by_name(tmp_path, ros, order, change):
         (["j0", "j1", "j2", "j3"], (1, 3, 0, 2), (1, 2, 3, 4), (0, 1, 2, 3)),
         (["l_2_joint", "l_3_joint", "l_4_joint", "l_1_joint"], (0, 1, 2, 3), (1, 2, 3, 4), (3, 0, 1, 2)),
     ],
-)  # fmt: skip
+)
 def test_numbers_in_names_and_the_order_of_the_wire(tmp_path, names, order, stated, expected):
     path = write(tmp_path / "it", [*poses(), *joint_states(order, names)])
     recording = load_recording(path, config(TensionSource("/joint_states", stated)))
@@ -236,9 +242,15 @@ def test_each_tendon_has_its_topic(tmp_path, kind):
 
     package = "geometry_msgs" if kind == "WrenchStamped" else "std_msgs"
     entries = [
-        (f"/cells/{name}/force", f"{package}/msg/{kind}", at + 0.001 * k, message(at + 0.001 * k, 10.0 * (k + 1) + at, k))
-        for at in TIME for k, name in enumerate(("a", "b", "c"))
-    ]  # fmt: skip
+        (
+            f"/cells/{name}/force",
+            f"{package}/msg/{kind}",
+            at + 0.001 * k,
+            message(at + 0.001 * k, 10.0 * (k + 1) + at, k),
+        )
+        for at in TIME
+        for k, name in enumerate(("a", "b", "c"))
+    ]
     path = write(tmp_path / "it", [*poses(), *entries])
     source = TensionSource("/cells/{}/force", names=("c", "a", "b"))
     recording = load_recording(path, config(source))
@@ -258,8 +270,9 @@ def test_commands_of_each_tendon_hold_until_the_next(tmp_path):
     sent = {1: [(0.0, 5.0), (0.5, 7.0)], 2: [(0.2, 6.0), (1.0, 8.0)]}
     entries = [
         (f"/cmd_{k}", "std_msgs/msg/Float64", at, it.make("std_msgs/msg/Float64", data=value))
-        for k, rows in sent.items() for at, value in rows
-    ]  # fmt: skip
+        for k, rows in sent.items()
+        for at, value in rows
+    ]
     path = write(tmp_path / "it.bag", [*poses(1), *entries], ros=1)
     command = CommandSource("/cmd_{}", (1, 2))
     recording = load_recording(path, RecordingConfig(markers=TIP, command=command, tensions="commanded"))
@@ -374,7 +387,7 @@ def transforms(ros=2, kind=None, moving=False, static=False):
 
     it, kind = Messages(ros), kind or TF[ros]
     base = Rotation.from_rotvec(np.outer(0.2 * TIME if moving else 0.5 + 0.0 * TIME, [0.0, 0.0, 1.0]))
-    place = np.outer(0.1 * TIME if moving else 0.0 * TIME, [1.0, 0.0, 0.0]) + [0.3, 0.0, 0.2]
+    place = np.array([0.3, 0.0, 0.2]) + np.outer(0.1 * TIME if moving else 0.0 * TIME, [1.0, 0.0, 0.0])
     inside = base.inv().apply(POSITION - place)
     turned = (base.inv() * ROTATION).as_quat(scalar_first=True)
     for row, at in enumerate(TIME):
@@ -486,3 +499,77 @@ def test_compressed_messages_stay_within_the_limits(tmp_path, monkeypatch):
     recording = load_recording(path, config())
     assert len(recording.bodies[0].time) < len(TIME)
     assert any("KNODE_COSSERAT_LIMITS" in each.message for each in recording.findings)
+
+
+def test_parts_of_messages_are_not_written(tmp_path):
+    from knode_cosserat.recordings.write import MocapPoses, Pulls, write_recording
+
+    config = of("/poses[1]")
+    poses = {"tip": MocapPoses(TIME, POSITION, QUATERNION)}
+    with pytest.raises(
+        RecordingError, match=r"topic /poses\[1\] cannot be written; allowed is one topic for each"
+    ):
+        write_recording(tmp_path / "it.bag", config, poses, Pulls(TIME, PULLS))
+    assert not list(tmp_path.iterdir())
+
+
+# proposals
+
+
+def test_a_bag_with_other_topics_gets_a_proposal(tmp_path):
+    it = Messages(2)
+    base = [
+        (
+            "/mocap/base_plate/pose",
+            "geometry_msgs/msg/PoseStamped",
+            at,
+            it.pose_stamped(at, [0, 0, 0], [1, 0, 0, 0]),
+        )
+        for at in TIME
+    ]
+    middle = bent(TIME, 0.5)
+    rib = [
+        ("/mocap/rib/pose", "geometry_msgs/msg/PoseStamped", at, it.pose_stamped(at, place, wxyz))
+        for at, place, wxyz in zip(TIME, middle[0], middle[1].as_quat(scalar_first=True), strict=True)
+    ]
+    noise = [("/chatter", "std_msgs/msg/String", 0.0, it.make("std_msgs/msg/String", data="hello"))]
+    path = write(tmp_path / "it", [*poses(), *base, *rib, *joint_states((1, 0, 3, 2)), *noise])
+    found, remarks = proposed_config(path)
+    assert [(each.topic, each.fraction) for each in found.markers] == [
+        ("/mocap/rib/pose", 0.5),
+        ("/tip", 1.0),
+    ]
+    assert (found.base.topic, found.tension.topic) == ("/mocap/base_plate/pose", "/joint_states")
+    assert found.tension.names == ("tendon_1", "tendon_2", "tendon_3", "tendon_4")
+    assert any("places on the rod (fractions) are guessed" in each for each in remarks)
+    recording = load_recording(path, found)
+    np.testing.assert_allclose(recording.bodies[1].position, POSITION, atol=1e-9)
+    np.testing.assert_allclose(measured(recording), PULLS, atol=1e-12)
+    # inspect writes it, and its text is a configuration
+    text = succeeded("inspect", path).partition("--config:\n")[2]
+    (tmp_path / "it.yaml").write_text(text)
+    assert RecordingConfig.load(tmp_path / "it.yaml") == found
+
+
+def test_parts_and_topics_of_tendons_are_proposed(tmp_path):
+    it = Messages(2)
+    cells = [
+        (f"/cell{k}/force", "std_msgs/msg/Float64", at, it.make("std_msgs/msg/Float64", data=5.0 * k + at))
+        for at in TIME
+        for k in (1, 2)
+    ]
+    path = write(tmp_path / "it", [*array(), *cells])
+    found, remarks = proposed_config(path)
+    assert [each.topic for each in found.markers] == ["/poses[0]", "/poses[1]", "/poses[2]"]
+    assert (found.tension.topic, found.tension.names) == ("/cell{}/force", ("1", "2"))
+    assert any("no body is called base" in each for each in remarks)
+    seen = load_recording(path, found).tension
+    np.testing.assert_allclose(seen.tension, seen.time[:, None] + [5.0, 10.0], atol=1e-9)
+    path = write(tmp_path / "tf", [*transforms(), *cells])
+    found, _ = proposed_config(path)
+    assert sorted(each.topic for each in found.markers) == ["/tf[camera]", "/tf[tip]"]
+    assert found.base.topic == "/tf[base]"
+    with pytest.raises(
+        RecordingError, match=r"no topic has poses; the bag has /cell1/force \(std_msgs/Float64\)"
+    ):
+        proposed_config(write(tmp_path / "cells", cells))

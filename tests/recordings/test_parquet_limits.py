@@ -39,7 +39,7 @@ def good(count=50):
 )
 def test_files_of_all_kinds_are_read(tmp_path, options):
     path = written(tmp_path / "it.parquet", good(), **options)
-    said, numbers, findings = parquet.read_parquet(path)
+    said, numbers, findings = parquet.read_parquet(path)[:3]
     assert said == {} and findings == () and tuple(numbers.columns) == TITLES
     for name, values in good().items():
         np.testing.assert_array_equal(numbers[name], values)

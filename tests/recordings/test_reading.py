@@ -390,7 +390,7 @@ def test_trimming_and_asking_for_rows(tmp_path, exact):
     for dt in (0.0, -1.0, float("nan"), float("inf")):
         with pytest.raises(RecordingError, match=r"dt is .*; allowed is a time step above 0 s"):
             recording.sampled(dt)
-    with pytest.raises(RecordingError, match="tensions is 'guessed'; allowed is measured or commanded"):
+    with pytest.raises(RecordingError, match="tensions is 'guessed'; allowed is measured, commanded or none"):
         recording.sampled(tensions="guessed")
     with pytest.raises(RecordingError, match="one row has no time step"):
         _ = recording.sampled(0.05, 1.0, 1.01).dt

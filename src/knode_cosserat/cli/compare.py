@@ -25,7 +25,7 @@ from knode_cosserat.cli.arguments import (
     require_writable,
     shows_progress,
 )
-from knode_cosserat.cli.identify import Config, Seconds, Start, Step, evaluate_on_recordings
+from knode_cosserat.cli.identify import Config, Seconds, Start, evaluate_on_recordings
 from knode_cosserat.cli.output import table, write_output
 from knode_cosserat.cli.program import app, examples
 
@@ -96,7 +96,9 @@ def evaluate(
     config: Config = None,
     start: Start = None,
     seconds: Seconds = None,
-    dt: Step = 0.0125,
+    dt: Annotated[
+        float, typer.Option(metavar="S", help="Time between compared rows of a recording (s).")
+    ] = 0.0125,
     space: Space = "lobatto2",
     progress: Progress = None,
     as_json: Json = False,

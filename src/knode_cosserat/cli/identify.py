@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from pathlib import Path
 from time import perf_counter
@@ -48,6 +49,8 @@ Seconds = Annotated[
     float | None, typer.Option(metavar="S", help="Duration used (s).", show_default="to the end")
 ]
 
+#: longest time between predicted rows (s)
+FINELY = 0.0125
 Step = Annotated[float, typer.Option(metavar="S", help="Time step of the simulation (s).")]
 
 
@@ -121,8 +124,10 @@ def evaluate_on_recordings(
     lines = []
     for path, recording in zip(recordings, load_recordings(recordings, config), strict=True):
         end = None if seconds is None else (start or 0.0) + seconds
-        rows = recording.sampled(dt, start, end, mean=True)
-        evaluation = compare(system, rows, space=space)
+        # coarse rows would lose the tensions between them: predict finely, and compare every few rows
+        count = math.ceil(dt / FINELY - 1e-6) if FINELY < dt < math.inf else 1
+        rows = recording.sampled(dt / count, start, end, mean=True)
+        evaluation = compare(system, rows, every=1 if rows.static else count, space=space)
         facts[str(path)] = evaluation.to_dict()
         lines.append(f"{path}: {evaluation}")
     write_output(as_json, {"recordings": facts}, lines)

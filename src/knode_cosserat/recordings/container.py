@@ -21,6 +21,8 @@ class Topic:
     #: recording time of each message (ns)
     received: list[int] = dataclasses.field(default_factory=list)
     raw: list[bytes | memoryview] = dataclasses.field(default_factory=list)
+    #: decoded messages that several sources are read from; None before the first use
+    messages: list[Any] | None = None
 
 
 @dataclasses.dataclass

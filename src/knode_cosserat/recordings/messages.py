@@ -158,15 +158,24 @@ def decoded(container: Container, source: Any, role: Role, path: str) -> Stream:
 
 def messages_of(topic: Topic, ros: int) -> Iterator[tuple[int, Any]]:
     """Yield the recording time (ns) and the message, None for bytes that cannot be decoded."""
+    # messages about several bodies are read for each of them
+    if topic.type == POSE_ARRAY or topic.type in TRANSFORMS:
+        if topic.messages is None:
+            topic.messages = list(_messages(topic, ros))
+        return iter(zip(topic.received, topic.messages, strict=True))
+    return zip(topic.received, _messages(topic, ros), strict=True)
+
+
+def _messages(topic: Topic, ros: int) -> Iterator[Any]:
     store = typestore(ros)
     deserialize = store.deserialize_ros1 if ros == 1 else store.deserialize_cdr
-    for received, raw in zip(topic.received, topic.raw, strict=True):
+    for raw in topic.raw:
         # rosbags raises various errors on damaged bytes
         try:
             message = deserialize(raw, topic.type)
         except Exception:
             message = None
-        yield received, message
+        yield message
 
 
 def _simple(topic: Topic, ros: int, readers: Mapping[str, Any], role: str, path: str) -> Stream:
@@ -316,9 +325,7 @@ def _joints(topic: Topic, ros: int, source: TensionSource | MotorSource, path: s
             broken += 1
         else:
             rows.append((_stamp(message), received, names, values))
-    reference, remark = _joint_names(
-        source, [names for _, _, names, _ in rows], f"{path}: topic {topic.name}"
-    )
+    reference, remark = joint_names(source, [names for _, _, names, _ in rows], f"{path}: topic {topic.name}")
     if not reference:
         return _stream(topic.name, [(stamp, received, values) for stamp, received, _, values in rows], broken)
     chosen: list[_Row] = []
@@ -331,7 +338,7 @@ def _joints(topic: Topic, ros: int, source: TensionSource | MotorSource, path: s
     return dataclasses.replace(stream, remarks=(Finding("note", topic.name, remark),) if remark else ())
 
 
-def _joint_names(
+def joint_names(
     source: TensionSource | MotorSource, seen: Sequence[list[str]], where: str
 ) -> tuple[list[str], str]:
     """Return the joints in the order of the source's numbers, and a remark; no names if messages have none.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -15,13 +15,13 @@ from knode_cosserat.recordings.config import UP, RecordingConfig
 from knode_cosserat.recordings.container import Container
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.messages import (
-    JOINTS,
     NUMBERS,
     POSE_ARRAY,
     POSES,
     STATIC,
     TRANSFORMS,
     decoded,
+    joint_names,
     messages_of,
 )
 from knode_cosserat.recordings.sources import (
@@ -57,6 +57,9 @@ _QUATERNIONS = (
 _ROWS = 20
 
 
+_Sources = tuple[TensionSource | None, CommandSource | None, MotorSource | None]
+
+
 class _Body(NamedTuple):
     name: str
     topic: str
@@ -86,41 +89,52 @@ def config_of_bag(container: Container, path: str) -> tuple[RecordingConfig, tup
         elif topic.type == POSE_ARRAY or (topic.type in TRANSFORMS and topic.name != STATIC):
             for part in _parts(container, topic.name):
                 names[f"{topic.name}[{part}]"] = part if topic.type in TRANSFORMS else f"body {part}"
-    bodies = []
+    bodies: list[_Body] = []
     for name, word in names.items():
         stream = decoded(container, MarkerSource(word, name, 1.0), "pose", path)
         if len(stream.values):
-            bodies.append(_Body(word, name, stream.values[:, :3]))
+            is_new = word not in [body.name for body in bodies]
+            bodies.append(_Body(word if is_new else name, name, stream.values[:, :3]))
     if not bodies:
-        listed = ", ".join(f"{topic.name} ({topic.type})" for topic in container.topics.values())
+        listed = ", ".join(
+            f"{topic.name} ({topic.type.replace('/msg/', '/')})" for topic in container.topics.values()
+        )
         raise RecordingError(f"{path}: no topic has poses; the bag has {listed or 'no topics'}")
-    sources: dict[str, TensionSource] = {}
+    found: dict[str, tuple[str, tuple[str, ...]]] = {}
     remarks: list[str] = []
     singles: dict[tuple[str, str], list[str]] = {}
     for topic in container.topics.values():
         if topic.type not in NUMBERS or not topic.raw:
             continue
-        role = "command" if _COMMAND.search(topic.name) else "tension"
-        first = next(
-            (message for _, message in messages_of(topic, container.ros) if message is not None), None
-        )
-        joints = list(first.name) if topic.type == JOINTS and first is not None else []
+        messages = (message for _, message in messages_of(topic, container.ros) if message is not None)
+        first = next(messages, None)
         count = 0 if first is None else len(NUMBERS[topic.type](first))
-        kind = CommandSource if role == "command" else TensionSource
         if count == 1 and (numbered := re.fullmatch(r"(.*?)(\d+)(\D*)", topic.name)):
             singles.setdefault((numbered[1], numbered[3]), []).append(numbered[2])
-        elif count and role not in sources:
+        elif count:
             order = tuple(range(1, count + 1))
-            sources[role] = kind(topic.name, order, names=tuple(joints) or None)
+            named = [list(getattr(first, "name", ()))]
+            joints = joint_names(TensionSource(topic.name, order), named, path)[0]
+            found.setdefault(_role(topic.name), (topic.name, tuple(joints) or ("",) * count))
             if joints:
                 remarks.append(f"tendons 1 to {count} are taken to be the joints {', '.join(joints)}")
     for (before, after), numbers in singles.items():
-        role = "command" if _COMMAND.search(before + after) else "tension"
-        kind = CommandSource if role == "command" else TensionSource
-        if role not in sources:
-            ordered = tuple(sorted(numbers, key=int))
-            sources[role] = kind(f"{before}{{}}{after}", tuple(range(1, len(ordered) + 1)), names=ordered)
-    return _config(bodies, sources.get("tension"), sources.get("command"), None, None, remarks)
+        found.setdefault(_role(before + after), (f"{before}{{}}{after}", tuple(sorted(numbers, key=int))))
+    sources: dict[str, dict[str, Any]] = {
+        role: {
+            "topic": name,
+            "order": tuple(range(1, len(names) + 1)),
+            "names": names if any(names) else None,
+        }
+        for role, (name, names) in found.items()
+    }
+    tension = TensionSource(**sources["tension"]) if "tension" in sources else None
+    command = CommandSource(**sources["command"]) if "command" in sources else None
+    return _config(bodies, (tension, command, None), None, None, remarks)
+
+
+def _role(topic: str) -> str:
+    return "command" if _COMMAND.search(topic) else "tension"
 
 
 def _parts(container: Container, name: str) -> list[str]:
@@ -151,8 +165,8 @@ def config_of_table(table: Table, path: str) -> tuple[RecordingConfig, tuple[str
         sources = _number_columns(
             [title for title in titles if title not in taken and title != TIME], remarks
         )
-        mapped = ColumnMap(**{name: tuple(found) for name, found in sources.items()}) if sources else None
-        return _config(bodies, *_sources(sources), mapped, table.up, remarks)
+        mapped = ColumnMap.from_dict(sources) if sources else None
+        return _config(bodies, _sources(sources), mapped, table.up, remarks)
     time = next((title for title in titles if _TIME.match(title)), None)
     rest = [title for title in titles if title != time]
     bodies = _bodies(table, rest, path)
@@ -164,12 +178,10 @@ def config_of_table(table: Table, path: str) -> tuple[RecordingConfig, tuple[str
         remarks.append("no column looks like times: the rate of 100 Hz is a guess")
     elif stated_time_unit(time):
         remarks.append(f"times are in {stated_time_unit(time)} by their title")
-    mapped = ColumnMap(
-        tuple((body.topic, body.titles) for body in bodies), time,
-        **{name: tuple(found) for name, found in sources.items()},
-    )  # fmt: skip
+    places_of = {body.topic: body.titles for body in bodies}
+    mapped = ColumnMap.from_dict({"time": time, **sources, **places_of})
     is_mm = any("mm" in re.findall(r"[a-z]+", title.lower()) for title in used)
-    return _config(bodies, *_sources(sources), mapped, None, remarks, table=rate, is_mm=is_mm)
+    return _config(bodies, _sources(sources), mapped, None, remarks, table=rate, is_mm=is_mm)
 
 
 def _bodies(table: Table, titles: Sequence[str], path: str) -> list[_Body]:
@@ -242,7 +254,7 @@ def _number_columns(titles: Sequence[str], remarks: list[str]) -> dict[str, list
 
 def _sources(
     found: Mapping[str, Sequence[str]],
-) -> tuple[TensionSource | None, CommandSource | None, MotorSource | None]:
+) -> _Sources:
     order = {name: tuple(range(1, len(columns) + 1)) for name, columns in found.items()}
     gram = any(re.search(r"\[(gf|g)\]|\((gf|g)\)|_gf?$", title) for title in found.get("tensions", ()))
     return (
@@ -259,9 +271,7 @@ def _sources(
 
 def _config(
     bodies: Sequence[_Body],
-    tension: TensionSource | None,
-    command: CommandSource | None,
-    motors: MotorSource | None,
+    sources: _Sources,
     columns: ColumnMap | None,
     up: str | None,
     remarks: list[str],
@@ -299,6 +309,7 @@ def _config(
         remarks.append(
             "the rod is taken to point from the base to the last body: `rotation` turns this axis to z"
         )
+    tension, command, motors = sources
     kinds = "measured" if tension or motors else "commanded" if command else "none"
     if kinds == "none":
         remarks.append("no tensions were found: `tensions: none` makes a recording of poses only")

@@ -20,7 +20,7 @@ from knode_cosserat._files.writing import replacing, temporary_folder
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.config_values import PLACE
 from knode_cosserat.recordings.findings import RecordingError
-from knode_cosserat.recordings.messages import SIMULATED, typestore
+from knode_cosserat.recordings.messages import SIMULATED, topic_and_part, typestore
 from knode_cosserat.recordings.sources import POSITION_UNITS, TENSION_UNITS, CommandSource, TensionSource
 
 BAGS = (".bag", ".mcap", ".db3")
@@ -219,7 +219,16 @@ def _messages(
 
 
 def message_type(stream: WireStream, ros: int) -> str:
-    """Return the message type of a stream, as ROS 2 writes it, for a ROS version."""
+    """Return the message type of a stream, as ROS 2 writes it, for a ROS version.
+
+    Raises:
+        RecordingError: the topic is a part of messages, or stands for several topics.
+    """
+    if topic_and_part(stream.topic)[1] or PLACE in stream.topic:
+        raise RecordingError(
+            f"topic {stream.topic} cannot be written; allowed is one topic for each body, and one for all "
+            "tensions"
+        )
     size = np.shape(stream.values)[1]
     if stream.role == "pose":
         return "geometry_msgs/msg/PoseStamped" if size == 7 else "geometry_msgs/msg/PointStamped"

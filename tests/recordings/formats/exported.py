@@ -48,9 +48,19 @@ def _number(value, digits=6):
 
 
 def motive(
-    time, *, version="1.23", unit="Meters", rotation="Quaternion", labelled=False, lost=(), delimiter=",",
-    decimal=".", timecode=False, bodies=BODIES, markers=True,
-):  # fmt: skip
+    time,
+    *,
+    version="1.23",
+    unit="Meters",
+    rotation="Quaternion",
+    labelled=False,
+    lost=(),
+    delimiter=",",
+    decimal=".",
+    timecode=False,
+    bodies=BODIES,
+    markers=True,
+):
     """CSV of Motive: rigid bodies, markers on the tip and an unlabelled one; y up."""
     scale = {"Meters": 1.0, "Millimeters": 1e3, "Centimeters": 100.0}[unit]
     kinds, names, ids, measures, axes, columns = [], [], [], [], [], []
@@ -80,22 +90,40 @@ def motive(
         add("Rigid Body", name, number, "Mean Marker Error", [""], error[:, None])
         if markers:
             for kind, shift in (("Rigid Body Marker", 0.0), ("Marker", 0.001)):
-                seen = scale * (position + [0.02, 0.0, shift])
+                seen = scale * (position + np.array([0.02, 0.0, shift]))
                 add(kind, f"{name}:Marker1", f"9F{k}:M{shift}", "Position", "XYZ", seen)
     if markers:
         add("Marker", "Unlabeled 1189", "88", "Position", "XYZ", np.full((len(time), 3), 0.5 * scale))
     lead = (lambda word: ["", word]) if labelled else (lambda word: ["", ""])
     extra = [""] if timecode else []
     rows = [
-        [*lead("Type"), *extra, *kinds], [*lead("Name"), *extra, *names], [*lead("ID"), *extra, *ids],
+        [*lead("Type"), *extra, *kinds],
+        [*lead("Name"), *extra, *names],
+        [*lead("ID"), *extra, *ids],
         *([[*lead("Parent"), *extra, *[""] * len(kinds)]] if labelled else []),
-        ["", "", *extra, *measures], ["Frame", "Time (Seconds)", *(["TimeCode"] if timecode else []), *axes],
-    ]  # fmt: skip
+        ["", "", *extra, *measures],
+        ["Frame", "Time (Seconds)", *(["TimeCode"] if timecode else []), *axes],
+    ]
     meta = [
-        "Format Version", version, "Take Name", "Take 7", "Capture Frame Rate", "100.000000", "Export Frame Rate",
-        "100.000000", "Capture Start Time", "2026-08-04 03.25.39.123 PM", "Total Exported Frames", str(len(time)),
-        "Rotation Type", rotation, "Length Units", unit, "Coordinate Space", "Global",
-    ]  # fmt: skip
+        "Format Version",
+        version,
+        "Take Name",
+        "Take 7",
+        "Capture Frame Rate",
+        "100.000000",
+        "Export Frame Rate",
+        "100.000000",
+        "Capture Start Time",
+        "2026-08-04 03.25.39.123 PM",
+        "Total Exported Frames",
+        str(len(time)),
+        "Rotation Type",
+        rotation,
+        "Length Units",
+        unit,
+        "Coordinate Space",
+        "Global",
+    ]
     lines = [delimiter.join(meta), "", *map(delimiter.join, rows)]
     for k, at in enumerate(time):
         cells = [_number(column[k]) for column in columns]
@@ -138,8 +166,9 @@ def nexus(
     for k in range(len(time)):
         cells = [
             "" if name == "Robot:tip" and k in lost else _number(value, 3)
-            for name, place in zip(names, places, strict=True) for value in place[k]
-        ]  # fmt: skip
+            for name, place in zip(names, places, strict=True)
+            for value in place[k]
+        ]
         lines.append(row([str(first + k), "0", *cells]).replace(".", decimal))
     return ("\r\n".join([*lines, ""])).encode()
 
@@ -185,16 +214,29 @@ def trc(time, *, unit="mm", blank_line=True, lost=(), axes=True, tabs_after=True
     for k, at in enumerate(time):
         cells = [
             "" if name == "tip" and k in lost else _number(value, 5)
-            for name, place in zip(BODIES, places, strict=True) for value in place[k]
-        ]  # fmt: skip
+            for name, place in zip(BODIES, places, strict=True)
+            for value in place[k]
+        ]
         out.write("\t".join([str(k + 1), f"{at:.5f}", *cells]) + "\n")
     return out.getvalue().encode()
 
 
 def c3d(
-    time, *, unit="mm", order="<", floats=True, screen=("+X", "+Z"), lost=(), forces=None, rate=100.0, per_frame=2,
-    first=1, up="z", labels=None, leave_out=(),
-):  # fmt: skip
+    time,
+    *,
+    unit="mm",
+    order="<",
+    floats=True,
+    screen=("+X", "+Z"),
+    lost=(),
+    forces=None,
+    rate=100.0,
+    per_frame=2,
+    first=1,
+    up="z",
+    labels=None,
+    leave_out=(),
+):
     """C3D of markers, and of four analog channels with `per_frame` samples a frame."""
     processor = {"<": 84, ">": 86, "dec": 85}[order]
     endian = "<" if order == "dec" else order
@@ -234,16 +276,25 @@ def c3d(
         return struct.pack(f"{endian}H", value)
 
     point = {
-        "USED": (2, [], word(len(names))), "SCALE": (4, [], real(factor)), "RATE": (4, [], real(rate)),
-        "FRAMES": (2, [], word(len(time))), "DATA_START": (2, [], word(0)), "LABELS": (-1, *texts(names)),
-        "UNITS": (-1, [len(unit)], unit.encode()), "X_SCREEN": (-1, [2], screen[0].encode()),
+        "USED": (2, [], word(len(names))),
+        "SCALE": (4, [], real(factor)),
+        "RATE": (4, [], real(rate)),
+        "FRAMES": (2, [], word(len(time))),
+        "DATA_START": (2, [], word(0)),
+        "LABELS": (-1, *texts(names)),
+        "UNITS": (-1, [len(unit)], unit.encode()),
+        "X_SCREEN": (-1, [2], screen[0].encode()),
         "Y_SCREEN": (-1, [2], screen[1].encode()),
-    }  # fmt: skip
+    }
     analog = {
-        "USED": (2, [], word(count)), "RATE": (4, [], real(rate * per_frame)), "GEN_SCALE": (4, [], real(0.5)),
-        "SCALE": (4, [4], real(0.02) * 4), "OFFSET": (2, [4], word(100) * 4),
-        "LABELS": (-1, *texts([f"cell{k + 1}" for k in range(4)])), "UNITS": (-1, *texts(["N"] * 4)),
-    }  # fmt: skip
+        "USED": (2, [], word(count)),
+        "RATE": (4, [], real(rate * per_frame)),
+        "GEN_SCALE": (4, [], real(0.5)),
+        "SCALE": (4, [4], real(0.02) * 4),
+        "OFFSET": (2, [4], word(100) * 4),
+        "LABELS": (-1, *texts([f"cell{k + 1}" for k in range(4)])),
+        "UNITS": (-1, *texts(["N"] * 4)),
+    }
 
     def section(data_start):
         point["DATA_START"] = (2, [], word(data_start))

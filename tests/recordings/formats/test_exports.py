@@ -52,13 +52,17 @@ def agrees(recording, tolerance, angle=None, lost=()):
 MOTIVE = {
     "as by default": {},
     "in mm, with gaps, rows of parents, and timecodes": {
-        "version": "1.25", "unit": "Millimeters", "labelled": True, "timecode": True, "lost": LOST,
+        "version": "1.25",
+        "unit": "Millimeters",
+        "labelled": True,
+        "timecode": True,
+        "lost": LOST,
     },
     "in cm, rigid bodies only": {"unit": "Centimeters", "markers": False},
     "Euler angles XYZ": {"rotation": "XYZ"},
     "Euler angles ZYX": {"rotation": "ZYX"},
     "with semicolons and decimal commas": {"delimiter": ";", "decimal": ","},
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("variant", MOTIVE)
@@ -197,9 +201,12 @@ def test_a_c3d_file_that_was_cut_is_read_to_its_end(tmp_path):
 
 def test_the_content_decides_and_not_the_name(tmp_path):
     for name, data in (
-        ("a.txt", exported.motive(TIME)), ("b.tsv", exported.trc(TIME)), ("c.bin", exported.c3d(TIME)),
-        ("d.csv", b"\xef\xbb\xbf" + exported.motive(TIME)), ("e.csv", exported.nexus(TIME, blank_lines=2)),
-    ):  # fmt: skip
+        ("a.txt", exported.motive(TIME)),
+        ("b.tsv", exported.trc(TIME)),
+        ("c.bin", exported.c3d(TIME)),
+        ("d.csv", b"\xef\xbb\xbf" + exported.motive(TIME)),
+        ("e.csv", exported.nexus(TIME, blank_lines=2)),
+    ):
         (tmp_path / name).write_bytes(data)
         assert len(load_recording(tmp_path / name).bodies) == 2
     (tmp_path / "f.csv.gz").write_bytes(gzip.compress(exported.motive(TIME)))
@@ -246,34 +253,46 @@ SHORT = exported.times(seconds=0.1)
 DAMAGED = {
     "no header of motive": (exported.motive(SHORT).split(b"\r\n")[0], "the header of this export of Motive"),
     "no rows": (exported.motive(SHORT[:0]), "no rows after the header"),
-    "an unknown unit": (changed(exported.motive(SHORT), b"Meters", b"Furlongs"), "the unit of length is 'Furlongs'"),
+    "an unknown unit": (
+        changed(exported.motive(SHORT), b"Meters", b"Furlongs"),
+        "the unit of length is 'Furlongs'",
+    ),
     "an unknown rotation": (
         changed(exported.motive(SHORT, rotation="XYZ"), b"Rotation Type,XYZ", b"Rotation Type,ABC"),
         "the rotation type is 'ABC'",
     ),
     "text for a number": (
-        changed(exported.motive(SHORT), b"\r\n3,0.030000,", b"\r\n3,0.030000,what"), "allowed is a finite number",
+        changed(exported.motive(SHORT), b"\r\n3,0.030000,", b"\r\n3,0.030000,what"),
+        "allowed is a finite number",
     ),
     "no positions": (
-        exported.motive(SHORT).replace(b"Position", b"Velocity"), "it has no bodies and no markers with positions",
+        exported.motive(SHORT).replace(b"Position", b"Velocity"),
+        "it has no bodies and no markers with positions",
     ),
-    "a section of vicon without rows": (b"Trajectories\n100\n,,a,,\nFrame,Sub Frame,X,Y,Z\n", "Trajectories is incompl"),
+    "a section of vicon without rows": (
+        b"Trajectories\n100\n,,a,,\nFrame,Sub Frame,X,Y,Z\n",
+        "Trajectories is incompl",
+    ),
     "a section of vicon without frames": (
-        changed(exported.nexus(SHORT), b"Frame,Sub Frame", b"A,B"), "required are Frame, Sub Frame",
+        changed(exported.nexus(SHORT), b"Frame,Sub Frame", b"A,B"),
+        "required are Frame, Sub Frame",
     ),
     "an unknown angle": (exported.tracker(SHORT).replace(b"deg", b"gon"), "allowed is deg or rad"),
     "no names in trc": (changed(exported.trc(SHORT), b"Frame#", b"Number"), "the header of this TRC file"),
     "trc cut in its header": (exported.trc(SHORT)[:120], "the header of this TRC file"),
     "trc without rows": (exported.trc(SHORT[:0]), "no rows after the header"),
     "another processor": (
-        exported.c3d(SHORT)[:515] + b"\x57" + exported.c3d(SHORT)[516:], "is of the processor 87; allowed is 84",
+        exported.c3d(SHORT)[:515] + b"\x57" + exported.c3d(SHORT)[516:],
+        "is of the processor 87; allowed is 84",
     ),
     "c3d cut in its parameters": (exported.c3d(SHORT)[:600], "C3D file"),
     "c3d without a rate": (
-        changed(exported.c3d(SHORT, rate=100.0), b"RATE", b"RITE")[:20] + bytes(4)
-        + changed(exported.c3d(SHORT, rate=100.0), b"RATE", b"RITE")[24:], "has the rate 0",
+        changed(exported.c3d(SHORT, rate=100.0), b"RATE", b"RITE")[:20]
+        + bytes(4)
+        + changed(exported.c3d(SHORT, rate=100.0), b"RATE", b"RITE")[24:],
+        "has the rate 0",
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("damage", DAMAGED)

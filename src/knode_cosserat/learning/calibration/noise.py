@@ -18,7 +18,8 @@ from jaxtyping import Float
 from knode_cosserat.learning.calibration.misfit import LinearisedMisfit, SegmentMisfit, by_group
 from knode_cosserat.learning.calibration.search import Misfit, SearchResult
 from knode_cosserat.learning.discontinuities import slopes_of
-from knode_cosserat.learning.samples import histories, segment_history, settings_of
+from knode_cosserat.learning.samples import histories, segment_history
+from knode_cosserat.solvers.replay import replayed_settings
 from knode_cosserat.trajectory import Trajectory
 
 #: relative accuracy of the numbers of states
@@ -143,7 +144,7 @@ def _by_states(
     This is the transpose of `samples.samples`, which is linear in the states.
     """
     segments, (tip_y, tip_history) = pulled
-    data, settings, robot = misfit.data, settings_of(trajectory), misfit.robot
+    data, settings, robot = misfit.data, replayed_settings(trajectory), misfit.robot
     mine, tips = data.segments.origin[:, 0] == k, data.tips.origin[:, 0] == k
     rows = data.tips.origin[tips, 1]
     (count, nodes), (n, ny) = np.shape(trajectory.y)[:2], (len(tip_y), robot.y_layout.size)
