@@ -54,7 +54,7 @@ def static_run(task: Equilibria, system: System, controls: Any, y: Any = None, b
 
 
 def static_batch(task: Equilibria, system: System, controls: Any, y: Any = None, before: Any = None) -> Any:
-    """Solve the equilibria of a batch as `run_batch`, and those robots by themselves that need `static_run`.
+    """Solve the equilibria of a batch as `run_batch`, but robots that need `static_run` by themselves.
 
     There are controls (B, T, c) for one system, or for as many of them.
     """
@@ -62,22 +62,29 @@ def static_batch(task: Equilibria, system: System, controls: Any, y: Any = None,
     guess = unloaded_shape(system, task.settings.space) if y is None else y
     guess = guess if guess.ndim == 3 else jnp.broadcast_to(guess, (size, *guess.shape))
     last = np.broadcast_to(0.0 if before is None else before, (size, controls.shape[-1]))
-    rows, lasts, causes = run_batch(task, system, controls, guess, last)
-    for i in range(size):
-        robot = jax.tree.map(lambda leaf, i=i: leaf[i], system) if many else system
-        walk = _Walk(task, robot)
-        solved = np.flatnonzero(rows.result[i] >= 0)
-        in_parts = len(walk.path(controls[i], last[i])[0]) > len(controls[i])
-        if in_parts or (
-            y is None and any(walk.is_unstable(rows.records[i, k], controls[i, k]) for k in solved)
-        ):
-            alone = static_run(task, robot, controls[i], y, before)
-            for every, one in zip(rows, alone.rows, strict=True):
-                every[i] = one
-            causes.pop(i, None)
-            if alone.cause:
-                causes[i] = alone.cause
-    return rows, lasts, causes
+
+    def walk(i: int) -> _Walk:
+        return _Walk(task, jax.tree.map(lambda leaf: leaf[i], system) if many else system)
+
+    alone = {i for i in range(size) if len(walk(i).path(controls[i], last[i])[0]) > task.steps}
+    plain = np.array([i for i in range(size) if i not in alone], dtype=int)
+    runs: dict[int, tuple[StepRows, Any, str]] = {}
+    if len(plain):
+        own = jax.tree.map(lambda leaf: leaf[plain], system) if many else system
+        rows, states, causes = run_batch(task, own, controls[plain], guess[plain], last[plain])
+        for k, i in enumerate(plain):
+            one, state = jax.tree.map(lambda leaf, k=k: leaf[k], (rows, states))
+            runs[i] = one, state, causes.get(k, "")
+            solved = np.flatnonzero(one.result >= 0)
+            if y is None and any(walk(i).is_unstable(one.records[j], controls[i, j]) for j in solved):
+                alone.add(i)
+    for i in alone:
+        runs[i] = static_run(task, walk(i).system, controls[i], y, before)
+    parts = [runs[i] for i in range(size)]
+    rows, states = (
+        jax.tree.map(lambda *x: np.stack(x), *each) for each in list(zip(*parts, strict=True))[:2]
+    )
+    return rows, states, {i: cause for i, (*_, cause) in enumerate(parts) if cause}
 
 
 class _Walk:
