@@ -123,8 +123,8 @@ def calibrate(
         trajectories: full states of the real robot; or measurements that start at rest, in the equilibrium
             under their `initial_tension` or else under the first tension (`Recording.sampled`), which only
             "rollouts" can use.
-        names: parameters by name (`System.parameters`); by default all that have a value and that the data
-            determine.
+        names: parameters by name (`System.parameters`), those of parts with dots, such as `loads.0.mass`; by
+            default all of the robot's own that have a value and that the data determine.
         by: "segments" compares one-segment predictions from the full states in the data. It takes a fraction
             of a second and converges from a distant start. Noise in the states also enters the predictions;
             the resulting bias is corrected to leading order in the variance. The history between nodes is

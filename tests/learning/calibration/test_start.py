@@ -1,0 +1,97 @@
+"""The state from which compared simulations start: as the data do, at rest or unstressed."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import knode_cosserat as kc
+from knode_cosserat.learning.calibration.calibrate import calibrate
+from knode_cosserat.learning.calibration.rollouts import RolloutMisfit
+from knode_cosserat.learning.calibration.unknowns import searched, unknowns_of, values
+from knode_cosserat.learning.samples import DataError
+from tests.learning.bar import BAR, Bar, pulled
+
+
+class Weighed(Bar):
+    """A bar whose own weight stretches it by a quarter: its equilibrium is far from its unstressed shape."""
+
+    def balance(self, s, t, y, y_t, z, z_t, control):
+        return super().balance(s, t, y, y_t, z, z_t, control).at[1].add(-9.81 * self.density)
+
+
+REAL = Weighed(**{name: getattr(BAR, name) for name in BAR.parameters()}, nodes=6)
+GUESS = REAL.replace(stiffness=26.0, damping=0.8)
+NAMES = ["stiffness", "damping"]
+
+
+def measured(trajectory, noise=0.0):
+    seen = kc.recordings.Measurements.of(trajectory, (0.4, 1.0))
+    rng = np.random.default_rng(0)
+    return dataclasses.replace(seen, position=seen.position + noise * rng.normal(size=seen.position.shape))
+
+
+def found(data):
+    estimates = calibrate(GUESS, [data], NAMES, by="rollouts", space="euler").estimates
+    return estimates["stiffness"], estimates["damping"]
+
+
+def settled(**options):
+    return pulled(1.0, robot=REAL, space="euler", initial="equilibrium", **options)
+
+
+def pretensioned():
+    still = kc.equilibrium(REAL, [3.0], space="euler")
+    return pulled(1.0, robot=REAL, space="euler", initial=still)
+
+
+def rested():
+    pull = np.concatenate([np.full(3, 3.0), 3.0 + 2.0 * np.sin(0.7 * np.arange(1, 18))])[:, None]
+    still = kc.equilibrium(REAL, [3.0], space="euler")
+    moved = measured(kc.simulate(REAL, pull, 0.1, space="euler", initial=still))
+    return dataclasses.replace(moved, initial_tension=None)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("data", "tolerance"),
+    [
+        pytest.param(lambda: settled(), 1e-6, id="states from rest"),
+        pytest.param(lambda: measured(settled()), 1e-6, id="measured from rest"),
+        pytest.param(lambda: measured(settled(), 1e-4), 2e-2, id="noisy from rest"),
+        pytest.param(lambda: measured(pretensioned()), 1e-6, id="measured from a pull"),
+        pytest.param(lambda: rested(), 1e-6, id="at rest for a while, with an unknown pull before"),
+        pytest.param(lambda: pulled(1.0, robot=REAL, space="euler"), 1e-6, id="unstressed states"),
+        pytest.param(lambda: measured(pulled(1.0, robot=REAL, space="euler")), 1e-6, id="unstressed"),
+    ],
+)
+def test_what_starts_at_rest_gives_the_robot_that_made_it(data, tolerance):
+    np.testing.assert_allclose(found(data()), (20.0, 0.4), rtol=tolerance)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "data",
+    [
+        pytest.param(lambda: measured(settled()).rows(4, 20), id="from the middle of a motion"),
+        pytest.param(
+            lambda: dataclasses.replace(measured(settled()), initial_tension=np.array([9.0])), id="wrong pull"
+        ),
+    ],
+)
+def test_data_that_do_not_start_at_rest_are_refused(data):
+    with pytest.raises(DataError, match=r"recording 1: row 0 is .* mm from the equilibrium under \["):
+        found(data())
+
+
+@pytest.mark.slow
+def test_slopes_of_a_start_in_equilibrium_are_exact():
+    unknowns = unknowns_of(GUESS, ["length", "density", *NAMES])
+    misfit = RolloutMisfit(GUESS, [measured(pretensioned())], unknowns, space="euler")
+    at, h = searched(unknowns, values(GUESS, unknowns)), 1e-4
+    slopes = misfit(at).slopes
+    # row 0 is compared too, and depends on the stiffness
+    assert np.abs(slopes[1, 2]) > 0.01
+    for k, along in enumerate(h * np.eye(len(at))):
+        expected = (misfit(at + along).values - misfit(at - along).values) / (2.0 * h)
+        np.testing.assert_allclose(slopes[:, k], expected, atol=1e-6 * np.max(np.abs(expected)))
