@@ -1,5 +1,7 @@
 """Controls in time: a trajectory, its measurements and its table hold each tension over the same interval."""
 
+from typing import ClassVar
+
 import numpy as np
 import pytest
 
@@ -124,3 +126,45 @@ def test_a_configuration_says_that_tensions_are_held(tmp_path):
     assert RecordingConfig.load(tmp_path / "held.yaml") == held
     with pytest.raises(RecordingError, match="held is 3; allowed is true or false"):
         TensionSource("/tension", (1,), held=3)
+
+
+class Planar(kc.System):
+    """A string in a plane: positions of two numbers, no orientation, and controls of its own name."""
+
+    y_layout: ClassVar = kc.robots.Layout(
+        ("p", 2, "m", "position"), ("n", 2, "N", "internal force"), ("q", 2, "m/s", "velocity")
+    )
+    z_layout: ClassVar = kc.robots.Layout(("v", 2, "1", "tangent"))
+    control_layout: ClassVar = kc.robots.Layout(("wind", 1, "N/m", "force per length"))
+
+
+def planar_motion():
+    """Five rows of a planar system at six nodes, with made-up numbers."""
+    rng = np.random.default_rng(0)
+    zero = np.zeros(5)
+    return kc.Trajectory(
+        Planar(length=1.0, nodes=6), None, 0.1 * np.arange(5), rng.normal(size=(5, 6, 6)),
+        rng.normal(size=(5, 6, 2)), rng.normal(size=(5, 1)), zero.astype(int), zero, zero.astype(int),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("fractions", [(1.0,), (0.4, 1.0), (0.2, 0.4, 0.6)])
+def test_measurements_of_a_planar_system(fractions):
+    moved = planar_motion()
+    seen = kc.recordings.Measurements.of(moved, fractions)
+    at = [round(5 * each) for each in fractions]
+    np.testing.assert_allclose(seen.position, moved.y[:, at, :2], atol=1e-12)
+    assert seen.position.shape == (5, len(fractions), 2) and np.all(np.isnan(seen.quaternion))
+    assert seen.measured.all() and seen.complete.all()
+    np.testing.assert_array_equal(seen.tension[:-1], moved.control[1:])
+    np.testing.assert_array_equal(seen.initial_tension, moved.control[0])
+    assert len(seen.rows(1, 4).parts()) == 1 and seen.tip_position.shape == (5, 2)
+
+
+def test_planar_measurements_are_written_as_x_and_z(tmp_path):
+    moved = planar_motion()
+    seen = kc.recordings.Measurements.of(moved)
+    seen.save(tmp_path / "it.csv")
+    again = kc.load_recording(tmp_path / "it.csv").sampled(0.1)
+    np.testing.assert_allclose(again.position[:, 0, (0, 2)], seen.position[:, 0], atol=1e-9)
+    assert np.all(again.position[:, 0, 1] == 0.0)

@@ -8,7 +8,14 @@ import pytest
 import knode_cosserat as kc
 from knode_cosserat.learning.calibration.calibrate import calibrate
 from knode_cosserat.learning.calibration.rollouts import RolloutMisfit
-from knode_cosserat.learning.calibration.unknowns import searched, unknowns_of, values
+from knode_cosserat.learning.calibration.unknowns import (
+    limits,
+    number_units,
+    searched,
+    unknowns_of,
+    values,
+    with_numbers,
+)
 from knode_cosserat.learning.samples import DataError
 from tests.learning.bar import BAR, Bar, pulled
 
@@ -95,3 +102,51 @@ def test_slopes_of_a_start_in_equilibrium_are_exact():
     for k, along in enumerate(h * np.eye(len(at))):
         expected = (misfit(at + along).values - misfit(at - along).values) / (2.0 * h)
         np.testing.assert_allclose(slopes[:, k], expected, atol=1e-6 * np.max(np.abs(expected)))
+
+
+ROD = kc.robots.SlenderRod(
+    length=0.3, radius=0.004, density=1200.0, youngs_modulus=2e8, bending_damping=1e-3, nodes=5,
+    gravity=[9.81, 0.0, 0.0], base_end=kc.robots.ends.Driven(axes=("x",)),
+    loads=(
+        kc.robots.loads.AttachedMass(mass=0.02),
+        kc.robots.loads.PointWrench(at=0.5, force=[0.0, 0.1, 0.0]),
+    ),
+)  # fmt: skip
+
+
+def test_parameters_of_parts_have_names_with_dots():
+    names = ["youngs_modulus", "loads.0.mass", "loads.1.force"]
+    unknowns = unknowns_of(ROD, names)
+    assert [each.name for each in unknowns] == names
+    numbers = values(ROD, unknowns)
+    np.testing.assert_allclose(numbers, [2e8, 0.02, 0.0, 0.1, 0.0])
+    assert number_units(ROD, unknowns) == ("Pa", "kg", "N", "N", "N")
+    changed = with_numbers(ROD, unknowns, np.array([1e8, 0.05, 0.1, 0.2, 0.3]))
+    assert float(changed.loads[0].mass) == 0.05 and changed.loads[1].force.tolist() == [0.1, 0.2, 0.3]
+    low, high = limits(ROD, unknowns)
+    assert np.all(low <= numbers) and np.all(numbers <= high)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("loads.2.mass", "there is no parameter 'loads.2.mass': no '2' among 0, 1"),
+        ("loads.0.weight", "AttachedMass has no parameter 'weight'; there are .*mass"),
+        ("load.0.mass", "there is no parameter 'load.0.mass': no 'load' among"),
+        ("loads.0.at", "loads.0.at is a place, which a search cannot move"),
+        ("loads.0", "has no parameter '0'|there is no parameter"),
+    ],
+)
+def test_names_of_parts_that_are_not_right(name, message):
+    with pytest.raises(kc.robots.ParameterError, match=message):
+        unknowns_of(ROD, [name])
+
+
+@pytest.mark.slow
+def test_a_mass_at_the_tip_is_found():
+    t = 0.02 * np.arange(1, 26)[:, None]
+    moved = kc.simulate(ROD, 0.03 * np.sin(8.0 * t), 0.02, space="euler", initial="equilibrium")
+    guess = ROD.replace(**{"loads.0.mass": 0.03, "youngs_modulus": 2.4e8})
+    estimates = calibrate(guess, [moved], ["youngs_modulus", "loads.0.mass"]).estimates
+    np.testing.assert_allclose(estimates["loads.0.mass"], 0.02, rtol=1e-4)
+    np.testing.assert_allclose(estimates["youngs_modulus"], 2e8, rtol=1e-4)
