@@ -1,11 +1,10 @@
 """Controls in time: a trajectory, its measurements and its table hold each tension over the same interval."""
 
-from typing import ClassVar
-
 import numpy as np
 import pytest
 
 import knode_cosserat as kc
+from examples.hanging_string import HangingString
 from knode_cosserat.identification.evaluate import evaluate
 from knode_cosserat.recordings import RecordingConfig, RecordingError, TensionSource
 
@@ -128,24 +127,15 @@ def test_a_configuration_says_that_tensions_are_held(tmp_path):
         TensionSource("/tension", (1,), held=3)
 
 
-class Planar(kc.System):
-    """A string in a plane: positions of two numbers, no orientation, and controls of its own name."""
-
-    y_layout: ClassVar = kc.robots.Layout(
-        ("p", 2, "m", "position"), ("n", 2, "N", "internal force"), ("q", 2, "m/s", "velocity")
-    )
-    z_layout: ClassVar = kc.robots.Layout(("v", 2, "1", "tangent"))
-    control_layout: ClassVar = kc.robots.Layout(("wind", 1, "N/m", "force per length"))
-
-
 def planar_motion():
-    """Five rows of a planar system at six nodes, with made-up numbers."""
-    rng = np.random.default_rng(0)
-    zero = np.zeros(5)
+    """Five rows of a string in a plane: no orientations, and controls of its own name; made-up numbers."""
+    string = HangingString(length=1.0, density=0.1, stiffness=1e3, friction=0.05, nodes=6)
+    rng, zero = np.random.default_rng(0), np.zeros(5)
+    y, z = (rng.normal(size=(5, 6, each.size)) for each in (string.y_layout, string.z_layout))
+    control = rng.normal(size=(5, string.control_size))
     return kc.Trajectory(
-        Planar(length=1.0, nodes=6), None, 0.1 * np.arange(5), rng.normal(size=(5, 6, 6)),
-        rng.normal(size=(5, 6, 2)), rng.normal(size=(5, 1)), zero.astype(int), zero, zero.astype(int),
-    )  # fmt: skip
+        string, None, 0.1 * np.arange(5), y, z, control, zero.astype(int), zero, zero.astype(int)
+    )
 
 
 @pytest.mark.parametrize("fractions", [(1.0,), (0.4, 1.0), (0.2, 0.4, 0.6)])
@@ -153,7 +143,7 @@ def test_measurements_of_a_planar_system(fractions):
     moved = planar_motion()
     seen = kc.recordings.Measurements.of(moved, fractions)
     at = [round(5 * each) for each in fractions]
-    np.testing.assert_allclose(seen.position, moved.y[:, at, :2], atol=1e-12)
+    np.testing.assert_allclose(seen.position, moved.part("p")[:, at], atol=1e-12)
     assert seen.position.shape == (5, len(fractions), 2) and np.all(np.isnan(seen.quaternion))
     assert seen.measured.all() and seen.complete.all()
     np.testing.assert_array_equal(seen.tension[:-1], moved.control[1:])

@@ -226,7 +226,7 @@ def test_a_robot_that_sags_has_no_wrong_length(tmp_path):
     path = tmp_path / "it.csv"
     rows = [f"{0.01 * k:.2f},{tip[0]:.6f},0,{tip[2]:.6f},1,1" for k in range(100)]
     head = "# fraction tip: 1.0\n# source: a robot\ntime [s],tip_x [m],tip_y [m],tip_z [m],"
-    path.write_text(head + "load_cell_1 [N],load_cell_2 [N]\n" + "\n".join(rows) + "\n", encoding="utf-8")
+    path.write_text(head + "tension_1 [N],tension_2 [N]\n" + "\n".join(rows) + "\n", encoding="utf-8")
     report = kc.load_recording(path).health()
     assert report.rod_length == ()
     (note,) = [each.message for each in report.findings if "does not tell the rod's length" in each.message]
