@@ -41,8 +41,27 @@ def test_simulate_writes_what_the_package_computes(tmp_path):
     assert "16 converged" in text
     assert f"wrote {tmp_path / 'truth.nc'}\n" in text
     robot = kc.load_robot(ROBOT)
-    expected = kc.simulate(robot, kc.controls.sine(period=0.5, steps=16, dt=0.05), 0.05)
+    sine = kc.controls.sine(period=0.5, steps=16, dt=0.05)
+    expected = kc.simulate(robot, sine, 0.05, initial="equilibrium")
     np.testing.assert_array_equal(kc.load_trajectory(tmp_path / "truth.nc").y, expected.y)
+
+
+def test_a_robot_that_sags_is_simulated_from_its_equilibrium(tmp_path):
+    rod = kc.robots.SlenderRod(
+        length=0.3, radius=0.004, density=1200.0, youngs_modulus=2e8, bending_damping=1e-3, nodes=6,
+        gravity=[9.81, 0.0, 0.0], base_end=kc.robots.ends.Driven(axes=("x",)),
+    )  # fmt: skip
+    kc.save_robot(rod, tmp_path / "rod.yaml")
+    words = ("simulate", tmp_path / "rod.yaml", "--controls", "none", "--steps", 4, "--dt", 0.02, "--out")
+    told(*words, tmp_path / "a.nc")
+    tips = kc.load_trajectory(tmp_path / "a.nc").tip_position
+    assert np.ptp(tips, axis=0).max() < 1e-7 and tips[0, 0] > 0.01
+    told(*words, tmp_path / "b.nc", "--initial", "unstressed")
+    tips = kc.load_trajectory(tmp_path / "b.nc").tip_position
+    np.testing.assert_allclose(tips[0], [0.0, 0.0, 0.3], atol=1e-12)
+    assert tips[-1, 0] > 1e-3
+    result = run(*words, tmp_path / "c.nc", "--initial", "straight")
+    assert result.exit_code == 2 and "allowed is equilibrium, unstressed" in result.stderr
 
 
 @pytest.mark.campaign

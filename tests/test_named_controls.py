@@ -107,3 +107,46 @@ def test_a_signal_without_effect_during_the_run_is_refused():
         named_controls.parse(ROD, "base_z=sine:0.1", 10, DT)
     assert named_controls.parse(ROD, "base_z=step:1,at=2", 40, DT)[-1, 1] == 1.0
     assert np.all(named_controls.parse(ROD, "base_z=step:1", 10, DT)[:, 1] == 1.0)
+
+
+ROBOT = kc.load_robot("delrin-tendon-robot")
+
+
+@pytest.mark.parametrize(
+    ("word", "expected"),
+    [
+        ("tension_4=ramp:2", {3: [0.5, 1.0, 1.5, 2.0]}),
+        (" tension_2 = 3 ; tension_1=step:1,at=0.15", {0: [0.0, 0.0, 1.0, 1.0], 1: [3.0] * 4}),
+        ("tension=5", {k: [5.0] * 4 for k in range(4)}),
+        ("tension_3=sine:0.2,base=2,amplitude=1", {2: 2.0 + np.sin(np.pi * np.arange(1, 5) / 2)}),
+        ("none", {}),
+    ],
+)
+def test_tendons_have_names_too_and_the_others_are_slack(word, expected):
+    found = named_controls.parse(ROBOT, word, 4, 0.05)
+    rows = np.zeros((4, 4))
+    for column, values in expected.items():
+        rows[:, column] = values
+    np.testing.assert_allclose(found, rows, atol=1e-12)
+    np.testing.assert_array_equal(named_controls.parse(ROBOT.control_layout, word, 4, 0.05), found)
+
+
+def test_signals_of_the_paper_are_still_for_all_tendons():
+    for word in ("sine:0.2,base=8", "ramp:2,tendons=4", "7,5,5,7"):
+        np.testing.assert_array_equal(
+            named_controls.parse(ROBOT, word, 4, 0.05), kc.controls.parse(word, 4, 0.05)
+        )
+
+
+@pytest.mark.parametrize(
+    ("word", "parts"),
+    [
+        ("tension_5=ramp:2", ["the control 'tension_5' is unknown", "tension_1, tension_2"]),
+        ("tension_1=sine:0.2", ["a tension is -1 N", "allowed is 0 or more"]),
+        ("tension=5;tension_1=3", ["tension_1 is given already"]),
+        ("tension_1=5,tension_2=3", ["the signal '5,tension_2=3' is unknown"]),
+    ],
+)
+def test_named_tensions_that_are_not_right(word, parts):
+    with fails(*parts):
+        named_controls.parse(ROBOT, word, 4, 0.05)

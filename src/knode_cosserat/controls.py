@@ -246,7 +246,7 @@ def parse(
         close = difflib.get_close_matches(name, _SIGNALS, n=1)
         hint = f"; did you mean {close[0]}:{_SIGNALS[close[0]].main.upper()}?" if close else ""
         if "=" in name:
-            hint = "; NAME=SIGNAL is for robots with controls other than tensions"
+            hint = "; NAME=SIGNAL is for named_controls.parse, and for --controls"
         raise ControlsError(
             f"controls {specification!r}: no such signal or file; allowed is {SPECIFICATIONS}{hint}"
         )

@@ -17,7 +17,8 @@ from jaxtyping import Float
 from knode_cosserat import controls
 from knode_cosserat._files.csv_rows import SAME_TIME, Column, CSVTextError, held_rows, read_rows
 from knode_cosserat._files.yaml_text import did_you_mean
-from knode_cosserat._signals import Sampled, require_effect, step_times
+from knode_cosserat._numbers import numbers_in
+from knode_cosserat._signals import Sampled, checked_tensions, require_effect, step_times
 from knode_cosserat.controls import ControlsError
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.system import System
@@ -44,21 +45,23 @@ def titles(layout: Layout) -> list[str]:
     return [f"{name} [{unit}]" for name, unit in zip(labels(layout), units(layout), strict=True)]
 
 
-def parse(robot: System, specification: str, steps: int | None, dt: float) -> Array:
-    """Return controls (steps, c) of a robot from one word, as on the command line.
+def parse(robot: System | Layout, specification: str, steps: int | None, dt: float) -> Array:
+    """Return controls (steps, c) of a robot, or of its control layout, from one word as on the command line.
 
-    For a robot with tensions only, this is `controls.parse`. Otherwise the word has signals by name,
-    `base_z=ramp:0.1;reel_1=sine:2,amplitude=0.01`. The name of a field stands for all its numbers. Each
-    control is given at most once, and the others are zero. Signals are `constant:VALUE`,
-    `ramp:HEIGHT[,base=,start=,end=]`, `step:HEIGHT[,base=,at=]`, `sine:PERIOD[,base=,amplitude=,phase=]`. The
-    word may also be a CSV file with the columns `time [s]` and any of these names with their units, or the
-    numbers of a constant control in the layout's order. `none` stands for zeros.
+    The word has signals by name, `tension_4=ramp:2` or `base_z=ramp:0.1;reel_1=sine:2,amplitude=0.01`. The
+    name of a field stands for all its numbers. Each control is given at most once, and the others are zero.
+    Signals are a number or `constant:VALUE`, `ramp:HEIGHT[,base=,start=,end=]`, `step:HEIGHT[,base=,at=]`,
+    `sine:PERIOD[,base=,amplitude=,phase=]`. The word may also be a CSV file with the columns `time [s]` and
+    any of these names with their units, or the numbers of a constant control in the layout's order. `none`
+    stands for zeros. A robot with tensions only also takes the words of `controls.parse`: the signals of the
+    paper for all tendons, and files of tensions.
 
     Raises:
         ControlsError: the specification is not understood, or the file is invalid or too short.
     """
-    layout = robot.control_layout
-    if layout.names == ("tension",):
+    layout = robot if isinstance(robot, Layout) else robot.control_layout
+    tensions_only = layout.names == ("tension",)
+    if tensions_only and not _is_named(specification):
         return controls.parse(specification, steps, dt, tendons=layout.size)
     if not 0.0 < dt < np.inf:
         raise ControlsError(f"dt is {dt!r}; allowed is a number of seconds above 0")
@@ -75,7 +78,16 @@ def parse(robot: System, specification: str, steps: int | None, dt: float) -> Ar
     if held is not None:
         return np.tile(held, (steps, 1))
     words = [] if specification.strip() == "none" else specification.split(";")
-    return parse_signals(layout, words, {each: step_times(steps, dt, each) for each in ("middle", "end")})
+    times = {each: step_times(steps, dt, each) for each in ("middle", "end")}
+    found = parse_signals(layout, words, times)
+    return checked_tensions(found, f"controls {specification!r}") if tensions_only else found
+
+
+def _is_named(specification: str) -> bool:
+    """Return True for `NAME=SIGNAL;…` and `none`; words such as `sine:2,base=5` are for all tendons."""
+    name, equals, _ = specification.partition("=")
+    named = specification.strip() == "none" or bool(equals and not set(":,") & set(name))
+    return named and not os.path.isfile(specification)
 
 
 def parse_signals(
@@ -165,7 +177,7 @@ _SIGNALS: dict[str, tuple[Callable[..., Any], tuple[str, ...]]] = {
 
 
 def _signal(word: str, t: Float[np.ndarray, " steps"], sampled: Sampled) -> Float[np.ndarray, " steps"]:
-    name, _, rest = word.partition(":")
+    name, _, rest = word.partition(":") if numbers_in(word) is None else ("constant", "", word)
     if name not in _SIGNALS:
         raise ControlsError(
             f"the signal {word!r} is unknown; allowed is {', '.join(_SIGNALS)}{did_you_mean(name, _SIGNALS)}"

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -101,6 +102,12 @@ def quaternion_product(a: Float[Any, "4"], b: Float[Any, "4"]) -> Float[Any, "4"
 def conjugate(h: Float[Any, "4"]) -> Float[Any, "4"]:
     """Return the inverse rotation of a unit quaternion."""
     return h * np.array([1.0, -1.0, -1.0, -1.0])
+
+
+def since_first(h: Float[Any, "T M 4"]) -> Float[Any, "T M 4"]:
+    """Return rotations, in the global frame, since the first row; NaN where either is not known."""
+    first = jnp.broadcast_to(conjugate(h[:1]), h.shape)
+    return jax.vmap(jax.vmap(quaternion_product))(jnp.asarray(h), first)
 
 
 def _half(vector: Float[Any, "3"]) -> tuple[Any, Any, Any]:

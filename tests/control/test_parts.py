@@ -92,6 +92,31 @@ def test_references_begin_at_their_centre_and_reach_their_radius():
 
 
 @pytest.mark.parametrize(
+    ("reference", "across", "centre"),
+    [
+        (circle(0.1, 4.0, plane="yz", centre=[0.28, 0.0, 0.02]), 0, [0.28, 0.0, 0.02]),
+        (parse_reference("circle:radius=0.1,period=4,plane=yz,x=0.28,z=0.02"), 0, [0.28, 0.0, 0.02]),
+        (parse_reference("circle:radius=0.1,period=4,plane=xz,z=0.3"), 1, [0.0, np.nan, 0.3]),
+        (parse_reference("eight:radius=0.1,period=4,plane=zy,y=-0.1"), 0, [np.nan, -0.1, 0.0]),
+        (parse_reference("circle:radius=0.1,period=4,x=0.05,z=0.5"), 2, [0.05, 0.0, 0.5]),
+        (figure_eight(0.1, 4.0, centre=[0.0, 0.1, np.nan]), 2, [0.0, 0.1, np.nan]),
+    ],
+)
+def test_references_have_a_centre_and_a_plane(reference, across, centre):
+    rows = reference.at(np.linspace(0.0, 12.0, 500))
+    np.testing.assert_allclose(rows[0], centre, atol=1e-12)
+    away = rows - rows[0]
+    assert np.all(np.isnan(away[:, across])) if np.isnan(centre[across]) else np.all(away[:, across] == 0.0)
+    assert abs(np.max(np.linalg.norm(np.delete(away, across, axis=1), axis=1)) - 0.1) < 1e-4
+
+
+@pytest.mark.parametrize("plane", ["x", "xx", "xw", "xyz", ""])
+def test_a_plane_has_two_axes(plane):
+    with pytest.raises(ReferenceFormatError, match=f"plane is '{plane}'; allowed is two different axes"):
+        circle(0.1, 4.0, plane=plane)
+
+
+@pytest.mark.parametrize(
     ("text", "message"),
     [
         ("square", "there is no reference 'square'; there are circle, eight"),

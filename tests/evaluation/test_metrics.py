@@ -93,7 +93,7 @@ def test_dtw_of_shifted_ramps():
     assert dtw_distance(ramp, ramp + np.array([0, 2, 0])) == 2 + 1 + 1 + 2
 
 
-@pytest.mark.parametrize("bad", [np.zeros((0, 3)), np.zeros((4, 2)), np.zeros(3), np.zeros((2, 4, 3))])
+@pytest.mark.parametrize("bad", [np.zeros((0, 3)), np.zeros((4, 1)), np.zeros(3), np.zeros((2, 4, 3))])
 def test_dtw_rejects_other_shapes(bad):
     with pytest.raises(ValueError, match=r"second path has shape .* must be \(T, 3\)"):
         dtw_distance(np.zeros((2, 3)), bad)
@@ -218,7 +218,38 @@ def test_quaternions_must_match_positions(metric):
 
 
 @pytest.mark.parametrize("metric", METRICS)
-@pytest.mark.parametrize("shape", [(5, 3), (5, 4, 2), (0, 4, 3), (5, 0, 3)])
+@pytest.mark.parametrize("shape", [(5, 3), (5, 4, 1), (0, 4, 3), (5, 0, 3)])
 def test_positions_must_be_rows_of_nodes(metric, shape):
     with pytest.raises(ValueError, match=r"prediction\.position has shape .* must be \(T, N, 3\)"):
         metric(Poses(np.zeros(shape), np.zeros((*shape[:-1], 4))), straight())
+
+
+@dataclass
+class Positions:
+    position: np.ndarray
+
+
+@pytest.mark.parametrize("metric", [tip_dtw, tip_rmse, node_error])
+@pytest.mark.parametrize("kept", [(0, 1), (0, 2), (1, 2)])
+def test_a_planar_motion_has_the_errors_of_its_motion_in_space(metric, kept):
+    a, b = wiggling(), wiggling(seed=1)
+    flat = [Positions(each.position[..., kept]) for each in (a, b)]
+    for each in (a, b):
+        each.position[..., [axis for axis in range(3) if axis not in kept]] = 0.0
+    np.testing.assert_allclose(metric(*flat), metric(a, b), rtol=1e-12)
+
+
+@pytest.mark.parametrize("metric", [tip_dtw, tip_rmse, node_error])
+def test_positions_without_orientations_are_enough(metric):
+    a, b = wiggling(), wiggling(seed=1)
+    np.testing.assert_allclose(metric(Positions(a.position), b), metric(a, b))
+
+
+def test_what_a_planar_motion_lacks_is_named():
+    flat = Positions(np.zeros((5, 4, 2)))
+    with pytest.raises(ValueError, match=r"prediction has no orientations.*use node_error or tip_rmse"):
+        pose_mse(flat, flat)
+    with pytest.raises(ValueError, match="prediction has 2 coordinates and reference has 3"):
+        tip_rmse(flat, straight())
+    with pytest.raises(ValueError, match="the paths have 2 and 3 coordinates"):
+        dtw_distance(np.zeros((4, 2)), np.zeros((4, 3)))

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
+from examples.hanging_string import HangingString
 from knode_cosserat.identification.evaluate import evaluate
 from knode_cosserat.recordings import RecordingConfig, RecordingError, TensionSource
 
@@ -124,3 +125,36 @@ def test_a_configuration_says_that_tensions_are_held(tmp_path):
     assert RecordingConfig.load(tmp_path / "held.yaml") == held
     with pytest.raises(RecordingError, match="held is 3; allowed is true or false"):
         TensionSource("/tension", (1,), held=3)
+
+
+def planar_motion():
+    """Five rows of a string in a plane: no orientations, and controls of its own name; made-up numbers."""
+    string = HangingString(length=1.0, density=0.1, stiffness=1e3, friction=0.05, nodes=6)
+    rng, zero = np.random.default_rng(0), np.zeros(5)
+    y, z = (rng.normal(size=(5, 6, each.size)) for each in (string.y_layout, string.z_layout))
+    control = rng.normal(size=(5, string.control_size))
+    return kc.Trajectory(
+        string, None, 0.1 * np.arange(5), y, z, control, zero.astype(int), zero, zero.astype(int)
+    )
+
+
+@pytest.mark.parametrize("fractions", [(1.0,), (0.4, 1.0), (0.2, 0.4, 0.6)])
+def test_measurements_of_a_planar_system(fractions):
+    moved = planar_motion()
+    seen = kc.recordings.Measurements.of(moved, fractions)
+    at = [round(5 * each) for each in fractions]
+    np.testing.assert_allclose(seen.position, moved.part("p")[:, at], atol=1e-12)
+    assert seen.position.shape == (5, len(fractions), 2) and np.all(np.isnan(seen.quaternion))
+    assert seen.measured.all() and seen.complete.all()
+    np.testing.assert_array_equal(seen.tension[:-1], moved.control[1:])
+    np.testing.assert_array_equal(seen.initial_tension, moved.control[0])
+    assert len(seen.rows(1, 4).parts()) == 1 and seen.tip_position.shape == (5, 2)
+
+
+def test_planar_measurements_are_written_as_x_and_z(tmp_path):
+    moved = planar_motion()
+    seen = kc.recordings.Measurements.of(moved)
+    seen.save(tmp_path / "it.csv")
+    again = kc.load_recording(tmp_path / "it.csv").sampled(0.1)
+    np.testing.assert_allclose(again.position[:, 0, (0, 2)], seen.position[:, 0], atol=1e-9)
+    assert np.all(again.position[:, 0, 1] == 0.0)

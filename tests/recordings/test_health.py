@@ -10,6 +10,8 @@ from scipy.spatial.transform import Rotation
 import knode_cosserat as kc
 from knode_cosserat.cli import app
 from knode_cosserat.evaluation import recording_figures
+from knode_cosserat.recordings.frame import leans_of, rod_lengths
+from knode_cosserat.recordings.recording import Body
 from knode_cosserat.recordings.write import MocapPoses, Pulls
 from tests.recordings.made import LAG, PAPER, changed, made, write
 
@@ -181,3 +183,53 @@ def test_inspect_refuses_in_one_line(tmp_path):
     result = typer.testing.CliRunner().invoke(app, ["inspect", str(tmp_path / "nowhere.bag")])
     assert result.exit_code == 2
     assert result.stderr == f"error: {tmp_path / 'nowhere.bag'}: no such file\n"
+
+
+# the length of a rod that is not straight at rest
+
+
+SHAPES = {
+    "straight": lambda u: np.ones_like(u),
+    "an arc": lambda u: u,
+    "a load at the tip": lambda u: 2.0 * u - u**2,
+    "its weight": lambda u: 1.0 - (1.0 - u) ** 3,
+    "a weight in the middle": lambda u: np.where(u < 0.5, 4.0 * (u - u**2), 1.0),
+}
+
+
+def places(shape, angle, length, at=(1.0,)):
+    """Places on a plane curve with the angle `angle` times a shape from the z axis, by quadrature."""
+    u = np.linspace(0.0, 1.0, 20001)
+    turned = angle * SHAPES[shape](u)
+    steps = np.stack([np.sin(turned), 0.0 * u, np.cos(turned)], axis=1)
+    along = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * (steps[1:] + steps[:-1]), axis=0)])
+    return length * along[[round(20000 * each) for each in at]] / 20000
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("angle", [0.02, 0.1, 0.25, 0.5, 0.8, 1.2, 1.6])
+def test_a_length_is_told_within_half_a_percent_or_not_at_all(shape, angle):
+    fractions = (0.3, 0.6, 1.0)
+    where = places(shape, angle, 0.3, fractions)
+    time = np.arange(30) * 0.01
+    bodies = [
+        Body(name, name, fraction, time, np.tile(each, (30, 1)), None)
+        for name, fraction, each in zip("abc", fractions, where, strict=True)
+    ]
+    lengths = rod_lengths(bodies, where)
+    np.testing.assert_allclose(lengths, 0.3, rtol=5e-3)
+    assert len(lengths) == np.sum(leans_of(where) <= np.radians(10.0))
+
+
+def test_a_robot_that_sags_has_no_wrong_length(tmp_path):
+    tip = places("its weight", 1.0, 0.3)[0]
+    path = tmp_path / "it.csv"
+    rows = [f"{0.01 * k:.2f},{tip[0]:.6f},0,{tip[2]:.6f},1,1" for k in range(100)]
+    head = "# fraction tip: 1.0\n# source: a robot\ntime [s],tip_x [m],tip_y [m],tip_z [m],"
+    path.write_text(head + "tension_1 [N],tension_2 [N]\n" + "\n".join(rows) + "\n", encoding="utf-8")
+    report = kc.load_recording(path).health()
+    assert report.rod_length == ()
+    (note,) = [each.message for each in report.findings if "does not tell the rod's length" in each.message]
+    least = float(note.split("it is above ")[1].split(" m")[0])
+    assert 0.25 < least < 0.3
+    assert "length of the rod" not in told(path)

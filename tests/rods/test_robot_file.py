@@ -1,5 +1,6 @@
 import os
 import re
+import warnings
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -11,6 +12,7 @@ import yaml
 from hypothesis import given, settings
 
 import knode_cosserat as kc
+from knode_cosserat.cli.arguments import modified
 from knode_cosserat.rods import robot_file
 from knode_cosserat.rods.parameters import parameter
 from knode_cosserat.rods.robot_file import (
@@ -420,3 +422,36 @@ def test_other_kinds_can_join(monkeypatch):
     assert_equal(parse_robot(format_robot(pendulum), "here"), pendulum)
     with fails("length must be between 0 and 1 m (got 2)"):
         parse_robot("format: 1\nkind: pendulum\nparameters: {length: 2}\n", "here")
+
+
+# tendons of the paper's model
+
+
+def warned(call):
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        call()
+    return [str(each.message) for each in seen if "routed-tendon-robot" in str(each.message)]
+
+
+def test_an_offset_that_the_papers_model_ignores_is_named(tmp_path):
+    file = tmp_path / "mine.yaml"
+    file.write_text(text(tendon_offset="0.02"), encoding="utf-8")
+    (message,) = warned(lambda: load_robot(file))
+    assert message.startswith(f"{file}: kind tendon-robot is the paper's model")
+    # the offset is indeed ignored
+    robot = load_robot(PAPER)
+    one, other = (robot.replace(tendon_offset=each).actuation(np.arange(4.0)) for each in (0.0, 0.05))
+    np.testing.assert_array_equal(one, other)
+    assert len(warned(lambda: modified(robot, ["tendon_offset=0.03"]))) == 1
+
+
+@pytest.mark.parametrize("change", [{}, {"tendon_offset": "0.0"}, {"kind": "routed-tendon-robot"}])
+def test_other_robots_are_not_warned_of(tmp_path, change):
+    kind = change.pop("kind", "tendon-robot")
+    file = tmp_path / "mine.yaml"
+    words = text(**change) if kind == "tendon-robot" else text(tendon_offset="0.02")
+    file.write_text(words.replace("kind: tendon-robot", f"kind: {kind}"), encoding="utf-8")
+    assert warned(lambda: load_robot(file)) == []
+    assert warned(lambda: load_robot(PAPER)) == []
+    assert warned(lambda: modified(load_robot(PAPER), ["length=0.4"])) == []

@@ -158,7 +158,12 @@ def modified(system: System, changes: list[str] | None, nodes: int | None = None
             other = "--nodes" if name == "nodes" and nodes is not None else "another --set"
             raise ValueError(f"--set {change!r}: {name} is given by {other} too; allowed is each name once")
         values[name] = value
-    return system.replace(**values)
+    found = system.replace(**values)
+    if "tendon_offset" in values:
+        from knode_cosserat.rods.robot_file import warn_of_paper_tendons
+
+        warn_of_paper_tendons(found.nominal, "--set tendon_offset")
+    return found
 
 
 def _parse_value(text: str) -> Any:

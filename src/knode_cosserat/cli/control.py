@@ -14,8 +14,8 @@ from knode_cosserat.cli.arguments import Changes, Json, Robot, load_system, pars
 from knode_cosserat.cli.output import write_output
 from knode_cosserat.cli.program import app, examples
 
-#: distance from the workspace at which a warning is given, as part of the length
-OUT_OF_REACH = 0.01
+#: distance from the nearest tip at rest at which a warning is given, as part of the length
+OUT_OF_REACH = 2e-3
 #: names of controllers, as `control.named` has them
 CONTROLLERS = ("predictive", "ilqr", "mppi", "lqr", "koopman", "kinematic", "pid")
 
@@ -97,7 +97,8 @@ def control(
         str | None,
         typer.Option(
             metavar="NAME|CSV",
-            help="Wanted tip: circle:radius=0.1,period=4, eight:radius=0.1,period=6, or a CSV table.",
+            help="Wanted tip: circle:radius=0.1,period=4, eight:radius=0.1,period=6, or a CSV table. The "
+            "centre is at x=, y=, z= (m), in plane=xy, yz or xz.",
         ),
     ] = None,
     live: Annotated[
@@ -203,12 +204,13 @@ def control(
     controlled = _plant(plant, model, dt, kcc.Sensor(TipPosition(), noise))
     if reference is None:
         title = robot if plant is None else f"{plant}, controlled by {robot}"
+        beyond = None  # the target moves
         log = _live(controller, controlled, str(title), (export, port, not no_open), as_json)
         if log is None:
             return
     else:
         wanted = parsed_reference(reference)
-        _warn_out_of_reach(model, limits, wanted, seconds)
+        beyond = _out_of_reach(model, limits, wanted, seconds)
         log = kcc.run_loop(controller, controlled, wanted, seconds)
     if out is not None:
         log.to_csv(out)
@@ -225,30 +227,35 @@ def control(
 
         closed_loop(log).savefig(figure)
     length = float(model.nominal.length)
-    facts = log.summary() | {"tip_rmse_percent": 100.0 * log.tip_rmse(min(5.0, 0.5 * seconds)) / length}
-    write_output(as_json, facts, _lines(facts, log), out=out, export=export)
+    facts = log.summary() | {"tip_rmse_percent": 100.0 * log.tip_rmse() / length, "out_of_reach": beyond}
+    write_output(as_json, facts, _lines(facts, log, dt), out=out, export=export)
 
 
-def _warn_out_of_reach(model: Any, limits: Any, reference: Any, seconds: float) -> None:
-    """Warn before the loop starts if the tip cannot follow the reference."""
+def _out_of_reach(model: Any, limits: Any, reference: Any, seconds: float) -> float:
+    """Return the distance (m) that the tip lacks to the reference; warn of it before the loop starts."""
     from knode_cosserat.control.checks import check_within_length, distance_out_of_reach
 
     check_within_length(model, reference, seconds)
     apart, time = distance_out_of_reach(model, limits, reference, seconds)
     if apart > OUT_OF_REACH * float(model.nominal.length):
         typer.echo(
-            f"warning: the {reference.name} is {apart:.3g} m out of reach at t = {time:.3g} s: no controls "
-            "within the limits bring the tip there at rest",
+            f"warning: the {reference.name} is {1e3 * apart:.3g} mm out of reach at t = {time:.3g} s: no "
+            "controls within the limits were found that bring the tip nearer at rest",
             err=True,
         )
+        return float(apart)
+    return 0.0
 
 
-def _lines(facts: dict[str, Any], log: Any) -> list[str]:
+def _lines(facts: dict[str, Any], log: Any, dt: float) -> list[str]:
     found = [
         f"tip RMSE {facts['tip_rmse']:.3g} m over the second half, "
         f"{facts['tip_rmse_percent']:.3g} % of the length",
         f"{facts['periods']} periods, {facts['fallbacks']} without a solution; feedback "
-        f"{facts['feedback_ms']:.2f} ms, preparation {facts['preparation_ms']:.1f} ms (medians)",
+        f"{facts['feedback_ms']:.2f} ms, preparation {facts['preparation_ms']:.1f} ms (medians); "
+        f"{facts['missed']} took longer than the period of {1e3 * dt:g} ms",
     ]
+    if facts["out_of_reach"]:
+        found.insert(1, f"the reference is up to {1e3 * facts['out_of_reach']:.3g} mm out of reach")
     found += [f"{name}: {values[-1]:.4g}" for name, values in log.parameters.items()]
     return found

@@ -51,6 +51,9 @@ COARSE = (
     "use more --nodes, or --space lobatto4"
 )
 
+#: states before the first step, as `simulate` takes them
+INITIAL: dict[str, Any] = {"equilibrium": "equilibrium", "unstressed": None}
+
 
 @app.command(
     epilog=examples(
@@ -69,8 +72,9 @@ def simulate(
         typer.Option(
             metavar="CONTROLS",
             help="Tensions: sine:PERIOD (s), step:HEIGHT (N; at 1.5 s, or step:HEIGHT,at=S), ramp:HEIGHT "
-            "(N), random:SEED, constant tensions (N) such as 7,5,5,7, or a CSV file. Other controls: "
-            "NAME=SIGNAL;…, such as base_z=ramp:0.1 (`knode-cosserat info ROBOT` lists the names), or none.",
+            "(N), random:SEED, constant tensions (N) such as 7,5,5,7, or a CSV file. Any controls by name: "
+            "NAME=SIGNAL;…, such as tension_4=ramp:2;base_z=0.1 (`knode-cosserat info ROBOT` lists the "
+            "names), the others zero; or none.",
         ),
     ],
     out: Annotated[Path, NetCDF],
@@ -85,6 +89,14 @@ def simulate(
         str, typer.Option(metavar="SCHEME", help="Time scheme: sdirk2, bdf1, bdf2, bdf-alpha or trapezoidal.")
     ] = "sdirk2",
     space: Space = "lobatto2",
+    initial: Annotated[
+        str,
+        typer.Option(
+            metavar="STATE",
+            help="State before the first step: equilibrium (at rest without controls), or unstressed (the "
+            "shape that the rod was made in, as in the paper's studies).",
+        ),
+    ] = "equilibrium",
     changes: Changes = None,
     nodes: Nodes = None,
     allow_failure: Annotated[
@@ -97,6 +109,8 @@ def simulate(
     """Simulate a robot under tensions or other controls."""
     require_trajectory_name(out)
     require_writable(out, figure)
+    if initial not in INITIAL:
+        raise ValueError(f"--initial is {initial!r}; allowed is {', '.join(INITIAL)}")
     drawing = figures() if figure else None
     import knode_cosserat as kc
 
@@ -108,8 +122,8 @@ def simulate(
     began = perf_counter()
     with coarse_grid_in_output():
         trajectory = kc.simulate(
-            system, sequence, dt, time=time, space=space, progress=shows_progress(progress),
-            on_failure="return" if allow_failure else "raise",
+            system, sequence, dt, time=time, space=space, initial=INITIAL[initial],
+            progress=shows_progress(progress), on_failure="return" if allow_failure else "raise",
         )  # fmt: skip
     seconds = perf_counter() - began
     trajectory.save(out)

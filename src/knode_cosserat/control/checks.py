@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from typing import Any
 
@@ -12,14 +13,15 @@ from knode_cosserat.control.commands import ControlLimits
 from knode_cosserat.control.references import Reference, ReferenceFormatError
 from knode_cosserat.estimation.outputs import BodyPoses, BodyPositions
 from knode_cosserat.rods.system import System
-from knode_cosserat.statics.workspace import workspace
+from knode_cosserat.statics.reach import inverse_kinematics
 
 #: seconds of a reference that are checked, and the time between two of them (s)
 CHECKED, SAMPLING = 60.0, 0.02
 #: distance from the base, in lengths of the rod, which a rod that stretches or a moving base may reach
 STRETCH = 1.5
-#: controls whose equilibria bound the workspace
-SAMPLES = 256
+#: points of a reference whose nearest tips are searched, initial controls of each search, and the part of the
+#: length within which a point is reached
+POINTS, STARTS, REACHED = 12, 2, 1e-4
 #: part of the memory that predictions may take
 SHARE = 0.5
 
@@ -62,10 +64,10 @@ def check_within_length(robot: System, reference: Reference, seconds: float = CH
 def distance_out_of_reach(
     robot: System, limits: ControlLimits, reference: Reference, seconds: float = CHECKED
 ) -> tuple[float, float]:
-    """Return how far a reference is outside the workspace at most (m), and at which time (s).
+    """Return the largest distance (m) from a reference to the nearest tip at rest, and its time (s).
 
-    The workspace is the convex hull of the tip's positions in equilibria under sampled controls within the
-    limits, so the distance is a lower bound at rest; a moving robot may swing further.
+    Inverse kinematics within the limits gives the nearest tip of some points spread over the reference, so
+    the distance is a lower bound of the largest one. A moving robot may swing further.
 
     Args:
         robot: the model.
@@ -74,31 +76,41 @@ def distance_out_of_reach(
         seconds: checked duration (s).
     """
     bounds = limits.of(robot)
-    corners = np.stack(np.meshgrid(*zip(bounds.low, bounds.high, strict=True)), axis=-1)
-    corners = corners.reshape(-1, robot.control_size)[:SAMPLES]
-    inside = np.random.default_rng(0).uniform(bounds.low, bounds.high, (SAMPLES, robot.control_size))
-    found = workspace(robot, np.concatenate([corners, inside]))
-    tips = np.asarray(found.position)[found.valid]
     times = np.arange(0.0, seconds, SAMPLING)
     wanted = reference.at(times)[:, :3]
-    known = np.isfinite(wanted[0])
-    apart = _outside(tips[:, known], wanted[:, known])
+    known = tuple(np.flatnonzero(np.isfinite(wanted[0])).tolist())
+    if not known:
+        return 0.0, 0.0
+    wanted = wanted[:, known]
+    chosen = _spread(wanted, POINTS)
+    found = inverse_kinematics(
+        robot, wanted[chosen], low=bounds.low, high=bounds.high, tolerance=REACHED, starts=STARTS,
+        pose=_coordinates(known),
+    )  # fmt: skip
+    apart = np.where(found.converged, 0.0, np.nan_to_num(found.position_error))
     k = int(np.argmax(apart))
-    return float(apart[k]), float(times[k])
+    return float(apart[k]), float(times[chosen[k]])
 
 
-def _outside(points: Float[np.ndarray, "n d"], wanted: Float[np.ndarray, "T d"]) -> Float[np.ndarray, " T"]:
-    """Return distances outside the convex hull of points, at least 0; NaN do not count."""
-    if points.shape[1] == 0:
-        return np.zeros(len(wanted))
-    if points.shape[1] == 1:
-        beyond = np.maximum(points.min() - wanted[:, 0], wanted[:, 0] - points.max())
-    else:
-        from scipy.spatial import ConvexHull
+@functools.cache
+def _coordinates(known: tuple[int, ...]) -> Any:
+    """Return the pose function of some of the tip's coordinates; the same one each time, for compilation."""
 
-        planes = ConvexHull(points).equations
-        beyond = np.max(wanted @ planes[:, :-1].T + planes[:, -1], axis=1)
-    return np.nan_to_num(np.maximum(beyond, 0.0))
+    def pose(system: System, y: Any) -> tuple[Any, None]:
+        return system.positions(y)[np.array(known)], None
+
+    return pose
+
+
+def _spread(points: Float[np.ndarray, "T d"], count: int) -> list[int]:
+    """Return the rows of points that are far from each other, in the order of time."""
+    centre = np.nanmean(points, axis=0)
+    chosen = [int(np.nanargmax(np.linalg.norm(points - centre, axis=1)))]
+    apart = np.linalg.norm(points - points[chosen[0]], axis=1)
+    while len(chosen) < count and np.nanmax(apart) > 0.0:
+        chosen.append(int(np.nanargmax(apart)))
+        apart = np.minimum(apart, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return sorted(chosen)
 
 
 def check_memory(robot: System, horizon: int, columns: int) -> None:

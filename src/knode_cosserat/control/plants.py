@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 from collections import deque
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -106,9 +106,9 @@ class SimulatedPlant(Plant):
         *,
         substeps: int = 1,
         control_noise: float = 0.0,
-        initial: Trajectory | None = None,
+        initial: Trajectory | Literal["equilibrium"] | None = "equilibrium",
     ):
-        """Set up the robot at rest, or at the last row of a trajectory.
+        """Set up the robot at rest, under zero control, or at the last row of a trajectory.
 
         Args:
             robot: the true robot.
@@ -117,7 +117,8 @@ class SimulatedPlant(Plant):
             substeps: steps of the simulation in each period.
             control_noise: standard deviation by which acting controls differ from commanded ones, in their
                 unit, independent in each period.
-            initial: a motion or equilibrium from which it moves on.
+            initial: a motion or equilibrium from which it moves on, or None for the unstressed robot, as in
+                `simulate`.
         """
         self.robot, self.dt, self.sensor = robot, float(dt), sensor
         if control_noise < 0.0:

@@ -65,39 +65,63 @@ def _eased(t: Any, rise: float) -> Any:
 
 
 def circle(
-    radius: float, period: float, centre: Sequence[float] = (0.0, 0.0, np.nan), rise: float = 2.0
+    radius: float, period: float, centre: Sequence[float] | None = None, rise: float = 2.0, plane: str = "xy"
 ) -> Reference:
-    """Return a circle about the z axis; a NaN in the centre leaves that coordinate free.
+    """Return a circle in a plane of two axes of the robot's frame.
 
     Args:
         radius: radius (m).
         period: time of one turn (s).
-        centre: centre (m).
+        centre: centre (m); NaN leaves a coordinate free. None: zero in the plane, and free across it. The tip
+            of a robot along z circles about z by default; others need the centre near their tip.
         rise: time (s) in which the radius grows from zero, so that the start is at the centre.
+        plane: the two axes, such as "xy" or "yz"; the turn is from the first to the second.
+
+    Raises:
+        ReferenceFormatError: a radius, period, centre or plane that is not allowed.
     """
-    _positive(radius=radius, period=period)
-    middle = np.asarray(centre, dtype=float)
 
-    def values(t: Any) -> Any:
-        angle, r = 2.0 * np.pi * t / period, radius * _eased(t, rise)
-        return middle + np.stack([r * np.cos(angle), r * np.sin(angle), np.zeros_like(t)], axis=1)
+    def shape(angle: Any) -> tuple[Any, Any]:
+        return np.cos(angle), np.sin(angle)
 
-    return Reference(values, 3, f"circle of {radius:g} m, period {period:g} s")
+    return _closed_path("circle", shape, radius, period, centre, rise, plane)
 
 
 def figure_eight(
-    radius: float, period: float, centre: Sequence[float] = (0.0, 0.0, np.nan), rise: float = 2.0
+    radius: float, period: float, centre: Sequence[float] | None = None, rise: float = 2.0, plane: str = "xy"
 ) -> Reference:
-    """Return a figure of eight (Gerono's lemniscate) in the xy plane, of half-width `radius` (m)."""
+    """Return a figure of eight (Gerono's lemniscate) of half-width `radius` (m); see `circle`."""
+
+    def shape(angle: Any) -> tuple[Any, Any]:
+        return np.sin(angle), np.sin(angle) * np.cos(angle)
+
+    return _closed_path("figure of eight", shape, radius, period, centre, rise, plane)
+
+
+def _closed_path(
+    name: str, shape: Callable[[Any], tuple[Any, Any]], radius: float, period: float, centre: Any,
+    rise: float, plane: str,
+) -> Reference:  # fmt: skip
+    """Return a path of the tip by the two coordinates of a unit shape (from an angle) in a plane."""
     _positive(radius=radius, period=period)
-    middle = np.asarray(centre, dtype=float)
+    axes = ["xyz".find(axis) for axis in plane]
+    if len(axes) != 2 or -1 in axes or axes[0] == axes[1]:
+        raise ReferenceFormatError(f"plane is {plane!r}; allowed is two different axes, such as xy, yz or xz")
+    middle = np.full(3, np.nan)
+    middle[axes] = 0.0
+    if centre is not None:
+        middle = np.asarray(centre, dtype=float)
+        if middle.shape != (3,) or np.any(np.isinf(middle)):
+            raise ReferenceFormatError(f"centre is {centre}; allowed is three numbers (m), NaN if free")
 
     def values(t: Any) -> Any:
-        angle, r = 2.0 * np.pi * t / period, radius * _eased(t, rise)
-        x, y = r * np.sin(angle), r * np.sin(angle) * np.cos(angle)
-        return middle + np.stack([x, y, np.zeros_like(t)], axis=1)
+        away = np.zeros((len(t), 3))
+        away[:, axes] = (radius * _eased(t, rise) * np.stack(shape(2.0 * np.pi * t / period))).T
+        return middle + away
 
-    return Reference(values, 3, f"figure of eight of {radius:g} m, period {period:g} s")
+    usual = plane == "xy" and np.array_equal(middle, [0.0, 0.0, np.nan], equal_nan=True)
+    where = "" if usual else f" in {plane} about {middle.tolist()} m"
+    return Reference(values, 3, f"{name} of {radius:g} m, period {period:g} s{where}")
 
 
 def steps(points: Sequence[Sequence[float]], hold: float, announced: bool = False) -> Reference:
@@ -150,6 +174,10 @@ NAMED: dict[str, Callable[..., Reference]] = {"circle": circle, "eight": figure_
 def parse_reference(text: str) -> Reference:
     """Return a reference from a text such as "circle:radius=0.1,period=4".
 
+    Options are radius and period, rise, plane, and the coordinates of the centre: x, y and z (m). The centre
+    is at zero in the plane, and free across it, unless they are given: `circle:radius=0.05,period=4,plane=yz,
+    x=0.28`.
+
     Raises:
         ReferenceFormatError: a name or option that does not exist, or a value that is not a number.
     """
@@ -158,16 +186,22 @@ def parse_reference(text: str) -> Reference:
         raise ReferenceFormatError(
             f"there is no reference {name!r}; there are {', '.join(NAMED)}, or a CSV file"
         )
-    options: dict[str, float] = {}
+    options: dict[str, Any] = {}
     for part in filter(None, rest.split(",")):
-        key, _, value = part.partition("=")
-        if key not in ("radius", "period", "rise"):
-            raise ReferenceFormatError(f"{name} has no option {key!r}; there are radius, period, rise")
+        key, _, value = (each.strip() for each in part.partition("="))
+        if key not in _OPTIONS:
+            raise ReferenceFormatError(f"{name} has no option {key!r}; there are {', '.join(_OPTIONS)}")
         try:
-            options[key] = float(value)
+            options[key] = value if key == "plane" else float(value)
         except ValueError:
             raise ReferenceFormatError(f"{key} is {value!r}; allowed is a number") from None
     for key in ("radius", "period"):
         if key not in options:
             raise ReferenceFormatError(f"{name} needs {key}, such as {name}:radius=0.1,period=4")
-    return NAMED[name](**options)
+    plane = options.get("plane", "xy")
+    centre = [options.pop(axis, 0.0 if axis in plane else np.nan) for axis in "xyz"]
+    return NAMED[name](**options, centre=centre)
+
+
+#: options of the references by name
+_OPTIONS = ("radius", "period", "rise", "plane", "x", "y", "z")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -23,16 +23,16 @@ class BoundaryObserver:
 
     def __init__(
         self, robot: System, dt: float, *, stiffness: float | None = None, damping: float | None = None,
-        initial: Trajectory | None = None,
+        initial: Trajectory | Literal["equilibrium"] | None = "equilibrium",
     ):  # fmt: skip
-        """Start at rest, or at the last row of a trajectory.
+        """Start at rest under zero control, or at the last row of a trajectory.
 
         Args:
             robot: the model: a rod with `loads`.
             dt: period (s).
             stiffness: of the virtual spring (N/m); by default ten times that of the rod's tip, 30 EI/L³.
             damping: of the virtual damper (N s/m); by default √(k m) with the rod's mass m.
-            initial: a motion or equilibrium from which it moves on.
+            initial: a motion or equilibrium from which it moves on; None: the unstressed robot.
         """
         base: Any = robot
         if not hasattr(base.nominal, "loads"):

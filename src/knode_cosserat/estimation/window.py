@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections import deque
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from jaxtyping import Float
@@ -54,7 +54,7 @@ class MovingHorizonObserver(KalmanObserver):
         nothing = np.full((window, output.size), np.nan)
         predicted_motion(self.model, self.belief, controls, nothing, self._deviations(), output)
 
-    def restart(self, initial: Trajectory | None = None) -> None:
+    def restart(self, initial: Trajectory | Literal["equilibrium"] | None = "equilibrium") -> None:
         """Start again at rest, or at the last row of a trajectory, with the initial uncertainty."""
         self._controls: deque[Any] = deque()
         self._measured: deque[Any] = deque()

@@ -18,11 +18,15 @@ Array = NDArray[np.float64]
 
 
 class PoseHistory(Protocol):
-    """Protocol of a trajectory's data for the metrics."""
+    """Protocol of a trajectory's data for the metrics; a `quaternion` beside it is checked too."""
 
     @property
     def position(self) -> ArrayLike:
-        """Positions (T, N, 3) in m, global frame."""
+        """Positions (T, N, 3) in m, global frame; (T, N, 2) of a planar system."""
+
+
+class OrientedHistory(PoseHistory, Protocol):
+    """Protocol of a trajectory's data with orientations, for `pose_mse`."""
 
     @property
     def quaternion(self) -> ArrayLike:
@@ -33,30 +37,34 @@ def dtw_distance(a: ArrayLike, b: ArrayLike) -> float:
     """Return the exact dynamic-time-warping distance between two paths, with the L1 ground distance.
 
     The distance is the smallest sum of |Δx| + |Δy| + |Δz| over all monotone alignments that match both first
-    points and both last points. There is no window and no normalisation by the alignment's length. Time
-    grows with T · S, memory with T + S.
+    points and both last points; planar paths have no Δz. There is no window and no normalisation by the
+    alignment's length. Time grows with T · S, memory with T + S.
 
     Args:
-        a: (T, 3) m.
-        b: (S, 3) m.
+        a: (T, 3) m, or (T, 2).
+        b: (S, 3) m, or (S, 2).
 
     Returns:
         The distance, m.
 
     Raises:
-        ValueError: a path is not (T, 3), is empty, or has NaN or inf.
+        ValueError: a path is not (T, 3) or (T, 2), is empty, or has NaN or inf; or one is planar only.
 
     Source: Sakoe & Chiba, "Dynamic programming algorithm optimization for spoken word recognition", 1978,
     without slope constraint and with every step weighted one, as in the paper's result tables.
     """
     a = _path("first path", a)
     b = _path("second path", b)
+    if a.shape[1] != b.shape[1]:
+        raise ValueError(
+            f"the paths have {a.shape[1]} and {b.shape[1]} coordinates; allowed is equal numbers"
+        )
     _require_finite("first path", a)
     _require_finite("second path", b)
 
     # All cells (i, j) with i + j = k depend on the two antidiagonals before only, so each is one vector
-    # operation. Reversed, b lies along the antidiagonal in the direction of a. Columns make the three
-    # coordinates contiguous.
+    # operation. Reversed, b lies along the antidiagonal in the direction of a. Columns make each
+    # coordinate contiguous.
     rows, columns = len(a), len(b)
     forward = np.ascontiguousarray(a.T)
     backward = np.ascontiguousarray(b[::-1].T)
@@ -71,7 +79,7 @@ def dtw_distance(a: ArrayLike, b: ArrayLike) -> float:
         cheapest = np.minimum(one_before[first:last], one_before[first + 1 : last + 1])
         np.minimum(cheapest, two_before[first:last], out=cheapest)
         current.fill(np.inf)
-        current[first + 1 : last + 1] = cheapest + difference[0] + difference[1] + difference[2]
+        current[first + 1 : last + 1] = sum(difference, start=cheapest)
         two_before, one_before, current = one_before, current, two_before
     return float(one_before[rows])
 
@@ -89,12 +97,11 @@ def tip_dtw(prediction: PoseHistory, reference: PoseHistory) -> float:
 
     Source: "Tip Position DTW" in the paper's simulation and real-world result tables.
     """
-    predicted, _ = _poses("prediction", prediction)
-    expected, _ = _poses("reference", reference)
+    (predicted, _), (expected, _) = _poses("prediction", prediction), _poses("reference", reference)
     return dtw_distance(predicted[:, -1], expected[:, -1])
 
 
-def pose_mse(prediction: PoseHistory, reference: PoseHistory) -> float:
+def pose_mse(prediction: OrientedHistory, reference: OrientedHistory) -> float:
     """Return the mean squared error of positions and orientations, times 1000, as in the paper's tables.
 
     The mean runs over rows, nodes and six numbers: x, y, z in metres and three Euler angles in radians,
@@ -105,11 +112,18 @@ def pose_mse(prediction: PoseHistory, reference: PoseHistory) -> float:
         1000 times the mean, no unit.
 
     Raises:
-        ValueError: a shape is wrong, rows or nodes differ, or a state is invalid.
+        ValueError: a shape is wrong, rows or nodes differ, a state is invalid, or there are no orientations,
+            as in planar systems, for which `node_error` and `tip_rmse` compare positions.
 
     Source: "Pose MSE (× 10³)" in the paper's simulation result table.
     """
     predicted, expected = _comparable_poses(prediction, reference)
+    for name, pose in (("prediction", predicted), ("reference", expected)):
+        if pose[1] is None:
+            raise ValueError(
+                f"{name} has no orientations, quaternion (T, N, 4), which pose_mse compares; use node_error "
+                "or tip_rmse"
+            )
     position_error = predicted[0] - expected[0]
     angle_error = _euler_angles(predicted[1]) - _euler_angles(expected[1])
     return float(1000 * np.mean(np.concatenate([position_error, angle_error], axis=-1) ** 2))
@@ -144,7 +158,7 @@ def node_error(prediction: PoseHistory, reference: PoseHistory) -> Array:
 
 
 def rms_distance(a: Array, b: Array) -> Array:
-    """Return the root mean square over time (...) of the distances between points (T, ..., 3)."""
+    """Return the root mean square over time (...) of the distances between points (T, ..., d)."""
     return np.sqrt(np.mean(np.sum((a - b) ** 2, axis=-1), axis=0))
 
 
@@ -162,32 +176,37 @@ def _comparable_poses(
 ) -> tuple[Any, Any]:
     predicted = _poses("prediction", prediction)
     expected = _poses("reference", reference)
-    for axis, what in enumerate(("rows", "nodes") if same_nodes else ("rows",)):
+    for axis, what in enumerate(("rows", "nodes", "coordinates")):
         given, wanted = predicted[0].shape[axis], expected[0].shape[axis]
-        if given != wanted:
+        if given != wanted and (same_nodes or what != "nodes"):
             raise ValueError(
                 f"prediction has {given} {what} and reference has {wanted}; both must have the same number"
             )
     return predicted, expected
 
 
-def _poses(name: str, history: PoseHistory) -> tuple[Array, Array]:
-    if not (hasattr(history, "position") and hasattr(history, "quaternion")):
+def _poses(name: str, history: PoseHistory) -> tuple[Array, Array | None]:
+    """Return positions (T, N, d), and quaternions (T, N, 4) or None of a system without orientations."""
+    if not hasattr(history, "position"):
         raise ValueError(
             f"{name} is a {type(history).__name__}; allowed is a Trajectory, or anything with position "
-            "(T, N, 3) in m and quaternion (T, N, 4)"
+            "(T, N, 3) or (T, N, 2) in m, and quaternion (T, N, 4) if it has orientations"
         )
     position = np.asarray(history.position, dtype=float)
-    quaternion = np.asarray(history.quaternion, dtype=float)
     if position.ndim == 4:
         raise ValueError(
             f"{name}.position has shape {position.shape}, a batch of {len(position)} trajectories; "
             "index a single trajectory, (T, N, 3)"
         )
-    if position.ndim != 3 or position.shape[-1] != 3 or position.size == 0:
+    if position.ndim != 3 or position.shape[-1] not in (2, 3) or position.size == 0:
         raise ValueError(
-            f"{name}.position has shape {position.shape}; it must be (T, N, 3) with at least one row and node"
+            f"{name}.position has shape {position.shape}; it must be (T, N, 3), or (T, N, 2) in a plane, "
+            "with at least one row and node"
         )
+    if not hasattr(history, "quaternion"):
+        _require_finite(name, position)
+        return position, None
+    quaternion = np.asarray(history.quaternion, dtype=float)
     if quaternion.shape != (*position.shape[:2], 4):
         raise ValueError(
             f"{name}.quaternion has shape {quaternion.shape}; "
@@ -199,8 +218,10 @@ def _poses(name: str, history: PoseHistory) -> tuple[Array, Array]:
 
 def _path(name: str, points: ArrayLike) -> Array:
     points = np.asarray(points, dtype=float)
-    if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
-        raise ValueError(f"{name} has shape {points.shape}; it must be (T, 3) with at least one row")
+    if points.ndim != 2 or points.shape[1] not in (2, 3) or len(points) == 0:
+        raise ValueError(
+            f"{name} has shape {points.shape}; it must be (T, 3), or (T, 2) in a plane, with at least one row"
+        )
     return points
 
 

@@ -163,7 +163,7 @@ class SimulatedRobot(TrueShape, Driver):
         if self._stepper is not None:
             return
         try:
-            stepper = Stepper(self.robot, STEP)
+            stepper = Stepper(self.robot, STEP, initial="equilibrium")
             stepper.preview(self.tension)
         except SimulationError as error:
             raise HardwareError(f"the robot cannot be simulated: {error}") from None

@@ -10,10 +10,11 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.evaluation.metrics import dtw_distance, pose_mse
-from knode_cosserat.identification.misfit import since_first, turned_from
+from knode_cosserat.identification.misfit import turned_from
 from knode_cosserat.identification.steps import simulated_rows
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.system import System
+from knode_cosserat.rotation import since_first
 from knode_cosserat.solvers.equilibrium import equilibria, equilibrium
 from knode_cosserat.solvers.places import places_at, positions_at, quaternions_at
 from knode_cosserat.solvers.result import SimulationError
@@ -168,7 +169,7 @@ def evaluate(
     seen, known = measured.position[rows], measured.complete[rows]
     off = position[known, -1] - seen[known, -1]
     # the mounting of bodies is unknown: rotations are relative to the first row, where the robot is at rest
-    turned = turned_from(quaternion[0], since_first(measured.quaternion[rows]))
+    turned = turned_from(quaternion[0], np.asarray(since_first(measured.quaternion[rows])))
     oriented = np.isfinite(turned).all(axis=(1, 2)) & known
     mse = None
     if oriented.any():

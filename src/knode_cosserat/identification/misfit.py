@@ -18,7 +18,7 @@ from knode_cosserat.identification.steps import stepped, steps_per_row, time_sch
 from knode_cosserat.learning.samples import DataError
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.load_cells import LoadCells
-from knode_cosserat.rotation import conjugate, quaternion_product
+from knode_cosserat.rotation import conjugate, quaternion_product, since_first
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.history import constant_history
 from knode_cosserat.solvers.places import Places, places_at, positions_at, quaternions_at
@@ -89,7 +89,7 @@ def data_of(given: Measurements, model: Model, name: str) -> RecordingData:
     moving = np.flatnonzero(swing > 0.05 * max(np.max(swing), 1e-12))
     return RecordingData(
         name, given.dt, np.asarray(initial), tension, places_at(given.fractions, model.nominal.nodes),
-        given.position, since_first(given.quaternion),
+        given.position, np.asarray(since_first(given.quaternion)),
         int(moving[0]) if len(moving) and not given.static else 0, given.static, given.continuous,
         steps_per_row(given.dt, given.continuous),
     )  # fmt: skip
@@ -108,13 +108,6 @@ def _as_steps(given: Measurements) -> Measurements:
         quaternion=late(given.quaternion),
         initial_tension=given.tension[0],
     )
-
-
-def since_first(quaternion: Float[np.ndarray, "T M 4"]) -> Float[np.ndarray, "T M 4"]:
-    """Return rotations, in the global frame, since the first row; NaN where either is not known."""
-    first = np.broadcast_to(np.array(quaternion[:1]), quaternion.shape)
-    both = jax.vmap(jax.vmap(lambda h, first: quaternion_product(h, conjugate(first))))
-    return np.asarray(both(jnp.asarray(quaternion), jnp.asarray(first)))
 
 
 def turned_from(

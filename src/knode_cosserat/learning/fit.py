@@ -17,6 +17,7 @@ import numpy as np
 from knode_cosserat._files.writing import package_version
 from knode_cosserat.learning.config import FitConfig, NetworkOptions, PassiveOptions
 from knode_cosserat.learning.ensemble import Ensemble
+from knode_cosserat.learning.gain import rollout_errors
 from knode_cosserat.learning.knode import KNODE, About
 from knode_cosserat.learning.passive import passive, require_bending
 from knode_cosserat.learning.residual import Residual, network
@@ -56,6 +57,7 @@ def fit(
     checkpoint_every: int = 100,
     log_dir: str | Path | None = None,
     progress: bool = False,
+    verify: bool | None = None,
 ) -> Any:
     """Learn the model error of an imperfect nominal model from trajectories.
 
@@ -70,13 +72,17 @@ def fit(
         checkpoint_every: epochs (or updates) between two checkpoints.
         log_dir: folder for metrics as TensorBoard event files, with one subfolder for each seed.
         progress: show a progress bar with the loss and the time left.
+        verify: simulate the first trajectory with the nominal model and with each fitted model, and warn if a
+            model cannot be simulated or gained little. None: for systems that are not of this package, whose
+            residuals nothing else has tried.
 
     Returns:
         A `KNODE`, or an `Ensemble` with one member for each seed if `config.seed` holds several. Its
         `about.facts` has "config", "seed", "trajectories" and "held_out" (SHA-256 of the data, rows, time
         step), "versions", "date" and "seconds". Each stage of gradient training, "segments" and "rollouts",
         has the "loss" before every step, the "learning_rate", and the "held_out_error" (step, m) at every
-        check. The final "held_out_error" (m) is that of the model.
+        check. The final "held_out_error" (m) is that of the model. "rollout_errors" are those of the nominal
+        model and of the model, if they were verified (`RolloutErrors`).
 
     Raises:
         DataError: trajectories that do not fit the knowledge or each other, are too short or not finite.
@@ -105,11 +111,16 @@ def fit(
                 for seed in run.seeds:
                     histories[seed][run.stage] = run.history(seed)
     facts, trained = _facts(config, trajectories, held_out), TrainedRange.of(trajectories)
+    if verify is None:
+        verify = not type(knowledge.nominal).__module__.startswith("knode_cosserat.")
     models = []
     for seed, residual in learned.items():
         own: dict[str, Any] = {**facts, "seed": seed, **histories[seed]}
         if given.held_out is not None:
             own["held_out_error"] = tip_error(KNODE(knowledge, residual), given.held_out)
+        if verify:
+            errors = rollout_errors(knowledge, KNODE(knowledge, residual), trajectories[0])
+            own["rollout_errors"] = list(errors)
         own["seconds"] = time.perf_counter() - began
         models.append(KNODE(knowledge, residual, About(own), trained))
         log.info("learned from %d trajectories in %.2f s, seed %s", len(trajectories), own["seconds"], seed)

@@ -26,19 +26,25 @@ def measurement_fields(trajectory: Trajectory, fractions: Sequence[float]) -> di
     y, system = np.asarray(trajectory.y), trajectory.system
     if y.ndim == 4:
         raise ValueError("a batch of trajectories; allowed is one, such as `batch[0]`")
-    held = np.array(trajectory.held_tension)
-    before = np.asarray(system.control_layout.get(np.asarray(trajectory.control), "tension"))[0]
+    held, before = np.array(trajectory.held_control), np.asarray(trajectory.control)[0]
+    if "tension" in system.control_layout.names:
+        held, before = (system.control_layout.get(each, "tension") for each in (held, before))
     # the last row has no following tension; without a value it would not count as complete
     held[-1] = held[-2] if len(held) > 1 else before
     along = np.array(fractions, dtype=float)
     places = places_at(along, system.nodes)
     position = np.asarray(positions_at(system, y, places, np.asarray(trajectory.z)))
+    try:
+        quaternion = np.asarray(quaternions_at(system, y, places))
+    except AttributeError:
+        # the system has no orientations
+        quaternion = np.full((*position.shape[:2], 4), np.nan)
     return {
         "time": np.asarray(trajectory.time, dtype=float),
         "tension": held,
         "fractions": along,
         "position": position,
-        "quaternion": np.asarray(quaternions_at(system, y, places)),
+        "quaternion": quaternion,
         "measured": np.isfinite(position).all(axis=-1),
         "simulated": True,
         "source": f"simulated {type(system).__name__}",
@@ -51,7 +57,8 @@ def save(measurements: Measurements, path: str | Path) -> None:
 
     A table's titles state everything: `load_recording(path).sampled(measurements.dt)` gives the same rows.
     Beside a bag its configuration is written, with the suffix .yaml, for `load_recording(path, config)`.
-    Bridged poses are not written. Bodies are named `tip` and `body_1`, `body_2` and so on.
+    Planar positions are written as x and z. Bridged poses are not written. Bodies are named `tip` and
+    `body_1`, `body_2` and so on.
 
     Raises:
         RecordingError: the name's ending is not .csv, .parquet, .bag, .mcap or .db3, or a file cannot be
@@ -62,13 +69,16 @@ def save(measurements: Measurements, path: str | Path) -> None:
     if path.suffix not in FORMATS:
         raise RecordingError(f"{path}: allowed is a name that ends in {', '.join(FORMATS)}")
     it, root = measurements, "/" if path.suffix in BAGS else ""
+    position = it.position
+    if position.shape[-1] == 2:
+        position = np.stack([position[..., 0], np.zeros(position.shape[:-1]), position[..., 1]], axis=-1)
     names = ["tip" if at == 1.0 else f"body_{k + 1}" for k, at in enumerate(it.fractions)]
     poses = {}
     for k, name in enumerate(names):
         rows = it.measured[:, k]
         oriented = bool(np.isfinite(it.quaternion[rows, k]).any())
         quaternion = it.quaternion[rows, k] if oriented else None
-        poses[name] = MocapPoses(it.time[rows], it.position[rows, k], quaternion)
+        poses[name] = MocapPoses(it.time[rows], position[rows, k], quaternion)
     before = it.initial_tension
     config = RecordingConfig(
         markers=tuple(

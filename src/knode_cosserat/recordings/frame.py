@@ -26,6 +26,9 @@ BACK = np.radians(80.0)
 #: a rod clamped along z leans less near its base: at most by this fraction of the tip's lean. Checked for
 #: leans of the tip above the second number (rad), the largest misalignment of a mounted base
 ALIKE, ASKEW = 0.8, np.radians(15.0)
+#: largest lean of a body (rad) from which the rod's length is estimated: the arc is then within 0.5 % of
+#: shapes that sag by their weight or by a load at the tip, and of straight ones that lean
+BENT = np.radians(10.0)
 #: largest relative spread of the rod's lengths estimated from its bodies
 UNEQUAL = 0.05
 
@@ -150,6 +153,9 @@ def _judged(bodies: Sequence[Body], rest: tuple[float, float] | None) -> list[Fi
             f"{angle}: the robot sags, is bent or is pulled there. Orientations of bodies are as if it were "
             "straight, where the configuration does not state a marker's `rotation`"
         )
+        if leans > BENT:
+            chord = float(np.linalg.norm(where[-1])) / bodies[-1].fraction
+            what += f". Such a shape does not tell the rod's length: it is above {chord:.3g} m"
         findings.append(Finding("note", bodies[-1].topic, what))
     lengths = rod_lengths(bodies, where)
     if len(lengths) > 1 and np.ptp(lengths) > UNEQUAL * abs(np.median(lengths)):
@@ -163,12 +169,18 @@ def rod_lengths(bodies: Sequence[Body], where: Float[np.ndarray, "M 3"]) -> Floa
     """Return the rod's length (m) estimated from each body away from the clamped end, at rest.
 
     The length is measured along a circular arc that leaves the clamped end along z and passes through the
-    body, because a robot may sag at rest.
+    body, because a robot may sag at rest. Bodies that lean more than `BENT` are left out: their chord and
+    their direction belong to rods of many lengths.
     """
-    lean = np.minimum(leans_of(where), np.pi / 2)
-    along = np.linalg.norm(where, axis=1) / np.sinc(lean / np.pi)
-    pairs = [(body.fraction, arc) for body, arc in zip(bodies, along, strict=True)]
-    return np.array([arc / fraction for fraction, arc in pairs if fraction > 0.05])
+    leans = leans_of(where)
+    along = np.linalg.norm(where, axis=1) / np.sinc(np.minimum(leans, BENT) / np.pi)
+    return np.array(
+        [
+            arc / body.fraction
+            for body, arc, lean in zip(bodies, along, leans, strict=True)
+            if body.fraction > 0.05 and lean <= BENT
+        ]
+    )
 
 
 def leans_of(where: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, " M"]:

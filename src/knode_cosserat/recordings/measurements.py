@@ -29,13 +29,14 @@ class Measurements:
     #: s, from the recording's start
     time: Float[np.ndarray, " T"]
     #: tensions (N), held: row i drives the robot from row i to row i + 1 (`held_tension`). For a robot with
-    #: motor-driven tendons: the motor angles (rad) or the wound-up lengths (m)
+    #: motor-driven tendons: the motor angles (rad) or the wound-up lengths (m). For any other system without
+    #: tensions: its controls
     tension: Float[np.ndarray, "T tendons"]
     #: places of the bodies, as fractions of the rod's length, from base to tip
     fractions: Float[np.ndarray, " M"]
-    #: positions of the bodies (m)
-    position: Float[np.ndarray, "T M 3"]
-    #: orientation of the rod's local frame, scalar first; NaN for bodies without orientation
+    #: positions of the bodies (m); of a planar system, two numbers each
+    position: Float[np.ndarray, "T M d"]
+    #: orientation of the rod's local frame, scalar first; NaN for bodies or systems without orientation
     quaternion: Float[np.ndarray, "T M 4"]
     #: False where a pose is interpolated across a gap
     measured: Bool[np.ndarray, "T M"]
@@ -67,11 +68,11 @@ class Measurements:
         """Return noise-free measurements of a trajectory of one robot.
 
         Args:
-            trajectory: a whole trajectory, or consecutive rows; the robot is driven by tensions.
+            trajectory: a whole trajectory, or consecutive rows, of a system with positions.
             fractions: places of the bodies, as fractions of the rod's length, from base to tip.
 
         Raises:
-            KeyError: the robot is not driven by tensions.
+            AttributeError: the system has no positions.
             ValueError: the trajectory is a batch, or its rows are further apart than the time steps.
         """
         return cls(**provided(cls, "of")(trajectory, fractions))
@@ -86,7 +87,7 @@ class Measurements:
         return self.tension
 
     @property
-    def tip_position(self) -> Float[np.ndarray, "T 3"]:
+    def tip_position(self) -> Float[np.ndarray, "T d"]:
         """Positions of the last body (m)."""
         return self.position[:, -1]
 

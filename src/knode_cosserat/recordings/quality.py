@@ -77,7 +77,8 @@ class Health:
         simulated: True if the robot was a simulation; None: not stated.
         duration: time from the start for which all poses and tensions are known (s).
         rest: interval in which the robot rests (s), or None.
-        rod_length: estimates (m) from each body away from the clamped end, at rest; empty without a rest.
+        rod_length: estimates (m) from each body away from the clamped end, at rest; none from bodies that
+            lean by more than 10 degrees, and none without a rest.
         streams: quality of each topic.
         latency: latency of tensions after commands, or None if it cannot be estimated.
         tension_errors: errors of each tendon; empty without both tensions.

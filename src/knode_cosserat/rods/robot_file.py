@@ -17,6 +17,7 @@ import dataclasses
 import difflib
 import importlib.resources
 import os
+import warnings
 from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
@@ -68,10 +69,27 @@ class RobotFileError(KnodeCosseratError, ValueError):
 def load_robot(name_or_path: str | Path) -> System:
     """Return a robot from the catalog, by name, or from a file, by path. The catalog has priority.
 
+    A file of the paper's tendon model (`kind: tendon-robot`) that states a `tendon_offset` is warned of: the
+    tendons of that model push the rod sideways, wherever they run.
+
     Raises:
         RobotFileError: there is no such robot, or its file is invalid.
     """
-    return parse_robot(_text_of(name_or_path), str(name_or_path))
+    robot, source = parse_robot(_text_of(name_or_path), str(name_or_path)), str(name_or_path)
+    if source not in _catalog_files():
+        warn_of_paper_tendons(robot, source)
+    return robot
+
+
+def warn_of_paper_tendons(robot: System, source: str) -> None:
+    """Warn of a tendon offset that the paper's tendon model ignores."""
+    if type(robot) is TendonRobot and float(robot.tendon_offset):
+        warnings.warn(
+            f"{source}: kind tendon-robot is the paper's model, whose tendons push the rod sideways: its "
+            "simulation ignores tendon_offset. For tendons that run beside the rod, write kind: "
+            "routed-tendon-robot",
+            stacklevel=3,
+        )
 
 
 def file_mapping(name_or_path: str | Path) -> dict[Any, Any]:

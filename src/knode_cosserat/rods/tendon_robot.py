@@ -14,8 +14,8 @@ from knode_cosserat.rods.tendons import transverse_force
 class TendonRobot(TendonRod):
     """A round rod with tendons, gravity, drag and material damping, as in the paper.
 
-    The tendons load the rod as in the paper (`tendons.transverse_force`): a force across it, no moment. See
-    `RoutedTendonRobot` for realistic tendons.
+    The tendons load the rod as in the paper (`tendons.transverse_force`): a force across it, no moment, so
+    that `tendon_offset` does not matter. See `RoutedTendonRobot` for tendons that run beside the rod.
     """
 
     def actuation(self, control: Float[Any, " c"]) -> Float[Any, " a"]:

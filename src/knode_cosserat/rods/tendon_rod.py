@@ -20,8 +20,8 @@ class TendonRod(Rod):
     """A rod with straight tendons around it. A subclass defines the tendons' action on the rod."""
 
     tendon_offset: Any = parameter(
-        "m", "distance of the tendons from the rod's axis; of no use to the crude model", low=0.0, high=1.0,
-        default=0.0,
+        "m", "distance of the tendons from the rod's axis; the paper's tendon-robot ignores it", low=0.0,
+        high=1.0, default=0.0,
     )  # fmt: skip
     tendon_angles: Any = parameter(
         "rad", "angles of the tendons about the rod", shape="list", low=-10.0, high=10.0, default=FOUR_TENDONS

@@ -38,25 +38,35 @@ from knode_cosserat.trajectory import Trajectory
 
 
 def initial_state(
-    system: System, settings: Settings, batch: int | None = None, recovery_budget: float | None = None
+    system: System,
+    settings: Settings,
+    batch: int | None = None,
+    recovery_budget: float | None = None,
+    held: Any = None,
 ) -> InitialState:
-    """Return the initial state at rest, or in equilibrium under zero control if that is only a guess.
+    """Return the unstressed state, or the equilibrium under a held control.
 
-    For a batch of `batch` robots, of one system or of as many.
+    Args:
+        system: one system, or a batch.
+        settings: of the run.
+        batch: number of robots, of one system or of as many.
+        recovery_budget: seconds that recovery of the equilibrium may take.
+        held: control (c,) of the equilibrium. None: the unstressed state, or the equilibrium under zero
+            control if that state is only a guess.
     """
     many, made = np.ndim(system.length) > 0, history_settings(settings)
     coarse: Any = False
-    if system.rest_is_guess:
-        record, coarse = _settled(system, settings, recovery_budget)
-        none = np.zeros(system.control_size)
-        history = (_all_at_one_state if many else at_one_state)(system, made, record, none)
+    control = np.zeros(system.control_size) if held is None else np.asarray(held, dtype=float)
+    if held is not None or system.rest_is_guess:
+        record, coarse = _settled(system, settings, recovery_budget, control)
+        history = (_all_at_one_state if many else at_one_state)(system, made, record, control)
     else:
         record, history = (_all_at_rest if many else _at_rest)(system, made)
     found = record, SolverState(history), coarse
     if batch and not many:
         found = jax.tree.map(lambda x: jnp.broadcast_to(x, (batch, *jnp.shape(x))), found)
     shape = (batch, system.control_size) if batch else (system.control_size,)
-    return InitialState(found[0], np.zeros(shape), *found[1:])
+    return InitialState(found[0], np.broadcast_to(control, shape).copy(), *found[1:])
 
 
 @functools.partial(jax.jit, static_argnames="settings")
@@ -74,25 +84,25 @@ def _all_at_one_state(system: System, settings: Settings, records: Any, control:
     return jax.vmap(lambda one, row: constant_history(one, settings, row, control))(system, records)
 
 
-def _settled(system: System, settings: Settings, budget: float | None) -> tuple[Any, Any]:
-    """Return y and z of the equilibrium under zero control, and a flag: true if its grid is too coarse."""
-    many, none = np.ndim(system.length) > 0, np.zeros((1, system.control_size))
+def _settled(system: System, settings: Settings, budget: float | None, control: Any) -> tuple[Any, Any]:
+    """Return y and z of the equilibrium under a control, and a flag: true if its grid is too coarse."""
+    many, held = np.ndim(system.length) > 0, control[None]
     task = Equilibria(Settings(None, settings.space, newton=settings.newton), 1, budget)
     if is_traced(system):
         find, y = static_rollout(task), unloaded_shape(system, settings.space)
-        rows = jax.vmap(find, in_axes=(0, None, 0))(system, none, y) if many else find(system, none, y)
+        rows = jax.vmap(find, in_axes=(0, None, 0))(system, held, y) if many else find(system, held, y)
         found, coarse = rows.records[..., 0, :, :], is_coarse(rows.position_error, system.length)[..., 0]
     elif many:
         each = range(np.shape(system.length)[0])
-        both = [_settled_one(task, jax.tree.map(lambda x, i=i: x[i], system), i) for i in each]
+        both = [_settled_one(task, jax.tree.map(lambda x, i=i: x[i], system), i, held) for i in each]
         found, coarse = map(np.stack, zip(*both, strict=True))
     else:
-        found, coarse = _settled_one(task, system, None)
+        found, coarse = _settled_one(task, system, None, held)
     return found[..., : system.y_layout.size + system.z_layout.size], coarse
 
 
-def _settled_one(task: Equilibria, system: System, robot: int | None) -> tuple[Any, Any]:
-    rows, _, cause = static_run(task, system, np.zeros((1, system.control_size)))
+def _settled_one(task: Equilibria, system: System, robot: int | None, held: np.ndarray) -> tuple[Any, Any]:
+    rows, _, cause = static_run(task, system, held)
     if rows.result[0] < 0:
         raise SimulationError(0, 0.0, float(rows.error[0]), Result(int(rows.result[0])), cause, robot)
     warn_of_results(rows)

@@ -56,7 +56,7 @@ def simulate(
     space: str | SpaceScheme = "lobatto2",
     start: Literal["paper", "consistent"] = "consistent",
     between: Literal["held", "linear"] = "held",
-    initial: Trajectory | None = None,
+    initial: Trajectory | Literal["equilibrium"] | None = None,
     newton: NewtonOptions = NewtonOptions(),
     position_tolerance: float | None = None,
     recovery_budget: float | None = None,
@@ -79,12 +79,14 @@ def simulate(
             displacements and rotations (controls in m or rad) cannot jump, and are linear from row to row.
             "linear": so are all others. Linear controls reach control i at row i + 1. A motion from rest or
             from an equilibrium begins suddenly: the first control of the others is held.
-        initial: start from this trajectory's last row. By default the simulation starts from the robot's
-            state at rest, or from the equilibrium under zero control if that state is only a guess (such as
-            for a platform on bent legs). A simulated motion continues exactly, by its `final_state`, with the
-            same time step. A part of it, `motion[:k]`, has its rows evaluated again first. For a part from
-            the middle, and for measured rows, states between nodes are interpolated, and a scheme that needs
-            rates (BDF-α, the trapezoidal rule) makes its first step by BDF1.
+        initial: start from this trajectory's last row; or "equilibrium": at rest under zero control, as the
+            command line, plants and viewers do. By default the simulation starts unstressed, as in the
+            paper's studies: the rod has the shape that it was made in, and then moves by its weight. (If that
+            state is only a guess, such as for a platform on bent legs, the default is the equilibrium too.)
+            A simulated motion continues exactly, by its `final_state`, with the same time step. A part of it,
+            `motion[:k]`, has its rows evaluated again first. For a part from the middle, and for measured
+            rows, states between nodes are interpolated, and a scheme that needs rates (BDF-α, the trapezoidal
+            rule) makes its first step by BDF1.
         newton: tolerances and limits of the solve in each step.
         position_tolerance: largest discretisation error (m) of positions along the rod. The number of nodes
             is chosen so that the estimate stays below it in every row; by default it is the robot's.
@@ -103,8 +105,7 @@ def simulate(
         SimulationError: a step was not solved, and recovery failed.
         ValueError: arguments of a wrong shape or name.
     """
-    if initial is not None and not isinstance(initial, Trajectory):
-        raise ValueError(f"initial is a {type(initial).__name__}; allowed is a Trajectory, or None")
+    initial, settled = split_initial(initial)
     if time in (None, "static"):
         raise ValueError(f"time is {time!r}; equilibria have no time steps: use solvers.equilibria")
     settings = Settings.of(time, space, start, newton, between)
@@ -115,8 +116,9 @@ def simulate(
     warn_of_long_steps(robot, dt)
     if position_tolerance is not None:
         refine = functools.partial(
-            simulate, controls=controls, dt=dt, time=time, space=space, start=start, newton=newton,
-            between=between, recovery_budget=recovery_budget, on_failure=on_failure, progress=progress,
+            simulate, controls=controls, dt=dt, time=time, space=space, start=start, between=between,
+            initial="equilibrium" if settled else None, newton=newton,
+            recovery_budget=recovery_budget, on_failure=on_failure, progress=progress,
         )  # fmt: skip
         return refined_trajectory(refine, robot, initial, position_tolerance, settings.space.order)
     system, batch = stacked(robot)
@@ -126,11 +128,21 @@ def simulate(
     # ranges are not part of the equations: programs are compiled for systems without them
     bare, before = without_range(system), without_range(unmarked(initial))
     if is_traced((system, controls, initial)):
-        found = _traced(bare, controls, before, settings, dt)
+        found = _traced(bare, controls, before, settled, settings, dt)
     else:
-        at_start, task, acting = _initial(bare, controls, before, settings, dt, recovery_budget)
+        at_start, task, acting = _initial(bare, controls, before, settled, settings, dt, recovery_budget)
         found = _plain(bare, acting, at_start, task, on_failure, progress)
     return marked(dataclasses.replace(found, system=system), initial)
+
+
+def split_initial(initial: Any) -> tuple[Trajectory | None, bool]:
+    """Return the argument `initial` of a run as a trajectory or None, and True for an equilibrium."""
+    if isinstance(initial, str) and initial == "equilibrium":
+        return None, True
+    if initial is not None and not isinstance(initial, Trajectory):
+        given = repr(initial) if isinstance(initial, str) else f"a {type(initial).__name__}"
+        raise ValueError(f'initial is {given}; allowed is a Trajectory, "equilibrium", or None')
+    return initial, False
 
 
 def unmarked(initial: Trajectory | None) -> Trajectory | None:
@@ -300,11 +312,14 @@ def check_initial(system: System, initial: Trajectory, batch: int | None) -> Non
 # runs
 
 
-def _initial(system: Any, controls: Any, initial: Any, settings: Settings, dt: float, budget: Any) -> Any:
+def _initial(
+    system: Any, controls: Any, initial: Any, settled: bool, settings: Settings, dt: float, budget: Any
+) -> Any:
     """Return the initial state of a run, its time steps, and the controls of their stages."""
     if initial is None:
         batch = len(controls) if np.ndim(controls) == 3 else None
-        at_start = initial_state(system, settings, batch, budget)
+        held = np.zeros(system.control_size) if settled else None
+        at_start = initial_state(system, settings, batch, budget, held)
     else:
         at_start = continued_state(system, initial, settings, dt)
     first = at_start.state.first_step(settings)
@@ -326,13 +341,13 @@ def _plain(
     return _trajectory(system, controls, at_start, task, rows, history)
 
 
-@functools.partial(jax.jit, static_argnames=("settings", "dt"))
-def _traced(system, controls, initial, settings, dt):  # type: ignore[no-untyped-def]
+@functools.partial(jax.jit, static_argnames=("settled", "settings", "dt"))
+def _traced(system, controls, initial, settled, settings, dt):  # type: ignore[no-untyped-def]
     """Simulate inside JAX's transformations: without recovery; unsolved rows become NaN.
 
     A single jitted function, so that a transformation traces it once and not at every call.
     """
-    at_start, task, controls = _initial(system, controls, initial, settings, dt, None)
+    at_start, task, controls = _initial(system, controls, initial, settled, settings, dt, None)
     run: Any = sensitivity.rollout(task)
     if np.ndim(controls) == 3:
         run = jax.vmap(run, in_axes=(0 if np.ndim(system.length) else None, 0, 0))

@@ -18,7 +18,7 @@ from knode_cosserat.solvers.recovery import Budget
 from knode_cosserat.solvers.result import Result, SimulationError
 from knode_cosserat.solvers.run import LEAST_CAPACITY, TimeIntegration, is_coarse, rows_of
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.simulate import check_initial, checked_dt, marked
+from knode_cosserat.solvers.simulate import check_initial, checked_dt, marked, split_initial
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.time import TimeScheme
 from knode_cosserat.solvers.time_loop import StepRows
@@ -57,11 +57,11 @@ class Stepper:
         time: str | TimeScheme = "sdirk2",
         space: str | SpaceScheme = "lobatto2",
         start: Literal["paper", "consistent"] = "consistent",
-        initial: Trajectory | None = None,
+        initial: Trajectory | Literal["equilibrium"] | None = None,
         newton: NewtonOptions = NewtonOptions(),
         recovery_budget: float | None = None,
     ):
-        """Start at rest, or at the last row of `initial`. The arguments are the same as in `simulate`.
+        """Start unstressed, in equilibrium, or at the last row of `initial`: arguments as in `simulate`.
 
         Raises:
             SimulationError: the initial equilibrium was not found.
@@ -76,8 +76,10 @@ class Stepper:
         self.robot, self.dt = robot, checked_dt(dt)
         # layouts are put together anew in each call
         self._layout, self._control_shape = robot.control_layout, (robot.control_size,)
+        initial, settled = split_initial(initial)
         if initial is None:
-            at_start = initial_state(robot, settings, recovery_budget=recovery_budget)
+            held = np.zeros(robot.control_size) if settled else None
+            at_start = initial_state(robot, settings, recovery_budget=recovery_budget, held=held)
         else:
             check_initial(robot, initial, None)
             at_start = continued_state(robot, initial, settings, self.dt)

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Iterator
 
 from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.equilibrium import equilibrium
 from knode_cosserat.solvers.result import SimulationError
 from knode_cosserat.solvers.stepper import Stepper
 from knode_cosserat.viewer.document import document
@@ -55,10 +56,16 @@ def view_live(
     """
     require_websockets()
     checked_port(port)
-    stepper = Stepper(robot, usual_step(robot) if dt is None else dt, space=space)
+    stepper = resting_stepper(robot, usual_step(robot) if dt is None else dt, space)
     page = live_page(stepper, title, target)
     with prompt_threads():
         asyncio.run(serve_page(page, lambda connection: Session(stepper, connection), port, open_browser))
+
+
+def resting_stepper(robot: System, dt: float, space: str = "lobatto2") -> Stepper:
+    """Return the robot in equilibrium under the sliders' initial controls: nothing moves by itself."""
+    start = [slider["start"] for slider in sliders(robot)]
+    return Stepper(robot, dt, space=space, initial=equilibrium(robot, start, space=space))
 
 
 @contextlib.contextmanager

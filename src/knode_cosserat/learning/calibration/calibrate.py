@@ -120,10 +120,11 @@ def calibrate(
 
     Args:
         robot: initial robot of the search; parameters that are not named stay unchanged.
-        trajectories: full states of the real robot; or measurements that start at rest (`Recording.sampled`),
-            which only "rollouts" can use.
-        names: parameters by name (`System.parameters`); by default all that have a value and that the data
-            determine.
+        trajectories: full states of the real robot; or measurements that start at rest, in the equilibrium
+            under their `initial_tension` or else under the first tension (`Recording.sampled`), which only
+            "rollouts" can use.
+        names: parameters by name (`System.parameters`), those of parts with dots, such as `loads.0.mass`; by
+            default all of the robot's own that have a value and that the data determine.
         by: "segments" compares one-segment predictions from the full states in the data. It takes a fraction
             of a second and converges from a distant start. Noise in the states also enters the predictions;
             the resulting bias is corrected to leading order in the variance. The history between nodes is
@@ -143,7 +144,8 @@ def calibrate(
     Raises:
         CalibrationError: the data do not determine a named parameter, or the search does not converge.
         ParameterError: a name that does not exist, or a parameter that cannot be calibrated.
-        DataError: trajectories that do not fit the robot, or are too short or not finite.
+        DataError: trajectories that do not fit the robot, are too short or not finite, or do not start at
+            rest although "rollouts" needs it.
         ValueError: a scheme that does not exist.
     """
     _check(robot, trajectories, by, level)
@@ -152,9 +154,16 @@ def calibrate(
     may_leave_out = names is None if undetermined is None else undetermined == "keep"
     unknowns = unknowns_of(robot, names)
     misfit, start = _misfit(robot, trajectories, unknowns, by, space)
-    ended, errors = _ended(misfit, start, may_leave_out)
     if isinstance(misfit, SegmentMisfit):
+        ended, errors = _ended(misfit, start, may_leave_out)
         misfit, ended, errors = _with_its_own_past(misfit, ended, errors, may_leave_out)
+    else:
+        try:
+            ended, errors = _ended(misfit, start, may_leave_out)
+        except CalibrationError:
+            misfit.require_start(start)
+            raise
+        misfit.require_start(ended.coordinates)
     return _calibration(misfit, ended, errors, level)
 
 

@@ -30,10 +30,18 @@ from knode_cosserat.learning.calibration.unknowns import (
 from knode_cosserat.learning.samples import DataError, samples
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.system import System, unknowns_of
+from knode_cosserat.rotation import since_first
 from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.history import StateHistory, at_stages, constant_history, resting_history
+from knode_cosserat.solvers.history import (
+    StateHistory,
+    at_stages,
+    constant_history,
+    rest_record,
+    resting_history,
+)
 from knode_cosserat.solvers.initial import continued_state, initial_state
 from knode_cosserat.solvers.places import Places, places_at, positions_at, quaternions_at
+from knode_cosserat.solvers.result import SimulationError
 from knode_cosserat.solvers.run import TimeIntegration, run_one
 from knode_cosserat.solvers.sensitivity import TangentState, static_tangents, tangent_time_loop
 from knode_cosserat.solvers.settings import MEASURED, Settings
@@ -41,13 +49,15 @@ from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.tangent import SystemMoves
 from knode_cosserat.trajectory import Trajectory
 
-#: growth factor of the number of rows in preliminary searches
-GROWTH = 2
-
 #: numbers of rows in preliminary searches
 FIRST_ROWS = (2, 5, 10, 20, 50, 100)
+#: row 0 disagrees with the initial equilibrium if it is further away than this part of the length, and than
+#: this part of the motion's root mean square
+AWAY, OF_MOTION = 0.01, 0.25
 
-
+#: a trajectory starts unstressed if its row 0 is nearer to that shape than so many times to the equilibrium,
+#: measurements if it is so many times nearer: a real robot is never unstressed
+UNSTRESSED = 2.0
 #: number of parallel rollouts: each keeps one core busy
 CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
@@ -57,13 +67,17 @@ class _Rollout(NamedTuple):
 
     settings: Settings
     dt: float
-    #: the initial rows, or None: it starts from the robot's own state at rest
+    #: the initial rows, or None: it starts from an equilibrium, or unstressed
     initial: Trajectory | None
+    #: control of the initial equilibrium, whose row is compared too; None: it starts unstressed, or from rows
+    held: Float[np.ndarray, " c"] | None
     control: Float[np.ndarray, "T c"]
     #: places that are compared
     places: Places
     #: position and, if compared, unit quaternion; NaN where nothing was measured
     target: Float[np.ndarray, "T M k"]
+    #: True if orientations are relative to row 0
+    relative: bool
 
 
 def _seen(robot: System, oriented: bool, y: Any, places: Places) -> Any:
@@ -83,15 +97,16 @@ class _Rows(NamedTuple):
     past: StateHistory
     #: last row and control of the initial rows, if there are any
     before: Any
-    #: y and z of the initial state at the nodes
+    #: y and z of the initial state at the nodes, and the control of an initial equilibrium
     first: Float[Any, "N x"]
+    held: Any
     control: Float[Any, "T c"]
     places: Places
     target: Float[Any, "T M k"]
 
 
-@functools.partial(jax.jit, static_argnames=("unknowns", "settings", "oriented", "one_state"))
-def _differences(robot, coordinates, rows, steps, unknowns, settings, oriented, one_state):  # type: ignore[no-untyped-def]
+@functools.partial(jax.jit, static_argnames=("unknowns", "settings", "oriented", "one_state", "relative"))
+def _differences(robot, coordinates, rows, steps, unknowns, settings, oriented, one_state, relative):  # type: ignore[no-untyped-def]
     """Return differences (M,) of solved rows from measurements, and their derivatives (M, n)."""
     ny = robot.y_layout.size
 
@@ -106,53 +121,60 @@ def _differences(robot, coordinates, rows, steps, unknowns, settings, oriented, 
 
     def left(y: Any) -> Any:
         seen = _seen(robot, oriented, y, rows.places)
+        if relative:
+            seen = jnp.concatenate([seen[..., :-4], since_first(seen[..., -4:])], axis=-1)
+        seen = seen if rows.held is not None else seen[1:]
         target = jnp.where(jnp.isnan(rows.target), 0.0, rows.target)
         if oriented:
-            same = jnp.sum(seen[..., 3:] * target[..., 3:], axis=-1, keepdims=True) >= 0.0
-            target = jnp.concatenate(
-                [target[..., :3], jnp.where(same, target[..., 3:], -target[..., 3:])], axis=-1
-            )
+            turn = target[..., -4:]
+            same = jnp.sum(seen[..., -4:] * turn, axis=-1, keepdims=True) >= 0.0
+            target = jnp.concatenate([target[..., :-4], jnp.where(same, turn, -turn)], axis=-1)
         return jnp.where(jnp.isnan(rows.target), 0.0, seen - target).ravel()
 
     def settled(system: Any, d_system: Any) -> Any:
-        """Return the initial history and its tangent, if the initial state is a solved equilibrium."""
-        none = jnp.zeros(system.control_size)
+        """Return the initial history and its tangent, and that of row 0, a solved equilibrium."""
         solved = rows.first[None], unknowns_of(system, rows.first[0])[None]
+        held = rows.held[None]
         d_first, _, _ = static_tangents(
-            settings, solved, (system, none[None]), (SystemMoves.of(d_system), jnp.zeros_like(none[None]))
+            settings, solved, (system, held), (SystemMoves.of(d_system), jnp.zeros_like(held))
         )
         d_first = d_first[0, :, : rows.first.shape[1]]
-        return jax.jvp(
-            lambda system, row: constant_history(system, settings, row, none),
+        past, d_past = jax.jvp(
+            lambda system, row: constant_history(system, settings, row, rows.held),
             (system, rows.first), (d_system, d_first),
         )  # fmt: skip
+        return past, d_past, d_first
 
     def at_start(direction: Any) -> Any:
-        """Return the system and its tangent, and the initial history and the tangents of its states."""
+        """Return the system and its tangent, the initial history, and tangents of its states and row 0."""
         (system, past), (d_system, d_past) = jax.jvp(start, (coordinates,), (direction,))
-        if rows.before is None and system.rest_is_guess:
-            past, d_past = settled(system, d_system)
-        return system, d_system, past, (d_past.records, d_past.rate)
+        d_first = jnp.zeros_like(rows.first)
+        if rows.held is not None:
+            past, d_past, d_first = settled(system, d_system)
+        return system, d_system, past, (d_past.records, d_past.rate, d_first)
 
     n = coordinates.shape[0]
     columns = jax.vmap(at_start, out_axes=(None, 0, None, -1))
-    system, d_systems, past, d_past = columns(jnp.eye(n))
+    system, d_systems, past, (*d_past, d_first) = columns(jnp.eye(n))
     changes = SystemMoves(d_systems, jnp.eye(n)), jnp.zeros((*rows.control.shape, n))
     state = TangentState.of(system, settings.space, past, *d_past)
     _, (d_records, _) = tangent_time_loop(
         settings, steps, (rows.records, rows.unknowns), (system, rows.control), changes, state
     )
-    own = slice(settings.stages - 1, None, settings.stages)
-    y = rows.records[own, :, :ny]
+    last = slice(settings.stages - 1, None, settings.stages)
+    y = jnp.concatenate([rows.first[None, :, :ny], rows.records[last, :, :ny]])
+    d_y = jnp.concatenate([d_first[None, :, :ny], d_records[last, :, :ny]])
     by_column = jax.vmap(lambda d_y: jax.jvp(left, (y,), (d_y,))[1], in_axes=-1, out_axes=1)
-    return left(y), by_column(d_records[own, :, :ny])
+    return left(y), by_column(d_y)
 
 
 class RolloutMisfit:
     """Misfit of whole simulations to measured positions and orientations, from the same initial state.
 
-    Measurements, and trajectories from t = 0 under zero control, start from the robot's own state at rest.
-    Any other trajectory starts from its own first rows, which must then be states without noise.
+    Measurements, and trajectories from t = 0 under zero control, start at rest: in the equilibrium under the
+    controls before row 0, which is compared with row 0. A simulation that began unstressed does so here too:
+    row 0 tells which of the two it is. Any other trajectory starts from its own first rows, which must then
+    be states without noise.
     """
 
     #: true if the first step of a search must be limited: distant robots mislead the search
@@ -176,6 +198,8 @@ class RolloutMisfit:
         with contextlib.suppress(AttributeError):
             sizes.append(np.size(robot.quaternions(y)))
         self.oriented = len(sizes) == 2
+        #: number of a position's coordinates
+        self._dimension = sizes[0]
         trajectories = [each for each in given if isinstance(each, Trajectory)]
         if trajectories:
             samples(robot, [_without_unused(robot, each) for each in trajectories])  # checks them
@@ -255,9 +279,12 @@ class RolloutMisfit:
         return LinearisedMisfit(np.concatenate(values), np.concatenate(slopes))
 
     def _of_one(self, system: System, coordinates: np.ndarray, rollout: _Rollout) -> LinearisedMisfit | None:
-        settings, dt, initial, control, places, target = rollout
+        settings, dt, initial, held, control, places, target, relative = rollout
         if initial is None:
-            at_start = initial_state(system, settings)
+            try:
+                at_start = initial_state(system, settings, held=held)
+            except SimulationError:
+                return None
         else:
             at_start = continued_state(system, initial, settings, dt)
         first = at_start.state.first_step(settings)
@@ -268,10 +295,10 @@ class RolloutMisfit:
             return None
         before = None if initial is None else (at_start.record, at_start.control)
         past = at_start.state.history
-        rows = _Rows(*found.every_stage, past, before, at_start.record, acting, places, target)
+        rows = _Rows(*found.every_stage, past, before, at_start.record, held, acting, places, target)
         values, slopes = _differences(
             self.robot, coordinates, rows, task.coefficients, self.unknowns, settings, self.oriented,
-            first == "start",
+            first == "start", relative,
         )  # fmt: skip
         return LinearisedMisfit(np.asarray(values), np.asarray(slopes))
 
@@ -288,6 +315,29 @@ class RolloutMisfit:
             fields = groups.reshape(rows, -1)[0]
             found.append((fields[fields >= 0], whole.reshape(rows, -1)[:, fields >= 0]))
         return found
+
+    def require_start(self, coordinates: np.ndarray) -> None:
+        """Raise `DataError` if a rollout's row 0 is not the equilibrium that it starts from."""
+        values = self(coordinates).values
+        ends = np.cumsum([known.sum() for known in self._known])[:-1]
+        for k, (mine, known, one) in enumerate(
+            zip(np.split(values, ends), self._known, self.rollouts, strict=True)
+        ):
+            if one.held is None or not np.all(np.isfinite(mine)):
+                continue
+            left = np.zeros(one.target.shape)
+            left[known.reshape(left.shape)] = mine
+            moved = one.target - one.target[:1]
+            apart, motion = (
+                np.linalg.norm(each[..., : self._dimension], axis=-1) for each in (left, np.nan_to_num(moved))
+            )
+            away, usual = np.max(apart[0]), np.max(np.sqrt(np.mean(motion**2, axis=0)))
+            if away > max(AWAY * float(np.asarray(self.robot.length)), OF_MOTION * usual):
+                raise DataError(
+                    f"recording {k + 1}: row 0 is {1e3 * away:.3g} mm from the equilibrium under "
+                    f"{np.round(one.held, 4).tolist()}; allowed is data that start at rest. Use the rows "
+                    "after the robot has settled, state initial_tension, or give full states"
+                )
 
     def beginnings(self) -> list[Float[np.ndarray, " M"]]:
         """Return masks of differences for preliminary searches, with more rows each time.
@@ -317,12 +367,44 @@ class RolloutMisfit:
 def _of_trajectory(robot: System, oriented: bool, trajectory: Trajectory) -> _Rollout:
     begins = _first_row(trajectory)
     control, y = (np.asarray(values, dtype=float)[begins:] for values in (trajectory.control, trajectory.y))
-    initial = None if _from_rest(trajectory) else trajectory[:begins]
     settings = trajectory.settings or MEASURED
     # the base is left out: its pose is given
     places = Places(np.arange(robot.nodes - 1), np.ones(robot.nodes - 1))
+    initial, held = trajectory[:begins], None
+    if _from_rest(trajectory):
+        initial = None
+        first = np.asarray(_seen(robot, False, np.asarray(trajectory.y, dtype=float)[:1], places))[0]
+        held = _held_at_start(robot, settings, np.zeros(robot.control_size), places, first, UNSTRESSED)
+        y = y if held is None else np.asarray(trajectory.y, dtype=float)
     target = np.asarray(_seen(robot, oriented, y, places))
-    return _Rollout(settings, trajectory.dt, initial, control, places, target)
+    return _Rollout(settings, trajectory.dt, initial, held, control, places, target, False)
+
+
+def _held_at_start(
+    robot: System, settings: Settings, control: Any, places: Places, seen: Float[np.ndarray, "M d"],
+    ratio: float,
+) -> Float[np.ndarray, " c"] | None:  # fmt: skip
+    """Return the control of the initial equilibrium; None if row 0 shows the unstressed robot.
+
+    Args:
+        robot: initial robot of the search.
+        settings: of the simulation.
+        control: control before row 0 (c,).
+        places: of the measured positions.
+        seen: their positions in row 0 (m), NaN where not measured.
+        ratio: the robot is unstressed if the distance to that shape is below so many times the other one.
+    """
+    if not robot.rest_is_guess:
+        try:
+            settled = np.asarray(initial_state(robot, settings, held=control).record)
+        except SimulationError:
+            return np.asarray(control)
+        size = robot.y_layout.size
+        shapes = jnp.stack([rest_record(robot)[:, :size], settled[:, :size]])
+        apart = np.nansum((np.asarray(_seen(robot, False, shapes, places)) - seen) ** 2, axis=(1, 2))
+        if np.any(np.isfinite(seen)) and apart[0] <= ratio**2 * apart[1]:
+            return None
+    return np.asarray(control)
 
 
 def _of_measurements(robot: System, oriented: bool, given: Any, space: str | SpaceScheme) -> _Rollout:
@@ -346,13 +428,22 @@ def _of_measurements(robot: System, oriented: bool, given: Any, space: str | Spa
         raise DataError(
             f"{given.source}: no tension is known at {given.time[row]:g} s; use the part before (`parts`)"
         )
-    places = places_at(given.fractions, robot.nodes)
-    target = given.position[1:]
-    if oriented:
-        length = np.linalg.norm(given.quaternion[1:], axis=-1, keepdims=True)
-        target = np.concatenate([target, given.quaternion[1:] / length], axis=-1)
     settings = Settings.of("bdf2", space, "paper", NewtonOptions())
-    return _Rollout(settings, given.dt, None, given.tension[:-1], places, target)
+    places = places_at(given.fractions, robot.nodes)
+    before = given.tension[0] if given.initial_tension is None else given.initial_tension
+    held = _held_at_start(robot, settings, before, places, given.position[0], 1.0 / UNSTRESSED)
+    begins, quaternion = 1 if held is None else 0, given.quaternion
+    target = given.position
+    if oriented:
+        if held is not None:
+            # a body's axes are calibrated at rest, not on a straight robot
+            quaternion = np.asarray(since_first(quaternion))
+        length = np.linalg.norm(quaternion, axis=-1, keepdims=True)
+        target = np.concatenate([target, quaternion / length], axis=-1)
+    return _Rollout(
+        settings, given.dt, None, held, given.tension[:-1], places, target[begins:],
+        oriented and held is not None,
+    )  # fmt: skip
 
 
 def _names(given: Sequence[Measurements]) -> list[str]:

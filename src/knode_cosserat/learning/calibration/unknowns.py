@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
@@ -9,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.rods.parameters import Parameter, ParameterError, unknown_parameter
+from knode_cosserat.rods.parameters import Parameter, ParameterError, parameters_of, unknown_parameter
+from knode_cosserat.rods.paths import owner_at, parameter_at, value_at
 from knode_cosserat.rods.system import System
 
 
@@ -46,7 +48,9 @@ Unknowns = tuple[Unknown, ...]
 
 
 def unknowns_of(robot: System, names: Sequence[str] | None) -> Unknowns:
-    """Return the named parameters of a robot, or all that have a value and can be searched.
+    """Return the named parameters of a robot, or all of its own that have a value and can be searched.
+
+    Parameters of parts have names with dots, such as `loads.0.mass`.
 
     Raises:
         ParameterError: a name that does not exist or is given twice, a parameter without a value, or a
@@ -64,11 +68,15 @@ def unknowns_of(robot: System, names: Sequence[str] | None) -> Unknowns:
         raise ParameterError(f"names is {given!r}; allowed is a list of parameters: {', '.join(known)}")
     found = []
     for name in names:
-        if name not in known:
+        parameter = known.get(name) if "." not in str(name) else parameter_at(owner, name)
+        if parameter is None and "." in str(name):
+            part, last = owner_at(owner, name)
+            raise ParameterError(unknown_parameter(type(part), last, parameters_of(type(part))))
+        if parameter is None:
             raise ParameterError(unknown_parameter(type(owner), name, known))
         if list(names).count(name) > 1:
             raise ParameterError(f"names has {name} twice")
-        unknown = _unknown(owner, name, known[name])
+        unknown = _unknown(owner, name, parameter)
         if isinstance(unknown, str):
             raise ParameterError(unknown)
         found.append(unknown)
@@ -77,7 +85,10 @@ def unknowns_of(robot: System, names: Sequence[str] | None) -> Unknowns:
 
 def _unknown(owner: System, name: str, parameter: Parameter) -> Unknown | str:
     """Return the unknown of a parameter, or the reason why it cannot be searched."""
-    given = getattr(owner, name)
+    part, last = owner_at(owner, name)
+    if any(field.name == last and field.metadata.get("static") for field in dataclasses.fields(part)):
+        return f"{name} is a place, which a search cannot move; leave it out of names, and compare several"
+    given = value_at(owner, name)
     if given is None:
         return f"{name} has no value: it follows from other parameters; give it one first, or calibrate those"
     value = np.asarray(given)
@@ -103,24 +114,30 @@ def values(robot: System, unknowns: Unknowns) -> Float[np.ndarray, " n"]:
     owner = robot.nominal
     parts = []
     for unknown in unknowns:
-        value = np.asarray(getattr(owner, unknown.name), dtype=float)
+        value = np.asarray(value_at(owner, unknown.name), dtype=float)
         parts.append(np.diag(value) if value.ndim == 2 else np.atleast_1d(value))
     return np.concatenate([part[: unknown.size] for part, unknown in zip(parts, unknowns, strict=True)])
 
 
 def limits(robot: System, unknowns: Unknowns) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Return the lowest and the highest allowed value of each number."""
-    known = robot.nominal.parameters()
+    known = _stated(robot, unknowns)
     low, high = (
-        [getattr(known[u.name], end) for u in unknowns for _ in range(u.size)] for end in ("low", "high")
+        [getattr(each, end) for each, u in zip(known, unknowns, strict=True) for _ in range(u.size)]
+        for end in ("low", "high")
     )
     return np.array(low, dtype=float), np.array(high, dtype=float)
 
 
 def number_units(robot: System, unknowns: Unknowns) -> tuple[str, ...]:
     """Return the unit of each number."""
-    known = robot.nominal.parameters()
-    return tuple(known[unknown.name].unit for unknown in unknowns for _ in range(unknown.size))
+    known = _stated(robot, unknowns)
+    return tuple(each.unit for each, u in zip(known, unknowns, strict=True) for _ in range(u.size))
+
+
+def _stated(robot: System, unknowns: Unknowns) -> list[Parameter]:
+    """Return the statements of the unknown parameters."""
+    return [each for u in unknowns if (each := parameter_at(robot.nominal, u.name)) is not None]
 
 
 def logarithmic(unknowns: Unknowns) -> np.ndarray:

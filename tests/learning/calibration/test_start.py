@@ -1,0 +1,152 @@
+"""The state from which compared simulations start: as the data do, at rest or unstressed."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import knode_cosserat as kc
+from knode_cosserat.learning.calibration.calibrate import calibrate
+from knode_cosserat.learning.calibration.rollouts import RolloutMisfit
+from knode_cosserat.learning.calibration.unknowns import (
+    limits,
+    number_units,
+    searched,
+    unknowns_of,
+    values,
+    with_numbers,
+)
+from knode_cosserat.learning.samples import DataError
+from tests.learning.bar import BAR, Bar, pulled
+
+
+class Weighed(Bar):
+    """A bar whose own weight stretches it by a quarter: its equilibrium is far from its unstressed shape."""
+
+    def balance(self, s, t, y, y_t, z, z_t, control):
+        return super().balance(s, t, y, y_t, z, z_t, control).at[1].add(-9.81 * self.density)
+
+
+REAL = Weighed(**{name: getattr(BAR, name) for name in BAR.parameters()}, nodes=6)
+GUESS = REAL.replace(stiffness=26.0, damping=0.8)
+NAMES = ["stiffness", "damping"]
+
+
+def measured(trajectory, noise=0.0):
+    seen = kc.recordings.Measurements.of(trajectory, (0.4, 1.0))
+    rng = np.random.default_rng(0)
+    return dataclasses.replace(seen, position=seen.position + noise * rng.normal(size=seen.position.shape))
+
+
+def found(data):
+    estimates = calibrate(GUESS, [data], NAMES, by="rollouts", space="euler").estimates
+    return estimates["stiffness"], estimates["damping"]
+
+
+def settled(**options):
+    return pulled(1.0, robot=REAL, space="euler", initial="equilibrium", **options)
+
+
+def pretensioned():
+    still = kc.equilibrium(REAL, [3.0], space="euler")
+    return pulled(1.0, robot=REAL, space="euler", initial=still)
+
+
+def rested():
+    pull = np.concatenate([np.full(3, 3.0), 3.0 + 2.0 * np.sin(0.7 * np.arange(1, 18))])[:, None]
+    still = kc.equilibrium(REAL, [3.0], space="euler")
+    moved = measured(kc.simulate(REAL, pull, 0.1, space="euler", initial=still))
+    return dataclasses.replace(moved, initial_tension=None)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("data", "tolerance"),
+    [
+        pytest.param(lambda: settled(), 1e-6, id="states from rest"),
+        pytest.param(lambda: measured(settled()), 1e-6, id="measured from rest"),
+        pytest.param(lambda: measured(settled(), 1e-4), 2e-2, id="noisy from rest"),
+        pytest.param(lambda: measured(pretensioned()), 1e-6, id="measured from a pull"),
+        pytest.param(lambda: rested(), 1e-6, id="at rest for a while, with an unknown pull before"),
+        pytest.param(lambda: pulled(1.0, robot=REAL, space="euler"), 1e-6, id="unstressed states"),
+        pytest.param(lambda: measured(pulled(1.0, robot=REAL, space="euler")), 1e-6, id="unstressed"),
+    ],
+)
+def test_what_starts_at_rest_gives_the_robot_that_made_it(data, tolerance):
+    np.testing.assert_allclose(found(data()), (20.0, 0.4), rtol=tolerance)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "data",
+    [
+        pytest.param(lambda: measured(settled()).rows(4, 20), id="from the middle of a motion"),
+        pytest.param(
+            lambda: dataclasses.replace(measured(settled()), initial_tension=np.array([9.0])), id="wrong pull"
+        ),
+    ],
+)
+def test_data_that_do_not_start_at_rest_are_refused(data):
+    with pytest.raises(DataError, match=r"recording 1: row 0 is .* mm from the equilibrium under \["):
+        found(data())
+
+
+@pytest.mark.slow
+def test_slopes_of_a_start_in_equilibrium_are_exact():
+    unknowns = unknowns_of(GUESS, ["length", "density", *NAMES])
+    misfit = RolloutMisfit(GUESS, [measured(pretensioned())], unknowns, space="euler")
+    at, h = searched(unknowns, values(GUESS, unknowns)), 1e-4
+    slopes = misfit(at).slopes
+    # row 0 is compared too, and depends on the stiffness
+    assert np.abs(slopes[1, 2]) > 0.01
+    for k, along in enumerate(h * np.eye(len(at))):
+        expected = (misfit(at + along).values - misfit(at - along).values) / (2.0 * h)
+        np.testing.assert_allclose(slopes[:, k], expected, atol=1e-6 * np.max(np.abs(expected)))
+
+
+ROD = kc.robots.SlenderRod(
+    length=0.3, radius=0.004, density=1200.0, youngs_modulus=2e8, bending_damping=1e-3, nodes=5,
+    gravity=[9.81, 0.0, 0.0], base_end=kc.robots.ends.Driven(axes=("x",)),
+    loads=(
+        kc.robots.loads.AttachedMass(mass=0.02),
+        kc.robots.loads.PointWrench(at=0.5, force=[0.0, 0.1, 0.0]),
+    ),
+)  # fmt: skip
+
+
+def test_parameters_of_parts_have_names_with_dots():
+    names = ["youngs_modulus", "loads.0.mass", "loads.1.force"]
+    unknowns = unknowns_of(ROD, names)
+    assert [each.name for each in unknowns] == names
+    numbers = values(ROD, unknowns)
+    np.testing.assert_allclose(numbers, [2e8, 0.02, 0.0, 0.1, 0.0])
+    assert number_units(ROD, unknowns) == ("Pa", "kg", "N", "N", "N")
+    changed = with_numbers(ROD, unknowns, np.array([1e8, 0.05, 0.1, 0.2, 0.3]))
+    assert float(changed.loads[0].mass) == 0.05 and changed.loads[1].force.tolist() == [0.1, 0.2, 0.3]
+    low, high = limits(ROD, unknowns)
+    assert np.all(low <= numbers) and np.all(numbers <= high)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("loads.2.mass", "there is no parameter 'loads.2.mass': no '2' among 0, 1"),
+        ("loads.0.weight", "AttachedMass has no parameter 'weight'; there are .*mass"),
+        ("load.0.mass", "there is no parameter 'load.0.mass': no 'load' among"),
+        ("loads.0.at", "loads.0.at is a place, which a search cannot move"),
+        ("loads.0", "has no parameter '0'|there is no parameter"),
+    ],
+)
+def test_names_of_parts_that_are_not_right(name, message):
+    with pytest.raises(kc.robots.ParameterError, match=message):
+        unknowns_of(ROD, [name])
+
+
+@pytest.mark.slow
+def test_a_mass_at_the_tip_is_found():
+    t = 0.02 * np.arange(1, 26)[:, None]
+    moved = kc.simulate(ROD, 0.03 * np.sin(8.0 * t), 0.02, space="euler", initial="equilibrium")
+    guess = ROD.replace(**{"loads.0.mass": 0.03, "youngs_modulus": 2.4e8})
+    estimates = calibrate(guess, [moved], ["youngs_modulus", "loads.0.mass"]).estimates
+    np.testing.assert_allclose(estimates["loads.0.mass"], 0.02, rtol=1e-4)
+    np.testing.assert_allclose(estimates["youngs_modulus"], 2e8, rtol=1e-4)
