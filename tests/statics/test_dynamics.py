@@ -5,6 +5,8 @@ and a torque that follow its tip, a tangential force along it, a dead force, a t
 drag.
 """
 
+import dataclasses
+
 import numpy as np
 import pytest
 from numpy.polynomial import Legendre, Polynomial
@@ -36,7 +38,7 @@ def decided(**loads):
 
 
 def beam(follower=0.0, tangential=0.0, dead=0.0, mass=0.0, damping=0.0, drag=0.0):
-    """Return λ of the slowest modes of a plane Euler-Bernoulli column (natural units), by Galerkin's method."""
+    """Return λ of the slowest modes of a plane column (natural units), by Galerkin's method."""
     x = Polynomial([0.0, 1.0])
     # clamped at 0
     basis = [x**2 * Legendre.basis(k, domain=[0.0, 1.0]).convert(kind=Polynomial) for k in range(9)]
@@ -65,5 +67,61 @@ def beam(follower=0.0, tangential=0.0, dead=0.0, mass=0.0, damping=0.0, drag=0.0
     return values[np.argsort(np.abs(values))][:8]
 
 
-def kinds(loads, name, **others):
-    return [decided(**{name: load}, **others).kind for load in loads]
+@pytest.mark.slow
+def test_a_force_that_follows_the_tip_flutters_and_never_buckles():
+    """Beck (1952): 20.05 EI/L², in both planes at once; a dead force buckles at π²/4."""
+    for load in (5.0, 15.0, 19.8):
+        found = decided(follower=load)
+        assert found.kind == "stable" and found.stable and found.unstable_directions == 0
+        slowest = np.min(np.abs(beam(follower=load)))
+        assert found.eigenvalue.imag * TIME == pytest.approx(slowest, rel=0.01)
+    found, theory = decided(follower=21.0), beam(follower=21.0)
+    fastest = theory[np.argmax(theory.real)]
+    assert found.kind == "flutter" and not found.stable and found.unstable_directions == 2
+    assert found.eigenvalue.real * TIME == pytest.approx(fastest.real, rel=0.02)
+    assert found.eigenvalue.imag * TIME == pytest.approx(abs(fastest.imag), rel=0.01)
+    # the tip moves most, and sideways
+    moved = np.linalg.norm(found.mode[:, :2], axis=1)
+    assert np.max(moved) == pytest.approx(1.0, abs=1e-3)
+    assert "unstable in 2 directions by flutter" in repr(found)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("load", "critical", "kind"),
+    [
+        # Leipholz: a tangential load along the column
+        (lambda q: {"tangential": q}, 40.05, "flutter"),
+        # Pflüger: a tip mass equal to the column's; Galerkin's method
+        (lambda P: {"follower": P, "mass": 1.0}, 16.21, "flutter"),
+        # Bolotin & Zhinzher (1969): slight internal damping halves Beck's load
+        (lambda P: {"follower": P, "damping": 1e-3}, 10.94, "flutter"),
+        # drag raises it; Galerkin's method
+        (lambda P: {"follower": P, "drag": 2.0}, 20.26, "flutter"),
+        # three tenths follow: cos √P = -3/7
+        (lambda P: {"follower": 0.3 * P, "dead": 0.7 * P}, 4.055, "divergence"),
+        (lambda P: {"follower": 0.6 * P, "dead": 0.4 * P}, 16.26, "flutter"),
+    ],
+    ids=["Leipholz", "Pflüger", "Ziegler", "drag", "part, divergence", "part, flutter"],
+)
+def test_classical_loads_are_found_from_both_sides(load, critical, kind):
+    below, above = (decided(**load(part * critical)) for part in (0.98, 1.02))
+    assert below.kind == "stable" and above.kind == kind and above.unstable_directions == 2
+    theory = beam(**load(1.02 * critical))
+    assert above.eigenvalue.real * TIME == pytest.approx(np.max(theory.real), rel=0.1)
+
+
+@pytest.mark.slow
+def test_dead_loads_are_decided_by_energy():
+    for load, kind in ((0.98, "stable"), (1.02, "divergence")):
+        found = decided(dead=load * np.pi**2 / 4.0)
+        assert found.kind == kind and found.eigenvalue is None and found.asymmetry < 1e-8
+
+
+@pytest.mark.slow
+def test_velocities_of_rounding_size_are_no_motion():
+    rest = kc.equilibrium(column(dead=1.0), np.zeros(0), space="lobatto4")
+    y = np.array(rest.y)
+    y[..., rest.system.y_layout.slice("w")] = 3e-8 / TIME
+    found, still = kc.statics.stability(dataclasses.replace(rest, y=y)), kc.statics.stability(rest)
+    assert found.stable and found.least == pytest.approx(still.least, rel=1e-9)

@@ -14,6 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from knode_cosserat.rods.law import InternalState, MaterialLaw
+from knode_cosserat.rods.strands import in_strands
 from knode_cosserat.rods.system import System, unknowns_of
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.grid import grid_of
@@ -32,10 +34,14 @@ MOST_TERMS = 4000
 RATE = 10.0
 #: factors below this are of history that does not move anything
 STILL = 1e-9
-#: largest difference of λ between the two grids in a resolved mode, as a fraction of λ or of the natural rate
-RESOLVED = 0.05
+#: largest difference of λ between the two grids, as a fraction of λ or of the natural rate, up to the first
+#: mode with a larger one: modes beyond it are of the grid. A scheme of order 4 has a fifteenth of the
+#: difference as its error on the finer grid; a quarter is taken
+RESOLVED, ERROR = 0.1, 0.25
 #: rounding of a factor ζ; rounding of λ as a fraction of it; natural rate below which a mode is neutral
 FACTOR_ROUNDING, ROUNDING, NEUTRAL = 1e-13, 1e-8, 1e-4
+#: frequency below which an eigenvalue is real, as a fraction of λ or of the natural rate
+TOGETHER = 1e-6
 #: largest distance, in lengths, between the equilibria of the two grids
 SAME = 0.02
 
@@ -72,6 +78,11 @@ def linearised_modes(system: System, y: np.ndarray, control: np.ndarray) -> Mode
     layout, scale = system.strand.y_layout, np.asarray(system.strand.scales().y)
     if "q" not in layout.names:
         raise ValueError(f"a {type(system).__name__} has no velocity q in y")
+    s = jnp.zeros(())
+    base = in_strands(system, jnp.asarray(y[0]))[0]
+    law = system.nominal.strand.constitutive(s, s, base, jnp.zeros_like(base), jnp.asarray(control))
+    if isinstance(law, InternalState) or (isinstance(law, MaterialLaw) and law.internal is not None):
+        raise ValueError("its friction has no linearisation at rest")
     time = float(scale[layout.slice("p")][0] / scale[layout.slice("q")][0])
     found, c0 = [], RATE / time
     for nodes in grids:
@@ -81,7 +92,7 @@ def linearised_modes(system: System, y: np.ndarray, control: np.ndarray) -> Mode
         at = np.linspace(0.0, 1.0, nodes)
         guess = np.stack([np.interp(at, np.linspace(0.0, 1.0, system.nodes), each) for each in y.T], axis=1)
         solved, error, step = map(np.asarray, _step(own, guess, control, c0))
-        off = np.max(np.abs(system.positions(solved)[[0, -1]] - system.positions(y)[[0, -1]]))
+        off = np.max(np.abs(in_strands(system, solved - guess)[..., layout.slice("p")]))
         if not (error <= NewtonOptions().acceptable and off < SAME * float(system.length)):
             raise ValueError(f"no equilibrium near it is found with {nodes} nodes")
         moving = np.any(step != 0.0, axis=0)
@@ -91,19 +102,25 @@ def linearised_modes(system: System, y: np.ndarray, control: np.ndarray) -> Mode
     coarse, fine = found
     nearest = np.abs(fine[:, None] - coarse).argmin(axis=1)
     sizes = np.maximum(np.abs(fine), 1.0)
-    kept = (np.abs(fine - coarse[nearest]) < RESOLVED * sizes) & (fine.imag >= 0.0)
+    # a double real eigenvalue may be computed as a complex pair
+    fine = np.where(np.abs(fine.imag) < TOGETHER * sizes, fine.real, fine)
+    differs = np.abs(fine - coarse[nearest]) > RESOLVED * sizes
+    kept = (np.abs(fine) < np.min(np.abs(fine[differs]), initial=np.inf)) & (fine.imag >= 0.0)
+    if not np.any(kept):
+        raise ValueError(f"none of its motions is the same with {grids[0]} and {grids[1]} nodes")
     fine, factors, other = fine[kept], factors[kept], coarse[nearest[kept]]
     rounding = (
         ROUNDING * np.abs(fine)
         + FACTOR_ROUNDING * np.abs(RATE - fine) ** 2 / RATE
         + NEUTRAL * (np.abs(fine) < NEUTRAL)
     )
-    uncertainty = np.abs(fine.real - other.real) + rounding
+    uncertainty = ERROR * np.abs(fine.real - other.real) + rounding
     # of motions that neither grow nor decay, the slowest first
     growth = np.where(np.abs(fine.real) <= uncertainty, 0.0, fine.real)
     order = np.lexsort((np.abs(fine), -growth))
     first = _motion(own, step, moving, factors[order[0]])
-    return Modes(*(each[order] / time for each in (fine, uncertainty, rounding)), first)
+    fine, uncertainty, rounding = (each[order] / time for each in (fine, uncertainty, rounding))
+    return Modes(fine, uncertainty, rounding, first)
 
 
 def _history_size(system: System) -> int:
@@ -128,7 +145,7 @@ def _step(system: System, guess: Any, control: Any, c0: Any) -> tuple[Any, Any, 
 
 def _motion(system: System, step: np.ndarray, moving: np.ndarray, factor: complex) -> np.ndarray:
     """Return the complex amplitude of y at the nodes in the motion with a factor, by inverse iteration."""
-    own = step[np.ix_(moving, moving)] - factor * (1.0 + STILL) * np.eye(np.count_nonzero(moving))
+    own = step[np.ix_(moving, moving)] - factor * (1.0 + STILL) * np.eye(int(np.sum(moving)))
     vector = np.linalg.solve(own, np.linalg.solve(own, np.ones(len(own))))
     grid = grid_of(system, Lobatto4())
     record = (step[:, moving] @ (vector / np.max(np.abs(vector)))).reshape(-1, _history_size(system))

@@ -273,7 +273,7 @@ class _Variation:
                 f"{modes.uncertainty[doubtful][0]:.2g} 1/s"
             )
         # the phase of the largest displacement
-        p = np.asarray(system.positions(modes.first)).reshape(len(modes.first), system.strands, 3)
+        p = in_strands(system, modes.first)[..., system.strand.y_layout.slice("p")]
         largest = p.ravel()[np.argmax(np.abs(p))]
         moves = np.real(p * np.conj(largest))
         grid, nodes = (np.linspace(0.0, 1.0, size) for size in (len(moves), system.nodes))
