@@ -26,6 +26,7 @@ from knode_cosserat.cli.arguments import (
 )
 from knode_cosserat.cli.output import vector_text, write_output
 from knode_cosserat.cli.program import app, examples
+from knode_cosserat.cli.summaries import stability_summary
 from knode_cosserat.rods.parameters import in_other_unit
 
 if TYPE_CHECKING:
@@ -98,6 +99,7 @@ def reach(
         low=parse_limits("--low", low, size), high=parse_limits("--high", high, size),
         tolerance=tolerance, space=space,
     )  # fmt: skip
+    stability, warnings = _stability(found)
     facts: dict[str, Any] = {
         "robot": robot,
         "result": found.result.name.lower(),
@@ -112,7 +114,7 @@ def reach(
         "at_low": found.at_low.tolist(),
         "at_high": found.at_high.tolist(),
         "from_rest": found.from_rest,
-        "unstable": _unstable(found),
+        **stability,
         "iterations": found.iterations,
     }
     lines = [
@@ -131,8 +133,7 @@ def reach(
         if np.any(active):
             indices = np.flatnonzero(active)
             lines.append(f"at the {name} limit: {', '.join(names[i] for i in indices)}")
-    if facts["unstable"]:
-        lines.append("UNSTABLE: a small disturbance moves the robot away from this shape")
+    lines += warnings
     if not found.from_rest and facts["position"]:
         lines.append(f"the robot has several equilibria under these {word}: start near this one to reach it")
     write_output(as_json, facts, lines)
@@ -232,14 +233,15 @@ def _control_text(system: System, control: list[float]) -> str:
     return "controls: " + ", ".join(words)
 
 
-def _unstable(found: InverseKinematics) -> bool | None:
-    """Return True if the equilibrium is unstable; None if `kc.statics.stability` does not apply."""
+def _stability(found: InverseKinematics) -> tuple[dict[str, Any], list[str]]:
+    """Return facts and lines on the stability of the equilibrium, if `kc.statics.stability` applies."""
     import knode_cosserat as kc
 
     try:
-        return not kc.statics.stability(found.equilibrium).stable
+        decided = kc.statics.stability(found.equilibrium)
     except ValueError:
-        return None
+        return stability_summary(None)
+    return stability_summary(decided.kind, decided.reason)
 
 
 def _number(value: float) -> float | None:

@@ -41,6 +41,7 @@ from knode_cosserat.cli.summaries import (
     motion_summary,
     parameters,
     residual_summary,
+    stability_summary,
 )
 
 if TYPE_CHECKING:
@@ -184,10 +185,10 @@ def equilibrium(
     system = load_system(robot, changes, nodes)
     with coarse_grid_in_output():
         rest = kc.equilibrium(system, _control(system, tension, control), space=space)
-        unstable = _unstable(rest, space)
+        stability, warnings = _stability(rest, space)
     if out:
         rest.save(out)
-    facts = {"robot": robot, **equilibrium_summary(rest), "unstable": unstable}
+    facts = {"robot": robot, **equilibrium_summary(rest), **stability}
     lines = [
         f"tip: {vector_text(facts['tip_position'])} m",
         f"inclination of the tip from the z axis: {np.degrees(facts['tip_inclination']):.2f} degrees",
@@ -197,8 +198,7 @@ def equilibrium(
     if "base_force" in facts:
         lines.append(f"internal force at the base: {vector_text(facts['base_force'])} N")
         lines.append(f"internal moment at the base: {vector_text(facts['base_moment'])} N m")
-    if facts["unstable"]:
-        lines.append("UNSTABLE: a small disturbance moves the robot away from this shape")
+    lines += warnings
     if rest.result[0] == kc.Result.OTHER_TURNS:
         lines.append(f"OTHER TURNS: {facts['result']}")
     if rest.extrapolation:
@@ -270,19 +270,21 @@ def schema(
     typer.echo(json.dumps(kc.robots.robot_schema(), indent=None if as_json else 2, ensure_ascii=False))
 
 
-def _unstable(rest: Any, space: str) -> bool | None:
-    """Return True if an equilibrium is unstable, by its energy or its compliance; None if unknown."""
+def _stability(rest: Any, space: str) -> tuple[dict[str, Any], list[str]]:
+    """Return facts and lines on the stability of an equilibrium, by `kc.statics.stability` or compliance."""
     import knode_cosserat as kc
 
     if rest.result[0] == kc.Result.UNSTABLE:
-        return True
+        return stability_summary("divergence")
     try:
-        return not kc.statics.stability(rest).stable
+        decided = kc.statics.stability(rest)
+        return stability_summary(decided.kind, decided.reason)
     except ValueError:
         # with reels, or without internal force and moment
         if not {"n", "m"} <= set(rest.system.tip_layout.names):
-            return None
-        return bool(kc.statics.configuration(rest.system, rest.control[0], space=space).unstable)
+            return stability_summary(None)
+        unstable = bool(kc.statics.configuration(rest.system, rest.control[0], space=space).unstable)
+        return stability_summary("divergence" if unstable else "stable")
 
 
 def _control(system: System, tension: str | None, control: str | None) -> Any:

@@ -83,6 +83,17 @@ def equilibrium_summary(rest: Trajectory) -> dict[str, Any]:
     return facts
 
 
+def stability_summary(kind: str | None, reason: str = "") -> tuple[dict[str, Any], list[str]]:
+    """Return facts and lines on a kind of `kc.statics.Stability`; None: no decision is possible."""
+    lines = {
+        "divergence": ["UNSTABLE: a small disturbance moves the robot away from this shape"],
+        "flutter": ["UNSTABLE by flutter: a small disturbance grows to oscillations about this shape"],
+        "undecided": [f"stability is undecided: {reason}"],
+    }
+    unstable = None if kind in (None, "undecided") else kind != "stable"
+    return {"unstable": unstable, "stability": kind}, lines.get(kind or "", [])
+
+
 def parameters(system: System) -> dict[str, dict[str, Any]]:
     """Return the parameters by name, with value, unit and meaning; for a model, of its nominal robot."""
     system = system.nominal

@@ -3,6 +3,10 @@
 A robot's equilibria G(y, ξ; control) = 0 form a curve as the control moves on a line. Parametrised by the
 load, the curve ends at a maximum of the load: the robot snaps. Parametrised by its own arclength it continues
 beyond (Keller 1977).
+
+Some equilibria belong to a neutral family at one control: a closed ring of round section turns about its
+tangent without a force. The path does not move along such a family: of all tangents and corrections it takes
+the smallest.
 """
 
 from __future__ import annotations
@@ -31,6 +35,10 @@ from knode_cosserat.trajectory import Trajectory
 MOST_CORRECTIONS, FEW, MANY = 12, 4, 7
 #: shortest, longest and first step along the path, in natural units
 SHORTEST, LONGEST, FIRST = 1e-5, 0.2, 0.05
+#: singular value of the tip's conditions below which a direction may be neutral, as a fraction of the
+#: largest. At a limit point the load drives the robot along it: the tip's conditions then have a residual,
+#: as a fraction of the change of y in natural units
+NEUTRAL, DRIVEN = 1e-7, 1e-5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -181,6 +189,14 @@ def _corrected(system, settings, ends, start, tangent, plane):  # type: ignore[n
         error = jnp.maximum(jnp.max(jnp.abs(defects) / scale), jnp.max(jnp.abs(tip) / system.scales().tip))
         problem = static_problem(system, settings, ends[0] + part * (ends[1] - ends[0]))
         factors = factors_of(problem, y, unknowns_of(system, y[0]))
+        # of a neutral family, the smallest solutions
+        rows, columns = system.scales().tip, scale[pivots]
+        at_tip = factors.tip @ factors.X[-1, -1] * columns / rows[:, None]
+        smallest = factors._replace(inverse=columns[:, None] * jnp.linalg.pinv(at_tip, NEUTRAL) / rows)
+        follow, _ = solved_correction(smallest, pivots, *moved)
+        left = jnp.max(jnp.abs(moved[1] + factors.tip @ follow[-1]) / rows)
+        driven = left > DRIVEN * jnp.sqrt(jnp.mean((follow / scale) ** 2))
+        factors = factors._replace(inverse=jnp.where(driven, factors.inverse, smallest.inverse))
         remove, _ = solved_correction(factors, pivots, defects, tip, base)
         follow, _ = solved_correction(factors, pivots, *moved)
         return jnp.where(jnp.isnan(error), jnp.inf, error), remove, follow

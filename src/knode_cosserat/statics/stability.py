@@ -1,16 +1,19 @@
-"""Stability of an equilibrium: the second variation of its energy, by the stiffness of its segments.
+"""Stability of an equilibrium: by its energy, or for loads without a potential by its linearised motion.
 
 Each segment is a finite element (`stiffness`). The sum over the segments, restricted by the boundary
-conditions, is the second variation of the energy. An equilibrium is stable if this has no negative
-eigenvalue. Segments are divided until the number of negative eigenvalues is constant. Buckling between two
-nodes is counted too.
+conditions, is the stiffness of the robot. With a potential it is symmetric, the second variation of the
+energy, and an equilibrium is stable if this has no negative eigenvalue. Segments are divided until the number
+of negative eigenvalues is constant. Buckling between two nodes is counted too.
+
+Loads that follow the rod may have no potential. The stiffness is then unsymmetric on any grid, and its
+eigenvalues decide nothing: Beck's column flutters at 20.05 EI/L² and has no other critical load. The
+eigenvalues of its linearised motion decide (`dynamics`), with the robot's own damping.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -25,6 +28,7 @@ from knode_cosserat.solvers.equilibrium import equilibrium as rests
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import Lobatto4
+from knode_cosserat.statics.dynamics import linearised_modes
 from knode_cosserat.statics.stiffness import (
     NEEDED,
     Pieces,
@@ -51,32 +55,64 @@ POINTS = 400
 ROUNDING = 1e-14
 #: if rounding exceeds this, in natural units, a least eigenvalue within rounding is not decided
 SEEN = 1e-3
+#: asymmetry above which loads have no potential; that of a scheme's error falls as segments are divided, at
+#: order 4 to a sixteenth
+UNSYMMETRIC, FALLING = 1e-6, 0.25
+#: number of slowest directions in which the asymmetry is measured
+SLOWEST = 60
 #: results of a solve that converged to a nearby solution
 NEARBY = (Result.CONVERGED, Result.COARSE, Result.RECOVERED_LOAD_CONTINUATION)
 
 
 class Stability(NamedTuple):
-    """The second variation of an equilibrium's energy."""
+    """Stability of an equilibrium: the second variation of its energy, or its linearised motion."""
 
-    #: number of negative eigenvalues; zero for a stable equilibrium. If segments would buckle even in 16
-    #: parts, it is the count in the nodes' displacements only
+    #: number of directions in which it is unstable, zero for a stable equilibrium, -1 if undecided: negative
+    #: eigenvalues of the second variation (in the nodes' displacements only, if segments would buckle even in
+    #: 16 parts), or for loads without a potential growing modes
     unstable_directions: int
-    #: the smallest eigenvalue, in natural units (EI/L): zero at the onset of buckling or snapping
+    #: the smallest eigenvalue of the stiffness's symmetric part, in natural units (EI/L): with a potential it
+    #: is zero at the onset of buckling or snapping
     least: float
-    #: (nodes, 3): displacement of the line in the direction of the smallest eigenvalue, with maximum 1; for
-    #: several rods (nodes, rods, 3)
+    #: (nodes, 3): displacement of the line in the direction of the smallest eigenvalue, or in the fastest
+    #: growing mode, with maximum 1; for several rods (nodes, rods, 3)
     mode: np.ndarray
-    #: asymmetry of the stiffness, as a fraction of its largest entry: conservative loads give a symmetric
-    #: stiffness; follower loads do not
+    #: work of the loads around a small cycle of two displacements, over the energies of both: zero for loads
+    #: with a potential; it does not depend on the nodes
     asymmetry: float
+    #: for loads without a potential: growth rate + i · angular frequency (1/s) of the mode that grows most or
+    #: decays least
+    eigenvalue: complex | None = None
+    #: reason why stability is undecided
+    reason: str = ""
+    #: number of directions whose eigenvalue is zero within the error of the segments, such as rotations of a
+    #: closed ring
+    neutral_directions: int = 0
 
     def __repr__(self) -> str:
-        kind = "stable" if self.stable else f"unstable in {count_of(self.unstable_directions, 'direction')}"
-        return f"Stability: {kind}; smallest eigenvalue {self.least:.4g} (in units of EI/L)"
+        count = f"unstable in {count_of(max(self.unstable_directions, 0), 'direction')}"
+        kind = {
+            "stable": "stable", "neutral": "neutral", "divergence": count, "flutter": f"{count} by flutter",
+            "undecided": f"undecided: {self.reason}",
+        }[self.kind]  # fmt: skip
+        if self.eigenvalue is None:
+            return f"Stability: {kind}; smallest eigenvalue {self.least:.4g} (in units of EI/L)"
+        growth, frequency = self.eigenvalue.real, abs(self.eigenvalue.imag) / (2.0 * np.pi)
+        return f"Stability: {kind}; growth rate {growth:.4g} 1/s at {frequency:.4g} Hz"
+
+    @property
+    def kind(self) -> str:
+        """Kind: "stable", "neutral", "divergence" or "flutter" if it is unstable, or "undecided".
+
+        A robot with a potential can only diverge. With several growing modes, the fastest decides the kind.
+        """
+        if self.unstable_directions < 1:
+            return "undecided" if not self.stable else "neutral" if self.neutral_directions else "stable"
+        return "divergence" if self.eigenvalue is None or self.eigenvalue.imag == 0.0 else "flutter"
 
     @property
     def stable(self) -> bool:
-        """True if the second variation has no negative eigenvalue."""
+        """True if it is decided that nothing grows; neutral directions count as stable."""
         return self.unstable_directions == 0
 
 
@@ -84,18 +120,22 @@ def stability(equilibrium: Trajectory, row: int = -1) -> Stability:
     """Return the stability of a robot's equilibrium under small perturbations.
 
     It holds for any boundary conditions: buckling between clamps, an arch about to snap, a column about to
-    fall. An equilibrium from another scheme along the rod is solved again by Lobatto4. Follower loads have no
-    potential: their divergence is detected, their flutter is not. Friction is ignored, because it can only
-    stabilise.
+    fall. An equilibrium from another scheme along the rod is solved again by Lobatto4. Loads with a potential
+    are decided by the energy; friction is then ignored, because it can only stabilise. Other loads, such as
+    those that follow the rod, are decided by the eigenvalues of the linearised motion: it may grow without
+    oscillation (divergence) or with one (flutter). The robot's own damping enters, also if it is zero.
 
     Args:
         equilibrium: result of `kc.equilibrium` for one robot, or a trajectory that has come to rest.
         row: index of the row.
 
+    Returns:
+        A `Stability`. Its kind is "undecided", with a reason, if rounding exceeds the stiffness, if there are
+        too few nodes for the loads, or if two grids disagree on the growth of a motion.
+
     Raises:
         ValueError: the row is no equilibrium; the system is not made of rods with positions and orientations;
-            or its y has further energetic variables (such as tendons on reels). Or stability cannot be
-            decided: too few nodes for the loads, or rounding that exceeds the stiffness.
+            or its y has further energetic variables (such as tendons on reels).
     """
     system, y, z, control = _checked(equilibrium, row)
     space = (equilibrium.settings or Settings()).space
@@ -111,8 +151,12 @@ def stability(equilibrium: Trajectory, row: int = -1) -> Stability:
                 'allowed is one that was solved with space="lobatto4"'
             )
         y = np.asarray(found.y[0])
+    # the velocities of an equilibrium are rounding of the solver
+    y, layout = y.copy(), system.strand.y_layout
+    for name in set(system.strand.velocities) & set(layout.names):
+        in_strands(system, y)[..., layout.slice(name)] = 0.0
     by = [count for count in DIVISIONS if count <= 2 or count * system.nodes * system.strands <= POINTS]
-    return _decided(system, divided(system, y, control, by), row)
+    return _decided(system, y, control, by)
 
 
 def _checked(equilibrium: Any, row: Any) -> tuple[System, np.ndarray, np.ndarray, np.ndarray]:
@@ -172,11 +216,11 @@ class _Variation:
 
     @functools.cached_property
     def spectrum(self) -> tuple[np.ndarray, np.ndarray]:
-        """Eigenvalues in natural units, and the poses of all points in their directions (points, ways)."""
+        """Eigenvalues of the symmetric part in natural units, and directions in the free coordinates."""
         weight = np.repeat(self.part, len(self.free) // len(self.part))
         root = 1.0 / np.sqrt(np.sum(self.free**2 * weight[:, None], axis=0))
         values, vectors = np.linalg.eigh(root[:, None] * symmetric(self.energy) * root)
-        return values, self.free @ (root[:, None] * vectors)
+        return values, root[:, None] * vectors
 
     @property
     def rounding(self) -> float:
@@ -188,42 +232,91 @@ class _Variation:
         """Number of negative eigenvalues."""
         return int(np.sum(self.spectrum[0] < -self.rounding))
 
-    def told(self, system: System, row: int) -> Stability:
-        """Return the result; raise `ValueError` if rounding leaves it open."""
-        values, ways = self.spectrum
+    @functools.cached_property
+    def asymmetry(self) -> float:
+        """Largest work around a cycle of two displacements, over the energies of both.
+
+        The slowest directions have nearly all of it: with more of them, or more nodes, it converges.
+        """
+        values, vectors = self.spectrum
+        slow = np.argsort(np.abs(values))[:SLOWEST]
+        own = vectors[:, slow] / np.sqrt(np.maximum(np.abs(values[slow]), 1.0))
+        return float(np.linalg.norm(own.T @ (self.energy - self.energy.T) @ own / 2.0, 2))
+
+    def by_energy(self, system: System, count: int, neutral: int = 0, reason: str = "") -> Stability:
+        """Return the stability of a robot with a potential, from the numbers of eigenvalues."""
+        values, vectors = self.spectrum
         least = float(values[0])
-        if self.rounding > SEEN and abs(least) <= self.rounding:
-            raise ValueError(
-                f"row {row} cannot be decided: its least eigenvalue, {least:.2g} EI/L, is within the "
-                f"rounding of the largest, {self.rounding:.2g} EI/L; allowed is a rod that is less slender"
+        if not reason and self.rounding > SEEN and abs(least) <= self.rounding:
+            count, reason = (
+                -1,
+                (
+                    f"the least eigenvalue, {least:.2g} EI/L, is within the rounding of the largest, "
+                    f"{self.rounding:.2g} EI/L; a rod that is less slender can be decided"
+                ),
             )
-        moves = ways[:, 0].reshape(-1, system.strands, 6)[self.nodes, :, :3]
-        # a mode of pure torsion does not move the line
-        moves = moves / max(float(np.max(np.linalg.norm(moves, axis=-1))), np.finfo(float).tiny)
-        mode = moves[:, 0] if system.strands == 1 else moves
-        asymmetry = float(np.max(np.abs(self.energy - self.energy.T)) / np.max(np.abs(self.energy)))
-        return Stability(self.count, least, mode, asymmetry)
+        moves = (self.free @ vectors[:, 0]).reshape(-1, system.strands, 6)[self.nodes, :, :3]
+        return Stability(count, least, _mode(moves), self.asymmetry, None, reason, neutral)
+
+    def by_motion(self, system: System, y: np.ndarray, control: np.ndarray) -> Stability:
+        """Return the stability of a robot whose loads have no potential."""
+        try:
+            modes = linearised_modes(system, y, control)
+        except ValueError as error:
+            return self.by_energy(system, -1, reason=f"loads without a potential; {error}")
+        first, growing, doubtful = modes.values[0], modes.growing, modes.undecided
+        directions, reason = int(np.sum(growing)), ""
+        if not directions and np.any(doubtful):
+            directions, first = -1, modes.values[doubtful][0]
+            reason = (
+                f"loads without a potential; a mode's growth rate of {first.real:.2g} 1/s is uncertain by "
+                f"{modes.uncertainty[doubtful][0]:.2g} 1/s"
+            )
+        # the phase of the largest displacement
+        p = in_strands(system, modes.first)[..., system.strand.y_layout.slice("p")]
+        largest = p.ravel()[np.argmax(np.abs(p))]
+        moves = np.real(p * np.conj(largest))
+        grid, nodes = (np.linspace(0.0, 1.0, size) for size in (len(moves), system.nodes))
+        moves = np.apply_along_axis(lambda own: np.interp(nodes, grid, own), 0, moves)
+        least = float(self.spectrum[0][0])
+        return Stability(directions, least, _mode(moves), self.asymmetry, complex(first), reason)
 
 
-def _decided(system: System, divisions: Iterator[Pieces], row: int) -> Stability:
-    """Return the result if two divisions in a row agree, or if the last ones are all unstable."""
-    counts: list[int] = []
-    sure, found = False, None
-    for pieces in divisions:
+def _mode(moves: np.ndarray) -> np.ndarray:
+    """Return displacements (nodes, strands, 3) with maximum 1; a single strand has no axis."""
+    # a mode of pure torsion does not move the line
+    moves = moves / max(float(np.max(np.linalg.norm(moves, axis=-1))), np.finfo(float).tiny)
+    return moves[:, 0] if moves.shape[1] == 1 else moves
+
+
+def _decided(system: System, y: np.ndarray, control: np.ndarray, by: list[int]) -> Stability:
+    """Return the stability if two divisions in a row agree, or if the last ones are all unstable."""
+    found: list[_Variation] = []
+    sure = False
+    for pieces in divided(system, y, control, by):
         _require_rest(system, pieces.ends.base, pieces.moved)
-        found = _variation(system, pieces)
-        counts.append(found.count)
+        found.append(_variation(system, pieces))
+        asymmetry = [each.asymmetry for each in found[-2:]]
+        if len(found) > 1 and asymmetry[1] > max(UNSYMMETRIC, FALLING * asymmetry[0]):
+            return found[-1].by_motion(system, y, control)
         # a piece that is unstable by itself may hide negative eigenvalues
         before, sure = sure, firm(pieces.stiffness)
-        if before and sure and counts[-1] == counts[-2]:
-            return found.told(system, row)
-    if found is not None and all(counts[-2:]):
-        return found.told(system, row)
-    raise ValueError(
-        f"row {row} cannot be decided: with segments divided further and further it has "
-        f"{', '.join(map(str, counts))} unstable directions; allowed is a rod with more nodes than "
-        f"{system.nodes}, by which no segment buckles alone"
+        if before and sure:
+            coarse, fine = found[-2:]
+            values, error = fine.spectrum[0], fine.rounding
+            if len(coarse.spectrum[0]) == len(values):
+                error = error + np.abs(values - coarse.spectrum[0])
+            count, neutral = int(np.sum(values < -error)), int(np.sum(np.abs(values) <= error))
+            if count <= coarse.count <= count + neutral:
+                return fine.by_energy(system, count, neutral)
+    counts = [each.count for each in found]
+    if all(counts[-2:]):
+        return found[-1].by_energy(system, counts[-1])
+    reason = (
+        f"with segments divided in {', '.join(map(str, by))} it has {', '.join(map(str, counts))} unstable "
+        f"directions; more nodes than {system.nodes}, by which no segment buckles alone, can decide"
     )
+    return found[-1].by_energy(system, -1, reason=reason)
 
 
 def _variation(system: System, pieces: Pieces) -> _Variation:
