@@ -87,7 +87,7 @@ def simulated_rows(
     tension = stepped(tension, tension[0] if initial is None else initial, count, continuous)
     acting = robot.undelayed(tension, dt / count, initial)
     found = simulate(
-        robot, acting, dt / count, time=time_scheme(dt, continuous), space=space, initial=start,
-        recovery_budget=recovery,
+        robot, acting, dt / count, time=time_scheme(dt, continuous), space=space, start="paper",
+        initial=start, recovery_budget=recovery,
     )  # fmt: skip
     return found[::count] if count > 1 else found

@@ -128,7 +128,7 @@ def applied_controls(part: RecordingPart) -> Float[np.ndarray, "T c"]:
 def _estimated(part: RecordingPart, robot: System, method: str) -> Trajectory:
     control, settings = applied_controls(part), None
     if method == "paper":
-        settings = Settings(space=Euler())
+        settings = Settings(space=Euler(), start="paper")
         y, z = paper.paper_states(part, robot, control, settings)
     else:
         y, z = _best(part, robot, control)
