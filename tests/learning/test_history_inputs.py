@@ -25,7 +25,7 @@ DT = 0.05
 
 
 def learned(c0, **options):
-    """The robot with a random network of history inputs; its weights are twice the first ones of the paper."""
+    """The robot with a random network of history inputs; its weights are twice the first ones."""
     net = network(ROBOT, NetworkOptions(hidden=3, history=True, **options), jax.random.key(0), c0)
     return KNODE(ROBOT, dataclasses.replace(net, output_weights=2.0 * net.output_weights))
 
