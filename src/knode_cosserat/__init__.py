@@ -111,7 +111,7 @@ _MOVED = {
         "configuration equilibrium_path jacobian manipulability stability"
     ),
     "identification": "IdentificationError Identified",
-    "metrics": "StateError node_error pose_mse state_errors tip_dtw tip_rmse",
+    "metrics": "StateError node_error pose_mse rotation_rmse state_errors tip_dtw tip_rmse",
     "viewer": "export_scene view_live",
     "diagnosis": "Diagnosis doctor",
 }

@@ -7,7 +7,14 @@ from hypothesis import given
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
-from knode_cosserat.evaluation.metrics import dtw_distance, node_error, pose_mse, tip_dtw, tip_rmse
+from knode_cosserat.evaluation.metrics import (
+    dtw_distance,
+    node_error,
+    pose_mse,
+    rotation_rmse,
+    tip_dtw,
+    tip_rmse,
+)
 
 
 @dataclass
@@ -112,7 +119,7 @@ def test_tip_dtw_reads_last_nodes_and_takes_different_rows_and_nodes():
     assert tip_dtw(a, b) == dtw_distance(a.position[:, 3], b.position[:, 2])
 
 
-@pytest.mark.parametrize("metric", [tip_dtw, pose_mse, tip_rmse])
+@pytest.mark.parametrize("metric", [tip_dtw, pose_mse, rotation_rmse, tip_rmse])
 def test_equal_histories_have_no_error(metric):
     assert metric(wiggling(), wiggling()) == 0
 
@@ -128,6 +135,36 @@ def test_pose_mse_of_a_constant_rotation(axis):
     turned = straight()
     turned.quaternion[:] = Rotation.from_euler(axis, 0.3).as_quat(scalar_first=True)
     assert pose_mse(turned, straight()) == pytest.approx(1000 * 0.3**2 / 6)
+
+
+@pytest.mark.parametrize("angle", [0.3, 1.7, 3.0])
+def test_rotation_rmse_is_the_angle_about_any_axis(angle):
+    """Also beyond a right angle, where Euler angles jump."""
+    for seed in range(5):
+        moved, axis = wiggling(seed=seed), np.random.default_rng(seed).normal(size=3)
+        turn = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis))
+        before = Rotation.from_quat(moved.quaternion.reshape(-1, 4), scalar_first=True)
+        moved.quaternion = -2.0 * (turn * before).as_quat(scalar_first=True).reshape(6, 4, 4)
+        assert rotation_rmse(moved, wiggling(seed=seed)) == pytest.approx(angle, abs=1e-9)
+
+
+def test_rotation_rmse_does_not_depend_on_the_global_frame():
+    """Two histories seen from a turned frame: the paper's metric changes, the angle does not."""
+    both = wiggling(), wiggling(seed=1)
+    angle, paper = rotation_rmse(*both), pose_mse(*both)
+    turn = Rotation.from_euler("x", 1.2)
+    for each in both:
+        seen = turn * Rotation.from_quat(each.quaternion.reshape(-1, 4), scalar_first=True)
+        each.quaternion = seen.as_quat(scalar_first=True).reshape(6, 4, 4)
+        each.position = turn.apply(each.position.reshape(-1, 3)).reshape(6, 4, 3)
+    assert rotation_rmse(*both) == pytest.approx(angle, rel=1e-12)
+    assert pose_mse(*both) != pytest.approx(paper, rel=0.01)
+
+
+def test_rotation_rmse_averages_squares_over_rows_and_nodes():
+    moved = straight(rows=5, nodes=4)
+    moved.quaternion[2, 1] = Rotation.from_rotvec([0.0, 0.6, 0.0]).as_quat(scalar_first=True)
+    assert rotation_rmse(moved, straight(rows=5, nodes=4)) == pytest.approx(0.6 / np.sqrt(20.0))
 
 
 def test_pose_mse_order_of_the_angles():
@@ -167,19 +204,19 @@ def test_tip_rmse_takes_different_nodes():
     assert tip_rmse(straight(nodes=4, length=1.0), straight(nodes=9, length=1.5)) == pytest.approx(0.5)
 
 
-@pytest.mark.parametrize("metric", [pose_mse, tip_rmse, node_error])
+@pytest.mark.parametrize("metric", [pose_mse, rotation_rmse, tip_rmse, node_error])
 def test_rows_must_agree(metric):
     with pytest.raises(ValueError, match="prediction has 5 rows and reference has 6"):
         metric(straight(rows=5), straight(rows=6))
 
 
-@pytest.mark.parametrize("metric", [pose_mse, node_error])
+@pytest.mark.parametrize("metric", [pose_mse, rotation_rmse, node_error])
 def test_nodes_must_agree(metric):
     with pytest.raises(ValueError, match="prediction has 4 nodes and reference has 3"):
         metric(straight(nodes=4), straight(nodes=3))
 
 
-METRICS = [tip_dtw, pose_mse, tip_rmse, node_error]
+METRICS = [tip_dtw, pose_mse, rotation_rmse, tip_rmse, node_error]
 
 
 @pytest.mark.parametrize("metric", METRICS)

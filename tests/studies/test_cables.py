@@ -10,13 +10,23 @@ import pytest
 from typer.testing import CliRunner
 
 from knode_cosserat.cli import app
+from knode_cosserat.recordings.cables import CableData, CableMotion
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.studies.cables import frames, study
 from knode_cosserat.studies.cables.correction import learned_correction
 from knode_cosserat.studies.cables.identification import SearchStage, identify_cable
 from knode_cosserat.studies.cables.model import DT, CableModel, CableParameters, Grips
 from knode_cosserat.studies.cables.places import marker_places
-from knode_cosserat.studies.cables.rollouts import CHUNK, NAMES, Rollouts, cable_coordinates, cable_parameters
+from knode_cosserat.studies.cables.report import as_markdown
+from knode_cosserat.studies.cables.result import CableResult
+from knode_cosserat.studies.cables.rollouts import (
+    CHUNK,
+    NAMES,
+    CablePrediction,
+    Rollouts,
+    cable_coordinates,
+    cable_parameters,
+)
 from knode_cosserat.studies.cables.shapes import CableGrid, Fitter
 
 SPACE, NODES = "lobatto2", 9
@@ -177,6 +187,96 @@ def test_a_correction_is_kept_only_where_it_helps():
 def test_a_prediction_that_fails_has_a_reason(motions):
     prediction = Rollouts(MODEL, "no such scheme").predict(TRUE, motions[0])
     assert prediction.markers is None and "no such scheme" in prediction.failure
+
+
+def _shaken(markers):
+    """One grip shakes at 5 m/s."""
+    moved = markers.copy()
+    moved[2:, -2:] += 0.05 * np.sin(np.arange(len(markers) - 2))[:, None, None] * np.array([0.0, 1.0, 0.0])
+    return moved
+
+
+def _turned(markers):
+    """One grip turns by a right angle in one frame."""
+    moved = markers.copy()
+    moved[12:, 0] = moved[12:, 1] - [0.0, 0.02, 0.0]
+    return moved
+
+
+def _taut(markers):
+    """The grips move apart to 2 % more than the length at 4 m/s, and jump back in one frame."""
+    moved = markers.copy()
+    apart = frames.unit(markers[0, -2] - markers[0, 1])
+    missing = 1.02 * PLACES[-1] - np.linalg.norm(markers[0, -2] - markers[0, 1])
+    away = np.zeros(len(markers))
+    away[4:16] = np.minimum(0.04 * np.arange(1, 13), missing)
+    moved[:, -2:] += away[:, None, None] * apart
+    return moved
+
+
+def _dropped(markers):
+    """One grip is 12 cm away from one frame to the next."""
+    moved = markers.copy()
+    moved[12:, -2:] += [-0.07, 0.07, 0.07]
+    return moved
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:the grid is too coarse")
+@pytest.mark.parametrize("fast", [_shaken, _turned, _taut, _dropped, lambda markers: markers[::6]])
+@pytest.mark.parametrize("thin", [False, True])
+def test_fast_grips_do_not_stop_a_prediction(rollouts, fast, thin):
+    """Thin: a tenth of the stiffness and hardly any damping. The cable stays between its grips."""
+    markers = fast(held(120, 1))
+    p = TRUE.replace(bending=2e-3, torsion=2e-3, damping_time=2e-3, drag=0.1) if thin else TRUE
+    found = rollouts.predict(p, markers)
+    assert found.failure == "" and found.markers.shape == (len(markers) - 2, 3, 3)
+    for grip in (1, -2):
+        far = np.linalg.norm(found.markers - markers[2:, grip, None], axis=-1)
+        assert np.max(far) < 1.1 * PLACES[-1]
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:the grid is too coarse")
+@pytest.mark.parametrize("hardest", [4, 16])
+def test_frames_without_a_solution_are_divided(rollouts, monkeypatch, hardest):
+    """Whole steps, and those of a quarter, are told to fail late: the motion is nearly the same."""
+    markers = held(60, 1)
+    plain = rollouts.predict(TRUE, markers)
+    whole = simulate
+
+    def failing(robot, controls, dt, **given):
+        found = whole(robot, controls, dt, **given)
+        result, after = np.array(found.result), np.asarray(found.time) > 0.201
+        if dt * hardest > 1.001 * DT and after.any():
+            result[max(1, np.argmax(after)) :] = -1
+        return dataclasses.replace(found, result=result)
+
+    monkeypatch.setattr("knode_cosserat.studies.cables.rollouts.simulate", failing)
+    divided = rollouts.predict(TRUE, markers)
+    assert plain.divided == 0 and 30 < divided.divided < 50
+    np.testing.assert_array_equal(divided.markers[:15], plain.markers[:15])
+    moved = np.ptp(plain.markers, axis=0).max()
+    np.testing.assert_allclose(divided.markers, plain.markers, atol=0.1 * moved)
+
+
+@pytest.mark.slow
+def test_a_motion_without_prediction_is_named_and_left_out(rollouts, motions, monkeypatch):
+    """The means are those of the others."""
+    data = CableData("A", (), tuple(CableMotion(str(k), markers) for k, markers in enumerate(motions)))
+    predict_all = rollouts.predict_all
+
+    def one_fails(p, given):
+        found = predict_all(p, given)
+        return [CablePrediction(None, failure="frame 7: no solution found"), *found[1:]]
+
+    monkeypatch.setattr(rollouts, "predict_all", one_fails)
+    cells, predictions = study._evaluated(data, rollouts, TRUE, None)
+    result = CableResult(data, MODEL, TRUE, cells, predictions, [])
+    text = as_markdown([result])
+    assert "- 0, best: frame 7: no solution found" in text and "left out of the means" in text
+    mean = np.mean([each["mean_abs_error"] for each in cells[2::3] if "failed" not in each])
+    assert f"{1e3 * mean:.2f} (1 failed)" in text
 
 
 @matplotlib

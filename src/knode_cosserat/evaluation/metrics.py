@@ -144,6 +144,23 @@ def tip_rmse(prediction: PoseHistory, reference: PoseHistory) -> float:
     return float(rms_distance(predicted[0][:, -1], expected[0][:, -1]))
 
 
+def rotation_rmse(prediction: PoseHistory, reference: PoseHistory) -> float:
+    """Return the root mean square over rows and nodes of the angle between the orientations.
+
+    The angle is that of the one rotation which turns the reference's orientation to the prediction's, from 0
+    to π. Unlike the Euler angles of `pose_mse` it does not depend on the axes of the global frame.
+
+    Returns:
+        The error, rad.
+
+    Raises:
+        ValueError: a shape is wrong, rows or nodes differ, or a state is invalid.
+    """
+    predicted, expected = _comparable_poses(prediction, reference)
+    turned, from_there = (_rotations(each[1]) for each in (predicted, expected))
+    return float(np.sqrt(np.mean((from_there.inv() * turned).magnitude() ** 2)))
+
+
 def node_error(prediction: PoseHistory, reference: PoseHistory) -> Array:
     """Return the root mean square over rows of the Euclidean distance between positions, for each node.
 
@@ -163,12 +180,15 @@ def rms_distance(a: Array, b: Array) -> Array:
 
 
 def _euler_angles(quaternion: Array) -> Array:
+    return np.asarray(_rotations(quaternion).as_euler("zyx").reshape(*quaternion.shape[:-1], 3))
+
+
+def _rotations(quaternion: Array) -> Any:
     # imported here, because the import takes a third of a second
     from scipy.spatial.transform import Rotation
 
     scalar_last = np.roll(quaternion, -1, axis=-1)
-    angles = Rotation.from_quat(scalar_last.reshape(-1, 4)).as_euler("zyx")
-    return angles.reshape(*quaternion.shape[:-1], 3)
+    return Rotation.from_quat(scalar_last.reshape(-1, 4))
 
 
 def _comparable_poses(

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.evaluation.metrics import dtw_distance, pose_mse
+from knode_cosserat.evaluation.metrics import dtw_distance, pose_mse, rotation_rmse
 from knode_cosserat.identification.misfit import turned_from
 from knode_cosserat.identification.steps import simulated_rows
 from knode_cosserat.recordings.measurements import Measurements
@@ -39,7 +39,8 @@ class Evaluation:
     Attributes:
         tip_dtw: dynamic-time-warping distance of the tip (m), or None.
         tip_rmse: root mean square distance of the tip (m), or None.
-        pose_mse: mean square error of positions and quaternions of all bodies, or None.
+        pose_mse: mean square error of positions and Euler angles of all bodies, times 1000, or None.
+        rotation_rmse: root mean square angle between the orientations of all bodies (rad), or None.
         failed: why there is no prediction, or None.
         tip: predicted positions of the last body (m), or None.
         extrapolated: part of the rows outside the range that the robot was identified in; None: not known.
@@ -48,6 +49,7 @@ class Evaluation:
     tip_dtw: float | None = None
     tip_rmse: float | None = None
     pose_mse: float | None = None
+    rotation_rmse: float | None = None
     failed: str | None = None
     tip: Float[np.ndarray, "T 3"] | None = None
     extrapolated: float | None = None
@@ -56,6 +58,7 @@ class Evaluation:
         """Return the errors, or the reason of a failure, as plain JSON values."""
         figures: dict[str, Any] = {
             "tip_dtw": self.tip_dtw, "pose_mse": self.pose_mse, "tip_rmse": self.tip_rmse,
+            "rotation_rmse": self.rotation_rmse,
         }  # fmt: skip
         if self.extrapolated is not None:
             figures["extrapolated"] = self.extrapolated
@@ -68,7 +71,10 @@ class Evaluation:
         if self.failed is not None:
             return f"no prediction: {self.failed}"
         assert self.tip_rmse is not None
-        turned = "" if self.pose_mse is None else f", pose MSE {self.pose_mse:.3g}"
+        turned = ""
+        if self.pose_mse is not None and self.rotation_rmse is not None:
+            degrees = np.degrees(self.rotation_rmse)
+            turned = f", pose MSE {self.pose_mse:.3g}e-3, orientations {degrees:.3g} degrees off"
         outside = f", {self.extrapolated:.0%} of the rows extrapolated" if self.extrapolated else ""
         return f"tip RMSE {1e3 * self.tip_rmse:.2f} mm{turned}{outside}"
 
@@ -161,6 +167,13 @@ def evaluate(
         moved = predict(robot, measured, space=space, recovery=recovery)
     except SimulationError as error:
         return Evaluation(failed=str(error))
+    return compared(robot, moved, measured, every=every, last=last)
+
+
+def compared(
+    robot: System, moved: Trajectory, measured: Measurements, *, every: int = 1, last: int | None = None
+) -> Evaluation:
+    """Return the errors of a motion in the rows of a recording; arguments as in `evaluate`."""
     rows = np.arange(len(measured.time))[::every][:last]
     y, z = np.asarray(moved.y)[rows], np.asarray(moved.z)[rows]
     places = places_at(measured.fractions, robot.nodes)
@@ -171,16 +184,18 @@ def evaluate(
     # the mounting of bodies is unknown: rotations are relative to the first row, where the robot is at rest
     turned = turned_from(quaternion[0], np.asarray(since_first(measured.quaternion[rows])))
     oriented = np.isfinite(turned).all(axis=(1, 2)) & known
-    mse = None
+    mse = rotation = None
     if oriented.any():
-        mse = pose_mse(
+        both = (
             PredictedPoses(position[oriented], quaternion[oriented]),
             PredictedPoses(seen[oriented], turned[oriented]),
         )
+        mse, rotation = pose_mse(*both), rotation_rmse(*both)
     return Evaluation(
         tip_dtw=dtw_distance(position[known, -1], seen[known, -1]),
         tip_rmse=float(np.sqrt(np.mean(np.sum(off**2, axis=1)))),
         pose_mse=mse,
+        rotation_rmse=rotation,
         tip=position[:, -1],
         extrapolated=None if moved.extrapolated is None else float(np.mean(moved.extrapolated[rows])),
     )

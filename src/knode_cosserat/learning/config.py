@@ -144,6 +144,8 @@ class NetworkOptions(Options):
     convex: bool = _option(True, _flag())
     #: if true, inputs and outputs are standardised by the statistics of the data
     standardised: bool = _option(False, _flag())
+    #: if true, the correction of an orientation's quaternion turns it and leaves its length as it is
+    unit_quaternions: bool = _option(False, _flag())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -265,11 +267,17 @@ class FitConfig:
 
     @classmethod
     def paper_recordings(cls, seed: int | tuple[int, ...] = 0) -> Self:
-        """Return the paper's settings for recordings: history inputs, weight decay 0.1, data noise 0.01."""
+        """Return the paper's settings for recordings: history inputs, weight decay 0.1, data noise 0.01.
+
+        In addition the corrections leave the length of quaternions as it is, which no data determine.
+        """
         same = cls.paper(seed, history=True)
-        assert same.segments is not None
-        training = dataclasses.replace(same.segments, weight_decay=0.1, data_noise=0.01)
-        return dataclasses.replace(same, segments=training)
+        assert same.segments is not None and isinstance(same.residual, NetworkOptions)
+        return dataclasses.replace(
+            same,
+            residual=dataclasses.replace(same.residual, unit_quaternions=True),
+            segments=dataclasses.replace(same.segments, weight_decay=0.1, data_noise=0.01),
+        )
 
     @classmethod
     def network(

@@ -21,7 +21,7 @@ from knode_cosserat.learning.gain import rollout_errors
 from knode_cosserat.learning.knode import KNODE, About
 from knode_cosserat.learning.passive import passive, require_bending
 from knode_cosserat.learning.residual import Residual, network
-from knode_cosserat.learning.samples import Dataset, samples, strand_samples
+from knode_cosserat.learning.samples import Dataset, samples, settings_of, strand_samples
 from knode_cosserat.learning.structured.closed_form import residuals_of
 from knode_cosserat.learning.training.checkpoint import Checkpoints, Identity, data_hash
 from knode_cosserat.learning.training.descent import standardised
@@ -36,6 +36,7 @@ from knode_cosserat.learning.training.runs import FitError, Run, run_all
 from knode_cosserat.learning.training.stages import RolloutRun, SegmentRun
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.rods.trained_range import TrainedRange
+from knode_cosserat.solvers.history import coefficient_table
 from knode_cosserat.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
@@ -183,7 +184,12 @@ def _first(knowledge: System, trajectories: Sequence[Trajectory], config: FitCon
         noisy = [_noisy(each, noise, k) for k, each in enumerate(trajectories)]
         dataset = strand_samples(knowledge, samples(knowledge, noisy, nodes))
     if isinstance(options, NetworkOptions):
-        networks = [network(knowledge.strand, options, jax.random.key(seed)) for seed in config.seeds]
+        c0 = None
+        if options.history and trajectories:
+            first = trajectories[0]
+            c0 = np.asarray(coefficient_table(settings_of(first), first.dt)[1, 0])
+        keys = map(jax.random.key, config.seeds)
+        networks = [network(knowledge.strand, options, key, c0) for key in keys]
         if options.standardised and dataset is not None:
             networks = [standardised(net, knowledge.strand, dataset) for net in networks]
         return _First(dataset, list(networks))

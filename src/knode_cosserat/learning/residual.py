@@ -145,13 +145,16 @@ def _elu_tangent(primals: Any, tangents: Any) -> Any:
 class Network(Residual):
     """One hidden layer of ELU units, f_θ, added to y_s and z: the paper's residual, and its variants.
 
-    Its inputs are y, the nominal model's z and the actuation; with `history`, ʰy and ʰz too. The corrected z
-    is an output only: it does not enter y_s. With `convex` the weights are nonnegative, so that every output
-    is convex and non-decreasing in every input; `clamped` enforces this. Inputs are shifted and scaled, and
-    outputs scaled, by constants stored in the model.
+    Its inputs are y, the nominal model's z and the actuation; with `history`, ʰy and ʰz too. These depend on
+    the time scheme: at rest they are -c0 times y and z in a time step, and zero in an equilibrium. Those of
+    the training's time steps, with the same rates y_t and z_t, are the inputs everywhere, so that the model
+    is the same in equilibria and at other time steps. The corrected z is an output only: it does not enter
+    y_s. With `convex` the weights are nonnegative, so that every output is convex and non-decreasing in every
+    input; `clamped` enforces this. Inputs are shifted and scaled, and outputs scaled, by constants stored in
+    the model.
     """
 
-    fixed: ClassVar[tuple[str, ...]] = ("input_mean", "input_scale", "output_scale")
+    fixed: ClassVar[tuple[str, ...]] = ("input_mean", "input_scale", "output_scale", "history_c0")
     linear_in: ClassVar[tuple[str, ...]] = ("output_weights", "output_biases")
 
     #: (hidden, inputs) and (hidden,)
@@ -165,34 +168,53 @@ class Network(Residual):
     output_scale: Float[Any, " outputs"]
     history: bool = eqx.field(static=True, default=False)
     convex: bool = eqx.field(static=True, default=True)
+    #: c0 of the training's time steps (1/s); None in files of earlier versions: that of each problem
+    history_c0: Float[Any, ""] | None = None
+    #: first and last + 1 place in y of a quaternion whose length the correction leaves as it is, or None
+    quaternion: tuple[int, int] | None = eqx.field(static=True, default=None)
 
     def inputs(self, knowledge: System, point: Point, z: Float[Any, " z"]) -> Float[Any, " inputs"]:
         """Return the inputs: y, z and the actuation; with history, y, ʰy, z, ʰz and the actuation."""
         force = knowledge.actuation(point.control)
         if self.history:
-            return jnp.concatenate([point.y, point.history.y, z, point.history.z, force])
+            past = point.history
+            more = 0.0 if self.history_c0 is None else past.c0 - self.history_c0
+            return jnp.concatenate([point.y, past.y + more * point.y, z, past.z + more * z, force])
         return jnp.concatenate([point.y, z, force])
 
-    def correction(self, inputs: Float[Any, " inputs"]) -> Float[Any, " outputs"]:
-        """Return f_θ, the correction of [y_s; z]."""
-        hidden = self.input_weights @ ((inputs - self.input_mean) / self.input_scale) + self.input_biases
-        return self.output_scale * (self.output_weights @ elu(hidden) + self.output_biases)
+    def correction(self, knowledge: System, point: Point, z: Float[Any, " z"]) -> Float[Any, " outputs"]:
+        """Return f_θ, the correction of [y_s; z], at the nominal model's z."""
+        inputs = (self.inputs(knowledge, point, z) - self.input_mean) / self.input_scale
+        hidden = self.input_weights @ inputs + self.input_biases
+        added = self.output_scale * (self.output_weights @ elu(hidden) + self.output_biases)
+        return self.turning(added, point.y)
+
+    def turning(self, added: Any, y: Any) -> Any:
+        """Return corrections (outputs, …) at y (y, …) without the part that lengthens the quaternion.
+
+        That part turns nothing, so data cannot determine it.
+        """
+        if self.quaternion is None:
+            return added
+        own = slice(*self.quaternion)
+        h, h_s = y[own], added[own]
+        return added.at[own].add(-h * (jnp.sum(h * h_s, axis=0) / jnp.sum(h * h, axis=0)))
 
     def derivatives(self, knowledge: System, point: Point) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
         """Return the nominal model's y_s and z plus the correction."""
         y_s, z = semi_discrete.derivatives(knowledge, point)
-        added = self.correction(self.inputs(knowledge, point, z))
+        added = self.correction(knowledge, point, z)
         return y_s + added[: point.y.shape[0]], z + added[point.y.shape[0] :]
 
     def strains(self, knowledge: System, point: Point) -> Float[Any, " z"]:
         """Return the nominal model's z plus the correction."""
         z = semi_discrete.strains(knowledge, point)
-        return z + self.correction(self.inputs(knowledge, point, z))[point.y.shape[0] :]
+        return z + self.correction(knowledge, point, z)[point.y.shape[0] :]
 
     def rates(self, knowledge: System, point: Point, z: Float[Any, " z"]) -> Float[Any, " y"]:
         """Return the nominal model's y_s at z less its correction, plus the correction of y_s."""
         z0 = semi_discrete.strains(knowledge, point)
-        added = self.correction(self.inputs(knowledge, point, z0))
+        added = self.correction(knowledge, point, z0)
         return (
             semi_discrete.rates(knowledge, point, z - added[point.y.shape[0] :]) + added[: point.y.shape[0]]
         )
@@ -205,8 +227,10 @@ class Network(Residual):
         return eqx.tree_at(lambda net: (net.input_weights, net.output_weights), self, weights)
 
 
-def network(knowledge: System, options: NetworkOptions, key: Any) -> Network:
+def network(knowledge: System, options: NetworkOptions, key: Any, c0: Any = None) -> Network:
     """Return a network with random initial weights; inputs and outputs are not scaled.
+
+    `c0` (1/s) is that of the training's time steps, for a network with history.
 
     A convex network starts like the paper's: weights |N(0.01, 0.01)|, biases N(0, 0.01). Any other starts
     with N(0, 1/√inputs) and N(0, 0.1/√hidden), and is therefore close to the nominal model.
@@ -222,9 +246,13 @@ def network(knowledge: System, options: NetworkOptions, key: Any) -> Network:
         first, second = draws[0] / np.sqrt(inputs), 0.1 * draws[2] / np.sqrt(options.hidden)
         biases = 0.1 * draws[1], jnp.zeros(outputs)
     mean, scale, output_scale = jnp.zeros(inputs), jnp.ones(inputs), jnp.ones(outputs)
+    layout, kept = knowledge.y_layout, None
+    if options.unit_quaternions and "h" in layout.names:
+        kept = layout.slice("h").start, layout.slice("h").stop
     return Network(
-        first, biases[0], second, biases[1], mean, scale, output_scale, options.history, options.convex
-    )
+        first, biases[0], second, biases[1], mean, scale, output_scale, options.history, options.convex,
+        c0 if options.history else None, kept,
+    )  # fmt: skip
 
 
 def input_layout(knowledge: System, history: bool) -> Layout:

@@ -29,6 +29,8 @@ ALIKE, ASKEW = 0.8, np.radians(15.0)
 #: largest lean of a body (rad) from which the rod's length is estimated: the arc is then within 0.5 % of
 #: shapes that sag by their weight or by a load at the tip, and of straight ones that lean
 BENT = np.radians(10.0)
+#: pieces of the curve from body to body, in each of which a leaning rod's frame turns once
+PIECES = 16
 #: largest relative spread of the rod's lengths estimated from its bodies
 UNEQUAL = 0.05
 
@@ -75,11 +77,12 @@ def bodies_in_robot_frame(
     rest = given or rest_of(bodies)
     findings += _judged(bodies, rest)
     placed_bodies = []
-    for body, marker, quaternion in zip(bodies, config.markers, recorded, strict=True):
+    directions = _frames_at_rest(bodies, rest)
+    for body, marker, quaternion, at_rest in zip(bodies, config.markers, recorded, directions, strict=True):
         if quaternion is not None and not config.static:
             misread = misread_orientation(quaternion, turn, body, rest_mask(body.time, rest))
             findings += [misread] if misread else []
-        placed_body, found = _of_the_rod(body, marker.rotation, rest)
+        placed_body, found = _of_the_rod(body, marker.rotation, rest, at_rest)
         placed_bodies.append(placed_body)
         findings += found
     return placed_bodies, base, rest, findings
@@ -92,8 +95,40 @@ def _turned(body: Body, turn: Rotation, scale: float) -> Body:
     return dataclasses.replace(body, position=turn.apply(body.position) * scale, quaternion=quaternion)
 
 
+def _frames_at_rest(bodies: Sequence[Body], rest: tuple[float, float] | None) -> list[Rotation]:
+    """Return the rod's frames at the bodies at rest: they point up unless the rod leans.
+
+    A leaning rod is a smooth curve that leaves the clamped end along z, passes through the bodies and is not
+    twisted. Its frames turn by the shortest rotation from body to body.
+    """
+    from scipy.interpolate import CubicSpline
+
+    frames = [Rotation.identity() for _ in bodies]
+    where = rest_positions(bodies, rest)
+    if where is None or not np.max(leans_of(where), initial=0.0) > LEANING:
+        return frames
+    fractions, which = np.unique([body.fraction for body in bodies], return_index=True)
+    away = fractions > 0.05
+    places = np.concatenate([[0.0], fractions[away]])
+    points = np.concatenate([np.zeros((1, 3)), where[which[away]]])
+    chord = np.linalg.norm(points[1]) / places[1]
+    curve = CubicSpline(places, points, bc_type=((1, [0.0, 0.0, chord]), (2, np.zeros(3))))
+    frame, before, at = Rotation.identity(), np.array([0.0, 0.0, 1.0]), 0.0
+    for k in np.argsort([body.fraction for body in bodies], kind="stable"):
+        # in short pieces: the shortest rotations between them do not twist the rod
+        for place in np.linspace(at, bodies[k].fraction, PIECES + 1)[1:]:
+            tangent = curve(place, 1) / np.linalg.norm(curve(place, 1))
+            axis = np.cross(before, tangent)
+            sine = np.linalg.norm(axis)
+            angle = np.arctan2(sine, before @ tangent)
+            frame = Rotation.from_rotvec(axis * (angle / sine if sine > 0.0 else 0.0)) * frame
+            before = tangent
+        frames[k], at = frame, bodies[k].fraction
+    return frames
+
+
 def _of_the_rod(
-    body: Body, rotation: Sequence[float] | None, rest: tuple[float, float] | None
+    body: Body, rotation: Sequence[float] | None, rest: tuple[float, float] | None, at_rest: Rotation
 ) -> tuple[Body, list[Finding]]:
     """Return the body with the rod's local orientation in place of its own, and the findings."""
     if body.quaternion is None:
@@ -109,8 +144,7 @@ def _of_the_rod(
                 "left out (the configuration can state the rest or the marker's rotation)"
             )
             return dataclasses.replace(body, quaternion=None), [Finding("problem", body.topic, what)]
-        # at rest the rod points up, and its frame is the robot's
-        constant = own[np.flatnonzero(still)].mean()
+        constant = at_rest.inv() * own[np.flatnonzero(still)].mean()
     turned = (own * constant.inv()).as_quat(scalar_first=True)
     return dataclasses.replace(body, quaternion=turned), []
 
@@ -150,8 +184,8 @@ def _judged(bodies: Sequence[Body], rest: tuple[float, float] | None) -> list[Fi
         findings.append(Finding("problem", bodies[-1].topic, what))
     elif leans > LEANING:
         what = (
-            f"{angle}: the robot sags, is bent or is pulled there. Orientations of bodies are as if it were "
-            "straight, where the configuration does not state a marker's `rotation`"
+            f"{angle}: the robot sags, is bent or is pulled there. Orientations of bodies are those of a "
+            "smooth curve through them at rest, where the configuration does not state a marker's `rotation`"
         )
         if leans > BENT:
             chord = float(np.linalg.norm(where[-1])) / bodies[-1].fraction

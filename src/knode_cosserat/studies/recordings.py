@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from knode_cosserat.identification.evaluate import Evaluation, evaluate
+from knode_cosserat.identification.evaluate import Evaluation, compared, predict
 from knode_cosserat.identification.fit import fit as learn
 from knode_cosserat.identification.identify import IdentificationError, identify
 from knode_cosserat.learning.calibration.calibrate import CalibrationError, calibrate
@@ -30,7 +30,11 @@ from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
 from knode_cosserat.rods.robot_file import format_robot, load_robot, parse_robot
 from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.equilibrium import equilibrium
+from knode_cosserat.solvers.result import SimulationError
+from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.studies.runner import Job, Product, StudyError
+from knode_cosserat.trajectory import Trajectory
 
 ROBOT = "delrin-tendon-robot"
 #: files in a folder of recordings that describe the robot, and its topics or columns
@@ -236,6 +240,8 @@ class TrainedSystems(NamedTuple):
     loss: Mapping[str, list[float]] = {}
     #: report of the fit, a text
     told: str = ""
+    #: nominal robot of the paper's models, in whose rest they start; None: each starts in its own equilibrium
+    resting: System | None = None
 
 
 def _baseline(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence[int]) -> TrainedSystems:
@@ -260,7 +266,8 @@ def _paper(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence
         str(model.about.facts["seed"]): np.asarray(model.about.facts["segments"]["loss"]).tolist()
         for model in models
     }
-    return TrainedSystems(dict(zip(seeds, models, strict=True)), space=PAPER_SPACE, loss=losses)
+    systems = dict(zip(seeds, models, strict=True))
+    return TrainedSystems(systems, space=PAPER_SPACE, loss=losses, resting=knowledge)
 
 
 def _best(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence[int]) -> TrainedSystems:
@@ -375,8 +382,30 @@ def _outcome(
     """Return a model's metrics for a recording, or the cause of a failure."""
     if isinstance(system, str):
         return Evaluation(failed=system)
+    measured = read.rows(name, learned.finer)
+    try:
+        moved = (
+            predict(system, measured, space=learned.space, recovery=recovery)
+            if learned.resting is None
+            else _paper_motion(system, learned.resting, measured, recovery)
+        )
+    except SimulationError as error:
+        return Evaluation(failed=str(error))
     rows = round(read.window(name).seconds / DT)
-    return evaluate(
-        system, read.rows(name, learned.finer), every=learned.finer, last=rows, space=learned.space,
-        recovery=recovery,
+    return compared(system, moved, measured, every=learned.finer, last=rows)
+
+
+def _paper_motion(
+    system: System, resting: System, measured: Measurements, recovery: float
+) -> Trajectory:  # fmt: skip
+    """Return a motion by the paper's schemes: as in its simulations, all models start in the same rest.
+
+    That is the equilibrium of the nominal robot: the paper's robot points up there, others may sag.
+    """
+    before = measured.initial_tension
+    rest = None if before is None else equilibrium(resting, before, space=PAPER_SPACE)
+    acting = system.undelayed(measured.tension[:-1], measured.dt, before)
+    return simulate(
+        system, acting, measured.dt, time="bdf2", space=PAPER_SPACE, start="paper", initial=rest,
+        recovery_budget=recovery,
     )  # fmt: skip

@@ -24,6 +24,7 @@ MEASURES = {
     "tip_dtw": ("Tip DTW [m]", 1.0),
     "pose_mse": ("Pose MSE [1e-3]", 1.0),
     "tip_rmse": ("Tip RMSE [cm]", 100.0),
+    "rotation_rmse": ("Angle between orientations, RMS [degrees]", 180.0 / np.pi),
 }
 #: the two that the paper improves by so many percent on average, on its own robot, from Dataset B
 PAPER_MEASURES, PAPER_GAIN = ("tip_dtw", "pose_mse"), 58.7

@@ -126,8 +126,11 @@ def test_what_no_weight_changes_is_found_once(robot, moved, bars, system):
     """Prediction and gradient are those of `predict` on the KNODE, sample by sample."""
     imperfect, known_of = (robot.replace(length=0.4), moved) if system == "robot" else (WRONG, bars)
     data = samples(imperfect, known_of)
-    options = NetworkOptions(hidden=9, history="history" in system, convex=False, standardised=True)
-    net = program.standardised(network(imperfect, options, jax.random.key(1)), imperfect, data)
+    options = NetworkOptions(
+        hidden=9, history="history" in system, convex=False, standardised=True, unit_quaternions=True
+    )
+    net = network(imperfect, options, jax.random.key(1), np.asarray(1.5 / DT))
+    net = program.standardised(net, imperfect, data)
     size = imperfect.y_layout.size + imperfect.z_layout.size
     target = jnp.asarray(np.random.default_rng(0).normal(size=(size, len(data.segments.t))))
 

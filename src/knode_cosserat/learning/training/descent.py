@@ -66,6 +66,8 @@ class NominalPredictions(NamedTuple):
     #: at the starts of segments, then at their ends if the scheme uses them; the last row is ones, for the
     #: biases
     inputs: Float[Any, "inputs+1 E*S"]
+    #: true states there
+    at: Float[Any, "y E*S"]
     y: Float[Any, "y S"]
     z: Float[Any, "z S"]
     #: length of a segment times the scheme's weights of the start and of the end
@@ -95,7 +97,8 @@ def nominal_predictions(
 
     inputs, y, z = jax.vmap(one, out_axes=-1)(samples)
     joined = jnp.concatenate(inputs, axis=1)
-    return NominalPredictions(jnp.concatenate([joined, jnp.ones_like(joined[:1])]), y, z, steps)
+    states = jnp.concatenate([samples.y, samples.y_next][: len(inputs)]).T
+    return NominalPredictions(jnp.concatenate([joined, jnp.ones_like(joined[:1])]), states, y, z, steps)
 
 
 def corrected(net: Network, known: NominalPredictions) -> tuple[Float[Any, "y S"], Float[Any, "z S"]]:
@@ -106,7 +109,7 @@ def corrected(net: Network, known: NominalPredictions) -> tuple[Float[Any, "y S"
     """
     first = jnp.concatenate([net.input_weights, net.input_biases[:, None]], axis=1)
     second = _product(net.output_weights, elu(first @ known.inputs)) + net.output_biases[:, None]
-    added = net.output_scale[:, None] * second
+    added = net.turning(net.output_scale[:, None] * second, known.at)
     size, count = known.y.shape
     y = known.y + known.steps[0] * added[:size, :count]
     if added.shape[1] > count:

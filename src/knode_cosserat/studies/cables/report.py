@@ -67,8 +67,18 @@ def as_markdown(results: Sequence[CableResult]) -> str:
                 "Discretisation error of positions by the solver's estimate, mean over a motion's frames: "
                 f"{1e3 * np.median(estimates):.1f} mm in the median, at most {1e3 * max(estimates):.1f} mm."
             )
-        failed = {cell["failed"] for cell in result.cells if "failed" in cell}
-        parts += [f"Failed: {reason}." for reason in sorted(failed)]
+        failed = [cell for cell in result.cells if "failed" in cell]
+        if failed:
+            listed = [f"- {cell['file']}, {cell['method']}: {cell['failed']}" for cell in failed]
+            parts += ["Failed, and left out of the means:", "\n".join(listed)]
+        hard = [cell for cell in result.cells if cell.get("divided") or cell.get("restarts")]
+        if hard:
+            listed = [
+                f"- {cell['file']}, {cell['method']}: {cell['divided']} frames in several steps, "
+                f"{cell['restarts']} restarts from a smooth shape"
+                for cell in hard
+            ]
+            parts += ["Motions with frames that had no solution in one step:", "\n".join(listed)]
         parts += ["Identified:", _parameters(result), "; ".join(result.notes) + "."]
     return "\n\n".join(parts) + "\n"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import concurrent.futures
+import dataclasses
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -12,12 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.run import usable_cores
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.studies.cables.model import DT, CableModel, CableParameters, Prepared
 from knode_cosserat.studies.cables.shapes import CableShape
-from knode_cosserat.trajectory import Trajectory
 
 
 class CableUnknown(NamedTuple):
@@ -51,8 +50,12 @@ UNKNOWNS: dict[str, CableUnknown] = {
     **{f"offset{k}": CableUnknown("offset", k, 3e-3, grip=True, width=3e-3) for k in range(2)},
     "stretch": CableUnknown("stretch", None, 3e-3, grip=True, width=3e-3),
 }
-#: frames of one compiled program with derivatives, and seconds for recovery of one motion
-CHUNK, RECOVERY = 40, 1.0
+#: frames of one compiled program with derivatives
+CHUNK = 40
+#: time steps of a frame: whole frames first, shorter steps where these have no solution
+SUBSTEPS = (1, 4, 16, 64)
+#: short steps that are solved at a time, before whole frames are tried again
+SPAN = 128
 #: step of differences in the initial state, as a part of `move`
 STEP = 0.05
 
@@ -85,10 +88,16 @@ def cable_parameters(x: Any) -> CableParameters:
 
 
 class CablePrediction(NamedTuple):
-    """Predicted positions of the free markers from frame 2 on, or the reason for there being none."""
+    """Predicted positions of the free markers from frame 2 on, or the reason for there being none.
+
+    `position_error` is the mean estimate of the discretisation error (m). `divided` is the number of frames
+    that were solved in several steps, and `restarts` that of starts from a new shape.
+    """
 
     markers: Float[np.ndarray, "T M 3"] | None
-    trajectory: Trajectory | None
+    position_error: float = np.nan
+    divided: int = 0
+    restarts: int = 0
     failure: str = ""
 
 
@@ -105,24 +114,71 @@ class Rollouts:
         self._starts: dict[Any, tuple[tuple[CableShape, CableShape], Prepared]] = {}
 
     def predict(self, p: CableParameters, markers: Float[np.ndarray, "T N 3"]) -> CablePrediction:
-        """Return the free markers for the given motion of those that are held, from the first two frames."""
+        """Return the free markers for the given motion of those that are held, from the first two frames.
+
+        Where a rod has no solution even in the shortest steps (it has kinked between two nodes, for one), the
+        prediction starts again from the smooth shape near the markers that it has predicted last.
+        """
+        known, begin, starts, divided = np.array(markers), 0, 0, 0
+        errors: list[Any] = []
         try:
-            prepared, _ = self.model.prepared(p, markers)
-            robot = self.model.robot(p, prepared.base, prepared.tip)
-            found = simulate(
-                robot, prepared.controls, DT, time="bdf2", initial=self.model.initial(robot, prepared),
-                space=self.space, recovery_budget=RECOVERY, on_failure="return",
-            )  # fmt: skip
+            while begin < len(known) - 2:
+                prepared, _ = self.model.prepared(p, known[begin:])
+                y, estimates, short = self._moved(p, prepared)
+                starts, divided = starts + 1, divided + short
+                following = begin + 2
+                if len(y):
+                    seen = self.model.free_markers(y, prepared.beside, p.stretch)
+                    known[following : following + len(y), 2:-2] = seen
+                    errors.append(estimates)
+                else:
+                    known[following, 2:-2] = known[following - 1, 2:-2] + _carried(known[following - 1 :])
+                begin += max(1, len(y))
         except (ValueError, RuntimeError, ArithmeticError) as error:
-            return CablePrediction(None, None, " ".join(str(error).split()))
-        result = np.asarray(found.result)
-        if result.min() < 0:
-            row = int(np.argmax(result < 0))
-            return CablePrediction(None, None, f"frame {row + 1}: {Result(int(result[row])).message}")
-        seen = np.asarray(self.model.free_markers(np.asarray(found.y)[1:], prepared.beside, p.stretch))
-        if not np.all(np.isfinite(seen)):
-            return CablePrediction(None, None, "positions are not finite")
-        return CablePrediction(seen, found)
+            return CablePrediction(None, failure=f"frame {begin + 2}: {' '.join(str(error).split())}")
+        free = known[2:, 2:-2]
+        if not np.all(np.isfinite(free)):
+            return CablePrediction(None, failure="positions are not finite")
+        mean = float(np.mean(np.concatenate(errors))) if errors else np.nan
+        return CablePrediction(free, mean, divided, starts - 1)
+
+    def _moved(self, p: CableParameters, prepared: Prepared) -> tuple[Any, Any, int]:
+        """Return y of the frames that have a solution, its estimated errors, and how many were divided.
+
+        Frames without a solution are divided into shorter steps, between which the ends move on monotone
+        cubics through the frames.
+        """
+        from scipy.interpolate import PchipInterpolator
+
+        robot = self.model.robot(p, prepared.base, prepared.tip)
+        ends = np.concatenate([prepared.first_controls, prepared.controls])
+        between = PchipInterpolator(np.arange(-2.0, len(prepared.controls)), ends)
+        at, done, level, divided = self.model.initial(robot, prepared), 0, 0, 0
+        y, errors = [np.zeros((0, self.model.nodes, 19))], [np.zeros(0)]
+        while done < len(prepared.controls):
+            parts, frames = SUBSTEPS[level], len(prepared.controls) - done
+            frames = frames if parts == 1 else min(frames, SPAN // parts)
+            moved = simulate(
+                robot, between(done - 1.0 + np.arange(1.0, frames * parts + 1.0) / parts), DT / parts,
+                initial=at, time="bdf2", space=self.space, start="consistent", recovery_budget=0.0,
+                on_failure="return",
+            )  # fmt: skip
+            result = np.asarray(moved.result)
+            new = frames if result.min() >= 0 else (int(np.argmax(result < 0)) - 1) // parts
+            if parts == 1 or new == frames:
+                y.append(np.asarray(moved.y)[parts : new * parts + 1 : parts])
+                errors.append(np.asarray(moved.position_error)[parts : new * parts + 1 : parts])
+                done, divided = done + new, divided + new * (parts > 1)
+            if new == frames:
+                at, level = moved, 0
+            elif level + 1 == len(SUBSTEPS):
+                break
+            else:
+                if parts == 1 and new:
+                    last = moved[new - 1 : new + 1]
+                    at = dataclasses.replace(last, settings=None, initial_state=None, final_state=None)
+                level += 1
+        return np.concatenate(y), np.concatenate(errors), divided
 
     def predict_all(self, p: CableParameters, motions: Sequence[Any]) -> list[CablePrediction]:
         """Return the predictions of many motions, one thread a core."""
@@ -201,6 +257,13 @@ class Rollouts:
             return jax.jvp(run, (x, prepared), (direction, d))
 
         return jax.vmap(along, out_axes=(None, 0))(d_x, d_prepared)
+
+
+def _carried(markers: Float[np.ndarray, "T N 3"]) -> Float[np.ndarray, "M 3"]:
+    """Return displacements of the free markers to the next frame as the held ones' displacements say."""
+    before, after = np.diff(markers[:2, [1, -2]], axis=0)[0]
+    part = np.linspace(0.0, 1.0, markers.shape[1] - 2)[1:-1, None]
+    return np.asarray((1.0 - part) * before + part * after)
 
 
 def in_threads(work: Callable[[Any], Any], pieces: Sequence[Any]) -> list[Any]:

@@ -94,7 +94,10 @@ def study_cable(data: CableData, options: CableOptions, tell: Callable[[str], No
         errors = [cell["mean_abs_error"] for cell in cells if cell["method"] == method]
         solved = [each for each in errors if each is not None]
         if solved:
-            tell(f"{data.name}: {method} {1e3 * np.mean(solved):.2f} mm, {len(errors) - len(solved)} failed")
+            tell(f"{data.name}: {method} {1e3 * np.mean(solved):.2f} mm, mean of {len(solved)} motions")
+    for cell in cells:
+        if "failed" in cell:
+            tell(f"{data.name}: {cell['method']} failed on {cell['file']}, left out: {cell['failed']}")
     notes.append(f"{time.perf_counter() - began:.0f} s")
     return CableResult(data, model, found.parameters, cells, predictions, notes)
 
@@ -137,7 +140,7 @@ def _evaluated(
                 cell |= {"mean_abs_error": None, "failed": found.failure}
             else:
                 cell["mean_abs_error"] = mean_abs_error(found.markers, motion.markers)
-                cell["position_error"] = float(np.mean(found.trajectory.position_error))
+                cell |= {name: getattr(found, name) for name in ("position_error", "divided", "restarts")}
                 predictions[method][motion.name] = found.markers
             cells.append(cell)
     return cells, predictions

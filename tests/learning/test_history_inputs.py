@@ -1,0 +1,124 @@
+"""A network with history inputs is one model: in time steps of any length and scheme, and in equilibria.
+
+Five variations of the fault, from which a learned robot started 50 degrees off: an equilibrium, another time
+step, another time scheme, another kind of first step, and a start by another robot's equilibrium.
+"""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+import knode_cosserat as kc
+from knode_cosserat.learning.config import FitConfig, NetworkOptions, Training
+from knode_cosserat.learning.knode import KNODE
+from knode_cosserat.learning.residual import network
+from knode_cosserat.recordings.measurements import Measurements
+from knode_cosserat.solvers import semi_discrete
+from knode_cosserat.solvers.semi_discrete import History, Point
+from knode_cosserat.studies.recordings import _paper_motion
+
+ROBOT = kc.load_robot("delrin-tendon-robot").replace(nodes=5)
+TENSION = np.array([5.0, 5.0, 5.2, 5.4])
+DT = 0.05
+
+
+def learned(c0, **options):
+    """The robot with a random network of history inputs; its weights are twice the first ones."""
+    net = network(ROBOT, NetworkOptions(hidden=3, history=True, **options), jax.random.key(0), c0)
+    return KNODE(ROBOT, dataclasses.replace(net, output_weights=2.0 * net.output_weights))
+
+
+def drift(model, initial, dt, time="bdf2", start="paper"):
+    """Largest distance (m) of the tip from its first row while the tensions are held."""
+    moved = kc.simulate(
+        model, np.tile(TENSION, (5, 1)), dt, time=time, start=start, space="euler", initial=initial
+    )
+    tip = np.asarray(moved.tip_position)
+    return np.max(np.linalg.norm(tip - tip[0], axis=1))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "scheme",
+    [{}, {"dt": 0.02}, {"dt": 0.2}, {"time": "bdf1"}, {"start": "consistent"}],
+    ids=["the training's steps", "shorter steps", "longer steps", "BDF1", "a consistent start"],
+)
+def test_an_equilibrium_of_a_learned_robot_stays_at_rest(scheme):
+    model = learned(1.5 / DT)
+    still = kc.equilibrium(model, TENSION, space="euler")
+    bare = kc.equilibrium(ROBOT, TENSION, space="euler")
+    assert np.linalg.norm(np.asarray(still.tip_position)[-1] - np.asarray(bare.tip_position)[-1]) > 1e-3
+    assert drift(model, still, **{"dt": DT, **scheme}) < 1e-6
+
+
+@pytest.mark.slow
+def test_history_as_each_problem_has_it_would_not_rest():
+    """The fault: in an equilibrium ʰ is zero, and in a time step of a robot at rest it is -c0 y."""
+    model = learned(None)
+    assert drift(model, kc.equilibrium(model, TENSION, space="euler"), DT) > 1e-3
+
+
+@pytest.mark.slow
+def test_models_of_the_paper_start_in_one_rest():
+    rows = 4
+    measured = Measurements(
+        time=DT * np.arange(rows), tension=np.tile(TENSION, (rows, 1)), fractions=np.ones(1),
+        position=np.zeros((rows, 1, 3)), quaternion=np.zeros((rows, 1, 4)), measured=np.ones((rows, 1), bool),
+        simulated=True, source="none", initial_tension=TENSION,
+    )  # fmt: skip
+    rest = kc.equilibrium(ROBOT, TENSION, space="euler")
+    moved = _paper_motion(learned(1.5 / DT), ROBOT, measured, 0.0)
+    np.testing.assert_array_equal(moved.y[0], rest.y[-1])
+    assert np.linalg.norm(moved.tip_position[-1] - moved.tip_position[0]) > 1e-3
+
+
+def points(count):
+    """Random points of the rod in a time step; quaternions are of any length."""
+    rng = np.random.default_rng(1)
+    size, strains = ROBOT.y_layout.size, ROBOT.z_layout.size
+    for _ in range(count):
+        y = rng.normal(size=size)
+        past = History(np.asarray(1.5 / DT), rng.normal(size=size), rng.normal(size=strains), np.zeros(size))
+        yield Point(0.1, 0.0, y, TENSION, past)
+
+
+def test_corrections_turn_a_quaternion_and_keep_its_length():
+    """What turns is the network's own; all other corrections are unchanged."""
+    free, kept = (learned(1.5 / DT, unit_quaternions=unit).residual for unit in (False, True))
+    own = ROBOT.y_layout.slice("h")
+    for point in points(5):
+        z = semi_discrete.strains(ROBOT, point)
+        both = [np.array(net.correction(ROBOT, point, z)) for net in (free, kept)]
+        h = point.y[own]
+        assert abs(h @ both[1][own]) < 1e-12 < 1e-6 < abs(h @ both[0][own])
+        across = np.eye(4) - np.outer(h, h) / (h @ h)
+        np.testing.assert_allclose(both[1][own], across @ both[0][own], atol=1e-12)
+        for each in both:
+            each[own] = 0.0
+        np.testing.assert_array_equal(*both)
+
+
+def test_inputs_are_those_of_the_training_with_the_same_rates():
+    model, at_rest = learned(1.5 / DT), learned(None)
+    for point in points(3):
+        z = semi_discrete.strains(ROBOT, point)
+        np.testing.assert_array_equal(
+            model.residual.inputs(ROBOT, point, z), at_rest.residual.inputs(ROBOT, point, z)
+        )
+        y_t, z_t = point.history.y_t(point.y), point.history.z_t(z)
+        for c0 in (0.0, 7.0):
+            other = History(np.asarray(c0), y_t - c0 * point.y, z_t - c0 * z, point.history.y_s)
+            np.testing.assert_allclose(
+                model.residual.inputs(ROBOT, point._replace(history=other), z),
+                model.residual.inputs(ROBOT, point, z), rtol=1e-9, atol=1e-9,
+            )  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dt", [0.05, 0.02])
+def test_a_fit_keeps_c0_of_its_time_steps(dt):
+    data = kc.simulate(ROBOT, kc.controls.sine(0.5, 4, dt), dt, space="euler")
+    config = FitConfig(NetworkOptions(hidden=2, history=True), Training(epochs=1))
+    assert kc.fit(ROBOT.replace(length=0.5), [data], config).residual.history_c0 == pytest.approx(1.5 / dt)
