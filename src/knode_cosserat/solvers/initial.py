@@ -28,7 +28,7 @@ from knode_cosserat.solvers.replay import (
     state_of_rows,
 )
 from knode_cosserat.solvers.result import Result, SimulationError
-from knode_cosserat.solvers.run import Equilibria, InitialState, is_coarse, run_one
+from knode_cosserat.solvers.run import Equilibria, InitialState, run_one
 from knode_cosserat.solvers.sensitivity import static_rollout
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
@@ -81,7 +81,7 @@ def _settled(system: System, settings: Settings, budget: float | None) -> tuple[
     if is_traced((system, y)):
         find = static_rollout(task)
         rows = jax.vmap(find, in_axes=(0, None, 0))(system, none, y) if many else find(system, none, y)
-        found, coarse = rows.records[..., 0, :, :], is_coarse(rows.position_error, system.length)[..., 0]
+        found, coarse = rows.records[..., 0, :, :], (rows.result == int(Result.COARSE))[..., 0]
     elif many:
         each = range(len(y))
         both = [_settled_one(task, jax.tree.map(lambda x, i=i: x[i], system), y[i], i) for i in each]
@@ -96,7 +96,7 @@ def _settled_one(task: Equilibria, system: System, y: Any, robot: int | None) ->
     rows, _, cause = run_one(task, system, none, y, none[0])
     if rows.result[0] < 0:
         raise SimulationError(0, 0.0, float(rows.error[0]), Result(int(rows.result[0])), cause, robot)
-    return rows.records[0], is_coarse(rows.position_error[0], system.length)
+    return rows.records[0], rows.result[0] == Result.COARSE
 
 
 # continuation of another trajectory

@@ -31,6 +31,7 @@ from knode_cosserat.solvers.run import (
     run_batch,
     run_one,
     warn_of_coarse_grids,
+    warn_outside_rod_theory,
 )
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
@@ -172,7 +173,7 @@ def refined_trajectory(
     segments = FIRST_SEGMENTS
     while True:
         found = solve(robot.replace(nodes=segments + 1))
-        error = float(np.nanmax(found.position_error))
+        error = float(np.max(found.position_error))
         if error <= tolerance or not found.all_valid:
             return found
         if segments == MOST_SEGMENTS:
@@ -182,7 +183,8 @@ def refined_trajectory(
                 stacklevel=3,
             )
             return found
-        wanted = segments * max(1.2, 1.1 * (error / tolerance) ** (1.0 / order))
+        wanted = 2 * segments if np.isnan(error) else 1.1 * segments * (error / tolerance) ** (1.0 / order)
+        wanted = max(wanted, 1.2 * segments)
         # few different numbers of nodes, so few programs to compile
         segments = min(MOST_SEGMENTS, next(n for n in _ladder() if n >= min(wanted, MOST_SEGMENTS)))
 
@@ -329,8 +331,9 @@ def _plain(
     if on_failure == "raise" and causes:
         times = float(np.ravel(at_start.state.history.t0)[0]) + (1.0 + np.arange(task.steps)) * task.dt
         raise failure(rows, causes, times)
-    rows = mark_coarse(rows, system, at_start.coarse)
+    rows = mark_coarse(rows, at_start.coarse)
     warn_of_coarse_grids(system, task.settings, rows)
+    warn_outside_rod_theory(system, rows)
     return _trajectory(system, controls, at_start, task, rows, history)
 
 
@@ -345,7 +348,7 @@ def _traced(system, controls, initial, settings, dt):  # type: ignore[no-untyped
     if np.ndim(controls) == 3:
         run = jax.vmap(run, in_axes=(0 if np.ndim(system.length) else None, 0, 0))
     rows, history = run(system, controls, at_start.state.history)
-    return _trajectory(system, controls, at_start, task, mark_coarse(rows, system, at_start.coarse), history)
+    return _trajectory(system, controls, at_start, task, mark_coarse(rows, at_start.coarse), history)
 
 
 def _trajectory(

@@ -16,7 +16,7 @@ from knode_cosserat.solvers.history import SolverState, StateHistory
 from knode_cosserat.solvers.initial import continued_state, initial_state
 from knode_cosserat.solvers.recovery import Budget
 from knode_cosserat.solvers.result import Result, SimulationError
-from knode_cosserat.solvers.run import LEAST_CAPACITY, TimeIntegration, is_coarse, rows_of
+from knode_cosserat.solvers.run import LEAST_CAPACITY, TimeIntegration, rows_of
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.simulate import check_initial, checked_dt, marked
 from knode_cosserat.solvers.space import SpaceScheme
@@ -170,8 +170,7 @@ class Stepper:
         if not result.solved:
             raise SimulationError(self._steps + 1, self.time + self.dt, float(row.error), result, cause)
         # same rule as `mark_coarse`
-        coarse = self._coarse or is_coarse(np.asarray(row.position_error), self.robot.length)
-        return row._replace(result=int(Result.COARSE) if coarse else result), after
+        return row._replace(result=int(Result.COARSE) if self._coarse else result), after
 
     def _state_after(self, past: StateHistory, time: float) -> SolverState:
         """Return the solver's state after a step."""

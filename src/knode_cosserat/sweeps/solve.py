@@ -91,8 +91,7 @@ def solve_chunk(robot, values, initial, controls, coefficients, form):  # type: 
     errors = jnp.concatenate([jnp.zeros((len(controls), 1)), rows.position_error], axis=1)
     records = jnp.where((solved < 0)[..., None, None], jnp.nan, records)
     found = stored_of(systems, records, store)
-    length = jnp.broadcast_to(jnp.asarray(systems.length), (len(controls),))
-    return done, solved, jnp.where(solved < 0, jnp.nan, errors), length, found
+    return done, solved, jnp.where(solved < 0, jnp.nan, errors), found
 
 
 def stored_of(systems: System, records: Any, store: tuple[str, ...]) -> dict[str, Any]:
@@ -166,7 +165,7 @@ class Solver:
         coefficients = StepCoefficients(*map(jnp.asarray, task.coefficients))
         form = Form(settings, steps, plan.sweep.store, self.lockstep)
         found = solve_chunk(bare, values, settled.start, cases.controls[index], coefficients, form)
-        done, result, error, length, stored = jax.tree.map(lambda leaf: np.array(leaf[:count]), found)
+        done, result, error, stored = jax.tree.map(lambda leaf: np.array(leaf[:count]), found)
         columns = {"result": result, "position_error": error} | stored
         reasons = [""] * count
         for k in range(count):
@@ -178,7 +177,9 @@ class Solver:
                 own = {name: each[k] for name, each in values.items()}
                 system = bare.replace(**own) if own else bare
                 reasons[k] = self._failed(system, task, cases.controls[first + k], columns, k)
-        _mark_coarse(columns, length, settled.coarse[:count])
+        result = columns["result"]
+        marked = coarse_results(result[:, 1:], settled.coarse[:count])
+        columns["result"] = np.concatenate([result[:, :1], marked], axis=1).astype(np.int8)
         return columns | {"reason": np.array(reasons, dtype=object)}
 
     def _failed(
@@ -194,13 +195,6 @@ class Solver:
         code = Result(int(result[k, step]))
         cause = cause or likely_cause(code, system, plan.settings, controls[step - 1])
         return f"step {step} (t = {step * plan.sweep.dt:g} s): {code.message}. {cause}".strip()
-
-
-def _mark_coarse(columns: dict[str, Any], length: Any, before: Any) -> None:
-    """Mark solved rows from the first one on for which the grid is too coarse; the initial row is not one."""
-    result, error = columns["result"], columns["position_error"][:, 1:]
-    marked = coarse_results(result[:, 1:], error, length, before)
-    columns["result"] = np.concatenate([result[:, :1], marked], axis=1).astype(np.int8)
 
 
 @functools.lru_cache(maxsize=64)
