@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
+from knode_cosserat.rods.section import INWARD
 from knode_cosserat.rods.strands import in_strands
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.solvers.history import FirstStep, SolverState, StateHistory, coefficient_table
@@ -220,7 +221,9 @@ def warn_outside_rod_theory(system: System, rows: StepRows) -> None:
     radius = np.asarray(strand.radius)[..., None]
     if strand.sections:
         still = np.zeros(system.control_size)
-        s = np.linspace(0.0, 1.0, system.nodes)
+        # on the far side of the ends of sections, inside the rod, as z
+        s = (np.arange(system.nodes) + 0.2 * INWARD) / (system.nodes - 1)
+        s[-1] -= 0.4 * INWARD / (system.nodes - 1)
 
         def along(rod: Any) -> Any:
             return jax.vmap(lambda part: rod.material(part * rod.length, still).radius)(s)
