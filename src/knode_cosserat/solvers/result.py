@@ -23,8 +23,8 @@ class Code(enum.IntEnum):
 class Result(Code):
     """Outcome of a step. Zero and above: solved to tolerance. Below zero: not solved, the state is invalid.
 
-    COARSE is also solved, but its estimated discretisation error is more than 2 % of the length or 0.1 rad, or
-    there is no estimate.
+    COARSE is also solved, but its estimated discretisation error is more than 2 % of the length or 0.1 rad,
+    or there is no estimate.
     """
 
     CONVERGED = 0

@@ -196,5 +196,5 @@ def _require_accurate(row: Trajectory) -> None:
     share = error / float(row.system.length)
     # NaN: there is no estimate
     if not share <= MOST_ERROR:
-        off = f"off by about {error:.2g} m ({share:.0%} of the length)" if share > 0.0 else "off by any amount"
-        raise ValueError(f"the grid of {row.system.nodes} nodes is too coarse, positions would be {off}")
+        off = "by any amount" if np.isnan(share) else f"by about {error:.2g} m ({share:.0%} of the length)"
+        raise ValueError(f"the grid of {row.system.nodes} nodes is too coarse, positions would be off {off}")
