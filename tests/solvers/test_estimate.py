@@ -2,10 +2,12 @@
 
 import warnings
 
+import jax
 import numpy as np
 import pytest
 
 import knode_cosserat as kc
+from knode_cosserat.solvers.run import carried_results
 
 LENGTH, RADIUS, MODULUS, DENSITY = 1.0, 0.005, 70e9, 2700.0
 ENDS = kc.robots.ends
@@ -163,3 +165,24 @@ def test_a_stretch_beyond_rod_theory_is_warned_of(stretch):
     said = ["outside rod theory: the stretch is 2.5" in str(each.message) for each in caught]
     assert np.sum(said) == (stretch > 2.0)
     assert rest.tip_position[0, 2] == pytest.approx(stretch * LENGTH, rel=1e-6)
+
+
+def test_results_that_hold_for_all_later_rows():
+    codes = kc.Result
+    converged, coarse, continued, halved, failed = (
+        codes.CONVERGED, codes.COARSE, codes.RECOVERED_LOAD_CONTINUATION, codes.RECOVERED_STEP_HALVING,
+        codes.NO_CONVERGENCE,
+    )  # fmt: skip
+    rows = np.array([
+        [converged, continued, converged, halved, converged, coarse, converged, continued],
+        [converged, coarse, converged, converged, failed, failed, failed, failed],
+        [converged] * 8,
+    ])  # fmt: skip
+    carried = carried_results(rows, np.array([converged, converged, halved]))
+    assert carried.tolist() == [
+        [converged, continued, continued, halved, halved, coarse, coarse, coarse],
+        [converged, coarse, coarse, coarse, failed, failed, failed, failed],
+        [halved] * 8,
+    ]
+    traced = jax.jit(carried_results)(rows, np.array([converged, converged, halved]))
+    assert np.array_equal(traced, carried)

@@ -44,14 +44,14 @@ def initial_state(
     For a batch of `batch` robots, of one system or of as many.
     """
     many, made = np.ndim(system.length) > 0, history_settings(settings)
-    coarse: Any = False
+    result: Any = int(Result.CONVERGED)
     if system.rest_is_guess:
-        record, coarse = _settled(system, settings, recovery_budget)
+        record, result = _settled(system, settings, recovery_budget)
         none = np.zeros(system.control_size)
         history = (_all_at_one_state if many else at_one_state)(system, made, record, none)
     else:
         record, history = (_all_at_rest if many else _at_rest)(system, made)
-    found = record, SolverState(history), coarse
+    found = record, SolverState(history), result
     if batch and not many:
         found = jax.tree.map(lambda x: jnp.broadcast_to(x, (batch, *jnp.shape(x))), found)
     shape = (batch, system.control_size) if batch else (system.control_size,)
@@ -74,21 +74,21 @@ def _all_at_one_state(system: System, settings: Settings, records: Any, control:
 
 
 def _settled(system: System, settings: Settings, budget: float | None) -> tuple[Any, Any]:
-    """Return y and z of the equilibrium under zero control, and a flag: true if its grid is too coarse."""
+    """Return y and z of the equilibrium under zero control, and COARSE or CONVERGED."""
     many, none = np.ndim(system.length) > 0, np.zeros((1, system.control_size))
     task = Equilibria(Settings(None, settings.space, newton=settings.newton), 1, budget)
     y = unloaded_shape(system, settings.space)
     if is_traced((system, y)):
         find = static_rollout(task)
         rows = jax.vmap(find, in_axes=(0, None, 0))(system, none, y) if many else find(system, none, y)
-        found, coarse = rows.records[..., 0, :, :], (rows.result == int(Result.COARSE))[..., 0]
+        found, result = rows.records[..., 0, :, :], _coarse_only(rows.result[..., 0])
     elif many:
         each = range(len(y))
         both = [_settled_one(task, jax.tree.map(lambda x, i=i: x[i], system), y[i], i) for i in each]
-        found, coarse = map(np.stack, zip(*both, strict=True))
+        found, result = map(np.stack, zip(*both, strict=True))
     else:
-        found, coarse = _settled_one(task, system, y, None)
-    return found[..., : system.y_layout.size + system.z_layout.size], coarse
+        found, result = _settled_one(task, system, y, None)
+    return found[..., : system.y_layout.size + system.z_layout.size], result
 
 
 def _settled_one(task: Equilibria, system: System, y: Any, robot: int | None) -> tuple[Any, Any]:
@@ -96,7 +96,7 @@ def _settled_one(task: Equilibria, system: System, y: Any, robot: int | None) ->
     rows, _, cause = run_one(task, system, none, y, none[0])
     if rows.result[0] < 0:
         raise SimulationError(0, 0.0, float(rows.error[0]), Result(int(rows.result[0])), cause, robot)
-    return rows.records[0], rows.result[0] == Result.COARSE
+    return rows.records[0], _coarse_only(rows.result[0])
 
 
 # continuation of another trajectory
@@ -123,7 +123,14 @@ def continued_state(system: System, initial: Trajectory, settings: Settings, dt:
         )
         state = SolverState(alone, None, state.rate_known)
     state = SolverState(state.history._replace(t0=jnp.asarray(t0, dtype=float)), state.dt, state.rate_known)
-    return InitialState(record, control, state, initial.result[-1] == Result.COARSE)
+    made = initial.settings
+    result = initial.result[-1] if made and made.time else _coarse_only(initial.result[-1])
+    return InitialState(record, control, state, result)
+
+
+def _coarse_only(result: Any) -> Any:
+    """Return COARSE or CONVERGED: a recovered equilibrium is one on every grid."""
+    return int(Result.COARSE) * (result == int(Result.COARSE))
 
 
 def _last_state(

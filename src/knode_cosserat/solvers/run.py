@@ -47,8 +47,8 @@ class InitialState(NamedTuple):
     #: control before the first step
     control: Any
     state: SolverState
-    #: true if the grid was too coarse for the state before the first step
-    coarse: Any = False
+    #: result that the motion's rows take on: COARSE or recovered, otherwise CONVERGED
+    result: Any = int(Result.CONVERGED)
 
 
 class Run(NamedTuple):
@@ -173,21 +173,26 @@ def padded_rows(rows: Any, least: int = 1) -> np.ndarray:
     return np.pad(rows, width, mode="edge")
 
 
-def mark_coarse(rows: StepRows, before: Any) -> StepRows:
-    """Mark solved rows of a motion from the first one on for which the grid is too coarse.
+def with_carried_results(rows: StepRows, before: Any) -> StepRows:
+    """Return the rows of a motion with results that hold for all later rows, too; see `carried_results`."""
+    return rows._replace(result=carried_results(rows.result, before))
 
-    `before` is true if the grid was too coarse before the motion. The error is carried along the computed
-    motion. It cannot show that the exact motion diverges from it.
+
+def carried_results(result: Any, before: Any) -> Any:
+    """Return the results of a motion's rows: COARSE, or recovered, from the first such row on.
+
+    The error estimate is that of one solution. It cannot show that the exact motion diverges from the
+    computed one on a coarse grid. A step that needed recovery may have several solutions, and two grids may
+    follow different ones. `before` is the result before the motion.
     """
-    return rows._replace(result=coarse_results(rows.result, before))
-
-
-def coarse_results(result: Any, before: Any) -> Any:
-    """Return the results of a motion's rows after the rule of `mark_coarse`."""
-    numeric: Any = jnp if is_traced((result, before)) else np
-    coarse = numeric.cumsum(result == int(Result.COARSE), axis=-1) > 0
-    coarse = (coarse | numeric.asarray(before)[..., None]) & (result >= 0)
-    return numeric.where(coarse, int(Result.COARSE), result)
+    traced = is_traced((result, before))
+    numeric: Any = jnp if traced else np
+    codes = numeric.concatenate([numeric.asarray(before)[..., None], result], axis=-1)
+    latest = numeric.where(codes > int(Result.COARSE), numeric.arange(codes.shape[-1]), 0)
+    latest = jax.lax.cummax(latest, codes.ndim - 1) if traced else np.maximum.accumulate(latest, axis=-1)
+    coarse = numeric.cumsum(codes == int(Result.COARSE), axis=-1) > 0
+    codes = numeric.where(coarse, int(Result.COARSE), numeric.take_along_axis(codes, latest, axis=-1))
+    return numeric.where(result >= 0, codes[..., 1:], result)
 
 
 def warn_of_coarse_grids(system: System, settings: Settings, rows: StepRows) -> None:

@@ -26,12 +26,12 @@ from knode_cosserat.solvers.run import (
     InitialState,
     TimeIntegration,
     failure,
-    mark_coarse,
     rows_of,
     run_batch,
     run_one,
     warn_of_coarse_grids,
     warn_outside_rod_theory,
+    with_carried_results,
 )
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
@@ -331,7 +331,7 @@ def _plain(
     if on_failure == "raise" and causes:
         times = float(np.ravel(at_start.state.history.t0)[0]) + (1.0 + np.arange(task.steps)) * task.dt
         raise failure(rows, causes, times)
-    rows = mark_coarse(rows, at_start.coarse)
+    rows = with_carried_results(rows, at_start.result)
     warn_of_coarse_grids(system, task.settings, rows)
     warn_outside_rod_theory(system, rows)
     return _trajectory(system, controls, at_start, task, rows, history)
@@ -348,7 +348,8 @@ def _traced(system, controls, initial, settings, dt):  # type: ignore[no-untyped
     if np.ndim(controls) == 3:
         run = jax.vmap(run, in_axes=(0 if np.ndim(system.length) else None, 0, 0))
     rows, history = run(system, controls, at_start.state.history)
-    return _trajectory(system, controls, at_start, task, mark_coarse(rows, at_start.coarse), history)
+    rows = with_carried_results(rows, at_start.result)
+    return _trajectory(system, controls, at_start, task, rows, history)
 
 
 def _trajectory(

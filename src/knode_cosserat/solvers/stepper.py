@@ -16,7 +16,7 @@ from knode_cosserat.solvers.history import SolverState, StateHistory
 from knode_cosserat.solvers.initial import continued_state, initial_state
 from knode_cosserat.solvers.recovery import Budget
 from knode_cosserat.solvers.result import Result, SimulationError
-from knode_cosserat.solvers.run import LEAST_CAPACITY, TimeIntegration, rows_of
+from knode_cosserat.solvers.run import LEAST_CAPACITY, TimeIntegration, carried_results, rows_of
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.simulate import check_initial, checked_dt, marked
 from knode_cosserat.solvers.space import SpaceScheme
@@ -84,7 +84,7 @@ class Stepper:
         first = at_start.state.first_step(settings)
         self._task = TimeIntegration(settings, self.dt, 1, first, recovery_budget)
         self._past, self._t0 = at_start.state.history, float(at_start.state.history.t0)
-        self._index, self._steps, self._coarse = 0, 0, bool(at_start.coarse)
+        self._index, self._steps, self._result = 0, 0, int(at_start.result)
         self._control = np.asarray(at_start.control, dtype=float)
         # same capacity as in a run of up to 128 steps, so that they share a program
         self._controls = np.zeros((LEAST_CAPACITY, robot.control_size))
@@ -120,7 +120,7 @@ class Stepper:
         control = self._checked(control)
         row, after = self._solve(control, stop)
         self._past, self._control = after, control
-        self._coarse = row.result == Result.COARSE
+        self._result = int(row.result)
         self._steps, self._index = self._steps + 1, self._index + 1
         if self._index == LEAST_CAPACITY:
             # restart the count at row 1, not at row 0, because the coefficients of row 0 may differ
@@ -169,8 +169,7 @@ class Stepper:
         result = Result(int(row.result))
         if not result.solved:
             raise SimulationError(self._steps + 1, self.time + self.dt, float(row.error), result, cause)
-        # same rule as `mark_coarse`
-        return row._replace(result=int(Result.COARSE) if self._coarse else result), after
+        return row._replace(result=int(carried_results(np.array([result]), self._result)[0])), after
 
     def _state_after(self, past: StateHistory, time: float) -> SolverState:
         """Return the solver's state after a step."""

@@ -25,7 +25,7 @@ from knode_cosserat.solvers.result import Result, SimulationError
 from knode_cosserat.solvers.run import (
     InitialState,
     TimeIntegration,
-    coarse_results,
+    carried_results,
     run_one,
     usable_cores,
 )
@@ -50,8 +50,8 @@ class Settled(NamedTuple):
     """Initial states of a chunk that had to be solved for; see `_settled`."""
 
     start: Start | None
-    #: true where the grid was too coarse
-    coarse: Any
+    #: COARSE where the grid was, otherwise CONVERGED
+    result: Any
     #: by case, the reasons of equilibria that were not found
     reasons: dict[int, str]
 
@@ -178,7 +178,7 @@ class Solver:
                 system = bare.replace(**own) if own else bare
                 reasons[k] = self._failed(system, task, cases.controls[first + k], columns, k)
         result = columns["result"]
-        marked = coarse_results(result[:, 1:], settled.coarse[:count])
+        marked = carried_results(result[:, 1:], settled.result[:count])
         columns["result"] = np.concatenate([result[:, :1], marked], axis=1).astype(np.int8)
         return columns | {"reason": np.array(reasons, dtype=object)}
 
@@ -223,7 +223,7 @@ def _settled(plan: Plan, robot: int, values: dict[str, Any], size: int) -> Settl
     """
     system, settings = _bare(plan, robot), plan.settings
     if not system.rest_is_guess:
-        return Settled(None, np.zeros(size, dtype=bool), {})
+        return Settled(None, np.full(size, int(Result.CONVERGED)), {})
     found: list[InitialState | None] = []
     reasons: dict[int, str] = {}
     for k in range(size if values else 1):
@@ -240,8 +240,8 @@ def _settled(plan: Plan, robot: int, values: dict[str, Any], size: int) -> Settl
         every, reasons = every * size, dict.fromkeys(range(size), reasons[0]) if reasons else {}
     pairs = [Start(each.record, each.state.history) for each in every]
     start = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *pairs)
-    coarse = np.array([bool(each.coarse) for each in every])
-    return Settled(start, coarse, reasons)
+    result = np.array([int(each.result) for each in every])
+    return Settled(start, result, reasons)
 
 
 def _guessed(system: System, settings: Settings) -> InitialState:
