@@ -212,7 +212,11 @@ class Trajectory(eqx.Module):
             if error is not None and np.any(np.isfinite(error))
         ]
         if errors:
-            lines.append(f"largest position error, by estimate: {', '.join(errors)}")
+            lost = np.count_nonzero(np.isnan(self.position_error) & (np.asarray(self.result) >= 0))
+            lines.append(
+                f"largest position error, by estimate: {', '.join(errors)}"
+                + (f"; no estimate along the rod in {count_of(lost, 'row')}" if lost else "")
+            )
         if self.extrapolation:
             lines.append(f"EXTRAPOLATION: {self.extrapolation}")
         return "\n".join(lines)

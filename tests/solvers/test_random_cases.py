@@ -132,10 +132,7 @@ def extreme(seed: int) -> tuple[kc.System, np.ndarray]:
 @pytest.mark.filterwarnings("ignore:the grid is too coarse")
 @pytest.mark.parametrize("moving", [False, True])
 def test_a_converged_row_is_close_to_a_four_times_finer_grid(moving):
-    """1,000 extreme cases, up to the first row that needed recovery: after it, grids may be on two branches.
-
-    Without that limit 3 of the 500 motions have converged rows that are further off.
-    """
+    """1,000 extreme cases. Rows after recovery do not claim to be converged: grids may be on two branches."""
     worst, counted = 0.0, collections.Counter()
     for seed in range(500):
         robot, tensions = extreme(seed)
@@ -148,8 +145,7 @@ def test_a_converged_row_is_close_to_a_four_times_finer_grid(moving):
             both.append(found)
         one, fine = both
         counted.update(kc.Result(int(result)).name for result in one.result)
-        recovered = np.cumsum(one.result > kc.Result.COARSE) > 0
-        claimed = (one.result == kc.Result.CONVERGED) & (fine.result >= 0) & ~recovered
+        claimed = (one.result == kc.Result.CONVERGED) & (fine.result >= 0)
         off = np.linalg.norm(one.tip_position - fine.tip_position, axis=1) / robot.length
         worst = max(worst, float(np.max(off[claimed], initial=0.0)))
     print(f"\n{dict(counted)}; converged rows are off by {100 * worst:.1f} % of the length at most")

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from knode_cosserat.rods.system import System
 
 COARSE = (
-    "COARSE GRID: the estimated position error is above 2 % of the length; "
+    "COARSE GRID: the estimated error is above 2 % of the length or 0.1 rad, or there is no estimate; "
     "use more --nodes, or --space lobatto4"
 )
 

@@ -56,7 +56,7 @@ def _largest_error(errors: Any, valid: Any) -> float | None:
 def error_text(error: float | None, length: float) -> str:
     """Return a position error as text: in mm, and as a percentage of the length."""
     if error is None:
-        return "unknown"
+        return "no estimate"
     return f"{1e3 * error:.2g} mm ({100 * error / length:.2g} % of the length)"
 
 

@@ -18,7 +18,7 @@ from knode_cosserat.envs.tasks.base import Tip
 from knode_cosserat.rods.system import System
 from knode_cosserat.rotation import dot, rotation_matrix
 from knode_cosserat.solvers.history import StateHistory, rest_record, resting_history
-from knode_cosserat.solvers.run import is_coarse
+from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.time_loop import StepCoefficients, StepRows, loop_many
 
 
@@ -190,7 +190,7 @@ def _arrived(
     """Return the state after a solved step, and its outcome; without a solution the state before it."""
     state, system = move.state, arrays.robot if spec.is_shared else move.system
     solved, ny = row.result >= 0, system.y_layout.size
-    coarse = solved & is_coarse(row.position_error, system.length)
+    coarse = row.result == int(Result.COARSE)
     record = jnp.where(solved, row.records, 0.0)
     y, z = record[:, :ny], record[:, ny : ny + system.z_layout.size]
     key, noise_key = jax.random.split(state.key)

@@ -19,10 +19,10 @@ from knode_cosserat.solvers.guess import state_from_positions
 from knode_cosserat.solvers.run import (
     Equilibria,
     failure,
-    mark_coarse,
     rows_of,
     warn_of_coarse_grids,
     warn_of_results,
+    warn_outside_rod_theory,
 )
 from knode_cosserat.solvers.sensitivity import static_rollout
 from knode_cosserat.solvers.settings import Settings
@@ -139,9 +139,9 @@ def equilibria(
         rows, _, causes = (static_batch if batch else static_run)(task, bare, controls, y, before)
         if on_failure == "raise" and causes:
             raise failure(rows, causes, None)
-        rows = mark_coarse(rows, system)
         warn_of_coarse_grids(system, settings, rows)
         warn_of_results(rows)
+        warn_outside_rod_theory(system, rows)
     time = np.arange(float(task.steps))
     return marked(Trajectory(system, settings, time, control=controls, **rows_of(system, rows)), None)
 
@@ -152,7 +152,7 @@ def _traced(system, controls, y, task):  # type: ignore[no-untyped-def]
     run: Any = static_rollout(task)
     if np.ndim(controls) == 3:
         run = jax.vmap(run, in_axes=(0 if np.ndim(system.length) else None, 0, 0))
-    return mark_coarse(run(system, controls, y), system)
+    return run(system, controls, y)
 
 
 def _checked_control(control: Any) -> Any:

@@ -28,7 +28,7 @@ from knode_cosserat.solvers.replay import (
     state_of_rows,
 )
 from knode_cosserat.solvers.result import Result, SimulationError
-from knode_cosserat.solvers.run import Equilibria, InitialState, is_coarse, warn_of_results
+from knode_cosserat.solvers.run import Equilibria, InitialState, warn_of_results
 from knode_cosserat.solvers.sensitivity import static_rollout
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
@@ -55,14 +55,14 @@ def initial_state(
             control if that state is only a guess.
     """
     many, made = np.ndim(system.length) > 0, history_settings(settings)
-    coarse: Any = False
+    result: Any = int(Result.CONVERGED)
     control = np.zeros(system.control_size) if held is None else np.asarray(held, dtype=float)
     if held is not None or system.rest_is_guess:
-        record, coarse = _settled(system, settings, recovery_budget, control)
+        record, result = _settled(system, settings, recovery_budget, control)
         history = (_all_at_one_state if many else at_one_state)(system, made, record, control)
     else:
         record, history = (_all_at_rest if many else _at_rest)(system, made)
-    found = record, SolverState(history), coarse
+    found = record, SolverState(history), result
     if batch and not many:
         found = jax.tree.map(lambda x: jnp.broadcast_to(x, (batch, *jnp.shape(x))), found)
     shape = (batch, system.control_size) if batch else (system.control_size,)
@@ -85,20 +85,20 @@ def _all_at_one_state(system: System, settings: Settings, records: Any, control:
 
 
 def _settled(system: System, settings: Settings, budget: float | None, control: Any) -> tuple[Any, Any]:
-    """Return y and z of the equilibrium under a control, and a flag: true if its grid is too coarse."""
+    """Return y and z of the equilibrium under a control, and COARSE or CONVERGED."""
     many, held = np.ndim(system.length) > 0, control[None]
     task = Equilibria(Settings(None, settings.space, newton=settings.newton), 1, budget)
     if is_traced(system):
         find, y = static_rollout(task), unloaded_shape(system, settings.space)
         rows = jax.vmap(find, in_axes=(0, None, 0))(system, held, y) if many else find(system, held, y)
-        found, coarse = rows.records[..., 0, :, :], is_coarse(rows.position_error, system.length)[..., 0]
+        found, result = rows.records[..., 0, :, :], _coarse_only(rows.result[..., 0])
     elif many:
         each = range(np.shape(system.length)[0])
         both = [_settled_one(task, jax.tree.map(lambda x, i=i: x[i], system), i, held) for i in each]
-        found, coarse = map(np.stack, zip(*both, strict=True))
+        found, result = map(np.stack, zip(*both, strict=True))
     else:
-        found, coarse = _settled_one(task, system, None, held)
-    return found[..., : system.y_layout.size + system.z_layout.size], coarse
+        found, result = _settled_one(task, system, None, held)
+    return found[..., : system.y_layout.size + system.z_layout.size], result
 
 
 def _settled_one(task: Equilibria, system: System, robot: int | None, held: np.ndarray) -> tuple[Any, Any]:
@@ -106,7 +106,7 @@ def _settled_one(task: Equilibria, system: System, robot: int | None, held: np.n
     if rows.result[0] < 0:
         raise SimulationError(0, 0.0, float(rows.error[0]), Result(int(rows.result[0])), cause, robot)
     warn_of_results(rows)
-    return rows.records[0], is_coarse(rows.position_error[0], system.length)
+    return rows.records[0], _coarse_only(rows.result[0])
 
 
 # continuation of another trajectory
@@ -133,7 +133,14 @@ def continued_state(system: System, initial: Trajectory, settings: Settings, dt:
         )
         state = SolverState(alone, None, state.rate_known)
     state = SolverState(state.history._replace(t0=jnp.asarray(t0, dtype=float)), state.dt, state.rate_known)
-    return InitialState(record, control, state, initial.result[-1] == Result.COARSE)
+    made = initial.settings
+    result = initial.result[-1] if made and made.time else _coarse_only(initial.result[-1])
+    return InitialState(record, control, state, result)
+
+
+def _coarse_only(result: Any) -> Any:
+    """Return COARSE or CONVERGED: a recovered equilibrium is one on every grid."""
+    return int(Result.COARSE) * (result == int(Result.COARSE))
 
 
 def _last_state(

@@ -189,6 +189,8 @@ class Recovery(abc.ABC):
 
     def _outcome(self, result: Result, found: Attempt) -> SolvedStep:
         row = StepRows(*map(np.asarray, found.row))
+        if result.solved and row.result == Result.COARSE:
+            result = Result.COARSE
         return SolvedStep(found.state, row._replace(corrections=self.corrections, result=int(result)))
 
     def _by_all_methods(

@@ -23,8 +23,9 @@ class Code(enum.IntEnum):
 class Result(Code):
     """Outcome of a step. Zero and above: solved to tolerance. Below zero: not solved, the state is invalid.
 
-    COARSE is also solved, but its estimated discretisation error is more than 2 % of the length. UNSTABLE is
-    an equilibrium that a small disturbance destroys. OTHER_TURNS has another winding than the control's.
+    COARSE is also solved, but its estimated discretisation error is more than 2 % of the length or 0.1 rad,
+    or there is no estimate. In a motion, all rows after a COARSE or recovered one have its result. UNSTABLE
+    is an equilibrium that a small disturbance destroys. OTHER_TURNS has another winding than the control's.
     """
 
     CONVERGED = 0

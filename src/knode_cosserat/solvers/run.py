@@ -15,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
+from knode_cosserat.rods.section import INWARD
+from knode_cosserat.rods.strands import in_strands
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.solvers.history import FirstStep, SolverState, StateHistory
 from knode_cosserat.solvers.recovery import Budget, SolvedStep
@@ -33,8 +35,8 @@ CHUNK = 64
 LEAST_CAPACITY = 128
 #: seconds between two checks for signals, and number of steps before the first check
 RESPONSE, FIRST_STEPS = 0.2, 128
-#: a row whose position error is above this part of the length is COARSE
-COARSE_SHARE = 0.02
+#: rod theory holds up to this product of radius and curvature, and between these stretches
+MOST_BENT, STRETCH = 0.5, (0.5, 2.0)
 
 
 class InitialState(NamedTuple):
@@ -45,8 +47,8 @@ class InitialState(NamedTuple):
     #: control before the first step
     control: Any
     state: SolverState
-    #: true if the grid was too coarse for the state before the first step
-    coarse: Any = False
+    #: result that the motion's rows take on: COARSE or recovered, otherwise CONVERGED
+    result: Any = int(Result.CONVERGED)
 
 
 class Run(NamedTuple):
@@ -171,41 +173,79 @@ def padded_rows(rows: Any, least: int = 1) -> np.ndarray:
     return np.pad(rows, width, mode="edge")
 
 
-def is_coarse(position_error: Any, length: Any) -> Any:
-    """Return true where a position error is above `COARSE_SHARE` of the length, or NaN."""
-    return ~(position_error <= COARSE_SHARE * (length[..., None] if np.ndim(length) else length))
+def with_carried_results(rows: StepRows, before: Any) -> StepRows:
+    """Return the rows of a motion with results that hold for all later rows, too; see `carried_results`."""
+    return rows._replace(result=carried_results(rows.result, before))
 
 
-def mark_coarse(rows: StepRows, system: System, before: Any = None) -> StepRows:
-    """Mark solved rows for which the grid is too coarse, and in a motion all rows after such a row.
+def carried_results(result: Any, before: Any) -> Any:
+    """Return the results of a motion's rows: COARSE, or recovered, from the first such row on.
 
-    `before` is true if the grid was too coarse before a motion; None for equilibria. The error is propagated
-    by linearised equations. They give its decay along the computed motion, but cannot show that the exact
-    motion diverges from it.
+    The error estimate is that of one solution. It cannot show that the exact motion diverges from the
+    computed one on a coarse grid. A step that needed recovery may have several solutions, and two grids may
+    follow different ones. `before` is the result before the motion.
     """
-    return rows._replace(result=coarse_results(rows.result, rows.position_error, system.length, before))
-
-
-def coarse_results(result: Any, position_error: Any, length: Any, before: Any = None) -> Any:
-    """Return the results of rows after the rule of `mark_coarse`, from their position errors (m)."""
-    numeric: Any = jnp if is_traced((result, position_error, length, before)) else np
-    coarse = is_coarse(position_error, length)
-    if before is not None:
-        coarse = (numeric.cumsum(coarse, axis=-1) > 0) | numeric.asarray(before)[..., None]
-    coarse &= result >= 0
-    return numeric.where(coarse, int(Result.COARSE), result)
+    traced = is_traced((result, before))
+    numeric: Any = jnp if traced else np
+    codes = numeric.concatenate([numeric.asarray(before)[..., None], result], axis=-1)
+    latest = numeric.where(codes > int(Result.COARSE), numeric.arange(codes.shape[-1]), 0)
+    latest = jax.lax.cummax(latest, codes.ndim - 1) if traced else np.maximum.accumulate(latest, axis=-1)
+    coarse = numeric.cumsum(codes == int(Result.COARSE), axis=-1) > 0
+    codes = numeric.where(coarse, int(Result.COARSE), numeric.take_along_axis(codes, latest, axis=-1))
+    return numeric.where(result >= 0, codes[..., 1:], result)
 
 
 def warn_of_coarse_grids(system: System, settings: Settings, rows: StepRows) -> None:
     """Warn of rows with a large discretisation error; not for Euler, which only reproduces the paper."""
     coarse = np.asarray(rows.result) == Result.COARSE
-    if np.any(coarse) and not isinstance(settings.space, Euler):
-        worst, length = float(np.max(rows.position_error[coarse])), float(np.max(system.length))
+    if not np.any(coarse) or isinstance(settings.space, Euler):
+        return
+    errors, length = np.asarray(rows.position_error)[coarse], float(np.max(system.length))
+    said = "there is no estimate of the positions' error"
+    if not np.all(np.isnan(errors)):
+        worst = float(np.nanmax(errors))
+        said = f"positions are off by up to about {worst:.2g} m ({worst / length:.0%} of the length)"
+        lost = np.count_nonzero(np.isnan(errors))
+        said += f", without an estimate in {lost} rows," if lost else ""
+    warnings.warn(
+        f"the grid is too coarse in {np.count_nonzero(coarse)} of {coarse.size} rows: {said} with "
+        f"{system.nodes} nodes. Use more nodes, or position_tolerance.",
+        stacklevel=4,
+    )
+
+
+def warn_outside_rod_theory(system: System, rows: StepRows) -> None:
+    """Warn once if solved rows are bent or stretched beyond the assumptions of rod theory."""
+    many, solved = np.ndim(system.length) > 0, np.asarray(rows.result) >= 0
+    # a batch of robots of several rods has no `strand`
+    strand = system if system.strands == 1 or many else system.strand
+    if not solved.any() or not {"v", "u"} <= set(strand.z_layout.names) or not hasattr(strand, "radius"):
+        return
+    ny, nz = system.y_layout.size, system.z_layout.size
+    z = in_strands(system, np.asarray(rows.records)[..., ny : ny + nz])
+    radius = np.asarray(strand.radius)[..., None]
+    if strand.sections:
+        still = np.zeros(system.control_size)
+        # on the far side of the ends of sections, inside the rod, as z
+        s = (np.arange(system.nodes) + 0.2 * INWARD) / (system.nodes - 1)
+        s[-1] -= 0.4 * INWARD / (system.nodes - 1)
+
+        def along(rod: Any) -> Any:
+            return jax.vmap(lambda part: rod.material(part * rod.length, still).radius)(s)
+
+        radius = np.asarray(jax.vmap(along)(strand) if many else along(strand))
+    bent = np.linalg.norm(strand.z_layout.get(z, "u")[..., :2], axis=-1) * radius[..., None, :, None]
+    stretch = np.linalg.norm(strand.z_layout.get(z, "v"), axis=-1)
+    found = []
+    if np.max(bent[solved]) > MOST_BENT:
+        found.append(f"radius × curvature reaches {np.max(bent[solved]):.2g} (allowed: up to {MOST_BENT:g})")
+    low, high = float(np.min(stretch[solved])), float(np.max(stretch[solved]))
+    if low < STRETCH[0] or high > STRETCH[1]:
+        found.append(f"the stretch is {low:.2g} to {high:.2g} (allowed: {STRETCH[0]:g} to {STRETCH[1]:g})")
+    if found:
         warnings.warn(
-            f"the grid is too coarse in {np.count_nonzero(coarse)} of {coarse.size} rows: positions are "
-            f"off by up to about {worst:.2g} m ({worst / length:.0%} of the length) with "
-            f"{system.nodes} nodes. "
-            "Use more nodes, or position_tolerance.",
+            f"outside rod theory: {' and '.join(found)}; such rows solve the equations, but no real rod "
+            "follows them: check loads, stiffness and radius, and their units",
             stacklevel=4,
         )
 

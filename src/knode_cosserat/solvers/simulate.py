@@ -25,11 +25,12 @@ from knode_cosserat.solvers.run import (
     InitialState,
     TimeIntegration,
     failure,
-    mark_coarse,
     rows_of,
     run_batch,
     run_one,
     warn_of_coarse_grids,
+    warn_outside_rod_theory,
+    with_carried_results,
 )
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
@@ -188,7 +189,7 @@ def refined_trajectory(
     segments = FIRST_SEGMENTS
     while True:
         found = solve(robot.replace(nodes=segments + 1))
-        error = float(np.nanmax(found.position_error))
+        error = float(np.max(found.position_error))
         if error <= tolerance or not found.all_valid:
             return found
         if segments == MOST_SEGMENTS:
@@ -198,7 +199,8 @@ def refined_trajectory(
                 stacklevel=3,
             )
             return found
-        wanted = segments * max(1.2, 1.1 * (error / tolerance) ** (1.0 / order))
+        wanted = 2 * segments if np.isnan(error) else 1.1 * segments * (error / tolerance) ** (1.0 / order)
+        wanted = max(wanted, 1.2 * segments)
         # few different numbers of nodes, so few programs to compile
         segments = min(MOST_SEGMENTS, next(n for n in _ladder() if n >= min(wanted, MOST_SEGMENTS)))
 
@@ -336,8 +338,9 @@ def _plain(
     if on_failure == "raise" and causes:
         times = float(np.ravel(at_start.state.history.t0)[0]) + (1.0 + np.arange(task.steps)) * task.dt
         raise failure(rows, causes, times)
-    rows = mark_coarse(rows, system, at_start.coarse)
+    rows = with_carried_results(rows, at_start.result)
     warn_of_coarse_grids(system, task.settings, rows)
+    warn_outside_rod_theory(system, rows)
     return _trajectory(system, controls, at_start, task, rows, history)
 
 
@@ -352,7 +355,8 @@ def _traced(system, controls, initial, settled, settings, dt):  # type: ignore[n
     if np.ndim(controls) == 3:
         run = jax.vmap(run, in_axes=(0 if np.ndim(system.length) else None, 0, 0))
     rows, history = run(system, controls, at_start.state.history)
-    return _trajectory(system, controls, at_start, task, mark_coarse(rows, system, at_start.coarse), history)
+    rows = with_carried_results(rows, at_start.result)
+    return _trajectory(system, controls, at_start, task, rows, history)
 
 
 def _trajectory(

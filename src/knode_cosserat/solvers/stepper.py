@@ -16,7 +16,7 @@ from knode_cosserat.solvers.history import SolverState, StateHistory, at_stages
 from knode_cosserat.solvers.initial import continued_state, initial_state
 from knode_cosserat.solvers.recovery import Budget
 from knode_cosserat.solvers.result import Result, SimulationError
-from knode_cosserat.solvers.run import LEAST_CAPACITY, TimeIntegration, is_coarse, rows_of
+from knode_cosserat.solvers.run import LEAST_CAPACITY, TimeIntegration, carried_results, rows_of
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.simulate import check_initial, checked_dt, marked, split_initial
 from knode_cosserat.solvers.space import SpaceScheme
@@ -86,7 +86,7 @@ class Stepper:
         first = at_start.state.first_step(settings)
         self._task = TimeIntegration(settings, self.dt, 1, first, recovery_budget)
         self._past, self._t0 = at_start.state.history, float(at_start.state.history.t0)
-        self._index, self._steps, self._coarse = 0, 0, bool(at_start.coarse)
+        self._index, self._steps, self._result = 0, 0, int(at_start.result)
         self._control = np.asarray(at_start.control, dtype=float)
         self._begun = at_start.state.dt is not None
         stages = np.full((settings.stages - 1, *np.shape(at_start.record)), np.nan)
@@ -122,7 +122,7 @@ class Stepper:
         control = self._checked(control)
         row, after = self._solve(control, stop)
         self._past, self._control, self._begun = after, control, True
-        self._coarse = row.result == Result.COARSE
+        self._result = int(row.result)
         self._steps, self._index = self._steps + 1, self._index + 1
         if self._index == LEAST_CAPACITY:
             # restart the count at row 1, not at row 0, because the coefficients of row 0 may differ
@@ -173,9 +173,7 @@ class Stepper:
         result = Result(int(row.result))
         if not result.solved:
             raise SimulationError(self._steps + 1, self.time + self.dt, float(row.error), result, cause)
-        # same rule as `mark_coarse`
-        coarse = self._coarse or is_coarse(np.asarray(row.position_error), self.robot.length)
-        return row._replace(result=int(Result.COARSE) if coarse else result), after
+        return row._replace(result=int(carried_results(np.array([result]), self._result)[0])), after
 
     def _state_after(self, past: StateHistory, time: float) -> SolverState:
         """Return the solver's state after a step."""

@@ -17,6 +17,7 @@ from knode_cosserat.solvers.boundary import (
     Kept,
     NewtonOptions,
     Solution,
+    largest_of,
     largest_residual,
     newton,
     none_kept,
@@ -30,7 +31,6 @@ from knode_cosserat.solvers.history import (
     advanced,
     coefficient_table,
     history_of,
-    used_places,
 )
 from knode_cosserat.solvers.linear import Factors, solved_correction
 from knode_cosserat.solvers.problem import Stages, StepProblem, no_history, row_of
@@ -41,8 +41,13 @@ from knode_cosserat.solvers.time import SDIRK2
 
 #: extrapolations are weighted by this power of their errors in the newest step
 TRUST = -3
+#: a row is COARSE if its position error is above this part of the length, or its orientation error above this
+#: angle (rad), which is the position error relative to the radius of curvature of a coil
+COARSE_SHARE, COARSE_ANGLE = 0.02, 0.1
 #: axis name of robots that are solved in lockstep
 BATCH = "robots"
+#: tolerance of a step's error estimate relative to its change, and largest number of corrections
+ESTIMATE_TOLERANCE, ESTIMATE_TURNS = 1e-2, 10
 #: misfits below this are rounding errors (natural units)
 ROUNDING = 1e-12
 
@@ -58,7 +63,7 @@ class StepRows(NamedTuple):
     #: largest residual, natural units
     error: Float[Any, " steps"]
     corrections: Int[Any, " steps"]
-    #: estimated discretisation error of positions (m), the largest over the nodes
+    #: estimated discretisation error of positions (m), the largest over the nodes; NaN: no estimate
     position_error: Float[Any, " steps"]
     #: result codes (`result.Result`)
     result: Int[Any, " steps"]
@@ -153,9 +158,10 @@ def stage_controls(system: System, settings: Settings, control: Any) -> Float[An
 
 def joined_stages(rows: StepRows) -> StepRows:
     """Return the row of a step from those of its stages: the last, with the worst result of all."""
-    last = jax.tree.map(lambda leaf: leaf[-1], rows)
+    last, failed = jax.tree.map(lambda leaf: leaf[-1], rows), jnp.min(rows.result)
     return last._replace(
-        error=jnp.max(rows.error), corrections=jnp.sum(rows.corrections), result=jnp.min(rows.result),
+        error=jnp.max(rows.error), corrections=jnp.sum(rows.corrections),
+        result=jnp.where(failed < 0, failed, jnp.max(rows.result)),
         stages=rows.records[:-1], stage_unknowns=rows.unknowns[:-1],
     )  # fmt: skip
 
@@ -202,7 +208,7 @@ def recorded_step(
     """Return the history after a solved step, and its row."""
     past, c0 = step.past, step.coefficients[0]
     d_history = history_of(past.error[:2], past.error[2], step.coefficients, settings)
-    row, records, error = solved_row(problem, settings.newton, solution, factors, d_history)
+    row, records, error = solved_row(problem, settings.newton, solution, factors, (d_history, past.error))
     rate, d_rate = past.rate, past.error[2]
     if settings.uses_rate:
         rate, d_rate = c0 * records + problem.history, c0 * error + d_history
@@ -211,42 +217,35 @@ def recorded_step(
 
 
 def solved_row(
-    problem: StepProblem, newton: NewtonOptions, solution: Solution, factors: Factors, d_history: Any = None
+    problem: StepProblem, newton: NewtonOptions, solution: Solution, factors: Factors, earlier: Any = None
 ) -> tuple[StepRows, Float[Any, "places x"], Any]:
     """Return the row of a solution, its records at all places, and their discretisation error.
 
-    The error e of a step solves the step's linear equations. Their right-hand side is the defect of the check
-    formula, plus the effect of earlier steps' errors through the history; an equilibrium has none.
+    `earlier` are the errors of the history terms, and those of earlier records; an equilibrium has none.
     """
     system, space, y = problem.system, problem.space, solution.y
-    used = used_places(system, space)
-
-    def scheme(used_history: Any, y: Any) -> tuple[Stages, Any, Any, Any]:
-        own = problem.with_history(jnp.concatenate([used_history, problem.history[used:]]))
-        found = own.stages(y, space.formula, own.ends(y))
-        reached = own.reached_by(space.formula, found)
-        return found, reached, own.tip_residual(y[-1]), own.base(solution.unknowns)
-
-    history, moved = problem.history[:used], None
-    if d_history is None:
-        found, reached, tip, base = scheme(history, y)
-        moved = jnp.zeros_like(reached), jnp.zeros_like(tip), jnp.zeros_like(base)
-    else:
-        at = jax.jvp(lambda h: scheme(h, y), (history,), (d_history,))
-        (found, reached, tip, _), (_, *moved) = at
+    found = problem.stages(y, space.formula, problem.ends(y))
+    missing = problem.reached_by(space.formula, found) - y[1:], problem.tip_residual(y[-1])
     checked = problem.stages(y, space.check, found)
     defects = problem.reached_by(space.check, checked) - y[1:]
-    e, _ = solved_correction(factors, pivots_of(system), defects + moved[0], *moved[1:])
     records, error = problem.packed(checked), None
-    if d_history is not None:
-        error = jax.jvp(lambda *at: problem.packed(scheme(*at)[0]), (history, y), (d_history, e))[1]
+    if earlier is None:
+        e, _ = solved_correction(factors, pivots_of(system), defects, jnp.zeros_like(missing[1]))
+    else:
+        better, error = _corrected(problem, solution, factors, (defects - missing[0], -missing[1]), earlier)
+        # larger errors are no estimates: they are lost for the rest of the motion
+        known = jnp.where(position_error(system, better - y) <= system.length, 1.0, jnp.nan)
+        e, error = known * (better - y), known * (error - records[: len(error)])
     # residual of the returned state, evaluated independently of the iteration
-    residual = jnp.maximum(solution.error, largest_residual(problem, reached - y[1:], tip))
+    residual = jnp.maximum(solution.error, largest_residual(problem, *missing))
     residual = _finite_or_infinite(residual, records)
-    result = jnp.where(residual <= newton.acceptable, int(Result.CONVERGED), int(Result.NO_CONVERGENCE))
+    off = position_error(system, e)
+    fine = (off <= COARSE_SHARE * system.length) & (orientation_error(system, y, e) <= COARSE_ANGLE)
+    result = jnp.where(fine, int(Result.CONVERGED), int(Result.COARSE))
+    result = jnp.where(residual <= newton.acceptable, result, int(Result.NO_CONVERGENCE))
     row = StepRows(
-        row_of(system, y, records), solution.unknowns, residual, solution.corrections,
-        position_error(system, e), result, jnp.array(jnp.nan), *no_stages(system),
+        row_of(system, y, records), solution.unknowns, residual, solution.corrections, off, result,
+        jnp.array(jnp.nan), *no_stages(system),
     )  # fmt: skip
     return row, records, error
 
@@ -296,6 +295,62 @@ def time_errors(
     return jnp.stack([records, past[0]]), position_error(system, e)
 
 
+class _Corrected(NamedTuple):
+    """Iterate of a corrected step: y, unknowns, stages, and residuals of pieces and tip."""
+
+    y: Float[Any, "points y"]
+    unknowns: Float[Any, " k"]
+    stages: Stages
+    residuals: tuple[Any, Any]
+    #: largest residual, natural units
+    largest: Any
+    #: expected size of the next correction, and number of corrections
+    left: Any
+    turns: Any
+
+
+def _corrected(
+    problem: StepProblem, solution: Solution, factors: Factors, defects: tuple[Any, Any], earlier: Any
+) -> tuple[Any, Any]:
+    """Return y at the points, and the records at the places of the scheme, of the corrected step.
+
+    The corrected motion solves the equations with the defects of the check formula, from its own history. The
+    factors may be those of an earlier step, so that a single correction would leave an error at every step.
+    These errors add up where the motion turns: corrections go on until the one that is left is small relative
+    to the change of the error in this step.
+    """
+    system, formula, y = problem.system, problem.space.formula, solution.y
+    d_history, errors = earlier
+    used = len(d_history)
+    history = jnp.concatenate([problem.history[:used] + d_history, problem.history[used:]])
+    own, scales = problem.with_history(history), system.scales()
+    scale = scales.y + jnp.abs(y)
+    before, earliest = errors[:2, : len(y), : y.shape[1]]
+
+    def evaluated(y: Any, unknowns: Any, left: Any, turns: Any) -> _Corrected:
+        y = jnp.concatenate([own.base(unknowns)[None], y[1:]])
+        found = own.stages(y, formula, own.ends(y))
+        residuals = own.reached_by(formula, found) - y[1:] + defects[0], own.tip_residual(y[-1]) + defects[1]
+        return _Corrected(y, unknowns, found, residuals, largest_of(scales, *residuals), left, turns)
+
+    def better(last: _Corrected) -> _Corrected:
+        d_y, d_unknowns = solved_correction(factors, pivots_of(system), *last.residuals)
+        size = jnp.max(jnp.abs(d_y) / scale)
+        now = evaluated(last.y + d_y, last.unknowns + d_unknowns, size, last.turns + 1)
+        return now._replace(left=size * now.largest / last.largest)
+
+    def going(last: _Corrected) -> Any:
+        change = jnp.max(jnp.abs(last.y - y - before) / scale)
+        far = (last.left > ESTIMATE_TOLERANCE * change + ROUNDING) & (last.turns < ESTIMATE_TURNS)
+        return (last.turns < 1) | far
+
+    # linear extrapolation of the errors in time
+    e = 2.0 * before - earliest
+    first = evaluated(y + e, solution.unknowns + unknowns_of(system, e[0]), jnp.inf, 0)
+    last = jax.lax.while_loop(going, better, first)
+    return last.y, own.packed(last.stages)
+
+
 def position_error(system: System, e: Float[Any, "points y"]) -> Float[Any, ""]:
     """Return the largest position error (m); without positions, that of y over its scale times the length."""
     strand = system.strand
@@ -303,6 +358,17 @@ def position_error(system: System, e: Float[Any, "points y"]) -> Float[Any, ""]:
         return jnp.max(jnp.abs(e) / system.scales().y) * system.length
     p = strand.y_layout.get(in_strands(system, e), "p")
     return jnp.sqrt(jnp.max(jnp.sum(p * p, axis=-1)))
+
+
+def orientation_error(system: System, y: Float[Any, "points y"], e: Float[Any, "points y"]) -> Any:
+    """Return the largest angle (rad) by which an error of y turns cross-sections; 0 without orientations."""
+    layout = system.strand.y_layout
+    if "h" not in layout.names:
+        return 0.0
+    h, d_h = (layout.get(in_strands(system, rows), "h") for rows in (y, e))
+    square = jnp.sum(h * h, axis=-1)
+    across = d_h - h * (jnp.sum(h * d_h, axis=-1) / square)[..., None]
+    return 2.0 * jnp.sqrt(jnp.max(jnp.sum(across * across, axis=-1) / square))
 
 
 def _finite_or_infinite(error: Any, records: Any) -> Any:

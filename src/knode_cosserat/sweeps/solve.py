@@ -25,7 +25,7 @@ from knode_cosserat.solvers.result import Result, SimulationError
 from knode_cosserat.solvers.run import (
     InitialState,
     TimeIntegration,
-    coarse_results,
+    carried_results,
     run_one,
     usable_cores,
 )
@@ -50,8 +50,8 @@ class Settled(NamedTuple):
     """Initial states of a chunk that had to be solved for; see `_settled`."""
 
     start: Start | None
-    #: true where the grid was too coarse
-    coarse: Any
+    #: COARSE where the grid was, otherwise CONVERGED
+    result: Any
     #: by case, the reasons of equilibria that were not found
     reasons: dict[int, str]
 
@@ -91,8 +91,7 @@ def solve_chunk(robot, values, initial, controls, coefficients, form):  # type: 
     errors = jnp.concatenate([jnp.zeros((len(controls), 1)), rows.position_error], axis=1)
     records = jnp.where((solved < 0)[..., None, None], jnp.nan, records)
     found = stored_of(systems, records, store)
-    length = jnp.broadcast_to(jnp.asarray(systems.length), (len(controls),))
-    return done, solved, jnp.where(solved < 0, jnp.nan, errors), length, found
+    return done, solved, jnp.where(solved < 0, jnp.nan, errors), found
 
 
 def stored_of(systems: System, records: Any, store: tuple[str, ...]) -> dict[str, Any]:
@@ -166,7 +165,7 @@ class Solver:
         coefficients = StepCoefficients(*map(jnp.asarray, task.coefficients))
         form = Form(settings, steps, plan.sweep.store, self.lockstep)
         found = solve_chunk(bare, values, settled.start, cases.controls[index], coefficients, form)
-        done, result, error, length, stored = jax.tree.map(lambda leaf: np.array(leaf[:count]), found)
+        done, result, error, stored = jax.tree.map(lambda leaf: np.array(leaf[:count]), found)
         columns = {"result": result, "position_error": error} | stored
         reasons = [""] * count
         for k in range(count):
@@ -178,7 +177,9 @@ class Solver:
                 own = {name: each[k] for name, each in values.items()}
                 system = bare.replace(**own) if own else bare
                 reasons[k] = self._failed(system, task, cases.controls[first + k], columns, k)
-        _mark_coarse(columns, length, settled.coarse[:count])
+        result = columns["result"]
+        marked = carried_results(result[:, 1:], settled.result[:count])
+        columns["result"] = np.concatenate([result[:, :1], marked], axis=1).astype(np.int8)
         return columns | {"reason": np.array(reasons, dtype=object)}
 
     def _failed(
@@ -194,13 +195,6 @@ class Solver:
         code = Result(int(result[k, step]))
         cause = cause or likely_cause(code, system, plan.settings, controls[step - 1])
         return f"step {step} (t = {step * plan.sweep.dt:g} s): {code.message}. {cause}".strip()
-
-
-def _mark_coarse(columns: dict[str, Any], length: Any, before: Any) -> None:
-    """Mark solved rows from the first one on for which the grid is too coarse; the initial row is not one."""
-    result, error = columns["result"], columns["position_error"][:, 1:]
-    marked = coarse_results(result[:, 1:], error, length, before)
-    columns["result"] = np.concatenate([result[:, :1], marked], axis=1).astype(np.int8)
 
 
 @functools.lru_cache(maxsize=64)
@@ -229,7 +223,7 @@ def _settled(plan: Plan, robot: int, values: dict[str, Any], size: int) -> Settl
     """
     system, settings = _bare(plan, robot), plan.settings
     if not system.rest_is_guess:
-        return Settled(None, np.zeros(size, dtype=bool), {})
+        return Settled(None, np.full(size, int(Result.CONVERGED)), {})
     found: list[InitialState | None] = []
     reasons: dict[int, str] = {}
     for k in range(size if values else 1):
@@ -246,8 +240,8 @@ def _settled(plan: Plan, robot: int, values: dict[str, Any], size: int) -> Settl
         every, reasons = every * size, dict.fromkeys(range(size), reasons[0]) if reasons else {}
     pairs = [Start(each.record, each.state.history) for each in every]
     start = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *pairs)
-    coarse = np.array([bool(each.coarse) for each in every])
-    return Settled(start, coarse, reasons)
+    result = np.array([int(each.result) for each in every])
+    return Settled(start, result, reasons)
 
 
 def _guessed(system: System, settings: Settings) -> InitialState:

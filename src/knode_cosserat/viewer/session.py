@@ -194,8 +194,7 @@ def _require_accurate(row: Trajectory) -> None:
     """Raise `ValueError` for a row whose estimated discretisation error makes its shape meaningless."""
     error = float(row.position_error[0])
     share = error / float(row.system.length)
-    if share > MOST_ERROR:
-        raise ValueError(
-            f"the grid of {row.system.nodes} nodes is too coarse, positions would be off by about "
-            f"{error:.2g} m ({share:.0%} of the length)"
-        )
+    # NaN: there is no estimate
+    if not share <= MOST_ERROR:
+        off = "by any amount" if np.isnan(share) else f"by about {error:.2g} m ({share:.0%} of the length)"
+        raise ValueError(f"the grid of {row.system.nodes} nodes is too coarse, positions would be off {off}")
