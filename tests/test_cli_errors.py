@@ -44,7 +44,7 @@ def bad_inputs():
         ((*simulation, "--controls", "step:1e5", "--steps", "10"), "use 30 steps or more, or at=0"),
         ((*simulation, "--controls", "7,5,5", "--steps", "10"), "must be 4 finite numbers"),
         ((*simulation, "--controls", "7,5,5,7"), "the number of steps is not given"),
-        ((*simulation, "--controls", "base_z=ramp:1", "--steps", "3"), "other than tensions"),
+        ((*simulation, "--controls", "base_z=ramp:1", "--steps", "3"), "the control 'base_z' is unknown"),
         ((*full, "--figure", "a.doc"), ".png"),
         ((*full, "--figure", "nowhere/a.png"), "no folder nowhere"),
         (("simulate", ROBOT, "--controls", "sine:1.5", "--steps", "3", "--out", "nowhere/a.nc"), "no folder"),

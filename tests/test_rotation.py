@@ -6,7 +6,7 @@ import pytest
 from scipy.integrate import quad_vec
 from scipy.spatial.transform import Rotation
 
-from knode_cosserat.rotation import mean_turned, quaternion_of, turned
+from knode_cosserat.rotation import mean_turned, quaternion_of, since_first, turned
 
 AXIS, VECTOR = np.array([2.0, -1.0, 2.0]) / 3.0, np.array([0.3, -0.7, 0.5])
 #: on both sides of where series give way to sines, too
@@ -36,3 +36,17 @@ def test_slope_of_mean_turned_by_the_angle(angle):
         )
     expected = slopes[0] * across + slopes[1] * np.cross(AXIS, across)
     np.testing.assert_allclose(found, expected, atol=1e-11)
+
+
+def test_rotations_since_the_first_row():
+    """About a fixed axis of the global frame angles are differences, whatever the orientation before."""
+    angles = np.array([[0.3, 0.0], [0.9, 0.4], [-0.5, 1.0]])
+    about = Rotation.from_rotvec(angles.reshape(-1, 1) * [[0.0, 0.0, 1.0]])
+    before = Rotation.from_rotvec([[0.2, 0.5, -0.1], [1.0, 0.0, 0.3]] * 3)
+    h = (about * before).as_quat(scalar_first=True).reshape(3, 2, 4)
+    expected = Rotation.from_rotvec((angles - angles[0]).reshape(-1, 1) * [[0.0, 0.0, 1.0]])
+    found = Rotation.from_quat(np.asarray(since_first(h)).reshape(-1, 4), scalar_first=True)
+    np.testing.assert_allclose((found * expected.inv()).magnitude(), 0.0, atol=1e-12)
+    h[0, 1] = np.nan
+    found = np.asarray(since_first(h))
+    assert np.all(np.isnan(found[:, 1])) and np.all(np.isfinite(found[:, 0]))

@@ -106,8 +106,9 @@ def conjugate(h: Float[Any, "4"]) -> Float[Any, "4"]:
 
 def since_first(h: Float[Any, "T M 4"]) -> Float[Any, "T M 4"]:
     """Return rotations, in the global frame, since the first row; NaN where either is not known."""
-    first = jnp.broadcast_to(conjugate(h[:1]), h.shape)
-    return jax.vmap(jax.vmap(quaternion_product))(jnp.asarray(h), first)
+    h = jnp.asarray(h)
+    first = jnp.broadcast_to(jax.vmap(conjugate)(h[0]), h.shape)
+    return jax.vmap(jax.vmap(quaternion_product))(h, first)
 
 
 def _half(vector: Float[Any, "3"]) -> tuple[Any, Any, Any]:

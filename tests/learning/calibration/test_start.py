@@ -130,11 +130,12 @@ def test_parameters_of_parts_have_names_with_dots():
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("loads.2.mass", "there is no parameter 'loads.2.mass': no '2' among 0, 1"),
+        ("loads.2.mass", "there is no parameter 'loads.2': no '2' among 0, 1"),
         ("loads.0.weight", "AttachedMass has no parameter 'weight'; there are .*mass"),
-        ("load.0.mass", "there is no parameter 'load.0.mass': no 'load' among"),
+        ("load.0.mass", "there is no parameter 'load.0': no 'load' among"),
         ("loads.0.at", "loads.0.at is a place, which a search cannot move"),
-        ("loads.0", "has no parameter '0'|there is no parameter"),
+        ("loads.0", "loads.0 is a part; allowed is one of its parameters"),
+        ("loads.7", "there is no parameter 'loads.7': no '7' among 0, 1"),
     ],
 )
 def test_names_of_parts_that_are_not_right(name, message):

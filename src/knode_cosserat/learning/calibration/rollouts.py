@@ -370,7 +370,8 @@ def _of_trajectory(robot: System, oriented: bool, trajectory: Trajectory) -> _Ro
     settings = trajectory.settings or MEASURED
     # the base is left out: its pose is given
     places = Places(np.arange(robot.nodes - 1), np.ones(robot.nodes - 1))
-    initial, held = trajectory[:begins], None
+    initial: Trajectory | None = trajectory[:begins]
+    held = None
     if _from_rest(trajectory):
         initial = None
         first = np.asarray(_seen(robot, False, np.asarray(trajectory.y, dtype=float)[:1], places))[0]

@@ -71,6 +71,9 @@ def unknowns_of(robot: System, names: Sequence[str] | None) -> Unknowns:
         parameter = known.get(name) if "." not in str(name) else parameter_at(owner, name)
         if parameter is None and "." in str(name):
             part, last = owner_at(owner, name)
+            if not dataclasses.is_dataclass(part):
+                value_at(owner, name)
+                raise ParameterError(f"{name} is a part; allowed is one of its parameters, after a dot")
             raise ParameterError(unknown_parameter(type(part), last, parameters_of(type(part))))
         if parameter is None:
             raise ParameterError(unknown_parameter(type(owner), name, known))
