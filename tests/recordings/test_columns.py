@@ -1,6 +1,8 @@
 """Tables of other programs, whose columns are mapped one by one; and the map that inspect proposes."""
 
 import json
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -314,3 +316,13 @@ def test_a_table_without_positions_has_no_proposal(tmp_path):
     # other commands name the one that proposes
     other = run("identify", "delrin-tendon-robot", path, "--out", tmp_path / "found.yaml")
     assert other.exit_code == 2 and f"(knode-cosserat inspect {path} proposes one)" in other.stderr
+
+
+def test_the_settings_in_the_documentation_are_valid(tmp_path):
+    text = (Path(__file__).parents[2] / "docs" / "recordings.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
+    assert len(blocks) >= 4
+    for block in blocks:
+        config = written(tmp_path, block)
+        (tmp_path / "map.yaml").write_text(config.to_yaml(brief=True))
+        assert RecordingConfig.load(tmp_path / "map.yaml") == config
