@@ -1,6 +1,8 @@
 """Tables of other programs, whose columns are mapped one by one; and the map that inspect proposes."""
 
 import json
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -241,32 +243,32 @@ def test_commas_that_separate_thousands_are_not_decimal(tmp_path):
 # proposals
 
 #: titles that programs write, and the map expected of them
+T = [f"T{k}" for k in range(1, 7)]
+OF_ROS = [f"field.pose.position.{axis}" for axis in "xyz"]
+TURN_OF_ROS = [f"field.pose.orientation.{axis}" for axis in "wxyz"]
+MM = [f"pos_{axis} [mm]" for axis in "xyz"]
 TITLES = {
-    "plain": (columns(), ("time", ["T1", "T2", "T3", "T4", "T5", "T6"], ["x", "y", "z"])),
+    "plain": (columns(), ("time", T, ["x", "y", "z"])),
     "with units": (
-        columns("Time [ms]", "tension {} (N)", ("pos_x [mm]", "pos_y [mm]", "pos_z [mm]"), 1e3, 1e3),
-        ("Time [ms]", [f"tension {k} (N)" for k in range(1, 7)], ["pos_x [mm]", "pos_y [mm]", "pos_z [mm]"]),
+        columns("Time [ms]", "tension {} (N)", MM, 1e3, 1e3),
+        ("Time [ms]", [f"tension {k} (N)" for k in range(1, 7)], MM),
     ),
     "capitals": (
         columns("t", "F{}", ("TIP_X", "TIP_Y", "TIP_Z")),
         ("t", [f"F{k}" for k in range(1, 7)], ["TIP_X", "TIP_Y", "TIP_Z"]),
     ),
     "of ROS": (
-        columns(
-            "%time",
-            "field.effort{}",
-            ("field.pose.position.x", "field.pose.position.y", "field.pose.position.z"),
-            clock=1.0,
-        ),
-        (
-            "%time",
-            [f"field.effort{k}" for k in range(1, 7)],
-            [f"field.pose.position.{axis}" for axis in "xyz"],
-        ),
+        columns("%time", "field.effort{}", OF_ROS, turned=TURN_OF_ROS),
+        ("%time", [f"field.effort{k}" for k in range(1, 7)], OF_ROS + TURN_OF_ROS),
     ),
-    "with an orientation": (
-        columns(turned=("qw", "qx", "qy", "qz")),
-        ("time", ["T1", "T2", "T3", "T4", "T5", "T6"], ["x", "y", "z", "qw", "qx", "qy", "qz"]),
+    "with an orientation, and the time last": (
+        {**columns("", turned=("qw", "qx", "qy", "qz")), "t_s": TIME},
+        ("t_s", T, ["x", "y", "z", "qw", "qx", "qy", "qz"]),
+    ),
+    "with speeds and forces": (
+        {"Fx": TIME, "Fy": TIME, "Fz": TIME, "vx": TIME, "vy": TIME, "vz": TIME}
+        | columns(place=("px", "py", "pz")),
+        ("time", T, ["px", "py", "pz"]),
     ),
 }
 
@@ -314,3 +316,13 @@ def test_a_table_without_positions_has_no_proposal(tmp_path):
     # other commands name the one that proposes
     other = run("identify", "delrin-tendon-robot", path, "--out", tmp_path / "found.yaml")
     assert other.exit_code == 2 and f"(knode-cosserat inspect {path} proposes one)" in other.stderr
+
+
+def test_the_settings_in_the_documentation_are_valid(tmp_path):
+    text = (Path(__file__).parents[2] / "docs" / "recordings.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
+    assert len(blocks) >= 4
+    for block in blocks:
+        config = written(tmp_path, block)
+        (tmp_path / "map.yaml").write_text(config.to_yaml(brief=True))
+        assert RecordingConfig.load(tmp_path / "map.yaml") == config

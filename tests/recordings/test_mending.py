@@ -223,6 +223,32 @@ def test_a_clock_that_is_set_meanwhile_is_told_by_the_times_of_recording(
     np.testing.assert_allclose(recording.bodies[3].time, streams[0]["rib 4"].time, rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize(("topics", "rate"), [((TIP,), 0.01), ((TIP,), -0.008), ((TIP,), 0.001), ((), 0.01)])
+def test_a_clock_that_drifts_against_the_others_is_named(tmp_path, streams, topics, rate, monkeypatch):
+    from knode_cosserat.recordings import write as module
+
+    original = module._messages
+
+    def restamped(*arguments):
+        for topic, kind, received, message in original(*arguments):
+            # without topics, all clocks drift alike against the recorder's
+            if topic in topics or not topics:
+                late = round(rate * (received - module.START * 10**9))
+                received += late
+            yield topic, kind, received, message
+
+    monkeypatch.setattr(module, "_messages", restamped)
+    recording = read(tmp_path, streams)
+    found = [each for each in recording.findings if "its clock drifts" in each.message]
+    if not topics or abs(rate) < 0.005:
+        assert not found
+        return
+    (finding,) = found
+    assert finding.topic == TIP
+    # medians of the first and the last fifth of 3 s
+    assert f"drifts by {1e3 * abs(rate) * 2.4:.0f} ms" in finding.message
+
+
 def test_a_clock_that_is_another_one_is_not_used(tmp_path, streams):
     recording = read(tmp_path, streams, delays={TIP: 3.0})
     finding = said(recording, "is 3.000 s behind the recorder's")

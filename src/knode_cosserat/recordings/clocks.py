@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -15,6 +15,8 @@ DISAGREEMENT = 0.5
 JUMP = 0.1
 #: messages separated from the largest group by a longer pause do not belong to the recording (s)
 FAR = 600.0
+#: smallest drift of a clock against another (s), and smallest number of stamps that show one
+DRIFT, FEWEST_STAMPS = 0.01, 20
 
 
 def offsets(streams: Sequence[Stream]) -> dict[str, float]:
@@ -55,7 +57,29 @@ def measurement_times(
         else:
             times[stream.topic], found = _without_jumps(stream)
             findings += found
-    return times, findings
+    return times, [*findings, *_about_drift(streams, times)]
+
+
+def _about_drift(streams: Sequence[Stream], times: Mapping[str, Int[np.ndarray, " n"]]) -> list[Finding]:
+    """Return a finding on the topic whose clock drifts most against the others'."""
+    drifts: dict[str, float] = {}
+    noise = 0.0
+    for stream in streams:
+        delay = (stream.received - times[stream.topic]) * 1e-9
+        if len(delay) >= FEWEST_STAMPS:
+            fifth = len(delay) // 5
+            drifts[stream.topic] = float(np.median(delay[-fifth:]) - np.median(delay[:fifth]))
+            noise = max(noise, float(np.median(np.abs(delay[:fifth] - np.median(delay[:fifth])))))
+    if not drifts or max(drifts.values()) - min(drifts.values()) <= max(DRIFT, 3.0 * noise):
+        return []
+    usual = float(np.median(list(drifts.values())))
+    topic = max(drifts, key=lambda name: abs(drifts[name] - usual))
+    off = max(abs(drifts[topic] - drift) for drift in drifts.values())
+    what = (
+        f"its clock drifts by {1e3 * off:.0f} ms against the others' during the recording; "
+        "`clock: received` in the configuration takes the times of recording"
+    )
+    return [Finding("warning", topic, what)]
 
 
 def _without_jumps(stream: Stream) -> tuple[Int[np.ndarray, " n"], list[Finding]]:

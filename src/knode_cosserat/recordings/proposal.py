@@ -39,19 +39,25 @@ from knode_cosserat.recordings.table import TIME, Table, columns_of, position_ti
 #: names of a body at the clamped end, of times, and of numbers that drive the robot
 _BASE = re.compile(r"base|clamp|root|ground|origin|mount|world", re.IGNORECASE)
 _TIME = re.compile(
-    r"^(%?(time|zeit|temps|tiempo)|t$|t[^a-z]|stamp|timestamp|rosbagtimestamp|clock|sec)", re.IGNORECASE
+    r"%?(time|zeit|temps|tiempo)|t$|t ?[\[(/]|t_(s|sec|ms|us|ns)$|stamp|rosbagtimestamp|clock|sec",
+    re.IGNORECASE,
 )
 _TENSION = re.compile(
     r"tension|tendon|force|load|cell|effort|pull|cable|wire|zug|kraft|^[tf]$", re.IGNORECASE
 )
 _COMMAND = re.compile(r"cmd|command|desired|target|ref|set|soll|goal", re.IGNORECASE)
 _MOTOR = re.compile(r"motor|phi|encoder|angle|servo", re.IGNORECASE)
-#: spellings of the parts of an orientation, scalar first, and of a position
+#: beginnings of titles of turns, speeds and forces along x, y, z
+_NO_PLACE = re.compile(
+    r"(q|quat|quaternion|rot|rotation|orientation|vel|speed|acc|(^|[_ .])[vrawf])[_ .]?$", re.I
+)
+#: spellings of the parts of an orientation, scalar first
 _QUATERNIONS = (
-    ("qw", "qx", "qy", "qz"),
+    *(
+        tuple(f"{stem}{part}" for part in "wxyz")
+        for stem in ("q", "r", "o", "quat_", "orientation.", "orientation_")
+    ),
     ("q0", "q1", "q2", "q3"),
-    ("rw", "rx", "ry", "rz"),
-    ("ow", "ox", "oy", "oz"),
 )
 #: rows at the start that a body's place is estimated from
 _ROWS = 20
@@ -189,18 +195,16 @@ def _bodies(table: Table, titles: Sequence[str], path: str) -> list[_Body]:
     columns = list(map(str, table.numbers.columns))
     found: dict[str, _Body] = {}
     for title in titles:
-        for match in re.finditer(r"(?<![a-wyz])x(?![a-wyz])", title.lower()):
+        for match in re.finditer("x", title.lower()):
             variants = [title[: match.start()] + axis + title[match.end() :] for axis in "xyz"]
             variants = [next((each for each in titles if each.lower() == it.lower()), it) for it in variants]
             before = title[: match.start()]
             # the x of a quaternion, or of a speed, is not that of a position
-            if not set(variants) <= set(titles) or re.search(
-                r"(q|quat|rot|vel|speed|acc|^v|^r)[_ .]?$", before, re.I
-            ):
+            if not set(variants) <= set(titles) or _NO_PLACE.search(before):
                 continue
             name = re.sub(r"\[.*?\]|\(.*?\)", "", title[: match.start()] + title[match.end() :])
             name = (
-                re.sub(r"(^|[_ .-])(pos(ition)?|mm|m)(?=$|[_ .-])", "", name, flags=re.IGNORECASE).strip(
+                re.sub(r"(^|[_ .-])(pos(ition)?|p|mm|m)(?=$|[_ .-])", "", name, flags=re.IGNORECASE).strip(
                     "_ .-"
                 )
                 or "tip"

@@ -311,7 +311,7 @@ def test_bytes_changed_at_random_give_a_recording_or_its_error(tmp_path, kind):
     whole = getattr(exported, kind)(SHORT)
     rng = np.random.default_rng(0)
     path = tmp_path / "it"
-    for _ in range(60):
+    for _ in range(25):
         data = bytearray(whole)
         for place in rng.integers(0, len(data) if rng.random() < 0.5 else min(len(data), 1200), 4):
             data[place] = rng.integers(0, 256)
