@@ -218,7 +218,7 @@ def warn_outside_rod_theory(system: System, rows: StepRows) -> None:
     """Warn once if solved rows are bent or stretched beyond the assumptions of rod theory."""
     many, solved = np.ndim(system.length) > 0, np.asarray(rows.result) >= 0
     # a batch of robots of several rods has no `strand`
-    strand = system if system.strands == 1 or many else system.strand
+    strand: Any = system if system.strands == 1 or many else system.strand
     if not solved.any() or not {"v", "u"} <= set(strand.z_layout.names) or not hasattr(strand, "radius"):
         return
     ny, nz = system.y_layout.size, system.z_layout.size
