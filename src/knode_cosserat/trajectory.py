@@ -202,7 +202,7 @@ class Trajectory(eqx.Module):
         lines = [f"Trajectory of a {type(self.system).__name__}: {batch}{rows}: {results}"]
         lines += self._tip_text()
         if self.position_error is not None and np.any(np.isfinite(self.position_error)):
-            lost = np.count_nonzero(np.isnan(self.position_error) & (np.asarray(self.result) >= 0))
+            lost = int(np.sum(np.isnan(self.position_error) & (np.asarray(self.result) >= 0)))
             lines.append(
                 f"largest position error, by estimate: {1e3 * np.nanmax(self.position_error):.2g} mm"
                 + (f"; no estimate in {count_of(lost, 'row')}" if lost else "")
