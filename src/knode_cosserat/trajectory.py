@@ -211,8 +211,8 @@ class Trajectory(eqx.Module):
             for where, error in (("along the rod", self.position_error), ("in time", self.time_error))
             if error is not None and np.any(np.isfinite(error))
         ]
-        if errors:
-            lost = np.count_nonzero(np.isnan(self.position_error) & (np.asarray(self.result) >= 0))
+        if errors and self.position_error is not None:
+            lost = int(np.sum(np.isnan(self.position_error) & (np.asarray(self.result) >= 0)))
             lines.append(
                 f"largest position error, by estimate: {', '.join(errors)}"
                 + (f"; no estimate along the rod in {count_of(lost, 'row')}" if lost else "")

@@ -97,7 +97,7 @@ def test_the_estimate_of_a_shaft_between_two_driven_chucks():
 def test_the_estimate_of_a_turning_shaft_in_other_time_schemes(time):
     controls = driven("turned", np.arange(1, 1001) * 0.002)
     motion = moved(shaft(11), controls, 0.002, time=time)
-    assert np.max(motion.position_error) < 3e-4
+    assert np.max(motion.position_error) < 1e-3
     assert np.all(motion.result == kc.Result.CONVERGED)
 
 
@@ -157,7 +157,13 @@ def test_a_stretch_beyond_rod_theory_is_warned_of(stretch):
     E, area = 1e5, np.pi * RADIUS**2
     pull = kc.robots.loads.PointWrench(at=1.0, force=(0.0, 0.0, (stretch - 1.0) * E * area))
     rod = kc.robots.SlenderRod(
-        length=LENGTH, radius=RADIUS, youngs_modulus=E, gravity=(0.0, 0.0, 0.0), nodes=11, loads=(pull,)
+        length=LENGTH,
+        radius=RADIUS,
+        density=DENSITY,
+        youngs_modulus=E,
+        gravity=(0.0, 0.0, 0.0),
+        nodes=11,
+        loads=(pull,),
     )
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

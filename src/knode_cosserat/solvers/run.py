@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
+from knode_cosserat.rods.elastic_rod import ElasticRod
 from knode_cosserat.rods.section import INWARD
 from knode_cosserat.rods.strands import in_strands
 from knode_cosserat.rods.system import System, is_traced
@@ -219,7 +220,7 @@ def warn_outside_rod_theory(system: System, rows: StepRows) -> None:
     many, solved = np.ndim(system.length) > 0, np.asarray(rows.result) >= 0
     # a batch of robots of several rods has no `strand`
     strand = system if system.strands == 1 or many else system.strand
-    if not solved.any() or not {"v", "u"} <= set(strand.z_layout.names) or not hasattr(strand, "radius"):
+    if not solved.any() or not isinstance(strand, ElasticRod):
         return
     ny, nz = system.y_layout.size, system.z_layout.size
     z = in_strands(system, np.asarray(rows.records)[..., ny : ny + nz])
