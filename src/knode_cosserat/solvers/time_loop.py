@@ -161,7 +161,7 @@ def joined_stages(rows: StepRows) -> StepRows:
     last, failed = jax.tree.map(lambda leaf: leaf[-1], rows), jnp.min(rows.result)
     return last._replace(
         error=jnp.max(rows.error), corrections=jnp.sum(rows.corrections),
-        result=jnp.where(failed < 0, failed, jnp.max(rows.result)),
+        result=jnp.where(failed < 0, failed, last.result),
         stages=rows.records[:-1], stage_unknowns=rows.unknowns[:-1],
     )  # fmt: skip
 
@@ -256,43 +256,39 @@ def time_errors(
 ) -> tuple[Any, Any]:  # fmt: skip
     """Return the errors of the states after a stage by the time scheme, and the largest of positions (m).
 
-    They are carried along by the step's linear equations, like those of the grid. A step of y' = J y + … adds
-    a multiple of dt³ J² y'. The difference of the rates at both stages is one of dt J y'; the equations of
-    the step multiply it once more by J, and damp the share of vibrations that a step does not resolve.
+    They are the distances to a corrected motion, as the errors of the grid are. A step of y' = J y + … adds a
+    multiple of dt³ J² y'. The difference of the rates at both stages is one of dt J y'; the equations of the
+    step multiply it once more by J, and damp the share of vibrations that a step does not resolve.
     """
     scheme, past, used = settings.time, step.past.time_error, step.past.time_error.shape[1]
     assert isinstance(scheme, SDIRK2)
-    c0, system = problem.c0, problem.system
+    c0, system, y, history = problem.c0, problem.system, solution.y, problem.history[:used]
+    newest, (stage, row) = after.records[0, :used], step.past.records[:, :used]
+
+    def solved(history: Any, y: Any) -> tuple[Any, Any]:
+        """Return the residuals of pieces, tip and base, and the records."""
+        own = problem.with_history(jnp.concatenate([history, problem.history[used:]]))
+        found = own.stages(y, problem.space.formula, own.ends(y))
+        reached = own.reached_by(problem.space.formula, found) - y[1:]
+        return (reached, own.tip_residual(y[-1]), own.base(solution.unknowns)), own.packed(found)
+
+    (reached, tip, _), _ = solved(history, y)
+
+    def added() -> Any:
+        difference = newest + history / c0 - (stage - row)
+        moved, _ = jax.jvp(lambda h: solved(h, y), (history,), (-c0 * difference,))[1]
+        e, _ = solved_correction(factors, pivots_of(system), *moved)
+        once = jax.jvp(lambda h, y: solved(h, y)[1], (history, y), (-c0 * difference, e))[1]
+        return -c0 * scheme.defect * (once - difference)
+
     carried = history_of(past, jnp.zeros_like(past[0]), step.coefficients, settings)
-
-    def moved(d_history: Any) -> tuple[Any, Any]:
-        """Return the changes of y and of the records when the history changes."""
-
-        def ends(history: Any) -> Any:
-            own = problem.with_history(jnp.concatenate([history, problem.history[used:]]))
-            found = own.stages(solution.y, problem.space.formula, own.ends(solution.y))
-            return (
-                own.reached_by(problem.space.formula, found), own.tip_residual(solution.y[-1]),
-                own.base(solution.unknowns),
-            )  # fmt: skip
-
-        def packed(history: Any, y: Any) -> Any:
-            own = problem.with_history(jnp.concatenate([history, problem.history[used:]]))
-            return own.packed(own.stages(y, problem.space.formula, own.ends(y)))
-
-        history = problem.history[:used]
-        e, _ = solved_correction(factors, pivots_of(system), *jax.jvp(ends, (history,), (d_history,))[1])
-        return e, jax.jvp(packed, (history, solution.y), (d_history, e))[1]
-
-    def last() -> tuple[Any, Any]:
-        newest, (stage, row) = after.records[0, :used], step.past.records[:, :used]
-        difference = newest + problem.history[:used] / c0 - (stage - row)
-        _, once = moved(-c0 * difference)
-        return moved(carried - c0 * scheme.defect * (once - difference))
-
     is_last = step.coefficients[2] != 0.0
-    e, records = jax.lax.cond(is_last, last, lambda: moved(carried))
-    return jnp.stack([records, past[0]]), position_error(system, e)
+    d_history = carried + jax.lax.cond(is_last, added, lambda: jnp.zeros_like(carried))
+    better, records = _corrected(problem, solution, factors, (-reached, -tip), (d_history, past))
+    off = position_error(system, better - y)
+    # larger errors are no estimates: they are lost for the rest of the motion
+    known = jnp.where(off <= system.length, 1.0, jnp.nan)
+    return jnp.stack([known * (records - newest), past[0]]), known * off
 
 
 class _Corrected(NamedTuple):
