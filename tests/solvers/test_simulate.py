@@ -287,7 +287,7 @@ def test_the_first_guess_of_what_stands_still_is_where_it_stands(misfit):
         ({"controls": np.full((3, 4), np.nan)}, r"controls are nan at index \(0, 0\)"),
         ({"dt": 0.0}, "dt is 0.0; allowed is a positive number of seconds"),
         ({"dt": "fast"}, "dt is 'fast'"),
-        ({"time": "lobatto4"}, "time is 'lobatto4'; allowed is \"bdf1\""),
+        ({"time": "lobatto4"}, "time is 'lobatto4'; allowed is \"sdirk2\""),
         ({"space": "bdf2"}, 'space is \'bdf2\'; allowed is "lobatto2", "lobatto4", "euler"'),
         ({"start": "cold"}, "start is 'cold'"),
         ({"on_failure": "ignore"}, "on_failure is 'ignore'"),

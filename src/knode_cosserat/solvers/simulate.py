@@ -95,9 +95,9 @@ def simulate(
 
     Returns:
         A `Trajectory` of T + 1 rows; row 0 is the initial state. Every row carries its result, and estimates
-        of its errors by the nodes (`position_error`) and by the time step (`time_error`). Rows in which a learned or identified model
-        is outside the range of its training data are marked (`extrapolated`). Inside `jit`, `grad` or `vmap`
-        no error can be raised: unsolved rows are NaN there.
+        of its errors by the nodes (`position_error`) and by the time step (`time_error`). Rows in which a
+        learned or identified model is outside the range of its training data are marked (`extrapolated`).
+        Inside `jit`, `grad` or `vmap` no error can be raised: unsolved rows are NaN there.
 
     Raises:
         SimulationError: a step was not solved, and recovery failed.
