@@ -228,7 +228,7 @@ def test_labels(tmp_path):
         assert data.attrs["format"] == "knode-cosserat trajectory"
         assert data.attrs["format_version"] == 2
         assert "length: 0.635  # m" in data.attrs["robot"]
-        assert '"scheme": "BDF2"' in data.attrs["settings"]
+        assert '"scheme": "SDIRK2"' in data.attrs["settings"]
         assert {"title", "knode_cosserat_version"} <= set(data.attrs)
 
 

@@ -10,7 +10,7 @@ import knode_cosserat as kc
 from knode_cosserat.solvers.history import resting_history
 from knode_cosserat.solvers.recovery import Budget, BudgetError
 from knode_cosserat.solvers.recovery_methods import StepRecovery
-from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.settings import MEASURED
 from knode_cosserat.solvers.time_loop import TimeStep
 from tests.trajectories import HOPELESS
 
@@ -48,14 +48,14 @@ def test_on_request_the_rest_is_marked_invalid(robot):
 
 
 def _step(robot, past, coefficients):
-    return StepRecovery(robot, Settings(), TimeStep(past, coefficients, DT), DT, Budget(60.0))
+    return StepRecovery(robot, MEASURED, TimeStep(past, coefficients, DT), DT, Budget(60.0))
 
 
 BDF2 = kc.solvers.BDF2().coefficients(DT, DT)
 
 
 def test_load_continuation_reaches_the_solution_that_newton_finds(robot):
-    step = _step(robot, resting_history(robot, Settings()), BDF2)
+    step = _step(robot, resting_history(robot, MEASURED), BDF2)
     control = np.array([30.0, 5.0, 5.0, 30.0])
     direct = step.solve(control, step.guesses()[0])
     assert step.solved(direct)
@@ -67,7 +67,7 @@ def test_load_continuation_reaches_the_solution_that_newton_finds(robot):
 
 def test_a_divided_step_is_the_same_motion_in_smaller_steps(robot):
     """Two halves by hand, with the coefficients for unequal steps, give the row that dividing gives."""
-    past = resting_history(robot, Settings())
+    past = resting_history(robot, MEASURED)
     control = np.array([7.0, 5.0, 5.0, 7.0])
     _, found = _step(robot, past, BDF2).last_method((control, control))
     by_hand = past

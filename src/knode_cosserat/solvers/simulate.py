@@ -97,10 +97,10 @@ def simulate(
         progress: show a progress bar.
 
     Returns:
-        A `Trajectory` of T + 1 rows; row 0 is the initial state. Every row carries its result, and an
-        estimate of its discretisation error (`position_error`). Rows in which a learned or identified model
-        is outside the range of its training data are marked (`extrapolated`). Inside `jit`, `grad` or `vmap`
-        no error can be raised: unsolved rows are NaN there.
+        A `Trajectory` of T + 1 rows; row 0 is the initial state. Every row carries its result, and estimates
+        of its errors by the nodes (`position_error`) and by the time step (`time_error`). Rows in which a
+        learned or identified model is outside the range of its training data are marked (`extrapolated`).
+        Inside `jit`, `grad` or `vmap` no error can be raised: unsolved rows are NaN there.
 
     Raises:
         SimulationError: a step was not solved, and recovery failed.
