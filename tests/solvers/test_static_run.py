@@ -70,17 +70,12 @@ def test_a_strip_buckles_about_its_weak_axis_also_against_gravity():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("gravity", [(0.0, 0.0, 0.0), (0.0, 0.0, -G), (-G, 0.0, 0.0)])
-def test_pinned_ends_too(gravity):
-    """A pinned elastica has half the length between inflections: d/L = 2 E/K - 1, deflection k L/K."""
-    for base in (ends.Clamped(), ends.Pinned()):
-        rod = CABLE.replace(gravity=gravity, base_end=base, tip_end=ends.Pinned(position=(0.0, 0.0, 0.4)))
-        found = kc.equilibrium(rod, np.zeros(0))
-        assert found.result[0] == kc.Result.CONVERGED and is_stable(found)
-        assert np.min(found.part("v")[0, :, 2]) > 0.98
-        if not any(gravity) and isinstance(base, ends.Pinned):
-            m = brentq(lambda m: 2.0 * ellipe(m) / ellipk(m) - 1.8, 0.0, 0.9)
-            middle = np.hypot(*found.position[0, 10, :2])
-            assert middle == pytest.approx(np.sqrt(m) * LENGTH / ellipk(m), rel=0.02)
+def test_a_rod_between_a_clamp_and_a_pin_too(gravity):
+    rod = CABLE.replace(gravity=gravity, tip_end=ends.Pinned(position=(0.0, 0.0, 0.4)))
+    found = kc.equilibrium(rod, np.zeros(0))
+    assert found.result[0] == kc.Result.CONVERGED and is_stable(found)
+    assert np.min(found.part("v")[0, :, 2]) > 0.98
+    np.testing.assert_allclose(found.moment[0, -1], 0.0, atol=1e-9)
 
 
 @pytest.mark.slow
