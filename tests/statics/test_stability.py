@@ -20,8 +20,13 @@ PINNED = 4.493409457909064**2
 
 def squeezed(end, load):
     """Straight, its tip held where `load` EI/L² press it to."""
-    held = end(position=[0.0, 0.0, (1.0 - load * EI / L**2 / EA) * L])
-    return kc.equilibrium(ROD.replace(tip_end=held), np.zeros(0), space="lobatto4")
+    tip = [0.0, 0.0, (1.0 - load * EI / L**2 / EA) * L]
+    return straight(ROD.replace(tip_end=end(position=tip)), tip)
+
+
+def straight(rod, tip):
+    """The straight equilibrium, stable or not."""
+    return kc.equilibrium(rod, np.zeros(0), space="lobatto4", initial=[[0.0, 0.0, 0.0], tip])
 
 
 # columns
@@ -54,8 +59,8 @@ def test_the_least_eigenvalue_crosses_zero_at_the_load_whatever_the_nodes():
         at = np.array([0.99, 1.01]) * 4.0 * np.pi**2
         found = []
         for load in at:
-            end = Clamped(position=[0.0, 0.0, (1.0 - load * EI / L**2 / EA) * L])
-            rest = kc.equilibrium(rod.replace(tip_end=end), np.zeros(0), space="lobatto4")
+            tip = [0.0, 0.0, (1.0 - load * EI / L**2 / EA) * L]
+            rest = straight(rod.replace(tip_end=Clamped(position=tip)), tip)
             found.append(kc.statics.stability(rest).least)
         critical.append(at[0] - found[0] * (at[1] - at[0]) / (found[1] - found[0]))
     # P (1 + P/GA - P/EA) = 4π² EI/L²: shear makes it softer, and squeezing shorter
@@ -213,8 +218,8 @@ def test_a_slender_arch_pushed_inwards_leaves_its_plane(nodes):
 def test_what_buckles_between_two_nodes_is_counted_too(nodes):
     counts = []
     for part in (0.98, 1.02, 1.5, 9.0):
-        end = Clamped(position=[0.0, 0.0, (1.0 - part * 4.0 * np.pi**2 * EI / L**2 / EA) * L])
-        rest = kc.equilibrium(ROD.replace(tip_end=end, nodes=nodes), np.zeros(0), space="lobatto4")
+        tip = [0.0, 0.0, (1.0 - part * 4.0 * np.pi**2 * EI / L**2 / EA) * L]
+        rest = straight(ROD.replace(tip_end=Clamped(position=tip), nodes=nodes), tip)
         counts.append(kc.statics.stability(rest).unstable_directions)
     assert counts[:3] == [0, 2, 2] and counts[3] >= 8
 

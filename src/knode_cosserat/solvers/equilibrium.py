@@ -56,8 +56,9 @@ def equilibrium(
         robot: one system, or a sequence of systems that differ in their parameters only.
         control: (c,), or (B, c) for a batch; for a tendon robot the tensions in N.
         space: "lobatto2", "lobatto4", "euler", or a scheme.
-        initial: initial guess, by default the unloaded robot: a `Trajectory` (its last row), or measured
-            positions (M, 3) in m, evenly spaced along the rod from its base to its tip.
+        initial: initial guess: a `Trajectory` (its last row), or measured positions (M, 3) in m, evenly
+            spaced along the rod from its base to its tip. By default it is the unloaded robot, or a curve
+            of the rod's length between two held ends that are nearer to each other than in that shape.
         newton: tolerances and limits of the solve.
         position_tolerance: largest discretisation error (m) of positions. The number of nodes is chosen for
             it; by default it is the robot's.
@@ -66,9 +67,12 @@ def equilibrium(
 
     Returns:
         A `Trajectory` of one row, at time 0 and without a solver state; it can be the `initial` of a
-        simulation. If direct iteration fails, three methods follow: a rod between two held ends starts from a
-        hanging curve, the load is applied in parts, and a damped motion is simulated until the robot rests.
-        If there are several equilibria, this is one of them, stable or unstable: see `kc.statics.stability`.
+        simulation. Driven ends are turned in parts of at most 1 rad from zero, or from the control of
+        `initial`, and keep their turns; if not, the result is OTHER_TURNS. If direct iteration fails, the
+        load is applied in parts, or a damped motion is simulated until the robot rests. There may be several
+        equilibria. Without a guess, a rod under dead loads is tested for stability. An unstable shape of a
+        compressed rod is replaced by a stable one; if there is none near it, and for all other rods, the
+        result is UNSTABLE. For robots that are not tested, see `kc.statics.stability`.
 
     Raises:
         SimulationError: no equilibrium was found.

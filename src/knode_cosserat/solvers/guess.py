@@ -108,21 +108,24 @@ def state_from_positions(
         )
     if not np.all(np.isfinite(positions)) or np.any(np.all(np.diff(positions, axis=0) == 0.0, axis=1)):
         raise ValueError("initial holds positions that are not finite, or that repeat")
-    record = np.array(rest_record(system))
+    record = np.array(_rest(system))
     s = np.linspace(0.0, 1.0, system.nodes)
     p, tangent = _curve(positions, s)
     base, tip = held_ends(system, control)
-    u_rest = _unstressed(system, s * float(system.length), control)
+    ny, material = y_layout.size, None
+    u_rows = slice(ny + z_layout.slice("u").start, ny + z_layout.slice("u").stop)
+    u_rest = record[:, u_rows].copy()
+    if hasattr(system, "material"):
+        material = materials(system, s * float(system.length), np.asarray(control))
+        u_rest = np.asarray(material.u_star)
     h = _carried(record[0, y_layout.slice("h")] if base is None or base.h is None else base.h, tangent)
     spin = (0.0 if tip is None else tip.spin) - (0.0 if base is None else base.spin)
     h = _twisted(h, None if tip is None else tip.h, u_rest[:, 2] * float(system.length), spin)
     u = _curvatures(h, float(system.length) / (system.nodes - 1))
-    ny = y_layout.size
     record[:, y_layout.slice("p")], record[:, y_layout.slice("h")] = p, h
-    u_rows = slice(ny + z_layout.slice("u").start, ny + z_layout.slice("u").stop)
     record[:, u_rows] = u
-    if "m" in y_layout.names and hasattr(system, "material"):
-        Kbt = np.asarray(materials(system, s * float(system.length), control).Kbt)
+    if "m" in y_layout.names and material is not None:
+        Kbt = np.asarray(material.Kbt)
         record[:, y_layout.slice("m")] = rotations(h).apply(np.einsum("kij,kj->ki", Kbt, u - u_rest))
     return record
 
@@ -144,15 +147,7 @@ def materials(system: Any, s: Any, control: Any) -> Any:
     return jax.vmap(lambda s: system.material(s, control))(s)
 
 
-@jax.jit
-def _unstressed_rows(system: System, s: Any, control: Any) -> Any:
-    return jax.vmap(lambda s: system.unstressed(s, control))(s)
-
-
-def _unstressed(system: System, s: Any, control: Any) -> Float[np.ndarray, "nodes 3"]:
-    """Return the curvatures u (1/m) of the unstressed material at places along the rod."""
-    rows = _unstressed_rows(system, jnp.asarray(s), jnp.asarray(control))
-    return np.asarray(rows)[:, system.z_layout.slice("u")]
+_rest = jax.jit(rest_record)
 
 
 def rotations(h: Any) -> Any:

@@ -162,8 +162,11 @@ def first_solved(system: System, settings: Settings, pose: Pose, control: Any, g
     from knode_cosserat.solvers.equilibrium import equilibrium
 
     control = np.asarray(control, dtype=float)
-    found = respond(system, settings, pose, control, *(guess or rest_guess(system)))
-    if not found.error <= settings.newton.acceptable:
+    found = None
+    # a rod that is held at both ends may need another guess, or be turned in parts
+    if guess or not system.rest_is_guess:
+        found = respond(system, settings, pose, control, *(guess or rest_guess(system)))
+    if found is None or not found.error <= settings.newton.acceptable:
         recovered = equilibrium(system, control, space=settings.space, newton=settings.newton)
         y = _filled(system, settings, control, jnp.asarray(recovered.y[0]))
         found = respond(system, settings, pose, control, y, unknowns_of(system, y[0]))
