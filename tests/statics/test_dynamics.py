@@ -112,6 +112,23 @@ def test_classical_loads_are_found_from_both_sides(load, critical, kind):
 
 
 @pytest.mark.slow
+def test_the_least_torque_at_a_free_end_is_unstable_without_damping():
+    """Nicolai's paradox (1928): growth in proportion to the torque; drag c slows every growth by c/2."""
+    growth = [decided(torque=torque).eigenvalue.real * TIME for torque in (0.05, 0.5)]
+    assert growth[1] == pytest.approx(10.0 * growth[0], rel=0.02)
+    found = decided(torque=0.5, drag=1.0)
+    assert found.kind == "flutter"
+    assert found.eigenvalue.real * TIME == pytest.approx(growth[1] - 0.5, abs=1e-3)
+    assert decided(torque=0.05, drag=1.0).kind == "stable"
+
+
+@pytest.mark.slow
+def test_strong_damping_of_bending_leaves_a_decision():
+    """Over-damped bending, and undamped stretching."""
+    assert decided(follower=5.0, damping=0.3).kind == "stable"
+
+
+@pytest.mark.slow
 def test_dead_loads_are_decided_by_energy():
     for load, kind in ((0.98, "stable"), (1.02, "divergence")):
         found = decided(dead=load * np.pi**2 / 4.0)

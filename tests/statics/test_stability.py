@@ -153,7 +153,8 @@ def test_a_slender_wire_is_stable_however_it_is_bent_and_at_few_nodes(bends):
                 kc.equilibrium(wire(slenderness, bend, 10), np.zeros(0), space="lobatto4")
             )
             assert found.unstable_directions == 0 and found.least == pytest.approx(1.7, rel=0.25)
-            assert found.asymmetry < 1e-9
+            # rounding of the stretching stiffness, over the energy of bending
+            assert found.asymmetry < 1e-9 + 1e-15 * slenderness**2
 
 
 @pytest.mark.campaign
@@ -225,13 +226,14 @@ def test_what_buckles_between_two_nodes_is_counted_too(nodes):
 
 
 @pytest.mark.campaign
-def test_what_rounding_hides_is_refused():
+def test_what_rounding_hides_is_undecided():
     """A rod between two pins turns about itself for nothing: a zero, in a rod so slender of rounding only."""
     free = wire(1e5, 0.0, 10).replace(
         loads=(), base_end=Pinned(), tip_end=Pinned(position=[0.0, 0.0, 0.3 * (1.0 + 1e-9)])
     )
-    with pytest.raises(ValueError, match=r"row -1 cannot be decided: its least eigenvalue, .* less slender"):
-        kc.statics.stability(kc.equilibrium(free, np.zeros(0), space="lobatto4"))
+    found = kc.statics.stability(kc.equilibrium(free, np.zeros(0), space="lobatto4"))
+    assert found.kind == "undecided" and found.unstable_directions == -1 and not found.stable
+    assert "least eigenvalue" in found.reason and "less slender" in found.reason
 
 
 # several rods, and others

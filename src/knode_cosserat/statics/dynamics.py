@@ -54,6 +54,8 @@ class Modes(NamedTuple):
     #: uncertainty of the growth rates (1/s), by two grids, and the part of it that is rounding
     uncertainty: np.ndarray
     rounding: np.ndarray
+    #: growth rates on the coarser grid (1/s)
+    coarse: np.ndarray
     #: (nodes, y): complex amplitude of y in the first mode
     first: np.ndarray
 
@@ -64,9 +66,8 @@ class Modes(NamedTuple):
 
     @property
     def undecided(self) -> np.ndarray:
-        """True for modes that may grow; without damping, a growth rate of zero is no doubt."""
-        doubt = self.uncertainty > 2.0 * self.rounding
-        return doubt & (np.abs(self.values.real) <= self.uncertainty)
+        """True for modes that grow on one of the grids, but not for certain."""
+        return ~self.growing & (np.maximum(self.values.real, self.coarse) > self.rounding)
 
 
 def linearised_modes(system: System, y: np.ndarray, control: np.ndarray) -> Modes:
@@ -119,8 +120,8 @@ def linearised_modes(system: System, y: np.ndarray, control: np.ndarray) -> Mode
     growth = np.where(np.abs(fine.real) <= uncertainty, 0.0, fine.real)
     order = np.lexsort((np.abs(fine), -growth))
     first = _motion(own, step, moving, factors[order[0]])
-    fine, uncertainty, rounding = (each[order] / time for each in (fine, uncertainty, rounding))
-    return Modes(fine, uncertainty, rounding, first)
+    found = [each[order] / time for each in (fine, uncertainty, rounding, other.real)]
+    return Modes(found[0], found[1], found[2], found[3], first)
 
 
 def _history_size(system: System) -> int:

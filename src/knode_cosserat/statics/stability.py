@@ -297,7 +297,8 @@ def _decided(system: System, y: np.ndarray, control: np.ndarray, by: list[int]) 
         _require_rest(system, pieces.ends.base, pieces.moved)
         found.append(_variation(system, pieces))
         asymmetry = [each.asymmetry for each in found[-2:]]
-        if len(found) > 1 and asymmetry[1] > max(UNSYMMETRIC, FALLING * asymmetry[0]):
+        least = max(UNSYMMETRIC, found[-1].rounding)
+        if len(found) > 1 and asymmetry[1] > max(least, FALLING * asymmetry[0]):
             return found[-1].by_motion(system, y, control)
         # a piece that is unstable by itself may hide negative eigenvalues
         before, sure = sure, firm(pieces.stiffness)
