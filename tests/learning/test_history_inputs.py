@@ -25,9 +25,18 @@ DT = 0.05
 
 
 def learned(c0, **options):
-    """The robot with a random network of history inputs; its weights are twice the first ones."""
+    """The robot with a random network of history inputs that corrects y_s.
+
+    It has no correction of z: ʰz holds corrected strains, so that one would act as a rate of strain at rest.
+    """
     net = network(ROBOT, NetworkOptions(hidden=3, history=True, **options), jax.random.key(0), c0)
-    return KNODE(ROBOT, dataclasses.replace(net, output_weights=2.0 * net.output_weights))
+    rows = np.arange(len(net.output_biases)) < ROBOT.y_layout.size
+    return KNODE(
+        ROBOT,
+        dataclasses.replace(
+            net, output_weights=rows[:, None] * net.output_weights, output_biases=rows * net.output_biases
+        ),
+    )
 
 
 def drift(model, initial, dt, time="bdf2", start="paper"):
