@@ -78,7 +78,8 @@ def parse(robot: System | Layout, specification: str, steps: int | None, dt: flo
     if held is not None:
         return np.tile(held, (steps, 1))
     words = [] if specification.strip() == "none" else specification.split(";")
-    times = {each: step_times(steps, dt, each) for each in ("middle", "end")}
+    places: tuple[Sampled, ...] = ("middle", "end")
+    times = {place: step_times(steps, dt, place) for place in places}
     found = parse_signals(layout, words, times)
     return checked_tensions(found, f"controls {specification!r}") if tensions_only else found
 

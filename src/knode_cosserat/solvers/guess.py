@@ -50,14 +50,17 @@ def held_ends(system: System, control: Any) -> tuple[HeldEnd | None, HeldEnd | N
     found: list[HeldEnd | None] = []
     for pose, pinned, turn in zip(*_poses(system, jnp.asarray(control)), turns, strict=True):
         held = pose or pinned
-        found.append(held and HeldEnd(*(None if x is None else np.asarray(x) for x in held), turn))
+        if held is None:
+            found.append(None)
+        else:
+            found.append(HeldEnd(np.asarray(held.p), None if held.h is None else np.asarray(held.h), turn))
     return found[0], found[1]
 
 
 @jax.jit
 def _poses(system: System, control: Any) -> Any:
     """Return the poses of clamped ends and of pinned ends."""
-    rod, pinned = system.nominal, [None, None]
+    rod, pinned = system.nominal, list[Any]((None, None))
     for k, end in enumerate((rod.base_end, rod.tip_end) if isinstance(rod, Rod) else ()):
         if isinstance(end, Pinned):
             p, h = rod.y_layout.split(rod.rest(k * jnp.asarray(rod.length))[0])[:2]

@@ -156,7 +156,8 @@ class _Walk:
             angles = np.linalg.norm(np.diff(every[:, columns], axis=0), axis=1)
             counts = np.maximum(counts, np.ceil(angles / LARGEST_TURN - 1e-9).astype(int))
         first = [] if fits or np.all(counts == 1) else [every[:1]]
-        parts = [np.linspace(*pair, n + 1)[1:] for *pair, n in zip(every[:-1], controls, counts, strict=True)]
+        pairs = zip(every[:-1], controls, counts, strict=True)
+        parts = [np.linspace(start, end, n + 1)[1:] for start, end, n in pairs]
         return np.concatenate([*first, *parts]), np.cumsum(counts) - 1 + len(first)
 
     def is_unstable(self, records: Any, control: Any) -> bool:
