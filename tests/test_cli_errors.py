@@ -41,7 +41,7 @@ def bad_inputs():
         ((*full, "--set", "radius=6 mm"), "(got '6 mm'). Did you mean 0.006?"),
         ((*full, "--set", "gravity=0", "0", "-9810"), "Did you mean [0, 0, -9.81] ([0, 0, -9810] mm/s2)?"),
         ((*simulation, "--controls", "step:1e5", "--steps", "10"), "the step starts at 1.5 s, after the end"),
-        ((*simulation, "--controls", "step:1e5", "--steps", "10"), "use 30 steps or more, or at=0"),
+        ((*simulation, "--controls", "step:1e5", "--steps", "10"), "use 31 steps or more, or at=0"),
         ((*simulation, "--controls", "7,5,5", "--steps", "10"), "must be 4 finite numbers"),
         ((*simulation, "--controls", "7,5,5,7"), "the number of steps is not given"),
         ((*simulation, "--controls", "base_z=ramp:1", "--steps", "3"), "the control 'base_z' is unknown"),

@@ -141,7 +141,7 @@ def test_tensions_that_are_no_newtons_are_suspected():
 
 
 def test_milliseconds_are_suspected():
-    with pytest.warns(UserWarning, match=r"dt is 50 s, .* natural time .* meant in seconds\?"):
+    with pytest.warns(UserWarning, match=r"dt is 50 s, longer than .*\(is dt in seconds\?\)"):
         kc.simulate(ROBOT, TENSIONS, 50)
 
 

@@ -115,10 +115,10 @@ ROBOT = kc.load_robot("delrin-tendon-robot")
 @pytest.mark.parametrize(
     ("word", "expected"),
     [
-        ("tension_4=ramp:2", {3: [0.5, 1.0, 1.5, 2.0]}),
-        (" tension_2 = 3 ; tension_1=step:1,at=0.15", {0: [0.0, 0.0, 1.0, 1.0], 1: [3.0] * 4}),
+        ("tension_4=ramp:2", {3: 2.0 * np.array([1, 3, 5, 7]) / 7}),
+        (" tension_2 = 3 ; tension_1=step:1,at=0.1", {0: [0.0, 0.0, 1.0, 1.0], 1: [3.0] * 4}),
         ("tension=5", {k: [5.0] * 4 for k in range(4)}),
-        ("tension_3=sine:0.2,base=2,amplitude=1", {2: 2.0 + np.sin(np.pi * np.arange(1, 5) / 2)}),
+        ("tension_3=sine:0.2,base=2,amplitude=1", {2: 2.0 + np.sin(np.pi * (np.arange(4) + 0.5) / 2)}),
         ("none", {}),
     ],
 )
@@ -142,7 +142,7 @@ def test_signals_of_the_paper_are_still_for_all_tendons():
     ("word", "parts"),
     [
         ("tension_5=ramp:2", ["the control 'tension_5' is unknown", "tension_1, tension_2"]),
-        ("tension_1=sine:0.2", ["a tension is -1 N", "allowed is 0 or more"]),
+        ("tension_1=sine:0.2", ["a tension is -0.7", "allowed is 0 or more"]),
         ("tension=5;tension_1=3", ["tension_1 is given already"]),
         ("tension_1=5,tension_2=3", ["the signal '5,tension_2=3' is unknown"]),
     ],

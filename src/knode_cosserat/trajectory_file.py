@@ -308,12 +308,12 @@ def _state(path: Path, data: xarray.Dataset, name: str) -> SolverState | None:
             path, data, name + suffix, (*batch, *(fixed.get(x, data.sizes.get(x, 0)) for x in along))
         )
         for suffix, along, _ in _STATE_PARTS
-        if name + suffix in data.variables
+        if suffix != "_time_error" or name + suffix in data.variables
     }
     states, error, y, weights, time = (
         parts[suffix] for suffix in ("", "_error", "_guess", "_weights", "_time")
     )
-    # files of earlier versions have no errors in time
+    # measured rows and earlier files have no errors in time
     unknown = np.full((*error.shape[:-3], 2, *error.shape[-2:]), np.nan)
     t0, dt, known = np.moveaxis(time, -1, 0)
     history = StateHistory(

@@ -19,7 +19,7 @@ SMALL = FitConfig.network(hidden=5, epochs=300)
 
 @pytest.fixture(scope="module")
 def seen():
-    return [pulled(1.0), pulled(0.7)]
+    return [pulled(period, time="bdf2", start="paper") for period in (1.0, 0.7)]
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def test_the_range_is_that_of_the_trajectories(model, seen):
 
 def test_nothing_is_marked_in_what_it_learned_from(model, seen):
     for each in seen:
-        again = kc.simulate(model, each.held_control[:-1], each.dt)
+        again = kc.simulate(model, each.held_control[:-1], each.dt, time="bdf2", start="paper")
         assert again.extrapolated.shape == (len(each.time),) and not again.extrapolated.any()
         assert "EXTRAPOLATION" not in str(again) and again.extrapolation == ""
     # the knowledge alone was not trained

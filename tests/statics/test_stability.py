@@ -265,7 +265,7 @@ def test_tendons_keep_a_potential():
 
 def test_what_is_no_equilibrium_is_refused():
     robot = kc.load_robot("delrin-tendon-robot")
-    moved = kc.simulate(robot, kc.controls.step(1.0, 5, 0.05), 0.05)
+    moved = kc.simulate(robot, kc.controls.sine(1.0, 5, 0.05), 0.05)
     with pytest.raises(ValueError, match=r"row 3 is no equilibrium"):
         kc.statics.stability(moved, row=3)
     with pytest.raises(ValueError, match=r"row is 9; allowed is -6 to 5"):

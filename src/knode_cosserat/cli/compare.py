@@ -34,6 +34,9 @@ if TYPE_CHECKING:
     from knode_cosserat.rods.system import System
     from knode_cosserat.trajectory import Trajectory
 
+#: largest distance (natural units of y) from the unstressed state of a motion that starts there
+UNSTRESSED = 1e-9
+
 
 class Kind(enum.StrEnum):
     """Kinds of figures that `plot` draws."""
@@ -277,17 +280,21 @@ def _measures() -> tuple[Any, ...]:
 
 
 def _simulated(system: System | Ensemble, reference: Trajectory, rows: int | None, progress: bool) -> Any:
-    """Return the simulation from rest under the reference's controls, with its schemes.
+    """Return the simulation under the reference's controls, with its schemes.
 
-    For an ensemble it is the prediction of all members, compared by its mean.
+    It starts unstressed if the reference does, and else in its own equilibrium. For an
+    ensemble it is the prediction of all members, compared by its mean.
     """
     import knode_cosserat as kc
     from knode_cosserat.learning.ensemble import Ensemble, Prediction
+    from knode_cosserat.solvers.history import rest_record
 
     if np.ndim(reference.y) != 3 or len(reference.time) < 2:
         raise ValueError("allowed is a trajectory of one robot, with two rows or more")
-    it = reference.settings or kc.solvers.Settings()
+    it, rest = reference.settings or kc.solvers.Settings(), rest_record(reference.system)
+    unstressed = np.allclose(reference.y[0], rest[:, : reference.y.shape[-1]], rtol=0.0, atol=UNSTRESSED)
     options: Any = {
+        "initial": None if unstressed else "equilibrium",
         "time": it.time, "space": it.space, "start": it.start, "newton": it.newton, "between": it.between,
         "progress": progress,
     }  # fmt: skip

@@ -105,7 +105,6 @@ class ResultCodes(Codes):
 EARLIER_RESULTS = {
     "recovered_stable_elimination": Result.CONVERGED,
     "recovered_finer_segments": Result.CONVERGED,
-    "unstable": Result.NO_CONVERGENCE,
 }
 
 

@@ -96,7 +96,7 @@ class Settings:
         )
 
 
-#: for rows that were not simulated: rates are differences of the rows (paper eq. 2, backward differentiation)
+#: for rows that were not simulated: rates are differences of the rows, by the paper's scheme
 MEASURED = Settings(time_schemes.BDF2(), start="paper")
 
 #: schemes along the rod of earlier versions, and present schemes of the same order

@@ -141,8 +141,10 @@ def split_initial(initial: Any) -> tuple[Trajectory | None, bool]:
     if isinstance(initial, str) and initial == "equilibrium":
         return None, True
     if initial is not None and not isinstance(initial, Trajectory):
-        given = repr(initial) if isinstance(initial, str) else f"a {type(initial).__name__}"
-        raise ValueError(f'initial is {given}; allowed is a Trajectory, "equilibrium", or None')
+        given = f" {initial!r}" if isinstance(initial, str) else ""
+        raise ValueError(
+            f'initial is a {type(initial).__name__}{given}; allowed is a Trajectory, "equilibrium", or None'
+        )
     return initial, False
 
 

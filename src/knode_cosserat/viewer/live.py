@@ -7,6 +7,7 @@ import contextlib
 import gc
 import sys
 from collections.abc import Iterator
+from typing import Any
 
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.equilibrium import equilibrium
@@ -56,6 +57,9 @@ def view_live(
     """
     require_websockets()
     checked_port(port)
+    given: Any = robot
+    if not isinstance(given, System):
+        raise ValueError(f"robot is a {type(given).__name__}; allowed is one robot")
     stepper = resting_stepper(robot, usual_step(robot) if dt is None else dt, space)
     page = live_page(stepper, title, target)
     with prompt_threads():
