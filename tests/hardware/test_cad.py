@@ -56,7 +56,6 @@ def test_ribs_are_at_the_attached_masses_else_at_equal_distances():
     np.testing.assert_allclose(plain.rib_heights, [127, 254, 381, 508, 635])
 
 
-@pytest.mark.filterwarnings("ignore:.*is the paper's model")
 def test_the_hardware_section_of_a_file_is_used(tmp_path):
     path = tmp_path / "robot.yaml"
     text = format_robot(kc.load_robot("delrin-tendon-robot"))

@@ -436,7 +436,7 @@ def warned(call):
 
 def test_an_offset_that_the_papers_model_ignores_is_named(tmp_path):
     file = tmp_path / "mine.yaml"
-    file.write_text(text(tendon_offset="0.02"), encoding="utf-8")
+    file.write_text(text(tendon_offset="0.012"), encoding="utf-8")
     (message,) = warned(lambda: load_robot(file))
     assert message.startswith(f"{file}: kind tendon-robot is the paper's model")
     # the offset is indeed ignored
@@ -446,7 +446,9 @@ def test_an_offset_that_the_papers_model_ignores_is_named(tmp_path):
     assert len(warned(lambda: modified(robot, ["tendon_offset=0.03"]))) == 1
 
 
-@pytest.mark.parametrize("change", [{}, {"tendon_offset": "0.0"}, {"kind": "routed-tendon-robot"}])
+@pytest.mark.parametrize(
+    "change", [{}, {"tendon_offset": "0.02"}, {"tendon_offset": "0.0"}, {"kind": "routed-tendon-robot"}]
+)
 def test_other_robots_are_not_warned_of(tmp_path, change):
     kind = change.pop("kind", "tendon-robot")
     file = tmp_path / "mine.yaml"

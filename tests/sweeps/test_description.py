@@ -80,7 +80,6 @@ store: [tip_position, controls]
     assert "64 cases" in text and "2 robots, 2 controls, 1 seeds, 16 samples by sobol" in text
 
 
-@pytest.mark.filterwarnings("ignore:.*is the paper's model")
 def test_a_plan_depends_on_everything_that_changes_results(tmp_path):
     base = Plan.of(sweep(**RANDOM)).identity
     for changes in ({"samples": 9}, {"seed": 1}, {"steps": 5}, {"dt": 0.01}, {"shard": 3}, {"store": ["y"]}):

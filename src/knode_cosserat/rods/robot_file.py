@@ -59,6 +59,9 @@ KINDS: dict[str, type[System]] = {
     "parallel-robot": ParallelRobot,
 }
 
+#: distance (m) of the tendons from the axis of the paper's robot
+PAPER_OFFSET = 0.02
+
 
 class RobotFileError(KnodeCosseratError, ValueError):
     """A robot file is invalid: one line that names file, key, value and the allowed values."""
@@ -69,8 +72,8 @@ class RobotFileError(KnodeCosseratError, ValueError):
 def load_robot(name_or_path: str | Path) -> System:
     """Return a robot from the catalog, by name, or from a file, by path. The catalog has priority.
 
-    A file of the paper's tendon model (`kind: tendon-robot`) that states a `tendon_offset` is warned of: the
-    tendons of that model push the rod sideways, wherever they run.
+    A file of the paper's tendon model (`kind: tendon-robot`) with another `tendon_offset` than the paper's
+    robot is warned of: the tendons of that model push the rod sideways, wherever they run.
 
     Raises:
         RobotFileError: there is no such robot, or its file is invalid.
@@ -82,8 +85,8 @@ def load_robot(name_or_path: str | Path) -> System:
 
 
 def warn_of_paper_tendons(robot: System, source: str) -> None:
-    """Warn of a tendon offset that the paper's tendon model ignores."""
-    if type(robot) is TendonRobot and float(robot.tendon_offset):
+    """Warn of a tendon offset that was chosen for the paper's tendon model, which ignores it."""
+    if type(robot) is TendonRobot and float(robot.tendon_offset) not in (0.0, PAPER_OFFSET):
         warnings.warn(
             f"{source}: kind tendon-robot is the paper's model, whose tendons push the rod sideways: its "
             "simulation ignores tendon_offset. For tendons that run beside the rod, write kind: "

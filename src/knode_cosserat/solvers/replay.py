@@ -77,8 +77,9 @@ def replay(trajectory: Trajectory, system: System, dt: float | None = None) -> R
         every = jnp.concatenate([between, rows[1:, None]], axis=1)
         rows = jnp.concatenate([rows[:1], every.reshape(-1, *rows.shape[1:])])
         acting = at_stages(system, made, controls[1:], controls[:1], state.dt is None)
-        repeats = 1 if acting.shape[1] > controls.shape[1] else made.stages
-        acting = jnp.repeat(acting.reshape(-1, controls.shape[1]), repeats, axis=0)
+        if acting.shape[1] == controls.shape[1]:
+            acting = jnp.tile(acting, made.stages)
+        acting = acting.reshape(len(acting) * made.stages, controls.shape[1])
         controls = jnp.concatenate([controls[:1], acting])
     count = len(rows)
     if not is_traced((rows, controls)):
