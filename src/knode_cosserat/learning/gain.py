@@ -14,6 +14,8 @@ from knode_cosserat.trajectory import Trajectory
 
 #: gain below which a fit is reported as of little use
 LITTLE = 0.2
+#: errors below this are those of the solver
+SOLVED = 1e-8
 
 
 class RolloutErrors(NamedTuple):
@@ -30,7 +32,7 @@ class RolloutErrors(NamedTuple):
         """Part of the nominal model's error that the model removes; negative if its error is larger."""
         if np.isinf(self.model):
             return -np.inf
-        return 1.0 if np.isinf(self.nominal) else 1.0 - self.model / self.nominal
+        return 1.0 if np.isinf(self.nominal) else 1.0 - self.model / max(self.nominal, SOLVED)
 
 
 def rollout_errors(nominal: System, model: System, trajectory: Trajectory) -> RolloutErrors:
@@ -58,7 +60,7 @@ def rollout_errors(nominal: System, model: System, trajectory: Trajectory) -> Ro
     elif made.gain < LITTLE:
         warnings.warn(
             "the fit gained little: over its first training trajectory the model's error is "
-            f"{100.0 * made.model / made.nominal:.3g} % of the nominal model's. Its residual may not have "
+            f"{100.0 * (1.0 - made.gain):.3g} % of the nominal model's. Its residual may not have "
             "the missing effect, or the error is in the length, the base or the tip, which it leaves alone",
             stacklevel=3,
         )

@@ -188,7 +188,8 @@ def carried_results(result: Any, before: Any) -> Any:
     """
     traced = is_traced((result, before))
     numeric: Any = jnp if traced else np
-    codes = numeric.concatenate([numeric.asarray(before)[..., None], result], axis=-1)
+    first = numeric.broadcast_to(numeric.asarray(before)[..., None], (*result.shape[:-1], 1))
+    codes = numeric.concatenate([first, result], axis=-1)
     latest = numeric.where(codes > int(Result.COARSE), numeric.arange(codes.shape[-1]), 0)
     latest = jax.lax.cummax(latest, codes.ndim - 1) if traced else np.maximum.accumulate(latest, axis=-1)
     coarse = numeric.cumsum(codes == int(Result.COARSE), axis=-1) > 0
