@@ -106,6 +106,9 @@ class _Walk:
             guess = self._best(controls[0], curve_guesses(self.system, controls[0]))[0]
         if guess is None:
             run = self.along(controls, y, before, fits=False)
+            if np.any(run.rows.result < 0) and np.all(self._angles(controls) <= np.pi):
+                # no turns can be lost: at once, where recovery starts from curves between the ends
+                run = run_one(self.task, self.system, controls, y, before)
         else:
             run = self.along(controls, guess, controls[0])
         for k in np.flatnonzero((run.rows.result >= 0) & (run.rows.result != Result.OTHER_TURNS)):
@@ -151,14 +154,19 @@ class _Walk:
         """
         every = np.concatenate([np.asarray(before)[None], controls])
         counts = np.ones(len(controls), dtype=int)
-        for columns in turn_columns(self.system) if are_clamped(self.system) else ():
-            columns = columns[columns >= 0]
-            angles = np.linalg.norm(np.diff(every[:, columns], axis=0), axis=1)
+        if are_clamped(self.system):
+            angles = np.max(self._angles(np.diff(every, axis=0)), axis=1)
             counts = np.maximum(counts, np.ceil(angles / LARGEST_TURN - 1e-9).astype(int))
         first = [] if fits or np.all(counts == 1) else [every[:1]]
         pairs = zip(every[:-1], controls, counts, strict=True)
         parts = [np.linspace(start, end, n + 1)[1:] for start, end, n in pairs]
         return np.concatenate([*first, *parts]), np.cumsum(counts) - 1 + len(first)
+
+    def _angles(self, controls: np.ndarray) -> np.ndarray:
+        """Return the angles (T, 2) (rad) by which controls (T, c) turn base and tip."""
+        columns = turn_columns(self.system)
+        turns = np.where(columns < 0, 0.0, np.pad(controls, ((0, 0), (0, 1)))[:, columns])
+        return np.asarray(np.linalg.norm(turns, axis=-1))
 
     def is_unstable(self, records: Any, control: Any) -> bool:
         """True if an equilibrium is unstable; false where that is not tested."""
