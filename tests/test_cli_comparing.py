@@ -35,7 +35,9 @@ def test_evaluate_compares_trajectories(tmp_path, truth):
 def test_evaluate_simulates_a_robot_as_the_papers_table_has_it(tmp_path):
     # protocol.md: stiffness, sine: DTW 19.99, MSE 12.52; the paper keeps the first 100 rows
     out = tmp_path / "truth.nc"
-    succeeded(*simulated(out, "--space", "euler", controls="sine:1.5", steps=100))
+    tensions = kc.controls.sine(1.5, 100, 0.05, sampled="end")
+    paper = {"time": "bdf2", "space": "euler", "start": "paper"}
+    kc.simulate(kc.load_robot(ROBOT), tensions, 0.05, **paper).save(out)
     (row,) = told("evaluate", ROBOT, out, "--set", "youngs_modulus=10e9", "--rows", 100)["references"]
     assert row["rows"] == 100
     assert row["tip_dtw"] == pytest.approx(19.99, abs=0.005)

@@ -38,7 +38,10 @@ def test_a_trajectory():
 def test_a_model_predicts_what_it_did():
     model = kc.load_model(FILES / "model-1.model")
     before = kc.load_trajectory(FILES / "prediction-1.nc")
-    found = kc.simulate(model, np.asarray(before.control)[1:], before.dt, space=before.settings.space)
+    it = before.settings
+    found = kc.simulate(
+        model, np.asarray(before.control)[1:], before.dt, time=it.time, space=it.space, start=it.start
+    )
     np.testing.assert_allclose(found.tip_position[-1], TOLD["predicted tip"], atol=1e-9)
     np.testing.assert_allclose(found.y, before.y, atol=1e-7)
 
@@ -89,7 +92,7 @@ def test_a_trajectory_without_a_final_state_goes_on_by_a_replay_of_its_rows(tmp_
     data = xarray.load_dataset(tmp_path / "a.nc", engine="h5netcdf", decode_cf=False)
     data.attrs["format_version"] = 1  # without a checksum
     states = [name for name in data.variables if name.startswith(("initial_history", "final_history"))]
-    assert len(states) == 10
+    assert len(states) == 12
     data = data.drop_vars([name for name in states if name != "initial_history"])
     data["initial_history_step"] = "history_coefficient", np.array([40.0, -40.0, 0.0, -1.0, 0.05])
     data.to_netcdf(tmp_path / "b.nc", engine="h5netcdf")

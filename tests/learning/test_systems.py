@@ -96,7 +96,7 @@ def test_forward_euler_moves_a_rod_with_loads_at_a_node():
 @pytest.fixture(scope="module", params=["lobatto2", pytest.param("lobatto4", marks=pytest.mark.campaign)])
 def laden(request):
     control = pushed(1.0, 1.0, np.zeros(1))[:30]
-    return kc.simulate(LADEN, control, DT, space=request.param)
+    return kc.simulate(LADEN, control, DT, time="bdf2", start="paper", space=request.param)
 
 
 @pytest.mark.slow

@@ -244,7 +244,7 @@ def test_a_pose_beyond_the_actuators_is_not_reached():
 
 @functools.cache
 def swung():
-    return kc.simulate(ROBOT, smooth(0), DT)
+    return kc.simulate(ROBOT, smooth(0), DT, time="bdf2", start="paper")
 
 
 @pytest.mark.slow

@@ -44,7 +44,8 @@ class BoundaryObserver:
         mass = float(base.nominal.mass_per_length) * length
         self.stiffness = 30.0 * bending / length**3 if stiffness is None else float(stiffness)
         self.damping = np.sqrt(self.stiffness * mass) if damping is None else float(damping)
-        self._stepper = Stepper(self.robot, dt, initial=initial)
+        # the wrench acts a period late: BDF2 damps the fast modes that it would excite
+        self._stepper = Stepper(self.robot, dt, time="bdf2", initial=initial)
         self._measured: Any = None
         self._force = np.zeros(3)
 
