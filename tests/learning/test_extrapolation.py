@@ -14,12 +14,13 @@ from knode_cosserat.rods.trained_range import MARGIN, TrainedRange, without_rang
 from knode_cosserat.solvers import time_loop
 from tests.learning.bar import BAR, WRONG, pulled
 
+PAPER = {"time": "bdf2", "start": "paper"}
 SMALL = FitConfig.network(hidden=5, epochs=300)
 
 
 @pytest.fixture(scope="module")
 def seen():
-    return [pulled(period, time="bdf2", start="paper") for period in (1.0, 0.7)]
+    return [pulled(period, **PAPER) for period in (1.0, 0.7)]
 
 
 @pytest.fixture(scope="module")
@@ -36,12 +37,12 @@ def model(ensemble):
 def beyond():
     """More pull than in training, at first within its range."""
     pull = 2.0 * np.sin(2 * np.pi * np.arange(1, 21) * 0.1) * np.linspace(0.2, 1.6, 20)
-    return kc.simulate(BAR, pull[:, None], 0.1)
+    return kc.simulate(BAR, pull[:, None], 0.1, **PAPER)
 
 
 @pytest.fixture(scope="module")
 def predicted(model, beyond):
-    return kc.simulate(model, beyond.held_control[:-1], beyond.dt)
+    return kc.simulate(model, beyond.held_control[:-1], beyond.dt, **PAPER)
 
 
 def test_the_range_is_that_of_the_trajectories(model, seen):
@@ -60,7 +61,7 @@ def test_the_range_is_that_of_the_trajectories(model, seen):
 
 def test_nothing_is_marked_in_what_it_learned_from(model, seen):
     for each in seen:
-        again = kc.simulate(model, each.held_control[:-1], each.dt, time="bdf2", start="paper")
+        again = kc.simulate(model, each.held_control[:-1], each.dt, **PAPER)
         assert again.extrapolated.shape == (len(each.time),) and not again.extrapolated.any()
         assert "EXTRAPOLATION" not in str(again) and again.extrapolation == ""
     # the knowledge alone was not trained
@@ -93,30 +94,30 @@ def test_marks_survive_slices_files_continuing_batches_and_equilibria(
     np.testing.assert_array_equal(loaded.extrapolated, marks)
     assert loaded.system.trained_range() is not None
     half = len(controls) // 2
-    first = kc.simulate(model, controls[:half], beyond.dt)
-    second = kc.simulate(model, controls[half:], beyond.dt, initial=first)
+    first = kc.simulate(model, controls[:half], beyond.dt, **PAPER)
+    second = kc.simulate(model, controls[half:], beyond.dt, **PAPER, initial=first)
     np.testing.assert_array_equal(np.concatenate([first.extrapolated, second.extrapolated[1:]]), marks)
     assert second.extrapolated[0] == first.extrapolated[-1]
-    both = kc.simulate(model, np.stack([controls, 0.2 * controls]), beyond.dt)
+    both = kc.simulate(model, np.stack([controls, 0.2 * controls]), beyond.dt, **PAPER)
     np.testing.assert_array_equal(both.extrapolated[0], marks)
     assert not both[1].extrapolated[1:].all() and "2 robots" in str(both)
-    prediction = ensemble.predict(controls, beyond.dt)
+    prediction = ensemble.predict(controls, beyond.dt, **PAPER)
     np.testing.assert_array_equal(
         prediction.extrapolated, prediction.members[0].extrapolated | prediction.members[1].extrapolated
     )
     top = 2.0 * np.asarray(model.trained_range().control_high)
     rest = kc.equilibrium(model, top)
     assert rest.extrapolated.shape == (1,) and rest.extrapolated[0]
-    traced = jax.jit(lambda part: kc.simulate(model, part * controls, beyond.dt).extrapolated)(1.0)
+    traced = jax.jit(lambda part: kc.simulate(model, part * controls, beyond.dt, **PAPER).extrapolated)(1.0)
     np.testing.assert_array_equal(traced, marks)
 
 
 def test_a_range_needs_no_program_of_its_own(model, beyond):
     bare = KNODE(model.knowledge, model.residual, model.about)
     assert jax.tree.structure(without_range(model)) == jax.tree.structure(bare)
-    kc.simulate(bare, beyond.held_control[:-1], beyond.dt)
+    kc.simulate(bare, beyond.held_control[:-1], beyond.dt, **PAPER)
     programs = time_loop.loop_one._cache_size()
-    kc.simulate(model, beyond.held_control[:-1], beyond.dt)
+    kc.simulate(model, beyond.held_control[:-1], beyond.dt, **PAPER)
     assert time_loop.loop_one._cache_size() == programs
 
 
