@@ -128,6 +128,7 @@ def test_inputs_are_those_of_the_training_with_the_same_rates():
 @pytest.mark.slow
 @pytest.mark.parametrize("dt", [0.05, 0.02])
 def test_a_fit_keeps_c0_of_its_time_steps(dt):
-    data = kc.simulate(ROBOT, kc.controls.sine(0.5, 4, dt), dt, space="euler")
+    tensions = kc.controls.sine(0.5, 4, dt)
+    data = kc.simulate(ROBOT, tensions, dt, time="bdf2", space="euler", start="paper")
     config = FitConfig(NetworkOptions(hidden=2, history=True), Training(epochs=1))
     assert kc.fit(ROBOT.replace(length=0.5), [data], config).residual.history_c0 == pytest.approx(1.5 / dt)

@@ -88,7 +88,10 @@ def test_the_estimate_of_a_shaft_between_two_driven_chucks():
     chuck = ENDS.Driven(axes=("rz",))
     rods = (shaft(nodes, axes=("rz",), tip_end=chuck) for nodes in (11, 41))
     one, fine = (moved(rod, angle, 0.002) for rod in rods)
-    assert np.max(one.position_error) < 2.0 * np.max(off(one, fine))
+    true = off(one, fine)
+    late = slice(len(true) // 10, None)
+    assert 0.7 < np.median(one.position_error[late] / true[late]) < 1.5
+    assert np.max(one.position_error) < 3.0 * np.max(true)
     assert np.all(one.result == kc.Result.CONVERGED)
 
 

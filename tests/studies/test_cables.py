@@ -222,7 +222,7 @@ def _dropped(markers):
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:the grid is too coarse")
+@pytest.mark.filterwarnings("ignore:the grid is too coarse", "ignore:outside rod theory")
 @pytest.mark.parametrize("fast", [_shaken, _turned, _taut, _dropped, lambda markers: markers[::6]])
 @pytest.mark.parametrize("thin", [False, True])
 def test_fast_grips_do_not_stop_a_prediction(rollouts, fast, thin):

@@ -169,7 +169,8 @@ class Recovery(abc.ABC):
                 return self._outcome(*found)
         except BudgetError:
             cause = f"Recovery was stopped after {self.budget.seconds:.3g} s (recovery_budget)."
-            self.budget = Budget(np.inf)
+        # an attempt that is only reported
+        self.budget = Budget(np.inf)
         least = min(best, key=lambda each: float(each.solution.error)) if best else None
         if least is None:
             least = self.solve(controls[1], self.guesses()[0])

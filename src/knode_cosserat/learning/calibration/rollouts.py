@@ -44,7 +44,7 @@ from knode_cosserat.solvers.places import Places, places_at, positions_at, quate
 from knode_cosserat.solvers.result import SimulationError
 from knode_cosserat.solvers.run import TimeIntegration, run_one
 from knode_cosserat.solvers.sensitivity import TangentState, static_tangents, tangent_time_loop
-from knode_cosserat.solvers.settings import MEASURED, Settings
+from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.tangent import SystemMoves
 from knode_cosserat.trajectory import Trajectory
@@ -367,7 +367,7 @@ class RolloutMisfit:
 def _of_trajectory(robot: System, oriented: bool, trajectory: Trajectory) -> _Rollout:
     begins = _first_row(trajectory)
     control, y = (np.asarray(values, dtype=float)[begins:] for values in (trajectory.control, trajectory.y))
-    settings = trajectory.settings or MEASURED
+    settings = trajectory.settings or Settings()
     # the base is left out: its pose is given
     places = Places(np.arange(robot.nodes - 1), np.ones(robot.nodes - 1))
     initial: Trajectory | None = trajectory[:begins]
@@ -429,7 +429,7 @@ def _of_measurements(robot: System, oriented: bool, given: Any, space: str | Spa
         raise DataError(
             f"{given.source}: no tension is known at {given.time[row]:g} s; use the part before (`parts`)"
         )
-    settings = Settings.of("bdf2", space, "paper", NewtonOptions())
+    settings = Settings.of("sdirk2", space, "consistent", NewtonOptions())
     places = places_at(given.fractions, robot.nodes)
     before = given.tension[0] if given.initial_tension is None else given.initial_tension
     held = _held_at_start(robot, settings, before, places, given.position[0], 1.0 / UNSTRESSED)
