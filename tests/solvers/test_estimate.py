@@ -53,7 +53,16 @@ def off(one, fine):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("speed", "dt"), [(1.0, 0.002), (5.0, 0.002), (5.0, 0.0005), (10.0, 0.005)])
+@pytest.mark.parametrize(
+    ("speed", "dt"),
+    [
+        (5.0, 0.002),
+        *(
+            pytest.param(*it, marks=pytest.mark.campaign)
+            for it in ((1.0, 0.002), (5.0, 0.0005), (10.0, 0.005))
+        ),
+    ],
+)
 def test_the_estimate_of_a_turning_shaft_does_not_grow(speed, dt):
     t = np.arange(1, int(4.0 / dt) + 1) * dt
     motion = moved(shaft(11, axes=("rz",)), turned(t, speed)[:, None], dt, space="lobatto4")
@@ -65,10 +74,13 @@ def test_the_estimate_of_a_turning_shaft_does_not_grow(speed, dt):
 @pytest.mark.parametrize(
     ("kind", "dt"),
     [
-        ("turned", 0.002), ("swung", 0.005), ("swung", 0.001), ("shaken and turned", 0.002),
-        ("tumbling", 0.002),
+        ("swung", 0.005),
+        *(
+            pytest.param(*it, marks=pytest.mark.campaign)
+            for it in (("turned", 0.002), ("swung", 0.001), ("shaken and turned", 0.002), ("tumbling", 0.002))
+        ),
     ],
-)  # fmt: skip
+)
 def test_the_estimate_is_the_error_of_a_driven_motion(kind, dt):
     controls = driven(kind, np.arange(1, int(3.0 / dt) + 1) * dt)
     one, fine = (moved(shaft(nodes), controls, dt) for nodes in (11, 41))
@@ -81,7 +93,7 @@ def test_the_estimate_is_the_error_of_a_driven_motion(kind, dt):
     assert np.all(one.result == kc.Result.CONVERGED)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_the_estimate_of_a_shaft_between_two_driven_chucks():
     t = np.arange(1, 1501) * 0.002
     angle = turned(t, 3.0)[:, None] * np.ones(2)
@@ -95,7 +107,7 @@ def test_the_estimate_of_a_shaft_between_two_driven_chucks():
     assert np.all(one.result == kc.Result.CONVERGED)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.parametrize("time", ["bdf1", "bdf-alpha", "trapezoidal"])
 def test_the_estimate_of_a_turning_shaft_in_other_time_schemes(time):
     controls = driven("turned", np.arange(1, 1001) * 0.002)
@@ -104,7 +116,7 @@ def test_the_estimate_of_a_turning_shaft_in_other_time_schemes(time):
     assert np.all(motion.result == kc.Result.CONVERGED)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_the_estimate_of_a_bending_plane_that_turns():
     robot = kc.load_robot("delrin-tendon-robot")
     t = np.arange(1, 2001) * 0.005

@@ -224,7 +224,7 @@ def _dropped(markers):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the grid is too coarse", "ignore:outside rod theory")
 @pytest.mark.parametrize("fast", [_shaken, _turned, _taut, _dropped, lambda markers: markers[::6]])
-@pytest.mark.parametrize("thin", [False, True])
+@pytest.mark.parametrize("thin", [False, pytest.param(True, marks=pytest.mark.campaign)])
 def test_fast_grips_do_not_stop_a_prediction(rollouts, fast, thin):
     """Thin: a tenth of the stiffness and hardly any damping. The cable stays between its grips."""
     markers = fast(held(120, 1))
