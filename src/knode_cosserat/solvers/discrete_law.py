@@ -52,15 +52,18 @@ class DiscreteLaw(Protocol):
         """Return the derivative of the residual by z."""
 
 
-def discrete_law(law: Any, layout: Layout, c0: Any, hz: Float[Any, " z"]) -> DiscreteLaw:
-    """Return a law in time (`System.constitutive`) for one time step; `layout` is that of z."""
+def discrete_law(law: Any, layout: Layout, c0: Any, hz: Float[Any, " z"], length: Any = 1.0) -> DiscreteLaw:
+    """Return a law in time (`System.constitutive`) for one time step; `layout` is that of z.
+
+    The rod's `length` (m) is a scale: curvatures are found to a small part of 1 / length.
+    """
     if isinstance(law, InternalState):
         internal = {
             name: evolved(evolution, layout.get(hz, name), c0) for name, evolution in law.evolutions.items()
         }
-        return MaterialStep(law.law(internal), layout, c0, hz, internal)
+        return MaterialStep(law.law(internal), layout, c0, hz, internal, length)
     if isinstance(law, MaterialLaw):
-        return MaterialStep(law, layout, c0, hz, {})
+        return MaterialStep(law, layout, c0, hz, {}, length)
     if isinstance(law, tuple):
         return LinearStep(LinearLaw(*law), c0, hz)
     return StatedStrains(law)
@@ -123,8 +126,8 @@ class LinearStep:
 class MaterialStep:
     """Strains by their elastic laws of this step, then internal variables."""
 
-    def __init__(self, law: MaterialLaw, layout: Layout, c0: Any, hz: Any, internal: Fields):
-        self.law, self.layout, self.c0 = law, layout, c0
+    def __init__(self, law: MaterialLaw, layout: Layout, c0: Any, hz: Any, internal: Fields, length: Any):
+        self.law, self.layout, self.c0, self.length = law, layout, c0, length
         #: history of each field of z
         self.history: Fields = dict(zip(layout.names, layout.split(hz), strict=True))
         #: internal variables that do not depend on the strains
@@ -183,7 +186,9 @@ class MaterialStep:
         strain, elastic = self.law.strains[name], self.elastic[name]
         if strain.moment is None:
             return elastic.strain()
-        return nonlinear_strain(NonlinearStrain(elastic, strain.moment, self.c0, self.history[name]))
+        return nonlinear_strain(
+            NonlinearStrain(elastic, strain.moment, self.c0, self.history[name], self.length)
+        )
 
     def _internal(self, strains: Fields) -> Fields:
         """Return all internal variables for these strains."""
@@ -209,6 +214,8 @@ class NonlinearStrain(NamedTuple):
     moment: Any
     c0: Any
     h: Float[Any, "3"]
+    #: length of the rod (m)
+    length: Any
 
     def residual(self, strain: Float[Any, "3"]) -> Float[Any, "3"]:
         """Return the residual of the law."""
@@ -231,7 +238,8 @@ def _searched(law: NonlinearStrain) -> Float[Any, "3"]:
     moving = law.c0 > 0.0
     # without sliding, friction does not make the first corrections overshoot
     start = jnp.where(moving, -law.h / jnp.where(moving, law.c0, 1.0), law.elastic.strain())
-    elastic = dot(jnp.abs(law.elastic.softened), jnp.abs(start))
+    # a straight rod at rest has no moments, only rounding errors of the tendons' that cancel
+    elastic = dot(jnp.abs(law.elastic.softened), jnp.abs(start) + 1.0 / law.length)
     size = jnp.max(elastic + jnp.abs(law.elastic.stress) + jnp.abs(law.moment(start, jnp.zeros_like(start))))
 
     def unsolved(strain: Any) -> Any:

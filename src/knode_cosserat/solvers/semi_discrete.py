@@ -107,7 +107,7 @@ def law(system: System, point: Point) -> DiscreteLaw:
         return _CorrectedLaw(system.correction, point)
     s, t, y, control, history = point
     stated = system.constitutive(s, t, y, point.y_t, control)
-    return discrete_law(stated, system.z_layout, history.c0, history.z)
+    return discrete_law(stated, system.z_layout, history.c0, history.z, system.length)
 
 
 def strains(system: System, point: Point) -> Float[Any, " z"]:
