@@ -1,0 +1,484 @@
+"""Machine code from Python: values, arrays, loops and functions of an LLVM module.
+
+A value is a number or a vector of `lanes` numbers. An operation on a number and a vector repeats the number in
+every lane. Python's operators and loops over Python lists write straight-line code; `Function.loop`,
+`Function.while_` and `Function.if_` write control flow. Programs (`program.Program`) become straight-line code
+by `Function.evaluate`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import struct
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+import llvmlite.binding as llvm
+
+from knode_cosserat.engine.program import Program
+
+llvm.initialize_native_target()
+llvm.initialize_native_asmprinter()
+
+#: rounding may change, NaN and infinity are kept
+MATH = "contract nsz arcp"
+#: functions of one number that LLVM provides, then those of the C library, a call for every lane
+INTRINSICS = {"abs": "fabs", "sqrt": "sqrt", "exp": "exp", "log": "log", "sin": "sin", "cos": "cos",
+              "max": "maxnum", "min": "minnum", "pow": "pow", "floor": "floor"}  # fmt: skip
+LIBRARY = {
+    "log1p", "expm1", "tanh", "tan", "atan", "asin", "acos", "atan2", "erf", "fmod",
+}  # fmt: skip
+COMPARISONS = {"lt": "olt", "le": "ole", "gt": "ogt", "ge": "oge", "eq": "oeq", "ne": "une"}
+
+
+def literal(value: float) -> str:
+    """Return a floating-point constant in LLVM's notation."""
+    return f"0x{struct.unpack('<Q', struct.pack('<d', float(value)))[0]:016X}"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Value:
+    """A number ("double"), truth ("i1") or whole number ("i64"), or a vector of `lanes` of them."""
+
+    function: Function
+    name: str
+    kind: str = "double"
+    lanes: int = 1
+
+    @property
+    def type(self) -> str:
+        """The type in LLVM's notation."""
+        return self.kind if self.lanes == 1 else f"<{self.lanes} x {self.kind}>"
+
+    def __add__(self, other: Any) -> Value:
+        return self.function.binary("add", self, other)
+
+    def __radd__(self, other: Any) -> Value:
+        return self.function.binary("add", other, self)
+
+    def __sub__(self, other: Any) -> Value:
+        return self.function.binary("sub", self, other)
+
+    def __rsub__(self, other: Any) -> Value:
+        return self.function.binary("sub", other, self)
+
+    def __mul__(self, other: Any) -> Value:
+        return self.function.binary("mul", self, other)
+
+    def __rmul__(self, other: Any) -> Value:
+        return self.function.binary("mul", other, self)
+
+    def __truediv__(self, other: Any) -> Value:
+        return self.function.binary("div", self, other)
+
+    def __rtruediv__(self, other: Any) -> Value:
+        return self.function.binary("div", other, self)
+
+    def __neg__(self) -> Value:
+        return self.function.apply("neg", self)
+
+    def __lt__(self, other: Any) -> Value:
+        return self.function.compare("lt", self, other)
+
+    def __le__(self, other: Any) -> Value:
+        return self.function.compare("le", self, other)
+
+    def __gt__(self, other: Any) -> Value:
+        return self.function.compare("gt", self, other)
+
+    def __ge__(self, other: Any) -> Value:
+        return self.function.compare("ge", self, other)
+
+    def __and__(self, other: Any) -> Value:
+        return self.function.logical("and", self, other)
+
+    def __or__(self, other: Any) -> Value:
+        return self.function.logical("or", self, other)
+
+    def __invert__(self) -> Value:
+        return self.function.logical("xor", self, True)
+
+
+class Variable:
+    """A value that changes in loops: memory on the stack, which LLVM turns into registers."""
+
+    def __init__(self, function: Function, value: Value):
+        self._function, self._kind, self._lanes = function, value.kind, value.lanes
+        # booleans are stored as they are; alignment is the type's own
+        self._place = function.reserve(value.type)
+        self.set(value)
+
+    def set(self, value: Any) -> None:
+        """Change the value."""
+        value = self._function.splat(self._function.value(value, self._kind), self._lanes)
+        self._function.emit(f"store {value.type} {value.name}, ptr {self._place}")
+
+    def get(self) -> Value:
+        """Return the value."""
+        kind = self._kind if self._lanes == 1 else f"<{self._lanes} x {self._kind}>"
+        return self._function.result(f"load {kind}, ptr {self._place}", self._kind, self._lanes)
+
+
+class Module:
+    """Functions that are compiled together."""
+
+    def __init__(self) -> None:
+        self._functions: list[Function] = []
+        self.declarations: set[str] = set()
+
+    def function(self, name: str, arguments: Sequence[str], exported: bool = False) -> Function:
+        """Begin a function; arguments are pointers, or whole numbers if their name begins with `n_`."""
+        self._functions.append(Function(self, name, arguments, exported))
+        return self._functions[-1]
+
+    @property
+    def text(self) -> str:
+        """The module in LLVM's assembly language."""
+        return "\n".join([*sorted(self.declarations), *(function.text for function in self._functions)])
+
+    def compile(self, optimisation: int = 2) -> Compiled:
+        """Return machine code for this computer."""
+        module = llvm.parse_assembly(self.text)
+        machine = llvm.Target.from_default_triple().create_target_machine(
+            cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=optimisation
+        )
+        options = llvm.create_pipeline_tuning_options(speed_level=optimisation)
+        options.loop_vectorization = options.slp_vectorization = options.loop_unrolling = False
+        builder = llvm.create_pass_builder(machine, options)
+        builder.getModulePassManager().run(module, builder)
+        engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
+        engine.add_object_file(llvm.ObjectFileRef.from_data(machine.emit_object(module)))
+        engine.finalize_object()
+        return Compiled(engine)
+
+
+class Compiled:
+    """Machine code of a module; valid while this object lives."""
+
+    def __init__(self, engine: Any):
+        self._engine = engine
+
+    def address(self, name: str) -> int:
+        """Return the address of an exported function."""
+        return self._engine.get_function_address(name)
+
+
+class Function:
+    """A function of a module, and the place where code is written."""
+
+    def __init__(self, module: Module, name: str, arguments: Sequence[str], exported: bool):
+        self.module, self.name, self._count, self._exported = module, name, 0, exported
+        self._lines: list[str] = []
+        self._stack: list[str] = []
+        self._types = ["i64" if each.startswith("n_") else "ptr" for each in arguments]
+        self._names = [f"%{each}" for each in arguments]
+        self.arguments = [
+            Value(self, name, kind) for name, kind in zip(self._names, self._types, strict=True)
+        ]
+
+    @property
+    def text(self) -> str:
+        """The function in LLVM's assembly language."""
+        given = ", ".join(
+            f"{kind} noalias {name}" if kind == "ptr" else f"{kind} {name}"
+            for kind, name in zip(self._types, self._names, strict=True)
+        )
+        linkage = "" if self._exported else "internal "
+        body = "\n".join([*self._stack, "  br label %begin", "begin:", *self._lines])
+        inline = "nounwind" if self._exported else "noinline nounwind"
+        return f"define {linkage}void @{self.name}({given}) {inline} {{\nentry:\n{body}\n  ret void\n}}"
+
+    # lines
+
+    def emit(self, line: str) -> None:
+        """Write a line."""
+        self._lines.append("  " + line)
+
+    def _fresh(self, prefix: str = "x") -> str:
+        self._count += 1
+        return f"{prefix}{self._count}"
+
+    def result(self, expression: str, kind: str = "double", lanes: int = 1) -> Value:
+        """Write an expression and return its value."""
+        name = "%" + self._fresh()
+        self.emit(f"{name} = {expression}")
+        return Value(self, name, kind, lanes)
+
+    def reserve(self, kind: str) -> str:
+        """Return the address of memory for one value of this type."""
+        name = "%" + self._fresh("m")
+        self._stack.append(f"  {name} = alloca {kind}")
+        return name
+
+    # values
+
+    def value(self, value: Any, kind: str = "double") -> Value:
+        """Return a constant, or the value itself."""
+        if isinstance(value, Value):
+            return value
+        if isinstance(value, Variable):
+            return value.get()
+        if kind == "i1" or isinstance(value, bool):
+            return Value(self, "true" if value else "false", "i1")
+        if kind == "i64":
+            return Value(self, str(int(value)), "i64")
+        return Value(self, literal(value))
+
+    def splat(self, value: Value, lanes: int) -> Value:
+        """Return a vector with the value in every lane."""
+        if value.lanes == lanes:
+            return value
+        if not value.name.startswith("%"):
+            inside = ", ".join([f"{value.kind} {value.name}"] * lanes)
+            return Value(self, f"<{inside}>", value.kind, lanes)
+        kind = f"<{lanes} x {value.kind}>"
+        one = self.result(f"insertelement {kind} poison, {value.kind} {value.name}, i32 0", value.kind, lanes)
+        zeros = f"<{lanes} x i32> zeroinitializer"
+        return self.result(f"shufflevector {kind} {one.name}, {kind} poison, {zeros}", value.kind, lanes)
+
+    def _same(self, *values: Any, kind: str = "double") -> tuple[list[Value], int]:
+        found = [self.value(each, kind) for each in values]
+        lanes = max(each.lanes for each in found)
+        return [self.splat(each, lanes) for each in found], lanes
+
+    def binary(self, operation: str, a: Any, b: Any) -> Value:
+        """Return a sum, difference, product or quotient."""
+        whole = any(isinstance(each, Value) and each.kind == "i64" for each in (a, b))
+        (a, b), lanes = self._same(a, b, kind="i64" if whole else "double")
+        if whole:
+            return self.result(f"{operation} i64 {a.name}, {b.name}", "i64")
+        return self.result(f"f{operation} {MATH} {a.type} {a.name}, {b.name}", lanes=lanes)
+
+    def compare(self, operation: str, a: Any, b: Any) -> Value:
+        """Return the truth of a comparison; false for NaN, except for `ne`."""
+        whole = any(isinstance(each, Value) and each.kind == "i64" for each in (a, b))
+        (a, b), lanes = self._same(a, b, kind="i64" if whole else "double")
+        if whole:
+            sign = operation if operation in ("eq", "ne") else "s" + operation
+            return self.result(f"icmp {sign} i64 {a.name}, {b.name}", "i1")
+        return self.result(f"fcmp {COMPARISONS[operation]} {a.type} {a.name}, {b.name}", "i1", lanes)
+
+    def logical(self, operation: str, a: Any, b: Any) -> Value:
+        """Return a conjunction, disjunction or exclusive disjunction."""
+        (a, b), lanes = self._same(a, b, kind="i1")
+        return self.result(f"{operation} {a.type} {a.name}, {b.name}", "i1", lanes)
+
+    def select(self, condition: Any, yes: Any, no: Any) -> Value:
+        """Return one of two values for each lane."""
+        kind = next((each.kind for each in (yes, no) if isinstance(each, Value)), "double")
+        (yes, no), lanes = self._same(yes, no, kind=kind)
+        condition = self.value(condition, "i1")
+        lanes = max(lanes, condition.lanes)
+        yes, no = self.splat(yes, lanes), self.splat(no, lanes)
+        if condition.lanes < lanes:
+            condition = self.splat(condition, lanes)
+        return self.result(
+            f"select {condition.type} {condition.name}, {yes.type} {yes.name}, {no.type} {no.name}",
+            yes.kind, lanes,
+        )  # fmt: skip
+
+    def apply(self, operation: str, *arguments: Any) -> Value:
+        """Return an operation of a program (`program.Program`)."""
+        if operation in ("add", "sub", "mul", "div"):
+            return self.binary(operation, *arguments)
+        if operation in COMPARISONS:
+            return self.compare(operation, *arguments)
+        if operation in ("and", "or"):
+            return self.logical(operation, *arguments)
+        if operation == "not":
+            return self.logical("xor", arguments[0], True)
+        if operation == "select":
+            condition, no, yes = arguments
+            return self.select(condition, yes, no)
+        if operation == "hold":
+            return arguments[0]
+        values, lanes = self._same(*arguments)
+        kind = values[0].type
+        if operation == "neg":
+            return self.result(f"fneg {MATH} {kind} {values[0].name}", lanes=lanes)
+        if operation == "sign":
+            x = values[0]
+            return self.select(x > 0.0, 1.0, self.select(x < 0.0, -1.0, 0.0))
+        if operation == "isfinite":
+            return self.apply("abs", values[0]) < float("inf")
+        if operation == "logistic":
+            return 1.0 / (1.0 + self.apply("exp", -values[0]))
+        if operation in INTRINSICS:
+            suffix = "f64" if lanes == 1 else f"v{lanes}f64"
+            name = f"llvm.{INTRINSICS[operation]}.{suffix}"
+            self.module.declarations.add(f"declare {kind} @{name}({', '.join([kind] * len(values))})")
+            given = ", ".join(f"{kind} {each.name}" for each in values)
+            return self.result(f"call {MATH} {kind} @{name}({given})", lanes=lanes)
+        name = "fmod" if operation == "rem" else operation
+        if name not in LIBRARY:
+            raise NotImplementedError(operation)
+        self.module.declarations.add(f"declare double @{name}({', '.join(['double'] * len(values))})")
+        found = [self._call(name, [self.lane(each, k) for each in values]) for k in range(lanes)]
+        return self.joined(found)
+
+    def _call(self, name: str, values: Sequence[Value]) -> Value:
+        return self.result(f"call double @{name}({', '.join(f'double {each.name}' for each in values)})")
+
+    def lane(self, value: Value, k: int) -> Value:
+        """Return the number in lane k."""
+        if value.lanes == 1:
+            return value
+        return self.result(f"extractelement {value.type} {value.name}, i32 {k}", value.kind)
+
+    def joined(self, numbers: Sequence[Value]) -> Value:
+        """Return the vector of these numbers."""
+        if len(numbers) == 1:
+            return numbers[0]
+        kind, found = f"<{len(numbers)} x double>", "poison"
+        for k, each in enumerate(numbers):
+            one = self.result(f"insertelement {kind} {found}, double {each.name}, i32 {k}", lanes=len(numbers))
+            found = one.name
+        return one
+
+    def largest(self, value: Value) -> Value:
+        """Return the largest number of all lanes."""
+        return self._reduce(value, "fmax")
+
+    def any(self, value: Value) -> Value:
+        """Return true if a lane is true."""
+        return self._reduce(value, "or")
+
+    def _reduce(self, value: Value, operation: str) -> Value:
+        if value.lanes == 1:
+            return value
+        suffix = f"v{value.lanes}{'i1' if value.kind == 'i1' else 'f64'}"
+        name = f"llvm.vector.reduce.{operation}.{suffix}"
+        self.module.declarations.add(f"declare {value.kind} @{name}({value.type})")
+        flags = MATH + " " if operation == "fmax" else ""
+        return self.result(f"call {flags}{value.kind} @{name}({value.type} {value.name})", value.kind)
+
+    # memory
+
+    def pointer(self, base: Value, offset: Any) -> Value:
+        """Return the address of the double at an offset."""
+        offset = self.value(offset, "i64")
+        return self.result(f"getelementptr inbounds double, ptr {base.name}, i64 {offset.name}", "ptr")
+
+    def load(self, base: Value, offset: Any, lanes: int = 1) -> Value:
+        """Return numbers in memory; offset in doubles."""
+        at = self.pointer(base, offset)
+        kind = "double" if lanes == 1 else f"<{lanes} x double>"
+        return self.result(f"load {kind}, ptr {at.name}, align 8", lanes=lanes)
+
+    def store(self, value: Any, base: Value, offset: Any, lanes: int | None = None) -> None:
+        """Write numbers to memory; offset in doubles."""
+        value = self.value(value)
+        value = self.splat(value, lanes) if lanes is not None else value
+        at = self.pointer(base, offset)
+        self.emit(f"store {value.type} {value.name}, ptr {at.name}, align 8")
+
+    # control flow
+
+    def _label(self, name: str) -> None:
+        self._lines.append(f"{name}:")
+
+    @contextlib.contextmanager
+    def loop(self, count: Any, start: Any = 0, step: int = 1) -> Iterator[Value]:
+        """Write a loop over start, start + step, … below (or, for a negative step, not below) count."""
+        index = Variable(self, self.value(start, "i64"))
+        names = [self._fresh(part) for part in ("head", "body", "end")]
+        count = self.value(count, "i64")
+        self.emit(f"br label %{names[0]}")
+        self._label(names[0])
+        i = index.get()
+        more = i < count if step > 0 else i >= count
+        self.emit(f"br i1 {more.name}, label %{names[1]}, label %{names[2]}")
+        self._label(names[1])
+        yield i
+        index.set(i + step)
+        self.emit(f"br label %{names[0]}")
+        self._label(names[2])
+
+    @contextlib.contextmanager
+    def while_(self, condition: Callable[[], Value]) -> Iterator[None]:
+        """Write a loop that runs as long as a condition is true; it is evaluated before every turn."""
+        names = [self._fresh(part) for part in ("head", "body", "end")]
+        self.emit(f"br label %{names[0]}")
+        self._label(names[0])
+        self.emit(f"br i1 {condition().name}, label %{names[1]}, label %{names[2]}")
+        self._label(names[1])
+        yield
+        self.emit(f"br label %{names[0]}")
+        self._label(names[2])
+
+    @contextlib.contextmanager
+    def if_(self, condition: Value) -> Iterator[None]:
+        """Write code that runs if a condition is true."""
+        names = [self._fresh(part) for part in ("body", "end")]
+        self.emit(f"br i1 {condition.name}, label %{names[0]}, label %{names[1]}")
+        self._label(names[0])
+        yield
+        self.emit(f"br label %{names[1]}")
+        self._label(names[1])
+
+    def call(self, function: Function, *arguments: Any) -> None:
+        """Call another function of the module."""
+        given = []
+        for kind, argument in zip(function._types, arguments, strict=True):
+            argument = self.value(argument, "i64")
+            given.append(f"{kind} {argument.name}")
+        self.emit(f"call void @{function.name}({', '.join(given)})")
+
+    # programs
+
+    def evaluate(
+        self, program: Program, outputs: Sequence[int], known: Mapping[int, Value], lanes: int
+    ) -> dict[int, Value]:
+        """Write the operations that outputs need, and return the values of all of them.
+
+        `known` are values of inputs and of operations that have been evaluated. Loops are run until every lane
+        is done; lanes that are done keep their values.
+        """
+        values = dict(known)
+        for node in program.needed(outputs, frozenset(values)):
+            if node in values:
+                continue
+            operation, *arguments = program.operations[node]
+            if operation == "constant":
+                value = program.values[node]
+                values[node] = self.value(value if isinstance(value, bool) else float(value))
+            elif operation == "input":
+                raise KeyError(f"input {arguments[0]} has no value")
+            elif operation == "loop":
+                self._loop(program, node, values, lanes)
+            elif operation != "result":
+                values[node] = self.apply(operation, *(values[each] for each in arguments))
+        return values
+
+    def _loop(self, program: Program, node: int, values: dict[int, Value], lanes: int) -> None:
+        loop = program.loops[program.operations[node][1]]
+        inner: dict[int, Value] = {}
+        for name, outer in loop.inputs:
+            inner[loop.program.input(name, 1)] = values[outer]
+        state = []
+        for start, kind in zip(loop.initial, loop.kinds, strict=True):
+            value = self.value(values[start], "i1" if kind == "b" else "double")
+            state.append(Variable(self, self.splat(value, lanes)))
+        found: dict[int, Value] = {}
+        running: list[Value] = []
+
+        def condition() -> Value:
+            now = {each: variable.get() for each, variable in zip(loop.state, state, strict=True)}
+            found.clear()
+            found.update(self.evaluate(loop.program, [loop.condition], inner | now, lanes))
+            running[:] = [self.splat(found[loop.condition], lanes)]
+            return self.any(running[0])
+
+        with self.while_(condition):
+            after = self.evaluate(loop.program, loop.next, found, lanes)
+            kept = [
+                self.select(running[0], after[new], variable.get())
+                for new, variable in zip(loop.next, state, strict=True)
+            ]
+            for variable, value in zip(state, kept, strict=True):
+                variable.set(value)
+        for later in range(node + 1, len(program.operations)):
+            operation = program.operations[later]
+            if operation[0] == "result" and operation[1] == node:
+                values[later] = state[operation[2]].get()

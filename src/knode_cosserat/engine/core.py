@@ -1,0 +1,1106 @@
+"""The time loop of a rod as machine code: history, Newton's method, elimination along the rod, error estimate.
+
+The equations at a point come from the system as a program (`Equations`). This module adds the mathematics of
+`solvers`: the box scheme along the rod, corrections damped by the natural monotonicity test with factors that
+are kept, elimination with a change of parameters after every few pieces, and the corrected motion whose
+distance is the estimated discretisation error.
+
+A lane of a vector is a robot of a batch. For a single robot it is a place along the rod; in the recursion along
+the rod it is a column of the matrix that is eliminated. The code is the same: arrays know their layout
+(`Array`), and values are `wide` where all places are independent, else `plain`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import dataclasses
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from knode_cosserat.engine.codegen import Function, Module, Value, Variable
+from knode_cosserat.engine.program import Program
+from knode_cosserat.rods.system import System, unknown_count
+from knode_cosserat.solvers.boundary import LARGEST_CORRECTION, NewtonOptions, pivots_of
+from knode_cosserat.solvers.grid import grid_of
+from knode_cosserat.solvers.linear import _each
+from knode_cosserat.solvers.problem import StepProblem
+from knode_cosserat.solvers.space import LOBATTO2
+from knode_cosserat.solvers.time_loop import ESTIMATE_TOLERANCE, ESTIMATE_TURNS, ROUNDING
+
+#: levels of inputs: parameters (once a run), step, place, state
+RUN, STEP, PLACE, STATE = 1, 2, 3, 4
+
+
+class Equations:
+    """Programs of a system: rates and strains at a point with their derivatives, base and tip."""
+
+    def __init__(self, system: System):
+        self.system = system
+        leaves, tree = jax.tree.flatten(system)
+        leaves = [np.asarray(leaf, dtype=float) for leaf in leaves]
+        self.ny, self.nz = system.y_layout.size, system.z_layout.size
+        self.nc, self.k = system.control_size, unknown_count(system)
+        self.numbers = self.ny + self.nz
+        program = self.program = Program()
+        self.parameters = [program.inputs(f"p{i}", leaf.shape, RUN) for i, leaf in enumerate(leaves)]
+        #: the place of each parameter's node in the vector of parameters
+        self.parameter_values = np.concatenate([leaf.reshape(-1) for leaf in leaves])
+        # parameters that are zero are constants: fewer operations
+        folded = [
+            np.where(leaf == 0.0, program.constant(0.0), nodes)
+            for leaf, nodes in zip(leaves, self.parameters, strict=True)
+        ]
+        self.c0, self.t = program.inputs("c0", (), STEP), program.inputs("t", (), STEP)
+        self.control = program.inputs("control", (self.nc,), STEP)
+        self.s = program.inputs("s", (), PLACE)
+        self.y = program.inputs("y", (self.ny,), STATE)
+        self.history = program.inputs("history", (self.numbers,), STATE)
+        self.unknowns = program.inputs("unknowns", (self.k,), STATE)
+
+        def problem(leaves: Any, c0: Any, t: Any, control: Any, record: Any) -> StepProblem:
+            own = jax.tree.unflatten(tree, leaves)
+            return StepProblem(own, t, control, c0, record[None], LOBATTO2)
+
+        def rates(leaves: Any, c0: Any, t: Any, control: Any, s: Any, y: Any, record: Any) -> Any:
+            return problem(leaves, c0, t, control, record).point_rates(s, y, record)
+
+        def base(leaves: Any, c0: Any, t: Any, control: Any, unknowns: Any) -> Any:
+            still = problem(leaves, c0, t, control, jnp.zeros(self.numbers))
+            return still.base(unknowns)
+
+        def tip(leaves: Any, c0: Any, t: Any, control: Any, y: Any) -> Any:
+            from knode_cosserat.solvers import semi_discrete
+
+            own = jax.tree.unflatten(tree, leaves)
+            record = semi_discrete.unpacked_history(own, c0, jnp.zeros(self.numbers))
+            return semi_discrete.tip(own, t, control, y, record)
+
+        one, step = np.zeros(()), (1.0, 0.0, np.zeros(self.nc))
+        known = [*folded, self.c0, self.t, self.control]
+        traced = jax.make_jaxpr(rates)(leaves, *step, one, np.ones(self.ny), np.zeros(self.numbers))
+        self.f, self.z = program.evaluate(traced, [*known, self.s, self.y, self.history])
+        traced = jax.make_jaxpr(base)(leaves, *step, np.zeros(self.k))
+        [self.base] = program.evaluate(traced, [*known, self.unknowns])
+        traced = jax.make_jaxpr(tip)(leaves, *step, np.ones(self.ny))
+        [self.tip] = program.evaluate(traced, [*known, self.y])
+        self.slopes = program.jacobian(self.f, self.y)
+        self.base_slopes = program.jacobian(self.base, self.unknowns)
+        self.tip_slopes = program.jacobian(self.tip, self.y)
+        #: structural nonzeros of the Jacobian
+        self.pattern = [
+            (i, j)
+            for i, j in np.ndindex(self.slopes.shape)
+            if not program.is_constant(self.slopes[i, j], 0.0)
+        ]
+        needed = set(program.needed([*self.f, *self.z]))
+        #: entries of a record that the equations need as history
+        self.used_history = [i for i in range(self.numbers) if int(self.history[i]) in needed]
+        outputs = [*self.f, *self.z, *self.slopes.reshape(-1), *self.base, *self.tip]
+        outputs += [*self.base_slopes.reshape(-1), *self.tip_slopes.reshape(-1)]
+        self.step_terms = self._hoisted(outputs, {STEP, RUN})
+        self.place_terms = self._hoisted(outputs, {PLACE})
+
+    def _hoisted(self, outputs: Sequence[int], levels: set[int]) -> list[int]:
+        """Return the operations of these levels that operations of higher levels need."""
+        program, found = self.program, set()
+        for node in program.needed(outputs):
+            if program.levels[node] > max(levels):
+                found |= {each for each in program.arguments(node) if program.levels[each] in levels}
+        found |= {int(node) for node in outputs if program.levels[int(node)] in levels}
+        todo = [node for node in found if program.is_boolean(node)]
+        while todo:  # truths are evaluated where they are used
+            node = todo.pop()
+            found.discard(node)
+            for each in program.arguments(node):
+                if program.levels[each] in levels and each not in found:
+                    todo.append(each) if program.is_boolean(each) else found.add(each)
+        return sorted(found)
+
+
+class Elimination:
+    """Program of one piece: factors of B = 1 - h/2 J at its end, and B⁻¹ (A x + r) with A = 1 + h/2 J at its start."""
+
+    def __init__(self, equations: Equations):
+        program = self.program = Program()
+        n, pattern = equations.ny, equations.pattern
+        zero, one = program.constant(0.0), program.constant(1.0)
+        self.h = program.input("h", 1)
+        half = program.apply("mul", self.h, program.constant(0.5))
+        self.start = program.inputs("start", (len(pattern),), 1)
+        self.end = program.inputs("end", (len(pattern),), 1)
+        A, B = np.full((n, n), zero), np.full((n, n), zero)
+        for k, (i, j) in enumerate(pattern):
+            A[i, j] = program.apply("mul", half, int(self.start[k]))
+            B[i, j] = program.apply("neg", program.apply("mul", half, int(self.end[k])))
+        for i in range(n):
+            B[i, i] = program.apply("add", one, int(B[i, i]))
+        self._order = order = _least_fill(pattern, n)
+        for at, p in enumerate(order):
+            B[p, p] = program.apply("div", one, int(B[p, p]))
+            for i in order[at + 1 :]:
+                if B[i, p] == zero:
+                    continue
+                B[i, p] = program.apply("mul", int(B[i, p]), int(B[p, p]))
+                for j in order[at + 1 :]:
+                    product = program.apply("mul", int(B[i, p]), int(B[p, j]))
+                    B[i, j] = program.apply("sub", int(B[i, j]), product)
+        #: factors that are not constant
+        self.places = [(i, j) for i, j in np.ndindex(B.shape) if not program.is_constant(B[i, j])]
+        self.factors = [int(B[i, j]) for i, j in self.places]
+        stored = program.inputs("factor", (len(self.places),), 1)
+        self.stored = stored
+        LU = B.copy()
+        for node, (i, j) in zip(stored, self.places, strict=True):
+            LU[i, j] = node
+        self.x, self.r = program.inputs("x", (n,), 1), program.inputs("r", (n,), 1)
+        self.advanced = [
+            self._solved(A, LU, added) for added in ([int(each) for each in self.r], [zero] * n)
+        ]
+
+    def _solved(self, A: Any, LU: Any, r: list[int]) -> list[int]:
+        apply = self.program.apply
+        x = [int(each) for each in self.x]
+        out = [apply("add", a, b) for a, b in zip(x, r, strict=True)]
+        for i, j in np.ndindex(A.shape):
+            out[i] = apply("add", out[i], apply("mul", int(A[i, j]), x[j]))
+        for at, i in enumerate(self._order):
+            for j in self._order[:at]:
+                out[i] = apply("sub", out[i], apply("mul", int(LU[i, j]), out[j]))
+        for at, i in reversed(list(enumerate(self._order))):
+            for j in self._order[at + 1 :]:
+                out[i] = apply("sub", out[i], apply("mul", int(LU[i, j]), out[j]))
+            out[i] = apply("mul", out[i], int(LU[i, i]))
+        return out
+
+
+def _least_fill(pattern: Sequence[tuple[int, int]], n: int) -> list[int]:
+    """Return an order of pivots on the diagonal with little fill-in (Markowitz 1957)."""
+    nonzero = np.eye(n, dtype=bool)
+    for i, j in pattern:
+        nonzero[i, j] = True
+    rest, order = list(range(n)), []
+    while rest:
+        counts = [(nonzero[rest, k].sum() - 1) * (nonzero[k, rest].sum() - 1) for k in rest]
+        best = rest[int(np.argmin(counts))]
+        for i in rest:
+            if i != best and nonzero[i, best]:
+                nonzero[i] |= nonzero[best]
+        order.append(best)
+        rest.remove(best)
+    return order
+
+
+@dataclasses.dataclass(frozen=True)
+class Array:
+    """Numbers of `size` components at `count` places, in the memory of a run."""
+
+    offset: int
+    size: int
+    count: int
+    #: distance between components and between places, in doubles
+    component: int
+    place: int
+
+    def at(self, i: Any, j: Any) -> Any:
+        """Return the offset of component i at place j."""
+        return j * self.place + (self.offset + i * self.component)
+
+
+class Core:
+    """Machine code of a system's time loop."""
+
+    def __init__(self, system: System, robots: bool, lanes: int = 8, newton: NewtonOptions = NewtonOptions()):
+        self.equations, self.batch, self.L, self.newton = Equations(system), robots, lanes, newton
+        self.elimination = Elimination(self.equations)
+        self.grid = grid_of(system, LOBATTO2)
+        self.pivots = [int(each) for each in pivots_of(system)]
+        self.P = lanes if robots else 1
+        self._size = 0
+        e, grid = self.equations, self.grid
+        self.pieces, self.points, self.ends, self.count = grid.tip, grid.tip + 1, grid.ends, grid.count
+        self.stride = (-(-(grid.count + 1) // lanes) + 1) * lanes
+        ny, nz, k = e.ny, e.nz, e.k
+        a = self._array
+        self.params, self.scale_y, self.scale_tip = a(len(e.parameter_values), 1), a(ny, 1), a(k, 1)
+        self.inputs, self.steps_terms = a(2 + e.nc, 1), a(len(e.step_terms), 1)
+        self.s, self.h = a(1, self.count), a(1, self.pieces)
+        self.place_terms = a(len(e.place_terms), self.count)
+        self.y, self.trial, self.better = (a(ny, self.ends) for _ in range(3))
+        self.direction, self.dy = a(ny, self.ends), a(ny, self.ends)
+        self.f, self.z, self.fe = a(ny, self.count), a(nz, self.count), a(ny, self.pieces)
+        self.slope, self.slope_end = a(len(e.pattern), self.ends), a(len(e.pattern), self.pieces)
+        self.factor = a(len(self.elimination.factors), self.pieces)
+        self.r, self.defect = a(ny, self.pieces), a(ny, self.pieces)
+        self.w, self.X = a(ny, self.points), a(ny * k, self.points)
+        groups = -(-self.pieces // _each(self.pieces))
+        self.T, self.inverse = a(k * k, groups), a(k * k, 1)
+        self.beta, self.alpha = a(k, groups), a(k, self.points)
+        self.unknowns, self.step_unknowns, self.trial_unknowns = a(k, 1), a(k, 1), a(k, 1)
+        self.S, self.M = a(ny * k, 1), a(ny * k, 1)
+        self.tip, self.tip_defect = a(k, 1), a(k, 1)
+        self.records = [a(ny + nz, self.count) for _ in range(2)]
+        self.errors = [a(ny + nz, self.ends) for _ in range(2)]
+        self.H, self.dH = a(ny + nz, self.count), a(ny + nz, self.ends)
+        self.past = [a(ny, self.ends) for _ in range(3)]
+        self.weights = a(3, 1)
+        self.columns = [self._columns(ny * k) for _ in range(2)]
+        self.module = Module()
+        self._write()
+        self.compiled = self.module.compile()
+
+    # memory
+
+    def _array(self, size: int, count: int) -> Array:
+        """Reserve an array: robots in lanes, or places in lanes."""
+        place, component = (size * self.L, self.L) if self.batch else (1, 1 if count == 1 else self.stride)
+        found = Array(self._size, size, count, component, place)
+        length = size * count * self.L if self.batch else size * (1 if count == 1 else self.stride)
+        self._size += -(-length // self.L) * self.L
+        return found
+
+    def _columns(self, size: int) -> Array:
+        """Reserve a matrix whose columns are in lanes (one robot), or follow each other (robots in lanes)."""
+        found = Array(self._size, size, 1, self.L, 0)
+        self._size += size * self.L
+        return found
+
+    # writing functions
+
+    def _function(self, name: str, *arguments: str) -> Function:
+        f = self.module.function(name, ["memory", *arguments])
+        self._now = f
+        return f
+
+    def _get(self, array: Array, i: Any, j: Any = 0, lanes: int = 0) -> Value:
+        f = self._now
+        return f.load(f.arguments[0], array.at(i, j), lanes or self.P)
+
+    def _put(self, value: Any, array: Array, i: Any, j: Any = 0, lanes: int = 0) -> None:
+        f = self._now
+        f.store(value, f.arguments[0], array.at(i, j), lanes or self.P)
+
+    def _wide(self, array: Array, i: Any, j: Any = 0) -> Value:
+        # a number that is the same at all places
+        lanes = self.L if self.batch or array.count > 1 else 1
+        return self._get(array, i, j, lanes)
+
+    def _write_wide(self, value: Any, array: Array, i: Any, j: Any) -> None:
+        self._put(value, array, i, j, self.L)
+
+    @contextlib.contextmanager
+    def _places(self, count: int, first: int = 0) -> Iterator[Value]:
+        """Write a loop over places, all independent: one by one, or as many as there are lanes.
+
+        The last lanes of a single robot may lie beyond the last place. They hold numbers that nobody reads.
+        """
+        with self._now.loop(first + count, first, 1 if self.batch else self.L) as j:
+            yield j
+
+    def _inside(self, j: Value, end: int) -> Any:
+        """Return true for the lanes before a place."""
+        if self.batch:
+            return True
+        f = self._now
+        numbers = f.joined([f.value(float(k)) for k in range(self.L)])
+        here = f.result(f"sitofp i64 {j.name} to double")
+        return numbers + here < float(end)
+
+    def _largest(self, value: Value) -> Value:
+        """Return the largest of a wide value for each robot."""
+        return value if self.batch else self._now.largest(value)
+
+    # the equations
+
+    def _known(self, j: Any, wide: bool, state: dict[int, Value]) -> dict[int, Value]:
+        """Return the values of hoisted terms at a place."""
+        e = self.equations
+        nodes = e.program.needed(self._outputs, frozenset(state))
+        needed = set(nodes) | {each for node in nodes for each in e.program.arguments(node)}
+        values = dict(state)
+        for k, node in enumerate(e.step_terms):
+            if node in needed:
+                values[node] = self._wide(self.steps_terms, k) if wide else self._get(self.steps_terms, k)
+        for k, node in enumerate(e.place_terms):
+            if node in needed:
+                values[node] = self._wide(self.place_terms, k, j)
+        return values
+
+    def _evaluated(self, outputs: Sequence[int], j: Any, wide: bool, state: dict[int, Value]) -> list[Value]:
+        """Write the operations of outputs at a place."""
+        self._outputs = [int(each) for each in outputs]
+        lanes = self.L if wide else self.P
+        known = self._known(j, wide, state)
+        values = self._now.evaluate(self.equations.program, self._outputs, known, lanes)
+        return [values[node] for node in self._outputs]
+
+    def _write_terms(self) -> None:
+        """Terms that depend on neither y nor the history: once a step."""
+        e = self.equations
+        self.terms = f = self._function("terms")
+        state = {int(node): self._get(self.params, k) for k, node in enumerate(np.concatenate(
+            [nodes.reshape(-1) for nodes in e.parameters]))}  # fmt: skip
+        for k, node in enumerate([e.c0.item(), e.t.item(), *e.control]):
+            state[int(node)] = self._get(self.inputs, k)
+        own = {n: v for n, v in state.items()}
+        values = f.evaluate(e.program, e.step_terms, own, self.P)
+        for k, node in enumerate(e.step_terms):
+            self._put(values[node], self.steps_terms, k)
+        if not e.place_terms:
+            return
+        known = {node: values[node] for node in e.step_terms} | own
+        with self._places(self.count) as j:
+            here = known | {e.s.item(): self._wide(self.s, 0, j)}
+            values = f.evaluate(e.program, e.place_terms, here, self.L)
+            for k, node in enumerate(e.place_terms):
+                self._write_wide(values[node], self.place_terms, k, j)
+
+    def _write_rates(self, name: str, slopes: bool) -> Function:
+        """A function of the offsets of y, history, and a place: rates and strains there, and their slopes."""
+        e = self.equations
+        f = self._function(name, "n_y", "n_history", "n_place")
+        memory, y, history, j = f.arguments
+        component = self.f.component
+        state = {int(node): f.load(memory, y + i * component, self.L) for i, node in enumerate(e.y)}
+        for i in e.used_history:
+            state[int(e.history[i])] = f.load(memory, history + i * component, self.L)
+        outputs = [*e.f, *e.z, *([e.slopes[at] for at in e.pattern] if slopes else [])]
+        found = self._evaluated(outputs, j, True, state)
+        for i in range(e.ny):
+            self._write_wide(found[i], self.f, i, j)
+        for i in range(e.nz):
+            self._write_wide(found[e.ny + i], self.z, i, j)
+        for i in range(len(e.pattern) if slopes else 0):
+            self._write_wide(found[e.ny + e.nz + i], self.slope, i, j)
+        return f
+
+    def _rates_at(self, function: Function, y: Array, history: Array, j: Any, place: Any = None) -> None:
+        """Write a call of a function of rates; `place` if y is not stored by place."""
+        place = j if place is None else place
+        f = self._now
+        f.call(function, f.arguments[0], y.at(0, j), history.at(0, place), place)
+
+    def _write_near(self, y: Array) -> None:
+        """Copy y of points to the near sides of discontinuities."""
+        for k, point in enumerate(self.grid.near):
+            for i in range(self.equations.ny):
+                self._put(self._get(y, i, int(point)), y, i, self.points + k)
+
+    def _write_ends(self, source: Array, target: Array) -> None:
+        """Copy values at places to the ends of pieces."""
+        with self._places(self.pieces) as j:
+            for i in range(source.size):
+                self._write_wide(self._wide(source, i, j + 1), target, i, j)
+        for k, point in enumerate(self.grid.near):
+            for i in range(source.size):
+                self._put(self._get(source, i, self.points + k), target, i, int(point) - 1)
+
+    def _write_residual(self, name: str, y: Array, history: Array) -> Function:
+        """Rates at all ends of pieces by y, and the defects of all pieces and of the tip."""
+        e = self.equations
+        f = self._function(name)
+        self._write_near(y)
+        with self._places(self.ends) as j:
+            self._rates_at(self.rates, y, history, j)
+        self._write_defects(y)
+        return f
+
+    def _write_defects(self, y: Array) -> None:
+        e = self.equations
+        self._write_ends(self.f, self.fe)
+        with self._places(self.pieces) as j:
+            half = self._wide(self.h, 0, j) * 0.5
+            for i in range(e.ny):
+                rates = self._wide(self.f, i, j) + self._wide(self.fe, i, j)
+                self._write_wide(
+                    self._wide(y, i, j) - self._wide(y, i, j + 1) + half * rates, self.r, i, j
+                )
+        at_tip = self._tip_state(y)
+        for i, value in enumerate(self._evaluated(e.tip, 0, False, at_tip)):
+            self._put(value, self.tip, i)
+
+    def _tip_state(self, y: Array) -> dict[int, Value]:
+        e = self.equations
+        return {int(node): self._get(y, i, self.points - 1) for i, node in enumerate(e.y)}
+
+    # elimination along the rod
+
+    def _write_factor(self) -> None:
+        """Factors of all pieces, from the slopes at their ends."""
+        f, el = self._function("factored"), self.elimination
+        self.factored = f
+        with self._places(self.pieces) as j:
+            known = {int(node): self._wide(self.slope_end, k, j) for k, node in enumerate(el.end)}
+            known[el.h] = self._wide(self.h, 0, j)
+            values = f.evaluate(el.program, el.factors, known, self.L)
+            for k, node in enumerate(el.factors):
+                self._write_wide(values[node], self.factor, k, j)
+
+    def _write_advance(self, name: str, columns: bool) -> Function:
+        """A piece's B⁻¹ (A x + r), of one vector, or of the columns of a matrix without r."""
+        el, e = self.elimination, self.equations
+        f = self._function(name, "n_from", "n_to", "n_piece")
+        memory, source, target, j = f.arguments
+        lanes = self.L if columns else self.P
+        step = self.L if self.batch or columns else self.w.component
+        known = {int(node): self._get(self.slope, k, j) for k, node in enumerate(el.start)}
+        known |= {int(node): self._get(self.factor, k, j) for k, node in enumerate(el.stored)}
+        known[el.h] = self._get(self.h, 0, j)
+        known |= {int(node): f.load(memory, source + i * step, lanes) for i, node in enumerate(el.x)}
+        if not columns:
+            known |= {int(node): self._get(self.r, i, j) for i, node in enumerate(el.r)}
+        outputs = el.advanced[1 if columns else 0]
+        values = f.evaluate(el.program, outputs, known, lanes)
+        for i, node in enumerate(outputs):
+            f.store(values[node], memory, target + i * step, lanes)
+        return f
+
+    def _matrix(self, i: int, c: int) -> int:
+        """Index of an entry of a matrix of `columns`."""
+        return c * self.equations.ny + i if self.batch else i
+
+    def _write_change(self) -> None:
+        """Change of parameters: X T with T the inverse of X's rows of pivots, and T."""
+        self.change = f = self._function("change", "n_group")
+        memory, group = f.arguments
+        e, columns = self.equations, self.columns[0]
+        k = e.k
+        rows = [self._row(columns, i) for i in range(e.ny)]
+        eye = [self._unit_row(i) for i in range(k)]
+        for r, pivot in enumerate(self.pivots):
+            scale = 1.0 / self._entry(rows[pivot], r)
+            g = [each * scale for each in rows[pivot]]
+            g = self._with_entry(g, r, 1.0 - scale)
+            for each in (rows, eye):
+                for i, row in enumerate(each):
+                    x = self._entry(row, r)
+                    each[i] = [a - x * b for a, b in zip(row, g, strict=True)]
+        for i, row in enumerate(rows):
+            self._set_row(row, columns, i)
+        for i, row in enumerate(eye):
+            for c in range(k):
+                self._put(self._entry(row, c), self.T, i * k + c, group)
+
+    def _row(self, columns: Array, i: int) -> list[Value]:
+        """Return a row of a matrix of `columns`: a list of robots' numbers, or one vector."""
+        count = self.equations.k if self.batch else 1
+        return [self._get(columns, self._matrix(i, c), 0, self.L) for c in range(count)]
+
+    def _set_row(self, row: list[Value], columns: Array, i: int) -> None:
+        for c, value in enumerate(row):
+            self._put(value, columns, self._matrix(i, c), 0, self.L)
+
+    def _unit_row(self, i: int) -> list[Value]:
+        f, k = self._now, self.equations.k
+        if self.batch:
+            return [f.splat(f.value(float(c == i)), self.L) for c in range(k)]
+        return [f.joined([f.value(float(c == i)) for c in range(self.L)])]
+
+    def _entry(self, row: list[Value], c: int) -> Value:
+        return row[c] if self.batch else self._now.lane(row[0], c)
+
+    def _with_entry(self, row: list[Value], c: int, value: Value) -> list[Value]:
+        if self.batch:
+            return [*row[:c], value, *row[c + 1 :]]
+        kind = row[0].type
+        found = f"insertelement {kind} {row[0].name}, double {value.name}, i32 {c}"
+        return [self._now.result(found, lanes=self.L)]
+
+    def _write_along(self) -> None:
+        """X along the rod, from S at the base; at the tip the inverse of M X."""
+        e = self.equations
+        k = e.k
+        self.along = f = self._function("along")
+        memory = f.arguments[0]
+        one, other = self.columns
+        for i in range(e.ny):
+            if self.batch:
+                self._set_row([self._get(self.S, i * k + c) for c in range(k)], one, i)
+            else:
+                numbers = [self._get(self.S, i * k + c) if c < k else f.value(0.0) for c in range(self.L)]
+                self._set_row([f.joined(numbers)], one, i)
+        each = _each(self.pieces)
+        full = (self.pieces - 1) // each
+
+        def piece(j: Any) -> None:
+            for c in range(k if self.batch else 1):
+                first = self._matrix(0, c)
+                f.call(self.advance_columns, memory, one.at(first, 0), other.at(first, 0), j)
+            for i in range(e.ny):
+                self._set_row(self._row(other, i), one, i)
+
+        def keep(j: Any) -> None:
+            for i in range(e.ny):
+                row = self._row(one, i)
+                for c in range(k):
+                    self._put(self._entry(row, c), self.X, i * k + c, j + 1)
+
+        with f.loop(full) as g:
+            with f.loop((g + 1) * each, g * each) as j:
+                piece(j)
+                keep(j)
+            f.call(self.change, memory, g)
+            keep((g + 1) * each - 1)
+        with f.loop(self.pieces, full * each) as j:
+            piece(j)
+            keep(j)
+        # M X at the tip and its inverse: reuse of the change of parameters
+        rows = []
+        for a in range(k):
+            row = None
+            for i in range(e.ny):
+                if e.program.is_constant(int(e.tip_slopes[a, i]), 0.0):
+                    continue
+                term = [self._get(self.M, a * e.ny + i) * x for x in self._row(one, i)]
+                row = term if row is None else [p + q for p, q in zip(row, term, strict=True)]
+            assert row is not None
+            rows.append(row)
+        eye = [self._unit_row(i) for i in range(k)]
+        for r in range(k):
+            scale = 1.0 / self._entry(rows[r], r)
+            g = self._with_entry([x * scale for x in rows[r]], r, 1.0 - scale)
+            for matrix in (rows, eye):
+                for i, row in enumerate(matrix):
+                    x = self._entry(row, r)
+                    matrix[i] = [p - x * q for p, q in zip(row, g, strict=True)]
+        for i, row in enumerate(eye):
+            for c in range(k):
+                self._put(self._entry(row, c), self.inverse, i * k + c)
+
+    def _write_linearise(self) -> None:
+        """Rates, slopes and factors at y."""
+        e = self.equations
+        self.linearised = f = self._function("linearised")
+        memory = f.arguments[0]
+        self._write_near(self.y)
+        with self._places(self.ends) as j:
+            self._rates_at(self.rates_and_slopes, self.y, self.H, j)
+        self._write_ends(self.slope, self.slope_end)
+        f.call(self.factored, memory)
+        state = {int(node): self._get(self.unknowns, i) for i, node in enumerate(e.unknowns)}
+        for k, value in enumerate(self._evaluated(e.base_slopes.reshape(-1), 0, False, state)):
+            self._put(value, self.S, k)
+        for k, value in enumerate(self._evaluated(e.tip_slopes.reshape(-1), 0, False, self._tip_state(self.y))):
+            self._put(value, self.M, k)
+        f.call(self.along, memory)
+
+    def _write_correct(self) -> None:
+        """The correction of all points and of the unknowns, from the defects."""
+        e = self.equations
+        ny, k = e.ny, e.k
+        self.correct = f = self._function("correct")
+        memory = f.arguments[0]
+        each = _each(self.pieces)
+        full = (self.pieces - 1) // each
+        for i in range(ny):
+            self._put(0.0, self.w, i, 0)
+
+        def piece(j: Any) -> None:
+            f.call(self.advance, memory, self.w.at(0, j), self.w.at(0, j + 1), j)
+
+        with f.loop(full) as g:
+            with f.loop((g + 1) * each, g * each) as j:
+                piece(j)
+            last = (g + 1) * each
+            beta = [self._get(self.w, p, last) for p in self.pivots]
+            for c in range(k):
+                self._put(beta[c], self.beta, c, g)
+            for i in range(ny):
+                w = self._get(self.w, i, last)
+                for c in range(k):
+                    w = w - self._get(self.X, i * k + c, last) * beta[c]
+                self._put(w, self.w, i, last)
+        with f.loop(self.pieces, full * each) as j:
+            piece(j)
+        at_tip = []
+        for a in range(k):
+            value = self._get(self.tip, a)
+            for i in range(ny):
+                if not e.program.is_constant(int(e.tip_slopes[a, i]), 0.0):
+                    value = value + self._get(self.M, a * ny + i) * self._get(self.w, i, self.points - 1)
+            at_tip.append(value)
+        alpha = [Variable(f, f.splat(f.value(0.0), self.P)) for _ in range(k)]
+        for a in range(k):
+            value = self._get(self.inverse, a * k) * at_tip[0]
+            for c in range(1, k):
+                value = value + self._get(self.inverse, a * k + c) * at_tip[c]
+            alpha[a].set(-value)
+
+        def keep(j: Any) -> None:
+            for a in range(k):
+                self._put(alpha[a].get(), self.alpha, a, j)
+
+        with f.loop(self.pieces + 1, full * each + 1) as j:
+            keep(j)
+        with f.loop(0, full - 1, -1) as g:
+            keep((g + 1) * each)
+            change = [alpha[c].get() - self._get(self.beta, c, g) for c in range(k)]
+            for a in range(k):
+                value = self._get(self.T, a * k, g) * change[0]
+                for c in range(1, k):
+                    value = value + self._get(self.T, a * k + c, g) * change[c]
+                alpha[a].set(value)
+            with f.loop((g + 1) * each, g * each + 1) as j:
+                keep(j)
+        for a in range(k):
+            self._put(alpha[a].get(), self.step_unknowns, a)
+        with self._places(self.points - 1, 1) as j:
+            own = [self._wide(self.alpha, c, j) for c in range(k)]
+            for i in range(ny):
+                value = self._wide(self.w, i, j)
+                for c in range(k):
+                    value = value + self._wide(self.X, i * k + c, j) * own[c]
+                self._write_wide(value, self.dy, i, j)
+        for i in range(ny):
+            value = f.splat(f.value(0.0), self.P)
+            for c in range(k):
+                if not e.program.is_constant(int(e.base_slopes[i, c]), 0.0):
+                    value = value + self._get(self.S, i * k + c) * alpha[c].get()
+            self._put(value, self.dy, i, 0)
+
+    # sizes
+
+    def _norm(self, array: Array, scale: str, count: int, first: int = 0, relative: Array | None = None) -> Value:
+        """Return the largest component over its natural unit; infinite for NaN."""
+        f = self._now
+        found = Variable(f, f.splat(f.value(0.0), self.L))
+        finite = Variable(f, f.splat(f.value(0.0), self.L))
+        with self._places(count, first) as j:
+            largest, total = found.get(), finite.get()
+            inside = self._inside(j, first + count)
+            for i in range(array.size):
+                x = f.apply("abs", self._wide(array, i, j))
+                unit = self._wide(self.scale_y, i)
+                if relative is None:
+                    x = x * unit
+                else:
+                    x = x / (1.0 / unit + f.apply("abs", self._wide(relative, i, j)))
+                x = x if self.batch else f.select(inside, x, 0.0)
+                largest, total = f.apply("max", largest, x), total + x
+            found.set(largest)
+            finite.set(total)
+        # maxnum drops NaN; a sum keeps it
+        known = f.compare("lt", finite.get(), float("inf"))
+        return self._largest(f.select(known, found.get(), float("inf")))
+
+    def _tip_norm(self) -> Value:
+        f = self._now
+        found = f.splat(f.value(0.0), self.P)
+        for i in range(self.equations.k):
+            x = f.apply("abs", self._get(self.tip, i)) * self._get(self.scale_tip, i)
+            found = f.select(f.compare("le", x, found), found, x)
+        return found
+
+    # Newton's method
+
+    def _write_base(self, unknowns: Array, y: Array) -> None:
+        e = self.equations
+        state = {int(node): self._get(unknowns, i) for i, node in enumerate(e.unknowns)}
+        for i, value in enumerate(self._evaluated(e.base, 0, False, state)):
+            self._put(value, y, i, 0)
+
+    def _write_newton(self) -> None:
+        """Solve one step from y and the unknowns; results in y, the rates belong to y."""
+        e, newton = self.equations, self.newton
+        self.solve = f = self._function("solve", "numbers")
+        memory, numbers = f.arguments
+        P, infinity = self.P, float("inf")
+
+        def plain(value: float) -> Variable:
+            return Variable(f, f.splat(f.value(value), P))
+
+        def truth(value: bool) -> Variable:
+            return Variable(f, f.splat(f.value(value), P))
+
+        error, size, left, damping = plain(infinity), plain(infinity), plain(infinity), plain(1.0)
+        corrections, linearisations = plain(0.0), plain(0.0)
+        usable = f.load(numbers, 0, P) > 0.0
+        renew, first, fresh, old, done = (truth(False) for _ in range(5))
+        renew.set(~usable)
+        old.set(usable)
+        with self._places(self.points) as j:
+            for i in range(e.ny):
+                self._write_wide(0.0, self.direction, i, j)
+        for i in range(e.k):
+            self._put(0.0, self.trial_unknowns, i)  # the direction of the unknowns
+
+        def active() -> Value:
+            count = linearisations.get() + f.select(renew.get(), 1.0, 0.0)
+            return ~done.get() & (count <= float(newton.max_linearisations))
+
+        with f.while_(lambda: f.any(active())):
+            going = active()
+            anew = Variable(f, f.any(renew.get() & going))
+            with f.if_(anew.get()):
+                f.call(self.linearised, memory)
+                now = active()
+                damping.set(f.select(now, 1.0, damping.get()))
+                size.set(f.select(now, infinity, size.get()))
+                old.set(old.get() & ~now)
+                first.set(now | first.get())
+                fresh.set(fresh.get() & ~now)
+                renew.set(renew.get() & ~now)
+                linearisations.set(linearisations.get() + f.select(now, 1.0, 0.0))
+                with self._places(self.points) as j:
+                    for i in range(e.ny):
+                        self._write_wide(self._wide(self.y, i, j), self.trial, i, j)
+                self._write_near(self.trial)
+                f.call(self.defects, memory)
+            with f.if_(~anew.get()):
+                step = self._spread(damping.get())
+                with self._places(self.points) as j:
+                    for i in range(e.ny):
+                        moved = self._wide(self.y, i, j) + step * self._wide(self.direction, i, j)
+                        self._write_wide(moved, self.trial, i, j)
+                for i in range(e.k):
+                    moved = self._get(self.unknowns, i) + damping.get() * self._get(self.trial_unknowns, i)
+                    self._put(moved, self.tip_defect, i)  # the trial's unknowns
+                self._write_base(self.tip_defect, self.trial)
+                f.call(self.residual, memory)
+            with f.if_(anew.get()):
+                for i in range(e.k):
+                    self._put(self._get(self.unknowns, i), self.tip_defect, i)
+            now_error = f.apply("max", self._norm(self.r, "y", self.pieces), self._tip_norm())
+            f.call(self.correct, memory)
+            now_size = self._norm(self.dy, "y", self.points)
+            now_left = self._norm(self.dy, "y", self.points, 0, self.trial)
+            was_first, was_fresh, was_old = first.get(), fresh.get(), old.get()
+            was_damping, was_size, was_error = damping.get(), size.get(), error.get()
+            good = (now_error <= newton.tolerance) & (now_left <= LARGEST_CORRECTION)
+            shorter = (now_size <= (1.0 - was_damping * 0.25) * was_size) & (now_size < infinity)
+            accept = good | shorter
+            ratio = f.apply("max", was_size / now_size, 1.0 + 1e-6)
+            rate = f.apply("log", ratio)
+            slow = f.apply("log", now_error / newton.tolerance) > rate * float(newton.patience)
+            slow = shorter & ~was_first & (was_size < infinity) & (slow | (was_damping < 1.0))
+            shorten = ~accept & was_fresh & ~was_first & (was_damping > newton.least_damping)
+            rounding = ~accept & (was_error <= newton.acceptable) & ~was_old & ~was_first
+            dead = rounding | (~accept & (was_first | was_fresh) & ~shorten)
+            again = ~good & ~dead & (slow | (~accept & ~shorten))
+            longer = f.select(was_first, 1.0, f.apply("min", 1.0, 4.0 * was_damping))
+            accept = accept & going
+            error.set(f.select(accept, now_error, was_error))
+            size.set(f.select(accept, now_size, was_size))
+            left.set(f.select(accept, now_left, left.get()))
+            damping.set(f.select(going, f.select(accept, longer, was_damping * 0.25), was_damping))
+            renew.set(f.select(going, again, renew.get()))
+            fresh.set(f.select(accept, was_first, was_fresh))
+            first.set(was_first & ~going)
+            done.set(done.get() | ((good | dead) & going))
+            more = going & ~(good | dead | again)
+            corrections.set(corrections.get() + f.select(more, 1.0, 0.0))
+            wide_accept = self._spread(accept)
+            with self._places(self.points) as j:
+                for i in range(e.ny):
+                    for source, target in ((self.trial, self.y), (self.dy, self.direction)):
+                        value = f.select(wide_accept, self._wide(source, i, j), self._wide(target, i, j))
+                        self._write_wide(value, target, i, j)
+            for i in range(e.k):
+                for source, target in (
+                    (self.tip_defect, self.unknowns),
+                    (self.step_unknowns, self.trial_unknowns),
+                ):
+                    self._put(f.select(accept, self._get(source, i), self._get(target, i)), target, i)
+        last = f.select(
+            left.get() <= LARGEST_CORRECTION,
+            error.get(),
+            f.apply("max", error.get(), f.apply("min", left.get(), 1.0)),
+        )
+        keeps = (last <= newton.acceptable) & ~renew.get()
+        f.store(f.select(keeps, 1.0, 0.0), numbers, 0, P)
+        f.store(last, numbers, P, P)
+        f.store(corrections.get(), numbers, 2 * P, P)
+        f.store(linearisations.get(), numbers, 3 * P, P)
+
+    def _spread(self, value: Value) -> Value:
+        return self._now.splat(value, self.L)
+
+    # the corrected motion
+
+    def _write_estimate(self) -> None:
+        """The corrected motion: y with the defects of Simpson's formula, from its own history."""
+        e = self.equations
+        self.estimate = f = self._function("estimate", "numbers")
+        memory, numbers = f.arguments
+        f.call(self.residual_of_y, memory)  # rates, strains and defects of the solution
+        for i in range(e.k):
+            self._put(self._get(self.tip, i), self.tip_defect, i)
+        middle = self.ends
+        with self._places(self.pieces) as j:
+            h = self._wide(self.h, 0, j)
+            for i in range(e.ny):
+                a, b = self._wide(self.y, i, j), self._wide(self.y, i, j + 1)
+                rates = self._wide(self.f, i, j) - self._wide(self.fe, i, j)
+                self._write_wide(0.5 * (a + b) + 0.125 * h * rates, self.middle, i, j)
+            self._rates_at(self.rates, self.middle, self.H, j, j + middle)
+            for i in range(e.ny):
+                rates = self._wide(self.f, i, j) + self._wide(self.fe, i, j)
+                mid = self._wide(self.f, i, j + middle)
+                # Simpson's increment less that of the box scheme, less the defect that is left
+                change = h * ((1 / 6 - 0.5) * rates + (2 / 3) * mid) - self._wide(self.r, i, j)
+                self._write_wide(change, self.defect, i, j)
+        # records before the corrected rates replace them
+        self._write_records()
+        with self._places(self.ends) as j:
+            for i in range(e.ny):
+                start = 2.0 * self._wide(self.errors[0], i, j) - self._wide(self.errors[1], i, j)
+                self._write_wide(self._wide(self.y, i, j) + start, self.better, i, j)
+            for i in e.used_history:
+                value = self._wide(self.H, i, j) + self._wide(self.dH, i, j)
+                self._write_wide(value, self.dH, i, j)
+        for i, p in enumerate(self.pivots):
+            self._put(self._get(self.better, p, 0), self.trial_unknowns, i)
+
+        def evaluated() -> Value:
+            self._write_base(self.trial_unknowns, self.better)
+            f.call(self.residual_of_better, memory)
+            with self._places(self.pieces) as j:
+                for i in range(e.ny):
+                    value = self._wide(self.r, i, j) + self._wide(self.defect, i, j)
+                    self._write_wide(value, self.r, i, j)
+            for i in range(e.k):
+                self._put(self._get(self.tip, i) - self._get(self.tip_defect, i), self.tip, i)
+            return f.apply("max", self._norm(self.r, "y", self.pieces), self._tip_norm())
+
+        largest = Variable(f, f.splat(f.value(0.0), self.P))
+        left = Variable(f, f.splat(f.value(float("inf")), self.P))
+        turns = Variable(f, f.value(0.0))
+        largest.set(evaluated())
+
+        def going() -> Value:
+            found = Variable(f, f.splat(f.value(0.0), self.L))
+            with self._places(self.points) as j:
+                for i in range(e.ny):
+                    y = self._wide(self.y, i, j)
+                    change = self._wide(self.better, i, j) - y - self._wide(self.errors[0], i, j)
+                    size = f.apply("abs", change) / (1.0 / self._wide(self.scale_y, i) + f.apply("abs", y))
+                    size = size if self.batch else f.select(self._inside(j, self.points), size, 0.0)
+                    found.set(f.apply("max", found.get(), size))
+            far = left.get() > ESTIMATE_TOLERANCE * self._largest(found.get()) + ROUNDING
+            return f.any(far) & (turns.get() < float(ESTIMATE_TURNS)) | (turns.get() < 1.0)
+
+        with f.while_(going):
+            f.call(self.correct, memory)
+            with self._places(self.points) as j:
+                for i in range(e.ny):
+                    value = self._wide(self.better, i, j) + self._wide(self.dy, i, j)
+                    self._write_wide(value, self.better, i, j)
+            for i in range(e.k):
+                value = self._get(self.trial_unknowns, i) + self._get(self.step_unknowns, i)
+                self._put(value, self.trial_unknowns, i)
+            size = self._norm(self.dy, "y", self.points, 0, self.y)
+            before = largest.get()
+            largest.set(evaluated())
+            left.set(size * largest.get() / before)
+            turns.set(turns.get() + 1.0)
+        with self._places(self.ends) as j:
+            for i in range(self.errors[0].size):
+                self._write_wide(self._wide(self.errors[0], i, j), self.errors[1], i, j)
+        with self._places(self.ends) as j:
+            for i in range(e.ny):
+                value = self._wide(self.better, i, j) - self._wide(self.records[0], i, j)
+                self._write_wide(value, self.errors[0], i, j)
+            for i in range(e.nz):
+                value = self._wide(self.z, i, j) - self._wide(self.records[0], e.ny + i, j)
+                self._write_wide(value, self.errors[0], e.ny + i, j)
+        layout = self.equations.system.y_layout
+        found = Variable(f, f.splat(f.value(0.0), self.L))
+        with self._places(self.points) as j:
+            square = f.value(0.0)
+            for i in range(layout.slice("p").start, layout.slice("p").stop):
+                x = self._wide(self.errors[0], i, j)
+                square = square + x * x
+            square = square if self.batch else f.select(self._inside(j, self.points), square, 0.0)
+            found.set(f.apply("max", found.get(), square))
+        f.store(f.apply("sqrt", self._largest(found.get())), numbers, 4 * self.P, self.P)
+
+    def _write_records(self) -> None:
+        """Shift the records by one step."""
+        e = self.equations
+        with self._places(self.count) as j:
+            for i in range(e.numbers):
+                self._write_wide(self._wide(self.records[0], i, j), self.records[1], i, j)
+        with self._places(self.ends) as j:
+            for i in range(e.ny):
+                self._write_wide(self._wide(self.y, i, j), self.records[0], i, j)
+        with self._places(self.pieces) as j:
+            for i in range(e.ny):
+                self._write_wide(self._wide(self.middle, i, j), self.records[0], i, j + self.ends)
+        with self._places(self.count) as j:
+            for i in range(e.nz):
+                self._write_wide(self._wide(self.z, i, j), self.records[0], e.ny + i, j)
+
+    # the time loop
+
+    def _write_run(self) -> None:
+        """All steps: controls, coefficients of the scheme, numbers of steps; rows out."""
+        e = self.equations
+        f = self.module.function(
+            "run", ["memory", "controls", "coefficients", "rows", "infos", "n_steps"], exported=True
+        )
+        self._now = f
+        memory, controls, coefficients, rows, infos, steps = f.arguments
+        P, L = self.P, self.L
+        numbers = Value(f, f.reserve(f"[{8 * P} x double]"), "ptr")
+        f.store(0.0, numbers, 0, P)
+        with f.loop(steps) as step:
+            c0, c1, c2, t = (f.load(coefficients, step * 4 + i) for i in range(4))
+            self._put(c0, self.inputs, 0)
+            self._put(t, self.inputs, 1)
+            for i in range(e.nc):
+                self._put(f.load(controls, (step * e.nc + i) * P, P), self.inputs, 2 + i)
+            f.call(self.terms, memory)
+            with self._places(self.count) as j:
+                for i in e.used_history:
+                    value = c1 * self._wide(self.records[0], i, j) + c2 * self._wide(self.records[1], i, j)
+                    self._write_wide(value, self.H, i, j)
+            with self._places(self.ends) as j:
+                for i in e.used_history:
+                    value = c1 * self._wide(self.errors[0], i, j) + c2 * self._wide(self.errors[1], i, j)
+                    self._write_wide(value, self.dH, i, j)
+            weights = [self._wide(self.weights, k) for k in range(3)]
+            with self._places(self.points) as j:
+                for i in range(e.ny):
+                    guess = weights[0] * self._wide(self.past[0], i, j)
+                    for k in (1, 2):
+                        guess = guess + weights[k] * self._wide(self.past[k], i, j)
+                    self._write_wide(guess, self.y, i, j)
+            for i, p in enumerate(self.pivots):
+                self._put(self._get(self.y, p, 0), self.unknowns, i)
+            self._write_base(self.unknowns, self.y)
+            f.call(self.solve, memory, numbers)
+            f.call(self.estimate, memory, numbers)
+            f.call(self.guesses, memory)
+            with f.loop(len(self.grid.nodes)) as node:
+                for i in range(e.numbers):
+                    value = self._get(self.records[0], i, self._node(node))
+                    f.store(value, rows, ((step * len(self.grid.nodes) + node) * e.numbers + i) * P, P)
+            for i in range(5):
+                f.store(f.load(numbers, i * P, P), infos, (step * 5 + i) * P, P)
+
+    def _node(self, node: Value) -> Value:
+        f = self._now
+        if not len(self.grid.between):
+            return node
+        return f.result(
+            f"load i64, ptr {self._now.pointer(f.arguments[0], node + self.node_table.offset).name}", "i64"
+        )
+
+    def _write_guesses(self) -> None:
+        """Weights of the extrapolations in the next first guess, and the shift of earlier states."""
+        e = self.equations
+        self.guesses = f = self._function("guesses")
+        extrapolations = ((1.0, 0.0, 0.0), (2.0, -1.0, 0.0), (3.0, -3.0, 1.0))
+        misfits = [Variable(f, f.splat(f.value(0.0), self.L)) for _ in range(3)]
+        with self._places(self.points) as j:
+            for i in range(e.ny):
+                past = [self._wide(each, i, j) for each in self.past]
+                unit, y = self._wide(self.scale_y, i), self._wide(self.y, i, j)
+                for misfit, weights in zip(misfits, extrapolations, strict=True):
+                    guess = past[0] * weights[0]
+                    for k in (1, 2):
+                        guess = guess + past[k] * weights[k] if weights[k] else guess
+                    size = f.apply("abs", guess - y) * unit
+                    size = size if self.batch else f.select(self._inside(j, self.points), size, 0.0)
+                    misfit.set(f.apply("max", misfit.get(), size))
+        sizes = [self._largest(each.get()) for each in misfits]
+        least = f.apply("max", f.apply("min", sizes[0], f.apply("min", sizes[1], sizes[2])), ROUNDING)
+        ratios = [f.apply("max", each / least, 1.0) for each in sizes]
+        trusts = [1.0 / (each * each * each) for each in ratios]
+        total = trusts[0] + trusts[1] + trusts[2]
+        for k in range(3):
+            weight = f.value(0.0)
+            for trust, weights in zip(trusts, extrapolations, strict=True):
+                weight = weight + trust / total * weights[k] if weights[k] else weight
+            self._put(weight, self.weights, k)
+        for source, target in ((self.past[1], self.past[2]), (self.past[0], self.past[1]), (self.y, self.past[0])):
+            with self._places(self.points) as j:
+                for i in range(e.ny):
+                    self._write_wide(self._wide(source, i, j), target, i, j)
+
+    def _write(self) -> None:
+        e = self.equations
+        self.middle = self._array(e.ny, self.pieces)
+        self.node_table = self._array(len(self.grid.nodes), 1)
+        self._write_terms()
+        self.rates = self._write_rates("rates", slopes=False)
+        self.rates_and_slopes = self._write_rates("rates_and_slopes", slopes=True)
+        self.residual = self._write_residual("residual", self.trial, self.H)
+        self.residual_of_y = self._write_residual("residual_of_y", self.y, self.H)
+        self.residual_of_better = self._write_residual("residual_of_better", self.better, self.dH)
+        self.defects = self._function("defects")
+        self._write_defects(self.trial)
+        self._write_factor()
+        self.advance = self._write_advance("advance", columns=False)
+        self.advance_columns = self._write_advance("advance_columns", columns=True)
+        self._write_change()
+        self._write_along()
+        self._write_linearise()
+        self._write_correct()
+        self._write_newton()
+        self._write_estimate()
+        self._write_guesses()
+        self._write_run()
+
+    # running
+
+    def run(self, systems: Sequence[System], controls: np.ndarray, dt: float, coefficients: np.ndarray) -> Any:
+        """Run motions from rest: controls (robots, steps, c), coefficients (steps, 3) of a scheme.
+
+        Returns rows (robots, steps, nodes, y + z) and infos (robots, steps, 5): kept, error, corrections,
+        linearisations, position error.
+        """
+        e, P = self.equations, self.P
+        count, steps, _ = controls.shape
+        outputs = np.empty((count, steps, len(self.grid.nodes), e.numbers)), np.empty((count, steps, 5))
+        function = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 5, ctypes.c_long)(self.compiled.address("run"))
+        times = np.concatenate([coefficients, (1.0 + np.arange(steps))[:, None] * dt], axis=1)
+        for first in range(0, count, P):
+            chosen = [min(first + k, count - 1) for k in range(P)]
+            memory = self.memory([systems[min(k, len(systems) - 1)] for k in chosen])
+            own = np.ascontiguousarray(np.moveaxis(controls[chosen], 0, -1))
+            rows, infos = (np.empty((*each.shape[1:], P)) for each in outputs)
+            arrays = memory, own, times, rows, infos
+            function(*(each.ctypes.data for each in arrays), steps)
+            kept = slice(first, min(first + P, count))
+            for whole, part in zip(outputs, (rows, infos), strict=True):
+                whole[kept] = np.moveaxis(part, -1, 0)[: kept.stop - first]
+        return outputs
+
+    def memory(self, systems: Sequence[System]) -> np.ndarray:
+        """Return the memory of a run that begins at rest."""
+        e = self.equations
+        raw = np.zeros(self._size + 16)
+        memory = raw[(-raw.ctypes.data // 8) % 8 :][: self._size]
+        lanes = []
+        for system in systems:
+            still = StepProblem.still(system, LOBATTO2, np.zeros(e.nc))
+            places = np.asarray(still.places)
+            y, z = jax.vmap(system.rest)(still.places)
+            scales = system.scales()
+            params = np.concatenate([np.asarray(leaf, float).reshape(-1) for leaf in jax.tree.leaves(system)])
+            lanes.append((params, 1.0 / np.asarray(scales.y), 1.0 / np.asarray(scales.tip), places,
+                          np.asarray(still.lengths())[:, 0], np.concatenate([y, z], axis=1)))  # fmt: skip
+
+        def put(array: Array, values: list[np.ndarray]) -> None:
+            """Write values (places, size) of all lanes."""
+            for lane, value in enumerate(values):
+                value = np.asarray(value, float).reshape(-1, array.size)
+                for j in range(array.count if self.batch or array.count == 1 else self.stride):
+                    at = array.at(np.arange(array.size), j) + (lane if self.batch else 0)
+                    memory[at] = value[min(j, len(value) - 1)]
+
+        for k, array in enumerate((self.params, self.scale_y, self.scale_tip, self.s, self.h)):
+            put(array, [each[k] for each in lanes])
+        for array in self.records:
+            put(array, [each[5] for each in lanes])
+        for array in (self.y, *self.past):
+            put(array, [each[5][:, : e.ny] for each in lanes])
+        put(self.weights, [np.array([1.0, 0.0, 0.0])] * len(lanes))
+        table = memory[self.node_table.offset :].view(np.int64)
+        table[: len(self.grid.nodes)] = self.grid.nodes
+        return memory
