@@ -29,7 +29,7 @@ LAYERS = (
     ),
     ("rods", "robots"),
     ("controls", "_signals"),
-    ("solvers", "trajectory", "trajectory_file", "trajectory_integrity", "trajectory_system"),
+    ("solvers", "engine", "trajectory", "trajectory_file", "trajectory_integrity", "trajectory_system"),
     ("named_controls",),
     ("metrics", "evaluation.metrics", "evaluation.state_errors"),
     ("recordings", "statics", "estimation"),

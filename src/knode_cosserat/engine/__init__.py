@@ -1,0 +1,1 @@
+"""Equations compiled to vector code: programs, code generator, time loop (see docs/engine.md)."""

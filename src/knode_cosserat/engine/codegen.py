@@ -1,15 +1,16 @@
 """Machine code from Python: values, arrays, loops and functions of an LLVM module.
 
-A value is a number or a vector of `lanes` numbers. An operation on a number and a vector repeats the number in
-every lane. Python's operators and loops over Python lists write straight-line code; `Function.loop`,
-`Function.while_` and `Function.if_` write control flow. Programs (`program.Program`) become straight-line code
-by `Function.evaluate`.
+A value is a number or a vector of `lanes` numbers. An operation on a number and a vector repeats the number
+in every lane. Python's operators and loops over Python lists write straight-line code; `Function.loop`,
+`Function.while_` and `Function.if_` write control flow. Programs (`program.Program`) become straight-line
+code by `Function.evaluate`.
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
@@ -100,6 +101,35 @@ class Value:
         return self.function.logical("xor", self, True)
 
 
+class Index:
+    """A whole number, plus a constant, that counts places in memory.
+
+    The address of a place is written once, where the number is known, and serves all numbers stored there.
+    """
+
+    def __init__(self, value: Value, slot: list[str], delta: int = 0):
+        self._root, self._slot, self.delta = value, slot, delta
+
+    def __add__(self, number: int) -> Index:
+        return Index(self._root, self._slot, self.delta + number)
+
+    @property
+    def value(self) -> Value:
+        """The number."""
+        return self._root + self.delta if self.delta else self._root
+
+    def address(self, base: Value, place: int) -> Value:
+        """Return the address of the place `value - delta`, `place` doubles apart from the next."""
+        function, root = self._root.function, self._root
+        key = (base.name, root.name, place)
+        if key not in function.addresses:
+            a, b = (function.fresh() for _ in range(2))
+            self._slot.append(f"  {a} = mul nsw i64 {root.name}, {place}")
+            self._slot.append(f"  {b} = getelementptr inbounds double, ptr {base.name}, i64 {a}")
+            function.addresses[key] = Value(function, b, "ptr")
+        return function.addresses[key]
+
+
 class Variable:
     """A value that changes in loops: memory on the stack, which LLVM turns into registers."""
 
@@ -137,16 +167,19 @@ class Module:
         """The module in LLVM's assembly language."""
         return "\n".join([*sorted(self.declarations), *(function.text for function in self._functions)])
 
-    def compile(self, optimisation: int = 2) -> Compiled:
-        """Return machine code for this computer."""
+    def compile(self, optimisation: int = 1) -> Compiled:
+        """Return machine code for this computer.
+
+        Programs come without repetition, and loops are written with their vectors: LLVM's general passes take
+        three times as long and make steps no faster. Variables are turned into registers.
+        """
         module = llvm.parse_assembly(self.text)
         machine = llvm.Target.from_default_triple().create_target_machine(
             cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=optimisation
         )
-        options = llvm.create_pipeline_tuning_options(speed_level=optimisation)
-        options.loop_vectorization = options.slp_vectorization = options.loop_unrolling = False
-        builder = llvm.create_pass_builder(machine, options)
-        builder.getModulePassManager().run(module, builder)
+        passes = llvm.create_new_module_pass_manager()
+        passes.add_sroa_pass()
+        passes.run(module, llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options()))
         engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
         engine.add_object_file(llvm.ObjectFileRef.from_data(machine.emit_object(module)))
         engine.finalize_object()
@@ -169,8 +202,10 @@ class Function:
 
     def __init__(self, module: Module, name: str, arguments: Sequence[str], exported: bool):
         self.module, self.name, self._count, self._exported = module, name, 0, exported
-        self._lines: list[str] = []
+        self._lines: list[Any] = []
         self._stack: list[str] = []
+        #: addresses of places that have been written
+        self.addresses: dict[Any, Value] = {}
         self._types = ["i64" if each.startswith("n_") else "ptr" for each in arguments]
         self._names = [f"%{each}" for each in arguments]
         self.arguments = [
@@ -180,12 +215,12 @@ class Function:
     @property
     def text(self) -> str:
         """The function in LLVM's assembly language."""
-        given = ", ".join(
-            f"{kind} noalias {name}" if kind == "ptr" else f"{kind} {name}"
-            for kind, name in zip(self._types, self._names, strict=True)
-        )
+        given = ", ".join(f"{kind} {name}" for kind, name in zip(self._types, self._names, strict=True))
         linkage = "" if self._exported else "internal "
-        body = "\n".join([*self._stack, "  br label %begin", "begin:", *self._lines])
+        lines = itertools.chain.from_iterable(
+            [line] if isinstance(line, str) else line for line in self._lines
+        )
+        body = "\n".join([*self._stack, "  br label %begin", "begin:", *lines])
         inline = "nounwind" if self._exported else "noinline nounwind"
         return f"define {linkage}void @{self.name}({given}) {inline} {{\nentry:\n{body}\n  ret void\n}}"
 
@@ -198,6 +233,16 @@ class Function:
     def _fresh(self, prefix: str = "x") -> str:
         self._count += 1
         return f"{prefix}{self._count}"
+
+    def fresh(self) -> str:
+        """Return a new name."""
+        return "%" + self._fresh()
+
+    def index(self, value: Value) -> Index:
+        """Return an index of places, for code from here on."""
+        slot: list[str] = []
+        self._lines.append(slot)
+        return Index(value, slot)
 
     def result(self, expression: str, kind: str = "double", lanes: int = 1) -> Value:
         """Write an expression and return its value."""
@@ -332,7 +377,9 @@ class Function:
             return numbers[0]
         kind, found = f"<{len(numbers)} x double>", "poison"
         for k, each in enumerate(numbers):
-            one = self.result(f"insertelement {kind} {found}, double {each.name}, i32 {k}", lanes=len(numbers))
+            one = self.result(
+                f"insertelement {kind} {found}, double {each.name}, i32 {k}", lanes=len(numbers)
+            )
             found = one.name
         return one
 
@@ -379,7 +426,7 @@ class Function:
         self._lines.append(f"{name}:")
 
     @contextlib.contextmanager
-    def loop(self, count: Any, start: Any = 0, step: int = 1) -> Iterator[Value]:
+    def loop(self, count: Any, start: Any = 0, step: int = 1) -> Iterator[Index]:
         """Write a loop over start, start + step, … below (or, for a negative step, not below) count."""
         index = Variable(self, self.value(start, "i64"))
         names = [self._fresh(part) for part in ("head", "body", "end")]
@@ -390,7 +437,7 @@ class Function:
         more = i < count if step > 0 else i >= count
         self.emit(f"br i1 {more.name}, label %{names[1]}, label %{names[2]}")
         self._label(names[1])
-        yield i
+        yield self.index(i)
         index.set(i + step)
         self.emit(f"br label %{names[0]}")
         self._label(names[2])
@@ -432,8 +479,8 @@ class Function:
     ) -> dict[int, Value]:
         """Write the operations that outputs need, and return the values of all of them.
 
-        `known` are values of inputs and of operations that have been evaluated. Loops are run until every lane
-        is done; lanes that are done keep their values.
+        `known` are values of inputs and of operations that have been evaluated. Loops run until every lane is
+        done; lanes that are done keep their values.
         """
         values = dict(known)
         for node in program.needed(outputs, frozenset(values)):

@@ -1,12 +1,12 @@
-"""The time loop of a rod as machine code: history, Newton's method, elimination along the rod, error estimate.
+"""The time loop of a rod as machine code: history, Newton's method, elimination, error estimate.
 
 The equations at a point come from the system as a program (`Equations`). This module adds the mathematics of
 `solvers`: the box scheme along the rod, corrections damped by the natural monotonicity test with factors that
 are kept, elimination with a change of parameters after every few pieces, and the corrected motion whose
 distance is the estimated discretisation error.
 
-A lane of a vector is a robot of a batch. For a single robot it is a place along the rod; in the recursion along
-the rod it is a column of the matrix that is eliminated. The code is the same: arrays know their layout
+A lane of a vector is a robot of a batch. For a single robot it is a place along the rod; in the recursion
+along the rod it is a column of the matrix that is eliminated. The code is the same: arrays know their layout
 (`Array`), and values are `wide` where all places are independent, else `plain`.
 """
 
@@ -19,12 +19,12 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from knode_cosserat.engine.codegen import Function, Module, Value, Variable
+from knode_cosserat.engine.codegen import Function, Index, Module, Value, Variable
 from knode_cosserat.engine.program import Program
 from knode_cosserat.rods.system import System, unknown_count
+from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.boundary import LARGEST_CORRECTION, NewtonOptions, pivots_of
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.linear import _each
@@ -69,25 +69,36 @@ class Equations:
         def rates(leaves: Any, c0: Any, t: Any, control: Any, s: Any, y: Any, record: Any) -> Any:
             return problem(leaves, c0, t, control, record).point_rates(s, y, record)
 
-        def base(leaves: Any, c0: Any, t: Any, control: Any, unknowns: Any) -> Any:
-            still = problem(leaves, c0, t, control, jnp.zeros(self.numbers))
-            return still.base(unknowns)
+        def base(leaves: Any, c0: Any, t: Any, control: Any, unknowns: Any, record: Any) -> Any:
+            return problem(leaves, c0, t, control, record).base(unknowns)
 
-        def tip(leaves: Any, c0: Any, t: Any, control: Any, y: Any) -> Any:
-            from knode_cosserat.solvers import semi_discrete
-
+        def tip(leaves: Any, c0: Any, t: Any, control: Any, y: Any, record: Any) -> Any:
             own = jax.tree.unflatten(tree, leaves)
-            record = semi_discrete.unpacked_history(own, c0, jnp.zeros(self.numbers))
-            return semi_discrete.tip(own, t, control, y, record)
+            return semi_discrete.tip(own, t, control, y, semi_discrete.unpacked_history(own, c0, record))
+
+        def jump(leaves: Any, c0: Any, t: Any, control: Any, acting: Any, y: Any, record: Any) -> Any:
+            return problem(leaves, c0, t, control, record).jump(acting, y, record)
 
         one, step = np.zeros(()), (1.0, 0.0, np.zeros(self.nc))
         known = [*folded, self.c0, self.t, self.control]
         traced = jax.make_jaxpr(rates)(leaves, *step, one, np.ones(self.ny), np.zeros(self.numbers))
         self.f, self.z = program.evaluate(traced, [*known, self.s, self.y, self.history])
-        traced = jax.make_jaxpr(base)(leaves, *step, np.zeros(self.k))
-        [self.base] = program.evaluate(traced, [*known, self.unknowns])
-        traced = jax.make_jaxpr(tip)(leaves, *step, np.ones(self.ny))
-        [self.tip] = program.evaluate(traced, [*known, self.y])
+        traced = jax.make_jaxpr(base)(leaves, *step, np.zeros(self.k), np.zeros(self.numbers))
+        [self.base] = program.evaluate(traced, [*known, self.unknowns, self.history])
+        traced = jax.make_jaxpr(tip)(leaves, *step, np.ones(self.ny), np.zeros(self.numbers))
+        [self.tip] = program.evaluate(traced, [*known, self.y, self.history])
+        #: y on the far side of the discontinuities that act, and the nonzeros of its derivative, less 1
+        self.acting, self.far, self.jumping = program.inputs("acting", (len(system.cuts),), STATE), self.y, []
+        if system.jumps:
+            shapes = np.zeros(len(system.cuts)), np.ones(self.ny), np.zeros(self.numbers)
+            traced = jax.make_jaxpr(jump)(leaves, *step, *shapes)
+            [self.far] = program.evaluate(traced, [*known, self.acting, self.y, self.history])
+            slopes = program.jacobian(self.far, self.y)
+            for i, j in np.ndindex(slopes.shape):
+                if i == j:
+                    slopes[i, i] = program.apply("sub", int(slopes[i, i]), program.constant(1.0))
+                if not program.is_constant(int(slopes[i, j]), 0.0):
+                    self.jumping.append((i, j, int(slopes[i, j])))
         self.slopes = program.jacobian(self.f, self.y)
         self.base_slopes = program.jacobian(self.base, self.unknowns)
         self.tip_slopes = program.jacobian(self.tip, self.y)
@@ -95,17 +106,18 @@ class Equations:
         self.pattern = [
             (i, j)
             for i, j in np.ndindex(self.slopes.shape)
-            if not program.is_constant(self.slopes[i, j], 0.0)
+            if not program.is_constant(int(self.slopes[i, j]), 0.0)
         ]
-        needed = set(program.needed([*self.f, *self.z]))
+        needed = set(program.needed([*self.f, *self.z, *self.far, *self.base, *self.tip]))
         #: entries of a record that the equations need as history
         self.used_history = [i for i in range(self.numbers) if int(self.history[i]) in needed]
         outputs = [*self.f, *self.z, *self.slopes.reshape(-1), *self.base, *self.tip]
         outputs += [*self.base_slopes.reshape(-1), *self.tip_slopes.reshape(-1)]
+        outputs += [*self.far, *(node for *_, node in self.jumping)]
         self.step_terms = self._hoisted(outputs, {STEP, RUN})
         self.place_terms = self._hoisted(outputs, {PLACE})
 
-    def _hoisted(self, outputs: Sequence[int], levels: set[int]) -> list[int]:
+    def _hoisted(self, outputs: Sequence[int] | np.ndarray, levels: set[int]) -> list[int]:
         """Return the operations of these levels that operations of higher levels need."""
         program, found = self.program, set()
         for node in program.needed(outputs):
@@ -123,7 +135,7 @@ class Equations:
 
 
 class Elimination:
-    """Program of one piece: factors of B = 1 - h/2 J at its end, and B⁻¹ (A x + r) with A = 1 + h/2 J at its start."""
+    """Program of a piece: factors of B = 1 - h/2 J at its end; B⁻¹ (A x + r), A = 1 + h/2 J at its start."""
 
     def __init__(self, equations: Equations):
         program = self.program = Program()
@@ -150,7 +162,7 @@ class Elimination:
                     product = program.apply("mul", int(B[i, p]), int(B[p, j]))
                     B[i, j] = program.apply("sub", int(B[i, j]), product)
         #: factors that are not constant
-        self.places = [(i, j) for i, j in np.ndindex(B.shape) if not program.is_constant(B[i, j])]
+        self.places = [(i, j) for i, j in np.ndindex(B.shape) if not program.is_constant(int(B[i, j]))]
         self.factors = [int(B[i, j]) for i, j in self.places]
         stored = program.inputs("factor", (len(self.places),), 1)
         self.stored = stored
@@ -158,13 +170,16 @@ class Elimination:
         for node, (i, j) in zip(stored, self.places, strict=True):
             LU[i, j] = node
         self.x, self.r = program.inputs("x", (n,), 1), program.inputs("r", (n,), 1)
-        self.advanced = [
-            self._solved(A, LU, added) for added in ([int(each) for each in self.r], [zero] * n)
-        ]
+        self.jump = program.inputs("jump", (len(equations.jumping),), 1)
+        #: x on the far side of the discontinuities at the start
+        self._far = [int(each) for each in self.x]
+        for node, (i, j, _) in zip(self.jump, equations.jumping, strict=True):
+            self._far[i] = program.apply("add", self._far[i], program.apply("mul", int(node), int(self.x[j])))
+        self.advanced = [self._solved(A, LU, added) for added in ([int(each) for each in self.r], [zero] * n)]
 
     def _solved(self, A: Any, LU: Any, r: list[int]) -> list[int]:
         apply = self.program.apply
-        x = [int(each) for each in self.x]
+        x = self._far
         out = [apply("add", a, b) for a, b in zip(x, r, strict=True)]
         for i, j in np.ndindex(A.shape):
             out[i] = apply("add", out[i], apply("mul", int(A[i, j]), x[j]))
@@ -206,9 +221,9 @@ class Array:
     component: int
     place: int
 
-    def at(self, i: Any, j: Any) -> Any:
+    def at(self, i: int, j: int) -> int:
         """Return the offset of component i at place j."""
-        return j * self.place + (self.offset + i * self.component)
+        return self.offset + j * self.place + i * self.component
 
 
 class Core:
@@ -236,6 +251,9 @@ class Core:
         self.slope, self.slope_end = a(len(e.pattern), self.ends), a(len(e.pattern), self.pieces)
         self.factor = a(len(self.elimination.factors), self.pieces)
         self.r, self.defect = a(ny, self.pieces), a(ny, self.pieces)
+        self.acting, self.jump = a(len(system.cuts), self.pieces), a(len(e.jumping), self.pieces)
+        #: y at the places of the ends; with jumps it differs from y at the points
+        self.far = a(ny, self.ends) if system.jumps else None
         self.w, self.X = a(ny, self.points), a(ny * k, self.points)
         groups = -(-self.pieces // _each(self.pieces))
         self.T, self.inverse = a(k * k, groups), a(k * k, 1)
@@ -276,13 +294,22 @@ class Core:
         self._now = f
         return f
 
-    def _get(self, array: Array, i: Any, j: Any = 0, lanes: int = 0) -> Value:
-        f = self._now
-        return f.load(f.arguments[0], array.at(i, j), lanes or self.P)
+    def _at(self, array: Array, i: int, j: int | Index) -> tuple[Value, int]:
+        """Return an address and an offset from it."""
+        memory = self._now.arguments[0]
+        if isinstance(j, int):
+            return memory, array.at(i, j)
+        return j.address(memory, array.place), array.at(i, j.delta)
 
-    def _put(self, value: Any, array: Array, i: Any, j: Any = 0, lanes: int = 0) -> None:
-        f = self._now
-        f.store(value, f.arguments[0], array.at(i, j), lanes or self.P)
+    def _pointer(self, array: Array, j: int | Index) -> Value:
+        """Return the address of component 0 at a place."""
+        return self._now.pointer(*self._at(array, 0, j))
+
+    def _get(self, array: Array, i: int, j: int | Index = 0, lanes: int = 0) -> Value:
+        return self._now.load(*self._at(array, i, j), lanes or self.P)
+
+    def _put(self, value: Any, array: Array, i: int, j: int | Index = 0, lanes: int = 0) -> None:
+        self._now.store(value, *self._at(array, i, j), lanes or self.P)
 
     def _wide(self, array: Array, i: Any, j: Any = 0) -> Value:
         # a number that is the same at all places
@@ -293,7 +320,7 @@ class Core:
         self._put(value, array, i, j, self.L)
 
     @contextlib.contextmanager
-    def _places(self, count: int, first: int = 0) -> Iterator[Value]:
+    def _places(self, count: int, first: int = 0) -> Iterator[Index]:
         """Write a loop over places, all independent: one by one, or as many as there are lanes.
 
         The last lanes of a single robot may lie beyond the last place. They hold numbers that nobody reads.
@@ -301,13 +328,13 @@ class Core:
         with self._now.loop(first + count, first, 1 if self.batch else self.L) as j:
             yield j
 
-    def _inside(self, j: Value, end: int) -> Any:
+    def _inside(self, j: Index, end: int) -> Any:
         """Return true for the lanes before a place."""
         if self.batch:
             return True
         f = self._now
         numbers = f.joined([f.value(float(k)) for k in range(self.L)])
-        here = f.result(f"sitofp i64 {j.name} to double")
+        here = f.result(f"sitofp i64 {j.value.name} to double")
         return numbers + here < float(end)
 
     def _largest(self, value: Value) -> Value:
@@ -330,7 +357,9 @@ class Core:
                 values[node] = self._wide(self.place_terms, k, j)
         return values
 
-    def _evaluated(self, outputs: Sequence[int], j: Any, wide: bool, state: dict[int, Value]) -> list[Value]:
+    def _evaluated(
+        self, outputs: Sequence[int] | np.ndarray, j: Any, wide: bool, state: dict[int, Value]
+    ) -> list[Value]:
         """Write the operations of outputs at a place."""
         self._outputs = [int(each) for each in outputs]
         lanes = self.L if wide else self.P
@@ -346,13 +375,12 @@ class Core:
             [nodes.reshape(-1) for nodes in e.parameters]))}  # fmt: skip
         for k, node in enumerate([e.c0.item(), e.t.item(), *e.control]):
             state[int(node)] = self._get(self.inputs, k)
-        own = {n: v for n, v in state.items()}
-        values = f.evaluate(e.program, e.step_terms, own, self.P)
+        values = f.evaluate(e.program, e.step_terms, state, self.P)
         for k, node in enumerate(e.step_terms):
             self._put(values[node], self.steps_terms, k)
         if not e.place_terms:
             return
-        known = {node: values[node] for node in e.step_terms} | own
+        known = {node: values[node] for node in e.step_terms} | state
         with self._places(self.count) as j:
             here = known | {e.s.item(): self._wide(self.s, 0, j)}
             values = f.evaluate(e.program, e.place_terms, here, self.L)
@@ -360,14 +388,15 @@ class Core:
                 self._write_wide(values[node], self.place_terms, k, j)
 
     def _write_rates(self, name: str, slopes: bool) -> Function:
-        """A function of the offsets of y, history, and a place: rates and strains there, and their slopes."""
+        """A function of the addresses of y and history, and a place: rates and strains, and their slopes."""
         e = self.equations
-        f = self._function(name, "n_y", "n_history", "n_place")
-        memory, y, history, j = f.arguments
+        f = self._function(name, "y", "history", "n_place")
+        _, y, history, place = f.arguments
+        j = f.index(place)
         component = self.f.component
-        state = {int(node): f.load(memory, y + i * component, self.L) for i, node in enumerate(e.y)}
+        state = {int(node): f.load(y, i * component, self.L) for i, node in enumerate(e.y)}
         for i in e.used_history:
-            state[int(e.history[i])] = f.load(memory, history + i * component, self.L)
+            state[int(e.history[i])] = f.load(history, i * component, self.L)
         outputs = [*e.f, *e.z, *([e.slopes[at] for at in e.pattern] if slopes else [])]
         found = self._evaluated(outputs, j, True, state)
         for i in range(e.ny):
@@ -378,17 +407,35 @@ class Core:
             self._write_wide(found[e.ny + e.nz + i], self.slope, i, j)
         return f
 
-    def _rates_at(self, function: Function, y: Array, history: Array, j: Any, place: Any = None) -> None:
+    def _rates_at(
+        self, function: Function, y: Array, history: Array, j: Index, place: Index | None = None
+    ) -> None:
         """Write a call of a function of rates; `place` if y is not stored by place."""
         place = j if place is None else place
         f = self._now
-        f.call(function, f.arguments[0], y.at(0, j), history.at(0, place), place)
+        f.call(function, f.arguments[0], self._pointer(y, j), self._pointer(history, place), place.value)
 
-    def _write_near(self, y: Array) -> None:
-        """Copy y of points to the near sides of discontinuities."""
+    def _write_far(self, y: Array, history: Array, slopes: bool = False) -> Array:
+        """Write y at all ends of pieces: after jumps at their starts, before jumps at their ends."""
+        e = self.equations
+        far = y if self.far is None else self.far
+        if self.far is not None:
+            with self._places(self.points) as j:
+                for i in range(e.ny):
+                    self._write_wide(self._wide(y, i, j), far, i, j)
+            with self._places(self.pieces) as j:
+                state = {int(node): self._wide(y, i, j) for i, node in enumerate(e.y)}
+                state |= {int(e.history[i]): self._wide(history, i, j) for i in e.used_history}
+                state |= {int(node): self._wide(self.acting, i, j) for i, node in enumerate(e.acting)}
+                outputs = [*e.far, *(node for *_, node in e.jumping if slopes)]
+                found = self._evaluated(outputs, j, True, state)
+                for k, value in enumerate(found):
+                    array, i = (far, k) if k < e.ny else (self.jump, k - e.ny)
+                    self._write_wide(value, array, i, j)
         for k, point in enumerate(self.grid.near):
-            for i in range(self.equations.ny):
-                self._put(self._get(y, i, int(point)), y, i, self.points + k)
+            for i in range(e.ny):
+                self._put(self._get(y, i, int(point)), far, i, self.points + k)
+        return far
 
     def _write_ends(self, source: Array, target: Array) -> None:
         """Copy values at places to the ends of pieces."""
@@ -401,31 +448,35 @@ class Core:
 
     def _write_residual(self, name: str, y: Array, history: Array) -> Function:
         """Rates at all ends of pieces by y, and the defects of all pieces and of the tip."""
-        e = self.equations
         f = self._function(name)
-        self._write_near(y)
+        far = self._write_far(y, history)
         with self._places(self.ends) as j:
-            self._rates_at(self.rates, y, history, j)
-        self._write_defects(y)
+            self._rates_at(self.rates, far, history, j)
+        self._write_defects(y, history)
         return f
 
-    def _write_defects(self, y: Array) -> None:
-        e = self.equations
+    def _write_defects(self, y: Array, history: Array) -> None:
+        e, far = self.equations, y if self.far is None else self.far
         self._write_ends(self.f, self.fe)
         with self._places(self.pieces) as j:
             half = self._wide(self.h, 0, j) * 0.5
             for i in range(e.ny):
                 rates = self._wide(self.f, i, j) + self._wide(self.fe, i, j)
-                self._write_wide(
-                    self._wide(y, i, j) - self._wide(y, i, j + 1) + half * rates, self.r, i, j
-                )
-        at_tip = self._tip_state(y)
+                change = self._wide(far, i, j) - self._wide(y, i, j + 1)
+                self._write_wide(change + half * rates, self.r, i, j)
+        at_tip = self._tip_state(y, history)
         for i, value in enumerate(self._evaluated(e.tip, 0, False, at_tip)):
             self._put(value, self.tip, i)
 
-    def _tip_state(self, y: Array) -> dict[int, Value]:
+    def _tip_state(self, y: Array, history: Array) -> dict[int, Value]:
+        e, tip = self.equations, self.points - 1
+        state = {int(node): self._get(y, i, tip) for i, node in enumerate(e.y)}
+        return state | {int(e.history[i]): self._get(history, i, tip) for i in e.used_history}
+
+    def _base_state(self, unknowns: Array, history: Array) -> dict[int, Value]:
         e = self.equations
-        return {int(node): self._get(y, i, self.points - 1) for i, node in enumerate(e.y)}
+        state = {int(node): self._get(unknowns, i) for i, node in enumerate(e.unknowns)}
+        return state | {int(e.history[i]): self._get(history, i, 0) for i in e.used_history}
 
     # elimination along the rod
 
@@ -442,21 +493,23 @@ class Core:
 
     def _write_advance(self, name: str, columns: bool) -> Function:
         """A piece's B⁻¹ (A x + r), of one vector, or of the columns of a matrix without r."""
-        el, e = self.elimination, self.equations
-        f = self._function(name, "n_from", "n_to", "n_piece")
-        memory, source, target, j = f.arguments
+        el = self.elimination
+        f = self._function(name, "from", "to", "n_piece")
+        _, source, target, piece = f.arguments
+        j = f.index(piece)
         lanes = self.L if columns else self.P
         step = self.L if self.batch or columns else self.w.component
         known = {int(node): self._get(self.slope, k, j) for k, node in enumerate(el.start)}
         known |= {int(node): self._get(self.factor, k, j) for k, node in enumerate(el.stored)}
+        known |= {int(node): self._get(self.jump, k, j) for k, node in enumerate(el.jump)}
         known[el.h] = self._get(self.h, 0, j)
-        known |= {int(node): f.load(memory, source + i * step, lanes) for i, node in enumerate(el.x)}
+        known |= {int(node): f.load(source, i * step, lanes) for i, node in enumerate(el.x)}
         if not columns:
             known |= {int(node): self._get(self.r, i, j) for i, node in enumerate(el.r)}
         outputs = el.advanced[1 if columns else 0]
         values = f.evaluate(el.program, outputs, known, lanes)
         for i, node in enumerate(outputs):
-            f.store(values[node], memory, target + i * step, lanes)
+            f.store(values[node], target, i * step, lanes)
         return f
 
     def _matrix(self, i: int, c: int) -> int:
@@ -466,7 +519,7 @@ class Core:
     def _write_change(self) -> None:
         """Change of parameters: X T with T the inverse of X's rows of pivots, and T."""
         self.change = f = self._function("change", "n_group")
-        memory, group = f.arguments
+        group = f.index(f.arguments[1])
         e, columns = self.equations, self.columns[0]
         k = e.k
         rows = [self._row(columns, i) for i in range(e.ny)]
@@ -526,25 +579,26 @@ class Core:
         each = _each(self.pieces)
         full = (self.pieces - 1) // each
 
-        def piece(j: Any) -> None:
+        def piece(j: Index) -> None:
             for c in range(k if self.batch else 1):
                 first = self._matrix(0, c)
-                f.call(self.advance_columns, memory, one.at(first, 0), other.at(first, 0), j)
+                source, target = (f.pointer(memory, each.at(first, 0)) for each in (one, other))
+                f.call(self.advance_columns, memory, source, target, j.value)
             for i in range(e.ny):
                 self._set_row(self._row(other, i), one, i)
 
-        def keep(j: Any) -> None:
+        def keep(j: Index) -> None:
             for i in range(e.ny):
                 row = self._row(one, i)
                 for c in range(k):
                     self._put(self._entry(row, c), self.X, i * k + c, j + 1)
 
         with f.loop(full) as g:
-            with f.loop((g + 1) * each, g * each) as j:
+            with f.loop((g.value + 1) * each, g.value * each) as j:
                 piece(j)
                 keep(j)
-            f.call(self.change, memory, g)
-            keep((g + 1) * each - 1)
+            f.call(self.change, memory, g.value)
+            keep(f.index((g.value + 1) * each - 1))
         with f.loop(self.pieces, full * each) as j:
             piece(j)
             keep(j)
@@ -562,11 +616,11 @@ class Core:
         eye = [self._unit_row(i) for i in range(k)]
         for r in range(k):
             scale = 1.0 / self._entry(rows[r], r)
-            g = self._with_entry([x * scale for x in rows[r]], r, 1.0 - scale)
+            changed = self._with_entry([x * scale for x in rows[r]], r, 1.0 - scale)
             for matrix in (rows, eye):
                 for i, row in enumerate(matrix):
                     x = self._entry(row, r)
-                    matrix[i] = [p - x * q for p, q in zip(row, g, strict=True)]
+                    matrix[i] = [p - x * q for p, q in zip(row, changed, strict=True)]
         for i, row in enumerate(eye):
             for c in range(k):
                 self._put(self._entry(row, c), self.inverse, i * k + c)
@@ -576,15 +630,17 @@ class Core:
         e = self.equations
         self.linearised = f = self._function("linearised")
         memory = f.arguments[0]
-        self._write_near(self.y)
+        far = self._write_far(self.y, self.H, slopes=True)
         with self._places(self.ends) as j:
-            self._rates_at(self.rates_and_slopes, self.y, self.H, j)
+            self._rates_at(self.rates_and_slopes, far, self.H, j)
         self._write_ends(self.slope, self.slope_end)
         f.call(self.factored, memory)
-        state = {int(node): self._get(self.unknowns, i) for i, node in enumerate(e.unknowns)}
+        state = self._base_state(self.unknowns, self.H)
         for k, value in enumerate(self._evaluated(e.base_slopes.reshape(-1), 0, False, state)):
             self._put(value, self.S, k)
-        for k, value in enumerate(self._evaluated(e.tip_slopes.reshape(-1), 0, False, self._tip_state(self.y))):
+        for k, value in enumerate(
+            self._evaluated(e.tip_slopes.reshape(-1), 0, False, self._tip_state(self.y, self.H))
+        ):
             self._put(value, self.M, k)
         f.call(self.along, memory)
 
@@ -599,13 +655,14 @@ class Core:
         for i in range(ny):
             self._put(0.0, self.w, i, 0)
 
-        def piece(j: Any) -> None:
-            f.call(self.advance, memory, self.w.at(0, j), self.w.at(0, j + 1), j)
+        def piece(j: Index) -> None:
+            source, target = self._pointer(self.w, j), self._pointer(self.w, j + 1)
+            f.call(self.advance, memory, source, target, j.value)
 
         with f.loop(full) as g:
-            with f.loop((g + 1) * each, g * each) as j:
+            with f.loop((g.value + 1) * each, g.value * each) as j:
                 piece(j)
-            last = (g + 1) * each
+            last = f.index((g.value + 1) * each)
             beta = [self._get(self.w, p, last) for p in self.pivots]
             for c in range(k):
                 self._put(beta[c], self.beta, c, g)
@@ -630,21 +687,21 @@ class Core:
                 value = value + self._get(self.inverse, a * k + c) * at_tip[c]
             alpha[a].set(-value)
 
-        def keep(j: Any) -> None:
+        def keep(j: Index) -> None:
             for a in range(k):
                 self._put(alpha[a].get(), self.alpha, a, j)
 
         with f.loop(self.pieces + 1, full * each + 1) as j:
             keep(j)
         with f.loop(0, full - 1, -1) as g:
-            keep((g + 1) * each)
+            keep(f.index((g.value + 1) * each))
             change = [alpha[c].get() - self._get(self.beta, c, g) for c in range(k)]
             for a in range(k):
                 value = self._get(self.T, a * k, g) * change[0]
                 for c in range(1, k):
                     value = value + self._get(self.T, a * k + c, g) * change[c]
                 alpha[a].set(value)
-            with f.loop((g + 1) * each, g * each + 1) as j:
+            with f.loop((g.value + 1) * each, g.value * each + 1) as j:
                 keep(j)
         for a in range(k):
             self._put(alpha[a].get(), self.step_unknowns, a)
@@ -664,7 +721,9 @@ class Core:
 
     # sizes
 
-    def _norm(self, array: Array, scale: str, count: int, first: int = 0, relative: Array | None = None) -> Value:
+    def _norm(
+        self, array: Array, scale: str, count: int, first: int = 0, relative: Array | None = None
+    ) -> Value:
         """Return the largest component over its natural unit; infinite for NaN."""
         f = self._now
         found = Variable(f, f.splat(f.value(0.0), self.L))
@@ -697,9 +756,9 @@ class Core:
 
     # Newton's method
 
-    def _write_base(self, unknowns: Array, y: Array) -> None:
+    def _write_base(self, unknowns: Array, y: Array, history: Array) -> None:
         e = self.equations
-        state = {int(node): self._get(unknowns, i) for i, node in enumerate(e.unknowns)}
+        state = self._base_state(unknowns, history)
         for i, value in enumerate(self._evaluated(e.base, 0, False, state)):
             self._put(value, y, i, 0)
 
@@ -748,7 +807,6 @@ class Core:
                 with self._places(self.points) as j:
                     for i in range(e.ny):
                         self._write_wide(self._wide(self.y, i, j), self.trial, i, j)
-                self._write_near(self.trial)
                 f.call(self.defects, memory)
             with f.if_(~anew.get()):
                 step = self._spread(damping.get())
@@ -759,7 +817,7 @@ class Core:
                 for i in range(e.k):
                     moved = self._get(self.unknowns, i) + damping.get() * self._get(self.trial_unknowns, i)
                     self._put(moved, self.tip_defect, i)  # the trial's unknowns
-                self._write_base(self.tip_defect, self.trial)
+                self._write_base(self.tip_defect, self.trial, self.H)
                 f.call(self.residual, memory)
             with f.if_(anew.get()):
                 for i in range(e.k):
@@ -830,10 +888,11 @@ class Core:
         for i in range(e.k):
             self._put(self._get(self.tip, i), self.tip_defect, i)
         middle = self.ends
+        far = self.y if self.far is None else self.far
         with self._places(self.pieces) as j:
             h = self._wide(self.h, 0, j)
             for i in range(e.ny):
-                a, b = self._wide(self.y, i, j), self._wide(self.y, i, j + 1)
+                a, b = self._wide(far, i, j), self._wide(self.y, i, j + 1)
                 rates = self._wide(self.f, i, j) - self._wide(self.fe, i, j)
                 self._write_wide(0.5 * (a + b) + 0.125 * h * rates, self.middle, i, j)
             self._rates_at(self.rates, self.middle, self.H, j, j + middle)
@@ -856,7 +915,7 @@ class Core:
             self._put(self._get(self.better, p, 0), self.trial_unknowns, i)
 
         def evaluated() -> Value:
-            self._write_base(self.trial_unknowns, self.better)
+            self._write_base(self.trial_unknowns, self.better, self.dH)
             f.call(self.residual_of_better, memory)
             with self._places(self.pieces) as j:
                 for i in range(e.ny):
@@ -900,9 +959,10 @@ class Core:
         with self._places(self.ends) as j:
             for i in range(self.errors[0].size):
                 self._write_wide(self._wide(self.errors[0], i, j), self.errors[1], i, j)
+        far = self.better if self.far is None else self.far
         with self._places(self.ends) as j:
             for i in range(e.ny):
-                value = self._wide(self.better, i, j) - self._wide(self.records[0], i, j)
+                value = self._wide(far, i, j) - self._wide(self.records[0], i, j)
                 self._write_wide(value, self.errors[0], i, j)
             for i in range(e.nz):
                 value = self._wide(self.z, i, j) - self._wide(self.records[0], e.ny + i, j)
@@ -924,9 +984,10 @@ class Core:
         with self._places(self.count) as j:
             for i in range(e.numbers):
                 self._write_wide(self._wide(self.records[0], i, j), self.records[1], i, j)
+        far = self.y if self.far is None else self.far
         with self._places(self.ends) as j:
             for i in range(e.ny):
-                self._write_wide(self._wide(self.y, i, j), self.records[0], i, j)
+                self._write_wide(self._wide(far, i, j), self.records[0], i, j)
         with self._places(self.pieces) as j:
             for i in range(e.ny):
                 self._write_wide(self._wide(self.middle, i, j), self.records[0], i, j + self.ends)
@@ -944,15 +1005,16 @@ class Core:
         )
         self._now = f
         memory, controls, coefficients, rows, infos, steps = f.arguments
-        P, L = self.P, self.L
+        P = self.P
         numbers = Value(f, f.reserve(f"[{8 * P} x double]"), "ptr")
         f.store(0.0, numbers, 0, P)
         with f.loop(steps) as step:
-            c0, c1, c2, t = (f.load(coefficients, step * 4 + i) for i in range(4))
+            number = step.value
+            c0, c1, c2, t = (f.load(coefficients, number * 4 + i) for i in range(4))
             self._put(c0, self.inputs, 0)
             self._put(t, self.inputs, 1)
             for i in range(e.nc):
-                self._put(f.load(controls, (step * e.nc + i) * P, P), self.inputs, 2 + i)
+                self._put(f.load(controls, (number * e.nc + i) * P, P), self.inputs, 2 + i)
             f.call(self.terms, memory)
             with self._places(self.count) as j:
                 for i in e.used_history:
@@ -971,24 +1033,27 @@ class Core:
                     self._write_wide(guess, self.y, i, j)
             for i, p in enumerate(self.pivots):
                 self._put(self._get(self.y, p, 0), self.unknowns, i)
-            self._write_base(self.unknowns, self.y)
+            self._write_base(self.unknowns, self.y, self.H)
             f.call(self.solve, memory, numbers)
             f.call(self.estimate, memory, numbers)
             f.call(self.guesses, memory)
             with f.loop(len(self.grid.nodes)) as node:
+                point = self._node(node)
+                row = (number * len(self.grid.nodes) + node.value) * (e.numbers * P)
+                target = f.pointer(rows, row)
                 for i in range(e.numbers):
-                    value = self._get(self.records[0], i, self._node(node))
-                    f.store(value, rows, ((step * len(self.grid.nodes) + node) * e.numbers + i) * P, P)
+                    value = self._get(self.y if i < e.ny else self.records[0], i, point)
+                    f.store(value, target, i * P, P)
             for i in range(5):
-                f.store(f.load(numbers, i * P, P), infos, (step * 5 + i) * P, P)
+                f.store(f.load(numbers, i * P, P), infos, (number * 5 + i) * P, P)
 
-    def _node(self, node: Value) -> Value:
+    def _node(self, node: Index) -> Index:
+        """Return the point of a node."""
         f = self._now
         if not len(self.grid.between):
             return node
-        return f.result(
-            f"load i64, ptr {self._now.pointer(f.arguments[0], node + self.node_table.offset).name}", "i64"
-        )
+        at = f.pointer(f.pointer(f.arguments[0], self.node_table.offset), node.value)
+        return f.index(f.result(f"load i64, ptr {at.name}", "i64"))
 
     def _write_guesses(self) -> None:
         """Weights of the extrapolations in the next first guess, and the shift of earlier states."""
@@ -1017,7 +1082,11 @@ class Core:
             for trust, weights in zip(trusts, extrapolations, strict=True):
                 weight = weight + trust / total * weights[k] if weights[k] else weight
             self._put(weight, self.weights, k)
-        for source, target in ((self.past[1], self.past[2]), (self.past[0], self.past[1]), (self.y, self.past[0])):
+        for source, target in (
+            (self.past[1], self.past[2]),
+            (self.past[0], self.past[1]),
+            (self.y, self.past[0]),
+        ):
             with self._places(self.points) as j:
                 for i in range(e.ny):
                     self._write_wide(self._wide(source, i, j), target, i, j)
@@ -1033,7 +1102,7 @@ class Core:
         self.residual_of_y = self._write_residual("residual_of_y", self.y, self.H)
         self.residual_of_better = self._write_residual("residual_of_better", self.better, self.dH)
         self.defects = self._function("defects")
-        self._write_defects(self.trial)
+        self._write_defects(self.trial, self.H)
         self._write_factor()
         self.advance = self._write_advance("advance", columns=False)
         self.advance_columns = self._write_advance("advance_columns", columns=True)
@@ -1048,7 +1117,9 @@ class Core:
 
     # running
 
-    def run(self, systems: Sequence[System], controls: np.ndarray, dt: float, coefficients: np.ndarray) -> Any:
+    def run(
+        self, systems: Sequence[System], controls: np.ndarray, dt: float, coefficients: np.ndarray
+    ) -> Any:
         """Run motions from rest: controls (robots, steps, c), coefficients (steps, 3) of a scheme.
 
         Returns rows (robots, steps, nodes, y + z) and infos (robots, steps, 5): kept, error, corrections,
@@ -1076,26 +1147,22 @@ class Core:
         e = self.equations
         raw = np.zeros(self._size + 16)
         memory = raw[(-raw.ctypes.data // 8) % 8 :][: self._size]
-        lanes = []
-        for system in systems:
-            still = StepProblem.still(system, LOBATTO2, np.zeros(e.nc))
-            places = np.asarray(still.places)
-            y, z = jax.vmap(system.rest)(still.places)
-            scales = system.scales()
-            params = np.concatenate([np.asarray(leaf, float).reshape(-1) for leaf in jax.tree.leaves(system)])
-            lanes.append((params, 1.0 / np.asarray(scales.y), 1.0 / np.asarray(scales.tip), places,
-                          np.asarray(still.lengths())[:, 0], np.concatenate([y, z], axis=1)))  # fmt: skip
+        known = {id(system): self._numbers(system) for system in systems}
+        lanes = [known[id(system)] for system in systems]
 
         def put(array: Array, values: list[np.ndarray]) -> None:
-            """Write values (places, size) of all lanes."""
+            """Write values (places, size) of all lanes; the last place is repeated in the lanes beyond it."""
+            count = array.count if self.batch or array.count == 1 else self.stride
+            at = np.arange(count)[:, None] * array.place + np.arange(array.size) * array.component
             for lane, value in enumerate(values):
                 value = np.asarray(value, float).reshape(-1, array.size)
-                for j in range(array.count if self.batch or array.count == 1 else self.stride):
-                    at = array.at(np.arange(array.size), j) + (lane if self.batch else 0)
-                    memory[at] = value[min(j, len(value) - 1)]
+                own = value[np.minimum(np.arange(count), len(value) - 1)]
+                memory[array.offset + at + (lane if self.batch else 0)] = own
 
         for k, array in enumerate((self.params, self.scale_y, self.scale_tip, self.s, self.h)):
             put(array, [each[k] for each in lanes])
+        if self.acting.size:
+            put(self.acting, [self.grid.acting] * len(lanes))
         for array in self.records:
             put(array, [each[5] for each in lanes])
         for array in (self.y, *self.past):
@@ -1104,3 +1171,14 @@ class Core:
         table = memory[self.node_table.offset :].view(np.int64)
         table[: len(self.grid.nodes)] = self.grid.nodes
         return memory
+
+    def _numbers(self, system: System) -> tuple[np.ndarray, ...]:
+        """Return parameters, inverse scales, places, lengths of pieces and the state at rest of a robot."""
+        still = StepProblem.still(system, LOBATTO2, np.zeros(self.equations.nc))
+        y, z = jax.vmap(system.rest)(still.places)
+        scales, leaves = system.scales(), jax.tree.leaves(system)
+        parameters = np.concatenate([np.asarray(leaf, float).reshape(-1) for leaf in leaves])
+        return (
+            parameters, 1.0 / np.asarray(scales.y), 1.0 / np.asarray(scales.tip), np.asarray(still.places),
+            np.asarray(still.lengths())[:, 0], np.concatenate([y, z], axis=1),
+        )  # fmt: skip

@@ -12,10 +12,11 @@ of their own. Derivatives at ties (max, min, abs, clamp) are those of JAX.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -24,7 +25,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 from knode_cosserat.errors import KnodeCosseratError
 
 #: largest number of scalar products of one matrix product: larger ones would be long code
-LARGEST_PRODUCT = 64 * 64
+LARGEST_PRODUCT = 8192
 #: largest number of entries of a table with a variable index, of turns of a scan, and of numbers to sort
 LARGEST_TABLE, LONGEST_SCAN, LONGEST_SORT = 256, 1024, 32
 #: largest matrix that is factorised with row exchanges that depend on values
@@ -63,21 +64,31 @@ class Loop:
     source: str = ""
 
 
-@dataclasses.dataclass(frozen=True)
+class Product(NamedTuple):
+    """Product of a Jacobian with a vector: nodes that depend linearly on inputs."""
+
+    inputs: list[int]
+    outputs: list[int]
+    #: nodes that depend on the inputs, in order
+    steps: list[int]
+
+
+@dataclasses.dataclass(eq=False)
 class Rule:
     """Derivative rule of a JAX function: of `jax.custom_jvp`, or of a linear solver."""
 
-    #: identifies the function
-    name: str
     function: Callable[..., Any]
+    #: shapes and types of the arguments
     shapes: list[Any]
     arguments: list[Nodes]
     #: "hold" nodes of the results
-    results: list[Nodes]
-    traced: dict[Any, Any] = dataclasses.field(default_factory=dict)
+    results: list[Nodes] = dataclasses.field(default_factory=list)
+    #: places of the arguments with tangents, and the results' tangents, once needed
+    product: tuple[list[int], Product] | None = None
 
-    def products(self, active: tuple[int, ...], count: int) -> Any:
-        """Return the jaxpr of products of the Jacobian with `count` tangents of the active arguments."""
+    def traced(self) -> tuple[list[int], Any]:
+        """Return the places of the arguments with tangents, and the jaxpr of the results' tangents."""
+        active = [k for k, each in enumerate(self.shapes) if np.issubdtype(each.dtype, np.floating)]
 
         def along(primals: Any, tangents: Any) -> Any:
             def of_active(*moving: Any) -> Any:
@@ -86,15 +97,9 @@ class Rule:
                     values[place] = value
                 return self.function(*values)
 
-            moving = [primals[place] for place in active]
-            return jax.vmap(lambda *each: jax.jvp(of_active, moving, each)[1])(*tangents)
+            return jax.jvp(of_active, [primals[place] for place in active], tangents)[1]
 
-        if (active, count) not in self.traced:
-            tangents = [
-                jax.ShapeDtypeStruct((count, *self.shapes[k].shape), self.shapes[k].dtype) for k in active
-            ]
-            self.traced[active, count] = jax.make_jaxpr(along)(self.shapes, tangents)
-        return self.traced[active, count]
+        return active, jax.make_jaxpr(along)(self.shapes, [self.shapes[place] for place in active])
 
 
 def _logistic(x: float) -> float:
@@ -128,12 +133,12 @@ class Program:
         #: 0 of constants, given for inputs, and otherwise the largest of the arguments
         self.levels: list[int] = []
         self.loops: list[Loop] = []
-        #: derivative rules of "hold" nodes, by node; a node without a rule has derivative zero
-        self.rules: dict[int, Rule] = {}
+        #: derivative rules of "hold" nodes, by node; None: the derivative is zero
+        self.rules: dict[int, Rule | None] = {}
         self._boolean: list[bool] = []
-        self._memo: dict[Any, int] = {}
+        self._memo: dict[Any, Any] = {}
         #: selects with constants only, such as an index of the smallest entry
-        self._choices: set[int] = set()
+        self.choices: set[int] = set()
 
     # construction
 
@@ -158,7 +163,7 @@ class Program:
         return self._new(("input", name), ("input", name), level, boolean)
 
     def inputs(self, name: str, shape: tuple[int, ...], level: int) -> Nodes:
-        """Return an array of inputs, named by their flat index: name[0], name[1], …"""
+        """Return an array of inputs, named by their flat index, such as name[0]."""
         nodes = [self.input(f"{name}[{k}]", level) for k in range(math.prod(shape))]
         return np.array(nodes, dtype=np.int64).reshape(shape)
 
@@ -185,9 +190,9 @@ class Program:
     def _created(self, operation: str, *arguments: int) -> int:
         key, level = (operation, *arguments), max(self.levels[a] for a in arguments)
         last = self._boolean[arguments[-1]]
-        node = self._new(key, key, level, operation in BOOLEANS or (last and operation in ("select", "hold")))
-        if operation == "select" and all(self.is_constant(a) or a in self._choices for a in arguments[1:]):
-            self._choices.add(node)
+        node = self._new(key, key, level, operation in BOOLEANS or (last and operation == "select"))
+        if operation == "select" and all(self.is_constant(a) or a in self.choices for a in arguments[1:]):
+            self.choices.add(node)
         return node
 
     def _simplified(self, operation: str, *arguments: int) -> int | None:
@@ -207,7 +212,7 @@ class Program:
     def _spread(self, operation: str, arguments: tuple[int, ...]) -> int | None:
         """Return an operation of constants and one choice of constants: a choice of results."""
         choices = [a for a in arguments if not self.is_constant(a)]
-        if len(choices) != 1 or choices[0] not in self._choices or self.is_boolean(choices[0]):
+        if len(choices) != 1 or choices[0] not in self.choices or self.is_boolean(choices[0]):
             return None
         _, p, *branches = self.operations[choices[0]]
         results = [
@@ -335,26 +340,39 @@ class Program:
 
     _simple_min = _simple_max
 
-    def _simple_hold(self, a: int) -> int | None:
-        return a if self.operations[a][0] == "hold" and a not in self.rules else None
+    def _simple_hold(self, a: int) -> int:
+        stopped = self.operations[a][0] == "hold" and self.rules[a] is None
+        return a if stopped else self.held(a, None)
 
-    def held(self, node: int, rule: Rule) -> int:
-        """Return a node of the same value whose derivative follows a rule."""
-        while True:
-            node = self._created("hold", node)
-            known = self.rules.setdefault(node, rule)
-            if known is rule or (
-                known.name == rule.name
-                and all(np.array_equal(a, b) for a, b in zip(known.arguments, rule.arguments, strict=True))
-            ):
-                return node
+    def held(self, node: int, rule: Rule | None) -> int:
+        """Return a node of the same value whose derivative follows a rule; None: it is zero."""
+        while (known := self._memo.get(("held", node))) is not None:
+            if self.rules[known] is rule:
+                return known
+            node = known
+        new = self._new(("held", node), ("hold", node), self.levels[node], self._boolean[node])
+        self.rules[new] = rule
+        return new
+
+    def ruled(
+        self, name: str, function: Any, shapes: Any, arguments: list[Nodes], values: Any
+    ) -> list[Nodes]:
+        """Return the results of a function with a derivative rule; `values` evaluates it."""
+        key = ("rule", name, *(x for each in arguments for x in (each.shape, each.tobytes())))
+        if key not in self._memo:
+            rule = Rule(function, shapes, arguments)
+            for array in values():
+                held = [self.held(node, rule) for node in array.ravel().tolist()]
+                rule.results.append(np.array(held, dtype=np.int64).reshape(array.shape))
+            self._memo[key] = rule.results
+        return self._memo[key]
 
     def loop(self, loop: Loop) -> list[int]:
         """Return the nodes of the final state of a loop."""
         arguments = [*(node for _, node in loop.inputs), *loop.initial]
         inner = loop.program
         program = (*zip(inner.operations, map(repr, inner.values), strict=True),)
-        nested = tuple(inner._memo[key] for key in inner._memo if key[0] == "loop")
+        nested = tuple(key for key in inner._memo if key[0] == "loop")
         key = ("loop", program, nested, tuple(loop.next), loop.condition, tuple(arguments))
         if key not in self._memo:
             level = max((self.levels[a] for a in arguments), default=0)
@@ -404,13 +422,13 @@ class Program:
 
     # derivatives
 
-    def derivative(self, outputs: Sequence[int], tangents: Mapping[int, int]) -> list[int]:
+    def derivative(self, outputs: Sequence[int] | Nodes, tangents: Mapping[int, int]) -> list[int]:
         """Return the tangents of the outputs from those of independent nodes: a product J·v."""
         found = self._forward(outputs, {int(node): {0: int(tangent)} for node, tangent in tangents.items()})
         zero = self.constant(0.0)
         return [found.get(int(node), {}).get(0, zero) for node in outputs]
 
-    def jacobian(self, outputs: Sequence[int], variables: Sequence[int]) -> Nodes:
+    def jacobian(self, outputs: Sequence[int] | Nodes, variables: Sequence[int] | Nodes) -> Nodes:
         """Return the derivatives (outputs, variables); structural zeros are the constant 0."""
         one, zero = self.constant(1.0), self.constant(0.0)
         found = self._forward(outputs, {int(node): {k: one} for k, node in enumerate(variables)})
@@ -418,16 +436,11 @@ class Program:
         entries = [[row.get(k, zero) for k in range(len(variables))] for row in rows]
         return np.array(entries, dtype=np.int64).reshape(len(rows), len(variables))
 
-    def _forward(self, outputs: Sequence[int], seeds: Tangents) -> Tangents:
+    def _forward(self, outputs: Sequence[int] | Nodes, seeds: Tangents) -> Tangents:
         """Return tangents of the nodes needed, by variable; zero ones are left out."""
 
         def sources(node: int) -> Iterable[int]:
-            if node in seeds:
-                return ()
-            if self.operations[node][0] != "hold":
-                return self.arguments(node)
-            rule = self.rules.get(node)
-            return () if rule is None else np.concatenate([a.ravel() for a in rule.arguments]).tolist()
+            return () if node in seeds else self._differentiated(node)
 
         found = {node: self._nonzero(each) for node, each in seeds.items()}
         for node in self._order(outputs, sources):
@@ -438,8 +451,8 @@ class Program:
                 found[node] = self._selected(node, found)
             elif name in PARTIALS:
                 found[node] = self._chained(node, found)
-            elif node in self.rules:
-                self._by_rule(self.rules[node], found)
+            elif (rule := self.rules.get(node)) is not None:
+                self._by_rule(rule, found)
             elif name == "loop" and any(found.get(a) for a in self.arguments(node)):
                 source = self.loops[self.operations[node][1]].source
                 raise EngineError(
@@ -459,38 +472,82 @@ class Program:
 
     def _chained(self, node: int, found: Tangents) -> dict[Any, int]:
         name, *arguments = self.operations[node]
-        partials: dict[int, int] = {}
+        partials, zero = dict[int, int](), self.constant(0.0)
         for argument, partial in zip(arguments, PARTIALS[name], strict=True):
             if found.get(argument):
-                own = partial(self.apply, self.constant, node, *arguments)
-                partials[argument] = (
-                    self.apply("add", partials[argument], own) if argument in partials else own
-                )
+                value = partial(*(Scalar(self, each) for each in (node, *arguments)))
+                own = value.node if isinstance(value, Scalar) else self.constant(value)
+                partials[argument] = self.apply("add", partials.get(argument, zero), own)
         total: dict[Any, int] = {}
-        for argument, partial in partials.items():
+        for argument, own in partials.items():
             for key, tangent in found[argument].items():
-                term = self.apply("mul", partial, tangent)
-                total[key] = self.apply("add", total[key], term) if key in total else term
+                total[key] = self.apply("add", total.get(key, zero), self.apply("mul", own, tangent))
         return self._nonzero(total)
+
+    def _differentiated(self, node: int) -> Iterable[int]:
+        """Return the nodes that the derivative of a node depends on."""
+        if self.operations[node][0] != "hold":
+            return self.arguments(node)
+        rule = self.rules[node]
+        return () if rule is None else _flat(rule.arguments)
 
     def _by_rule(self, rule: Rule, found: Tangents) -> None:
         """Add the tangents of all results of a rule."""
-        moving = [[found.get(node, {}) for node in nodes.ravel().tolist()] for nodes in rule.arguments]
-        active = tuple(k for k, each in enumerate(moving) if any(each))
-        keys = list(dict.fromkeys(key for each in moving for one in each for key in one))
-        if keys:
-            zero = self.constant(0.0)
-            tangents = [
-                np.array([[one.get(key, zero) for one in moving[k]] for key in keys], dtype=np.int64).reshape(
-                    len(keys), *rule.shapes[k].shape
-                )
-                for k in active
-            ]
-            columns = self.evaluate(rule.products(active, len(keys)), [*rule.arguments, *tangents])
-        for k, nodes in enumerate(rule.results):
-            for place in np.ndindex(nodes.shape):
-                own = {key: int(columns[k][(i, *place)]) for i, key in enumerate(keys)}
-                found[int(nodes[place])] = self._nonzero(own)
+        moving = {node: found[node] for node in _flat(rule.arguments) if found.get(node)}
+        results = _flat(rule.results)
+        found.update((node, {}) for node in results)
+        zero = self.constant(0.0)
+        for key in dict.fromkeys(key for each in moving.values() for key in each):
+            active, product = self._product(rule)
+            own = [moving.get(node, {}).get(key, zero) for node in _flat(rule.arguments[k] for k in active)]
+            tangents = self._replaced(product, dict(zip(product.inputs, own, strict=True)))
+            for node, tangent in zip(results, tangents, strict=True):
+                if not self.is_constant(tangent, 0.0):
+                    found[node][key] = tangent
+
+    def _product(self, rule: Rule) -> tuple[list[int], Product]:
+        """Return the active arguments of a rule, and its results' tangents."""
+        if rule.product is None:
+            active, jaxpr = rule.traced()
+            prefix, shapes = f"tangent {len(self.operations)}", [rule.arguments[k].shape for k in active]
+            tangents = [self.inputs(f"{prefix} {k}", shape, 1) for k, shape in enumerate(shapes)]
+            outputs = _flat(self.evaluate(jaxpr, [*rule.arguments, *tangents]))
+            inputs = _flat(tangents)
+            depending, steps = set(inputs), []
+            for node in self._order(outputs, self._sources):
+                if not depending.isdisjoint(self._sources(node)):
+                    depending.add(node)
+                    steps.append(node)
+            rule.product = active, Product(inputs, outputs, steps)
+        return rule.product
+
+    def _sources(self, node: int) -> tuple[int, ...]:
+        """Return the nodes that value and derivatives of a node, and its rule's other results, depend on."""
+        rule = self.rules.get(node)
+        if rule is None:
+            return self.arguments(node)
+        return (*_flat(rule.arguments), *(self.operations[each][1] for each in _flat(rule.results)))
+
+    def _replaced(self, product: Product, new: dict[int, int]) -> list[int]:
+        """Return the outputs with other nodes in the place of the inputs."""
+        for node in product.steps:
+            rule = self.rules.get(node)
+            if node in new:
+                continue
+            if rule is None:
+                name, *arguments = self.operations[node]
+                if name in ("loop", "result"):
+                    raise EngineError("a derivative rule depends on tangents by a while loop; use a formula")
+                new[node] = self.apply(name, *(new.get(each, each) for each in arguments))
+                continue
+            swap = np.vectorize(lambda each: new.get(each, each), otypes=[np.int64])
+            copy = Rule(rule.function, rule.shapes, [swap(each) for each in rule.arguments])
+            for array in rule.results:
+                values = [self.operations[each][1] for each in array.ravel().tolist()]
+                held = [self.held(new.get(each, each), copy) for each in values]
+                new.update(zip(array.ravel().tolist(), held, strict=True))
+                copy.results.append(np.array(held, dtype=np.int64).reshape(array.shape))
+        return [new.get(node, node) for node in product.outputs]
 
     # jaxprs
 
@@ -499,56 +556,756 @@ class Program:
         return Evaluation(self).closed(closed_jaxpr, arguments)
 
 
-#: partial derivatives by each argument, from (apply, constant, own node, *arguments); without: zero
-PARTIALS: dict[str, tuple[Callable[..., int], ...]] = {
-    "add": (lambda f, c, r, a, b: c(1.0), lambda f, c, r, a, b: c(1.0)),
-    "sub": (lambda f, c, r, a, b: c(1.0), lambda f, c, r, a, b: c(-1.0)),
-    "mul": (lambda f, c, r, a, b: b, lambda f, c, r, a, b: a),
-    "div": (
-        lambda f, c, r, a, b: f("div", c(1.0), b),
-        lambda f, c, r, a, b: f("neg", f("mul", r, f("div", c(1.0), b))),
-    ),
-    "neg": (lambda f, c, r, a: c(-1.0),),
-    "abs": (lambda f, c, r, a: f("sign", a),),
-    "sqrt": (lambda f, c, r, a: f("div", c(0.5), r),),
-    "exp": (lambda f, c, r, a: r,),
-    "log": (lambda f, c, r, a: f("div", c(1.0), a),),
-    "log1p": (lambda f, c, r, a: f("div", c(1.0), f("add", c(1.0), a)),),
-    "expm1": (lambda f, c, r, a: f("add", c(1.0), r),),
-    "sin": (lambda f, c, r, a: f("cos", a),),
-    "cos": (lambda f, c, r, a: f("neg", f("sin", a)),),
-    "tan": (lambda f, c, r, a: f("add", c(1.0), f("mul", r, r)),),
-    "tanh": (lambda f, c, r, a: f("sub", c(1.0), f("mul", r, r)),),
-    "atan2": (
-        lambda f, c, r, a, b: f("div", b, f("add", f("mul", a, a), f("mul", b, b))),
-        lambda f, c, r, a, b: f("neg", f("div", a, f("add", f("mul", a, a), f("mul", b, b)))),
-    ),
-    "asin": (lambda f, c, r, a: f("div", c(1.0), f("sqrt", f("sub", c(1.0), f("mul", a, a)))),),
-    "acos": (lambda f, c, r, a: f("div", c(-1.0), f("sqrt", f("sub", c(1.0), f("mul", a, a)))),),
-    "atan": (lambda f, c, r, a: f("div", c(1.0), f("add", c(1.0), f("mul", a, a))),),
-    "pow": (
-        lambda f, c, r, a, b: f("mul", b, f("pow", a, f("sub", b, c(1.0)))),
-        lambda f, c, r, a, b: f("mul", f("log", f("select", f("eq", a, c(0.0)), a, c(1.0))), r),
-    ),
-    "max": (
-        lambda f, c, r, a, b: _share(f, c, "gt", a, b),
-        lambda f, c, r, a, b: f("sub", c(1.0), _share(f, c, "gt", a, b)),
-    ),
-    "min": (
-        lambda f, c, r, a, b: _share(f, c, "lt", a, b),
-        lambda f, c, r, a, b: f("sub", c(1.0), _share(f, c, "lt", a, b)),
-    ),
-    "rem": (lambda f, c, r, a, b: c(1.0), lambda f, c, r, a, b: f("div", f("sub", r, a), b)),
-    "erf": (
-        lambda f, c, r, a: f(
-            "mul", c(2.0 / math.sqrt(math.pi)), f("exp", f("neg", f("mul", a, a)))
-        ),
-    ),
-    "logistic": (lambda f, c, r, a: f("mul", r, f("sub", c(1.0), r)),),
-}  # fmt: skip
+class Scalar:
+    """A node with arithmetic, to write formulas."""
+
+    def __init__(self, program: Program, node: int) -> None:
+        self.program = program
+        self.node = node
+
+    def of(self, operation: str, *others: Scalar | float) -> Scalar:
+        """Return an operation on this and on other scalars or numbers."""
+        nodes = [
+            other.node if isinstance(other, Scalar) else self.program.constant(other) for other in others
+        ]
+        return Scalar(self.program, self.program.apply(operation, self.node, *nodes))
+
+    def __neg__(self) -> Scalar:
+        return self.of("neg")
+
+    def __add__(self, other: Scalar | float) -> Scalar:
+        return self.of("add", other)
+
+    def __sub__(self, other: Scalar | float) -> Scalar:
+        return self.of("sub", other)
+
+    def __mul__(self, other: Scalar | float) -> Scalar:
+        return self.of("mul", other)
+
+    def __truediv__(self, other: Scalar | float) -> Scalar:
+        return self.of("div", other)
+
+    def __radd__(self, other: float) -> Scalar:
+        return self + other
+
+    def __rsub__(self, other: float) -> Scalar:
+        return Scalar(self.program, self.program.constant(other)) - self
+
+    def __rmul__(self, other: float) -> Scalar:
+        return self * other
+
+    def __rtruediv__(self, other: float) -> Scalar:
+        return Scalar(self.program, self.program.constant(other)) / self
 
 
-def _share(apply: Any, constant: Any, comparison: str, a: int, b: int) -> int:
+def _share(a: Scalar, b: Scalar, comparison: str) -> Scalar:
     """Return the derivative of max or min by the first argument: a half at ties."""
-    tied = apply("select", apply("eq", a, b), constant(0.0), constant(0.5))
-    return apply("select", apply(comparison, a, b), tied, constant(1.0))
+    tied = a.of("eq", b).of("select", 0.0, 0.5)
+    return a.of(comparison, b).of("select", tied, 1.0)
+
+
+#: partial derivatives by each argument, from the result r and the arguments; other operations have none
+PARTIALS: dict[str, tuple[Callable[..., Scalar | float], ...]] = {
+    "add": (lambda r, a, b: 1.0, lambda r, a, b: 1.0),
+    "sub": (lambda r, a, b: 1.0, lambda r, a, b: -1.0),
+    "mul": (lambda r, a, b: b, lambda r, a, b: a),
+    "div": (lambda r, a, b: 1.0 / b, lambda r, a, b: -r * (1.0 / b)),
+    "neg": (lambda r, a: -1.0,),
+    "abs": (lambda r, a: a.of("ge", 0.0).of("select", -1.0, 1.0),),
+    "sqrt": (lambda r, a: 0.5 / r,),
+    "exp": (lambda r, a: r,),
+    "log": (lambda r, a: 1.0 / a,),
+    "log1p": (lambda r, a: 1.0 / (1.0 + a),),
+    "expm1": (lambda r, a: 1.0 + r,),
+    "sin": (lambda r, a: a.of("cos"),),
+    "cos": (lambda r, a: -a.of("sin"),),
+    "tan": (lambda r, a: 1.0 + r * r,),
+    "tanh": (lambda r, a: 1.0 - r * r,),
+    "atan2": (lambda r, a, b: b / (a * a + b * b), lambda r, a, b: -a / (a * a + b * b)),
+    "asin": (lambda r, a: 1.0 / (1.0 - a * a).of("sqrt"),),
+    "acos": (lambda r, a: -1.0 / (1.0 - a * a).of("sqrt"),),
+    "atan": (lambda r, a: 1.0 / (1.0 + a * a),),
+    "pow": (
+        lambda r, a, b: b * a.of("pow", b - 1.0),
+        lambda r, a, b: a.of("eq", 0.0).of("select", a, 1.0).of("log") * r,
+    ),
+    "max": (lambda r, a, b: _share(a, b, "gt"), lambda r, a, b: 1.0 - _share(a, b, "gt")),
+    "min": (lambda r, a, b: _share(a, b, "lt"), lambda r, a, b: 1.0 - _share(a, b, "lt")),
+    "rem": (lambda r, a, b: 1.0, lambda r, a, b: (r - a) / b),
+    "erf": (lambda r, a: (-(a * a)).of("exp") * (2.0 / math.sqrt(math.pi)),),
+    "logistic": (lambda r, a: r * (1.0 - r),),
+}
+
+
+def _sinh(x: Scalar) -> Scalar:
+    grown = x.of("expm1")
+    return 0.5 * (grown + grown / (1.0 + grown))
+
+
+def _cbrt(x: Scalar) -> Scalar:
+    size = (x.of("abs").of("log") / 3.0).of("exp")
+    return x.of("sign") * x.of("eq", 0.0).of("select", size, 0.0)
+
+
+def _rounded_to_even(x: Scalar) -> Scalar:
+    up = (x + 0.5).of("floor")
+    odd = up.of("rem", 2.0).of("ne", 0.0)
+    return odd.of("and", (up - x).of("eq", 0.5)).of("select", up, up - 1.0)
+
+
+#: functions of one number by other operations
+FORMULAS: dict[str, Callable[[Scalar], Scalar]] = {
+    "square": lambda x: x * x,
+    "rsqrt": lambda x: 1.0 / x.of("sqrt"),
+    "cbrt": _cbrt,
+    "exp2": lambda x: (x * math.log(2.0)).of("exp"),
+    "ceil": lambda x: -(-x).of("floor"),
+    "sinh": _sinh,
+    "cosh": lambda x: 0.5 * (x.of("exp") + (-x).of("exp")),
+    "asinh": lambda x: x.of("sign") * (x.of("abs") + x * x / (1.0 + (1.0 + x * x).of("sqrt"))).of("log1p"),
+    "acosh": lambda x: (x + ((x - 1.0) * (x + 1.0)).of("sqrt")).of("log"),
+    "atanh": lambda x: 0.5 * (2.0 * x / (1.0 - x)).of("log1p"),
+    "round": lambda x: x.of("sign") * (x.of("abs") + 0.5).of("floor"),
+}
+
+#: primitives that are operations under another or the same name
+ELEMENTWISE = {name: name for name in FOLDED if name not in ("select", "hold", "isfinite")} | {
+    "add_any": "add", "is_finite": "isfinite", "stop_gradient": "hold", "lt_to": "lt", "le_to": "le",
+}  # fmt: skip
+UNCHANGED = frozenset({"copy", "copy_p", "optimization_barrier", "reduce_precision", "device_put", "pvary"})
+CALLS = ("jaxpr", "call_jaxpr", "fun_jaxpr")
+REDUCED = {
+    "reduce_sum": "add", "reduce_prod": "mul", "reduce_max": "max", "reduce_min": "min", "reduce_and": "and",
+    "reduce_or": "or", "cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min",
+}  # fmt: skip
+SCATTERED = {
+    "scatter-add": "add", "scatter_add": "add", "scatter_mul": "mul", "scatter-mul": "mul",
+    "scatter_min": "min", "scatter-min": "min", "scatter_max": "max", "scatter-max": "max",
+}  # fmt: skip
+#: primitives that are not covered, with what to use instead
+INSTEAD = {
+    "custom_vjp_call": "use jax.custom_jvp",
+    "custom_vjp_call_jaxpr": "use jax.custom_jvp",
+    "eigh": "use a closed form, or a Cholesky factorisation",
+    "svd": "use jnp.linalg.solve or a Cholesky factorisation",
+    "qr": "use jnp.linalg.solve or a Cholesky factorisation",
+    "random_bits": "draw random numbers outside of the equations",
+    "threefry2x32": "draw random numbers outside of the equations",
+    "pure_callback": "write the function in jax.numpy",
+    "io_callback": "write the function in jax.numpy",
+    "debug_callback": "remove jax.debug.print and jax.debug.callback",
+}
+JAX = str(Path(jax.__file__).parent)
+
+
+def source_line(equations: Sequence[Any]) -> str:
+    """Return file and line of the user's code that made the last of nested equations."""
+    for equation in reversed(equations):
+        traceback = equation.source_info.traceback
+        for frame in () if traceback is None else traceback.frames:
+            if not frame.file_name.startswith((JAX, "<")) and "site-packages" not in frame.file_name:
+                return f"{frame.file_name}:{frame.line_num}"
+    return "unknown line"
+
+
+class Evaluation:
+    """Evaluates jaxprs on the nodes of a program. Methods `_do_…` are of primitives."""
+
+    def __init__(self, program: Program) -> None:
+        self.program = program
+        self.apply = program.apply
+        #: equations that are being evaluated, from the outermost one
+        self.nested: list[Any] = []
+
+    def closed(self, closed: Any, arguments: Sequence[Nodes]) -> list[Nodes]:
+        """Return the results of a closed jaxpr."""
+        return self.run(closed.jaxpr, [self.program.constants(each) for each in closed.consts], arguments)
+
+    def run(self, jaxpr: Any, constants: Sequence[Nodes], arguments: Sequence[Nodes]) -> list[Nodes]:
+        """Return the results of a jaxpr."""
+        known = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*constants, *arguments), strict=True))
+
+        def read(atom: Any) -> Nodes:
+            return self.program.constants(atom.val) if isinstance(atom, Literal) else known[atom]
+
+        for equation in jaxpr.eqns:
+            self.nested.append(equation)
+            results = self.equation(equation, [read(atom) for atom in equation.invars])
+            self.nested.pop()
+            known.update(zip(equation.outvars, results, strict=True))
+        return [read(atom) for atom in jaxpr.outvars]
+
+    def equation(self, equation: Any, arguments: list[Nodes]) -> list[Nodes]:
+        """Return the results of an equation of a jaxpr."""
+        name, params = equation.primitive.name, equation.params
+        method = getattr(self, f"_do_{name.replace('-', '_')}", None)
+        if method is not None:
+            results = method(equation, *arguments, **params)
+            return results if isinstance(results, list) else [results]
+        if name in UNCHANGED:
+            return arguments
+        if name in FORMULAS:
+            return [self._of_one(FORMULAS[name], arguments[0])]
+        if name in ELEMENTWISE:
+            return [self.elementwise(self._operation(equation, ELEMENTWISE[name]), *arguments)]
+        if name in REDUCED:
+            return [self._reduced(REDUCED[name], arguments[0], **params)]
+        if name in SCATTERED:
+            return [self._scattered(equation, SCATTERED[name], *arguments, **params)]
+        inner = next((params[key] for key in CALLS if key in params), None)
+        if inner is None or name in INSTEAD:
+            raise self.error(equation)
+        if isinstance(inner, Jaxpr):
+            inner = ClosedJaxpr(inner, ())
+        return self.closed(inner, arguments)
+
+    def error(
+        self, equation: Any, reason: str = "is not covered by the engine", instead: str = ""
+    ) -> EngineError:
+        """Return the error of an equation that is not covered."""
+        name = equation.primitive.name
+        instead = instead or INSTEAD.get(name, "write it with other functions of jax.numpy")
+        return EngineError(f"{source_line(self.nested)}: {name} {reason}; {instead}")
+
+    def _operation(self, equation: Any, name: str) -> Any:
+        """Return an operation on scalars: those of integers and booleans differ."""
+        dtype = equation.invars[0].aval.dtype
+        boolean = np.issubdtype(dtype, np.bool_)
+        if boolean and name in ("eq", "ne"):
+            return self._differs if name == "ne" else lambda a, b: self.apply("not", self._differs(a, b))
+        if boolean and name in ("max", "min"):
+            return {"max": "or", "min": "and"}[name]
+        if name in ("and", "or", "not") and not boolean:
+            raise self.error(equation, "of integers is not covered by the engine", "use booleans")
+        if name == "div" and np.issubdtype(dtype, np.integer):
+            return lambda a, b: self.truncated(self.apply("div", a, b))
+        return name
+
+    def _differs(self, a: int, b: int) -> int:
+        return self.apply("select", a, b, self.apply("not", b))
+
+    def truncated(self, a: int) -> int:
+        """Return a number rounded towards zero."""
+        return self.apply("mul", self.apply("sign", a), self.apply("floor", self.apply("abs", a)))
+
+    def elementwise(self, operation: Any, *arrays: Nodes) -> Nodes:
+        """Return the results of an operation (a name or a function) for all entries."""
+        if isinstance(operation, str):
+            name, apply = operation, self.apply
+            operation = lambda *nodes: apply(name, *nodes)  # noqa: E731
+        if len(arrays) > 1:
+            arrays = np.broadcast_arrays(*arrays)
+        entries = zip(*(array.ravel().tolist() for array in arrays), strict=True)
+        return np.array([operation(*each) for each in entries], dtype=np.int64).reshape(arrays[0].shape)
+
+    def where(self, condition: int, no: list[Nodes], yes: list[Nodes]) -> list[Nodes]:
+        """Return one or the other of two lists of arrays."""
+        return [
+            self.elementwise(lambda a, b: self.apply("select", condition, a, b), *each)
+            for each in zip(no, yes, strict=True)
+        ]
+
+    # shapes
+
+    def _do_broadcast_in_dim(
+        self, e: Any, x: Nodes, *_: Any, shape: Any, broadcast_dimensions: Any, **__: Any
+    ) -> Nodes:
+        own = [1] * len(shape)
+        for size, axis in zip(x.shape, broadcast_dimensions, strict=True):
+            own[axis] = size
+        return np.broadcast_to(x.reshape(own), shape)
+
+    def _do_reshape(self, e: Any, x: Nodes, *, new_sizes: Any, **_: Any) -> Nodes:
+        return x.reshape(new_sizes)
+
+    def _do_squeeze(self, e: Any, x: Nodes, *, dimensions: Any) -> Nodes:
+        return np.squeeze(x, tuple(dimensions))
+
+    def _do_expand_dims(self, e: Any, x: Nodes, *, dimensions: Any) -> Nodes:
+        return np.expand_dims(x, tuple(dimensions))
+
+    def _do_transpose(self, e: Any, x: Nodes, *, permutation: Any) -> Nodes:
+        return np.transpose(x, permutation)
+
+    def _do_slice(self, e: Any, x: Nodes, *, start_indices: Any, limit_indices: Any, strides: Any) -> Nodes:
+        strides = strides or (1,) * x.ndim
+        return x[tuple(map(slice, start_indices, limit_indices, strides))]
+
+    def _do_concatenate(self, e: Any, *arrays: Nodes, dimension: int) -> Nodes:
+        return np.concatenate(arrays, axis=dimension)
+
+    def _do_stack(self, e: Any, *arrays: Nodes, axis: int) -> Nodes:
+        return np.stack(arrays, axis=axis)
+
+    def _do_split(self, e: Any, x: Nodes, *, sizes: Any, axis: int) -> list[Nodes]:
+        return list(np.split(x, np.cumsum(sizes)[:-1], axis))
+
+    def _do_tile(self, e: Any, x: Nodes, *, reps: Any) -> Nodes:
+        return np.tile(x, reps)
+
+    def _do_rev(self, e: Any, x: Nodes, *, dimensions: Any) -> Nodes:
+        return np.flip(x, dimensions)
+
+    def _do_iota(self, e: Any, *, dtype: Any, shape: Any, dimension: int, **_: Any) -> Nodes:
+        own = [1] * len(shape)
+        own[dimension] = -1
+        return self.program.constants(np.broadcast_to(np.arange(shape[dimension]).reshape(own), shape))
+
+    def _do_pad(self, e: Any, x: Nodes, fill: Nodes, *, padding_config: Any) -> Nodes:
+        for axis, (low, high, inner) in enumerate(padding_config):
+            x = np.moveaxis(x, axis, 0)
+            size = max(0, len(x) + max(0, len(x) - 1) * inner)
+            out = np.full((size + max(low, 0) + max(high, 0), *x.shape[1:]), int(fill))
+            out[max(low, 0) : max(low, 0) + size : inner + 1] = x
+            x = np.moveaxis(out[max(-low, 0) : len(out) - max(-high, 0)], 0, axis)
+        return x
+
+    # numbers
+
+    def _do_convert_element_type(self, e: Any, x: Nodes, *, new_dtype: Any, **_: Any) -> Nodes:
+        old = e.invars[0].aval.dtype
+        if old == new_dtype:
+            return x
+        zero, one = self.program.constant(0.0), self.program.constant(1.0)
+        if np.issubdtype(old, np.bool_):
+            return self.elementwise(lambda a: self.apply("select", a, zero, one), x)
+        if np.issubdtype(new_dtype, np.bool_):
+            return self.elementwise(lambda a: self.apply("ne", a, zero), x)
+        if np.issubdtype(old, np.floating) and np.issubdtype(new_dtype, np.integer):
+            return self.elementwise(self.truncated, x)
+        return x
+
+    def _do_integer_pow(self, e: Any, x: Nodes, *, y: int) -> Nodes:
+        return self.elementwise(lambda a: self.program.power(a, y), x)
+
+    def _do_round(self, e: Any, x: Nodes, *, rounding_method: Any) -> Nodes:
+        return self._of_one(_rounded_to_even if int(rounding_method) == 1 else FORMULAS["round"], x)
+
+    def _of_one(self, formula: Callable[[Scalar], Scalar], x: Nodes) -> Nodes:
+        return self.elementwise(lambda node: formula(Scalar(self.program, node)).node, x)
+
+    def _do_xor(self, e: Any, a: Nodes, b: Nodes) -> Nodes:
+        return self.elementwise(self._operation(e, "ne"), a, b)
+
+    def _do_clamp(self, e: Any, low: Nodes, x: Nodes, high: Nodes) -> Nodes:
+        def clamped(low: int, x: int, high: int) -> int:
+            below = self.apply("select", self.apply("ge", x, high), x, high)
+            return self.apply("select", self.apply("le", x, low), below, low)
+
+        return self.elementwise(clamped, low, x, high)
+
+    def _do_select_n(self, e: Any, which: Nodes, *cases: Nodes) -> Nodes:
+        if np.issubdtype(e.invars[0].aval.dtype, np.bool_):
+            return self.elementwise("select", which, *cases)
+        entries = np.stack(cases).reshape(len(cases), -1)
+        which = np.broadcast_to(which, cases[0].shape).ravel()
+        chosen = [
+            self.by_index(e, [node], [(0, len(cases) - 1)], lambda case, k=k: [entries[case, k : k + 1]])[0]
+            for k, node in enumerate(which.tolist())
+        ]
+        return np.concatenate(chosen).reshape(cases[0].shape)
+
+    # reductions
+
+    def _reduced(
+        self, operation: str, x: Nodes, *, axes: Any = None, axis: Any = None, **options: Any
+    ) -> Nodes:
+        if axis is not None:
+            x = np.moveaxis(x, axis, 0)
+            x = x[::-1] if options["reverse"] else x
+            found = x.copy()
+            for k in range(1, len(x)):
+                found[k] = self.elementwise(operation, found[k - 1], x[k])
+            return np.moveaxis(found[::-1] if options["reverse"] else found, 0, axis)
+        rest = tuple(k for k in range(x.ndim) if k not in axes)
+        shape = tuple(x.shape[k] for k in rest)
+        rows = x.transpose(*axes, *rest).reshape(-1, *shape)
+        if not len(rows):
+            empty: Any = {"add": 0.0, "mul": 1.0, "max": -np.inf, "min": np.inf, "and": True, "or": False}
+            return np.full(shape, self.program.constant(empty[operation]))
+        total = rows[0]
+        for row in rows[1:]:
+            total = self.elementwise(operation, total, row)
+        return total
+
+    def _do_argmin(self, e: Any, x: Nodes, *, axes: Any, comparison: str = "lt", **_: Any) -> Nodes:
+        f, rows = self.apply, np.moveaxis(x, axes[0], 0)
+        best, index = rows[0], np.full(rows.shape[1:], self.program.constant(0.0))
+        for k in range(1, len(rows)):
+            # the first NaN counts as the smallest and as the largest number
+            missing = self.elementwise(lambda a, b: f("and", f("ne", a, a), f("eq", b, b)), rows[k], best)
+            better = self.elementwise("or", self.elementwise(comparison, rows[k], best), missing)
+            best = self.elementwise("select", better, best, rows[k])
+            index = self.elementwise("select", better, index, self.program.constants(k))
+        return index
+
+    def _do_argmax(self, e: Any, x: Nodes, *, axes: Any, **_: Any) -> Nodes:
+        return self._do_argmin(e, x, axes=axes, comparison="gt")
+
+    def _do_sort(self, e: Any, *arrays: Nodes, dimension: int, num_keys: int, **_: Any) -> list[Nodes]:
+        moved = [np.moveaxis(array, dimension, 0) for array in arrays]
+        count = len(moved[0])
+        keys = [self._values(key) for key in moved[:num_keys]]
+        if not any(np.isnan(key).any() for key in keys):
+            order = np.lexsort(keys[::-1], axis=0)
+            moved = [np.take_along_axis(array, order, axis=0) for array in moved]
+        elif len(arrays) == 1 and count <= LONGEST_SORT:
+            rows = list(moved[0])
+            for last in range(count - 1, 0, -1):
+                for k in range(last):
+                    pair = rows[k], rows[k + 1]
+                    rows[k], rows[k + 1] = self.elementwise("min", *pair), self.elementwise("max", *pair)
+            moved = [np.stack(rows)]
+        else:
+            raise self.error(e, f"of {count} variable numbers is not covered by the engine", "sort constants")
+        return [np.moveaxis(array, 0, dimension) for array in moved]
+
+    def _values(self, x: Nodes) -> np.ndarray:
+        """Return the values of constants, and NaN for other nodes."""
+        values = [self.program.values[node] for node in x.ravel().tolist()]
+        return np.array([math.nan if each is None else each for each in values], dtype=float).reshape(x.shape)
+
+    # variable indices
+
+    def by_index(
+        self,
+        e: Any,
+        nodes: Sequence[int],
+        ranges: Sequence[tuple[int, int]],
+        entry: Callable[..., list[Nodes]],
+    ) -> list[Nodes]:
+        """Return the entry for indices that may be variables: by selects; indices are clipped to ranges."""
+        if not nodes:
+            return entry()
+        program, memo = self.program, {}
+        low, high = ranges[0]
+
+        def at(k: int) -> list[Nodes]:
+            return self.by_index(e, nodes[1:], ranges[1:], lambda *rest: entry(k, *rest))
+
+        def found(node: int) -> list[Nodes]:
+            if node not in memo:
+                memo[node] = search(node)
+            return memo[node]
+
+        def search(node: int) -> list[Nodes]:
+            if program.is_constant(node):
+                return at(min(max(int(program.values[node]), low), high))
+            if node in program.choices:
+                _, p, no, yes = program.operations[node]
+                return self.where(p, found(no), found(yes))
+            if high - low >= LARGEST_TABLE:
+                raise self.error(
+                    e, f"with a variable index into {high - low + 1} entries is not covered by the engine",
+                    f"use a formula, or at most {LARGEST_TABLE} entries",
+                )  # fmt: skip
+            values = at(low)
+            for k in range(low + 1, high + 1):
+                beyond = self.apply("ge", node, program.constant(float(k)))
+                values = self.where(beyond, values, at(k))
+            return values
+
+        return found(int(nodes[0]))
+
+    def _do_dynamic_slice(self, e: Any, x: Nodes, *starts: Nodes, slice_sizes: Any) -> list[Nodes]:
+        ranges = [(0, size - own) for size, own in zip(x.shape, slice_sizes, strict=True)]
+
+        def entry(*first: int) -> list[Nodes]:
+            return [x[tuple(slice(k, k + n) for k, n in zip(first, slice_sizes, strict=True))]]
+
+        return self.by_index(e, [int(start) for start in starts], ranges, entry)
+
+    def _do_dynamic_update_slice(self, e: Any, x: Nodes, update: Nodes, *starts: Nodes) -> list[Nodes]:
+        ranges = [(0, size - own) for size, own in zip(x.shape, update.shape, strict=True)]
+
+        def entry(*first: int) -> list[Nodes]:
+            out = x.copy()
+            out[tuple(slice(k, k + n) for k, n in zip(first, update.shape, strict=True))] = update
+            return [out]
+
+        return self.by_index(e, [int(start) for start in starts], ranges, entry)
+
+    def _windows(
+        self, e: Any, shape: Any, indices: Nodes, axes: Any, batching: Any, sizes: Any, clip: bool,
+        entry: Callable[[Any, Any], list[Nodes]],
+    ) -> Callable[[Any], list[Nodes]]:  # fmt: skip
+        """Return a function that calls entry(place, slices) for a batch index; slices are None outside."""
+        own, batch_axes = batching
+
+        def at(place: Any) -> list[Nodes]:
+            fixed = {axis: place[k] for axis, k in zip(own, batch_axes, strict=True)}
+            margin = 0 if clip else 1
+            ranges = [(-margin, shape[axis] - sizes[axis] + margin) for axis in axes]
+
+            def window(*starts: int) -> list[Nodes]:
+                first = fixed | dict(zip(axes, starts, strict=True))
+                inside = all(0 <= k <= shape[axis] - sizes[axis] for axis, k in first.items())
+                slices = tuple(slice(first.get(a, 0), first.get(a, 0) + sizes[a]) for a in range(len(shape)))
+                return entry(place, slices if inside else None)
+
+            return self.by_index(e, indices[place].tolist(), ranges, window)
+
+        return at
+
+    def _do_gather(
+        self, e: Any, x: Nodes, indices: Nodes, *, dimension_numbers: Any, slice_sizes: Any, mode: Any,
+        fill_value: Any, **_: Any,
+    ) -> Nodes:  # fmt: skip
+        d = dimension_numbers
+        dropped = (*d.collapsed_slice_dims, *d.operand_batching_dims)
+        kept = tuple(size for axis, size in enumerate(slice_sizes) if axis not in dropped)
+        fill = np.full(kept, self.program.constant(math.nan if fill_value is None else fill_value))
+        batching = d.operand_batching_dims, d.start_indices_batching_dims
+        at = self._windows(
+            e, x.shape, indices, d.start_index_map, batching, slice_sizes, not _fills(mode),
+            lambda _, slices: [fill if slices is None else x[slices].reshape(kept)],
+        )  # fmt: skip
+        batch = indices.shape[:-1]
+        out = np.empty((*batch, *kept), dtype=np.int64)
+        for place in np.ndindex(*batch):
+            out[place] = at(place)[0]
+        return np.moveaxis(out, range(len(batch), out.ndim), d.offset_dims)
+
+    def _do_scatter(self, e: Any, *arrays: Nodes, **params: Any) -> Nodes:
+        return self._scattered(e, "", *arrays, **params)
+
+    def _scattered(
+        self, e: Any, operation: str, x: Nodes, indices: Nodes, updates: Nodes, *, dimension_numbers: Any,
+        mode: Any, **_: Any,
+    ) -> Nodes:  # fmt: skip
+        d, batch = dimension_numbers, indices.shape[:-1]
+        window = d.update_window_dims
+        updates = np.moveaxis(updates, window, range(len(batch), len(batch) + len(window)))
+        dropped = (*d.inserted_window_dims, *d.operand_batching_dims)
+        own = iter(updates.shape[len(batch) :])
+        sizes = [1 if axis in dropped else next(own) for axis in range(x.ndim)]
+        out = x
+
+        def entry(place: Any, slices: Any) -> list[Nodes]:
+            if slices is None:
+                return [out]
+            new, update = out.copy(), updates[place].reshape(sizes)
+            new[slices] = self.elementwise(operation, out[slices], update) if operation else update
+            return [new]
+
+        batching = d.operand_batching_dims, d.scatter_indices_batching_dims
+        at = self._windows(
+            e, x.shape, indices, d.scatter_dims_to_operand_dims, batching, sizes, not _fills(mode), entry
+        )
+        for place in np.ndindex(*batch):
+            out = at(place)[0]
+        return out
+
+    # linear algebra
+
+    def _do_dot_general(self, e: Any, a: Nodes, b: Nodes, *, dimension_numbers: Any, **_: Any) -> Nodes:
+        (summed_a, summed_b), (batch_a, batch_b) = dimension_numbers
+
+        def ordered(x: Nodes, batch: Any, summed: Any) -> tuple[Nodes, tuple[int, ...]]:
+            free = [k for k in range(x.ndim) if k not in batch and k not in summed]
+            x = x.transpose(*batch, *free, *summed)
+            shape = x.shape[: len(batch)], x.shape[len(batch) : len(batch) + len(free)]
+            return x.reshape(*(math.prod(each) for each in shape), -1), shape[1]
+
+        batch = tuple(a.shape[k] for k in batch_a)
+        (a, free_a), (b, free_b) = ordered(a, batch_a, summed_a), ordered(b, batch_b, summed_b)
+        if np.sum(self._nonzero(a) @ self._nonzero(b).transpose(0, 2, 1)) > LARGEST_PRODUCT:
+            shapes = f"{a.shape[1]}x{a.shape[2]} and {b.shape[2]}x{b.shape[1]}"
+            raise self.error(e, f"of {shapes} numbers is too large for the engine", "use smaller matrices")
+        products = self.elementwise("mul", a[:, :, None, :], b[:, None, :, :])
+        return self._reduced("add", products, axes=(3,)).reshape(*batch, *free_a, *free_b)
+
+    def _nonzero(self, x: Nodes) -> Any:
+        """Return 1 for entries that are not structural zeros."""
+        return np.where(self._values(x) == 0.0, 0, 1)
+
+    def _each(self, function: Callable[..., list[Nodes]], *arrays: Nodes) -> list[Nodes]:
+        """Return the results of a function of matrices for stacks of matrices."""
+        batch = arrays[0].shape[:-2]
+        if not batch:
+            return function(*arrays)
+        found = [function(*(array[place] for array in arrays)) for place in np.ndindex(*batch)]
+        return [np.stack(each).reshape(*batch, *each[0].shape) for each in zip(*found, strict=True)]
+
+    def _less(self, start: int, a: Iterable[Any], b: Iterable[Any]) -> int:
+        """Return start - a·b."""
+        for x, y in zip(a, b, strict=True):
+            start = self.apply("sub", start, self.apply("mul", int(x), int(y)))
+        return start
+
+    def _do_cholesky(self, e: Any, A: Nodes, **_: Any) -> list[Nodes]:
+        def factor(A: Nodes) -> list[Nodes]:
+            L = self.program.constants(np.zeros(A.shape))
+            for j, i in itertools.combinations_with_replacement(range(len(A)), 2):
+                rest = self._less(int(A[i, j]), L[i, :j], L[j, :j])
+                L[i, j] = self.apply("sqrt", rest) if i == j else self.apply("div", rest, int(L[j, j]))
+            return [L]
+
+        return self._each(factor, A)
+
+    def _do_triangular_solve(
+        self, e: Any, A: Nodes, B: Nodes, *, left_side: bool, lower: bool, transpose_a: bool,
+        unit_diagonal: bool, **_: Any,
+    ) -> list[Nodes]:  # fmt: skip
+        lower = lower != (transpose_a == left_side)
+
+        def solve(A: Nodes, B: Nodes) -> list[Nodes]:
+            A, X = (A.T if transpose_a == left_side else A), (B if left_side else B.T).copy()
+            n = len(A)
+            for k, c in (
+                (k, c) for c in range(X.shape[1]) for k in (range(n) if lower else range(n - 1, -1, -1))
+            ):
+                others = slice(0, k) if lower else slice(k + 1, n)
+                rest = self._less(int(X[k, c]), A[k, others], X[others, c])
+                X[k, c] = rest if unit_diagonal else self.apply("div", rest, int(A[k, k]))
+            return [X if left_side else X.T]
+
+        return self._each(solve, A, B)
+
+    def _do_lu(self, e: Any, A: Nodes) -> list[Nodes]:
+        return self._each(self._factors, A)
+
+    def _factors(self, A: Nodes) -> list[Nodes]:
+        """Return LU factors, pivots and the permutation.
+
+        Rows are exchanged by values if the matrix is small and not triangular, otherwise only where a pivot
+        would be a structural zero.
+        """
+        f, A = self.apply, A.copy()
+        n, columns = A.shape
+        pivoted = n <= PIVOTED and np.triu(self._nonzero(A), 1).any()
+        order = self.program.constants(np.arange(n))
+        pivots = self.program.constants(np.arange(min(n, columns)))
+        for k in range(min(n, columns)):
+            rows = [i for i in range(k, n) if not self.program.is_constant(int(A[i, k]), 0.0)]
+            if not rows:
+                continue
+            if not pivoted or len(rows) == 1:
+                rows = rows[:1]
+            sizes = self.elementwise("abs", A[rows, k])
+            index = self.by_index(
+                None, [int(self._do_argmax(None, sizes, axes=(0,)))], [(0, len(rows) - 1)],
+                lambda place, rows=rows: [self.program.constants(rows[place])],
+            )[0]  # fmt: skip
+            pivots[k] = index
+            full = np.concatenate([A, order[:, None]], axis=1)
+            chosen = self.by_index(None, [int(index)], [(k, n - 1)], lambda row, full=full: [full[row]])[0]
+            for i in set(rows) - {k}:
+                here = f("eq", int(index), self.program.constant(i))
+                full[i] = self.elementwise(lambda a, b, here=here: f("select", here, a, b), full[i], full[k])
+            full[k] = chosen
+            A, order = full[:, :-1], full[:, -1]
+            for i in range(k + 1, n):
+                A[i, k] = f("div", int(A[i, k]), int(A[k, k]))
+                for j in range(k + 1, columns):
+                    A[i, j] = self._less(int(A[i, j]), A[i, k : k + 1], A[k, j : j + 1])
+        return [A, pivots, order]
+
+    # functions
+
+    def _rule(
+        self, e: Any, arguments: Sequence[Nodes], name: str, debug_info: Any, values: Any
+    ) -> list[Nodes]:
+        """Return results whose derivatives follow the rule of the function."""
+        known: dict[Any, Nodes] = {
+            atom: nodes
+            for atom, nodes in zip(e.invars, arguments, strict=True)
+            if not isinstance(atom, Literal)
+        }
+        if not all(np.issubdtype(var.aval.dtype, np.floating) for var in e.outvars):
+            raise self.error(e, "with results that are no floats is not covered by the engine")
+        info = debug_info._replace(arg_names=("",) * len(known), result_paths=None)
+        jaxpr = Jaxpr((), list(known), list(e.outvars), [e], debug_info=info)
+        function, shapes = jaxpr_as_fun(ClosedJaxpr(jaxpr, ())), [var.aval for var in known]
+        name = f"{name} {[atom.val for atom in e.invars if isinstance(atom, Literal)]}"
+        return self.program.ruled(name, function, shapes, list(known.values()), values)
+
+    def _do_custom_jvp_call(self, e: Any, *arguments: Nodes, call_jaxpr: Any, **_: Any) -> list[Nodes]:
+        info = call_jaxpr.jaxpr.debug_info
+        return self._rule(
+            e, arguments, str(info.func_src_info), info, lambda: self.closed(call_jaxpr, arguments)
+        )
+
+    def _do_custom_linear_solve(
+        self, e: Any, *arguments: Nodes, const_lengths: Any, jaxprs: Any
+    ) -> list[Nodes]:
+        first = const_lengths.matvec + const_lengths.vecmat
+        last = first + const_lengths.solve
+        used = [*arguments[first:last], *arguments[last + const_lengths.transpose_solve :]]
+        name, info = f"custom_linear_solve {jaxprs.solve.jaxpr}", jaxprs.solve.jaxpr.debug_info
+        return self._rule(e, arguments, name, info, lambda: self.closed(jaxprs.solve, used))
+
+    def _do_platform_index(self, e: Any, *, platforms: Any) -> Nodes:
+        places = [k for k, each in enumerate(platforms) if each is None or "cpu" in each]
+        return self.program.constants(places[0])
+
+    def _do_cond(self, e: Any, index: Nodes, *arguments: Nodes, branches: Any, **_: Any) -> list[Nodes]:
+        last = len(branches) - 1
+        return self.by_index(e, [int(index)], [(0, last)], lambda k: self.closed(branches[k], arguments))
+
+    def _do_scan(
+        self, e: Any, *arguments: Nodes, jaxpr: Any, length: int, num_consts: int, num_carry: int,
+        reverse: bool, **_: Any,
+    ) -> list[Nodes]:  # fmt: skip
+        if length > LONGEST_SCAN:
+            raise self.error(e, f"of {length} turns is too long for the engine", "use fewer turns")
+        constants, carry = arguments[:num_consts], list(arguments[num_consts : num_consts + num_carry])
+        rows = []
+        for k in reversed(range(length)) if reverse else range(length):
+            turn = [each[k] for each in arguments[num_consts + num_carry :]]
+            found = self.closed(jaxpr, [*constants, *carry, *turn])
+            carry = found[:num_carry]
+            rows.append(found[num_carry:])
+        stacked = [np.stack(each) for each in zip(*(rows[::-1] if reverse else rows), strict=True)]
+        if not length:
+            stacked = [np.empty(var.aval.shape, dtype=np.int64) for var in e.outvars[num_carry:]]
+        return [*carry, *stacked]
+
+    def _do_while(
+        self,
+        e: Any,
+        *arguments: Nodes,
+        cond_jaxpr: Any,
+        body_jaxpr: Any,
+        cond_nconsts: int,
+        body_nconsts: int,
+    ) -> list[Nodes]:
+        outer, inner = self.program, Program()
+        count = cond_nconsts + body_nconsts
+        inputs: dict[int, str] = {}
+
+        def imported(node: int) -> int:
+            if outer.is_constant(node):
+                return inner.constant(outer.values[node])
+            name = inputs.setdefault(node, f"input[{len(inputs)}]")
+            return inner.input(name, 1, outer.is_boolean(node))
+
+        fixed = [self.elementwise(imported, each) for each in arguments[:count]]
+        state, kinds = list[Nodes](), list[str]()
+        for array, var in zip(arguments[count:], e.invars[count:], strict=True):
+            boolean = np.issubdtype(var.aval.dtype, np.bool_)
+            names = range(len(kinds), len(kinds) + array.size)
+            own = [inner.input(f"state[{k}]", 2, boolean) for k in names]
+            state.append(np.array(own, dtype=np.int64).reshape(array.shape))
+            kinds += ["b" if boolean else "f"] * array.size
+        condition = inner.evaluate(cond_jaxpr, [*fixed[:cond_nconsts], *state])[0]
+        following = inner.evaluate(body_jaxpr, [*fixed[cond_nconsts:], *state])
+
+        loop = Loop(
+            inner, [(name, node) for node, name in inputs.items()], _flat(state), _flat(arguments[count:]),
+            _flat(following), int(condition), kinds, source_line(self.nested),
+        )  # fmt: skip
+        results = iter(outer.loop(loop))
+        return [
+            np.array([next(results) for _ in range(array.size)], dtype=np.int64).reshape(array.shape)
+            for array in state
+        ]
+
+
+def _flat(arrays: Iterable[Nodes]) -> list[int]:
+    return [node for array in arrays for node in array.ravel().tolist()]
+
+
+def _fills(mode: Any) -> bool:
+    """Return True if a gather or scatter skips indices outside of an array."""
+    return "FILL" in str(mode).upper()
