@@ -1,61 +1,129 @@
-"""The emitted time loop against the solver in JAX: the same equations and the same mathematics."""
+"""The emitted time loop against the one in JAX: the same equations and the same mathematics."""
 
 import functools
 
+import jax
 import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.engine.core import Core
-from knode_cosserat.solvers.time import BDF2
+from knode_cosserat.engine import loops
+from knode_cosserat.engine.program import EngineError
+from knode_cosserat.solvers import time_loop
+from knode_cosserat.solvers.boundary import NewtonOptions
+from knode_cosserat.solvers.history import resting_history
+from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.time_loop import StepCoefficients
 
 DT, STEPS = 0.05, 25
-COEFFICIENTS = np.array([BDF2().coefficients(DT, DT)[:3]] * STEPS)
-ROBOTS = ["delrin-tendon-robot", "delrin-routed-tendon-robot"]
+PAPER, ROUTED = "delrin-tendon-robot", "delrin-routed-tendon-robot"
 
 
 @functools.cache
-def core_of(name, robots):
-    return Core(kc.load_robot(name), robots)
+def robot_of(name):
+    return kc.load_robot(name)
 
 
 def tensions(count, low=4.0, high=8.0):
     return np.random.default_rng(3).uniform(low, high, (count, STEPS, 4))
 
 
-def assert_same(robot, control, rows, infos, estimate):
-    wanted = kc.simulate(robot, control, DT, time="bdf2", start="paper")
-    ny, scale = robot.y_layout.size, np.asarray(robot.scales().y)
-    assert np.max(np.abs(rows[..., :ny] - np.asarray(wanted.y)[1:]) / scale) < 1e-8
-    np.testing.assert_allclose(rows[..., ny:], np.asarray(wanted.z)[1:], atol=1e-7)
-    assert np.all(infos[:, 1] < 1e-8)
-    error = np.asarray(wanted.position_error)[1:]
-    np.testing.assert_allclose(infos[:, 4], error, atol=estimate * error.max())
+def settings_of(scheme, space="lobatto2"):
+    return Settings.of(scheme, space, "consistent" if scheme == "sdirk2" else "paper", NewtonOptions())
 
 
-@pytest.mark.parametrize("name", ROBOTS)
-def test_a_robot_with_places_in_lanes(name):
-    robot, control = kc.load_robot(name), tensions(1)
-    rows, infos = core_of(name, False).run([robot], control, DT, COEFFICIENTS)
-    # one lane is one robot: the same iterates, and the same estimate
-    assert_same(robot, control[0], rows[0], infos[0], estimate=1e-6)
+def in_jax(robot, settings, controls, span=(0, STEPS)):
+    steps, past = StepCoefficients.of(settings, DT), resting_history(robot, settings)
+    return time_loop.loop_one(robot, settings, steps, controls, past, span)
 
 
-@pytest.mark.parametrize("name", ROBOTS)
-def test_robots_in_lanes_have_their_own_parameters_and_controls(name):
-    """Ten robots in lanes of eight. Estimates of a vector stop together: they differ by their tolerance."""
-    robot = kc.load_robot(name)
-    moduli = np.linspace(2e9, 4e9, 10)
-    systems = [robot.replace(youngs_modulus=modulus) for modulus in moduli]
-    control = tensions(10)
-    rows, infos = core_of(name, True).run(systems, control, DT, COEFFICIENTS)
-    for k in (0, 3, 9):
-        assert_same(systems[k], control[k], rows[k], infos[k], estimate=0.05)
+def emitted(robot, settings, controls, span=(0, STEPS)):
+    steps, past = StepCoefficients.of(settings, DT), resting_history(robot, settings)
+    return loops.loop_one(robot, settings, steps, controls, past, span)
+
+
+def assert_same(wanted, found, tolerance, estimates):
+    for name, one, other in zip(wanted._fields, wanted, found, strict=True):
+        one, other = np.asarray(one), np.asarray(other)
+        assert one.shape == other.shape, name
+        if name in ("corrections", "result"):
+            np.testing.assert_array_equal(one, other, name)
+            continue
+        relative = estimates if name in ("error", "position_error", "time_error") else tolerance
+        np.testing.assert_allclose(
+            other, one, atol=relative * np.nanmax(np.abs(one), initial=1e-300), err_msg=name
+        )
+
+
+@pytest.mark.parametrize(("name", "scheme"), [(PAPER, "sdirk2"), (ROUTED, "bdf-alpha")])
+def test_a_robot_with_places_in_lanes(name, scheme):
+    """The iterates are those of the loop in JAX; so are the estimates, and the state that follows."""
+    robot, settings, control = robot_of(name), settings_of(scheme), tensions(1)[0]
+    done, state, rows = in_jax(robot, settings, control)
+    own_done, own_state, own_rows = emitted(robot, settings, control)
+    assert int(done) == own_done == STEPS
+    assert_same(rows, own_rows, 1e-11, 1e-5)
+    for name, one, other in zip(state._fields, state, own_state, strict=True):
+        atol = (1e-5 if "error" in name else 1e-10) * max(float(np.max(np.abs(one))), 1e-300)
+        np.testing.assert_allclose(other, one, atol=atol, err_msg=name)
+
+
+def test_a_span_continues_another():
+    robot, settings, control = robot_of(PAPER), settings_of("sdirk2"), tensions(1)[0]
+    steps, past = StepCoefficients.of(settings, DT), resting_history(robot, settings)
+    _, _, whole = loops.loop_one(robot, settings, steps, control, past, (0, STEPS))
+    done, state, first = loops.loop_one(robot, settings, steps, control, past, (0, 10))
+    assert done == 10
+    _, _, second = loops.loop_one(robot, settings, steps, control, state, (10, STEPS))
+    # factors are not kept from one span to the next: equal within the tolerance of a step
+    np.testing.assert_allclose(first.records[:10], whole.records[:10], atol=1e-13)
+    np.testing.assert_allclose(second.records[10:], whole.records[10:], atol=1e-8)
 
 
 def test_hard_steps_are_damped():
     """Tensions between 0 and 30 N in steps of 50 ms need several linearisations and shorter corrections."""
-    robot, control = kc.load_robot(ROBOTS[0]), tensions(1, 0.0, 30.0)
-    rows, infos = core_of(ROBOTS[0], False).run([robot], control, DT, COEFFICIENTS)
-    assert np.max(infos[0, :, 3]) >= 3.0
-    assert_same(robot, control[0], rows[0], infos[0], estimate=1e-3)
+    robot, settings, control = robot_of(PAPER), settings_of("bdf2"), tensions(1, 0.0, 30.0)[0]
+    _, _, rows = in_jax(robot, settings, control)
+    _, _, own = emitted(robot, settings, control)
+    assert np.max(own.corrections) > 8
+    assert_same(rows, own, 1e-9, 1e-3)
+
+
+def test_a_failed_step_ends_the_loop_with_the_state_before_it():
+    robot, settings = robot_of(PAPER), settings_of("sdirk2")
+    control = np.concatenate([tensions(1)[0][:4], np.full((STEPS - 4, 4), [1e7, 0.0, 0.0, 1e7])])
+    done, state, rows = in_jax(robot, settings, control)
+    own_done, own_state, own_rows = emitted(robot, settings, control)
+    assert own_done == int(done) < STEPS
+    assert own_rows.result[own_done] == kc.Result.NO_CONVERGENCE
+    np.testing.assert_allclose(own_state.records, state.records, atol=1e-9)
+    np.testing.assert_allclose(own_rows.records[:own_done], rows.records[:own_done], atol=1e-9)
+
+
+@pytest.mark.parametrize("name", [PAPER, ROUTED])
+def test_robots_in_lanes_have_their_own_parameters_and_controls(name):
+    """Ten robots in lanes of eight. Estimates of a vector stop together: they differ by their tolerance."""
+    robot, settings, control = robot_of(name), settings_of("sdirk2"), tensions(10)
+    moduli = np.linspace(2e9, 4e9, 10)
+    systems = [robot.replace(youngs_modulus=modulus) for modulus in moduli]
+    batch = jax.tree.map(lambda *leaves: np.stack(leaves), *systems)
+    pasts = jax.tree.map(
+        lambda *leaves: np.stack(leaves), *(resting_history(each, settings) for each in systems)
+    )
+    steps = StepCoefficients.of(settings, DT)
+    done, states, rows = loops.loop_many(batch, settings, steps, control, pasts, STEPS)
+    assert np.all(done == STEPS) and states.y.shape == pasts.y.shape
+    for k in (0, 3, 9):
+        past = resting_history(systems[k], settings)
+        _, _, wanted = loops.loop_one(systems[k], settings, steps, control[k], past, (0, STEPS))
+        scale = np.max(np.abs(wanted.records))
+        np.testing.assert_allclose(rows.records[k], wanted.records, atol=1e-8 * scale)
+        for field in ("position_error", "time_error"):
+            estimate = getattr(wanted, field)
+            np.testing.assert_allclose(getattr(rows, field)[k], estimate, atol=0.1 * estimate.max())
+
+
+def test_what_is_not_covered_is_refused_in_one_line():
+    settings = settings_of("sdirk2", "lobatto4")
+    with pytest.raises(EngineError, match="lobatto2"):
+        emitted(robot_of(PAPER), settings, tensions(1)[0])

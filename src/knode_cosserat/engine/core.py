@@ -19,19 +19,35 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from knode_cosserat.engine.codegen import Function, Index, Module, Value, Variable
-from knode_cosserat.engine.program import Program
+from knode_cosserat.engine.program import EngineError, Program
 from knode_cosserat.rods.system import System, unknown_count
 from knode_cosserat.solvers import semi_discrete
-from knode_cosserat.solvers.boundary import LARGEST_CORRECTION, NewtonOptions, pivots_of
+from knode_cosserat.solvers.boundary import LARGEST_CORRECTION, pivots_of
 from knode_cosserat.solvers.grid import grid_of
+from knode_cosserat.solvers.history import EXTRAPOLATIONS, StateHistory
 from knode_cosserat.solvers.linear import _each
 from knode_cosserat.solvers.problem import StepProblem
+from knode_cosserat.solvers.result import Result
+from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import LOBATTO2
-from knode_cosserat.solvers.time_loop import ESTIMATE_TOLERANCE, ESTIMATE_TURNS, ROUNDING
+from knode_cosserat.solvers.time import SDIRK2
+from knode_cosserat.solvers.time_loop import (
+    COARSE_ANGLE,
+    COARSE_SHARE,
+    ESTIMATE_TOLERANCE,
+    ESTIMATE_TURNS,
+    ROUNDING,
+    StepCoefficients,
+    StepRows,
+    stage_extrapolations,
+)
 
+#: numbers of a solved stage, for each robot
+USABLE, ERROR, CORRECTIONS, LINEARISATIONS, POSITION, ANGLE, TIME, ALIVE = range(8)
 #: levels of inputs: parameters (once a run), step, place, state
 RUN, STEP, PLACE, STATE = 1, 2, 3, 4
 
@@ -79,7 +95,22 @@ class Equations:
         def jump(leaves: Any, c0: Any, t: Any, control: Any, acting: Any, y: Any, record: Any) -> Any:
             return problem(leaves, c0, t, control, record).jump(acting, y, record)
 
+        def geometry(leaves: Any) -> Any:
+            own = jax.tree.unflatten(tree, leaves)
+            still, scales = StepProblem.still(own, LOBATTO2, np.zeros(self.nc)), own.scales()
+            length = jnp.asarray(own.length)[None]
+            return 1.0 / scales.y, 1.0 / scales.tip, still.places, still.lengths()[:, 0], length
+
         one, step = np.zeros(()), (1.0, 0.0, np.zeros(self.nc))
+        # of the parameters alone: inverse scales, places and lengths of pieces
+        self.geometry = [
+            np.broadcast_to(nodes, size)
+            for nodes, size in zip(
+                program.evaluate(jax.make_jaxpr(geometry)(leaves), folded),
+                (self.ny, self.k, grid_of(system, LOBATTO2).count, grid_of(system, LOBATTO2).tip, 1),
+                strict=True,
+            )
+        ]
         known = [*folded, self.c0, self.t, self.control]
         traced = jax.make_jaxpr(rates)(leaves, *step, one, np.ones(self.ny), np.zeros(self.numbers))
         self.f, self.z = program.evaluate(traced, [*known, self.s, self.y, self.history])
@@ -114,6 +145,18 @@ class Equations:
         outputs = [*self.f, *self.z, *self.slopes.reshape(-1), *self.base, *self.tip]
         outputs += [*self.base_slopes.reshape(-1), *self.tip_slopes.reshape(-1)]
         outputs += [*self.far, *(node for *_, node in self.jumping)]
+        #: tangents of y and of the history, and the products of derivatives with them
+        self.dy = program.inputs("dy", (self.ny,), STATE)
+        self.dhistory = program.inputs("dhistory", (self.numbers,), STATE)
+        directions = dict(zip([*self.y, *self.history], [*self.dy, *self.dhistory], strict=True))
+        self.products = {
+            name: program.derivative([int(node) for node in nodes], directions)
+            for name, nodes in (
+                ("rates", [*self.f, *self.z]), ("far", self.far), ("tip", self.tip), ("base", self.base)
+            )
+        }  # fmt: skip
+        for nodes in self.products.values():
+            outputs += nodes
         self.step_terms = self._hoisted(outputs, {STEP, RUN})
         self.place_terms = self._hoisted(outputs, {PLACE})
 
@@ -229,8 +272,14 @@ class Array:
 class Core:
     """Machine code of a system's time loop."""
 
-    def __init__(self, system: System, robots: bool, lanes: int = 8, newton: NewtonOptions = NewtonOptions()):
-        self.equations, self.batch, self.L, self.newton = Equations(system), robots, lanes, newton
+    def __init__(self, system: System, settings: Settings, robots: bool, lanes: int = 8):
+        if system.strands > 1 or system.mixed or settings.space != LOBATTO2 or settings.time is None:
+            raise EngineError("engine: one rod, a balance with B = 0, motions, lobatto2; use simulate")
+        self.settings, self.scheme, self.newton = settings, settings.time, settings.newton
+        self.equations, self.batch, self.L = Equations(system), robots, lanes
+        moving = [node for node in self.equations.products["base"] if not self._is_zero(node)]
+        if moving and isinstance(self.scheme, SDIRK2):
+            raise EngineError("engine: a base that depends on rates needs a scheme of one stage")
         self.elimination = Elimination(self.equations)
         self.grid = grid_of(system, LOBATTO2)
         self.pivots = [int(each) for each in pivots_of(system)]
@@ -242,8 +291,9 @@ class Core:
         ny, nz, k = e.ny, e.nz, e.k
         a = self._array
         self.params, self.scale_y, self.scale_tip = a(len(e.parameter_values), 1), a(ny, 1), a(k, 1)
-        self.inputs, self.steps_terms = a(2 + e.nc, 1), a(len(e.step_terms), 1)
-        self.s, self.h = a(1, self.count), a(1, self.pieces)
+        self.inputs, self.steps_terms, self.t0 = a(2 + e.nc, 1), a(len(e.step_terms), 1), a(1, 1)
+        self.s, self.h, self.length = a(1, self.count), a(1, self.pieces), a(1, 1)
+        self.geometry = self.scale_y, self.scale_tip, self.s, self.h, self.length
         self.place_terms = a(len(e.place_terms), self.count)
         self.y, self.trial, self.better = (a(ny, self.ends) for _ in range(3))
         self.direction, self.dy = a(ny, self.ends), a(ny, self.ends)
@@ -263,13 +313,21 @@ class Core:
         self.tip, self.tip_defect = a(k, 1), a(k, 1)
         self.records = [a(ny + nz, self.count) for _ in range(2)]
         self.errors = [a(ny + nz, self.ends) for _ in range(2)]
-        self.H, self.dH = a(ny + nz, self.count), a(ny + nz, self.ends)
+        self.time_errors = [a(ny + nz, self.ends) for _ in range(2)]
+        self.rate, self.error_rate = a(ny + nz, self.count), a(ny + nz, self.ends)
+        self.H, self.dH, self.own_dH = a(ny + nz, self.count), a(ny + nz, self.ends), a(ny + nz, self.ends)
+        self.move, self.dfar, self.df = a(ny + nz, self.ends), a(ny, self.ends), a(ny, self.ends)
+        self.dz, self.dfe, self.own_defect = a(nz, self.ends), a(ny, self.pieces), a(ny, self.pieces)
+        self.difference, self.sum = a(ny + nz, self.ends), a(ny + nz, self.ends)
         self.past = [a(ny, self.ends) for _ in range(3)]
         self.weights = a(3, 1)
         self.columns = [self._columns(ny * k) for _ in range(2)]
         self.module = Module()
         self._write()
         self.compiled = self.module.compile()
+
+    def _is_zero(self, node: int) -> bool:
+        return self.equations.program.is_constant(int(node), 0.0)
 
     # memory
 
@@ -367,12 +425,30 @@ class Core:
         values = self._now.evaluate(self.equations.program, self._outputs, known, lanes)
         return [values[node] for node in self._outputs]
 
+    def _write_setup(self) -> None:
+        """Scales, places and lengths of pieces: once a run."""
+        e = self.equations
+        self.setup = f = self._function("setup")
+        outputs = [int(node) for nodes in e.geometry for node in nodes]
+        values = f.evaluate(e.program, outputs, self._parameters(), self.P)
+        for array, nodes in zip(self.geometry, e.geometry, strict=True):
+            for k, node in enumerate(nodes):
+                i, j = (0, k) if array.size == 1 else (k, 0)
+                self._put(values[int(node)], array, i, j)
+            if array.count > 1 and not self.batch:
+                # the lanes beyond the last place
+                for k in range(array.count, self.stride):
+                    self._put(values[int(nodes[-1])], array, 0, k)
+
+    def _parameters(self) -> dict[int, Value]:
+        nodes = np.concatenate([nodes.reshape(-1) for nodes in self.equations.parameters])
+        return {int(node): self._get(self.params, k) for k, node in enumerate(nodes)}
+
     def _write_terms(self) -> None:
         """Terms that depend on neither y nor the history: once a step."""
         e = self.equations
         self.terms = f = self._function("terms")
-        state = {int(node): self._get(self.params, k) for k, node in enumerate(np.concatenate(
-            [nodes.reshape(-1) for nodes in e.parameters]))}  # fmt: skip
+        state = self._parameters()
         for k, node in enumerate([e.c0.item(), e.t.item(), *e.control]):
             state[int(node)] = self._get(self.inputs, k)
         values = f.evaluate(e.program, e.step_terms, state, self.P)
@@ -777,7 +853,8 @@ class Core:
 
         error, size, left, damping = plain(infinity), plain(infinity), plain(infinity), plain(1.0)
         corrections, linearisations = plain(0.0), plain(0.0)
-        usable = f.load(numbers, 0, P) > 0.0
+        usable = f.load(numbers, USABLE * P, P) > 0.0
+        alive = f.load(numbers, ALIVE * P, P) > 0.0
         renew, first, fresh, old, done = (truth(False) for _ in range(5))
         renew.set(~usable)
         old.set(usable)
@@ -789,7 +866,7 @@ class Core:
 
         def active() -> Value:
             count = linearisations.get() + f.select(renew.get(), 1.0, 0.0)
-            return ~done.get() & (count <= float(newton.max_linearisations))
+            return alive & ~done.get() & (count <= float(newton.max_linearisations))
 
         with f.while_(lambda: f.any(active())):
             going = active()
@@ -869,24 +946,24 @@ class Core:
             f.apply("max", error.get(), f.apply("min", left.get(), 1.0)),
         )
         keeps = (last <= newton.acceptable) & ~renew.get()
-        f.store(f.select(keeps, 1.0, 0.0), numbers, 0, P)
-        f.store(last, numbers, P, P)
-        f.store(corrections.get(), numbers, 2 * P, P)
-        f.store(linearisations.get(), numbers, 3 * P, P)
+        f.store(f.select(keeps, 1.0, 0.0), numbers, USABLE * P, P)
+        f.store(last, numbers, ERROR * P, P)
+        f.store(corrections.get(), numbers, CORRECTIONS * P, P)
+        f.store(linearisations.get(), numbers, LINEARISATIONS * P, P)
 
     def _spread(self, value: Value) -> Value:
         return self._now.splat(value, self.L)
 
     # the corrected motion
 
-    def _write_estimate(self) -> None:
-        """The corrected motion: y with the defects of Simpson's formula, from its own history."""
+    def _write_check(self) -> None:
+        """Rates and residual of the solution, its records, and the defects of Simpson's formula."""
         e = self.equations
-        self.estimate = f = self._function("estimate", "numbers")
-        memory, numbers = f.arguments
-        f.call(self.residual_of_y, memory)  # rates, strains and defects of the solution
-        for i in range(e.k):
-            self._put(self._get(self.tip, i), self.tip_defect, i)
+        self.check = f = self._function("check", "numbers", "coefficients")
+        memory, numbers, _ = f.arguments
+        f.call(self.residual_of_y, memory)
+        largest = f.apply("max", self._norm(self.r, "y", self.pieces), self._tip_norm())
+        f.store(f.apply("max", largest, f.load(numbers, ERROR * self.P, self.P)), numbers, ERROR * self.P)
         middle = self.ends
         far = self.y if self.far is None else self.far
         with self._places(self.pieces) as j:
@@ -899,32 +976,59 @@ class Core:
             for i in range(e.ny):
                 rates = self._wide(self.f, i, j) + self._wide(self.fe, i, j)
                 mid = self._wide(self.f, i, j + middle)
-                # Simpson's increment less that of the box scheme, less the defect that is left
-                change = h * ((1 / 6 - 0.5) * rates + (2 / 3) * mid) - self._wide(self.r, i, j)
-                self._write_wide(change, self.defect, i, j)
-        # records before the corrected rates replace them
+                # Simpson's increment less that of the box scheme
+                self._write_wide(h * ((1 / 6 - 0.5) * rates + (2 / 3) * mid), self.defect, i, j)
         self._write_records()
+        # no residual has the strains of the tip
+        total = Variable(f, f.splat(f.value(0.0), self.L))
+        with self._places(self.points) as j:
+            for i in range(e.nz):
+                size = f.apply("abs", self._wide(self.z, i, j))
+                total.set(
+                    total.get() + (size if self.batch else f.select(self._inside(j, self.points), size, 0.0))
+                )
+        finite = self._largest(f.select(total.get() < float("inf"), 0.0, float("inf")))
+        f.store(f.apply("max", finite, f.load(numbers, ERROR * self.P, self.P)), numbers, ERROR * self.P)
+
+    def _write_corrected(self, name: str, errors: list[Array], has_defect: bool, number: int) -> Function:
+        """The corrected motion: from its own history, and with defects or, without, those of the solution.
+
+        The residual that the solution has left is none of its errors. Errors beyond the rod's length, and all
+        later ones, are unknown.
+        """
+        e = self.equations
+        f = self._function(name, "numbers")
+        memory, numbers = f.arguments
+        f.call(self.residual_of_y, memory)
+        with self._places(self.pieces) as j:
+            for i in range(e.ny):
+                defect = self._wide(self.defect, i, j) if has_defect else 0.0
+                self._write_wide(defect - self._wide(self.r, i, j), self.own_defect, i, j)
+        for i in range(e.k):
+            self._put(self._get(self.tip, i), self.tip_defect, i)
         with self._places(self.ends) as j:
             for i in range(e.ny):
-                start = 2.0 * self._wide(self.errors[0], i, j) - self._wide(self.errors[1], i, j)
+                start = 2.0 * self._wide(errors[0], i, j) - self._wide(errors[1], i, j)
                 self._write_wide(self._wide(self.y, i, j) + start, self.better, i, j)
             for i in e.used_history:
                 value = self._wide(self.H, i, j) + self._wide(self.dH, i, j)
-                self._write_wide(value, self.dH, i, j)
+                self._write_wide(value, self.own_dH, i, j)
         for i, p in enumerate(self.pivots):
-            self._put(self._get(self.better, p, 0), self.trial_unknowns, i)
+            change = 2.0 * self._get(errors[0], p, 0) - self._get(errors[1], p, 0)
+            self._put(self._get(self.unknowns, i) + change, self.trial_unknowns, i)
 
         def evaluated() -> Value:
-            self._write_base(self.trial_unknowns, self.better, self.dH)
+            self._write_base(self.trial_unknowns, self.better, self.own_dH)
             f.call(self.residual_of_better, memory)
             with self._places(self.pieces) as j:
                 for i in range(e.ny):
-                    value = self._wide(self.r, i, j) + self._wide(self.defect, i, j)
+                    value = self._wide(self.r, i, j) + self._wide(self.own_defect, i, j)
                     self._write_wide(value, self.r, i, j)
             for i in range(e.k):
                 self._put(self._get(self.tip, i) - self._get(self.tip_defect, i), self.tip, i)
             return f.apply("max", self._norm(self.r, "y", self.pieces), self._tip_norm())
 
+        alive = f.load(numbers, ALIVE * self.P, self.P) > 0.0
         largest = Variable(f, f.splat(f.value(0.0), self.P))
         left = Variable(f, f.splat(f.value(float("inf")), self.P))
         turns = Variable(f, f.value(0.0))
@@ -935,12 +1039,12 @@ class Core:
             with self._places(self.points) as j:
                 for i in range(e.ny):
                     y = self._wide(self.y, i, j)
-                    change = self._wide(self.better, i, j) - y - self._wide(self.errors[0], i, j)
+                    change = self._wide(self.better, i, j) - y - self._wide(errors[0], i, j)
                     size = f.apply("abs", change) / (1.0 / self._wide(self.scale_y, i) + f.apply("abs", y))
                     size = size if self.batch else f.select(self._inside(j, self.points), size, 0.0)
                     found.set(f.apply("max", found.get(), size))
             far = left.get() > ESTIMATE_TOLERANCE * self._largest(found.get()) + ROUNDING
-            return f.any(far) & (turns.get() < float(ESTIMATE_TURNS)) | (turns.get() < 1.0)
+            return f.any(far & alive) & (turns.get() < float(ESTIMATE_TURNS)) | (turns.get() < 1.0)
 
         with f.while_(going):
             f.call(self.correct, memory)
@@ -956,35 +1060,162 @@ class Core:
             largest.set(evaluated())
             left.set(size * largest.get() / before)
             turns.set(turns.get() + 1.0)
+        off, angle = self._errors_of_poses()
+        known = self._spread(f.select(off <= self._get(self.length, 0), 1.0, float("nan")))
         with self._places(self.ends) as j:
-            for i in range(self.errors[0].size):
-                self._write_wide(self._wide(self.errors[0], i, j), self.errors[1], i, j)
+            for i in range(errors[0].size):
+                self._write_wide(self._wide(errors[0], i, j), errors[1], i, j)
         far = self.better if self.far is None else self.far
         with self._places(self.ends) as j:
             for i in range(e.ny):
                 value = self._wide(far, i, j) - self._wide(self.records[0], i, j)
-                self._write_wide(value, self.errors[0], i, j)
+                self._write_wide(value * known, errors[0], i, j)
             for i in range(e.nz):
                 value = self._wide(self.z, i, j) - self._wide(self.records[0], e.ny + i, j)
-                self._write_wide(value, self.errors[0], e.ny + i, j)
-        layout = self.equations.system.y_layout
-        found = Variable(f, f.splat(f.value(0.0), self.L))
+                self._write_wide(value * known, errors[0], e.ny + i, j)
+        f.store(f.select(off <= self._get(self.length, 0), off, float("nan")), numbers, number * self.P)
+        if has_defect:
+            f.store(angle, numbers, ANGLE * self.P)
+        return f
+
+    def _errors_of_poses(self) -> tuple[Value, Value]:
+        """Return the largest error of positions (m) and of orientations (rad), of the better y."""
+        f, layout = self._now, self.equations.system.y_layout
+        offs, angles = (Variable(f, f.splat(f.value(0.0), self.L)) for _ in range(2))
+        total = Variable(f, f.splat(f.value(0.0), self.L))
         with self._places(self.points) as j:
-            square = f.value(0.0)
-            for i in range(layout.slice("p").start, layout.slice("p").stop):
-                x = self._wide(self.errors[0], i, j)
-                square = square + x * x
-            square = square if self.batch else f.select(self._inside(j, self.points), square, 0.0)
-            found.set(f.apply("max", found.get(), square))
-        f.store(f.apply("sqrt", self._largest(found.get())), numbers, 4 * self.P, self.P)
+
+            def change(i: int) -> Value:
+                return self._wide(self.better, i, j) - self._wide(self.y, i, j)
+
+            def largest(found: Variable, value: Value) -> None:
+                value = value if self.batch else f.select(self._inside(j, self.points), value, 0.0)
+                found.set(f.apply("max", found.get(), value))
+                total.set(total.get() + value)
+
+            names = layout.names
+            if "p" in names:
+                span = layout.slice("p")
+                p = [change(i) for i in range(span.start, span.stop)]
+                largest(offs, p[0] * p[0] + p[1] * p[1] + p[2] * p[2])
+            else:
+                for i in range(self.equations.ny):
+                    size = change(i) * self._wide(self.scale_y, i) * self._wide(self.length, 0)
+                    largest(offs, size * size)
+            if "h" in names:
+                span = layout.slice("h")
+                rows = range(span.start, span.stop)
+                h, d = [self._wide(self.y, i, j) for i in rows], [change(i) for i in rows]
+                square = h[0] * h[0] + h[1] * h[1] + h[2] * h[2] + h[3] * h[3]
+                along = (h[0] * d[0] + h[1] * d[1] + h[2] * d[2] + h[3] * d[3]) / square
+                across = [a - b * along for a, b in zip(d, h, strict=True)]
+                size = across[0] * across[0] + across[1] * across[1]
+                largest(angles, (size + across[2] * across[2] + across[3] * across[3]) / square)
+        finite = f.compare("lt", total.get(), float("inf"))
+        off, angle = (
+            f.apply("sqrt", self._largest(f.select(finite, each.get(), float("inf"))))
+            for each in (offs, angles)
+        )
+        return off, 2.0 * angle
+
+    def _write_time_errors(self) -> None:
+        """Errors of the states after a stage by the time scheme (see `solvers.time_loop.time_errors`)."""
+        e, scheme = self.equations, self.scheme
+        assert isinstance(scheme, SDIRK2)
+        self.time_error = f = self._function("time_error", "numbers", "coefficients")
+        memory, numbers, coefficients = f.arguments
+        c0, c1, c2 = (f.load(coefficients, i) for i in range(3))
+        with self._places(self.ends) as j:
+            for i in range(e.numbers):
+                value = c1 * self._wide(self.time_errors[0], i, j) + c2 * self._wide(
+                    self.time_errors[1], i, j
+                )
+                self._write_wide(value, self.dH, i, j)
+        with f.if_(f.compare("ne", c2, 0.0)):
+            # the difference of the rates at both stages, and its product with the equations' derivatives
+            with self._places(self.ends) as j:
+                for i in range(e.numbers):
+                    self._write_wide(-c0 * self._wide(self.difference, i, j), self.move, i, j)
+                for i in range(e.ny):
+                    self._write_wide(0.0, self.dy, i, j)
+            f.call(self.products, memory)
+            f.call(self.correct, memory)
+            f.call(self.products, memory)
+            with self._places(self.ends) as j:
+                for i in range(e.numbers):
+                    once = self._wide(self.dfar, i, j) if i < e.ny else self._wide(self.dz, i - e.ny, j)
+                    once = once - self._wide(self.difference, i, j)
+                    value = self._wide(self.dH, i, j) - c0 * scheme.defect * once
+                    self._write_wide(value, self.sum, i, j)
+            with self._places(self.ends) as j:
+                for i in range(e.numbers):
+                    self._write_wide(self._wide(self.sum, i, j), self.dH, i, j)
+        f.call(self.corrected_in_time, memory, numbers)
+
+    def _write_products(self) -> None:
+        """Products of derivatives with `dy` at the points and `move` of the history: defects, tip, z."""
+        e = self.equations
+        self.products = self._function("products")
+        far = self.y if self.far is None else self.far
+        with self._places(self.points) as j:
+            for i in range(e.ny):
+                self._write_wide(self._wide(self.dy, i, j), self.dfar, i, j)
+        if self.far is not None:
+            self._write_far(self.y, self.H)
+            with self._places(self.pieces) as j:
+                state = self._state_with_tangents(self.y, self.dy, j)
+                state |= {int(node): self._wide(self.acting, i, j) for i, node in enumerate(e.acting)}
+                for i, value in enumerate(self._evaluated(e.products["far"], j, True, state)):
+                    self._write_wide(value, self.dfar, i, j)
+        else:
+            self._write_far(self.y, self.H)
+        for k, point in enumerate(self.grid.near):
+            for i in range(e.ny):
+                self._put(self._get(self.dy, i, int(point)), self.dfar, i, self.points + k)
+        with self._places(self.ends) as j:
+            state = self._state_with_tangents(far, self.dfar, j)
+            found = self._evaluated(e.products["rates"], j, True, state)
+            for i in range(e.ny):
+                self._write_wide(found[i], self.df, i, j)
+            for i in range(e.nz):
+                self._write_wide(found[e.ny + i], self.dz, i, j)
+        self._write_ends(self.df, self.dfe)
+        with self._places(self.pieces) as j:
+            half = self._wide(self.h, 0, j) * 0.5
+            for i in range(e.ny):
+                rates = self._wide(self.df, i, j) + self._wide(self.dfe, i, j)
+                change = self._wide(self.dfar, i, j) - self._wide(self.dy, i, j + 1)
+                self._write_wide(change + half * rates, self.r, i, j)
+        tip = self.points - 1
+        state = self._tip_state(self.y, self.H)
+        state |= {int(node): self._get(self.dy, i, tip) for i, node in enumerate(e.dy)}
+        state |= {int(e.dhistory[i]): self._get(self.move, i, tip) for i in range(e.numbers)}
+        for i, value in enumerate(self._evaluated(e.products["tip"], 0, False, state)):
+            self._put(value, self.tip, i)
+
+    def _state_with_tangents(self, y: Array, dy: Array, j: Index) -> dict[int, Value]:
+        e = self.equations
+        state = {int(node): self._wide(y, i, j) for i, node in enumerate(e.y)}
+        state |= {int(e.history[i]): self._wide(self.H, i, j) for i in e.used_history}
+        state |= {int(node): self._wide(dy, i, j) for i, node in enumerate(e.dy)}
+        return state | {int(node): self._wide(self.move, i, j) for i, node in enumerate(e.dhistory)}
 
     def _write_records(self) -> None:
-        """Shift the records by one step."""
-        e = self.equations
+        """Shift the records by one step; the rate and the stages' difference of rates need the old ones."""
+        e, f = self.equations, self._now
+        coefficients = f.arguments[-1]
+        c0 = f.load(coefficients, 0)
+        far = self.y if self.far is None else self.far
+        newest = [(far, i) for i in range(e.ny)] + [(self.z, i) for i in range(e.nz)]
+        if isinstance(self.scheme, SDIRK2):
+            with self._places(self.ends) as j:
+                for i, (array, k) in enumerate(newest):
+                    rate = self._wide(array, k, j) + self._wide(self.H, i, j) / c0
+                    step = self._wide(self.records[0], i, j) - self._wide(self.records[1], i, j)
+                    self._write_wide(rate - step, self.difference, i, j)
         with self._places(self.count) as j:
             for i in range(e.numbers):
                 self._write_wide(self._wide(self.records[0], i, j), self.records[1], i, j)
-        far = self.y if self.far is None else self.far
         with self._places(self.ends) as j:
             for i in range(e.ny):
                 self._write_wide(self._wide(far, i, j), self.records[0], i, j)
@@ -994,58 +1225,96 @@ class Core:
         with self._places(self.count) as j:
             for i in range(e.nz):
                 self._write_wide(self._wide(self.z, i, j), self.records[0], e.ny + i, j)
+        if self.settings.uses_rate:
+            with self._places(self.count) as j:
+                for i in range(e.numbers):
+                    value = c0 * self._wide(self.records[0], i, j) + self._wide(self.H, i, j)
+                    self._write_wide(value, self.rate, i, j)
 
     # the time loop
 
     def _write_run(self) -> None:
-        """All steps: controls, coefficients of the scheme, numbers of steps; rows out."""
-        e = self.equations
-        f = self.module.function(
-            "run", ["memory", "controls", "coefficients", "rows", "infos", "n_steps"], exported=True
-        )
-        self._now = f
-        memory, controls, coefficients, rows, infos, steps = f.arguments
-        P = self.P
+        """All steps from `n_start` to `n_stop`, until every robot has failed; `reached` counts the solved."""
+        e, P = self.equations, self.P
+        names = ["memory", "controls", "coefficients", "extrapolations", "rows", "infos", "reached"]
+        f = self._now = self.module.function("run", [*names, "n_start", "n_stop"], exported=True)
+        memory, controls, coefficients, extrapolations, rows, infos, reached, start, stop = f.arguments
         numbers = Value(f, f.reserve(f"[{8 * P} x double]"), "ptr")
-        f.store(0.0, numbers, 0, P)
-        with f.loop(steps) as step:
-            number = step.value
-            c0, c1, c2, t = (f.load(coefficients, number * 4 + i) for i in range(4))
-            self._put(c0, self.inputs, 0)
-            self._put(t, self.inputs, 1)
-            for i in range(e.nc):
-                self._put(f.load(controls, (number * e.nc + i) * P, P), self.inputs, 2 + i)
-            f.call(self.terms, memory)
-            with self._places(self.count) as j:
-                for i in e.used_history:
-                    value = c1 * self._wide(self.records[0], i, j) + c2 * self._wide(self.records[1], i, j)
-                    self._write_wide(value, self.H, i, j)
-            with self._places(self.ends) as j:
-                for i in e.used_history:
-                    value = c1 * self._wide(self.errors[0], i, j) + c2 * self._wide(self.errors[1], i, j)
-                    self._write_wide(value, self.dH, i, j)
-            weights = [self._wide(self.weights, k) for k in range(3)]
-            with self._places(self.points) as j:
-                for i in range(e.ny):
-                    guess = weights[0] * self._wide(self.past[0], i, j)
-                    for k in (1, 2):
-                        guess = guess + weights[k] * self._wide(self.past[k], i, j)
-                    self._write_wide(guess, self.y, i, j)
-            for i, p in enumerate(self.pivots):
-                self._put(self._get(self.y, p, 0), self.unknowns, i)
-            self._write_base(self.unknowns, self.y, self.H)
-            f.call(self.solve, memory, numbers)
-            f.call(self.estimate, memory, numbers)
-            f.call(self.guesses, memory)
-            with f.loop(len(self.grid.nodes)) as node:
-                point = self._node(node)
-                row = (number * len(self.grid.nodes) + node.value) * (e.numbers * P)
-                target = f.pointer(rows, row)
+        for k in range(8):
+            f.store(1.0 if k == ALIVE else 0.0, numbers, k * P, P)
+        f.call(self.setup, memory)
+        step, nodes, stages = Variable(f, start), len(self.grid.nodes), self.settings.stages
+
+        def going() -> Value:
+            return (step.get() < stop) & f.any(f.load(numbers, ALIVE * P, P) > 0.0)
+
+        with f.while_(going):
+            with f.loop(stages) as stage:
+                number = step.get() * stages + stage.value
+                table = f.pointer(coefficients, number * 5)
+                f.call(self.stage, memory, numbers, table, f.pointer(controls, number * (e.nc * P)))
+                guesses = f.pointer(extrapolations, stage.value * 18)
+                f.call(self.guesses, memory, guesses)
+                with f.loop(nodes) as node:
+                    point = self._node(node)
+                    target = f.pointer(rows, (number * nodes + node.value) * (e.numbers * P))
+                    for i in range(e.numbers):
+                        value = self._get(self.y if i < e.ny else self.records[0], i, point)
+                        f.store(value, target, i * P, P)
+                info = f.pointer(infos, number * ((8 + e.k) * P))
+                for k in range(8):
+                    f.store(f.load(numbers, k * P, P), info, k * P, P)
+                for k in range(e.k):
+                    f.store(self._get(self.unknowns, k), info, (8 + k) * P, P)
+            alive = f.load(numbers, ALIVE * P, P) > 0.0
+            f.store(f.load(reached, 0, P) + f.select(alive, 1.0, 0.0), reached, 0, P)
+            step.set(step.get() + 1)
+
+    def _write_stage(self) -> None:
+        """One stage of a step: history, first guess, solution, records and estimates."""
+        e, P = self.equations, self.P
+        self.stage = f = self._function("stage", "numbers", "coefficients", "controls")
+        memory, numbers, coefficients, controls = f.arguments
+        c0, c1, c2, d1, t = (f.load(coefficients, i) for i in range(5))
+        self._put(c0, self.inputs, 0)
+        self._put(t + self._get(self.t0, 0), self.inputs, 1)
+        for i in range(e.nc):
+            self._put(f.load(controls, i * P, P), self.inputs, 2 + i)
+        f.call(self.terms, memory)
+
+        def history(states: list[Array], rate: Array, target: Array, count: int) -> None:
+            with self._places(count) as j:
                 for i in range(e.numbers):
-                    value = self._get(self.y if i < e.ny else self.records[0], i, point)
-                    f.store(value, target, i * P, P)
-            for i in range(5):
-                f.store(f.load(numbers, i * P, P), infos, (number * 5 + i) * P, P)
+                    value = c1 * self._wide(states[0], i, j) + c2 * self._wide(states[1], i, j)
+                    if self.settings.uses_rate:
+                        value = value + d1 * self._wide(rate, i, j)
+                    self._write_wide(value, target, i, j)
+
+        history(self.records, self.rate, self.H, self.count)
+        weights = [self._wide(self.weights, k) for k in range(3)]
+        with self._places(self.points) as j:
+            for i in range(e.ny):
+                guess = weights[0] * self._wide(self.past[0], i, j)
+                for k in (1, 2):
+                    guess = guess + weights[k] * self._wide(self.past[k], i, j)
+                self._write_wide(guess, self.y, i, j)
+        for i, p in enumerate(self.pivots):
+            self._put(self._get(self.y, p, 0), self.unknowns, i)
+        self._write_base(self.unknowns, self.y, self.H)
+        f.call(self.solve, memory, numbers)
+        history(self.errors, self.error_rate, self.dH, self.ends)
+        f.call(self.check, memory, numbers, coefficients)
+        f.call(self.corrected, memory, numbers)
+        if self.settings.uses_rate:
+            with self._places(self.ends) as j:
+                for i in range(e.numbers):
+                    value = c0 * self._wide(self.errors[0], i, j) + self._wide(self.dH, i, j)
+                    self._write_wide(value, self.error_rate, i, j)
+        if isinstance(self.scheme, SDIRK2):
+            f.call(self.time_error, memory, numbers, coefficients)
+        solved = f.load(numbers, ERROR * P, P) <= self.newton.acceptable
+        alive = f.load(numbers, ALIVE * P, P)
+        f.store(f.select(solved, alive, 0.0), numbers, ALIVE * P, P)
 
     def _node(self, node: Index) -> Index:
         """Return the point of a node."""
@@ -1056,19 +1325,26 @@ class Core:
         return f.index(f.result(f"load i64, ptr {at.name}", "i64"))
 
     def _write_guesses(self) -> None:
-        """Weights of the extrapolations in the next first guess, and the shift of earlier states."""
+        """Weights of the extrapolations in the next first guess, and the shift of earlier states.
+
+        The extrapolations (2, 3, 3) are those to this stage and to the next.
+        """
         e = self.equations
-        self.guesses = f = self._function("guesses")
-        extrapolations = ((1.0, 0.0, 0.0), (2.0, -1.0, 0.0), (3.0, -3.0, 1.0))
+        self.guesses = f = self._function("guesses", "extrapolations")
+        _, table = f.arguments
+        this, following = (
+            [[f.load(table, 9 * half + 3 * row + k) for k in range(3)] for row in range(3)]
+            for half in range(2)
+        )
         misfits = [Variable(f, f.splat(f.value(0.0), self.L)) for _ in range(3)]
         with self._places(self.points) as j:
             for i in range(e.ny):
                 past = [self._wide(each, i, j) for each in self.past]
                 unit, y = self._wide(self.scale_y, i), self._wide(self.y, i, j)
-                for misfit, weights in zip(misfits, extrapolations, strict=True):
+                for order, (misfit, weights) in enumerate(zip(misfits, this, strict=True)):
                     guess = past[0] * weights[0]
-                    for k in (1, 2):
-                        guess = guess + past[k] * weights[k] if weights[k] else guess
+                    for k in range(1, order + 1):
+                        guess = guess + past[k] * weights[k]
                     size = f.apply("abs", guess - y) * unit
                     size = size if self.batch else f.select(self._inside(j, self.points), size, 0.0)
                     misfit.set(f.apply("max", misfit.get(), size))
@@ -1079,14 +1355,12 @@ class Core:
         total = trusts[0] + trusts[1] + trusts[2]
         for k in range(3):
             weight = f.value(0.0)
-            for trust, weights in zip(trusts, extrapolations, strict=True):
-                weight = weight + trust / total * weights[k] if weights[k] else weight
+            for order in range(k, 3):
+                weight = weight + trusts[order] / total * following[order][k]
             self._put(weight, self.weights, k)
         for source, target in (
-            (self.past[1], self.past[2]),
-            (self.past[0], self.past[1]),
-            (self.y, self.past[0]),
-        ):
+            (self.past[1], self.past[2]), (self.past[0], self.past[1]), (self.y, self.past[0])
+        ):  # fmt: skip
             with self._places(self.points) as j:
                 for i in range(e.ny):
                     self._write_wide(self._wide(source, i, j), target, i, j)
@@ -1095,12 +1369,13 @@ class Core:
         e = self.equations
         self.middle = self._array(e.ny, self.pieces)
         self.node_table = self._array(len(self.grid.nodes), 1)
+        self._write_setup()
         self._write_terms()
         self.rates = self._write_rates("rates", slopes=False)
         self.rates_and_slopes = self._write_rates("rates_and_slopes", slopes=True)
         self.residual = self._write_residual("residual", self.trial, self.H)
         self.residual_of_y = self._write_residual("residual_of_y", self.y, self.H)
-        self.residual_of_better = self._write_residual("residual_of_better", self.better, self.dH)
+        self.residual_of_better = self._write_residual("residual_of_better", self.better, self.own_dH)
         self.defects = self._function("defects")
         self._write_defects(self.trial, self.H)
         self._write_factor()
@@ -1111,74 +1386,132 @@ class Core:
         self._write_linearise()
         self._write_correct()
         self._write_newton()
-        self._write_estimate()
+        self._write_check()
+        self.corrected = self._write_corrected("corrected", self.errors, True, POSITION)
+        if isinstance(self.scheme, SDIRK2):
+            self._write_products()
+            self.corrected_in_time = self._write_corrected("in_time", self.time_errors, False, TIME)
+            self._write_time_errors()
+        self._write_stage()
         self._write_guesses()
         self._write_run()
 
     # running
 
-    def run(
-        self, systems: Sequence[System], controls: np.ndarray, dt: float, coefficients: np.ndarray
-    ) -> Any:
-        """Run motions from rest: controls (robots, steps, c), coefficients (steps, 3) of a scheme.
+    def integrate(
+        self, parameters: np.ndarray, controls: np.ndarray, steps: StepCoefficients, states: StateHistory,
+        span: tuple[int, int],
+    ) -> tuple[np.ndarray, StateHistory, StepRows]:  # fmt: skip
+        """Solve a span of steps of each robot until one fails (see `time_loop.time_loop`).
 
-        Returns rows (robots, steps, nodes, y + z) and infos (robots, steps, 5): kept, error, corrections,
-        linearisations, position error.
+        Parameters (lanes, n), controls (lanes, T, c) or (lanes, T, stages * c) and states (lanes, ...).
+        Returns the numbers of steps done, the states after them, and rows.
         """
-        e, P = self.equations, self.P
-        count, steps, _ = controls.shape
-        outputs = np.empty((count, steps, len(self.grid.nodes), e.numbers)), np.empty((count, steps, 5))
-        function = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 5, ctypes.c_long)(self.compiled.address("run"))
-        times = np.concatenate([coefficients, (1.0 + np.arange(steps))[:, None] * dt], axis=1)
-        for first in range(0, count, P):
-            chosen = [min(first + k, count - 1) for k in range(P)]
-            memory = self.memory([systems[min(k, len(systems) - 1)] for k in chosen])
-            own = np.ascontiguousarray(np.moveaxis(controls[chosen], 0, -1))
-            rows, infos = (np.empty((*each.shape[1:], P)) for each in outputs)
-            arrays = memory, own, times, rows, infos
-            function(*(each.ctypes.data for each in arrays), steps)
-            kept = slice(first, min(first + P, count))
-            for whole, part in zip(outputs, (rows, infos), strict=True):
-                whole[kept] = np.moveaxis(part, -1, 0)[: kept.stop - first]
-        return outputs
+        e, P, stages = self.equations, self.P, self.settings.stages
+        start, stop = span
+        total, nodes = controls.shape[1], len(self.grid.nodes)
+        own = controls.reshape(P, total, -1, e.nc)
+        own = np.broadcast_to(own, (P, total, stages, e.nc))
+        own = np.ascontiguousarray(np.moveaxis(own, 0, -1))
+        table = np.empty((total, stages, 5))
+        coefficients = np.asarray(steps.table).reshape(2, stages, 4)
+        table[..., :4] = coefficients[1]
+        table[:1, :, :4] = coefficients[0]
+        table[..., 4] = (np.arange(total)[:, None] + np.asarray(steps.ends)) * steps.dt
+        guesses = stage_extrapolations(self.settings) if stages > 1 else EXTRAPOLATIONS[None]
+        guesses = np.ascontiguousarray(np.stack([guesses, np.roll(guesses, -1, axis=0)], axis=1))
+        rows = np.zeros((total, stages, nodes, e.numbers, P))
+        infos = np.zeros((total, stages, 8 + e.k, P))
+        run = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 7, *[ctypes.c_long] * 2)(
+            self.compiled.address("run")
+        )
 
-    def memory(self, systems: Sequence[System]) -> np.ndarray:
-        """Return the memory of a run that begins at rest."""
-        e = self.equations
+        def ran(stop: int) -> tuple[np.ndarray, np.ndarray]:
+            memory, reached = self._memory(parameters, states), np.full(P, float(start))
+            arrays = memory, own, table, guesses, rows, infos, reached
+            run(*(each.ctypes.data for each in arrays), start, stop)
+            return memory, reached
+
+        memory, reached = ran(stop)
+        if not self.batch and reached[0] < stop:
+            # the state before the step that failed
+            failed = rows.copy(), infos.copy()
+            memory, _ = ran(int(reached[0]))
+            rows, infos = failed
+        return reached.astype(int), self._states(memory, states), self._rows(rows, infos)
+
+    def _rows(self, rows: np.ndarray, infos: np.ndarray) -> StepRows:
+        """Return rows (lanes, steps, ...); a step's row is that of its last stage."""
+        rows, infos = np.moveaxis(rows, -1, 0), np.moveaxis(infos, -1, 0)
+        numbers, unknowns = infos[..., :8], infos[..., 8:]
+        error = np.max(numbers[..., ERROR], axis=-1)
+        off, angle = numbers[..., -1, POSITION], numbers[..., -1, ANGLE]
+        length = self._lengths[:, None]
+        fine = (off <= COARSE_SHARE * length) & (angle <= COARSE_ANGLE)
+        result = np.where(fine, int(Result.CONVERGED), int(Result.COARSE))
+        result = np.where(error <= self.newton.acceptable, result, int(Result.NO_CONVERGENCE))
+        time_error = numbers[..., -1, TIME] if isinstance(self.scheme, SDIRK2) else np.full(off.shape, np.nan)
+        corrections = np.sum(numbers[..., CORRECTIONS], axis=-1).astype(int)
+        return StepRows(
+            rows[:, :, -1], unknowns[:, :, -1], error, corrections, off, result, time_error,
+            rows[:, :, :-1], unknowns[:, :, :-1],
+        )  # fmt: skip
+
+    def _arrays(self) -> dict[str, list[Array]]:
+        """Return the arrays of each part of a `StateHistory`."""
+        return {
+            "records": self.records, "rate": [self.rate], "y": self.past, "weights": [self.weights],
+            "t0": [self.t0], "error": [*self.errors, self.error_rate], "time_error": self.time_errors,
+        }  # fmt: skip
+
+    def _places_of(self, array: Array) -> tuple[np.ndarray, int]:
+        """Return the offsets (places, size) of an array for the first lane, and its number of places."""
+        count = array.count if self.batch or array.count == 1 else self.stride
+        at = np.arange(count)[:, None] * array.place + np.arange(array.size) * array.component
+        return array.offset + at, count
+
+    def _memory(self, parameters: np.ndarray, states: StateHistory) -> np.ndarray:
+        """Return the memory of a run from these states."""
         raw = np.zeros(self._size + 16)
         memory = raw[(-raw.ctypes.data // 8) % 8 :][: self._size]
-        known = {id(system): self._numbers(system) for system in systems}
-        lanes = [known[id(system)] for system in systems]
 
-        def put(array: Array, values: list[np.ndarray]) -> None:
-            """Write values (places, size) of all lanes; the last place is repeated in the lanes beyond it."""
-            count = array.count if self.batch or array.count == 1 else self.stride
-            at = np.arange(count)[:, None] * array.place + np.arange(array.size) * array.component
+        def put(array: Array, values: np.ndarray) -> None:
+            """Write values (lanes, places, size); the last place is repeated in the lanes beyond it."""
+            at, count = self._places_of(array)
+            values = values.reshape(self.P, -1, array.size)
+            values = values[:, np.minimum(np.arange(count), values.shape[1] - 1)]
             for lane, value in enumerate(values):
-                value = np.asarray(value, float).reshape(-1, array.size)
-                own = value[np.minimum(np.arange(count), len(value) - 1)]
-                memory[array.offset + at + (lane if self.batch else 0)] = own
+                memory[at + lane] = value
 
-        for k, array in enumerate((self.params, self.scale_y, self.scale_tip, self.s, self.h)):
-            put(array, [each[k] for each in lanes])
+        put(self.params, parameters)
         if self.acting.size:
-            put(self.acting, [self.grid.acting] * len(lanes))
-        for array in self.records:
-            put(array, [each[5] for each in lanes])
-        for array in (self.y, *self.past):
-            put(array, [each[5][:, : e.ny] for each in lanes])
-        put(self.weights, [np.array([1.0, 0.0, 0.0])] * len(lanes))
+            put(self.acting, np.broadcast_to(self.grid.acting, (self.P, *self.grid.acting.shape)))
+        for name, arrays in self._arrays().items():
+            values = np.asarray(getattr(states, name), float)
+            if name == "weights":
+                put(self.weights, values)
+                continue
+            for k, array in enumerate(arrays):
+                put(array, values[:, k] if len(arrays) > 1 else values)
+        put(self.y, np.asarray(states.y, float)[:, 0])
         table = memory[self.node_table.offset :].view(np.int64)
         table[: len(self.grid.nodes)] = self.grid.nodes
         return memory
 
-    def _numbers(self, system: System) -> tuple[np.ndarray, ...]:
-        """Return parameters, inverse scales, places, lengths of pieces and the state at rest of a robot."""
-        still = StepProblem.still(system, LOBATTO2, np.zeros(self.equations.nc))
-        y, z = jax.vmap(system.rest)(still.places)
-        scales, leaves = system.scales(), jax.tree.leaves(system)
-        parameters = np.concatenate([np.asarray(leaf, float).reshape(-1) for leaf in leaves])
-        return (
-            parameters, 1.0 / np.asarray(scales.y), 1.0 / np.asarray(scales.tip), np.asarray(still.places),
-            np.asarray(still.lengths())[:, 0], np.concatenate([y, z], axis=1),
-        )  # fmt: skip
+    def _states(self, memory: np.ndarray, states: StateHistory) -> StateHistory:
+        """Return the states at the end of a run."""
+
+        def get(array: Array, count: int) -> np.ndarray:
+            at, _ = self._places_of(array)
+            return np.stack([memory[at[:count] + lane] for lane in range(self.P)])
+
+        self._lengths = get(self.length, 1)[:, 0, 0]
+        found = {}
+        for name, arrays in self._arrays().items():
+            before = np.asarray(getattr(states, name))
+            if name in ("weights", "t0"):
+                found[name] = get(arrays[0], 1).reshape(before.shape)
+                continue
+            values = [get(array, before.shape[-2]) for array in arrays]
+            found[name] = np.stack(values, axis=1) if len(values) > 1 else values[0]
+        return StateHistory(**found)

@@ -1,0 +1,83 @@
+"""Time loops of the engine: the same arguments and results as the compiled loops of `solvers.time_loop`."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import jax
+import numpy as np
+
+from knode_cosserat.engine.core import Core
+from knode_cosserat.engine.program import EngineError
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.history import StateHistory
+from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.time_loop import StepCoefficients, StepRows
+
+#: compiled cores, by what their code depends on; None where the engine cannot run a system
+_CORES: dict[Any, Core | None] = {}
+
+
+def core_of(system: System, settings: Settings, robots: bool) -> Core | None:
+    """Return the core of a system, with robots or places in lanes; None if the engine does not cover it.
+
+    Parameters that are zero are constants of the code.
+    """
+    leaves, structure = jax.tree.flatten(system)
+    leaves = [np.asarray(leaf) for leaf in leaves]
+    zeros = tuple((leaf.shape, np.packbits(leaf == 0.0).tobytes()) for leaf in leaves)
+    key = structure, zeros, settings, robots
+    if key not in _CORES:
+        try:
+            _CORES[key] = Core(system, settings, robots)
+        except EngineError:
+            _CORES[key] = None
+    return _CORES[key]
+
+
+def parameters_of(system: System) -> np.ndarray:
+    """Return all numeric parameters of a system in one vector."""
+    return np.concatenate([np.asarray(leaf, float).reshape(-1) for leaf in jax.tree.leaves(system)])
+
+
+def loop_one(
+    system: System, settings: Settings, steps: StepCoefficients, controls: Any, past: StateHistory,
+    span: tuple[int, int],
+) -> tuple[int, StateHistory, StepRows]:  # fmt: skip
+    """Solve a span of steps until one fails: the number of steps done, the state after them, and rows."""
+    core = core_of(system, settings, robots=False)
+    if core is None:
+        raise EngineError("engine: these equations or settings are not covered")
+    one = functools.partial(jax.tree.map, lambda leaf: np.asarray(leaf)[None])
+    done, states, rows = core.integrate(
+        parameters_of(system), np.asarray(controls)[None], steps, one(past), span
+    )
+    return int(done[0]), *jax.tree.map(lambda leaf: leaf[0], (states, rows))
+
+
+def loop_many(
+    system: System, settings: Settings, steps: StepCoefficients, controls: Any, pasts: StateHistory, stop: int
+) -> tuple[np.ndarray, StateHistory, StepRows]:
+    """Solve all steps of a batch: controls (B, T, c), states (B, ...), and one system or a batch of them.
+
+    Robots are solved side by side in the lanes of a vector. A robot with a failed step waits for the others;
+    its last state is not kept.
+    """
+    many, size = np.ndim(system.length) > 0, len(controls)
+    core = core_of(jax.tree.map(lambda leaf: leaf[0], system) if many else system, settings, robots=True)
+    if core is None:
+        raise EngineError("engine: these equations or settings are not covered")
+    parts = []
+    for first in range(0, size, core.P):
+        index = np.minimum(np.arange(first, first + core.P), size - 1)
+        if many:
+            leaves = [np.asarray(leaf, float)[index] for leaf in jax.tree.leaves(system)]
+            parameters = np.concatenate([leaf.reshape(core.P, -1) for leaf in leaves], axis=1)
+        else:
+            parameters = np.broadcast_to(
+                parameters_of(system), (core.P, len(core.equations.parameter_values))
+            )
+        states = jax.tree.map(lambda leaf, index=index: np.asarray(leaf)[index], pasts)
+        parts.append(core.integrate(parameters, np.asarray(controls)[index], steps, states, (0, stop)))
+    return jax.tree.map(lambda *lanes: np.concatenate(lanes)[:size], *parts)
