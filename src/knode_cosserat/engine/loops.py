@@ -15,14 +15,15 @@ from knode_cosserat.solvers.history import StateHistory
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.time_loop import StepCoefficients, StepRows
 
-#: compiled cores, by what their code depends on; None where the engine cannot run a system
-_CORES: dict[Any, Core | None] = {}
+#: compiled cores, or the reason why there is none, by what their code depends on
+_CORES: dict[Any, Core | EngineError] = {}
 
 
-def core_of(system: System, settings: Settings, robots: bool) -> Core | None:
-    """Return the core of a system, with robots or places in lanes; None if the engine does not cover it.
+def core_of(system: System, settings: Settings, robots: bool) -> Core:
+    """Return the core of a system, with robots or places in lanes.
 
-    Parameters that are zero are constants of the code.
+    Parameters that are zero are constants of the code. Raises `EngineError` if the engine does not cover the
+    system or the settings.
     """
     leaves, structure = jax.tree.flatten(system)
     leaves = [np.asarray(leaf) for leaf in leaves]
@@ -31,9 +32,12 @@ def core_of(system: System, settings: Settings, robots: bool) -> Core | None:
     if key not in _CORES:
         try:
             _CORES[key] = Core(system, settings, robots)
-        except EngineError:
-            _CORES[key] = None
-    return _CORES[key]
+        except EngineError as error:
+            _CORES[key] = error
+    core = _CORES[key]
+    if isinstance(core, EngineError):
+        raise core
+    return core
 
 
 def parameters_of(system: System) -> np.ndarray:
@@ -47,8 +51,6 @@ def loop_one(
 ) -> tuple[int, StateHistory, StepRows]:  # fmt: skip
     """Solve a span of steps until one fails: the number of steps done, the state after them, and rows."""
     core = core_of(system, settings, robots=False)
-    if core is None:
-        raise EngineError("engine: these equations or settings are not covered")
     one = functools.partial(jax.tree.map, lambda leaf: np.asarray(leaf)[None])
     done, states, rows = core.integrate(
         parameters_of(system), np.asarray(controls)[None], steps, one(past), span
@@ -66,8 +68,6 @@ def loop_many(
     """
     many, size = np.ndim(system.length) > 0, len(controls)
     core = core_of(jax.tree.map(lambda leaf: leaf[0], system) if many else system, settings, robots=True)
-    if core is None:
-        raise EngineError("engine: these equations or settings are not covered")
     parts = []
     for first in range(0, size, core.P):
         index = np.minimum(np.arange(first, first + core.P), size - 1)

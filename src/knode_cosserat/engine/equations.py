@@ -1,0 +1,223 @@
+"""Programs of a system's equations, and of the elimination of one piece of the rod.
+
+All come from the system's own functions (`program.Program`), and derivatives from rules on the program.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from knode_cosserat.engine.program import Program
+from knode_cosserat.rods.system import System, unknown_count
+from knode_cosserat.solvers import semi_discrete
+from knode_cosserat.solvers.grid import grid_of
+from knode_cosserat.solvers.problem import StepProblem
+from knode_cosserat.solvers.space import LOBATTO2
+
+RUN, STEP, PLACE, STATE = 1, 2, 3, 4
+
+
+class Equations:
+    """Programs of a system: rates and strains at a point with their derivatives, base and tip."""
+
+    def __init__(self, system: System):
+        self.system = system
+        leaves, tree = jax.tree.flatten(system)
+        leaves = [np.asarray(leaf, dtype=float) for leaf in leaves]
+        self.ny, self.nz = system.y_layout.size, system.z_layout.size
+        self.nc, self.k = system.control_size, unknown_count(system)
+        self.numbers = self.ny + self.nz
+        program = self.program = Program()
+        self.parameters = [program.inputs(f"p{i}", leaf.shape, RUN) for i, leaf in enumerate(leaves)]
+        #: the place of each parameter's node in the vector of parameters
+        self.parameter_values = np.concatenate([leaf.reshape(-1) for leaf in leaves])
+        # parameters that are zero are constants: fewer operations
+        folded = [
+            np.where(leaf == 0.0, program.constant(0.0), nodes)
+            for leaf, nodes in zip(leaves, self.parameters, strict=True)
+        ]
+        self.c0, self.t = program.inputs("c0", (), STEP), program.inputs("t", (), STEP)
+        self.control = program.inputs("control", (self.nc,), STEP)
+        self.s = program.inputs("s", (), PLACE)
+        self.y = program.inputs("y", (self.ny,), STATE)
+        self.history = program.inputs("history", (self.numbers,), STATE)
+        self.unknowns = program.inputs("unknowns", (self.k,), STATE)
+
+        def problem(leaves: Any, c0: Any, t: Any, control: Any, record: Any) -> StepProblem:
+            own = jax.tree.unflatten(tree, leaves)
+            return StepProblem(own, t, control, c0, record[None], LOBATTO2)
+
+        def rates(leaves: Any, c0: Any, t: Any, control: Any, s: Any, y: Any, record: Any) -> Any:
+            return problem(leaves, c0, t, control, record).point_rates(s, y, record)
+
+        def base(leaves: Any, c0: Any, t: Any, control: Any, unknowns: Any, record: Any) -> Any:
+            return problem(leaves, c0, t, control, record).base(unknowns)
+
+        def tip(leaves: Any, c0: Any, t: Any, control: Any, y: Any, record: Any) -> Any:
+            own = jax.tree.unflatten(tree, leaves)
+            return semi_discrete.tip(own, t, control, y, semi_discrete.unpacked_history(own, c0, record))
+
+        def jump(leaves: Any, c0: Any, t: Any, control: Any, acting: Any, y: Any, record: Any) -> Any:
+            return problem(leaves, c0, t, control, record).jump(acting, y, record)
+
+        def geometry(leaves: Any) -> Any:
+            own = jax.tree.unflatten(tree, leaves)
+            still, scales = StepProblem.still(own, LOBATTO2, np.zeros(self.nc)), own.scales()
+            length = jnp.asarray(own.length)[None]
+            return 1.0 / scales.y, 1.0 / scales.tip, still.places, still.lengths()[:, 0], length
+
+        one, step = np.zeros(()), (1.0, 0.0, np.zeros(self.nc))
+        # of the parameters alone: inverse scales, places and lengths of pieces
+        self.geometry = [
+            np.broadcast_to(nodes, size)
+            for nodes, size in zip(
+                program.evaluate(jax.make_jaxpr(geometry)(leaves), folded),
+                (self.ny, self.k, grid_of(system, LOBATTO2).count, grid_of(system, LOBATTO2).tip, 1),
+                strict=True,
+            )
+        ]
+        known = [*folded, self.c0, self.t, self.control]
+        traced = jax.make_jaxpr(rates)(leaves, *step, one, np.ones(self.ny), np.zeros(self.numbers))
+        self.f, self.z = program.evaluate(traced, [*known, self.s, self.y, self.history])
+        traced = jax.make_jaxpr(base)(leaves, *step, np.zeros(self.k), np.zeros(self.numbers))
+        [self.base] = program.evaluate(traced, [*known, self.unknowns, self.history])
+        traced = jax.make_jaxpr(tip)(leaves, *step, np.ones(self.ny), np.zeros(self.numbers))
+        [self.tip] = program.evaluate(traced, [*known, self.y, self.history])
+        #: y on the far side of the discontinuities that act, and the nonzeros of its derivative, less 1
+        self.acting, self.far, self.jumping = program.inputs("acting", (len(system.cuts),), STATE), self.y, []
+        if system.jumps:
+            shapes = np.zeros(len(system.cuts)), np.ones(self.ny), np.zeros(self.numbers)
+            traced = jax.make_jaxpr(jump)(leaves, *step, *shapes)
+            [self.far] = program.evaluate(traced, [*known, self.acting, self.y, self.history])
+            slopes = program.jacobian(self.far, self.y)
+            for i, j in np.ndindex(slopes.shape):
+                if i == j:
+                    slopes[i, i] = program.apply("sub", int(slopes[i, i]), program.constant(1.0))
+                if not program.is_constant(int(slopes[i, j]), 0.0):
+                    self.jumping.append((i, j, int(slopes[i, j])))
+        self.slopes = program.jacobian(self.f, self.y)
+        self.base_slopes = program.jacobian(self.base, self.unknowns)
+        self.tip_slopes = program.jacobian(self.tip, self.y)
+        #: structural nonzeros of the Jacobian
+        self.pattern = [
+            (i, j)
+            for i, j in np.ndindex(self.slopes.shape)
+            if not program.is_constant(int(self.slopes[i, j]), 0.0)
+        ]
+        needed = set(program.needed([*self.f, *self.z, *self.far, *self.base, *self.tip]))
+        #: entries of a record that the equations need as history
+        self.used_history = [i for i in range(self.numbers) if int(self.history[i]) in needed]
+        outputs = [*self.f, *self.z, *self.slopes.reshape(-1), *self.base, *self.tip]
+        outputs += [*self.base_slopes.reshape(-1), *self.tip_slopes.reshape(-1)]
+        outputs += [*self.far, *(node for *_, node in self.jumping)]
+        #: tangents of y and of the history, and the products of derivatives with them
+        self.dy = program.inputs("dy", (self.ny,), STATE)
+        self.dhistory = program.inputs("dhistory", (self.numbers,), STATE)
+        directions = dict(zip([*self.y, *self.history], [*self.dy, *self.dhistory], strict=True))
+        self.products = {
+            name: program.derivative([int(node) for node in nodes], directions)
+            for name, nodes in (
+                ("rates", [*self.f, *self.z]), ("far", self.far), ("tip", self.tip), ("base", self.base)
+            )
+        }  # fmt: skip
+        for nodes in self.products.values():
+            outputs += nodes
+        self.step_terms = self._hoisted(outputs, {STEP, RUN})
+        self.place_terms = self._hoisted(outputs, {PLACE})
+
+    def _hoisted(self, outputs: Sequence[int] | np.ndarray, levels: set[int]) -> list[int]:
+        """Return the operations of these levels that operations of higher levels need."""
+        program, found = self.program, set()
+        for node in program.needed(outputs):
+            if program.levels[node] > max(levels):
+                found |= {each for each in program.arguments(node) if program.levels[each] in levels}
+        found |= {int(node) for node in outputs if program.levels[int(node)] in levels}
+        todo = [node for node in found if program.is_boolean(node)]
+        while todo:  # truths are evaluated where they are used
+            node = todo.pop()
+            found.discard(node)
+            for each in program.arguments(node):
+                if program.levels[each] in levels and each not in found:
+                    todo.append(each) if program.is_boolean(each) else found.add(each)
+        return sorted(found)
+
+
+class Elimination:
+    """Program of a piece: factors of B = 1 - h/2 J at its end; B⁻¹ (A x + r), A = 1 + h/2 J at its start."""
+
+    def __init__(self, equations: Equations):
+        program = self.program = Program()
+        n, pattern = equations.ny, equations.pattern
+        zero, one = program.constant(0.0), program.constant(1.0)
+        self.h = program.input("h", 1)
+        half = program.apply("mul", self.h, program.constant(0.5))
+        self.start = program.inputs("start", (len(pattern),), 1)
+        self.end = program.inputs("end", (len(pattern),), 1)
+        A, B = np.full((n, n), zero), np.full((n, n), zero)
+        for k, (i, j) in enumerate(pattern):
+            A[i, j] = program.apply("mul", half, int(self.start[k]))
+            B[i, j] = program.apply("neg", program.apply("mul", half, int(self.end[k])))
+        for i in range(n):
+            B[i, i] = program.apply("add", one, int(B[i, i]))
+        self._order = order = _least_fill(pattern, n)
+        for at, p in enumerate(order):
+            B[p, p] = program.apply("div", one, int(B[p, p]))
+            for i in order[at + 1 :]:
+                if B[i, p] == zero:
+                    continue
+                B[i, p] = program.apply("mul", int(B[i, p]), int(B[p, p]))
+                for j in order[at + 1 :]:
+                    product = program.apply("mul", int(B[i, p]), int(B[p, j]))
+                    B[i, j] = program.apply("sub", int(B[i, j]), product)
+        #: factors that are not constant
+        self.places = [(i, j) for i, j in np.ndindex(B.shape) if not program.is_constant(int(B[i, j]))]
+        self.factors = [int(B[i, j]) for i, j in self.places]
+        stored = program.inputs("factor", (len(self.places),), 1)
+        self.stored = stored
+        LU = B.copy()
+        for node, (i, j) in zip(stored, self.places, strict=True):
+            LU[i, j] = node
+        self.x, self.r = program.inputs("x", (n,), 1), program.inputs("r", (n,), 1)
+        self.jump = program.inputs("jump", (len(equations.jumping),), 1)
+        #: x on the far side of the discontinuities at the start
+        self._far = [int(each) for each in self.x]
+        for node, (i, j, _) in zip(self.jump, equations.jumping, strict=True):
+            self._far[i] = program.apply("add", self._far[i], program.apply("mul", int(node), int(self.x[j])))
+        self.advanced = [self._solved(A, LU, added) for added in ([int(each) for each in self.r], [zero] * n)]
+
+    def _solved(self, A: Any, LU: Any, r: list[int]) -> list[int]:
+        apply = self.program.apply
+        x = self._far
+        out = [apply("add", a, b) for a, b in zip(x, r, strict=True)]
+        for i, j in np.ndindex(A.shape):
+            out[i] = apply("add", out[i], apply("mul", int(A[i, j]), x[j]))
+        for at, i in enumerate(self._order):
+            for j in self._order[:at]:
+                out[i] = apply("sub", out[i], apply("mul", int(LU[i, j]), out[j]))
+        for at, i in reversed(list(enumerate(self._order))):
+            for j in self._order[at + 1 :]:
+                out[i] = apply("sub", out[i], apply("mul", int(LU[i, j]), out[j]))
+            out[i] = apply("mul", out[i], int(LU[i, i]))
+        return out
+
+
+def _least_fill(pattern: Sequence[tuple[int, int]], n: int) -> list[int]:
+    """Return an order of pivots on the diagonal with little fill-in (Markowitz 1957)."""
+    nonzero = np.eye(n, dtype=bool)
+    for i, j in pattern:
+        nonzero[i, j] = True
+    rest, order = list(range(n)), []
+    while rest:
+        counts = [(nonzero[rest, k].sum() - 1) * (nonzero[k, rest].sum() - 1) for k in rest]
+        best = rest[int(np.argmin(counts))]
+        for i in rest:
+            if i != best and nonzero[i, best]:
+                nonzero[i] |= nonzero[best]
+        order.append(best)
+        rest.remove(best)
+    return order

@@ -1,0 +1,116 @@
+"""Memory of a run, and code that reads and writes it: robots in lanes, or places along the rod in lanes.
+
+A lane of a vector is a robot of a batch. For a single robot it is a place along the rod; in the recursion
+along the rod it is a column of the matrix that is eliminated. The code is the same: arrays know their layout
+(`Array`), and values are `wide` where all places are independent, else `plain`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+from knode_cosserat.engine.codegen import Function, Index, Module, Value
+
+
+@dataclasses.dataclass(frozen=True)
+class Array:
+    """Numbers of `size` components at `count` places, in the memory of a run."""
+
+    offset: int
+    size: int
+    count: int
+    #: distance between components and between places, in doubles
+    component: int
+    place: int
+
+    def at(self, i: int, j: int) -> int:
+        """Return the offset of component i at place j."""
+        return self.offset + j * self.place + i * self.component
+
+
+class Memory:
+    """Arrays of a run, and the function that is being written."""
+
+    def __init__(self, robots: bool, lanes: int, places: int):
+        self.batch, self.L = robots, lanes
+        #: lanes of a plain value
+        self.P = lanes if robots else 1
+        #: distance between components of a single robot's arrays
+        self.stride = (-(-(places + 1) // lanes) + 1) * lanes
+        self.module = Module()
+        self._size = 0
+
+    def _array(self, size: int, count: int) -> Array:
+        """Reserve an array: robots in lanes, or places in lanes."""
+        place, component = (size * self.L, self.L) if self.batch else (1, 1 if count == 1 else self.stride)
+        found = Array(self._size, size, count, component, place)
+        length = size * count * self.L if self.batch else size * (1 if count == 1 else self.stride)
+        self._size += -(-length // self.L) * self.L
+        return found
+
+    def _columns(self, size: int) -> Array:
+        """Reserve a matrix whose columns are in lanes (one robot), or follow each other (robots in lanes)."""
+        found = Array(self._size, size, 1, self.L, 0)
+        self._size += size * self.L
+        return found
+
+    # code that reads and writes
+
+    def _function(self, name: str, *arguments: str) -> Function:
+        f = self.module.function(name, ["memory", *arguments])
+        self._now = f
+        return f
+
+    def _at(self, array: Array, i: int, j: int | Index) -> tuple[Value, int]:
+        """Return an address and an offset from it."""
+        memory = self._now.arguments[0]
+        if isinstance(j, int):
+            return memory, array.at(i, j)
+        return j.address(memory, array.place), array.at(i, j.delta)
+
+    def _pointer(self, array: Array, j: int | Index) -> Value:
+        """Return the address of component 0 at a place."""
+        return self._now.pointer(*self._at(array, 0, j))
+
+    def _get(self, array: Array, i: int, j: int | Index = 0, lanes: int = 0) -> Value:
+        return self._now.load(*self._at(array, i, j), lanes or self.P)
+
+    def _put(self, value: Any, array: Array, i: int, j: int | Index = 0, lanes: int = 0) -> None:
+        self._now.store(value, *self._at(array, i, j), lanes or self.P)
+
+    def _wide(self, array: Array, i: Any, j: Any = 0) -> Value:
+        # a number that is the same at all places
+        lanes = self.L if self.batch or array.count > 1 else 1
+        return self._get(array, i, j, lanes)
+
+    def _write_wide(self, value: Any, array: Array, i: Any, j: Any) -> None:
+        self._put(value, array, i, j, self.L)
+
+    @contextlib.contextmanager
+    def _places(self, count: int, first: int = 0) -> Iterator[Index]:
+        """Write a loop over places, all independent: one by one, or as many as there are lanes.
+
+        The last lanes of a single robot may lie beyond the last place. They hold numbers that nobody reads.
+        """
+        with self._now.loop(first + count, first, 1 if self.batch else self.L) as j:
+            yield j
+
+    def _inside(self, j: Index, end: int) -> Any:
+        """Return true for the lanes before a place."""
+        if self.batch:
+            return True
+        f = self._now
+        numbers = f.joined([f.value(float(k)) for k in range(self.L)])
+        here = f.result(f"sitofp i64 {j.value.name} to double")
+        return numbers + here < float(end)
+
+    def _largest(self, value: Value) -> Value:
+        """Return the largest of a wide value for each robot."""
+        return value if self.batch else self._now.largest(value)
+
+    def _spread(self, value: Value) -> Value:
+        """Return a plain value in all lanes of a wide one."""
+        return self._now.splat(value, self.L)

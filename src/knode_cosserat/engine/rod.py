@@ -1,0 +1,233 @@
+"""Code of a rod's equations at all places: terms, rates, jumps, defects of the box scheme, norms."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from knode_cosserat.engine.codegen import Function, Index, Value, Variable
+from knode_cosserat.engine.equations import Equations
+from knode_cosserat.engine.memory import Array, Memory
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.grid import grid_of
+from knode_cosserat.solvers.space import LOBATTO2
+
+
+class RodCode(Memory):
+    """Functions that evaluate the equations of a system along the rod."""
+
+    rates: Function
+    rates_and_slopes: Function
+
+    def __init__(self, system: System, robots: bool, lanes: int):
+        self.equations, self.grid = Equations(system), grid_of(system, LOBATTO2)
+        e, grid = self.equations, self.grid
+        super().__init__(robots, lanes, grid.count)
+        self.pieces, self.points, self.ends, self.count = grid.tip, grid.tip + 1, grid.ends, grid.count
+        ny, nz, k, a = e.ny, e.nz, e.k, self._array
+        self.params, self.scale_y, self.scale_tip = a(len(e.parameter_values), 1), a(ny, 1), a(k, 1)
+        self.inputs, self.step_terms = a(2 + e.nc, 1), a(len(e.step_terms), 1)
+        self.s, self.h, self.length = a(1, self.count), a(1, self.pieces), a(1, 1)
+        self.geometry = self.scale_y, self.scale_tip, self.s, self.h, self.length
+        self.place_terms = a(len(e.place_terms), self.count)
+        self.f, self.z, self.fe = a(ny, self.count), a(nz, self.count), a(ny, self.pieces)
+        self.slope, self.slope_end = a(len(e.pattern), self.ends), a(len(e.pattern), self.pieces)
+        self.acting, self.jump = a(len(system.cuts), self.pieces), a(len(e.jumping), self.pieces)
+        #: y at the places of the ends; with jumps it differs from y at the points
+        self.far = a(ny, self.ends) if system.jumps else None
+        #: defects of the pieces and of the tip
+        self.r, self.tip = a(ny, self.pieces), a(k, 1)
+
+    def _known(self, j: Any, wide: bool, state: dict[int, Value]) -> dict[int, Value]:
+        """Return the values of hoisted terms at a place."""
+        e = self.equations
+        nodes = e.program.needed(self._outputs, frozenset(state))
+        needed = set(nodes) | {each for node in nodes for each in e.program.arguments(node)}
+        values = dict(state)
+        for k, node in enumerate(e.step_terms):
+            if node in needed:
+                values[node] = self._wide(self.step_terms, k) if wide else self._get(self.step_terms, k)
+        for k, node in enumerate(e.place_terms):
+            if node in needed:
+                values[node] = self._wide(self.place_terms, k, j)
+        return values
+
+    def _evaluated(
+        self, outputs: Sequence[int] | np.ndarray, j: Any, wide: bool, state: dict[int, Value]
+    ) -> list[Value]:
+        """Write the operations of outputs at a place."""
+        self._outputs = [int(each) for each in outputs]
+        lanes = self.L if wide else self.P
+        known = self._known(j, wide, state)
+        values = self._now.evaluate(self.equations.program, self._outputs, known, lanes)
+        return [values[node] for node in self._outputs]
+
+    def _write_setup(self) -> None:
+        """Scales, places and lengths of pieces: once a run."""
+        e = self.equations
+        self.setup = f = self._function("setup")
+        outputs = [int(node) for nodes in e.geometry for node in nodes]
+        values = f.evaluate(e.program, outputs, self._parameters(), self.P)
+        for array, nodes in zip(self.geometry, e.geometry, strict=True):
+            for k, node in enumerate(nodes):
+                i, j = (0, k) if array.size == 1 else (k, 0)
+                self._put(values[int(node)], array, i, j)
+            if array.count > 1 and not self.batch:
+                # the lanes beyond the last place
+                for k in range(array.count, self.stride):
+                    self._put(values[int(nodes[-1])], array, 0, k)
+
+    def _parameters(self) -> dict[int, Value]:
+        nodes = np.concatenate([nodes.reshape(-1) for nodes in self.equations.parameters])
+        return {int(node): self._get(self.params, k) for k, node in enumerate(nodes)}
+
+    def _write_terms(self) -> None:
+        """Terms that depend on neither y nor the history: once a step."""
+        e = self.equations
+        self.terms = f = self._function("terms")
+        state = self._parameters()
+        for k, node in enumerate([e.c0.item(), e.t.item(), *e.control]):
+            state[int(node)] = self._get(self.inputs, k)
+        values = f.evaluate(e.program, e.step_terms, state, self.P)
+        for k, node in enumerate(e.step_terms):
+            self._put(values[node], self.step_terms, k)
+        if not e.place_terms:
+            return
+        known = {node: values[node] for node in e.step_terms} | state
+        with self._places(self.count) as j:
+            here = known | {e.s.item(): self._wide(self.s, 0, j)}
+            values = f.evaluate(e.program, e.place_terms, here, self.L)
+            for k, node in enumerate(e.place_terms):
+                self._write_wide(values[node], self.place_terms, k, j)
+
+    def _write_rates(self, name: str, slopes: bool) -> Function:
+        """A function of the addresses of y and history, and a place: rates and strains, and their slopes."""
+        e = self.equations
+        f = self._function(name, "y", "history", "n_place")
+        _, y, history, place = f.arguments
+        j = f.index(place)
+        component = self.f.component
+        state = {int(node): f.load(y, i * component, self.L) for i, node in enumerate(e.y)}
+        for i in e.used_history:
+            state[int(e.history[i])] = f.load(history, i * component, self.L)
+        outputs = [*e.f, *e.z, *([e.slopes[at] for at in e.pattern] if slopes else [])]
+        found = self._evaluated(outputs, j, True, state)
+        for i in range(e.ny):
+            self._write_wide(found[i], self.f, i, j)
+        for i in range(e.nz):
+            self._write_wide(found[e.ny + i], self.z, i, j)
+        for i in range(len(e.pattern) if slopes else 0):
+            self._write_wide(found[e.ny + e.nz + i], self.slope, i, j)
+        return f
+
+    def _rates_at(
+        self, function: Function, y: Array, history: Array, j: Index, place: Index | None = None
+    ) -> None:
+        """Write a call of a function of rates; `place` if y is not stored by place."""
+        place = j if place is None else place
+        f = self._now
+        f.call(function, f.arguments[0], self._pointer(y, j), self._pointer(history, place), place.value)
+
+    def _write_far(self, y: Array, history: Array, slopes: bool = False) -> Array:
+        """Write y at all ends of pieces: after jumps at their starts, before jumps at their ends."""
+        e = self.equations
+        far = y if self.far is None else self.far
+        if self.far is not None:
+            with self._places(self.points) as j:
+                for i in range(e.ny):
+                    self._write_wide(self._wide(y, i, j), far, i, j)
+            with self._places(self.pieces) as j:
+                state = {int(node): self._wide(y, i, j) for i, node in enumerate(e.y)}
+                state |= {int(e.history[i]): self._wide(history, i, j) for i in e.used_history}
+                state |= {int(node): self._wide(self.acting, i, j) for i, node in enumerate(e.acting)}
+                outputs = [*e.far, *(node for *_, node in e.jumping if slopes)]
+                found = self._evaluated(outputs, j, True, state)
+                for k, value in enumerate(found):
+                    array, i = (far, k) if k < e.ny else (self.jump, k - e.ny)
+                    self._write_wide(value, array, i, j)
+        for k, point in enumerate(self.grid.near):
+            for i in range(e.ny):
+                self._put(self._get(y, i, int(point)), far, i, self.points + k)
+        return far
+
+    def _write_ends(self, source: Array, target: Array) -> None:
+        """Copy values at places to the ends of pieces."""
+        with self._places(self.pieces) as j:
+            for i in range(source.size):
+                self._write_wide(self._wide(source, i, j + 1), target, i, j)
+        for k, point in enumerate(self.grid.near):
+            for i in range(source.size):
+                self._put(self._get(source, i, self.points + k), target, i, int(point) - 1)
+
+    def _write_residual(self, name: str, y: Array, history: Array) -> Function:
+        """Rates at all ends of pieces by y, and the defects of all pieces and of the tip."""
+        f = self._function(name)
+        far = self._write_far(y, history)
+        with self._places(self.ends) as j:
+            self._rates_at(self.rates, far, history, j)
+        self._write_defects(y, history)
+        return f
+
+    def _write_defects(self, y: Array, history: Array) -> None:
+        e, far = self.equations, y if self.far is None else self.far
+        self._write_ends(self.f, self.fe)
+        with self._places(self.pieces) as j:
+            half = self._wide(self.h, 0, j) * 0.5
+            for i in range(e.ny):
+                rates = self._wide(self.f, i, j) + self._wide(self.fe, i, j)
+                change = self._wide(far, i, j) - self._wide(y, i, j + 1)
+                self._write_wide(change + half * rates, self.r, i, j)
+        at_tip = self._tip_state(y, history)
+        for i, value in enumerate(self._evaluated(e.tip, 0, False, at_tip)):
+            self._put(value, self.tip, i)
+
+    def _tip_state(self, y: Array, history: Array) -> dict[int, Value]:
+        e, tip = self.equations, self.points - 1
+        state = {int(node): self._get(y, i, tip) for i, node in enumerate(e.y)}
+        return state | {int(e.history[i]): self._get(history, i, tip) for i in e.used_history}
+
+    def _base_state(self, unknowns: Array, history: Array) -> dict[int, Value]:
+        e = self.equations
+        state = {int(node): self._get(unknowns, i) for i, node in enumerate(e.unknowns)}
+        return state | {int(e.history[i]): self._get(history, i, 0) for i in e.used_history}
+
+    def _norm(
+        self, array: Array, scale: str, count: int, first: int = 0, relative: Array | None = None
+    ) -> Value:
+        """Return the largest component over its natural unit; infinite for NaN."""
+        f = self._now
+        found = Variable(f, f.splat(f.value(0.0), self.L))
+        finite = Variable(f, f.splat(f.value(0.0), self.L))
+        with self._places(count, first) as j:
+            largest, total = found.get(), finite.get()
+            inside = self._inside(j, first + count)
+            for i in range(array.size):
+                x = f.apply("abs", self._wide(array, i, j))
+                unit = self._wide(self.scale_y, i)
+                if relative is None:
+                    x = x * unit
+                else:
+                    x = x / (1.0 / unit + f.apply("abs", self._wide(relative, i, j)))
+                x = x if self.batch else f.select(inside, x, 0.0)
+                largest, total = f.apply("max", largest, x), total + x
+            found.set(largest)
+            finite.set(total)
+        # maxnum drops NaN; a sum keeps it
+        known = f.compare("lt", finite.get(), float("inf"))
+        return self._largest(f.select(known, found.get(), float("inf")))
+
+    def _tip_norm(self) -> Value:
+        f = self._now
+        found = f.splat(f.value(0.0), self.P)
+        for i in range(self.equations.k):
+            x = f.apply("abs", self._get(self.tip, i)) * self._get(self.scale_tip, i)
+            found = f.select(f.compare("le", x, found), found, x)
+        return found
+
+    def _write_base(self, unknowns: Array, y: Array, history: Array) -> None:
+        e = self.equations
+        state = self._base_state(unknowns, history)
+        for i, value in enumerate(self._evaluated(e.base, 0, False, state)):
+            self._put(value, y, i, 0)
