@@ -35,6 +35,8 @@ from knode_cosserat.solvers.time_loop import (
 
 #: numbers of a solved stage, for each robot
 USABLE, ERROR, CORRECTIONS, LINEARISATIONS, POSITION, ANGLE, TIME, ALIVE = range(8)
+#: part of the largest correction allowed at a solution, below which an expected correction is not computed
+SURELY_SMALL = 1e-2
 
 
 class Core(EliminationCode):
@@ -61,7 +63,8 @@ class Core(EliminationCode):
         self.errors, self.time_errors = ([a(numbers, self.ends) for _ in range(2)] for _ in range(2))
         self.error_rate, self.dH, self.own_dH = (a(numbers, self.ends) for _ in range(3))
         self.better, self.better_unknowns = a(ny, self.ends), a(k, 1)
-        self.defect, self.own_defect, self.tip_defect = a(ny, self.pieces), a(ny, self.pieces), a(k, 1)
+        self.defect, self.own_defect, self.rest = (a(ny, self.pieces) for _ in range(3))
+        self.tip_rest = a(k, 1)
         # products of derivatives, for the error of the time scheme
         self.difference, self.move, self.sum = (a(numbers, self.ends) for _ in range(3))
         self.dfar, self.df, self.dz = a(ny, self.ends), a(ny, self.ends), a(nz, self.ends)
@@ -136,9 +139,16 @@ class Core(EliminationCode):
                 for i in range(e.k):
                     self._put(self._get(self.unknowns, i), self.trial_unknowns, i)
             now_error = f.apply("max", self._norm(self.r, "y", self.pieces), self._tip_norm())
-            f.call(self.correct, memory)
-            now_size = self._norm(self.dy, "y", self.points)
-            now_left = self._norm(self.dy, "y", self.points, 0, self.trial)
+            # by the same factors, the correction shrinks as the residual does: a tiny one is not computed
+            expected = left.get() * now_error
+            enough = expected <= SURELY_SMALL * LARGEST_CORRECTION * error.get()
+            sure = (now_error <= newton.tolerance) & (size.get() < infinity) & enough
+            lengths = plain(0.0), plain(0.0)
+            with f.if_(f.any(going & ~sure)):
+                f.call(self.correct, memory)
+                lengths[0].set(self._norm(self.dy, "y", self.points))
+                lengths[1].set(self._norm(self.dy, "y", self.points, 0, self.trial))
+            now_size, now_left = (each.get() for each in lengths)
             was_first, was_fresh, was_old = first.get(), fresh.get(), old.get()
             was_damping, was_size, was_error = damping.get(), size.get(), error.get()
             good = (now_error <= newton.tolerance) & (now_left <= LARGEST_CORRECTION)
@@ -197,6 +207,12 @@ class Core(EliminationCode):
         f.call(self.residual_of_y, memory)
         largest = f.apply("max", self._norm(self.r, "y", self.pieces), self._tip_norm())
         f.store(f.apply("max", largest, f.load(numbers, ERROR * self.P, self.P)), numbers, ERROR * self.P)
+        # what the solution has left: no part of its errors
+        with self._places(self.pieces) as j:
+            for i in range(e.ny):
+                self._write_wide(self._wide(self.r, i, j), self.rest, i, j)
+        for i in range(e.k):
+            self._put(self._get(self.tip, i), self.tip_rest, i)
         middle = self.ends
         far = self.y if self.far is None else self.far
         with self._places(self.pieces) as j:
@@ -232,13 +248,10 @@ class Core(EliminationCode):
         e = self.equations
         f = self._function(name, "numbers")
         memory, numbers = f.arguments
-        f.call(self.residual_of_y, memory)
         with self._places(self.pieces) as j:
             for i in range(e.ny):
                 defect = self._wide(self.defect, i, j) if has_defect else 0.0
-                self._write_wide(defect - self._wide(self.r, i, j), self.own_defect, i, j)
-        for i in range(e.k):
-            self._put(self._get(self.tip, i), self.tip_defect, i)
+                self._write_wide(defect - self._wide(self.rest, i, j), self.own_defect, i, j)
         with self._places(self.ends) as j:
             for i in range(e.ny):
                 start = 2.0 * self._wide(errors[0], i, j) - self._wide(errors[1], i, j)
@@ -258,7 +271,7 @@ class Core(EliminationCode):
                     value = self._wide(self.r, i, j) + self._wide(self.own_defect, i, j)
                     self._write_wide(value, self.r, i, j)
             for i in range(e.k):
-                self._put(self._get(self.tip, i) - self._get(self.tip_defect, i), self.tip, i)
+                self._put(self._get(self.tip, i) - self._get(self.tip_rest, i), self.tip, i)
             return f.apply("max", self._norm(self.r, "y", self.pieces), self._tip_norm())
 
         alive = f.load(numbers, ALIVE * self.P, self.P) > 0.0

@@ -23,6 +23,10 @@ class EliminationCode(RodCode):
         self.pivots = [int(index) for index in pivots_of(system)]
         ny, k, a = self.equations.ny, self.equations.k, self._array
         self.factor = a(len(self.elimination.factors), self.pieces)
+        # the recursion along the rod reads one piece after the other
+        self.pieces_in_turn = [self.slope, self.factor, self.jump]
+        if not robots:
+            self.pieces_in_turn = [self._by_place(each.size, self.pieces) for each in self.pieces_in_turn]
         self.w, self.X = a(ny, self.points), a(ny * k, self.points)
         groups = -(-self.pieces // _each(self.pieces))
         self.T, self.inverse = a(k * k, groups), a(k * k, 1)
@@ -54,10 +58,9 @@ class EliminationCode(RodCode):
         j = f.index(piece)
         lanes = self.L if columns else self.P
         step = self.L if self.batch or columns else self.w.component
-        known = {int(node): self._get(self.slope, k, j) for k, node in enumerate(el.start)}
-        known |= {int(node): self._get(self.factor, k, j) for k, node in enumerate(el.stored)}
-        known |= {int(node): self._get(self.jump, k, j) for k, node in enumerate(el.jump)}
-        known[el.h] = self._get(self.h, 0, j)
+        known = {el.h: self._get(self.h, 0, j)}
+        for array, nodes in zip(self.pieces_in_turn, (el.start, el.stored, el.jump), strict=True):
+            known |= {int(node): self._get(array, k, j) for k, node in enumerate(nodes)}
         known |= {int(node): f.load(source, i * step, lanes) for i, node in enumerate(el.x)}
         if not columns:
             known |= {int(node): self._get(self.r, i, j) for i, node in enumerate(el.r)}
@@ -190,6 +193,9 @@ class EliminationCode(RodCode):
             self._rates_at(self.rates_and_slopes, far, self.H, j)
         self._write_ends(self.slope, self.slope_end)
         f.call(self.factored, memory)
+        if not self.batch:
+            for source, target in zip((self.slope, self.factor, self.jump), self.pieces_in_turn, strict=True):
+                self._write_in_turn(source, target)
         state = self._base_state(self.unknowns, self.H)
         for k, value in enumerate(self._evaluated(e.base_slopes.reshape(-1), 0, False, state)):
             self._put(value, self.S, k)
@@ -198,6 +204,14 @@ class EliminationCode(RodCode):
         ):
             self._put(value, self.M, k)
         f.call(self.along, memory)
+
+    def _write_in_turn(self, source: Array, target: Array) -> None:
+        """Copy numbers with places in lanes to numbers by place."""
+        f = self._now
+        memory = f.arguments[0]
+        with f.loop(self.pieces) as j, f.loop(source.size) as i:
+            value = f.load(memory, i.value * source.component + (j.value + source.offset))
+            f.store(value, memory, j.value * target.place + (i.value + target.offset))
 
     def _write_correct(self) -> None:
         """The correction of all points and of the unknowns, from the defects."""

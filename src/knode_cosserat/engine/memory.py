@@ -51,6 +51,14 @@ class Memory:
         self._size += -(-length // self.L) * self.L
         return found
 
+    def _by_place(self, size: int, count: int) -> Array:
+        """Reserve an array in which the numbers of one place follow each other, for code that visits one."""
+        if self.batch:
+            return self._array(size, count)
+        found = Array(self._size, size, count, 1, size)
+        self._size += -(-size * count // self.L) * self.L
+        return found
+
     def _columns(self, size: int) -> Array:
         """Reserve a matrix whose columns are in lanes (one robot), or follow each other (robots in lanes)."""
         found = Array(self._size, size, 1, self.L, 0)
