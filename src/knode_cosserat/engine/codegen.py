@@ -17,7 +17,7 @@ from typing import Any
 
 import llvmlite.binding as llvm
 
-from knode_cosserat.engine.program import Program
+from knode_cosserat.engine.program import EngineError, Program
 
 llvm.initialize_native_target()
 llvm.initialize_native_asmprinter()
@@ -26,7 +26,7 @@ llvm.initialize_native_asmprinter()
 MATH = "contract nsz arcp"
 #: functions of one number that LLVM provides, then those of the C library, a call for every lane
 INTRINSICS = {"abs": "fabs", "sqrt": "sqrt", "exp": "exp", "log": "log", "sin": "sin", "cos": "cos",
-              "max": "maxnum", "min": "minnum", "pow": "pow", "floor": "floor"}  # fmt: skip
+              "max": "maximum", "min": "minimum", "pow": "pow", "floor": "floor"}  # fmt: skip
 LIBRARY = {
     "log1p", "expm1", "tanh", "tan", "atan", "asin", "acos", "atan2", "erf", "fmod",
 }  # fmt: skip
@@ -357,7 +357,7 @@ class Function:
             return self.result(f"call {MATH} {kind} @{name}({given})", lanes=lanes)
         name = "fmod" if operation == "rem" else operation
         if name not in LIBRARY:
-            raise NotImplementedError(operation)
+            raise EngineError(f"engine: no machine code for {operation!r}")
         self.module.declarations.add(f"declare double @{name}({', '.join(['double'] * len(values))})")
         found = [self._call(name, [self.lane(each, k) for each in values]) for k in range(lanes)]
         return self.joined(found)

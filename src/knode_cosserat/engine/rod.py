@@ -219,12 +219,13 @@ class RodCode(Memory):
         return self._largest(f.select(known, found.get(), float("inf")))
 
     def _tip_norm(self) -> Value:
+        """Return the tip's largest residual in natural units; infinite for NaN."""
         f = self._now
         found = f.splat(f.value(0.0), self.P)
         for i in range(self.equations.k):
-            x = f.apply("abs", self._get(self.tip, i)) * self._get(self.scale_tip, i)
-            found = f.select(f.compare("le", x, found), found, x)
-        return found
+            size = f.apply("abs", self._get(self.tip, i)) * self._get(self.scale_tip, i)
+            found = f.apply("max", found, size)
+        return f.select(found < float("inf"), found, float("inf"))
 
     def _write_base(self, unknowns: Array, y: Array, history: Array) -> None:
         e = self.equations

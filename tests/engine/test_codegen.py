@@ -1,0 +1,47 @@
+"""Machine code of single operations against NumPy, on numbers and on vectors, with NaN and infinity."""
+
+import ctypes
+
+import numpy as np
+import pytest
+import scipy.special
+
+from knode_cosserat.engine.codegen import Module
+from knode_cosserat.engine.program import Program
+
+VALUES = np.array([-2.5, -1.0, -0.3, 0.0, 0.4, 1.0, np.nan, np.inf])
+ONE = {
+    "neg": np.negative, "abs": np.abs, "exp": np.exp, "sin": np.sin, "cos": np.cos, "tan": np.tan,
+    "tanh": np.tanh, "atan": np.arctan, "expm1": np.expm1, "floor": np.floor, "erf": scipy.special.erf,
+    "sqrt": np.sqrt, "log": np.log, "log1p": np.log1p, "asin": np.arcsin, "acos": np.arccos,
+    "logistic": scipy.special.expit,
+}  # fmt: skip
+TWO = {
+    "add": np.add, "sub": np.subtract, "mul": np.multiply, "max": np.maximum, "min": np.minimum,
+    "atan2": np.arctan2, "rem": np.fmod,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("lanes", [1, 8])
+def test_operations_are_those_of_numpy(lanes):
+    program, module = Program(), Module()
+    x, y = program.input("x", 1), program.input("y", 1)
+    nodes = [program.apply(name, x) for name in ONE] + [program.apply(name, x, y) for name in TWO]
+    f = module.function("run", ["x", "y", "out"], exported=True)
+    left, right, out = f.arguments
+    known = {x: f.load(left, 0, lanes), y: f.load(right, 0, lanes)}
+    found = f.evaluate(program, nodes, known, lanes)
+    for k, node in enumerate(nodes):
+        f.store(found[node], out, k * lanes, lanes)
+    compiled = module.compile()
+    run = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 3)(compiled.address("run"))
+    for first in range(0, len(VALUES), lanes):
+        one = VALUES[first : first + lanes].copy()
+        for shift in range(len(VALUES)):
+            other = np.roll(VALUES, shift)[first : first + lanes].copy()
+            numbers = np.zeros((len(nodes), lanes))
+            run(one.ctypes.data, other.ctypes.data, numbers.ctypes.data)
+            with np.errstate(all="ignore"):
+                wanted = [g(one) for g in ONE.values()] + [g(one, other) for g in TWO.values()]
+            for name, got, value in zip([*ONE, *TWO], numbers, wanted, strict=True):
+                np.testing.assert_allclose(got, value, rtol=1e-14, atol=1e-15, err_msg=name)
