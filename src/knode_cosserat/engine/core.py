@@ -8,6 +8,9 @@ of the grid and of the time scheme.
 from __future__ import annotations
 
 import ctypes
+import functools
+import operator
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -72,6 +75,28 @@ class Core(EliminationCode):
         self.node_table = a(len(self.grid.nodes), 1)
         self._write()
         self.compiled = self.module.compile()
+        self._run = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 7, *[ctypes.c_long] * 2)(
+            self.compiled.address("run")
+        )
+        arrays = {
+            "records": self.records, "rate": [self.rate], "y": self.past, "weights": [self.weights],
+            "t0": [self.t0], "error": [*self.errors, self.error_rate], "time_error": self.time_errors,
+        }  # fmt: skip
+        #: places in memory of each part of a `StateHistory`: (lanes, parts, places, size)
+        self._state_places = {
+            name: np.stack([self._places_of(part) for part in parts], axis=1)
+            for name, parts in arrays.items()
+        }
+        self._parameter_places, self._length_places = (
+            self._places_of(array)[:, 0] for array in (self.params, self.length)
+        )
+        #: memory at the start of a run, but for parameters and states
+        self._empty = np.zeros(self._size)
+        if self.acting.size:
+            acting = self.grid.acting[np.minimum(np.arange(self._count(self.acting)), self.pieces - 1)]
+            self._empty[self._places_of(self.acting)] = acting
+        table = self._empty[self.node_table.offset :].view(np.int64)
+        table[: len(self.grid.nodes)] = self.grid.nodes
 
     # Newton's method
 
@@ -342,8 +367,7 @@ class Core(EliminationCode):
             names = layout.names
             if "p" in names:
                 span = layout.slice("p")
-                p = [change(i) for i in range(span.start, span.stop)]
-                largest(offs, p[0] * p[0] + p[1] * p[1] + p[2] * p[2])
+                largest(offs, _sum(d * d for d in map(change, range(span.start, span.stop))))
             else:
                 for i in range(self.equations.ny):
                     size = change(i) * self._wide(self.scale_y, i) * self._wide(self.length, 0)
@@ -352,11 +376,10 @@ class Core(EliminationCode):
                 span = layout.slice("h")
                 rows = range(span.start, span.stop)
                 h, d = [self._wide(self.y, i, j) for i in rows], [change(i) for i in rows]
-                square = h[0] * h[0] + h[1] * h[1] + h[2] * h[2] + h[3] * h[3]
-                along = (h[0] * d[0] + h[1] * d[1] + h[2] * d[2] + h[3] * d[3]) / square
+                square = _sum(a * a for a in h)
+                along = _sum(a * b for a, b in zip(d, h, strict=True)) / square
                 across = [a - b * along for a, b in zip(d, h, strict=True)]
-                size = across[0] * across[0] + across[1] * across[1]
-                largest(angles, (size + across[2] * across[2] + across[3] * across[3]) / square)
+                largest(angles, _sum(a * a for a in across) / square)
         finite = f.compare("lt", total.get(), float("inf"))
         off, angle = (
             f.apply("sqrt", self._largest(f.select(finite, each.get(), float("inf"))))
@@ -621,10 +644,9 @@ class Core(EliminationCode):
         self.residual_of_better = self._write_residual("residual_of_better", self.better, self.own_dH)
         self.defects = self._function("defects")
         self._write_defects(self.trial, self.H)
+        self._write_solved()
         self._write_factor()
-        self.advance = self._write_advance("advance", columns=False)
-        self.advance_columns = self._write_advance("advance_columns", columns=True)
-        self._write_change()
+        self._write_advance()
         self._write_along()
         self._write_linearise()
         self._write_correct()
@@ -652,47 +674,46 @@ class Core(EliminationCode):
         """
         e, P, stages = self.equations, self.P, self.settings.stages
         start, stop = span
-        total, nodes = controls.shape[1], len(self.grid.nodes)
-        own = controls.reshape(P, total, -1, e.nc)
-        own = np.broadcast_to(own, (P, total, stages, e.nc))
-        own = np.ascontiguousarray(np.moveaxis(own, 0, -1))
-        table = np.empty((total, stages, 5))
+        count, nodes = stop - start, len(self.grid.nodes)
+        held = 1 if controls.shape[2] == e.nc else stages
+        own = controls[:, start:stop].reshape(P, count, held, e.nc)
+        own = np.ascontiguousarray(np.moveaxis(np.broadcast_to(own, (P, count, stages, e.nc)), 0, -1))
+        table = np.empty((count, stages, 5))
         coefficients = np.asarray(steps.table).reshape(2, stages, 4)
         table[..., :4] = coefficients[1]
-        table[:1, :, :4] = coefficients[0]
-        table[..., 4] = (np.arange(total)[:, None] + np.asarray(steps.ends)) * steps.dt
+        table[: int(start == 0), :, :4] = coefficients[0]
+        table[..., 4] = (np.arange(start, stop)[:, None] + np.asarray(steps.ends)) * steps.dt
         guesses = stage_extrapolations(self.settings) if stages > 1 else EXTRAPOLATIONS[None]
         guesses = np.ascontiguousarray(np.stack([guesses, np.roll(guesses, -1, axis=0)], axis=1))
-        rows = np.zeros((total, stages, nodes, e.numbers, P))
-        infos = np.zeros((total, stages, 8 + e.k, P))
-        run = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 7, *[ctypes.c_long] * 2)(
-            self.compiled.address("run")
-        )
+        rows = np.zeros((count, stages, nodes, e.numbers, P))
+        infos = np.zeros((count, stages, 8 + e.k, P))
 
         def ran(stop: int) -> tuple[np.ndarray, np.ndarray]:
-            memory, reached = self._memory(parameters, states), np.full(P, float(start))
+            memory, reached = self._memory(parameters, states), np.zeros(P)
             arrays = memory, own, table, guesses, rows, infos, reached
-            run(*(each.ctypes.data for each in arrays), start, stop)
+            self._run(*(each.ctypes.data for each in arrays), 0, stop)
             return memory, reached
 
-        memory, reached = ran(stop)
-        if not self.batch and reached[0] < stop:
+        memory, reached = ran(count)
+        if not self.batch and reached[0] < count:
             # the state before the step that failed
             failed = rows.copy(), infos.copy()
             memory, _ = ran(int(reached[0]))
             rows, infos = failed
-        return reached.astype(int), self._states(memory, states), self._rows(rows, infos)
+        done = reached.astype(int)
+        lengths = memory[self._length_places]
+        return start + done, self._states(memory, states), self._rows(rows, infos, lengths, done)
 
-    def _rows(self, rows: np.ndarray, infos: np.ndarray) -> StepRows:
+    def _rows(self, rows: np.ndarray, infos: np.ndarray, length: np.ndarray, done: np.ndarray) -> StepRows:
         """Return rows (lanes, steps, ...); a step's row is that of its last stage."""
         rows, infos = np.moveaxis(rows, -1, 0), np.moveaxis(infos, -1, 0)
         numbers, unknowns = infos[..., :8], infos[..., 8:]
         error = np.max(numbers[..., ERROR], axis=-1)
         off, angle = numbers[..., -1, POSITION], numbers[..., -1, ANGLE]
-        length = self._lengths[:, None]
         fine = (off <= COARSE_SHARE * length) & (angle <= COARSE_ANGLE)
         result = np.where(fine, int(Result.CONVERGED), int(Result.COARSE))
         result = np.where(error <= self.newton.acceptable, result, int(Result.NO_CONVERGENCE))
+        result[np.arange(result.shape[1]) > done[:, None]] = int(Result.NOT_REACHED)
         time_error = numbers[..., -1, TIME] if isinstance(self.scheme, SDIRK2) else np.full(off.shape, np.nan)
         corrections = np.sum(numbers[..., CORRECTIONS], axis=-1).astype(int)
         return StepRows(
@@ -700,61 +721,38 @@ class Core(EliminationCode):
             rows[:, :, :-1], unknowns[:, :, :-1],
         )  # fmt: skip
 
-    def _arrays(self) -> dict[str, list[Array]]:
-        """Return the arrays of each part of a `StateHistory`."""
-        return {
-            "records": self.records, "rate": [self.rate], "y": self.past, "weights": [self.weights],
-            "t0": [self.t0], "error": [*self.errors, self.error_rate], "time_error": self.time_errors,
-        }  # fmt: skip
+    def _count(self, array: Array) -> int:
+        """Return the number of places of an array in memory, with the lanes beyond the last place."""
+        return array.count if self.batch or array.count == 1 else self.stride
 
-    def _places_of(self, array: Array) -> tuple[np.ndarray, int]:
-        """Return the offsets (places, size) of an array for the first lane, and its number of places."""
-        count = array.count if self.batch or array.count == 1 else self.stride
-        at = np.arange(count)[:, None] * array.place + np.arange(array.size) * array.component
-        return array.offset + at, count
+    def _places_of(self, array: Array) -> np.ndarray:
+        """Return the places in memory of an array's numbers (lanes, places, size)."""
+        lanes, places = np.arange(self.P)[:, None, None], np.arange(self._count(array))[:, None]
+        return array.offset + lanes + places * array.place + np.arange(array.size) * array.component
 
     def _memory(self, parameters: np.ndarray, states: StateHistory) -> np.ndarray:
         """Return the memory of a run from these states."""
-        raw = np.zeros(self._size + 16)
+        raw = np.empty(self._size + 8)
         memory = raw[(-raw.ctypes.data // 8) % 8 :][: self._size]
-
-        def put(array: Array, values: np.ndarray) -> None:
-            """Write values (lanes, places, size); the last place is repeated in the lanes beyond it."""
-            at, count = self._places_of(array)
-            values = values.reshape(self.P, -1, array.size)
-            values = values[:, np.minimum(np.arange(count), values.shape[1] - 1)]
-            for lane, value in enumerate(values):
-                memory[at + lane] = value
-
-        put(self.params, parameters)
-        if self.acting.size:
-            put(self.acting, np.broadcast_to(self.grid.acting, (self.P, *self.grid.acting.shape)))
-        for name, arrays in self._arrays().items():
-            values = np.asarray(getattr(states, name), float)
-            if name == "weights":
-                put(self.weights, values)
-                continue
-            for k, array in enumerate(arrays):
-                put(array, values[:, k] if len(arrays) > 1 else values)
-        put(self.y, np.asarray(states.y, float)[:, 0])
-        table = memory[self.node_table.offset :].view(np.int64)
-        table[: len(self.grid.nodes)] = self.grid.nodes
+        memory[:] = self._empty
+        memory[self._parameter_places] = parameters
+        for name, places in self._state_places.items():
+            lanes, parts, count, size = places.shape
+            values = np.asarray(getattr(states, name)).reshape(lanes, parts, -1, size)
+            if values.shape[2] < count:  # repeated in the lanes beyond the last place
+                memory[places] = values[:, :, -1:]
+            memory[places[:, :, : values.shape[2]]] = values
         return memory
 
     def _states(self, memory: np.ndarray, states: StateHistory) -> StateHistory:
         """Return the states at the end of a run."""
-
-        def get(array: Array, count: int) -> np.ndarray:
-            at, _ = self._places_of(array)
-            return np.stack([memory[at[:count] + lane] for lane in range(self.P)])
-
-        self._lengths = get(self.length, 1)[:, 0, 0]
         found = {}
-        for name, arrays in self._arrays().items():
+        for name, places in self._state_places.items():
             before = np.asarray(getattr(states, name))
-            if name in ("weights", "t0"):
-                found[name] = get(arrays[0], 1).reshape(before.shape)
-                continue
-            values = [get(array, before.shape[-2]) for array in arrays]
-            found[name] = np.stack(values, axis=1) if len(values) > 1 else values[0]
+            count = before.size // (places.shape[0] * places.shape[1] * places.shape[3])
+            found[name] = memory[places[:, :, :count]].reshape(before.shape)
         return StateHistory(**found)
+
+
+def _sum(values: Iterable[Value]) -> Value:
+    return functools.reduce(operator.add, values)

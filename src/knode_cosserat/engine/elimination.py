@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from knode_cosserat.engine.codegen import Function, Index, Value, Variable
+from typing import Any
+
+import numpy as np
+
+from knode_cosserat.engine.codegen import Index, Value, Variable
 from knode_cosserat.engine.equations import Elimination
-from knode_cosserat.engine.memory import Array
 from knode_cosserat.engine.rod import RodCode
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import pivots_of
@@ -12,176 +15,156 @@ from knode_cosserat.solvers.linear import _each
 
 
 class EliminationCode(RodCode):
-    """Functions that factor a linearisation and solve for corrections, of one vector or of columns."""
-
-    advance: Function
-    advance_columns: Function
+    """Functions that factor a linearisation and solve for corrections."""
 
     def __init__(self, system: System, robots: bool, lanes: int):
         super().__init__(system, robots, lanes)
         self.elimination = Elimination(self.equations)
         self.pivots = [int(index) for index in pivots_of(system)]
-        ny, k, a = self.equations.ny, self.equations.k, self._array
+        ny, k, a, by_rows = self.equations.ny, self.equations.k, self._array, self._by_rows
         self.factor = a(len(self.elimination.factors), self.pieces)
-        # the recursion along the rod reads one piece after the other
-        self.pieces_in_turn = [self.slope, self.factor, self.jump]
+        #: columns of B⁻¹ A, and B⁻¹ r: places in lanes, and rows in lanes for the recursion along the rod
+        self.wide_matrix, self.wide_added = a(ny * ny, self.pieces), a(ny, self.pieces)
+        self.matrix, self.added = self.wide_matrix, self.wide_added
         if not robots:
-            self.pieces_in_turn = [self._by_place(each.size, self.pieces) for each in self.pieces_in_turn]
-        self.w, self.X = a(ny, self.points), a(ny * k, self.points)
-        groups = -(-self.pieces // _each(self.pieces))
-        self.T, self.inverse = a(k * k, groups), a(k * k, 1)
-        self.beta, self.alpha = a(k, groups), a(k, self.points)
-        self.S, self.M = a(ny * k, 1), a(ny * k, 1)
+            self.matrix, self.added = by_rows(ny, ny, self.pieces), by_rows(ny, 1, self.pieces)
+        #: corrections along the rod without those of the unknowns, and the columns of these
+        self.w, self.X = by_rows(ny, 1, self.points), by_rows(ny, k, self.points)
+        self.groups = _each(self.pieces), (self.pieces - 1) // _each(self.pieces)
+        self.T, self.M, self.inverse = by_rows(k, k, self.groups[1]), by_rows(k, ny, 1), by_rows(k, k, 1)
+        self.beta, self.zeros = by_rows(k, 1, self.groups[1]), by_rows(ny, 1, 1)
         #: the solution, its unknowns, and the correction of both
         self.y, self.unknowns = a(ny, self.ends), a(k, 1)
         self.dy, self.step_unknowns = a(ny, self.ends), a(k, 1)
+        self.dy_by_rows = self.dy if robots else by_rows(ny, 1, self.points)
         #: history terms of the step
         self.H = a(self.equations.numbers, self.count)
-        self.columns = [self._columns(ny * k) for _ in range(2)]
+
+    def _write_solved(self) -> None:
+        """A piece's B⁻¹ r."""
+        f, el = self._function("solved", "from", "to", "n_piece"), self.elimination
+        self.solved = f
+        _, source, target, piece = f.arguments
+        j, component = f.index(piece), self.wide_added.component
+        known = {int(node): self._wide(self.factor, k, j) for k, node in enumerate(el.stored)}
+        known |= {int(node): f.load(source, i * component, self.L) for i, node in enumerate(el.r)}
+        values = f.evaluate(el.program, el.solved, known, self.L)
+        for i, node in enumerate(el.solved):
+            f.store(values[node], target, i * component, self.L)
 
     def _write_factor(self) -> None:
-        """Factors of all pieces, from the slopes at their ends."""
-        f, el = self._function("factored"), self.elimination
+        """Factors and the matrix B⁻¹ A of all pieces, from the slopes at their ends."""
+        f, el, n = self._function("factored"), self.elimination, self.equations.ny
         self.factored = f
+        memory = f.arguments[0]
         with self._places(self.pieces) as j:
-            known = {int(node): self._wide(self.slope_end, k, j) for k, node in enumerate(el.end)}
-            known[el.h] = self._wide(self.h, 0, j)
-            values = f.evaluate(el.program, el.factors, known, self.L)
+            known = {el.h: self._wide(self.h, 0, j)}
+            for array, nodes in ((self.slope, el.start), (self.slope_end, el.end), (self.jump, el.jump)):
+                known |= {int(node): self._wide(array, k, j) for k, node in enumerate(nodes)}
+            outputs = [*el.factors, *map(int, el.matrix.reshape(-1))]
+            values = f.evaluate(el.program, outputs, known, self.L)
             for k, node in enumerate(el.factors):
                 self._write_wide(values[node], self.factor, k, j)
+            for i, c in np.ndindex(n, n):
+                self._write_wide(values[int(el.matrix[i, c])], self.wide_matrix, c * n + i, j)
+        with self._places(self.pieces) as j:
+            first = self._pointer(self.wide_matrix, j)
+            with f.loop(n) as c:
+                column = f.pointer(first, c.value * (n * self.wide_matrix.component))
+                f.call(self.solved, memory, column, column, j.value)
+        if not self.batch:
+            with f.loop(n) as c:
+                source = c.value * (n * self.wide_matrix.component) + self.wide_matrix.offset
+                target = c.value * self._padded(n) + self.matrix.offset
+                with f.loop(self.pieces) as j:
+                    self._copy(
+                        n, (f.pointer(memory, source + j.value), self.wide_matrix.component),
+                        (f.pointer(memory, target + j.value * self.matrix.place), 1),
+                    )  # fmt: skip
 
-    def _write_advance(self, name: str, columns: bool) -> Function:
-        """A piece's B⁻¹ (A x + r), of one vector, or of the columns of a matrix without r."""
-        el = self.elimination
-        f = self._function(name, "from", "to", "n_piece")
-        _, source, target, piece = f.arguments
-        j = f.index(piece)
-        lanes = self.L if columns else self.P
-        step = self.L if self.batch or columns else self.w.component
-        known = {el.h: self._get(self.h, 0, j)}
-        for array, nodes in zip(self.pieces_in_turn, (el.start, el.stored, el.jump), strict=True):
-            known |= {int(node): self._get(array, k, j) for k, node in enumerate(nodes)}
-        known |= {int(node): f.load(source, i * step, lanes) for i, node in enumerate(el.x)}
-        if not columns:
-            known |= {int(node): self._get(self.r, i, j) for i, node in enumerate(el.r)}
-        outputs = el.advanced[1 if columns else 0]
-        values = f.evaluate(el.program, outputs, known, lanes)
-        for i, node in enumerate(outputs):
-            f.store(values[node], target, i * step, lanes)
-        return f
+    def _copy(self, count: int, source: tuple[Value, int], target: tuple[Value, int]) -> None:
+        """Write numbers from an address to another, each with the distance between numbers."""
+        f = self._now
+        for i in range(count):
+            f.store(f.load(source[0], i * source[1]), target[0], i * target[1])
 
-    def _matrix(self, i: int, c: int) -> int:
-        """Index of an entry of a matrix of `columns`."""
-        return c * self.equations.ny + i if self.batch else i
+    def _write_advance(self) -> None:
+        """A column at a piece's start to its end: B⁻¹ A x plus what is added."""
+        el, n = self.elimination, self.equations.ny
+        self.advance = f = self._function("advance", "from", "added", "to", "n_piece")
+        _, source, added, target, piece = f.arguments
+        j, component = f.index(piece), 1 if not self.batch else self.L
+        width = 1 if self.batch else self.L
+        x = [f.load(source, c * component, self.P) for c in range(n)]
+        for row in self._blocks(n):
+            # two sums, because each addition waits for the one before
+            sums = [f.load(added, row * component, self.L), f.splat(f.value(0.0), self.L)]
+            for c in range(n):
+                if el.nonzero[row : row + width, c].any():
+                    entry = self._get(self.matrix, c * self._padded(n) + row, j, self.L)
+                    sums = [sums[1], sums[0] + entry * x[c]]
+            f.store(sums[0] + sums[1], target, row * component, self.L)
 
-    def _write_change(self) -> None:
-        """Change of parameters: X T with T the inverse of X's rows of pivots, and T."""
-        self.change = f = self._function("change", "n_group")
-        group = f.index(f.arguments[1])
-        e, columns = self.equations, self.columns[0]
-        k = e.k
-        rows = [self._row(columns, i) for i in range(e.ny)]
-        eye = [self._unit_row(i) for i in range(k)]
-        for r, pivot in enumerate(self.pivots):
-            scale = 1.0 / self._entry(rows[pivot], r)
-            g = [each * scale for each in rows[pivot]]
-            g = self._with_entry(g, r, 1.0 - scale)
-            for each in (rows, eye):
-                for i, row in enumerate(each):
-                    x = self._entry(row, r)
-                    each[i] = [a - x * b for a, b in zip(row, g, strict=True)]
-        for i, row in enumerate(rows):
-            self._set_row(row, columns, i)
-        for i, row in enumerate(eye):
-            for c in range(k):
-                self._put(self._entry(row, c), self.T, i * k + c, group)
+    def _changed(self, columns: list[list[Value]], pivots: list[int]) -> list[list[Value]]:
+        """Write X T, with T the inverse of X's rows of pivots, and return T; X's columns are replaced."""
+        k = len(columns)
+        eye = [self._unit_column(c, k) for c in range(k)]
+        for r, pivot in enumerate(pivots):
+            scale = 1.0 / self._entry(columns[r], pivot)
+            factors = [self._entry(column, pivot) * scale for column in columns]
+            for matrix in (columns, eye):
+                pivotal = matrix[r]
+                for c in range(k):
+                    if c != r:
+                        pairs = zip(matrix[c], pivotal, strict=True)
+                        matrix[c] = [a - factors[c] * b for a, b in pairs]
+                matrix[r] = [scale * b for b in pivotal]
+        return eye
 
-    def _row(self, columns: Array, i: int) -> list[Value]:
-        """Return a row of a matrix of `columns`: a list of robots' numbers, or one vector."""
-        count = self.equations.k if self.batch else 1
-        return [self._get(columns, self._matrix(i, c), 0, self.L) for c in range(count)]
-
-    def _set_row(self, row: list[Value], columns: Array, i: int) -> None:
-        for c, value in enumerate(row):
-            self._put(value, columns, self._matrix(i, c), 0, self.L)
-
-    def _unit_row(self, i: int) -> list[Value]:
-        f, k = self._now, self.equations.k
+    def _unit_column(self, c: int, rows: int) -> list[Value]:
+        f = self._now
         if self.batch:
-            return [f.splat(f.value(float(c == i)), self.L) for c in range(k)]
-        return [f.joined([f.value(float(c == i)) for c in range(self.L)])]
-
-    def _entry(self, row: list[Value], c: int) -> Value:
-        return row[c] if self.batch else self._now.lane(row[0], c)
-
-    def _with_entry(self, row: list[Value], c: int, value: Value) -> list[Value]:
-        if self.batch:
-            return [*row[:c], value, *row[c + 1 :]]
-        kind = row[0].type
-        found = f"insertelement {kind} {row[0].name}, double {value.name}, i32 {c}"
-        return [self._now.result(found, lanes=self.L)]
+            return [f.splat(f.value(float(i == c)), self.L) for i in range(rows)]
+        lanes = range(self.L)
+        return [f.joined([f.value(float(row + i == c)) for i in lanes]) for row in self._blocks(rows)]
 
     def _write_along(self) -> None:
-        """X along the rod, from S at the base; at the tip the inverse of M X."""
-        e = self.equations
-        k = e.k
+        """X along the rod from the base; at the tip the inverse of M X."""
+        ny, k = self.equations.ny, self.equations.k
         self.along = f = self._function("along")
         memory = f.arguments[0]
-        one, other = self.columns
-        for i in range(e.ny):
-            if self.batch:
-                self._set_row([self._get(self.S, i * k + c) for c in range(k)], one, i)
-            else:
-                numbers = [self._get(self.S, i * k + c) if c < k else f.value(0.0) for c in range(self.L)]
-                self._set_row([f.joined(numbers)], one, i)
-        each = _each(self.pieces)
-        full = (self.pieces - 1) // each
+        none = self._pointer(self.zeros, 0)
+        each, full = self.groups
 
         def piece(j: Index) -> None:
-            for c in range(k if self.batch else 1):
-                first = self._matrix(0, c)
-                source, target = (f.pointer(memory, each.at(first, 0)) for each in (one, other))
-                f.call(self.advance_columns, memory, source, target, j.value)
-            for i in range(e.ny):
-                self._set_row(self._row(other, i), one, i)
-
-        def keep(j: Index) -> None:
-            for i in range(e.ny):
-                row = self._row(one, i)
-                for c in range(k):
-                    self._put(self._entry(row, c), self.X, i * k + c, j + 1)
+            for c in range(k):
+                first = c * self._padded(ny)
+                source, target = (f.pointer(*self._at(self.X, first, point)) for point in (j, j + 1))
+                f.call(self.advance, memory, source, none, target, j.value)
 
         with f.loop(full) as g:
             with f.loop((g.value + 1) * each, g.value * each) as j:
                 piece(j)
-                keep(j)
-            f.call(self.change, memory, g.value)
-            keep(f.index((g.value + 1) * each - 1))
+            last = f.index((g.value + 1) * each)
+            columns = [self._column(self.X, ny, c, last) for c in range(k)]
+            T = self._changed(columns, self.pivots)
+            for c in range(k):
+                self._set_column(columns[c], self.X, ny, c, last)
+                self._set_column(T[c], self.T, k, c, g)
         with f.loop(self.pieces, full * each) as j:
             piece(j)
-            keep(j)
-        # M X at the tip and its inverse: reuse of the change of parameters
-        rows = []
-        for a in range(k):
-            row = None
-            for i in range(e.ny):
-                if e.program.is_constant(int(e.tip_slopes[a, i]), 0.0):
-                    continue
-                term = [self._get(self.M, a * e.ny + i) * x for x in self._row(one, i)]
-                row = term if row is None else [p + q for p, q in zip(row, term, strict=True)]
-            assert row is not None
-            rows.append(row)
-        eye = [self._unit_row(i) for i in range(k)]
-        for r in range(k):
-            scale = 1.0 / self._entry(rows[r], r)
-            changed = self._with_entry([x * scale for x in rows[r]], r, 1.0 - scale)
-            for matrix in (rows, eye):
-                for i, row in enumerate(matrix):
-                    x = self._entry(row, r)
-                    matrix[i] = [p - x * q for p, q in zip(row, changed, strict=True)]
-        for i, row in enumerate(eye):
-            for c in range(k):
-                self._put(self._entry(row, c), self.inverse, i * k + c)
+        at_tip = [self._column(self.X, ny, c, self.points - 1) for c in range(k)]
+        M = [self._column(self.M, k, i) for i in range(ny)]
+        products = [self._product(M, [self._entry(column, i) for i in range(ny)]) for column in at_tip]
+        for c, column in enumerate(self._changed(products, list(range(k)))):
+            self._set_column(column, self.inverse, k, c)
+
+    def _product(self, columns: list[list[Value]], x: list[Value]) -> list[Value]:
+        """Return a matrix times a vector."""
+        found = [x[0] * part for part in columns[0]]
+        for column, number in zip(columns[1:], x[1:], strict=True):
+            found = [a + number * part for a, part in zip(found, column, strict=True)]
+        return found
 
     def _write_linearise(self) -> None:
         """Rates, slopes and factors at y."""
@@ -193,97 +176,83 @@ class EliminationCode(RodCode):
             self._rates_at(self.rates_and_slopes, far, self.H, j)
         self._write_ends(self.slope, self.slope_end)
         f.call(self.factored, memory)
-        if not self.batch:
-            for source, target in zip((self.slope, self.factor, self.jump), self.pieces_in_turn, strict=True):
-                self._write_in_turn(source, target)
-        state = self._base_state(self.unknowns, self.H)
-        for k, value in enumerate(self._evaluated(e.base_slopes.reshape(-1), 0, False, state)):
-            self._put(value, self.S, k)
-        for k, value in enumerate(
-            self._evaluated(e.tip_slopes.reshape(-1), 0, False, self._tip_state(self.y, self.H))
+        for nodes, state, array, rows in (
+            (e.base_slopes, self._base_state(self.unknowns, self.H), self.X, e.ny),
+            (e.tip_slopes, self._tip_state(self.y, self.H), self.M, e.k),
         ):
-            self._put(value, self.M, k)
+            values = self._evaluated(nodes.reshape(-1), 0, False, state)
+            for (i, c), value in zip(np.ndindex(nodes.shape), values, strict=True):
+                self._put(value, array, c * self._padded(rows) + i)
         f.call(self.along, memory)
-
-    def _write_in_turn(self, source: Array, target: Array) -> None:
-        """Copy numbers with places in lanes to numbers by place."""
-        f = self._now
-        memory = f.arguments[0]
-        with f.loop(self.pieces) as j, f.loop(source.size) as i:
-            value = f.load(memory, i.value * source.component + (j.value + source.offset))
-            f.store(value, memory, j.value * target.place + (i.value + target.offset))
 
     def _write_correct(self) -> None:
         """The correction of all points and of the unknowns, from the defects."""
-        e = self.equations
-        ny, k = e.ny, e.k
+        ny, k = self.equations.ny, self.equations.k
         self.correct = f = self._function("correct")
         memory = f.arguments[0]
-        each = _each(self.pieces)
-        full = (self.pieces - 1) // each
-        for i in range(ny):
-            self._put(0.0, self.w, i, 0)
+        each, full = self.groups
+        with self._places(self.pieces) as j:
+            f.call(self.solved, memory, self._pointer(self.r, j), self._pointer(self.wide_added, j), j.value)
+        if not self.batch:
+            with f.loop(self.pieces) as j:
+                source = self._pointer(self.wide_added, j), self.wide_added.component
+                self._copy(ny, source, (self._pointer(self.added, j), 1))
 
         def piece(j: Index) -> None:
-            source, target = self._pointer(self.w, j), self._pointer(self.w, j + 1)
-            f.call(self.advance, memory, source, target, j.value)
+            points = self._pointer(self.w, j), self._pointer(self.added, j), self._pointer(self.w, j + 1)
+            f.call(self.advance, memory, *points, j.value)
 
         with f.loop(full) as g:
             with f.loop((g.value + 1) * each, g.value * each) as j:
                 piece(j)
             last = f.index((g.value + 1) * each)
-            beta = [self._get(self.w, p, last) for p in self.pivots]
-            for c in range(k):
-                self._put(beta[c], self.beta, c, g)
-            for i in range(ny):
-                w = self._get(self.w, i, last)
-                for c in range(k):
-                    w = w - self._get(self.X, i * k + c, last) * beta[c]
-                self._put(w, self.w, i, last)
+            w = self._column(self.w, ny, 0, last)
+            columns = [self._column(self.X, ny, c, last) for c in range(k)]
+            moved = self._product(columns, [self._entry(w, pivot) for pivot in self.pivots])
+            self._set_column([a - b for a, b in zip(w, moved, strict=True)], self.w, ny, 0, last)
+            self._set_column(self._gathered(w), self.beta, k, 0, g)
         with f.loop(self.pieces, full * each) as j:
             piece(j)
-        at_tip = []
-        for a in range(k):
-            value = self._get(self.tip, a)
-            for i in range(ny):
-                if not e.program.is_constant(int(e.tip_slopes[a, i]), 0.0):
-                    value = value + self._get(self.M, a * ny + i) * self._get(self.w, i, self.points - 1)
-            at_tip.append(value)
-        alpha = [Variable(f, f.splat(f.value(0.0), self.P)) for _ in range(k)]
-        for a in range(k):
-            value = self._get(self.inverse, a * k) * at_tip[0]
-            for c in range(1, k):
-                value = value + self._get(self.inverse, a * k + c) * at_tip[c]
-            alpha[a].set(-value)
+        w = self._column(self.w, ny, 0, self.points - 1)
+        M = [self._column(self.M, k, i) for i in range(ny)]
+        tip = self._product(M, [self._entry(w, i) for i in range(ny)])
+        tip = [a + b for a, b in zip(tip, self._column(self.tip, k), strict=True)]
+        inverse = [self._column(self.inverse, k, c) for c in range(k)]
+        alpha = [
+            Variable(f, -each) for each in self._product(inverse, [self._entry(tip, c) for c in range(k)])
+        ]
 
-        def keep(j: Index) -> None:
-            for a in range(k):
-                self._put(alpha[a].get(), self.alpha, a, j)
+        def correct(start: Any, stop: Any) -> None:
+            """Write the corrections of points that share their unknowns."""
+            numbers = [self._entry([each.get() for each in alpha], c) for c in range(k)]
+            with f.loop(stop, start) as j:
+                columns = [self._column(self.X, ny, c, j) for c in range(k)]
+                moved = self._product(columns, numbers)
+                w = self._column(self.w, ny, 0, j)
+                self._set_column([a + b for a, b in zip(w, moved, strict=True)], self.dy_by_rows, ny, 0, j)
 
-        with f.loop(self.pieces + 1, full * each + 1) as j:
-            keep(j)
+        correct(full * each + 1, self.points)
         with f.loop(0, full - 1, -1) as g:
-            keep(f.index((g.value + 1) * each))
-            change = [alpha[c].get() - self._get(self.beta, c, g) for c in range(k)]
-            for a in range(k):
-                value = self._get(self.T, a * k, g) * change[0]
-                for c in range(1, k):
-                    value = value + self._get(self.T, a * k + c, g) * change[c]
-                alpha[a].set(value)
-            with f.loop((g.value + 1) * each, g.value * each + 1) as j:
-                keep(j)
-        for a in range(k):
-            self._put(alpha[a].get(), self.step_unknowns, a)
-        with self._places(self.points - 1, 1) as j:
-            own = [self._wide(self.alpha, c, j) for c in range(k)]
-            for i in range(ny):
-                value = self._wide(self.w, i, j)
-                for c in range(k):
-                    value = value + self._wide(self.X, i * k + c, j) * own[c]
-                self._write_wide(value, self.dy, i, j)
-        for i in range(ny):
-            value = f.splat(f.value(0.0), self.P)
-            for c in range(k):
-                if not e.program.is_constant(int(e.base_slopes[i, c]), 0.0):
-                    value = value + self._get(self.S, i * k + c) * alpha[c].get()
-            self._put(value, self.dy, i, 0)
+            end = (g.value + 1) * each
+            correct(end, end + 1)
+            own = [a.get() - b for a, b in zip(alpha, self._column(self.beta, k, 0, g), strict=True)]
+            T = [self._column(self.T, k, c, g) for c in range(k)]
+            for variable, value in zip(
+                alpha, self._product(T, [self._entry(own, c) for c in range(k)]), strict=True
+            ):
+                variable.set(value)
+            correct(g.value * each + 1, end)
+        correct(0, 1)
+        self._set_column([each.get() for each in alpha], self.step_unknowns, k)
+        if not self.batch:
+            with f.loop(self.points) as j:
+                source = self._pointer(self.dy_by_rows, j), 1
+                self._copy(ny, source, (self._pointer(self.dy, j), self.dy.component))
+
+    def _gathered(self, w: list[Value]) -> list[Value]:
+        """Return the rows of pivots of a column."""
+        if self.batch:
+            return [w[pivot] for pivot in self.pivots]
+        f, rows = self._now, [self._now.lane(w[p // self.L], p % self.L) for p in self.pivots]
+        rows += [f.value(0.0)] * (self._padded(len(rows)) - len(rows))
+        return [f.joined(rows[first : first + self.L]) for first in self._blocks(len(self.pivots))]

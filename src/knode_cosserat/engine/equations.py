@@ -148,62 +148,65 @@ class Equations:
 
 
 class Elimination:
-    """Program of a piece: factors of B = 1 - h/2 J at its end; B⁻¹ (A x + r), A = 1 + h/2 J at its start."""
+    """Programs of a piece, with B = 1 - h/2 J at its end and A = 1 + h/2 J at its start, behind jumps there.
+
+    B is factored. A correction x of the start goes on as B⁻¹ (A x + r).
+    """
 
     def __init__(self, equations: Equations):
         program = self.program = Program()
-        n, pattern = equations.ny, equations.pattern
+        apply, n, pattern = program.apply, equations.ny, equations.pattern
         zero, one = program.constant(0.0), program.constant(1.0)
         self.h = program.input("h", 1)
-        half = program.apply("mul", self.h, program.constant(0.5))
+        half = apply("mul", self.h, program.constant(0.5))
         self.start = program.inputs("start", (len(pattern),), 1)
         self.end = program.inputs("end", (len(pattern),), 1)
         A, B = np.full((n, n), zero), np.full((n, n), zero)
         for k, (i, j) in enumerate(pattern):
-            A[i, j] = program.apply("mul", half, int(self.start[k]))
-            B[i, j] = program.apply("neg", program.apply("mul", half, int(self.end[k])))
+            A[i, j] = apply("mul", half, int(self.start[k]))
+            B[i, j] = apply("neg", apply("mul", half, int(self.end[k])))
         for i in range(n):
-            B[i, i] = program.apply("add", one, int(B[i, i]))
-        self._order = order = _least_fill(pattern, n)
+            A[i, i], B[i, i] = (apply("add", one, int(matrix[i, i])) for matrix in (A, B))
+        self.jump = program.inputs("jump", (len(equations.jumping),), 1)
+        near = A.copy()
+        for node, (i, j, _) in zip(self.jump, equations.jumping, strict=True):
+            for row in range(n):
+                product = apply("mul", int(near[row, i]), int(node))
+                A[row, j] = apply("add", int(A[row, j]), product)
+        #: the matrix A
+        self.matrix = A
+        order = _least_fill(pattern, n)
         for at, p in enumerate(order):
-            B[p, p] = program.apply("div", one, int(B[p, p]))
+            B[p, p] = apply("div", one, int(B[p, p]))
             for i in order[at + 1 :]:
                 if B[i, p] == zero:
                     continue
-                B[i, p] = program.apply("mul", int(B[i, p]), int(B[p, p]))
+                B[i, p] = apply("mul", int(B[i, p]), int(B[p, p]))
                 for j in order[at + 1 :]:
-                    product = program.apply("mul", int(B[i, p]), int(B[p, j]))
-                    B[i, j] = program.apply("sub", int(B[i, j]), product)
+                    product = apply("mul", int(B[i, p]), int(B[p, j]))
+                    B[i, j] = apply("sub", int(B[i, j]), product)
         #: factors that are not constant
-        self.places = [(i, j) for i, j in np.ndindex(B.shape) if not program.is_constant(int(B[i, j]))]
-        self.factors = [int(B[i, j]) for i, j in self.places]
-        stored = program.inputs("factor", (len(self.places),), 1)
-        self.stored = stored
-        LU = B.copy()
-        for node, (i, j) in zip(stored, self.places, strict=True):
-            LU[i, j] = node
-        self.x, self.r = program.inputs("x", (n,), 1), program.inputs("r", (n,), 1)
-        self.jump = program.inputs("jump", (len(equations.jumping),), 1)
-        #: x on the far side of the discontinuities at the start
-        self._far = [int(each) for each in self.x]
-        for node, (i, j, _) in zip(self.jump, equations.jumping, strict=True):
-            self._far[i] = program.apply("add", self._far[i], program.apply("mul", int(node), int(self.x[j])))
-        self.advanced = [self._solved(A, LU, added) for added in ([int(each) for each in self.r], [zero] * n)]
+        places = [(i, j) for i, j in np.ndindex(B.shape) if not program.is_constant(int(B[i, j]))]
+        self.factors = [int(B[i, j]) for i, j in places]
+        self.stored = program.inputs("factor", (len(places),), 1)
+        for node, (i, j) in zip(self.stored, places, strict=True):
+            B[i, j] = node
+        self.r = program.inputs("r", (n,), 1)
+        #: B⁻¹ r, and the nonzeros of B⁻¹ A
+        self.solved, self.nonzero = [int(node) for node in self.r], np.not_equal(A, zero)
 
-    def _solved(self, A: Any, LU: Any, r: list[int]) -> list[int]:
-        apply = self.program.apply
-        x = self._far
-        out = [apply("add", a, b) for a, b in zip(x, r, strict=True)]
-        for i, j in np.ndindex(A.shape):
-            out[i] = apply("add", out[i], apply("mul", int(A[i, j]), x[j]))
-        for at, i in enumerate(self._order):
-            for j in self._order[:at]:
-                out[i] = apply("sub", out[i], apply("mul", int(LU[i, j]), out[j]))
-        for at, i in reversed(list(enumerate(self._order))):
-            for j in self._order[at + 1 :]:
-                out[i] = apply("sub", out[i], apply("mul", int(LU[i, j]), out[j]))
-            out[i] = apply("mul", out[i], int(LU[i, i]))
-        return out
+        def eliminate(i: int, others: Sequence[int]) -> None:
+            for j in others:
+                if B[i, j] != zero:
+                    product = apply("mul", int(B[i, j]), self.solved[j])
+                    self.solved[i] = apply("sub", self.solved[i], product)
+                    self.nonzero[i] |= self.nonzero[j]
+
+        for at, i in enumerate(order):
+            eliminate(i, order[:at])
+        for at, i in reversed(list(enumerate(order))):
+            eliminate(i, order[at + 1 :])
+            self.solved[i] = apply("mul", self.solved[i], int(B[i, i]))
 
 
 def _least_fill(pattern: Sequence[tuple[int, int]], n: int) -> list[int]:

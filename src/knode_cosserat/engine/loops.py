@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import threading
 from typing import Any
 
 import jax
@@ -17,23 +18,29 @@ from knode_cosserat.solvers.time_loop import StepCoefficients, StepRows
 
 #: compiled cores, or the reason why there is none, by what their code depends on
 _CORES: dict[Any, Core | EngineError] = {}
+_COMPILING = threading.Lock()
 
 
 def core_of(system: System, settings: Settings, robots: bool) -> Core:
-    """Return the core of a system, with robots or places in lanes.
+    """Return the core of a system or, with robots in lanes, of a batch of systems or one for all.
 
-    Parameters that are zero are constants of the code. Raises `EngineError` if the engine does not cover the
-    system or the settings.
+    Parameters that are zero, in all systems of a batch, are constants of the code.
+
+    Raises:
+        EngineError: the engine does not cover the system or the settings.
     """
     leaves, structure = jax.tree.flatten(system)
-    leaves = [np.asarray(leaf) for leaf in leaves]
+    leaves = [np.asarray(leaf, dtype=float) for leaf in leaves]
+    if np.ndim(system.length):
+        leaves = [np.max(np.abs(leaf), axis=0) for leaf in leaves]
     zeros = tuple((leaf.shape, np.packbits(leaf == 0.0).tobytes()) for leaf in leaves)
     key = structure, zeros, settings, robots
-    if key not in _CORES:
-        try:
-            _CORES[key] = Core(system, settings, robots)
-        except EngineError as error:
-            _CORES[key] = error
+    with _COMPILING:
+        if key not in _CORES:
+            try:
+                _CORES[key] = Core(jax.tree.unflatten(structure, leaves), settings, robots)
+            except EngineError as error:
+                _CORES[key] = error
     core = _CORES[key]
     if isinstance(core, EngineError):
         raise core
@@ -63,11 +70,11 @@ def loop_many(
 ) -> tuple[np.ndarray, StateHistory, StepRows]:
     """Solve all steps of a batch: controls (B, T, c), states (B, ...), and one system or a batch of them.
 
-    Robots are solved side by side in the lanes of a vector. A robot with a failed step waits for the others;
-    its last state is not kept.
+    Robots are solved side by side in the lanes of a vector. A robot with a failed step waits for the others.
+    Its last state is not kept, except if the first step failed.
     """
     many, size = np.ndim(system.length) > 0, len(controls)
-    core = core_of(jax.tree.map(lambda leaf: leaf[0], system) if many else system, settings, robots=True)
+    core = core_of(system, settings, robots=True)
     parts = []
     for first in range(0, size, core.P):
         index = np.minimum(np.arange(first, first + core.P), size - 1)
@@ -79,5 +86,9 @@ def loop_many(
                 parameters_of(system), (core.P, len(core.equations.parameter_values))
             )
         states = jax.tree.map(lambda leaf, index=index: np.asarray(leaf)[index], pasts)
-        parts.append(core.integrate(parameters, np.asarray(controls)[index], steps, states, (0, stop)))
+        done, lasts, rows = core.integrate(parameters, np.asarray(controls)[index], steps, states, (0, stop))
+        failed = done == 0
+        for before, after in zip(states, lasts, strict=True):
+            after[failed] = before[failed]
+        parts.append((done, lasts, rows))
     return jax.tree.map(lambda *lanes: np.concatenate(lanes)[:size], *parts)

@@ -1,8 +1,8 @@
 """Memory of a run, and code that reads and writes it: robots in lanes, or places along the rod in lanes.
 
 A lane of a vector is a robot of a batch. For a single robot it is a place along the rod; in the recursion
-along the rod it is a column of the matrix that is eliminated. The code is the same: arrays know their layout
-(`Array`), and values are `wide` where all places are independent, else `plain`.
+along the rod it is a row of a matrix. The code is the same: arrays know their layout (`Array`), and values
+are `wide` where all places are independent, else `plain`.
 """
 
 from __future__ import annotations
@@ -51,19 +51,22 @@ class Memory:
         self._size += -(-length // self.L) * self.L
         return found
 
-    def _by_place(self, size: int, count: int) -> Array:
-        """Reserve an array in which the numbers of one place follow each other, for code that visits one."""
+    def _by_rows(self, rows: int, columns: int, count: int) -> Array:
+        """Reserve matrices of which a vector holds a row of all robots, or as many rows as lanes."""
+        size = columns * self._padded(rows)
         if self.batch:
             return self._array(size, count)
         found = Array(self._size, size, count, 1, size)
-        self._size += -(-size * count // self.L) * self.L
+        self._size += size * count
         return found
 
-    def _columns(self, size: int) -> Array:
-        """Reserve a matrix whose columns are in lanes (one robot), or follow each other (robots in lanes)."""
-        found = Array(self._size, size, 1, self.L, 0)
-        self._size += size * self.L
-        return found
+    def _padded(self, rows: int) -> int:
+        """Return the number of rows that a column takes in memory."""
+        return rows if self.batch else -(-rows // self.L) * self.L
+
+    def _blocks(self, rows: int) -> range:
+        """Return the first row of each vector of a column."""
+        return range(0, rows, 1 if self.batch else self.L)
 
     # code that reads and writes
 
@@ -96,6 +99,23 @@ class Memory:
 
     def _write_wide(self, value: Any, array: Array, i: Any, j: Any) -> None:
         self._put(value, array, i, j, self.L)
+
+    def _column(self, array: Array, rows: int, column: int = 0, j: int | Index = 0) -> list[Value]:
+        """Return the vectors of a column of a matrix."""
+        first = column * self._padded(rows)
+        return [self._get(array, first + row, j, self.L) for row in self._blocks(rows)]
+
+    def _set_column(self, values: list[Value], array: Array, rows: int, column: int = 0, j: Any = 0) -> None:
+        first = column * self._padded(rows)
+        for row, value in zip(self._blocks(rows), values, strict=True):
+            self._put(value, array, first + row, j, self.L)
+
+    def _entry(self, column: list[Value], row: int) -> Value:
+        """Return the number in a row of a column, in all lanes."""
+        if self.batch:
+            return column[row]
+        f = self._now
+        return f.splat(f.lane(column[row // self.L], row % self.L), self.L)
 
     @contextlib.contextmanager
     def _places(self, count: int, first: int = 0) -> Iterator[Index]:

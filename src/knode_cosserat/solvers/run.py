@@ -15,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
+from knode_cosserat.engine import loops as engine
+from knode_cosserat.engine.program import EngineError
 from knode_cosserat.rods.elastic_rod import ElasticRod
 from knode_cosserat.rods.section import INWARD
 from knode_cosserat.rods.strands import in_strands
@@ -77,14 +79,26 @@ class TimeIntegration:
         return StepCoefficients.of(self.settings, self.dt, self.first)
 
     def solve(self, system: System, controls: Any, state: StateHistory, span: tuple[int, int]) -> Any:
-        """Solve a span of steps until one fails: number of steps done, the last state, all rows."""
-        return loop_one(system, self.settings, self.coefficients, controls, state, span)
+        """Solve a span of steps until one fails: number of steps done, the last state, rows of the span."""
+        try:
+            return engine.loop_one(system, self.settings, self.coefficients, controls, state, span)
+        except EngineError:
+            padded = padded_rows(controls, least=LEAST_CAPACITY)
+            found = loop_one(system, self.settings, self.coefficients, padded, state, span)
+            return _of_span(found, span)
 
-    def solve_many(self, system: System, controls: Any, states: StateHistory, lockstep: bool) -> Any:
-        """Solve all steps of a batch of robots, each until one fails."""
-        return loop_many(
-            system, self.settings, self.coefficients, controls, states, self.steps, lockstep
-        )  # fmt: skip
+    def solve_many(self, system: System, controls: Any, states: StateHistory) -> Any:
+        """Solve all steps of a batch of robots, each until one fails: as `solve`, for each robot."""
+        try:
+            return engine.loop_many(
+                system, self.settings, self.coefficients, controls, states, self.steps
+            )  # fmt: skip
+        except EngineError:
+            padded = padded_rows(controls)
+            found = loop_many(
+                system, self.settings, self.coefficients, padded, states, self.steps, lockstep=False
+            )  # fmt: skip
+            return _of_span(found, (0, self.steps))
 
     def recover(self, system: System, state: Any, controls: Any, i: int, budget: Budget) -> SolvedStep:
         """Recover step i; `controls` are the previous step's and its own."""
@@ -103,16 +117,25 @@ class Equilibria:
     recovery_budget: float | None = None
 
     def solve(self, system: System, controls: Any, state: Any, span: tuple[int, int]) -> Any:
-        """Solve a span of equilibria until one fails: the number done, the last state, all rows."""
-        return static_one(system, self.settings, controls, state, span)
+        """Solve a span of equilibria until one fails: the number done, the last state, rows of the span."""
+        padded = padded_rows(controls, least=LEAST_CAPACITY)
+        return _of_span(static_one(system, self.settings, padded, state, span), span)
 
-    def solve_many(self, system: System, controls: Any, states: Any, lockstep: bool) -> Any:
-        """Solve the lists of a batch of robots, each until one fails."""
-        return static_many(system, self.settings, controls, states, self.steps, lockstep)
+    def solve_many(self, system: System, controls: Any, states: Any) -> Any:
+        """Solve the lists of a batch of robots, each until one fails: as `solve`, for each robot."""
+        found = static_many(system, self.settings, padded_rows(controls), states, self.steps, False)
+        return _of_span(found, (0, self.steps))
 
     def recover(self, system: System, state: Any, controls: Any, i: int, budget: Budget) -> SolvedStep:
         """Recover an equilibrium; `controls` are the previous one's and its own."""
         return StaticRecovery(system, self.settings, state, budget).recover(controls)
+
+
+def _of_span(results: tuple[Any, Any, StepRows], span: tuple[int, int]) -> Any:
+    """Return the results of a compiled loop in NumPy's arrays, with the rows of a span."""
+    done, last, rows = jax.tree.map(np.asarray, results)
+    rows = jax.tree.map(lambda leaf: leaf[(slice(None),) * done.ndim + (slice(*span),)], rows)
+    return done, last, rows
 
 
 def run_one(
@@ -126,7 +149,6 @@ def run_one(
     """
     total = task.steps
     piece = FIRST_STEPS if np.isfinite(response) else total
-    padded = padded_rows(controls, least=LEAST_CAPACITY)
     budget = Budget(task.recovery_budget)
     rows: StepRows | None = None
     done, cause = 0, ""
@@ -134,7 +156,7 @@ def run_one(
         while done < total and not cause:
             began = time.perf_counter()
             stop = min(total, done + piece)
-            reached, state, new = task.solve(system, padded, state, (done, stop))
+            reached, state, new = task.solve(system, controls, state, (done, stop))
             reached = int(reached)
             elapsed = time.perf_counter() - began
             budget.ran(elapsed)
@@ -159,9 +181,10 @@ def run_one(
 def _merged(rows: StepRows | None, new: StepRows, first: int, last: int, total: int) -> StepRows:
     """Add the rows `first` to `last` of a compiled loop to the existing rows."""
     if rows is None:
-        return StepRows(*(np.array(leaf[:total]) for leaf in map(np.asarray, new)))
+        rows = StepRows(*(np.zeros((total, *leaf.shape[1:]), leaf.dtype) for leaf in new))
+        rows.result[:] = int(Result.NOT_REACHED)
     for every, leaf in zip(rows, new, strict=True):
-        every[first:last] = np.asarray(leaf)[first:last]
+        every[first:last] = leaf[: last - first]
     return rows
 
 
@@ -314,10 +337,8 @@ def run_batch(
     recovery.
     """
     size, batched = controls.shape[0], np.ndim(system.length) > 0
-    lockstep = jax.default_backend() != "cpu"
-    workers = 1 if lockstep else usable_cores()
-    chunk = size if lockstep else min(CHUNK, -(-size // workers))
-    padded = padded_rows(controls)
+    workers = usable_cores()
+    chunk = min(CHUNK, -(-size // workers))
 
     def robot(index: Any) -> System:
         return _picked(system, index) if batched else system
@@ -327,14 +348,13 @@ def run_batch(
         def work(first: int) -> Any:
             # the last chunk is padded with its last robot: one shape, one program
             index = np.minimum(np.arange(first, first + chunk), size - 1)
-            done, lasts, rows = task.solve_many(robot(index), padded[index], _picked(states, index), lockstep)
+            done, lasts, rows = task.solve_many(robot(index), controls[index], _picked(states, index))
             count = min(chunk, size - first)
             bar.update(count)
-            rows = (np.asarray(leaf)[:count, : task.steps] for leaf in rows)
-            return np.asarray(done)[:count], jax.tree.map(lambda x: np.asarray(x)[:count], lasts), *rows
+            return jax.tree.map(lambda leaf: leaf[:count], (done, lasts, *rows))
 
         firsts = range(0, size, chunk)
-        program = _program(system, states, padded, task.settings, batched, lockstep, chunk)
+        program = _program(system, states, padded_rows(controls), task.settings, batched, chunk)
         first = [] if program in _COMPILED else [work(firsts[0])]
         _COMPILED.add(program)
         with concurrent.futures.ThreadPoolExecutor(workers) as pool:

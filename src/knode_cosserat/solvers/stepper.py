@@ -161,11 +161,10 @@ class Stepper:
     def _solve(self, control: np.ndarray, stop: Callable[[], bool] | None) -> tuple[StepRows, StateHistory]:
         i, settings = self._index, self._task.settings
         control = at_stages(self.robot, settings, control[None], self._control[None], not self._begun)[0]
-        # same capacity as in a run of up to 128 steps, so that they share a program
         controls = np.zeros((LEAST_CAPACITY, len(control)))
         controls[i] = control
         done, after, rows = self._task.solve(self.robot, controls, self._past, (i, i + 1))
-        row, cause = StepRows(*(np.asarray(leaf)[i] for leaf in rows)), ""
+        row, cause = StepRows(*(leaf[0] for leaf in rows)), ""
         if int(done) == i:
             budget = _StoppableBudget(self._task.recovery_budget, stop)
             pair = self._control, control
