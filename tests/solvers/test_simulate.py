@@ -16,9 +16,8 @@ from knode_cosserat.rods.tendon_friction import TendonFriction, Vibration
 from knode_cosserat.solvers.grid import at_places
 from knode_cosserat.solvers.history import EXTRAPOLATIONS, advanced, history_of, resting_history
 from knode_cosserat.solvers.problem import StepProblem
-from knode_cosserat.solvers.run import padded_rows
-from knode_cosserat.solvers.settings import MEASURED, Settings
-from knode_cosserat.solvers.time_loop import StepCoefficients, loop_many, weights_by
+from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.time_loop import weights_by
 from tests.trajectories import HOPELESS, synthetic
 
 DT = 0.05
@@ -188,18 +187,6 @@ def test_jit_equals_plain(jitted, sine, truth):
 
 
 # batches
-
-
-@pytest.mark.campaign
-def test_lockstep_as_on_a_gpu_equals_one_after_the_other(robot, sine):
-    past = resting_history(robot, Settings())
-    tensions = np.stack([sine[:16], 1.2 * sine[:16], 0.8 * sine[:16]])
-    pasts = jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), past)
-    table = np.array([kc.solvers.BDF2().coefficients(DT, DT)] * 2)
-    arguments = (robot, MEASURED, StepCoefficients(table, DT), padded_rows(tensions), pasts, 16)
-    one_by_one, together = loop_many(*arguments, lockstep=False), loop_many(*arguments, lockstep=True)
-    np.testing.assert_array_equal(one_by_one[0], [16, 16, 16])
-    np.testing.assert_allclose(one_by_one[2].records, together[2].records, atol=1e-8)
 
 
 @pytest.mark.slow

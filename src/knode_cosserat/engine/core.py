@@ -10,7 +10,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import operator
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
@@ -58,13 +58,21 @@ class Core(EliminationCode):
         # Newton's method: a trial point, and the correction from the last accepted one
         self.trial, self.direction = a(ny, self.ends), a(ny, self.ends)
         self.trial_unknowns, self.direction_unknowns = a(k, 1), a(k, 1)
-        # the motion: records of two states, their rate, three states for the first guess
+        # the motion: records of two states and their rate, states for the first guess, errors of the records
+        first = self._size
         self.records, self.rate = [a(numbers, self.count) for _ in range(2)], a(numbers, self.count)
         self.past, self.weights, self.t0 = [a(ny, self.ends) for _ in range(3)], a(3, 1), a(1, 1)
-        self.middle = a(ny, self.pieces)
-        # corrected motions: errors of the records, history terms, defects
         self.errors, self.time_errors = ([a(numbers, self.ends) for _ in range(2)] for _ in range(2))
-        self.error_rate, self.dH, self.own_dH = (a(numbers, self.ends) for _ in range(3))
+        self.error_rate = a(numbers, self.ends)
+        #: the part of the memory that is the state of a motion, and its arrays as in a `StateHistory`
+        self._motion = slice(first, self._size)
+        self._parts = {
+            "records": self.records, "rate": [self.rate], "y": self.past, "weights": [self.weights],
+            "t0": [self.t0], "error": [*self.errors, self.error_rate], "time_error": self.time_errors,
+        }  # fmt: skip
+        self.middle = a(ny, self.pieces)
+        # corrected motions: history terms, defects
+        self.dH, self.own_dH = (a(numbers, self.ends) for _ in range(2))
         self.better, self.better_unknowns = a(ny, self.ends), a(k, 1)
         self.defect, self.own_defect, self.rest = (a(ny, self.pieces) for _ in range(3))
         self.tip_rest = a(k, 1)
@@ -78,23 +86,15 @@ class Core(EliminationCode):
         self._run = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 7, *[ctypes.c_long] * 2)(
             self.compiled.address("run")
         )
-        arrays = {
-            "records": self.records, "rate": [self.rate], "y": self.past, "weights": [self.weights],
-            "t0": [self.t0], "error": [*self.errors, self.error_rate], "time_error": self.time_errors,
-        }  # fmt: skip
-        #: places in memory of each part of a `StateHistory`: (lanes, parts, places, size)
-        self._state_places = {
-            name: np.stack([self._places_of(part) for part in parts], axis=1)
-            for name, parts in arrays.items()
-        }
-        self._parameter_places, self._length_places = (
-            self._places_of(array)[:, 0] for array in (self.params, self.length)
-        )
+        guesses = EXTRAPOLATIONS[None]
+        if settings.stages > 1:
+            guesses = np.asarray(stage_extrapolations(settings))
+        #: extrapolations to each stage and to the one after it
+        self._guesses = np.ascontiguousarray(np.stack([guesses, np.roll(guesses, -1, axis=0)], axis=1))
         #: memory at the start of a run, but for parameters and states
         self._empty = np.zeros(self._size)
         if self.acting.size:
-            acting = self.grid.acting[np.minimum(np.arange(self._count(self.acting)), self.pieces - 1)]
-            self._empty[self._places_of(self.acting)] = acting
+            self._put_in(self._empty[None], self.acting, self.grid.acting[None, None])
         table = self._empty[self.node_table.offset :].view(np.int64)
         table[: len(self.grid.nodes)] = self.grid.nodes
 
@@ -669,48 +669,68 @@ class Core(EliminationCode):
     ) -> tuple[np.ndarray, StateHistory, StepRows]:  # fmt: skip
         """Solve a span of steps of each robot until one fails (see `time_loop.time_loop`).
 
-        Parameters (lanes, n), controls (lanes, T, c) or (lanes, T, stages * c) and states (lanes, ...).
-        Returns the numbers of steps done, the states after them, and rows.
+        Parameters (n,) or (robots, n), controls (robots, T, c) or (robots, T, stages * c) and states
+        (robots, ...). Returns the numbers of steps done, the states after them, and rows. In a batch, a robot
+        with a failed step waits for the others in its vector; its last state is not kept, except if the first
+        step failed.
         """
-        e, P, stages = self.equations, self.P, self.settings.stages
-        start, stop = span
-        count, nodes = stop - start, len(self.grid.nodes)
+        e, P, stages, (start, stop) = self.equations, self.P, self.settings.stages, span
+        count, nodes, size = stop - start, len(self.grid.nodes), len(controls)
+        vectors = -(-size // P)
+
+        def in_lanes(values: np.ndarray) -> np.ndarray:
+            """Return values (vectors, lanes, ...); the last vector is filled with the last robot."""
+            if vectors * P > size:
+                values = values[np.minimum(np.arange(vectors * P), size - 1)]
+            return values.reshape(vectors, P, *values.shape[1:])
+
         held = 1 if controls.shape[2] == e.nc else stages
-        own = controls[:, start:stop].reshape(P, count, held, e.nc)
-        own = np.ascontiguousarray(np.moveaxis(np.broadcast_to(own, (P, count, stages, e.nc)), 0, -1))
+        own = in_lanes(controls[:, start:stop]).reshape(vectors, P, count, held, e.nc)
+        own = np.broadcast_to(own, (vectors, P, count, stages, e.nc))
+        own = np.ascontiguousarray(np.moveaxis(own, 1, -1))
+        own_parameters = in_lanes(np.broadcast_to(parameters, (size, parameters.shape[-1])))
         table = np.empty((count, stages, 5))
         coefficients = np.asarray(steps.table).reshape(2, stages, 4)
         table[..., :4] = coefficients[1]
         table[: int(start == 0), :, :4] = coefficients[0]
         table[..., 4] = (np.arange(start, stop)[:, None] + np.asarray(steps.ends)) * steps.dt
-        guesses = stage_extrapolations(self.settings) if stages > 1 else EXTRAPOLATIONS[None]
-        guesses = np.ascontiguousarray(np.stack([guesses, np.roll(guesses, -1, axis=0)], axis=1))
-        rows = np.zeros((count, stages, nodes, e.numbers, P))
-        infos = np.zeros((count, stages, 8 + e.k, P))
+        rows = np.zeros((vectors, count, stages, nodes, e.numbers, P))
+        infos = np.zeros((vectors, count, stages, 8 + e.k, P))
+        reached, length = np.zeros((2, vectors, P))
+        before = np.empty((vectors, self._motion.stop - self._motion.start))
+        for array, value in self._parts_of(states):
+            self._put_in(before, array, in_lanes(value), self._motion.start)
+        after = np.empty_like(before)
 
-        def ran(stop: int) -> tuple[np.ndarray, np.ndarray]:
-            memory, reached = self._memory(parameters, states), np.zeros(P)
-            arrays = memory, own, table, guesses, rows, infos, reached
+        raw = np.empty(self._size + 8)
+        memory = raw[(-raw.ctypes.data // 8) % 8 :][: self._size]
+
+        def solve(k: int, stop: int, *results: np.ndarray) -> None:
+            memory[:] = self._empty
+            memory[self._motion] = before[k]
+            self._put_in(memory[None], self.params, own_parameters[k][None, :, None])
+            arrays = memory, own[k], table, self._guesses, *results
             self._run(*(each.ctypes.data for each in arrays), 0, stop)
-            return memory, reached
+            after[k], length[k] = memory[self._motion], self._numbers(memory[None], self.length)[0, :, 0, 0]
 
-        memory, reached = ran(count)
-        if not self.batch and reached[0] < count:
-            # the state before the step that failed
-            failed = rows.copy(), infos.copy()
-            memory, _ = ran(int(reached[0]))
-            rows, infos = failed
-        done = reached.astype(int)
-        lengths = memory[self._length_places]
-        return start + done, self._states(memory, states), self._rows(rows, infos, lengths, done)
+        for k in range(vectors):
+            solve(k, count, rows[k], infos[k], reached[k])
+            if not self.batch and reached[k, 0] < count:
+                # again, for the state before the step that failed
+                solve(k, int(reached[k, 0]), rows[k].copy(), infos[k].copy(), reached[k].copy())
+        done = reached.reshape(-1)[:size].astype(int)
+        lasts = self._states(after, states)
+        for one, other in zip(states, lasts, strict=True):
+            other[done == 0] = one[done == 0]
+        flat = [np.moveaxis(x, -1, 1).reshape(-1, *x.shape[1:-1])[:size] for x in (rows, infos)]
+        return start + done, lasts, self._rows(*flat, length.reshape(-1)[:size], done)
 
     def _rows(self, rows: np.ndarray, infos: np.ndarray, length: np.ndarray, done: np.ndarray) -> StepRows:
-        """Return rows (lanes, steps, ...); a step's row is that of its last stage."""
-        rows, infos = np.moveaxis(rows, -1, 0), np.moveaxis(infos, -1, 0)
+        """Return rows (robots, steps, ...); a step's row is that of its last stage."""
         numbers, unknowns = infos[..., :8], infos[..., 8:]
         error = np.max(numbers[..., ERROR], axis=-1)
         off, angle = numbers[..., -1, POSITION], numbers[..., -1, ANGLE]
-        fine = (off <= COARSE_SHARE * length) & (angle <= COARSE_ANGLE)
+        fine = (off <= COARSE_SHARE * length[:, None]) & (angle <= COARSE_ANGLE)
         result = np.where(fine, int(Result.CONVERGED), int(Result.COARSE))
         result = np.where(error <= self.newton.acceptable, result, int(Result.NO_CONVERGENCE))
         result[np.arange(result.shape[1]) > done[:, None]] = int(Result.NOT_REACHED)
@@ -721,36 +741,38 @@ class Core(EliminationCode):
             rows[:, :, :-1], unknowns[:, :, :-1],
         )  # fmt: skip
 
-    def _count(self, array: Array) -> int:
-        """Return the number of places of an array in memory, with the lanes beyond the last place."""
-        return array.count if self.batch or array.count == 1 else self.stride
+    def _numbers(self, memory: np.ndarray, array: Array, first: int = 0) -> np.ndarray:
+        """Return an array's numbers (m, lanes, places, size): a view of memories (m, n) from `first` on."""
+        shape, axes = (array.size, 1 if array.count == 1 else self.stride, 1), (0, 3, 2, 1)
+        if self.batch:
+            shape, axes = (array.count, array.size, self.L), (0, 3, 1, 2)
+        at = array.offset - first
+        return memory[:, at : at + shape[0] * shape[1] * shape[2]].reshape(-1, *shape).transpose(axes)
 
-    def _places_of(self, array: Array) -> np.ndarray:
-        """Return the places in memory of an array's numbers (lanes, places, size)."""
-        lanes, places = np.arange(self.P)[:, None, None], np.arange(self._count(array))[:, None]
-        return array.offset + lanes + places * array.place + np.arange(array.size) * array.component
+    def _put_in(self, memory: np.ndarray, array: Array, values: np.ndarray, first: int = 0) -> None:
+        """Write values (m, lanes, places, size); the last place is repeated in the lanes beyond it."""
+        target = self._numbers(memory, array, first)
+        count = values.shape[-2]
+        target[:, :, :count] = values
+        target[:, :, count:] = values[:, :, -1:]
 
-    def _memory(self, parameters: np.ndarray, states: StateHistory) -> np.ndarray:
-        """Return the memory of a run from these states."""
-        raw = np.empty(self._size + 8)
-        memory = raw[(-raw.ctypes.data // 8) % 8 :][: self._size]
-        memory[:] = self._empty
-        memory[self._parameter_places] = parameters
-        for name, places in self._state_places.items():
-            lanes, parts, count, size = places.shape
-            values = np.asarray(getattr(states, name)).reshape(lanes, parts, -1, size)
-            if values.shape[2] < count:  # repeated in the lanes beyond the last place
-                memory[places] = values[:, :, -1:]
-            memory[places[:, :, : values.shape[2]]] = values
-        return memory
+    def _parts_of(self, states: StateHistory) -> Iterator[tuple[Array, np.ndarray]]:
+        """Yield the arrays of a motion's state with their values (robots, places, size)."""
+        for name, arrays in self._parts.items():
+            values = np.asarray(getattr(states, name), float)
+            values = values.reshape(len(values), len(arrays), -1, arrays[0].size)
+            for part, array in enumerate(arrays):
+                yield array, values[:, part]
 
-    def _states(self, memory: np.ndarray, states: StateHistory) -> StateHistory:
-        """Return the states at the end of a run."""
+    def _states(self, motions: np.ndarray, before: StateHistory) -> StateHistory:
+        """Return the states in memories (vectors, n)."""
         found = {}
-        for name, places in self._state_places.items():
-            before = np.asarray(getattr(states, name))
-            count = before.size // (places.shape[0] * places.shape[1] * places.shape[3])
-            found[name] = memory[places[:, :, :count]].reshape(before.shape)
+        for name, arrays in self._parts.items():
+            shape = np.shape(getattr(before, name))
+            count = int(np.prod(shape[1:])) // (len(arrays) * arrays[0].size)
+            parts = [self._numbers(motions, array, self._motion.start)[..., :count, :] for array in arrays]
+            values = np.stack(parts, axis=2).reshape(-1, len(arrays), count, arrays[0].size)
+            found[name] = values[: shape[0]].reshape(shape)
         return StateHistory(**found)
 
 

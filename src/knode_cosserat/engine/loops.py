@@ -70,25 +70,12 @@ def loop_many(
 ) -> tuple[np.ndarray, StateHistory, StepRows]:
     """Solve all steps of a batch: controls (B, T, c), states (B, ...), and one system or a batch of them.
 
-    Robots are solved side by side in the lanes of a vector. A robot with a failed step waits for the others.
-    Its last state is not kept, except if the first step failed.
+    Robots are solved side by side in the lanes of vectors; see `Core.integrate`.
     """
-    many, size = np.ndim(system.length) > 0, len(controls)
-    core = core_of(system, settings, robots=True)
-    parts = []
-    for first in range(0, size, core.P):
-        index = np.minimum(np.arange(first, first + core.P), size - 1)
-        if many:
-            leaves = [np.asarray(leaf, float)[index] for leaf in jax.tree.leaves(system)]
-            parameters = np.concatenate([leaf.reshape(core.P, -1) for leaf in leaves], axis=1)
-        else:
-            parameters = np.broadcast_to(
-                parameters_of(system), (core.P, len(core.equations.parameter_values))
-            )
-        states = jax.tree.map(lambda leaf, index=index: np.asarray(leaf)[index], pasts)
-        done, lasts, rows = core.integrate(parameters, np.asarray(controls)[index], steps, states, (0, stop))
-        failed = done == 0
-        for before, after in zip(states, lasts, strict=True):
-            after[failed] = before[failed]
-        parts.append((done, lasts, rows))
-    return jax.tree.map(lambda *lanes: np.concatenate(lanes)[:size], *parts)
+    core = core_of(system, settings, robots=len(controls) > 1)
+    parameters = parameters_of(system)
+    if np.ndim(system.length):
+        leaves = [np.asarray(leaf, float) for leaf in jax.tree.leaves(system)]
+        parameters = np.concatenate([leaf.reshape(len(leaf), -1) for leaf in leaves], axis=1)
+    pasts = jax.tree.map(np.asarray, pasts)
+    return core.integrate(parameters, np.asarray(controls), steps, pasts, (0, stop))

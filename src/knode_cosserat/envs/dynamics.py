@@ -1,7 +1,6 @@
 """Pure functions of an environment: reset, and steps of many episodes at once.
 
-The motion is that of `simulate`, by the same compiled loop. On a CPU robots are solved in turn, and all else
-is computed for all of them together.
+The motion is that of `simulate`. All but the solution of the steps is computed for all robots together.
 """
 
 from __future__ import annotations
@@ -162,7 +161,7 @@ def reset(spec: Spec, arrays: Arrays, key: Any) -> tuple[EpisodeState, Float[Any
 # steps
 
 
-class _Move(NamedTuple):
+class Move(NamedTuple):
     """Command of a step, before it is solved."""
 
     system: Any
@@ -171,7 +170,7 @@ class _Move(NamedTuple):
     valid: Any
 
 
-def _moved_by(spec: Spec, arrays: Arrays, state: EpisodeState, action: Any) -> _Move:
+def _moved_by(spec: Spec, arrays: Arrays, state: EpisodeState, action: Any) -> Move:
     """Return the command of an action, and the acting control after its delay."""
     before, action = state.commands[0], jnp.asarray(action, dtype=float)
     valid = jnp.all(jnp.isfinite(action))
@@ -181,11 +180,11 @@ def _moved_by(spec: Spec, arrays: Arrays, state: EpisodeState, action: Any) -> _
     history = state.history._replace(t0=jnp.asarray(state.count * spec.dt, dtype=float))
     state = state._replace(commands=commands, history=history)
     system = None if spec.is_shared else system_of(spec, arrays, state)
-    return _Move(system, state, commands[state.delay], valid)
+    return Move(system, state, commands[state.delay], valid)
 
 
 def _arrived(
-    spec: Spec, arrays: Arrays, move: _Move, history: StateHistory, row: StepRows
+    spec: Spec, arrays: Arrays, move: Move, history: StateHistory, row: StepRows
 ) -> tuple[EpisodeState, Transition]:
     """Return the state after a solved step, and its outcome; without a solution the state before it."""
     state, system = move.state, arrays.robot if spec.is_shared else move.system
@@ -224,13 +223,26 @@ def step_many(
     spec: Spec, arrays: Arrays, states: EpisodeState, actions: Float[Any, "B c"]
 ) -> tuple[EpisodeState, Transition]:
     """Return the states after one period of many episodes, and their transitions, all with a leading axis."""
-    moves = jax.vmap(lambda state, action: _moved_by(spec, arrays, state, action))(states, actions)
+    moves = moved(spec, arrays, states, actions)
     systems = arrays.robot if spec.is_shared else moves.system
-    steps = StepCoefficients.of(spec.settings, spec.dt, "regular")
-    lockstep = jax.default_backend() != "cpu"
-    acting = moves.acting[:, None]
-    _, histories, rows = loop_many(
-        systems, spec.settings, steps, acting, moves.state.history, 1, lockstep
-    )  # fmt: skip
+    acting, pasts = moves.acting[:, None], moves.state.history
+    _, histories, rows = loop_many(systems, spec.settings, coefficients(spec), acting, pasts, 1)
+    return arrived(spec, arrays, moves, histories, rows)
+
+
+def coefficients(spec: Spec) -> StepCoefficients:
+    """Return the coefficients of the steps of an environment."""
+    return StepCoefficients.of(spec.settings, spec.dt, "regular")
+
+
+def moved(spec: Spec, arrays: Arrays, states: EpisodeState, actions: Float[Any, "B c"]) -> Move:
+    """Return the commands of many episodes."""
+    return jax.vmap(lambda state, action: _moved_by(spec, arrays, state, action))(states, actions)
+
+
+def arrived(
+    spec: Spec, arrays: Arrays, moves: Move, histories: StateHistory, rows: StepRows
+) -> tuple[EpisodeState, Transition]:
+    """Return the states after a solved step of many episodes, with rows (B, 1, ...), and the transitions."""
     rows = jax.tree.map(lambda leaf: leaf[:, 0], rows)
     return jax.vmap(lambda *each: _arrived(spec, arrays, *each))(moves, histories, rows)

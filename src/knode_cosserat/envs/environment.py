@@ -119,9 +119,7 @@ class Environment:
 
     def step_many(self, states: EpisodeState, actions: Float[Any, "B c"]) -> tuple[EpisodeState, Transition]:
         """Return the states of many episodes after one period under actions (B, c), and the transitions."""
-        # the program overwrites its states
-        kept = jax.tree.map(jnp.array, states)
-        found: tuple[EpisodeState, Transition] = programs.step(self.spec, self.arrays, kept, actions)
+        found: tuple[EpisodeState, Transition] = programs.step(self.spec, self.arrays, states, actions)
         return found
 
     def system(self, state: EpisodeState) -> System:

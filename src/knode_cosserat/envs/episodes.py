@@ -25,8 +25,7 @@ class Episodes:
         if not isinstance(given, int) or isinstance(given, bool) or count < 1:
             raise TaskError(f"count is {count!r}; allowed is a whole number from 1")
         self.environment, self.count = environment, count
-        lockstep = jax.default_backend() != "cpu"
-        parts = 1 if lockstep else min(usable_cores(), count)
+        parts = min(usable_cores(), count)
         # equal parts, the last one filled up: one shape, one program
         self._size = -(-count // parts)
         self._parts: list[Any] = [None] * -(-count // self._size)

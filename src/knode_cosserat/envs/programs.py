@@ -1,4 +1,4 @@
-"""Compiled programs of environments; those of steps overwrite the states that they receive."""
+"""Compiled programs of environments."""
 
 from __future__ import annotations
 
@@ -6,8 +6,12 @@ import functools
 from typing import Any
 
 import jax
+import numpy as np
 
+from knode_cosserat.engine import loops as engine
+from knode_cosserat.engine.program import EngineError
 from knode_cosserat.envs import dynamics
+from knode_cosserat.rods.system import is_traced
 
 
 @functools.partial(jax.jit, static_argnames="spec")
@@ -16,10 +20,24 @@ def reset(spec: Any, arrays: Any, keys: Any) -> Any:
     return jax.vmap(lambda key: dynamics.reset(spec, arrays, key))(keys)
 
 
-@functools.partial(jax.jit, static_argnames="spec", donate_argnames="states")
 def step(spec: Any, arrays: Any, states: Any, actions: Any) -> Any:
     """Return the states of many episodes after one period under actions (B, c), and the transitions."""
-    return dynamics.step_many(spec, arrays, states, actions)
+    if is_traced((arrays, states, actions)):
+        return dynamics.step_many(spec, arrays, states, actions)
+    moves = _moved(spec, arrays, states, actions)
+    systems = arrays.robot if spec.is_shared else moves.system
+    acting, pasts = np.asarray(moves.acting)[:, None], moves.state.history
+    try:
+        steps = dynamics.coefficients(spec)
+        _, histories, rows = engine.loop_many(systems, spec.settings, steps, acting, pasts, 1)
+    except EngineError:
+        return _step(spec, arrays, states, actions)
+    return _arrived(spec, arrays, moves, histories, rows)
+
+
+_step = jax.jit(dynamics.step_many, static_argnames="spec")
+_moved = jax.jit(dynamics.moved, static_argnames="spec")
+_arrived = jax.jit(dynamics.arrived, static_argnames="spec")
 
 
 @functools.partial(jax.jit, static_argnames="spec", donate_argnames="states")

@@ -161,12 +161,11 @@ def _packed(progress: _Progress) -> Float[Any, "11"]:
 
 def newton(
     problem: StepProblem, y: Float[Any, "points y"], unknowns: Float[Any, " k"], options: NewtonOptions,
-    kept: Kept | None = None, batch: str | None = None,
+    kept: Kept | None = None,
 ) -> tuple[Solution, Kept]:  # fmt: skip
     """Solve one step from a first guess, beginning with kept factors if they are usable.
 
-    `batch` is the name of the axis of robots that are solved in lockstep. They are linearised together if one
-    of them needs it. Never fails: the `error` of the solution tells if it is solved.
+    Never fails: the `error` of the solution tells if it is solved.
     """
     scales, pivots, size_of_y, shape = problem.system.scales(), pivots_of(problem.system), y.size, y.shape
     kept = none_kept(problem, y, unknowns) if kept is None else kept
@@ -217,13 +216,10 @@ def newton(
         renew = last.renew > 0.0
 
         def anew(state: tuple[Any, Factors]) -> tuple[Any, Factors]:
-            found = factors_of(problem, *unpacked(search.point))
-            return jnp.array(False), found if batch is None else _where(renew, found, state[1])
+            return jnp.array(False), factors_of(problem, *unpacked(search.point))
 
-        # one flag for the whole batch: with one flag a robot, a batch would always evaluate both branches
-        needed = renew if batch is None else jax.lax.psum(renew.astype(int), batch) > 0
         # a loop of one turn at most: `cond` would copy the factors that are kept
-        _, factors = jax.lax.while_loop(lambda state: state[0], anew, (needed, factors))
+        _, factors = jax.lax.while_loop(lambda state: state[0], anew, (renew, factors))
         progress = last._replace(
             damping=jnp.where(renew, 1.0, last.damping), size=jnp.where(renew, jnp.inf, last.size),
             old=(last.old > 0.0) & ~renew, first=renew, renew=False,
@@ -259,7 +255,3 @@ def newton(
         *unpacked(search.point), error, end.corrections.astype(int), end.linearisations.astype(int)
     )
     return solution, Kept(factors, (error <= options.acceptable) & ~(end.renew > 0.0))
-
-
-def _where(condition: Any, one: Any, other: Any) -> Any:
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), one, other)

@@ -95,9 +95,7 @@ class TimeIntegration:
             )  # fmt: skip
         except EngineError:
             padded = padded_rows(controls)
-            found = loop_many(
-                system, self.settings, self.coefficients, padded, states, self.steps, lockstep=False
-            )  # fmt: skip
+            found = loop_many(system, self.settings, self.coefficients, padded, states, self.steps)
             return _of_span(found, (0, self.steps))
 
     def recover(self, system: System, state: Any, controls: Any, i: int, budget: Budget) -> SolvedStep:
@@ -123,7 +121,7 @@ class Equilibria:
 
     def solve_many(self, system: System, controls: Any, states: Any) -> Any:
         """Solve the lists of a batch of robots, each until one fails: as `solve`, for each robot."""
-        found = static_many(system, self.settings, padded_rows(controls), states, self.steps, False)
+        found = static_many(system, self.settings, padded_rows(controls), states, self.steps)
         return _of_span(found, (0, self.steps))
 
     def recover(self, system: System, state: Any, controls: Any, i: int, budget: Budget) -> SolvedStep:

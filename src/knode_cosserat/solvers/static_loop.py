@@ -56,8 +56,8 @@ def static_one(system, settings, controls, y, span):  # type: ignore[no-untyped-
     return static_loop(system, settings, controls, y, span)
 
 
-@functools.partial(jax.jit, static_argnames=("settings", "lockstep"))
-def static_many(system, settings, controls, y, stop, lockstep):  # type: ignore[no-untyped-def]
+@functools.partial(jax.jit, static_argnames="settings")
+def static_many(system, settings, controls, y, stop):  # type: ignore[no-untyped-def]
     """Solve a batch as one compiled program: controls (B, T, c), and one system or a batch of them."""
     many = jnp.ndim(system.length) > 0
 
@@ -65,4 +65,4 @@ def static_many(system, settings, controls, y, stop, lockstep):  # type: ignore[
         return static_loop(given[0] if many else system, settings, given[-2], given[-1], (0, stop))
 
     given = (system, controls, y) if many else (controls, y)
-    return jax.vmap(one)(given) if lockstep else jax.lax.map(one, given)
+    return jax.lax.map(one, given)

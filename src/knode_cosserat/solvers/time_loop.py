@@ -44,8 +44,6 @@ TRUST = -3
 #: a row is COARSE if its position error is above this part of the length, or its orientation error above this
 #: angle (rad), which is the position error relative to the radius of curvature of a coil
 COARSE_SHARE, COARSE_ANGLE = 0.02, 0.1
-#: axis name of robots that are solved in lockstep
-BATCH = "robots"
 #: tolerance of a step's error estimate relative to its change, and largest number of corrections
 ESTIMATE_TOLERANCE, ESTIMATE_TURNS = 1e-2, 10
 #: misfits below this are rounding errors (natural units)
@@ -124,7 +122,7 @@ class TimeStep(NamedTuple):
 
 
 def solve_time_step(
-    system: System, settings: Settings, step: TimeStep, control: Any, kept: Kept, batch: str | None = None
+    system: System, settings: Settings, step: TimeStep, control: Any, kept: Kept
 ) -> tuple[StateHistory, StepRows, Kept]:
     """Solve one time step: return the next history, the step's row, and the kept factors.
 
@@ -132,7 +130,7 @@ def solve_time_step(
     """
     if settings.stages == 1:
         guesses = EXTRAPOLATIONS, EXTRAPOLATIONS
-        return solve_stage(system, settings, step, control, kept, guesses, batch)
+        return solve_stage(system, settings, step, control, kept, guesses)
     own = stage_controls(system, settings, control)
     own_guesses = stage_extrapolations(settings)
     pairs = own_guesses, jnp.roll(own_guesses, -1, axis=0)
@@ -141,7 +139,7 @@ def solve_time_step(
         past, kept = state
         coefficients, t, control, guesses = stage
         one = TimeStep(past, coefficients, t)
-        past, row, kept = solve_stage(system, settings, one, control, kept, guesses, batch)
+        past, row, kept = solve_stage(system, settings, one, control, kept, guesses)
         return (past, kept), row
 
     stages = step.coefficients, step.t, own, pairs
@@ -184,14 +182,13 @@ def stage_extrapolations(settings: Settings) -> Float[Any, "stages past past"]:
 
 def solve_stage(
     system: System, settings: Settings, step: TimeStep, control: Any, kept: Kept, guesses: tuple[Any, Any],
-    batch: str | None,
 ) -> tuple[StateHistory, StepRows, Kept]:  # fmt: skip
     """Solve one stage of a time step; `guesses` are the extrapolations to it and to the next stage."""
     extrapolations, following = guesses
     problem, past = step.problem(system, settings, control).ready(), step.past
     # sum of products instead of a matrix product: XLA fuses it with the next operations
     guess = jnp.sum(past.weights[:, None, None] * past.y, axis=0)
-    solution, kept = newton(problem, guess, unknowns_of(system, guess[0]), settings.newton, kept, batch)
+    solution, kept = newton(problem, guess, unknowns_of(system, guess[0]), settings.newton, kept)
     after, row = recorded_step(problem, settings, step, solution, kept.factors)
     if settings.stages > 1:
         time_error, largest = time_errors(problem, settings, step, solution, kept.factors, after)
@@ -438,23 +435,28 @@ def _where(condition: Any, one: Any, other: Any) -> Any:
 
 def time_loop(
     system: System, settings: Settings, steps: StepCoefficients, controls: Any, past: StateHistory,
-    span: tuple[Any, Any], batch: str | None = None,
+    span: tuple[Any, Any],
 ) -> tuple[Any, StateHistory, StepRows]:  # fmt: skip
     """Solve the steps of a span (step i uses controls[i] and ends at t0 + (i + 1) dt) until one fails."""
 
     def solve(past: StateHistory, kept: Kept, i: Any) -> tuple[StateHistory, StepRows, Kept]:
         step = TimeStep.of(steps, past, i)
-        return solve_time_step(system, settings, step, controls[i], kept, batch)
+        return solve_time_step(system, settings, step, controls[i], kept)
 
     kept = no_factors(system, settings, past.y[0], controls[0])
     rows = no_rows(system, controls.shape[:1], settings.stages)
     return solve_until_failure(solve, past, kept, rows, *span)
 
 
-def loop_in_turn(
-    system: System, settings: Settings, steps: StepCoefficients, controls: Any, pasts: StateHistory, stop: Any
-) -> tuple[Any, StateHistory, StepRows]:
-    """Solve all steps, one robot after the other; return the numbers of steps done, histories and rows.
+@functools.partial(jax.jit, static_argnames="settings")
+def loop_one(system, settings, steps, controls, past, span):  # type: ignore[no-untyped-def]
+    """Run `time_loop` as a compiled program."""
+    return time_loop(system, settings, steps, controls, past, span)
+
+
+@functools.partial(jax.jit, static_argnames="settings")
+def loop_many(system, settings, steps, controls, pasts, stop):  # type: ignore[no-untyped-def]
+    """Solve a batch, one robot after the other: controls (B, T, c), and one system or a batch of them.
 
     It is a single loop over robots and steps: XLA would copy all rows at every turn of an inner loop. First
     and last histories are different arrays, one only read and one only written, for the same reason.
@@ -486,27 +488,3 @@ def loop_in_turn(
     state = (zero, zero, past, lasts, jnp.zeros(size, dtype=int), rows, kept)
     _, _, _, lasts, done, rows, _ = jax.lax.while_loop(lambda state: state[0] < size, one, state)
     return done, lasts, rows
-
-
-@functools.partial(jax.jit, static_argnames="settings")
-def loop_one(system, settings, steps, controls, past, span):  # type: ignore[no-untyped-def]
-    """Run `time_loop` as a compiled program."""
-    return time_loop(system, settings, steps, controls, past, span)
-
-
-@functools.partial(jax.jit, static_argnames=("settings", "lockstep"))
-def loop_many(system, settings, steps, controls, pasts, stop, lockstep):  # type: ignore[no-untyped-def]
-    """Simulate a batch as one compiled program: controls (B, T, c), and one system or a batch of them.
-
-    On a CPU the robots are solved one after the other, each with its own number of corrections; lockstep was
-    measured at a third of the speed, because all robots wait for the slowest. On a GPU lockstep is faster.
-    """
-    if not lockstep:
-        return loop_in_turn(system, settings, steps, controls, pasts, stop)
-
-    def one(system: System, control: Any, past: StateHistory) -> Any:
-        return time_loop(system, settings, steps, control, past, (0, stop), BATCH)
-
-    many = jnp.ndim(system.length) > 0
-    robots = jax.vmap(one, in_axes=(0 if many else None, 0, 0), axis_name=BATCH)
-    return robots(system, controls, pasts)

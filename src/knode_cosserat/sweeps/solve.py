@@ -1,7 +1,7 @@
-"""Solution of the cases of a shard: compiled chunks, of which only the stored quantities are kept.
+"""Solution of the cases of a shard, in chunks of which only the stored quantities are kept.
 
-Results do not depend on the number of threads or processes: chunks have a fixed size, and every chunk is one
-call of one compiled program. Recovery has no limit of time, for the same reason.
+Results do not depend on the number of threads or processes: chunks have a fixed size. Recovery has no limit
+of time, for the same reason.
 """
 
 from __future__ import annotations
@@ -30,11 +30,10 @@ from knode_cosserat.solvers.run import (
     usable_cores,
 )
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.time_loop import StepCoefficients, loop_many
 from knode_cosserat.sweeps.plan import Cases, Plan
 
-#: robots that one call of the program solves: on a CPU one after the other, on a GPU in lockstep
-CHUNK, LOCKSTEP_CHUNK = 16, 1024
+#: robots that one call solves
+CHUNK = 16
 #: quantities that are functions of y
 _OF_Y = ("tip_position", "tip_quaternion", "position")
 
@@ -56,42 +55,26 @@ class Settled(NamedTuple):
     reasons: dict[int, str]
 
 
-class Form(NamedTuple):
-    """Settings that determine the program of a chunk, beside shapes."""
-
-    settings: Settings
-    steps: int
-    #: names of the stored quantities
-    store: tuple[str, ...]
-    #: solve all robots side by side
-    lockstep: bool
-
-
-@functools.partial(jax.jit, static_argnames="form")
-def solve_chunk(robot, values, initial, controls, coefficients, form):  # type: ignore[no-untyped-def]
-    """Return results and stored quantities of a chunk of cases, as one compiled program.
-
-    Args:
-        robot: the robot whose parameters are replaced.
-        values: parameters (cases, …) by name.
-        initial: initial state of the cases; None for rest.
-        controls: (cases, steps, c).
-        coefficients: of the time steps.
-        form: settings of the program.
-    """
-    settings, steps, store, lockstep = form
+@functools.partial(jax.jit, static_argnames=("settings", "size"))
+def _started(robot, values, start, settings, size):  # type: ignore[no-untyped-def]
+    """Return the systems of a chunk, or one for all, and their initial states; None: at rest."""
     systems = jax.vmap(lambda own: robot.replace(**own))(values) if values else robot
-    if initial is None:
-        at = initial_state(systems, settings, len(controls))
-        initial = Start(at.record, at.state.history)
-    done, _, rows = loop_many(systems, settings, coefficients, controls, initial.history, steps, lockstep)
-    ny, nz = robot.y_layout.size, robot.z_layout.size
-    records = jnp.concatenate([initial.record[:, None, :, : ny + nz], rows.records[..., : ny + nz]], axis=1)
-    solved = jnp.concatenate([jnp.zeros((len(controls), 1), dtype=int), rows.result], axis=1)
-    errors = jnp.concatenate([jnp.zeros((len(controls), 1)), rows.position_error], axis=1)
+    if start is None:
+        at = initial_state(systems, settings, size)
+        start = Start(at.record, at.state.history)
+    return systems, start
+
+
+@functools.partial(jax.jit, static_argnames="store")
+def _stored(systems, record, rows, store):  # type: ignore[no-untyped-def]
+    """Return results, position errors and stored quantities of the rows of a chunk."""
+    size = systems.y_layout.size + systems.z_layout.size
+    records = jnp.concatenate([record[:, None, :, :size], rows.records[..., :size]], axis=1)
+    none = jnp.zeros((len(record), 1))
+    solved = jnp.concatenate([none.astype(int), rows.result], axis=1)
+    errors = jnp.concatenate([none, rows.position_error], axis=1)
     records = jnp.where((solved < 0)[..., None, None], jnp.nan, records)
-    found = stored_of(systems, records, store)
-    return done, solved, jnp.where(solved < 0, jnp.nan, errors), found
+    return solved, jnp.where(solved < 0, jnp.nan, errors), stored_of(systems, records, store)
 
 
 def stored_of(systems: System, records: Any, store: tuple[str, ...]) -> dict[str, Any]:
@@ -114,9 +97,7 @@ class Solver:
     def __init__(self, plan: Plan, threads: int | None = None):
         """Prepare a plan; by default with one thread for each core that this process may use."""
         self.plan = plan
-        self.lockstep = jax.default_backend() != "cpu"
-        self.threads = 1 if self.lockstep else threads or usable_cores()
-        self.chunk = LOCKSTEP_CHUNK if self.lockstep else CHUNK
+        self.threads = threads or usable_cores()
         self._compiled: set[int] = set()
 
     def shard(self, number: int) -> dict[str, Any]:
@@ -125,7 +106,7 @@ class Solver:
         robot, _, _ = plan.span(number)
         cases = plan.cases(number)
         size = len(cases.case)
-        firsts = range(0, size, self.chunk)
+        firsts = range(0, size, CHUNK)
 
         def work(first: int) -> Any:
             return self._chunk(robot, cases, first)
@@ -155,17 +136,17 @@ class Solver:
     def _chunk(self, robot: int, cases: Cases, first: int) -> dict[str, Any]:
         """Return result, position error, reason and stored quantities of a chunk of cases."""
         plan, size = self.plan, len(cases.case)
-        count = min(self.chunk, size - first)
+        count = min(CHUNK, size - first)
         # the last chunk is filled with its last case: one shape, one program
-        index = np.minimum(np.arange(first, first + self.chunk), size - 1)
+        index = np.minimum(np.arange(first, first + CHUNK), size - 1)
         bare, settings, steps = _bare(plan, robot), plan.settings, plan.sweep.steps
         values = {name: each[index] for name, each in plan.robot_values(robot, cases.values).items()}
-        settled = _settled(plan, robot, values, self.chunk)
+        settled = _settled(plan, robot, values, CHUNK)
         task = TimeIntegration(settings, plan.sweep.dt, steps)
-        coefficients = StepCoefficients(*map(jnp.asarray, task.coefficients))
-        form = Form(settings, steps, plan.sweep.store, self.lockstep)
-        found = solve_chunk(bare, values, settled.start, cases.controls[index], coefficients, form)
-        done, result, error, stored = jax.tree.map(lambda leaf: np.array(leaf[:count]), found)
+        systems, start = _started(bare, values, settled.start, settings, CHUNK)
+        done, _, rows = task.solve_many(systems, cases.controls[index], start.history)
+        found = _stored(systems, start.record, rows, plan.sweep.store)
+        result, error, stored = jax.tree.map(lambda leaf: np.array(leaf[:count]), found)
         columns = {"result": result, "position_error": error} | stored
         reasons = [""] * count
         for k in range(count):

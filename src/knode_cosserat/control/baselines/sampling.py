@@ -17,7 +17,7 @@ from knode_cosserat.control.references import Reference
 from knode_cosserat.estimation.observer import KalmanObserver
 from knode_cosserat.estimation.online import OnlineModel, split_record
 from knode_cosserat.estimation.outputs import Output
-from knode_cosserat.solvers.time_loop import loop_in_turn
+from knode_cosserat.solvers.time_loop import loop_many
 
 
 @functools.partial(jax.jit, static_argnames="target")
@@ -29,7 +29,7 @@ def sampled_errors(
     system, steps = model.at(x), len(basis)
     controls = jnp.einsum("tn,knc->ktc", basis, plans)
     pasts = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(plans), *jnp.shape(leaf))), past)
-    done, _, rows = loop_in_turn(system, model.settings, model.coefficients, controls, pasts, steps)
+    done, _, rows = loop_many(system, model.settings, model.coefficients, controls, pasts, steps)
 
     def error(record: Any, wanted: Any) -> Any:
         return target.error(system, *split_record(system, record), wanted)
