@@ -15,12 +15,7 @@ import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-import llvmlite.binding as llvm
-
 from knode_cosserat.engine.program import EngineError, Program
-
-llvm.initialize_native_target()
-llvm.initialize_native_asmprinter()
 
 #: rounding may change, NaN and infinity are kept
 MATH = "contract nsz arcp"
@@ -173,6 +168,10 @@ class Module:
         Programs come without repetition, and loops are written with their vectors: LLVM's general passes take
         three times as long and make steps no faster. Variables are turned into registers.
         """
+        import llvmlite.binding as llvm  # later than the package, which is to be imported fast
+
+        llvm.initialize_native_target()
+        llvm.initialize_native_asmprinter()
         module = llvm.parse_assembly(self.text)
         machine = llvm.Target.from_default_triple().create_target_machine(
             cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=optimisation

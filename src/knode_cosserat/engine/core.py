@@ -722,8 +722,10 @@ class Core(EliminationCode):
         lasts = self._states(after, states)
         for one, other in zip(states, lasts, strict=True):
             other[done == 0] = one[done == 0]
-        flat = [np.moveaxis(x, -1, 1).reshape(-1, *x.shape[1:-1])[:size] for x in (rows, infos)]
-        return start + done, lasts, self._rows(*flat, length.reshape(-1)[:size], done)
+        own_rows, own_infos = (
+            np.moveaxis(part, -1, 1).reshape(-1, *part.shape[1:-1])[:size] for part in (rows, infos)
+        )
+        return start + done, lasts, self._rows(own_rows, own_infos, length.reshape(-1)[:size], done)
 
     def _rows(self, rows: np.ndarray, infos: np.ndarray, length: np.ndarray, done: np.ndarray) -> StepRows:
         """Return rows (robots, steps, ...); a step's row is that of its last stage."""
