@@ -45,3 +45,30 @@ def test_operations_are_those_of_numpy(lanes):
                 wanted = [g(one) for g in ONE.values()] + [g(one, other) for g in TWO.values()]
             for name, got, value in zip([*ONE, *TWO], numbers, wanted, strict=True):
                 np.testing.assert_allclose(got, value, rtol=1e-14, atol=1e-15, err_msg=name)
+
+
+def answer():
+    """Return what a compiled module writes, 42."""
+    module = Module()
+    f = module.function("run", ["out"], exported=True)
+    f.store(42.0, f.arguments[0], 0)
+    compiled, out = module.compile(), np.zeros(1)
+    ctypes.CFUNCTYPE(None, ctypes.c_void_p)(compiled.address("run"))(out.ctypes.data)
+    return out[0]
+
+
+@pytest.mark.parametrize("damage", [lambda code: code, lambda code: code[:100], lambda code: b""])
+def test_machine_code_is_kept_on_disk(tmp_path, monkeypatch, damage):
+    monkeypatch.setenv("KNODE_COSSERAT_CACHE", str(tmp_path))
+    assert answer() == 42.0
+    [file] = tmp_path.rglob("engine-*")
+    content = file.read_bytes()
+    file.write_bytes(damage(content))
+    assert answer() == 42.0
+    assert file.read_bytes() == content
+
+
+def test_a_cache_that_cannot_be_written_is_not_needed(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("no folder")
+    monkeypatch.setenv("KNODE_COSSERAT_CACHE", str(tmp_path / "file"))
+    assert answer() == 42.0

@@ -9,10 +9,11 @@ import pytest
 import knode_cosserat as kc
 from knode_cosserat.engine import loops
 from knode_cosserat.engine.program import EngineError
-from knode_cosserat.solvers import time_loop
+from knode_cosserat.solvers import static_loop, time_loop
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.history import resting_history
 from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.static_loop import unloaded_shape
 from knode_cosserat.solvers.time_loop import StepCoefficients
 
 DT, STEPS = 0.05, 25
@@ -66,6 +67,35 @@ def test_a_robot_with_places_in_lanes(name, scheme):
     for name, one, other in zip(state._fields, state, own_state, strict=True):
         atol = (1e-5 if "error" in name else 1e-10) * max(float(np.max(np.abs(one))), 1e-300)
         np.testing.assert_allclose(other, one, atol=atol, err_msg=name)
+
+
+@pytest.mark.parametrize("name", [PAPER, ROUTED, "variable-curvature-robot"])
+def test_equilibria(name):
+    """Equilibria in turn, of one robot and of several in lanes, are those of the loop in JAX."""
+    robot, settings = robot_of(name), Settings(None)
+    rng = np.random.default_rng(1)
+    controls = rng.uniform(0.0, 1.0, (3, 4, robot.control_size)) * (
+        8.0 if "tension" in robot.control_layout.names else 1.0
+    )
+    y = unloaded_shape(robot, settings.space)
+    for own in controls:
+        done, last, rows = static_loop.static_one(robot, settings, own, y, (0, 4))
+        own_done, own_last, own_rows = loops.static_one(robot, settings, own, y, (0, 4))
+        assert own_done == int(done) == 4
+        np.testing.assert_allclose(own_last, last, atol=1e-11 * np.max(np.abs(last)))
+        assert_same(rows, own_rows, 1e-11, 1e-5)
+    many = loops.static_many(robot, settings, controls, np.stack([y] * 3), 4)
+    np.testing.assert_array_equal(many[0], [4, 4, 4])
+    np.testing.assert_allclose(many[2].records[-1], rows.records, atol=1e-8)
+
+
+def test_equilibria_end_at_the_first_without_a_solution():
+    robot, settings = robot_of(PAPER), Settings(None)
+    controls = np.array([[5.0, 4.0, 4.0, 5.0], [1e7, 0.0, 0.0, 1e7], [5.0, 4.0, 4.0, 5.0]])
+    y = unloaded_shape(robot, settings.space)
+    done, last, rows = loops.static_one(robot, settings, controls, y, (0, 3))
+    assert done == 1 and rows.result.tolist()[1:] == [kc.Result.NO_CONVERGENCE, kc.Result.NOT_REACHED]
+    np.testing.assert_array_equal(last, loops.static_one(robot, settings, controls[:1], y, (0, 1))[1])
 
 
 def test_a_span_continues_another():

@@ -10,11 +10,14 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import hashlib
 import itertools
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
+from knode_cosserat._jax import cache_directory
+from knode_cosserat._program_cache import ProgramCache
 from knode_cosserat.engine.program import EngineError, Program
 
 #: rounding may change, NaN and infinity are kept
@@ -172,17 +175,41 @@ class Module:
 
         llvm.initialize_native_target()
         llvm.initialize_native_asmprinter()
-        module = llvm.parse_assembly(self.text)
+        cpu, features = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
         machine = llvm.Target.from_default_triple().create_target_machine(
-            cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=optimisation
+            cpu=cpu, features=features, opt=optimisation
         )
-        passes = llvm.create_new_module_pass_manager()
-        passes.add_sroa_pass()
-        passes.run(module, llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options()))
+        version = ".".join(map(str, llvm.llvm_version_info))
+        described = "\n".join([self.text, machine.triple, cpu, features, version, str(optimisation)])
+        name = f"engine-{hashlib.sha256(described.encode()).hexdigest()}"
+        code = _stored(name)
+        if code is None:
+            module = llvm.parse_assembly(self.text)
+            passes = llvm.create_new_module_pass_manager()
+            passes.add_sroa_pass()
+            passes.run(module, llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options()))
+            code = machine.emit_object(module)
+            _store(name, code)
         engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
-        engine.add_object_file(llvm.ObjectFileRef.from_data(machine.emit_object(module)))
+        engine.add_object_file(llvm.ObjectFileRef.from_data(code))
         engine.finalize_object()
         return Compiled(engine)
+
+
+def _stored(name: str) -> bytes | None:
+    """Return machine code from the cache on disk; None if it is not there, or cannot be read."""
+    directory = cache_directory()
+    with contextlib.suppress(OSError):
+        return ProgramCache(directory).get(name) if directory else None
+    return None
+
+
+def _store(name: str, code: bytes) -> None:
+    """Write machine code to the cache on disk; without an error, if the folder is full or read-only."""
+    directory = cache_directory()
+    with contextlib.suppress(OSError):
+        if directory:
+            ProgramCache(directory).put(name, code)
 
 
 class Compiled:

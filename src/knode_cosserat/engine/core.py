@@ -11,8 +11,10 @@ import ctypes
 import functools
 import operator
 from collections.abc import Iterable, Iterator
+from typing import NamedTuple, TypeVar
 
 import numpy as np
+from jaxtyping import Float
 
 from knode_cosserat.engine.codegen import Function, Index, Value, Variable
 from knode_cosserat.engine.elimination import EliminationCode
@@ -42,12 +44,21 @@ USABLE, ERROR, CORRECTIONS, LINEARISATIONS, POSITION, ANGLE, TIME, ALIVE = range
 SURELY_SMALL = 1e-2
 
 
+class Shape(NamedTuple):
+    """The state from which an equilibrium is solved."""
+
+    y: Float[np.ndarray, "points y"]
+
+
+States = TypeVar("States", StateHistory, Shape)
+
+
 class Core(EliminationCode):
-    """Machine code of a system's time loop."""
+    """Machine code of a system's time loop, or of its equilibria in turn."""
 
     def __init__(self, system: System, settings: Settings, robots: bool, lanes: int = 8):
-        if system.strands > 1 or system.mixed or settings.space != LOBATTO2 or settings.time is None:
-            raise EngineError("engine: one rod, a balance with B = 0, motions, lobatto2; use simulate")
+        if system.strands > 1 or system.mixed or settings.space != LOBATTO2:
+            raise EngineError("engine: only one rod by lobatto2, with a balance in which B is zero")
         self.settings, self.scheme, self.newton = settings, settings.time, settings.newton
         super().__init__(system, robots, lanes)
         e = self.equations
@@ -70,6 +81,8 @@ class Core(EliminationCode):
             "records": self.records, "rate": [self.rate], "y": self.past, "weights": [self.weights],
             "t0": [self.t0], "error": [*self.errors, self.error_rate], "time_error": self.time_errors,
         }  # fmt: skip
+        if settings.time is None:
+            self._motion, self._parts = slice(self.y.offset, self.unknowns.offset), {"y": [self.y]}
         self.middle = a(ny, self.pieces)
         # corrected motions: history terms, defects
         self.dH, self.own_dH = (a(numbers, self.ends) for _ in range(2))
@@ -349,6 +362,23 @@ class Core(EliminationCode):
             f.store(angle, numbers, ANGLE * self.P)
         return f
 
+    def _write_static_errors(self) -> None:
+        """Errors of an equilibrium: the correction that its defects ask for."""
+        self.corrected = f = self._function("corrected", "numbers")
+        memory, numbers = f.arguments
+        ny = self.equations.ny
+        with self._places(self.pieces) as j:
+            for i in range(ny):
+                self._write_wide(self._wide(self.defect, i, j), self.r, i, j)
+        for i in range(self.equations.k):
+            self._put(0.0, self.tip, i)
+        f.call(self.correct, memory)
+        with self._places(self.points) as j:
+            for i in range(ny):
+                self._write_wide(self._wide(self.y, i, j) + self._wide(self.dy, i, j), self.better, i, j)
+        for number, value in zip((POSITION, ANGLE), self._errors_of_poses(), strict=True):
+            f.store(value, numbers, number * self.P)
+
     def _errors_of_poses(self) -> tuple[Value, Value]:
         """Return the largest error of positions (m) and of orientations (rad), of the better y."""
         f, layout = self._now, self.equations.system.y_layout
@@ -522,8 +552,8 @@ class Core(EliminationCode):
                 number = step.get() * stages + stage.value
                 table = f.pointer(coefficients, number * 5)
                 f.call(self.stage, memory, numbers, table, f.pointer(controls, number * (e.nc * P)))
-                guesses = f.pointer(extrapolations, stage.value * 18)
-                f.call(self.guesses, memory, guesses)
+                if self.scheme:
+                    f.call(self.guesses, memory, f.pointer(extrapolations, stage.value * 18))
                 with f.loop(nodes) as node:
                     point = self._node(node)
                     target = f.pointer(rows, (number * nodes + node.value) * (e.numbers * P))
@@ -559,20 +589,22 @@ class Core(EliminationCode):
                         value = value + d1 * self._wide(rate, i, j)
                     self._write_wide(value, target, i, j)
 
-        history(self.records, self.rate, self.H, self.count)
-        weights = [self._wide(self.weights, k) for k in range(3)]
-        with self._places(self.points) as j:
-            for i in range(e.ny):
-                guess = weights[0] * self._wide(self.past[0], i, j)
-                for k in (1, 2):
-                    guess = guess + weights[k] * self._wide(self.past[k], i, j)
-                self._write_wide(guess, self.y, i, j)
+        if self.scheme:
+            history(self.records, self.rate, self.H, self.count)
+            weights = [self._wide(self.weights, k) for k in range(3)]
+            with self._places(self.points) as j:
+                for i in range(e.ny):
+                    guess = weights[0] * self._wide(self.past[0], i, j)
+                    for k in (1, 2):
+                        guess = guess + weights[k] * self._wide(self.past[k], i, j)
+                    self._write_wide(guess, self.y, i, j)
         for i, p in enumerate(self.pivots):
             self._put(self._get(self.y, p, 0), self.unknowns, i)
         self._write_base(self.unknowns, self.y, self.H)
         f.call(self.solve, memory, numbers)
-        history(self.errors, self.error_rate, self.dH, self.ends)
         f.call(self.check, memory, numbers, coefficients)
+        if self.scheme:
+            history(self.errors, self.error_rate, self.dH, self.ends)
         f.call(self.corrected, memory, numbers)
         if self.settings.uses_rate:
             with self._places(self.ends) as j:
@@ -652,7 +684,10 @@ class Core(EliminationCode):
         self._write_correct()
         self._write_newton()
         self._write_check()
-        self.corrected = self._write_corrected("corrected", self.errors, True, POSITION)
+        if self.scheme:
+            self.corrected = self._write_corrected("corrected", self.errors, True, POSITION)
+        else:
+            self._write_static_errors()
         if isinstance(self.scheme, SDIRK2):
             self._write_products()
             self.corrected_in_time = self._write_corrected("in_time", self.time_errors, False, TIME)
@@ -664,9 +699,9 @@ class Core(EliminationCode):
     # running
 
     def integrate(
-        self, parameters: np.ndarray, controls: np.ndarray, steps: StepCoefficients, states: StateHistory,
+        self, parameters: np.ndarray, controls: np.ndarray, steps: StepCoefficients, states: States,
         span: tuple[int, int],
-    ) -> tuple[np.ndarray, StateHistory, StepRows]:  # fmt: skip
+    ) -> tuple[np.ndarray, States, StepRows]:  # fmt: skip
         """Solve a span of steps of each robot until one fails (see `time_loop.time_loop`).
 
         Parameters (n,) or (robots, n), controls (robots, T, c) or (robots, T, stages * c) and states
@@ -758,7 +793,7 @@ class Core(EliminationCode):
         target[:, :, :count] = values
         target[:, :, count:] = values[:, :, -1:]
 
-    def _parts_of(self, states: StateHistory) -> Iterator[tuple[Array, np.ndarray]]:
+    def _parts_of(self, states: States) -> Iterator[tuple[Array, np.ndarray]]:
         """Yield the arrays of a motion's state with their values (robots, places, size)."""
         for name, arrays in self._parts.items():
             values = np.asarray(getattr(states, name), float)
@@ -766,7 +801,7 @@ class Core(EliminationCode):
             for part, array in enumerate(arrays):
                 yield array, values[:, part]
 
-    def _states(self, motions: np.ndarray, before: StateHistory) -> StateHistory:
+    def _states(self, motions: np.ndarray, before: States) -> States:
         """Return the states in memories (vectors, n)."""
         found = {}
         for name, arrays in self._parts.items():
@@ -775,7 +810,7 @@ class Core(EliminationCode):
             parts = [self._numbers(motions, array, self._motion.start)[..., :count, :] for array in arrays]
             values = np.stack(parts, axis=2).reshape(-1, len(arrays), count, arrays[0].size)
             found[name] = values[: shape[0]].reshape(shape)
-        return StateHistory(**found)
+        return type(before)(**found)
 
 
 def _sum(values: Iterable[Value]) -> Value:

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import functools
 import threading
 from typing import Any
 
 import jax
 import numpy as np
 
-from knode_cosserat.engine.core import Core
+from knode_cosserat.engine.core import Core, Shape, States
 from knode_cosserat.engine.program import EngineError
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.history import StateHistory
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.time_loop import StepCoefficients, StepRows
 
-#: compiled cores, or the reason why there is none, by what their code depends on
+#: compiled cores, or the reason why there is none, by what their code depends on; the last used come last
 _CORES: dict[Any, Core | EngineError] = {}
+#: number of cores that a process keeps: a core takes some MB
+MOST_CORES = 100
 _COMPILING = threading.Lock()
 
 
@@ -36,12 +36,15 @@ def core_of(system: System, settings: Settings, robots: bool) -> Core:
     zeros = tuple((leaf.shape, np.packbits(leaf == 0.0).tobytes()) for leaf in leaves)
     key = structure, zeros, settings, robots
     with _COMPILING:
-        if key not in _CORES:
+        core = _CORES.pop(key, None)
+        if core is None:
             try:
-                _CORES[key] = Core(jax.tree.unflatten(structure, leaves), settings, robots)
+                core = Core(jax.tree.unflatten(structure, leaves), settings, robots)
             except EngineError as error:
-                _CORES[key] = error
-    core = _CORES[key]
+                core = error
+        _CORES[key] = core
+        if len(_CORES) > MOST_CORES:
+            del _CORES[next(iter(_CORES))]
     if isinstance(core, EngineError):
         raise core
     return core
@@ -53,21 +56,20 @@ def parameters_of(system: System) -> np.ndarray:
 
 
 def loop_one(
-    system: System, settings: Settings, steps: StepCoefficients, controls: Any, past: StateHistory,
+    system: System, settings: Settings, steps: StepCoefficients, controls: Any, past: States,
     span: tuple[int, int],
-) -> tuple[int, StateHistory, StepRows]:  # fmt: skip
+) -> tuple[int, States, StepRows]:  # fmt: skip
     """Solve a span of steps until one fails: the number of steps done, the state after them, and rows."""
     core = core_of(system, settings, robots=False)
-    one = functools.partial(jax.tree.map, lambda leaf: np.asarray(leaf)[None])
-    done, states, rows = core.integrate(
-        parameters_of(system), np.asarray(controls)[None], steps, one(past), span
-    )
-    return int(done[0]), *jax.tree.map(lambda leaf: leaf[0], (states, rows))
+    batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], past)
+    found = core.integrate(parameters_of(system), np.asarray(controls)[None], steps, batch, span)
+    done, last, rows = jax.tree.map(lambda leaf: leaf[0], found)
+    return int(done), last, rows
 
 
 def loop_many(
-    system: System, settings: Settings, steps: StepCoefficients, controls: Any, pasts: StateHistory, stop: int
-) -> tuple[np.ndarray, StateHistory, StepRows]:
+    system: System, settings: Settings, steps: StepCoefficients, controls: Any, pasts: States, stop: int
+) -> tuple[np.ndarray, States, StepRows]:
     """Solve all steps of a batch: controls (B, T, c), states (B, ...), and one system or a batch of them.
 
     Robots are solved side by side in the lanes of vectors; see `Core.integrate`.
@@ -79,3 +81,19 @@ def loop_many(
         parameters = np.concatenate([leaf.reshape(len(leaf), -1) for leaf in leaves], axis=1)
     pasts = jax.tree.map(np.asarray, pasts)
     return core.integrate(parameters, np.asarray(controls), steps, pasts, (0, stop))
+
+
+#: the coefficients of equilibria
+STILL = StepCoefficients(np.zeros((2, 4)), 0.0)
+
+
+def static_one(system: System, settings: Settings, controls: Any, y: Any, span: tuple[int, int]) -> Any:
+    """Solve a span of equilibria in turn until one fails: the number done, y at all points, and rows."""
+    done, last, rows = loop_one(system, settings, STILL, controls, Shape(y), span)
+    return done, last.y, rows
+
+
+def static_many(system: System, settings: Settings, controls: Any, y: Any, stop: int) -> Any:
+    """Solve the equilibria of a batch: controls (B, T, c), y (B, points, y), and one system or a batch."""
+    done, last, rows = loop_many(system, settings, STILL, controls, Shape(y), stop)
+    return done, last.y, rows

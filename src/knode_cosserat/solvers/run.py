@@ -82,7 +82,8 @@ class TimeIntegration:
         """Solve a span of steps until one fails: number of steps done, the last state, rows of the span."""
         try:
             return engine.loop_one(system, self.settings, self.coefficients, controls, state, span)
-        except EngineError:
+        except EngineError as reason:
+            log.info("%s; JAX runs it", reason)
             padded = padded_rows(controls, least=LEAST_CAPACITY)
             found = loop_one(system, self.settings, self.coefficients, padded, state, span)
             return _of_span(found, span)
@@ -93,7 +94,8 @@ class TimeIntegration:
             return engine.loop_many(
                 system, self.settings, self.coefficients, controls, states, self.steps
             )  # fmt: skip
-        except EngineError:
+        except EngineError as reason:
+            log.info("%s; JAX runs it", reason)
             padded = padded_rows(controls)
             found = loop_many(system, self.settings, self.coefficients, padded, states, self.steps)
             return _of_span(found, (0, self.steps))
@@ -116,13 +118,21 @@ class Equilibria:
 
     def solve(self, system: System, controls: Any, state: Any, span: tuple[int, int]) -> Any:
         """Solve a span of equilibria until one fails: the number done, the last state, rows of the span."""
-        padded = padded_rows(controls, least=LEAST_CAPACITY)
-        return _of_span(static_one(system, self.settings, padded, state, span), span)
+        try:
+            return engine.static_one(system, self.settings, controls, state, span)
+        except EngineError as reason:
+            log.info("%s; JAX runs it", reason)
+            padded = padded_rows(controls, least=LEAST_CAPACITY)
+            return _of_span(static_one(system, self.settings, padded, state, span), span)
 
     def solve_many(self, system: System, controls: Any, states: Any) -> Any:
         """Solve the lists of a batch of robots, each until one fails: as `solve`, for each robot."""
-        found = static_many(system, self.settings, padded_rows(controls), states, self.steps)
-        return _of_span(found, (0, self.steps))
+        try:
+            return engine.static_many(system, self.settings, controls, states, self.steps)
+        except EngineError as reason:
+            log.info("%s; JAX runs it", reason)
+            found = static_many(system, self.settings, padded_rows(controls), states, self.steps)
+            return _of_span(found, (0, self.steps))
 
     def recover(self, system: System, state: Any, controls: Any, i: int, budget: Budget) -> SolvedStep:
         """Recover an equilibrium; `controls` are the previous one's and its own."""

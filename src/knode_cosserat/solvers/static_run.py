@@ -27,7 +27,7 @@ from knode_cosserat.solvers.guess import (
     turn_columns,
 )
 from knode_cosserat.solvers.result import Result
-from knode_cosserat.solvers.run import LEAST_CAPACITY, Equilibria, Run, padded_rows, run_batch, run_one
+from knode_cosserat.solvers.run import Equilibria, Run, run_batch, run_one
 from knode_cosserat.solvers.static_loop import unloaded_shape
 from knode_cosserat.solvers.time_loop import StepRows
 
@@ -211,10 +211,9 @@ class _Walk:
     def _best(self, control: Any, guesses: list[Any]) -> tuple[Any, StepRows | None]:
         """Return the first guess with a stable equilibrium near it, or else with any, and the equilibrium."""
         best: tuple[Any, StepRows | None] = None, None
-        padded = padded_rows(np.asarray(control)[None], least=LEAST_CAPACITY)
         for guess in guesses:
-            rows = self.task.solve(self.system, padded, guess, (0, 1))[2]
-            row = StepRows(*(np.asarray(leaf)[0] for leaf in rows))
+            rows = self.task.solve(self.system, np.asarray(control)[None], guess, (0, 1))[2]
+            row = StepRows(*(leaf[0] for leaf in rows))
             if row.result < 0 or self._turns(np.asarray(guess)[self.grid.nodes], row.records):
                 continue
             if not self.is_unstable(row.records, control):
