@@ -41,7 +41,7 @@ def row_of(label, robot, scheme, batch):
     if batch:
         pasts = jax.tree.map(lambda leaf: np.stack([leaf] * BATCH), past)
         runs = (
-            lambda: time_loop.loop_many(robot, settings, steps, tensions, pasts, STEPS, False),
+            lambda: time_loop.loop_many(robot, settings, steps, tensions, pasts, STEPS),
             lambda: loops.loop_many(robot, settings, steps, tensions, pasts, STEPS),
         )
     else:
