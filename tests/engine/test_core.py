@@ -9,6 +9,7 @@ import pytest
 import knode_cosserat as kc
 from knode_cosserat.engine import loops
 from knode_cosserat.engine.program import EngineError
+from knode_cosserat.learning.residual import network
 from knode_cosserat.solvers import static_loop, time_loop
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.history import resting_history
@@ -97,6 +98,14 @@ def test_equilibria_end_at_the_first_without_a_solution():
     done, last, rows = loops.static_one(robot, settings, controls, y, (0, 3))
     assert done == 1 and rows.result.tolist()[1:] == [kc.Result.NO_CONVERGENCE, kc.Result.NOT_REACHED]
     np.testing.assert_array_equal(last, loops.static_one(robot, settings, controls[:1], y, (0, 1))[1])
+
+
+@pytest.mark.parametrize("hidden", [32, 512])
+def test_a_large_network_is_refused(hidden):
+    """It would be code without end; simulate runs it in JAX."""
+    net = network(robot_of(PAPER), kc.learning.NetworkOptions(hidden=hidden, convex=False), jax.random.key(0))
+    with pytest.raises(EngineError, match=r"operations|too large"):
+        loops.core_of(kc.KNODE(robot_of(PAPER), net), settings_of("sdirk2"), robots=False)
 
 
 def test_a_span_continues_another():

@@ -40,6 +40,8 @@ from knode_cosserat.solvers.time_loop import (
 
 #: numbers of a solved stage, for each robot
 USABLE, ERROR, CORRECTIONS, LINEARISATIONS, POSITION, ANGLE, TIME, ALIVE = range(8)
+#: largest number of operations of a system: LLVM's time grows faster than their number (learned networks)
+MOST_OPERATIONS = 20_000
 #: part of the largest correction allowed at a solution, below which an expected correction is not computed
 SURELY_SMALL = 1e-2
 
@@ -62,6 +64,10 @@ class Core(EliminationCode):
         self.settings, self.scheme, self.newton = settings, settings.time, settings.newton
         super().__init__(system, robots, lanes)
         e = self.equations
+        if len(e.program.operations) > MOST_OPERATIONS:
+            raise EngineError(
+                f"engine: {len(e.program.operations)} operations; allowed are {MOST_OPERATIONS}"
+            )
         moving = [node for node in e.products["base"] if not e.program.is_constant(int(node), 0.0)]
         if moving and isinstance(self.scheme, SDIRK2):
             raise EngineError("engine: a base that depends on rates needs a scheme of one stage")

@@ -25,7 +25,7 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 from knode_cosserat.errors import KnodeCosseratError
 
 #: largest number of scalar products of one matrix product: larger ones would be long code
-LARGEST_PRODUCT = 8192
+LARGEST_PRODUCT = 1024
 #: largest number of entries of a table with a variable index, of turns of a scan, and of numbers to sort
 LARGEST_TABLE, LONGEST_SCAN, LONGEST_SORT = 256, 1024, 32
 #: largest matrix that is factorised with row exchanges that depend on values
