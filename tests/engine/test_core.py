@@ -100,6 +100,15 @@ def test_equilibria_end_at_the_first_without_a_solution():
     np.testing.assert_array_equal(last, loops.static_one(robot, settings, controls[:1], y, (0, 1))[1])
 
 
+def test_a_refusal_keeps_no_frames():
+    """It is raised at every step of a robot that the engine does not cover."""
+    robot = robot_of(PAPER)
+    for _ in range(3):
+        with pytest.raises(EngineError) as caught:
+            loops.core_of(robot, settings_of("sdirk2", "lobatto4"), robots=False)
+        assert len(caught.traceback) == 2
+
+
 @pytest.mark.parametrize("hidden", [32, 512])
 def test_a_large_network_is_refused(hidden):
     """It would be code without end; simulate runs it in JAX."""

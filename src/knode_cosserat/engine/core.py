@@ -40,8 +40,6 @@ from knode_cosserat.solvers.time_loop import (
 
 #: numbers of a solved stage, for each robot
 USABLE, ERROR, CORRECTIONS, LINEARISATIONS, POSITION, ANGLE, TIME, ALIVE = range(8)
-#: largest number of operations of a system: LLVM's time grows faster than their number (learned networks)
-MOST_OPERATIONS = 20_000
 #: part of the largest correction allowed at a solution, below which an expected correction is not computed
 SURELY_SMALL = 1e-2
 
@@ -64,10 +62,6 @@ class Core(EliminationCode):
         self.settings, self.scheme, self.newton = settings, settings.time, settings.newton
         super().__init__(system, robots, lanes)
         e = self.equations
-        if len(e.program.operations) > MOST_OPERATIONS:
-            raise EngineError(
-                f"engine: {len(e.program.operations)} operations; allowed are {MOST_OPERATIONS}"
-            )
         moving = [node for node in e.products["base"] if not e.program.is_constant(int(node), 0.0)]
         if moving and isinstance(self.scheme, SDIRK2):
             raise EngineError("engine: a base that depends on rates needs a scheme of one stage")
@@ -726,10 +720,10 @@ class Core(EliminationCode):
             return values.reshape(vectors, P, *values.shape[1:])
 
         held = 1 if controls.shape[2] == e.nc else stages
-        own = in_lanes(controls[:, start:stop]).reshape(vectors, P, count, held, e.nc)
-        own = np.broadcast_to(own, (vectors, P, count, stages, e.nc))
-        own = np.ascontiguousarray(np.moveaxis(own, 1, -1))
-        own_parameters = in_lanes(np.broadcast_to(parameters, (size, parameters.shape[-1])))
+        lane_controls = in_lanes(controls[:, start:stop]).reshape(vectors, P, count, held, e.nc)
+        lane_controls = np.broadcast_to(lane_controls, (vectors, P, count, stages, e.nc))
+        lane_controls = np.ascontiguousarray(np.moveaxis(lane_controls, 1, -1))
+        lane_parameters = in_lanes(np.broadcast_to(parameters, (size, parameters.shape[-1])))
         table = np.empty((count, stages, 5))
         coefficients = np.asarray(steps.table).reshape(2, stages, 4)
         table[..., :4] = coefficients[1]
@@ -738,21 +732,24 @@ class Core(EliminationCode):
         rows = np.zeros((vectors, count, stages, nodes, e.numbers, P))
         infos = np.zeros((vectors, count, stages, 8 + e.k, P))
         reached, length = np.zeros((2, vectors, P))
-        before = np.empty((vectors, self._motion.stop - self._motion.start))
+        first_motions = np.empty((vectors, self._motion.stop - self._motion.start))
         for array, value in self._parts_of(states):
-            self._put_in(before, array, in_lanes(value), self._motion.start)
-        after = np.empty_like(before)
+            self._put_in(first_motions, array, in_lanes(value), self._motion.start)
+        last_motions = np.empty_like(first_motions)
 
         raw = np.empty(self._size + 8)
         memory = raw[(-raw.ctypes.data // 8) % 8 :][: self._size]
 
         def solve(k: int, stop: int, *results: np.ndarray) -> None:
             memory[:] = self._empty
-            memory[self._motion] = before[k]
-            self._put_in(memory[None], self.params, own_parameters[k][None, :, None])
-            arrays = memory, own[k], table, self._guesses, *results
+            memory[self._motion] = first_motions[k]
+            self._put_in(memory[None], self.params, lane_parameters[k][None, :, None])
+            arrays = memory, lane_controls[k], table, self._guesses, *results
             self._run(*(each.ctypes.data for each in arrays), 0, stop)
-            after[k], length[k] = memory[self._motion], self._numbers(memory[None], self.length)[0, :, 0, 0]
+            last_motions[k], length[k] = (
+                memory[self._motion],
+                self._numbers(memory[None], self.length)[0, :, 0, 0],
+            )
 
         for k in range(vectors):
             solve(k, count, rows[k], infos[k], reached[k])
@@ -760,13 +757,13 @@ class Core(EliminationCode):
                 # again, for the state before the step that failed
                 solve(k, int(reached[k, 0]), rows[k].copy(), infos[k].copy(), reached[k].copy())
         done = reached.reshape(-1)[:size].astype(int)
-        lasts = self._states(after, states)
+        lasts = self._states(last_motions, states)
         for one, other in zip(states, lasts, strict=True):
             other[done == 0] = one[done == 0]
-        own_rows, own_infos = (
+        robot_rows, robot_infos = (
             np.moveaxis(part, -1, 1).reshape(-1, *part.shape[1:-1])[:size] for part in (rows, infos)
         )
-        return start + done, lasts, self._rows(own_rows, own_infos, length.reshape(-1)[:size], done)
+        return start + done, lasts, self._rows(robot_rows, robot_infos, length.reshape(-1)[:size], done)
 
     def _rows(self, rows: np.ndarray, infos: np.ndarray, length: np.ndarray, done: np.ndarray) -> StepRows:
         """Return rows (robots, steps, ...); a step's row is that of its last stage."""

@@ -133,25 +133,25 @@ class EliminationCode(RodCode):
         ny, k = self.equations.ny, self.equations.k
         self.along = f = self._function("along")
         memory = f.arguments[0]
-        none = self._pointer(self.zeros, 0)
-        each, full = self.groups
+        zero = self._pointer(self.zeros, 0)
+        size, count = self.groups
 
         def piece(j: Index) -> None:
             for c in range(k):
                 first = c * self._padded(ny)
                 source, target = (f.pointer(*self._at(self.X, first, point)) for point in (j, j + 1))
-                f.call(self.advance, memory, source, none, target, j.value)
+                f.call(self.advance, memory, source, zero, target, j.value)
 
-        with f.loop(full) as g:
-            with f.loop((g.value + 1) * each, g.value * each) as j:
+        with f.loop(count) as g:
+            with f.loop((g.value + 1) * size, g.value * size) as j:
                 piece(j)
-            last = f.index((g.value + 1) * each)
+            last = f.index((g.value + 1) * size)
             columns = [self._column(self.X, ny, c, last) for c in range(k)]
             T = self._changed(columns, self.pivots)
             for c in range(k):
                 self._set_column(columns[c], self.X, ny, c, last)
                 self._set_column(T[c], self.T, k, c, g)
-        with f.loop(self.pieces, full * each) as j:
+        with f.loop(self.pieces, count * size) as j:
             piece(j)
         at_tip = [self._column(self.X, ny, c, self.points - 1) for c in range(k)]
         M = [self._column(self.M, k, i) for i in range(ny)]
@@ -190,7 +190,7 @@ class EliminationCode(RodCode):
         ny, k = self.equations.ny, self.equations.k
         self.correct = f = self._function("correct")
         memory = f.arguments[0]
-        each, full = self.groups
+        size, count = self.groups
         with self._places(self.pieces) as j:
             f.call(self.solved, memory, self._pointer(self.r, j), self._pointer(self.wide_added, j), j.value)
         if not self.batch:
@@ -202,16 +202,16 @@ class EliminationCode(RodCode):
             points = self._pointer(self.w, j), self._pointer(self.added, j), self._pointer(self.w, j + 1)
             f.call(self.advance, memory, *points, j.value)
 
-        with f.loop(full) as g:
-            with f.loop((g.value + 1) * each, g.value * each) as j:
+        with f.loop(count) as g:
+            with f.loop((g.value + 1) * size, g.value * size) as j:
                 piece(j)
-            last = f.index((g.value + 1) * each)
+            last = f.index((g.value + 1) * size)
             w = self._column(self.w, ny, 0, last)
             columns = [self._column(self.X, ny, c, last) for c in range(k)]
             moved = self._product(columns, [self._entry(w, pivot) for pivot in self.pivots])
             self._set_column([a - b for a, b in zip(w, moved, strict=True)], self.w, ny, 0, last)
             self._set_column(self._gathered(w), self.beta, k, 0, g)
-        with f.loop(self.pieces, full * each) as j:
+        with f.loop(self.pieces, count * size) as j:
             piece(j)
         w = self._column(self.w, ny, 0, self.points - 1)
         M = [self._column(self.M, k, i) for i in range(ny)]
@@ -231,17 +231,17 @@ class EliminationCode(RodCode):
                 w = self._column(self.w, ny, 0, j)
                 self._set_column([a + b for a, b in zip(w, moved, strict=True)], self.dy_by_rows, ny, 0, j)
 
-        correct(full * each + 1, self.points)
-        with f.loop(0, full - 1, -1) as g:
-            end = (g.value + 1) * each
+        correct(count * size + 1, self.points)
+        with f.loop(0, count - 1, -1) as g:
+            end = (g.value + 1) * size
             correct(end, end + 1)
-            own = [a.get() - b for a, b in zip(alpha, self._column(self.beta, k, 0, g), strict=True)]
+            change = [a.get() - b for a, b in zip(alpha, self._column(self.beta, k, 0, g), strict=True)]
             T = [self._column(self.T, k, c, g) for c in range(k)]
             for variable, value in zip(
-                alpha, self._product(T, [self._entry(own, c) for c in range(k)]), strict=True
+                alpha, self._product(T, [self._entry(change, c) for c in range(k)]), strict=True
             ):
                 variable.set(value)
-            correct(g.value * each + 1, end)
+            correct(g.value * size + 1, end)
         correct(0, 1)
         self._set_column([each.get() for each in alpha], self.step_unknowns, k)
         if not self.batch:

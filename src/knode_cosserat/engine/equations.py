@@ -168,10 +168,10 @@ class Elimination:
         for i in range(n):
             A[i, i], B[i, i] = (apply("add", one, int(matrix[i, i])) for matrix in (A, B))
         self.jump = program.inputs("jump", (len(equations.jumping),), 1)
-        near = A.copy()
+        start = A.copy()
         for node, (i, j, _) in zip(self.jump, equations.jumping, strict=True):
             for row in range(n):
-                product = apply("mul", int(near[row, i]), int(node))
+                product = apply("mul", int(start[row, i]), int(node))
                 A[row, j] = apply("add", int(A[row, j]), product)
         #: the matrix A
         self.matrix = A

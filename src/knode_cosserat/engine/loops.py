@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from typing import Any
 
@@ -13,6 +14,8 @@ from knode_cosserat.engine.program import EngineError
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.time_loop import StepCoefficients, StepRows
+
+log = logging.getLogger(__name__)
 
 #: compiled cores, or the reason why there is none, by what their code depends on; the last used come last
 _CORES: dict[Any, Core | EngineError] = {}
@@ -41,12 +44,14 @@ def core_of(system: System, settings: Settings, robots: bool) -> Core:
             try:
                 core = Core(jax.tree.unflatten(structure, leaves), settings, robots)
             except EngineError as error:
-                core = error
+                log.info("%s; JAX runs it", error)
+                # without the frames that a traceback keeps alive
+                core = error.with_traceback(None)
         _CORES[key] = core
         if len(_CORES) > MOST_CORES:
             del _CORES[next(iter(_CORES))]
     if isinstance(core, EngineError):
-        raise core
+        raise core.with_traceback(None)
     return core
 
 

@@ -25,7 +25,9 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 from knode_cosserat.errors import KnodeCosseratError
 
 #: largest number of scalar products of one matrix product: larger ones would be long code
-LARGEST_PRODUCT = 1024
+LARGEST_PRODUCT = 8192
+#: largest number of operations: LLVM's time grows faster than their number, to minutes for a large network
+MOST_OPERATIONS = 20_000
 #: largest number of entries of a table with a variable index, of turns of a scan, and of numbers to sort
 LARGEST_TABLE, LONGEST_SCAN, LONGEST_SORT = 256, 1024, 32
 #: largest matrix that is factorised with row exchanges that depend on values
@@ -188,6 +190,8 @@ class Program:
         return found
 
     def _created(self, operation: str, *arguments: int) -> int:
+        if len(self.operations) > MOST_OPERATIONS:
+            raise EngineError(f"engine: more than {MOST_OPERATIONS} operations; use smaller networks or laws")
         key, level = (operation, *arguments), max(self.levels[a] for a in arguments)
         last = self._boolean[arguments[-1]]
         node = self._new(key, key, level, operation in BOOLEANS or (last and operation == "select"))

@@ -18,7 +18,8 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.rotation import dot, rotation_matrix
 from knode_cosserat.solvers.history import StateHistory, rest_record, resting_history
 from knode_cosserat.solvers.result import Result
-from knode_cosserat.solvers.time_loop import StepCoefficients, StepRows, loop_many
+from knode_cosserat.solvers.run import TimeIntegration
+from knode_cosserat.solvers.time_loop import StepRows, loop_many
 
 
 class EpisodeState(NamedTuple):
@@ -226,13 +227,13 @@ def step_many(
     moves = moved(spec, arrays, states, actions)
     systems = arrays.robot if spec.is_shared else moves.system
     acting, pasts = moves.acting[:, None], moves.state.history
-    _, histories, rows = loop_many(systems, spec.settings, coefficients(spec), acting, pasts, 1)
+    _, histories, rows = loop_many(systems, spec.settings, task_of(spec).coefficients, acting, pasts, 1)
     return arrived(spec, arrays, moves, histories, rows)
 
 
-def coefficients(spec: Spec) -> StepCoefficients:
-    """Return the coefficients of the steps of an environment."""
-    return StepCoefficients.of(spec.settings, spec.dt, "regular")
+def task_of(spec: Spec) -> TimeIntegration:
+    """Return the time integration of a period."""
+    return TimeIntegration(spec.settings, spec.dt, 1, "regular")
 
 
 def moved(spec: Spec, arrays: Arrays, states: EpisodeState, actions: Float[Any, "B c"]) -> Move:

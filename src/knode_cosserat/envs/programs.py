@@ -8,8 +8,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from knode_cosserat.engine import loops as engine
-from knode_cosserat.engine.program import EngineError
 from knode_cosserat.envs import dynamics
 from knode_cosserat.rods.system import is_traced
 
@@ -26,16 +24,11 @@ def step(spec: Any, arrays: Any, states: Any, actions: Any) -> Any:
         return dynamics.step_many(spec, arrays, states, actions)
     moves = _moved(spec, arrays, states, actions)
     systems = arrays.robot if spec.is_shared else moves.system
-    acting, pasts = np.asarray(moves.acting)[:, None], moves.state.history
-    try:
-        steps = dynamics.coefficients(spec)
-        _, histories, rows = engine.loop_many(systems, spec.settings, steps, acting, pasts, 1)
-    except EngineError:
-        return _step(spec, arrays, states, actions)
+    task, acting = dynamics.task_of(spec), np.asarray(moves.acting)[:, None]
+    _, histories, rows = task.solve_many(systems, acting, moves.state.history)
     return _arrived(spec, arrays, moves, histories, rows)
 
 
-_step = jax.jit(dynamics.step_many, static_argnames="spec")
 _moved = jax.jit(dynamics.moved, static_argnames="spec")
 _arrived = jax.jit(dynamics.arrived, static_argnames="spec")
 

@@ -8,6 +8,7 @@ import logging
 import os
 import time
 import warnings
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -80,25 +81,21 @@ class TimeIntegration:
 
     def solve(self, system: System, controls: Any, state: StateHistory, span: tuple[int, int]) -> Any:
         """Solve a span of steps until one fails: number of steps done, the last state, rows of the span."""
-        try:
-            return engine.loop_one(system, self.settings, self.coefficients, controls, state, span)
-        except EngineError as reason:
-            log.info("%s; JAX runs it", reason)
-            padded = padded_rows(controls, least=LEAST_CAPACITY)
-            found = loop_one(system, self.settings, self.coefficients, padded, state, span)
-            return _of_span(found, span)
+        arguments = system, self.settings, self.coefficients
+        return _solved(
+            lambda: engine.loop_one(*arguments, controls, state, span),
+            lambda: loop_one(*arguments, padded_rows(controls, least=LEAST_CAPACITY), state, span),
+            span,
+        )
 
     def solve_many(self, system: System, controls: Any, states: StateHistory) -> Any:
         """Solve all steps of a batch of robots, each until one fails: as `solve`, for each robot."""
-        try:
-            return engine.loop_many(
-                system, self.settings, self.coefficients, controls, states, self.steps
-            )  # fmt: skip
-        except EngineError as reason:
-            log.info("%s; JAX runs it", reason)
-            padded = padded_rows(controls)
-            found = loop_many(system, self.settings, self.coefficients, padded, states, self.steps)
-            return _of_span(found, (0, self.steps))
+        arguments = system, self.settings, self.coefficients
+        return _solved(
+            lambda: engine.loop_many(*arguments, controls, states, self.steps),
+            lambda: loop_many(*arguments, padded_rows(controls), states, self.steps),
+            (0, self.steps),
+        )
 
     def recover(self, system: System, state: Any, controls: Any, i: int, budget: Budget) -> SolvedStep:
         """Recover step i; `controls` are the previous step's and its own."""
@@ -118,32 +115,35 @@ class Equilibria:
 
     def solve(self, system: System, controls: Any, state: Any, span: tuple[int, int]) -> Any:
         """Solve a span of equilibria until one fails: the number done, the last state, rows of the span."""
-        try:
-            return engine.static_one(system, self.settings, controls, state, span)
-        except EngineError as reason:
-            log.info("%s; JAX runs it", reason)
-            padded = padded_rows(controls, least=LEAST_CAPACITY)
-            return _of_span(static_one(system, self.settings, padded, state, span), span)
+        return _solved(
+            lambda: engine.static_one(system, self.settings, controls, state, span),
+            lambda: static_one(
+                system, self.settings, padded_rows(controls, least=LEAST_CAPACITY), state, span
+            ),
+            span,
+        )
 
     def solve_many(self, system: System, controls: Any, states: Any) -> Any:
         """Solve the lists of a batch of robots, each until one fails: as `solve`, for each robot."""
-        try:
-            return engine.static_many(system, self.settings, controls, states, self.steps)
-        except EngineError as reason:
-            log.info("%s; JAX runs it", reason)
-            found = static_many(system, self.settings, padded_rows(controls), states, self.steps)
-            return _of_span(found, (0, self.steps))
+        return _solved(
+            lambda: engine.static_many(system, self.settings, controls, states, self.steps),
+            lambda: static_many(system, self.settings, padded_rows(controls), states, self.steps),
+            (0, self.steps),
+        )
 
     def recover(self, system: System, state: Any, controls: Any, i: int, budget: Budget) -> SolvedStep:
         """Recover an equilibrium; `controls` are the previous one's and its own."""
         return StaticRecovery(system, self.settings, state, budget).recover(controls)
 
 
-def _of_span(results: tuple[Any, Any, StepRows], span: tuple[int, int]) -> Any:
-    """Return the results of a compiled loop in NumPy's arrays, with the rows of a span."""
-    done, last, rows = jax.tree.map(np.asarray, results)
-    rows = jax.tree.map(lambda leaf: leaf[(slice(None),) * done.ndim + (slice(*span),)], rows)
-    return done, last, rows
+def _solved(in_engine: Callable[[], Any], in_jax: Callable[[], Any], span: tuple[int, int]) -> Any:
+    """Return the results of a loop of the engine or, of what it does not cover, of JAX: rows of the span."""
+    try:
+        return in_engine()
+    except EngineError:
+        done, last, rows = jax.tree.map(np.asarray, in_jax())
+        inside = (slice(None),) * done.ndim + (slice(*span),)
+        return done, last, jax.tree.map(lambda leaf: leaf[inside], rows)
 
 
 def run_one(
