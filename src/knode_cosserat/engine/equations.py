@@ -20,6 +20,8 @@ from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.space import LOBATTO2
 
 RUN, STEP, PLACE, STATE = 1, 2, 3, 4
+#: largest number of operations: LLVM's time grows faster than their number, to minutes for a large network
+MOST_OPERATIONS = 20_000
 
 
 class Equations:
@@ -32,7 +34,7 @@ class Equations:
         self.ny, self.nz = system.y_layout.size, system.z_layout.size
         self.nc, self.k = system.control_size, unknown_count(system)
         self.numbers = self.ny + self.nz
-        program = self.program = Program()
+        program = self.program = Program(MOST_OPERATIONS)
         self.parameters = [program.inputs(f"p{i}", leaf.shape, RUN) for i, leaf in enumerate(leaves)]
         #: the place of each parameter's node in the vector of parameters
         self.parameter_values = np.concatenate([leaf.reshape(-1) for leaf in leaves])
@@ -154,7 +156,7 @@ class Elimination:
     """
 
     def __init__(self, equations: Equations):
-        program = self.program = Program()
+        program = self.program = Program(MOST_OPERATIONS)
         apply, n, pattern = program.apply, equations.ny, equations.pattern
         zero, one = program.constant(0.0), program.constant(1.0)
         self.h = program.input("h", 1)

@@ -26,8 +26,6 @@ from knode_cosserat.errors import KnodeCosseratError
 
 #: largest number of scalar products of one matrix product: larger ones would be long code
 LARGEST_PRODUCT = 8192
-#: largest number of operations: LLVM's time grows faster than their number, to minutes for a large network
-MOST_OPERATIONS = 20_000
 #: largest number of entries of a table with a variable index, of turns of a scan, and of numbers to sort
 LARGEST_TABLE, LONGEST_SCAN, LONGEST_SORT = 256, 1024, 32
 #: largest matrix that is factorised with row exchanges that depend on values
@@ -127,7 +125,9 @@ BOOLEANS = COMPARISONS | {"and", "or", "not", "isfinite"}
 class Program:
     """Scalar operations in the order of evaluation, without repetition."""
 
-    def __init__(self) -> None:
+    def __init__(self, limit: float = math.inf) -> None:
+        #: largest number of operations
+        self.limit = limit
         #: ("constant",), ("input", name), ("add", a, b), …, ("loop", k, *arguments), ("result", loop node, k)
         self.operations: list[tuple[Any, ...]] = []
         #: values of constants, None of all others
@@ -190,8 +190,8 @@ class Program:
         return found
 
     def _created(self, operation: str, *arguments: int) -> int:
-        if len(self.operations) > MOST_OPERATIONS:
-            raise EngineError(f"engine: more than {MOST_OPERATIONS} operations; use smaller networks or laws")
+        if len(self.operations) > self.limit:
+            raise EngineError(f"engine: more than {self.limit} operations; use smaller networks or laws")
         key, level = (operation, *arguments), max(self.levels[a] for a in arguments)
         last = self._boolean[arguments[-1]]
         node = self._new(key, key, level, operation in BOOLEANS or (last and operation == "select"))
@@ -1274,7 +1274,7 @@ class Evaluation:
         cond_nconsts: int,
         body_nconsts: int,
     ) -> list[Nodes]:
-        outer, inner = self.program, Program()
+        outer, inner = self.program, Program(self.program.limit)
         count = cond_nconsts + body_nconsts
         inputs: dict[int, str] = {}
 
