@@ -18,6 +18,7 @@ from jaxtyping import Float
 
 from knode_cosserat.engine.codegen import Function, Index, Value, Variable
 from knode_cosserat.engine.elimination import EliminationCode
+from knode_cosserat.engine.equations import Equations
 from knode_cosserat.engine.memory import Array
 from knode_cosserat.engine.program import EngineError
 from knode_cosserat.rods.system import System
@@ -53,14 +54,19 @@ class Shape(NamedTuple):
 States = TypeVar("States", StateHistory, Shape)
 
 
+def require_covered(system: System, settings: Settings) -> None:
+    """Raise `EngineError` for systems and schemes along the rod that are not covered."""
+    if system.strands > 1 or system.mixed or settings.space != LOBATTO2:
+        raise EngineError("engine: only one rod by lobatto2, with a balance in which B is zero")
+
+
 class Core(EliminationCode):
     """Machine code of a system's time loop, or of its equilibria in turn."""
 
     def __init__(self, system: System, settings: Settings, robots: bool, lanes: int = 8):
-        if system.strands > 1 or system.mixed or settings.space != LOBATTO2:
-            raise EngineError("engine: only one rod by lobatto2, with a balance in which B is zero")
+        require_covered(system, settings)
         self.settings, self.scheme, self.newton = settings, settings.time, settings.newton
-        super().__init__(system, robots, lanes)
+        super().__init__(Equations(system), robots, lanes)
         e = self.equations
         moving = [node for node in e.products["base"] if not e.program.is_constant(int(node), 0.0)]
         if moving and isinstance(self.scheme, SDIRK2):
@@ -93,7 +99,6 @@ class Core(EliminationCode):
         self.difference, self.move, self.sum = (a(numbers, self.ends) for _ in range(3))
         self.dfar, self.df, self.dz = a(ny, self.ends), a(ny, self.ends), a(nz, self.ends)
         self.dfe = a(ny, self.pieces)
-        self.node_table = a(len(self.grid.nodes), 1)
         self._write()
         self.compiled = self.module.compile()
         self._run = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 7, *[ctypes.c_long] * 2)(
@@ -105,11 +110,7 @@ class Core(EliminationCode):
         #: extrapolations to each stage and to the one after it
         self._guesses = np.ascontiguousarray(np.stack([guesses, np.roll(guesses, -1, axis=0)], axis=1))
         #: memory at the start of a run, but for parameters and states
-        self._empty = np.zeros(self._size)
-        if self.acting.size:
-            self._put_in(self._empty[None], self.acting, self.grid.acting[None, None])
-        table = self._empty[self.node_table.offset :].view(np.int64)
-        table[: len(self.grid.nodes)] = self.grid.nodes
+        self._empty = self._empty_memory()
 
     # Newton's method
 
@@ -617,14 +618,6 @@ class Core(EliminationCode):
         alive = f.load(numbers, ALIVE * P, P)
         f.store(f.select(solved, alive, 0.0), numbers, ALIVE * P, P)
 
-    def _node(self, node: Index) -> Index:
-        """Return the point of a node."""
-        f = self._now
-        if not len(self.grid.between):
-            return node
-        at = f.pointer(f.pointer(f.arguments[0], self.node_table.offset), node.value)
-        return f.index(f.result(f"load i64, ptr {at.name}", "i64"))
-
     def _write_guesses(self) -> None:
         """Weights of the extrapolations in the next first guess, and the shift of earlier states.
 
@@ -669,16 +662,16 @@ class Core(EliminationCode):
     def _write(self) -> None:
         self._write_setup()
         self._write_terms()
-        self.rates = self._write_rates("rates", slopes=False)
-        self.rates_and_slopes = self._write_rates("rates_and_slopes", slopes=True)
+        self.rates = self._write_rates("rates")
+        self.rates_and_slopes = self._write_rates("rates_and_slopes", [(self.slope, self.equations.nonzeros)])
         self.residual = self._write_residual("residual", self.trial, self.H)
         self.residual_of_y = self._write_residual("residual_of_y", self.y, self.H)
         self.residual_of_better = self._write_residual("residual_of_better", self.better, self.own_dH)
         self.defects = self._function("defects")
         self._write_defects(self.trial, self.H)
-        self._write_solved()
+        self.solved = self._write_solved()
         self._write_factor()
-        self._write_advance()
+        self.advance = self._write_advance()
         self._write_along()
         self._write_linearise()
         self._write_correct()
@@ -724,11 +717,7 @@ class Core(EliminationCode):
         lane_controls = np.broadcast_to(lane_controls, (vectors, P, count, stages, e.nc))
         lane_controls = np.ascontiguousarray(np.moveaxis(lane_controls, 1, -1))
         lane_parameters = in_lanes(np.broadcast_to(parameters, (size, parameters.shape[-1])))
-        table = np.empty((count, stages, 5))
-        coefficients = np.asarray(steps.table).reshape(2, stages, 4)
-        table[..., :4] = coefficients[1]
-        table[: int(start == 0), :, :4] = coefficients[0]
-        table[..., 4] = (np.arange(start, stop)[:, None] + np.asarray(steps.ends)) * steps.dt
+        table = coefficients_of(steps, stages, span)
         rows = np.zeros((vectors, count, stages, nodes, e.numbers, P))
         infos = np.zeros((vectors, count, stages, 8 + e.k, P))
         reached, length = np.zeros((2, vectors, P))
@@ -781,21 +770,6 @@ class Core(EliminationCode):
             rows[:, :, :-1], unknowns[:, :, :-1],
         )  # fmt: skip
 
-    def _numbers(self, memory: np.ndarray, array: Array, first: int = 0) -> np.ndarray:
-        """Return an array's numbers (m, lanes, places, size): a view of memories (m, n) from `first` on."""
-        shape, axes = (array.size, 1 if array.count == 1 else self.stride, 1), (0, 3, 2, 1)
-        if self.batch:
-            shape, axes = (array.count, array.size, self.L), (0, 3, 1, 2)
-        at = array.offset - first
-        return memory[:, at : at + shape[0] * shape[1] * shape[2]].reshape(-1, *shape).transpose(axes)
-
-    def _put_in(self, memory: np.ndarray, array: Array, values: np.ndarray, first: int = 0) -> None:
-        """Write values (m, lanes, places, size); the last place is repeated in the lanes beyond it."""
-        target = self._numbers(memory, array, first)
-        count = values.shape[-2]
-        target[:, :, :count] = values
-        target[:, :, count:] = values[:, :, -1:]
-
     def _parts_of(self, states: States) -> Iterator[tuple[Array, np.ndarray]]:
         """Yield the arrays of a motion's state with their values (robots, places, size)."""
         for name, arrays in self._parts.items():
@@ -814,6 +788,19 @@ class Core(EliminationCode):
             values = np.stack(parts, axis=2).reshape(-1, len(arrays), count, arrays[0].size)
             found[name] = values[: shape[0]].reshape(shape)
         return type(before)(**found)
+
+
+def coefficients_of(
+    steps: StepCoefficients, stages: int, span: tuple[int, int]
+) -> Float[np.ndarray, "T stages 5"]:
+    """Return coefficients and the time since row 0 (s) of all stages of a span of steps."""
+    start, stop = span
+    table = np.empty((stop - start, stages, 5))
+    coefficients = np.asarray(steps.table).reshape(2, stages, 4)
+    table[..., :4] = coefficients[1]
+    table[: int(start == 0), :, :4] = coefficients[0]
+    table[..., 4] = (np.arange(start, stop)[:, None] + np.asarray(steps.ends)) * steps.dt
+    return table
 
 
 def _sum(values: Iterable[Value]) -> Value:

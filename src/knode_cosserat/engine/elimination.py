@@ -2,24 +2,39 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from knode_cosserat.engine.codegen import Index, Value, Variable
-from knode_cosserat.engine.equations import Elimination
+from knode_cosserat.engine.codegen import Function, Index, Value, Variable
+from knode_cosserat.engine.equations import Elimination, Equations
+from knode_cosserat.engine.memory import Array
 from knode_cosserat.engine.rod import RodCode
-from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import pivots_of
 from knode_cosserat.solvers.linear import _each
+
+
+class Correction(NamedTuple):
+    """Arrays of one right-hand side: defects of pieces and tip, and the correction of y and unknowns."""
+
+    r: Array
+    tip: Array
+    #: B⁻¹ r
+    added: Array
+    #: corrections along the rod without those of the unknowns, and what the groups of pieces take from them
+    w: Array
+    beta: Array
+    dy: Array
+    unknowns: Array
 
 
 class EliminationCode(RodCode):
     """Functions that factor a linearisation and solve for corrections."""
 
-    def __init__(self, system: System, robots: bool, lanes: int):
-        super().__init__(system, robots, lanes)
-        self.elimination = Elimination(self.equations)
+    def __init__(self, equations: Equations, robots: bool, lanes: int):
+        super().__init__(equations, robots, lanes)
+        system = equations.system
+        self.elimination = Elimination(equations)
         self.pivots = [int(index) for index in pivots_of(system)]
         ny, k, a, by_rows = self.equations.ny, self.equations.k, self._array, self._by_rows
         self.factor = a(len(self.elimination.factors), self.pieces)
@@ -28,29 +43,34 @@ class EliminationCode(RodCode):
         self.matrix, self.added = self.wide_matrix, self.wide_added
         if not robots:
             self.matrix, self.added = by_rows(ny, ny, self.pieces), by_rows(ny, 1, self.pieces)
-        #: corrections along the rod without those of the unknowns, and the columns of these
-        self.w, self.X = by_rows(ny, 1, self.points), by_rows(ny, k, self.points)
+        #: columns of the unknowns along the rod
+        self.X = by_rows(ny, k, self.points)
         self.groups = _each(self.pieces), (self.pieces - 1) // _each(self.pieces)
         self.T, self.M, self.inverse = by_rows(k, k, self.groups[1]), by_rows(k, ny, 1), by_rows(k, k, 1)
-        self.beta, self.zeros = by_rows(k, 1, self.groups[1]), by_rows(ny, 1, 1)
+        self.zeros = by_rows(ny, 1, 1)
         #: the solution, its unknowns, and the correction of both
         self.y, self.unknowns = a(ny, self.ends), a(k, 1)
         self.dy, self.step_unknowns = a(ny, self.ends), a(k, 1)
-        self.dy_by_rows = self.dy if robots else by_rows(ny, 1, self.points)
+        self.correction = Correction(
+            self.r, self.tip, self.added, by_rows(ny, 1, self.points), by_rows(k, 1, self.groups[1]),
+            self.dy if robots else by_rows(ny, 1, self.points), self.step_unknowns,
+        )  # fmt: skip
         #: history terms of the step
         self.H = a(self.equations.numbers, self.count)
 
-    def _write_solved(self) -> None:
+    def _write_solved(self, name: str = "solved") -> Function:
         """A piece's B⁻¹ r."""
-        f, el = self._function("solved", "from", "to", "n_piece"), self.elimination
-        self.solved = f
+        f, el = self._function(name, "from", "to", "n_piece"), self.elimination
         _, source, target, piece = f.arguments
-        j, component = f.index(piece), self.wide_added.component
-        known = {int(node): self._wide(self.factor, k, j) for k, node in enumerate(el.stored)}
+        j, component = f.index(piece), self.L if self.has_tangents else self.wide_added.component
+        known = {
+            int(node): self._get(self.factor, k, j, self._matrix_lanes) for k, node in enumerate(el.stored)
+        }
         known |= {int(node): f.load(source, i * component, self.L) for i, node in enumerate(el.r)}
         values = f.evaluate(el.program, el.solved, known, self.L)
         for i, node in enumerate(el.solved):
             f.store(values[node], target, i * component, self.L)
+        return f
 
     def _write_factor(self) -> None:
         """Factors and the matrix B⁻¹ A of all pieces, from the slopes at their ends."""
@@ -88,22 +108,23 @@ class EliminationCode(RodCode):
         for i in range(count):
             f.store(f.load(source[0], i * source[1]), target[0], i * target[1])
 
-    def _write_advance(self) -> None:
+    def _write_advance(self, name: str = "advance") -> Function:
         """A column at a piece's start to its end: B⁻¹ A x plus what is added."""
         el, n = self.elimination, self.equations.ny
-        self.advance = f = self._function("advance", "from", "added", "to", "n_piece")
+        f = self._function(name, "from", "added", "to", "n_piece")
         _, source, added, target, piece = f.arguments
-        j, component = f.index(piece), 1 if not self.batch else self.L
-        width = 1 if self.batch else self.L
-        x = [f.load(source, c * component, self.P) for c in range(n)]
+        width, j, lanes = self._rows_at_once, f.index(piece), self._vector_lanes
+        component = 1 if width > 1 else self.L
+        x = [f.load(source, c * component, lanes) for c in range(n)]
         for row in self._blocks(n):
             # two sums, because each addition waits for the one before
             sums = [f.load(added, row * component, self.L), f.splat(f.value(0.0), self.L)]
             for c in range(n):
                 if el.nonzero[row : row + width, c].any():
-                    entry = self._get(self.matrix, c * self._padded(n) + row, j, self.L)
+                    entry = self._get(self.matrix, c * self._padded(n) + row, j, self._matrix_lanes)
                     sums = [sums[1], sums[0] + entry * x[c]]
             f.store(sums[0] + sums[1], target, row * component, self.L)
+        return f
 
     def _changed(self, columns: list[list[Value]], pivots: list[int]) -> list[list[Value]]:
         """Write X T, with T the inverse of X's rows of pivots, and return T; X's columns are replaced."""
@@ -187,36 +208,45 @@ class EliminationCode(RodCode):
 
     def _write_correct(self) -> None:
         """The correction of all points and of the unknowns, from the defects."""
-        ny, k = self.equations.ny, self.equations.k
+        ny = self.equations.ny
         self.correct = f = self._function("correct")
         memory = f.arguments[0]
-        size, count = self.groups
         with self._places(self.pieces) as j:
             f.call(self.solved, memory, self._pointer(self.r, j), self._pointer(self.wide_added, j), j.value)
         if not self.batch:
             with f.loop(self.pieces) as j:
                 source = self._pointer(self.wide_added, j), self.wide_added.component
                 self._copy(ny, source, (self._pointer(self.added, j), 1))
+        self._write_correction(self.correction, self.advance)
+        if not self.batch:
+            with f.loop(self.points) as j:
+                source = self._pointer(self.correction.dy, j), 1
+                self._copy(ny, source, (self._pointer(self.dy, j), self.dy.component))
+
+    def _write_correction(self, arrays: Correction, advance: Function) -> None:
+        """Solve for a correction, from B⁻¹ r of all pieces."""
+        f, ny, k = self._now, self.equations.ny, self.equations.k
+        memory, (size, count) = f.arguments[0], self.groups
 
         def piece(j: Index) -> None:
-            points = self._pointer(self.w, j), self._pointer(self.added, j), self._pointer(self.w, j + 1)
-            f.call(self.advance, memory, *points, j.value)
+            start, added, end = (arrays.w, j), (arrays.added, j), (arrays.w, j + 1)
+            f.call(advance, memory, *(self._pointer(*each) for each in (start, added, end)), j.value)
 
         with f.loop(count) as g:
             with f.loop((g.value + 1) * size, g.value * size) as j:
                 piece(j)
             last = f.index((g.value + 1) * size)
-            w = self._column(self.w, ny, 0, last)
+            w = self._column(arrays.w, ny, 0, last)
             columns = [self._column(self.X, ny, c, last) for c in range(k)]
             moved = self._product(columns, [self._entry(w, pivot) for pivot in self.pivots])
-            self._set_column([a - b for a, b in zip(w, moved, strict=True)], self.w, ny, 0, last)
-            self._set_column(self._gathered(w), self.beta, k, 0, g)
+            self._set_column([a - b for a, b in zip(w, moved, strict=True)], arrays.w, ny, 0, last)
+            self._set_column(self._gathered(w), arrays.beta, k, 0, g)
         with f.loop(self.pieces, count * size) as j:
             piece(j)
-        w = self._column(self.w, ny, 0, self.points - 1)
+        w = self._column(arrays.w, ny, 0, self.points - 1)
         M = [self._column(self.M, k, i) for i in range(ny)]
         tip = self._product(M, [self._entry(w, i) for i in range(ny)])
-        tip = [a + b for a, b in zip(tip, self._column(self.tip, k), strict=True)]
+        tip = [a + b for a, b in zip(tip, self._column(arrays.tip, k), strict=True)]
         inverse = [self._column(self.inverse, k, c) for c in range(k)]
         alpha = [
             Variable(f, -each) for each in self._product(inverse, [self._entry(tip, c) for c in range(k)])
@@ -228,14 +258,14 @@ class EliminationCode(RodCode):
             with f.loop(stop, start) as j:
                 columns = [self._column(self.X, ny, c, j) for c in range(k)]
                 moved = self._product(columns, numbers)
-                w = self._column(self.w, ny, 0, j)
-                self._set_column([a + b for a, b in zip(w, moved, strict=True)], self.dy_by_rows, ny, 0, j)
+                w = self._column(arrays.w, ny, 0, j)
+                self._set_column([a + b for a, b in zip(w, moved, strict=True)], arrays.dy, ny, 0, j)
 
         correct(count * size + 1, self.points)
         with f.loop(0, count - 1, -1) as g:
             end = (g.value + 1) * size
             correct(end, end + 1)
-            change = [a.get() - b for a, b in zip(alpha, self._column(self.beta, k, 0, g), strict=True)]
+            change = [a.get() - b for a, b in zip(alpha, self._column(arrays.beta, k, 0, g), strict=True)]
             T = [self._column(self.T, k, c, g) for c in range(k)]
             for variable, value in zip(
                 alpha, self._product(T, [self._entry(change, c) for c in range(k)]), strict=True
@@ -243,15 +273,11 @@ class EliminationCode(RodCode):
                 variable.set(value)
             correct(g.value * size + 1, end)
         correct(0, 1)
-        self._set_column([each.get() for each in alpha], self.step_unknowns, k)
-        if not self.batch:
-            with f.loop(self.points) as j:
-                source = self._pointer(self.dy_by_rows, j), 1
-                self._copy(ny, source, (self._pointer(self.dy, j), self.dy.component))
+        self._set_column([each.get() for each in alpha], arrays.unknowns, k)
 
     def _gathered(self, w: list[Value]) -> list[Value]:
         """Return the rows of pivots of a column."""
-        if self.batch:
+        if self._rows_at_once == 1:
             return [w[pivot] for pivot in self.pivots]
         f, rows = self._now, [self._now.lane(w[p // self.L], p % self.L) for p in self.pivots]
         rows += [f.value(0.0)] * (self._padded(len(rows)) - len(rows))

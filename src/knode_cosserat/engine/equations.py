@@ -25,9 +25,12 @@ MOST_OPERATIONS = 20_000
 
 
 class Equations:
-    """Programs of a system: rates and strains at a point with their derivatives, base and tip."""
+    """Programs of a system: rates and strains at a point with their derivatives, base and tip.
 
-    def __init__(self, system: System):
+    Parameters that are zero are constants, which takes fewer operations; but not those that are `moving`.
+    """
+
+    def __init__(self, system: System, moving: Sequence[np.ndarray] | None = None):
         self.system = system
         leaves, tree = jax.tree.flatten(system)
         leaves = [np.asarray(leaf, dtype=float) for leaf in leaves]
@@ -38,10 +41,11 @@ class Equations:
         self.parameters = [program.inputs(f"p{i}", leaf.shape, RUN) for i, leaf in enumerate(leaves)]
         #: the place of each parameter's node in the vector of parameters
         self.parameter_values = np.concatenate([leaf.reshape(-1) for leaf in leaves])
-        # parameters that are zero are constants: fewer operations
         folded = [
-            np.where(leaf == 0.0, program.constant(0.0), nodes)
-            for leaf, nodes in zip(leaves, self.parameters, strict=True)
+            np.where((leaf == 0.0) & ~moves, program.constant(0.0), nodes)
+            for leaf, nodes, moves in zip(
+                leaves, self.parameters, moving or [np.array(False)] * len(leaves), strict=True
+            )
         ]
         self.c0, self.t = program.inputs("c0", (), STEP), program.inputs("t", (), STEP)
         self.control = program.inputs("control", (self.nc,), STEP)
@@ -111,6 +115,7 @@ class Equations:
             for i, j in np.ndindex(self.slopes.shape)
             if not program.is_constant(int(self.slopes[i, j]), 0.0)
         ]
+        self.nonzeros = [int(self.slopes[at]) for at in self.pattern]
         needed = set(program.needed([*self.f, *self.z, *self.far, *self.base, *self.tip]))
         #: entries of a record that the equations need as history
         self.used_history = [i for i in range(self.numbers) if int(self.history[i]) in needed]
@@ -129,8 +134,12 @@ class Equations:
         }  # fmt: skip
         for nodes in self.products.values():
             outputs += nodes
-        self.step_terms = self._hoisted(outputs, {STEP, RUN})
-        self.place_terms = self._hoisted(outputs, {PLACE})
+        self._outputs = outputs
+        self._hoist()
+
+    def _hoist(self) -> None:
+        self.step_terms = self._hoisted(self._outputs, {STEP, RUN})
+        self.place_terms = self._hoisted(self._outputs, {PLACE})
 
     def _hoisted(self, outputs: Sequence[int] | np.ndarray, levels: set[int]) -> list[int]:
         """Return the operations of these levels that operations of higher levels need."""
@@ -147,6 +156,48 @@ class Equations:
                 if program.levels[each] in levels and each not in found:
                     todo.append(each) if program.is_boolean(each) else found.add(each)
         return sorted(found)
+
+
+#: nonzeros of a matrix: row, column and node of each
+Nonzeros = list[tuple[int, int, int]]
+
+
+class TangentEquations(Equations):
+    """Programs of a system with all derivatives of rates and strains, jumps, tip and base."""
+
+    def __init__(self, system: System, moving: Sequence[np.ndarray]):
+        """Differentiate the equations by y, history, control, and the parameters that are `moving`."""
+        super().__init__(system, moving)
+        program = self.program
+        results = {
+            "rates": [*self.f, *self.z], "far": [*self.far] if system.jumps else [], "tip": [*self.tip],
+            "base": [*self.base],
+        }  # fmt: skip
+        self.z_by_y = self._nonzeros(self.z, self.y)
+        self.by_history = {name: self._nonzeros(nodes, self.history) for name, nodes in results.items()}
+        self.by_control = {name: self._nonzeros(nodes, self.control) for name, nodes in results.items()}
+        for nonzeros in (self.z_by_y, *self.by_history.values(), *self.by_control.values()):
+            self._outputs += [node for *_, node in nonzeros]
+        self._hoist()
+        moved = [nodes[moves] for nodes, moves in zip(self.parameters, moving, strict=True)]
+        self.dparameters = program.inputs("dparameter", (sum(map(len, moved)),), RUN)
+        tangents = dict(zip(np.concatenate(moved).tolist(), self.dparameters.tolist(), strict=True))
+        #: tangents of places and of lengths of pieces
+        self.dplaces, self.dlengths = (program.derivative(nodes, tangents) for nodes in self.geometry[2:4])
+        self.ds = program.inputs("ds", (), PLACE)
+        tangents[self.s.item()] = self.ds.item()
+        #: tangents of the results by the system, at fixed y, history and control
+        self.moved = {name: program.derivative(nodes, tangents) for name, nodes in results.items()}
+        outputs = [node for nodes in self.moved.values() for node in nodes]
+        self.moved_terms = self._hoisted(outputs, {STEP, RUN})
+
+    def _nonzeros(self, outputs: Any, variables: Any) -> Nonzeros:
+        slopes = self.program.jacobian(outputs, variables)
+        return [
+            (i, j, int(slopes[i, j]))
+            for i, j in np.ndindex(slopes.shape)
+            if not self.program.is_constant(int(slopes[i, j]), 0.0)
+        ]
 
 
 class Elimination:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import logging
 import threading
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
 
-from knode_cosserat.engine.core import Core, Shape, States
+from knode_cosserat.engine.core import Core, Shape, States, coefficients_of, require_covered
 from knode_cosserat.engine.program import EngineError
+from knode_cosserat.engine.tangents import TangentCore
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.time_loop import StepCoefficients, StepRows
@@ -18,10 +20,12 @@ from knode_cosserat.solvers.time_loop import StepCoefficients, StepRows
 log = logging.getLogger(__name__)
 
 #: compiled cores, or the reason why there is none, by what their code depends on; the last used come last
-_CORES: dict[Any, Core | EngineError] = {}
+_CORES: dict[Any, Core | TangentCore | EngineError] = {}
 #: number of cores that a process keeps: a core takes some MB
 MOST_CORES = 100
 _COMPILING = threading.Lock()
+
+CoreOrTangents = TypeVar("CoreOrTangents", Core, TangentCore)
 
 
 def core_of(system: System, settings: Settings, robots: bool) -> Core:
@@ -36,13 +40,21 @@ def core_of(system: System, settings: Settings, robots: bool) -> Core:
     leaves = [np.asarray(leaf, dtype=float) for leaf in leaves]
     if np.ndim(system.length):
         leaves = [np.max(np.abs(leaf), axis=0) for leaf in leaves]
-    zeros = tuple((leaf.shape, np.packbits(leaf == 0.0).tobytes()) for leaf in leaves)
-    key = structure, zeros, settings, robots
+    key = structure, _masks([leaf == 0.0 for leaf in leaves]), settings, robots
+    return _compiled(key, lambda: Core(jax.tree.unflatten(structure, leaves), settings, robots))
+
+
+def _masks(masks: Sequence[np.ndarray]) -> Any:
+    return tuple((mask.shape, np.packbits(mask).tobytes()) for mask in masks)
+
+
+def _compiled(key: Any, build: Callable[[], CoreOrTangents]) -> CoreOrTangents:
+    """Return compiled code that is kept by a key."""
     with _COMPILING:
-        core = _CORES.pop(key, None)
+        core: Any = _CORES.pop(key, None)
         if core is None:
             try:
-                core = Core(jax.tree.unflatten(structure, leaves), settings, robots)
+                core = build()
             except EngineError as error:
                 log.info("%s; JAX runs it", error)
                 # without the frames that a traceback keeps alive
@@ -102,3 +114,44 @@ def static_many(system: System, settings: Settings, controls: Any, y: Any, stop:
     """Solve the equilibria of a batch: controls (B, T, c), y (B, points, y), and one system or a batch."""
     done, last, rows = loop_many(system, settings, STILL, controls, Shape(y), stop)
     return done, last.y, rows
+
+
+def tangent_loop(
+    settings: Settings, steps: StepCoefficients, solved: tuple[Any, Any], at: tuple[System, Any],
+    changes: tuple[tuple[Any, Any], Any], states: tuple[Any, Any, Any, Any], t0: float,
+) -> tuple[Any, Any]:  # fmt: skip
+    """Return the tangents of solved steps: see `solvers.sensitivity.tangent_time_loop`, and its states."""
+    (system, controls), ((directions, weights), d_controls) = at, changes
+    require_covered(system, settings)
+    leaves, structure = jax.tree.flatten(system)
+    leaves = [np.asarray(leaf, float) for leaf in leaves]
+    count, stages, m = len(controls), settings.stages, d_controls.shape[-1]
+    if directions is None:
+        stacked, weights = [np.zeros((0, *leaf.shape)) for leaf in leaves], np.zeros((0, m))
+    else:
+        stacked = [np.asarray(leaf, float) for leaf in jax.tree.leaves(directions)]
+    moving = [np.any(leaf != 0.0, axis=0) for leaf in stacked]
+    masks = _masks([leaf == 0.0 for leaf in leaves]), _masks(moving)
+    key = structure, *masks, settings.space, settings.uses_rate, "tangents"
+    core = _compiled(key, lambda: TangentCore(jax.tree.unflatten(structure, leaves), settings, moving))
+    moved = np.concatenate(
+        [
+            leaf[:, mask].reshape(len(leaf), int(mask.sum()))
+            for leaf, mask in zip(stacked, moving, strict=True)
+        ],
+        axis=1,
+    )
+    table = coefficients_of(steps, stages, (0, count))
+    table[..., 4] += t0
+
+    def of_stages(values: Any) -> np.ndarray:
+        """Return controls, or their tangents, of all stages of all steps."""
+        values, size = np.asarray(values, float), system.control_size
+        if values.shape[1] > size:
+            return values.reshape(count * stages, size, *values.shape[2:])
+        return np.repeat(values, stages, axis=0)
+
+    return core.solve(
+        parameters_of(system), table.reshape(-1, 5), solved, of_stages(controls), (moved, weights),
+        of_stages(d_controls), states,
+    )  # fmt: skip

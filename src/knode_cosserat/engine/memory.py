@@ -1,8 +1,8 @@
 """Memory of a run, and code that reads and writes it: robots in lanes, or places along the rod in lanes.
 
 A lane of a vector is a robot of a batch. For a single robot it is a place along the rod; in the recursion
-along the rod it is a row of a matrix. The code is the same: arrays know their layout (`Array`), and values
-are `wide` where all places are independent, else `plain`.
+along the rod it is a row of a matrix, or one of many tangents. The code is the same: arrays know their layout
+(`Array`), and values are `wide` where all places are independent, else `plain`.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ import contextlib
 import dataclasses
 from collections.abc import Iterator
 from typing import Any
+
+import numpy as np
 
 from knode_cosserat.engine.codegen import Function, Index, Module, Value
 
@@ -25,6 +27,10 @@ class Array:
     #: distance between components and between places, in doubles
     component: int
     place: int
+    #: number of the function's argument that is its memory
+    memory: int = 0
+    #: true if tangents are in lanes
+    is_tangent: bool = False
 
     def at(self, i: int, j: int) -> int:
         """Return the offset of component i at place j."""
@@ -40,13 +46,15 @@ class Memory:
         self.P = lanes if robots else 1
         #: distance between components of a single robot's arrays
         self.stride = (-(-(places + 1) // lanes) + 1) * lanes
+        #: true in code that has tangents in lanes
+        self.has_tangents = False
         self.module = Module()
         self._size = 0
 
-    def _array(self, size: int, count: int) -> Array:
+    def _array(self, size: int, count: int, memory: int = 0) -> Array:
         """Reserve an array: robots in lanes, or places in lanes."""
         place, component = (size * self.L, self.L) if self.batch else (1, 1 if count == 1 else self.stride)
-        found = Array(self._size, size, count, component, place)
+        found = Array(self._size, size, count, component, place, memory)
         length = size * count * self.L if self.batch else size * (1 if count == 1 else self.stride)
         self._size += -(-length // self.L) * self.L
         return found
@@ -60,13 +68,51 @@ class Memory:
         self._size += size * count
         return found
 
+    def _of_tangents(self, size: int, count: int, memory: int = 0) -> Array:
+        """Reserve an array with as many tangents in lanes as there are lanes."""
+        found = Array(self._size, size, count, self.L, size * self.L, memory, is_tangent=True)
+        self._size += size * count * self.L
+        return found
+
     def _padded(self, rows: int) -> int:
         """Return the number of rows that a column takes in memory."""
         return rows if self.batch else -(-rows // self.L) * self.L
 
     def _blocks(self, rows: int) -> range:
         """Return the first row of each vector of a column."""
-        return range(0, rows, 1 if self.batch else self.L)
+        return range(0, rows, self._rows_at_once)
+
+    @property
+    def _rows_at_once(self) -> int:
+        """Rows of a matrix in one vector."""
+        return 1 if self.batch or self.has_tangents else self.L
+
+    @property
+    def _matrix_lanes(self) -> int:
+        """Lanes of a matrix's entries; all tangents have the same matrix."""
+        return 1 if self.has_tangents else self.L
+
+    @property
+    def _vector_lanes(self) -> int:
+        """Lanes of a number that multiplies a matrix's column."""
+        return self.L if self.has_tangents else self.P
+
+    # numbers from outside
+
+    def _numbers(self, memory: np.ndarray, array: Array, first: int = 0) -> np.ndarray:
+        """Return an array's numbers (m, lanes, places, size): a view of memories (m, n) from `first` on."""
+        shape, axes = (array.size, 1 if array.count == 1 else self.stride, 1), (0, 3, 2, 1)
+        if self.batch or array.is_tangent:
+            shape, axes = (array.count, array.size, self.L), (0, 3, 1, 2)
+        at = array.offset - first
+        return memory[:, at : at + shape[0] * shape[1] * shape[2]].reshape(-1, *shape).transpose(axes)
+
+    def _put_in(self, memory: np.ndarray, array: Array, values: np.ndarray, first: int = 0) -> None:
+        """Write values (m, lanes, places, size); the last place is repeated in the lanes beyond it."""
+        target = self._numbers(memory, array, first)
+        count = values.shape[-2]
+        target[:, :, :count] = values
+        target[:, :, count:] = values[:, :, -1:]
 
     # code that reads and writes
 
@@ -77,7 +123,7 @@ class Memory:
 
     def _at(self, array: Array, i: int, j: int | Index) -> tuple[Value, int]:
         """Return an address and an offset from it."""
-        memory = self._now.arguments[0]
+        memory = self._now.arguments[array.memory]
         if isinstance(j, int):
             return memory, array.at(i, j)
         return j.address(memory, array.place), array.at(i, j.delta)
@@ -102,8 +148,8 @@ class Memory:
 
     def _column(self, array: Array, rows: int, column: int = 0, j: int | Index = 0) -> list[Value]:
         """Return the vectors of a column of a matrix."""
-        first = column * self._padded(rows)
-        return [self._get(array, first + row, j, self.L) for row in self._blocks(rows)]
+        first, lanes = column * self._padded(rows), self.L if array.is_tangent else self._matrix_lanes
+        return [self._get(array, first + row, j, lanes) for row in self._blocks(rows)]
 
     def _set_column(self, values: list[Value], array: Array, rows: int, column: int = 0, j: Any = 0) -> None:
         first = column * self._padded(rows)
@@ -112,7 +158,7 @@ class Memory:
 
     def _entry(self, column: list[Value], row: int) -> Value:
         """Return the number in a row of a column, in all lanes."""
-        if self.batch:
+        if self._rows_at_once == 1:
             return column[row]
         f = self._now
         return f.splat(f.lane(column[row // self.L], row % self.L), self.L)

@@ -10,7 +10,6 @@ import numpy as np
 from knode_cosserat.engine.codegen import Function, Index, Value, Variable
 from knode_cosserat.engine.equations import Equations
 from knode_cosserat.engine.memory import Array, Memory
-from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.space import LOBATTO2
 
@@ -21,8 +20,9 @@ class RodCode(Memory):
     rates: Function
     rates_and_slopes: Function
 
-    def __init__(self, system: System, robots: bool, lanes: int):
-        self.equations, self.grid = Equations(system), grid_of(system, LOBATTO2)
+    def __init__(self, equations: Equations, robots: bool, lanes: int):
+        system = equations.system
+        self.equations, self.grid = equations, grid_of(system, LOBATTO2)
         e, grid = self.equations, self.grid
         super().__init__(robots, lanes, grid.count)
         self.pieces, self.points, self.ends, self.count = grid.tip, grid.tip + 1, grid.ends, grid.count
@@ -37,8 +37,28 @@ class RodCode(Memory):
         self.acting, self.jump = a(len(system.cuts), self.pieces), a(len(e.jumping), self.pieces)
         #: y at the places of the ends; with jumps it differs from y at the points
         self.far = a(ny, self.ends) if system.jumps else None
+        #: points of the nodes, as whole numbers
+        self.node_table = a(len(grid.nodes), 1)
+        #: slopes of jumps
+        self.jumps = [(self.jump, [node for *_, node in e.jumping])]
         #: defects of the pieces and of the tip
         self.r, self.tip = a(ny, self.pieces), a(k, 1)
+
+    def _empty_memory(self) -> np.ndarray:
+        """Return the memory before a run: zeros, but for discontinuities and nodes."""
+        found = np.zeros(self._size)
+        if self.acting.size:
+            self._put_in(found[None], self.acting, self.grid.acting[None, None])
+        found[self.node_table.offset :].view(np.int64)[: len(self.grid.nodes)] = self.grid.nodes
+        return found
+
+    def _node(self, node: Index) -> Index:
+        """Return the point of a node."""
+        f = self._now
+        if not len(self.grid.between):
+            return node
+        at = f.pointer(f.pointer(f.arguments[0], self.node_table.offset), node.value)
+        return f.index(f.result(f"load i64, ptr {at.name}", "i64"))
 
     def _known(self, j: Any, wide: bool, state: dict[int, Value]) -> dict[int, Value]:
         """Return the values of hoisted terms at a place."""
@@ -102,8 +122,8 @@ class RodCode(Memory):
             for k, node in enumerate(e.place_terms):
                 self._write_wide(values[node], self.place_terms, k, j)
 
-    def _write_rates(self, name: str, slopes: bool) -> Function:
-        """A function of the addresses of y and history, and a place: rates and strains, and their slopes."""
+    def _write_rates(self, name: str, slopes: Sequence[tuple[Array, Sequence[int]]] = ()) -> Function:
+        """A function of the addresses of y and history, and a place: rates and strains, and slopes."""
         e = self.equations
         f = self._function(name, "y", "history", "n_place")
         _, y, history, place = f.arguments
@@ -112,15 +132,18 @@ class RodCode(Memory):
         state = {int(node): f.load(y, i * component, self.L) for i, node in enumerate(e.y)}
         for i in e.used_history:
             state[int(e.history[i])] = f.load(history, i * component, self.L)
-        outputs = [*e.f, *e.z, *([e.slopes[at] for at in e.pattern] if slopes else [])]
-        found = self._evaluated(outputs, j, True, state)
-        for i in range(e.ny):
-            self._write_wide(found[i], self.f, i, j)
-        for i in range(e.nz):
-            self._write_wide(found[e.ny + i], self.z, i, j)
-        for i in range(len(e.pattern) if slopes else 0):
-            self._write_wide(found[e.ny + e.nz + i], self.slope, i, j)
+        results = (self.f, e.f), (self.z, e.z), *slopes
+        self._write_results(results, j, state)
         return f
+
+    def _write_results(
+        self, results: Sequence[tuple[Array, Sequence[int]]], j: Any, state: dict[int, Value]
+    ) -> None:
+        """Write the values of nodes at a place into arrays."""
+        found = iter(self._evaluated([node for _, nodes in results for node in nodes], j, True, state))
+        for array, nodes in results:
+            for i in range(len(nodes)):
+                self._write_wide(next(found), array, i, j)
 
     def _rates_at(
         self, function: Function, y: Array, history: Array, j: Index, place: Index | None = None
@@ -142,11 +165,8 @@ class RodCode(Memory):
                 state = {int(node): self._wide(y, i, j) for i, node in enumerate(e.y)}
                 state |= {int(e.history[i]): self._wide(history, i, j) for i in e.used_history}
                 state |= {int(node): self._wide(self.acting, i, j) for i, node in enumerate(e.acting)}
-                outputs = [*e.far, *(node for *_, node in e.jumping if slopes)]
-                found = self._evaluated(outputs, j, True, state)
-                for k, value in enumerate(found):
-                    array, i = (far, k) if k < e.ny else (self.jump, k - e.ny)
-                    self._write_wide(value, array, i, j)
+                results = (far, e.far), *(self.jumps if slopes else ())
+                self._write_results(results, j, state)
         for k, point in enumerate(self.grid.near):
             for i in range(e.ny):
                 self._put(self._get(y, i, int(point)), far, i, self.points + k)

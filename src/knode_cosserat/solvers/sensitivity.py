@@ -17,6 +17,8 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Float
 
+from knode_cosserat.engine import loops as engine
+from knode_cosserat.engine.program import EngineError
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.history import StateHistory, history_of, used_places
 from knode_cosserat.solvers.problem import StepProblem, row_of
@@ -73,7 +75,7 @@ def rollout(task: TimeIntegration) -> Callable[[System, Any, StateHistory], tupl
         moves = SystemMoves.of(_system_tangent(tangents[0]))
         _, d_controls, d_past = jax.tree.map(_instantiated, tangents, is_leaf=_is_zero)
         state = TangentState.of(system, settings.space, past, d_past.records, d_past.rate)
-        after, d_solved = tangent_time_loop(
+        after, d_solved = tangent_loop_in_jax(
             settings, task.coefficients, solved, (system, controls), (moves, d_controls), state
         )
         # first guesses, error estimates and the extra stages of these count as constants
@@ -148,7 +150,6 @@ def _row_tangents(rows: StepRows, d_records: Any, d_unknowns: Any) -> StepRows:
     return StepRows(d_records, d_unknowns, zero, whole, zero, whole, zero, *none)
 
 
-@functools.partial(jax.jit, static_argnames="settings")
 def tangent_time_loop(
     settings: Settings, steps: StepCoefficients, solved: tuple[Any, Any], at: tuple[System, Any],
     changes: tuple[SystemMoves, Any], state: TangentState,
@@ -157,9 +158,22 @@ def tangent_time_loop(
 
     They are linear in `changes`, the tangents of system and controls, and in those of `state`. `solved` are
     all rows and unknowns, and with several stages those of every stage, like the result; `at` are system and
-    controls. Many tangents at once are columns: weights, controls, state and results have one more axis, the
-    last. This is faster than `jax.vmap` over them.
+    controls. Tangents are columns: weights, controls, state and results have one more axis, the last.
     """
+    given = state.records, state.rate, state.d_records, state.d_rate
+    try:
+        after, found = engine.tangent_loop(settings, steps, solved, at, changes, given, float(state.t0))
+    except EngineError:
+        return tangent_loop_in_jax(settings, steps, solved, at, changes, state)
+    return TangentState(*after, state.t0), found
+
+
+@functools.partial(jax.jit, static_argnames="settings")
+def tangent_loop_in_jax(
+    settings: Settings, steps: StepCoefficients, solved: tuple[Any, Any], at: tuple[System, Any],
+    changes: tuple[SystemMoves, Any], state: TangentState,
+) -> tuple[TangentState, tuple[Any, Any]]:  # fmt: skip
+    """Return the same as `tangent_time_loop`, traced by JAX, also for one tangent without the last axis."""
     (system, controls), (moves, d_controls) = at, changes
     stages, count = settings.stages, len(controls)
     coefficients, t = jax.vmap(functools.partial(steps.at, state.t0))(jnp.arange(count))
