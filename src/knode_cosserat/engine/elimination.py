@@ -31,6 +31,9 @@ class Correction(NamedTuple):
 class EliminationCode(RodCode):
     """Functions that factor a linearisation and solve for corrections."""
 
+    solved: Function
+    advance: Function
+
     def __init__(self, equations: Equations, robots: bool, lanes: int):
         super().__init__(equations, robots, lanes)
         system = equations.system

@@ -122,7 +122,7 @@ class RodCode(Memory):
             for k, node in enumerate(e.place_terms):
                 self._write_wide(values[node], self.place_terms, k, j)
 
-    def _write_rates(self, name: str, slopes: Sequence[tuple[Array, Sequence[int]]] = ()) -> Function:
+    def _write_rates(self, name: str, slopes: Sequence[tuple[Array, Any]] = ()) -> Function:
         """A function of the addresses of y and history, and a place: rates and strains, and slopes."""
         e = self.equations
         f = self._function(name, "y", "history", "n_place")
@@ -136,9 +136,7 @@ class RodCode(Memory):
         self._write_results(results, j, state)
         return f
 
-    def _write_results(
-        self, results: Sequence[tuple[Array, Sequence[int]]], j: Any, state: dict[int, Value]
-    ) -> None:
+    def _write_results(self, results: Sequence[tuple[Array, Any]], j: Any, state: dict[int, Value]) -> None:
         """Write the values of nodes at a place into arrays."""
         found = iter(self._evaluated([node for _, nodes in results for node in nodes], j, True, state))
         for array, nodes in results:

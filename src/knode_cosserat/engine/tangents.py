@@ -71,9 +71,11 @@ class TangentCore(EliminationCode):
         e = self.equations
         self._write_setup()
         self._write_terms()
-        nonzeros = (self.z_by_y, e.z_by_y), (self.by_history["rates"], e.by_history["rates"])
-        nonzeros += ((self.by_control["rates"], e.by_control["rates"]),)
-        slopes = [(self.slope, e.nonzeros), *((array, _nodes(each)) for array, each in nonzeros)]
+        slopes = [
+            (self.slope, e.nonzeros), (self.z_by_y, _nodes(e.z_by_y)),
+            (self.by_history["rates"], _nodes(e.by_history["rates"])),
+            (self.by_control["rates"], _nodes(e.by_control["rates"])),
+        ]  # fmt: skip
         self.rates_and_slopes = self._write_rates("rates_and_slopes", slopes)
         self.solved = self._write_solved()
         self._write_factor()
@@ -187,8 +189,8 @@ class TangentCore(EliminationCode):
             for i, value in enumerate(self._evaluated(e.moved[name], 0, False, here | known)):
                 self._put(value, self.moved[name], i)
 
-    def _sums(self, products: Iterable[tuple[Nonzeros, Array, Any, Any]], size: int, j: Any) -> list[Value]:
-        """Return products of sparse matrices at a place with tangents: (nonzeros, matrix, place, vector)."""
+    def _sums(self, products: Iterable[tuple[Nonzeros, Array, Any]], size: int, j: Any) -> list[Value]:
+        """Return the sum of products of sparse matrices at a place with vectors of tangents."""
         f = self._now
         zero = f.splat(f.value(0.0), self.L)
         found = [zero] * size
@@ -253,7 +255,7 @@ class TangentCore(EliminationCode):
                     self._put(get(arrays.r, i, j) + half * rates, arrays.r, i, j, L)
         if e.jumping:
             with f.loop(self.pieces) as j:
-                slopes = (((i, c, 0) for i, c in e.pattern), self.slope, lambda c: get(self.dfar, c, j))
+                slopes = ([(i, c, 0) for i, c in e.pattern], self.slope, lambda c: get(self.dfar, c, j))
                 for i, change in enumerate(self._sums([slopes], ny, j)):
                     self._put(get(self.dx, i, j) + change, self.dx, i, j, L)
         with f.loop(self.pieces) as j:
@@ -291,9 +293,9 @@ class TangentCore(EliminationCode):
                 c0 = f.load(coefficients, 0)
                 put([c0 * get(newest, i, j) + get(self.dH, i, j) for i in range(e.numbers)], self.d_rate, j)
         with f.loop(len(self.grid.nodes)) as node:
-            at, point = f.pointer(row, node.value * width * e.numbers), self._node(node)
+            at, here = f.pointer(row, node.value * width * e.numbers), self._node(node)
             for i in range(e.numbers):
-                f.store(get(arrays.dy if i < ny else newest, i, point), at, width * i, L)
+                f.store(get(arrays.dy if i < ny else newest, i, here), at, width * i, L)
         for i in range(e.k):
             f.store(get(arrays.unknowns, i), d_unknowns, width * i, L)
 
@@ -334,9 +336,10 @@ class TangentCore(EliminationCode):
             with f.loop(width, 0, L) as first:
                 parts = (f.pointer(each, first.value) for each in (weights, own, d_row, d_unknown))
                 own_weights, own_control, own_row, own_unknowns = parts
+                state = f.pointer(states, first.value * (self.state_size // L))
                 f.call(
-                    self.tangents, memory, f.pointer(states, first.value * (self.state_size // L)), directions,
-                    own_weights, own_control, table, own_row, own_unknowns, count, width,
+                    self.tangents, memory, state, directions, own_weights, own_control, table, own_row,
+                    own_unknowns, count, width,
                 )  # fmt: skip
             f.call(self.shift, memory, table)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import concurrent.futures
 import dataclasses
-import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -32,9 +31,8 @@ from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.static_loop import unloaded_shape
 from knode_cosserat.solvers.tangent import SystemMoves
+from knode_cosserat.solvers.time_loop import StepCoefficients
 
-#: rows of one compiled program with derivatives
-PIECE = 40
 #: seconds that recovery of one simulation may take
 RECOVERY = 0.5
 #: a rotation counts as the displacement at this part of the length
@@ -168,8 +166,7 @@ class Misfit:
         settings = dataclasses.replace(self.settings, time=time_scheme(data.dt, data.continuous))
         acting, slope = _acting(system, data)
         still = Equilibria(self.settings, 1, RECOVERY)
-        # controls have room for a motion: one program for all equilibria
-        held = np.broadcast_to(data.initial_tension, acting.shape)
+        held = data.initial_tension[None]
         first = run_one(still, system, held, unloaded_shape(system, settings.space), held[0])
         if first.cause:
             return None
@@ -189,45 +186,27 @@ class Misfit:
         y = np.concatenate([first.rows.records[:1, :, :ny], found.records[compared, :, :ny]])
         if not derivatives:
             return Rollout(np.asarray(_compared(system, y, *self._target(data, seen))), None)
-        beginning = first.rows.records, first.rows.unknowns, held, np.zeros_like(held)
-        d_first, d_records = self._static_slopes(still, x, beginning, 1)
-        moved = *found.every_stage, acting, slope
+        directions, by_latency = _directions(self.model.robot, x)
+        moves, none = SystemMoves(directions, np.eye(len(x))), np.zeros((*held.shape, len(x)))
+        solved = first.rows.records, first.rows.unknowns
+        d_first, _, d_records = static_tangents(self.settings, solved, (system, held), (moves, none))
+        acting, changes = acting[:steps], (moves, slope[:steps, :, None] * np.asarray(by_latency))
+        solved = tuple(each[: steps * settings.stages] for each in found.every_stage)
         if not steps:
             d_rows = d_first[:0]
-        elif isinstance(task, Equilibria):
-            d_rows = self._static_slopes(task, x, moved, steps)[0]
+        elif data.static:
+            d_rows, _, _ = static_tangents(self.settings, solved, (system, acting), changes)
         else:
-            both = np.stack([d_records[0]] * 2)
-            carry = TangentState.of(system, settings.space, state, both, np.zeros_like(both[0]))
-            d_rows = self._slopes(task, x, moved, steps, carry)[compared]
+            both = np.stack([d_records] * 2)
+            begun = TangentState.of(system, settings.space, state, both, np.zeros_like(both[0]))
+            coefficients = StepCoefficients.of(settings, data.dt / data.steps)
+            _, (d_solves, _) = tangent_time_loop(
+                settings, coefficients, solved, (system, acting), changes, begun
+            )
+            d_rows = d_solves[settings.stages - 1 :: settings.stages][compared]
         d_y = np.concatenate([d_first, d_rows])[:, :, :ny]
         values, slopes = _with_slopes(system, y, d_y, *self._target(data, seen))
         return Rollout(np.asarray(values), np.asarray(slopes))
-
-    def _slopes(self, task: TimeIntegration, x: Any, rows: Any, count: int, carry: Any) -> np.ndarray:
-        """Derivatives of a motion's rows; `carry` is the state before the first one."""
-        parts, steps, stages = [], task.coefficients, task.settings.stages
-        for k in range(0, count, PIECE):
-            size = min(PIECE, count - k)
-            piece = tuple(
-                _filled(each[k * m : (k + size) * m], PIECE * m)
-                for each, m in zip(rows, (stages, stages, 1, 1), strict=True)
-            )
-            carry, d_rows = _piece(self.model.robot, x, task.settings, steps, piece, carry)
-            parts.append(np.asarray(d_rows)[stages - 1 : size * stages : stages])
-            steps = steps._replace(table=steps.table[[1, 1]])
-        return np.concatenate(parts)
-
-    def _static_slopes(self, task: Equilibria, x: Any, rows: Any, count: int) -> tuple[np.ndarray, Any]:
-        """Derivatives of equilibria, and of their records at all places."""
-        parts, length = [], PIECE if count > 1 else 1
-        for k in range(0, count, length):
-            size = min(length, count - k)
-            piece = tuple(_filled(each[k : k + size], length) for each in rows)
-            found = _static_piece(self.model.robot, x, task.settings, piece)
-            parts.append([np.asarray(each)[:size] for each in found])
-        d_rows, d_records = (np.concatenate(each) for each in zip(*parts, strict=True))
-        return d_rows, d_records
 
     def _target(self, data: RecordingData, steps: int) -> tuple[Any, ...]:
         return data.places, data.position[: steps + 1], data.rotation[: steps + 1]
@@ -257,11 +236,6 @@ def _acting(system: Any, data: RecordingData) -> tuple[np.ndarray, np.ndarray]:
     return acting, (late - early) / dt
 
 
-def _filled(rows: Any, count: int) -> np.ndarray:
-    """Exactly so many rows: the last one again and again."""
-    return np.asarray(rows)[np.minimum(np.arange(count), len(rows) - 1)]
-
-
 @jax.jit
 def _system(robot: ParametrisedRobot, x: Any) -> Any:
     return robot(x)
@@ -270,37 +244,16 @@ def _system(robot: ParametrisedRobot, x: Any) -> Any:
 _initial = jax.jit(constant_history, static_argnames="settings")
 
 
-def _directions(robot: ParametrisedRobot, x: Any, by_latency: Any) -> Any:
-    """Return a system, its tangents by each coordinate, stacked, and those of its controls (T, c, n)."""
+@jax.jit
+def _directions(robot: ParametrisedRobot, x: Any) -> tuple[Any, Any]:
+    """Return a system's tangents by each coordinate, stacked, and those of the load cells' latency (n,)."""
 
     def along(direction: Any) -> Any:
-        system, d_system = jax.jvp(robot, (x,), (direction,))
+        d_system = jax.jvp(robot, (x,), (direction,))[1]
         cells = _cells(d_system)
-        return system, d_system, jnp.zeros_like(by_latency) if cells is None else by_latency * cells.latency
+        return d_system, jnp.zeros(()) if cells is None else cells.latency
 
-    return jax.vmap(along, out_axes=(None, 0, -1))(jnp.eye(len(x)))
-
-
-@functools.partial(jax.jit, static_argnames="settings")
-def _piece(
-    robot: ParametrisedRobot, x: Any, settings: Settings, steps: Any, rows: Any, carry: TangentState
-) -> Any:
-    """Return the state after a piece, and derivatives of its rows; `rows` end with controls by latency."""
-    records, xi, controls, by_latency = rows
-    system, directions, d_controls = _directions(robot, x, by_latency)
-    changes = SystemMoves(directions, jnp.eye(len(x))), d_controls
-    after, (d_rows, _) = tangent_time_loop(settings, steps, (records, xi), (system, controls), changes, carry)
-    return after._replace(t0=after.t0 + PIECE * steps.dt), d_rows
-
-
-@functools.partial(jax.jit, static_argnames="settings")
-def _static_piece(robot: ParametrisedRobot, x: Any, settings: Settings, rows: Any) -> Any:
-    """Return derivatives of a piece's equilibria, and of their records."""
-    records, xi, controls, by_latency = rows
-    system, directions, d_controls = _directions(robot, x, by_latency)
-    changes = SystemMoves(directions, jnp.eye(len(x))), d_controls
-    found = static_tangents(settings, (records, xi), (system, controls), changes)
-    return found[0], found[2]
+    return jax.vmap(along)(jnp.eye(len(x)))
 
 
 @jax.jit

@@ -7,6 +7,7 @@ The iteration is not differentiated, and reverse mode is the transpose of the sa
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple, Self
@@ -21,13 +22,16 @@ from knode_cosserat.engine import loops as engine
 from knode_cosserat.engine.program import EngineError
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.history import StateHistory, history_of, used_places
-from knode_cosserat.solvers.problem import StepProblem, row_of
+from knode_cosserat.solvers.problem import StepProblem, no_history, row_of
 from knode_cosserat.solvers.run import Equilibria, TimeIntegration
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.static_loop import static_one
 from knode_cosserat.solvers.tangent import Moves, StepTangent, SystemMoves
 from knode_cosserat.solvers.time_loop import StepCoefficients, StepRows, loop_one
+
+#: number of steps of one program
+PIECE = 40
 
 
 class TangentState(NamedTuple):
@@ -108,7 +112,7 @@ def static_rollout(task: Equilibria) -> Callable[[System, Any, Any], StepRows]:
         rows = run(*primals)
         solved, moves = (rows.records, rows.unknowns), SystemMoves.of(_system_tangent(tangents[0]))
         changes = moves, _instantiated(tangents[1])
-        d_rows, d_unknowns, _ = static_tangents(task.settings, solved, primals[:2], changes)
+        d_rows, d_unknowns, _ = static_tangents_in_jax(task.settings, solved, primals[:2], changes)
         return rows, _row_tangents(rows, d_rows, d_unknowns)
 
     run.defjvp(tangent, symbolic_zeros=True)
@@ -163,17 +167,39 @@ def tangent_time_loop(
     given = state.records, state.rate, state.d_records, state.d_rate
     try:
         after, found = engine.tangent_loop(settings, steps, solved, at, changes, given, float(state.t0))
+        return TangentState._make((*after, state.t0)), found
     except EngineError:
-        return tangent_loop_in_jax(settings, steps, solved, at, changes, state)
-    return TangentState(*after, state.t0), found
+        pass
+    (system, controls), (moves, d_controls) = at, changes
+    parts, stages, begun = [], settings.stages, state.t0
+    for k in range(0, len(controls), PIECE):
+        size = min(PIECE, len(controls) - k)
+
+        def piece(rows: Any, m: int = 1, k: int = k, size: int = size) -> np.ndarray:
+            """Return the rows of these steps; the last one again and again, for one program."""
+            own = np.asarray(rows)[k * m : (k + size) * m]
+            return own[np.minimum(np.arange(PIECE * m), len(own) - 1)]
+
+        own = piece(solved[0], stages), piece(solved[1], stages)
+        state, found = tangent_loop_in_jax(
+            settings, steps, own, (system, piece(controls)), (moves, piece(d_controls)), state, size
+        )
+        state = state._replace(t0=state.t0 + size * steps.dt)
+        parts.append([np.asarray(each)[: size * stages] for each in found])
+        steps = steps._replace(table=steps.table[[1, 1]])
+    d_rows, d_unknowns = (np.concatenate(each) for each in zip(*parts, strict=True))
+    return state._replace(t0=begun), (d_rows, d_unknowns)
 
 
 @functools.partial(jax.jit, static_argnames="settings")
 def tangent_loop_in_jax(
     settings: Settings, steps: StepCoefficients, solved: tuple[Any, Any], at: tuple[System, Any],
-    changes: tuple[SystemMoves, Any], state: TangentState,
+    changes: tuple[SystemMoves, Any], state: TangentState, last: Any = None,
 ) -> tuple[TangentState, tuple[Any, Any]]:  # fmt: skip
-    """Return the same as `tangent_time_loop`, traced by JAX, also for one tangent without the last axis."""
+    """Return the same as `tangent_time_loop`, traced by JAX, also for one tangent without the last axis.
+
+    The state is that after `last` steps, or after all.
+    """
     (system, controls), (moves, d_controls) = at, changes
     stages, count = settings.stages, len(controls)
     coefficients, t = jax.vmap(functools.partial(steps.at, state.t0))(jnp.arange(count))
@@ -185,7 +211,7 @@ def tangent_loop_in_jax(
     )
 
     def one(state: TangentState, now: Any) -> Any:
-        coefficients, t, row, unknowns, control, d_control = now
+        coefficients, t, row, unknowns, control, d_control, i = now
         c0 = coefficients[0]
         history = history_of(state.records, state.rate, coefficients, settings)
         d_history = history_of(state.d_records, state.d_rate, coefficients, settings)
@@ -199,9 +225,12 @@ def tangent_loop_in_jax(
             jnp.stack([records, state.records[0]]), rate, jnp.stack([d_records, state.d_records[0]]), d_rate,
             state.t0,
         )  # fmt: skip
+        if last is not None:
+            after = jax.tree.map(lambda a, b: jnp.where(i < last * stages, a, b), after, state)
         return after, (d_row, d_unknowns)
 
-    solves = coefficients.reshape(-1, 4), t.reshape(-1), *solved, controls, d_controls
+    numbers = jnp.arange(count * stages)
+    solves = coefficients.reshape(-1, 4), t.reshape(-1), *solved, controls, d_controls, numbers
     return jax.lax.scan(one, state, solves)
 
 
@@ -217,14 +246,28 @@ def _step_tangent(problem: StepProblem, row: Any, unknowns: Any, moves: SystemMo
     return problem.packed(step.found), d_records, row_of(problem.system, d_y, d_records), d_unknowns
 
 
-@functools.partial(jax.jit, static_argnames="settings")
 def static_tangents(
     settings: Settings, solved: tuple[Any, Any], at: tuple[System, Any], changes: tuple[SystemMoves, Any]
 ) -> tuple[Any, Any, Any]:
-    """Return the tangents of rows, unknowns and records of solved equilibria, at the places of the scheme.
+    """Return the tangents of rows and unknowns of solved equilibria, and of the records of the last.
 
-    `solved` are all rows and unknowns; `at` are system and controls, and `changes` their tangents.
+    `solved` are all rows and unknowns; `at` are system and controls, and `changes` their tangents. Tangents
+    are columns. Records are those at the places of the scheme.
     """
+    system, (_, d_controls) = at[0], changes
+    none = np.zeros((used_places(system, settings.space), no_history(system, settings.space).shape[1]))
+    d_none = np.zeros((*none.shape, d_controls.shape[-1]))
+    state = TangentState(np.stack([none] * 2), none, np.stack([d_none] * 2), d_none, 0.0)
+    still = dataclasses.replace(settings, time=None)
+    after, found = tangent_time_loop(still, engine.STILL, solved, at, changes, state)
+    return *found, after.d_records[0]
+
+
+@functools.partial(jax.jit, static_argnames="settings")
+def static_tangents_in_jax(
+    settings: Settings, solved: tuple[Any, Any], at: tuple[System, Any], changes: tuple[SystemMoves, Any]
+) -> tuple[Any, Any, Any]:
+    """Return the tangents of rows, unknowns and records of solved equilibria, traced by JAX."""
     (system, controls), (moves, d_controls) = at, changes
 
     def one(now: Any) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -23,8 +24,13 @@ class Report(NamedTuple):
 
 
 def as_json(cells: Sequence[Mapping[str, Any]]) -> str:
-    """Return a JSON list with one cell per line."""
-    return "[\n" + ",\n".join(json.dumps(cell, allow_nan=False) for cell in cells) + "\n]\n"
+    """Return a JSON list with one cell per line; numbers that are not finite are null."""
+
+    def known(cell: Mapping[str, Any]) -> dict[str, Any]:
+        unknown = {name for name, each in cell.items() if isinstance(each, float) and not math.isfinite(each)}
+        return {name: None if name in unknown else each for name, each in cell.items()}
+
+    return "[\n" + ",\n".join(json.dumps(known(cell), allow_nan=False) for cell in cells) + "\n]\n"
 
 
 def check_row(name: str, value: float, limit: float, least: bool = False) -> dict[str, Any]:

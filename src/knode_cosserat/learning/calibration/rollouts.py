@@ -105,19 +105,43 @@ class _Rows(NamedTuple):
     target: Float[Any, "T M k"]
 
 
-@functools.partial(jax.jit, static_argnames=("unknowns", "settings", "oriented", "one_state", "relative"))
-def _differences(robot, coordinates, rows, steps, unknowns, settings, oriented, one_state, relative):  # type: ignore[no-untyped-def]
-    """Return differences (M,) of solved rows from measurements, and their derivatives (M, n)."""
-    ny = robot.y_layout.size
+@functools.partial(jax.jit, static_argnames=("unknowns", "settings", "one_state"))
+def _started(robot, coordinates, before, past, unknowns, settings, one_state):  # type: ignore[no-untyped-def]
+    """Return a system's tangents by each coordinate, stacked, and the initial history with its tangents."""
 
     def start(x: Any) -> Any:
         system = with_coordinates(robot, unknowns, x)
-        if rows.before is None:
+        if before is None:
             return system, resting_history(system, settings)
         if system.mixed and one_state:
-            record, control = rows.before
-            return system, constant_history(system, settings, record, control, rows.past.t0)
-        return system, rows.past
+            record, control = before
+            return system, constant_history(system, settings, record, control, past.t0)
+        return system, past
+
+    def along(direction: Any) -> Any:
+        (_, past), (d_system, d_past) = jax.jvp(start, (coordinates,), (direction,))
+        return d_system, past, (d_past.records, d_past.rate)
+
+    return jax.vmap(along, out_axes=(0, None, -1))(jnp.eye(coordinates.shape[0]))
+
+
+@functools.partial(jax.jit, static_argnames="settings")
+def _settled(system, directions, first, d_first, held, settings):  # type: ignore[no-untyped-def]
+    """Return the history of an equilibrium, and its tangents by the directions of system and row."""
+
+    def along(d_system: Any, d_first: Any) -> Any:
+        past, d_past = jax.jvp(
+            lambda system, row: constant_history(system, settings, row, held),
+            (system, first), (d_system, d_first),
+        )  # fmt: skip
+        return past, (d_past.records, d_past.rate)
+
+    return jax.vmap(along, in_axes=(0, -1), out_axes=(None, -1))(directions, d_first)
+
+
+@functools.partial(jax.jit, static_argnames=("oriented", "relative"))
+def _compared(robot, rows, y, d_y, oriented, relative):  # type: ignore[no-untyped-def]
+    """Return differences (M,) of y in all rows from measurements, and their derivatives (M, n)."""
 
     def left(y: Any) -> Any:
         seen = _seen(robot, oriented, y, rows.places)
@@ -131,41 +155,37 @@ def _differences(robot, coordinates, rows, steps, unknowns, settings, oriented, 
             target = jnp.concatenate([target[..., :-4], jnp.where(same, turn, -turn)], axis=-1)
         return jnp.where(jnp.isnan(rows.target), 0.0, seen - target).ravel()
 
-    def settled(system: Any, d_system: Any) -> Any:
-        """Return the initial history and its tangent, and that of row 0, a solved equilibrium."""
-        solved = rows.first[None], unknowns_of(system, rows.first[0])[None]
-        held = rows.held[None]
-        d_first, _, _ = static_tangents(
-            settings, solved, (system, held), (SystemMoves.of(d_system), jnp.zeros_like(held))
-        )
-        d_first = d_first[0, :, : rows.first.shape[1]]
-        past, d_past = jax.jvp(
-            lambda system, row: constant_history(system, settings, row, rows.held),
-            (system, rows.first), (d_system, d_first),
-        )  # fmt: skip
-        return past, d_past, d_first
+    return left(y), jax.vmap(lambda d_y: jax.jvp(left, (y,), (d_y,))[1], in_axes=-1, out_axes=1)(d_y)
 
-    def at_start(direction: Any) -> Any:
-        """Return the system and its tangent, the initial history, and tangents of its states and row 0."""
-        (system, past), (d_system, d_past) = jax.jvp(start, (coordinates,), (direction,))
-        d_first = jnp.zeros_like(rows.first)
-        if rows.held is not None:
-            past, d_past, d_first = settled(system, d_system)
-        return system, d_system, past, (d_past.records, d_past.rate, d_first)
 
-    n = coordinates.shape[0]
-    columns = jax.vmap(at_start, out_axes=(None, 0, None, -1))
-    system, d_systems, past, (*d_past, d_first) = columns(jnp.eye(n))
-    changes = SystemMoves(d_systems, jnp.eye(n)), jnp.zeros((*rows.control.shape, n))
+def _differences(
+    robot: System, system: System, coordinates: Any, rows: _Rows, task: TimeIntegration, unknowns: Unknowns,
+    oriented: bool, relative: bool,
+) -> LinearisedMisfit:  # fmt: skip
+    """Return differences (M,) of solved rows from measurements, and their derivatives (M, n)."""
+    settings, ny, n = task.settings, robot.y_layout.size, len(coordinates)
+    directions, past, d_past = _started(
+        robot, coordinates, rows.before, rows.past, unknowns, settings, task.first == "start"
+    )
+    moves, first = SystemMoves(directions, np.eye(n)), np.asarray(rows.first)
+    d_first = np.zeros((*first.shape, n))
+    if rows.held is not None:
+        solved, held = (first[None], np.asarray(unknowns_of(system, first[0]))[None]), rows.held[None]
+        changes = moves, np.zeros((*held.shape, n))
+        d_first = np.asarray(static_tangents(settings, solved, (system, held), changes)[0])[0]
+        d_first = d_first[:, : first.shape[1]]
+        past, d_past = _settled(system, directions, first, d_first, rows.held, settings)
     state = TangentState.of(system, settings.space, past, *d_past)
+    changes = moves, np.zeros((*rows.control.shape, n))
     _, (d_records, _) = tangent_time_loop(
-        settings, steps, (rows.records, rows.unknowns), (system, rows.control), changes, state
+        settings, task.coefficients, (rows.records, rows.unknowns), (system, rows.control), changes, state
     )
     last = slice(settings.stages - 1, None, settings.stages)
-    y = jnp.concatenate([rows.first[None, :, :ny], rows.records[last, :, :ny]])
-    d_y = jnp.concatenate([d_first[None, :, :ny], d_records[last, :, :ny]])
-    by_column = jax.vmap(lambda d_y: jax.jvp(left, (y,), (d_y,))[1], in_axes=-1, out_axes=1)
-    return left(y), by_column(d_y)
+    y, d_y = (
+        np.concatenate([one[None, :, :ny], np.asarray(all_rows)[last, :, :ny]])
+        for one, all_rows in ((first, rows.records), (d_first, d_records))
+    )
+    return LinearisedMisfit(*map(np.asarray, _compared(robot, rows, y, d_y, oriented, relative)))
 
 
 class RolloutMisfit:
@@ -296,11 +316,9 @@ class RolloutMisfit:
         before = None if initial is None else (at_start.record, at_start.control)
         past = at_start.state.history
         rows = _Rows(*found.every_stage, past, before, at_start.record, held, acting, places, target)
-        values, slopes = _differences(
-            self.robot, coordinates, rows, task.coefficients, self.unknowns, settings, self.oriented,
-            first == "start", relative,
-        )  # fmt: skip
-        return LinearisedMisfit(np.asarray(values), np.asarray(slopes))
+        return _differences(
+            self.robot, system, coordinates, rows, task, self.unknowns, self.oriented, relative
+        )
 
     def blocks(self, values: Float[np.ndarray, " M"]) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return for each trajectory the field (n,) of a row's differences, and the differences (R, n)."""

@@ -62,10 +62,13 @@ def as_markdown(results: Sequence[CableResult]) -> str:
         ]
         parts += [f"## {result.data.name}", markdown_table(["motion", *METHODS], each)]
         estimates = [cell["position_error"] for cell in result.cells if "position_error" in cell]
-        if estimates:
+        known = [each for each in estimates if np.isfinite(each)]
+        if known:
+            lost = len(estimates) - len(known)
             parts.append(
                 "Discretisation error of positions by the solver's estimate, mean over a motion's frames: "
-                f"{1e3 * np.median(estimates):.1f} mm in the median, at most {1e3 * max(estimates):.1f} mm."
+                f"{1e3 * np.median(known):.1f} mm in the median, at most {1e3 * max(known):.1f} mm"
+                + (f"; no estimate for {lost} of {len(estimates)} predictions." if lost else ".")
             )
         failed = [cell for cell in result.cells if "failed" in cell]
         if failed:
