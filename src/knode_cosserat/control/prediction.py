@@ -7,10 +7,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.estimation.online import Belief, OnlineModel, errors_along, split_record
 from knode_cosserat.estimation.outputs import Output
+from knode_cosserat.rods.system import System
 
 
 class Prediction(NamedTuple):
@@ -33,29 +35,38 @@ class Prediction(NamedTuple):
         return self._replace(by_plan=self.by_plan[:count], limited_by_plan=self.limited_by_plan[:count])
 
 
-@functools.partial(jax.jit, static_argnames=("target", "limited"))
 def linearised_prediction(
     model: OnlineModel, belief: Belief, plan: Float[Any, "knots c"], basis: Float[Any, "T knots"],
     reference: Float[Any, "T p"], target: Output, limited: tuple[Output, ...],
 ) -> Prediction:  # fmt: skip
     """Return the prediction of a plan, whose controls are `basis` times `plan`, from an estimated state."""
     (count, c), (steps, m) = plan.shape, (len(basis), len(belief.spread.records))
-    of_plan = jnp.einsum("tk,ij->kjti", basis, jnp.eye(c)).reshape(count * c, steps, c)
+    of_plan = np.einsum("tk,ij->kjti", basis, np.eye(c)).reshape(count * c, steps, c)
 
     def extended(part: Any) -> Any:
-        return jnp.concatenate([jnp.zeros((count * c, *part.shape[1:])), part])
+        return np.concatenate([np.zeros((count * c, *part.shape[1:])), part])
 
     wide = jax.tree.map(extended, belief.spread)
-    d_controls = jnp.concatenate([of_plan, jnp.zeros((m, steps, c))])
+    d_controls = np.concatenate([of_plan, np.zeros((m, steps, c))])
     system, found = model.rollout(belief._replace(spread=wide), basis @ plan, d_controls)
-    error, slopes = errors_along(system, target, found.records, found.d_records, reference)
-    path = system.positions(split_record(system, found.records[:, -1])[0])
-    values, moved = [jnp.zeros((steps, 0))], [jnp.zeros((count * c + m, steps, 0))]
-    for output in limited:
-        zero = jnp.zeros((steps, output.size))
-        value, slope = errors_along(system, output, found.records, found.d_records, zero)
-        values.append(value)
-        moved.append(slope)
-    value, slope = jnp.concatenate(values, axis=-1), jnp.concatenate(moved, axis=-1)
+    outputs = _outputs(system, found.records, found.d_records, reference, target, limited)
+    error, slopes, value, slope, path = map(np.asarray, outputs)
     n = count * c
     return Prediction(error, slopes[:n], slopes[n:], value, slope[:n], slope[n:], path, found.solved)
+
+
+@functools.partial(jax.jit, static_argnames=("target", "limited"))
+def _outputs(
+    system: System, records: Any, d_records: Any, reference: Any, target: Output, limited: tuple[Output, ...]
+) -> Any:
+    """Return errors of the target and the limited outputs, with their tangents, and the tip's path."""
+    steps, columns = len(records), d_records.shape[-1]
+    error, slopes = errors_along(system, target, records, d_records, reference)
+    values, moved = [jnp.zeros((steps, 0))], [jnp.zeros((columns, steps, 0))]
+    for output in limited:
+        zero = jnp.zeros((steps, output.size))
+        value, slope = errors_along(system, output, records, d_records, zero)
+        values.append(value)
+        moved.append(slope)
+    path = system.positions(split_record(system, records[:, -1])[0])
+    return error, slopes, jnp.concatenate(values, axis=-1), jnp.concatenate(moved, axis=-1), path

@@ -88,8 +88,8 @@ class PredictiveController(PlanController):
             observer.model, observer.belief, self.with_acting(self._plan), self._basis, wanted, self.target,
             limited,
         )  # fmt: skip
-        if bool(found.solved):
-            self._prediction = Prediction(*(np.asarray(part) for part in found)).of_plan(self._plan.size)
+        if found.solved:
+            self._prediction = found.of_plan(self._plan.size)
         else:
             self._prediction, self._reason = None, "the prediction was not solved"
             # a constant plan is the easiest to predict

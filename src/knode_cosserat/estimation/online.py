@@ -19,10 +19,10 @@ from knode_cosserat.estimation.adapted import AdaptedParameters
 from knode_cosserat.estimation.outputs import Output
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.history import StateHistory
+from knode_cosserat.solvers.run import TimeIntegration
 from knode_cosserat.solvers.sensitivity import TangentState, tangent_time_loop
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.tangent import SystemMoves
-from knode_cosserat.solvers.time_loop import StepCoefficients, time_loop
 
 
 class Spread(NamedTuple):
@@ -69,25 +69,24 @@ class OnlineModel(eqx.Module):
 
     robot: System
     parameters: AdaptedParameters
-    coefficients: StepCoefficients
+    dt: float = eqx.field(static=True)
     settings: Settings = eqx.field(static=True)
 
     def __init__(self, robot: System, parameters: AdaptedParameters, dt: float):
         """Set the default schemes: a plant holds its controls, as these do."""
-        self.robot, self.parameters = robot, parameters
-        self.settings = Settings()
-        self.coefficients = StepCoefficients.of(self.settings, dt, "regular")
+        self.robot, self.parameters, self.dt, self.settings = robot, parameters, dt, Settings()
+
+    def task(self, steps: int) -> TimeIntegration:
+        """Return so many steps from a state with a history."""
+        return TimeIntegration(self.settings, self.dt, steps, "regular")
 
     def at(self, x: Any) -> System:
         """Return the robot at coordinates of its parameters."""
         return self.parameters.of(self.robot, x)
 
-    def directions(self, x: Any) -> Any:
-        """Return the robot's tangents by each parameter, stacked; None if there are none."""
-        if not self.parameters.size:
-            return None
-        by_x = jax.vmap(lambda d: jax.jvp(self.at, (x,), (d,))[1])
-        return by_x(jnp.eye(self.parameters.size))
+    def moved(self, x: Any) -> tuple[System, Any]:
+        """Return the robot, and its tangents by each parameter, stacked; None if there are none."""
+        return _moved(self, x) if self.parameters.size else (self.robot, None)
 
     def rollout(
         self, belief: Belief, controls: Float[Any, "T c"], d_controls: Float[Any, "k T c"]
@@ -96,24 +95,29 @@ class OnlineModel(eqx.Module):
 
         A column is a direction of the belief's spread, with the tangents of the controls beside it.
         """
-        system, directions = self.at(belief.x), self.directions(belief.x)
+        system, directions = self.moved(belief.x)
         settings, steps, past, spread = self.settings, len(controls), belief.past, belief.spread
-        done, after, rows = time_loop(system, settings, self.coefficients, controls, past, (0, steps))
-        state = TangentState.of(system, settings.space, past, *map(_last, (spread.records, spread.rate)))
-        changes = SystemMoves(directions, _last(spread.parameters)), _last(d_controls)
-        last, (d_solves, _) = tangent_time_loop(
-            settings, self.coefficients, rows.every_stage, (system, controls), changes, state
-        )
-        d_rows = d_solves[settings.stages - 1 :: settings.stages]
-        d_records, d_rate = (jnp.moveaxis(part, -1, 0) for part in (last.d_records, last.d_rate))
+        task = self.task(steps)
+        done, after, rows = task.solve(system, controls, past, (0, steps))
+        columns = [np.moveaxis(np.asarray(part), 0, -1) for part in (*spread, d_controls)]
+        last = TangentState.of(system, settings.space, past, *columns[:2])
+        d_rows = np.zeros((*rows.records.shape, columns[0].shape[-1]))
+        if done == steps:
+            changes = SystemMoves(directions, columns[2]), columns[3]
+            last, (d_solves, _) = tangent_time_loop(
+                settings, task.coefficients, rows.every_stage, (system, controls), changes, last
+            )
+            d_rows = d_solves[settings.stages - 1 :: settings.stages]
+        d_records, d_rate = (np.moveaxis(part, -1, 0) for part in (last.d_records, last.d_rate))
         moved = Spread(d_records, d_rate, spread.parameters)
-        after = after._replace(t0=past.t0 + steps * self.coefficients.dt)
-        return system, Rollout(after, rows.records, d_rows, moved, done == steps)
+        after = after._replace(t0=past.t0 + steps * self.dt)
+        return system, Rollout(after, rows.records, d_rows, moved, bool(done == steps))
 
 
-def _last(columns: Float[Any, "k ..."]) -> Float[Any, "... k"]:
-    """Return an array with its columns in the last axis."""
-    return jnp.moveaxis(jnp.asarray(columns), 0, -1)
+@jax.jit
+def _moved(model: OnlineModel, x: Any) -> tuple[System, Any]:
+    by_x = jax.vmap(lambda d: jax.jvp(model.at, (x,), (d,))[1])
+    return model.at(x), by_x(jnp.eye(model.parameters.size))
 
 
 class Rollout(NamedTuple):
@@ -133,6 +137,7 @@ def split_record(system: System, record: Any) -> tuple[Any, Any]:
     return record[..., :ny], record[..., ny : ny + nz]
 
 
+@functools.partial(jax.jit, static_argnames="output")
 def errors_along(
     system: System, output: Output, records: Float[Any, "T N x"], d_records: Float[Any, "T N x k"],
     references: Float[Any, "T p"],
@@ -149,6 +154,7 @@ def errors_along(
     return jax.vmap(one, out_axes=(0, 1))(records, references, d_records)
 
 
+@functools.partial(jax.jit, static_argnames="output")
 def errors_of(
     system: System, output: Output, records: Float[Any, "T N x"], measured: Float[Any, "T p"]
 ) -> Float[Any, "T e"]:
@@ -173,7 +179,6 @@ class Predicted(NamedTuple):
     solved: Any
 
 
-@functools.partial(jax.jit, static_argnames="output")
 def predicted_motion(
     model: OnlineModel, belief: Belief, controls: Any, measured: Any, deviations: tuple[Any, Any],
     output: Output,
@@ -190,30 +195,35 @@ def predicted_motion(
     count = steps * c
 
     def more(part: Any) -> Any:
-        return jnp.concatenate([part, jnp.zeros((count + n, *part.shape[1:]))])
+        return np.concatenate([part, np.zeros((count + n, *part.shape[1:]))])
 
-    drifts = jnp.concatenate([spread.parameters, jnp.zeros((count, n)), jnp.diag(of_drift)])
+    drifts = np.concatenate([spread.parameters, np.zeros((count, n)), np.diag(of_drift)])
     wide = Spread(more(spread.records), more(spread.rate), drifts)
-    noise = jnp.diag(jnp.tile(of_control, steps)).reshape(count, steps, c)
-    d_controls = jnp.concatenate([jnp.zeros((m, steps, c)), noise, jnp.zeros((n, steps, c))])
+    noise = np.diag(np.tile(of_control, steps)).reshape(count, steps, c)
+    d_controls = np.concatenate([np.zeros((m, steps, c)), noise, np.zeros((n, steps, c))])
     system, found = model.rollout(belief._replace(spread=wide), controls, d_controls)
-    values = jax.vmap(lambda record: output.value(system, *split_record(system, record)))(found.records)
-    errors = errors_of(system, output, found.records, measured)
-    # where nothing was measured the derivatives are those at the prediction
-    known = jnp.where(jnp.isnan(measured), values, measured)
-    _, slopes = errors_along(system, output, found.records, found.d_records, known)
+    values, errors, slopes = _measured(system, output, found.records, found.d_records, measured)
     return Predicted(found.past, found.records[-1], found.spread, values, errors, slopes, found.solved)
 
 
 @functools.partial(jax.jit, static_argnames="output")
+def _measured(system: System, output: Output, records: Any, d_records: Any, measured: Any) -> Any:
+    """Return values of the output in every row, their errors, and the errors' tangents."""
+    values = jax.vmap(lambda record: output.value(system, *split_record(system, record)))(records)
+    errors = errors_of(system, output, records, measured)
+    # where nothing was measured the derivatives are those at the prediction
+    known = jnp.where(jnp.isnan(measured), values, measured)
+    return values, errors, errors_along(system, output, records, d_records, known)[1]
+
+
 def motion_errors(
     model: OnlineModel, x: Float[Any, " n"], past: StateHistory, controls: Any, measured: Any, output: Output
 ) -> Float[Any, "T e"]:
     """Return the errors of the motion with these parameters; infinite after a failure."""
-    system, steps = model.at(x), len(controls)
-    done, _, rows = time_loop(system, model.settings, model.coefficients, controls, past, (0, steps))
-    errors = errors_of(system, output, rows.records, measured)
-    return jnp.where((jnp.arange(steps) < done)[:, None], errors, jnp.inf)
+    system, steps = model.moved(x)[0], len(controls)
+    done, _, rows = model.task(steps).solve(system, controls, past, (0, steps))
+    errors = np.asarray(errors_of(system, output, rows.records, measured))
+    return np.where((np.arange(steps) < done)[:, None], errors, np.inf)
 
 
 @functools.partial(jax.jit, static_argnames="output")

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from knode_cosserat.rods.strands import in_strands
-from knode_cosserat.rods.system import System, unknown_count, unknowns_of
+from knode_cosserat.rods.system import System, is_traced, unknown_count, unknowns_of
 from knode_cosserat.solvers.boundary import (
     Kept,
     NewtonOptions,
@@ -74,7 +74,8 @@ class StepRows(NamedTuple):
     def every_stage(self) -> tuple[Float[Any, "solves nodes x"], Float[Any, "solves k"]]:
         """Records and unknowns of all stages of all steps in turn, those of the rows among them."""
         pairs = (self.stages, self.records), (self.stage_unknowns, self.unknowns)
-        joined = [jnp.concatenate([stages, last[:, None]], axis=1) for stages, last in pairs]
+        numeric: Any = jnp if is_traced(self) else np
+        joined = [numeric.concatenate([stages, last[:, None]], axis=1) for stages, last in pairs]
         records, unknowns = (part.reshape(-1, *part.shape[2:]) for part in joined)
         return records, unknowns
 

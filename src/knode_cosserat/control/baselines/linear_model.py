@@ -6,11 +6,8 @@ are exact derivatives of a simulation.
 
 from __future__ import annotations
 
-import functools
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -36,13 +33,13 @@ class LinearModel(NamedTuple):
     output: Float[np.ndarray, " p"]
 
 
-@functools.partial(jax.jit, static_argnames=("output", "steps"))
 def _impulses(model: OnlineModel, belief: Belief, control: Any, output: Output, steps: int) -> Any:
     """Return the output at rest (p,), and its responses (c, steps, p) to each control's first period."""
     count = len(control)
-    pulses = jnp.zeros((count, steps, count)).at[:, 0].set(jnp.eye(count))
-    system, found = model.rollout(belief, jnp.tile(control, (steps, 1)), pulses)
-    zero = jnp.zeros((steps, output.size))
+    pulses = np.zeros((count, steps, count))
+    pulses[:, 0] = np.eye(count)
+    system, found = model.rollout(belief, np.tile(control, (steps, 1)), pulses)
+    zero = np.zeros((steps, output.size))
     values, slopes = errors_along(system, output, found.records, found.d_records, zero)
     return values[-1], slopes, found.solved
 

@@ -6,7 +6,6 @@ import functools
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -15,26 +14,26 @@ from knode_cosserat.control.planning import PlanController
 from knode_cosserat.control.program import Weights
 from knode_cosserat.control.references import Reference
 from knode_cosserat.estimation.observer import KalmanObserver
-from knode_cosserat.estimation.online import OnlineModel, split_record
+from knode_cosserat.estimation.online import OnlineModel, errors_of
 from knode_cosserat.estimation.outputs import Output
-from knode_cosserat.solvers.time_loop import loop_many
+from knode_cosserat.rods.system import System
 
 
-@functools.partial(jax.jit, static_argnames="target")
 def sampled_errors(
     model: OnlineModel, x: Any, past: Any, plans: Float[Any, "k knots c"], basis: Float[Any, "T knots"],
     reference: Float[Any, "T p"], target: Output,
 ) -> Any:  # fmt: skip
     """Return the errors (k, T, e) of each plan's motion, and which motions were solved."""
-    system, steps = model.at(x), len(basis)
-    controls = jnp.einsum("tn,knc->ktc", basis, plans)
-    pasts = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(plans), *jnp.shape(leaf))), past)
-    done, _, rows = loop_many(system, model.settings, model.coefficients, controls, pasts, steps)
+    system, steps = model.moved(x)[0], len(basis)
+    controls = np.einsum("tn,knc->ktc", basis, plans)
+    pasts = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (len(plans), *np.shape(leaf))), past)
+    done, _, rows = model.task(steps).solve_many(system, controls, pasts)
+    return _errors(system, target, rows.records, reference), done == steps
 
-    def error(record: Any, wanted: Any) -> Any:
-        return target.error(system, *split_record(system, record), wanted)
 
-    return jax.vmap(jax.vmap(error), in_axes=(0, None))(rows.records, reference), done == steps
+@functools.partial(jax.jit, static_argnames="target")
+def _errors(system: System, target: Output, records: Any, reference: Any) -> Any:
+    return jax.vmap(lambda each: errors_of(system, target, each, reference))(records)
 
 
 class MPPI(PlanController):
