@@ -202,7 +202,8 @@ def predicted_motion(
     noise = np.diag(np.tile(of_control, steps)).reshape(count, steps, c)
     d_controls = np.concatenate([np.zeros((m, steps, c)), noise, np.zeros((n, steps, c))])
     system, found = model.rollout(belief._replace(spread=wide), controls, d_controls)
-    values, errors, slopes = _measured(system, output, found.records, found.d_records, measured)
+    outputs = _measured(system, output, found.records, found.d_records, measured)
+    values, errors, slopes = map(np.asarray, outputs)
     return Predicted(found.past, found.records[-1], found.spread, values, errors, slopes, found.solved)
 
 

@@ -55,10 +55,6 @@ class TangentState(NamedTuple):
         return cls(records, past.rate[:used], d_records, d_rate[:used], past.t0)
 
 
-#: axes for `jax.vmap` of a state with many tangents
-BY_COLUMN = TangentState(None, None, -1, -1, None)
-
-
 @functools.lru_cache(maxsize=64)
 def rollout(task: TimeIntegration) -> Callable[[System, Any, StateHistory], tuple[StepRows, StateHistory]]:
     """Return a differentiable function from (system, controls (T, c), past) to all rows and the last history.
