@@ -106,7 +106,7 @@ class Core(EliminationCode):
         )
         guesses = EXTRAPOLATIONS[None]
         if settings.stages > 1:
-            guesses = np.asarray(stage_extrapolations(settings))
+            guesses = stage_extrapolations(settings)
         #: extrapolations to each stage and to the one after it
         self._guesses = np.ascontiguousarray(np.stack([guesses, np.roll(guesses, -1, axis=0)], axis=1))
         #: memory at the start of a run, but for parameters and states

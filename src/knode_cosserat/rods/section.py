@@ -19,6 +19,8 @@ from knode_cosserat.rotation import cross, mean_turned, quaternion_of, quaternio
 
 #: d₃: along the rod
 ALONG = np.array([0.0, 0.0, 1.0])
+#: diagonal matrices of the axes across and along the rod
+ACROSS, AXIAL = np.diag([1.0, 1.0, 0.0]), np.diag(ALONG)
 #: equal steps for integrating the shape of a rod that is curved at rest; section edges split them further
 REST_STEPS = 50
 #: points are moved into an interval by this fraction of it, so that one-sided values are used at its ends
@@ -49,11 +51,11 @@ class CircularSection(NamedTuple):
 
     def shear_stiffness(self, youngs_modulus: Any, shear_modulus: Any) -> Float[Any, "3 3"]:
         """Return Kse = diag(GA, GA, EA): shear and extension (N)."""
-        return self.area * jnp.diag(jnp.stack([shear_modulus, shear_modulus, youngs_modulus]))
+        return self.area * (shear_modulus * ACROSS + youngs_modulus * AXIAL)
 
     def bending_stiffness(self, youngs_modulus: Any, shear_modulus: Any) -> Float[Any, "3 3"]:
         """Return Kbt = diag(EI, EI, 2GI): bending and twisting (N·m²)."""
-        return self.second_moment * jnp.diag(jnp.stack([youngs_modulus, youngs_modulus, 2.0 * shear_modulus]))
+        return self.second_moment * (youngs_modulus * ACROSS + 2.0 * shear_modulus * AXIAL)
 
 
 def shear_modulus(youngs_modulus: Any) -> Any:

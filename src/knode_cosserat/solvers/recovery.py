@@ -292,10 +292,14 @@ def other_unit(system: System, control: np.ndarray) -> str:
     return ""
 
 
+#: one program: without it, each operation is compiled at a robot's first simulation
+_scales_of_y = jax.jit(lambda system: system.scales().y)
+
+
 def natural_time(system: System) -> float | None:
     """Return the time (s) in which the system moves by its own length; None if its scales do not give it."""
     layout = system.strand.y_layout
     if "p" not in layout.names or "q" not in layout.names:
         return None
-    scale = np.asarray(system.strand.scales().y)
+    scale = np.asarray(_scales_of_y(system.strand))
     return float(np.min(scale[..., layout.slice("p")] / scale[..., layout.slice("q")]))

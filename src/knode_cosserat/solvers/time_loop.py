@@ -165,7 +165,7 @@ def joined_stages(rows: StepRows) -> StepRows:
     )  # fmt: skip
 
 
-def stage_extrapolations(settings: Settings) -> Float[Any, "stages past past"]:
+def stage_extrapolations(settings: Settings) -> Float[np.ndarray, "stages past past"]:
     """Return for each stage the constant, linear and quadratic extrapolations from the last three states."""
     assert settings.time is not None
     ends = np.array(settings.time.ends)
@@ -178,7 +178,7 @@ def stage_extrapolations(settings: Settings) -> Float[Any, "stages past past"]:
             found[k, order, : order + 1] = np.linalg.solve(
                 np.vander(nodes, increasing=True).T, np.eye(order + 1)[0]
             )
-    return jnp.asarray(found)
+    return found
 
 
 def solve_stage(
