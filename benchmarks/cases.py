@@ -129,13 +129,18 @@ def gradient() -> dict[str, Any]:
 
 
 def tangents(steps: int = 20, columns: int = 32) -> dict[str, Any]:
-    """Derivatives of a motion's tip with respect to 32 numbers: four tensions in eight blocks."""
+    """A motion and its derivatives by 32 numbers, four tensions in eight blocks; those of its tip by JAX."""
     one_core()
     import jax
     import jax.numpy as jnp
     import numpy as np
 
     import knode_cosserat as kc
+    from knode_cosserat.solvers.history import resting_history
+    from knode_cosserat.solvers.run import TimeIntegration
+    from knode_cosserat.solvers.sensitivity import TangentState, tangent_time_loop
+    from knode_cosserat.solvers.settings import Settings
+    from knode_cosserat.solvers.tangent import SystemMoves
 
     robot, tensions = kc.load_robot("delrin-tendon-robot"), kc.controls.sine(1.5, steps, DT, sampled="end")
     block = np.eye(columns // 4)[np.arange(steps) * (columns // 4) // steps]
@@ -145,8 +150,26 @@ def tangents(steps: int = 20, columns: int = 32) -> dict[str, Any]:
         return kc.simulate(robot, moved, DT, **PAPER).tip_position
 
     slopes, none = jax.jit(jax.jacfwd(tip)), jnp.zeros(columns)
-    taken = medians({"tangents": lambda: jax.block_until_ready(slopes(none))}, rounds=25)
-    return {"columns": columns, "steps": steps, "milliseconds": 1e3 * taken["tangents"]}
+    settings = Settings.of(PAPER["time"], "lobatto2", PAPER["start"], kc.solvers.NewtonOptions())
+    task, past = (
+        TimeIntegration(settings, DT, steps),
+        jax.tree.map(np.asarray, resting_history(robot, settings)),
+    )
+    used = past.error.shape[1]
+    zeros = [np.zeros((*part.shape, columns)) for part in (past.records[:, :used], past.rate[:used])]
+    state = TangentState(past.records[:, :used], past.rate[:used], *zeros, 0.0)
+    d_controls = np.einsum("tk,ij->tikj", block, np.eye(4)).reshape(steps, 4, columns)
+    changes = SystemMoves(None, np.zeros((0, columns))), d_controls
+
+    def moved() -> Any:
+        _, _, rows = task.solve(robot, tensions, past, (0, steps))
+        at = rows.every_stage, (robot, tensions)
+        return tangent_time_loop(settings, task.coefficients, *at, changes, state)
+
+    cases = {"tangents": moved, "jax": lambda: jax.block_until_ready(slopes(none))}
+    taken = medians(cases, rounds=25)
+    own, by_jax = (1e3 * taken[name] for name in cases)
+    return {"columns": columns, "steps": steps, "milliseconds": own, "by_jax": by_jax}
 
 
 def schemes() -> dict[str, Any]:

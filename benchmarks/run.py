@@ -115,10 +115,11 @@ def table(found: dict[str, Any]) -> str:
         ("second process, command to result", f"{found['second_process']['seconds']:.1f} s", "<= 3 s"),
         ("gradient of 100 steps against the steps", f"{gradient['ratio']:.1f}x", "<= 5x"),
         (
-            f"{found['tangents']['columns']} tangents of {found['tangents']['steps']} steps",
+            f"{found['tangents']['steps']} steps with {found['tangents']['columns']} tangents of all states",
             f"{found['tangents']['milliseconds']:.1f} ms",
             "<= 3 ms",
         ),
+        ("the same of the tip, by `jax.jacfwd`", f"{found['tangents']['by_jax']:.1f} ms", "none"),
         (
             f"tip within 1 mm: default, {default}, against forward Euler, {euler}",
             f"{schemes['fine_euler'] / schemes['default']:.0f}x",
