@@ -7,6 +7,7 @@ import pytest
 import knode_cosserat as kc
 from knode_cosserat.engine import loops
 from knode_cosserat.engine.program import EngineError
+from knode_cosserat.rods.loads import PointWrench
 from knode_cosserat.solvers import sensitivity
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.history import resting_history
@@ -22,8 +23,8 @@ PAPER, ROUTED, CURVED = "delrin-tendon-robot", "delrin-routed-tendon-robot", "va
 class Motion:
     """A motion under random controls, and random tangents of its history, controls and all parameters."""
 
-    def __init__(self, name, scheme):
-        rng, robot = np.random.default_rng(0), kc.load_robot(name)
+    def __init__(self, name, scheme, **changes):
+        rng, robot = np.random.default_rng(0), kc.load_robot(name).replace(**changes)
         self.robot, self.settings = robot, Settings.of(scheme, "lobatto2", "paper", NewtonOptions())
         self.steps = StepCoefficients.of(self.settings, DT)
         self.past = jax.tree.map(np.asarray, resting_history(robot, self.settings))
@@ -82,6 +83,21 @@ def test_tangents_are_differences_of_motions(name, scheme):
             # components have different units
             size = np.max(np.abs(wanted), axis=tuple(range(wanted.ndim - 1)))
             assert np.all(np.abs(own[..., column] - wanted) <= 1e-4 * size + 1e-12)
+
+
+def test_a_parameter_that_is_zero_moves():
+    """Zeros are constants of the code, except those that move: an unknown force at the tip."""
+    motion, eps = Motion(PAPER, "sdirk2", loads=(PointWrench(),)), 1e-4
+    leaves, tree = jax.tree.flatten(motion.robot)
+    unit = jax.tree.leaves(motion.robot.replace(**{"loads.0.force": np.array([0.0, 1.0, 0.0])}))
+    moves = [(np.asarray(b) - np.asarray(a))[None] for a, b in zip(leaves, unit, strict=True)]
+    motion.directions, motion.weights = jax.tree.unflatten(tree, moves), np.ones((1, 1))
+    for name in ("d_controls", "d_records", "d_rate"):
+        setattr(motion, name, 0.0 * getattr(motion, name)[..., :1])
+    _, (d_rows, _) = tangent_time_loop(*motion.given)
+    above, below = (motion.rows(0, part)[1].every_stage[0] for part in (eps, -eps))
+    wanted = (above - below) / (2.0 * eps)
+    np.testing.assert_allclose(d_rows[..., 0], wanted, atol=1e-6 * np.max(np.abs(wanted)))
 
 
 def test_tangents_equal_those_in_jax(monkeypatch):
