@@ -27,16 +27,17 @@ def test_a_lag_is_identified_from_noisy_tensions():
 
 
 def test_lag_weights_are_those_of_the_lag():
-    """Oracle: the exponential approach to a constant command."""
+    """Oracle: the mean over each period of the exponential approach to a constant command."""
     weights = lag_weights(np.ones((5, 1)), 0.1, 0.05)
-    remaining = np.exp(-0.5 * np.arange(1, 6))
-    assert_allclose(weights, np.stack([1.0 - remaining, remaining], axis=1), rtol=1e-12)
+    times = 0.05 * (np.arange(5)[:, None] + (np.arange(10_000) + 0.5) / 10_000)
+    remaining = np.exp(-times / 0.1).mean(axis=1)
+    assert_allclose(weights, np.stack([1.0 - remaining, remaining], axis=1), rtol=1e-8)
 
 
 @pytest.mark.campaign
 def test_a_planning_controller_predicts_with_the_lag():
-    """Oracle: a plant whose tensions follow the commands by the same lag."""
-    lag, dt = 0.08, 0.05
+    """Oracle: a plant whose tensions follow the commands by the same lag, in eight steps of each period."""
+    lag, dt, parts = 0.08, 0.05, 8
     limits = ControlLimits(0.0, 10.0, 40.0, lag=lag)
     sensor = Sensor(TipPosition())
 
@@ -46,10 +47,13 @@ def test_a_planning_controller_predicts_with_the_lag():
             return self.pulled
 
         def apply(self, control):
-            self.pulled = lagged(np.asarray(control)[None], dt, lag, self.pulled)[0]
-            super().apply(self.pulled)
+            ends = lagged(np.tile(control, (parts, 1)), dt / parts, lag, self.pulled)
+            for start, end in zip([self.pulled, *ends[:-1]], ends, strict=True):
+                self._stepper.step(0.5 * (start + end))
+            self.pulled = ends[-1]
+            self._sense()
 
-    plant, errors = Lagging(ROBOT, dt, sensor), {}
+    plant, errors = Lagging(ROBOT, dt, sensor, substeps=parts), {}
     for known in (True, False):
         limits = dataclasses.replace(limits, lag=lag if known else 0.0)
         controller = PredictiveController(KalmanObserver(ROBOT, dt, TipPosition()), TipPosition(), limits)

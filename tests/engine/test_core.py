@@ -106,7 +106,7 @@ def test_a_refusal_keeps_no_frames():
     for _ in range(3):
         with pytest.raises(EngineError) as caught:
             loops.core_of(robot, settings_of("sdirk2", "lobatto4"), robots=False)
-        assert len(caught.traceback) == 2
+        assert len(caught.traceback) == 3
 
 
 @pytest.mark.parametrize("hidden", [32, 512])

@@ -14,6 +14,14 @@ def remaining_part(lag: float, dt: float) -> float:
     return float(np.exp(-dt / lag)) if lag > 0.0 else 0.0
 
 
+def mean_part(lag: float, dt: float) -> float:
+    """Return the part of the distance from a command that is left on average over a time `dt` (s).
+
+    A step of a motion holds its controls: those of motors that lag count by their mean.
+    """
+    return lag / dt * (1.0 - remaining_part(lag, dt)) if lag > 0.0 else 0.0
+
+
 def lagged(
     commanded: Float[np.ndarray, "T c"], dt: float, lag: float, initial: Float[np.ndarray, " c"]
 ) -> Float[np.ndarray, "T c"]:
@@ -33,7 +41,7 @@ def lagged(
 
 
 def lag_weights(basis: Float[np.ndarray, "T knots"], lag: float, dt: float) -> Float[np.ndarray, "T more"]:
-    """Return the weights of a plan's knots, and of the acting controls before it, in the acting controls.
+    """Return the weights of a plan's knots, and of the controls before it, in the mean controls of periods.
 
     Args:
         basis: weights of the knots in the commands of the horizon.
@@ -43,7 +51,8 @@ def lag_weights(basis: Float[np.ndarray, "T knots"], lag: float, dt: float) -> F
     before = np.zeros(basis.shape[1] + 1)
     before[-1] = 1.0
     commands = np.concatenate([basis, np.zeros((len(basis), 1))], axis=1)
-    return lagged(commands, dt, lag, before)
+    starts = np.concatenate([before[None], lagged(commands, dt, lag, before)[:-1]])
+    return commands + (starts - commands) * mean_part(lag, dt)
 
 
 def identified_lag(

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from knode_cosserat.control.checks import check_memory
 from knode_cosserat.control.commands import Command, Controller, ControlLimits, Status
-from knode_cosserat.control.lag import lag_weights, remaining_part
+from knode_cosserat.control.lag import lag_weights, mean_part, remaining_part
 from knode_cosserat.control.plans import Knots
 from knode_cosserat.control.program import Tracking, Weights
 from knode_cosserat.control.references import Reference
@@ -70,12 +70,12 @@ class PlanController(Controller):
     def advance(self, control: Float[np.ndarray, " c"]) -> None:
         """Take over the control that acts from now on: shift the plan and predict the observer's state."""
         self._control = np.asarray(control, dtype=float)
-        remaining = remaining_part(self.limits.lag, self.dt)
-        self._acting = self._control + (self._acting - self._control) * remaining
+        away, lag = self._acting - self._control, self.limits.lag
+        self._acting = self._control + away * remaining_part(lag, self.dt)
         self._plan = self.knots.shifted(self._plan)
         self._reason = "no prediction is prepared"
         try:
-            self.observer.predict(self._acting)
+            self.observer.predict(self._control + away * mean_part(lag, self.dt))
         except ObserverError as error:
             self._reason = str(error)
             self.observer.wait()
@@ -83,7 +83,7 @@ class PlanController(Controller):
     def with_acting(self, plan: Float[np.ndarray, "... knots c"]) -> Float[np.ndarray, "... more c"]:
         """Return a plan with the acting controls as one more knot, if motors lag.
 
-        `_basis` times the result are the acting controls of the horizon.
+        `_basis` times the result are the mean acting controls of the horizon's periods.
         """
         if not self.limits.lag:
             return plan

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat._files.yaml_text import did_you_mean
+from knode_cosserat.control.lag import mean_part, remaining_part
 from knode_cosserat.hardware.driver import Driver, DriverState, HardwareError, Latency, Limits, Reading
 from knode_cosserat.hardware.faults import FAULTS, fault_message
 from knode_cosserat.hardware.limits import LatencyWindow, TensionLimiter
@@ -321,10 +322,10 @@ class SimulatedRobot(TrueShape, Driver):
             self._planned.remove(planned)
             self._latch(planned[1])
         stepper = self._require()
-        part = np.exp(-STEP / self.machine.lag) if self.machine.lag else 0.0
-        acting = self._wanted + (self.tension - self._wanted) * part
+        away, lag = self.tension - self._wanted, self.machine.lag
+        acting = self._wanted + away * remaining_part(lag, STEP)
         try:
-            stepper.step(acting)
+            stepper.step(self._wanted + away * mean_part(lag, STEP))
         except SimulationError as error:
             self._latch("stopped:0")
             raise HardwareError(
