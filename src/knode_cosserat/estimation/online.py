@@ -24,6 +24,9 @@ from knode_cosserat.solvers.sensitivity import TangentState, tangent_time_loop
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.tangent import SystemMoves
 
+#: in the place of zero
+TINY = 1e-200
+
 
 class Spread(NamedTuple):
     """Columns of a square root of the covariance of the history and of the adapted parameters."""
@@ -85,8 +88,19 @@ class OnlineModel(eqx.Module):
         return self.parameters.of(self.robot, x)
 
     def moved(self, x: Any) -> tuple[System, Any]:
-        """Return the robot, and its tangents by each parameter, stacked; None if there are none."""
-        return _moved(self, x) if self.parameters.size else (self.robot, None)
+        """Return the robot, and its tangents by each parameter, stacked; None if there are none.
+
+        Zeros that are adapted are tiny numbers: others are constants of the machine code, which would be
+        compiled again, in the loop, as soon as they move.
+        """
+        if not self.parameters.size:
+            return self.robot, None
+        system, directions = jax.tree.map(np.asarray, _moved(self, x))
+
+        def adapted(leaf: Any, moves: Any) -> Any:
+            return np.where((leaf == 0.0) & np.any(moves != 0.0, axis=0), TINY, leaf)
+
+        return jax.tree.map(adapted, system, directions), directions
 
     def rollout(
         self, belief: Belief, controls: Float[Any, "T c"], d_controls: Float[Any, "k T c"]
