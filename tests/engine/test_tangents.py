@@ -7,7 +7,9 @@ import pytest
 import knode_cosserat as kc
 from knode_cosserat.engine import loops
 from knode_cosserat.engine.program import EngineError
-from knode_cosserat.rods.loads import PointWrench
+from knode_cosserat.estimation.adapted import Adapted, AdaptedParameters
+from knode_cosserat.estimation.online import OnlineModel
+from knode_cosserat.rods.loads import AttachedMass, PointWrench
 from knode_cosserat.solvers import sensitivity
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.history import resting_history
@@ -98,6 +100,20 @@ def test_a_parameter_that_is_zero_moves():
     above, below = (motion.rows(0, part)[1].every_stage[0] for part in (eps, -eps))
     wanted = (above - below) / (2.0 * eps)
     np.testing.assert_allclose(d_rows[..., 0], wanted, atol=1e-6 * np.max(np.abs(wanted)))
+
+
+def test_an_adapted_zero_is_no_constant_of_the_code():
+    """Otherwise the machine code would be compiled again in the loop, as soon as the zero moves."""
+    robot = kc.load_robot(PAPER).replace(loads=(AttachedMass(mass=0.0),))
+    model = OnlineModel(robot, AdaptedParameters(robot, [Adapted("loads.0.mass", 0.03)]), DT)
+    cores, still = [], np.zeros(robot.control_size)
+    for x in (0.0, 0.5):
+        system, _ = model.moved(np.array([x]))
+        cores.append(loops.core_of(system, model.settings, robots=False))
+        assert (
+            model.task(1).solve(system, still[None], resting_history(system, model.settings), (0, 1))[0] == 1
+        )
+    assert cores[0] is cores[1]
 
 
 def test_tangents_equal_those_in_jax(monkeypatch):

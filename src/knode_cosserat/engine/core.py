@@ -463,8 +463,7 @@ class Core(EliminationCode):
         if self.far is not None:
             self._write_far(self.y, self.H)
             with self._places(self.pieces) as j:
-                state = self._state_with_tangents(self.y, self.dy, j)
-                state |= {int(node): self._wide(self.acting, i, j) for i, node in enumerate(e.acting)}
+                state = self._state_with_tangents(self.y, self.dy, j) | self._acting_at(j)
                 for i, value in enumerate(self._evaluated(e.products["far"], j, True, state)):
                     self._write_wide(value, self.dfar, i, j)
         else:
@@ -494,9 +493,7 @@ class Core(EliminationCode):
             self._put(value, self.tip, i)
 
     def _state_with_tangents(self, y: Array, dy: Array, j: Index) -> dict[int, Value]:
-        e = self.equations
-        state = {int(node): self._wide(y, i, j) for i, node in enumerate(e.y)}
-        state |= {int(e.history[i]): self._wide(self.H, i, j) for i in e.used_history}
+        e, state = self.equations, self._state(y, self.H, j)
         state |= {int(node): self._wide(dy, i, j) for i, node in enumerate(e.dy)}
         return state | {int(node): self._wide(self.move, i, j) for i, node in enumerate(e.dhistory)}
 
@@ -576,11 +573,7 @@ class Core(EliminationCode):
         self.stage = f = self._function("stage", "numbers", "coefficients", "controls")
         memory, numbers, coefficients, controls = f.arguments
         c0, c1, c2, d1, t = (f.load(coefficients, i) for i in range(5))
-        self._put(c0, self.inputs, 0)
-        self._put(t + self._get(self.t0, 0), self.inputs, 1)
-        for i in range(e.nc):
-            self._put(f.load(controls, i * P, P), self.inputs, 2 + i)
-        f.call(self.terms, memory)
+        self._write_inputs(c0, t + self._get(self.t0, 0), controls)
 
         def history(states: list[Array], rate: Array, target: Array, count: int) -> None:
             with self._places(count) as j:
@@ -726,8 +719,7 @@ class Core(EliminationCode):
             self._put_in(first_motions, array, in_lanes(value), self._motion.start)
         last_motions = np.empty_like(first_motions)
 
-        raw = np.empty(self._size + 8)
-        memory = raw[(-raw.ctypes.data // 8) % 8 :][: self._size]
+        memory = self._empty_memory()
 
         def solve(k: int, stop: int, *results: np.ndarray) -> None:
             memory[:] = self._empty

@@ -144,7 +144,7 @@ def tangent_loop(
     table = coefficients_of(steps, stages, (0, count))
     table[..., 4] += t0
 
-    def of_stages(values: Any) -> np.ndarray:
+    def all_stages(values: Any) -> np.ndarray:
         """Return controls, or their tangents, of all stages of all steps."""
         values, size = np.asarray(values, float), system.control_size
         if values.shape[1] > size:
@@ -152,6 +152,6 @@ def tangent_loop(
         return np.repeat(values, stages, axis=0)
 
     return core.solve(
-        parameters_of(system), table.reshape(-1, 5), solved, of_stages(controls), (moved, weights),
-        of_stages(d_controls), states,
+        parameters_of(system), table.reshape(-1, 5), solved, all_stages(controls), (moved, weights),
+        all_stages(d_controls), states,
     )  # fmt: skip

@@ -68,7 +68,7 @@ class Memory:
         self._size += size * count
         return found
 
-    def _of_tangents(self, size: int, count: int, memory: int = 0) -> Array:
+    def _tangent_array(self, size: int, count: int, memory: int = 0) -> Array:
         """Reserve an array with as many tangents in lanes as there are lanes."""
         found = Array(self._size, size, count, self.L, size * self.L, memory, is_tangent=True)
         self._size += size * count * self.L

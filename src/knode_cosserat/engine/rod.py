@@ -45,8 +45,9 @@ class RodCode(Memory):
         self.r, self.tip = a(ny, self.pieces), a(k, 1)
 
     def _empty_memory(self) -> np.ndarray:
-        """Return the memory before a run: zeros, but for discontinuities and nodes."""
-        found = np.zeros(self._size)
+        """Return the memory before a run: zeros, but for discontinuities and nodes; aligned to 64 bytes."""
+        raw = np.zeros(self._size + 8)
+        found = raw[(-raw.ctypes.data // 8) % 8 :][: self._size]
         if self.acting.size:
             self._put_in(found[None], self.acting, self.grid.acting[None, None])
         found[self.node_table.offset :].view(np.int64)[: len(self.grid.nodes)] = self.grid.nodes
@@ -122,6 +123,15 @@ class RodCode(Memory):
             for k, node in enumerate(e.place_terms):
                 self._write_wide(values[node], self.place_terms, k, j)
 
+    def _write_inputs(self, c0: Value, t: Value, control: Value) -> None:
+        """Set the inputs of a step, with the control at an address, and evaluate its terms."""
+        f, P = self._now, self.P
+        self._put(c0, self.inputs, 0)
+        self._put(t, self.inputs, 1)
+        for i in range(self.equations.nc):
+            self._put(f.load(control, i * P, P), self.inputs, 2 + i)
+        f.call(self.terms, f.arguments[0])
+
     def _write_rates(self, name: str, slopes: Sequence[tuple[Array, Any]] = ()) -> Function:
         """A function of the addresses of y and history, and a place: rates and strains, and slopes."""
         e = self.equations
@@ -160,11 +170,8 @@ class RodCode(Memory):
                 for i in range(e.ny):
                     self._write_wide(self._wide(y, i, j), far, i, j)
             with self._places(self.pieces) as j:
-                state = {int(node): self._wide(y, i, j) for i, node in enumerate(e.y)}
-                state |= {int(e.history[i]): self._wide(history, i, j) for i in e.used_history}
-                state |= {int(node): self._wide(self.acting, i, j) for i, node in enumerate(e.acting)}
                 results = (far, e.far), *(self.jumps if slopes else ())
-                self._write_results(results, j, state)
+                self._write_results(results, j, self._state(y, history, j) | self._acting_at(j))
         for k, point in enumerate(self.grid.near):
             for i in range(e.ny):
                 self._put(self._get(y, i, int(point)), far, i, self.points + k)
@@ -200,6 +207,16 @@ class RodCode(Memory):
         at_tip = self._tip_state(y, history)
         for i, value in enumerate(self._evaluated(e.tip, 0, False, at_tip)):
             self._put(value, self.tip, i)
+
+    def _state(self, y: Array, history: Array, j: Index) -> dict[int, Value]:
+        """Return the values of y and of the history at a place."""
+        e = self.equations
+        state = {int(node): self._wide(y, i, j) for i, node in enumerate(e.y)}
+        return state | {int(e.history[i]): self._wide(history, i, j) for i in e.used_history}
+
+    def _acting_at(self, j: Index) -> dict[int, Value]:
+        """Return which discontinuities act at the start of a piece."""
+        return {int(node): self._wide(self.acting, i, j) for i, node in enumerate(self.equations.acting)}
 
     def _tip_state(self, y: Array, history: Array) -> dict[int, Value]:
         e, tip = self.equations, self.points - 1

@@ -34,7 +34,7 @@ class TangentCore(EliminationCode):
     def __init__(self, system: System, settings: Settings, moving: Sequence[np.ndarray], lanes: int = 8):
         self.settings = settings
         super().__init__(TangentEquations(system, moving), False, lanes)
-        e, a, of = self.equations, self._array, self._of_tangents
+        e, a, many = self.equations, self._array, self._tangent_array
         ny, nx, numbers, k = e.ny, e.ny + e.nz, e.numbers, e.k
         self.records, self.rate = [a(numbers, self.ends) for _ in range(2)], a(numbers, self.ends)
         # derivatives at all places
@@ -47,10 +47,14 @@ class TangentCore(EliminationCode):
             (self.by_control["far"], _nodes(e.by_control["far"])),
         ]
         # tangents: history terms; rates and strains, and y behind jumps, at fixed y
-        self.dH, self.dx, self.dfar = of(numbers, self.ends), of(nx, self.ends), of(ny, self.pieces)
+        self.dH, self.dx, self.dfar = (
+            many(numbers, self.ends),
+            many(nx, self.ends),
+            many(ny, self.pieces),
+        )
         self.tangent = Correction(
-            of(ny, self.pieces), of(k, 1), of(ny, self.pieces), of(ny, self.points), of(k, self.groups[1]),
-            of(ny, self.points), of(k, 1),
+            many(ny, self.pieces), many(k, 1), many(ny, self.pieces), many(ny, self.points),
+            many(k, self.groups[1]), many(ny, self.points), many(k, 1),
         )  # fmt: skip
         whole, self._size = self._size, 0
         # of one direction of the system
@@ -59,7 +63,10 @@ class TangentCore(EliminationCode):
         self.moved = {name: a(len(nodes), places[name], 1) for name, nodes in e.moved.items()}
         self.direction_size, self._size = self._size, 0
         # of as many tangents as there are lanes
-        self.d_records, self.d_rate = [of(numbers, self.ends, 1) for _ in range(2)], of(numbers, self.ends, 1)
+        self.d_records, self.d_rate = (
+            [many(numbers, self.ends, 1) for _ in range(2)],
+            many(numbers, self.ends, 1),
+        )
         self.state_size, self._size = self._size, whole
         self._write()
         self.compiled = self.module.compile()
@@ -98,11 +105,7 @@ class TangentCore(EliminationCode):
         e = self.equations
         self.step = f = self._function("step", "coefficients", "control", "row", "unknowns")
         memory, coefficients, control, row, unknowns = f.arguments
-        for place, number in enumerate((0, 4)):
-            self._put(f.load(coefficients, number), self.inputs, place)
-        for i in range(e.nc):
-            self._put(f.load(control, i), self.inputs, 2 + i)
-        f.call(self.terms, memory)
+        self._write_inputs(f.load(coefficients, 0), f.load(coefficients, 4), control)
         with self._places(self.ends) as j:
             for i in range(e.numbers):
                 parts = [self._wide(each, i, j) for each in (*self.records, self.rate)]
@@ -171,18 +174,16 @@ class TangentCore(EliminationCode):
         known = {node: values[node] for node in e.moved_terms}
         far = self.y if self.far is None else self.far
 
-        def at(y: Array, j: Index) -> dict[int, Value]:
-            here = {int(node): self._wide(y, i, j) for i, node in enumerate(e.y)}
-            here |= {int(e.history[i]): self._wide(self.H, i, j) for i in e.used_history}
-            return here | known | {e.s.item(): self._wide(self.s, 0, j)}
+        def values_at(y: Array, j: Index) -> dict[int, Value]:
+            return self._state(y, self.H, j) | known | {e.s.item(): self._wide(self.s, 0, j)}
 
         with self._places(self.ends) as j:
-            here = at(far, j) | {e.ds.item(): self._wide(self.ds, 0, j)}
+            here = values_at(far, j) | {e.ds.item(): self._wide(self.ds, 0, j)}
             self._write_results([(self.moved["rates"], e.moved["rates"])], j, here)
         if e.moved["far"]:
             with self._places(self.pieces) as j:
-                acting = {int(node): self._wide(self.acting, i, j) for i, node in enumerate(e.acting)}
-                self._write_results([(self.moved["far"], e.moved["far"])], j, at(self.y, j) | acting)
+                here = values_at(self.y, j) | self._acting_at(j)
+                self._write_results([(self.moved["far"], e.moved["far"])], j, here)
         for name, here in (
             ("tip", self._tip_state(self.y, self.H)), ("base", self._base_state(self.unknowns, self.H))
         ):  # fmt: skip
@@ -365,9 +366,7 @@ class TangentCore(EliminationCode):
             found[..., :m] = values
             return found
 
-        raw = np.zeros(self._size + 8)
-        memory = raw[(-raw.ctypes.data // 8) % 8 :][: self._size]
-        memory[:] = self._empty_memory()
+        memory = self._empty_memory()
         self._put_in(memory[None], self.params, parameters[None, None, None])
         for array, values in zip((*self.records, self.rate), (*records, rate), strict=True):
             self._put_in(memory[None], array, np.asarray(values, float)[None, None])
