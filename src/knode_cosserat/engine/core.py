@@ -1,14 +1,15 @@
 """The time loop of a rod as machine code: history, Newton's method, estimates of errors.
 
-The mathematics is that of `solvers`: the box scheme along the rod, corrections damped by the natural
-monotonicity test with factors that are kept, and corrected motions whose distances are the estimated errors
-of the grid and of the time scheme.
+The mathematics is that of `solvers`: a mono-implicit Runge-Kutta scheme along the rod, corrections damped by
+the natural monotonicity test with factors that are kept, and corrected motions whose distances are the
+estimated errors of the grid and of the time scheme.
 """
 
 from __future__ import annotations
 
 import ctypes
 import functools
+import itertools
 import operator
 from collections.abc import Iterable, Iterator
 from typing import NamedTuple, TypeVar
@@ -20,13 +21,11 @@ from knode_cosserat.engine.codegen import Function, Index, Value, Variable
 from knode_cosserat.engine.elimination import EliminationCode
 from knode_cosserat.engine.equations import Equations
 from knode_cosserat.engine.memory import Array
-from knode_cosserat.engine.program import EngineError
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import LARGEST_CORRECTION
 from knode_cosserat.solvers.history import EXTRAPOLATIONS, StateHistory
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.space import LOBATTO2
 from knode_cosserat.solvers.time import SDIRK2
 from knode_cosserat.solvers.time_loop import (
     COARSE_ANGLE,
@@ -54,23 +53,22 @@ class Shape(NamedTuple):
 States = TypeVar("States", StateHistory, Shape)
 
 
-def require_covered(system: System, settings: Settings) -> None:
-    """Raise `EngineError` for systems and schemes along the rod that are not covered."""
-    if system.strands > 1 or system.mixed or settings.space != LOBATTO2:
-        raise EngineError("engine: only one rod by lobatto2, with a balance in which B is zero")
+class Evaluated(NamedTuple):
+    """Arrays of an evaluated state, or of its tangents: y at ends of pieces and at stages, z and y_s."""
+
+    far: Array
+    between: Array
+    z: Array
+    f: Array
 
 
 class Core(EliminationCode):
     """Machine code of a system's time loop, or of its equilibria in turn."""
 
     def __init__(self, system: System, settings: Settings, robots: bool, lanes: int = 8):
-        require_covered(system, settings)
         self.settings, self.scheme, self.newton = settings, settings.time, settings.newton
-        super().__init__(Equations(system), robots, lanes)
+        super().__init__(Equations(system, space=settings.space), robots, lanes)
         e = self.equations
-        moving = [node for node in e.products["base"] if not e.program.is_constant(int(node), 0.0)]
-        if moving and isinstance(self.scheme, SDIRK2):
-            raise EngineError("engine: a base that depends on rates needs a scheme of one stage")
         ny, nz, k, numbers, a = e.ny, e.nz, e.k, e.numbers, self._array
         # Newton's method: a trial point, and the correction from the last accepted one
         self.trial, self.direction = a(ny, self.ends), a(ny, self.ends)
@@ -79,8 +77,8 @@ class Core(EliminationCode):
         first = self._size
         self.records, self.rate = [a(numbers, self.count) for _ in range(2)], a(numbers, self.count)
         self.past, self.weights, self.t0 = [a(ny, self.ends) for _ in range(3)], a(3, 1), a(1, 1)
-        self.errors, self.time_errors = ([a(numbers, self.ends) for _ in range(2)] for _ in range(2))
-        self.error_rate = a(numbers, self.ends)
+        self.errors, self.time_errors = ([a(numbers, self.used) for _ in range(2)] for _ in range(2))
+        self.error_rate = a(numbers, self.used)
         #: the part of the memory that is the state of a motion, and its arrays as in a `StateHistory`
         self._motion = slice(first, self._size)
         self._parts = {
@@ -89,15 +87,16 @@ class Core(EliminationCode):
         }  # fmt: skip
         if settings.time is None:
             self._motion, self._parts = slice(self.y.offset, self.unknowns.offset), {"y": [self.y]}
-        self.middle = a(ny, self.pieces)
         # corrected motions: history terms, defects
-        self.dH, self.own_dH = (a(numbers, self.ends) for _ in range(2))
+        self.dH, self.own_dH = (a(numbers, self.used) for _ in range(2))
         self.better, self.better_unknowns = a(ny, self.ends), a(k, 1)
         self.defect, self.own_defect, self.rest = (a(ny, self.pieces) for _ in range(3))
         self.tip_rest = a(k, 1)
         # products of derivatives, for the error of the time scheme
-        self.difference, self.move, self.sum = (a(numbers, self.ends) for _ in range(3))
-        self.dfar, self.df, self.dz = a(ny, self.ends), a(ny, self.ends), a(nz, self.ends)
+        self.difference, self.move, self.time_dH = (a(numbers, self.used) for _ in range(3))
+        self.tangents = Evaluated(
+            a(ny, self.ends), a(ny, self.used - self.ends), a(nz, self.used), a(ny, self.used)
+        )
         self.dfe = a(ny, self.pieces)
         self._write()
         self.compiled = self.module.compile()
@@ -239,7 +238,7 @@ class Core(EliminationCode):
     # the corrected motion
 
     def _write_check(self) -> None:
-        """Rates and residual of the solution, its records, and the defects of Simpson's formula."""
+        """Rates and residual of the solution, its records, and the defects of the scheme's check formula."""
         e = self.equations
         self.check = f = self._function("check", "numbers", "coefficients")
         memory, numbers, _ = f.arguments
@@ -252,28 +251,22 @@ class Core(EliminationCode):
                 self._write_wide(self._wide(self.r, i, j), self.rest, i, j)
         for i in range(e.k):
             self._put(self._get(self.tip, i), self.tip_rest, i)
-        middle = self.ends
-        far = self.y if self.far is None else self.far
+        formula, check = self.space.formula, self.space.check
+        for k in range(len(formula.stages), len(check.stages)):
+            self._write_rates_between(self.rates, k, check.stages[k], self.y, self.H)
+        pairs = itertools.zip_longest(check.weights, formula.weights, fillvalue=0.0)
+        changes = [weight - own for weight, own in pairs]
         with self._places(self.pieces) as j:
-            h = self._wide(self.h, 0, j)
             for i in range(e.ny):
-                a, b = self._wide(far, i, j), self._wide(self.y, i, j + 1)
-                rates = self._wide(self.f, i, j) - self._wide(self.fe, i, j)
-                self._write_wide(0.5 * (a + b) + 0.125 * h * rates, self.middle, i, j)
-            self._rates_at(self.rates, self.middle, self.H, j, j + middle)
-            for i in range(e.ny):
-                rates = self._wide(self.f, i, j) + self._wide(self.fe, i, j)
-                mid = self._wide(self.f, i, j + middle)
-                # Simpson's increment less that of the box scheme
-                self._write_wide(h * ((1 / 6 - 0.5) * rates + (2 / 3) * mid), self.defect, i, j)
+                self._write_wide(self._increment(changes, (self.f, self.fe), i, j), self.defect, i, j)
         self._write_records()
         # no residual has the strains of the tip
         total = Variable(f, f.splat(f.value(0.0), self.L))
-        with self._places(self.points) as j:
-            for i in range(e.nz):
-                size = f.apply("abs", self._wide(self.z, i, j))
+        with self._places(self.count) as j:
+            for i in range(e.numbers):
+                size = f.apply("abs", self._wide(self.records[0], i, j))
                 total.set(
-                    total.get() + (size if self.batch else f.select(self._inside(j, self.points), size, 0.0))
+                    total.get() + (size if self.batch else f.select(self._inside(j, self.count), size, 0.0))
                 )
         finite = self._largest(f.select(total.get() < float("inf"), 0.0, float("inf")))
         f.store(f.apply("max", finite, f.load(numbers, ERROR * self.P, self.P)), numbers, ERROR * self.P)
@@ -295,6 +288,7 @@ class Core(EliminationCode):
             for i in range(e.ny):
                 start = 2.0 * self._wide(errors[0], i, j) - self._wide(errors[1], i, j)
                 self._write_wide(self._wide(self.y, i, j) + start, self.better, i, j)
+        with self._places(self.used) as j:
             for i in e.used_history:
                 value = self._wide(self.H, i, j) + self._wide(self.dH, i, j)
                 self._write_wide(value, self.own_dH, i, j)
@@ -347,17 +341,11 @@ class Core(EliminationCode):
             turns.set(turns.get() + 1.0)
         off, angle = self._errors_of_poses()
         known = self._spread(f.select(off <= self._get(self.length, 0), 1.0, float("nan")))
-        with self._places(self.ends) as j:
+        with self._places(self.used) as j:
             for i in range(errors[0].size):
                 self._write_wide(self._wide(errors[0], i, j), errors[1], i, j)
-        far = self.better if self.far is None else self.far
-        with self._places(self.ends) as j:
-            for i in range(e.ny):
-                value = self._wide(far, i, j) - self._wide(self.records[0], i, j)
-                self._write_wide(value * known, errors[0], i, j)
-            for i in range(e.nz):
-                value = self._wide(self.z, i, j) - self._wide(self.records[0], e.ny + i, j)
-                self._write_wide(value * known, errors[0], e.ny + i, j)
+        for i, j, value in self._numbers_of(self._evaluated_at(self.better), self.used):
+            self._write_wide((value - self._wide(self.records[0], i, j)) * known, errors[0], i, j)
         f.store(f.select(off <= self._get(self.length, 0), off, float("nan")), numbers, number * self.P)
         if has_defect:
             f.store(angle, numbers, ANGLE * self.P)
@@ -418,110 +406,116 @@ class Core(EliminationCode):
         )
         return off, 2.0 * angle
 
-    def _write_time_errors(self) -> None:
-        """Errors of the states after a stage by the time scheme (see `solvers.time_loop.time_errors`)."""
+    def _write_time_history(self) -> None:
+        """History terms of the time scheme's errors, of a checked stage (see `time_loop.time_errors`)."""
         e, scheme = self.equations, self.scheme
         assert isinstance(scheme, SDIRK2)
-        self.time_error = f = self._function("time_error", "numbers", "coefficients")
-        memory, numbers, coefficients = f.arguments
+        self.time_history = f = self._function("time_history", "coefficients")
+        memory, coefficients = f.arguments
         c0, c1, c2 = (f.load(coefficients, i) for i in range(3))
-        with self._places(self.ends) as j:
+
+        def carried(i: int, j: Index) -> Value:
+            newest, older = (self._wide(error, i, j) for error in self.time_errors)
+            return c1 * newest + c2 * older
+
+        with self._places(self.used) as j:
             for i in range(e.numbers):
-                value = c1 * self._wide(self.time_errors[0], i, j) + c2 * self._wide(
-                    self.time_errors[1], i, j
-                )
-                self._write_wide(value, self.dH, i, j)
+                self._write_wide(carried(i, j), self.time_dH, i, j)
         with f.if_(f.compare("ne", c2, 0.0)):
             # the difference of the rates at both stages, and its product with the equations' derivatives
-            with self._places(self.ends) as j:
+            with self._places(self.used) as j:
                 for i in range(e.numbers):
                     self._write_wide(-c0 * self._wide(self.difference, i, j), self.move, i, j)
+            with self._places(self.points) as j:
                 for i in range(e.ny):
                     self._write_wide(0.0, self.dy, i, j)
             f.call(self.products, memory)
+            state = self._base_state(self.unknowns, self.H) | self._tangents_of_history(0)
+            for i, value in enumerate(self._evaluated(e.products["base"], 0, False, state)):
+                self._put(value, self.correction.w, i)
             f.call(self.correct, memory)
+            for i in range(e.ny):
+                self._put(0.0, self.correction.w, i)
             f.call(self.products, memory)
-            with self._places(self.ends) as j:
-                for i in range(e.numbers):
-                    once = self._wide(self.dfar, i, j) if i < e.ny else self._wide(self.dz, i - e.ny, j)
-                    once = once - self._wide(self.difference, i, j)
-                    value = self._wide(self.dH, i, j) - c0 * scheme.defect * once
-                    self._write_wide(value, self.sum, i, j)
-            with self._places(self.ends) as j:
-                for i in range(e.numbers):
-                    self._write_wide(self._wide(self.sum, i, j), self.dH, i, j)
-        f.call(self.corrected_in_time, memory, numbers)
+            for i, j, product in self._numbers_of(self.tangents, self.used):
+                once = product - self._wide(self.difference, i, j)
+                self._write_wide(carried(i, j) - c0 * scheme.defect * once, self.time_dH, i, j)
 
     def _write_products(self) -> None:
-        """Products of derivatives with `dy` at the points and `move` of the history: defects, tip, z."""
+        """Products of derivatives with `dy` at the points and `move` of the history: defects, tip, record."""
         e = self.equations
         self.products = self._function("products")
-        far = self.y if self.far is None else self.far
+        (far, between, *_), tangents = self._evaluated_at(self.y), self.tangents
         with self._places(self.points) as j:
             for i in range(e.ny):
-                self._write_wide(self._wide(self.dy, i, j), self.dfar, i, j)
+                self._write_wide(self._wide(self.dy, i, j), tangents.far, i, j)
         if self.far is not None:
-            self._write_far(self.y, self.H)
             with self._places(self.pieces) as j:
-                state = self._state_with_tangents(self.y, self.dy, j) | self._acting_at(j)
-                for i, value in enumerate(self._evaluated(e.products["far"], j, True, state)):
-                    self._write_wide(value, self.dfar, i, j)
-        else:
-            self._write_far(self.y, self.H)
+                state = self._state_with_tangents((self.y, self.dy), j, j) | self._acting_at(j)
+                self._write_results([(tangents.far, e.products["far"])], j, state)
         for k, point in enumerate(self.grid.near):
             for i in range(e.ny):
-                self._put(self._get(self.dy, i, int(point)), self.dfar, i, self.points + k)
+                self._put(self._get(self.dy, i, int(point)), tangents.far, i, self.points + k)
+        results = (tangents.f, e.products["rates"][: e.ny]), (tangents.z, e.products["rates"][e.ny :])
+        ends = tangents.far, self.dy
+        rates = tangents.f, self.dfe
         with self._places(self.ends) as j:
-            state = self._state_with_tangents(far, self.dfar, j)
-            found = self._evaluated(e.products["rates"], j, True, state)
-            for i in range(e.ny):
-                self._write_wide(found[i], self.df, i, j)
-            for i in range(e.nz):
-                self._write_wide(found[e.ny + i], self.dz, i, j)
-        self._write_ends(self.df, self.dfe)
-        with self._places(self.pieces) as j:
-            half = self._wide(self.h, 0, j) * 0.5
-            for i in range(e.ny):
-                rates = self._wide(self.df, i, j) + self._wide(self.dfe, i, j)
-                change = self._wide(self.dfar, i, j) - self._wide(self.dy, i, j + 1)
-                self._write_wide(change + half * rates, self.r, i, j)
+            self._write_results(results, j, self._state_with_tangents((far, tangents.far), j, j))
+        self._write_ends(*rates)
+        for k, stage in enumerate(self.space.formula.stages):
+            self._write_between(k, stage, ends, rates, tangents.between)
+            with self._places(self.pieces) as j:
+                y = between, tangents.between
+                state = self._state_with_tangents(y, j + k * self.pieces, j + self.stages[k])
+                self._write_results(results, j + self.stages[k], state)
+        self._write_missing(ends, rates)
         tip = self.points - 1
         state = self._tip_state(self.y, self.H)
         state |= {int(node): self._get(self.dy, i, tip) for i, node in enumerate(e.dy)}
-        state |= {int(e.dhistory[i]): self._get(self.move, i, tip) for i in range(e.numbers)}
+        state |= self._tangents_of_history(tip)
         for i, value in enumerate(self._evaluated(e.products["tip"], 0, False, state)):
             self._put(value, self.tip, i)
 
-    def _state_with_tangents(self, y: Array, dy: Array, j: Index) -> dict[int, Value]:
-        e, state = self.equations, self._state(y, self.H, j)
-        state |= {int(node): self._wide(dy, i, j) for i, node in enumerate(e.dy)}
-        return state | {int(node): self._wide(self.move, i, j) for i, node in enumerate(e.dhistory)}
+    def _tangents_of_history(self, point: int) -> dict[int, Value]:
+        return {int(node): self._get(self.move, i, point) for i, node in enumerate(self.equations.dhistory)}
+
+    def _state_with_tangents(self, y: tuple[Array, Array], j: Index, place: Index) -> dict[int, Value]:
+        e = self.equations
+        state = self._state(y[0], self.H, j, place)
+        state |= {int(node): self._wide(y[1], i, j) for i, node in enumerate(e.dy)}
+        return state | {int(node): self._wide(self.move, i, place) for i, node in enumerate(e.dhistory)}
+
+    def _evaluated_at(self, y: Array) -> Evaluated:
+        """Return the arrays of the state that was evaluated last, from y at the points."""
+        return Evaluated(y if self.far is None else self.far, self.between, self.z, self.f)
+
+    def _numbers_of(self, state: Evaluated, stop: int) -> Iterator[tuple[int, Index, Value]]:
+        """Write loops over places, and yield components of their records, places and numbers."""
+        e = self.equations
+        for y, first, end in ((state.far, 0, self.ends), (state.between, self.ends, stop)):
+            with self._places(end - first) as j:
+                here = j + first
+                sources = [(y, i, j) for i in range(e.ny)] + [(state.z, i, here) for i in range(e.nz)]
+                sources += [(state.f, i, here) for i in range(e.numbers - len(sources))]
+                for i, source in enumerate(sources):
+                    yield i, here, self._wide(*source)
 
     def _write_records(self) -> None:
         """Shift the records by one step; the rate and the stages' difference of rates need the old ones."""
         e, f = self.equations, self._now
         coefficients = f.arguments[-1]
         c0 = f.load(coefficients, 0)
-        far = self.y if self.far is None else self.far
-        newest = [(far, i) for i in range(e.ny)] + [(self.z, i) for i in range(e.nz)]
+        newest = self._evaluated_at(self.y)
         if isinstance(self.scheme, SDIRK2):
-            with self._places(self.ends) as j:
-                for i, (array, k) in enumerate(newest):
-                    rate = self._wide(array, k, j) + self._wide(self.H, i, j) / c0
-                    step = self._wide(self.records[0], i, j) - self._wide(self.records[1], i, j)
-                    self._write_wide(rate - step, self.difference, i, j)
+            for i, j, value in self._numbers_of(newest, self.used):
+                rate = value + self._wide(self.H, i, j) / c0
+                step = self._wide(self.records[0], i, j) - self._wide(self.records[1], i, j)
+                self._write_wide(rate - step, self.difference, i, j)
         with self._places(self.count) as j:
             for i in range(e.numbers):
                 self._write_wide(self._wide(self.records[0], i, j), self.records[1], i, j)
-        with self._places(self.ends) as j:
-            for i in range(e.ny):
-                self._write_wide(self._wide(far, i, j), self.records[0], i, j)
-        with self._places(self.pieces) as j:
-            for i in range(e.ny):
-                self._write_wide(self._wide(self.middle, i, j), self.records[0], i, j + self.ends)
-        with self._places(self.count) as j:
-            for i in range(e.nz):
-                self._write_wide(self._wide(self.z, i, j), self.records[0], e.ny + i, j)
+        for i, j, value in self._numbers_of(newest, self.count):
+            self._write_wide(value, self.records[0], i, j)
         if self.settings.uses_rate:
             with self._places(self.count) as j:
                 for i in range(e.numbers):
@@ -597,16 +591,21 @@ class Core(EliminationCode):
         self._write_base(self.unknowns, self.y, self.H)
         f.call(self.solve, memory, numbers)
         f.call(self.check, memory, numbers, coefficients)
+        if isinstance(self.scheme, SDIRK2):
+            f.call(self.time_history, memory, coefficients)
         if self.scheme:
-            history(self.errors, self.error_rate, self.dH, self.ends)
+            history(self.errors, self.error_rate, self.dH, self.used)
         f.call(self.corrected, memory, numbers)
         if self.settings.uses_rate:
-            with self._places(self.ends) as j:
+            with self._places(self.used) as j:
                 for i in range(e.numbers):
                     value = c0 * self._wide(self.errors[0], i, j) + self._wide(self.dH, i, j)
                     self._write_wide(value, self.error_rate, i, j)
         if isinstance(self.scheme, SDIRK2):
-            f.call(self.time_error, memory, numbers, coefficients)
+            with self._places(self.used) as j:
+                for i in range(e.numbers):
+                    self._write_wide(self._wide(self.time_dH, i, j), self.dH, i, j)
+            f.call(self.corrected_in_time, memory, numbers)
         solved = f.load(numbers, ERROR * P, P) <= self.newton.acceptable
         alive = f.load(numbers, ALIVE * P, P)
         f.store(f.select(solved, alive, 0.0), numbers, ALIVE * P, P)
@@ -677,7 +676,7 @@ class Core(EliminationCode):
         if isinstance(self.scheme, SDIRK2):
             self._write_products()
             self.corrected_in_time = self._write_corrected("in_time", self.time_errors, False, TIME)
-            self._write_time_errors()
+            self._write_time_history()
         self._write_stage()
         self._write_guesses()
         self._write_run()

@@ -76,14 +76,15 @@ class EliminationCode(RodCode):
         return f
 
     def _write_factor(self) -> None:
-        """Factors and the matrix B⁻¹ A of all pieces, from the slopes at their ends."""
+        """Factors and the matrix B⁻¹ A of all pieces, from the slopes at their ends and stages."""
         f, el, n = self._function("factored"), self.elimination, self.equations.ny
         self.factored = f
         memory = f.arguments[0]
         with self._places(self.pieces) as j:
             known = {el.h: self._wide(self.h, 0, j)}
-            for array, nodes in ((self.slope, el.start), (self.slope_end, el.end), (self.jump, el.jump)):
-                known |= {int(node): self._wide(array, k, j) for k, node in enumerate(nodes)}
+            slopes = (self.slope, j), (self.slope_end, j), *((self.slope, j + k) for k in self.stages)
+            for (array, at), nodes in zip((*slopes, (self.jump, j)), (*el.slopes, el.jump), strict=True):
+                known |= {int(node): self._wide(array, k, at) for k, node in enumerate(nodes)}
             outputs = [*el.factors, *map(int, el.matrix.reshape(-1))]
             values = f.evaluate(el.program, outputs, known, self.L)
             for k, node in enumerate(el.factors):
@@ -195,9 +196,7 @@ class EliminationCode(RodCode):
         e = self.equations
         self.linearised = f = self._function("linearised")
         memory = f.arguments[0]
-        far = self._write_far(self.y, self.H, slopes=True)
-        with self._places(self.ends) as j:
-            self._rates_at(self.rates_and_slopes, far, self.H, j)
+        self._write_places(self.rates_and_slopes, self.y, self.H, slopes=True)
         self._write_ends(self.slope, self.slope_end)
         f.call(self.factored, memory)
         for nodes, state, array, rows in (

@@ -17,7 +17,7 @@ from knode_cosserat.rods.system import System, unknown_count
 from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.problem import StepProblem
-from knode_cosserat.solvers.space import LOBATTO2
+from knode_cosserat.solvers.space import LOBATTO2, SpaceScheme
 
 RUN, STEP, PLACE, STATE = 1, 2, 3, 4
 #: largest number of operations: LLVM's time grows faster than their number, to minutes for a large network
@@ -30,13 +30,16 @@ class Equations:
     Parameters that are zero are constants, which takes fewer operations; but not those that are `moving`.
     """
 
-    def __init__(self, system: System, moving: Sequence[np.ndarray] | None = None):
-        self.system = system
+    def __init__(
+        self, system: System, moving: Sequence[np.ndarray] | None = None, space: SpaceScheme = LOBATTO2
+    ):
+        self.system, self.space = system, space
         leaves, tree = jax.tree.flatten(system)
         leaves = [np.asarray(leaf, dtype=float) for leaf in leaves]
         self.ny, self.nz = system.y_layout.size, system.z_layout.size
         self.nc, self.k = system.control_size, unknown_count(system)
-        self.numbers = self.ny + self.nz
+        #: numbers of a record: y, z and, if B is not zero, y_s
+        self.numbers = self.ny + self.nz + (self.ny if system.mixed else 0)
         program = self.program = Program(MOST_OPERATIONS)
         self.parameters = [program.inputs(f"p{i}", leaf.shape, RUN) for i, leaf in enumerate(leaves)]
         #: the place of each parameter's node in the vector of parameters
@@ -56,7 +59,7 @@ class Equations:
 
         def problem(leaves: Any, c0: Any, t: Any, control: Any, record: Any) -> StepProblem:
             own = jax.tree.unflatten(tree, leaves)
-            return StepProblem(own, t, control, c0, record[None], LOBATTO2)
+            return StepProblem(own, t, control, c0, record[None], space)
 
         def rates(leaves: Any, c0: Any, t: Any, control: Any, s: Any, y: Any, record: Any) -> Any:
             return problem(leaves, c0, t, control, record).point_rates(s, y, record)
@@ -73,7 +76,7 @@ class Equations:
 
         def geometry(leaves: Any) -> Any:
             own = jax.tree.unflatten(tree, leaves)
-            still, scales = StepProblem.still(own, LOBATTO2, np.zeros(self.nc)), own.scales()
+            still, scales = StepProblem.still(own, space, np.zeros(self.nc)), own.scales()
             length = jnp.asarray(own.length)[None]
             return 1.0 / scales.y, 1.0 / scales.tip, still.places, still.lengths()[:, 0], length
 
@@ -83,7 +86,7 @@ class Equations:
             np.broadcast_to(nodes, size)
             for nodes, size in zip(
                 program.evaluate(jax.make_jaxpr(geometry)(leaves), folded),
-                (self.ny, self.k, grid_of(system, LOBATTO2).count, grid_of(system, LOBATTO2).tip, 1),
+                (self.ny, self.k, grid_of(system, space).count, grid_of(system, space).tip, 1),
                 strict=True,
             )
         ]
@@ -201,25 +204,54 @@ class TangentEquations(Equations):
 
 
 class Elimination:
-    """Programs of a piece, with B = 1 - h/2 J at its end and A = 1 + h/2 J at its start, behind jumps there.
+    """Programs of a piece: A and B are derivatives of its defect by y at its start (before jumps) and end.
 
     B is factored. A correction x of the start goes on as B⁻¹ (A x + r).
     """
 
     def __init__(self, equations: Equations):
         program = self.program = Program(MOST_OPERATIONS)
-        apply, n, pattern = program.apply, equations.ny, equations.pattern
+        apply, n = program.apply, equations.ny
         zero, one = program.constant(0.0), program.constant(1.0)
         self.h = program.input("h", 1)
-        half = apply("mul", self.h, program.constant(0.5))
-        self.start = program.inputs("start", (len(pattern),), 1)
-        self.end = program.inputs("end", (len(pattern),), 1)
-        A, B = np.full((n, n), zero), np.full((n, n), zero)
-        for k, (i, j) in enumerate(pattern):
-            A[i, j] = apply("mul", half, int(self.start[k]))
-            B[i, j] = apply("neg", apply("mul", half, int(self.end[k])))
-        for i in range(n):
-            A[i, i], B[i, i] = (apply("add", one, int(matrix[i, i])) for matrix in (A, B))
+        stages, weights = equations.space.formula
+        #: nonzeros of the slopes at the start, at the end, and at each stage
+        self.slopes = [
+            program.inputs(name, (len(equations.pattern),), 1)
+            for name in ("start", "end", *(f"stage{k}" for k in range(len(stages))))
+        ]
+
+        def combined(part: float, factors: Sequence[float], rates: Sequence[Any]) -> Any:
+            """Return part 1 + h Σ factor rate."""
+            found = np.full((n, n), zero)
+            for factor, rate in zip(factors, rates, strict=False):
+                scaled = apply("mul", self.h, program.constant(factor))
+                for i, j in zip(*np.nonzero(rate != zero), strict=True):
+                    product = apply("mul", scaled, int(rate[i, j]))
+                    found[i, j] = apply("add", int(found[i, j]), product)
+            for i in range(n):
+                found[i, i] = apply("add", program.constant(part), int(found[i, i]))
+            return found
+
+        def products(slopes: np.ndarray, matrix: Any) -> Any:
+            found = np.full((n, n), zero)
+            for node, (i, k) in zip(slopes, equations.pattern, strict=True):
+                for j in np.flatnonzero(matrix[k] != zero):
+                    term = apply("mul", int(node), int(matrix[k, j]))
+                    found[i, j] = apply("add", int(found[i, j]), term)
+            return found
+
+        def derivative(side: int, sign: float) -> Any:
+            """Return 1 plus `sign` times the derivative of the increment by y at the start (0) or end (1)."""
+            rates = [np.full((n, n), zero) for _ in range(2)]
+            for node, at in zip(self.slopes[side], equations.pattern, strict=True):
+                rates[side][at] = node
+            for slopes, stage in zip(self.slopes[2:], stages, strict=True):
+                part = (1.0 - stage.end, stage.end)[side]
+                rates.append(products(slopes, combined(part, stage.rates, rates)))
+            return combined(1.0, [sign * weight for weight in weights], rates)
+
+        A, B = derivative(0, 1.0), derivative(1, -1.0)
         self.jump = program.inputs("jump", (len(equations.jumping),), 1)
         start = A.copy()
         for node, (i, j, _) in zip(self.jump, equations.jumping, strict=True):
@@ -228,7 +260,7 @@ class Elimination:
                 A[row, j] = apply("add", int(A[row, j]), product)
         #: the matrix A
         self.matrix = A
-        order = _least_fill(pattern, n)
+        order = _least_fill(np.not_equal(B, zero))
         for at, p in enumerate(order):
             B[p, p] = apply("div", one, int(B[p, p]))
             for i in order[at + 1 :]:
@@ -262,12 +294,9 @@ class Elimination:
             self.solved[i] = apply("mul", self.solved[i], int(B[i, i]))
 
 
-def _least_fill(pattern: Sequence[tuple[int, int]], n: int) -> list[int]:
+def _least_fill(nonzero: np.ndarray) -> list[int]:
     """Return an order of pivots on the diagonal with little fill-in (Markowitz 1957)."""
-    nonzero = np.eye(n, dtype=bool)
-    for i, j in pattern:
-        nonzero[i, j] = True
-    rest, order = list(range(n)), []
+    nonzero, rest, order = nonzero.copy(), list(range(len(nonzero))), []
     while rest:
         counts = [(nonzero[rest, k].sum() - 1) * (nonzero[k, rest].sum() - 1) for k in rest]
         best = rest[int(np.argmin(counts))]

@@ -10,11 +10,12 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 
-from knode_cosserat.engine.core import Core, Shape, States, coefficients_of, require_covered
+from knode_cosserat.engine.core import Core, Shape, States, coefficients_of
 from knode_cosserat.engine.program import EngineError
 from knode_cosserat.engine.tangents import TangentCore
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.space import LOBATTO2
 from knode_cosserat.solvers.time_loop import StepCoefficients, StepRows
 
 log = logging.getLogger(__name__)
@@ -122,7 +123,8 @@ def tangent_loop(
 ) -> tuple[Any, Any]:  # fmt: skip
     """Return the tangents of solved steps: see `solvers.sensitivity.tangent_time_loop`, and its states."""
     (system, controls), ((directions, weights), d_controls) = at, changes
-    require_covered(system, settings)
+    if system.strands > 1 or system.mixed or settings.space != LOBATTO2:
+        raise EngineError("engine: tangents only of one rod by lobatto2, with a balance in which B is zero")
     leaves, structure = jax.tree.flatten(system)
     leaves = [np.asarray(leaf, float) for leaf in leaves]
     count, stages, m = len(controls), settings.stages, d_controls.shape[-1]

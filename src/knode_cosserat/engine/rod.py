@@ -1,7 +1,9 @@
-"""Code of a rod's equations at all places: terms, rates, jumps, defects of the box scheme, norms."""
+"""Code of a rod's equations at all places: terms, rates, jumps, stages and defects of pieces, norms."""
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,7 +13,7 @@ from knode_cosserat.engine.codegen import Function, Index, Value, Variable
 from knode_cosserat.engine.equations import Equations
 from knode_cosserat.engine.memory import Array, Memory
 from knode_cosserat.solvers.grid import grid_of
-from knode_cosserat.solvers.space import LOBATTO2
+from knode_cosserat.solvers.space import Stage
 
 
 class RodCode(Memory):
@@ -22,10 +24,13 @@ class RodCode(Memory):
 
     def __init__(self, equations: Equations, robots: bool, lanes: int):
         system = equations.system
-        self.equations, self.grid = equations, grid_of(system, LOBATTO2)
+        self.equations, self.grid, self.space = equations, grid_of(system, equations.space), equations.space
         e, grid = self.equations, self.grid
         super().__init__(robots, lanes, grid.count)
         self.pieces, self.points, self.ends, self.count = grid.tip, grid.tip + 1, grid.ends, grid.count
+        #: first places of the scheme's stages, and the number of places that the scheme uses
+        self.stages = [grid.stage(k).start for k in range(len(self.space.formula.stages))]
+        self.used = self.ends + len(self.stages) * self.pieces
         ny, nz, k, a = e.ny, e.nz, e.k, self._array
         self.params, self.scale_y, self.scale_tip = a(len(e.parameter_values), 1), a(ny, 1), a(k, 1)
         self.inputs, self.step_terms = a(2 + e.nc, 1), a(len(e.step_terms), 1)
@@ -33,10 +38,12 @@ class RodCode(Memory):
         self.geometry = self.scale_y, self.scale_tip, self.s, self.h, self.length
         self.place_terms = a(len(e.place_terms), self.count)
         self.f, self.z, self.fe = a(ny, self.count), a(nz, self.count), a(ny, self.pieces)
-        self.slope, self.slope_end = a(len(e.pattern), self.ends), a(len(e.pattern), self.pieces)
+        self.slope, self.slope_end = a(len(e.pattern), self.used), a(len(e.pattern), self.pieces)
         self.acting, self.jump = a(len(system.cuts), self.pieces), a(len(e.jumping), self.pieces)
         #: y at the places of the ends; with jumps it differs from y at the points
         self.far = a(ny, self.ends) if system.jumps else None
+        #: y at the stages between ends
+        self.between = a(ny, self.count - self.ends)
         #: points of the nodes, as whole numbers
         self.node_table = a(len(grid.nodes), 1)
         #: slopes of jumps
@@ -189,30 +196,80 @@ class RodCode(Memory):
     def _write_residual(self, name: str, y: Array, history: Array) -> Function:
         """Rates at all ends of pieces by y, and the defects of all pieces and of the tip."""
         f = self._function(name)
-        far = self._write_far(y, history)
-        with self._places(self.ends) as j:
-            self._rates_at(self.rates, far, history, j)
+        self._write_places(self.rates, y, history)
         self._write_defects(y, history)
         return f
 
+    def _write_places(self, function: Function, y: Array, history: Array, slopes: bool = False) -> None:
+        """Evaluate a function of rates at all places that the scheme uses."""
+        far = self._write_far(y, history, slopes)
+        with self._places(self.ends) as j:
+            self._rates_at(function, far, history, j)
+        self._write_ends(self.f, self.fe)
+        for k, stage in enumerate(self.space.formula.stages):
+            self._write_rates_between(function, k, stage, y, history)
+
+    def _write_rates_between(
+        self, function: Function, k: int, stage: Stage, y: Array, history: Array
+    ) -> None:
+        """Evaluate a function of rates at a stage of all pieces."""
+        first = self.grid.stage(k).start
+        far = y if self.far is None else self.far
+        self._write_between(k, stage, (far, y), (self.f, self.fe), self.between)
+        with self._places(self.pieces) as j:
+            self._rates_at(function, self.between, history, j + (first - self.ends), j + first)
+
+    def _write_between(
+        self, k: int, stage: Stage, y: tuple[Array, Array], rates: tuple[Array, Array], target: Array
+    ) -> None:
+        """Write y at stage k, from y at starts of pieces and at points, and earlier rates."""
+        with self._places(self.pieces) as j:
+            for i in range(self.equations.ny):
+                ends = self._wide(y[0], i, j), self._wide(y[1], i, j + 1)
+                mean = self._weighted((1.0 - stage.end, stage.end), ends)
+                moved = self._increment(stage.rates, rates, i, j)
+                self._write_wide(mean + moved, target, i, j + k * self.pieces)
+
+    def _increment(self, weights: Sequence[float], rates: tuple[Array, Array], i: int, j: Index) -> Value:
+        """Return h times the weighted sum of a piece's rates: at its start, its end and its stages."""
+        at, end = rates
+        places = [(at, j), (end, j)]
+        places += [(at, j + self.grid.stage(k).start) for k in range(len(weights) - len(places))]
+        values = [self._wide(array, i, place) for array, place in places[: len(weights)]]
+        return self._weighted(weights, values, self._wide(self.h, 0, j))
+
+    def _weighted(self, weights: Sequence[float], values: Sequence[Value], unit: Any = 1.0) -> Value:
+        """Return a weighted sum times a unit, by one product for each size of a weight."""
+        found = self._now.value(0.0)
+        for size in dict.fromkeys(abs(weight) for weight in weights if weight):
+            parts = [
+                value if weight > 0.0 else -value
+                for weight, value in zip(weights, values, strict=True)
+                if abs(weight) == size
+            ]
+            found = found + size * unit * functools.reduce(operator.add, parts)
+        return found
+
     def _write_defects(self, y: Array, history: Array) -> None:
         e, far = self.equations, y if self.far is None else self.far
-        self._write_ends(self.f, self.fe)
-        with self._places(self.pieces) as j:
-            half = self._wide(self.h, 0, j) * 0.5
-            for i in range(e.ny):
-                rates = self._wide(self.f, i, j) + self._wide(self.fe, i, j)
-                change = self._wide(far, i, j) - self._wide(y, i, j + 1)
-                self._write_wide(change + half * rates, self.r, i, j)
+        self._write_missing((far, y), (self.f, self.fe))
         at_tip = self._tip_state(y, history)
         for i, value in enumerate(self._evaluated(e.tip, 0, False, at_tip)):
             self._put(value, self.tip, i)
 
-    def _state(self, y: Array, history: Array, j: Index) -> dict[int, Value]:
-        """Return the values of y and of the history at a place."""
-        e = self.equations
+    def _write_missing(self, y: tuple[Array, Array], rates: tuple[Array, Array]) -> None:
+        """Write the defects of all pieces: y at their ends by the scheme, minus y."""
+        with self._places(self.pieces) as j:
+            for i in range(self.equations.ny):
+                change = self._wide(y[0], i, j) - self._wide(y[1], i, j + 1)
+                value = change + self._increment(self.space.formula.weights, rates, i, j)
+                self._write_wide(value, self.r, i, j)
+
+    def _state(self, y: Array, history: Array, j: Index, place: Index | None = None) -> dict[int, Value]:
+        """Return the values of y and of the history at a place; `place` if y is not stored by place."""
+        e, place = self.equations, j if place is None else place
         state = {int(node): self._wide(y, i, j) for i, node in enumerate(e.y)}
-        return state | {int(e.history[i]): self._wide(history, i, j) for i in e.used_history}
+        return state | {int(e.history[i]): self._wide(history, i, place) for i in e.used_history}
 
     def _acting_at(self, j: Index) -> dict[int, Value]:
         """Return which discontinuities act at the start of a piece."""
