@@ -292,9 +292,9 @@ class Core(EliminationCode):
             for i in e.used_history:
                 value = self._wide(self.H, i, j) + self._wide(self.dH, i, j)
                 self._write_wide(value, self.own_dH, i, j)
-        for i, p in enumerate(self.pivots):
-            change = 2.0 * self._get(errors[0], p, 0) - self._get(errors[1], p, 0)
-            self._put(self._get(self.unknowns, i) + change, self.better_unknowns, i)
+        for k, (i, base) in enumerate(self._unknown_numbers()):
+            change = 2.0 * self._get(errors[0], i, base) - self._get(errors[1], i, base)
+            self._put(self._get(self.unknowns, k) + change, self.better_unknowns, k)
 
         def evaluated() -> Value:
             self._write_base(self.better_unknowns, self.better, self.own_dH)
@@ -319,7 +319,7 @@ class Core(EliminationCode):
                 for i in range(e.ny):
                     y = self._wide(self.y, i, j)
                     change = self._wide(self.better, i, j) - y - self._wide(errors[0], i, j)
-                    size = f.apply("abs", change) / (1.0 / self._wide(self.scale_y, i) + f.apply("abs", y))
+                    size = f.apply("abs", change) / (1.0 / self._unit(i, j) + f.apply("abs", y))
                     size = size if self.batch else f.select(self._inside(j, self.points), size, 0.0)
                     found.set(f.apply("max", found.get(), size))
             far = left.get() > ESTIMATE_TOLERANCE * self._largest(found.get()) + ROUNDING
@@ -370,7 +370,7 @@ class Core(EliminationCode):
 
     def _errors_of_poses(self) -> tuple[Value, Value]:
         """Return the largest error of positions (m) and of orientations (rad), of the better y."""
-        f, layout = self._now, self.equations.system.y_layout
+        f, layout = self._now, self.equations.system.strand.y_layout
         offs, angles = (Variable(f, f.splat(f.value(0.0), self.L)) for _ in range(2))
         total = Variable(f, f.splat(f.value(0.0), self.L))
         with self._places(self.points) as j:
@@ -389,7 +389,7 @@ class Core(EliminationCode):
                 largest(offs, _sum(d * d for d in map(change, range(span.start, span.stop))))
             else:
                 for i in range(self.equations.ny):
-                    size = change(i) * self._wide(self.scale_y, i) * self._wide(self.length, 0)
+                    size = change(i) * self._unit(i, j) * self._wide(self.length, 0)
                     largest(offs, size * size)
             if "h" in names:
                 span = layout.slice("h")
@@ -430,12 +430,13 @@ class Core(EliminationCode):
                 for i in range(e.ny):
                     self._write_wide(0.0, self.dy, i, j)
             f.call(self.products, memory)
-            state = self._base_state(self.unknowns, self.H) | self._tangents_of_history(0)
-            for i, value in enumerate(self._evaluated(e.products["base"], 0, False, state)):
-                self._put(value, self.correction.w, i)
+            state = self._base_state(self.unknowns, self.H) | self._tangents_of_history(self.bases)
+            moved = self._evaluated(e.products["base"], 0, False, state)
+            for k, value in enumerate(moved):
+                self._put(value, self.correction.w, k % e.ny, self.bases[k // e.ny])
             f.call(self.correct, memory)
-            for i in range(e.ny):
-                self._put(0.0, self.correction.w, i)
+            for k in range(len(moved)):
+                self._put(0.0, self.correction.w, k % e.ny, self.bases[k // e.ny])
             f.call(self.products, memory)
             for i, j, product in self._numbers_of(self.tangents, self.used):
                 once = product - self._wide(self.difference, i, j)
@@ -453,9 +454,9 @@ class Core(EliminationCode):
             with self._places(self.pieces) as j:
                 state = self._state_with_tangents((self.y, self.dy), j, j) | self._acting_at(j)
                 self._write_results([(tangents.far, e.products["far"])], j, state)
-        for k, point in enumerate(self.grid.near):
+        for k, point in enumerate(self.near):
             for i in range(e.ny):
-                self._put(self._get(self.dy, i, int(point)), tangents.far, i, self.points + k)
+                self._put(self._get(self.dy, i, point), tangents.far, i, self.points + k)
         results = (tangents.f, e.products["rates"][: e.ny]), (tangents.z, e.products["rates"][e.ny :])
         ends = tangents.far, self.dy
         rates = tangents.f, self.dfe
@@ -469,21 +470,31 @@ class Core(EliminationCode):
                 state = self._state_with_tangents(y, j + k * self.pieces, j + self.stages[k])
                 self._write_results(results, j + self.stages[k], state)
         self._write_missing(ends, rates)
-        tip = self.points - 1
-        state = self._tip_state(self.y, self.H)
-        state |= {int(node): self._get(self.dy, i, tip) for i, node in enumerate(e.dy)}
-        state |= self._tangents_of_history(tip)
+        state = self._tip_state(self.y, self.H) | self._tangents_of_history(self.tips)
+        for tip, nodes in zip(self.tips, e.dy, strict=True):
+            state |= {int(node): self._get(self.dy, i, tip) for i, node in enumerate(nodes)}
         for i, value in enumerate(self._evaluated(e.products["tip"], 0, False, state)):
             self._put(value, self.tip, i)
 
-    def _tangents_of_history(self, point: int) -> dict[int, Value]:
-        return {int(node): self._get(self.move, i, point) for i, node in enumerate(self.equations.dhistory)}
+    def _tangents_of_history(self, points: list[int]) -> dict[int, Value]:
+        """Return the tangents of the history of each strand at its point."""
+        return {
+            int(node): self._get(self.move, i, point)
+            for point, nodes in zip(points, self.equations.dhistory, strict=True)
+            for i, node in enumerate(nodes)
+        }
+
+    def _unknown_numbers(self) -> Iterator[tuple[int, int]]:
+        """Yield the component and the point of each unknown."""
+        for base in self.bases:
+            for i in self.pivots:
+                yield i, base
 
     def _state_with_tangents(self, y: tuple[Array, Array], j: Index, place: Index) -> dict[int, Value]:
         e = self.equations
         state = self._state(y[0], self.H, j, place)
-        state |= {int(node): self._wide(y[1], i, j) for i, node in enumerate(e.dy)}
-        return state | {int(node): self._wide(self.move, i, place) for i, node in enumerate(e.dhistory)}
+        state |= {int(node): self._wide(y[1], i, j) for i, node in enumerate(e.dy[0])}
+        return state | {int(node): self._wide(self.move, i, place) for i, node in enumerate(e.dhistory[0])}
 
     def _evaluated_at(self, y: Array) -> Evaluated:
         """Return the arrays of the state that was evaluated last, from y at the points."""
@@ -548,10 +559,11 @@ class Core(EliminationCode):
                     f.call(self.guesses, memory, f.pointer(extrapolations, stage.value * 18))
                 with f.loop(nodes) as node:
                     point = self._node(node)
-                    target = f.pointer(rows, (number * nodes + node.value) * (e.numbers * P))
-                    for i in range(e.numbers):
-                        value = self._get(self.y if i < e.ny else self.records[0], i, point)
-                        f.store(value, target, i * P, P)
+                    target = f.pointer(rows, (number * nodes + node.value) * (self.strands * e.numbers * P))
+                    for q, i in np.ndindex(self.strands, e.numbers):
+                        array = self.y if i < e.ny else self.records[0]
+                        value = self._get(array, i, point + self.bases[q])
+                        f.store(value, target, (q * e.numbers + i) * P, P)
                 info = f.pointer(infos, number * ((8 + e.k) * P))
                 for k in range(8):
                     f.store(f.load(numbers, k * P, P), info, k * P, P)
@@ -586,8 +598,8 @@ class Core(EliminationCode):
                     for k in (1, 2):
                         guess = guess + weights[k] * self._wide(self.past[k], i, j)
                     self._write_wide(guess, self.y, i, j)
-        for i, p in enumerate(self.pivots):
-            self._put(self._get(self.y, p, 0), self.unknowns, i)
+        for k, (i, base) in enumerate(self._unknown_numbers()):
+            self._put(self._get(self.y, i, base), self.unknowns, k)
         self._write_base(self.unknowns, self.y, self.H)
         f.call(self.solve, memory, numbers)
         f.call(self.check, memory, numbers, coefficients)
@@ -626,7 +638,7 @@ class Core(EliminationCode):
         with self._places(self.points) as j:
             for i in range(e.ny):
                 past = [self._wide(each, i, j) for each in self.past]
-                unit, y = self._wide(self.scale_y, i), self._wide(self.y, i, j)
+                unit, y = self._unit(i, j), self._wide(self.y, i, j)
                 for order, (misfit, weights) in enumerate(zip(misfits, this, strict=True)):
                     guess = past[0] * weights[0]
                     for k in range(1, order + 1):
@@ -710,7 +722,7 @@ class Core(EliminationCode):
         lane_controls = np.ascontiguousarray(np.moveaxis(lane_controls, 1, -1))
         lane_parameters = in_lanes(np.broadcast_to(parameters, (size, parameters.shape[-1])))
         table = coefficients_of(steps, stages, span)
-        rows = np.zeros((vectors, count, stages, nodes, e.numbers, P))
+        rows = np.zeros((vectors, count, stages, nodes, self.strands * e.numbers, P))
         infos = np.zeros((vectors, count, stages, 8 + e.k, P))
         reached, length = np.zeros((2, vectors, P))
         first_motions = np.empty((vectors, self._motion.stop - self._motion.start))
@@ -747,6 +759,8 @@ class Core(EliminationCode):
 
     def _rows(self, rows: np.ndarray, infos: np.ndarray, length: np.ndarray, done: np.ndarray) -> StepRows:
         """Return rows (robots, steps, ...); a step's row is that of its last stage."""
+        if self.strands > 1:
+            rows = self.equations.joined(rows.reshape(*rows.shape[:-1], self.strands, -1))
         numbers, unknowns = infos[..., :8], infos[..., 8:]
         error = np.max(numbers[..., ERROR], axis=-1)
         off, angle = numbers[..., -1, POSITION], numbers[..., -1, ANGLE]
@@ -765,7 +779,10 @@ class Core(EliminationCode):
         """Yield the arrays of a motion's state with their values (robots, places, size)."""
         for name, arrays in self._parts.items():
             values = np.asarray(getattr(states, name), float)
-            values = values.reshape(len(values), len(arrays), -1, arrays[0].size)
+            values = values.reshape(len(values), len(arrays), -1, self._width(arrays[0]))
+            if self._width(arrays[0]) > arrays[0].size:
+                strand, place = self.origins[self.origins[:, 1] < values.shape[-2]].T
+                values = self.equations.by_strand(values)[..., place, strand, :]
             for part, array in enumerate(arrays):
                 yield array, values[:, part]
 
@@ -774,11 +791,19 @@ class Core(EliminationCode):
         found = {}
         for name, arrays in self._parts.items():
             shape = np.shape(getattr(before, name))
-            count = int(np.prod(shape[1:])) // (len(arrays) * arrays[0].size)
-            parts = [self._numbers(motions, array, self._motion.start)[..., :count, :] for array in arrays]
-            values = np.stack(parts, axis=2).reshape(-1, len(arrays), count, arrays[0].size)
+            count = int(np.prod(shape[1:])) // (len(arrays) * self._width(arrays[0]))
+            parts = [self._numbers(motions, array, self._motion.start) for array in arrays]
+            values = np.stack(parts, axis=2)
+            values = values.reshape(-1, *values.shape[2:])
+            if self._width(arrays[0]) > arrays[0].size:
+                values = self.equations.joined(values[:, :, self.places[:, :count].T])
+            values = values[:, :, :count]
             found[name] = values[: shape[0]].reshape(shape)
         return type(before)(**found)
+
+    def _width(self, array: Array) -> int:
+        """Return the size of an array's packed numbers, of all strands, at one place."""
+        return array.size * (self.strands if array.count > 1 else 1)
 
 
 def coefficients_of(

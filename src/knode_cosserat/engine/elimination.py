@@ -9,6 +9,7 @@ import numpy as np
 from knode_cosserat.engine.codegen import Function, Index, Value, Variable
 from knode_cosserat.engine.equations import Elimination, Equations
 from knode_cosserat.engine.memory import Array
+from knode_cosserat.engine.program import EngineError
 from knode_cosserat.engine.rod import RodCode
 from knode_cosserat.solvers.boundary import pivots_of
 from knode_cosserat.solvers.linear import _each
@@ -25,6 +26,7 @@ class Correction(NamedTuple):
     w: Array
     beta: Array
     dy: Array
+    #: those of the unknowns of each strand
     unknowns: Array
 
 
@@ -38,8 +40,22 @@ class EliminationCode(RodCode):
         super().__init__(equations, robots, lanes)
         system = equations.system
         self.elimination = Elimination(equations)
-        self.pivots = [int(index) for index in pivots_of(system)]
-        ny, k, a, by_rows = self.equations.ny, self.equations.k, self._array, self._by_rows
+        e, a, by_rows = self.equations, self._array, self._by_rows
+        ny, k = e.ny, e.k
+        #: number of unknowns of a strand, and their rows in y
+        self.own = k // self.strands
+        self.pivots = [int(index) for index in pivots_of(system)[: self.own]]
+        #: nonzero slopes of base and tip: row, column, node
+        self.base_slopes, self.tip_slopes = (
+            [
+                (i, c, int(slopes[i, c]))
+                for i, c in np.ndindex(slopes.shape)
+                if not e.program.is_constant(int(slopes[i, c]), 0.0)
+            ]
+            for slopes in (e.base_slopes, e.tip_slopes)
+        )
+        if any(i // ny != c // self.own for i, c, _ in self.base_slopes):
+            raise EngineError("engine: the base of a strand depends on the unknowns of another")
         self.factor = a(len(self.elimination.factors), self.pieces)
         #: columns of B⁻¹ A, and B⁻¹ r: places in lanes, and rows in lanes for the recursion along the rod
         self.wide_matrix, self.wide_added = a(ny * ny, self.pieces), a(ny, self.pieces)
@@ -47,16 +63,20 @@ class EliminationCode(RodCode):
         if not robots:
             self.matrix, self.added = by_rows(ny, ny, self.pieces), by_rows(ny, 1, self.pieces)
         #: columns of the unknowns along the rod
-        self.X = by_rows(ny, k, self.points)
-        self.groups = _each(self.pieces), (self.pieces - 1) // _each(self.pieces)
-        self.T, self.M, self.inverse = by_rows(k, k, self.groups[1]), by_rows(k, ny, 1), by_rows(k, k, 1)
+        self.X = by_rows(ny, self.own, self.points)
+        tip = self.grid.tip
+        #: number of pieces of a group, and of groups of a strand
+        self.groups = _each(tip), (tip - 1) // _each(tip)
+        self.T = by_rows(self.own, self.own, self.groups[1] * self.strands)
+        self.M, self.inverse = by_rows(k, ny, self.strands), by_rows(k, k, 1)
         self.zeros = by_rows(ny, 1, 1)
         #: the solution, its unknowns, and the correction of both
         self.y, self.unknowns = a(ny, self.ends), a(k, 1)
         self.dy, self.step_unknowns = a(ny, self.ends), a(k, 1)
         self.correction = Correction(
-            self.r, self.tip, self.added, by_rows(ny, 1, self.points), by_rows(k, 1, self.groups[1]),
-            self.dy if robots else by_rows(ny, 1, self.points), self.step_unknowns,
+            self.r, self.tip, self.added, by_rows(ny, 1, self.points),
+            by_rows(self.own, 1, self.groups[1] * self.strands),
+            self.dy if robots else by_rows(ny, 1, self.points), by_rows(self.own, 1, self.strands),
         )  # fmt: skip
         #: history terms of the step
         self.H = a(self.equations.numbers, self.count)
@@ -130,11 +150,11 @@ class EliminationCode(RodCode):
             f.store(sums[0] + sums[1], target, row * component, self.L)
         return f
 
-    def _changed(self, columns: list[list[Value]], pivots: list[int]) -> list[list[Value]]:
+    def _changed(self, columns: list[list[Value]]) -> list[list[Value]]:
         """Write X T, with T the inverse of X's rows of pivots, and return T; X's columns are replaced."""
         k = len(columns)
         eye = [self._unit_column(c, k) for c in range(k)]
-        for r, pivot in enumerate(pivots):
+        for r, pivot in enumerate(self.pivots):
             scale = 1.0 / self._entry(columns[r], pivot)
             factors = [self._entry(column, pivot) * scale for column in columns]
             for matrix in (columns, eye):
@@ -154,35 +174,61 @@ class EliminationCode(RodCode):
         return [f.joined([f.value(float(row + i == c)) for i in lanes]) for row in self._blocks(rows)]
 
     def _write_along(self) -> None:
-        """X along the rod from the base; at the tip the inverse of M X."""
-        ny, k = self.equations.ny, self.equations.k
+        """X along the strands from their bases; at the tips the inverse of M X."""
+        ny, k, own = self.equations.ny, self.equations.k, self.own
         self.along = f = self._function("along")
         memory = f.arguments[0]
         zero = self._pointer(self.zeros, 0)
         size, count = self.groups
 
         def piece(j: Index) -> None:
-            for c in range(k):
+            for c in range(own):
                 first = c * self._padded(ny)
                 source, target = (f.pointer(*self._at(self.X, first, point)) for point in (j, j + 1))
                 f.call(self.advance, memory, source, zero, target, j.value)
 
-        with f.loop(count) as g:
-            with f.loop((g.value + 1) * size, g.value * size) as j:
+        with f.loop(self.strands) as strand:
+            base = strand.value * self.strand_points
+            with f.loop(count) as g:
+                last = f.index(base + (g.value + 1) * size)
+                with f.loop(last.value, base + g.value * size) as j:
+                    piece(j)
+                columns = [self._column(self.X, ny, c, last) for c in range(own)]
+                T = self._changed(columns)
+                group = f.index(strand.value * count + g.value)
+                for c in range(own):
+                    self._set_column(columns[c], self.X, ny, c, last)
+                    self._set_column(T[c], self.T, own, c, group)
+            tip = f.index(base + self.grid.tip)
+            with f.loop(tip.value, base + count * size) as j:
                 piece(j)
-            last = f.index((g.value + 1) * size)
-            columns = [self._column(self.X, ny, c, last) for c in range(k)]
-            T = self._changed(columns, self.pivots)
-            for c in range(k):
-                self._set_column(columns[c], self.X, ny, c, last)
-                self._set_column(T[c], self.T, k, c, g)
-        with f.loop(self.pieces, count * size) as j:
-            piece(j)
-        at_tip = [self._column(self.X, ny, c, self.points - 1) for c in range(k)]
-        M = [self._column(self.M, k, i) for i in range(ny)]
-        products = [self._product(M, [self._entry(column, i) for i in range(ny)]) for column in at_tip]
-        for c, column in enumerate(self._changed(products, list(range(k)))):
-            self._set_column(column, self.inverse, k, c)
+            M = [self._column(self.M, k, i, strand) for i in range(ny)]
+            component, lanes = self.X.component, self._vector_lanes
+            for c in range(own):
+                x = f.pointer(*self._at(self.X, c * self._padded(ny), tip))
+                product = self._product(M, [f.load(x, i * component, lanes) for i in range(ny)])
+                column = f.pointer(memory, (strand.value * own + c) * (self._padded(k) * component))
+                for row, value in zip(self._blocks(k), product, strict=True):
+                    f.store(value, column, self.inverse.at(row, 0), self.L)
+        self._write_inverse()
+
+    def _write_inverse(self) -> None:
+        """Replace M X by its inverse: elimination of columns (Gauss-Jordan), without pivoting."""
+        f, k, component = self._now, self.equations.k, self.inverse.component
+        first, column = self._pointer(self.inverse, 0), self._padded(k) * component
+        rows, lanes = [row * component for row in self._blocks(k)], self._vector_lanes
+        with f.loop(k) as r:
+            row, pivotal = f.pointer(first, r.value * component), f.pointer(first, r.value * column)
+            scale = 1.0 / f.load(row, r.value * column, lanes)
+            for at in rows:
+                f.store(scale * f.load(pivotal, at, self.L), pivotal, at)
+            f.store(scale, row, r.value * column)
+            for start, stop in ((0, r.value), (r.value + 1, k)):
+                with f.loop(stop, start) as c:
+                    factor, other = f.load(row, c.value * column, lanes), f.pointer(first, c.value * column)
+                    for at in rows:
+                        f.store(f.load(other, at, self.L) - factor * f.load(pivotal, at, self.L), other, at)
+                    f.store(-factor * scale, row, c.value * column)
 
     def _product(self, columns: list[list[Value]], x: list[Value]) -> list[Value]:
         """Return a matrix times a vector."""
@@ -199,13 +245,16 @@ class EliminationCode(RodCode):
         self._write_places(self.rates_and_slopes, self.y, self.H, slopes=True)
         self._write_ends(self.slope, self.slope_end)
         f.call(self.factored, memory)
-        for nodes, state, array, rows in (
-            (e.base_slopes, self._base_state(self.unknowns, self.H), self.X, e.ny),
-            (e.tip_slopes, self._tip_state(self.y, self.H), self.M, e.k),
-        ):
-            values = self._evaluated(nodes.reshape(-1), 0, False, state)
-            for (i, c), value in zip(np.ndindex(nodes.shape), values, strict=True):
-                self._put(value, array, c * self._padded(rows) + i)
+        state = self._base_state(self.unknowns, self.H)
+        values = self._evaluated([node for *_, node in self.base_slopes], 0, False, state)
+        for (i, c, _), value in zip(self.base_slopes, values, strict=True):
+            strand, row = divmod(i, e.ny)
+            self._put(value, self.X, c % self.own * self._padded(e.ny) + row, self.bases[strand])
+        state = self._tip_state(self.y, self.H)
+        values = self._evaluated([node for *_, node in self.tip_slopes], 0, False, state)
+        for (i, c, _), value in zip(self.tip_slopes, values, strict=True):
+            strand, column = divmod(c, e.ny)
+            self._put(value, self.M, column * self._padded(e.k) + i, strand)
         f.call(self.along, memory)
 
     def _write_correct(self) -> None:
@@ -224,63 +273,78 @@ class EliminationCode(RodCode):
             with f.loop(self.points) as j:
                 source = self._pointer(self.correction.dy, j), 1
                 self._copy(ny, source, (self._pointer(self.dy, j), self.dy.component))
+        for k in range(self.equations.k):
+            strand, i = divmod(k, self.own)
+            self._put(self._get(self.correction.unknowns, i, strand), self.step_unknowns, k)
 
     def _write_correction(self, arrays: Correction, advance: Function) -> None:
         """Solve for a correction, from B⁻¹ r of all pieces."""
-        f, ny, k = self._now, self.equations.ny, self.equations.k
+        f, ny, k, own = self._now, self.equations.ny, self.equations.k, self.own
         memory, (size, count) = f.arguments[0], self.groups
 
         def piece(j: Index) -> None:
             start, added, end = (arrays.w, j), (arrays.added, j), (arrays.w, j + 1)
             f.call(advance, memory, *(self._pointer(*each) for each in (start, added, end)), j.value)
 
-        with f.loop(count) as g:
-            with f.loop((g.value + 1) * size, g.value * size) as j:
+        tips = [Variable(f, each) for each in self._column(arrays.tip, k)]
+        with f.loop(self.strands) as strand:
+            base = strand.value * self.strand_points
+            with f.loop(count) as g:
+                last = f.index(base + (g.value + 1) * size)
+                with f.loop(last.value, base + g.value * size) as j:
+                    piece(j)
+                w = self._column(arrays.w, ny, 0, last)
+                columns = [self._column(self.X, ny, c, last) for c in range(own)]
+                moved = self._product(columns, [self._entry(w, pivot) for pivot in self.pivots])
+                self._set_column([a - b for a, b in zip(w, moved, strict=True)], arrays.w, ny, 0, last)
+                group = f.index(strand.value * count + g.value)
+                self._set_column(self._gathered(w, self.pivots), arrays.beta, own, 0, group)
+            tip = f.index(base + self.grid.tip)
+            with f.loop(tip.value, base + count * size) as j:
                 piece(j)
-            last = f.index((g.value + 1) * size)
-            w = self._column(arrays.w, ny, 0, last)
-            columns = [self._column(self.X, ny, c, last) for c in range(k)]
-            moved = self._product(columns, [self._entry(w, pivot) for pivot in self.pivots])
-            self._set_column([a - b for a, b in zip(w, moved, strict=True)], arrays.w, ny, 0, last)
-            self._set_column(self._gathered(w), arrays.beta, k, 0, g)
-        with f.loop(self.pieces, count * size) as j:
-            piece(j)
-        w = self._column(arrays.w, ny, 0, self.points - 1)
-        M = [self._column(self.M, k, i) for i in range(ny)]
-        tip = self._product(M, [self._entry(w, i) for i in range(ny)])
-        tip = [a + b for a, b in zip(tip, self._column(arrays.tip, k), strict=True)]
+            w = self._column(arrays.w, ny, 0, tip)
+            M = [self._column(self.M, k, i, strand) for i in range(ny)]
+            products = self._product(M, [self._entry(w, i) for i in range(ny)])
+            for variable, value in zip(tips, products, strict=True):
+                variable.set(variable.get() + value)
         inverse = [self._column(self.inverse, k, c) for c in range(k)]
-        alpha = [
-            Variable(f, -each) for each in self._product(inverse, [self._entry(tip, c) for c in range(k)])
-        ]
+        tip_values = [each.get() for each in tips]
+        unknowns = [-each for each in self._product(inverse, [self._entry(tip_values, c) for c in range(k)])]
+        for q in range(self.strands):
+            rows = list(range(q * own, (q + 1) * own))
+            self._set_column(self._gathered(unknowns, rows), arrays.unknowns, own, 0, q)
 
         def correct(start: Any, stop: Any) -> None:
             """Write the corrections of points that share their unknowns."""
-            numbers = [self._entry([each.get() for each in alpha], c) for c in range(k)]
+            numbers = [self._entry([each.get() for each in alpha], c) for c in range(own)]
             with f.loop(stop, start) as j:
-                columns = [self._column(self.X, ny, c, j) for c in range(k)]
+                columns = [self._column(self.X, ny, c, j) for c in range(own)]
                 moved = self._product(columns, numbers)
                 w = self._column(arrays.w, ny, 0, j)
                 self._set_column([a + b for a, b in zip(w, moved, strict=True)], arrays.dy, ny, 0, j)
 
-        correct(count * size + 1, self.points)
-        with f.loop(0, count - 1, -1) as g:
-            end = (g.value + 1) * size
-            correct(end, end + 1)
-            change = [a.get() - b for a, b in zip(alpha, self._column(arrays.beta, k, 0, g), strict=True)]
-            T = [self._column(self.T, k, c, g) for c in range(k)]
-            for variable, value in zip(
-                alpha, self._product(T, [self._entry(change, c) for c in range(k)]), strict=True
-            ):
-                variable.set(value)
-            correct(g.value * size + 1, end)
-        correct(0, 1)
-        self._set_column([each.get() for each in alpha], arrays.unknowns, k)
+        with f.loop(self.strands) as strand:
+            base = strand.value * self.strand_points
+            alpha = [Variable(f, each) for each in self._column(arrays.unknowns, own, 0, strand)]
+            correct(base + (count * size + 1), base + self.strand_points)
+            with f.loop(0, count - 1, -1) as g:
+                end = base + (g.value + 1) * size
+                correct(end, end + 1)
+                group = f.index(strand.value * count + g.value)
+                beta = self._column(arrays.beta, own, 0, group)
+                change = [a.get() - b for a, b in zip(alpha, beta, strict=True)]
+                T = [self._column(self.T, own, c, group) for c in range(own)]
+                moved = self._product(T, [self._entry(change, c) for c in range(own)])
+                for variable, value in zip(alpha, moved, strict=True):
+                    variable.set(value)
+                correct(base + (g.value * size + 1), end)
+            correct(base, base + 1)
+            self._set_column([each.get() for each in alpha], arrays.unknowns, own, 0, strand)
 
-    def _gathered(self, w: list[Value]) -> list[Value]:
-        """Return the rows of pivots of a column."""
+    def _gathered(self, column: list[Value], rows: list[int]) -> list[Value]:
+        """Return rows of a column as a column."""
         if self._rows_at_once == 1:
-            return [w[pivot] for pivot in self.pivots]
-        f, rows = self._now, [self._now.lane(w[p // self.L], p % self.L) for p in self.pivots]
-        rows += [f.value(0.0)] * (self._padded(len(rows)) - len(rows))
-        return [f.joined(rows[first : first + self.L]) for first in self._blocks(len(self.pivots))]
+            return [column[row] for row in rows]
+        f, numbers = self._now, [self._now.lane(column[p // self.L], p % self.L) for p in rows]
+        numbers += [f.value(0.0)] * (self._padded(len(rows)) - len(rows))
+        return [f.joined(numbers[first : first + self.L]) for first in self._blocks(len(rows))]

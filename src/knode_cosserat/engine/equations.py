@@ -25,7 +25,7 @@ MOST_OPERATIONS = 20_000
 
 
 class Equations:
-    """Programs of a system: rates and strains at a point with their derivatives, base and tip.
+    """Programs of a system: rates and strains at a point of a strand with their derivatives, base and tip.
 
     Parameters that are zero are constants, which takes fewer operations; but not those that are `moving`.
     """
@@ -36,7 +36,8 @@ class Equations:
         self.system, self.space = system, space
         leaves, tree = jax.tree.flatten(system)
         leaves = [np.asarray(leaf, dtype=float) for leaf in leaves]
-        self.ny, self.nz = system.y_layout.size, system.z_layout.size
+        strand, self.strands = system.strand, system.strands
+        self.ny, self.nz = strand.y_layout.size, strand.z_layout.size
         self.nc, self.k = system.control_size, unknown_count(system)
         #: numbers of a record: y, z and, if B is not zero, y_s
         self.numbers = self.ny + self.nz + (self.ny if system.mixed else 0)
@@ -55,6 +56,12 @@ class Equations:
         self.s = program.inputs("s", (), PLACE)
         self.y = program.inputs("y", (self.ny,), STATE)
         self.history = program.inputs("history", (self.numbers,), STATE)
+        #: y and history of all strands, for base and tip; the first strand's inputs are those of a point
+        self.strand_y, self.strand_history = (
+            [nodes, *(program.inputs(f"{name}{q}", nodes.shape, STATE) for q in range(1, self.strands))]
+            for name, nodes in (("y", self.y), ("history", self.history))
+        )
+        whole_y, whole_history = np.concatenate(self.strand_y), self.joined(np.array(self.strand_history))
         self.unknowns = program.inputs("unknowns", (self.k,), STATE)
 
         def problem(leaves: Any, c0: Any, t: Any, control: Any, record: Any) -> StepProblem:
@@ -86,17 +93,18 @@ class Equations:
             np.broadcast_to(nodes, size)
             for nodes, size in zip(
                 program.evaluate(jax.make_jaxpr(geometry)(leaves), folded),
-                (self.ny, self.k, grid_of(system, space).count, grid_of(system, space).tip, 1),
+                (len(whole_y), self.k, grid_of(system, space).count, grid_of(system, space).tip, 1),
                 strict=True,
             )
         ]
         known = [*folded, self.c0, self.t, self.control]
         traced = jax.make_jaxpr(rates)(leaves, *step, one, np.ones(self.ny), np.zeros(self.numbers))
         self.f, self.z = program.evaluate(traced, [*known, self.s, self.y, self.history])
-        traced = jax.make_jaxpr(base)(leaves, *step, np.zeros(self.k), np.zeros(self.numbers))
-        [self.base] = program.evaluate(traced, [*known, self.unknowns, self.history])
-        traced = jax.make_jaxpr(tip)(leaves, *step, np.ones(self.ny), np.zeros(self.numbers))
-        [self.tip] = program.evaluate(traced, [*known, self.y, self.history])
+        record = np.zeros(len(whole_history))
+        traced = jax.make_jaxpr(base)(leaves, *step, np.zeros(self.k), record)
+        [self.base] = program.evaluate(traced, [*known, self.unknowns, whole_history])
+        traced = jax.make_jaxpr(tip)(leaves, *step, np.ones(len(whole_y)), record)
+        [self.tip] = program.evaluate(traced, [*known, whole_y, whole_history])
         #: y on the far side of the discontinuities that act, and the nonzeros of its derivative, less 1
         self.acting, self.far, self.jumping = program.inputs("acting", (len(system.cuts),), STATE), self.y, []
         if system.jumps:
@@ -111,7 +119,7 @@ class Equations:
                     self.jumping.append((i, j, int(slopes[i, j])))
         self.slopes = program.jacobian(self.f, self.y)
         self.base_slopes = program.jacobian(self.base, self.unknowns)
-        self.tip_slopes = program.jacobian(self.tip, self.y)
+        self.tip_slopes = program.jacobian(self.tip, whole_y)
         #: structural nonzeros of the Jacobian
         self.pattern = [
             (i, j)
@@ -121,14 +129,22 @@ class Equations:
         self.nonzeros = [int(self.slopes[at]) for at in self.pattern]
         needed = set(program.needed([*self.f, *self.z, *self.far, *self.base, *self.tip]))
         #: entries of a record that the equations need as history
-        self.used_history = [i for i in range(self.numbers) if int(self.history[i]) in needed]
+        self.used_history = [
+            i for i in range(self.numbers) if any(int(nodes[i]) in needed for nodes in self.strand_history)
+        ]
         outputs = [*self.f, *self.z, *self.slopes.reshape(-1), *self.base, *self.tip]
         outputs += [*self.base_slopes.reshape(-1), *self.tip_slopes.reshape(-1)]
         outputs += [*self.far, *(node for *_, node in self.jumping)]
-        #: tangents of y and of the history, and the products of derivatives with them
-        self.dy = program.inputs("dy", (self.ny,), STATE)
-        self.dhistory = program.inputs("dhistory", (self.numbers,), STATE)
-        directions = dict(zip([*self.y, *self.history], [*self.dy, *self.dhistory], strict=True))
+        #: tangents of y and of the history of all strands, and the products of derivatives with them
+        self.dy, self.dhistory = (
+            [program.inputs(f"d{name}{q}", (size,), STATE) for q in range(self.strands)]
+            for name, size in (("y", self.ny), ("history", self.numbers))
+        )
+        directions = {
+            int(node): int(tangent)
+            for nodes, tangents in ((self.strand_y, self.dy), (self.strand_history, self.dhistory))
+            for node, tangent in zip(np.concatenate(nodes), np.concatenate(tangents), strict=True)
+        }
         self.products = {
             name: program.derivative([int(node) for node in nodes], directions)
             for name, nodes in (
@@ -139,6 +155,18 @@ class Equations:
             outputs += nodes
         self._outputs = outputs
         self._hoist()
+
+    def by_strand(self, values: np.ndarray) -> np.ndarray:
+        """Return packed y or records (…, x of all strands) split by strand: (…, strands, x of one)."""
+        sizes = self.strands * np.array([self.ny, self.ny + self.nz])
+        parts = np.split(values, sizes[sizes < values.shape[-1]], axis=-1)
+        return np.concatenate([part.reshape(*part.shape[:-1], self.strands, -1) for part in parts], axis=-1)
+
+    def joined(self, values: np.ndarray) -> np.ndarray:
+        """Return y or records by strand (…, strands, x of one) packed: (…, x of all)."""
+        sizes = np.array([self.ny, self.ny + self.nz])
+        parts = np.split(values, sizes[sizes < values.shape[-1]], axis=-1)
+        return np.concatenate([part.reshape(*part.shape[:-2], -1) for part in parts], axis=-1)
 
     def _hoist(self) -> None:
         self.step_terms = self._hoisted(self._outputs, {STEP, RUN})

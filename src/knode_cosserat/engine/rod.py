@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import itertools
 import operator
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,7 +19,11 @@ from knode_cosserat.solvers.space import Stage
 
 
 class RodCode(Memory):
-    """Functions that evaluate the equations of a system along the rod."""
+    """Functions that evaluate the equations of a system along the rod.
+
+    Several strands lie end to end. The pieces between the tip of one and the base of the next are idle: of no
+    length and without defects.
+    """
 
     rates: Function
     rates_and_slopes: Function
@@ -26,16 +32,56 @@ class RodCode(Memory):
         system = equations.system
         self.equations, self.grid, self.space = equations, grid_of(system, equations.space), equations.space
         e, grid = self.equations, self.grid
-        super().__init__(robots, lanes, grid.count)
-        self.pieces, self.points, self.ends, self.count = grid.tip, grid.tip + 1, grid.ends, grid.count
-        #: first places of the scheme's stages, and the number of places that the scheme uses
-        self.stages = [grid.stage(k).start for k in range(len(self.space.formula.stages))]
-        self.used = self.ends + len(self.stages) * self.pieces
+        self.strands, self.strand_points = e.strands, grid.tip + 1
+        self.points = self.strands * self.strand_points
+        self.pieces = self.points - 1
+        #: first and last point of each strand
+        self.bases = [q * self.strand_points for q in range(self.strands)]
+        self.tips = [base + grid.tip for base in self.bases]
+        #: points that have a near side
+        self.near = [base + int(point) for base in self.bases for point in grid.near]
+        self.ends = self.points + len(self.near)
+        #: first places of the stages of scheme and check, and the numbers of places of both and of the scheme
+        self.check_stages = [self.ends + k * self.pieces for k in range(len(self.space.check.stages))]
+        self.stages = self.check_stages[: len(self.space.formula.stages)]
+        self.count, self.used = (
+            self.ends + len(stages) * self.pieces for stages in (self.check_stages, self.stages)
+        )
+        #: strand and place in the grid of each place; an idle piece has the stages of the one before
+        self.origins = np.array(
+            [
+                *((q, j) for q in range(self.strands) for j in range(self.strand_points)),
+                *((q, j) for q in range(self.strands) for j in range(self.strand_points, grid.ends)),
+                *(
+                    (q, grid.stage(k).start + min(j, grid.tip - 1))
+                    for k in range(len(self.check_stages))
+                    for q, j in list(np.ndindex(self.strands, self.strand_points))[:-1]
+                ),
+            ]
+        )
+        #: the place of each strand's places in the grid (strands, places)
+        self.places = np.stack(
+            [
+                np.unique(self.origins[:, 1] + (self.origins[:, 0] != q) * grid.count, return_index=True)[1]
+                for q in range(self.strands)
+            ]
+        )[:, : grid.count]
+        super().__init__(robots, lanes, self.count)
         ny, nz, k, a = e.ny, e.nz, e.k, self._array
-        self.params, self.scale_y, self.scale_tip = a(len(e.parameter_values), 1), a(ny, 1), a(k, 1)
+        self.params, self.scale_tip = a(len(e.parameter_values), 1), a(k, 1)
+        self.scale_y = a(ny, 1 if self.strands == 1 else self.points)
         self.inputs, self.step_terms = a(2 + e.nc, 1), a(len(e.step_terms), 1)
         self.s, self.h, self.length = a(1, self.count), a(1, self.pieces), a(1, 1)
-        self.geometry = self.scale_y, self.scale_tip, self.s, self.h, self.length
+        scale_y, scale_tip, places, lengths, length = e.geometry
+        idle = e.program.constant(0.0)
+        #: arrays of numbers that depend on the parameters alone, and their nodes (size, count)
+        self.geometry = [
+            (self.scale_y, scale_y.reshape(self.strands, ny)[self.origins[: self.scale_y.count, 0]].T),
+            (self.scale_tip, scale_tip[:, None]),
+            (self.s, places[None, self.origins[:, 1]]),
+            (self.h, np.tile(np.append(lengths, idle), self.strands)[None, :-1]),
+            (self.length, length[None]),
+        ]
         self.place_terms = a(len(e.place_terms), self.count)
         self.f, self.z, self.fe = a(ny, self.count), a(nz, self.count), a(ny, self.pieces)
         self.slope, self.slope_end = a(len(e.pattern), self.used), a(len(e.pattern), self.pieces)
@@ -96,16 +142,19 @@ class RodCode(Memory):
         """Scales, places and lengths of pieces: once a run."""
         e = self.equations
         self.setup = f = self._function("setup")
-        outputs = [int(node) for nodes in e.geometry for node in nodes]
+        outputs = [int(node) for _, nodes in self.geometry for node in nodes.flat]
         values = f.evaluate(e.program, outputs, self._parameters(), self.P)
-        for array, nodes in zip(self.geometry, e.geometry, strict=True):
-            for k, node in enumerate(nodes):
-                i, j = (0, k) if array.size == 1 else (k, 0)
-                self._put(values[int(node)], array, i, j)
-            if array.count > 1 and not self.batch:
-                # the lanes beyond the last place
-                for k in range(array.count, self.stride):
-                    self._put(values[int(nodes[-1])], array, 0, k)
+        for array, nodes in self.geometry:
+            # the lanes beyond the last place have its numbers
+            beyond = 0 if self.batch or array.count == 1 else self.stride - array.count
+            for i, row in enumerate(np.pad(nodes, ((0, 0), (0, beyond)), mode="edge")):
+                first = 0
+                for node, places in itertools.groupby(row):
+                    stop = first + len(list(places))
+                    # a loop, even for one place: LLVM is slow where a block has thousands of stores
+                    with f.loop(stop, first) as j:
+                        self._put(values[int(node)], array, i, j)
+                    first = stop
 
     def _parameters(self) -> dict[int, Value]:
         nodes = np.concatenate([nodes.reshape(-1) for nodes in self.equations.parameters])
@@ -179,9 +228,9 @@ class RodCode(Memory):
             with self._places(self.pieces) as j:
                 results = (far, e.far), *(self.jumps if slopes else ())
                 self._write_results(results, j, self._state(y, history, j) | self._acting_at(j))
-        for k, point in enumerate(self.grid.near):
+        for k, point in enumerate(self.near):
             for i in range(e.ny):
-                self._put(self._get(y, i, int(point)), far, i, self.points + k)
+                self._put(self._get(y, i, point), far, i, self.points + k)
         return far
 
     def _write_ends(self, source: Array, target: Array) -> None:
@@ -189,9 +238,9 @@ class RodCode(Memory):
         with self._places(self.pieces) as j:
             for i in range(source.size):
                 self._write_wide(self._wide(source, i, j + 1), target, i, j)
-        for k, point in enumerate(self.grid.near):
+        for k, point in enumerate(self.near):
             for i in range(source.size):
-                self._put(self._get(source, i, self.points + k), target, i, int(point) - 1)
+                self._put(self._get(source, i, self.points + k), target, i, point - 1)
 
     def _write_residual(self, name: str, y: Array, history: Array) -> Function:
         """Rates at all ends of pieces by y, and the defects of all pieces and of the tip."""
@@ -213,7 +262,7 @@ class RodCode(Memory):
         self, function: Function, k: int, stage: Stage, y: Array, history: Array
     ) -> None:
         """Evaluate a function of rates at a stage of all pieces."""
-        first = self.grid.stage(k).start
+        first = self.check_stages[k]
         far = y if self.far is None else self.far
         self._write_between(k, stage, (far, y), (self.f, self.fe), self.between)
         with self._places(self.pieces) as j:
@@ -229,12 +278,21 @@ class RodCode(Memory):
                 mean = self._weighted((1.0 - stage.end, stage.end), ends)
                 moved = self._increment(stage.rates, rates, i, j)
                 self._write_wide(mean + moved, target, i, j + k * self.pieces)
+        with self._idle_pieces() as j:
+            for i in range(self.equations.ny):
+                self._put(self._get(y[0], i, j), target, i, j + k * self.pieces)
+
+    @contextlib.contextmanager
+    def _idle_pieces(self) -> Iterator[Index]:
+        """Write a loop over the pieces between strands."""
+        with self._now.loop(self.strands - 1) as q:
+            yield self._now.index(q.value * self.strand_points) + (self.strand_points - 1)
 
     def _increment(self, weights: Sequence[float], rates: tuple[Array, Array], i: int, j: Index) -> Value:
         """Return h times the weighted sum of a piece's rates: at its start, its end and its stages."""
         at, end = rates
         places = [(at, j), (end, j)]
-        places += [(at, j + self.grid.stage(k).start) for k in range(len(weights) - len(places))]
+        places += [(at, j + first) for first in self.check_stages]
         values = [self._wide(array, i, place) for array, place in places[: len(weights)]]
         return self._weighted(weights, values, self._wide(self.h, 0, j))
 
@@ -264,6 +322,9 @@ class RodCode(Memory):
                 change = self._wide(y[0], i, j) - self._wide(y[1], i, j + 1)
                 value = change + self._increment(self.space.formula.weights, rates, i, j)
                 self._write_wide(value, self.r, i, j)
+        with self._idle_pieces() as j:
+            for i in range(self.equations.ny):
+                self._put(0.0, self.r, i, j)
 
     def _state(self, y: Array, history: Array, j: Index, place: Index | None = None) -> dict[int, Value]:
         """Return the values of y and of the history at a place; `place` if y is not stored by place."""
@@ -276,14 +337,26 @@ class RodCode(Memory):
         return {int(node): self._wide(self.acting, i, j) for i, node in enumerate(self.equations.acting)}
 
     def _tip_state(self, y: Array, history: Array) -> dict[int, Value]:
-        e, tip = self.equations, self.points - 1
-        state = {int(node): self._get(y, i, tip) for i, node in enumerate(e.y)}
-        return state | {int(e.history[i]): self._get(history, i, tip) for i in e.used_history}
+        state = {
+            int(node): self._get(y, i, tip)
+            for tip, nodes in zip(self.tips, self.equations.strand_y, strict=True)
+            for i, node in enumerate(nodes)
+        }
+        return state | self._history_of_strands(history, self.tips)
+
+    def _history_of_strands(self, history: Array, points: Sequence[int]) -> dict[int, Value]:
+        """Return the values of the history of each strand at its point."""
+        e = self.equations
+        return {
+            int(nodes[i]): self._get(history, i, point)
+            for point, nodes in zip(points, e.strand_history, strict=True)
+            for i in e.used_history
+        }
 
     def _base_state(self, unknowns: Array, history: Array) -> dict[int, Value]:
         e = self.equations
         state = {int(node): self._get(unknowns, i) for i, node in enumerate(e.unknowns)}
-        return state | {int(e.history[i]): self._get(history, i, 0) for i in e.used_history}
+        return state | self._history_of_strands(history, self.bases)
 
     def _norm(
         self, array: Array, scale: str, count: int, first: int = 0, relative: Array | None = None
@@ -297,7 +370,7 @@ class RodCode(Memory):
             inside = self._inside(j, first + count)
             for i in range(array.size):
                 x = f.apply("abs", self._wide(array, i, j))
-                unit = self._wide(self.scale_y, i)
+                unit = self._unit(i, j)
                 if relative is None:
                     x = x * unit
                 else:
@@ -309,6 +382,10 @@ class RodCode(Memory):
         # maxnum drops NaN; a sum keeps it
         known = f.compare("lt", finite.get(), float("inf"))
         return self._largest(f.select(known, found.get(), float("inf")))
+
+    def _unit(self, i: int, j: Index) -> Value:
+        """Return 1 over the natural unit of a component of y at a point."""
+        return self._wide(self.scale_y, i, j if self.strands > 1 else 0)
 
     def _tip_norm(self) -> Value:
         """Return the tip's largest residual in natural units; infinite for NaN."""
@@ -322,5 +399,5 @@ class RodCode(Memory):
     def _write_base(self, unknowns: Array, y: Array, history: Array) -> None:
         e = self.equations
         state = self._base_state(unknowns, history)
-        for i, value in enumerate(self._evaluated(e.base, 0, False, state)):
-            self._put(value, y, i, 0)
+        for k, value in enumerate(self._evaluated(e.base, 0, False, state)):
+            self._put(value, y, k % e.ny, self.bases[k // e.ny])
