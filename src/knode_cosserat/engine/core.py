@@ -780,30 +780,23 @@ class Core(EliminationCode):
         for name, arrays in self._parts.items():
             values = np.asarray(getattr(states, name), float)
             values = values.reshape(len(values), len(arrays), -1, self._width(arrays[0]))
-            if self._width(arrays[0]) > arrays[0].size:
-                strand, place = self.origins[self.origins[:, 1] < values.shape[-2]].T
-                values = self.equations.by_strand(values)[..., place, strand, :]
             for part, array in enumerate(arrays):
-                yield array, values[:, part]
+                yield array, self._by_strand(array, values[:, part])
 
     def _states(self, motions: np.ndarray, before: States) -> States:
         """Return the states in memories (vectors, n)."""
         found = {}
         for name, arrays in self._parts.items():
             shape = np.shape(getattr(before, name))
-            count = int(np.prod(shape[1:])) // (len(arrays) * self._width(arrays[0]))
-            parts = [self._numbers(motions, array, self._motion.start) for array in arrays]
-            values = np.stack(parts, axis=2)
-            values = values.reshape(-1, *values.shape[2:])
-            if self._width(arrays[0]) > arrays[0].size:
-                values = self.equations.joined(values[:, :, self.places[:, :count].T])
-            values = values[:, :, :count]
+            width = self._width(arrays[0])
+            count = int(np.prod(shape[1:])) // (len(arrays) * width)
+            parts = [
+                self._joined(array, self._numbers(motions, array, self._motion.start), count)
+                for array in arrays
+            ]
+            values = np.stack(parts, axis=2).reshape(-1, len(arrays), count, width)
             found[name] = values[: shape[0]].reshape(shape)
         return type(before)(**found)
-
-    def _width(self, array: Array) -> int:
-        """Return the size of an array's packed numbers, of all strands, at one place."""
-        return array.size * (self.strands if array.count > 1 else 1)
 
 
 def coefficients_of(

@@ -47,25 +47,12 @@ class RodCode(Memory):
         self.count, self.used = (
             self.ends + len(stages) * self.pieces for stages in (self.check_stages, self.stages)
         )
+        strands, pieces = range(self.strands), list(np.ndindex(self.strands, self.strand_points))[:-1]
         #: strand and place in the grid of each place; an idle piece has the stages of the one before
-        self.origins = np.array(
-            [
-                *((q, j) for q in range(self.strands) for j in range(self.strand_points)),
-                *((q, j) for q in range(self.strands) for j in range(self.strand_points, grid.ends)),
-                *(
-                    (q, grid.stage(k).start + min(j, grid.tip - 1))
-                    for k in range(len(self.check_stages))
-                    for q, j in list(np.ndindex(self.strands, self.strand_points))[:-1]
-                ),
-            ]
-        )
-        #: the place of each strand's places in the grid (strands, places)
-        self.places = np.stack(
-            [
-                np.unique(self.origins[:, 1] + (self.origins[:, 0] != q) * grid.count, return_index=True)[1]
-                for q in range(self.strands)
-            ]
-        )[:, : grid.count]
+        self.origins = [(q, j) for q in strands for j in range(self.strand_points)]
+        self.origins += [(q, j) for q in strands for j in range(self.strand_points, grid.ends)]
+        for k in range(len(self.check_stages)):
+            self.origins += [(q, grid.stage(k).start + min(j, grid.tip - 1)) for q, j in pieces]
         super().__init__(robots, lanes, self.count)
         ny, nz, k, a = e.ny, e.nz, e.k, self._array
         self.params, self.scale_tip = a(len(e.parameter_values), 1), a(k, 1)
@@ -76,9 +63,9 @@ class RodCode(Memory):
         idle = e.program.constant(0.0)
         #: arrays of numbers that depend on the parameters alone, and their nodes (size, count)
         self.geometry = [
-            (self.scale_y, scale_y.reshape(self.strands, ny)[self.origins[: self.scale_y.count, 0]].T),
+            (self.scale_y, np.repeat(scale_y.reshape(-1, ny).T, self.scale_y.count // self.strands, axis=1)),
             (self.scale_tip, scale_tip[:, None]),
-            (self.s, places[None, self.origins[:, 1]]),
+            (self.s, places[None, [place for _, place in self.origins]]),
             (self.h, np.tile(np.append(lengths, idle), self.strands)[None, :-1]),
             (self.length, length[None]),
         ]
@@ -105,6 +92,25 @@ class RodCode(Memory):
             self._put_in(found[None], self.acting, self.grid.acting[None, None])
         found[self.node_table.offset :].view(np.int64)[: len(self.grid.nodes)] = self.grid.nodes
         return found
+
+    def _width(self, array: Array) -> int:
+        """Return the size of an array's numbers, of all strands, at one place of the grid."""
+        return array.size * (self.strands if array.count > 1 else 1)
+
+    def _by_strand(self, array: Array, packed: np.ndarray) -> np.ndarray:
+        """Return an array's numbers from those of all strands at places of the grid (…, places, width)."""
+        if self._width(array) == array.size:
+            return packed
+        strand, place = np.transpose([each for each in self.origins if each[1] < packed.shape[-2]])
+        return self.equations.by_strand(packed)[..., place, strand, :]
+
+    def _joined(self, array: Array, values: np.ndarray, count: int) -> np.ndarray:
+        """Return the numbers of all strands at the first places of the grid (…, count, width)."""
+        if self._width(array) == array.size:
+            return values[..., :count, :]
+        first = {origin: k for k, origin in reversed(list(enumerate(self.origins)))}
+        places = [[first[q, j] for q in range(self.strands)] for j in range(count)]
+        return self.equations.joined(values[..., places, :])
 
     def _node(self, node: Index) -> Index:
         """Return the point of a node."""
