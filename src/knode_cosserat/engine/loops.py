@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 
-from knode_cosserat.engine.core import Core, Shape, States, coefficients_of, require_covered
+from knode_cosserat.engine.core import Constants, Core, Shape, States, coefficients_of, require_covered
 from knode_cosserat.engine.program import EngineError
 from knode_cosserat.engine.tangents import TangentCore
 from knode_cosserat.rods.system import System
@@ -31,7 +31,7 @@ CoreOrTangents = TypeVar("CoreOrTangents", Core, TangentCore)
 def core_of(system: System, settings: Settings, robots: bool) -> Core:
     """Return the core of a system or, with robots in lanes, of a batch of systems or one for all.
 
-    Parameters that are zero, in all systems of a batch, are constants of the code.
+    Parameters that are zero, in all systems of a batch, are constants of the code. Newton's options are not.
 
     Raises:
         EngineError: the engine does not cover the system or the settings.
@@ -40,8 +40,9 @@ def core_of(system: System, settings: Settings, robots: bool) -> Core:
     leaves = [np.asarray(leaf, dtype=float) for leaf in leaves]
     if np.ndim(system.length):
         leaves = [np.max(np.abs(leaf), axis=0) for leaf in leaves]
-    key = structure, _masks([leaf == 0.0 for leaf in leaves]), settings, robots
-    return _compiled(key, lambda: Core(jax.tree.unflatten(structure, leaves), settings, robots))
+    schemes = Settings(settings.time, settings.space)
+    key = structure, _masks([leaf == 0.0 for leaf in leaves]), schemes, robots
+    return _compiled(key, lambda: Core(jax.tree.unflatten(structure, leaves), schemes, robots))
 
 
 def _masks(masks: Sequence[np.ndarray]) -> Any:
@@ -74,12 +75,16 @@ def parameters_of(system: System) -> np.ndarray:
 
 def loop_one(
     system: System, settings: Settings, steps: StepCoefficients, controls: Any, past: States,
-    span: tuple[int, int],
+    span: tuple[int, int], tip_offset: Any = 0.0,
 ) -> tuple[int, States, StepRows]:  # fmt: skip
-    """Solve a span of steps until one fails: the number of steps done, the state after them, and rows."""
+    """Solve a span of steps until one fails: the number of steps done, the state after them, and rows.
+
+    The offset (k,) is subtracted from the residual of the tip's conditions.
+    """
     core = core_of(system, settings, robots=False)
     batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], past)
-    found = core.integrate(parameters_of(system), np.asarray(controls)[None], steps, batch, span)
+    constants = Constants(parameters_of(system), settings.newton, tip_offset)
+    found = core.integrate(constants, np.asarray(controls)[None], steps, batch, span)
     done, last, rows = jax.tree.map(lambda leaf: leaf[0], found)
     return int(done), last, rows
 
@@ -97,7 +102,8 @@ def loop_many(
         leaves = [np.asarray(leaf, float) for leaf in jax.tree.leaves(system)]
         parameters = np.concatenate([leaf.reshape(len(leaf), -1) for leaf in leaves], axis=1)
     pasts = jax.tree.map(np.asarray, pasts)
-    return core.integrate(parameters, np.asarray(controls), steps, pasts, (0, stop))
+    constants = Constants(parameters, settings.newton)
+    return core.integrate(constants, np.asarray(controls), steps, pasts, (0, stop))
 
 
 #: the coefficients of equilibria

@@ -43,6 +43,8 @@ class RodCode(Memory):
         self.jumps = [(self.jump, [node for *_, node in e.jumping])]
         #: defects of the pieces and of the tip
         self.r, self.tip = a(ny, self.pieces), a(k, 1)
+        #: subtracted from the tip's residual
+        self.tip_offset = a(k, 1)
 
     def _empty_memory(self) -> np.ndarray:
         """Return the memory before a run: zeros, but for discontinuities and nodes; aligned to 64 bytes."""
@@ -206,7 +208,7 @@ class RodCode(Memory):
                 self._write_wide(change + half * rates, self.r, i, j)
         at_tip = self._tip_state(y, history)
         for i, value in enumerate(self._evaluated(e.tip, 0, False, at_tip)):
-            self._put(value, self.tip, i)
+            self._put(value - self._get(self.tip_offset, i), self.tip, i)
 
     def _state(self, y: Array, history: Array, j: Index) -> dict[int, Value]:
         """Return the values of y and of the history at a place."""
