@@ -25,6 +25,7 @@ from knode_cosserat.engine.program import EngineError
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import LARGEST_CORRECTION, NewtonOptions
 from knode_cosserat.solvers.history import EXTRAPOLATIONS, StateHistory
+from knode_cosserat.solvers.problem import FILLING, Evaluated
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import LOBATTO2
@@ -71,15 +72,6 @@ class Constants(NamedTuple):
     newton: NewtonOptions
     #: subtracted from the residual of the tip's conditions
     tip_offset: Any = 0.0
-
-
-class Evaluated(NamedTuple):
-    """A state by the equations of a step: y, records at all places, and residuals of pieces and tip."""
-
-    y: Float[np.ndarray, "points y"]
-    records: Float[np.ndarray, "places x"]
-    defects: Float[np.ndarray, "pieces y"]
-    tip: Float[np.ndarray, " k"]
 
 
 class Core(EliminationCode):
@@ -742,20 +734,24 @@ class Core(EliminationCode):
     def evaluator(self, parameters: np.ndarray) -> Callable[..., Evaluated]:
         """Return a function that evaluates states of one robot, all in the same memory.
 
-        Its arguments are c0, the time (s), the control, history terms (places, x), y at all points, and how
-        often y at points between nodes is corrected (0: it is a solution).
+        Its arguments are c0, the time (s), the control, history terms (places, x), and y at all points, or at
+        the nodes.
         """
-        memory, count = self._empty_memory(), self.count
+        memory = self._empty_memory()
         self._put_in(memory[None], self.params, parameters[None, None, None])
 
-        def evaluate(c0: float, t: float, control: Any, history: Any, y: Any, turns: int = 0) -> Evaluated:
+        def evaluate(c0: float, t: float, control: Any, history: Any, y: Any) -> Evaluated:
+            turns = 0
+            if len(y) < self.points:
+                y, turns = self.grid.spread(y), FILLING * (self.grid.parts.shape[1] - 1)
             for array, values in ((self.H, history), (self.y, y)):
                 self._put_in(memory[None], array, np.asarray(values)[None, None])
             table, control = np.array([c0, 0.0, 0.0, 0.0, t]), np.array(control, dtype=float)
             self._evaluate(*(each.ctypes.data for each in (memory, table, control)), turns)
-            counts = (self.y, self.points), (self.records[0], count), (self.r, self.pieces), (self.tip, 1)
-            found = [self._numbers(memory[None], array)[0, 0, :count].copy() for array, count in counts]
-            return Evaluated(*found[:-1], found[-1][0])
+            arrays = self.y, self.records[0], self.r, self.scale_y, self.tip
+            y, records, defects, inverse, tip = (self._numbers(memory[None], each)[0, 0] for each in arrays)
+            error = np.max(np.abs(defects[: self.pieces]) * inverse)
+            return Evaluated(y[: self.points].copy(), records[: self.count].copy(), error, tip[0].copy())
 
         return evaluate
 

@@ -14,6 +14,7 @@ from knode_cosserat.engine.core import Constants, Core, Shape, States, coefficie
 from knode_cosserat.engine.program import EngineError
 from knode_cosserat.engine.tangents import TangentCore
 from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.problem import Evaluated
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.time_loop import StepCoefficients, StepRows
 
@@ -110,9 +111,16 @@ def loop_many(
 STILL = StepCoefficients(np.zeros((2, 4)), 0.0)
 
 
-def static_one(system: System, settings: Settings, controls: Any, y: Any, span: tuple[int, int]) -> Any:
+def evaluator(system: System, settings: Settings) -> Callable[..., Evaluated]:
+    """Return a function that evaluates states of a system (see `Core.evaluator`)."""
+    return core_of(system, settings, robots=False).evaluator(parameters_of(system))
+
+
+def static_one(
+    system: System, settings: Settings, controls: Any, y: Any, span: tuple[int, int], tip_offset: Any = 0.0
+) -> Any:
     """Solve a span of equilibria in turn until one fails: the number done, y at all points, and rows."""
-    done, last, rows = loop_one(system, settings, STILL, controls, Shape(y), span)
+    done, last, rows = loop_one(system, settings, STILL, controls, Shape(y), span, tip_offset)
     return done, last.y, rows
 
 
