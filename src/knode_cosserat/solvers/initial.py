@@ -82,9 +82,11 @@ def _all_at_rest(system: System, settings: Settings) -> Any:
 def _all_at_one_state(system: System, settings: Settings, records: Any, control: Any) -> Any:
     if is_traced((system, records, control)):
         return jax.vmap(lambda one, row: constant_history(one, settings, row, control))(system, records)
-    robots = (jax.tree.map(lambda leaf, i=i: leaf[i], system) for i in range(len(records)))
-    found = [at_one_state(one, settings, *pair, control) for one, *pair in zip(robots, records, strict=True)]
-    return jax.tree.map(lambda *parts: np.stack(parts), *found)
+
+    def of_robot(i: int) -> StateHistory:
+        return at_one_state(jax.tree.map(lambda leaf: leaf[i], system), settings, records[i], control)
+
+    return jax.tree.map(lambda *parts: np.stack(parts), *map(of_robot, range(len(records))))
 
 
 def _settled(system: System, settings: Settings, budget: float | None, control: Any) -> tuple[Any, Any]:
