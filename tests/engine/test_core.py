@@ -14,13 +14,16 @@ from knode_cosserat.engine import loops
 from knode_cosserat.engine.program import EngineError
 from knode_cosserat.learning.residual import network
 from knode_cosserat.rods.ends import Driven
-from knode_cosserat.solvers import static_loop, time_loop
+from knode_cosserat.rods.system import unknown_count
+from knode_cosserat.solvers import evaluation, recovery, static_loop, time_loop
 from knode_cosserat.solvers.boundary import NewtonOptions
+from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.history import constant_history, resting_history
+from knode_cosserat.solvers.recovery import attempt
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import Formula, SpaceScheme, Stage
 from knode_cosserat.solvers.static_loop import unloaded_shape
-from knode_cosserat.solvers.time_loop import StepCoefficients
+from knode_cosserat.solvers.time_loop import StepCoefficients, TimeStep
 
 DT, STEPS = 0.05, 25
 PAPER, ROUTED, LEGS = "delrin-tendon-robot", "delrin-routed-tendon-robot", "six-legged-robot"
@@ -204,6 +207,65 @@ class Joined(kc.robots.ParallelRobot):
 
     def base(self, t, control, unknowns):
         return super().base(t, control, unknowns).at[0].add(1e-3 * unknowns[-1])
+
+
+def test_options_of_newtons_method_are_numbers_of_a_run():
+    """The machine code is the same, and the iterates are those of the loop in JAX."""
+    robot, control = robot_of(PAPER), tensions(1)[0][:5]
+    usual, loose = settings_of("bdf2"), settings_of("bdf2")
+    loose = dataclasses.replace(loose, newton=NewtonOptions(1e-3, 1e-2, max_linearisations=2, patience=1))
+    assert loops.core_of(robot, usual, robots=False) is loops.core_of(robot, loose, robots=False)
+    found, wanted = emitted(robot, loose, control, (0, 5)), in_jax(robot, loose, control, (0, 5))
+    # estimates take other corrections: the last ones of the loose solutions are not computed
+    assert_same(wanted[2], found[2], 1e-11, 1e-2)
+    assert np.sum(found[2].corrections) < np.sum(emitted(robot, usual, control, (0, 5))[2].corrections)
+
+
+@pytest.mark.parametrize("kind", ["equilibrium", "bdf-alpha", "sdirk2"])
+def test_one_problem_from_a_guess_with_an_offset_at_the_tip(kind):
+    """An equilibrium, a step, or the second stage of a step, as in recovery."""
+    robot, control = robot_of(PAPER), np.array([8.0, 5.0, 5.0, 7.0])
+    settings = Settings(None) if kind == "equilibrium" else settings_of(kind)
+    offset = np.random.default_rng(5).uniform(-0.02, 0.02, unknown_count(robot))
+    guess, step = unloaded_shape(robot, settings.space), None
+    if kind != "equilibrium":
+        past = emitted(robot, settings, tensions(1)[0], (0, 4))[1]
+        coefficients, t = StepCoefficients.of(settings, DT).at(past.t0, 4)
+        if kind == "sdirk2":
+            coefficients, t = coefficients[1], t[1]
+        guess, step = past.y[1], TimeStep(past, coefficients, t)
+    found = attempt(robot, settings, step, control, guess, offset)
+    assert found.row.error <= 1e-10
+    wanted = jax.tree.map(np.asarray, recovery._attempt_in_jax(robot, settings, step, control, guess, offset))
+    assert_same(wanted[1], found.row, 1e-11, 1e-5)
+    if step is None:
+        np.testing.assert_allclose(found.state, wanted[0], atol=1e-12)
+        still = loops.evaluator(robot, settings)(0.0, 0.0, control, 0.0 * past_of(robot), found.state)
+        np.testing.assert_allclose(still.tip, offset, atol=1e-10)
+        return
+    for name in ("records", "rate", "y", "weights", "t0"):
+        one, other = getattr(wanted[0], name), getattr(found.state, name)
+        np.testing.assert_allclose(other, one, atol=1e-10 * max(float(np.max(np.abs(one))), 1e-3))
+
+
+def past_of(robot):
+    """Return records of a motion at all places."""
+    return emitted(robot, settings_of("bdf2"), tensions(1)[0], (0, 3))[1].records[0]
+
+
+@pytest.mark.parametrize("name", [PAPER, ROUTED])
+def test_states_evaluated(name):
+    """Of y at the nodes, which is completed at discontinuities, and of y at all points."""
+    robot, settings = robot_of(name), settings_of("bdf2")
+    grid, records = grid_of(robot), past_of(robot)
+    control, points = tensions(1)[0, 0], records[: grid.tip + 1, : robot.y_layout.size]
+    evaluate = loops.evaluator(robot, settings)
+    for y in (points[grid.nodes], points):
+        given = 30.0, 0.1, control, -28.0 * records, y
+        wanted, found = evaluation._evaluated(robot, settings.space, *given), evaluate(*given)
+        for one, other in zip(wanted, found, strict=True):
+            np.testing.assert_allclose(other, one, atol=1e-11 * np.max(np.abs(one)))
+    assert len(grid.between) > 0 or name == PAPER
 
 
 def test_a_refusal_keeps_no_frames():

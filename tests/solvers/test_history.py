@@ -153,13 +153,13 @@ def test_only_an_equilibrium_is_taken_for_one(rod):
     hanging = kc.equilibrium(rod, none, space="lobatto4")
     row = jnp.concatenate([hanging.y[0], hanging.z[0]], axis=-1)
     still = StepProblem.still(rod, space, none)
-    y = still.filled(hanging.y[0])
+    state = still.evaluated(hanging.y[0])
     between = at_places(rod, space, row)
-    found = still_records(still, row, y)
-    np.testing.assert_array_equal(found, still.records(y))
+    found = still_records(rod, space, row, state)
+    np.testing.assert_array_equal(found, state.records)
     assert np.max(np.abs(found - between)) > 1e-6
     for other in (row.at[:, -1].add(1e-6), row.at[3, 9].add(1e-6), 0.999 * row):
-        seen = still_records(still, other, still.filled(other[:, : rod.y_layout.size]))
+        seen = still_records(rod, space, other, still.evaluated(other[:, : rod.y_layout.size]))
         np.testing.assert_array_equal(seen, at_places(rod, space, other))
 
 

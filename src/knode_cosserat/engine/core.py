@@ -8,11 +8,12 @@ estimated errors of the grid and of the time scheme.
 from __future__ import annotations
 
 import ctypes
+import dataclasses
 import functools
 import itertools
 import operator
-from collections.abc import Iterable, Iterator
-from typing import NamedTuple, TypeVar
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -22,8 +23,9 @@ from knode_cosserat.engine.elimination import EliminationCode
 from knode_cosserat.engine.equations import Equations
 from knode_cosserat.engine.memory import Array
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.boundary import LARGEST_CORRECTION
+from knode_cosserat.solvers.boundary import LARGEST_CORRECTION, NewtonOptions
 from knode_cosserat.solvers.history import EXTRAPOLATIONS, StateHistory
+from knode_cosserat.solvers.problem import FILLING, Evaluated
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.time import SDIRK2
@@ -42,6 +44,8 @@ from knode_cosserat.solvers.time_loop import (
 USABLE, ERROR, CORRECTIONS, LINEARISATIONS, POSITION, ANGLE, TIME, ALIVE = range(8)
 #: part of the largest correction allowed at a solution, below which an expected correction is not computed
 SURELY_SMALL = 1e-2
+#: index of `acceptable` in Newton's options
+ACCEPTABLE = [field.name for field in dataclasses.fields(NewtonOptions)].index("acceptable")
 
 
 class Shape(NamedTuple):
@@ -53,7 +57,7 @@ class Shape(NamedTuple):
 States = TypeVar("States", StateHistory, Shape)
 
 
-class Evaluated(NamedTuple):
+class StateArrays(NamedTuple):
     """Arrays of an evaluated state, or of its tangents: y at ends of pieces and at stages, z and y_s."""
 
     far: Array
@@ -62,15 +66,29 @@ class Evaluated(NamedTuple):
     f: Array
 
 
+class Constants(NamedTuple):
+    """Numbers that all steps of a run share."""
+
+    #: of the system, or of each robot
+    parameters: Float[np.ndarray, "*robots n"]
+    newton: NewtonOptions
+    #: subtracted from the residual of the tip's conditions
+    tip_offset: Any = 0.0
+
+
 class Core(EliminationCode):
-    """Machine code of a system's time loop, or of its equilibria in turn."""
+    """Machine code of a system's time loop, or of its equilibria in turn.
+
+    It does not depend on Newton's options. A run may have fewer stages in a step than the scheme.
+    """
 
     def __init__(self, system: System, settings: Settings, robots: bool, lanes: int = 8):
-        self.settings, self.scheme, self.newton = settings, settings.time, settings.newton
+        self.settings, self.scheme = settings, settings.time
         super().__init__(Equations(system, space=settings.space), robots, lanes)
         e = self.equations
         ny, nz, k, numbers, a = e.ny, e.nz, e.k, e.numbers, self._array
-        # Newton's method: a trial point, and the correction from the last accepted one
+        # Newton's method: its options, a trial point, and the correction from the last accepted one
+        self.options = a(len(dataclasses.fields(NewtonOptions)), 1)
         self.trial, self.direction = a(ny, self.ends), a(ny, self.ends)
         self.trial_unknowns, self.direction_unknowns = a(k, 1), a(k, 1)
         # the motion: records of two states and their rate, states for the first guess, errors of the records
@@ -94,15 +112,19 @@ class Core(EliminationCode):
         self.tip_rest = a(k, 1)
         # products of derivatives, for the error of the time scheme
         self.difference, self.move, self.time_dH = (a(numbers, self.used) for _ in range(3))
-        self.tangents = Evaluated(
+        self.tangents = StateArrays(
             a(ny, self.ends), a(ny, self.used - self.ends), a(nz, self.used), a(ny, self.used)
         )
         self.dfe = a(ny, self.pieces)
         self._write()
         self.compiled = self.module.compile()
-        self._run = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 7, *[ctypes.c_long] * 2)(
+        self._run = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 7, *[ctypes.c_long] * 3)(
             self.compiled.address("run")
         )
+        if not robots:
+            self._evaluate = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 3, ctypes.c_long)(
+                self.compiled.address("evaluate")
+            )
         guesses = EXTRAPOLATIONS[None]
         if settings.stages > 1:
             guesses = stage_extrapolations(settings)
@@ -115,9 +137,11 @@ class Core(EliminationCode):
 
     def _write_newton(self) -> None:
         """Solve one step from y and the unknowns; results in y, the rates belong to y."""
-        e, newton = self.equations, self.newton
+        e = self.equations
         self.solve = f = self._function("solve", "numbers")
         memory, numbers = f.arguments
+        options = range(self.options.size)
+        tolerance, acceptable, most, patience, least_damping = (self._get(self.options, i) for i in options)
         P, infinity = self.P, float("inf")
 
         def plain(value: float) -> Variable:
@@ -141,7 +165,7 @@ class Core(EliminationCode):
 
         def active() -> Value:
             count = linearisations.get() + f.select(renew.get(), 1.0, 0.0)
-            return alive & ~done.get() & (count <= float(newton.max_linearisations))
+            return alive & ~done.get() & (count <= most)
 
         with f.while_(lambda: f.any(active())):
             going = active()
@@ -180,7 +204,7 @@ class Core(EliminationCode):
             # by the same factors, the correction shrinks as the residual does: a tiny one is not computed
             expected = left.get() * now_error
             enough = expected <= SURELY_SMALL * LARGEST_CORRECTION * error.get()
-            sure = (now_error <= newton.tolerance) & (size.get() < infinity) & enough
+            sure = (now_error <= tolerance) & (size.get() < infinity) & enough
             lengths = plain(0.0), plain(0.0)
             with f.if_(f.any(going & ~sure)):
                 f.call(self.correct, memory)
@@ -189,15 +213,15 @@ class Core(EliminationCode):
             now_size, now_left = (each.get() for each in lengths)
             was_first, was_fresh, was_old = first.get(), fresh.get(), old.get()
             was_damping, was_size, was_error = damping.get(), size.get(), error.get()
-            good = (now_error <= newton.tolerance) & (now_left <= LARGEST_CORRECTION)
+            good = (now_error <= tolerance) & (now_left <= LARGEST_CORRECTION)
             shorter = (now_size <= (1.0 - was_damping * 0.25) * was_size) & (now_size < infinity)
             accept = good | shorter
             ratio = f.apply("max", was_size / now_size, 1.0 + 1e-6)
             rate = f.apply("log", ratio)
-            slow = f.apply("log", now_error / newton.tolerance) > rate * float(newton.patience)
+            slow = f.apply("log", now_error / tolerance) > rate * patience
             slow = shorter & ~was_first & (was_size < infinity) & (slow | (was_damping < 1.0))
-            shorten = ~accept & was_fresh & ~was_first & (was_damping > newton.least_damping)
-            rounding = ~accept & (was_error <= newton.acceptable) & ~was_old & ~was_first
+            shorten = ~accept & was_fresh & ~was_first & (was_damping > least_damping)
+            rounding = ~accept & (was_error <= acceptable) & ~was_old & ~was_first
             dead = rounding | (~accept & (was_first | was_fresh) & ~shorten)
             again = ~good & ~dead & (slow | (~accept & ~shorten))
             longer = f.select(was_first, 1.0, f.apply("min", 1.0, 4.0 * was_damping))
@@ -229,7 +253,7 @@ class Core(EliminationCode):
             error.get(),
             f.apply("max", error.get(), f.apply("min", left.get(), 1.0)),
         )
-        keeps = (last <= newton.acceptable) & ~renew.get()
+        keeps = (last <= acceptable) & ~renew.get()
         f.store(f.select(keeps, 1.0, 0.0), numbers, USABLE * P, P)
         f.store(last, numbers, ERROR * P, P)
         f.store(corrections.get(), numbers, CORRECTIONS * P, P)
@@ -237,20 +261,11 @@ class Core(EliminationCode):
 
     # the corrected motion
 
-    def _write_check(self) -> None:
-        """Rates and residual of the solution, its records, and the defects of the scheme's check formula."""
+    def _write_recorded(self) -> None:
+        """Rates and residual of y, the defects of the scheme's check formula, and the records."""
         e = self.equations
-        self.check = f = self._function("check", "numbers", "coefficients")
-        memory, numbers, _ = f.arguments
-        f.call(self.residual_of_y, memory)
-        largest = f.apply("max", self._norm(self.r, "y", self.pieces), self._tip_norm())
-        f.store(f.apply("max", largest, f.load(numbers, ERROR * self.P, self.P)), numbers, ERROR * self.P)
-        # what the solution has left: no part of its errors
-        with self._places(self.pieces) as j:
-            for i in range(e.ny):
-                self._write_wide(self._wide(self.r, i, j), self.rest, i, j)
-        for i in range(e.k):
-            self._put(self._get(self.tip, i), self.tip_rest, i)
+        self.recorded = f = self._function("recorded", "coefficients")
+        f.call(self.residual_of_y, f.arguments[0])
         formula, check = self.space.formula, self.space.check
         for k in range(len(formula.stages), len(check.stages)):
             self._write_rates_between(self.rates, k, check.stages[k], self.y, self.H)
@@ -260,6 +275,21 @@ class Core(EliminationCode):
             for i in range(e.ny):
                 self._write_wide(self._increment(changes, (self.f, self.fe), i, j), self.defect, i, j)
         self._write_records()
+
+    def _write_check(self) -> None:
+        """The solution's records, and its residual."""
+        e = self.equations
+        self.check = f = self._function("check", "numbers", "coefficients")
+        memory, numbers, coefficients = f.arguments
+        f.call(self.recorded, memory, coefficients)
+        largest = f.apply("max", self._norm(self.r, "y", self.pieces), self._tip_norm())
+        f.store(f.apply("max", largest, f.load(numbers, ERROR * self.P, self.P)), numbers, ERROR * self.P)
+        # what the solution has left: no part of its errors
+        with self._places(self.pieces) as j:
+            for i in range(e.ny):
+                self._write_wide(self._wide(self.r, i, j), self.rest, i, j)
+        for i in range(e.k):
+            self._put(self._get(self.tip, i), self.tip_rest, i)
         # no residual has the strains of the tip
         total = Variable(f, f.splat(f.value(0.0), self.L))
         with self._places(self.count) as j:
@@ -496,11 +526,11 @@ class Core(EliminationCode):
         state |= {int(node): self._wide(y[1], i, j) for i, node in enumerate(e.dy[0])}
         return state | {int(node): self._wide(self.move, i, place) for i, node in enumerate(e.dhistory[0])}
 
-    def _evaluated_at(self, y: Array) -> Evaluated:
+    def _evaluated_at(self, y: Array) -> StateArrays:
         """Return the arrays of the state that was evaluated last, from y at the points."""
-        return Evaluated(y if self.far is None else self.far, self.between, self.z, self.f)
+        return StateArrays(y if self.far is None else self.far, self.between, self.z, self.f)
 
-    def _numbers_of(self, state: Evaluated, stop: int) -> Iterator[tuple[int, Index, Value]]:
+    def _numbers_of(self, state: StateArrays, stop: int) -> Iterator[tuple[int, Index, Value]]:
         """Write loops over places, and yield components of their records, places and numbers."""
         e = self.equations
         for y, first, end in ((state.far, 0, self.ends), (state.between, self.ends, stop)):
@@ -539,13 +569,16 @@ class Core(EliminationCode):
         """All steps from `n_start` to `n_stop`, until every robot has failed; `reached` counts the solved."""
         e, P = self.equations, self.P
         names = ["memory", "controls", "coefficients", "extrapolations", "rows", "infos", "reached"]
-        f = self._now = self.module.function("run", [*names, "n_start", "n_stop"], exported=True)
-        memory, controls, coefficients, extrapolations, rows, infos, reached, start, stop = f.arguments
+        names += ["n_start", "n_stop", "n_stages"]
+        f = self._now = self.module.function("run", names, exported=True)
+        memory, controls, coefficients, extrapolations, rows, infos, reached, start, stop, stages = (
+            f.arguments
+        )
         numbers = Value(f, f.reserve(f"[{8 * P} x double]"), "ptr")
         for k in range(8):
             f.store(1.0 if k == ALIVE else 0.0, numbers, k * P, P)
         f.call(self.setup, memory)
-        step, nodes, stages = Variable(f, start), len(self.grid.nodes), self.settings.stages
+        step, nodes = Variable(f, start), len(self.grid.nodes)
 
         def going() -> Value:
             return (step.get() < stop) & f.any(f.load(numbers, ALIVE * P, P) > 0.0)
@@ -618,7 +651,7 @@ class Core(EliminationCode):
                 for i in range(e.numbers):
                     self._write_wide(self._wide(self.time_dH, i, j), self.dH, i, j)
             f.call(self.corrected_in_time, memory, numbers)
-        solved = f.load(numbers, ERROR * P, P) <= self.newton.acceptable
+        solved = f.load(numbers, ERROR * P, P) <= self._get(self.options, ACCEPTABLE)
         alive = f.load(numbers, ALIVE * P, P)
         f.store(f.select(solved, alive, 0.0), numbers, ALIVE * P, P)
 
@@ -663,6 +696,17 @@ class Core(EliminationCode):
                 for i in range(e.ny):
                     self._write_wide(self._wide(source, i, j), target, i, j)
 
+    def _write_evaluate(self) -> None:
+        """The state at y and history terms, with y at points between nodes corrected in some turns."""
+        names = ["memory", "coefficients", "control", "n_turns"]
+        f = self._now = self.module.function("evaluate", names, exported=True)
+        memory, coefficients, control, turns = f.arguments
+        f.call(self.setup, memory)
+        self._write_inputs(f.load(coefficients, 0), f.load(coefficients, 4), control)
+        if len(self.grid.between):
+            self._write_filling(turns, self.residual_of_y)
+        f.call(self.recorded, memory, coefficients)
+
     def _write(self) -> None:
         self._write_setup()
         self._write_terms()
@@ -680,6 +724,7 @@ class Core(EliminationCode):
         self._write_linearise()
         self._write_correct()
         self._write_newton()
+        self._write_recorded()
         self._write_check()
         if self.scheme:
             self.corrected = self._write_corrected("corrected", self.errors, True, POSITION)
@@ -692,21 +737,48 @@ class Core(EliminationCode):
         self._write_stage()
         self._write_guesses()
         self._write_run()
+        if not self.batch:
+            self._write_evaluate()
 
     # running
 
+    def evaluator(self, parameters: np.ndarray) -> Callable[..., Evaluated]:
+        """Return a function that evaluates states of one robot, all in the same memory.
+
+        Its arguments are c0, the time (s), the control, history terms (places, x), and y at all points, or at
+        the nodes.
+        """
+        memory = self._empty_memory()
+        self._put_in(memory[None], self.params, parameters[None, None, None])
+
+        def evaluate(c0: float, t: float, control: Any, history: Any, y: Any) -> Evaluated:
+            turns = 0
+            if len(y) < self.strand_points:
+                y, turns = self.grid.spread(y), FILLING * (self.grid.parts.shape[1] - 1)
+            for array, values in ((self.H, history), (self.y, y)):
+                self._put_in(memory[None], array, self._by_strand(array, np.asarray(values))[None, None])
+            table, control = np.array([c0, 0.0, 0.0, 0.0, t]), np.array(control, dtype=float)
+            self._evaluate(*(each.ctypes.data for each in (memory, table, control)), turns)
+            arrays = self.y, self.records[0], self.r, self.scale_y, self.tip
+            y, records, defects, inverse, tip = (self._numbers(memory[None], each)[0, 0] for each in arrays)
+            error = np.max(np.abs(defects[: self.pieces]) * inverse[: self.pieces])
+            y = self._joined(self.y, y, self.strand_points)
+            records = self._joined(self.records[0], records, self.grid.count)
+            return Evaluated(y.copy(), records.copy(), error, tip[0].copy())
+
+        return evaluate
+
     def integrate(
-        self, parameters: np.ndarray, controls: np.ndarray, steps: StepCoefficients, states: States,
+        self, constants: Constants, controls: np.ndarray, steps: StepCoefficients, states: States,
         span: tuple[int, int],
     ) -> tuple[np.ndarray, States, StepRows]:  # fmt: skip
         """Solve a span of steps of each robot until one fails (see `time_loop.time_loop`).
 
-        Parameters (n,) or (robots, n), controls (robots, T, c) or (robots, T, stages * c) and states
-        (robots, ...). Returns the numbers of steps done, the states after them, and rows. In a batch, a robot
-        with a failed step waits for the others in its vector; its last state is not kept, except if the first
-        step failed.
+        Controls (robots, T, c) or (robots, T, stages * c) and states (robots, ...). Returns the numbers of
+        steps done, the states after them, and rows. In a batch, a robot with a failed step waits for the
+        others in its vector; its last state is not kept, except if the first step failed.
         """
-        e, P, stages, (start, stop) = self.equations, self.P, self.settings.stages, span
+        e, P, stages, (start, stop) = self.equations, self.P, np.size(steps.ends), span
         count, nodes, size = stop - start, len(self.grid.nodes), len(controls)
         vectors = -(-size // P)
 
@@ -720,7 +792,7 @@ class Core(EliminationCode):
         lane_controls = in_lanes(controls[:, start:stop]).reshape(vectors, P, count, held, e.nc)
         lane_controls = np.broadcast_to(lane_controls, (vectors, P, count, stages, e.nc))
         lane_controls = np.ascontiguousarray(np.moveaxis(lane_controls, 1, -1))
-        lane_parameters = in_lanes(np.broadcast_to(parameters, (size, parameters.shape[-1])))
+        lane_parameters = in_lanes(np.broadcast_to(constants.parameters, (size, self.params.size)))
         table = coefficients_of(steps, stages, span)
         rows = np.zeros((vectors, count, stages, nodes, self.strands * e.numbers, P))
         infos = np.zeros((vectors, count, stages, 8 + e.k, P))
@@ -730,14 +802,18 @@ class Core(EliminationCode):
             self._put_in(first_motions, array, in_lanes(value), self._motion.start)
         last_motions = np.empty_like(first_motions)
 
-        memory = self._empty_memory()
+        memory, empty = self._empty_memory(), self._empty.copy()
+        for array, numbers in (
+            (self.options, dataclasses.astuple(constants.newton)), (self.tip_offset, constants.tip_offset)
+        ):  # fmt: skip
+            self._put_in(empty[None], array, np.broadcast_to(numbers, (1, P, 1, array.size)))
 
         def solve(k: int, stop: int, *results: np.ndarray) -> None:
-            memory[:] = self._empty
+            memory[:] = empty
             memory[self._motion] = first_motions[k]
             self._put_in(memory[None], self.params, lane_parameters[k][None, :, None])
             arrays = memory, lane_controls[k], table, self._guesses, *results
-            self._run(*(each.ctypes.data for each in arrays), 0, stop)
+            self._run(*(each.ctypes.data for each in arrays), 0, stop, stages)
             last_motions[k], length[k] = (
                 memory[self._motion],
                 self._numbers(memory[None], self.length)[0, :, 0, 0],
@@ -755,9 +831,12 @@ class Core(EliminationCode):
         robot_rows, robot_infos = (
             np.moveaxis(part, -1, 1).reshape(-1, *part.shape[1:-1])[:size] for part in (rows, infos)
         )
-        return start + done, lasts, self._rows(robot_rows, robot_infos, length.reshape(-1)[:size], done)
+        found = self._rows(robot_rows, robot_infos, constants.newton, length.reshape(-1)[:size], done)
+        return start + done, lasts, found
 
-    def _rows(self, rows: np.ndarray, infos: np.ndarray, length: np.ndarray, done: np.ndarray) -> StepRows:
+    def _rows(
+        self, rows: np.ndarray, infos: np.ndarray, newton: NewtonOptions, length: np.ndarray, done: np.ndarray
+    ) -> StepRows:
         """Return rows (robots, steps, ...); a step's row is that of its last stage."""
         if self.strands > 1:
             rows = self.equations.joined(rows.reshape(*rows.shape[:-1], self.strands, -1))
@@ -766,9 +845,9 @@ class Core(EliminationCode):
         off, angle = numbers[..., -1, POSITION], numbers[..., -1, ANGLE]
         fine = (off <= COARSE_SHARE * length[:, None]) & (angle <= COARSE_ANGLE)
         result = np.where(fine, int(Result.CONVERGED), int(Result.COARSE))
-        result = np.where(error <= self.newton.acceptable, result, int(Result.NO_CONVERGENCE))
+        result = np.where(error <= newton.acceptable, result, int(Result.NO_CONVERGENCE))
         result[np.arange(result.shape[1]) > done[:, None]] = int(Result.NOT_REACHED)
-        time_error = numbers[..., -1, TIME] if isinstance(self.scheme, SDIRK2) else np.full(off.shape, np.nan)
+        time_error = numbers[..., -1, TIME] if numbers.shape[2] > 1 else np.full(off.shape, np.nan)
         corrections = np.sum(numbers[..., CORRECTIONS], axis=-1).astype(int)
         return StepRows(
             rows[:, :, -1], unknowns[:, :, -1], error, corrections, off, result, time_error,

@@ -277,6 +277,20 @@ class EliminationCode(RodCode):
             strand, i = divmod(k, self.own)
             self._put(self._get(self.correction.unknowns, i, strand), self.step_unknowns, k)
 
+    def _write_filling(self, turns: Any, residual: Function) -> None:
+        """Corrections of y at points between nodes (see `StepProblem.filled`); `residual` is that at y."""
+        f = self._now
+        with f.loop(turns):
+            for function in (self.linearised, residual):
+                f.call(function, f.arguments[0])
+            with self._places(self.pieces) as j:
+                points = self._pointer(self.r, j), self._pointer(self.wide_added, j)
+                f.call(self.solved, f.arguments[0], *points, j.value)
+            for point in map(int, self.grid.between):
+                for i in range(self.equations.ny):
+                    change = self._get(self.wide_added, i, point - 1)
+                    self._put(self._get(self.y, i, point) + change, self.y, i, point)
+
     def _write_correction(self, arrays: Correction, advance: Function) -> None:
         """Solve for a correction, from B⁻¹ r of all pieces."""
         f, ny, k, own = self._now, self.equations.ny, self.equations.k, self.own

@@ -10,10 +10,11 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 
-from knode_cosserat.engine.core import Core, Shape, States, coefficients_of
+from knode_cosserat.engine.core import Constants, Core, Shape, States, coefficients_of
 from knode_cosserat.engine.program import EngineError
 from knode_cosserat.engine.tangents import TangentCore
 from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.problem import Evaluated
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import LOBATTO2
 from knode_cosserat.solvers.time_loop import StepCoefficients, StepRows
@@ -32,7 +33,7 @@ CoreOrTangents = TypeVar("CoreOrTangents", Core, TangentCore)
 def core_of(system: System, settings: Settings, robots: bool) -> Core:
     """Return the core of a system or, with robots in lanes, of a batch of systems or one for all.
 
-    Parameters that are zero, in all systems of a batch, are constants of the code.
+    Parameters that are zero, in all systems of a batch, are constants of the code. Newton's options are not.
 
     Raises:
         EngineError: the engine does not cover the system or the settings.
@@ -41,8 +42,9 @@ def core_of(system: System, settings: Settings, robots: bool) -> Core:
     leaves = [np.asarray(leaf, dtype=float) for leaf in leaves]
     if np.ndim(system.length):
         leaves = [np.max(np.abs(leaf), axis=0) for leaf in leaves]
-    key = structure, _masks([leaf == 0.0 for leaf in leaves]), settings, robots
-    return _compiled(key, lambda: Core(jax.tree.unflatten(structure, leaves), settings, robots))
+    schemes = Settings(settings.time, settings.space)
+    key = structure, _masks([leaf == 0.0 for leaf in leaves]), schemes, robots
+    return _compiled(key, lambda: Core(jax.tree.unflatten(structure, leaves), schemes, robots))
 
 
 def _masks(masks: Sequence[np.ndarray]) -> Any:
@@ -75,12 +77,16 @@ def parameters_of(system: System) -> np.ndarray:
 
 def loop_one(
     system: System, settings: Settings, steps: StepCoefficients, controls: Any, past: States,
-    span: tuple[int, int],
+    span: tuple[int, int], tip_offset: Any = 0.0,
 ) -> tuple[int, States, StepRows]:  # fmt: skip
-    """Solve a span of steps until one fails: the number of steps done, the state after them, and rows."""
+    """Solve a span of steps until one fails: the number of steps done, the state after them, and rows.
+
+    The offset (k,) is subtracted from the residual of the tip's conditions.
+    """
     core = core_of(system, settings, robots=False)
     batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], past)
-    found = core.integrate(parameters_of(system), np.asarray(controls)[None], steps, batch, span)
+    constants = Constants(parameters_of(system), settings.newton, tip_offset)
+    found = core.integrate(constants, np.asarray(controls)[None], steps, batch, span)
     done, last, rows = jax.tree.map(lambda leaf: leaf[0], found)
     return int(done), last, rows
 
@@ -98,16 +104,24 @@ def loop_many(
         leaves = [np.asarray(leaf, float) for leaf in jax.tree.leaves(system)]
         parameters = np.concatenate([leaf.reshape(len(leaf), -1) for leaf in leaves], axis=1)
     pasts = jax.tree.map(np.asarray, pasts)
-    return core.integrate(parameters, np.asarray(controls), steps, pasts, (0, stop))
+    constants = Constants(parameters, settings.newton)
+    return core.integrate(constants, np.asarray(controls), steps, pasts, (0, stop))
 
 
 #: the coefficients of equilibria
 STILL = StepCoefficients(np.zeros((2, 4)), 0.0)
 
 
-def static_one(system: System, settings: Settings, controls: Any, y: Any, span: tuple[int, int]) -> Any:
+def evaluator(system: System, settings: Settings) -> Callable[..., Evaluated]:
+    """Return a function that evaluates states of a system (see `Core.evaluator`)."""
+    return core_of(system, settings, robots=False).evaluator(parameters_of(system))
+
+
+def static_one(
+    system: System, settings: Settings, controls: Any, y: Any, span: tuple[int, int], tip_offset: Any = 0.0
+) -> Any:
     """Solve a span of equilibria in turn until one fails: the number done, y at all points, and rows."""
-    done, last, rows = loop_one(system, settings, STILL, controls, Shape(y), span)
+    done, last, rows = loop_one(system, settings, STILL, controls, Shape(y), span, tip_offset)
     return done, last.y, rows
 
 

@@ -83,6 +83,8 @@ class RodCode(Memory):
         self.jumps = [(self.jump, [node for *_, node in e.jumping])]
         #: defects of the pieces and of the tip
         self.r, self.tip = a(ny, self.pieces), a(k, 1)
+        #: subtracted from the tip's residual
+        self.tip_offset = a(k, 1)
 
     def _empty_memory(self) -> np.ndarray:
         """Return the memory before a run: zeros, but for discontinuities and nodes; aligned to 64 bytes."""
@@ -319,7 +321,7 @@ class RodCode(Memory):
         self._write_missing((far, y), (self.f, self.fe))
         at_tip = self._tip_state(y, history)
         for i, value in enumerate(self._evaluated(e.tip, 0, False, at_tip)):
-            self._put(value, self.tip, i)
+            self._put(value - self._get(self.tip_offset, i), self.tip, i)
 
     def _write_missing(self, y: tuple[Array, Array], rates: tuple[Array, Array]) -> None:
         """Write the defects of all pieces: y at their ends by the scheme, minus y."""

@@ -132,7 +132,7 @@ def equilibria(
     bare = without_range(system)
     y = before = None
     if initial is not None:
-        y, before = grid_of(system).spread(jnp.asarray(initial.y[-1])), initial.control[-1]
+        y, before = grid_of(system).spread(initial.y[-1]), initial.control[-1]
     task = Equilibria(settings, np.shape(controls)[-2], recovery_budget)
     if is_traced((system, controls, y)):
         rest = unloaded_shape(bare, settings.space) if y is None else y

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from knode_cosserat.rods.section import INWARD
-from knode_cosserat.rods.system import System
+from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.solvers.space import LOBATTO2, SpaceScheme
 
 #: a discontinuity closer to a node than this part of a segment is placed on the node
@@ -88,7 +88,7 @@ class Grid:
             return values
         part = self.bounds[:, 0].reshape(-1, *(1 for _ in values.shape[1:]))
         start, end = (taken(values, self.segment + k) for k in (0, 1))
-        return jnp.concatenate([start + part * (end - start), values[-1:]])
+        return _joined([start + part * (end - start), values[-1:]])
 
     @functools.cached_property
     def stencils(self) -> tuple[Stencil, Stencil]:
@@ -145,12 +145,12 @@ def at_places(system: System, space: SpaceScheme, records: Float[Any, "nodes x"]
     """Interpolate packed records at the nodes to all places; no stencil spans a discontinuity."""
     ny = system.y_layout.size
     found = [
-        jnp.sum(stencil.weights[..., None] * own[stencil.nodes], axis=1)
+        (stencil.weights[..., None] * own[stencil.nodes]).sum(axis=1)
         for stencil, own in zip(
             grid_of(system, space).stencils, (records[:, :ny], records[:, ny:]), strict=True
         )
     ]
-    return jnp.concatenate(found, axis=-1)
+    return _joined(found, axis=-1)
 
 
 def inside(s: Any, low: Any, high: Any) -> Any:
@@ -165,4 +165,9 @@ def taken(values: Any, rows: np.ndarray) -> Any:
         return values[:0]
     runs = np.split(rows, np.flatnonzero(np.diff(rows) != 1) + 1)
     found = [values[run[0] : run[-1] + 1] for run in runs]
-    return found[0] if len(found) == 1 else jnp.concatenate(found)
+    return found[0] if len(found) == 1 else _joined(found)
+
+
+def _joined(parts: list[Any], axis: int = 0) -> Any:
+    """Return arrays as one; by NumPy outside of JAX's transformations, where each shape would be compiled."""
+    return (jnp if is_traced(parts) else np).concatenate(parts, axis=axis)

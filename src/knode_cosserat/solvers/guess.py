@@ -140,7 +140,7 @@ def curve_guesses(system: System, control: Any) -> list[Float[Any, "points y"]]:
         points = hanging_curve(system, control, reach)
         if points is not None:
             record = state_from_positions(system, points, control)
-            found.append(grid_of(system).spread(jnp.asarray(record[:, : system.y_layout.size])))
+            found.append(grid_of(system).spread(record[:, : system.y_layout.size]))
     return found
 
 

@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.solvers.grid import at_places, grid_of
-from knode_cosserat.solvers.problem import StepProblem, row_of
+from knode_cosserat.solvers.problem import Evaluated, StepProblem, row_of
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.time import BDF1
@@ -114,10 +114,11 @@ def history_of(states: Any, rate: Any, coefficients: Any, settings: Settings) ->
 
 def advanced(past: StateHistory, records: Any, rate: Any, y: Any, weights: Any) -> StateHistory:
     """Return the history of the next step."""
+    numeric: Any = jnp if is_traced((past, records, rate, y)) else np
     return past._replace(
-        records=jnp.stack([records, past.records[0]]),
+        records=numeric.stack([records, past.records[0]]),
         rate=rate,
-        y=jnp.concatenate([y[None], past.y[:-1]]),
+        y=numeric.concatenate([y[None], past.y[:-1]]),
         weights=weights,
     )
 
@@ -153,8 +154,9 @@ def constant_history(
     interpolated.
     """
     still = StepProblem.still(system, settings.space, control, t0)
-    y = still.filled(row[:, : system.y_layout.size])
-    return repeated_record_history(system, settings.space, still_records(still, row, y), y, t0)
+    found = still.evaluated(row[:, : system.y_layout.size])
+    records = still_records(system, settings.space, row, found)
+    return repeated_record_history(system, settings.space, records, found.y, t0)
 
 
 def repeated_record_history(
@@ -162,14 +164,15 @@ def repeated_record_history(
 ) -> StateHistory:
     """Return a history in which all earlier states equal one state."""
     used = used_places(system, space)
+    numeric: Any = jnp if is_traced((records, y, t0)) else np
     return StateHistory(
-        jnp.stack([records] * 2),
-        jnp.zeros_like(records),
-        jnp.stack([y] * GUESS_STATES),
-        jnp.asarray(EXTRAPOLATIONS[0]),
-        jnp.asarray(t0, dtype=float),
-        jnp.zeros((3, used, records.shape[-1])),
-        jnp.zeros((2, used, records.shape[-1])),
+        numeric.stack([records] * 2),
+        numeric.zeros_like(records),
+        numeric.stack([y] * GUESS_STATES),
+        numeric.asarray(EXTRAPOLATIONS[0]),
+        numeric.asarray(t0, dtype=float),
+        numeric.zeros((3, used, records.shape[-1])),
+        numeric.zeros((2, used, records.shape[-1])),
     )
 
 
@@ -179,17 +182,20 @@ def used_places(system: System, space: SpaceScheme) -> int:
     return grid.ends + len(space.formula.stages) * grid.tip
 
 
-def still_records(still: StepProblem, row: Any, y: Any) -> Float[Any, "places x"]:
-    """Return records of one row at all places: evaluated if the row is an equilibrium, else interpolated."""
-    system, ny = still.system, still.system.y_layout.size
-    solved = still.records(y)
-    own = row_of(system, y, solved)
-    nodes = jnp.concatenate([row, own[:, row.shape[1] :]], axis=1)
-    scales = system.scales()
-    off = jnp.max(jnp.abs(still.reached(y) - y[1:]) / scales.y)
+def still_records(
+    system: System, space: SpaceScheme, row: Float[Any, "nodes x"], still: Evaluated
+) -> Float[Any, "places x"]:
+    """Return records of a row at all places.
+
+    They are those of the state at rest if the row is an equilibrium. If not, they are interpolated.
+    """
+    numeric: Any = jnp if is_traced((system, row, still)) else np
+    ny, own = system.y_layout.size, row_of(system, still.y, still.records)
+    nodes = numeric.concatenate([row, own[:, row.shape[1] :]], axis=1)
     # the strains must also equal the equilibrium's: otherwise the state moves
-    bent = jnp.max(jnp.abs(nodes - own)[:, ny:]) <= SOLVED * (1.0 + jnp.max(jnp.abs(own[:, ny:])))
-    return jnp.where((off <= SOLVED) & bent, solved, at_places(system, still.space, nodes))
+    bent = numeric.max(abs(nodes - own)[:, ny:]) <= SOLVED * (1.0 + numeric.max(abs(own[:, ny:])))
+    solved = (still.error <= SOLVED) & bent
+    return numeric.where(solved, still.records, at_places(system, space, nodes))
 
 
 def rows_suffice(system: System, space: SpaceScheme) -> bool:

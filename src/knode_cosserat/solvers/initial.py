@@ -79,9 +79,14 @@ def _all_at_rest(system: System, settings: Settings) -> Any:
     return jax.vmap(lambda one: _at_rest(one, settings))(system)
 
 
-@functools.partial(jax.jit, static_argnames="settings")
 def _all_at_one_state(system: System, settings: Settings, records: Any, control: Any) -> Any:
-    return jax.vmap(lambda one, row: constant_history(one, settings, row, control))(system, records)
+    if is_traced((system, records, control)):
+        return jax.vmap(lambda one, row: constant_history(one, settings, row, control))(system, records)
+
+    def of_robot(i: int) -> StateHistory:
+        return at_one_state(jax.tree.map(lambda leaf: leaf[i], system), settings, records[i], control)
+
+    return jax.tree.map(lambda *parts: np.stack(parts), *map(of_robot, range(len(records))))
 
 
 def _settled(system: System, settings: Settings, budget: float | None, control: Any) -> tuple[Any, Any]:
@@ -118,7 +123,8 @@ def continued_state(system: System, initial: Trajectory, settings: Settings, dt:
     A trajectory on the same points and stages gives the solver's state, by its own or by a replay of its
     rows. Other rows are interpolated between nodes. An equilibrium, or a single row, is one state.
     """
-    record = jnp.concatenate([initial.y[-1], initial.z[-1]], axis=-1)
+    numeric: Any = jnp if is_traced((system, initial)) else np
+    record = numeric.concatenate([initial.y[-1], initial.z[-1]], axis=-1)
     control, t0 = initial.control[-1], initial.time[-1]
     state = _last_state(system, initial, settings, dt, record)
     if state is None:
@@ -127,12 +133,13 @@ def continued_state(system: System, initial: Trajectory, settings: Settings, dt:
         # one state is all that a step of another length can use
         history = state.history
         alone = history._replace(
-            records=jnp.stack([history.records[0]] * 2),
-            weights=jnp.asarray(EXTRAPOLATIONS[0]),
-            error=jnp.stack([history.error[0], *history.error[::2]]),
+            records=numeric.stack([history.records[0]] * 2),
+            weights=numeric.asarray(EXTRAPOLATIONS[0]),
+            error=numeric.stack([history.error[0], *history.error[::2]]),
         )
         state = SolverState(alone, None, state.rate_known)
-    state = SolverState(state.history._replace(t0=jnp.asarray(t0, dtype=float)), state.dt, state.rate_known)
+    history = state.history._replace(t0=numeric.asarray(t0, dtype=float))
+    state = SolverState(history, state.dt, state.rate_known)
     made = initial.settings
     result = initial.result[-1] if made and made.time else _coarse_only(initial.result[-1])
     return InitialState(record, control, state, result)
@@ -153,7 +160,8 @@ def _last_state(
     if made is None or made.space != settings.space or not _alike(initial.system, system):
         if len(initial.time) < 2:
             return None
-        rows = jnp.concatenate([initial.y[-2:], initial.z[-2:]], axis=-1)
+        numeric: Any = jnp if is_traced(initial) else np
+        rows = numeric.concatenate([initial.y[-2:], initial.z[-2:]], axis=-1)
         apart = dt if is_traced(initial.time) else float(initial.time[-1] - initial.time[-2])
         return state_of_rows(system, settings.space, rows, apart)
     state = initial.final_state
@@ -163,7 +171,6 @@ def _last_state(
     return SolverState(_moved_to(system, settings.space, state.history, record), state.dt, state.rate_known)
 
 
-@functools.partial(jax.jit, static_argnames="space")
 def _moved_to(system: System, space: SpaceScheme, history: StateHistory, record: Any) -> StateHistory:
     """Return a history moved to a row that may have been changed since, with unchanged rates."""
     row = row_of(system, history.y[0], history.records[0])

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Shaped
 
 from knode_cosserat.rods.strands import in_strands
-from knode_cosserat.rods.system import System, unknowns_of
+from knode_cosserat.rods.system import System, is_traced, unknowns_of
 from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.grid import Grid, grid_of, inside, taken
 from knode_cosserat.solvers.hoisting import split_function
@@ -42,7 +42,7 @@ class Hoisted(NamedTuple):
 def no_history(system: System, space: SpaceScheme) -> Float[Any, "places x"]:
     """Zero history, for statics."""
     ny, nz = system.y_layout.size, system.z_layout.size
-    return jnp.zeros((grid_of(system, space).count, ny + nz + (ny if system.mixed else 0)))
+    return np.zeros((grid_of(system, space).count, ny + nz + (ny if system.mixed else 0)))
 
 
 def row_of(
@@ -50,7 +50,8 @@ def row_of(
 ) -> Float[Any, "nodes x ..."]:
     """Return the row of a solved step: y on the near side of discontinuities, z and y_s on the far side."""
     nodes, ny = grid_of(system).nodes, system.y_layout.size
-    return jnp.concatenate([taken(y, nodes), taken(records, nodes)[:, ny:]], axis=1)
+    numeric: Any = jnp if is_traced((y, records)) else np
+    return numeric.concatenate([taken(y, nodes), taken(records, nodes)[:, ny:]], axis=1)
 
 
 class Stages(NamedTuple):
@@ -59,6 +60,17 @@ class Stages(NamedTuple):
     y: list[Any]
     f: list[Any]
     z: list[Any]
+
+
+class Evaluated(NamedTuple):
+    """A state by the equations of a step."""
+
+    y: Float[Any, "points y"]
+    records: Float[Any, "places x"]
+    #: largest residual of the pieces, natural units
+    error: Float[Any, ""]
+    #: residual of the tip's conditions
+    tip: Float[Any, " k"]
 
 
 class StepProblem(eqx.Module):
@@ -299,6 +311,12 @@ class StepProblem(eqx.Module):
     def records(self, y: Float[Any, "points y"]) -> Float[Any, "places x"]:
         """Return the records of a state at every place."""
         return self.packed(self.stages(y, self.space.check, self.ends(y)))
+
+    def evaluated(self, y: Float[Any, "n y"]) -> Evaluated:
+        """Return the state of y at all points, or at the nodes."""
+        y = self.filled(y) if len(y) == self.system.nodes else y
+        defects, tip = self.residuals(y)
+        return Evaluated(y, self.records(y), jnp.max(jnp.abs(defects) / self.system.scales().y), tip)
 
     def linearise(self, y: Float[Any, "points y"], unknowns: Any) -> Linearisation:
         """Return the exact derivatives of the residuals, all pieces side by side."""

@@ -1,7 +1,7 @@
 """Recovery of a failed step: other guesses, load continuation, easing, then a method of the kind of problem.
 
-It runs outside the compiled loop, step by step in plain Python. It is rare, and its program is compiled only
-when it is first needed. `recovery_methods` has the methods of time steps and of equilibria.
+It runs outside the compiled loop, step by step in plain Python, by the machine code of the run.
+`recovery_methods` has the methods of time steps and of equilibria.
 """
 
 from __future__ import annotations
@@ -17,17 +17,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from knode_cosserat.engine import loops as engine
+from knode_cosserat.engine.program import EngineError
 from knode_cosserat.errors import KnodeCosseratError
-from knode_cosserat.rods.system import System, unknown_count
-from knode_cosserat.solvers.boundary import Solution, newton
+from knode_cosserat.rods.system import System, unknown_count, unknowns_of
+from knode_cosserat.solvers.boundary import newton
 from knode_cosserat.solvers.history import EXTRAPOLATIONS
 from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.time_loop import StepRows, TimeStep, no_stages, recorded_step, solved_row
+from knode_cosserat.solvers.time_loop import StepCoefficients, StepRows, TimeStep, recorded_step, solved_row
 
 #: smallest load step of continuation, as a part of the change of control
 LEAST_PART = 1.0 / 512.0
+#: largest number of linearisations of an attempt
+MOST_LINEARISATIONS = 40
 #: initial factor by which continuation eases friction and contact
 EASIEST = 1e-3
 #: forces in the control above this multiple of EI/L² suggest a wrong unit
@@ -75,40 +79,50 @@ class SolvedStep(NamedTuple):
     cause: str = ""
 
 
-class Attempt(NamedTuple):
-    """Result of one boundary-value problem."""
+def attempt(
+    system: System, settings: Settings, step: TimeStep | None, control: Any, y: Any, tip_offset: Any
+) -> SolvedStep:
+    """Solve one boundary-value problem, of a time step or of an equilibrium (None), from y at all points.
 
-    solution: Solution
-    #: as in `SolvedStep`
-    state: Any
-    row: StepRows
+    The search is long. The offset (k,) is subtracted from the residual of the tip's boundary conditions.
+    """
+    patient = dataclasses.replace(
+        settings, newton=dataclasses.replace(settings.newton, max_linearisations=MOST_LINEARISATIONS)
+    )
+    controls = np.asarray(control)[None]
+    try:
+        if step is None:
+            _, state, rows = engine.static_one(system, patient, controls, y, (0, 1), tip_offset)
+        else:
+            past, weights = step.past, EXTRAPOLATIONS[0]
+            # the first guess is the newest of the earlier states
+            guess = past._replace(y=np.stack([y, *past.y[:-1]]), weights=weights, t0=0.0)
+            one = StepCoefficients(np.stack([step.coefficients] * 2), step.t)
+            _, after, rows = engine.loop_one(system, patient, one, controls, guess, (0, 1), tip_offset)
+            state = after._replace(y=np.stack([after.y[0], *past.y[:-1]]), weights=weights, t0=past.t0)
+        return SolvedStep(state, StepRows(*(leaf[0] for leaf in rows)))
+    except EngineError:
+        found = _attempt_in_jax(system, patient, step, control, y, tip_offset)
+        return SolvedStep(*jax.tree.map(np.asarray, found))
 
 
 @functools.partial(jax.jit, static_argnames="settings")
-def attempt(
-    system: System, settings: Settings, step: TimeStep | None, control: Any, guess: tuple[Any, Any], tip: Any
-) -> Attempt:
-    """Solve one boundary-value problem, of a time step or of an equilibrium (None), with a long search.
-
-    With `tip` = (part, y at all points), the tip's boundary conditions are enforced in part: the rest of
-    their residual at that y remains.
-    """
-    part, from_y = tip
+def _attempt_in_jax(
+    system: System, settings: Settings, step: TimeStep | None, control: Any, y: Any, tip_offset: Any
+) -> tuple[Any, StepRows]:
     if step is None:
         problem = StepProblem.still(system, settings.space, control).ready()
     else:
         problem = step.problem(system, settings, control).ready()
-    problem = dataclasses.replace(problem, tip_offset=(1.0 - part) * problem.tip_residual(from_y[-1]))
-    patient = dataclasses.replace(settings.newton, max_linearisations=40)
-    solution, kept = newton(problem, *guess, patient)
+    problem = dataclasses.replace(problem, tip_offset=tip_offset)
+    solution, kept = newton(problem, y, unknowns_of(system, y[0]), settings.newton)
     if step is None:
-        row, _, _ = solved_row(problem, settings.newton, solution, kept.factors)
-        return Attempt(solution, solution.y, row)
+        return solution.y, solved_row(problem, settings.newton, solution, kept.factors)[0]
     after, row = recorded_step(problem, settings, step, solution, kept.factors)
-    return Attempt(solution, after._replace(weights=jnp.asarray(EXTRAPOLATIONS[0])), row)
+    return after._replace(weights=jnp.asarray(EXTRAPOLATIONS[0])), row
 
 
-#: compiled programs of `attempt`: the first call of each compiles and does not count
+#: programs of `attempt`: the first call of each compiles and does not count
 _COMPILED: set[Any] = set()
 
 
@@ -128,32 +142,31 @@ class Recovery(abc.ABC):
         """State before the step, as in `SolvedStep`."""
 
     @abc.abstractmethod
-    def guesses(self) -> list[tuple[Any, Any]]:
-        """Return initial guesses (y, unknowns) from the state before the step."""
+    def guesses(self) -> list[Any]:
+        """Return initial guesses, y at all points, from the state before the step."""
 
-    def first_guesses(self, control: Any) -> list[tuple[Any, Any]]:
+    def first_guesses(self, control: Any) -> list[Any]:
         """Return the guesses of the first attempts."""
         return self.guesses()
 
     @abc.abstractmethod
-    def last_method(self, controls: tuple[Any, Any]) -> tuple[Result, Attempt] | None:
+    def last_method(self, controls: tuple[Any, Any]) -> tuple[Result, SolvedStep] | None:
         """Return the result of the last method, which may change the problem on the way."""
 
     def solve(
-        self, control: Any, guess: tuple[Any, Any], tip: Any = None, system: System | None = None
-    ) -> Attempt:
-        """Solve the step under a control; `tip` as in `attempt`."""
+        self, control: Any, guess: Any, tip_offset: Any = 0.0, system: System | None = None
+    ) -> SolvedStep:
+        """Solve the step under a control; arguments as in `attempt`."""
         began, own = time.perf_counter(), system or self.system
-        tip = (1.0, guess[0]) if tip is None else tip
-        found = attempt(own, self.settings, self.step, control, guess, tip)
-        self.corrections += int(found.solution.corrections)
-        program = jax.tree.structure((own, self.step)), self.settings, np.shape(guess[0])
+        found = attempt(own, self.settings, self.step, control, guess, tip_offset)
+        self.corrections += int(found.row.corrections)
+        program = jax.tree.structure((own, self.step)), self.settings, np.shape(guess)
         if program in _COMPILED:
             self.budget.spend(time.perf_counter() - began)
         _COMPILED.add(program)
         return found
 
-    def solved(self, found: Attempt) -> bool:
+    def solved(self, found: SolvedStep) -> bool:
         """Return True if the attempt is a solution."""
         return bool(found.row.error <= self.settings.newton.acceptable)
 
@@ -161,7 +174,7 @@ class Recovery(abc.ABC):
         """Solve the step by all methods in order. `controls` are the previous step's and this one's."""
         if self.budget.seconds <= 0.0:
             return self._given_up(controls[1])
-        best: list[Attempt] = []
+        best: list[SolvedStep] = []
         cause = ""
         try:
             found = self._by_all_methods(controls, best)
@@ -171,10 +184,10 @@ class Recovery(abc.ABC):
             cause = f"Recovery was stopped after {self.budget.seconds:.3g} s (recovery_budget)."
         # an attempt that is only reported
         self.budget = Budget(np.inf)
-        least = min(best, key=lambda each: float(each.solution.error)) if best else None
+        least = min(best, key=lambda each: float(each.row.error)) if best else None
         if least is None:
             least = self.solve(controls[1], self.guesses()[0])
-        result = Result.NO_CONVERGENCE if np.isfinite(least.solution.error) else Result.NOT_FINITE
+        result = Result.NO_CONVERGENCE if np.isfinite(least.row.error) else Result.NOT_FINITE
         cause = f"{likely_cause(result, self.system, self.settings, controls[1])} {cause}".strip()
         return self._outcome(result, least)._replace(state=self.state, cause=cause)
 
@@ -183,20 +196,19 @@ class Recovery(abc.ABC):
         system, result = self.system, Result.NO_CONVERGENCE
         width = system.y_layout.size * (2 if system.mixed else 1) + system.z_layout.size
         record, unknowns = np.full((system.nodes, width), np.nan), np.full(unknown_count(system), np.nan)
-        row = StepRows(
-            record, unknowns, np.inf, 0, np.nan, int(result), np.nan, *map(np.asarray, no_stages(system))
-        )
+        stages = (np.zeros((0, *np.shape(each))) for each in (record, unknowns))
+        row = StepRows(record, unknowns, np.inf, 0, np.nan, int(result), np.nan, *stages)
         return SolvedStep(self.state, row, likely_cause(result, system, self.settings, control))
 
-    def _outcome(self, result: Result, found: Attempt) -> SolvedStep:
-        row = StepRows(*map(np.asarray, found.row))
+    def _outcome(self, result: Result, found: SolvedStep) -> SolvedStep:
+        row = found.row
         if result.solved and row.result == Result.COARSE:
             result = Result.COARSE
         return SolvedStep(found.state, row._replace(corrections=self.corrections, result=int(result)))
 
     def _by_all_methods(
-        self, controls: tuple[Any, Any], best: list[Attempt]
-    ) -> tuple[Result, Attempt] | None:
+        self, controls: tuple[Any, Any], best: list[SolvedStep]
+    ) -> tuple[Result, SolvedStep] | None:
         """Try all methods in order; attempts from direct guesses are added to `best`."""
         for guess in self.first_guesses(controls[1]):
             found = self.solve(controls[1], guess)
@@ -211,40 +223,41 @@ class Recovery(abc.ABC):
             return Result.RECOVERED_EASING, eased
         return self.last_method(controls)
 
-    def continue_load(self, before: Any, now: Any) -> Attempt | None:
+    def continue_load(self, before: Any, now: Any) -> SolvedStep | None:
         """Continue from the previous control to this one in load steps, each from the last solution."""
         before, now = np.asarray(before, dtype=float), np.asarray(now, dtype=float)
         if np.array_equal(before, now):
             return None
 
-        def at_part(part: float, at: Solution) -> Attempt:
-            return self.solve(before + part * (now - before), (at.y, at.unknowns))
+        def at_part(part: float, y: Any) -> SolvedStep:
+            return self.solve(before + part * (now - before), y)
 
         return self._in_parts(lambda guess: self.solve(before, guess), at_part)
 
-    def ease(self, control: Any) -> Attempt | None:
+    def ease(self, control: Any) -> SolvedStep | None:
         """Continue from eased friction and contact to the system's own."""
         system = self.system
         easiest = system.eased(EASIEST)
         if easiest is system:
             return None
 
-        def at_part(part: float, at: Solution) -> Attempt:
+        def at_part(part: float, y: Any) -> SolvedStep:
             easier = system.eased(EASIEST ** (1.0 - part)) if part < 1.0 else system
-            return self.solve(control, (at.y, at.unknowns), system=easier)
+            return self.solve(control, y, system=easier)
 
         return self._in_parts(lambda guess: self.solve(control, guess, system=easiest), at_part)
 
     def _in_parts(
-        self, first: Callable[[Any], Attempt], solve: Callable[[float, Solution], Attempt]
-    ) -> Attempt | None:
+        self, first: Callable[[Any], SolvedStep], solve: Callable[[float, Any], SolvedStep]
+    ) -> SolvedStep | None:
         """Continue from a solution at part 0 to part 1, with adaptive steps, each from the last solution."""
         for guess in self.guesses():
             found = first(guess)
             reached, part = 0.0, 0.25 if self.solved(found) else 0.0
             while reached < 1.0 and part >= LEAST_PART:
                 target = min(1.0, reached + part)
-                following = solve(target, found.solution)
+                y = found.state if self.step is None else found.state.y[0]
+                following = solve(target, y)
                 if self.solved(following):
                     found, reached, part = following, target, 2.0 * part
                 else:

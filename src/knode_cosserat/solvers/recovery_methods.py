@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 
-from knode_cosserat.rods.system import System, unknowns_of
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.evaluation import still_state
 from knode_cosserat.solvers.guess import curve_guesses
 from knode_cosserat.solvers.history import EXTRAPOLATIONS, repeated_record_history
-from knode_cosserat.solvers.problem import StepProblem
-from knode_cosserat.solvers.recovery import Attempt, Budget, Recovery, SolvedStep, natural_time
+from knode_cosserat.solvers.recovery import Budget, Recovery, SolvedStep, natural_time
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.time import BDF1, BDF2
@@ -33,8 +32,7 @@ class StepRecovery(Recovery):
 
     def __init__(self, system: System, settings: Settings, step: TimeStep, dt: float, budget: Budget):
         super().__init__(system, settings, budget)
-        coefficients, t = (np.asarray(each, dtype=float) for each in step[1:])
-        self.step = TimeStep(step.past, coefficients, t)
+        self.step = jax.tree.map(lambda leaf: np.asarray(leaf, dtype=float), step)
         self.dt = dt
 
     @property
@@ -42,12 +40,11 @@ class StepRecovery(Recovery):
         """History before the step."""
         return self.step.past
 
-    def guesses(self) -> list[tuple[Any, Any]]:
+    def guesses(self) -> list[Any]:
         """Return the last state, and its linear extrapolation."""
-        guesses = [jnp.einsum("p,pny->ny", w, self.step.past.y) for w in EXTRAPOLATIONS[:2]]
-        return [(y, unknowns_of(self.system, y[0])) for y in guesses]
+        return [np.einsum("p,pny->ny", w, self.step.past.y) for w in EXTRAPOLATIONS[:2]]
 
-    def last_method(self, controls: tuple[Any, Any]) -> tuple[Result, Attempt] | None:
+    def last_method(self, controls: tuple[Any, Any]) -> tuple[Result, SolvedStep] | None:
         """Divide the step into substeps: with a constant control first, then with a ramp."""
         for before in (controls[1], controls[0]):
             found = self._in_substeps(before, controls[1])
@@ -55,13 +52,17 @@ class StepRecovery(Recovery):
                 return Result.RECOVERED_STEP_HALVING, found
         return None
 
-    def _in_substeps(self, before: Any, now: Any) -> Attempt | None:
-        """Solve the step by adaptive substeps, with coefficients for unequal time steps."""
+    def _in_substeps(self, before: Any, now: Any) -> SolvedStep | None:
+        """Solve the step by adaptive substeps, with coefficients for unequal time steps.
+
+        The substeps of a scheme of several stages are those of BDF2.
+        """
         settings, past, dt = self.settings, self.step.past, self.dt
         before, now = np.asarray(before, dtype=float), np.asarray(now, dtype=float)
         reached, part, previous = 0.0, 0.5, 1.0
         assert settings.time is not None
-        scheme = settings.time if settings.start == "paper" else BDF1()
+        regular = settings.time if settings.stages == 1 else BDF2()
+        scheme = settings.time if settings.start == "paper" and settings.stages == 1 else BDF1()
         for _ in range(MOST_SUBSTEPS):
             until = min(1.0, reached + part)
             coefficients = scheme.coefficients((until - reached) * dt, previous * dt)
@@ -76,11 +77,11 @@ class StepRecovery(Recovery):
             self.corrections = substep.corrections
             if until == 1.0:
                 return found._replace(state=self._whole(found.state))
-            past, previous, scheme = found.state, until - reached, settings.time
+            past, previous, scheme = found.state, until - reached, regular
             reached, part = until, 2.0 * previous
         return None
 
-    def direct(self, control: Any, ease: bool) -> Attempt | None:
+    def direct(self, control: Any, ease: bool) -> SolvedStep | None:
         """Return a solution from the guesses, or by easing."""
         for guess in self.guesses():
             found = self.solve(control, guess)
@@ -92,16 +93,16 @@ class StepRecovery(Recovery):
         """Return the history of the next step, which holds whole steps, not substeps."""
         before = self.step.past
         return after._replace(
-            records=jnp.stack([after.records[0], before.records[0]]),
-            y=jnp.concatenate([after.y[:1], before.y[:-1]]),
-            error=jnp.stack([after.error[0], before.error[0], after.error[2]]),
+            records=np.stack([after.records[0], before.records[0]]),
+            y=np.stack([after.y[0], *before.y[:-1]]),
+            error=np.stack([after.error[0], before.error[0], after.error[2]]),
         )
 
 
 class _Substeps(StepRecovery):
     """Recovery of a step of several stages by substeps of one stage, its last method."""
 
-    def first_guesses(self, control: Any) -> list[tuple[Any, Any]]:
+    def first_guesses(self, control: Any) -> list[Any]:
         """Return none: a whole step of one stage would be another scheme's."""
         return []
 
@@ -116,7 +117,7 @@ def recovered_stages(
     system: System, settings: Settings, step: TimeStep, dt: float, budget: Budget, controls: tuple[Any, Any]
 ) -> SolvedStep:
     """Recover a step of several stages: each stage, or all of them by substeps of a multistep scheme."""
-    before, now = (np.asarray(stage_controls(system, settings, jnp.asarray(each))) for each in controls)
+    before, now = (stage_controls(system, settings, np.asarray(each)) for each in controls)
     last, past, found = before[-1], step.past, []
     for coefficients, t, own in zip(step.coefficients, step.t, now, strict=True):
         stage = _Stage(system, settings, TimeStep(past, coefficients, t), dt, budget)
@@ -127,13 +128,12 @@ def recovered_stages(
         past, last = solved.state, own
     else:
         rows = StepRows(*map(np.stack, zip(*found, strict=True)))
-        row = StepRows(*map(np.asarray, joined_stages(rows)))
-        past = past._replace(time_error=jnp.full_like(past.time_error, jnp.nan))
+        row = joined_stages(rows)
+        past = past._replace(time_error=np.full_like(past.time_error, np.nan))
         return SolvedStep(past, row._replace(result=max(int(each.result) for each in found)))
     whole = TimeStep(step.past, BDF1().coefficients(dt, dt), step.t[-1])
-    one_stage = dataclasses.replace(settings, time=BDF2(), start="consistent")
-    solved = _Substeps(system, one_stage, whole, dt, budget).recover((before[-1], now[-1]))
-    lost = solved.state._replace(time_error=jnp.full_like(solved.state.time_error, jnp.nan))
+    solved = _Substeps(system, settings, whole, dt, budget).recover((before[-1], now[-1]))
+    lost = solved.state._replace(time_error=np.full_like(solved.state.time_error, np.nan))
     row, count = solved.row, settings.stages - 1
     # between the ends of such a step no stages are known
     stages, unknowns = (np.repeat(each[None], count, axis=0) for each in (row.records, row.unknowns))
@@ -152,38 +152,37 @@ class StaticRecovery(Recovery):
 
     def __init__(self, system: System, settings: Settings, y: Any, budget: Budget):
         super().__init__(system, settings, budget)
-        self._y = jnp.asarray(y)
+        self._y = np.asarray(y)
 
     @property
     def state(self) -> Any:
         """y at all points before the equilibrium."""
         return self._y
 
-    def guesses(self) -> list[tuple[Any, Any]]:
+    def guesses(self) -> list[Any]:
         """Return the state before."""
-        return [(self._y, unknowns_of(self.system, self._y[0]))]
+        return [self._y]
 
-    def first_guesses(self, control: Any) -> list[tuple[Any, Any]]:
+    def first_guesses(self, control: Any) -> list[Any]:
         """Return curves of the rod's length between held ends, then the state before."""
-        curves = curve_guesses(self.system, control)
-        return [(y, unknowns_of(self.system, y[0])) for y in curves] + self.guesses()
+        return [*curve_guesses(self.system, control), *self.guesses()]
 
-    def last_method(self, controls: tuple[Any, Any]) -> tuple[Result, Attempt] | None:
+    def last_method(self, controls: tuple[Any, Any]) -> tuple[Result, SolvedStep] | None:
         """Relax by implicit Euler with growing time steps, then solve the equilibrium; it is then stable.
 
         The tip's boundary conditions are applied gradually in the first steps.
         """
         system, part = self.system, 0.0
         settings = Settings(BDF1(), self.settings.space, newton=self.settings.newton)
-        still = StepProblem.still(system, settings.space, controls[1])
-        past = repeated_record_history(system, settings.space, still.records(self._y), self._y, 0.0)
+        still = still_state(system, settings.space, controls[1], self._y)
+        past = repeated_record_history(system, settings.space, still.records, self._y, 0.0)
         natural = natural_time(system) or 0.1
         dt, longest = 0.1 * natural, 1e5 * natural
         for _ in range(80):
             step = TimeStep(past, BDF1().coefficients(dt, dt), 0.0)
             moving = StepRecovery(system, settings, step, dt, self.budget)
             target = min(1.0, part + DRAWN)
-            found = moving.solve(controls[1], moving.guesses()[0], (target, self._y))
+            found = moving.solve(controls[1], moving.guesses()[0], (1.0 - target) * still.tip)
             if not moving.solved(found):
                 dt /= 4.0
                 continue
@@ -192,6 +191,5 @@ class StaticRecovery(Recovery):
             part = target
             if dt > longest:
                 break
-        y = past.y[0]
-        found = self.solve(controls[1], (y, unknowns_of(system, y[0])))
+        found = self.solve(controls[1], past.y[0])
         return (Result.RECOVERED_RELAXATION, found) if self.solved(found) else None

@@ -7,7 +7,6 @@ an earlier version. Rows hold the nodes only; the equations give the other place
 from __future__ import annotations
 
 import dataclasses
-import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -16,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.system import System, is_traced
+from knode_cosserat.solvers.evaluation import evaluator, still_state
 from knode_cosserat.solvers.grid import at_places, grid_of
 from knode_cosserat.solvers.history import (
     EXTRAPOLATIONS,
@@ -28,9 +28,9 @@ from knode_cosserat.solvers.history import (
     repeated_record_history,
     rest_record,
     resting_history,
+    still_records,
 )
-from knode_cosserat.solvers.problem import StepProblem, no_history, row_of
-from knode_cosserat.solvers.run import padded_rows
+from knode_cosserat.solvers.problem import no_history, row_of
 from knode_cosserat.solvers.settings import MEASURED, Settings
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.time_loop import StepCoefficients
@@ -40,7 +40,15 @@ from knode_cosserat.trajectory import Trajectory
 AT_REST = 1e-12
 
 at_rest = jax.jit(resting_history, static_argnames="settings")
-at_one_state = jax.jit(constant_history, static_argnames="settings")
+
+
+def at_one_state(system: System, settings: Settings, row: Any, control: Any, t0: Any = 0.0) -> StateHistory:
+    """Return the history of one state (see `constant_history`), in the engine outside of transformations."""
+    if is_traced((system, row, control, t0)):
+        return constant_history(system, settings, row, control, t0)
+    still = still_state(system, settings.space, control, np.asarray(row)[:, : system.y_layout.size], t0)
+    records = still_records(system, settings.space, np.asarray(row), still)
+    return repeated_record_history(system, settings.space, records, still.y, t0)
 
 
 class Replay(NamedTuple):
@@ -70,28 +78,23 @@ def replay(trajectory: Trajectory, system: System, dt: float | None = None) -> R
     if known is None:
         return None
     row, state = known
-    rows: Any = jnp.concatenate([trajectory.y, trajectory.z], axis=-1)[row:]
+    numeric: Any = jnp if is_traced((trajectory, system)) else np
+    rows: Any = numeric.concatenate([trajectory.y, trajectory.z], axis=-1)[row:]
     controls: Any = trajectory.control[row:]
     if made.stages > 1:
         between: Any = trajectory.stages[row + 1 :, :, :, : rows.shape[-1]]
-        every = jnp.concatenate([between, rows[1:, None]], axis=1)
-        rows = jnp.concatenate([rows[:1], every.reshape(-1, *rows.shape[1:])])
+        every = numeric.concatenate([between, rows[1:, None]], axis=1)
+        rows = numeric.concatenate([rows[:1], every.reshape(-1, *rows.shape[1:])])
         acting = at_stages(system, made, controls[1:], controls[:1], state.dt is None)
         if acting.shape[1] == controls.shape[1]:
-            acting = jnp.tile(acting, made.stages)
+            acting = numeric.tile(acting, made.stages)
         acting = acting.reshape(len(acting) * made.stages, controls.shape[1])
-        controls = jnp.concatenate([controls[:1], acting])
-    count = len(rows)
-    if not is_traced((rows, controls)):
-        packed = padded_rows(np.reshape(rows, (count, -1)))
-        rows, controls = packed.reshape(-1, *np.shape(rows)[1:]), padded_rows(controls)
+        controls = numeric.concatenate([controls[:1], acting])
     steps = StepCoefficients.of(made, apart, state.first_step(made))
-    past = state.history._replace(t0=jnp.asarray(time[row], dtype=float))
-    history, terms = _along(system, made, past, (rows, controls, count), steps)
+    past = state.history._replace(t0=numeric.asarray(time[row], dtype=float))
+    history, terms = _along(system, made, past, (rows, controls), steps)
     rate_known = state.rate_known and made.uses_rate
-    return Replay(
-        row + 1, terms[made.stages - 1 : count - 1 : made.stages], SolverState(history, apart, rate_known)
-    )
+    return Replay(row + 1, terms[made.stages - 1 :: made.stages], SolverState(history, apart, rate_known))
 
 
 def history_settings(settings: Settings) -> Settings:
@@ -117,7 +120,8 @@ def _known_row(
     time, state = trajectory.time, trajectory.initial_state
     if state is not None and state.history.rate.shape == no_history(system, made.space).shape:
         return 0, state
-    rows: Any = jnp.concatenate([trajectory.y[:2], trajectory.z[:2]], axis=-1)
+    numeric: Any = jnp if is_traced(trajectory) else np
+    rows: Any = numeric.concatenate([trajectory.y[:2], trajectory.z[:2]], axis=-1)
     if is_traced(time) or time[0] != 0.0:
         state = state_of_rows(system, made.space, rows, dt)
         return None if state is None else (1, state)
@@ -135,53 +139,51 @@ def state_of_rows(
     return None if system.mixed else SolverState(_of_rows(system, space, rows), dt, rate_known=False)
 
 
-@functools.partial(jax.jit, static_argnames="space")
 def _of_rows(system: System, space: SpaceScheme, rows: Any) -> StateHistory:
-    records = jax.vmap(lambda row: at_places(system, space, row))(rows)[::-1]
+    numeric: Any = jnp if is_traced((system, rows)) else np
+    records = [at_places(system, space, row) for row in rows[::-1]]
     y = grid_of(system).spread(rows[1, :, : system.y_layout.size])
-    return repeated_record_history(system, space, records[0], y, 0.0)._replace(records=records)
+    repeated = repeated_record_history(system, space, records[0], y, 0.0)
+    return repeated._replace(records=numeric.stack(records))
 
 
-@functools.partial(jax.jit, static_argnames="settings")
 def _along(
-    system: System,
-    settings: Settings,
-    past: StateHistory,
-    motion: tuple[Any, Any, Any],
-    steps: StepCoefficients,
+    system: System, settings: Settings, past: StateHistory, motion: tuple[Any, Any], steps: StepCoefficients
 ) -> tuple[StateHistory, Float[Any, "steps places x"]]:
     """Return the history after a motion's last row, and the history terms of each step.
 
-    `motion` are rows, controls and the number of rows without padding, the stages between them included. If
-    a row was changed after it was solved, its difference from the equations at the nodes is interpolated to
-    the other places.
+    `motion` are rows and controls, the stages between them included. If a row was changed after it was
+    solved, its difference from the equations at the nodes is interpolated to the other places.
     """
-    rows, controls, count = motion
-    ny, t0, stages = system.y_layout.size, past.t0, settings.stages
+    t0, stages, (rows, controls) = past.t0, settings.stages, motion
+    traced = is_traced((system, past, motion))
+    evaluate = evaluator(system, settings, traced)
 
     def one(past: StateHistory, step: Any) -> Any:
         i, row, control = step
-        coefficients, t = steps.at(t0, (i - 1) // stages)
+        coefficients, t = steps.at(t0, i // stages)
         if stages > 1:
-            coefficients, t = coefficients[(i - 1) % stages], t[(i - 1) % stages]
+            coefficients, t = coefficients[i % stages], t[i % stages]
         history = history_of(past.records, past.rate, coefficients, settings)
-        problem = StepProblem(system, t, control, coefficients[0], history, settings.space)
-        y = problem.filled(row[:, :ny])
-        records = problem.records(y)
-        records = records + carried(
-            system, settings.space, row - row_of(system, y, records)[:, : row.shape[1]]
-        )
-        after = advanced(past, records, coefficients[0] * records + history, y, past.weights)
-        return jax.tree.map(lambda a, b: jnp.where(i < count, a, b), after, past), history
+        found = evaluate(coefficients[0], t, control, history, row[:, : system.y_layout.size])
+        change = row - row_of(system, found.y, found.records)[:, : row.shape[1]]
+        records = found.records + carried(system, settings.space, change)
+        return advanced(past, records, coefficients[0] * records + history, found.y, past.weights), history
 
     # errors in time are not evaluated again
-    lost = jnp.full_like(past.time_error, jnp.nan)
-    first = past._replace(time_error=lost, weights=jnp.asarray(EXTRAPOLATIONS[1]))
-    past, terms = jax.lax.scan(one, first, (jnp.arange(1, len(rows)), rows[1:], controls[1:]))
-    return past._replace(t0=t0 + (count - 1) // stages * steps.dt), terms
+    lost = np.full(past.time_error.shape, np.nan)
+    past, count = past._replace(time_error=lost, weights=EXTRAPOLATIONS[1]), len(rows) - 1
+    if traced:
+        past, terms = jax.lax.scan(one, past, (jnp.arange(count), rows[1:], controls[1:]))
+    else:
+        terms = np.empty((count, *past.rate.shape))
+        for i in range(count):
+            past, terms[i] = one(past, (i, rows[i + 1], controls[i + 1]))
+    return past._replace(t0=t0 + count // stages * steps.dt), terms
 
 
 def carried(system: System, space: SpaceScheme, change: Float[Any, "nodes x"]) -> Float[Any, "places more"]:
     """Return a change of y and z at the nodes as a change of the records at all places; y_s is unchanged."""
     width = no_history(system, space).shape[-1] - change.shape[1]
-    return at_places(system, space, jnp.pad(change, ((0, 0), (0, width))))
+    numeric: Any = jnp if is_traced(change) else np
+    return at_places(system, space, numeric.pad(change, ((0, 0), (0, width))))

@@ -99,7 +99,7 @@ class TimeIntegration:
 
     def recover(self, system: System, state: Any, controls: Any, i: int, budget: Budget) -> SolvedStep:
         """Recover step i; `controls` are the previous step's and its own."""
-        step = TimeStep(state, *map(np.asarray, self.coefficients.at(state.t0, i)))
+        step = TimeStep.of(self.coefficients, state, i)
         if self.settings.stages > 1:
             return recovered_stages(system, self.settings, step, self.dt, budget, controls)
         return StepRecovery(system, self.settings, step, self.dt, budget).recover(controls)

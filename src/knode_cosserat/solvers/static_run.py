@@ -184,7 +184,7 @@ class _Walk:
 
     def _points(self, records: Any) -> Any:
         """Return y at all points from records at the nodes."""
-        return self.grid.spread(jnp.asarray(records[:, : self.system.y_layout.size]))
+        return self.grid.spread(np.asarray(records)[:, : self.system.y_layout.size])
 
     def _turns(self, before: Any, after: Any) -> int:
         """Return the number of turns by which two shapes differ beyond the rotation of the ends.

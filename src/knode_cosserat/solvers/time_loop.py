@@ -98,7 +98,8 @@ class StepCoefficients(NamedTuple):
 
     def at(self, t0: Any, i: Any) -> tuple[Any, Any]:
         """Return the coefficients of step i, and the times (s) at its end or at those of its stages."""
-        return jnp.where(i == 0, self.table[0], self.table[1]), t0 + (i + self.ends) * self.dt
+        numeric: Any = jnp if is_traced((self, i)) else np
+        return numeric.where(i == 0, self.table[0], self.table[1]), t0 + (i + self.ends) * self.dt
 
 
 class TimeStep(NamedTuple):
@@ -152,15 +153,17 @@ def stage_controls(system: System, settings: Settings, control: Any) -> Float[An
     """Return the control of each stage of a step; see `solve_time_step`."""
     size = system.control_size
     own = control[None] if control.shape[0] == size else control.reshape(settings.stages, size)
-    return jnp.broadcast_to(own, (settings.stages, size))
+    numeric: Any = jnp if is_traced(own) else np
+    return numeric.broadcast_to(own, (settings.stages, size))
 
 
 def joined_stages(rows: StepRows) -> StepRows:
     """Return the row of a step from those of its stages: the last, with the worst result of all."""
-    last, failed = jax.tree.map(lambda leaf: leaf[-1], rows), jnp.min(rows.result)
+    numeric: Any = jnp if is_traced(rows) else np
+    last, failed = jax.tree.map(lambda leaf: leaf[-1], rows), numeric.min(rows.result)
     return last._replace(
-        error=jnp.max(rows.error), corrections=jnp.sum(rows.corrections),
-        result=jnp.where(failed < 0, failed, last.result),
+        error=numeric.max(rows.error), corrections=numeric.sum(rows.corrections),
+        result=numeric.where(failed < 0, failed, last.result),
         stages=rows.records[:-1], stage_unknowns=rows.unknowns[:-1],
     )  # fmt: skip
 

@@ -1,0 +1,44 @@
+"""States evaluated by the equations of a step, in the engine or inside JAX's transformations."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+from knode_cosserat.engine import loops as engine
+from knode_cosserat.engine.program import EngineError
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.problem import Evaluated, StepProblem, no_history
+from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.space import SpaceScheme
+
+
+def evaluator(system: System, settings: Settings, traced: bool = False) -> Callable[..., Evaluated]:
+    """Return a function that evaluates states.
+
+    Its arguments are c0, the time (s), the control, history terms (places, x), and y at all points, or at the
+    nodes. Inside JAX's transformations, all may be `traced`.
+    """
+    in_jax = functools.partial(_evaluated, system, settings.space)
+    if traced:
+        return in_jax
+    try:
+        return engine.evaluator(system, settings)
+    except EngineError:
+        return lambda *arguments: jax.tree.map(np.asarray, in_jax(*arguments))
+
+
+@functools.partial(jax.jit, static_argnames="space")
+def _evaluated(
+    system: System, space: SpaceScheme, c0: Any, t: Any, control: Any, history: Any, y: Any
+) -> Evaluated:
+    return StepProblem(system, t, control, c0, history, space).evaluated(y)
+
+
+def still_state(system: System, space: SpaceScheme, control: Any, y: Any, t: Any = 0.0) -> Evaluated:
+    """Return the state at rest of y at all points, or at the nodes, under a control."""
+    return evaluator(system, Settings(None, space))(0.0, t, control, no_history(system, space), y)
