@@ -105,6 +105,8 @@ class Core(EliminationCode):
         }  # fmt: skip
         if settings.time is None:
             self._motion, self._parts = slice(self.y.offset, self.unknowns.offset), {"y": [self.y]}
+        #: for sizes relative to the state: one over the natural unit plus |y|
+        self.weights_of_y = a(ny, self.points)
         # corrected motions: history terms, defects
         self.dH, self.own_dH = (a(numbers, self.used) for _ in range(2))
         self.better, self.better_unknowns = a(ny, self.ends), a(k, 1)
@@ -132,6 +134,15 @@ class Core(EliminationCode):
         self._guesses = np.ascontiguousarray(np.stack([guesses, np.roll(guesses, -1, axis=0)], axis=1))
         #: memory at the start of a run, but for parameters and states
         self._empty = self._empty_memory()
+
+    def _write_weights(self) -> None:
+        """Weights of sizes relative to the state."""
+        self.weigh = f = self._function("weigh")
+        with self._places(self.points) as j:
+            for i in range(self.equations.ny):
+                unit = self._unit(i, j)
+                size = f.apply("abs", self._wide(self.y, i, j))
+                self._write_wide(unit / (1.0 + unit * size), self.weights_of_y, i, j)
 
     # Newton's method
 
@@ -162,6 +173,7 @@ class Core(EliminationCode):
                 self._write_wide(0.0, self.direction, i, j)
         for i in range(e.k):
             self._put(0.0, self.direction_unknowns, i)
+        f.call(self.weigh, memory)
 
         def active() -> Value:
             count = linearisations.get() + f.select(renew.get(), 1.0, 0.0)
@@ -172,6 +184,7 @@ class Core(EliminationCode):
             anew = Variable(f, f.any(renew.get() & going))
             with f.if_(anew.get()):
                 f.call(self.linearised, memory)
+                f.call(self.weigh, memory)
                 now = active()
                 damping.set(f.select(now, 1.0, damping.get()))
                 size.set(f.select(now, infinity, size.get()))
@@ -200,7 +213,7 @@ class Core(EliminationCode):
             with f.if_(anew.get()):
                 for i in range(e.k):
                     self._put(self._get(self.unknowns, i), self.trial_unknowns, i)
-            now_error = f.apply("max", self._norm(self.r, "y", self.pieces), self._tip_norm())
+            now_error = f.apply("max", self._norm(self.r, self.pieces), self._tip_norm())
             # by the same factors, the correction shrinks as the residual does: a tiny one is not computed
             expected = left.get() * now_error
             enough = expected <= SURELY_SMALL * LARGEST_CORRECTION * error.get()
@@ -208,8 +221,8 @@ class Core(EliminationCode):
             lengths = plain(0.0), plain(0.0)
             with f.if_(f.any(going & ~sure)):
                 f.call(self.correct, memory)
-                lengths[0].set(self._norm(self.dy, "y", self.points))
-                lengths[1].set(self._norm(self.dy, "y", self.points, 0, self.trial))
+                lengths[0].set(self._norm(self.dy, self.points))
+                lengths[1].set(self._norm(self.dy, self.points, self.weights_of_y))
             now_size, now_left = (each.get() for each in lengths)
             was_first, was_fresh, was_old = first.get(), fresh.get(), old.get()
             was_damping, was_size, was_error = damping.get(), size.get(), error.get()
@@ -282,7 +295,8 @@ class Core(EliminationCode):
         self.check = f = self._function("check", "numbers", "coefficients")
         memory, numbers, coefficients = f.arguments
         f.call(self.recorded, memory, coefficients)
-        largest = f.apply("max", self._norm(self.r, "y", self.pieces), self._tip_norm())
+        f.call(self.weigh, memory)
+        largest = f.apply("max", self._norm(self.r, self.pieces), self._tip_norm())
         f.store(f.apply("max", largest, f.load(numbers, ERROR * self.P, self.P)), numbers, ERROR * self.P)
         # what the solution has left: no part of its errors
         with self._places(self.pieces) as j:
@@ -335,7 +349,7 @@ class Core(EliminationCode):
                     self._write_wide(value, self.r, i, j)
             for i in range(e.k):
                 self._put(self._get(self.tip, i) - self._get(self.tip_rest, i), self.tip, i)
-            return f.apply("max", self._norm(self.r, "y", self.pieces), self._tip_norm())
+            return f.apply("max", self._norm(self.r, self.pieces), self._tip_norm())
 
         alive = f.load(numbers, ALIVE * self.P, self.P) > 0.0
         largest = Variable(f, f.splat(f.value(0.0), self.P))
@@ -349,7 +363,7 @@ class Core(EliminationCode):
                 for i in range(e.ny):
                     y = self._wide(self.y, i, j)
                     change = self._wide(self.better, i, j) - y - self._wide(errors[0], i, j)
-                    size = f.apply("abs", change) / (1.0 / self._unit(i, j) + f.apply("abs", y))
+                    size = f.apply("abs", change) * self._wide(self.weights_of_y, i, j)
                     size = size if self.batch else f.select(self._inside(j, self.points), size, 0.0)
                     found.set(f.apply("max", found.get(), size))
             far = left.get() > ESTIMATE_TOLERANCE * self._largest(found.get()) + ROUNDING
@@ -364,7 +378,7 @@ class Core(EliminationCode):
             for i in range(e.k):
                 value = self._get(self.better_unknowns, i) + self._get(self.step_unknowns, i)
                 self._put(value, self.better_unknowns, i)
-            size = self._norm(self.dy, "y", self.points, 0, self.y)
+            size = self._norm(self.dy, self.points, self.weights_of_y)
             before = largest.get()
             largest.set(evaluated())
             left.set(size * largest.get() / before)
@@ -548,8 +562,9 @@ class Core(EliminationCode):
         c0 = f.load(coefficients, 0)
         newest = self._evaluated_at(self.y)
         if isinstance(self.scheme, SDIRK2):
+            of_rate = 1.0 / c0
             for i, j, value in self._numbers_of(newest, self.used):
-                rate = value + self._wide(self.H, i, j) / c0
+                rate = value + self._wide(self.H, i, j) * of_rate
                 step = self._wide(self.records[0], i, j) - self._wide(self.records[1], i, j)
                 self._write_wide(rate - step, self.difference, i, j)
         with self._places(self.count) as j:
@@ -723,6 +738,7 @@ class Core(EliminationCode):
         self._write_along()
         self._write_linearise()
         self._write_correct()
+        self._write_weights()
         self._write_newton()
         self._write_recorded()
         self._write_check()

@@ -57,10 +57,12 @@ class EliminationCode(RodCode):
         if any(i // ny != c // self.own for i, c, _ in self.base_slopes):
             raise EngineError("engine: the base of a strand depends on the unknowns of another")
         self.factor = a(len(self.elimination.factors), self.pieces)
-        #: columns of B⁻¹ A, and B⁻¹ r: places in lanes, and rows in lanes for the recursion along the rod
-        self.wide_matrix, self.wide_added = a(ny * ny, self.pieces), a(ny, self.pieces)
-        self.matrix, self.added = self.wide_matrix, self.wide_added
-        if not robots:
+        if robots:
+            #: entries of A; the recursion along the rod solves by B in every piece
+            self.matrix, self.added = a(len(self.elimination.entries), self.pieces), self.r
+        else:
+            #: columns of B⁻¹ A, and B⁻¹ r: places in lanes, and rows in lanes for the recursion along the rod
+            self.wide_matrix, self.wide_added = a(ny * ny, self.pieces), a(ny, self.pieces)
             self.matrix, self.added = by_rows(ny, ny, self.pieces), by_rows(ny, 1, self.pieces)
         #: columns of the unknowns along the rod
         self.X = by_rows(ny, self.own, self.points)
@@ -85,7 +87,7 @@ class EliminationCode(RodCode):
         """A piece's B⁻¹ r."""
         f, el = self._function(name, "from", "to", "n_piece"), self.elimination
         _, source, target, piece = f.arguments
-        j, component = f.index(piece), self.L if self.has_tangents else self.wide_added.component
+        j, component = f.index(piece), self.L if self.has_tangents else self.r.component
         known = {
             int(node): self._get(self.factor, k, j, self._matrix_lanes) for k, node in enumerate(el.stored)
         }
@@ -109,22 +111,27 @@ class EliminationCode(RodCode):
             values = f.evaluate(el.program, outputs, known, self.L)
             for k, node in enumerate(el.factors):
                 self._write_wide(values[node], self.factor, k, j)
-            for i, c in np.ndindex(n, n):
-                self._write_wide(values[int(el.matrix[i, c])], self.wide_matrix, c * n + i, j)
+            if self.batch:
+                for k, at in enumerate(el.entries):
+                    self._write_wide(values[int(el.matrix[at])], self.matrix, k, j)
+            else:
+                for i, c in np.ndindex(n, n):
+                    self._write_wide(values[int(el.matrix[i, c])], self.wide_matrix, c * n + i, j)
+        if self.batch:
+            return
         with self._places(self.pieces) as j:
             first = self._pointer(self.wide_matrix, j)
             with f.loop(n) as c:
                 column = f.pointer(first, c.value * (n * self.wide_matrix.component))
                 f.call(self.solved, memory, column, column, j.value)
-        if not self.batch:
-            with f.loop(n) as c:
-                source = c.value * (n * self.wide_matrix.component) + self.wide_matrix.offset
-                target = c.value * self._padded(n) + self.matrix.offset
-                with f.loop(self.pieces) as j:
-                    self._copy(
-                        n, (f.pointer(memory, source + j.value), self.wide_matrix.component),
-                        (f.pointer(memory, target + j.value * self.matrix.place), 1),
-                    )  # fmt: skip
+        with f.loop(n) as c:
+            source = c.value * (n * self.wide_matrix.component) + self.wide_matrix.offset
+            target = c.value * self._padded(n) + self.matrix.offset
+            with f.loop(self.pieces) as j:
+                self._copy(
+                    n, (f.pointer(memory, source + j.value), self.wide_matrix.component),
+                    (f.pointer(memory, target + j.value * self.matrix.place), 1),
+                )  # fmt: skip
 
     def _copy(self, count: int, source: tuple[Value, int], target: tuple[Value, int]) -> None:
         """Write numbers from an address to another, each with the distance between numbers."""
@@ -140,6 +147,15 @@ class EliminationCode(RodCode):
         width, j, lanes = self._rows_at_once, f.index(piece), self._vector_lanes
         component = 1 if width > 1 else self.L
         x = [f.load(source, c * component, lanes) for c in range(n)]
+        if self.batch:
+            known = {int(node): self._get(self.factor, k, j) for k, node in enumerate(el.stored)}
+            known |= {int(node): self._get(self.matrix, k, j) for k, node in enumerate(el.start_entries)}
+            known |= {int(node): f.load(added, i * self.L, self.L) for i, node in enumerate(el.r)}
+            known |= {int(node): value for node, value in zip(el.x, x, strict=True)}
+            values = f.evaluate(el.program, el.advanced, known, self.L)
+            for i, node in enumerate(el.advanced):
+                f.store(values[node], target, i * self.L, self.L)
+            return f
         for row in self._blocks(n):
             # two sums, because each addition waits for the one before
             sums = [f.load(added, row * component, self.L), f.splat(f.value(0.0), self.L)]
@@ -262,9 +278,10 @@ class EliminationCode(RodCode):
         ny = self.equations.ny
         self.correct = f = self._function("correct")
         memory = f.arguments[0]
-        with self._places(self.pieces) as j:
-            f.call(self.solved, memory, self._pointer(self.r, j), self._pointer(self.wide_added, j), j.value)
         if not self.batch:
+            with self._places(self.pieces) as j:
+                points = self._pointer(self.r, j), self._pointer(self.wide_added, j)
+                f.call(self.solved, memory, *points, j.value)
             with f.loop(self.pieces) as j:
                 source = self._pointer(self.wide_added, j), self.wide_added.component
                 self._copy(ny, source, (self._pointer(self.added, j), 1))

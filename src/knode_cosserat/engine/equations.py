@@ -304,22 +304,38 @@ class Elimination:
         self.stored = program.inputs("factor", (len(places),), 1)
         for node, (i, j) in zip(self.stored, places, strict=True):
             B[i, j] = node
-        self.r = program.inputs("r", (n,), 1)
-        #: B⁻¹ r, and the nonzeros of B⁻¹ A
-        self.solved, self.nonzero = [int(node) for node in self.r], np.not_equal(A, zero)
+        #: nonzeros of B⁻¹ A
+        self.nonzero = np.not_equal(A, zero)
 
-        def eliminate(i: int, others: Sequence[int]) -> None:
-            for j in others:
-                if B[i, j] != zero:
-                    product = apply("mul", int(B[i, j]), self.solved[j])
-                    self.solved[i] = apply("sub", self.solved[i], product)
-                    self.nonzero[i] |= self.nonzero[j]
+        def solve(right: list[int]) -> list[int]:
+            """Return B⁻¹ times a vector."""
+            ways = [(i, order[:at]) for at, i in enumerate(order)]
+            ways += [(i, order[at + 1 :]) for at, i in reversed(list(enumerate(order)))]
+            for turn, (i, others) in enumerate(ways):
+                for j in others:
+                    if B[i, j] != zero:
+                        product = apply("mul", int(B[i, j]), right[j])
+                        right[i] = apply("sub", right[i], product)
+                        self.nonzero[i] |= self.nonzero[j]
+                if turn >= n:
+                    right[i] = apply("mul", right[i], int(B[i, i]))
+            return right
 
-        for at, i in enumerate(order):
-            eliminate(i, order[:at])
-        for at, i in reversed(list(enumerate(order))):
-            eliminate(i, order[at + 1 :])
-            self.solved[i] = apply("mul", self.solved[i], int(B[i, i]))
+        self.r, self.x = program.inputs("r", (n,), 1), program.inputs("x", (n,), 1)
+        #: B⁻¹ r
+        self.solved = solve([int(node) for node in self.r])
+        #: entries of A that are not constant, and B⁻¹ (A x + r)
+        self.entries = [
+            (i, j) for i, j in np.ndindex(A.shape) if not program.is_constant(int(A[i, j]))
+        ]
+        self.start_entries = program.inputs("entry", (len(self.entries),), 1)
+        known = A.copy()
+        for node, at in zip(self.start_entries, self.entries, strict=True):
+            known[at] = node
+        right = [int(node) for node in self.r]
+        for i, j in np.ndindex(A.shape):
+            right[i] = apply("add", right[i], apply("mul", int(known[i, j]), int(self.x[j])))
+        self.advanced = solve(right)
 
 
 def _least_fill(nonzero: np.ndarray) -> list[int]:

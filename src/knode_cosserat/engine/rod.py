@@ -366,28 +366,23 @@ class RodCode(Memory):
         state = {int(node): self._get(unknowns, i) for i, node in enumerate(e.unknowns)}
         return state | self._history_of_strands(history, self.bases)
 
-    def _norm(
-        self, array: Array, scale: str, count: int, first: int = 0, relative: Array | None = None
-    ) -> Value:
-        """Return the largest component over its natural unit; infinite for NaN."""
+    def _norm(self, array: Array, count: int, weights: Array | None = None) -> Value:
+        """Return the largest weighted component, by default in natural units; infinite for NaN."""
         f = self._now
+        weights = weights or self.scale_y
         found = Variable(f, f.splat(f.value(0.0), self.L))
         finite = Variable(f, f.splat(f.value(0.0), self.L))
-        with self._places(count, first) as j:
+        with self._places(count) as j:
             largest, total = found.get(), finite.get()
-            inside = self._inside(j, first + count)
+            inside = self._inside(j, count)
             for i in range(array.size):
-                x = f.apply("abs", self._wide(array, i, j))
-                unit = self._unit(i, j)
-                if relative is None:
-                    x = x * unit
-                else:
-                    x = x / (1.0 / unit + f.apply("abs", self._wide(relative, i, j)))
+                weight = self._wide(weights, i, j if weights.count > 1 else 0)
+                x = f.apply("abs", self._wide(array, i, j)) * weight
                 x = x if self.batch else f.select(inside, x, 0.0)
-                largest, total = f.apply("max", largest, x), total + x
+                largest, total = f.select(x > largest, x, largest), total + x
             found.set(largest)
             finite.set(total)
-        # maxnum drops NaN; a sum keeps it
+        # a comparison drops NaN; a sum keeps it
         known = f.compare("lt", finite.get(), float("inf"))
         return self._largest(f.select(known, found.get(), float("inf")))
 
