@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.engine.codegen import Function, Index, Value, Variable
-from knode_cosserat.engine.elimination import EliminationCode
+from knode_cosserat.engine.elimination import COLUMNS, EliminationCode
 from knode_cosserat.engine.equations import Equations
 from knode_cosserat.engine.memory import Array
 from knode_cosserat.rods.system import System
@@ -733,6 +733,7 @@ class Core(EliminationCode):
         self.defects = self._function("defects")
         self._write_defects(self.trial, self.H)
         self.solved = self._write_solved()
+        self.solved_columns = self._write_solved("solved_columns", COLUMNS)
         self._write_factor()
         self.advance = self._write_advance()
         self._write_along()

@@ -30,6 +30,10 @@ class Correction(NamedTuple):
     unknowns: Array
 
 
+#: columns that are solved side by side: each operation of a column waits for the one before
+COLUMNS = 2
+
+
 class EliminationCode(RodCode):
     """Functions that factor a linearisation and solve for corrections."""
 
@@ -83,18 +87,26 @@ class EliminationCode(RodCode):
         #: history terms of the step
         self.H = a(self.equations.numbers, self.count)
 
-    def _write_solved(self, name: str = "solved") -> Function:
-        """A piece's B⁻¹ r."""
+    def _write_solved(self, name: str = "solved", columns: int = 1) -> Function:
+        """A piece's B⁻¹ r, of one column or of several one after the other."""
         f, el = self._function(name, "from", "to", "n_piece"), self.elimination
         _, source, target, piece = f.arguments
         j, component = f.index(piece), self.L if self.has_tangents else self.r.component
         known = {
             int(node): self._get(self.factor, k, j, self._matrix_lanes) for k, node in enumerate(el.stored)
         }
-        known |= {int(node): f.load(source, i * component, self.L) for i, node in enumerate(el.r)}
-        values = f.evaluate(el.program, el.solved, known, self.L)
-        for i, node in enumerate(el.solved):
-            f.store(values[node], target, i * component, self.L)
+        n = len(el.r)
+        every = []
+        for c in range(columns):
+            r = {int(node): f.load(source, (c * n + i) * component, self.L) for i, node in enumerate(el.r)}
+            every.append(known | r)
+        # one operation of each column in turn
+        for node in el.program.needed(el.solved, frozenset(every[0])):
+            for values in every:
+                values |= f.evaluate(el.program, [node], values, self.L)
+        for c, values in enumerate(every):
+            for i, node in enumerate(el.solved):
+                f.store(values[node], target, (c * n + i) * component, self.L)
         return f
 
     def _write_factor(self) -> None:
@@ -121,7 +133,10 @@ class EliminationCode(RodCode):
             return
         with self._places(self.pieces) as j:
             first = self._pointer(self.wide_matrix, j)
-            with f.loop(n) as c:
+            with f.loop(n // COLUMNS * COLUMNS, 0, COLUMNS) as c:
+                column = f.pointer(first, c.value * (n * self.wide_matrix.component))
+                f.call(self.solved_columns, memory, column, column, j.value)
+            with f.loop(n, n // COLUMNS * COLUMNS) as c:
                 column = f.pointer(first, c.value * (n * self.wide_matrix.component))
                 f.call(self.solved, memory, column, column, j.value)
         with f.loop(n) as c:

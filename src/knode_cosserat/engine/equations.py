@@ -325,9 +325,7 @@ class Elimination:
         #: B⁻¹ r
         self.solved = solve([int(node) for node in self.r])
         #: entries of A that are not constant, and B⁻¹ (A x + r)
-        self.entries = [
-            (i, j) for i, j in np.ndindex(A.shape) if not program.is_constant(int(A[i, j]))
-        ]
+        self.entries = [(i, j) for i, j in np.ndindex(A.shape) if not program.is_constant(int(A[i, j]))]
         self.start_entries = program.inputs("entry", (len(self.entries),), 1)
         known = A.copy()
         for node, at in zip(self.start_entries, self.entries, strict=True):
