@@ -135,6 +135,7 @@ def standing_history(settings):
 CASES = {
     # errors of 1e-7 m are few digits of positions
     "lobatto4, jumps": (ROUTED, tensions(1)[0], "bdf2", "lobatto4", 1e-3),
+    "a single piece": (robot_of(PAPER).replace(nodes=2), tensions(1)[0], "bdf2", "lobatto2", 1e-5),
     "euler": (PAPER, tensions(1)[0], "bdf-alpha", "euler", 1e-5),
     "a user's own": (Stretching(), np.sin(4.0 * TIMES), "bdf2", Quadratic(), 1e-5),
     "B is not zero": (Stretching(), np.sin(4.0 * TIMES), "sdirk2", "lobatto4", 1e-5),

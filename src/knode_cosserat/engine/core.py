@@ -72,11 +72,11 @@ class Core(EliminationCode):
         ny, nz, k, numbers, a = e.ny, e.nz, e.k, e.numbers, self._array
         # Newton's method: a trial point, and the correction from the last accepted one
         self.trial, self.direction = a(ny, self.ends), a(ny, self.ends)
-        self.trial_unknowns, self.direction_unknowns = a(k, 1), a(k, 1)
+        self.trial_unknowns, self.direction_unknowns = a(k), a(k)
         # the motion: records of two states and their rate, states for the first guess, errors of the records
         first = self._size
         self.records, self.rate = [a(numbers, self.count) for _ in range(2)], a(numbers, self.count)
-        self.past, self.weights, self.t0 = [a(ny, self.ends) for _ in range(3)], a(3, 1), a(1, 1)
+        self.past, self.weights, self.t0 = [a(ny, self.ends) for _ in range(3)], a(3), a(1)
         self.errors, self.time_errors = ([a(numbers, self.used) for _ in range(2)] for _ in range(2))
         self.error_rate = a(numbers, self.used)
         #: the part of the memory that is the state of a motion, and its arrays as in a `StateHistory`
@@ -89,9 +89,9 @@ class Core(EliminationCode):
             self._motion, self._parts = slice(self.y.offset, self.unknowns.offset), {"y": [self.y]}
         # corrected motions: history terms, defects
         self.dH, self.own_dH = (a(numbers, self.used) for _ in range(2))
-        self.better, self.better_unknowns = a(ny, self.ends), a(k, 1)
+        self.better, self.better_unknowns = a(ny, self.ends), a(k)
         self.defect, self.own_defect, self.rest = (a(ny, self.pieces) for _ in range(3))
-        self.tip_rest = a(k, 1)
+        self.tip_rest = a(k)
         # products of derivatives, for the error of the time scheme
         self.difference, self.move, self.time_dH = (a(numbers, self.used) for _ in range(3))
         self.tangents = Evaluated(
