@@ -18,7 +18,7 @@ from knode_cosserat.solvers import static_loop, time_loop
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.history import constant_history, resting_history
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.space import Formula, SpaceScheme, Stage
+from knode_cosserat.solvers.space import SCHEMES, Formula, SpaceScheme, Stage
 from knode_cosserat.solvers.static_loop import unloaded_shape
 from knode_cosserat.solvers.time_loop import StepCoefficients
 
@@ -172,10 +172,13 @@ def test_strands_in_lanes():
         np.testing.assert_allclose(states.records[k], state.records, atol=1e-8 * np.max(state.records))
 
 
-@pytest.mark.parametrize("name", [PAPER, ROUTED, "variable-curvature-robot", LEGS])
-def test_equilibria(name):
+@pytest.mark.parametrize(
+    ("name", "space"),
+    [(PAPER, "lobatto2"), (ROUTED, "lobatto2"), ("variable-curvature-robot", "euler"), (LEGS, "lobatto2")],
+)
+def test_equilibria(name, space):
     """Equilibria in turn, of one robot and of several in lanes, are those of the loop in JAX."""
-    robot, settings = robot_of(name), Settings(None)
+    robot, settings = robot_of(name), Settings(None, SCHEMES[space])
     rng = np.random.default_rng(1)
     size = 8.0 if "tension" in robot.control_layout.names else 0.05 if name == LEGS else 1.0
     controls = rng.uniform(0.0, size, (3, 4, robot.control_size))

@@ -260,10 +260,10 @@ class Core(EliminationCode):
             for i in range(e.ny):
                 self._write_wide(self._increment(changes, (self.f, self.fe), i, j), self.defect, i, j)
         self._write_records()
-        # no residual has the strains of the tip
+        # no residual has the strains of the tip; y_s is part of a record if B is not zero
         total = Variable(f, f.splat(f.value(0.0), self.L))
         with self._places(self.count) as j:
-            for i in range(e.numbers):
+            for i in range(e.ny, e.numbers):
                 size = f.apply("abs", self._wide(self.records[0], i, j))
                 total.set(
                     total.get() + (size if self.batch else f.select(self._inside(j, self.count), size, 0.0))
@@ -271,7 +271,9 @@ class Core(EliminationCode):
         finite = self._largest(f.select(total.get() < float("inf"), 0.0, float("inf")))
         f.store(f.apply("max", finite, f.load(numbers, ERROR * self.P, self.P)), numbers, ERROR * self.P)
 
-    def _write_corrected(self, name: str, errors: list[Array], has_defect: bool, number: int) -> Function:
+    def _write_corrected(
+        self, name: str, errors: list[Array], history: Array, has_defect: bool, number: int
+    ) -> Function:
         """The corrected motion: from its own history, and with defects or, without, those of the solution.
 
         The residual that the solution has left is none of its errors. Errors beyond the rod's length, and all
@@ -290,7 +292,7 @@ class Core(EliminationCode):
                 self._write_wide(self._wide(self.y, i, j) + start, self.better, i, j)
         with self._places(self.used) as j:
             for i in e.used_history:
-                value = self._wide(self.H, i, j) + self._wide(self.dH, i, j)
+                value = self._wide(self.H, i, j) + self._wide(history, i, j)
                 self._write_wide(value, self.own_dH, i, j)
         for k, (i, base) in enumerate(self._unknown_numbers()):
             change = 2.0 * self._get(errors[0], i, base) - self._get(errors[1], i, base)
@@ -614,9 +616,6 @@ class Core(EliminationCode):
                     value = c0 * self._wide(self.errors[0], i, j) + self._wide(self.dH, i, j)
                     self._write_wide(value, self.error_rate, i, j)
         if isinstance(self.scheme, SDIRK2):
-            with self._places(self.used) as j:
-                for i in range(e.numbers):
-                    self._write_wide(self._wide(self.time_dH, i, j), self.dH, i, j)
             f.call(self.corrected_in_time, memory, numbers)
         solved = f.load(numbers, ERROR * P, P) <= self.newton.acceptable
         alive = f.load(numbers, ALIVE * P, P)
@@ -682,12 +681,14 @@ class Core(EliminationCode):
         self._write_newton()
         self._write_check()
         if self.scheme:
-            self.corrected = self._write_corrected("corrected", self.errors, True, POSITION)
+            self.corrected = self._write_corrected("corrected", self.errors, self.dH, True, POSITION)
         else:
             self._write_static_errors()
         if isinstance(self.scheme, SDIRK2):
             self._write_products()
-            self.corrected_in_time = self._write_corrected("in_time", self.time_errors, False, TIME)
+            self.corrected_in_time = self._write_corrected(
+                "in_time", self.time_errors, self.time_dH, False, TIME
+            )
             self._write_time_history()
         self._write_stage()
         self._write_guesses()
