@@ -88,13 +88,13 @@ class Core(EliminationCode):
         e = self.equations
         ny, nz, k, numbers, a = e.ny, e.nz, e.k, e.numbers, self._array
         # Newton's method: its options, a trial point, and the correction from the last accepted one
-        self.options = a(len(dataclasses.fields(NewtonOptions)), 1)
+        self.options = a(len(dataclasses.fields(NewtonOptions)))
         self.trial, self.direction = a(ny, self.ends), a(ny, self.ends)
-        self.trial_unknowns, self.direction_unknowns = a(k, 1), a(k, 1)
+        self.trial_unknowns, self.direction_unknowns = a(k), a(k)
         # the motion: records of two states and their rate, states for the first guess, errors of the records
         first = self._size
         self.records, self.rate = [a(numbers, self.count) for _ in range(2)], a(numbers, self.count)
-        self.past, self.weights, self.t0 = [a(ny, self.ends) for _ in range(3)], a(3, 1), a(1, 1)
+        self.past, self.weights, self.t0 = [a(ny, self.ends) for _ in range(3)], a(3), a(1)
         self.errors, self.time_errors = ([a(numbers, self.used) for _ in range(2)] for _ in range(2))
         self.error_rate = a(numbers, self.used)
         #: the part of the memory that is the state of a motion, and its arrays as in a `StateHistory`
@@ -109,9 +109,9 @@ class Core(EliminationCode):
         self.weights_of_y = a(ny, self.points)
         # corrected motions: history terms, defects
         self.dH, self.own_dH = (a(numbers, self.used) for _ in range(2))
-        self.better, self.better_unknowns = a(ny, self.ends), a(k, 1)
+        self.better, self.better_unknowns = a(ny, self.ends), a(k)
         self.defect, self.own_defect, self.rest = (a(ny, self.pieces) for _ in range(3))
-        self.tip_rest = a(k, 1)
+        self.tip_rest = a(k)
         # products of derivatives, for the error of the time scheme
         self.difference, self.move, self.time_dH = (a(numbers, self.used) for _ in range(3))
         self.tangents = StateArrays(
@@ -304,10 +304,10 @@ class Core(EliminationCode):
                 self._write_wide(self._wide(self.r, i, j), self.rest, i, j)
         for i in range(e.k):
             self._put(self._get(self.tip, i), self.tip_rest, i)
-        # no residual has the strains of the tip
+        # no residual has the strains of the tip; y_s is part of a record if B is not zero
         total = Variable(f, f.splat(f.value(0.0), self.L))
         with self._places(self.count) as j:
-            for i in range(e.numbers):
+            for i in range(e.ny, e.numbers):
                 size = f.apply("abs", self._wide(self.records[0], i, j))
                 total.set(
                     total.get() + (size if self.batch else f.select(self._inside(j, self.count), size, 0.0))
@@ -315,7 +315,9 @@ class Core(EliminationCode):
         finite = self._largest(f.select(total.get() < float("inf"), 0.0, float("inf")))
         f.store(f.apply("max", finite, f.load(numbers, ERROR * self.P, self.P)), numbers, ERROR * self.P)
 
-    def _write_corrected(self, name: str, errors: list[Array], has_defect: bool, number: int) -> Function:
+    def _write_corrected(
+        self, name: str, errors: list[Array], history: Array, has_defect: bool, number: int
+    ) -> Function:
         """The corrected motion: from its own history, and with defects or, without, those of the solution.
 
         The residual that the solution has left is none of its errors. Errors beyond the rod's length, and all
@@ -334,7 +336,7 @@ class Core(EliminationCode):
                 self._write_wide(self._wide(self.y, i, j) + start, self.better, i, j)
         with self._places(self.used) as j:
             for i in e.used_history:
-                value = self._wide(self.H, i, j) + self._wide(self.dH, i, j)
+                value = self._wide(self.H, i, j) + self._wide(history, i, j)
                 self._write_wide(value, self.own_dH, i, j)
         for k, (i, base) in enumerate(self._unknown_numbers()):
             change = 2.0 * self._get(errors[0], i, base) - self._get(errors[1], i, base)
@@ -662,9 +664,6 @@ class Core(EliminationCode):
                     value = c0 * self._wide(self.errors[0], i, j) + self._wide(self.dH, i, j)
                     self._write_wide(value, self.error_rate, i, j)
         if isinstance(self.scheme, SDIRK2):
-            with self._places(self.used) as j:
-                for i in range(e.numbers):
-                    self._write_wide(self._wide(self.time_dH, i, j), self.dH, i, j)
             f.call(self.corrected_in_time, memory, numbers)
         solved = f.load(numbers, ERROR * P, P) <= self._get(self.options, ACCEPTABLE)
         alive = f.load(numbers, ALIVE * P, P)
@@ -744,12 +743,14 @@ class Core(EliminationCode):
         self._write_recorded()
         self._write_check()
         if self.scheme:
-            self.corrected = self._write_corrected("corrected", self.errors, True, POSITION)
+            self.corrected = self._write_corrected("corrected", self.errors, self.dH, True, POSITION)
         else:
             self._write_static_errors()
         if isinstance(self.scheme, SDIRK2):
             self._write_products()
-            self.corrected_in_time = self._write_corrected("in_time", self.time_errors, False, TIME)
+            self.corrected_in_time = self._write_corrected(
+                "in_time", self.time_errors, self.time_dH, False, TIME
+            )
             self._write_time_history()
         self._write_stage()
         self._write_guesses()

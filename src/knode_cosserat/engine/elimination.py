@@ -77,8 +77,8 @@ class EliminationCode(RodCode):
         self.M, self.inverse = by_rows(k, ny, self.strands), by_rows(k, k, 1)
         self.zeros = by_rows(ny, 1, 1)
         #: the solution, its unknowns, and the correction of both
-        self.y, self.unknowns = a(ny, self.ends), a(k, 1)
-        self.dy, self.step_unknowns = a(ny, self.ends), a(k, 1)
+        self.y, self.unknowns = a(ny, self.ends), a(k)
+        self.dy, self.step_unknowns = a(ny, self.ends), a(k)
         self.correction = Correction(
             self.r, self.tip, self.added, by_rows(ny, 1, self.points),
             by_rows(self.own, 1, self.groups[1] * self.strands),

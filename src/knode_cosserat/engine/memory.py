@@ -19,7 +19,7 @@ from knode_cosserat.engine.codegen import Function, Index, Module, Value
 
 @dataclasses.dataclass(frozen=True)
 class Array:
-    """Numbers of `size` components at `count` places, in the memory of a run."""
+    """Numbers of `size` components at `count` places, or (count 0) of no place, in the memory of a run."""
 
     offset: int
     size: int
@@ -51,11 +51,11 @@ class Memory:
         self.module = Module()
         self._size = 0
 
-    def _array(self, size: int, count: int, memory: int = 0) -> Array:
+    def _array(self, size: int, count: int = 0, memory: int = 0) -> Array:
         """Reserve an array: robots in lanes, or places in lanes."""
-        place, component = (size * self.L, self.L) if self.batch else (1, 1 if count == 1 else self.stride)
+        place, component = (size * self.L, self.L) if self.batch else (1, self.stride if count else 1)
         found = Array(self._size, size, count, component, place, memory)
-        length = size * count * self.L if self.batch else size * (1 if count == 1 else self.stride)
+        length = size * max(count, 1) * self.L if self.batch else size * component
         self._size += -(-length // self.L) * self.L
         return found
 
@@ -101,9 +101,9 @@ class Memory:
 
     def _numbers(self, memory: np.ndarray, array: Array, first: int = 0) -> np.ndarray:
         """Return an array's numbers (m, lanes, places, size): a view of memories (m, n) from `first` on."""
-        shape, axes = (array.size, 1 if array.count == 1 else self.stride, 1), (0, 3, 2, 1)
+        shape, axes = (array.size, self.stride if array.count else 1, 1), (0, 3, 2, 1)
         if self.batch or array.is_tangent:
-            shape, axes = (array.count, array.size, self.L), (0, 3, 1, 2)
+            shape, axes = (max(array.count, 1), array.size, self.L), (0, 3, 1, 2)
         at = array.offset - first
         return memory[:, at : at + shape[0] * shape[1] * shape[2]].reshape(-1, *shape).transpose(axes)
 
@@ -140,7 +140,7 @@ class Memory:
 
     def _wide(self, array: Array, i: Any, j: Any = 0) -> Value:
         # a number that is the same at all places
-        lanes = self.L if self.batch or array.count > 1 else 1
+        lanes = self.L if self.batch or array.count else 1
         return self._get(array, i, j, lanes)
 
     def _write_wide(self, value: Any, array: Array, i: Any, j: Any) -> None:

@@ -55,15 +55,16 @@ class RodCode(Memory):
             self.origins += [(q, grid.stage(k).start + min(j, grid.tip - 1)) for q, j in pieces]
         super().__init__(robots, lanes, self.count)
         ny, nz, k, a = e.ny, e.nz, e.k, self._array
-        self.params, self.scale_tip = a(len(e.parameter_values), 1), a(k, 1)
-        self.scale_y = a(ny, 1 if self.strands == 1 else self.points)
-        self.inputs, self.step_terms = a(2 + e.nc, 1), a(len(e.step_terms), 1)
-        self.s, self.h, self.length = a(1, self.count), a(1, self.pieces), a(1, 1)
+        self.params, self.scale_tip = a(len(e.parameter_values)), a(k)
+        self.scale_y = a(ny, 0 if self.strands == 1 else self.points)
+        self.inputs, self.step_terms = a(2 + e.nc), a(len(e.step_terms))
+        self.s, self.h, self.length = a(1, self.count), a(1, self.pieces), a(1)
         scale_y, scale_tip, places, lengths, length = e.geometry
         idle = e.program.constant(0.0)
+        units = np.repeat(scale_y.reshape(-1, ny).T, self.scale_y.count // self.strands or 1, axis=1)
         #: arrays of numbers that depend on the parameters alone, and their nodes (size, count)
         self.geometry = [
-            (self.scale_y, np.repeat(scale_y.reshape(-1, ny).T, self.scale_y.count // self.strands, axis=1)),
+            (self.scale_y, units),
             (self.scale_tip, scale_tip[:, None]),
             (self.s, places[None, [place for _, place in self.origins]]),
             (self.h, np.tile(np.append(lengths, idle), self.strands)[None, :-1]),
@@ -78,13 +79,13 @@ class RodCode(Memory):
         #: y at the stages between ends
         self.between = a(ny, self.count - self.ends)
         #: points of the nodes, as whole numbers
-        self.node_table = a(len(grid.nodes), 1)
+        self.node_table = a(len(grid.nodes))
         #: slopes of jumps
         self.jumps = [(self.jump, [node for *_, node in e.jumping])]
         #: defects of the pieces and of the tip
-        self.r, self.tip = a(ny, self.pieces), a(k, 1)
+        self.r, self.tip = a(ny, self.pieces), a(k)
         #: subtracted from the tip's residual
-        self.tip_offset = a(k, 1)
+        self.tip_offset = a(k)
 
     def _empty_memory(self) -> np.ndarray:
         """Return the memory before a run: zeros, but for discontinuities and nodes; aligned to 64 bytes."""
@@ -97,7 +98,7 @@ class RodCode(Memory):
 
     def _width(self, array: Array) -> int:
         """Return the size of an array's numbers, of all strands, at one place of the grid."""
-        return array.size * (self.strands if array.count > 1 else 1)
+        return array.size * (self.strands if array.count else 1)
 
     def _by_strand(self, array: Array, packed: np.ndarray) -> np.ndarray:
         """Return an array's numbers from those of all strands at places of the grid (…, places, width)."""
@@ -154,7 +155,7 @@ class RodCode(Memory):
         values = f.evaluate(e.program, outputs, self._parameters(), self.P)
         for array, nodes in self.geometry:
             # the lanes beyond the last place have its numbers
-            beyond = 0 if self.batch or array.count == 1 else self.stride - array.count
+            beyond = 0 if self.batch or not array.count else self.stride - array.count
             for i, row in enumerate(np.pad(nodes, ((0, 0), (0, beyond)), mode="edge")):
                 first = 0
                 for node, places in itertools.groupby(row):
@@ -376,7 +377,7 @@ class RodCode(Memory):
             largest, total = found.get(), finite.get()
             inside = self._inside(j, count)
             for i in range(array.size):
-                weight = self._wide(weights, i, j if weights.count > 1 else 0)
+                weight = self._wide(weights, i, j if weights.count else 0)
                 x = f.apply("abs", self._wide(array, i, j)) * weight
                 x = x if self.batch else f.select(inside, x, 0.0)
                 largest, total = f.select(x > largest, x, largest), total + x
