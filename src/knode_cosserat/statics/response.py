@@ -135,11 +135,12 @@ def equilibrium_poses(system: System, settings: Settings, pose: Pose, controls: 
     records = rows.records[:, 0]
     strain = (records - rest_record(system))[..., ny : ny + system.z_layout.size]
     lengths = [np.max(np.linalg.norm(part, axis=-1), axis=-1) for part in system.z_layout.split(strain)]
-    return *_poses(system, pose, records[:, -1, :ny]), rows.error[:, 0], np.stack(lengths, axis=-1)
+    return *poses_of(system, pose, records[:, -1, :ny]), rows.error[:, 0], np.stack(lengths, axis=-1)
 
 
 @functools.partial(jax.jit, static_argnames="pose")
-def _poses(system, pose, y):  # type: ignore[no-untyped-def]
+def poses_of(system, pose, y):  # type: ignore[no-untyped-def]
+    """Return the poses of last nodes y (B, y)."""
     return jax.vmap(functools.partial(pose, system))(y)
 
 
