@@ -11,7 +11,7 @@ import numpy as np
 
 from knode_cosserat.engine import loops as engine
 from knode_cosserat.engine.program import EngineError
-from knode_cosserat.rods.system import System
+from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.solvers.problem import Evaluated, StepProblem, no_history
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
@@ -37,6 +37,16 @@ def _evaluated(
     system: System, space: SpaceScheme, c0: Any, t: Any, control: Any, history: Any, y: Any
 ) -> Evaluated:
     return StepProblem(system, t, control, c0, history, space).evaluated(y)
+
+
+def of_each_robot(function: Callable[..., Any], system: System, *arguments: Any) -> Any:
+    """Return a function of each robot of a batch, and of its part of the arguments."""
+    if is_traced((system, arguments)):
+        return jax.vmap(function)(system, *arguments)
+    leaves, structure = jax.tree.flatten((system, *arguments))
+    leaves = [np.asarray(leaf) for leaf in leaves]
+    robots = [jax.tree.unflatten(structure, own) for own in zip(*leaves, strict=True)]
+    return jax.tree.map(lambda *parts: np.stack(parts), *(function(*own) for own in robots))
 
 
 def still_state(system: System, space: SpaceScheme, control: Any, y: Any, t: Any = 0.0) -> Evaluated:

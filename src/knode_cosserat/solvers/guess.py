@@ -111,7 +111,7 @@ def state_from_positions(
         )
     if not np.all(np.isfinite(positions)) or np.any(np.all(np.diff(positions, axis=0) == 0.0, axis=1)):
         raise ValueError("initial holds positions that are not finite, or that repeat")
-    record = np.array(_rest(system))
+    record = np.array(rest_record(system))
     s = np.linspace(0.0, 1.0, system.nodes)
     p, tangent = _curve(positions, s)
     base, tip = held_ends(system, control)
@@ -148,9 +148,6 @@ def curve_guesses(system: System, control: Any) -> list[Float[Any, "points y"]]:
 def materials(system: Any, s: Any, control: Any) -> Any:
     """Return section and material at places (m) along a rod."""
     return jax.vmap(lambda s: system.material(s, control))(s)
-
-
-_rest = jax.jit(rest_record)
 
 
 def rotations(h: Any) -> Any:

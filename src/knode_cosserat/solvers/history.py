@@ -7,6 +7,7 @@ equations (`grid.Grid`). The history stores them there. The rows of a trajectory
 
 from __future__ import annotations
 
+import functools
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
@@ -19,7 +20,7 @@ from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.solvers.grid import at_places, grid_of
 from knode_cosserat.solvers.problem import Evaluated, StepProblem, row_of
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.solvers.space import LOBATTO2, SpaceScheme
 from knode_cosserat.solvers.time import BDF1
 
 #: number of earlier states in the first guess of a step, and the extrapolations in time (constant, linear,
@@ -126,25 +127,35 @@ def advanced(past: StateHistory, records: Any, rate: Any, y: Any, weights: Any) 
 # histories of one state
 
 
+def unloaded(system: System, space: SpaceScheme) -> tuple[Float[Any, "nodes x"], Float[Any, "places x"]]:
+    """Return y and z of the unloaded system, at the nodes and at all places."""
+    found = _unloaded(system, space)
+    return found if is_traced(found) else (np.asarray(found[0]), np.asarray(found[1]))
+
+
+@functools.partial(jax.jit, static_argnames="space")
+def _unloaded(system: System, space: SpaceScheme) -> Any:
+    nodes = jnp.linspace(0.0, 1.0, system.nodes) * system.length
+    places = StepProblem.still(system, space, jnp.zeros(system.control_size)).places
+    found = jnp.concatenate(jax.vmap(system.rest)(jnp.concatenate([nodes, places])), axis=1)
+    return found[: system.nodes], found[system.nodes :]
+
+
 def rest_record(system: System) -> Float[Any, "nodes x"]:
     """Return y and z (nodes, y + z) of the system at rest."""
-    s = jnp.linspace(0.0, 1.0, system.nodes) * system.length
-    y, z = jax.vmap(system.rest)(s)
-    return jnp.concatenate([y, z], axis=1)
+    return unloaded(system, LOBATTO2)[0]
 
 
 def resting_history(system: System, settings: Settings) -> StateHistory:
     """Return the history of the robot at rest under zero control, at time 0."""
-    none = jnp.zeros(system.control_size)
     if system.mixed:
-        return constant_history(system, settings, rest_record(system), none)
-    grid = grid_of(system, settings.space)
-    y, z = jax.vmap(system.rest)(StepProblem.still(system, settings.space, none).places)
-    return repeated_record_history(
-        system, settings.space, jnp.concatenate([y, z], axis=-1), y[: grid.tip + 1], 0.0
-    )
+        return constant_history(system, settings, rest_record(system), np.zeros(system.control_size))
+    _, records = unloaded(system, settings.space)
+    y = records[: grid_of(system).tip + 1, : system.y_layout.size]
+    return repeated_record_history(system, settings.space, records, y, 0.0)
 
 
+@functools.partial(jax.jit, static_argnames="settings")
 def constant_history(
     system: System, settings: Settings, row: Any, control: Any, t0: Any = 0.0
 ) -> StateHistory:

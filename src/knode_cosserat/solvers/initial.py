@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from typing import Any
 
 import jax
@@ -10,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from knode_cosserat.rods.system import System, is_traced
+from knode_cosserat.solvers.evaluation import of_each_robot
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.history import (
     EXTRAPOLATIONS,
     SolverState,
     StateHistory,
-    constant_history,
     rest_record,
     resting_history,
 )
@@ -59,34 +58,23 @@ def initial_state(
     control = np.zeros(system.control_size) if held is None else np.asarray(held, dtype=float)
     if held is not None or system.rest_is_guess:
         record, result = _settled(system, settings, recovery_budget, control)
-        history = (_all_at_one_state if many else at_one_state)(system, made, record, control)
+
+        def at_record(system: System, record: Any) -> StateHistory:
+            return at_one_state(system, made, record, control)
+
+        history = of_each_robot(at_record, system, record) if many else at_record(system, record)
     else:
-        record, history = (_all_at_rest if many else _at_rest)(system, made)
+
+        def at_rest(system: System) -> Any:
+            return rest_record(system), resting_history(system, made)
+
+        record, history = of_each_robot(at_rest, system) if many else at_rest(system)
     found = record, SolverState(history), result
     if batch and not many:
-        found = jax.tree.map(lambda x: jnp.broadcast_to(x, (batch, *jnp.shape(x))), found)
+        numeric: Any = jnp if is_traced(found) else np
+        found = jax.tree.map(lambda x: numeric.broadcast_to(x, (batch, *np.shape(x))), found)
     shape = (batch, system.control_size) if batch else (system.control_size,)
     return InitialState(found[0], np.broadcast_to(control, shape).copy(), *found[1:])
-
-
-@functools.partial(jax.jit, static_argnames="settings")
-def _at_rest(system: System, settings: Settings) -> Any:
-    return rest_record(system), resting_history(system, settings)
-
-
-@functools.partial(jax.jit, static_argnames="settings")
-def _all_at_rest(system: System, settings: Settings) -> Any:
-    return jax.vmap(lambda one: _at_rest(one, settings))(system)
-
-
-def _all_at_one_state(system: System, settings: Settings, records: Any, control: Any) -> Any:
-    if is_traced((system, records, control)):
-        return jax.vmap(lambda one, row: constant_history(one, settings, row, control))(system, records)
-
-    def of_robot(i: int) -> StateHistory:
-        return at_one_state(jax.tree.map(lambda leaf: leaf[i], system), settings, records[i], control)
-
-    return jax.tree.map(lambda *parts: np.stack(parts), *map(of_robot, range(len(records))))
 
 
 def _settled(system: System, settings: Settings, budget: float | None, control: Any) -> tuple[Any, Any]:

@@ -294,7 +294,7 @@ def other_unit(system: System, control: np.ndarray) -> str:
     """Return a hint at another unit if a force in the control is absurdly large."""
     if "n" not in system.y_layout.names:
         return ""
-    natural = float(np.asarray(system.scales().y)[system.y_layout.slice("n")][0])
+    natural = float(np.asarray(_scales_of_y(system))[system.y_layout.slice("n")][0])
     for field in system.control_layout.fields:
         largest = float(np.max(np.abs(system.control_layout.get(control, field.name)), initial=0.0))
         if field.unit == "N" and largest > ABSURD * natural:

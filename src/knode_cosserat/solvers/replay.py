@@ -39,8 +39,6 @@ from knode_cosserat.trajectory import Trajectory
 #: row 0 is the state at rest if it differs by less than this (natural units)
 AT_REST = 1e-12
 
-at_rest = jax.jit(resting_history, static_argnames="settings")
-
 
 def at_one_state(system: System, settings: Settings, row: Any, control: Any, t0: Any = 0.0) -> StateHistory:
     """Return the history of one state (see `constant_history`), in the engine outside of transformations."""
@@ -125,7 +123,7 @@ def _known_row(
     if is_traced(time) or time[0] != 0.0:
         state = state_of_rows(system, made.space, rows, dt)
         return None if state is None else (1, state)
-    history = at_rest(system, made)
+    history = resting_history(system, made)
     rest = rest_record(system)
     if not is_traced((rest, rows)) and not np.allclose(rest, rows[0], rtol=0.0, atol=AT_REST):
         history = at_one_state(system, made, rows[0], trajectory.control[0])

@@ -22,6 +22,8 @@ from knode_cosserat.rods.elastic_rod import ElasticRod
 from knode_cosserat.rods.section import INWARD
 from knode_cosserat.rods.strands import in_strands
 from knode_cosserat.rods.system import System, is_traced
+from knode_cosserat.solvers.evaluation import of_each_robot
+from knode_cosserat.solvers.guess import materials
 from knode_cosserat.solvers.history import FirstStep, SolverState, StateHistory
 from knode_cosserat.solvers.recovery import Budget, SolvedStep
 from knode_cosserat.solvers.recovery_methods import StaticRecovery, StepRecovery, recovered_stages
@@ -264,9 +266,9 @@ def warn_outside_rod_theory(system: System, rows: StepRows) -> None:
         s[-1] -= 0.4 * INWARD / (system.nodes - 1)
 
         def along(rod: Any) -> Any:
-            return jax.vmap(lambda part: rod.material(part * rod.length, still).radius)(s)
+            return np.asarray(materials(rod, s * rod.length, still).radius)
 
-        radius = np.asarray(jax.vmap(along)(strand) if many else along(strand))
+        radius = of_each_robot(along, strand) if many else along(strand)
     bent = np.linalg.norm(strand.z_layout.get(z, "u")[..., :2], axis=-1) * radius[..., None, :, None]
     stretch = np.linalg.norm(strand.z_layout.get(z, "v"), axis=-1)
     found = []

@@ -227,7 +227,8 @@ def stacked(robot: Any) -> tuple[System, int | None]:
         raise ValueError(f"robot is {type(robot).__name__}; allowed is a robot or a non-empty list of robots")
     if len({jax.tree.structure(one) for one in robots}) > 1:
         raise ValueError("the robots of a batch must be of one class, with the same nodes and options given")
-    return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(x) for x in leaves]), *robots), len(robots)
+    numeric: Any = jnp if is_traced(robots) else np
+    return jax.tree.map(lambda *leaves: numeric.stack(leaves), *robots), len(robots)
 
 
 def checked_dt(dt: Any) -> float:

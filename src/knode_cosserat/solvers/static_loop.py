@@ -11,7 +11,9 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.system import System, unknowns_of
 from knode_cosserat.solvers.boundary import Kept, newton
+from knode_cosserat.solvers.evaluation import of_each_robot
 from knode_cosserat.solvers.grid import grid_of
+from knode_cosserat.solvers.history import unloaded
 from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
@@ -24,13 +26,11 @@ from knode_cosserat.solvers.time_loop import (
 )
 
 
-@functools.partial(jax.jit, static_argnames="space")
 def unloaded_shape(system: System, space: SpaceScheme) -> Float[Any, "points y"]:
     """Return y at all points of the unloaded robot, or of a batch of robots."""
     if jnp.ndim(system.length):
-        return jax.vmap(lambda one: unloaded_shape(one, space))(system)
-    still = StepProblem.still(system, space, jnp.zeros(system.control_size))
-    return jax.vmap(system.rest)(still.places)[0][: grid_of(system, space).tip + 1]
+        return of_each_robot(lambda one: unloaded_shape(one, space), system)
+    return unloaded(system, space)[1][: grid_of(system).tip + 1, : system.y_layout.size]
 
 
 def static_loop(

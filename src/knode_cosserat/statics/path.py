@@ -226,10 +226,7 @@ def _corrected(system, settings, ends, start, tangent, plane):  # type: ignore[n
 
 def _trajectory(system: System, settings: Settings, walk: _Walk) -> Trajectory:
     controls = walk.ends[0] + np.array(walk.parts)[:, None] * (walk.ends[1] - walk.ends[0])
-    rows = [
-        node_values(system, settings, control, jnp.asarray(y))
-        for control, y in zip(controls, walk.y, strict=True)
-    ]
+    rows = [node_values(system, settings, control, y) for control, y in zip(controls, walk.y, strict=True)]
     y, z = (np.stack([np.asarray(row[k]) for row in rows]) for k in (0, 1))
     count = len(rows)
     return Trajectory(

@@ -11,6 +11,7 @@ from knode_cosserat._reprs import packed_text, quantity, wrapped
 from knode_cosserat.rods.strands import in_strands
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import NewtonOptions
+from knode_cosserat.solvers.history import rest_record
 from knode_cosserat.solvers.result import Code, Codes, Result, SimulationError
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.statics.arguments import (
@@ -20,7 +21,7 @@ from knode_cosserat.statics.arguments import (
     checked_vectors,
     static_settings,
 )
-from knode_cosserat.statics.response import Pose, Response, first_solved, node_values, tip_pose
+from knode_cosserat.statics.response import Pose, Response, first_solved, node_values, poses_of, tip_pose
 from knode_cosserat.statics.search import EquilibriumSearch, Wanted
 from knode_cosserat.trajectory import Trajectory
 
@@ -290,10 +291,10 @@ def _checked_wanted(
     system: System, pose: Pose, position: Any, quaternion: Any, measured_by: Any
 ) -> tuple[list[Wanted], bool]:
     """Return the wanted poses, and True if a single one was given."""
-    here, turned = pose(system, system.rest(system.length)[0])
+    here, turned = poses_of(system, pose, rest_record(system)[-1:, : system.y_layout.size])
     given: dict[str, np.ndarray] = {}
     if position is not None:
-        size = len(here)
+        size = here.shape[-1]
         given["position"] = checked_vectors("position", position, size, f"({size},) or (B, {size}) in m")
     if quaternion is not None:
         if turned is None:

@@ -14,13 +14,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from knode_cosserat.rods.system import System, unknown_count, unknowns_of
+from knode_cosserat.rods.system import System, unknown_count
 from knode_cosserat.solvers.boundary import Solution, factors_of, newton, pivots_of
-from knode_cosserat.solvers.grid import grid_of
+from knode_cosserat.solvers.evaluation import still_state
 from knode_cosserat.solvers.history import rest_record
 from knode_cosserat.solvers.linear import solved_correction
 from knode_cosserat.solvers.problem import StepProblem, row_of
+from knode_cosserat.solvers.run import Equilibria
 from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.static_loop import unloaded_shape
 
 #: function from a system and its last node's y to position (d,) in m and quaternion (scalar first) or None
 Pose = Callable[[System, Any], tuple[Any, Any]]
@@ -43,9 +45,7 @@ class Response(NamedTuple):
     """
 
     y: Any
-    unknowns: Any
     error: Any
-    corrections: Any
     position: Any
     quaternion: Any
     #: twist per control (p, c)
@@ -59,32 +59,16 @@ def static_problem(system: System, settings: Settings, control: Any) -> StepProb
     return StepProblem.still(system, settings.space, control)
 
 
-def unloaded_guess(system: System) -> tuple[Any, Any]:
-    """Return the unloaded initial guess of y at all points and of ξ."""
-    y = grid_of(system).spread(rest_record(system)[:, : system.y_layout.size])
-    return y, unknowns_of(system, y[0])
-
-
-rest_guess = jax.jit(unloaded_guess)
-
-
 def solve_response(system: System, settings: Settings, control: Any, y: Any, unknowns: Any) -> Solution:
     """Solve for an equilibrium from a guess; its `error` tells if it converged."""
     problem = static_problem(system, settings, control).ready()
     return newton(problem, y, unknowns, settings.newton)[0]
 
 
-@functools.partial(jax.jit, static_argnames="settings")
-def _filled(system, settings, control, y):  # type: ignore[no-untyped-def]
-    """Return y of an equilibrium at all points, from y at the nodes."""
-    return static_problem(system, settings, control).filled(y)
-
-
-@functools.partial(jax.jit, static_argnames="settings")
-def node_values(system, settings, control, y):  # type: ignore[no-untyped-def]
+def node_values(system: System, settings: Settings, control: Any, y: Any) -> tuple[Any, Any]:
     """Return y and z of an equilibrium at the nodes, from y at all points."""
-    record = row_of(system, y, static_problem(system, settings, control).records(y))
-    ny = system.y_layout.size
+    found, ny = still_state(system, settings.space, control, np.asarray(y)), system.y_layout.size
+    record = row_of(system, found.y, found.records)
     return record[:, :ny], record[:, ny : ny + system.z_layout.size]
 
 
@@ -103,59 +87,65 @@ def twist(system: System, pose: Pose, y: Any, dy: Any) -> Any:
     return jnp.concatenate([dp, 2.0 * (w * dv - dw * v - jnp.cross(dv, v)) / jnp.sum(h * h)])
 
 
+def respond(system: System, settings: Settings, pose: Pose, control: Any, guess: Any) -> Response:
+    """Return the equilibrium found from a guess of y at all points, its pose, and the pose's derivatives."""
+    control = np.asarray(control, dtype=float)
+    _, y, rows = Equilibria(settings, 1).solve(system, control[None], np.asarray(guess), (0, 1))
+    unknowns = rows.unknowns[0]
+    pose_and_slopes = _pose_of(system, settings, pose, control, y, unknowns)
+    return Response(y, rows.error[0], *pose_and_slopes)
+
+
 @functools.partial(jax.jit, static_argnames=("settings", "pose"))
-def respond(system, settings, pose, control, y, unknowns):  # type: ignore[no-untyped-def]
-    """Return a `Response`: the equilibrium found from a guess, its pose, and the pose's derivatives."""
-    found = solve_response(system, settings, control, y, unknowns)
+def _pose_of(system, settings, pose, control, y, unknowns):  # type: ignore[no-untyped-def]
+    """Return the pose of an equilibrium, and its derivatives by controls and by a wrench."""
     problem = static_problem(system, settings, control)
-    factors, pivots = factors_of(problem, found.y, found.unknowns), pivots_of(system)
+    factors, pivots = factors_of(problem, y, unknowns), pivots_of(system)
 
     def by_control(d_control: Any) -> Any:
         def at_solution(control: Any) -> Any:
             problem = static_problem(system, settings, control)
-            return *problem.residuals(found.y), problem.base(found.unknowns)
+            return *problem.residuals(y), problem.base(unknowns)
 
         defects, tip, base = jax.jvp(at_solution, (control,), (d_control,))[1]
         dy, _ = solved_correction(factors, pivots, defects, tip, base)
-        return twist(system, pose, found.y[-1], dy[-1])
+        return twist(system, pose, y[-1], dy[-1])
 
     def by_wrench(tip: Any) -> Any:
-        dy, _ = solved_correction(factors, pivots, jnp.zeros_like(found.y[1:]), tip)
-        return twist(system, pose, found.y[-1], dy[-1])
+        dy, _ = solved_correction(factors, pivots, jnp.zeros_like(y[1:]), tip)
+        return twist(system, pose, y[-1], dy[-1])
 
     names = wrench_fields(system)
     columns = np.eye(unknown_count(system))[system.tip_layout.indices(names) if names else []]
-    position, quaternion = pose(system, found.y[-1])
+    position, quaternion = pose(system, y[-1])
     jacobian = jax.vmap(by_control, out_axes=-1)(jnp.eye(system.control_size))
     empty = jnp.zeros((jacobian.shape[0], 0))
     compliance = jax.vmap(by_wrench, out_axes=-1)(jnp.asarray(columns)) if names else empty
-    return Response(
-        found.y, found.unknowns, found.error, found.corrections, position, quaternion, jacobian, compliance
-    )
+    return position, quaternion, jacobian, compliance
 
 
-@functools.partial(jax.jit, static_argnames=("settings", "pose"))
-def equilibrium_poses(system, settings, pose, controls):  # type: ignore[no-untyped-def]
-    """Return the poses of many equilibria (B, c), each solved from rest in sequence; only poses are kept.
+def equilibrium_poses(system: System, settings: Settings, pose: Pose, controls: np.ndarray) -> Any:
+    """Return the poses of many equilibria (B, c), each solved from rest.
 
-    Position, quaternion, error, corrections, and the largest change from rest of each strain's magnitude.
+    Position, quaternion, error, and the largest change from rest of each strain's magnitude.
     """
-    begin = unloaded_guess(system)
-    ny = system.y_layout.size
-    z_rest = rest_record(system)[:, ny : ny + system.z_layout.size]
-
-    def one(control: Any) -> Any:
-        found = solve_response(system, settings, control, *begin)
-        records = static_problem(system, settings, control).records(found.y)
-        strain = row_of(system, found.y, records)[:, ny : ny + system.z_layout.size] - z_rest
-        lengths = [jnp.max(jnp.linalg.norm(part, axis=-1)) for part in system.z_layout.split(strain)]
-        return *pose(system, found.y[-1]), found.error, found.corrections, jnp.stack(lengths)
-
-    return jax.lax.map(one, controls)
+    y, size, ny = unloaded_shape(system, settings.space), len(controls), system.y_layout.size
+    y = np.broadcast_to(y, (size, *y.shape))
+    rows = Equilibria(settings, 1).solve_many(system, controls[:, None], y)[2]
+    records = rows.records[:, 0]
+    strain = (records - rest_record(system))[..., ny : ny + system.z_layout.size]
+    lengths = [np.max(np.linalg.norm(part, axis=-1), axis=-1) for part in system.z_layout.split(strain)]
+    return *poses_of(system, pose, records[:, -1, :ny]), rows.error[:, 0], np.stack(lengths, axis=-1)
 
 
-def first_solved(system: System, settings: Settings, pose: Pose, control: Any, guess: Any = None) -> Response:
-    """Return the response at a control: from the guess or rest, then by the recoveries of `equilibrium`.
+@functools.partial(jax.jit, static_argnames="pose")
+def poses_of(system, pose, y):  # type: ignore[no-untyped-def]
+    """Return the poses of last nodes y (B, y)."""
+    return jax.vmap(functools.partial(pose, system))(y)
+
+
+def first_solved(system: System, settings: Settings, pose: Pose, control: Any) -> Response:
+    """Return the response at a control: from rest, then by the recoveries of `equilibrium`.
 
     Raises `SimulationError` if there is no equilibrium.
     """
@@ -164,10 +154,11 @@ def first_solved(system: System, settings: Settings, pose: Pose, control: Any, g
     control = np.asarray(control, dtype=float)
     found = None
     # a rod that is held at both ends may need another guess, or be turned in parts
-    if guess or not system.rest_is_guess:
-        found = respond(system, settings, pose, control, *(guess or rest_guess(system)))
+    if not system.rest_is_guess:
+        found = respond(system, settings, pose, control, unloaded_shape(system, settings.space))
     if found is None or not found.error <= settings.newton.acceptable:
         recovered = equilibrium(system, control, space=settings.space, newton=settings.newton)
-        y = _filled(system, settings, control, jnp.asarray(recovered.y[0]))
-        found = respond(system, settings, pose, control, y, unknowns_of(system, y[0]))
+        found = respond(
+            system, settings, pose, control, still_state(system, settings.space, control, recovered.y[0]).y
+        )
     return found

@@ -108,7 +108,7 @@ class EquilibriumSearch:
     def at(self, u: np.ndarray, guess: Response) -> Response | None:
         """Return the equilibrium near another, or None."""
         self.trials += 1
-        found = respond(self.system, self.settings, self.pose, self.control(u), guess.y, guess.unknowns)
+        found = respond(self.system, self.settings, self.pose, self.control(u), guess.y)
         return found if found.error <= self.settings.newton.acceptable else None
 
     def descend(self, wanted: Wanted, u: np.ndarray, found: Response) -> tuple[np.ndarray, Response, bool]:

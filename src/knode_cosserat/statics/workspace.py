@@ -239,7 +239,7 @@ def _found(system: System, settings: Settings, pose: Pose, controls: np.ndarray,
     joined: list[Any] = [
         None if parts[0] is None else np.concatenate(parts) for parts in zip(*chunks, strict=True)
     ]
-    position, quaternion, residual, _, strain = joined
+    position, quaternion, residual, strain = joined
     result = ResultCodes.of(np.full(total, int(Result.CONVERGED)))
     found = Workspace(system, controls, position, quaternion, result, residual, strain)
     for i in np.flatnonzero(~(residual <= settings.newton.acceptable)):

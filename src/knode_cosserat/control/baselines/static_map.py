@@ -38,7 +38,7 @@ class StaticMap:
 
     def solved(self, control: Any) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 c"], bool]:
         """Return the tip's position (m), its Jacobian (m per control), and True if it was solved."""
-        found = respond(self.robot, self._settings, tip_pose, control, self._found.y, self._found.unknowns)
+        found = respond(self.robot, self._settings, tip_pose, control, self._found.y)
         if bool(found.error <= self._settings.newton.acceptable):
             self._found = found
             return np.asarray(found.position), np.asarray(found.jacobian)[:3], True
