@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.engine.codegen import Function, Index, Value, Variable
-from knode_cosserat.engine.elimination import COLUMNS, EliminationCode
+from knode_cosserat.engine.elimination import EliminationCode
 from knode_cosserat.engine.equations import Equations
 from knode_cosserat.engine.memory import Array
 from knode_cosserat.rods.system import System
@@ -731,8 +731,8 @@ class Core(EliminationCode):
         self.residual_of_better = self._write_residual("residual_of_better", self.better, self.own_dH)
         self.defects = self._function("defects")
         self._write_defects(self.trial, self.H)
-        self.solved = self._write_solved()
-        self.solved_columns = self._write_solved("solved_columns", COLUMNS)
+        if not self.batch:
+            self.solved = self._write_solved()
         self._write_factor()
         self.advance = self._write_advance()
         self._write_along()

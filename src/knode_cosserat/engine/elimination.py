@@ -111,6 +111,8 @@ class EliminationCode(RodCode):
 
     def _write_factor(self) -> None:
         """Factors and the matrix B⁻¹ A of all pieces, from the slopes at their ends and stages."""
+        if not self.batch:
+            solved_columns = self._write_solved("solved_columns", COLUMNS)
         f, el, n = self._function("factored"), self.elimination, self.equations.ny
         self.factored = f
         memory = f.arguments[0]
@@ -124,8 +126,8 @@ class EliminationCode(RodCode):
             for k, node in enumerate(el.factors):
                 self._write_wide(values[node], self.factor, k, j)
             if self.batch:
-                for k, at in enumerate(el.entries):
-                    self._write_wide(values[int(el.matrix[at])], self.matrix, k, j)
+                for k, entry in enumerate(el.entries):
+                    self._write_wide(values[int(el.matrix[entry])], self.matrix, k, j)
             else:
                 for i, c in np.ndindex(n, n):
                     self._write_wide(values[int(el.matrix[i, c])], self.wide_matrix, c * n + i, j)
@@ -135,7 +137,7 @@ class EliminationCode(RodCode):
             first = self._pointer(self.wide_matrix, j)
             with f.loop(n // COLUMNS * COLUMNS, 0, COLUMNS) as c:
                 column = f.pointer(first, c.value * (n * self.wide_matrix.component))
-                f.call(self.solved_columns, memory, column, column, j.value)
+                f.call(solved_columns, memory, column, column, j.value)
             with f.loop(n, n // COLUMNS * COLUMNS) as c:
                 column = f.pointer(first, c.value * (n * self.wide_matrix.component))
                 f.call(self.solved, memory, column, column, j.value)

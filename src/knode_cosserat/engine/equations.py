@@ -328,8 +328,8 @@ class Elimination:
         self.entries = [(i, j) for i, j in np.ndindex(A.shape) if not program.is_constant(int(A[i, j]))]
         self.start_entries = program.inputs("entry", (len(self.entries),), 1)
         known = A.copy()
-        for node, at in zip(self.start_entries, self.entries, strict=True):
-            known[at] = node
+        for node, (i, j) in zip(self.start_entries, self.entries, strict=True):
+            known[i, j] = node
         right = [int(node) for node in self.r]
         for i, j in np.ndindex(A.shape):
             right[i] = apply("add", right[i], apply("mul", int(known[i, j]), int(self.x[j])))
