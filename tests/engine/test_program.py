@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.special
 
 import knode_cosserat as kc
 from examples.hanging_string import HangingString
@@ -25,6 +26,12 @@ from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.space import LOBATTO2
 
 
+#: operations on arrays that are not those of `FOLDED`
+OF_ARRAYS = {
+    "select": lambda p, no, yes: np.where(p, yes, no), "logistic": scipy.special.expit, "erf": scipy.special.erf,
+}  # fmt: skip
+
+
 def interpreted(program, outputs, inputs):
     """Return the values of nodes, from those of inputs by name."""
     found = {}
@@ -38,6 +45,17 @@ def interpreted(program, outputs, inputs):
             found[node] = found[rest[0]][rest[1]]
         elif name == "loop":
             found[node] = looped(program.loops[rest[0]], found)
+        elif name in ("stack", "inputs"):
+            found[node] = np.array([found[each] for each in program.arguments(node)])
+        elif name == "view":
+            found[node] = found[rest[0]].ravel()[rest[1].all()]
+        elif name == "sum":
+            found[node] = np.sum(found[rest[0]], axis=-1)
+        elif name == "entry":
+            found[node] = found[rest[0]].flat[rest[1]]
+        elif node in program.shapes:
+            found[node] = OF_ARRAYS.get(name, FOLDED[name])(*(found[each] for each in rest))
+            assert found[node].shape == program.shapes[node]
         else:
             found[node] = FOLDED[name](*(found[each] for each in rest))
             assert program.is_boolean(node) == isinstance(found[node], (bool, np.bool_))
@@ -130,15 +148,16 @@ def with_passive_residual():
     return KNODE(PAPER, empty.with_numbers(0.1 * np.random.default_rng(0).normal(size=empty.size)).clamped())
 
 
-def with_network():
-    net = network(PAPER, kc.learning.NetworkOptions(hidden=3, convex=False), jax.random.key(0))
+def with_network(hidden, history=False):
+    options = kc.learning.NetworkOptions(hidden=hidden, convex=False, history=history)
+    net = network(PAPER, options, jax.random.key(0))
     return KNODE(PAPER, dataclasses.replace(net, output_scale=np.full(25, 1e-3)))
 
 
 SYSTEMS = {name: functools.partial(kc.load_robot, name) for name in kc.robots.catalog()} | {
     "HangingString": lambda: STRING, "virtual robot": virtual_robot, "friction": with_friction,
     "reel and slack": with_reel, "curved law": with_curved_law, "passive": with_passive_residual,
-    "network": with_network,
+    "network": lambda: with_network(3), "loops of a network": lambda: with_network(64, history=True),
 }  # fmt: skip
 
 

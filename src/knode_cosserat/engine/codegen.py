@@ -18,6 +18,7 @@ from typing import Any
 
 from knode_cosserat._jax import cache_directory
 from knode_cosserat._program_cache import ProgramCache
+from knode_cosserat.engine.arrays import ArrayCode
 from knode_cosserat.engine.program import EngineError, Program
 
 #: rounding may change, NaN and infinity are kept
@@ -154,16 +155,26 @@ class Module:
     def __init__(self) -> None:
         self._functions: list[Function] = []
         self.declarations: set[str] = set()
+        self._tables: dict[tuple[float, ...], str] = {}
 
     def function(self, name: str, arguments: Sequence[str], exported: bool = False) -> Function:
         """Begin a function; arguments are pointers, or whole numbers if their name begins with `n_`."""
         self._functions.append(Function(self, name, arguments, exported))
         return self._functions[-1]
 
+    def constants(self, values: Sequence[float]) -> str:
+        """Return the address of constants in memory."""
+        return self._tables.setdefault(tuple(map(float, values)), f"@table{len(self._tables)}")
+
     @property
     def text(self) -> str:
         """The module in LLVM's assembly language."""
-        return "\n".join([*sorted(self.declarations), *(function.text for function in self._functions)])
+        tables = []
+        for numbers, name in self._tables.items():
+            inside = ", ".join(f"double {literal(number)}" for number in numbers)
+            tables.append(f"{name} = internal constant [{len(numbers)} x double] [{inside}], align 64")
+        functions = (function.text for function in self._functions)
+        return "\n".join([*sorted(self.declarations), *tables, *functions])
 
     def compile(self, optimisation: int = 1) -> Compiled:
         """Return machine code for this computer.
@@ -281,6 +292,10 @@ class Function:
         name = "%" + self._fresh("m")
         self._stack.append(f"  {name} = alloca {kind}")
         return name
+
+    def address(self, name: str) -> Value:
+        """Return an address as a value."""
+        return Value(self, name, "ptr")
 
     # values
 
@@ -501,15 +516,17 @@ class Function:
     # programs
 
     def evaluate(
-        self, program: Program, outputs: Sequence[int], known: Mapping[int, Value], lanes: int
-    ) -> dict[int, Value]:
+        self, program: Program, outputs: Sequence[int], known: Mapping[int, Any], lanes: int
+    ) -> dict[int, Any]:
         """Write the operations that outputs need, and return the values of all of them.
 
-        `known` are values of inputs and of operations that have been evaluated. Loops run until every lane is
-        done; lanes that are done keep their values.
+        `known` are values of inputs and of operations that have been evaluated; those of arrays are in memory
+        (`arrays.Stored`). Loops run until every lane is done; lanes that are done keep their values.
         """
-        values = dict(known)
-        for node in program.needed(outputs, frozenset(values)):
+        values: dict[int, Any] = dict(known)
+        needed = program.needed(outputs, frozenset(values))
+        arrays = ArrayCode(self, program, needed, outputs, values)
+        for node in needed:
             if node in values:
                 continue
             operation, *arguments = program.operations[node]
@@ -520,11 +537,15 @@ class Function:
                 raise KeyError(f"input {arguments[0]} has no value")
             elif operation == "loop":
                 self._loop(program, node, values, lanes)
+            elif operation == "entry":
+                values[node] = arrays.load(*arguments)
+            elif node in program.shapes:
+                arrays.write(node)
             elif operation != "result":
                 values[node] = self.apply(operation, *(values[each] for each in arguments))
         return values
 
-    def _loop(self, program: Program, node: int, values: dict[int, Value], lanes: int) -> None:
+    def _loop(self, program: Program, node: int, values: dict[int, Any], lanes: int) -> None:
         loop = program.loops[program.operations[node][1]]
         inner: dict[int, Value] = {}
         for name, outer in loop.inputs:

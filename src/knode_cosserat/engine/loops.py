@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
 import jax
 import numpy as np
 
 from knode_cosserat.engine.core import Core, Shape, States, coefficients_of, require_covered
+from knode_cosserat.engine.equations import constant_zeros
 from knode_cosserat.engine.program import EngineError
 from knode_cosserat.engine.tangents import TangentCore
 from knode_cosserat.rods.system import System
@@ -40,11 +41,11 @@ def core_of(system: System, settings: Settings, robots: bool) -> Core:
     leaves = [np.asarray(leaf, dtype=float) for leaf in leaves]
     if np.ndim(system.length):
         leaves = [np.max(np.abs(leaf), axis=0) for leaf in leaves]
-    key = structure, _masks([leaf == 0.0 for leaf in leaves]), settings, robots
+    key = structure, _masks(map(constant_zeros, leaves)), settings, robots
     return _compiled(key, lambda: Core(jax.tree.unflatten(structure, leaves), settings, robots))
 
 
-def _masks(masks: Sequence[np.ndarray]) -> Any:
+def _masks(masks: Iterable[np.ndarray]) -> Any:
     return tuple((mask.shape, np.packbits(mask).tobytes()) for mask in masks)
 
 
@@ -131,7 +132,7 @@ def tangent_loop(
     else:
         stacked = [np.asarray(leaf, float) for leaf in jax.tree.leaves(directions)]
     moving = [np.any(leaf != 0.0, axis=0) for leaf in stacked]
-    masks = _masks([leaf == 0.0 for leaf in leaves]), _masks(moving)
+    masks = _masks(map(constant_zeros, leaves)), _masks(moving)
     key = structure, *masks, settings.space, settings.uses_rate, "tangents"
     core = _compiled(key, lambda: TangentCore(jax.tree.unflatten(structure, leaves), settings, moving))
     moved = np.concatenate(

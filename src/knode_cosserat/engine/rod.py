@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
+from knode_cosserat.engine.arrays import Stored
 from knode_cosserat.engine.codegen import Function, Index, Value, Variable
 from knode_cosserat.engine.equations import Equations
 from knode_cosserat.engine.memory import Array, Memory
@@ -28,10 +29,10 @@ class RodCode(Memory):
         self.pieces, self.points, self.ends, self.count = grid.tip, grid.tip + 1, grid.ends, grid.count
         ny, nz, k, a = e.ny, e.nz, e.k, self._array
         self.params, self.scale_y, self.scale_tip = a(len(e.parameter_values), 1), a(ny, 1), a(k, 1)
-        self.inputs, self.step_terms = a(2 + e.nc, 1), a(len(e.step_terms), 1)
+        self.inputs, self.step_terms = a(2 + e.nc, 1), a(e.size(e.step_terms), 1)
         self.s, self.h, self.length = a(1, self.count), a(1, self.pieces), a(1, 1)
         self.geometry = self.scale_y, self.scale_tip, self.s, self.h, self.length
-        self.place_terms = a(len(e.place_terms), self.count)
+        self.place_terms = a(e.size(e.place_terms), self.count)
         self.f, self.z, self.fe = a(ny, self.count), a(nz, self.count), a(ny, self.pieces)
         self.slope, self.slope_end = a(len(e.pattern), self.ends), a(len(e.pattern), self.pieces)
         self.acting, self.jump = a(len(system.cuts), self.pieces), a(len(e.jumping), self.pieces)
@@ -61,22 +62,47 @@ class RodCode(Memory):
         at = f.pointer(f.pointer(f.arguments[0], self.node_table.offset), node.value)
         return f.index(f.result(f"load i64, ptr {at.name}", "i64"))
 
-    def _known(self, j: Any, wide: bool, state: dict[int, Value]) -> dict[int, Value]:
+    def _known(self, j: Any, wide: bool, state: dict[int, Any]) -> dict[int, Any]:
         """Return the values of hoisted terms at a place."""
         e = self.equations
-        nodes = e.program.needed(self._outputs, frozenset(state))
-        needed = set(nodes) | {each for node in nodes for each in e.program.arguments(node)}
-        values = dict(state)
-        for k, node in enumerate(e.step_terms):
-            if node in needed:
-                values[node] = self._wide(self.step_terms, k) if wide else self._get(self.step_terms, k)
-        for k, node in enumerate(e.place_terms):
-            if node in needed:
-                values[node] = self._wide(self.place_terms, k, j)
+        values = self._arrays_of(self.params, e.parameters) | state
+        needed = set(e.program.needed(self._outputs, frozenset([*values, *e.step_terms, *e.place_terms])))
+        for array, terms, place in (self.step_terms, e.step_terms, 0), (self.place_terms, e.place_terms, j):
+            for node, first, _ in e.slots(terms):
+                if node in needed:
+                    lanes = self._lanes(array) if wide else self.P
+                    values[node] = self._term(node, array, first, place, lanes)
         return values
 
+    def _term(self, node: int, array: Array, first: int, j: Any, lanes: int) -> Any:
+        """Return the value of a term; that of an array is its memory."""
+        if node not in self.equations.program.shapes:
+            return self._get(array, first, j, lanes)
+        return Stored(self._now.pointer(*self._at(array, first, j)), array.component, lanes)
+
+    def _put_terms(self, values: dict[int, Any], array: Array, terms: Sequence[int], j: Any, lanes: int) -> None:
+        """Write the values of terms to memory."""
+        for node, first, count in self.equations.slots(terms):
+            if node not in self.equations.program.shapes:
+                self._put(values[node], array, first, j, lanes)
+                continue
+            target, stored = self._pointer(array, j), values[node]
+            with self._now.loop(count) as k:
+                number = self._now.load(stored.base, k.value * stored.distance, stored.lanes)
+                self._now.store(number, target, (k.value + first) * array.component, lanes)
+
+    def _arrays_of(self, array: Array, inputs: Sequence[np.ndarray]) -> dict[int, Stored]:
+        """Return the memory of arrays of inputs that follow each other in an array."""
+        found, first = {}, 0
+        for nodes in inputs:
+            node = self.equations.program.known_inputs(nodes)
+            if node is not None:
+                found[node] = Stored(self._now.pointer(*self._at(array, first, 0)), array.component, self.P)
+            first += nodes.size
+        return found
+
     def _evaluated(
-        self, outputs: Sequence[int] | np.ndarray, j: Any, wide: bool, state: dict[int, Value]
+        self, outputs: Sequence[int] | np.ndarray, j: Any, wide: bool, state: dict[int, Any]
     ) -> list[Value]:
         """Write the operations of outputs at a place."""
         self._outputs = [int(each) for each in outputs]
@@ -90,7 +116,7 @@ class RodCode(Memory):
         e = self.equations
         self.setup = f = self._function("setup")
         outputs = [int(node) for nodes in e.geometry for node in nodes]
-        values = f.evaluate(e.program, outputs, self._parameters(), self.P)
+        values = f.evaluate(e.program, outputs, self._parameters(outputs), self.P)
         for array, nodes in zip(self.geometry, e.geometry, strict=True):
             for k, node in enumerate(nodes):
                 i, j = (0, k) if array.size == 1 else (k, 0)
@@ -100,28 +126,30 @@ class RodCode(Memory):
                 for k in range(array.count, self.stride):
                     self._put(values[int(nodes[-1])], array, 0, k)
 
-    def _parameters(self) -> dict[int, Value]:
-        nodes = np.concatenate([nodes.reshape(-1) for nodes in self.equations.parameters])
-        return {int(node): self._get(self.params, k) for k, node in enumerate(nodes)}
+    def _parameters(self, outputs: Iterable[int]) -> dict[int, Any]:
+        """Return the values of the parameters that outputs depend on, and the memory of arrays of them."""
+        e = self.equations
+        found: dict[int, Any] = dict(self._arrays_of(self.params, e.parameters))
+        needed = set(e.program.needed(outputs, frozenset(found)))
+        nodes = np.concatenate([nodes.reshape(-1) for nodes in e.parameters])
+        return found | {node: self._get(self.params, k) for k, node in enumerate(nodes.tolist()) if node in needed}
 
     def _write_terms(self) -> None:
         """Terms that depend on neither y nor the history: once a step."""
         e = self.equations
         self.terms = f = self._function("terms")
-        state = self._parameters()
+        state = self._parameters([*e.step_terms, *e.place_terms])
         for k, node in enumerate([e.c0.item(), e.t.item(), *e.control]):
             state[int(node)] = self._get(self.inputs, k)
         values = f.evaluate(e.program, e.step_terms, state, self.P)
-        for k, node in enumerate(e.step_terms):
-            self._put(values[node], self.step_terms, k)
+        self._put_terms(values, self.step_terms, e.step_terms, 0, self.P)
         if not e.place_terms:
             return
         known = {node: values[node] for node in e.step_terms} | state
         with self._places(self.count) as j:
             here = known | {e.s.item(): self._wide(self.s, 0, j)}
             values = f.evaluate(e.program, e.place_terms, here, self.L)
-            for k, node in enumerate(e.place_terms):
-                self._write_wide(values[node], self.place_terms, k, j)
+            self._put_terms(values, self.place_terms, e.place_terms, j, self.L)
 
     def _write_inputs(self, c0: Value, t: Value, control: Value) -> None:
         """Set the inputs of a step, with the control at an address, and evaluate its terms."""

@@ -161,12 +161,14 @@ class TangentCore(EliminationCode):
         """Tangents of rates, strains, jumps, tip and base by one direction of the system, at fixed y."""
         e = self.equations
         self.direction = f = self._function("direction", "direction")
-        state = self._parameters()
+        geometry = [*e.dplaces[: self.ends], *e.dlengths]
+        state = self._parameters([*e.moved_terms, *geometry])
         for k, node in enumerate([e.c0.item(), e.t.item(), *e.control]):
             state[int(node)] = self._get(self.inputs, k)
-        state |= {node: self._get(self.step_terms, k) for k, node in enumerate(e.step_terms)}
+        for node, first, _ in e.slots(e.step_terms):
+            state[node] = self._term(node, self.step_terms, first, 0, self.P)
         state |= {int(node): self._get(self.dparameters, k) for k, node in enumerate(e.dparameters)}
-        geometry = [*e.dplaces[: self.ends], *e.dlengths]
+        state |= self._arrays_of(self.dparameters, [e.dparameters])
         values = f.evaluate(e.program, [*e.moved_terms, *geometry], state, 1)
         for array, nodes in ((self.ds, e.dplaces[: self.ends]), (self.dh, e.dlengths)):
             for k, node in enumerate(nodes):
