@@ -681,11 +681,12 @@ class Program:
     def _stacked(self, scalars: Nodes, found: Tangents) -> dict[Any, int]:
         """Return the tangents of an array of scalars.
 
-        If they depend on more variables than their number, the variables are these scalars themselves.
+        The variables are these scalars themselves if that takes fewer products: unit vectors choose columns of
+        a matrix, at no cost, but there may be more of them.
         """
         moving = {k: found[node] for k, node in enumerate(scalars.tolist()) if found.get(node)}
         keys = dict.fromkeys(key for tangents in moving.values() for key in tangents)
-        if len(moving) <= len(keys) and len(keys) > 1:
+        if len(moving) < 2 * len(keys) and len(keys) > 1:
             return {Component(int(scalars[k])): self.unit(scalars.size, k) for k in moving}
         zero = np.full(scalars.size, self.constant(0.0))
         tangents = {}
@@ -1379,14 +1380,14 @@ class Evaluation:
         batch = tuple(a.shape[k] for k in batch_a)
         (a, free_a), (b, free_b) = ordered(a, batch_a, summed_a), ordered(b, batch_b, summed_b)
         if np.sum(self._nonzero(a) @ self._nonzero(b).transpose(0, 2, 1)) > LARGEST_PRODUCT:
-            program = self.program
-            own = a.shape[:2] + b.shape[1:]
-            views = [
-                program.view(program.array(x), np.broadcast_to(np.expand_dims(_positions(x), axis), own))
-                for x, axis in ((a, 2), (b, 1))
-            ]
-            total = program.total(self.apply("mul", *views), a.shape[2])
-            return program.entries(total, own[:-1]).reshape(*batch, *free_a, *free_b)
+            program, (*rows, count) = self.program, a.shape[:2] + b.shape[1:]
+            views = []
+            for x, axis in ((a, 2), (b, 1)):
+                positions = np.expand_dims(np.arange(x.size).reshape(x.shape), axis)
+                own = np.broadcast_to(positions, (*rows, count)).reshape(*(n for n in rows if n > 1), count)
+                views.append(program.view(program.array(x), own))
+            total = program.total(self.apply("mul", *views), count)
+            return program.entries(total).reshape(*batch, *free_a, *free_b)
         products = self.elementwise("mul", a[:, :, None, :], b[:, None, :, :])
         return self._reduced("add", products, axes=(3,)).reshape(*batch, *free_a, *free_b)
 
@@ -1579,11 +1580,6 @@ class Evaluation:
 
 def _flat(arrays: Iterable[Nodes]) -> list[int]:
     return [node for array in arrays for node in array.ravel().tolist()]
-
-
-def _positions(x: np.ndarray) -> np.ndarray:
-    """Return the place of every entry of an array in its order in memory."""
-    return np.arange(x.size).reshape(x.shape)
 
 
 def _fills(mode: Any) -> bool:
