@@ -39,15 +39,24 @@ class ArrayCode:
         values: dict[int, Any],
     ):  # fmt: skip
         self.function, self.program, self._values = function, program, values
+        whole = set(outputs)
         stored = {node for node in outputs if node in program.shapes}
+        #: entries that are needed, of arrays of which only entries are
+        self._entries: dict[int, list[int]] = {}
         for node in nodes:
             name, *rest = program.operations[node]
+            if name == "entry":
+                self._entries.setdefault(rest[0], []).append(rest[1])
+            for each in program.arguments(node) if name != "entry" else ():
+                whole.add(each)
             if name in ("view", "entry"):
                 stored.add(rest[0])
             elif name in ("stack", "inputs"):
                 stored.add(node)
             elif name == "sum":
                 stored |= {node, *self._costly(rest[0])}
+        for node in whole & set(self._entries):
+            del self._entries[node]
         #: arrays in memory, in order
         self._stored = sorted(stored)
         self._in_memory = stored
@@ -165,6 +174,11 @@ class ArrayCode:
                 self._store(terms.computed(node), target, at)
         self._values.update(zip(nodes, targets, strict=True))
 
+    def _rows(self, nodes: Sequence[int], width: int) -> tuple[int, int]:
+        """Return the range along the last axis, of this length, of the entries that are needed of arrays."""
+        needed = [k % width for node in nodes for k in self._entries.get(node, (0, width - 1))]
+        return min(needed), max(needed) + 1
+
     def _write_sums(self, nodes: Sequence[int]) -> None:
         """Write the sums along the last axis of arrays of the same shape, several rows at once."""
         from knode_cosserat.engine.codegen import Variable
@@ -174,23 +188,24 @@ class ArrayCode:
         lanes, size = self._lanes(nodes), math.prod(outer)
         targets = [self._reserved(size, lanes) for _ in nodes]
         strides = [stride * lanes for stride in Positions.whole(tuple(outer)).strides]
-        width = outer[-1] if outer else 1
-        most = min(width, ROWS, REGISTERS // len(nodes))
-        rows = -(-width // -(-width // most))
-        for first, stop, own in ((0, width - width % rows, rows), (width - width % rows, width, width % rows)):
+        start, end = self._rows(nodes, outer[-1] if outer else 1)
+        most = min(end - start, ROWS, REGISTERS // len(nodes))
+        rows = -(-(end - start) // -(-(end - start) // most))
+        last = end - (end - start) % rows
+        for first, stop, own in (start, last, rows), (last, end, end - last):
             if first == stop:
                 continue
             with contextlib.ExitStack() as loops:
                 indices = [loops.enter_context(f.loop(each)) for each in outer[:-1]]
                 if outer:
                     indices.append(loops.enter_context(f.loop(stop, first, own)))
-                starts = self._pointers(nodes, indices)
+                pointers = self._pointers(nodes, indices)
                 zero = f.splat(f.value(0.0), lanes)
                 sums = [[Variable(f, zero) for _ in range(own)] for _ in nodes]
                 with f.loop(count) as k:
                     here = {
-                        (base, steps): f.pointer(start, k.value * (steps[-1] * self.value(base).distance))
-                        for (base, steps), start in starts.items()
+                        (base, steps): f.pointer(pointer, k.value * (steps[-1] * self.value(base).distance))
+                        for (base, steps), pointer in pointers.items()
                     }
                     terms = Terms(self, here)
                     for node, row in zip(added, sums, strict=True):

@@ -30,8 +30,9 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 
 from knode_cosserat.errors import KnodeCosseratError
 
-#: largest number of scalar products of one matrix product, and of entries of an array, that are scalars
-LARGEST_PRODUCT, LARGEST_SPREAD = 256, 7
+#: largest number of scalar products of one matrix product, and of results of other operations on arrays, that
+#: are scalars
+LARGEST_PRODUCT, LARGEST_SPREAD = 256, 31
 #: largest number of entries of a table with a variable index, of turns of a scan, and of numbers to sort
 LARGEST_TABLE, LONGEST_SCAN, LONGEST_SORT = 256, 1024, 32
 #: largest matrix that is factorised with row exchanges that depend on values
