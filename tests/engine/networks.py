@@ -1,6 +1,7 @@
 """Models of the paper's robot with large networks."""
 
 import dataclasses
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -48,6 +49,6 @@ def with_committee():
     sizes = (ny + 1, 40, 48, ny)
     layers = [
         (rng.normal(size=(3, after, before)) / np.sqrt(before), rng.normal(size=(3, after)))
-        for before, after in zip(sizes, sizes[1:])
+        for before, after in itertools.pairwise(sizes)
     ]
     return KNODE(PAPER, Committee(layers, np.array(1e-3)))

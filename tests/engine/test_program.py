@@ -25,11 +25,12 @@ from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.space import LOBATTO2
 from tests.engine.networks import PAPER, with_committee, with_network
 
-
 #: operations on arrays that are not those of `FOLDED`
 OF_ARRAYS = {
-    "select": lambda p, no, yes: np.where(p, yes, no), "logistic": scipy.special.expit, "erf": scipy.special.erf,
-}  # fmt: skip
+    "select": lambda p, no, yes: np.where(p, yes, no),
+    "logistic": scipy.special.expit,
+    "erf": scipy.special.erf,
+}
 
 
 def interpreted(program, outputs, inputs):
@@ -45,8 +46,11 @@ def interpreted(program, outputs, inputs):
             found[node] = found[rest[0]][rest[1]]
         elif name == "loop":
             found[node] = looped(program.loops[rest[0]], found)
-        elif name in ("stack", "inputs"):
-            found[node] = np.array([found[each] for each in program.arguments(node)])
+        elif name == "stack":
+            found[node] = np.array([found[each] for each in rest])
+        elif name == "inputs":
+            scalars = range(rest[0], rest[0] + rest[1])
+            found[node] = np.array([inputs[program.operations[each][1]] for each in scalars])
         elif name == "view":
             found[node] = found[rest[0]].ravel()[rest[1].all()]
         elif name == "sum":
@@ -78,7 +82,7 @@ def looped(loop, outer):
 def evaluated(function, *arguments):
     """Return a program of a function of arrays, its inputs and outputs, and a function of outputs' values."""
     program = Program()
-    nodes = [program.inputs(f"x{k}", np.shape(each), 1) for k, each in enumerate(arguments)]
+    nodes = [program.inputs(f"x{k}", np.shape(each), 1, in_memory=True) for k, each in enumerate(arguments)]
     outputs = program.evaluate(jax.make_jaxpr(function)(*arguments), nodes)
 
     def values(outputs, *arguments):

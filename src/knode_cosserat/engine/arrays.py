@@ -51,15 +51,15 @@ class ArrayCode:
                 whole.add(each)
             if name in ("view", "entry"):
                 stored.add(rest[0])
-            elif name in ("stack", "inputs"):
+            elif name == "stack":
                 stored.add(node)
             elif name == "sum":
                 stored |= {node, *self._costly(rest[0])}
         for node in whole & set(self._entries):
             del self._entries[node]
-        #: arrays in memory, in order
-        self._stored = sorted(stored)
-        self._in_memory = stored
+        #: arrays that are written to memory, in order
+        self._stored = sorted(stored - values.keys())
+        self._in_memory = stored | (values.keys() & program.shapes.keys())
 
     def _costly(self, node: int) -> set[int]:
         """Return the arrays in the terms of a sum that are not to be computed again for every sum."""
@@ -96,10 +96,12 @@ class ArrayCode:
         if node not in self._in_memory or node in self._values:
             return
         name = self.program.operations[node][0]
-        if name in ("stack", "inputs"):
+        if name == "stack":
             self._values[node] = self._copied(self.program.arguments(node))
             return
-        alike = [each for each in self._stored if self._kind(each) == self._kind(node) and self._is_ready(each)]
+        alike = [
+            each for each in self._stored if self._kind(each) == self._kind(node) and self._is_ready(each)
+        ]
         if name != "sum":
             self._write_entries(alike)
         for first in range(0, len(alike), SHARED) if name == "sum" else ():
@@ -110,7 +112,7 @@ class ArrayCode:
         return (name, self.program.shapes[rest[0]]) if name == "sum" else self.program.shapes[node]
 
     def _is_ready(self, node: int) -> bool:
-        if node in self._values or self.program.operations[node][0] in ("stack", "inputs", "input"):
+        if node in self._values or self.program.operations[node][0] in ("stack", "input", "inputs"):
             return False
         return all(self.value(each) is not None for each, _ in self._sources(node))
 

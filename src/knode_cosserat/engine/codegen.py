@@ -564,7 +564,7 @@ class Function:
             if operation == "constant":
                 value = program.values[node]
                 values[node] = self.value(value if isinstance(value, bool) else float(value))
-            elif operation == "input":
+            elif operation in ("input", "inputs"):
                 raise KeyError(f"input {arguments[0]} has no value")
             elif operation == "loop":
                 self._loop(program, node, values, lanes)

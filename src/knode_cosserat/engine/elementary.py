@@ -54,9 +54,9 @@ def _number(f: Function, x: Value) -> Value:
     return f.result(f"bitcast {x.type} {x.name} to <{x.lanes} x double>", "double", x.lanes)
 
 
-def _whole(f: Function, operation: str, x: Value, number: int) -> Value:
-    """Return an operation of whole numbers in lanes, with one number."""
-    other = f.splat(f.value(number, "i64"), x.lanes)
+def _whole(f: Function, operation: str, x: Value, other: Any) -> Value:
+    """Return an operation of whole numbers in lanes, with others or with one number."""
+    other = f.splat(f.value(other, "i64"), x.lanes)
     return f.result(f"{operation} {x.type} {x.name}, {other.name}", "i64", x.lanes)
 
 
@@ -74,13 +74,13 @@ def _reduced(f: Function, x: Value) -> tuple[Value, Value]:
 
 
 def exp(f: Function, x: Value) -> Value:
-    """Return exp(x); very large and small results by two factors, so that they are rounded once."""
+    """Return the exponential function; very large and small results by two factors, rounded once."""
     from knode_cosserat.engine.codegen import Variable
 
     k, grown = _reduced(f, x)
-    part = 1.0 + grown
-    shift = _whole(f, "shl", _bits(f, k + WHOLE), 52)
-    found = Variable(f, _number(f, f.result(f"add {shift.type} {shift.name}, {_bits(f, part).name}", "i64", x.lanes)))
+    found = Variable(
+        f, _number(f, _whole(f, "add", _bits(f, 1.0 + grown), _whole(f, "shl", _bits(f, k + WHOLE), 52)))
+    )
     with f.if_(f.any(~(f.apply("abs", x) < 708.0))):
         bounded = f.select(x > 720.0, 720.0, f.select(x < -760.0, -760.0, x))
         k, grown = _reduced(f, bounded)
@@ -90,7 +90,7 @@ def exp(f: Function, x: Value) -> Value:
 
 
 def expm1(f: Function, x: Value) -> Value:
-    """Return exp(x) - 1."""
+    """Return the exponential function less 1."""
     x = f.select(x > 709.9, 709.9, f.select(x < -100.0, -100.0, x))
     k, grown = _reduced(f, x)
     scale = _power(f, k - 1.0)
@@ -104,7 +104,7 @@ def _log(f: Function, x: Value, correction: Any) -> Value:
     # x = 2ᵏ m with √½ <= m < √2
     shifted = _whole(f, "sub", _bits(f, scaled), 0x3FE6A09E667F3BCD)
     k = _whole(f, "ashr", shifted, 52)
-    m = _number(f, f.result(f"sub {k.type} {_bits(f, scaled).name}, {_whole(f, 'shl', k, 52).name}", "i64", k.lanes))
+    m = _number(f, _whole(f, "sub", _bits(f, scaled), _whole(f, "shl", k, 52)))
     exponent = f.result(f"sitofp {k.type} {k.name} to {x.type}", "double", x.lanes)
     exponent = exponent - f.select(is_small, 54.0, 0.0)
     g = m - 1.0
@@ -122,7 +122,7 @@ def _with_limits(f: Function, x: Value, least: float, found: Value) -> Value:
 
 
 def log(f: Function, x: Value) -> Value:
-    """Return log(x)."""
+    """Return the natural logarithm."""
     return _with_limits(f, x, 0.0, _log(f, x, 0.0))
 
 
@@ -134,7 +134,7 @@ def log1p(f: Function, x: Value) -> Value:
 
 
 def tanh(f: Function, x: Value) -> Value:
-    """Return tanh(x) = (exp(2x) - 1)/(exp(2x) + 1), of the absolute value."""
+    """Return the hyperbolic tangent, (e - 1)/(e + 1) with e = exp(2|x|), and the sign of x."""
     size = f.apply("abs", x)
     grown = f.apply("expm1", 2.0 * f.select(size > 22.0, 22.0, size))
     return f.intrinsic("copysign", grown / (grown + 2.0), x)
@@ -174,17 +174,17 @@ def _turned(f: Function, x: Value, quarter: int) -> Value:
 
 
 def sin(f: Function, x: Value) -> Value:
-    """Return sin(x)."""
+    """Return the sine."""
     return _turned(f, x, 0)
 
 
 def cos(f: Function, x: Value) -> Value:
-    """Return cos(x)."""
+    """Return the cosine."""
     return _turned(f, x, 1)
 
 
 def tan(f: Function, x: Value) -> Value:
-    """Return tan(x)."""
+    """Return the tangent."""
     sine, cosine, n = _sine_and_cosine(f, x)
     odd = _is_odd(f, n)
     return f.select(odd, -cosine, sine) / f.select(odd, sine, cosine)

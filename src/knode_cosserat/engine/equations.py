@@ -44,7 +44,7 @@ class Equations:
         self.nc, self.k = system.control_size, unknown_count(system)
         self.numbers = self.ny + self.nz
         program = self.program = Program(MOST_OPERATIONS)
-        self.parameters = [program.inputs(f"p{i}", leaf.shape, RUN) for i, leaf in enumerate(leaves)]
+        self.parameters = [program.inputs(f"p{i}", leaf.shape, RUN, True) for i, leaf in enumerate(leaves)]
         #: the place of each parameter's node in the vector of parameters
         self.parameter_values = np.concatenate([leaf.reshape(-1) for leaf in leaves])
         folded = [
@@ -205,7 +205,7 @@ class TangentEquations(Equations):
             self._outputs += [node for *_, node in nonzeros]
         self._hoist()
         moved = [nodes[moves] for nodes, moves in zip(self.parameters, moving, strict=True)]
-        self.dparameters = program.inputs("dparameter", (sum(map(len, moved)),), RUN)
+        self.dparameters = program.inputs("dparameter", (sum(map(len, moved)),), RUN, True)
         tangents = dict(zip(np.concatenate(moved).tolist(), self.dparameters.tolist(), strict=True))
         #: tangents of places and of lengths of pieces
         self.dplaces, self.dlengths = (program.derivative(nodes, tangents) for nodes in self.geometry[2:4])

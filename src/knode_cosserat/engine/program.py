@@ -6,8 +6,8 @@ without effect are left out. All values are 64-bit floats or booleans; integers 
 
 A node is a scalar or, where scalars would be too many (matrix products of a network), an array. Arrays take
 the operations of scalars, entry by entry, and a scalar counts as an array of equal entries. Arrays begin
-with a "stack" of scalars, or with the "inputs" of one name, and end with an "entry"; "view" is an array of
-some of the entries of another, and "sum" adds those along the last axis.
+with a "stack" of scalars, or with "inputs" in memory, and end with an "entry"; "view" is an array of some of
+the entries of another, and "sum" adds those along the last axis.
 
 Algebra treats values as finite: x * 0 and x - x are 0. `x != x` is kept, because it tests for NaN. "max" and
 "min" return NaN if an argument is NaN. "hold" returns its argument: derivatives stop there, or follow a rule
@@ -178,7 +178,8 @@ class Program:
         self.shapes: dict[int, tuple[int, ...]] = {}
         self._boolean: list[bool] = []
         self._memo: dict[Any, Any] = {}
-        #: first node and number of scalars that are the entries of an array, and the array; or its operation
+        #: first node and number of scalars that are the entries of an array, and the array; or, of inputs in
+        #: memory, its operation
         self._families: list[tuple[int, int, Any]] = []
         self._count = 0
         #: selects with constants only, such as an index of the smallest entry
@@ -206,11 +207,15 @@ class Program:
         """Return the node of a named input; level 0 is of constants."""
         return self._new(("input", name), ("input", name), level, boolean)
 
-    def inputs(self, name: str, shape: tuple[int, ...], level: int) -> Nodes:
-        """Return an array of inputs, named by their flat index, such as name[0]."""
-        nodes, count = [self.input(f"{name}[{k}]", level) for k in range(math.prod(shape))], len(self._families)
-        if nodes and nodes[-1] == nodes[0] + len(nodes) - 1 and not (count and self._families[-1][0] >= nodes[0]):
-            self._families.append((nodes[0], len(nodes), ("inputs", nodes[0], len(nodes))))
+    def inputs(self, name: str, shape: tuple[int, ...], level: int, in_memory: bool = False) -> Nodes:
+        """Return an array of inputs, named by their flat index, such as name[0].
+
+        If they are in memory, in this order, arrays of them are read there.
+        """
+        first, size = len(self.operations), math.prod(shape)
+        nodes = [self.input(f"{name}[{k}]", level) for k in range(size)]
+        if size and in_memory:
+            self._families.append((first, size, ("inputs", first, size)))
         return np.array(nodes, dtype=np.int64).reshape(shape)
 
     def constants(self, values: Any) -> Nodes:
@@ -476,7 +481,7 @@ class Program:
         return self.view(owner, positions.all())
 
     def known_inputs(self, nodes: Nodes) -> int | None:
-        """Return the array of all inputs of one name, or None if there is none so far."""
+        """Return the array of all inputs of one name in memory, or None if nothing needs it."""
         return self._memo.get(("inputs", int(nodes.flat[0]), nodes.size)) if nodes.size else None
 
     def array_input(self, name: str, shape: tuple[int, ...], level: int) -> int:
@@ -570,10 +575,8 @@ class Program:
     def arguments(self, node: int) -> tuple[int, ...]:
         """Return the nodes that a node depends on directly."""
         name, *rest = self.operations[node]
-        if name in ("constant", "input"):
+        if name in ("constant", "input", "inputs"):
             return ()
-        if name == "inputs":
-            return tuple(range(rest[0], rest[0] + rest[1]))
         if name in ("view", "entry"):
             return (rest[0],)
         if name == "loop":
@@ -639,7 +642,9 @@ class Program:
                 found[node] = self._stacked(self.entries(node), found)
             elif name == "view":
                 positions = rest[1].all()
-                found[node] = {key: self.view(each, positions) for key, each in found.get(rest[0], {}).items()}
+                found[node] = {
+                    key: self.view(each, positions) for key, each in found.get(rest[0], {}).items()
+                }
             elif name == "sum":
                 count = self.shapes[rest[0]][-1]
                 sums = {key: self.total(each, count) for key, each in found.get(rest[0], {}).items()}
@@ -682,8 +687,8 @@ class Program:
     def _stacked(self, scalars: Nodes, found: Tangents) -> dict[Any, int]:
         """Return the tangents of an array of scalars.
 
-        The variables are these scalars themselves if that takes fewer products: unit vectors choose columns of
-        a matrix, at no cost, but there may be more of them.
+        The variables are these scalars themselves if that takes fewer products: unit vectors choose columns
+        of a matrix, at no cost, but there may be more of them.
         """
         moving = {k: found[node] for k, node in enumerate(scalars.tolist()) if found.get(node)}
         keys = dict.fromkeys(key for tangents in moving.values() for key in tangents)
@@ -790,7 +795,7 @@ class Program:
         if name in ("loop", "result"):
             raise EngineError("a derivative rule depends on tangents by a while loop; use a formula")
         arguments = [new.get(each, each) for each in self.arguments(node)]
-        if name in ("stack", "inputs"):
+        if name == "stack":
             return self.array(np.array(arguments, dtype=np.int64))
         if name == "view":
             return self.view(arguments[0], rest[1].all())

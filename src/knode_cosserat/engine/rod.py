@@ -80,7 +80,9 @@ class RodCode(Memory):
             return self._get(array, first, j, lanes)
         return Stored(self._now.pointer(*self._at(array, first, j)), array.component, lanes)
 
-    def _put_terms(self, values: dict[int, Any], array: Array, terms: Sequence[int], j: Any, lanes: int) -> None:
+    def _put_terms(
+        self, values: dict[int, Any], array: Array, terms: Sequence[int], j: Any, lanes: int
+    ) -> None:
         """Write the values of terms to memory."""
         for node, first, count in self.equations.slots(terms):
             if node not in self.equations.program.shapes:
@@ -132,7 +134,9 @@ class RodCode(Memory):
         found: dict[int, Any] = dict(self._arrays_of(self.params, e.parameters))
         needed = set(e.program.needed(outputs, frozenset(found)))
         nodes = np.concatenate([nodes.reshape(-1) for nodes in e.parameters])
-        return found | {node: self._get(self.params, k) for k, node in enumerate(nodes.tolist()) if node in needed}
+        return found | {
+            node: self._get(self.params, k) for k, node in enumerate(nodes.tolist()) if node in needed
+        }
 
     def _write_terms(self) -> None:
         """Terms that depend on neither y nor the history: once a step."""

@@ -168,12 +168,13 @@ class TangentCore(EliminationCode):
         for node, first, _ in e.slots(e.step_terms):
             state[node] = self._term(node, self.step_terms, first, 0, self.P)
         state |= {int(node): self._get(self.dparameters, k) for k, node in enumerate(e.dparameters)}
-        state |= self._arrays_of(self.dparameters, [e.dparameters])
+        moves = self._arrays_of(self.dparameters, [e.dparameters])
+        state |= moves
         values = f.evaluate(e.program, [*e.moved_terms, *geometry], state, 1)
         for array, nodes in ((self.ds, e.dplaces[: self.ends]), (self.dh, e.dlengths)):
             for k, node in enumerate(nodes):
                 self._put(values[node], array, 0, k)
-        known = {node: values[node] for node in e.moved_terms}
+        known = {node: values[node] for node in e.moved_terms} | moves
         far = self.y if self.far is None else self.far
 
         def values_at(y: Array, j: Index) -> dict[int, Value]:
