@@ -18,6 +18,8 @@ from knode_cosserat.engine.program import PRODUCTS, Positions, Program
 if TYPE_CHECKING:
     from knode_cosserat.engine.codegen import Function, Index, Value
 
+#: operations that take less time than memory
+CHEAP = PRODUCTS | {"add", "sub"}
 #: sums in registers, arrays whose sums share a loop, and rows of a matrix that are read side by side
 REGISTERS, SHARED, ROWS = 25, 5, 8
 
@@ -66,7 +68,7 @@ class ArrayCode:
         name, *rest = self.program.operations[node]
         if node not in self.program.shapes or name == "view":
             return set()
-        return {each for factor in rest for each in self._costly(factor)} if name in PRODUCTS else {node}
+        return {each for part in rest for each in self._costly(part)} if name in CHEAP else {node}
 
     def place(self, node: int) -> tuple[int, Positions] | None:
         """Return the array in memory, and the positions there, of the entries of an array; or None."""
@@ -183,8 +185,6 @@ class ArrayCode:
 
     def _write_sums(self, nodes: Sequence[int]) -> None:
         """Write the sums along the last axis of arrays of the same shape, several rows at once."""
-        from knode_cosserat.engine.codegen import Variable
-
         f, added = self.function, [self.program.operations[node][1] for node in nodes]
         *outer, count = self.program.shapes[added[0]]
         lanes, size = self._lanes(nodes), math.prod(outer)
@@ -203,7 +203,7 @@ class ArrayCode:
                     indices.append(loops.enter_context(f.loop(stop, first, own)))
                 pointers = self._pointers(nodes, indices)
                 zero = f.splat(f.value(0.0), lanes)
-                sums = [[Variable(f, zero) for _ in range(own)] for _ in nodes]
+                sums = [[f.variable(zero) for _ in range(own)] for _ in nodes]
                 with f.loop(count) as k:
                     here = {
                         (base, steps): f.pointer(pointer, k.value * (steps[-1] * self.value(base).distance))

@@ -316,6 +316,10 @@ class Function:
         self._stack.append(f"  {name} = alloca {kind}")
         return name
 
+    def variable(self, value: Value) -> Variable:
+        """Return a value that changes in loops."""
+        return Variable(self, value)
+
     def address(self, name: str) -> Value:
         """Return an address as a value."""
         return Value(self, name, "ptr")

@@ -75,12 +75,9 @@ def _reduced(f: Function, x: Value) -> tuple[Value, Value]:
 
 def exp(f: Function, x: Value) -> Value:
     """Return the exponential function; very large and small results by two factors, rounded once."""
-    from knode_cosserat.engine.codegen import Variable
-
     k, grown = _reduced(f, x)
-    found = Variable(
-        f, _number(f, _whole(f, "add", _bits(f, 1.0 + grown), _whole(f, "shl", _bits(f, k + WHOLE), 52)))
-    )
+    shift = _whole(f, "shl", _bits(f, k + WHOLE), 52)
+    found = f.variable(_number(f, _whole(f, "add", _bits(f, 1.0 + grown), shift)))
     with f.if_(f.any(~(f.apply("abs", x) < 708.0))):
         bounded = f.select(x > 720.0, 720.0, f.select(x < -760.0, -760.0, x))
         k, grown = _reduced(f, bounded)

@@ -128,15 +128,15 @@ class RodCode(Memory):
                 for k in range(array.count, self.stride):
                     self._put(values[int(nodes[-1])], array, 0, k)
 
+    def _inputs_of(self, array: Array, inputs: Sequence[np.ndarray], outputs: Iterable[int]) -> dict[int, Any]:
+        """Return the values of the inputs that outputs depend on, and the memory of arrays of them."""
+        found: dict[int, Any] = dict(self._arrays_of(array, inputs))
+        needed = set(self.equations.program.needed(outputs, frozenset(found)))
+        nodes = np.concatenate([nodes.reshape(-1) for nodes in inputs]).tolist()
+        return found | {node: self._get(array, k) for k, node in enumerate(nodes) if node in needed}
+
     def _parameters(self, outputs: Iterable[int]) -> dict[int, Any]:
-        """Return the values of the parameters that outputs depend on, and the memory of arrays of them."""
-        e = self.equations
-        found: dict[int, Any] = dict(self._arrays_of(self.params, e.parameters))
-        needed = set(e.program.needed(outputs, frozenset(found)))
-        nodes = np.concatenate([nodes.reshape(-1) for nodes in e.parameters])
-        return found | {
-            node: self._get(self.params, k) for k, node in enumerate(nodes.tolist()) if node in needed
-        }
+        return self._inputs_of(self.params, self.equations.parameters, outputs)
 
     def _write_terms(self) -> None:
         """Terms that depend on neither y nor the history: once a step."""

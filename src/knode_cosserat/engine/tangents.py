@@ -167,8 +167,7 @@ class TangentCore(EliminationCode):
             state[int(node)] = self._get(self.inputs, k)
         for node, first, _ in e.slots(e.step_terms):
             state[node] = self._term(node, self.step_terms, first, 0, self.P)
-        state |= {int(node): self._get(self.dparameters, k) for k, node in enumerate(e.dparameters)}
-        moves = self._arrays_of(self.dparameters, [e.dparameters])
+        moves = self._inputs_of(self.dparameters, [e.dparameters], [*e.moved_terms, *geometry])
         state |= moves
         values = f.evaluate(e.program, [*e.moved_terms, *geometry], state, 1)
         for array, nodes in ((self.ds, e.dplaces[: self.ends]), (self.dh, e.dlengths)):
