@@ -128,7 +128,9 @@ class RodCode(Memory):
                 for k in range(array.count, self.stride):
                     self._put(values[int(nodes[-1])], array, 0, k)
 
-    def _inputs_of(self, array: Array, inputs: Sequence[np.ndarray], outputs: Iterable[int]) -> dict[int, Any]:
+    def _inputs_of(
+        self, array: Array, inputs: Sequence[np.ndarray], outputs: Iterable[int]
+    ) -> dict[int, Any]:
         """Return the values of the inputs that outputs depend on, and the memory of arrays of them."""
         found: dict[int, Any] = dict(self._arrays_of(array, inputs))
         needed = set(self.equations.program.needed(outputs, frozenset(found)))
