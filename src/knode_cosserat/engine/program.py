@@ -650,7 +650,7 @@ class Program:
                 sums = {key: self.total(each, count) for key, each in found.get(rest[0], {}).items()}
                 found[node] = self._nonzero(sums)
             elif name == "entry":
-                found[node] = self._of_entry(*rest, found)
+                found[node] = self._of_entry(rest[0], rest[1], found)
             elif (rule := self.rules.get(node)) is not None:
                 self._by_rule(rule, found)
             elif name == "loop" and any(found.get(a) for a in self.arguments(node)):
