@@ -12,7 +12,6 @@ import pytest
 import knode_cosserat as kc
 from knode_cosserat.engine import loops
 from knode_cosserat.engine.program import EngineError
-from knode_cosserat.learning.residual import network
 from knode_cosserat.rods.ends import Driven
 from knode_cosserat.rods.system import unknown_count
 from knode_cosserat.solvers import evaluation, recovery, static_loop, time_loop
@@ -24,13 +23,19 @@ from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SCHEMES, Formula, SpaceScheme, Stage
 from knode_cosserat.solvers.static_loop import unloaded_shape
 from knode_cosserat.solvers.time_loop import StepCoefficients, TimeStep
+from tests.engine.networks import with_committee, with_network
 
 DT, STEPS = 0.05, 25
 PAPER, ROUTED, LEGS = "delrin-tendon-robot", "delrin-routed-tendon-robot", "six-legged-robot"
 
 
+NETWORK, COMMITTEE = "network of 512 units", "committee"
+
+
 @functools.cache
 def robot_of(name):
+    if name in (NETWORK, COMMITTEE):
+        return with_network(512, history=True) if name == NETWORK else with_committee()
     return kc.load_robot(name)
 
 
@@ -66,7 +71,10 @@ def assert_same(wanted, found, tolerance, estimates):
         np.testing.assert_allclose(other, one, atol=atol, err_msg=name)
 
 
-@pytest.mark.parametrize(("name", "scheme"), [(PAPER, "sdirk2"), (ROUTED, "bdf-alpha")])
+@pytest.mark.parametrize(
+    ("name", "scheme"),
+    [(PAPER, "sdirk2"), (ROUTED, "bdf-alpha"), (NETWORK, "bdf-alpha"), (COMMITTEE, "sdirk2")],
+)
 def test_a_robot_with_places_in_lanes(name, scheme):
     """The iterates are those of the loop in JAX; so are the estimates, and the state that follows."""
     robot, settings, control = robot_of(name), settings_of(scheme), tensions(1)[0]
@@ -282,14 +290,6 @@ def test_a_refusal_keeps_no_frames():
         assert len(caught.traceback) == 3
 
 
-@pytest.mark.parametrize("hidden", [32, 512])
-def test_a_large_network_is_refused(hidden):
-    """It would be code without end; simulate runs it in JAX."""
-    net = network(robot_of(PAPER), kc.learning.NetworkOptions(hidden=hidden, convex=False), jax.random.key(0))
-    with pytest.raises(EngineError, match=r"operations|too large"):
-        loops.core_of(kc.KNODE(robot_of(PAPER), net), settings_of("sdirk2"), robots=False)
-
-
 def test_a_span_continues_another():
     robot, settings, control = robot_of(PAPER), settings_of("sdirk2"), tensions(1)[0]
     steps, past = StepCoefficients.of(settings, DT), resting_history(robot, settings)
@@ -322,7 +322,7 @@ def test_a_failed_step_ends_the_loop_with_the_state_before_it():
     np.testing.assert_allclose(own_rows.records[:own_done], rows.records[:own_done], atol=1e-9)
 
 
-@pytest.mark.parametrize("name", [PAPER, ROUTED])
+@pytest.mark.parametrize("name", [PAPER, ROUTED, NETWORK])
 def test_robots_in_lanes_have_their_own_parameters_and_controls(name):
     """Ten robots in lanes of eight. Estimates of a vector stop together: they differ by their tolerance."""
     robot, settings, control = robot_of(name), settings_of("sdirk2"), tensions(10)

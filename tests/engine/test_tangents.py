@@ -17,16 +17,19 @@ from knode_cosserat.solvers.sensitivity import TangentState, tangent_loop_in_jax
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.tangent import SystemMoves
 from knode_cosserat.solvers.time_loop import StepCoefficients
+from tests.engine.networks import with_network
 
 DT, STEPS, COLUMNS = 0.05, 6, 11
 PAPER, ROUTED, CURVED = "delrin-tendon-robot", "delrin-routed-tendon-robot", "variable-curvature-robot"
+NETWORK = "network of 512 units"
 
 
 class Motion:
     """A motion under random controls, and random tangents of its history, controls and all parameters."""
 
     def __init__(self, name, scheme, **changes):
-        rng, robot = np.random.default_rng(0), kc.load_robot(name).replace(**changes)
+        rng = np.random.default_rng(0)
+        robot = with_network(512, history=True) if name == NETWORK else kc.load_robot(name).replace(**changes)
         self.robot, self.settings = robot, Settings.of(scheme, "lobatto2", "paper", NewtonOptions())
         self.steps = StepCoefficients.of(self.settings, DT)
         self.past = jax.tree.map(np.asarray, resting_history(robot, self.settings))
@@ -66,8 +69,11 @@ class Motion:
 
 @pytest.mark.parametrize(
     ("name", "scheme"),
-    [(PAPER, "bdf-alpha"), (ROUTED, "sdirk2"), (ROUTED, "bdf-alpha"), (CURVED, "bdf-alpha")],
-)
+    [
+        (PAPER, "bdf-alpha"), (ROUTED, "sdirk2"), (ROUTED, "bdf-alpha"), (CURVED, "bdf-alpha"),
+        (NETWORK, "bdf-alpha"),
+    ],
+)  # fmt: skip
 def test_tangents_are_differences_of_motions(name, scheme):
     motion, eps = Motion(name, scheme), 1e-4
     after, (d_rows, d_unknowns) = tangent_time_loop(*motion.given)

@@ -18,6 +18,8 @@ from typing import Any
 
 from knode_cosserat._jax import cache_directory
 from knode_cosserat._program_cache import ProgramCache
+from knode_cosserat.engine import elementary
+from knode_cosserat.engine.arrays import ArrayCode
 from knode_cosserat.engine.program import EngineError, Program
 
 #: rounding may change, NaN and infinity are kept
@@ -26,7 +28,7 @@ MATH = "contract nsz arcp"
 INTRINSICS = {"abs": "fabs", "sqrt": "sqrt", "exp": "exp", "log": "log", "sin": "sin", "cos": "cos",
               "max": "maximum", "min": "minimum", "pow": "pow", "floor": "floor"}  # fmt: skip
 LIBRARY = {
-    "log1p", "expm1", "tanh", "tan", "atan", "asin", "acos", "atan2", "erf", "fmod",
+    "log1p", "expm1", "tanh", "sin", "cos", "tan", "atan", "asin", "acos", "atan2", "erf", "fmod",
 }  # fmt: skip
 COMPARISONS = {"lt": "olt", "le": "ole", "gt": "ogt", "ge": "oge", "eq": "oeq", "ne": "une"}
 
@@ -154,16 +156,42 @@ class Module:
     def __init__(self) -> None:
         self._functions: list[Function] = []
         self.declarations: set[str] = set()
+        self._elementary: set[str] = set()
+        self._tables: dict[tuple[float, ...], str] = {}
 
     def function(self, name: str, arguments: Sequence[str], exported: bool = False) -> Function:
         """Begin a function; arguments are pointers, or whole numbers if their name begins with `n_`."""
         self._functions.append(Function(self, name, arguments, exported))
         return self._functions[-1]
 
+    def constants(self, values: Sequence[float]) -> str:
+        """Return the address of constants in memory."""
+        return self._tables.setdefault(tuple(map(float, values)), f"@table{len(self._tables)}")
+
+    def elementary(self, operation: str, lanes: int) -> str:
+        """Return the name of an elementary function of vectors."""
+        name = f"{operation}.{lanes}"
+        if name not in self._elementary:
+            self._elementary.add(name)
+            f = Function(self, name, ["x"], False, lanes)
+            x = f.arguments[0]
+            found = Variable(f, elementary.FUNCTIONS[operation](f, x))
+            if operation in elementary.OF_ANGLES:
+                with f.if_(f.any(f.apply("abs", x) > elementary.LARGEST_ANGLE)):
+                    found.set(f.by_library(operation, [x]))
+            f.returned = found.get()
+            self._functions.append(f)
+        return name
+
     @property
     def text(self) -> str:
         """The module in LLVM's assembly language."""
-        return "\n".join([*sorted(self.declarations), *(function.text for function in self._functions)])
+        tables = []
+        for numbers, name in self._tables.items():
+            inside = ", ".join(f"double {literal(number)}" for number in numbers)
+            tables.append(f"{name} = internal constant [{len(numbers)} x double] [{inside}], align 64")
+        functions = (function.text for function in self._functions)
+        return "\n".join([*sorted(self.declarations), *tables, *functions])
 
     def compile(self, optimisation: int = 1) -> Compiled:
         """Return machine code for this computer.
@@ -226,29 +254,35 @@ class Compiled:
 class Function:
     """A function of a module, and the place where code is written."""
 
-    def __init__(self, module: Module, name: str, arguments: Sequence[str], exported: bool):
+    def __init__(
+        self, module: Module, name: str, arguments: Sequence[str], exported: bool, lanes: int | None = None
+    ):
+        """Begin a function; with lanes, of vectors, which returns the vector `returned`."""
         self.module, self.name, self._count, self._exported = module, name, 0, exported
         self._lines: list[Any] = []
         self._stack: list[str] = []
         #: addresses of places that have been written
         self.addresses: dict[Any, Value] = {}
-        self._types = ["i64" if each.startswith("n_") else "ptr" for each in arguments]
-        self._names = [f"%{each}" for each in arguments]
+        self.returned: Any = None
+        kinds = ["double" if lanes else "i64" if each.startswith("n_") else "ptr" for each in arguments]
         self.arguments = [
-            Value(self, name, kind) for name, kind in zip(self._names, self._types, strict=True)
+            Value(self, f"%{name}", kind, lanes or 1) for name, kind in zip(arguments, kinds, strict=True)
         ]
 
     @property
     def text(self) -> str:
         """The function in LLVM's assembly language."""
-        given = ", ".join(f"{kind} {name}" for kind, name in zip(self._types, self._names, strict=True))
+        given = ", ".join(f"{each.type} {each.name}" for each in self.arguments)
         linkage = "" if self._exported else "internal "
         lines = itertools.chain.from_iterable(
             [line] if isinstance(line, str) else line for line in self._lines
         )
         body = "\n".join([*self._stack, "  br label %begin", "begin:", *lines])
         inline = "nounwind" if self._exported else "noinline nounwind"
-        return f"define {linkage}void @{self.name}({given}) {inline} {{\nentry:\n{body}\n  ret void\n}}"
+        kind, end = "void", "ret void"
+        if self.returned is not None:
+            kind, end = self.returned.type, f"ret {self.returned.type} {self.returned.name}"
+        return f"define {linkage}{kind} @{self.name}({given}) {inline} {{\nentry:\n{body}\n  {end}\n}}"
 
     # lines
 
@@ -281,6 +315,14 @@ class Function:
         name = "%" + self._fresh("m")
         self._stack.append(f"  {name} = alloca {kind}")
         return name
+
+    def variable(self, value: Value) -> Variable:
+        """Return a value that changes in loops."""
+        return Variable(self, value)
+
+    def address(self, name: str) -> Value:
+        """Return an address as a value."""
+        return Value(self, name, "ptr")
 
     # values
 
@@ -375,21 +417,30 @@ class Function:
             return self.apply("abs", values[0]) < float("inf")
         if operation == "logistic":
             return 1.0 / (1.0 + self.apply("exp", -values[0]))
+        if lanes > 1 and operation in elementary.FUNCTIONS:
+            return self._called(self.module.elementary(operation, lanes), values)
         if operation in INTRINSICS:
-            suffix = "f64" if lanes == 1 else f"v{lanes}f64"
-            name = f"llvm.{INTRINSICS[operation]}.{suffix}"
-            self.module.declarations.add(f"declare {kind} @{name}({', '.join([kind] * len(values))})")
-            given = ", ".join(f"{kind} {each.name}" for each in values)
-            return self.result(f"call {MATH} {kind} @{name}({given})", lanes=lanes)
-        name = "fmod" if operation == "rem" else operation
-        if name not in LIBRARY:
-            raise EngineError(f"engine: no machine code for {operation!r}")
-        self.module.declarations.add(f"declare double @{name}({', '.join(['double'] * len(values))})")
-        found = [self._call(name, [self.lane(each, k) for each in values]) for k in range(lanes)]
-        return self.joined(found)
+            return self.intrinsic(INTRINSICS[operation], *values)
+        return self.by_library("fmod" if operation == "rem" else operation, values)
 
-    def _call(self, name: str, values: Sequence[Value]) -> Value:
-        return self.result(f"call double @{name}({', '.join(f'double {each.name}' for each in values)})")
+    def intrinsic(self, name: str, *values: Value) -> Value:
+        """Return a function that LLVM provides, of numbers in the same lanes."""
+        kind, lanes = values[0].type, values[0].lanes
+        full = f"llvm.{name}.{'f64' if lanes == 1 else f'v{lanes}f64'}"
+        self.module.declarations.add(f"declare {kind} @{full}({', '.join([kind] * len(values))})")
+        return self._called(full, values)
+
+    def by_library(self, name: str, values: Sequence[Value]) -> Value:
+        """Return a function of the C library, by a call for every lane."""
+        if name not in LIBRARY:
+            raise EngineError(f"engine: no machine code for {name!r}")
+        self.module.declarations.add(f"declare double @{name}({', '.join(['double'] * len(values))})")
+        lanes = range(values[0].lanes)
+        return self.joined([self._called(name, [self.lane(each, k) for each in values]) for k in lanes])
+
+    def _called(self, name: str, values: Sequence[Value]) -> Value:
+        given = ", ".join(f"{each.type} {each.name}" for each in values)
+        return self.result(f"call {MATH} {values[0].type} @{name}({given})", lanes=values[0].lanes)
 
     def lane(self, value: Value, k: int) -> Value:
         """Return the number in lane k."""
@@ -493,38 +544,43 @@ class Function:
     def call(self, function: Function, *arguments: Any) -> None:
         """Call another function of the module."""
         given = []
-        for kind, argument in zip(function._types, arguments, strict=True):
-            argument = self.value(argument, "i64")
-            given.append(f"{kind} {argument.name}")
+        for own, argument in zip(function.arguments, arguments, strict=True):
+            given.append(f"{own.type} {self.value(argument, 'i64').name}")
         self.emit(f"call void @{function.name}({', '.join(given)})")
 
     # programs
 
     def evaluate(
-        self, program: Program, outputs: Sequence[int], known: Mapping[int, Value], lanes: int
-    ) -> dict[int, Value]:
+        self, program: Program, outputs: Sequence[int], known: Mapping[int, Any], lanes: int
+    ) -> dict[int, Any]:
         """Write the operations that outputs need, and return the values of all of them.
 
-        `known` are values of inputs and of operations that have been evaluated. Loops run until every lane is
-        done; lanes that are done keep their values.
+        `known` are values of inputs and of operations that have been evaluated; those of arrays are in memory
+        (`arrays.Stored`). Loops run until every lane is done; lanes that are done keep their values.
         """
-        values = dict(known)
-        for node in program.needed(outputs, frozenset(values)):
+        values: dict[int, Any] = dict(known)
+        needed = program.needed(outputs, frozenset(values))
+        arrays = ArrayCode(self, program, needed, outputs, values)
+        for node in needed:
             if node in values:
                 continue
             operation, *arguments = program.operations[node]
             if operation == "constant":
                 value = program.values[node]
                 values[node] = self.value(value if isinstance(value, bool) else float(value))
-            elif operation == "input":
+            elif operation in ("input", "inputs"):
                 raise KeyError(f"input {arguments[0]} has no value")
             elif operation == "loop":
                 self._loop(program, node, values, lanes)
+            elif operation == "entry":
+                values[node] = arrays.load(*arguments)
+            elif node in program.shapes:
+                arrays.write(node)
             elif operation != "result":
                 values[node] = self.apply(operation, *(values[each] for each in arguments))
         return values
 
-    def _loop(self, program: Program, node: int, values: dict[int, Value], lanes: int) -> None:
+    def _loop(self, program: Program, node: int, values: dict[int, Any], lanes: int) -> None:
         loop = program.loops[program.operations[node][1]]
         inner: dict[int, Value] = {}
         for name, outer in loop.inputs:

@@ -5,14 +5,15 @@ All come from the system's own functions (`program.Program`), and derivatives fr
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from knode_cosserat.engine.program import Program
+from knode_cosserat.engine.program import LARGEST_PRODUCT, PRODUCTS, Program
 from knode_cosserat.rods.system import System, unknown_count
 from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.grid import grid_of
@@ -22,6 +23,11 @@ from knode_cosserat.solvers.space import LOBATTO2, SpaceScheme
 RUN, STEP, PLACE, STATE = 1, 2, 3, 4
 #: largest number of operations: LLVM's time grows faster than their number, to minutes for a large network
 MOST_OPERATIONS = 20_000
+
+
+def constant_zeros(leaf: np.ndarray) -> np.ndarray:
+    """Return true where a parameter is a constant of the program: zeros, but not those of large arrays."""
+    return (leaf == 0.0) & (leaf.size <= LARGEST_PRODUCT)
 
 
 class Equations:
@@ -42,11 +48,11 @@ class Equations:
         #: numbers of a record: y, z and, if B is not zero, y_s
         self.numbers = self.ny + self.nz + (self.ny if system.mixed else 0)
         program = self.program = Program(MOST_OPERATIONS)
-        self.parameters = [program.inputs(f"p{i}", leaf.shape, RUN) for i, leaf in enumerate(leaves)]
+        self.parameters = [program.inputs(f"p{i}", leaf.shape, RUN, True) for i, leaf in enumerate(leaves)]
         #: the place of each parameter's node in the vector of parameters
         self.parameter_values = np.concatenate([leaf.reshape(-1) for leaf in leaves])
         folded = [
-            np.where((leaf == 0.0) & ~moves, program.constant(0.0), nodes)
+            np.where(constant_zeros(leaf) & ~moves, program.constant(0.0), nodes)
             for leaf, nodes, moves in zip(
                 leaves, self.parameters, moving or [np.array(False)] * len(leaves), strict=True
             )
@@ -168,6 +174,18 @@ class Equations:
         parts = np.split(values, sizes[sizes < values.shape[-1]], axis=-1)
         return np.concatenate([part.reshape(*part.shape[:-2], -1) for part in parts], axis=-1)
 
+    def slots(self, terms: Sequence[int]) -> Iterator[tuple[int, int, int]]:
+        """Return the nodes of terms, with the first of their numbers in memory and the count of these."""
+        first = 0
+        for node in terms:
+            count = math.prod(self.program.shapes.get(node, ()))
+            yield node, first, count
+            first += count
+
+    def size(self, terms: Sequence[int]) -> int:
+        """Return the count of all numbers of terms."""
+        return sum(count for *_, count in self.slots(terms))
+
     def _hoist(self) -> None:
         self.step_terms = self._hoisted(self._outputs, {STEP, RUN})
         self.place_terms = self._hoisted(self._outputs, {PLACE})
@@ -179,14 +197,21 @@ class Equations:
             if program.levels[node] > max(levels):
                 found |= {each for each in program.arguments(node) if program.levels[each] in levels}
         found |= {int(node) for node in outputs if program.levels[int(node)] in levels}
-        todo = [node for node in found if program.is_boolean(node)]
-        while todo:  # truths are evaluated where they are used
+
+        def is_used_there(node: int) -> bool:
+            """True for truths, views and products, which are evaluated where they are used."""
+            name = program.operations[node][0]
+            return program.is_boolean(node) or name == "view" or (name in PRODUCTS and node in program.shapes)
+
+        todo = [node for node in found if is_used_there(node)]
+        while todo:
             node = todo.pop()
             found.discard(node)
             for each in program.arguments(node):
                 if program.levels[each] in levels and each not in found:
-                    todo.append(each) if program.is_boolean(each) else found.add(each)
-        return sorted(found)
+                    todo.append(each) if is_used_there(each) else found.add(each)
+        # arrays of parameters are in memory
+        return sorted(node for node in found if program.operations[node][0] != "inputs")
 
 
 #: nonzeros of a matrix: row, column and node of each
@@ -211,7 +236,7 @@ class TangentEquations(Equations):
             self._outputs += [node for *_, node in nonzeros]
         self._hoist()
         moved = [nodes[moves] for nodes, moves in zip(self.parameters, moving, strict=True)]
-        self.dparameters = program.inputs("dparameter", (sum(map(len, moved)),), RUN)
+        self.dparameters = program.inputs("dparameter", (sum(map(len, moved)),), RUN, True)
         tangents = dict(zip(np.concatenate(moved).tolist(), self.dparameters.tolist(), strict=True))
         #: tangents of places and of lengths of pieces
         self.dplaces, self.dlengths = (program.derivative(nodes, tangents) for nodes in self.geometry[2:4])

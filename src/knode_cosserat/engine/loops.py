@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
 import jax
 import numpy as np
 
 from knode_cosserat.engine.core import Constants, Core, Shape, States, coefficients_of
+from knode_cosserat.engine.equations import constant_zeros
 from knode_cosserat.engine.program import EngineError
 from knode_cosserat.engine.tangents import TangentCore
 from knode_cosserat.rods.system import System
@@ -43,11 +44,11 @@ def core_of(system: System, settings: Settings, robots: bool) -> Core:
     if np.ndim(system.length):
         leaves = [np.max(np.abs(leaf), axis=0) for leaf in leaves]
     schemes = Settings(settings.time, settings.space)
-    key = structure, _masks([leaf == 0.0 for leaf in leaves]), schemes, robots
+    key = structure, _masks(map(constant_zeros, leaves)), schemes, robots
     return _compiled(key, lambda: Core(jax.tree.unflatten(structure, leaves), schemes, robots))
 
 
-def _masks(masks: Sequence[np.ndarray]) -> Any:
+def _masks(masks: Iterable[np.ndarray]) -> Any:
     return tuple((mask.shape, np.packbits(mask).tobytes()) for mask in masks)
 
 
@@ -147,7 +148,7 @@ def tangent_loop(
     else:
         stacked = [np.asarray(leaf, float) for leaf in jax.tree.leaves(directions)]
     moving = [np.any(leaf != 0.0, axis=0) for leaf in stacked]
-    masks = _masks([leaf == 0.0 for leaf in leaves]), _masks(moving)
+    masks = _masks(map(constant_zeros, leaves)), _masks(moving)
     key = structure, *masks, settings.space, settings.uses_rate, "tangents"
     core = _compiled(key, lambda: TangentCore(jax.tree.unflatten(structure, leaves), settings, moving))
     moved = np.concatenate(

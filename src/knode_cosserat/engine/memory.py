@@ -138,10 +138,12 @@ class Memory:
     def _put(self, value: Any, array: Array, i: int, j: int | Index = 0, lanes: int = 0) -> None:
         self._now.store(value, *self._at(array, i, j), lanes or self.P)
 
+    def _lanes(self, array: Array) -> int:
+        """Return the lanes of a wide value; 1 for a number that is the same at all places."""
+        return self.L if self.batch or array.count else 1
+
     def _wide(self, array: Array, i: Any, j: Any = 0) -> Value:
-        # a number that is the same at all places
-        lanes = self.L if self.batch or array.count else 1
-        return self._get(array, i, j, lanes)
+        return self._get(array, i, j, self._lanes(array))
 
     def _write_wide(self, value: Any, array: Array, i: Any, j: Any) -> None:
         self._put(value, array, i, j, self.L)

@@ -1,8 +1,13 @@
 """Programs of scalar operations: a jaxpr evaluated on symbols, and its derivatives.
 
-A `Program` is a list of scalar operations in the order of evaluation. An operation is a tuple of a name and
+A `Program` is a list of operations in the order of evaluation. An operation is a tuple of a name and
 of the numbers (nodes) of its arguments. Constants are folded, equal operations are shared, and operations
 without effect are left out. All values are 64-bit floats or booleans; integers are kept as floats.
+
+A node is a scalar or, where scalars would be too many (matrix products of a network), an array. Arrays take
+the operations of scalars, entry by entry, and a scalar counts as an array of equal entries. Arrays begin
+with a "stack" of scalars, or with "inputs" in memory, and end with an "entry"; "view" is an array of some of
+the entries of another, and "sum" adds those along the last axis.
 
 Algebra treats values as finite: x * 0 and x - x are 0. `x != x` is kept, because it tests for NaN. "max" and
 "min" return NaN if an argument is NaN. "hold" returns its argument: derivatives stop there, or follow a rule
@@ -11,6 +16,7 @@ of their own. Derivatives at ties (max, min, abs, clamp) are those of JAX.
 
 from __future__ import annotations
 
+import bisect
 import dataclasses
 import itertools
 import math
@@ -24,8 +30,9 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 
 from knode_cosserat.errors import KnodeCosseratError
 
-#: largest number of scalar products of one matrix product: larger ones would be long code
-LARGEST_PRODUCT = 8192
+#: largest number of scalar products of one matrix product, and of results of other operations on arrays, that
+#: are scalars
+LARGEST_PRODUCT, LARGEST_SPREAD = 256, 31
 #: largest number of entries of a table with a variable index, of turns of a scan, and of numbers to sort
 LARGEST_TABLE, LONGEST_SCAN, LONGEST_SORT = 256, 1024, 32
 #: largest matrix that is factorised with row exchanges that depend on values
@@ -73,6 +80,34 @@ class Product(NamedTuple):
     steps: list[int]
 
 
+class Positions(NamedTuple):
+    """Regular positions in an array: the first one, the distances along the axes of a view, and its shape."""
+
+    first: int
+    strides: tuple[int, ...]
+    shape: tuple[int, ...]
+
+    @classmethod
+    def whole(cls, shape: tuple[int, ...]) -> Positions:
+        """Return the positions of all entries in order."""
+        return cls(0, tuple(math.prod(shape[axis + 1 :]) for axis in range(len(shape))), shape)
+
+    def all(self) -> np.ndarray:
+        """Return the positions of all entries of the view."""
+        steps = (np.arange(n) * stride for n, stride in zip(self.shape, self.strides, strict=True))
+        return self.first + sum(np.ix_(*steps), start=np.zeros(self.shape, dtype=np.int64))
+
+
+def regular(positions: np.ndarray) -> Positions | None:
+    """Return positions that are regular, otherwise None."""
+    first, strides = int(positions.flat[0]), []
+    for axis, n in enumerate(positions.shape):
+        second = positions[tuple(int(k == axis) for k in range(positions.ndim))] if n > 1 else first
+        strides.append(int(second) - first)
+    found = Positions(first, tuple(strides), positions.shape)
+    return found if np.array_equal(found.all(), positions) else None
+
+
 @dataclasses.dataclass(eq=False)
 class Rule:
     """Derivative rule of a JAX function: of `jax.custom_jvp`, or of a linear solver."""
@@ -117,6 +152,8 @@ FOLDED: dict[str, Callable[..., Any]] = {
     "eq": np.equal, "ne": np.not_equal, "and": np.logical_and, "or": np.logical_or, "not": np.logical_not,
     "select": lambda p, no, yes: yes if p else no, "hold": lambda x: x,
 }  # fmt: skip
+#: products, of which views are views of the factors
+PRODUCTS = frozenset({"mul", "neg"})
 COMMUTATIVE = frozenset({"add", "mul", "max", "min", "and", "or", "eq", "ne"})
 COMPARISONS = frozenset({"lt", "le", "gt", "ge", "eq", "ne"})
 BOOLEANS = COMPARISONS | {"and", "or", "not", "isfinite"}
@@ -137,8 +174,14 @@ class Program:
         self.loops: list[Loop] = []
         #: derivative rules of "hold" nodes, by node; None: the derivative is zero
         self.rules: dict[int, Rule | None] = {}
+        #: shapes of arrays; other nodes are scalars
+        self.shapes: dict[int, tuple[int, ...]] = {}
         self._boolean: list[bool] = []
         self._memo: dict[Any, Any] = {}
+        #: first node and number of scalars that are the entries of an array, and the array; or, of inputs in
+        #: memory, its operation
+        self._families: list[tuple[int, int, Any]] = []
+        self._count = 0
         #: selects with constants only, such as an index of the smallest entry
         self.choices: set[int] = set()
 
@@ -164,9 +207,15 @@ class Program:
         """Return the node of a named input; level 0 is of constants."""
         return self._new(("input", name), ("input", name), level, boolean)
 
-    def inputs(self, name: str, shape: tuple[int, ...], level: int) -> Nodes:
-        """Return an array of inputs, named by their flat index, such as name[0]."""
-        nodes = [self.input(f"{name}[{k}]", level) for k in range(math.prod(shape))]
+    def inputs(self, name: str, shape: tuple[int, ...], level: int, in_memory: bool = False) -> Nodes:
+        """Return an array of inputs, named by their flat index, such as name[0].
+
+        If they are in memory, in this order, arrays of them are read there.
+        """
+        first, size = len(self.operations), math.prod(shape)
+        nodes = [self.input(f"{name}[{k}]", level) for k in range(size)]
+        if size and in_memory:
+            self._families.append((first, size, ("inputs", first, size)))
         return np.array(nodes, dtype=np.int64).reshape(shape)
 
     def constants(self, values: Any) -> Nodes:
@@ -190,11 +239,15 @@ class Program:
         return found
 
     def _created(self, operation: str, *arguments: int) -> int:
-        if len(self.operations) > self.limit:
-            raise EngineError(f"engine: more than {self.limit} operations; use smaller networks or laws")
+        self._count += 1
+        if self._count > self.limit:
+            raise EngineError(f"engine: more than {self.limit} operations; use smaller laws")
         key, level = (operation, *arguments), max(self.levels[a] for a in arguments)
         last = self._boolean[arguments[-1]]
         node = self._new(key, key, level, operation in BOOLEANS or (last and operation == "select"))
+        shape = next((self.shapes[a] for a in arguments if a in self.shapes), None)
+        if shape is not None:
+            self.shapes[node] = shape
         if operation == "select" and all(self.is_constant(a) or a in self.choices for a in arguments[1:]):
             self.choices.add(node)
         return node
@@ -356,6 +409,8 @@ class Program:
             node = known
         new = self._new(("held", node), ("hold", node), self.levels[node], self._boolean[node])
         self.rules[new] = rule
+        if node in self.shapes:
+            self.shapes[new] = self.shapes[node]
         return new
 
     def ruled(
@@ -366,8 +421,8 @@ class Program:
         if key not in self._memo:
             rule = Rule(function, shapes, arguments)
             for array in values():
-                held = [self.held(node, rule) for node in array.ravel().tolist()]
-                rule.results.append(np.array(held, dtype=np.int64).reshape(array.shape))
+                held = [self.held(node, rule) for node in self.parts(array)]
+                rule.results.append(self._nodes(held, array.shape))
             self._memo[key] = rule.results
         return self._memo[key]
 
@@ -389,13 +444,141 @@ class Program:
             for each, kind in zip(results, loop.kinds, strict=True)
         ]
 
+    # arrays
+
+    def _array(self, operation: tuple[Any, ...], shape: tuple[int, ...], level: int, boolean: bool) -> int:
+        node = self._new(operation, operation, level, boolean)
+        self.shapes[node] = shape
+        return node
+
+    def located(self, nodes: Nodes) -> tuple[Any, Positions] | None:
+        """Return the array, or the operation of an array of inputs, of which scalars are regular entries."""
+        at = bisect.bisect_right(self._families, nodes.flat[0], key=lambda family: family[0]) - 1
+        if at < 0:
+            return None
+        first, count, owner = self._families[at]
+        if nodes.min() < first or nodes.max() >= first + count:
+            return None
+        positions = regular(nodes - first)
+        return None if positions is None else (owner, positions)
+
+    def is_computed(self, nodes: Nodes) -> bool:
+        """Return True if scalars are regular entries of one array that is no input."""
+        found = self.located(nodes) if nodes.size > LARGEST_SPREAD else None
+        return found is not None and isinstance(found[0], int)
+
+    def array(self, nodes: Nodes) -> int:
+        """Return an array of scalars: a view if they are regular entries of one array, otherwise a copy."""
+        found = self.located(nodes)
+        if found is None:
+            scalars = nodes.ravel().tolist()
+            level = max(self.levels[node] for node in scalars)
+            base = self._array(("stack", *scalars), (nodes.size,), level, self._boolean[scalars[0]])
+            return self.view(base, np.arange(nodes.size).reshape(nodes.shape))
+        owner, positions = found
+        if not isinstance(owner, int):
+            owner = self._array(owner, owner[2:], self.levels[owner[1]], False)
+        return self.view(owner, positions.all())
+
+    def known_inputs(self, nodes: Nodes) -> int | None:
+        """Return the array of all inputs of one name in memory, or None if nothing needs it."""
+        return self._memo.get(("inputs", int(nodes.flat[0]), nodes.size)) if nodes.size else None
+
+    def array_input(self, name: str, shape: tuple[int, ...], level: int) -> int:
+        """Return an input that is an array, without inputs for its entries."""
+        return self._array(("input", name), shape, level, False)
+
+    def entries(self, node: int, shape: tuple[int, ...] | None = None) -> Nodes:
+        """Return the scalars of an array; a scalar is repeated."""
+        if node not in self.shapes:
+            return np.full(shape or (), node, dtype=np.int64)
+        own = self.shapes[node]
+        name, *rest = self.operations[node]
+        if name == "view":
+            return self.entries(rest[0]).ravel()[rest[1].all()]
+        if name == "inputs":
+            return np.arange(rest[0], rest[0] + rest[1])
+        if name == "stack":
+            return np.array(rest, dtype=np.int64)
+        key, count = ("entries", node), math.prod(own)
+        if key not in self._memo:
+            self._memo[key] = first = len(self.operations)
+            self._families.append((first, count, node))
+            for k in range(count):
+                each = ("entry", node, k)
+                self._new(each, each, self.levels[node], self._boolean[node])
+        return np.arange(self._memo[key], self._memo[key] + count).reshape(own)
+
+    def view(self, node: int, positions: np.ndarray) -> int:
+        """Return an array of the entries of another at these positions in it (as if it were flat)."""
+        if node not in self.shapes:
+            return node
+        shape = self.shapes[node]
+        name, *rest = self.operations[node]
+        if positions.shape == shape and np.array_equal(positions.ravel(), np.arange(positions.size)):
+            return node
+        if name in PRODUCTS:
+            # a view of factors, so that the products need no memory
+            parts = [self.view(each, positions) for each in rest]
+            return self.apply(name, *parts)
+        if name == "view":
+            return self.view(rest[0], rest[1].all().ravel()[positions])
+        found = regular(positions)
+        if found is None:
+            return self.array(self.entries(node).ravel()[positions])
+        return self._array(("view", node, found), found.shape, self.levels[node], self._boolean[node])
+
+    def total(self, node: int, count: int) -> int:
+        """Return the sums along the last axis, of this length, of an array."""
+        if node not in self.shapes:
+            return self.apply("mul", node, self.constant(float(count)))
+        name, *rest = self.operations[node]
+        if name == "neg":
+            return self.apply("neg", self.total(rest[0], count))
+        if name == "mul":
+            for factor, other in (rest, rest[::-1]):
+                found = self._chosen(factor, other)
+                if found is not None:
+                    return found
+        return self._array(("sum", node), self.shapes[node][:-1], self.levels[node], False)
+
+    def unit(self, size: int, k: int) -> int:
+        """Return the unit vector along axis k."""
+        found = self.array(self.constants(np.equal(np.arange(size), k).astype(float)))
+        self._memo["unit", found] = k
+        return found
+
+    def _chosen(self, factor: int, other: int) -> int | None:
+        """Return the entries that a product with a unit vector along the last axis chooses, or None."""
+        base, *rest = self.operations[factor][1:] if self.operations[factor][0] == "view" else (factor,)
+        one = self._memo.get(("unit", base))
+        if one is None:
+            return None
+        shape = self.shapes[factor]
+        chosen = (rest[0].all() if rest else np.arange(math.prod(shape)).reshape(shape)) == one
+        if not chosen.any():
+            return self.constant(0.0)
+        column = chosen.reshape(-1, shape[-1])[0]
+        if column.sum() != 1 or not (chosen == column).all():
+            return None
+        return self.view(other, np.arange(chosen.size).reshape(shape)[..., int(column.argmax())])
+
+    def parts(self, nodes: Nodes) -> list[int]:
+        """Return the array of which scalars are entries, or the scalars."""
+        return [self.array(nodes)] if self.is_computed(nodes) else nodes.ravel().tolist()
+
+    def _all_parts(self, arrays: Iterable[Nodes]) -> list[int]:
+        return [node for nodes in arrays for node in self.parts(nodes)]
+
     # queries
 
     def arguments(self, node: int) -> tuple[int, ...]:
         """Return the nodes that a node depends on directly."""
         name, *rest = self.operations[node]
-        if name in ("constant", "input"):
+        if name in ("constant", "input", "inputs"):
             return ()
+        if name in ("view", "entry"):
+            return (rest[0],)
         if name == "loop":
             return tuple(rest[1:])
         return (rest[0],) if name == "result" else tuple(rest)
@@ -450,11 +633,24 @@ class Program:
         for node in self._order(outputs, sources):
             if node in found:
                 continue
-            name = self.operations[node][0]
+            name, *rest = self.operations[node]
             if name == "select":
                 found[node] = self._selected(node, found)
             elif name in PARTIALS:
                 found[node] = self._chained(node, found)
+            elif name in ("stack", "inputs"):
+                found[node] = self._stacked(self.entries(node), found)
+            elif name == "view":
+                positions = rest[1].all()
+                found[node] = {
+                    key: self.view(each, positions) for key, each in found.get(rest[0], {}).items()
+                }
+            elif name == "sum":
+                count = self.shapes[rest[0]][-1]
+                sums = {key: self.total(each, count) for key, each in found.get(rest[0], {}).items()}
+                found[node] = self._nonzero(sums)
+            elif name == "entry":
+                found[node] = self._of_entry(rest[0], rest[1], found)
             elif (rule := self.rules.get(node)) is not None:
                 self._by_rule(rule, found)
             elif name == "loop" and any(found.get(a) for a in self.arguments(node)):
@@ -488,22 +684,52 @@ class Program:
                 total[key] = self.apply("add", total.get(key, zero), self.apply("mul", own, tangent))
         return self._nonzero(total)
 
+    def _stacked(self, scalars: Nodes, found: Tangents) -> dict[Any, int]:
+        """Return the tangents of an array of scalars.
+
+        The variables are these scalars themselves if that takes fewer products: unit vectors choose columns
+        of a matrix, at no cost, but there may be more of them.
+        """
+        moving = {k: found[node] for k, node in enumerate(scalars.tolist()) if found.get(node)}
+        keys = dict.fromkeys(key for tangents in moving.values() for key in tangents)
+        if len(moving) < 2 * len(keys) and len(keys) > 1:
+            return {Component(int(scalars[k])): self.unit(scalars.size, k) for k in moving}
+        zero = np.full(scalars.size, self.constant(0.0))
+        tangents = {}
+        for key in keys:
+            own = zero.copy()
+            for k, each in moving.items():
+                own[k] = each.get(key, zero[k])
+            tangents[key] = self.array(own)
+        return tangents
+
+    def _of_entry(self, array: int, k: int, found: Tangents) -> dict[Any, int]:
+        """Return the tangents of an entry of an array, by variables that are no components of arrays."""
+        total, zero = dict[Any, int](), self.constant(0.0)
+        for key, tangent in found.get(array, {}).items():
+            own = int(self.entries(tangent, self.shapes[array]).flat[k])
+            chain = found[key.node] if isinstance(key, Component) else {key: self.constant(1.0)}
+            for variable, slope in chain.items():
+                total[variable] = self.apply("add", total.get(variable, zero), self.apply("mul", own, slope))
+        return self._nonzero(total)
+
     def _differentiated(self, node: int) -> Iterable[int]:
         """Return the nodes that the derivative of a node depends on."""
         if self.operations[node][0] != "hold":
             return self.arguments(node)
         rule = self.rules[node]
-        return () if rule is None else _flat(rule.arguments)
+        return () if rule is None else self._all_parts(rule.arguments)
 
     def _by_rule(self, rule: Rule, found: Tangents) -> None:
         """Add the tangents of all results of a rule."""
-        moving = {node: found[node] for node in _flat(rule.arguments) if found.get(node)}
-        results = _flat(rule.results)
+        moving = {node: found[node] for node in self._all_parts(rule.arguments) if found.get(node)}
+        results = self._all_parts(rule.results)
         found.update((node, {}) for node in results)
         zero = self.constant(0.0)
         for key in dict.fromkeys(key for each in moving.values() for key in each):
             active, product = self._product(rule)
-            own = [moving.get(node, {}).get(key, zero) for node in _flat(rule.arguments[k] for k in active)]
+            places = self._all_parts(rule.arguments[k] for k in active)
+            own = [moving.get(node, {}).get(key, zero) for node in places]
             tangents = self._replaced(product, dict(zip(product.inputs, own, strict=True)))
             for node, tangent in zip(results, tangents, strict=True):
                 if not self.is_constant(tangent, 0.0):
@@ -513,10 +739,14 @@ class Program:
         """Return the active arguments of a rule, and its results' tangents."""
         if rule.product is None:
             active, jaxpr = rule.traced()
-            prefix, shapes = f"tangent {len(self.operations)}", [rule.arguments[k].shape for k in active]
-            tangents = [self.inputs(f"{prefix} {k}", shape, 1) for k, shape in enumerate(shapes)]
-            outputs = _flat(self.evaluate(jaxpr, [*rule.arguments, *tangents]))
-            inputs = _flat(tangents)
+            prefix, tangents = f"tangent {len(self.operations)}", []
+            for k, nodes in enumerate(rule.arguments[k] for k in active):
+                if self.is_computed(nodes):
+                    tangents.append(self.entries(self.array_input(f"{prefix} {k}", nodes.shape, 1)))
+                else:
+                    tangents.append(self.inputs(f"{prefix} {k}", nodes.shape, 1))
+            outputs = self._all_parts(self.evaluate(jaxpr, [*rule.arguments, *tangents]))
+            inputs = self._all_parts(tangents)
             depending, steps = set(inputs), []
             for node in self._order(outputs, self._sources):
                 if not depending.isdisjoint(self._sources(node)):
@@ -530,7 +760,8 @@ class Program:
         rule = self.rules.get(node)
         if rule is None:
             return self.arguments(node)
-        return (*_flat(rule.arguments), *(self.operations[each][1] for each in _flat(rule.results)))
+        results = self._all_parts(rule.results)
+        return (*self._all_parts(rule.arguments), *(self.operations[each][1] for each in results))
 
     def _replaced(self, product: Product, new: dict[int, int]) -> list[int]:
         """Return the outputs with other nodes in the place of the inputs."""
@@ -539,25 +770,52 @@ class Program:
             if node in new:
                 continue
             if rule is None:
-                name, *arguments = self.operations[node]
-                if name in ("loop", "result"):
-                    raise EngineError("a derivative rule depends on tangents by a while loop; use a formula")
-                new[node] = self.apply(name, *(new.get(each, each) for each in arguments))
+                new[node] = self._with_arguments(node, new)
                 continue
-            swap = np.vectorize(lambda each: new.get(each, each), otypes=[np.int64])
-            copy = Rule(rule.function, rule.shapes, [swap(each) for each in rule.arguments])
+            arguments = [self._nodes([new.get(each, each) for each in self.parts(array)], array.shape)
+                         for array in rule.arguments]  # fmt: skip
+            copy = Rule(rule.function, rule.shapes, arguments)
             for array in rule.results:
-                values = [self.operations[each][1] for each in array.ravel().tolist()]
+                parts = self.parts(array)
+                values = [self.operations[each][1] for each in parts]
                 held = [self.held(new.get(each, each), copy) for each in values]
-                new.update(zip(array.ravel().tolist(), held, strict=True))
-                copy.results.append(np.array(held, dtype=np.int64).reshape(array.shape))
+                new.update(zip(parts, held, strict=True))
+                copy.results.append(self._nodes(held, array.shape))
         return [new.get(node, node) for node in product.outputs]
+
+    def _nodes(self, parts: list[int], shape: tuple[int, ...]) -> Nodes:
+        """Return the scalars of an array, or of a list of all scalars."""
+        if len(parts) == 1:
+            return self.entries(parts[0], shape).reshape(shape)
+        return np.array(parts, dtype=np.int64).reshape(shape)
+
+    def _with_arguments(self, node: int, new: dict[int, int]) -> int:
+        """Return an operation with other arguments in the place of its own."""
+        name, *rest = self.operations[node]
+        if name in ("loop", "result"):
+            raise EngineError("a derivative rule depends on tangents by a while loop; use a formula")
+        arguments = [new.get(each, each) for each in self.arguments(node)]
+        if name == "stack":
+            return self.array(np.array(arguments, dtype=np.int64))
+        if name == "view":
+            return self.view(arguments[0], rest[1].all())
+        if name == "sum":
+            return self.total(arguments[0], self.shapes[rest[0]][-1])
+        if name == "entry":
+            return int(self.entries(arguments[0], self.shapes[rest[0]]).flat[rest[1]])
+        return self.apply(name, *arguments)
 
     # jaxprs
 
     def evaluate(self, closed_jaxpr: Any, arguments: Sequence[Nodes]) -> list[Nodes]:
         """Return the results of a jaxpr for arrays of nodes."""
         return Evaluation(self).closed(closed_jaxpr, arguments)
+
+
+class Component(NamedTuple):
+    """Variable of a derivative: a scalar in an array."""
+
+    node: int
 
 
 class Scalar:
@@ -799,8 +1057,19 @@ class Evaluation:
             operation = lambda *nodes: apply(name, *nodes)  # noqa: E731
         if len(arrays) > 1:
             arrays = np.broadcast_arrays(*arrays)
+        if any(self.program.is_computed(array) for array in arrays):
+            parts = [self._array_or_scalar(array) for array in arrays]
+            if None not in parts:
+                return self.program.entries(operation(*parts), arrays[0].shape)
         entries = zip(*(array.ravel().tolist() for array in arrays), strict=True)
         return np.array([operation(*each) for each in entries], dtype=np.int64).reshape(arrays[0].shape)
+
+    def _array_or_scalar(self, nodes: Nodes) -> int | None:
+        """Return an array, or the scalar that all entries are; None if the entries are few and different."""
+        if (nodes == nodes.flat[0]).all():
+            return int(nodes.flat[0])
+        few = nodes.size <= LARGEST_PRODUCT and self.program.located(nodes) is None
+        return None if few else self.program.array(nodes)
 
     def where(self, condition: int, no: list[Nodes], yes: list[Nodes]) -> list[Nodes]:
         """Return one or the other of two lists of arrays."""
@@ -927,6 +1196,9 @@ class Evaluation:
         if not len(rows):
             empty: Any = {"add": 0.0, "mul": 1.0, "max": -np.inf, "min": np.inf, "and": True, "or": False}
             return np.full(shape, self.program.constant(empty[operation]))
+        if operation == "add" and self.program.is_computed(rows):
+            last = self.program.array(np.moveaxis(rows, 0, -1))
+            return self.program.entries(self.program.total(last, len(rows)), shape)
         total = rows[0]
         for row in rows[1:]:
             total = self.elementwise(operation, total, row)
@@ -1114,8 +1386,14 @@ class Evaluation:
         batch = tuple(a.shape[k] for k in batch_a)
         (a, free_a), (b, free_b) = ordered(a, batch_a, summed_a), ordered(b, batch_b, summed_b)
         if np.sum(self._nonzero(a) @ self._nonzero(b).transpose(0, 2, 1)) > LARGEST_PRODUCT:
-            shapes = f"{a.shape[1]}x{a.shape[2]} and {b.shape[2]}x{b.shape[1]}"
-            raise self.error(e, f"of {shapes} numbers is too large for the engine", "use smaller matrices")
+            program, (*rows, count) = self.program, a.shape[:2] + b.shape[1:]
+            views = []
+            for x, axis in ((a, 2), (b, 1)):
+                positions = np.expand_dims(np.arange(x.size).reshape(x.shape), axis)
+                own = np.broadcast_to(positions, (*rows, count)).reshape(*(n for n in rows if n > 1), count)
+                views.append(program.view(program.array(x), own))
+            total = program.total(self.apply("mul", *views), count)
+            return program.entries(total).reshape(*batch, *free_a, *free_b)
         products = self.elementwise("mul", a[:, :, None, :], b[:, None, :, :])
         return self._reduced("add", products, axes=(3,)).reshape(*batch, *free_a, *free_b)
 

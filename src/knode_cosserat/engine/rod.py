@@ -6,11 +6,12 @@ import contextlib
 import functools
 import itertools
 import operator
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
+from knode_cosserat.engine.arrays import Stored
 from knode_cosserat.engine.codegen import Function, Index, Value, Variable
 from knode_cosserat.engine.equations import Equations
 from knode_cosserat.engine.memory import Array, Memory
@@ -57,7 +58,7 @@ class RodCode(Memory):
         ny, nz, k, a = e.ny, e.nz, e.k, self._array
         self.params, self.scale_tip = a(len(e.parameter_values)), a(k)
         self.scale_y = a(ny, 0 if self.strands == 1 else self.points)
-        self.inputs, self.step_terms = a(2 + e.nc), a(len(e.step_terms))
+        self.inputs, self.step_terms = a(2 + e.nc), a(e.size(e.step_terms))
         self.s, self.h, self.length = a(1, self.count), a(1, self.pieces), a(1)
         scale_y, scale_tip, places, lengths, length = e.geometry
         idle = e.program.constant(0.0)
@@ -70,7 +71,7 @@ class RodCode(Memory):
             (self.h, np.tile(np.append(lengths, idle), self.strands)[None, :-1]),
             (self.length, length[None]),
         ]
-        self.place_terms = a(len(e.place_terms), self.count)
+        self.place_terms = a(e.size(e.place_terms), self.count)
         self.f, self.z, self.fe = a(ny, self.count), a(nz, self.count), a(ny, self.pieces)
         self.slope, self.slope_end = a(len(e.pattern), self.used), a(len(e.pattern), self.pieces)
         self.acting, self.jump = a(len(system.cuts), self.pieces), a(len(e.jumping), self.pieces)
@@ -123,22 +124,49 @@ class RodCode(Memory):
         at = f.pointer(f.pointer(f.arguments[0], self.node_table.offset), node.value)
         return f.index(f.result(f"load i64, ptr {at.name}", "i64"))
 
-    def _known(self, j: Any, wide: bool, state: dict[int, Value]) -> dict[int, Value]:
+    def _known(self, j: Any, wide: bool, state: dict[int, Any]) -> dict[int, Any]:
         """Return the values of hoisted terms at a place."""
         e = self.equations
-        nodes = e.program.needed(self._outputs, frozenset(state))
-        needed = set(nodes) | {each for node in nodes for each in e.program.arguments(node)}
-        values = dict(state)
-        for k, node in enumerate(e.step_terms):
-            if node in needed:
-                values[node] = self._wide(self.step_terms, k) if wide else self._get(self.step_terms, k)
-        for k, node in enumerate(e.place_terms):
-            if node in needed:
-                values[node] = self._wide(self.place_terms, k, j)
+        values = self._arrays_of(self.params, e.parameters) | state
+        needed = set(e.program.needed(self._outputs, frozenset([*values, *e.step_terms, *e.place_terms])))
+        for array, terms, place in (self.step_terms, e.step_terms, 0), (self.place_terms, e.place_terms, j):
+            for node, first, _ in e.slots(terms):
+                if node in needed:
+                    lanes = self._lanes(array) if wide else self.P
+                    values[node] = self._term(node, array, first, place, lanes)
         return values
 
+    def _term(self, node: int, array: Array, first: int, j: Any, lanes: int) -> Any:
+        """Return the value of a term; that of an array is its memory."""
+        if node not in self.equations.program.shapes:
+            return self._get(array, first, j, lanes)
+        return Stored(self._now.pointer(*self._at(array, first, j)), array.component, lanes)
+
+    def _put_terms(
+        self, values: dict[int, Any], array: Array, terms: Sequence[int], j: Any, lanes: int
+    ) -> None:
+        """Write the values of terms to memory."""
+        for node, first, count in self.equations.slots(terms):
+            if node not in self.equations.program.shapes:
+                self._put(values[node], array, first, j, lanes)
+                continue
+            target, stored = self._pointer(array, j), values[node]
+            with self._now.loop(count) as k:
+                number = self._now.load(stored.base, k.value * stored.distance, stored.lanes)
+                self._now.store(number, target, (k.value + first) * array.component, lanes)
+
+    def _arrays_of(self, array: Array, inputs: Sequence[np.ndarray]) -> dict[int, Stored]:
+        """Return the memory of arrays of inputs that follow each other in an array."""
+        found, first = {}, 0
+        for nodes in inputs:
+            node = self.equations.program.known_inputs(nodes)
+            if node is not None:
+                found[node] = Stored(self._now.pointer(*self._at(array, first, 0)), array.component, self.P)
+            first += nodes.size
+        return found
+
     def _evaluated(
-        self, outputs: Sequence[int] | np.ndarray, j: Any, wide: bool, state: dict[int, Value]
+        self, outputs: Sequence[int] | np.ndarray, j: Any, wide: bool, state: dict[int, Any]
     ) -> list[Value]:
         """Write the operations of outputs at a place."""
         self._outputs = [int(each) for each in outputs]
@@ -152,7 +180,7 @@ class RodCode(Memory):
         e = self.equations
         self.setup = f = self._function("setup")
         outputs = [int(node) for _, nodes in self.geometry for node in nodes.flat]
-        values = f.evaluate(e.program, outputs, self._parameters(), self.P)
+        values = f.evaluate(e.program, outputs, self._parameters(outputs), self.P)
         for array, nodes in self.geometry:
             # the lanes beyond the last place have its numbers
             beyond = 0 if self.batch or not array.count else self.stride - array.count
@@ -165,28 +193,34 @@ class RodCode(Memory):
                         self._put(values[int(node)], array, i, j)
                     first = stop
 
-    def _parameters(self) -> dict[int, Value]:
-        nodes = np.concatenate([nodes.reshape(-1) for nodes in self.equations.parameters])
-        return {int(node): self._get(self.params, k) for k, node in enumerate(nodes)}
+    def _inputs_of(
+        self, array: Array, inputs: Sequence[np.ndarray], outputs: Iterable[int]
+    ) -> dict[int, Any]:
+        """Return the values of the inputs that outputs depend on, and the memory of arrays of them."""
+        found: dict[int, Any] = dict(self._arrays_of(array, inputs))
+        needed = set(self.equations.program.needed(outputs, frozenset(found)))
+        nodes = np.concatenate([nodes.reshape(-1) for nodes in inputs]).tolist()
+        return found | {node: self._get(array, k) for k, node in enumerate(nodes) if node in needed}
+
+    def _parameters(self, outputs: Iterable[int]) -> dict[int, Any]:
+        return self._inputs_of(self.params, self.equations.parameters, outputs)
 
     def _write_terms(self) -> None:
         """Terms that depend on neither y nor the history: once a step."""
         e = self.equations
         self.terms = f = self._function("terms")
-        state = self._parameters()
+        state = self._parameters([*e.step_terms, *e.place_terms])
         for k, node in enumerate([e.c0.item(), e.t.item(), *e.control]):
             state[int(node)] = self._get(self.inputs, k)
         values = f.evaluate(e.program, e.step_terms, state, self.P)
-        for k, node in enumerate(e.step_terms):
-            self._put(values[node], self.step_terms, k)
+        self._put_terms(values, self.step_terms, e.step_terms, 0, self.P)
         if not e.place_terms:
             return
         known = {node: values[node] for node in e.step_terms} | state
         with self._places(self.count) as j:
             here = known | {e.s.item(): self._wide(self.s, 0, j)}
             values = f.evaluate(e.program, e.place_terms, here, self.L)
-            for k, node in enumerate(e.place_terms):
-                self._write_wide(values[node], self.place_terms, k, j)
+            self._put_terms(values, self.place_terms, e.place_terms, j, self.L)
 
     def _write_inputs(self, c0: Value, t: Value, control: Value) -> None:
         """Set the inputs of a step, with the control at an address, and evaluate its terms."""

@@ -58,7 +58,7 @@ class TangentCore(EliminationCode):
         )  # fmt: skip
         whole, self._size = self._size, 0
         # of one direction of the system
-        self.dparameters = a(len(e.dparameters), 1, 1)
+        self.dparameters = a(len(e.dparameters), memory=1)
         self.ds, self.dh = a(1, self.ends, 1), a(1, self.pieces, 1)
         self.moved = {name: a(len(nodes), places[name], 1) for name, nodes in e.moved.items()}
         self.direction_size, self._size = self._size, 0
@@ -161,17 +161,19 @@ class TangentCore(EliminationCode):
         """Tangents of rates, strains, jumps, tip and base by one direction of the system, at fixed y."""
         e = self.equations
         self.direction = f = self._function("direction", "direction")
-        state = self._parameters()
+        geometry = [*e.dplaces[: self.ends], *e.dlengths]
+        state = self._parameters([*e.moved_terms, *geometry])
         for k, node in enumerate([e.c0.item(), e.t.item(), *e.control]):
             state[int(node)] = self._get(self.inputs, k)
-        state |= {node: self._get(self.step_terms, k) for k, node in enumerate(e.step_terms)}
-        state |= {int(node): self._get(self.dparameters, k) for k, node in enumerate(e.dparameters)}
-        geometry = [*e.dplaces[: self.ends], *e.dlengths]
+        for node, first, _ in e.slots(e.step_terms):
+            state[node] = self._term(node, self.step_terms, first, 0, self.P)
+        moves = self._inputs_of(self.dparameters, [e.dparameters], [*e.moved_terms, *geometry])
+        state |= moves
         values = f.evaluate(e.program, [*e.moved_terms, *geometry], state, 1)
         for array, nodes in ((self.ds, e.dplaces[: self.ends]), (self.dh, e.dlengths)):
             for k, node in enumerate(nodes):
                 self._put(values[node], array, 0, k)
-        known = {node: values[node] for node in e.moved_terms}
+        known = {node: values[node] for node in e.moved_terms} | moves
         far = self.y if self.far is None else self.far
 
         def values_at(y: Array, j: Index) -> dict[int, Value]:
