@@ -61,14 +61,12 @@ class EliminationCode(RodCode):
         #: history terms of the step
         self.H = a(self.equations.numbers, self.count)
 
-    def _write_solved(self, name: str = "solved") -> Function:
+    def _write_solved(self) -> Function:
         """A piece's B⁻¹ r."""
-        f, el = self._function(name, "from", "to", "n_piece"), self.elimination
+        f, el = self._function("solved", "from", "to", "n_piece"), self.elimination
         _, source, target, piece = f.arguments
-        j, component = f.index(piece), self.L if self.has_tangents else self.wide_added.component
-        known = {
-            int(node): self._get(self.factor, k, j, self._matrix_lanes) for k, node in enumerate(el.stored)
-        }
+        j, component = f.index(piece), self.wide_added.component
+        known = {int(node): self._get(self.factor, k, j, self.L) for k, node in enumerate(el.stored)}
         known |= {int(node): f.load(source, i * component, self.L) for i, node in enumerate(el.r)}
         values = f.evaluate(el.program, el.solved, known, self.L)
         for i, node in enumerate(el.solved):
@@ -111,12 +109,12 @@ class EliminationCode(RodCode):
         for i in range(count):
             f.store(f.load(source[0], i * source[1]), target[0], i * target[1])
 
-    def _write_advance(self, name: str = "advance") -> Function:
+    def _write_advance(self) -> Function:
         """A column at a piece's start to its end: B⁻¹ A x plus what is added."""
         el, n = self.elimination, self.equations.ny
-        f = self._function(name, "from", "added", "to", "n_piece")
+        f = self._function("advance", "from", "added", "to", "n_piece")
         _, source, added, target, piece = f.arguments
-        width, j, lanes = self._rows_at_once, f.index(piece), self._vector_lanes
+        width, j, lanes = self._rows_at_once, f.index(piece), self.P
         component = 1 if width > 1 else self.L
         x = [f.load(source, c * component, lanes) for c in range(n)]
         for row in self._blocks(n):
@@ -124,7 +122,7 @@ class EliminationCode(RodCode):
             sums = [f.load(added, row * component, self.L), f.splat(f.value(0.0), self.L)]
             for c in range(n):
                 if el.nonzero[row : row + width, c].any():
-                    entry = self._get(self.matrix, c * self._padded(n) + row, j, self._matrix_lanes)
+                    entry = self._get(self.matrix, c * self._padded(n) + row, j, self.L)
                     sums = [sums[1], sums[0] + entry * x[c]]
             f.store(sums[0] + sums[1], target, row * component, self.L)
         return f

@@ -165,10 +165,12 @@ Nonzeros = list[tuple[int, int, int]]
 class TangentEquations(Equations):
     """Programs of a system with all derivatives of rates and strains, jumps, tip and base."""
 
-    def __init__(self, system: System, moving: Sequence[np.ndarray]):
-        """Differentiate the equations by y, history, control, and the parameters that are `moving`."""
+    def __init__(self, system: System, moving: Sequence[np.ndarray], transposed: bool):
+        """Differentiate the equations by y, history, control, and the parameters that are `moving`.
+
+        By parameters: products of the derivatives with a direction or, if `transposed`, with cotangents.
+        """
         super().__init__(system, moving)
-        program = self.program
         results = {
             "rates": [*self.f, *self.z], "far": [*self.far] if system.jumps else [], "tip": [*self.tip],
             "base": [*self.base],
@@ -179,17 +181,50 @@ class TangentEquations(Equations):
         for nonzeros in (self.z_by_y, *self.by_history.values(), *self.by_control.values()):
             self._outputs += [node for *_, node in nonzeros]
         self._hoist()
-        moved = [nodes[moves] for nodes, moves in zip(self.parameters, moving, strict=True)]
-        self.dparameters = program.inputs("dparameter", (sum(map(len, moved)),), RUN)
-        tangents = dict(zip(np.concatenate(moved).tolist(), self.dparameters.tolist(), strict=True))
+        moved = np.concatenate([nodes[moves] for nodes, moves in zip(self.parameters, moving, strict=True)])
+        places = self.geometry[2][: grid_of(system, LOBATTO2).ends]
+        (self._pull if transposed else self._push)(results, moved, places)
+
+    def _push(self, results: dict[str, list[int]], moved: np.ndarray, places: np.ndarray) -> None:
+        program = self.program
+        self.dparameters = program.inputs("dparameter", moved.shape, RUN)
+        tangents = dict(zip(moved.tolist(), self.dparameters.tolist(), strict=True))
         #: tangents of places and of lengths of pieces
-        self.dplaces, self.dlengths = (program.derivative(nodes, tangents) for nodes in self.geometry[2:4])
+        self.dplaces, self.dlengths = (
+            program.derivative(nodes, tangents) for nodes in (places, self.geometry[3])
+        )
         self.ds = program.inputs("ds", (), PLACE)
         tangents[self.s.item()] = self.ds.item()
         #: tangents of the results by the system, at fixed y, history and control
         self.moved = {name: program.derivative(nodes, tangents) for name, nodes in results.items()}
         outputs = [node for nodes in self.moved.values() for node in nodes]
         self.moved_terms = self._hoisted(outputs, {STEP, RUN})
+
+    def _pull(self, results: dict[str, list[int]], moved: np.ndarray, places: np.ndarray) -> None:
+        program = self.program
+        #: cotangents of the results
+        self.cotangents = {
+            name: program.inputs(f"cotangent of {name}", (len(nodes),), STATE)
+            for name, nodes in results.items()
+        }
+        needed = self._hoisted([node for nodes in results.values() for node in nodes], {STEP, RUN})
+        #: terms of a step by which moving parameters act
+        self.moving_terms = sorted(program.dependent(needed, moved).intersection(needed))
+        #: cotangents of these terms and of the place, from those of the results at a place
+        self.pulled = {
+            name: program.gradient(nodes, self.cotangents[name], [*self.moving_terms, self.s.item()])
+            for name, nodes in results.items()
+        }
+        outputs = [node for nodes in self.pulled.values() for node in nodes]
+        self.pulled_terms = self._hoisted(outputs, {STEP, RUN})
+        #: cotangents of the parameters from those of the terms, and from those of places and lengths of pieces
+        self.dterms = program.inputs("cotangent of term", (len(self.moving_terms),), STEP)
+        self.dplaces = program.inputs("cotangent of place", places.shape, RUN)
+        self.dlengths = program.inputs("cotangent of length", self.geometry[3].shape, RUN)
+        self.by_terms = program.gradient(self.moving_terms, self.dterms, moved)
+        self.by_geometry = program.gradient(
+            [*places, *self.geometry[3]], [*self.dplaces, *self.dlengths], moved
+        )
 
     def _nonzeros(self, outputs: Any, variables: Any) -> Nonzeros:
         slopes = self.program.jacobian(outputs, variables)
@@ -247,12 +282,15 @@ class Elimination:
         self.r = program.inputs("r", (n,), 1)
         #: B⁻¹ r, and the nonzeros of B⁻¹ A
         self.solved, self.nonzero = [int(node) for node in self.r], np.not_equal(A, zero)
+        #: these operations one by one: x[i] -= factor x[j] or, if i = j, x[i] *= factor, with the factor's node
+        self.substitution: list[tuple[int, int, int]] = []
 
         def eliminate(i: int, others: Sequence[int]) -> None:
             for j in others:
                 if B[i, j] != zero:
                     product = apply("mul", int(B[i, j]), self.solved[j])
                     self.solved[i] = apply("sub", self.solved[i], product)
+                    self.substitution.append((i, j, int(B[i, j])))
                     self.nonzero[i] |= self.nonzero[j]
 
         for at, i in enumerate(order):
@@ -260,6 +298,7 @@ class Elimination:
         for at, i in reversed(list(enumerate(order))):
             eliminate(i, order[at + 1 :])
             self.solved[i] = apply("mul", self.solved[i], int(B[i, i]))
+            self.substitution.append((i, i, int(B[i, i])))
 
 
 def _least_fill(pattern: Sequence[tuple[int, int]], n: int) -> list[int]:

@@ -46,8 +46,6 @@ class Memory:
         self.P = lanes if robots else 1
         #: distance between components of a single robot's arrays
         self.stride = (-(-(places + 1) // lanes) + 1) * lanes
-        #: true in code that has tangents in lanes
-        self.has_tangents = False
         self.module = Module()
         self._size = 0
 
@@ -85,17 +83,7 @@ class Memory:
     @property
     def _rows_at_once(self) -> int:
         """Rows of a matrix in one vector."""
-        return 1 if self.batch or self.has_tangents else self.L
-
-    @property
-    def _matrix_lanes(self) -> int:
-        """Lanes of a matrix's entries; all tangents have the same matrix."""
-        return 1 if self.has_tangents else self.L
-
-    @property
-    def _vector_lanes(self) -> int:
-        """Lanes of a number that multiplies a matrix's column."""
-        return self.L if self.has_tangents else self.P
+        return 1 if self.batch else self.L
 
     # numbers from outside
 
@@ -148,8 +136,8 @@ class Memory:
 
     def _column(self, array: Array, rows: int, column: int = 0, j: int | Index = 0) -> list[Value]:
         """Return the vectors of a column of a matrix."""
-        first, lanes = column * self._padded(rows), self.L if array.is_tangent else self._matrix_lanes
-        return [self._get(array, first + row, j, lanes) for row in self._blocks(rows)]
+        first = column * self._padded(rows)
+        return [self._get(array, first + row, j, self.L) for row in self._blocks(rows)]
 
     def _set_column(self, values: list[Value], array: Array, rows: int, column: int = 0, j: Any = 0) -> None:
         first = column * self._padded(rows)
