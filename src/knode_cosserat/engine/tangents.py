@@ -348,7 +348,12 @@ class TangentCode(EliminationCode):
 
         def by_unknowns(target: Array, j: Any, source: Array, g: Any, is_negative: bool) -> list[Operation]:
             return [
-                Add(Number(target, i, j), Number(source, c, g), self._entry_at(self.X, ny, i, c, j), is_negative)
+                Add(
+                    Number(target, i, j),
+                    Number(source, c, g),
+                    self._entry_at(self.X, ny, i, c, j),
+                    is_negative,
+                )
                 for i, c in np.ndindex(ny, k)
             ]
 
@@ -357,7 +362,10 @@ class TangentCode(EliminationCode):
             pivots = [
                 operation
                 for c, pivot in enumerate(self.pivots)
-                for operation in (Clear(Number(t.beta, c, g)), Add(Number(t.beta, c, g), Number(t.w, pivot, last)))
+                for operation in (
+                    Clear(Number(t.beta, c, g)),
+                    Add(Number(t.beta, c, g), Number(t.w, pivot, last)),
+                )
             ]
             return [
                 Loop(g.value * size, (g.value + 1) * size, piece), *pivots,
@@ -634,7 +642,10 @@ class CotangentCore(TangentCode):
             self._put(self._get(self.parameter, k) + values_of[node], self.parameter, k)
         with self._places(self.pieces) as j:
             self._write_wide(
-                self._wide(self.length_of_piece, 0, j) + self._wide(t.lengths, 0, j), self.length_of_piece, 0, j
+                self._wide(self.length_of_piece, 0, j) + self._wide(t.lengths, 0, j),
+                self.length_of_piece,
+                0,
+                j,
             )
 
     def _write_geometry(self) -> None:
@@ -651,7 +662,9 @@ class CotangentCore(TangentCode):
     def _write_cotangents(self) -> None:
         """Cotangents of a step's data from those of its results."""
         e, t = self.equations, self.tangents
-        self.step = f = self._function("step", "state", "coefficients", "control", "row", "unknowns", "n_columns")
+        self.step = f = self._function(
+            "step", "state", "coefficients", "control", "row", "unknowns", "n_columns"
+        )
         memory, state, coefficients, control, row, unknowns, width = f.arguments
         with f.loop(len(self.grid.nodes)) as node:
             at = f.pointer(row, node.value * width * e.numbers)
@@ -751,7 +764,13 @@ def _callable(address: int, pointers: int, numbers: int) -> Any:
 
 
 def _data_of(
-    f: Function, step: Index, coefficients: Value, controls: Value, rows: Value, unknowns: Value, code: TangentCode
+    f: Function,
+    step: Index,
+    coefficients: Value,
+    controls: Value,
+    rows: Value,
+    unknowns: Value,
+    code: TangentCode,
 ) -> tuple[Value, Value, Value, Value]:
     """Return the addresses of a step's coefficients, control, row and unknowns."""
     e = code.equations
@@ -775,9 +794,14 @@ def _products(
     ]
 
 
-def _copies(size: int, target: tuple[Array, Any], source: tuple[Array, Any], first: int = 0) -> list[Operation]:
+def _copies(
+    size: int, target: tuple[Array, Any], source: tuple[Array, Any], first: int = 0
+) -> list[Operation]:
     """Copy components from `first` on; each has an array and a place."""
     found = list[Operation]()
     for i in range(first, first + size):
-        found += [Clear(Number(target[0], i, target[1])), Add(Number(target[0], i, target[1]), Number(source[0], i, source[1]))]
+        found += [
+            Clear(Number(target[0], i, target[1])),
+            Add(Number(target[0], i, target[1]), Number(source[0], i, source[1])),
+        ]
     return found
