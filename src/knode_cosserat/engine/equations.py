@@ -217,13 +217,13 @@ class TangentEquations(Equations):
         }
         outputs = [node for nodes in self.pulled.values() for node in nodes]
         self.pulled_terms = self._hoisted(outputs, {STEP, RUN})
-        #: cotangents of the parameters from those of the terms, and from those of places and lengths of pieces
-        self.dterms = program.inputs("cotangent of term", (len(self.moving_terms),), STEP)
-        self.dplaces = program.inputs("cotangent of place", places.shape, RUN)
-        self.dlengths = program.inputs("cotangent of length", self.geometry[3].shape, RUN)
-        self.by_terms = program.gradient(self.moving_terms, self.dterms, moved)
+        #: cotangents of the parameters from those of the terms, and of places and lengths of pieces
+        self.of_terms = program.inputs("cotangent of term", (len(self.moving_terms),), STEP)
+        self.of_places = program.inputs("cotangent of place", places.shape, RUN)
+        self.of_lengths = program.inputs("cotangent of length", self.geometry[3].shape, RUN)
+        self.by_terms = program.gradient(self.moving_terms, self.of_terms, moved)
         self.by_geometry = program.gradient(
-            [*places, *self.geometry[3]], [*self.dplaces, *self.dlengths], moved
+            [*places, *self.geometry[3]], [*self.of_places, *self.of_lengths], moved
         )
 
     def _nonzeros(self, outputs: Any, variables: Any) -> Nonzeros:
@@ -282,7 +282,7 @@ class Elimination:
         self.r = program.inputs("r", (n,), 1)
         #: B⁻¹ r, and the nonzeros of B⁻¹ A
         self.solved, self.nonzero = [int(node) for node in self.r], np.not_equal(A, zero)
-        #: these operations one by one: x[i] -= factor x[j] or, if i = j, x[i] *= factor, with the factor's node
+        #: these operations in turn, with the factor's node: x[i] -= factor x[j] or, if i = j, x[i] *= factor
         self.substitution: list[tuple[int, int, int]] = []
 
         def eliminate(i: int, others: Sequence[int]) -> None:

@@ -101,23 +101,25 @@ def write(memory: Memory, operations: Sequence[Operation], lanes: int, transpose
 def _write_straight(memory: Memory, operations: Sequence[Add | Scale | Clear], lanes: int) -> None:
     """Write operations without loops: each number is read once and written once."""
     values: dict[Any, Value | None] = {}
-    changed: dict[Any, Number] = {}
+    changed: dict[Any, tuple[Array, int, int | Index]] = {}
 
     def get(number: Number) -> Value | None:
         """Return the value of a number; None is zero."""
         if number.key not in values:
-            values[number.key] = None if number.array is None else memory._get(*number, lanes)
+            array, i, j = number
+            values[number.key] = None if array is None else memory._get(array, i, j, lanes)
         return values[number.key]
 
     def times(coefficient: Coefficient, value: Value) -> Value:
         if isinstance(coefficient, Number):
-            coefficient = memory._get(*coefficient, 1)
+            assert coefficient.array is not None
+            coefficient = memory._get(coefficient.array, coefficient.i, coefficient.j, 1)
         return value if coefficient == 1.0 else coefficient * value
 
     for operation in operations:
         target = operation.target
         if target.array is not None:
-            changed[target.key] = target
+            changed[target.key] = target.array, target.i, target.j
         if isinstance(operation, Clear):
             values[target.key] = None
             continue
@@ -133,6 +135,6 @@ def _write_straight(memory: Memory, operations: Sequence[Add | Scale | Clear], l
             values[target.key] = -product if operation.is_negative else product
         else:
             values[target.key] = value - product if operation.is_negative else value + product
-    for key, number in changed.items():
+    for key, place in changed.items():
         value = values[key]
-        memory._put(0.0 if value is None else value, *number, lanes)
+        memory._put(0.0 if value is None else value, *place, lanes)

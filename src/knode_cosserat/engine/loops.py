@@ -27,6 +27,7 @@ MOST_CORES = 100
 _COMPILING = threading.Lock()
 
 AnyCore = TypeVar("AnyCore", Core, TangentCore, CotangentCore)
+AnyTangents = TypeVar("AnyTangents", TangentCore, CotangentCore)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,7 +40,7 @@ class Pattern:
 
     @classmethod
     def of(cls, system: System) -> Self:
-        """Return the pattern of a system; in a batch of them, zeros are those of all. Traced leaves are none."""
+        """Return the pattern of a system; zeros of a batch are those of all, and no traced value is one."""
         leaves, structure = jax.tree.flatten(system)
         axis, zeros = np.ndim(system.length), []
         for leaf in leaves:
@@ -69,12 +70,12 @@ def core_of(system: System, settings: Settings, robots: bool) -> Core:
 
 
 def tangents_for(
-    kind: type[AnyCore], pattern: Pattern, settings: Settings, moving: Sequence[np.ndarray]
-) -> AnyCore:
-    """Return the core of tangents or cotangents of systems of a pattern, with masks of `moving` parameters."""
+    kind: type[AnyTangents], pattern: Pattern, settings: Settings, moving: Sequence[np.ndarray]
+) -> AnyTangents:
+    """Return the core of tangents or cotangents of a pattern, with masks of `moving` parameters."""
     key = pattern, _masks(moving), settings.space, settings.uses_rate, kind
 
-    def build() -> AnyCore:
+    def build() -> AnyTangents:
         require_covered(pattern.system, settings)
         return kind(pattern.system, settings, moving)
 
@@ -163,7 +164,8 @@ def tangent_loop(
     (system, controls), ((directions, weights), d_controls) = at, changes
     leaves = [np.asarray(leaf, float) for leaf in jax.tree.leaves(system)]
     if directions is None:
-        stacked, weights = [np.zeros((0, *leaf.shape)) for leaf in leaves], np.zeros((0, d_controls.shape[-1]))
+        stacked = [np.zeros((0, *leaf.shape)) for leaf in leaves]
+        weights = np.zeros((0, d_controls.shape[-1]))
     else:
         stacked = [np.asarray(leaf, float) for leaf in jax.tree.leaves(directions)]
     moving = [np.any(leaf != 0.0, axis=0) for leaf in stacked]
@@ -188,7 +190,7 @@ def table_of(settings: Settings, steps: StepCoefficients, count: int, t0: float)
 
 
 def at_all_stages(system: System, settings: Settings, values: Any) -> np.ndarray:
-    """Return controls (solves, c, ...) of all stages from those of steps (T, c, ...) or (T, stages * c, ...)."""
+    """Return controls (solves, c, ...) of all stages from (T, c, ...) or (T, stages * c, ...)."""
     values, size = np.asarray(values, float), system.control_size
     if values.shape[1] > size:
         return values.reshape(-1, size, *values.shape[2:])

@@ -93,7 +93,9 @@ class Memory:
         if self.batch or array.is_tangent:
             shape, axes = (array.count, array.size, self.L), (0, 3, 1, 2)
         at = array.offset - first
-        return memory[:, at : at + shape[0] * shape[1] * shape[2]].reshape(len(memory), *shape).transpose(axes)
+        return (
+            memory[:, at : at + shape[0] * shape[1] * shape[2]].reshape(len(memory), *shape).transpose(axes)
+        )
 
     def _put_in(self, memory: np.ndarray, array: Array, values: np.ndarray, first: int = 0) -> None:
         """Write values (m, lanes, places, size); the last place is repeated in the lanes beyond it."""

@@ -441,11 +441,16 @@ class Program:
         return np.array(entries, dtype=np.int64).reshape(len(rows), len(variables))
 
     def gradient(
-        self, outputs: Sequence[int] | Nodes, cotangents: Sequence[int] | Nodes, variables: Sequence[int]
-    ) -> list[int]:
-        """Return the cotangents of independent nodes from those of the outputs: a product λᵀ·J."""
+        self, outputs: Sequence[int] | Nodes, cotangents: Sequence[int] | Nodes,
+        variables: Sequence[int] | Nodes,
+        linear: bool = False,
+    ) -> list[int]:  # fmt: skip
+        """Return the cotangents of independent nodes from those of the outputs: a product λᵀ·J.
+
+        Outputs that are `linear` in the variables are differentiated as they are evaluated, without rules.
+        """
         zero, independent = self.constant(0.0), set(map(int, variables))
-        dependent = self.dependent(outputs, variables)
+        dependent = self.dependent(outputs, variables, linear)
         firsts: dict[int, int] = {}
         for node in sorted(dependent):
             firsts.setdefault(id(self.rules.get(node)), node)
@@ -459,7 +464,7 @@ class Program:
             add(int(node), int(cotangent))
         for node in sorted(dependent, reverse=True):
             name, *arguments = self.operations[node]
-            own, rule = found.get(node), self.rules.get(node)
+            own, rule = found.get(node), None if linear else self.rules.get(node)
             if node in independent:
                 continue
             if rule is not None:
@@ -467,10 +472,8 @@ class Program:
                 if node == firsts[id(rule)]:
                     active, product = self._product(rule)
                     results = [found.get(each, zero) for each in _flat(rule.results)]
-                    pulled = self.gradient(product.outputs, results, product.inputs)
-                    for each, cotangent in zip(
-                        _flat(rule.arguments[k] for k in active), pulled, strict=True
-                    ):
+                    pulled = self.gradient(product.outputs, results, product.inputs, linear=True)
+                    for each, cotangent in zip(_flat(rule.arguments[k] for k in active), pulled, strict=True):
                         add(each, cotangent)
             elif own is None:
                 continue
@@ -482,16 +485,21 @@ class Program:
                 for argument, partial in zip(arguments, PARTIALS[name], strict=True):
                     if argument in dependent:
                         add(argument, self.apply("mul", self._partial(partial, node), own))
-            elif name == "loop":
-                raise self._loop_error(node)
+            elif name == "hold" and linear:
+                add(arguments[0], own)
+            elif name == "result":
+                raise self._loop_error(arguments[0])
         return [found.get(int(node), zero) for node in variables]
 
-    def dependent(self, outputs: Sequence[int] | Nodes, variables: Sequence[int] | Nodes) -> set[int]:
-        """Return the nodes between variables and outputs, with both, that move with the variables."""
+    def dependent(
+        self, outputs: Sequence[int] | Nodes, variables: Sequence[int] | Nodes, linear: bool = False
+    ) -> set[int]:
+        """Return the nodes from variables to outputs that move with the variables; see `gradient`."""
         independent, found = set(map(int, variables)), set[int]()
+        arguments = self.arguments if linear else self._differentiated
 
         def sources(node: int) -> Iterable[int]:
-            return () if node in independent else self._differentiated(node)
+            return () if node in independent else arguments(node)
 
         for node in self._order(outputs, sources):
             if node in independent or not found.isdisjoint(sources(node)):

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.engine.codegen import Function, Index, Value
+from knode_cosserat.engine.codegen import Index, Value
 from knode_cosserat.engine.elimination import EliminationCode
 from knode_cosserat.engine.equations import Nonzeros, TangentEquations
 from knode_cosserat.engine.linear import Add, Clear, Loop, Number, Operation, Scale, write
@@ -151,9 +151,9 @@ class TangentCode(EliminationCode):
         self.solution = f = self._function("solution", "row")
         memory, row = f.arguments
         with f.loop(len(self.grid.nodes)) as node:
-            at, point = f.pointer(row, node.value * e.numbers), self._node(node)
+            at, here = f.pointer(row, node.value * e.numbers), self._node(node)
             for i in range(e.ny):
-                self._put(f.load(at, i), self.y, i, point)
+                self._put(f.load(at, i), self.y, i, here)
         if not len(grid.between):
             return
         for point in map(int, grid.between):
@@ -347,26 +347,17 @@ class TangentCode(EliminationCode):
             return found
 
         def by_unknowns(target: Array, j: Any, source: Array, g: Any, is_negative: bool) -> list[Operation]:
-            return [
-                Add(
-                    Number(target, i, j),
-                    Number(source, c, g),
-                    self._entry_at(self.X, ny, i, c, j),
-                    is_negative,
-                )
-                for i, c in np.ndindex(ny, k)
-            ]
+            found = list[Operation]()
+            for i, c in np.ndindex(ny, k):
+                entry = self._entry_at(self.X, ny, i, c, j)
+                found.append(Add(Number(target, i, j), Number(source, c, g), entry, is_negative))
+            return found
 
         def group(g: Index) -> list[Operation]:
             last = self._now.index((g.value + 1) * size)
-            pivots = [
-                operation
-                for c, pivot in enumerate(self.pivots)
-                for operation in (
-                    Clear(Number(t.beta, c, g)),
-                    Add(Number(t.beta, c, g), Number(t.w, pivot, last)),
-                )
-            ]
+            pivots = list[Operation]()
+            for c, pivot in enumerate(self.pivots):
+                pivots += [Clear(Number(t.beta, c, g)), Add(Number(t.beta, c, g), Number(t.w, pivot, last))]
             return [
                 Loop(g.value * size, (g.value + 1) * size, piece), *pivots,
                 *by_unknowns(t.w, last, t.beta, g, True),
@@ -409,6 +400,13 @@ class TangentCode(EliminationCode):
         return Number(matrix, c * self._padded(rows) + i, j)
 
     # running
+
+    def _data_of(self, step: Index, coefficients: Value, *data: Value) -> list[Value]:
+        """Return the addresses of a step's coefficients, and of its control, row and unknowns."""
+        f, e = self._now, self.equations
+        sizes = e.nc, len(self.grid.nodes) * e.numbers, e.k
+        found = [f.pointer(each, step.value * size) for each, size in zip(data, sizes, strict=True)]
+        return [f.pointer(coefficients, step.value * 5), *found]
 
     def _begun(
         self, parameters: np.ndarray, solved: tuple[Any, Any], controls: Any, table: Any,
@@ -506,7 +504,7 @@ class TangentCore(TangentCode):
         d_controls, d_rows, d_unknowns, steps, count, width = f.arguments[8:]
         f.call(self.setup, memory)
         with f.loop(steps) as step:
-            table, control, row, unknown = _data_of(f, step, coefficients, controls, rows, unknowns, self)
+            table, control, row, unknown = self._data_of(step, coefficients, controls, rows, unknowns)
             f.call(self.data, memory, table, control, unknown)
             f.call(self.solution, memory, row)
             f.call(self.derivatives, memory)
@@ -636,24 +634,20 @@ class CotangentCore(TangentCode):
                 here[int(node)] = self._get(self.results[name], i)
             values = self._evaluated(e.pulled[name], 0, False, here | known)
             sums = [a + b for a, b in zip(sums, values, strict=False)]
-        given = terms | {int(node): each for node, each in zip(e.dterms, sums, strict=True)}
+        given = terms | {int(node): each for node, each in zip(e.of_terms, sums, strict=True)}
         values_of = f.evaluate(e.program, e.by_terms, given, 1)
         for k, node in enumerate(e.by_terms):
             self._put(self._get(self.parameter, k) + values_of[node], self.parameter, k)
         with self._places(self.pieces) as j:
-            self._write_wide(
-                self._wide(self.length_of_piece, 0, j) + self._wide(t.lengths, 0, j),
-                self.length_of_piece,
-                0,
-                j,
-            )
+            total = self._wide(self.length_of_piece, 0, j) + self._wide(t.lengths, 0, j)
+            self._write_wide(total, self.length_of_piece, 0, j)
 
     def _write_geometry(self) -> None:
         """Add the cotangents of parameters from those of places and lengths: once a run."""
         e = self.equations
         self.by_geometry = f = self._function("by_geometry", "state")
         known = self._parameters()
-        for nodes, array in ((e.dplaces, self.place), (e.dlengths, self.length_of_piece)):
+        for nodes, array in ((e.of_places, self.place), (e.of_lengths, self.length_of_piece)):
             known |= {int(node): self._get(array, 0, k) for k, node in enumerate(nodes)}
         values = f.evaluate(e.program, e.by_geometry, known, 1)
         for k, node in enumerate(e.by_geometry):
@@ -702,14 +696,14 @@ class CotangentCore(TangentCode):
 
         f.call(self.setup, memory)
         with f.loop(steps) as step:
-            table, control, row, unknown = _data_of(f, step, coefficients, controls, rows, unknowns, self)
+            table, control, row, unknown = self._data_of(step, coefficients, controls, rows, unknowns)
             f.call(self.data, memory, table, control, unknown)
             f.call(self.solution, memory, row)
             copy(step, True)
             f.call(self.recorded, memory)
             f.call(self.shift, memory, table)
         with f.loop(0, steps - 1, -1) as step:
-            table, control, row, unknown = _data_of(f, step, coefficients, controls, rows, unknowns, self)
+            table, control, row, unknown = self._data_of(step, coefficients, controls, rows, unknowns)
             copy(step, False)
             f.call(self.data, memory, table, control, unknown)
             f.call(self.derivatives, memory)
@@ -763,23 +757,6 @@ def _callable(address: int, pointers: int, numbers: int) -> Any:
     return ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * pointers, *[ctypes.c_long] * numbers)(address)
 
 
-def _data_of(
-    f: Function,
-    step: Index,
-    coefficients: Value,
-    controls: Value,
-    rows: Value,
-    unknowns: Value,
-    code: TangentCode,
-) -> tuple[Value, Value, Value, Value]:
-    """Return the addresses of a step's coefficients, control, row and unknowns."""
-    e = code.equations
-    return (
-        f.pointer(coefficients, step.value * 5), f.pointer(controls, step.value * e.nc),
-        f.pointer(rows, step.value * (len(code.grid.nodes) * e.numbers)), f.pointer(unknowns, step.value * e.k),
-    )  # fmt: skip
-
-
 def _nodes(nonzeros: Nonzeros) -> list[int]:
     return [node for *_, node in nonzeros]
 
@@ -800,8 +777,6 @@ def _copies(
     """Copy components from `first` on; each has an array and a place."""
     found = list[Operation]()
     for i in range(first, first + size):
-        found += [
-            Clear(Number(target[0], i, target[1])),
-            Add(Number(target[0], i, target[1]), Number(source[0], i, source[1])),
-        ]
+        number = Number(target[0], i, target[1])
+        found += [Clear(number), Add(number, Number(source[0], i, source[1]))]
     return found

@@ -3,8 +3,8 @@
 Three primitives solve all steps, and map tangents of their data to those of their results, and cotangents
 back. They run in the engine, by callbacks with NumPy only, or in JAX where the engine does not cover them.
 
-Arrays of a primitive have robots as first axis, and tangents columns as second axis. One system for all robots
-has one entry there. A batch of tangents of the same robots is more columns.
+Arrays of a primitive have robots as first axis, and tangents columns as second axis. One system for all
+robots has one entry there. A batch of tangents of the same robots is more columns.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def _primitive(
 ) -> Primitive:  # fmt: skip
     """Return a primitive with results of some shapes.
 
-    `core` compiles code for the shapes of the operands, before the program runs; `run` evaluates the results by it.
+    `core` compiles code for the operands, before the program runs; `run` evaluates results by it.
     """
     primitive = Primitive(name)
     primitive.multiple_results = True
@@ -114,13 +114,13 @@ def _spread(x: Any, axis: Any, size: int) -> Any:
 
 def _joined(x: Any, robots: int) -> Any:
     """Return an array (batch, robots or 1, ...) with one axis for both."""
-    x = jnp.broadcast_to(x, (x.shape[0], robots, *x.shape[2:]))
-    return x.reshape(-1, *x.shape[2:])
+    size = x.shape[0]
+    return jnp.broadcast_to(x, (size, robots, *x.shape[2:])).reshape(size * robots, *x.shape[2:])
 
 
-def _divided(x: Any, size: int) -> Any:
+def _divided(x: Any, robots: int) -> Any:
     """Return an array with its first axis divided into a batch and robots."""
-    return x.reshape(size, -1, *x.shape[1:])
+    return x.reshape(x.shape[0] // robots, robots, *x.shape[1:])
 
 
 def _as_robots(spec: Solves, operands: Arrays, axes: Arrays, robots: int) -> list[Any]:
@@ -185,7 +185,7 @@ solve_p = _primitive("solve", _solved_shapes, _core_of_solves, _solve, _solve_in
 def _batched_solve(operands: Arrays, axes: Arrays, *, spec: Solves) -> Any:
     robots = _robots(operands[spec.leaves], axes[spec.leaves])
     found = solve_p.bind(*_as_robots(spec, operands, axes, robots), spec=spec)
-    return [_divided(x, x.shape[0] // robots) for x in found], [0] * len(found)
+    return [_divided(x, robots) for x in found], [0] * len(found)
 
 
 def _robots(x: Any, axis: Any) -> int:
@@ -224,7 +224,7 @@ def _core_of_linear(kind: Any, spec: Solves, *operands: Any) -> Any:
 
 
 def _each_robot(function: Callable[..., Any], spec: Solves, arrays: Arrays) -> list[np.ndarray]:
-    """Return results of a function of the parameters, coefficients, solved rows, controls, states and tangents.
+    """Return results of a function of each robot's parameters, solved steps, and tangents.
 
     Tangents and results have columns as the last axis in the function, and as the first one here.
     """
@@ -280,8 +280,8 @@ def _pull(core: CotangentCore, spec: Solves, *arrays: np.ndarray) -> list[np.nda
 
 def _push_in_jax(spec: Solves, *operands: Any) -> list[Any]:
     task, n = spec.task, _residuals(spec)
-    leaves, given = operands[: spec.leaves], operands[spec.leaves :]
-    leaves = [jnp.broadcast_to(leaf, (operands[-1].shape[0], *leaf.shape[1:])) for leaf in leaves]
+    robots = operands[-1].shape[0]
+    leaves = [jnp.broadcast_to(leaf, (robots, *leaf.shape[1:])) for leaf in operands[: spec.leaves]]
 
     def one(own: Any) -> Any:
         *leaves, controls, records, rate, t0, rows, unknowns = own[:n]
@@ -294,14 +294,16 @@ def _push_in_jax(spec: Solves, *operands: Any) -> list[Any]:
                 for leaf, moves in zip(leaves, spec.moving, strict=True)
             ]
             moves = SystemMoves(spec.of_system(directions), np.eye(columns))
-        d_controls, *d_states = (jnp.moveaxis(each, 0, -1) for each in (d_controls, d_records, d_rate))
+        d_controls, d_records, d_rate = (
+            jnp.moveaxis(each, 0, -1) for each in (d_controls, d_records, d_rate)
+        )
         after, found = tangent_loop_in_jax(
             task.settings, task.coefficients, (rows, unknowns), (spec.of_system(leaves), controls),
-            (moves, d_controls), TangentState(records, rate, *d_states, t0),
+            (moves, d_controls), TangentState(records, rate, d_records, d_rate, t0),
         )  # fmt: skip
         return [jnp.moveaxis(each, -1, 0) for each in (*found, after.d_records, after.d_rate)]
 
-    return jax.lax.map(one, [*leaves, *given])
+    return jax.lax.map(one, [*leaves, *operands[spec.leaves :]])
 
 
 def _pull_in_jax(spec: Solves, *operands: Any) -> list[Any]:
@@ -325,16 +327,14 @@ def _batched_linear(primitive: Primitive, operands: Arrays, axes: Arrays, *, spe
     n, robots = _residuals(spec), _robots(operands[-1], axes[-1])
     if all(axis is None for axis in axes[:n]):
         size = next(np.shape(x)[axis] for x, axis in zip(operands, axes, strict=True) if axis is not None)
-        columns = [
-            jnp.moveaxis(_spread(x, axis, size), 0, 1).reshape(
-                robots, -1, *np.shape(x)[2 + (axis is not None) :]
-            )
-            for x, axis in zip(operands[n:], axes[n:], strict=True)
-        ]
+        columns = []
+        for x, axis in zip(operands[n:], axes[n:], strict=True):
+            own = jnp.moveaxis(_spread(x, axis, size), 0, 1)
+            columns.append(own.reshape(robots, size * own.shape[2], *own.shape[3:]))
         found = primitive.bind(*operands[:n], *columns, spec=spec)
-        return [x.reshape(robots, size, -1, *x.shape[2:]) for x in found], [1] * len(found)
+        return [x.reshape(robots, size, x.shape[1] // size, *x.shape[2:]) for x in found], [1] * len(found)
     found = primitive.bind(*_as_robots(spec, operands, axes, robots), spec=spec)
-    return [_divided(x, x.shape[0] // robots) for x in found], [0] * len(found)
+    return [_divided(x, robots) for x in found], [0] * len(found)
 
 
 def _tangents_of_linear(
@@ -375,8 +375,8 @@ def rollout(
 
     @jax.custom_jvp
     def run(system: System, controls: Any, past: StateHistory) -> tuple[StepRows, StateHistory]:
-        done, last, rows = _solved(Solves(task, pattern), system, controls, past)
-        last = StateHistory(*last)._replace(t0=past.t0 + task.steps * task.dt)
+        done, found, rows = _solved(Solves(task, pattern), system, controls, past)
+        last = StateHistory(*found)._replace(t0=past.t0 + task.steps * task.dt)
         return rows, jax.tree.map(lambda x: jnp.where(done < task.steps, jnp.nan, x), last)
 
     def tangent(primals: Any, tangents: Any) -> Any:
@@ -447,18 +447,8 @@ def _pushed(
         each.reshape(task.steps, task.settings.stages, *each.shape[1:]) for each in (d_records, d_unknowns)
     )
     whole, zero = np.zeros(rows.result.shape, dtype=jax.dtypes.float0), jnp.zeros_like(rows.error)
-    d_rows = StepRows(
-        d_records[:, -1],
-        d_unknowns[:, -1],
-        zero,
-        whole,
-        zero,
-        whole,
-        zero,
-        d_records[:, :-1],
-        d_unknowns[:, :-1],
-    )
-    return d_rows, *after
+    last, stages = (d_records[:, -1], d_unknowns[:, -1]), (d_records[:, :-1], d_unknowns[:, :-1])
+    return StepRows(*last, zero, whole, zero, whole, zero, *stages), *after
 
 
 def _one_robot(x: Any) -> Any:
