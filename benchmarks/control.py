@@ -40,9 +40,10 @@ def costs() -> dict[str, Any]:
 
     from knode_cosserat.control import circle
     from knode_cosserat.control.prediction import linearised_prediction
+    from knode_cosserat.engine.loops import Pattern
     from knode_cosserat.estimation.online import Spread, errors_of
+    from knode_cosserat.solvers.rollout import rollout
     from knode_cosserat.solvers.run import TimeIntegration
-    from knode_cosserat.solvers.sensitivity import rollout
     from knode_cosserat.studies.control_cases import DT, nominal_robot, predictive
 
     controller = predictive(nominal_robot())
@@ -57,7 +58,8 @@ def costs() -> dict[str, Any]:
 
     @jax.jit
     def errors(plan: Any) -> Any:
-        rows, _ = rollout(task)(model.at(belief.x), basis @ plan, belief.past)
+        system = model.at(belief.x)
+        rows, _ = rollout(task, Pattern.of(system))(system, basis @ plan, belief.past)
         return errors_of(model.robot, controller.target, rows.records, wanted)
 
     by_jax = jax.jit(jax.jacfwd(errors))

@@ -1,6 +1,9 @@
 """Emitted tangents of motions: differences of motions, and the same linear equations in JAX."""
 
+import functools
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -10,11 +13,14 @@ from knode_cosserat.engine.program import EngineError
 from knode_cosserat.estimation.adapted import Adapted, AdaptedParameters
 from knode_cosserat.estimation.online import OnlineModel
 from knode_cosserat.rods.loads import AttachedMass, PointWrench
-from knode_cosserat.solvers import sensitivity
+from knode_cosserat.solvers import rollout, sensitivity
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.history import resting_history
+from knode_cosserat.solvers.run import Equilibria, TimeIntegration
 from knode_cosserat.solvers.sensitivity import TangentState, tangent_loop_in_jax, tangent_time_loop
 from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.space import LOBATTO2
+from knode_cosserat.solvers.static_loop import unloaded_shape
 from knode_cosserat.solvers.tangent import SystemMoves
 from knode_cosserat.solvers.time_loop import StepCoefficients
 from tests.engine.networks import with_network
@@ -131,6 +137,103 @@ def test_tangents_equal_those_in_jax(monkeypatch):
         one = np.asarray(one)
         assert np.shape(other) == one.shape
         np.testing.assert_allclose(other, one, atol=1e-9 * max(np.max(np.abs(one)), 1e-300))
+
+
+def assert_transposed(function, at, along):
+    """⟨v, J u⟩ = ⟨Jᵀ v, u⟩, and the part of each argument by itself."""
+    results, pull = jax.vjp(function, *at)
+    for k in range(len(at)):
+        own = [jax.tree.map(np.zeros_like, each) if i != k else each for i, each in enumerate(along)]
+        moved = jax.jvp(function, at, tuple(own))[1]
+        rng = np.random.default_rng(k)
+        # components have different units
+        v = [rng.normal(size=each.shape) / max(float(np.max(np.abs(each))), 1e-12) for each in moved]
+        products = np.concatenate([np.ravel(a * b) for a, b in zip(v, moved, strict=True)])
+        pulled = zip(*map(jax.tree.leaves, (pull(v), tuple(own))), strict=True)
+        found = sum(float(np.sum(np.asarray(a) * np.asarray(b))) for a, b in pulled)
+        assert np.max(np.abs(products)) > 0.1
+        assert found == pytest.approx(float(np.sum(products)), abs=1e-10 * np.sum(np.abs(products)))
+    assert all(np.all(np.isfinite(each)) for each in results)
+
+
+@pytest.mark.parametrize(
+    ("name", "scheme"),
+    [(PAPER, "bdf-alpha"), (ROUTED, "sdirk2"), (ROUTED, "bdf-alpha"), (CURVED, "bdf-alpha")],
+)
+def test_cotangents_are_those_of_the_transposed_map(name, scheme, monkeypatch):
+    monkeypatch.setattr(rollout, "tangent_loop_in_jax", None)
+    motion = Motion(name, scheme)
+    task = TimeIntegration(motion.settings, DT, STEPS)
+    run = rollout.rollout(task, loops.Pattern.of(motion.robot))
+
+    def results(robot, controls, records, rate):
+        rows, last = run(robot, controls, motion.past._replace(records=records, rate=rate))
+        return [*rows.every_stage, last.records, last.rate]
+
+    rng = np.random.default_rng(1)
+    at = motion.robot, motion.controls, motion.past.records, motion.past.rate
+    along = (
+        jax.tree.map(lambda x: 0.1 * x * rng.normal(size=np.shape(x)), motion.robot),
+        *(0.1 * rng.normal(size=x.shape) for x in at[1:]),
+    )
+    if not motion.settings.uses_rate:
+        results, at, along = functools.partial(results, rate=at[3]), at[:3], along[:3]
+    assert_transposed(results, at, along)
+
+
+def test_cotangents_of_equilibria(monkeypatch):
+    monkeypatch.setattr(rollout, "tangent_loop_in_jax", None)
+    robot, controls = kc.load_robot(ROUTED), np.random.default_rng(0).uniform(2.0, 5.0, (3, 4))
+    run = rollout.static_rollout(Equilibria(Settings(None), 3), loops.Pattern.of(robot))
+    y, rng = unloaded_shape(robot, LOBATTO2), np.random.default_rng(1)
+    along = jax.tree.map(lambda x: 0.1 * x * rng.normal(size=np.shape(x)), robot), rng.normal(size=(3, 4))
+    assert_transposed(lambda *at: [*run(*at, y)[:2]], (robot, controls), along)
+
+
+@pytest.fixture(scope="module")
+def tip_height():
+    robot = kc.load_robot(PAPER)
+
+    def function(stiffness, tensions):
+        moved = robot.replace(youngs_modulus=stiffness * robot.youngs_modulus)
+        return kc.simulate(moved, tensions, DT, time="bdf2").tip_position[-1, 2]
+
+    return function, np.random.default_rng(0).uniform(2.0, 5.0, (3, STEPS, 4))
+
+
+def test_gradients_are_differences_and_run_in_the_engine(tip_height, monkeypatch):
+    for name in ("tangent_loop_in_jax", "loop_one"):
+        monkeypatch.setattr(rollout, name, None)
+    function, tensions = tip_height
+    found, eps = jax.jit(jax.grad(function, (0, 1)))(1.0, tensions[0]), 1e-4
+    slope = (function(1.0 + eps, tensions[0]) - function(1.0 - eps, tensions[0])) / (2.0 * eps)
+    assert float(found[0]) == pytest.approx(float(slope), rel=1e-6)
+    direction = np.random.default_rng(1).normal(size=tensions[0].shape)
+    ends = [function(1.0, tensions[0] + part * direction) for part in (eps, -eps)]
+    slope = float(ends[0] - ends[1]) / (2.0 * eps)
+    assert float(np.sum(found[1] * direction)) == pytest.approx(slope, rel=1e-6)
+
+
+def test_transformations_agree_with_each_other(tip_height):
+    function, tensions = tip_height
+    one = np.asarray(jax.grad(function, 1)(1.0, tensions[0]))
+    size = 1e-9 * np.max(np.abs(one))
+    for transformation in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(transformation(function, 1)(1.0, tensions[0]), one, atol=size)
+    # Newton's tolerance lies between robots side by side and one by one
+    many = jax.jit(jax.vmap(jax.grad(function, 1), (None, 0)))(1.0, tensions)
+    np.testing.assert_allclose(many[0], one, atol=1e-6 * np.max(np.abs(one)))
+    total = jax.grad(lambda tensions: jnp.sum(jax.vmap(function, (None, 0))(1.0, tensions)))(tensions)
+    np.testing.assert_allclose(total, many, atol=size)
+    stiffness = np.array([1.0, 1.1, 0.9])
+    each = jax.vmap(jax.grad(function), (0, None))(stiffness, tensions[0])
+    wanted = [jax.grad(function)(value, tensions[0]) for value in stiffness]
+    np.testing.assert_allclose(each, wanted, rtol=1e-6)
+
+
+def test_unsolved_rows_are_nan(tip_height):
+    function, tensions = tip_height
+    assert np.isnan(jax.jit(function)(1.0, 1e7 * tensions[0]))
 
 
 def test_what_the_engine_does_not_cover_is_refused():

@@ -91,10 +91,8 @@ class EliminationCode(RodCode):
         """A piece's B⁻¹ r, of one column or of several one after the other."""
         f, el = self._function(name, "from", "to", "n_piece"), self.elimination
         _, source, target, piece = f.arguments
-        j, component = f.index(piece), self.L if self.has_tangents else self.r.component
-        known = {
-            int(node): self._get(self.factor, k, j, self._matrix_lanes) for k, node in enumerate(el.stored)
-        }
+        j, component = f.index(piece), self.r.component
+        known = {int(node): self._get(self.factor, k, j, self.L) for k, node in enumerate(el.stored)}
         n = len(el.r)
         every = []
         for c in range(columns):
@@ -156,12 +154,12 @@ class EliminationCode(RodCode):
         for i in range(count):
             f.store(f.load(source[0], i * source[1]), target[0], i * target[1])
 
-    def _write_advance(self, name: str = "advance") -> Function:
+    def _write_advance(self) -> Function:
         """A column at a piece's start to its end: B⁻¹ A x plus what is added."""
         el, n = self.elimination, self.equations.ny
-        f = self._function(name, "from", "added", "to", "n_piece")
+        f = self._function("advance", "from", "added", "to", "n_piece")
         _, source, added, target, piece = f.arguments
-        width, j, lanes = self._rows_at_once, f.index(piece), self._vector_lanes
+        width, j, lanes = self._rows_at_once, f.index(piece), self.P
         component = 1 if width > 1 else self.L
         x = [f.load(source, c * component, lanes) for c in range(n)]
         if self.batch:
@@ -178,7 +176,7 @@ class EliminationCode(RodCode):
             sums = [f.load(added, row * component, self.L), f.splat(f.value(0.0), self.L)]
             for c in range(n):
                 if el.nonzero[row : row + width, c].any():
-                    entry = self._get(self.matrix, c * self._padded(n) + row, j, self._matrix_lanes)
+                    entry = self._get(self.matrix, c * self._padded(n) + row, j, self.L)
                     sums = [sums[1], sums[0] + entry * x[c]]
             f.store(sums[0] + sums[1], target, row * component, self.L)
         return f
@@ -236,7 +234,7 @@ class EliminationCode(RodCode):
             with f.loop(tip.value, base + count * size) as j:
                 piece(j)
             M = [self._column(self.M, k, i, strand) for i in range(ny)]
-            component, lanes = self.X.component, self._vector_lanes
+            component, lanes = self.X.component, self.P
             for c in range(own):
                 x = f.pointer(*self._at(self.X, c * self._padded(ny), tip))
                 product = self._product(M, [f.load(x, i * component, lanes) for i in range(ny)])
@@ -249,7 +247,7 @@ class EliminationCode(RodCode):
         """Replace M X by its inverse: elimination of columns (Gauss-Jordan), without pivoting."""
         f, k, component = self._now, self.equations.k, self.inverse.component
         first, column = self._pointer(self.inverse, 0), self._padded(k) * component
-        rows, lanes = [row * component for row in self._blocks(k)], self._vector_lanes
+        rows, lanes = [row * component for row in self._blocks(k)], self.P
         with f.loop(k) as r:
             row, pivotal = f.pointer(first, r.value * component), f.pointer(first, r.value * column)
             scale = 1.0 / f.load(row, r.value * column, lanes)

@@ -221,10 +221,12 @@ Nonzeros = list[tuple[int, int, int]]
 class TangentEquations(Equations):
     """Programs of a system with all derivatives of rates and strains, jumps, tip and base."""
 
-    def __init__(self, system: System, moving: Sequence[np.ndarray]):
-        """Differentiate the equations by y, history, control, and the parameters that are `moving`."""
+    def __init__(self, system: System, moving: Sequence[np.ndarray], transposed: bool):
+        """Differentiate the equations by y, history, control, and the parameters that are `moving`.
+
+        By parameters: products of the derivatives with a direction or, if `transposed`, with cotangents.
+        """
         super().__init__(system, moving)
-        program = self.program
         results = {
             "rates": [*self.f, *self.z], "far": [*self.far] if system.jumps else [], "tip": [*self.tip],
             "base": [*self.base],
@@ -235,17 +237,50 @@ class TangentEquations(Equations):
         for nonzeros in (self.z_by_y, *self.by_history.values(), *self.by_control.values()):
             self._outputs += [node for *_, node in nonzeros]
         self._hoist()
-        moved = [nodes[moves] for nodes, moves in zip(self.parameters, moving, strict=True)]
-        self.dparameters = program.inputs("dparameter", (sum(map(len, moved)),), RUN, True)
-        tangents = dict(zip(np.concatenate(moved).tolist(), self.dparameters.tolist(), strict=True))
+        moved = np.concatenate([nodes[moves] for nodes, moves in zip(self.parameters, moving, strict=True)])
+        places = self.geometry[2][: grid_of(system, LOBATTO2).ends]
+        (self._pull if transposed else self._push)(results, moved, places)
+
+    def _push(self, results: dict[str, list[int]], moved: np.ndarray, places: np.ndarray) -> None:
+        program = self.program
+        self.dparameters = program.inputs("dparameter", moved.shape, RUN, True)
+        tangents = dict(zip(moved.tolist(), self.dparameters.tolist(), strict=True))
         #: tangents of places and of lengths of pieces
-        self.dplaces, self.dlengths = (program.derivative(nodes, tangents) for nodes in self.geometry[2:4])
+        self.dplaces, self.dlengths = (
+            program.derivative(nodes, tangents) for nodes in (places, self.geometry[3])
+        )
         self.ds = program.inputs("ds", (), PLACE)
         tangents[self.s.item()] = self.ds.item()
         #: tangents of the results by the system, at fixed y, history and control
         self.moved = {name: program.derivative(nodes, tangents) for name, nodes in results.items()}
         outputs = [node for nodes in self.moved.values() for node in nodes]
         self.moved_terms = self._hoisted(outputs, {STEP, RUN})
+
+    def _pull(self, results: dict[str, list[int]], moved: np.ndarray, places: np.ndarray) -> None:
+        program = self.program
+        #: cotangents of the results
+        self.cotangents = {
+            name: program.inputs(f"cotangent of {name}", (len(nodes),), STATE)
+            for name, nodes in results.items()
+        }
+        needed = self._hoisted([node for nodes in results.values() for node in nodes], {STEP, RUN})
+        #: terms of a step by which moving parameters act
+        self.moving_terms = sorted(program.dependent(needed, moved).intersection(needed))
+        #: cotangents of these terms and of the place, from those of the results at a place
+        self.pulled = {
+            name: program.gradient(nodes, self.cotangents[name], [*self.moving_terms, self.s.item()])
+            for name, nodes in results.items()
+        }
+        outputs = [node for nodes in self.pulled.values() for node in nodes]
+        self.pulled_terms = self._hoisted(outputs, {STEP, RUN})
+        #: cotangents of the parameters from those of the terms, and of places and lengths of pieces
+        self.of_terms = program.inputs("cotangent of term", (len(self.moving_terms),), STEP)
+        self.of_places = program.inputs("cotangent of place", places.shape, RUN)
+        self.of_lengths = program.inputs("cotangent of length", self.geometry[3].shape, RUN)
+        self.by_terms = program.gradient(self.moving_terms, self.of_terms, moved)
+        self.by_geometry = program.gradient(
+            [*places, *self.geometry[3]], [*self.of_places, *self.of_lengths], moved
+        )
 
     def _nonzeros(self, outputs: Any, variables: Any) -> Nonzeros:
         slopes = self.program.jacobian(outputs, variables)
@@ -331,19 +366,24 @@ class Elimination:
             B[i, j] = node
         #: nonzeros of B⁻¹ A
         self.nonzero = np.not_equal(A, zero)
+        #: B⁻¹ r in turn, with the factor's node: x[i] -= factor x[j] or, if i = j, x[i] *= factor
+        self.substitution: list[tuple[int, int, int]] = []
+        for turn, (i, others) in enumerate(
+            [(i, order[:at]) for at, i in enumerate(order)]
+            + [(i, order[at + 1 :]) for at, i in reversed(list(enumerate(order)))]
+        ):
+            for j in others:
+                if B[i, j] != zero:
+                    self.substitution.append((i, j, int(B[i, j])))
+                    self.nonzero[i] |= self.nonzero[j]
+            if turn >= n:
+                self.substitution.append((i, i, int(B[i, i])))
 
         def solve(right: list[int]) -> list[int]:
             """Return B⁻¹ times a vector."""
-            ways = [(i, order[:at]) for at, i in enumerate(order)]
-            ways += [(i, order[at + 1 :]) for at, i in reversed(list(enumerate(order)))]
-            for turn, (i, others) in enumerate(ways):
-                for j in others:
-                    if B[i, j] != zero:
-                        product = apply("mul", int(B[i, j]), right[j])
-                        right[i] = apply("sub", right[i], product)
-                        self.nonzero[i] |= self.nonzero[j]
-                if turn >= n:
-                    right[i] = apply("mul", right[i], int(B[i, i]))
+            for i, j, factor in self.substitution:
+                product = apply("mul", factor, right[j])
+                right[i] = product if i == j else apply("sub", right[i], product)
             return right
 
         self.r, self.x = program.inputs("r", (n,), 1), program.inputs("x", (n,), 1)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import threading
-from collections.abc import Callable, Iterable
-from typing import Any, TypeVar
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Self, TypeVar
 
 import jax
 import numpy as np
@@ -13,8 +14,8 @@ import numpy as np
 from knode_cosserat.engine.core import Constants, Core, Shape, States, coefficients_of
 from knode_cosserat.engine.equations import constant_zeros
 from knode_cosserat.engine.program import EngineError
-from knode_cosserat.engine.tangents import TangentCore
-from knode_cosserat.rods.system import System
+from knode_cosserat.engine.tangents import CotangentCore, TangentCode, TangentCore
+from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.solvers.problem import Evaluated
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import LOBATTO2
@@ -23,42 +24,84 @@ from knode_cosserat.solvers.time_loop import StepCoefficients, StepRows
 log = logging.getLogger(__name__)
 
 #: compiled cores, or the reason why there is none, by what their code depends on; the last used come last
-_CORES: dict[Any, Core | TangentCore | EngineError] = {}
+_CORES: dict[Any, Core | TangentCode | EngineError] = {}
 #: number of cores that a process keeps: a core takes some MB
 MOST_CORES = 100
 _COMPILING = threading.Lock()
 
-CoreOrTangents = TypeVar("CoreOrTangents", Core, TangentCore)
+AnyCore = TypeVar("AnyCore", Core, TangentCore, CotangentCore)
+AnyTangents = TypeVar("AnyTangents", TangentCore, CotangentCore)
+
+
+@dataclasses.dataclass(frozen=True)
+class Pattern:
+    """Structure of a system, and its parameters that are zero: constants of the code."""
+
+    structure: Any
+    #: shape of each leaf, and its zeros as bits
+    zeros: tuple[tuple[tuple[int, ...], bytes], ...]
+
+    @classmethod
+    def of(cls, system: System) -> Self:
+        """Return the pattern of a system; zeros of a batch are those of all, and no traced value is one."""
+        leaves, structure = jax.tree.flatten(system)
+        axis, zeros = np.ndim(system.length), []
+        for leaf in leaves:
+            known = np.ones(np.shape(leaf)) if is_traced(leaf) else np.asarray(leaf, float)
+            zeros.append(constant_zeros(np.max(np.abs(known), axis=tuple(range(axis)))))
+        return cls(structure, _masks(zeros))
+
+    @property
+    def system(self) -> System:
+        """A system of this pattern, with ones for all other parameters."""
+        leaves = []
+        for shape, bits in self.zeros:
+            size = int(np.prod(shape))
+            mask = np.unpackbits(np.frombuffer(bits, np.uint8), count=size).reshape(shape)
+            leaves.append(1.0 - mask)
+        return jax.tree.unflatten(self.structure, leaves)
 
 
 def core_of(system: System, settings: Settings, robots: bool) -> Core:
     """Return the core of a system or, with robots in lanes, of a batch of systems or one for all.
 
-    Parameters that are zero, in all systems of a batch, are constants of the code. Newton's options are not.
+    Newton's options are not part of the code.
 
     Raises:
         EngineError: the engine does not cover the system or the settings.
     """
-    leaves, structure = jax.tree.flatten(system)
-    leaves = [np.asarray(leaf, dtype=float) for leaf in leaves]
-    if np.ndim(system.length):
-        leaves = [np.max(np.abs(leaf), axis=0) for leaf in leaves]
-    schemes = Settings(settings.time, settings.space)
-    key = structure, _masks(map(constant_zeros, leaves)), schemes, robots
-    return _compiled(key, lambda: Core(jax.tree.unflatten(structure, leaves), schemes, robots))
+    pattern, schemes = Pattern.of(system), Settings(settings.time, settings.space)
+    return _compiled((pattern, schemes, robots), lambda: Core(pattern.system, schemes, robots))
+
+
+def tangents_for(
+    kind: type[AnyTangents], pattern: Pattern, settings: Settings, moving: Sequence[np.ndarray]
+) -> AnyTangents:
+    """Return the core of tangents or cotangents of a pattern, with masks of `moving` parameters."""
+    key = pattern, _masks(moving), settings.space, settings.uses_rate, kind
+
+    def build() -> AnyTangents:
+        system = pattern.system
+        if system.strands > 1 or system.mixed or settings.space != LOBATTO2:
+            raise EngineError("engine: tangents only of one rod by lobatto2, with B zero in its balance")
+        return kind(system, settings, moving)
+
+    return _compiled(key, build)
 
 
 def _masks(masks: Iterable[np.ndarray]) -> Any:
     return tuple((mask.shape, np.packbits(mask).tobytes()) for mask in masks)
 
 
-def _compiled(key: Any, build: Callable[[], CoreOrTangents]) -> CoreOrTangents:
+def _compiled(key: Any, build: Callable[[], AnyCore]) -> AnyCore:
     """Return compiled code that is kept by a key."""
     with _COMPILING:
         core: Any = _CORES.pop(key, None)
         if core is None:
             try:
-                core = build()
+                # also while JAX traces a caller: equations are traced by themselves
+                with jax.ensure_compile_time_eval():
+                    core = build()
             except EngineError as error:
                 log.info("%s; JAX runs it", error)
                 # without the frames that a traceback keeps alive
@@ -138,19 +181,14 @@ def tangent_loop(
 ) -> tuple[Any, Any]:  # fmt: skip
     """Return the tangents of solved steps: see `solvers.sensitivity.tangent_time_loop`, and its states."""
     (system, controls), ((directions, weights), d_controls) = at, changes
-    if system.strands > 1 or system.mixed or settings.space != LOBATTO2:
-        raise EngineError("engine: tangents only of one rod by lobatto2, with a balance in which B is zero")
-    leaves, structure = jax.tree.flatten(system)
-    leaves = [np.asarray(leaf, float) for leaf in leaves]
-    count, stages, m = len(controls), settings.stages, d_controls.shape[-1]
+    leaves = [np.asarray(leaf, float) for leaf in jax.tree.leaves(system)]
     if directions is None:
-        stacked, weights = [np.zeros((0, *leaf.shape)) for leaf in leaves], np.zeros((0, m))
+        stacked = [np.zeros((0, *leaf.shape)) for leaf in leaves]
+        weights = np.zeros((0, d_controls.shape[-1]))
     else:
         stacked = [np.asarray(leaf, float) for leaf in jax.tree.leaves(directions)]
     moving = [np.any(leaf != 0.0, axis=0) for leaf in stacked]
-    masks = _masks(map(constant_zeros, leaves)), _masks(moving)
-    key = structure, *masks, settings.space, settings.uses_rate, "tangents"
-    core = _compiled(key, lambda: TangentCore(jax.tree.unflatten(structure, leaves), settings, moving))
+    core = tangents_for(TangentCore, Pattern.of(system), settings, moving)
     moved = np.concatenate(
         [
             leaf[:, mask].reshape(len(leaf), int(mask.sum()))
@@ -158,17 +196,21 @@ def tangent_loop(
         ],
         axis=1,
     )
-    table = coefficients_of(steps, stages, (0, count))
-    table[..., 4] += t0
+    own, d_own = (at_all_stages(system, settings, each) for each in (controls, d_controls))
+    table = table_of(settings, steps, len(controls), t0)
+    return core.solve(parameters_of(system), table, solved, own, (moved, weights), d_own, states)
 
-    def all_stages(values: Any) -> np.ndarray:
-        """Return controls, or their tangents, of all stages of all steps."""
-        values, size = np.asarray(values, float), system.control_size
-        if values.shape[1] > size:
-            return values.reshape(count * stages, size, *values.shape[2:])
-        return np.repeat(values, stages, axis=0)
 
-    return core.solve(
-        parameters_of(system), table.reshape(-1, 5), solved, all_stages(controls), (moved, weights),
-        all_stages(d_controls), states,
-    )  # fmt: skip
+def table_of(settings: Settings, steps: StepCoefficients, count: int, t0: float) -> np.ndarray:
+    """Return the coefficients and the time (s) of all stages of the first steps (solves, 5)."""
+    table = coefficients_of(steps, settings.stages, (0, count)).reshape(-1, 5)
+    table[:, 4] += t0
+    return table
+
+
+def at_all_stages(system: System, settings: Settings, values: Any) -> np.ndarray:
+    """Return controls (solves, c, ...) of all stages from (T, c, ...) or (T, stages * c, ...)."""
+    values, size = np.asarray(values, float), system.control_size
+    if values.shape[1] > size:
+        return values.reshape(-1, size, *values.shape[2:])
+    return np.repeat(values, settings.stages, axis=0)

@@ -46,8 +46,6 @@ class Memory:
         self.P = lanes if robots else 1
         #: distance between components of a single robot's arrays
         self.stride = (-(-(places + 1) // lanes) + 1) * lanes
-        #: true in code that has tangents in lanes
-        self.has_tangents = False
         self.module = Module()
         self._size = 0
 
@@ -85,17 +83,7 @@ class Memory:
     @property
     def _rows_at_once(self) -> int:
         """Rows of a matrix in one vector."""
-        return 1 if self.batch or self.has_tangents else self.L
-
-    @property
-    def _matrix_lanes(self) -> int:
-        """Lanes of a matrix's entries; all tangents have the same matrix."""
-        return 1 if self.has_tangents else self.L
-
-    @property
-    def _vector_lanes(self) -> int:
-        """Lanes of a number that multiplies a matrix's column."""
-        return self.L if self.has_tangents else self.P
+        return 1 if self.batch else self.L
 
     # numbers from outside
 
@@ -105,7 +93,9 @@ class Memory:
         if self.batch or array.is_tangent:
             shape, axes = (max(array.count, 1), array.size, self.L), (0, 3, 1, 2)
         at = array.offset - first
-        return memory[:, at : at + shape[0] * shape[1] * shape[2]].reshape(-1, *shape).transpose(axes)
+        return (
+            memory[:, at : at + shape[0] * shape[1] * shape[2]].reshape(len(memory), *shape).transpose(axes)
+        )
 
     def _put_in(self, memory: np.ndarray, array: Array, values: np.ndarray, first: int = 0) -> None:
         """Write values (m, lanes, places, size); the last place is repeated in the lanes beyond it."""
@@ -150,8 +140,8 @@ class Memory:
 
     def _column(self, array: Array, rows: int, column: int = 0, j: int | Index = 0) -> list[Value]:
         """Return the vectors of a column of a matrix."""
-        first, lanes = column * self._padded(rows), self.L if array.is_tangent else self._matrix_lanes
-        return [self._get(array, first + row, j, lanes) for row in self._blocks(rows)]
+        first = column * self._padded(rows)
+        return [self._get(array, first + row, j, self.L) for row in self._blocks(rows)]
 
     def _set_column(self, values: list[Value], array: Array, rows: int, column: int = 0, j: Any = 0) -> None:
         first = column * self._padded(rows)

@@ -623,6 +623,86 @@ class Program:
         entries = [[row.get(k, zero) for k in range(len(variables))] for row in rows]
         return np.array(entries, dtype=np.int64).reshape(len(rows), len(variables))
 
+    def gradient(
+        self, outputs: Sequence[int] | Nodes, cotangents: Sequence[int] | Nodes,
+        variables: Sequence[int] | Nodes,
+        linear: bool = False,
+    ) -> list[int]:  # fmt: skip
+        """Return the cotangents of independent nodes from those of the outputs: a product λᵀ·J.
+
+        Outputs that are `linear` in the variables are differentiated as they are evaluated, without rules.
+        """
+        zero, independent = self.constant(0.0), set(map(int, variables))
+        dependent = self.dependent(outputs, variables, linear)
+        firsts: dict[int, int] = {}
+        for node in sorted(dependent):
+            firsts.setdefault(id(self.rules.get(node)), node)
+        found: dict[int, int] = {}
+
+        def add(node: int, cotangent: int) -> None:
+            if node in dependent:
+                found[node] = self.apply("add", found.get(node, zero), cotangent)
+
+        for node, cotangent in zip(outputs, cotangents, strict=True):
+            add(int(node), int(cotangent))
+        for node in sorted(dependent, reverse=True):
+            name, *arguments = self.operations[node]
+            own, rule = found.get(node), None if linear else self.rules.get(node)
+            if node in independent:
+                continue
+            if rule is not None:
+                # all results together: those that need them have been passed
+                if node == firsts[id(rule)]:
+                    active, product = self._product(rule)
+                    results = [found.get(each, zero) for each in _flat(rule.results)]
+                    pulled = self.gradient(product.outputs, results, product.inputs, linear=True)
+                    for each, cotangent in zip(_flat(rule.arguments[k] for k in active), pulled, strict=True):
+                        add(each, cotangent)
+            elif own is None:
+                continue
+            elif name == "select":
+                p, no, yes = arguments
+                add(no, self.apply("select", p, own, zero))
+                add(yes, self.apply("select", p, zero, own))
+            elif name in PARTIALS:
+                for argument, partial in zip(arguments, PARTIALS[name], strict=True):
+                    if argument in dependent:
+                        add(argument, self.apply("mul", self._partial(partial, node), own))
+            elif name == "hold" and linear:
+                add(arguments[0], own)
+            elif name == "result":
+                raise self._loop_error(arguments[0])
+            else:
+                raise EngineError("engine: no cotangents of large matrix products")
+        return [found.get(int(node), zero) for node in variables]
+
+    def dependent(
+        self, outputs: Sequence[int] | Nodes, variables: Sequence[int] | Nodes, linear: bool = False
+    ) -> set[int]:
+        """Return the nodes from variables to outputs that move with the variables; see `gradient`."""
+        independent, found = set(map(int, variables)), set[int]()
+        arguments = self.arguments if linear else self._differentiated
+
+        def sources(node: int) -> Iterable[int]:
+            return () if node in independent else arguments(node)
+
+        for node in self._order(outputs, sources):
+            if node in independent or not found.isdisjoint(sources(node)):
+                found.add(node)
+        return found
+
+    def _partial(self, partial: Callable[..., Scalar | float], node: int) -> int:
+        """Return a partial derivative of an operation."""
+        value = partial(*(Scalar(self, each) for each in (node, *self.operations[node][1:])))
+        return value.node if isinstance(value, Scalar) else self.constant(value)
+
+    def _loop_error(self, node: int) -> EngineError:
+        return EngineError(
+            f"{self.loops[self.operations[node][1]].source}: a while loop is differentiated; state its "
+            "derivative by jax.custom_jvp, or stop the gradient of its inputs and add one Newton correction "
+            "after it"
+        )
+
     def _forward(self, outputs: Sequence[int] | Nodes, seeds: Tangents) -> Tangents:
         """Return tangents of the nodes needed, by variable; zero ones are left out."""
 
@@ -654,11 +734,7 @@ class Program:
             elif (rule := self.rules.get(node)) is not None:
                 self._by_rule(rule, found)
             elif name == "loop" and any(found.get(a) for a in self.arguments(node)):
-                source = self.loops[self.operations[node][1]].source
-                raise EngineError(
-                    f"{source}: a while loop is differentiated; state its derivative by jax.custom_jvp, or "
-                    "stop the gradient of its inputs and add one Newton correction after it"
-                )
+                raise self._loop_error(node)
         return found
 
     def _nonzero(self, tangents: dict[Any, int]) -> dict[Any, int]:
@@ -675,8 +751,7 @@ class Program:
         partials, zero = dict[int, int](), self.constant(0.0)
         for argument, partial in zip(arguments, PARTIALS[name], strict=True):
             if found.get(argument):
-                value = partial(*(Scalar(self, each) for each in (node, *arguments)))
-                own = value.node if isinstance(value, Scalar) else self.constant(value)
+                own = self._partial(partial, node)
                 partials[argument] = self.apply("add", partials.get(argument, zero), own)
         total: dict[Any, int] = {}
         for argument, own in partials.items():

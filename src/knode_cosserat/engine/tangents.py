@@ -1,78 +1,105 @@
-"""Tangents of solved motions and equilibria as machine code, by the implicit function theorem.
+"""Tangents and cotangents of solved motions and equilibria as machine code, by the implicit function theorem.
 
 A solved step satisfies G(y, ξ; history, control, parameters) = 0. Its derivatives are evaluated once for a
-step, with places in lanes. All tangents then solve the linear equations of Newton's method, with tangents
-in lanes.
+step, with places in lanes. Its tangents are then a linear map (`linear`) of the tangents of its data, with
+tangents in lanes. Cotangents pass through the transposed maps, from the last step to the first.
 """
 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.engine.codegen import Index, Value
-from knode_cosserat.engine.elimination import Correction, EliminationCode
+from knode_cosserat.engine.elimination import EliminationCode
 from knode_cosserat.engine.equations import Nonzeros, TangentEquations
+from knode_cosserat.engine.linear import Add, Clear, Loop, Number, Operation, Scale, write
 from knode_cosserat.engine.memory import Array
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.problem import FILLING
 from knode_cosserat.solvers.settings import Settings
 
 
-class TangentCore(EliminationCode):
-    """Machine code of the tangents of a system's solved steps, by all data of a step.
+class Tangents(NamedTuple):
+    """Arrays of the tangents of a step, or of their cotangents."""
 
-    The system changes in its `moving` parameters, a mask for each of its leaves.
+    #: the step's data: records and rate before it, control
+    records: list[Array]
+    rate: Array
+    control: Array
+    #: history terms; rates and strains, y behind jumps, lengths, and defects of pieces and tip, at fixed y
+    history: Array
+    rates: Array
+    far: Array
+    lengths: Array
+    r: Array
+    tip: Array
+    #: y along the rod without the changes of the unknowns, and the unknowns of the groups of pieces
+    w: Array
+    alpha: Array
+    beta: Array
+    #: the solution: y, the new records, row and unknowns
+    y: Array
+    newest: Array
+    row: Array
+    unknowns: Array
+
+
+class TangentCode(EliminationCode):
+    """Code of the derivatives of a system's solved steps, by all data of a step.
+
+    The system changes in its `moving` parameters, a mask for each of its leaves. Functions are written by
+    subclasses, forward for many tangents side by side or transposed for one cotangent.
     """
 
     equations: TangentEquations
+    transposed: bool
 
     def __init__(self, system: System, settings: Settings, moving: Sequence[np.ndarray], lanes: int = 8):
         self.settings = settings
-        super().__init__(TangentEquations(system, moving), False, lanes)
-        e, a, many = self.equations, self._array, self._tangent_array
+        super().__init__(TangentEquations(system, moving, self.transposed), False, lanes)
+        e, a = self.equations, self._array
         ny, nx, numbers, k = e.ny, e.ny + e.nz, e.numbers, e.k
         self.records, self.rate = [a(numbers, self.ends) for _ in range(2)], a(numbers, self.ends)
         # derivatives at all places
         self.z_by_y = a(len(e.z_by_y), self.ends)
-        places = {"rates": self.ends, "far": self.pieces, "tip": 1, "base": 1}
-        self.by_history = {name: a(len(e.by_history[name]), count) for name, count in places.items()}
-        self.by_control = {name: a(len(e.by_control[name]), count) for name, count in places.items()}
+        self.places = {"rates": self.ends, "far": self.pieces, "tip": 1, "base": 1}
+        self.by_history = {name: a(len(e.by_history[name]), n) for name, n in self.places.items()}
+        self.by_control = {name: a(len(e.by_control[name]), n) for name, n in self.places.items()}
         self.jumps += [
             (self.by_history["far"], _nodes(e.by_history["far"])),
             (self.by_control["far"], _nodes(e.by_control["far"])),
         ]
-        # tangents: history terms; rates and strains, and y behind jumps, at fixed y
-        self.dH, self.dx, self.dfar = (
-            many(numbers, self.ends),
-            many(nx, self.ends),
-            many(ny, self.pieces),
-        )
-        self.tangent = Correction(
-            many(ny, self.pieces), many(k, 1), many(ny, self.pieces), many(ny, self.points),
-            many(k, self.groups[1]), many(ny, self.points), many(k, 1),
-        )  # fmt: skip
+        #: number of tangents side by side, and an array of them
+        self.columns = 1 if self.transposed else lanes
+        many = a if self.transposed else self._tangent_array
         whole, self._size = self._size, 0
-        # of one direction of the system
-        self.dparameters = a(len(e.dparameters), memory=1)
-        self.ds, self.dh = a(1, self.ends, 1), a(1, self.pieces, 1)
-        self.moved = {name: a(len(nodes), places[name], 1) for name, nodes in e.moved.items()}
-        self.direction_size, self._size = self._size, 0
-        # of as many tangents as there are lanes
-        self.d_records, self.d_rate = (
-            [many(numbers, self.ends, 1) for _ in range(2)],
-            many(numbers, self.ends, 1),
-        )
+        records, rate = [many(numbers, self.ends, 1) for _ in range(2)], many(numbers, self.ends, 1)
+        self._reserve_state()
         self.state_size, self._size = self._size, whole
+        groups = self.groups[1]
+        self.tangents = Tangents(
+            records, rate, many(e.nc, 1), many(numbers, self.ends), many(nx, self.ends),
+            many(ny, self.pieces), many(1, self.pieces), many(ny, self.pieces), many(k, 1),
+            many(ny, self.points), many(k, groups + 1), many(k, groups), many(ny, self.points),
+            many(numbers, self.ends), many(numbers, len(self.grid.nodes)), many(k, 1),
+        )  # fmt: skip
+        #: the results of the equations at fixed y, by the names of their derivatives
+        t = self.tangents
+        self.results = {"rates": t.rates, "far": t.far, "tip": t.tip, "base": t.w}
+        self._reserve_products()
         self._write()
         self.compiled = self.module.compile()
-        self._run = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 11, *[ctypes.c_long] * 3)(
-            self.compiled.address("run")
-        )
+
+    def _reserve_state(self) -> None:
+        """Reserve arrays that last from step to step, for each column."""
+
+    def _reserve_products(self) -> None:
+        """Reserve arrays of the products of derivatives by the system."""
 
     def _write(self) -> None:
         e = self.equations
@@ -91,216 +118,67 @@ class TangentCore(EliminationCode):
         self._write_linearise()
         self.defects = self._function("defects")
         self._write_defects(self.y, self.H)
-        self._write_step()
-        self._write_direction()
-        self.has_tangents = True
-        self.solved_tangents = self._write_solved("solved_tangents")
-        self.advance_tangents = self._write_advance("advance_tangents")
-        self._write_tangents()
+        self._write_data()
+        self._write_solution()
+        self._write_derivatives()
         self._write_shift()
-        self._write_run()
 
-    def _write_step(self) -> None:
-        """The derivatives of a solved step from its row: y at the nodes, unknowns, control and history."""
+    # a solved step
+
+    def _write_data(self) -> None:
+        """Inputs, history terms and unknowns of a step."""
         e = self.equations
-        self.step = f = self._function("step", "coefficients", "control", "row", "unknowns")
-        memory, coefficients, control, row, unknowns = f.arguments
+        self.data = f = self._function("data", "coefficients", "control", "unknowns")
+        _, coefficients, control, unknowns = f.arguments
         self._write_inputs(f.load(coefficients, 0), f.load(coefficients, 4), control)
+        weights = [f.load(coefficients, k) for k in self._history_weights]
         with self._places(self.ends) as j:
             for i in range(e.numbers):
                 parts = [self._wide(each, i, j) for each in (*self.records, self.rate)]
-                self._write_wide(self._history(coefficients, parts), self.H, i, j)
-        with f.loop(len(self.grid.nodes)) as node:
-            at, point = f.pointer(row, node.value * e.numbers), self._node(node)
-            for i in range(e.ny):
-                self._put(f.load(at, i), self.y, i, point)
+                products = [weight * part for weight, part in zip(weights, parts, strict=False)]
+                self._write_wide(sum(products[1:], products[0]), self.H, i, j)
         for i in range(e.k):
             self._put(f.load(unknowns, i), self.unknowns, i)
-        self._fill()
-        f.call(self.linearised, memory)
-        self._write_ends(self.f, self.fe)
-        for name, state in (
-            ("tip", self._tip_state(self.y, self.H)), ("base", self._base_state(self.unknowns, self.H))
-        ):  # fmt: skip
+
+    @property
+    def _history_weights(self) -> range:
+        """Numbers of the coefficients of records and, if the scheme uses it, of the rate."""
+        return range(1, 4 if self.settings.uses_rate else 3)
+
+    def _write_solution(self) -> None:
+        """The solution y at all points, from its row at the nodes (see `StepProblem.filled`)."""
+        e, grid = self.equations, self.grid
+        self.solution = f = self._function("solution", "row")
+        row = f.arguments[1]
+        with f.loop(len(self.grid.nodes)) as node:
+            at, here = f.pointer(row, node.value * e.numbers), self._node(node)
+            for i in range(e.ny):
+                self._put(f.load(at, i), self.y, i, here)
+        if not len(grid.between):
+            return
+        for point in map(int, grid.between):
+            start, end = (int(grid.nodes[grid.segment[point] + k]) for k in (0, 1))
+            part = float(grid.bounds[point, 0])
+            for i in range(e.ny):
+                low, high = self._get(self.y, i, start), self._get(self.y, i, end)
+                self._put(low + part * (high - low), self.y, i, point)
+        self._write_filling(FILLING * (int(np.max(np.diff(grid.nodes))) - 1), self.defects)
+
+    def _write_derivatives(self) -> None:
+        """The derivatives of a step at its solution."""
+        e = self.equations
+        self.derivatives = f = self._function("derivatives")
+        f.call(self.linearised, f.arguments[0])
+        for name, state in self._end_states():
             for array, nonzeros in (
                 (self.by_history[name], e.by_history[name]), (self.by_control[name], e.by_control[name])
             ):  # fmt: skip
                 for i, value in enumerate(self._evaluated(_nodes(nonzeros), 0, False, state)):
                     self._put(value, array, i)
 
-    def _history(self, coefficients: Value, parts: Sequence[Value]) -> Value:
-        """Return the history term of two records and the rate."""
-        f = self._now
-        found = f.load(coefficients, 1) * parts[0] + f.load(coefficients, 2) * parts[1]
-        return found + f.load(coefficients, 3) * parts[2] if self.settings.uses_rate else found
-
-    def _fill(self) -> None:
-        """Solve for y at points between nodes (see `StepProblem.filled`)."""
-        f, e, grid = self._now, self.equations, self.grid
-        if not len(grid.between):
-            return
-        memory, nodes = f.arguments[0], grid.nodes
-        for point in map(int, grid.between):
-            start, end = (int(nodes[grid.segment[point] + k]) for k in (0, 1))
-            part = float(grid.bounds[point, 0])
-            for i in range(e.ny):
-                low, high = self._get(self.y, i, start), self._get(self.y, i, end)
-                self._put(low + part * (high - low), self.y, i, point)
-        with f.loop(FILLING * (int(np.max(np.diff(nodes))) - 1)):
-            f.call(self.linearised, memory)
-            f.call(self.defects, memory)
-            with self._places(self.pieces) as j:
-                points = self._pointer(self.r, j), self._pointer(self.wide_added, j)
-                f.call(self.solved, memory, *points, j.value)
-            for point in map(int, grid.between):
-                for i in range(e.ny):
-                    change = self._get(self.wide_added, i, point - 1)
-                    self._put(self._get(self.y, i, point) + change, self.y, i, point)
-
-    def _write_direction(self) -> None:
-        """Tangents of rates, strains, jumps, tip and base by one direction of the system, at fixed y."""
-        e = self.equations
-        self.direction = f = self._function("direction", "direction")
-        geometry = [*e.dplaces[: self.ends], *e.dlengths]
-        state = self._parameters([*e.moved_terms, *geometry])
-        for k, node in enumerate([e.c0.item(), e.t.item(), *e.control]):
-            state[int(node)] = self._get(self.inputs, k)
-        for node, first, _ in e.slots(e.step_terms):
-            state[node] = self._term(node, self.step_terms, first, 0, self.P)
-        moves = self._inputs_of(self.dparameters, [e.dparameters], [*e.moved_terms, *geometry])
-        state |= moves
-        values = f.evaluate(e.program, [*e.moved_terms, *geometry], state, 1)
-        for array, nodes in ((self.ds, e.dplaces[: self.ends]), (self.dh, e.dlengths)):
-            for k, node in enumerate(nodes):
-                self._put(values[node], array, 0, k)
-        known = {node: values[node] for node in e.moved_terms} | moves
-        far = self.y if self.far is None else self.far
-
-        def values_at(y: Array, j: Index) -> dict[int, Value]:
-            return self._state(y, self.H, j) | known | {e.s.item(): self._wide(self.s, 0, j)}
-
-        with self._places(self.ends) as j:
-            here = values_at(far, j) | {e.ds.item(): self._wide(self.ds, 0, j)}
-            self._write_results([(self.moved["rates"], e.moved["rates"])], j, here)
-        if e.moved["far"]:
-            with self._places(self.pieces) as j:
-                here = values_at(self.y, j) | self._acting_at(j)
-                self._write_results([(self.moved["far"], e.moved["far"])], j, here)
-        for name, here in (
-            ("tip", self._tip_state(self.y, self.H)), ("base", self._base_state(self.unknowns, self.H))
-        ):  # fmt: skip
-            for i, value in enumerate(self._evaluated(e.moved[name], 0, False, here | known)):
-                self._put(value, self.moved[name], i)
-
-    def _sums(self, products: Iterable[tuple[Nonzeros, Array, Any]], size: int, j: Any) -> list[Value]:
-        """Return the sum of products of sparse matrices at a place with vectors of tangents."""
-        f = self._now
-        zero = f.splat(f.value(0.0), self.L)
-        found = [zero] * size
-        for nonzeros, matrix, vector in products:
-            for k, (i, c, _) in enumerate(nonzeros):
-                product = self._get(matrix, k, j, 1) * vector(c)
-                found[i] = product if found[i] is zero else found[i] + product
-        return found
-
-    def _write_tangents(self) -> None:
-        """Tangents of the step, of as many columns as there are lanes."""
-        e = self.equations
-        arguments = ["state", "directions", "weights", "d_control", "coefficients", "row", "unknowns"]
-        self.tangents = f = self._function("tangents", *arguments, "n_directions", "n_columns")
-        memory, _, directions, weights, d_control, coefficients, row, d_unknowns, count, width = f.arguments
-        L, ny, nx, arrays, tip = self.L, e.ny, e.ny + e.nz, self.tangent, self.pieces
-
-        def get(array: Array, i: int, j: Any = 0) -> Value:
-            return self._get(array, i, j, L)
-
-        def put(values: Iterable[Value], array: Array, j: Any = 0) -> None:
-            for i, value in enumerate(values):
-                self._put(value, array, i, j, L)
-
-        def by_data(name: str, size: int, j: Any, place: Any = None) -> list[Value]:
-            place = j if place is None else place
-            return self._sums(
-                (
-                    (e.by_history[name], self.by_history[name], lambda c: get(self.dH, c, place)),
-                    (e.by_control[name], self.by_control[name], lambda c: f.load(d_control, width * c, L)),
-                ),
-                size, j,
-            )  # fmt: skip
-
-        # at fixed y: by history and control, then by the system
-        with f.loop(self.ends) as j:
-            parts = ([get(each, i, j) for each in (*self.d_records, self.d_rate)] for i in range(e.numbers))
-            put([self._history(coefficients, each) for each in parts], self.dH, j)
-        with f.loop(self.ends) as j:
-            put(by_data("rates", nx, j), self.dx, j)
-        with f.loop(self.pieces) as j:
-            put(by_data("far", ny, j), self.dfar, j)
-            put([f.splat(f.value(0.0), L)] * ny, arrays.r, j)
-        put(by_data("tip", e.k, 0, tip), arrays.tip)
-        put(by_data("base", ny, 0), arrays.w)
-        with f.loop(count) as d:
-            own = f.pointer(directions, d.value * self.direction_size)
-            weight = f.load(weights, d.value * width, L)
-            for name, array, places in (
-                ("rates", self.dx, self.ends), ("far", self.dfar, self.pieces), ("tip", arrays.tip, 1),
-                ("base", arrays.w, 1),
-            ):  # fmt: skip
-                source = self.moved[name]
-                with f.loop(places) as j:
-                    for i in range(source.size):
-                        number = f.load(j.address(own, source.place), source.at(i, 0))
-                        self._put(get(array, i, j) + weight * number, array, i, j, L)
-            with f.loop(self.pieces) as j:
-                half = weight * (0.5 * f.load(j.address(own, self.dh.place), self.dh.at(0, 0)))
-                for i in range(ny):
-                    rates = self._get(self.f, i, j) + self._get(self.fe, i, j)
-                    self._put(get(arrays.r, i, j) + half * rates, arrays.r, i, j, L)
-        if e.jumping:
-            with f.loop(self.pieces) as j:
-                slopes = ([(i, c, 0) for i, c in e.pattern], self.slope, lambda c: get(self.dfar, c, j))
-                for i, change in enumerate(self._sums([slopes], ny, j)):
-                    self._put(get(self.dx, i, j) + change, self.dx, i, j, L)
-        with f.loop(self.pieces) as j:
-            half = self._get(self.h, 0, j) * 0.5
-            for i in range(ny):
-                rates = get(self.dx, i, j) + get(self.dx, i, j + 1)
-                self._put(get(arrays.r, i, j) + get(self.dfar, i, j) + half * rates, arrays.r, i, j, L)
-        for k, point in enumerate(map(int, self.grid.near)):
-            half = self._get(self.h, 0, point - 1) * 0.5
-            for i in range(ny):
-                change = half * (get(self.dx, i, self.points + k) - get(self.dx, i, point))
-                self._put(get(arrays.r, i, point - 1) + change, arrays.r, i, point - 1, L)
-        with f.loop(self.pieces) as j:
-            points = self._pointer(arrays.r, j), self._pointer(arrays.added, j)
-            f.call(self.solved_tangents, memory, *points, j.value)
-        self._write_correction(arrays, self.advance_tangents)
-        # the records
-        newest, older = self.d_records
-        with f.loop(self.ends) as j:
-            put([get(newest, i, j) for i in range(e.numbers)], older, j)
-        with f.loop(self.points) as j:
-            put([get(arrays.dy, i, j) for i in range(ny)], newest, j)
-        if e.jumping:
-            with f.loop(self.pieces) as j:
-                jumps = self._sums([(e.jumping, self.jump, lambda c: get(arrays.dy, c, j))], ny, j)
-                for i, change in enumerate(jumps):
-                    self._put(get(newest, i, j) + change + get(self.dfar, i, j), newest, i, j, L)
-        for k, point in enumerate(map(int, self.grid.near)):
-            put([get(arrays.dy, i, point) for i in range(ny)], newest, self.points + k)
-        with f.loop(self.ends) as j:
-            strains = self._sums([(e.z_by_y, self.z_by_y, lambda c: get(newest, c, j))], e.nz, j)
-            for i, change in enumerate(strains):
-                self._put(get(self.dx, ny + i, j) + change, newest, ny + i, j, L)
-            if self.settings.uses_rate:
-                c0 = f.load(coefficients, 0)
-                put([c0 * get(newest, i, j) + get(self.dH, i, j) for i in range(e.numbers)], self.d_rate, j)
-        with f.loop(len(self.grid.nodes)) as node:
-            at, here = f.pointer(row, node.value * width * e.numbers), self._node(node)
-            for i in range(e.numbers):
-                f.store(get(arrays.dy if i < ny else newest, i, here), at, width * i, L)
-        for i in range(e.k):
-            f.store(get(arrays.unknowns, i), d_unknowns, width * i, L)
+    def _end_states(self) -> Sequence[tuple[str, dict[int, Value]]]:
+        """Return the state at the tip and at the base."""
+        return ("tip", self._tip_state(self.y, self.H)), ("base", self._base_state(self.unknowns, self.H))
 
     def _write_shift(self) -> None:
         """The records after a step."""
@@ -316,6 +194,295 @@ class TangentCore(EliminationCode):
                 if self.settings.uses_rate:
                     self._write_wide(c0 * newest + self._wide(self.H, i, j), self.rate, i, j)
 
+    def _terms_known(self, nodes: Sequence[int], moves: Mapping[int, Any] | None = None) -> dict[int, Any]:
+        """Write terms of a step, once for all places, and return their values with those of the inputs."""
+        e = self.equations
+        known = self._parameters(nodes) | dict(moves or {})
+        for k, node in enumerate([e.c0.item(), e.t.item(), *e.control]):
+            known[int(node)] = self._get(self.inputs, k)
+        for node, first, _ in e.slots(e.step_terms):
+            known[node] = self._term(node, self.step_terms, first, 0, self.P)
+        return self._now.evaluate(e.program, nodes, known, 1)
+
+    def _state_at(self, name: str, j: Index) -> dict[int, Value]:
+        """Return the values at a place on which rates and strains, or y behind jumps, depend."""
+        far = self.y if self.far is None else self.far
+        if name == "far":
+            return self._state(self.y, self.H, j) | self._acting_at(j)
+        return self._state(far, self.H, j) | {self.equations.s.item(): self._wide(self.s, 0, j)}
+
+    # the linear map of a step
+
+    def _by_data(self, name: str, target: Array, j: Any, place: Any) -> list[Operation]:
+        """Set results at fixed y, by history and control."""
+        e, t = self.equations, self.tangents
+        found: list[Operation] = [Clear(Number(target, i, j)) for i in range(target.size)]
+        for nonzeros, matrix, source, at in (
+            (e.by_history[name], self.by_history[name], t.history, place),
+            (e.by_control[name], self.by_control[name], t.control, 0),
+        ):
+            found += _products(nonzeros, (matrix, j if matrix.count > 1 else 0), (target, j), (source, at))
+        return found
+
+    def _at_fixed_y(self, coefficients: Value) -> list[Operation]:
+        """Return the map from the data to the results at fixed y; the system does not change."""
+        t, f = self.tangents, self._now
+        weights = [f.load(coefficients, k) for k in self._history_weights]
+
+        def at_place(j: Index) -> list[Operation]:
+            found = list[Operation]()
+            for i in range(t.history.size):
+                found.append(Clear(Number(t.history, i, j)))
+                for part, weight in zip((*t.records, t.rate), weights, strict=False):
+                    found.append(Add(Number(t.history, i, j), Number(part, i, j), weight))
+            return found + self._by_data("rates", t.rates, j, j)
+
+        def behind(j: Index) -> list[Operation]:
+            return [Clear(Number(t.lengths, 0, j)), *self._by_data("far", t.far, j, j)]
+
+        return [
+            Loop(0, self.ends, at_place), Loop(0, self.pieces, behind),
+            *self._by_data("tip", t.tip, 0, self.pieces), *self._by_data("base", t.w, 0, 0),
+        ]  # fmt: skip
+
+    def _solution_and_records(self, coefficients: Value) -> list[Operation]:
+        """Return the map from the results at fixed y to the solution, and to the records after the step."""
+        e, t = self.equations, self.tangents
+        near = [(self.points + k, point) for k, point in enumerate(self.near)]
+
+        def moved(j: Index) -> list[Operation]:
+            return _products([(i, c, 0) for i, c in e.pattern], (self.slope, j), (t.rates, j), (t.far, j))
+
+        def defect(j: Index) -> list[Operation]:
+            half, found = self._get(self.h, 0, j) * 0.5, list[Operation]()
+            for i in range(e.ny):
+                r, rates = Number(t.r, i, j), self._get(self.f, i, j) + self._get(self.fe, i, j)
+                found += [
+                    Clear(r), Add(r, Number(t.far, i, j)), Add(r, Number(t.lengths, 0, j), rates * 0.5),
+                    Add(r, Number(t.rates, i, j), half), Add(r, Number(t.rates, i, j + 1), half),
+                ]  # fmt: skip
+            return found
+
+        found: list[Operation] = [Loop(0, self.pieces, moved)] if e.jumping else []
+        found.append(Loop(0, self.pieces, defect))
+        for place, point in near:
+            half = self._get(self.h, 0, point - 1) * 0.5
+            for i in range(e.ny):
+                r = Number(t.r, i, point - 1)
+                found.append(Add(r, Number(t.rates, i, place), half))
+                found.append(Add(r, Number(t.rates, i, point), half, is_negative=True))
+        found += self._correction()
+
+        def behind(j: Index) -> list[Operation]:
+            own = [(i, c, 0) for i, c, _ in e.jumping]
+            jumps = _products(own, (self.jump, j), (t.newest, j), (t.y, j))
+            return [*jumps, *(Add(Number(t.newest, i, j), Number(t.far, i, j)) for i in range(e.ny))]
+
+        found.append(Loop(0, self.points, lambda j: _copies(e.ny, (t.newest, j), (t.y, j))))
+        if self.far is not None:
+            found.append(Loop(0, self.pieces, behind))
+        for place, point in near:
+            found += _copies(e.ny, (t.newest, place), (t.y, point))
+        c0 = self._now.load(coefficients, 0)
+
+        def recorded(j: Index) -> list[Operation]:
+            found = _copies(e.nz, (t.newest, j), (t.rates, j), e.ny)
+            strains = [(e.ny + i, c, node) for i, c, node in e.z_by_y]
+            found += _products(strains, (self.z_by_y, j), (t.newest, j), (t.newest, j))
+            if self.settings.uses_rate:
+                found += _copies(e.numbers, (t.rate, j), (t.history, j))
+                for i in range(e.numbers):
+                    found.append(Add(Number(t.rate, i, j), Number(t.newest, i, j), c0))
+            newest, older = t.records
+            found += _copies(e.numbers, (older, j), (newest, j))
+            return found + _copies(e.numbers, (newest, j), (t.newest, j))
+
+        def shown(node: Index) -> list[Operation]:
+            point = self._node(node)
+            return [
+                *_copies(e.ny, (t.row, node), (t.y, point)),
+                *_copies(e.nz, (t.row, node), (t.newest, point), e.ny),
+            ]
+
+        found += [Loop(0, self.ends, recorded), Loop(0, len(self.grid.nodes), shown)]
+        return found + _copies(e.k, (t.unknowns, 0), (t.alpha, 0))
+
+    def _correction(self) -> list[Operation]:
+        """Return the map from the defects of pieces and tip, and y at the base, to y and the unknowns."""
+        e, t, el = self.equations, self.tangents, self.elimination
+        ny, k, (size, count) = e.ny, e.k, self.groups
+        stored = {int(node): n for n, node in enumerate(el.stored)}
+
+        def piece(j: Index) -> list[Operation]:
+            half, end = self._get(self.h, 0, j) * 0.5, [Number(t.w, i, j + 1) for i in range(ny)]
+            found = list[Operation]()
+            start, change = [Number(t.w, i, j) for i in range(ny)], [Number(None, i) for i in range(ny)]
+            if e.jumping:
+                behind = [Number(None, ny + i) for i in range(ny)]
+                found += [Add(one, other) for one, other in zip(behind, start, strict=True)]
+                for n, (i, c, _) in enumerate(e.jumping):
+                    found.append(Add(behind[i], start[c], Number(self.jump, n, j)))
+                start = behind
+            for n, (i, c) in enumerate(e.pattern):
+                found.append(Add(change[i], start[c], Number(self.slope, n, j)))
+            for i in range(ny):
+                found += [
+                    Clear(end[i]), Add(end[i], Number(t.r, i, j)), Add(end[i], start[i]),
+                    Add(end[i], change[i], half),
+                ]  # fmt: skip
+            for i, c, node in el.substitution:
+                factor = Number(self.factor, stored[node], j) if node in stored else el.program.values[node]
+                found.append(
+                    Scale(end[i], factor) if i == c else Add(end[i], end[c], factor, is_negative=True)
+                )
+            return found
+
+        def by_unknowns(target: Array, j: Any, source: Array, g: Any, is_negative: bool) -> list[Operation]:
+            found = list[Operation]()
+            for i, c in np.ndindex(ny, k):
+                entry = self._entry_at(self.X, ny, i, c, j)
+                found.append(Add(Number(target, i, j), Number(source, c, g), entry, is_negative))
+            return found
+
+        def group(g: Index) -> list[Operation]:
+            last = self._now.index((g.value + 1) * size)
+            pivots = list[Operation]()
+            for c, pivot in enumerate(self.pivots):
+                pivots += [Clear(Number(t.beta, c, g)), Add(Number(t.beta, c, g), Number(t.w, pivot, last))]
+            return [
+                Loop(g.value * size, (g.value + 1) * size, piece), *pivots,
+                *by_unknowns(t.w, last, t.beta, g, True),
+            ]  # fmt: skip
+
+        def solved(j: Any, g: Any) -> list[Operation]:
+            return [*_copies(ny, (t.y, j), (t.w, j)), *by_unknowns(t.y, j, t.alpha, g, False)]
+
+        def group_back(g: Index) -> list[Operation]:
+            end = self._now.index((g.value + 1) * size)
+            found = solved(end, g + 1)
+            for c in range(k):
+                found += [
+                    Clear(Number(t.alpha, c, g)),
+                    Add(Number(t.beta, c, g), Number(t.alpha, c, g + 1), is_negative=True),
+                ]
+            for i, c in np.ndindex(k, k):
+                entry = self._entry_at(self.T, k, i, c, g)
+                found.append(Add(Number(t.alpha, i, g), Number(t.beta, c, g), entry, is_negative=True))
+            start = g.value * size + 1
+            return [*found, Loop(start, (g.value + 1) * size, lambda j: solved(j, g))]
+
+        at_tip = list[Operation]()
+        for i, c, _ in self.tip_slopes:
+            entry = self._entry_at(self.M, k, i, c)
+            at_tip.append(Add(Number(t.tip, i), Number(t.w, c, self.points - 1), entry))
+        at_tip += [Clear(Number(t.alpha, i, count)) for i in range(k)]
+        for i, c in np.ndindex(k, k):
+            entry = self._entry_at(self.inverse, k, i, c)
+            at_tip.append(Add(Number(t.alpha, i, count), Number(t.tip, c), entry, is_negative=True))
+        return [
+            Loop(0, count, group), Loop(count * size, self.pieces, piece), *at_tip,
+            Loop(count * size + 1, self.points, lambda j: solved(j, count)),
+            Loop(0, count, group_back, descends=True), *solved(0, 0),
+        ]  # fmt: skip
+
+    def _entry_at(self, matrix: Array, rows: int, i: int, c: int, j: Any = 0) -> Number:
+        """Return an entry of a matrix of which a vector holds rows."""
+        return Number(matrix, c * self._padded(rows) + i, j)
+
+    # running
+
+    def _data_of(self, step: Index, coefficients: Value, *data: Value) -> list[Value]:
+        """Return the addresses of a step's coefficients, and of its control, row and unknowns."""
+        f, e = self._now, self.equations
+        sizes = e.nc, len(self.grid.nodes) * e.numbers, e.k
+        found = [f.pointer(each, step.value * size) for each, size in zip(data, sizes, strict=True)]
+        return [f.pointer(coefficients, step.value * 5), *found]
+
+    def _begun(
+        self, parameters: np.ndarray, solved: tuple[Any, Any], controls: Any, table: Any,
+        records: Any, rate: Any,
+    ) -> list[np.ndarray]:  # fmt: skip
+        """Return the memory before a run, controls, coefficients, rows and unknowns."""
+        memory = self._empty_memory()
+        self._put_in(memory[None], self.params, parameters[None, None, None])
+        for array, values in zip((*self.records, self.rate), (*records, rate), strict=True):
+            self._put_in(memory[None], array, np.asarray(values, float)[None, None])
+        rows, unknowns = solved
+        data = controls, table, np.asarray(rows)[..., : self.equations.numbers], unknowns
+        return [memory, *(np.ascontiguousarray(each, float) for each in data)]
+
+
+class TangentCore(TangentCode):
+    """Machine code of the tangents of solved steps, as many side by side as there are lanes."""
+
+    transposed = False
+
+    def __init__(self, system: System, settings: Settings, moving: Sequence[np.ndarray], lanes: int = 8):
+        super().__init__(system, settings, moving, lanes)
+        self._run = _callable(self.compiled.address("run"), 11, 3)
+
+    def _reserve_products(self) -> None:
+        e, a = self.equations, self._array
+        whole, self._size = self._size, 0
+        # of one direction of the system
+        self.dparameters = a(len(e.dparameters), memory=1)
+        self.ds, self.dh = a(1, self.ends, 1), a(1, self.pieces, 1)
+        self.moved = {name: a(len(nodes), self.places[name], 1) for name, nodes in e.moved.items()}
+        self.direction_size, self._size = self._size, whole
+
+    def _write(self) -> None:
+        super()._write()
+        self._write_direction()
+        self._write_tangents()
+        self._write_run()
+
+    def _write_direction(self) -> None:
+        """Tangents of rates, strains, jumps, tip and base by one direction of the system, at fixed y."""
+        e = self.equations
+        self.direction = self._function("direction", "direction")
+        every = [*e.moved_terms, *e.dplaces, *e.dlengths]
+        moves = self._inputs_of(self.dparameters, [e.dparameters], every)
+        values = self._terms_known(every, moves)
+        for array, nodes in ((self.ds, e.dplaces), (self.dh, e.dlengths)):
+            for k, node in enumerate(nodes):
+                self._put(values[node], array, 0, k)
+        known = {node: values[node] for node in e.moved_terms} | moves
+        for name in ("rates", "far"):
+            if e.moved[name]:
+                with self._places(self.places[name]) as j:
+                    here = self._state_at(name, j) | known | {e.ds.item(): self._wide(self.ds, 0, j)}
+                    self._write_results([(self.moved[name], e.moved[name])], j, here)
+        for name, here in self._end_states():
+            for i, value in enumerate(self._evaluated(e.moved[name], 0, False, here | known)):
+                self._put(value, self.moved[name], i)
+
+    def _write_tangents(self) -> None:
+        """Tangents of the step, of as many columns as there are lanes."""
+        e, L, t = self.equations, self.L, self.tangents
+        arguments = ["state", "directions", "weights", "d_control", "coefficients", "row", "unknowns"]
+        self.step = f = self._function("step", *arguments, "n_directions", "n_columns")
+        _, _, directions, weights, d_control, coefficients, row, d_unknowns, count, width = f.arguments
+        for i in range(e.nc):
+            self._put(f.load(d_control, width * i, L), t.control, i, 0, L)
+        write(self, self._at_fixed_y(coefficients), L, False)
+        with f.loop(count) as d:
+            own = f.pointer(directions, d.value * self.direction_size)
+            weight = f.load(weights, d.value * width, L)
+            for source, target in (
+                *((self.moved[name], target) for name, target in self.results.items()), (self.dh, t.lengths)
+            ):  # fmt: skip
+                with f.loop(source.count) as j:
+                    for i in range(source.size):
+                        number = f.load(j.address(own, source.place), source.at(i, 0))
+                        self._put(self._get(target, i, j, L) + weight * number, target, i, j, L)
+        write(self, self._solution_and_records(coefficients), L, False)
+        with f.loop(len(self.grid.nodes)) as node:
+            at = f.pointer(row, node.value * width * e.numbers)
+            for i in range(e.numbers):
+                f.store(self._get(t.row, i, node, L), at, width * i, L)
+        for i in range(e.k):
+            f.store(self._get(t.unknowns, i, 0, L), d_unknowns, width * i, L)
+
     def _write_run(self) -> None:
         """All solved steps in turn; tangents have `n_columns` columns, a multiple of the lanes."""
         e, L, nodes = self.equations, self.L, len(self.grid.nodes)
@@ -326,11 +493,10 @@ class TangentCore(EliminationCode):
         d_controls, d_rows, d_unknowns, steps, count, width = f.arguments[8:]
         f.call(self.setup, memory)
         with f.loop(steps) as step:
-            table = f.pointer(coefficients, step.value * 5)
-            f.call(
-                self.step, memory, table, f.pointer(controls, step.value * e.nc),
-                f.pointer(rows, step.value * (nodes * e.numbers)), f.pointer(unknowns, step.value * e.k),
-            )  # fmt: skip
+            table, control, row, unknown = self._data_of(step, coefficients, controls, rows, unknowns)
+            f.call(self.data, memory, table, control, unknown)
+            f.call(self.solution, memory, row)
+            f.call(self.derivatives, memory)
             with f.loop(count) as d:
                 f.call(self.direction, memory, f.pointer(directions, d.value * self.direction_size))
             own = f.pointer(d_controls, step.value * width * e.nc)
@@ -341,7 +507,7 @@ class TangentCore(EliminationCode):
                 own_weights, own_control, own_row, own_unknowns = parts
                 state = f.pointer(states, first.value * (self.state_size // L))
                 f.call(
-                    self.tangents, memory, state, directions, own_weights, own_control, table, own_row,
+                    self.step, memory, state, directions, own_weights, own_control, table, own_row,
                     own_unknowns, count, width,
                 )  # fmt: skip
             f.call(self.shift, memory, table)
@@ -357,8 +523,7 @@ class TangentCore(EliminationCode):
         returned are those after the last step.
         """
         e, L, (records, rate, d_records, d_rate) = self.equations, self.L, states
-        (rows, unknowns), (directions, weights), count = solved, moves, len(controls)
-        rows = np.ascontiguousarray(np.asarray(rows, float)[..., : e.numbers])
+        (directions, weights), count = moves, len(controls)
         m, nodes = d_controls.shape[-1], len(self.grid.nodes)
         blocks = -(-m // L)
 
@@ -368,25 +533,19 @@ class TangentCore(EliminationCode):
             found[..., :m] = values
             return found
 
-        memory = self._empty_memory()
-        self._put_in(memory[None], self.params, parameters[None, None, None])
-        for array, values in zip((*self.records, self.rate), (*records, rate), strict=True):
-            self._put_in(memory[None], array, np.asarray(values, float)[None, None])
+        begun = self._begun(parameters, solved, controls, table, records, rate)
+        memory = begun[0]
         moved = np.zeros((len(directions), self.direction_size))
         if directions.size:
             self._put_in(moved, self.dparameters, directions[:, None, None])
         tangents = np.zeros((blocks, self.state_size))
-        parts = (*self.d_records, self.d_rate)
+        parts = (*self.tangents.records, self.tangents.rate)
         for array, values in zip(parts, (*d_records, d_rate), strict=True):
             self._put_in(
                 tangents, array, np.moveaxis(filled(values).reshape(self.ends, -1, blocks, L), (2, 3), (0, 1))
             )
         d_rows, d_unknowns = (np.empty((count, *shape, blocks * L)) for shape in ((nodes, e.numbers), (e.k,)))
-        arrays = (
-            memory, np.ascontiguousarray(controls, float), np.ascontiguousarray(table, float), rows,
-            np.ascontiguousarray(unknowns, float), moved, tangents, filled(weights), filled(d_controls),
-            d_rows, d_unknowns,
-        )  # fmt: skip
+        arrays = *begun, moved, tangents, filled(weights), filled(d_controls), d_rows, d_unknowns
         self._run(*(each.ctypes.data for each in arrays), count, len(directions), blocks * L)
         after = [self._numbers(memory[None], each)[0, 0] for each in (*self.records, self.rate)]
         moved_after = [
@@ -400,5 +559,211 @@ class TangentCore(EliminationCode):
         return found, (d_rows[..., :m], d_unknowns[..., :m])
 
 
+class CotangentCore(TangentCode):
+    """Machine code of the cotangents of solved steps, one after the other."""
+
+    transposed = True
+
+    def __init__(self, system: System, settings: Settings, moving: Sequence[np.ndarray], lanes: int = 8):
+        super().__init__(system, settings, moving, lanes)
+        self._run = _callable(self.compiled.address("run"), 10, 2)
+
+    def _reserve_state(self) -> None:
+        e, a = self.equations, self._array
+        #: cotangents of the moving parameters, of places, and of lengths of pieces
+        self.parameter, self.place = a(len(e.by_terms), memory=1), a(1, self.ends, 1)
+        self.length_of_piece = a(1, self.pieces, 1)
+
+    def _reserve_products(self) -> None:
+        #: cotangents of the terms of a step, for each lane of places
+        self.term = self._tangent_array(len(self.equations.moving_terms), 1)
+
+    def _write(self) -> None:
+        super()._write()
+        self.rates = self._write_rates("rates")
+        self._write_recorded()
+        self._write_products()
+        self._write_geometry()
+        self._write_cotangents()
+        self._write_run()
+
+    def _write_recorded(self) -> None:
+        """Rates and strains at all ends of pieces."""
+        self.recorded = self._function("recorded")
+        self._write_places(self.rates, self.y, self.H)
+
+    def _write_products(self) -> None:
+        """Add the cotangents of parameters, places and lengths, from those of the results at fixed y."""
+        e, t = self.equations, self.tangents
+        self.pulled = f = self._function("pulled", "state")
+        terms = self._terms_known(e.pulled_terms)
+        known = {node: terms[node] for node in e.pulled_terms}
+        count, zero = len(e.moving_terms), f.splat(f.value(0.0), self.L)
+        for k in range(count):
+            self._put(zero, self.term, k, 0, self.L)
+        for name in ("rates", "far"):
+            if not self.results[name].size or not e.cotangents[name].size:
+                continue
+            with self._places(self.places[name]) as j:
+                here = self._state_at(name, j) | known
+                for i, node in enumerate(e.cotangents[name]):
+                    here[int(node)] = self._wide(self.results[name], i, j)
+                *values, place = self._evaluated(e.pulled[name], j, True, here)
+                inside = self._inside(j, self.places[name])
+                for k, value in enumerate(values):
+                    own = f.select(inside, f.splat(value, self.L), 0.0)
+                    self._put(self._get(self.term, k, 0, self.L) + own, self.term, k, 0, self.L)
+                if name == "rates":
+                    self._write_wide(self._wide(self.place, 0, j) + place, self.place, 0, j)
+        sums = [f.total(self._get(self.term, k, 0, self.L)) for k in range(count)]
+        for name, here in self._end_states():
+            for i, node in enumerate(e.cotangents[name]):
+                here[int(node)] = self._get(self.results[name], i)
+            values = self._evaluated(e.pulled[name], 0, False, here | known)
+            sums = [a + b for a, b in zip(sums, values, strict=False)]
+        given = terms | {int(node): each for node, each in zip(e.of_terms, sums, strict=True)}
+        values_of = f.evaluate(e.program, e.by_terms, given, 1)
+        for k, node in enumerate(e.by_terms):
+            self._put(self._get(self.parameter, k) + values_of[node], self.parameter, k)
+        with self._places(self.pieces) as j:
+            total = self._wide(self.length_of_piece, 0, j) + self._wide(t.lengths, 0, j)
+            self._write_wide(total, self.length_of_piece, 0, j)
+
+    def _write_geometry(self) -> None:
+        """Add the cotangents of parameters from those of places and lengths: once a run."""
+        e = self.equations
+        self.by_geometry = f = self._function("by_geometry", "state")
+        known = self._parameters(e.by_geometry)
+        for nodes, array in ((e.of_places, self.place), (e.of_lengths, self.length_of_piece)):
+            known |= {int(node): self._get(array, 0, k) for k, node in enumerate(nodes)}
+        values = f.evaluate(e.program, e.by_geometry, known, 1)
+        for k, node in enumerate(e.by_geometry):
+            self._put(self._get(self.parameter, k) + values[node], self.parameter, k)
+
+    def _write_cotangents(self) -> None:
+        """Cotangents of a step's data from those of its results."""
+        e, t = self.equations, self.tangents
+        self.step = f = self._function(
+            "step", "state", "coefficients", "control", "row", "unknowns", "n_columns"
+        )
+        memory, state, coefficients, control, row, unknowns, width = f.arguments
+        with f.loop(len(self.grid.nodes)) as node:
+            at = f.pointer(row, node.value * width * e.numbers)
+            for i in range(e.numbers):
+                self._put(f.load(at, width * i), t.row, i, node)
+        for i in range(e.k):
+            self._put(f.load(unknowns, width * i), t.unknowns, i)
+        write(self, self._solution_and_records(coefficients), 1, True)
+        if e.by_terms:
+            f.call(self.pulled, memory, state)
+        write(self, self._at_fixed_y(coefficients), 1, True)
+        for i in range(e.nc):
+            f.store(self._get(t.control, i), control, width * i)
+            self._put(0.0, t.control, i)
+
+    def _write_run(self) -> None:
+        """All solved steps in turn, which keeps what each starts from; then their cotangents in reverse."""
+        e, nodes = self.equations, len(self.grid.nodes)
+        names = ["memory", "controls", "coefficients", "rows", "unknowns", "kept", "states"]
+        names += ["d_controls", "d_rows", "d_unknowns", "n_steps", "n_columns"]
+        f = self._now = self.module.function("run", names, exported=True)
+        memory, controls, coefficients, rows, unknowns, kept, states = f.arguments[:7]
+        d_controls, d_rows, d_unknowns, steps, width = f.arguments[7:]
+
+        def copy(step: Index, forth: bool) -> None:
+            """Keep the arrays that a step starts from, or restore them."""
+            at = 0
+            for array in self._kept:
+                inside = f.pointer(memory, array.offset)
+                outside = f.pointer(kept, step.value * self._kept_size + at)
+                source, target = (inside, outside) if forth else (outside, inside)
+                with f.loop(self._length_of(array), 0, self.L) as k:
+                    f.store(f.load(source, k.value, self.L), target, k.value)
+                at += self._length_of(array)
+
+        f.call(self.setup, memory)
+        with f.loop(steps) as step:
+            table, control, row, unknown = self._data_of(step, coefficients, controls, rows, unknowns)
+            f.call(self.data, memory, table, control, unknown)
+            f.call(self.solution, memory, row)
+            copy(step, True)
+            f.call(self.recorded, memory)
+            f.call(self.shift, memory, table)
+        with f.loop(0, steps - 1, -1) as step:
+            table, control, row, unknown = self._data_of(step, coefficients, controls, rows, unknowns)
+            copy(step, False)
+            f.call(self.data, memory, table, control, unknown)
+            f.call(self.derivatives, memory)
+            own = f.pointer(d_controls, step.value * width * e.nc)
+            d_row = f.pointer(d_rows, step.value * width * (nodes * e.numbers))
+            d_unknown = f.pointer(d_unknowns, step.value * width * e.k)
+            with f.loop(width) as column:
+                parts = (f.pointer(each, column.value) for each in (own, d_row, d_unknown))
+                state = f.pointer(states, column.value * self.state_size)
+                f.call(self.step, memory, state, table, *parts, width)
+        if e.by_terms:
+            with f.loop(width) as column:
+                f.call(self.by_geometry, memory, f.pointer(states, column.value * self.state_size))
+
+    @property
+    def _kept(self) -> Sequence[Array]:
+        """Arrays from which the derivatives of a step are evaluated."""
+        return self.y, *self.records, self.rate
+
+    def _length_of(self, array: Array) -> int:
+        return array.size * array.component
+
+    @property
+    def _kept_size(self) -> int:
+        return sum(map(self._length_of, self._kept))
+
+    def solve(
+        self, parameters: np.ndarray, table: Float[np.ndarray, "solves 5"], solved: tuple[Any, Any],
+        controls: Float[np.ndarray, "solves c"], states: tuple[Any, Any], cotangents: Any,
+    ) -> tuple[Any, Any, Any, Any]:  # fmt: skip
+        """Return the cotangents of moving parameters (n, m), controls (solves, c, m), records and rate.
+
+        `states` are records (2, used, x) and rate before the first step. `cotangents` are those of rows
+        (solves, nodes, x, m) and unknowns (solves, k, m), and of records and rate after the last step.
+        """
+        begun, count = self._begun(parameters, solved, controls, table, *states), len(controls)
+        d_rows, d_unknowns, d_records, d_rate = (np.ascontiguousarray(each, float) for each in cotangents)
+        m, parts = d_rate.shape[-1], (*self.tangents.records, self.tangents.rate)
+        state = np.zeros((m, self.state_size))
+        for array, values in zip(parts, (*d_records, d_rate), strict=True):
+            self._put_in(state, array, np.moveaxis(values, -1, 0)[:, None])
+        d_controls = np.empty((count, self.equations.nc, m))
+        kept = np.empty((count, self._kept_size))
+        arrays = *begun, kept, state, d_controls, d_rows, d_unknowns
+        self._run(*(each.ctypes.data for each in arrays), count, m)
+        before = [np.moveaxis(self._numbers(state, each)[:, 0, : self.ends], 0, -1) for each in parts]
+        return self._numbers(state, self.parameter)[:, 0, 0].T, d_controls, np.stack(before[:2]), before[2]
+
+
+def _callable(address: int, pointers: int, numbers: int) -> Any:
+    return ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * pointers, *[ctypes.c_long] * numbers)(address)
+
+
 def _nodes(nonzeros: Nonzeros) -> list[int]:
     return [node for *_, node in nonzeros]
+
+
+def _products(
+    nonzeros: Nonzeros, matrix: tuple[Array, Any], target: tuple[Array, Any], source: tuple[Array, Any]
+) -> list[Operation]:
+    """Add the product of a sparse matrix with a vector; each has an array and a place."""
+    return [
+        Add(Number(target[0], i, target[1]), Number(source[0], c, source[1]), Number(matrix[0], n, matrix[1]))
+        for n, (i, c, _) in enumerate(nonzeros)
+    ]
+
+
+def _copies(
+    size: int, target: tuple[Array, Any], source: tuple[Array, Any], first: int = 0
+) -> list[Operation]:
+    """Copy components from `first` on; each has an array and a place."""
+    found = list[Operation]()
+    for i in range(first, first + size):
+        number = Number(target[0], i, target[1])
+        found += [Clear(number), Add(number, Number(source[0], i, source[1]))]
+    return found

@@ -11,11 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from knode_cosserat._numbers import real_array
+from knode_cosserat.engine.loops import Pattern
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.rods.trained_range import without_range
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.guess import state_from_positions
+from knode_cosserat.solvers.rollout import static_rollout
 from knode_cosserat.solvers.run import (
     Equilibria,
     failure,
@@ -24,7 +26,6 @@ from knode_cosserat.solvers.run import (
     warn_of_results,
     warn_outside_rod_theory,
 )
-from knode_cosserat.solvers.sensitivity import static_rollout
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.simulate import (
     check_initial,
@@ -138,7 +139,7 @@ def equilibria(
         rest = unloaded_shape(bare, settings.space) if y is None else y
         if batch and rest.ndim == 2:
             rest = jnp.broadcast_to(rest, (batch, *rest.shape))
-        rows = _traced(bare, controls, rest, task)
+        rows = _traced(bare, controls, rest, task, Pattern.of(bare))
     else:
         rows, _, causes = (static_batch if batch else static_run)(task, bare, controls, y, before)
         if on_failure == "raise" and causes:
@@ -150,10 +151,10 @@ def equilibria(
     return marked(Trajectory(system, settings, time, control=controls, **rows_of(system, rows)), None)
 
 
-@functools.partial(jax.jit, static_argnames="task")
-def _traced(system, controls, y, task):  # type: ignore[no-untyped-def]
+@functools.partial(jax.jit, static_argnames=("task", "pattern"))
+def _traced(system, controls, y, task, pattern):  # type: ignore[no-untyped-def]
     """Solve inside JAX's transformations: without recovery; unsolved rows become NaN."""
-    run: Any = static_rollout(task)
+    run: Any = static_rollout(task, pattern)
     if np.ndim(controls) == 3:
         run = jax.vmap(run, in_axes=(0 if np.ndim(system.length) else None, 0, 0))
     return run(system, controls, y)

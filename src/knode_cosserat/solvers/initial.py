@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from knode_cosserat.engine.loops import Pattern
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.solvers.evaluation import of_each_robot
 from knode_cosserat.solvers.grid import grid_of
@@ -27,8 +28,8 @@ from knode_cosserat.solvers.replay import (
     state_of_rows,
 )
 from knode_cosserat.solvers.result import Result, SimulationError
+from knode_cosserat.solvers.rollout import static_rollout
 from knode_cosserat.solvers.run import Equilibria, InitialState, warn_of_results
-from knode_cosserat.solvers.sensitivity import static_rollout
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.static_loop import unloaded_shape
@@ -82,7 +83,7 @@ def _settled(system: System, settings: Settings, budget: float | None, control: 
     many, held = np.ndim(system.length) > 0, control[None]
     task = Equilibria(Settings(None, settings.space, newton=settings.newton), 1, budget)
     if is_traced(system):
-        find, y = static_rollout(task), unloaded_shape(system, settings.space)
+        find, y = static_rollout(task, Pattern.of(system)), unloaded_shape(system, settings.space)
         rows = jax.vmap(find, in_axes=(0, None, 0))(system, held, y) if many else find(system, held, y)
         found, result = rows.records[..., 0, :, :], _coarse_only(rows.result[..., 0])
     elif many:

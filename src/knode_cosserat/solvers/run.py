@@ -115,6 +115,11 @@ class Equilibria:
     steps: int
     recovery_budget: float | None = None
 
+    @property
+    def coefficients(self) -> StepCoefficients:
+        """Coefficients of the steps: zeros."""
+        return engine.STILL
+
     def solve(self, system: System, controls: Any, state: Any, span: tuple[int, int]) -> Any:
         """Solve a span of equilibria until one fails: the number done, the last state, rows of the span."""
         return _solved(

@@ -9,13 +9,11 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple, Self
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Float
 
 from knode_cosserat.engine import loops as engine
@@ -23,12 +21,10 @@ from knode_cosserat.engine.program import EngineError
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.history import StateHistory, history_of, used_places
 from knode_cosserat.solvers.problem import StepProblem, no_history, row_of
-from knode_cosserat.solvers.run import Equilibria, TimeIntegration
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.solvers.static_loop import static_one
 from knode_cosserat.solvers.tangent import Moves, StepTangent, SystemMoves
-from knode_cosserat.solvers.time_loop import StepCoefficients, StepRows, loop_one
+from knode_cosserat.solvers.time_loop import StepCoefficients
 
 #: number of steps of one program
 PIECE = 40
@@ -53,101 +49,6 @@ class TangentState(NamedTuple):
         used = used_places(system, space)
         records, d_records = (part[:, :used] for part in (past.records, d_records))
         return cls(records, past.rate[:used], d_records, d_rate[:used], past.t0)
-
-
-@functools.lru_cache(maxsize=64)
-def rollout(task: TimeIntegration) -> Callable[[System, Any, StateHistory], tuple[StepRows, StateHistory]]:
-    """Return a differentiable function from (system, controls (T, c), past) to all rows and the last history.
-
-    Cached between calls: JAX recognises functions that it has already traced by identity.
-    """
-    settings, steps = task.settings, task.steps
-
-    @jax.custom_jvp
-    def run(system: System, controls: Any, past: StateHistory) -> tuple[StepRows, StateHistory]:
-        done, last, rows = loop_one(system, settings, task.coefficients, controls, past, (0, steps))
-        last = last._replace(t0=past.t0 + steps * task.dt)
-        return _nan_where_unsolved(rows), jax.tree.map(lambda x: jnp.where(done < steps, jnp.nan, x), last)
-
-    def tangent(primals: Any, tangents: Any) -> Any:
-        rows, last = run(*primals)
-        (system, controls, past), solved = primals, rows.every_stage
-        moves = SystemMoves.of(_system_tangent(tangents[0]))
-        _, d_controls, d_past = jax.tree.map(_instantiated, tangents, is_leaf=_is_zero)
-        state = TangentState.of(system, settings.space, past, d_past.records, d_past.rate)
-        after, d_solved = tangent_loop_in_jax(
-            settings, task.coefficients, solved, (system, controls), (moves, d_controls), state
-        )
-        # first guesses, error estimates and the extra stages of these count as constants
-        d_last = jax.tree.map(jnp.zeros_like, last)
-        used = len(after.d_rate)
-        d_last = d_last._replace(
-            records=d_last.records.at[:, :used].set(after.d_records),
-            rate=d_last.rate.at[:used].set(after.d_rate),
-            t0=d_past.t0,
-        )
-        d_records, d_unknowns = (d.reshape(steps, settings.stages, *d.shape[1:]) for d in d_solved)
-        d_rows = _row_tangents(rows, d_records[:, -1], d_unknowns[:, -1])
-        d_rows = d_rows._replace(stages=d_records[:, :-1], stage_unknowns=d_unknowns[:, :-1])
-        return (rows, last), (d_rows, d_last)
-
-    run.defjvp(tangent, symbolic_zeros=True)
-    return run
-
-
-@functools.lru_cache(maxsize=64)
-def static_rollout(task: Equilibria) -> Callable[[System, Any, Any], StepRows]:
-    """Return a differentiable function from (system, controls (T, c), y at all points) to all rows."""
-
-    @jax.custom_jvp
-    def run(system: System, controls: Any, y: Any) -> StepRows:
-        _, _, rows = static_one(system, task.settings, controls, y, (0, task.steps))
-        return _nan_where_unsolved(rows)
-
-    def tangent(primals: Any, tangents: Any) -> Any:
-        rows = run(*primals)
-        solved, moves = (rows.records, rows.unknowns), SystemMoves.of(_system_tangent(tangents[0]))
-        changes = moves, _instantiated(tangents[1])
-        d_rows, d_unknowns, _ = static_tangents_in_jax(task.settings, solved, primals[:2], changes)
-        return rows, _row_tangents(rows, d_rows, d_unknowns)
-
-    run.defjvp(tangent, symbolic_zeros=True)
-    return run
-
-
-def _is_zero(tangent: Any) -> bool:
-    return isinstance(tangent, SymbolicZero)
-
-
-def _instantiated(tangent: Any) -> Any:
-    """Return a tangent as an array."""
-    if not _is_zero(tangent):
-        return tangent
-    numeric: Any = np if tangent.dtype == jax.dtypes.float0 else jnp
-    return numeric.zeros(tangent.shape, tangent.dtype)
-
-
-def _system_tangent(tangent: Any) -> Any:
-    """Return the tangent of a system with arrays as leaves, or None if all of them are zero."""
-    leaves = jax.tree.leaves(tangent, is_leaf=_is_zero)
-    if all(_is_zero(leaf) for leaf in leaves):
-        return None
-    return jax.tree.map(_instantiated, tangent, is_leaf=_is_zero)
-
-
-def _nan_where_unsolved(rows: StepRows) -> StepRows:
-    unsolved = rows.result < 0
-    return rows._replace(
-        records=jnp.where(unsolved[:, None, None], jnp.nan, rows.records),
-        unknowns=jnp.where(unsolved[:, None], jnp.nan, rows.unknowns),
-        error=jnp.where(unsolved, jnp.inf, rows.error),
-    )
-
-
-def _row_tangents(rows: StepRows, d_records: Any, d_unknowns: Any) -> StepRows:
-    whole, zero = np.zeros(rows.result.shape, dtype=jax.dtypes.float0), jnp.zeros_like(rows.error)
-    none = jax.tree.map(jnp.zeros_like, (rows.stages, rows.stage_unknowns))
-    return StepRows(d_records, d_unknowns, zero, whole, zero, whole, zero, *none)
 
 
 def tangent_time_loop(
@@ -257,20 +158,3 @@ def static_tangents(
     still = dataclasses.replace(settings, time=None)
     after, found = tangent_time_loop(still, engine.STILL, solved, at, changes, state)
     return *found, after.d_records[0]
-
-
-@functools.partial(jax.jit, static_argnames="settings")
-def static_tangents_in_jax(
-    settings: Settings, solved: tuple[Any, Any], at: tuple[System, Any], changes: tuple[SystemMoves, Any]
-) -> tuple[Any, Any, Any]:
-    """Return the tangents of rows, unknowns and records of solved equilibria, traced by JAX."""
-    (system, controls), (moves, d_controls) = at, changes
-
-    def one(now: Any) -> Any:
-        row, unknowns, control, d_control = now
-        problem = StepProblem.still(system, settings.space, control)
-        none = jnp.zeros((*problem.history.shape, *d_control.shape[1:]))
-        _, d_records, d_row, d_unknowns = _step_tangent(problem, row, unknowns, moves, (none, d_control))
-        return d_row, d_unknowns, d_records
-
-    return jax.lax.map(one, (*solved, controls, d_controls))

@@ -14,13 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from knode_cosserat._numbers import real_array
+from knode_cosserat.engine.loops import Pattern
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.rods.trained_range import without_range
-from knode_cosserat.solvers import sensitivity
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.damping import warn_if_undamped, warn_of_long_steps
 from knode_cosserat.solvers.history import SolverState, at_stages
 from knode_cosserat.solvers.initial import continued_state, initial_state
+from knode_cosserat.solvers.rollout import rollout
 from knode_cosserat.solvers.run import (
     InitialState,
     TimeIntegration,
@@ -129,7 +130,7 @@ def simulate(
     # ranges are not part of the equations: programs are compiled for systems without them
     bare, before = without_range(system), without_range(unmarked(initial))
     if is_traced((system, controls, initial)):
-        found = _traced(bare, controls, before, settled, settings, dt)
+        found = _traced(bare, controls, before, settled, settings, dt, Pattern.of(bare))
     else:
         at_start, task, acting = _initial(bare, controls, before, settled, settings, dt, recovery_budget)
         found = _plain(bare, acting, at_start, task, on_failure, progress)
@@ -347,14 +348,14 @@ def _plain(
     return _trajectory(system, controls, at_start, task, rows, history)
 
 
-@functools.partial(jax.jit, static_argnames=("settled", "settings", "dt"))
-def _traced(system, controls, initial, settled, settings, dt):  # type: ignore[no-untyped-def]
+@functools.partial(jax.jit, static_argnames=("settled", "settings", "dt", "pattern"))
+def _traced(system, controls, initial, settled, settings, dt, pattern):  # type: ignore[no-untyped-def]
     """Simulate inside JAX's transformations: without recovery; unsolved rows become NaN.
 
     A single jitted function, so that a transformation traces it once and not at every call.
     """
     at_start, task, controls = _initial(system, controls, initial, settled, settings, dt, None)
-    run: Any = sensitivity.rollout(task)
+    run: Any = rollout(task, pattern)
     if np.ndim(controls) == 3:
         run = jax.vmap(run, in_axes=(0 if np.ndim(system.length) else None, 0, 0))
     rows, history = run(system, controls, at_start.state.history)

@@ -1,0 +1,467 @@
+"""Simulations and equilibria inside JAX's transformations: primitives that run in the engine.
+
+Three primitives solve all steps, and map tangents of their data to those of their results, and cotangents
+back. They run in the engine, by callbacks with NumPy only, or in JAX where the engine does not cover them.
+
+Arrays of a primitive have robots as first axis, and tangents columns as second axis. One system for all
+robots has one entry there. A batch of tangents of the same robots is more columns.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+
+from knode_cosserat.engine.core import Shape
+from knode_cosserat.engine.loops import Pattern, at_all_stages, core_of, table_of, tangents_for
+from knode_cosserat.engine.program import EngineError
+from knode_cosserat.engine.tangents import CotangentCore, TangentCore
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.history import StateHistory, used_places
+from knode_cosserat.solvers.problem import no_history
+from knode_cosserat.solvers.run import Equilibria, TimeIntegration
+from knode_cosserat.solvers.sensitivity import TangentState, tangent_loop_in_jax
+from knode_cosserat.solvers.static_loop import static_one
+from knode_cosserat.solvers.tangent import SystemMoves
+from knode_cosserat.solvers.time_loop import StepRows, loop_one, no_rows
+
+Arrays = Sequence[Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class Solves:
+    """All that the code of a primitive depends on, but for the shapes of its arrays."""
+
+    task: TimeIntegration | Equilibria
+    pattern: Pattern
+    #: true for leaves of the system that have tangents
+    moving: tuple[bool, ...] = ()
+
+    def of_system(self, leaves: Arrays) -> System:
+        """Return the system with these leaves."""
+        return jax.tree.unflatten(self.pattern.structure, leaves)
+
+    @property
+    def leaves(self) -> int:
+        """Number of arrays of a system."""
+        return len(self.pattern.zeros)
+
+    def moved(self, leaves: Arrays) -> list[Any]:
+        """Return the leaves that have tangents."""
+        return [leaf for leaf, moves in zip(leaves, self.moving, strict=True) if moves]
+
+
+def _primitive(
+    name: str, shapes: Callable[..., Any], core: Callable[..., Any], run: Callable[..., Any],
+    in_jax: Callable[..., Any],
+) -> Primitive:  # fmt: skip
+    """Return a primitive with results of some shapes.
+
+    `core` compiles code for the operands, before the program runs; `run` evaluates results by it.
+    """
+    primitive = Primitive(name)
+    primitive.multiple_results = True
+
+    @functools.lru_cache(maxsize=64)
+    def compiled(spec: Solves) -> Callable[..., Any]:
+        return jax.jit(functools.partial(primitive.bind, spec=spec))
+
+    @primitive.def_impl
+    def evaluate(*operands: Any, spec: Solves) -> Any:
+        return compiled(spec)(*operands)
+
+    @primitive.def_abstract_eval
+    def abstract(*operands: Any, spec: Solves) -> Any:
+        return [jax.core.ShapedArray(each.shape, each.dtype) for each in shapes(spec, *operands)]
+
+    def lower(ctx: Any, *operands: Any, spec: Solves) -> Any:
+        try:
+            code = core(spec, *ctx.avals_in)
+        except EngineError:
+            traced = functools.partial(in_jax, spec)
+            return mlir.lower_fun(traced, multiple_results=True)(ctx, *operands)
+
+        def call(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:
+            results = run(code, spec, *arrays)
+            return tuple(
+                np.asarray(each, aval.dtype) for each, aval in zip(results, ctx.avals_out, strict=True)
+            )
+
+        results, _, _ = mlir.emit_python_callback(
+            ctx, call, None, list(operands), ctx.avals_in, ctx.avals_out, has_side_effect=False
+        )
+        return results
+
+    mlir.register_lowering(primitive, lower)
+    return primitive
+
+
+def _spread(x: Any, axis: Any, size: int) -> Any:
+    """Return an array with its batch as first axis, which it may not have."""
+    if axis is None:
+        return jnp.broadcast_to(x, (size, *np.shape(x)))
+    return jnp.moveaxis(x, axis, 0)
+
+
+def _joined(x: Any, robots: int) -> Any:
+    """Return an array (batch, robots or 1, ...) with one axis for both."""
+    size = x.shape[0]
+    return jnp.broadcast_to(x, (size, robots, *x.shape[2:])).reshape(size * robots, *x.shape[2:])
+
+
+def _divided(x: Any, robots: int) -> Any:
+    """Return an array with its first axis divided into a batch and robots."""
+    return x.reshape(x.shape[0] // robots, robots, *x.shape[1:])
+
+
+def _as_robots(spec: Solves, operands: Arrays, axes: Arrays, robots: int) -> list[Any]:
+    """Return operands of a batch of robots; a system that is one for all remains one."""
+    size = next(np.shape(x)[axis] for x, axis in zip(operands, axes, strict=True) if axis is not None)
+    shared = all(
+        axis is None and x.shape[0] == 1 for x, axis in zip(operands, axes[: spec.leaves], strict=False)
+    )
+    return [
+        x if shared and k < spec.leaves else _joined(_spread(x, axis, size), robots)
+        for k, (x, axis) in enumerate(zip(operands, axes, strict=True))
+    ]
+
+
+# solved steps
+
+
+def _solved_shapes(spec: Solves, *operands: Any) -> list[Any]:
+    controls, states = operands[spec.leaves], operands[spec.leaves + 1 :]
+    system, shape = spec.pattern.system, controls.shape[:2]
+    rows = jax.eval_shape(lambda: no_rows(system, shape, spec.task.settings.stages))
+    return [jax.ShapeDtypeStruct(shape[:1], int), *states, *rows]
+
+
+def _core_of_solves(spec: Solves, *operands: Any) -> Any:
+    return core_of(spec.pattern.system, spec.task.settings, robots=operands[spec.leaves].shape[0] > 1)
+
+
+def _states_of(spec: Solves, states: Arrays) -> Any:
+    return Shape(*states) if isinstance(spec.task, Equilibria) else StateHistory(*states)
+
+
+def _solve(core: Any, spec: Solves, *arrays: np.ndarray) -> list[Any]:
+    leaves, controls = arrays[: spec.leaves], arrays[spec.leaves]
+    parameters = np.concatenate([leaf.reshape(len(leaf), -1) for leaf in leaves], axis=1)
+    states = _states_of(spec, arrays[spec.leaves + 1 :])
+    span = 0, spec.task.steps
+    done, last, rows = core.integrate(parameters, controls, spec.task.coefficients, states, span)
+    return [done, *last, *rows]
+
+
+def _solve_in_jax(spec: Solves, *operands: Any) -> list[Any]:
+    task, leaves, each = spec.task, operands[: spec.leaves], operands[spec.leaves :]
+    shared = all(leaf.shape[0] == 1 for leaf in leaves)
+
+    def one(given: Any) -> Any:
+        system = spec.of_system([leaf[0] for leaf in leaves] if shared else given[0])
+        controls, *states = given[1]
+        if isinstance(task, Equilibria):
+            done, last, rows = static_one(system, task.settings, controls, *states, (0, task.steps))
+            return done, last, *rows
+        past = StateHistory(*states)
+        done, last, rows = loop_one(system, task.settings, task.coefficients, controls, past, (0, task.steps))
+        return done, *last, *rows
+
+    return jax.lax.map(one, ((), each) if shared else (leaves, each))
+
+
+solve_p = _primitive("solve", _solved_shapes, _core_of_solves, _solve, _solve_in_jax)
+
+
+def _batched_solve(operands: Arrays, axes: Arrays, *, spec: Solves) -> Any:
+    robots = _robots(operands[spec.leaves], axes[spec.leaves])
+    found = solve_p.bind(*_as_robots(spec, operands, axes, robots), spec=spec)
+    return [_divided(x, robots) for x in found], [0] * len(found)
+
+
+def _robots(x: Any, axis: Any) -> int:
+    """Return the number of robots of an operand that may have a batch axis, too."""
+    return np.shape(x)[0 if axis is None else int(axis == 0)]
+
+
+batching.primitive_batchers[solve_p] = _batched_solve
+
+
+# tangents and cotangents: linear in their last operands. Those before are the leaves of the system, controls,
+# records, rate and time before the first step, and solved rows and unknowns
+
+
+def _residuals(spec: Solves) -> int:
+    return spec.leaves + 6
+
+
+def _sides(spec: Solves, operands: Arrays) -> tuple[list[Any], list[Any]]:
+    """Return, of the operands, the data and the results that have tangents."""
+    *leaves, controls, records, rate, _, rows, unknowns = operands[: _residuals(spec)]
+    return [*spec.moved(leaves), controls, records, rate], [rows, unknowns, records, rate]
+
+
+def _linear_shapes(side: int, spec: Solves, *operands: Any) -> list[Any]:
+    robots, columns = operands[-1].shape[:2]
+    return [
+        jax.ShapeDtypeStruct((robots, columns, *each.shape[1:]), each.dtype)
+        for each in _sides(spec, operands)[side]
+    ]
+
+
+def _core_of_linear(kind: Any, spec: Solves, *operands: Any) -> Any:
+    masks = [np.full(shape, moves) for (shape, _), moves in zip(spec.pattern.zeros, spec.moving, strict=True)]
+    return tangents_for(kind, spec.pattern, spec.task.settings, masks)
+
+
+def _each_robot(function: Callable[..., Any], spec: Solves, arrays: Arrays) -> list[np.ndarray]:
+    """Return results of a function of each robot's parameters, solved steps, and tangents.
+
+    Tangents and results have columns as the last axis in the function, and as the first one here.
+    """
+    task, n, system = spec.task, _residuals(spec), spec.pattern.system
+    found = []
+    for k in range(len(arrays[-1])):
+        own = [each[min(k, len(each) - 1)] for each in arrays]
+        *leaves, controls, records, rate, t0, rows, unknowns = own[:n]
+        parameters = np.concatenate([leaf.reshape(-1) for leaf in leaves])
+        table = table_of(task.settings, task.coefficients, task.steps, float(t0))
+        at = at_all_stages(system, task.settings, controls)
+        columns = [np.moveaxis(each, 0, -1) for each in own[n:]]
+        results = function(parameters, table, (rows, unknowns), at, (records, rate), columns)
+        found.append([np.moveaxis(each, -1, 0) for each in results])
+    return [np.stack(each) for each in zip(*found, strict=True)]
+
+
+def _push(core: TangentCore, spec: Solves, *arrays: np.ndarray) -> list[np.ndarray]:
+    system, settings = spec.pattern.system, spec.task.settings
+
+    def push(
+        parameters: Any, table: Any, solved: Any, controls: Any, states: Any, columns: Any
+    ) -> tuple[Any, ...]:
+        *leaves, d_controls, d_records, d_rate = columns
+        m = d_rate.shape[-1]
+        moved = [leaf.reshape(-1, m).T for leaf in leaves]
+        directions = np.concatenate(moved, axis=1) if moved else np.zeros((0, 0))
+        moves = directions, np.eye(len(directions), m)
+        d_own = at_all_stages(system, settings, d_controls)
+        after, found = core.solve(
+            parameters, table, solved, controls, moves, d_own, (*states, d_records, d_rate)
+        )
+        return *found, *after[2:]
+
+    return _each_robot(push, spec, arrays)
+
+
+def _pull(core: CotangentCore, spec: Solves, *arrays: np.ndarray) -> list[np.ndarray]:
+    shapes = spec.moved([shape for shape, _ in spec.pattern.zeros])
+    ends, steps = np.cumsum([int(np.prod(shape)) for shape in shapes])[:-1], spec.task.steps
+    held = arrays[spec.leaves].shape[2] == spec.pattern.system.control_size
+
+    def pull(*given: Any) -> tuple[Any, ...]:
+        moved, controls, *states = core.solve(*given)
+        leaves = np.split(moved, ends) if shapes else []
+        leaves = [leaf.reshape(*shape, -1) for leaf, shape in zip(leaves, shapes, strict=True)]
+        controls = controls.reshape(steps, spec.task.settings.stages, -1, controls.shape[-1])
+        controls = controls.sum(axis=1) if held else controls.reshape(steps, -1, controls.shape[-1])
+        return *leaves, controls, *states
+
+    return _each_robot(pull, spec, arrays)
+
+
+def _push_in_jax(spec: Solves, *operands: Any) -> list[Any]:
+    task, n = spec.task, _residuals(spec)
+    robots = operands[-1].shape[0]
+    leaves = [jnp.broadcast_to(leaf, (robots, *leaf.shape[1:])) for leaf in operands[: spec.leaves]]
+
+    def one(own: Any) -> Any:
+        *leaves, controls, records, rate, t0, rows, unknowns = own[:n]
+        *moved, d_controls, d_records, d_rate = own[n:]
+        columns, given = len(d_rate), iter(moved)
+        moves = SystemMoves(None, np.zeros((0, columns)))
+        if moved:
+            directions = [
+                next(given) if moves else jnp.zeros((columns, *leaf.shape))
+                for leaf, moves in zip(leaves, spec.moving, strict=True)
+            ]
+            moves = SystemMoves(spec.of_system(directions), np.eye(columns))
+        d_controls, d_records, d_rate = (
+            jnp.moveaxis(each, 0, -1) for each in (d_controls, d_records, d_rate)
+        )
+        after, found = tangent_loop_in_jax(
+            task.settings, task.coefficients, (rows, unknowns), (spec.of_system(leaves), controls),
+            (moves, d_controls), TangentState(records, rate, d_records, d_rate, t0),
+        )  # fmt: skip
+        return [jnp.moveaxis(each, -1, 0) for each in (*found, after.d_records, after.d_rate)]
+
+    return jax.lax.map(one, [*leaves, *operands[spec.leaves :]])
+
+
+def _pull_in_jax(spec: Solves, *operands: Any) -> list[Any]:
+    residuals, cotangents = operands[: _residuals(spec)], operands[_residuals(spec) :]
+    push = functools.partial(_push_in_jax, spec, *residuals)
+    return list(jax.linear_transpose(push, *_linear_shapes(0, spec, *operands))(list(cotangents)))
+
+
+DATA, RESULTS = 0, 1
+push_p = _primitive(
+    "push", functools.partial(_linear_shapes, RESULTS), functools.partial(_core_of_linear, TangentCore),
+    _push, _push_in_jax,
+)  # fmt: skip
+pull_p = _primitive(
+    "pull", functools.partial(_linear_shapes, DATA), functools.partial(_core_of_linear, CotangentCore),
+    _pull, _pull_in_jax,
+)  # fmt: skip
+
+
+def _batched_linear(primitive: Primitive, operands: Arrays, axes: Arrays, *, spec: Solves) -> Any:
+    n, robots = _residuals(spec), _robots(operands[-1], axes[-1])
+    if all(axis is None for axis in axes[:n]):
+        size = next(np.shape(x)[axis] for x, axis in zip(operands, axes, strict=True) if axis is not None)
+        columns = []
+        for x, axis in zip(operands[n:], axes[n:], strict=True):
+            own = jnp.moveaxis(_spread(x, axis, size), 0, 1)
+            columns.append(own.reshape(robots, size * own.shape[2], *own.shape[3:]))
+        found = primitive.bind(*operands[:n], *columns, spec=spec)
+        return [x.reshape(robots, size, x.shape[1] // size, *x.shape[2:]) for x in found], [1] * len(found)
+    found = primitive.bind(*_as_robots(spec, operands, axes, robots), spec=spec)
+    return [_divided(x, robots) for x in found], [0] * len(found)
+
+
+def _tangents_of_linear(
+    primitive: Primitive, in_jax: Any, primals: Arrays, tangents: Arrays, *, spec: Solves
+) -> Any:
+    n, found = _residuals(spec), primitive.bind(*primals, spec=spec)
+    moves = [not isinstance(tangent, ad.Zero) for tangent in tangents]
+    tangents = [ad.instantiate_zeros(each) for each in tangents]
+    if any(moves[:n]):
+        # second derivatives
+        return found, jax.jvp(functools.partial(in_jax, spec), tuple(primals), tuple(tangents))[1]
+    return found, primitive.bind(*primals[:n], *tangents[n:], spec=spec)
+
+
+def _transposed(other: Primitive, cotangents: Arrays, *operands: Any, spec: Solves) -> list[Any]:
+    n = _residuals(spec)
+    given = [ad.instantiate_zeros(each) for each in cotangents]
+    return [None] * n + list(other.bind(*operands[:n], *given, spec=spec))
+
+
+for _one, _other, _in_jax in ((push_p, pull_p, _push_in_jax), (pull_p, push_p, _pull_in_jax)):
+    batching.primitive_batchers[_one] = functools.partial(_batched_linear, _one)
+    ad.primitive_jvps[_one] = functools.partial(_tangents_of_linear, _one, _in_jax)
+    ad.primitive_transposes[_one] = functools.partial(_transposed, _other)
+
+
+# differentiable functions
+
+
+@functools.lru_cache(maxsize=64)
+def rollout(
+    task: TimeIntegration, pattern: Pattern
+) -> Callable[[System, Any, StateHistory], tuple[StepRows, StateHistory]]:
+    """Return a differentiable function from (system, controls (T, c), past) to all rows and the last history.
+
+    Cached between calls: JAX recognises functions that it has already traced by identity.
+    """
+
+    @jax.custom_jvp
+    def run(system: System, controls: Any, past: StateHistory) -> tuple[StepRows, StateHistory]:
+        done, found, rows = _solved(Solves(task, pattern), system, controls, past)
+        last = StateHistory(*found)._replace(t0=past.t0 + task.steps * task.dt)
+        return rows, jax.tree.map(lambda x: jnp.where(done < task.steps, jnp.nan, x), last)
+
+    def tangent(primals: Any, tangents: Any) -> Any:
+        rows, last = run(*primals)
+        d_past = jax.tree.map(_instantiated, tangents[2], is_leaf=_is_zero)
+        used = used_places(primals[0], task.settings.space)
+        past = primals[2]
+        states = past.records[:, :used], past.rate[:used], past.t0
+        d_states = d_past.records[:, :used], d_past.rate[:used]
+        d_rows, d_records, d_rate = _pushed(task, pattern, primals, tangents, rows, states, d_states)
+        # first guesses, error estimates and the extra stages of these count as constants
+        d_last = jax.tree.map(jnp.zeros_like, last)
+        d_last = d_last._replace(
+            records=d_last.records.at[:, :used].set(d_records), rate=d_last.rate.at[:used].set(d_rate),
+            t0=d_past.t0,
+        )  # fmt: skip
+        return (rows, last), (d_rows, d_last)
+
+    run.defjvp(tangent, symbolic_zeros=True)
+    return run
+
+
+@functools.lru_cache(maxsize=64)
+def static_rollout(task: Equilibria, pattern: Pattern) -> Callable[[System, Any, Any], StepRows]:
+    """Return a differentiable function from (system, controls (T, c), y at all points) to all rows."""
+
+    @jax.custom_jvp
+    def run(system: System, controls: Any, y: Any) -> StepRows:
+        return _solved(Solves(task, pattern), system, controls, Shape(y))[2]
+
+    def tangent(primals: Any, tangents: Any) -> Any:
+        rows, system = run(*primals), primals[0]
+        none = no_history(system, task.settings.space)[: used_places(system, task.settings.space)]
+        still = jnp.stack([none] * 2), none
+        return rows, _pushed(task, pattern, primals, tangents, rows, (*still, jnp.zeros(())), still)[0]
+
+    run.defjvp(tangent, symbolic_zeros=True)
+    return run
+
+
+def _solved(spec: Solves, system: System, controls: Any, states: Any) -> tuple[Any, list[Any], StepRows]:
+    """Return the number of steps done, the last state, and rows: NaN where unsolved."""
+    operands = [*jax.tree.leaves(system), controls, *states]
+    done, *found = (each[0] for each in solve_p.bind(*map(_one_robot, operands), spec=spec))
+    rows = StepRows(*found[len(states) :])
+    unsolved = rows.result < 0
+    rows = rows._replace(
+        records=jnp.where(unsolved[:, None, None], jnp.nan, rows.records),
+        unknowns=jnp.where(unsolved[:, None], jnp.nan, rows.unknowns),
+        error=jnp.where(unsolved, jnp.inf, rows.error),
+    )
+    return done, found[: len(states)], rows
+
+
+def _pushed(
+    task: Any, pattern: Pattern, primals: Any, tangents: Any, rows: StepRows, states: Any, d_states: Any
+) -> tuple[StepRows, Any, Any]:
+    """Return the tangents of rows, and of the records and the rate after the last step."""
+    system, controls = primals[:2]
+    d_leaves = jax.tree.leaves(tangents[0], is_leaf=_is_zero)
+    moving = tuple(not _is_zero(leaf) for leaf in d_leaves)
+    spec = Solves(task, pattern, moving)
+    residuals = *jax.tree.leaves(system), controls, *states, *rows.every_stage
+    moved = *spec.moved(d_leaves), _instantiated(tangents[1]), *d_states
+    operands = [*map(_one_robot, residuals), *(_one_robot(_one_robot(each)) for each in moved)]
+    d_records, d_unknowns, *after = (each[0, 0] for each in push_p.bind(*operands, spec=spec))
+    d_records, d_unknowns = (
+        each.reshape(task.steps, task.settings.stages, *each.shape[1:]) for each in (d_records, d_unknowns)
+    )
+    whole, zero = np.zeros(rows.result.shape, dtype=jax.dtypes.float0), jnp.zeros_like(rows.error)
+    last, stages = (d_records[:, -1], d_unknowns[:, -1]), (d_records[:, :-1], d_unknowns[:, :-1])
+    return StepRows(*last, zero, whole, zero, whole, zero, *stages), *after
+
+
+def _one_robot(x: Any) -> Any:
+    return jnp.asarray(x, float)[None]
+
+
+def _is_zero(tangent: Any) -> bool:
+    return isinstance(tangent, SymbolicZero)
+
+
+def _instantiated(tangent: Any) -> Any:
+    """Return a tangent as an array."""
+    if not _is_zero(tangent):
+        return tangent
+    numeric: Any = np if tangent.dtype == jax.dtypes.float0 else jnp
+    return numeric.zeros(tangent.shape, tangent.dtype)
