@@ -21,7 +21,7 @@ from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from knode_cosserat.engine.core import Shape
+from knode_cosserat.engine.core import Constants, Shape
 from knode_cosserat.engine.loops import Pattern, at_all_stages, core_of, table_of, tangents_for
 from knode_cosserat.engine.program import EngineError
 from knode_cosserat.engine.tangents import CotangentCore, TangentCore
@@ -155,10 +155,12 @@ def _states_of(spec: Solves, states: Arrays) -> Any:
 
 def _solve(core: Any, spec: Solves, *arrays: np.ndarray) -> list[Any]:
     leaves, controls = arrays[: spec.leaves], arrays[spec.leaves]
-    parameters = np.concatenate([leaf.reshape(len(leaf), -1) for leaf in leaves], axis=1)
-    states = _states_of(spec, arrays[spec.leaves + 1 :])
-    span = 0, spec.task.steps
-    done, last, rows = core.integrate(parameters, controls, spec.task.coefficients, states, span)
+    task, parameters = spec.task, np.concatenate([leaf.reshape(len(leaf), -1) for leaf in leaves], axis=1)
+    states, constants = (
+        _states_of(spec, arrays[spec.leaves + 1 :]),
+        Constants(parameters, task.settings.newton),
+    )
+    done, last, rows = core.integrate(constants, controls, task.coefficients, states, (0, task.steps))
     return [done, *last, *rows]
 
 
