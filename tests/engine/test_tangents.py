@@ -24,19 +24,25 @@ from knode_cosserat.solvers.static_loop import unloaded_shape
 from knode_cosserat.solvers.tangent import SystemMoves
 from knode_cosserat.solvers.time_loop import StepCoefficients
 from tests.engine.networks import with_network
+from tests.engine.test_core import Stretching
 
 DT, STEPS, COLUMNS = 0.05, 6, 11
 PAPER, ROUTED, CURVED = "delrin-tendon-robot", "delrin-routed-tendon-robot", "variable-curvature-robot"
-NETWORK = "network of 512 units"
+NETWORK, BAR = "network of 512 units", "bar"
+
+
+#: robots and schemes of which the places between ends, and y_s, enter
+SPACES = [(ROUTED, "sdirk2", "lobatto4"), (BAR, "bdf-alpha", "lobatto4"), (PAPER, "bdf2", "euler")]
 
 
 class Motion:
     """A motion under random controls, and random tangents of its history, controls and all parameters."""
 
-    def __init__(self, name, scheme, **changes):
+    def __init__(self, name, scheme, space="lobatto2", **changes):
         rng = np.random.default_rng(0)
-        robot = with_network(512, history=True) if name == NETWORK else kc.load_robot(name).replace(**changes)
-        self.robot, self.settings = robot, Settings.of(scheme, "lobatto2", "paper", NewtonOptions())
+        own = {NETWORK: functools.partial(with_network, 512, history=True), BAR: Stretching}
+        robot = own[name]() if name in own else kc.load_robot(name).replace(**changes)
+        self.robot, self.settings = robot, Settings.of(scheme, space, "paper", NewtonOptions())
         self.steps = StepCoefficients.of(self.settings, DT)
         self.past = jax.tree.map(np.asarray, resting_history(robot, self.settings))
         low, high = (2.0, 5.0) if name != CURVED else (0.2, 0.5)
@@ -74,14 +80,14 @@ class Motion:
 
 
 @pytest.mark.parametrize(
-    ("name", "scheme"),
+    ("name", "scheme", "space"),
     [
-        (PAPER, "bdf-alpha"), (ROUTED, "sdirk2"), (ROUTED, "bdf-alpha"), (CURVED, "bdf-alpha"),
-        (NETWORK, "bdf-alpha"),
+        (PAPER, "bdf-alpha", "lobatto2"), (ROUTED, "sdirk2", "lobatto2"), (ROUTED, "bdf-alpha", "lobatto2"),
+        (CURVED, "bdf-alpha", "lobatto2"), (NETWORK, "bdf-alpha", "lobatto2"), *SPACES,
     ],
 )  # fmt: skip
-def test_tangents_are_differences_of_motions(name, scheme):
-    motion, eps = Motion(name, scheme), 1e-4
+def test_tangents_are_differences_of_motions(name, scheme, space):
+    motion, eps = Motion(name, scheme, space), 1e-4
     after, (d_rows, d_unknowns) = tangent_time_loop(*motion.given)
     assert d_rows.shape[-1] == d_unknowns.shape[-1] == COLUMNS
     for column in (0, COLUMNS - 1):
@@ -157,12 +163,15 @@ def assert_transposed(function, at, along):
 
 
 @pytest.mark.parametrize(
-    ("name", "scheme"),
-    [(PAPER, "bdf-alpha"), (ROUTED, "sdirk2"), (ROUTED, "bdf-alpha"), (CURVED, "bdf-alpha")],
-)
-def test_cotangents_are_those_of_the_transposed_map(name, scheme, monkeypatch):
+    ("name", "scheme", "space"),
+    [
+        (PAPER, "bdf-alpha", "lobatto2"), (ROUTED, "sdirk2", "lobatto2"), (ROUTED, "bdf-alpha", "lobatto2"),
+        (CURVED, "bdf-alpha", "lobatto2"), *SPACES,
+    ],
+)  # fmt: skip
+def test_cotangents_are_those_of_the_transposed_map(name, scheme, space, monkeypatch):
     monkeypatch.setattr(rollout, "tangent_loop_in_jax", None)
-    motion = Motion(name, scheme)
+    motion = Motion(name, scheme, space)
     task = TimeIntegration(motion.settings, DT, STEPS)
     run = rollout.rollout(task, loops.Pattern.of(motion.robot))
 

@@ -22,6 +22,7 @@ from knode_cosserat.engine.codegen import Function, Index, Value, Variable
 from knode_cosserat.engine.elimination import EliminationCode
 from knode_cosserat.engine.equations import Equations
 from knode_cosserat.engine.memory import Array
+from knode_cosserat.engine.rod import StateArrays
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import LARGEST_CORRECTION, NewtonOptions
 from knode_cosserat.solvers.history import EXTRAPOLATIONS, StateHistory
@@ -55,15 +56,6 @@ class Shape(NamedTuple):
 
 
 States = TypeVar("States", StateHistory, Shape)
-
-
-class StateArrays(NamedTuple):
-    """Arrays of an evaluated state, or of its tangents: y at ends of pieces and at stages, z and y_s."""
-
-    far: Array
-    between: Array
-    z: Array
-    f: Array
 
 
 class Constants(NamedTuple):
@@ -541,21 +533,6 @@ class Core(EliminationCode):
         state = self._state(y[0], self.H, j, place)
         state |= {int(node): self._wide(y[1], i, j) for i, node in enumerate(e.dy[0])}
         return state | {int(node): self._wide(self.move, i, place) for i, node in enumerate(e.dhistory[0])}
-
-    def _evaluated_at(self, y: Array) -> StateArrays:
-        """Return the arrays of the state that was evaluated last, from y at the points."""
-        return StateArrays(y if self.far is None else self.far, self.between, self.z, self.f)
-
-    def _numbers_of(self, state: StateArrays, stop: int) -> Iterator[tuple[int, Index, Value]]:
-        """Write loops over places, and yield components of their records, places and numbers."""
-        e = self.equations
-        for y, first, end in ((state.far, 0, self.ends), (state.between, self.ends, stop)):
-            with self._places(end - first) as j:
-                here = j + first
-                sources = [(y, i, j) for i in range(e.ny)] + [(state.z, i, here) for i in range(e.nz)]
-                sources += [(state.f, i, here) for i in range(e.numbers - len(sources))]
-                for i, source in enumerate(sources):
-                    yield i, here, self._wide(*source)
 
     def _write_records(self) -> None:
         """Shift the records by one step; the rate and the stages' difference of rates need the old ones."""

@@ -39,6 +39,8 @@ class EliminationCode(RodCode):
 
     solved: Function
     advance: Function
+    #: true if the entries of A are needed
+    has_entries = False
 
     def __init__(self, equations: Equations, robots: bool, lanes: int):
         super().__init__(equations, robots, lanes)
@@ -61,9 +63,12 @@ class EliminationCode(RodCode):
         if any(i // ny != c // self.own for i, c, _ in self.base_slopes):
             raise EngineError("engine: the base of a strand depends on the unknowns of another")
         self.factor = a(len(self.elimination.factors), self.pieces)
+        #: entries of A
+        if robots or self.has_entries:
+            self.entries = a(len(self.elimination.entries), self.pieces)
         if robots:
-            #: entries of A; the recursion along the rod solves by B in every piece
-            self.matrix, self.added = a(len(self.elimination.entries), self.pieces), self.r
+            # the recursion along the rod solves by B in every piece
+            self.added = self.r
         else:
             #: columns of B⁻¹ A, and B⁻¹ r: places in lanes, and rows in lanes for the recursion along the rod
             self.wide_matrix, self.wide_added = a(ny * ny, self.pieces), a(ny, self.pieces)
@@ -123,10 +128,10 @@ class EliminationCode(RodCode):
             values = f.evaluate(el.program, outputs, known, self.L)
             for k, node in enumerate(el.factors):
                 self._write_wide(values[node], self.factor, k, j)
-            if self.batch:
+            if self.batch or self.has_entries:
                 for k, entry in enumerate(el.entries):
-                    self._write_wide(values[int(el.matrix[entry])], self.matrix, k, j)
-            else:
+                    self._write_wide(values[int(el.matrix[entry])], self.entries, k, j)
+            if not self.batch:
                 for i, c in np.ndindex(n, n):
                     self._write_wide(values[int(el.matrix[i, c])], self.wide_matrix, c * n + i, j)
         if self.batch:
@@ -164,7 +169,7 @@ class EliminationCode(RodCode):
         x = [f.load(source, c * component, lanes) for c in range(n)]
         if self.batch:
             known = {int(node): self._get(self.factor, k, j) for k, node in enumerate(el.stored)}
-            known |= {int(node): self._get(self.matrix, k, j) for k, node in enumerate(el.start_entries)}
+            known |= {int(node): self._get(self.entries, k, j) for k, node in enumerate(el.start_entries)}
             known |= {int(node): f.load(added, i * self.L, self.L) for i, node in enumerate(el.r)}
             known |= {int(node): value for node, value in zip(el.x, x, strict=True)}
             values = f.evaluate(el.program, el.advanced, known, self.L)

@@ -221,12 +221,14 @@ Nonzeros = list[tuple[int, int, int]]
 class TangentEquations(Equations):
     """Programs of a system with all derivatives of rates and strains, jumps, tip and base."""
 
-    def __init__(self, system: System, moving: Sequence[np.ndarray], transposed: bool):
+    def __init__(
+        self, system: System, moving: Sequence[np.ndarray], transposed: bool, space: SpaceScheme = LOBATTO2
+    ):
         """Differentiate the equations by y, history, control, and the parameters that are `moving`.
 
         By parameters: products of the derivatives with a direction or, if `transposed`, with cotangents.
         """
-        super().__init__(system, moving)
+        super().__init__(system, moving, space)
         results = {
             "rates": [*self.f, *self.z], "far": [*self.far] if system.jumps else [], "tip": [*self.tip],
             "base": [*self.base],
@@ -238,7 +240,8 @@ class TangentEquations(Equations):
             self._outputs += [node for *_, node in nonzeros]
         self._hoist()
         moved = np.concatenate([nodes[moves] for nodes, moves in zip(self.parameters, moving, strict=True)])
-        places = self.geometry[2][: grid_of(system, LOBATTO2).ends]
+        grid = grid_of(system, space)
+        places = self.geometry[2][: grid.ends + len(space.formula.stages) * grid.tip]
         (self._pull if transposed else self._push)(results, moved, places)
 
     def _push(self, results: dict[str, list[int]], moved: np.ndarray, places: np.ndarray) -> None:

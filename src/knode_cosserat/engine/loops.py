@@ -18,7 +18,6 @@ from knode_cosserat.engine.tangents import CotangentCore, TangentCode, TangentCo
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.solvers.problem import Evaluated
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.space import LOBATTO2
 from knode_cosserat.solvers.time_loop import StepCoefficients, StepRows
 
 log = logging.getLogger(__name__)
@@ -82,8 +81,8 @@ def tangents_for(
 
     def build() -> AnyTangents:
         system = pattern.system
-        if system.strands > 1 or system.mixed or settings.space != LOBATTO2:
-            raise EngineError("engine: tangents only of one rod by lobatto2, with B zero in its balance")
+        if system.strands > 1:
+            raise EngineError("engine: tangents only of one rod")
         return kind(system, settings, moving)
 
     return _compiled(key, build)

@@ -7,7 +7,7 @@ import functools
 import itertools
 import operator
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,6 +17,15 @@ from knode_cosserat.engine.equations import Equations
 from knode_cosserat.engine.memory import Array, Memory
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.space import Stage
+
+
+class StateArrays(NamedTuple):
+    """Arrays of an evaluated state, or of its tangents: y at ends of pieces and at stages, z and y_s."""
+
+    far: Array
+    between: Array
+    z: Array
+    f: Array
 
 
 class RodCode(Memory):
@@ -357,6 +366,21 @@ class RodCode(Memory):
         at_tip = self._tip_state(y, history)
         for i, value in enumerate(self._evaluated(e.tip, 0, False, at_tip)):
             self._put(value - self._get(self.tip_offset, i), self.tip, i)
+
+    def _evaluated_at(self, y: Array) -> StateArrays:
+        """Return the arrays of the state that was evaluated last, from y at the points."""
+        return StateArrays(y if self.far is None else self.far, self.between, self.z, self.f)
+
+    def _numbers_of(self, state: StateArrays, stop: int) -> Iterator[tuple[int, Index, Value]]:
+        """Write loops over places, and yield components of their records, places and numbers."""
+        e = self.equations
+        for y, first, end in ((state.far, 0, self.ends), (state.between, self.ends, stop)):
+            with self._places(end - first) as j:
+                here = j + first
+                sources = [(y, i, j) for i in range(e.ny)] + [(state.z, i, here) for i in range(e.nz)]
+                sources += [(state.f, i, here) for i in range(e.numbers - len(sources))]
+                for i, source in enumerate(sources):
+                    yield i, here, self._wide(*source)
 
     def _write_missing(self, y: tuple[Array, Array], rates: tuple[Array, Array]) -> None:
         """Write the defects of all pieces: y at their ends by the scheme, minus y."""

@@ -8,7 +8,9 @@ tangents in lanes. Cotangents pass through the transposed maps, from the last st
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Mapping, Sequence
+import functools
+import operator
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,10 +33,13 @@ class Tangents(NamedTuple):
     records: list[Array]
     rate: Array
     control: Array
-    #: history terms; rates and strains, y behind jumps, lengths, and defects of pieces and tip, at fixed y
+    #: history terms; rates and strains, those at ends of pieces, y behind jumps and at stages, lengths, and
+    #: defects of pieces and tip, at fixed y
     history: Array
     rates: Array
     far: Array
+    ends: Array
+    between: Array
     lengths: Array
     r: Array
     tip: Array
@@ -42,8 +47,9 @@ class Tangents(NamedTuple):
     w: Array
     alpha: Array
     beta: Array
-    #: the solution: y, the new records, row and unknowns
+    #: the solution: y, the change of rates by it, the new records, row and unknowns
     y: Array
+    change: Array
     newest: Array
     row: Array
     unknowns: Array
@@ -58,16 +64,17 @@ class TangentCode(EliminationCode):
 
     equations: TangentEquations
     transposed: bool
+    has_entries = True
 
     def __init__(self, system: System, settings: Settings, moving: Sequence[np.ndarray], lanes: int = 8):
         self.settings = settings
-        super().__init__(TangentEquations(system, moving, self.transposed), False, lanes)
+        super().__init__(TangentEquations(system, moving, self.transposed, settings.space), False, lanes)
         e, a = self.equations, self._array
         ny, nx, numbers, k = e.ny, e.ny + e.nz, e.numbers, e.k
-        self.records, self.rate = [a(numbers, self.ends) for _ in range(2)], a(numbers, self.ends)
+        self.records, self.rate = [a(numbers, self.used) for _ in range(2)], a(numbers, self.used)
         # derivatives at all places
-        self.z_by_y = a(len(e.z_by_y), self.ends)
-        self.places = {"rates": self.ends, "far": self.pieces, "tip": 1, "base": 1}
+        self.z_by_y = a(len(e.z_by_y), self.used)
+        self.places = {"rates": self.used, "far": self.pieces, "tip": 1, "base": 1}
         self.by_history = {name: a(len(e.by_history[name]), n) for name, n in self.places.items()}
         self.by_control = {name: a(len(e.by_control[name]), n) for name, n in self.places.items()}
         self.jumps += [
@@ -78,15 +85,16 @@ class TangentCode(EliminationCode):
         self.columns = 1 if self.transposed else lanes
         many = a if self.transposed else self._tangent_array
         whole, self._size = self._size, 0
-        records, rate = [many(numbers, self.ends, 1) for _ in range(2)], many(numbers, self.ends, 1)
+        records, rate = [many(numbers, self.used, 1) for _ in range(2)], many(numbers, self.used, 1)
         self._reserve_state()
         self.state_size, self._size = self._size, whole
         groups = self.groups[1]
         self.tangents = Tangents(
-            records, rate, many(e.nc, 1), many(numbers, self.ends), many(nx, self.ends),
-            many(ny, self.pieces), many(1, self.pieces), many(ny, self.pieces), many(k, 1),
+            records, rate, many(e.nc, 1), many(numbers, self.used), many(nx, self.used),
+            many(ny, self.pieces), many(ny, self.pieces), many(ny, self.used - self.ends),
+            many(1, self.pieces), many(ny, self.pieces), many(k, 1),
             many(ny, self.points), many(k, groups + 1), many(k, groups), many(ny, self.points),
-            many(numbers, self.ends), many(numbers, len(self.grid.nodes)), many(k, 1),
+            many(ny, self.used), many(numbers, self.used), many(numbers, len(self.grid.nodes)), many(k, 1),
         )  # fmt: skip
         #: the results of the equations at fixed y, by the names of their derivatives
         t = self.tangents
@@ -132,7 +140,7 @@ class TangentCode(EliminationCode):
         _, coefficients, control, unknowns = f.arguments
         self._write_inputs(f.load(coefficients, 0), f.load(coefficients, 4), control)
         weights = [f.load(coefficients, k) for k in self._history_weights]
-        with self._places(self.ends) as j:
+        with self._places(self.used) as j:
             for i in range(e.numbers):
                 parts = [self._wide(each, i, j) for each in (*self.records, self.rate)]
                 products = [weight * part for weight, part in zip(weights, parts, strict=False)]
@@ -182,17 +190,15 @@ class TangentCode(EliminationCode):
 
     def _write_shift(self) -> None:
         """The records after a step."""
-        e = self.equations
         self.shift = f = self._function("shift", "coefficients")
         c0 = f.load(f.arguments[1], 0)
-        far = self.y if self.far is None else self.far
-        with self._places(self.ends) as j:
-            for i in range(e.numbers):
+        with self._places(self.used) as j:
+            for i in range(self.equations.numbers):
                 self._write_wide(self._wide(self.records[0], i, j), self.records[1], i, j)
-                newest = self._wide(far, i, j) if i < e.ny else self._wide(self.z, i - e.ny, j)
-                self._write_wide(newest, self.records[0], i, j)
-                if self.settings.uses_rate:
-                    self._write_wide(c0 * newest + self._wide(self.H, i, j), self.rate, i, j)
+        for i, j, newest in self._numbers_of(self._evaluated_at(self.y), self.used):
+            self._write_wide(newest, self.records[0], i, j)
+            if self.settings.uses_rate:
+                self._write_wide(c0 * newest + self._wide(self.H, i, j), self.rate, i, j)
 
     def _terms_known(self, nodes: Sequence[int], moves: Mapping[int, Any] | None = None) -> dict[int, Any]:
         """Write terms of a step, once for all places, and return their values with those of the inputs."""
@@ -204,12 +210,21 @@ class TangentCode(EliminationCode):
             known[node] = self._term(node, self.step_terms, first, 0, self.P)
         return self._now.evaluate(e.program, nodes, known, 1)
 
-    def _state_at(self, name: str, j: Index) -> dict[int, Value]:
-        """Return the values at a place on which rates and strains, or y behind jumps, depend."""
+    def _states_at(self, name: str) -> Iterator[tuple[Index, Value | bool, dict[int, Value]]]:
+        """Write loops over places on which rates and strains, or y behind jumps, depend.
+
+        Yields the place, which lanes are inside, and the values there.
+        """
         far = self.y if self.far is None else self.far
         if name == "far":
-            return self._state(self.y, self.H, j) | self._acting_at(j)
-        return self._state(far, self.H, j) | {self.equations.s.item(): self._wide(self.s, 0, j)}
+            with self._places(self.pieces) as j:
+                yield j, self._inside(j, self.pieces), self._state(self.y, self.H, j) | self._acting_at(j)
+            return
+        for y, first, count in ((far, 0, self.ends), (self.between, self.ends, self.used - self.ends)):
+            if count:
+                with self._places(count) as j:
+                    place = {self.equations.s.item(): self._wide(self.s, 0, j + first)}
+                    yield j + first, self._inside(j, count), self._state(y, self.H, j, j + first) | place
 
     # the linear map of a step
 
@@ -241,54 +256,131 @@ class TangentCode(EliminationCode):
             return [Clear(Number(t.lengths, 0, j)), *self._by_data("far", t.far, j, j)]
 
         return [
-            Loop(0, self.ends, at_place), Loop(0, self.pieces, behind),
+            Loop(0, self.used, at_place), Loop(0, self.pieces, behind),
             *self._by_data("tip", t.tip, 0, self.pieces), *self._by_data("base", t.w, 0, 0),
         ]  # fmt: skip
 
     def _solution_and_records(self, coefficients: Value) -> list[Operation]:
         """Return the map from the results at fixed y to the solution, and to the records after the step."""
-        e, t = self.equations, self.tangents
+        e, t, formula = self.equations, self.tangents, self.space.formula
         near = [(self.points + k, point) for k, point in enumerate(self.near)]
+        stages = list(zip(formula.stages, self.stages, strict=True))
 
-        def moved(j: Index) -> list[Operation]:
-            return _products([(i, c, 0) for i, c in e.pattern], (self.slope, j), (t.rates, j), (t.far, j))
+        def slopes_by(target: tuple[Array, Any], source: Any, place: Any) -> list[Operation]:
+            """Add the product of the rates' derivatives at a place with numbers."""
+            return [
+                Add(Number(target[0], i, target[1]), source(c), Number(self.slope, n, place))
+                for n, (i, c) in enumerate(e.pattern)
+            ]
 
-        def defect(j: Index) -> list[Operation]:
-            half, found = self._get(self.h, 0, j) * 0.5, list[Operation]()
-            for i in range(e.ny):
-                r, rates = Number(t.r, i, j), self._get(self.f, i, j) + self._get(self.fe, i, j)
-                found += [
-                    Clear(r), Add(r, Number(t.far, i, j)), Add(r, Number(t.lengths, 0, j), rates * 0.5),
-                    Add(r, Number(t.rates, i, j), half), Add(r, Number(t.rates, i, j + 1), half),
-                ]  # fmt: skip
+        def at_ends(rates: Array) -> list[Operation]:
+            """Copy rates to the ends of pieces."""
+            found: list[Operation] = [
+                Loop(0, self.pieces, lambda j: _copies(e.ny, (t.ends, j), (rates, j + 1)))
+            ]
+            for place, point in near:
+                found += _copies(e.ny, (t.ends, point - 1), (rates, place))
             return found
 
-        found: list[Operation] = [Loop(0, self.pieces, moved)] if e.jumping else []
-        found.append(Loop(0, self.pieces, defect))
-        for place, point in near:
-            half = self._get(self.h, 0, point - 1) * 0.5
+        def increment(weights: Sequence[float], target: Any, rates: Array, j: Index) -> list[Operation]:
+            """Add h times the weighted sum of a piece's rates: at its start, its end and its stages."""
+            h, found = self._get(self.h, 0, j), list[Operation]()
+            places = (rates, j), (t.ends, j), *((rates, j + first) for first in self.stages)
+            for weight, (array, place) in zip(weights, places, strict=False):
+                if weight:
+                    own = h * weight
+                    found += [Add(target(i), Number(array, i, place), own) for i in range(e.ny)]
+            return found
+
+        def by_length(weights: Sequence[float], target: Any, j: Index) -> list[Operation]:
+            """Add the weighted sum of a piece's rates times the tangent of its length."""
+            places = (self.f, j), (self.fe, j), *((self.f, j + first) for first in self.stages)
+            found = list[Operation]()
             for i in range(e.ny):
-                r = Number(t.r, i, point - 1)
-                found.append(Add(r, Number(t.rates, i, place), half))
-                found.append(Add(r, Number(t.rates, i, point), half, is_negative=True))
+                parts = [
+                    weight * self._get(array, i, place)
+                    for weight, (array, place) in zip(weights, places, strict=False)
+                    if weight
+                ]
+                if parts:
+                    rate = functools.reduce(operator.add, parts)
+                    found.append(Add(target(i), Number(t.lengths, 0, j), rate))
+            return found
+
+        def moved(j: Index) -> list[Operation]:
+            return slopes_by((t.rates, j), lambda c: Number(t.far, c, j), j)
+
+        def between(k: int, j: Index) -> list[Operation]:
+            """Set y at a stage at fixed y, and add its part of the rates there."""
+            (stage, first), at = stages[k], j + k * self.pieces
+            own = [Number(t.between, i, at) for i in range(e.ny)]
+            found: list[Operation] = [Clear(number) for number in own]
+            if self.far is not None:
+                found += [Add(own[i], Number(t.far, i, j), 1.0 - stage.end) for i in range(e.ny)]
+            found += by_length(stage.rates, own.__getitem__, j)
+            found += increment(stage.rates, own.__getitem__, t.rates, j)
+            return found + slopes_by((t.rates, j + first), own.__getitem__, j + first)
+
+        def defect(j: Index) -> list[Operation]:
+            r = [Number(t.r, i, j) for i in range(e.ny)]
+            found: list[Operation] = [Clear(number) for number in r]
+            found += [Add(r[i], Number(t.far, i, j)) for i in range(e.ny)]
+            found += by_length(formula.weights, r.__getitem__, j)
+            return found + increment(formula.weights, r.__getitem__, t.rates, j)
+
+        found: list[Operation] = [Loop(0, self.pieces, moved)] if e.jumping else []
+        found += at_ends(t.rates)
+        found += [Loop(0, self.pieces, functools.partial(between, k)) for k in range(len(stages))]
+        found.append(Loop(0, self.pieces, defect))
         found += self._correction()
 
-        def behind(j: Index) -> list[Operation]:
+        def jumped(j: Index) -> list[Operation]:
             own = [(i, c, 0) for i, c, _ in e.jumping]
-            jumps = _products(own, (self.jump, j), (t.newest, j), (t.y, j))
-            return [*jumps, *(Add(Number(t.newest, i, j), Number(t.far, i, j)) for i in range(e.ny))]
+            return _products(own, (self.jump, j), (t.newest, j), (t.y, j))
+
+        def changed(j: Index) -> list[Operation]:
+            """Set the change of rates at ends of pieces by y."""
+            found: list[Operation] = [Clear(Number(t.change, i, j)) for i in range(e.ny)]
+            return found + slopes_by((t.change, j), lambda c: Number(t.newest, c, j), j)
+
+        def solved_between(k: int, j: Index) -> list[Operation]:
+            """Add the change of y at a stage, and set that of the rates there."""
+            (stage, first), at = stages[k], j + k * self.pieces
+            own = [Number(None, i) for i in range(e.ny)]
+            found = list[Operation]()
+            for i in range(e.ny):
+                found.append(Add(own[i], Number(t.newest, i, j), 1.0 - stage.end))
+                found.append(Add(own[i], Number(t.y, i, j + 1), stage.end))
+            found += increment(stage.rates, own.__getitem__, t.change, j)
+            found += [Clear(Number(t.change, i, j + first)) for i in range(e.ny)]
+            found += slopes_by((t.change, j + first), own.__getitem__, j + first)
+            found += [Add(Number(t.between, i, at), own[i]) for i in range(e.ny)]
+            return found + _copies(e.ny, (t.newest, j + first), (t.between, at))
 
         found.append(Loop(0, self.points, lambda j: _copies(e.ny, (t.newest, j), (t.y, j))))
-        if self.far is not None:
-            found.append(Loop(0, self.pieces, behind))
+        if e.jumping:
+            found.append(Loop(0, self.pieces, jumped))
         for place, point in near:
             found += _copies(e.ny, (t.newest, place), (t.y, point))
+        if stages or self.equations.system.mixed:
+            found += [Loop(0, self.ends, changed), *at_ends(t.change)]
+            found += [Loop(0, self.pieces, functools.partial(solved_between, k)) for k in range(len(stages))]
+        if self.far is not None:
+            found.append(
+                Loop(
+                    0, self.pieces,
+                    lambda j: [Add(Number(t.newest, i, j), Number(t.far, i, j)) for i in range(e.ny)],
+                )
+            )  # fmt: skip
         c0 = self._now.load(coefficients, 0)
 
         def recorded(j: Index) -> list[Operation]:
             found = _copies(e.nz, (t.newest, j), (t.rates, j), e.ny)
             strains = [(e.ny + i, c, node) for i, c, node in e.z_by_y]
             found += _products(strains, (self.z_by_y, j), (t.newest, j), (t.newest, j))
+            for i in range(e.numbers - e.ny - e.nz):
+                rate = Number(t.newest, e.ny + e.nz + i, j)
+                found += [Clear(rate), Add(rate, Number(t.rates, i, j)), Add(rate, Number(t.change, i, j))]
             if self.settings.uses_rate:
                 found += _copies(e.numbers, (t.rate, j), (t.history, j))
                 for i in range(e.numbers):
@@ -301,10 +393,10 @@ class TangentCode(EliminationCode):
             point = self._node(node)
             return [
                 *_copies(e.ny, (t.row, node), (t.y, point)),
-                *_copies(e.nz, (t.row, node), (t.newest, point), e.ny),
+                *_copies(e.numbers - e.ny, (t.row, node), (t.newest, point), e.ny),
             ]
 
-        found += [Loop(0, self.ends, recorded), Loop(0, len(self.grid.nodes), shown)]
+        found += [Loop(0, self.used, recorded), Loop(0, len(self.grid.nodes), shown)]
         return found + _copies(e.k, (t.unknowns, 0), (t.alpha, 0))
 
     def _correction(self) -> list[Operation]:
@@ -312,24 +404,17 @@ class TangentCode(EliminationCode):
         e, t, el = self.equations, self.tangents, self.elimination
         ny, k, (size, count) = e.ny, e.k, self.groups
         stored = {int(node): n for n, node in enumerate(el.stored)}
+        entries = {at: n for n, at in enumerate(el.entries)}
 
         def piece(j: Index) -> list[Operation]:
-            half, end = self._get(self.h, 0, j) * 0.5, [Number(t.w, i, j + 1) for i in range(ny)]
-            found = list[Operation]()
-            start, change = [Number(t.w, i, j) for i in range(ny)], [Number(None, i) for i in range(ny)]
-            if e.jumping:
-                behind = [Number(None, ny + i) for i in range(ny)]
-                found += [Add(one, other) for one, other in zip(behind, start, strict=True)]
-                for n, (i, c, _) in enumerate(e.jumping):
-                    found.append(Add(behind[i], start[c], Number(self.jump, n, j)))
-                start = behind
-            for n, (i, c) in enumerate(e.pattern):
-                found.append(Add(change[i], start[c], Number(self.slope, n, j)))
+            end, found = [Number(t.w, i, j + 1) for i in range(ny)], list[Operation]()
             for i in range(ny):
-                found += [
-                    Clear(end[i]), Add(end[i], Number(t.r, i, j)), Add(end[i], start[i]),
-                    Add(end[i], change[i], half),
-                ]  # fmt: skip
+                found += [Clear(end[i]), Add(end[i], Number(t.r, i, j))]
+            for i, c in zip(*np.nonzero(el.matrix != el.program.constant(0.0)), strict=True):
+                entry: Any = el.program.values[int(el.matrix[i, c])]
+                if (i, c) in entries:
+                    entry = Number(self.entries, entries[i, c], j)
+                found.append(Add(end[i], Number(t.w, int(c), j), entry))
             for i, c, node in el.substitution:
                 factor = Number(self.factor, stored[node], j) if node in stored else el.program.values[node]
                 found.append(
@@ -426,7 +511,7 @@ class TangentCore(TangentCode):
         whole, self._size = self._size, 0
         # of one direction of the system
         self.dparameters = a(len(e.dparameters), memory=1)
-        self.ds, self.dh = a(1, self.ends, 1), a(1, self.pieces, 1)
+        self.ds, self.dh = a(1, self.used, 1), a(1, self.pieces, 1)
         self.moved = {name: a(len(nodes), self.places[name], 1) for name, nodes in e.moved.items()}
         self.direction_size, self._size = self._size, whole
 
@@ -448,10 +533,9 @@ class TangentCore(TangentCode):
                 self._put(values[node], array, 0, k)
         known = {node: values[node] for node in e.moved_terms} | moves
         for name in ("rates", "far"):
-            if e.moved[name]:
-                with self._places(self.places[name]) as j:
-                    here = self._state_at(name, j) | known | {e.ds.item(): self._wide(self.ds, 0, j)}
-                    self._write_results([(self.moved[name], e.moved[name])], j, here)
+            for j, _, here in self._states_at(name) if e.moved[name] else ():
+                here |= known | ({e.ds.item(): self._wide(self.ds, 0, j)} if name == "rates" else {})
+                self._write_results([(self.moved[name], e.moved[name])], j, here)
         for name, here in self._end_states():
             for i, value in enumerate(self._evaluated(e.moved[name], 0, False, here | known)):
                 self._put(value, self.moved[name], i)
@@ -542,18 +626,18 @@ class TangentCore(TangentCode):
         parts = (*self.tangents.records, self.tangents.rate)
         for array, values in zip(parts, (*d_records, d_rate), strict=True):
             self._put_in(
-                tangents, array, np.moveaxis(filled(values).reshape(self.ends, -1, blocks, L), (2, 3), (0, 1))
+                tangents, array, np.moveaxis(filled(values).reshape(self.used, -1, blocks, L), (2, 3), (0, 1))
             )
         d_rows, d_unknowns = (np.empty((count, *shape, blocks * L)) for shape in ((nodes, e.numbers), (e.k,)))
         arrays = *begun, moved, tangents, filled(weights), filled(d_controls), d_rows, d_unknowns
         self._run(*(each.ctypes.data for each in arrays), count, len(directions), blocks * L)
         after = [self._numbers(memory[None], each)[0, 0] for each in (*self.records, self.rate)]
         moved_after = [
-            np.moveaxis(self._numbers(tangents, each), (0, 1), (2, 3)).reshape(self.ends, -1, blocks * L)
+            np.moveaxis(self._numbers(tangents, each), (0, 1), (2, 3)).reshape(self.used, -1, blocks * L)
             for each in parts
         ]
         found = (
-            np.stack([each[: self.ends] for each in after[:2]]), after[2][: self.ends],
+            np.stack([each[: self.used] for each in after[:2]]), after[2][: self.used],
             np.stack(moved_after[:2])[..., :m], moved_after[2][..., :m],
         )  # fmt: skip
         return found, (d_rows[..., :m], d_unknowns[..., :m])
@@ -571,7 +655,7 @@ class CotangentCore(TangentCode):
     def _reserve_state(self) -> None:
         e, a = self.equations, self._array
         #: cotangents of the moving parameters, of places, and of lengths of pieces
-        self.parameter, self.place = a(len(e.by_terms), memory=1), a(1, self.ends, 1)
+        self.parameter, self.place = a(len(e.by_terms), memory=1), a(1, self.used, 1)
         self.length_of_piece = a(1, self.pieces, 1)
 
     def _reserve_products(self) -> None:
@@ -604,24 +688,25 @@ class CotangentCore(TangentCode):
         for name in ("rates", "far"):
             if not self.results[name].size or not e.cotangents[name].size:
                 continue
-            with self._places(self.places[name]) as j:
-                here = self._state_at(name, j) | known
+            for j, inside, here in self._states_at(name):
+                here |= known
                 for i, node in enumerate(e.cotangents[name]):
                     here[int(node)] = self._wide(self.results[name], i, j)
                 *values, place = self._evaluated(e.pulled[name], j, True, here)
-                inside = self._inside(j, self.places[name])
                 for k, value in enumerate(values):
                     own = f.select(inside, f.splat(value, self.L), 0.0)
                     self._put(self._get(self.term, k, 0, self.L) + own, self.term, k, 0, self.L)
                 if name == "rates":
-                    self._write_wide(self._wide(self.place, 0, j) + place, self.place, 0, j)
+                    own = f.select(inside, f.splat(place, self.L), 0.0)
+                    self._write_wide(self._wide(self.place, 0, j) + own, self.place, 0, j)
         sums = [f.total(self._get(self.term, k, 0, self.L)) for k in range(count)]
         for name, here in self._end_states():
             for i, node in enumerate(e.cotangents[name]):
                 here[int(node)] = self._get(self.results[name], i)
             values = self._evaluated(e.pulled[name], 0, False, here | known)
             sums = [a + b for a, b in zip(sums, values, strict=False)]
-        given = terms | {int(node): each for node, each in zip(e.of_terms, sums, strict=True)}
+        given = self._parameters(e.by_terms) | terms
+        given |= {int(node): each for node, each in zip(e.of_terms, sums, strict=True)}
         values_of = f.evaluate(e.program, e.by_terms, given, 1)
         for k, node in enumerate(e.by_terms):
             self._put(self._get(self.parameter, k) + values_of[node], self.parameter, k)
@@ -736,7 +821,7 @@ class CotangentCore(TangentCode):
         kept = np.empty((count, self._kept_size))
         arrays = *begun, kept, state, d_controls, d_rows, d_unknowns
         self._run(*(each.ctypes.data for each in arrays), count, m)
-        before = [np.moveaxis(self._numbers(state, each)[:, 0, : self.ends], 0, -1) for each in parts]
+        before = [np.moveaxis(self._numbers(state, each)[:, 0, : self.used], 0, -1) for each in parts]
         return self._numbers(state, self.parameter)[:, 0, 0].T, d_controls, np.stack(before[:2]), before[2]
 
 
