@@ -246,7 +246,7 @@ def test_unsolved_rows_are_nan(tip_height):
 
 
 def test_what_the_engine_does_not_cover_is_refused():
-    settings = Settings.of("bdf2", "lobatto4", "paper", NewtonOptions())
-    at, changes = (kc.load_robot(PAPER), np.zeros((1, 4))), ((None, None), np.zeros((1, 4, 1)))
-    with pytest.raises(EngineError, match="lobatto2"):
+    settings = Settings.of("bdf2", "lobatto2", "paper", NewtonOptions())
+    at, changes = (kc.load_robot("six-legged-robot"), np.zeros((1, 6))), ((None, None), np.zeros((1, 6, 1)))
+    with pytest.raises(EngineError, match="one rod"):
         loops.tangent_loop(settings, None, None, at, changes, (), 0.0)
