@@ -413,6 +413,10 @@ class Function:
         """Return the largest number of all lanes."""
         return self._reduce(value, "fmax")
 
+    def total(self, value: Value) -> Value:
+        """Return the sum of all lanes."""
+        return self._reduce(value, "fadd")
+
     def any(self, value: Value) -> Value:
         """Return true if a lane is true."""
         return self._reduce(value, "or")
@@ -422,9 +426,11 @@ class Function:
             return value
         suffix = f"v{value.lanes}{'i1' if value.kind == 'i1' else 'f64'}"
         name = f"llvm.vector.reduce.{operation}.{suffix}"
-        self.module.declarations.add(f"declare {value.kind} @{name}({value.type})")
-        flags = MATH + " " if operation == "fmax" else ""
-        return self.result(f"call {flags}{value.kind} @{name}({value.type} {value.name})", value.kind)
+        start = f"{value.kind}, " if operation == "fadd" else ""
+        self.module.declarations.add(f"declare {value.kind} @{name}({start}{value.type})")
+        flags = "" if operation == "or" else f"reassoc {MATH} "
+        start = f"{value.kind} {literal(0.0)}, " if operation == "fadd" else ""
+        return self.result(f"call {flags}{value.kind} @{name}({start}{value.type} {value.name})", value.kind)
 
     # memory
 
