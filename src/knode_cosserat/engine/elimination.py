@@ -271,8 +271,8 @@ class EliminationCode(RodCode):
                 f.store(0.0, column(W, c), at, self.L)
             f.store(1.0, column(W, c), c.value * component, self.P)
             for i in range(k):
-                q = f.load(column(Q, c), i * component, self.P)
-                f.store(q * self._get(self.scale_tip, i), column(Q, c), i * component)
+                number = f.load(column(Q, c), i * component, self.P)
+                f.store(number * self._get(self.scale_tip, i), column(Q, c), i * component)
         with f.loop(k) as r:
             q = [f.load(column(Q, r), at, self.L) for at in rows]
             scale = 1.0 / f.apply("sqrt", total([each * each for each in q]))
