@@ -250,7 +250,7 @@ class EliminationCode(RodCode):
         self._write_inverse()
 
     def _write_inverse(self) -> None:
-        """The inverse of M X, by orthogonal columns (modified Gram-Schmidt), in the units of the residual.
+        """The inverse of M X, by orthogonal columns (Gram-Schmidt), in the units of the residual.
 
         With Q = M X W, in which the columns of Q are orthonormal, the inverse is W Qᵀ. There is no pivot to
         choose, which would differ from lane to lane.
@@ -273,19 +273,20 @@ class EliminationCode(RodCode):
             for i in range(k):
                 number = f.load(column(Q, c), i * component, self.P)
                 f.store(number * self._get(self.scale_tip, i), column(Q, c), i * component)
-        with f.loop(k) as r:
-            q = [f.load(column(Q, r), at, self.L) for at in rows]
-            scale = 1.0 / f.apply("sqrt", total([each * each for each in q]))
-            for matrix in (Q, W):
-                for at in rows:
-                    f.store(scale * f.load(column(matrix, r), at, self.L), column(matrix, r), at)
-            with f.loop(k, r.value + 1) as c:
+        with f.loop(k) as c:
+            # twice, because rounding leaves some of the other columns (Giraud et al. 2005)
+            with f.loop(2), f.loop(c.value) as r:
                 pairs = [(f.load(column(Q, r), at, self.L), f.load(column(Q, c), at, self.L)) for at in rows]
                 factor = total([one * other for one, other in pairs])
                 for matrix in (Q, W):
                     for at in rows:
                         change = factor * f.load(column(matrix, r), at, self.L)
                         f.store(f.load(column(matrix, c), at, self.L) - change, column(matrix, c), at)
+            own = [f.load(column(Q, c), at, self.L) for at in rows]
+            scale = 1.0 / f.apply("sqrt", total([each * each for each in own]))
+            for matrix in (Q, W):
+                for at in rows:
+                    f.store(scale * f.load(column(matrix, c), at, self.L), column(matrix, c), at)
         with f.loop(k) as c:
             found = [Variable(f, f.splat(f.value(0.0), self.L)) for _ in rows]
             with f.loop(k) as r:
