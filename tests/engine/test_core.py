@@ -66,7 +66,7 @@ def assert_same(wanted, found, tolerance, estimates):
             continue
         relative = estimates if name in ("error", "position_error", "time_error") else tolerance
         # residuals are differences of numbers of size one
-        least = 1e-13 if name == "error" else 1e-300
+        least = 1e-14 if name == "error" else 1e-300
         atol = max(relative * np.nanmax(np.abs(one), initial=0.0), least)
         np.testing.assert_allclose(other, one, atol=atol, err_msg=name)
 

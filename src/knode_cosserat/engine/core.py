@@ -408,7 +408,7 @@ class Core(EliminationCode):
 
     def _errors_of_poses(self) -> tuple[Value, Value]:
         """Return the largest error of positions (m) and of orientations (rad), of the better y."""
-        f, layout = self._now, self.equations.system.strand.y_layout
+        f, layout = self._now, self.equations.strand.y_layout
         offs, angles = (Variable(f, f.splat(f.value(0.0), self.L)) for _ in range(2))
         total = Variable(f, f.splat(f.value(0.0), self.L))
         with self._places(self.points) as j:

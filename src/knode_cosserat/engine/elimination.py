@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import operator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -80,6 +82,8 @@ class EliminationCode(RodCode):
         self.groups = _each(tip), (tip - 1) // _each(tip)
         self.T = by_rows(self.own, self.own, self.groups[1] * self.strands)
         self.M, self.inverse = by_rows(k, ny, self.strands), by_rows(k, k, 1)
+        #: M X with orthogonal columns, and the factor that makes them so
+        self.at_tip, self.triangle = by_rows(k, k, 1), by_rows(k, k, 1)
         self.zeros = by_rows(ny, 1, 1)
         #: the solution, its unknowns, and the correction of both
         self.y, self.unknowns = a(ny, self.ends), a(k)
@@ -245,26 +249,58 @@ class EliminationCode(RodCode):
                 product = self._product(M, [f.load(x, i * component, lanes) for i in range(ny)])
                 column = f.pointer(memory, (strand.value * own + c) * (self._padded(k) * component))
                 for row, value in zip(self._blocks(k), product, strict=True):
-                    f.store(value, column, self.inverse.at(row, 0), self.L)
+                    f.store(value, column, self.at_tip.at(row, 0), self.L)
         self._write_inverse()
 
     def _write_inverse(self) -> None:
-        """Replace M X by its inverse: elimination of columns (Gauss-Jordan), without pivoting."""
+        """The inverse of M X, by orthogonal columns (Gram-Schmidt), in the units of the residual.
+
+        With Q = M X W, in which the columns of Q are orthonormal, the inverse is W Qᵀ. There is no pivot to
+        choose, which would differ from lane to lane.
+        """
         f, k, component = self._now, self.equations.k, self.inverse.component
-        first, column = self._pointer(self.inverse, 0), self._padded(k) * component
-        rows, lanes = [row * component for row in self._blocks(k)], self.P
-        with f.loop(k) as r:
-            row, pivotal = f.pointer(first, r.value * component), f.pointer(first, r.value * column)
-            scale = 1.0 / f.load(row, r.value * column, lanes)
+        rows = [row * component for row in self._blocks(k)]
+        Q, W, inverse = (self._pointer(each, 0) for each in (self.at_tip, self.triangle, self.inverse))
+
+        def column(matrix: Value, c: Index) -> Value:
+            return f.pointer(matrix, c.value * (self._padded(k) * component))
+
+        def total(products: list[Value]) -> Value:
+            found = functools.reduce(operator.add, products)
+            return found if self.batch else f.total(found)
+
+        with f.loop(k) as c:
             for at in rows:
-                f.store(scale * f.load(pivotal, at, self.L), pivotal, at)
-            f.store(scale, row, r.value * column)
-            for start, stop in ((0, r.value), (r.value + 1, k)):
-                with f.loop(stop, start) as c:
-                    factor, other = f.load(row, c.value * column, lanes), f.pointer(first, c.value * column)
+                f.store(0.0, column(W, c), at, self.L)
+            f.store(1.0, column(W, c), c.value * component, self.P)
+            for i in range(k):
+                number = f.load(column(Q, c), i * component, self.P)
+                f.store(number * self._get(self.scale_tip, i), column(Q, c), i * component)
+        with f.loop(k) as c:
+            # twice, because rounding leaves some of the other columns (Giraud et al. 2005)
+            with f.loop(2), f.loop(c.value) as r:
+                pairs = [(f.load(column(Q, r), at, self.L), f.load(column(Q, c), at, self.L)) for at in rows]
+                factor = total([one * other for one, other in pairs])
+                for matrix in (Q, W):
                     for at in rows:
-                        f.store(f.load(other, at, self.L) - factor * f.load(pivotal, at, self.L), other, at)
-                    f.store(-factor * scale, row, c.value * column)
+                        change = factor * f.load(column(matrix, r), at, self.L)
+                        f.store(f.load(column(matrix, c), at, self.L) - change, column(matrix, c), at)
+            own = [f.load(column(Q, c), at, self.L) for at in rows]
+            scale = 1.0 / f.apply("sqrt", total([each * each for each in own]))
+            for matrix in (Q, W):
+                for at in rows:
+                    f.store(scale * f.load(column(matrix, c), at, self.L), column(matrix, c), at)
+        with f.loop(k) as c:
+            found = [Variable(f, f.splat(f.value(0.0), self.L)) for _ in rows]
+            with f.loop(k) as r:
+                number = f.load(column(Q, r), c.value * component, self.P)
+                for each, at in zip(found, rows, strict=True):
+                    each.set(each.get() + number * f.load(column(W, r), at, self.L))
+            unit = f.load(
+                f.pointer(self._pointer(self.scale_tip, 0), c.value * self.scale_tip.component), 0, self.P
+            )
+            for each, at in zip(found, rows, strict=True):
+                f.store(each.get() * unit, column(inverse, c), at)
 
     def _product(self, columns: list[list[Value]], x: list[Value]) -> list[Value]:
         """Return a matrix times a vector."""

@@ -42,7 +42,9 @@ class Equations:
         self.system, self.space = system, space
         leaves, tree = jax.tree.flatten(system)
         leaves = [np.asarray(leaf, dtype=float) for leaf in leaves]
-        strand, self.strands = system.strand, system.strands
+        # traced, because the numbers of a pattern are no robot's
+        strand = self.strand = jax.eval_shape(lambda own: own.strand, system)
+        self.strands = system.strands
         self.ny, self.nz = strand.y_layout.size, strand.z_layout.size
         self.nc, self.k = system.control_size, unknown_count(system)
         #: numbers of a record: y, z and, if B is not zero, y_s

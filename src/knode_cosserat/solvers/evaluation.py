@@ -39,8 +39,8 @@ def _evaluated(
     return StepProblem(system, t, control, c0, history, space).evaluated(y)
 
 
-def of_each_robot(function: Callable[..., Any], system: System, *arguments: Any) -> Any:
-    """Return a function of each robot of a batch, and of its part of the arguments."""
+def map_robots(function: Callable[..., Any], system: System, *arguments: Any) -> Any:
+    """Return the results of a function for each robot of a batch, with its part of the arguments."""
     if is_traced((system, arguments)):
         return jax.vmap(function)(system, *arguments)
     leaves, structure = jax.tree.flatten((system, *arguments))

@@ -10,7 +10,7 @@ import numpy as np
 
 from knode_cosserat.engine.loops import Pattern
 from knode_cosserat.rods.system import System, is_traced
-from knode_cosserat.solvers.evaluation import of_each_robot
+from knode_cosserat.solvers.evaluation import map_robots
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.history import (
     EXTRAPOLATIONS,
@@ -63,13 +63,13 @@ def initial_state(
         def at_record(system: System, record: Any) -> StateHistory:
             return at_one_state(system, made, record, control)
 
-        history = of_each_robot(at_record, system, record) if many else at_record(system, record)
+        history = map_robots(at_record, system, record) if many else at_record(system, record)
     else:
 
         def at_rest(system: System) -> Any:
             return rest_record(system), resting_history(system, made)
 
-        record, history = of_each_robot(at_rest, system) if many else at_rest(system)
+        record, history = map_robots(at_rest, system) if many else at_rest(system)
     found = record, SolverState(history), result
     if batch and not many:
         numeric: Any = jnp if is_traced(found) else np

@@ -22,7 +22,7 @@ from knode_cosserat.rods.elastic_rod import ElasticRod
 from knode_cosserat.rods.section import INWARD
 from knode_cosserat.rods.strands import in_strands
 from knode_cosserat.rods.system import System, is_traced
-from knode_cosserat.solvers.evaluation import of_each_robot
+from knode_cosserat.solvers.evaluation import map_robots
 from knode_cosserat.solvers.guess import materials
 from knode_cosserat.solvers.history import FirstStep, SolverState, StateHistory
 from knode_cosserat.solvers.recovery import Budget, SolvedStep
@@ -273,7 +273,7 @@ def warn_outside_rod_theory(system: System, rows: StepRows) -> None:
         def along(rod: Any) -> Any:
             return np.asarray(materials(rod, s * rod.length, still).radius)
 
-        radius = of_each_robot(along, strand) if many else along(strand)
+        radius = map_robots(along, strand) if many else along(strand)
     bent = np.linalg.norm(strand.z_layout.get(z, "u")[..., :2], axis=-1) * radius[..., None, :, None]
     stretch = np.linalg.norm(strand.z_layout.get(z, "v"), axis=-1)
     found = []

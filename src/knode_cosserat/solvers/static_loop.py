@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.system import System, unknowns_of
 from knode_cosserat.solvers.boundary import Kept, newton
-from knode_cosserat.solvers.evaluation import of_each_robot
+from knode_cosserat.solvers.evaluation import map_robots
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.history import unloaded
 from knode_cosserat.solvers.problem import StepProblem
@@ -29,7 +29,7 @@ from knode_cosserat.solvers.time_loop import (
 def unloaded_shape(system: System, space: SpaceScheme) -> Float[Any, "points y"]:
     """Return y at all points of the unloaded robot, or of a batch of robots."""
     if jnp.ndim(system.length):
-        return of_each_robot(lambda one: unloaded_shape(one, space), system)
+        return map_robots(lambda one: unloaded_shape(one, space), system)
     return unloaded(system, space)[1][: grid_of(system).tip + 1, : system.y_layout.size]
 
 
