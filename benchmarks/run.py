@@ -132,7 +132,11 @@ def table(found: dict[str, Any]) -> str:
             )
             for kind in ("sine", "step", "random")
         ),
-        ("a step of a steel cantilever, 40 segments", f"{found['cantilever']['microseconds']:.0f} µs", "<= 35 µs"),
+        (
+            "a step of a steel cantilever, 40 segments",
+            f"{found['cantilever']['microseconds']:.0f} µs",
+            "<= 35 µs",
+        ),
         ("40 nodes against 10", f"{nodes['40 nodes'] / nodes['10 nodes']:.1f}x", "<= 4x"),
         ("100 nodes against 10", f"{nodes['100 nodes'] / nodes['10 nodes']:.1f}x", "<= 8x"),
         (
