@@ -19,7 +19,7 @@ from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.history import resting_history
 from knode_cosserat.solvers.sensitivity import TangentState, tangent_loop_in_jax, tangent_time_loop
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.tangent import SystemMoves
+from knode_cosserat.solvers.sensitivity import SystemMoves
 from knode_cosserat.solvers.time_loop import StepCoefficients
 
 DT, STEPS, BATCH, ROUNDS = 0.05, 100, 64, 7

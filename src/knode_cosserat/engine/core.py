@@ -29,8 +29,7 @@ from knode_cosserat.solvers.history import EXTRAPOLATIONS, StateHistory
 from knode_cosserat.solvers.problem import FILLING, Evaluated
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.time import SDIRK2
-from knode_cosserat.solvers.time_loop import (
+from knode_cosserat.solvers.steps import (
     COARSE_ANGLE,
     COARSE_SHARE,
     ESTIMATE_TOLERANCE,
@@ -40,6 +39,7 @@ from knode_cosserat.solvers.time_loop import (
     StepRows,
     stage_extrapolations,
 )
+from knode_cosserat.solvers.time import SDIRK2
 
 #: numbers of a solved stage, for each robot
 USABLE, ERROR, CORRECTIONS, LINEARISATIONS, POSITION, ANGLE, TIME, ALIVE = range(8)

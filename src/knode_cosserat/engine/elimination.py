@@ -1,4 +1,13 @@
-"""Code of the linear equations of a correction: elimination along the rod (see `solvers.linear`)."""
+"""Code of the linear equations of a correction: elimination along the rod.
+
+    δy_0 = S δξ,     B δy_{j+1} = A δy_j + r_j,     M δy_N = -tip
+
+From base to tip every solution is written as δy_j = X_j α_j + w_j. α_j are the values at point j of the
+fields that are unknown at the base. For a clamped rod these are force and moment, and X is the compliance of
+the rod behind the point. After every few pieces α changes to the values at the point that is reached. Waves
+that grow along the rod are thereby kept apart, and rounding errors stay small. This is the Riccati form of
+the method of particular solutions (Ascher, Mattheij & Russell 1995, ch. 4).
+"""
 
 from __future__ import annotations
 
@@ -14,7 +23,6 @@ from knode_cosserat.engine.memory import Array
 from knode_cosserat.engine.program import EngineError
 from knode_cosserat.engine.rod import RodCode
 from knode_cosserat.solvers.boundary import pivots_of
-from knode_cosserat.solvers.linear import _each
 
 
 class Correction(NamedTuple):
@@ -32,6 +40,8 @@ class Correction(NamedTuple):
     unknowns: Array
 
 
+#: pieces between two changes of the unknowns
+GROUPS = (3, 4, 5)
 #: columns that are solved side by side: each operation of a column waits for the one before
 COLUMNS = 2
 
@@ -78,8 +88,10 @@ class EliminationCode(RodCode):
         #: columns of the unknowns along the rod
         self.X = by_rows(ny, self.own, self.points)
         tip = self.grid.tip
+        # a change of the unknowns costs about two pieces
+        size = min(GROUPS, key=lambda each: -(-tip // each) * (each + 2))
         #: number of pieces of a group, and of groups of a strand
-        self.groups = _each(tip), (tip - 1) // _each(tip)
+        self.groups = size, (tip - 1) // size
         self.T = by_rows(self.own, self.own, self.groups[1] * self.strands)
         self.M, self.inverse = by_rows(k, ny, self.strands), by_rows(k, k, 1)
         #: M X with orthogonal columns, and the factor that makes them so

@@ -1,4 +1,4 @@
-"""Time loops of the engine: the same arguments and results as the compiled loops of `solvers.time_loop`."""
+"""Time loops of the engine: the same arguments and results as the compiled loops of `solvers.steps`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from knode_cosserat.engine.tangents import CotangentCore, TangentCode, TangentCo
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.solvers.problem import Evaluated
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.time_loop import StepCoefficients, StepRows
+from knode_cosserat.solvers.steps import StepCoefficients, StepRows
 
 log = logging.getLogger(__name__)
 
@@ -102,7 +102,6 @@ def _compiled(key: Any, build: Callable[[], AnyCore]) -> AnyCore:
                 with jax.ensure_compile_time_eval():
                     core = build()
             except EngineError as error:
-                log.info("%s; JAX runs it", error)
                 # without the frames that a traceback keeps alive
                 core = error.with_traceback(None)
         _CORES[key] = core
@@ -172,32 +171,6 @@ def static_many(system: System, settings: Settings, controls: Any, y: Any, stop:
     """Solve the equilibria of a batch: controls (B, T, c), y (B, points, y), and one system or a batch."""
     done, last, rows = loop_many(system, settings, STILL, controls, Shape(y), stop)
     return done, last.y, rows
-
-
-def tangent_loop(
-    settings: Settings, steps: StepCoefficients, solved: tuple[Any, Any], at: tuple[System, Any],
-    changes: tuple[tuple[Any, Any], Any], states: tuple[Any, Any, Any, Any], t0: float,
-) -> tuple[Any, Any]:  # fmt: skip
-    """Return the tangents of solved steps: see `solvers.sensitivity.tangent_time_loop`, and its states."""
-    (system, controls), ((directions, weights), d_controls) = at, changes
-    leaves = [np.asarray(leaf, float) for leaf in jax.tree.leaves(system)]
-    if directions is None:
-        stacked = [np.zeros((0, *leaf.shape)) for leaf in leaves]
-        weights = np.zeros((0, d_controls.shape[-1]))
-    else:
-        stacked = [np.asarray(leaf, float) for leaf in jax.tree.leaves(directions)]
-    moving = [np.any(leaf != 0.0, axis=0) for leaf in stacked]
-    core = tangents_for(TangentCore, Pattern.of(system), settings, moving)
-    moved = np.concatenate(
-        [
-            leaf[:, mask].reshape(len(leaf), int(mask.sum()))
-            for leaf, mask in zip(stacked, moving, strict=True)
-        ],
-        axis=1,
-    )
-    own, d_own = (at_all_stages(system, settings, each) for each in (controls, d_controls))
-    table = table_of(settings, steps, len(controls), t0)
-    return core.solve(parameters_of(system), table, solved, own, (moved, weights), d_own, states)
 
 
 def table_of(settings: Settings, steps: StepCoefficients, count: int, t0: float) -> np.ndarray:

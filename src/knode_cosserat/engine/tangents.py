@@ -506,6 +506,10 @@ class TangentCore(TangentCode):
         super().__init__(system, settings, moving, lanes)
         self._run = _callable(self.compiled.address("run"), 11, 3)
 
+    def _reserve_state(self) -> None:
+        #: what is added to the residual of the tip's conditions
+        self.added_tip = self._tangent_array(self.equations.k, 1, 1)
+
     def _reserve_products(self) -> None:
         e, a = self.equations, self._array
         whole, self._size = self._size, 0
@@ -548,7 +552,8 @@ class TangentCore(TangentCode):
         _, _, directions, weights, d_control, coefficients, row, d_unknowns, count, width = f.arguments
         for i in range(e.nc):
             self._put(f.load(d_control, width * i, L), t.control, i, 0, L)
-        write(self, self._at_fixed_y(coefficients), L, False)
+        at_tip = [Add(Number(t.tip, i), Number(self.added_tip, i)) for i in range(e.k)]
+        write(self, [*self._at_fixed_y(coefficients), *at_tip], L, False)
         with f.loop(count) as d:
             own = f.pointer(directions, d.value * self.direction_size)
             weight = f.load(weights, d.value * width, L)
@@ -599,12 +604,13 @@ class TangentCore(TangentCode):
     def solve(
         self, parameters: np.ndarray, table: Float[np.ndarray, "solves 5"], solved: tuple[Any, Any],
         controls: Float[np.ndarray, "solves c"], moves: tuple[Any, Any], d_controls: Any, states: Any,
+        d_tip: Any = 0.0,
     ) -> tuple[Any, Any]:  # fmt: skip
         """Return the tangents of solved rows (solves, nodes, x, m) and unknowns (solves, k, m), and states.
 
         `moves` are directions of the moving parameters (d, n) and weights (d, m); `states` are records
-        (2, used, x) and rate before the first step, and their tangents with one more axis (m). The states
-        returned are those after the last step.
+        (2, used, x) and rate before the first step, and their tangents with one more axis (m). `d_tip` (k, m)
+        is added to the tangents of the tip's residual. The states returned are those after the last step.
         """
         e, L, (records, rate, d_records, d_rate) = self.equations, self.L, states
         (directions, weights), count = moves, len(controls)
@@ -628,6 +634,8 @@ class TangentCore(TangentCode):
             self._put_in(
                 tangents, array, np.moveaxis(filled(values).reshape(self.used, -1, blocks, L), (2, 3), (0, 1))
             )
+        added = filled(np.broadcast_to(d_tip, (e.k, m))).reshape(1, -1, blocks, L)
+        self._put_in(tangents, self.added_tip, np.moveaxis(added, (2, 3), (0, 1)))
         d_rows, d_unknowns = (np.empty((count, *shape, blocks * L)) for shape in ((nodes, e.numbers), (e.k,)))
         arrays = *begun, moved, tangents, filled(weights), filled(d_controls), d_rows, d_unknowns
         self._run(*(each.ctypes.data for each in arrays), count, len(directions), blocks * L)

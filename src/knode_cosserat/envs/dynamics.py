@@ -12,14 +12,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from knode_cosserat.engine.loops import Pattern
 from knode_cosserat.envs.spec import MEASURED, PREVIEW, Arrays, Ending, Spec, commanded, scaled
 from knode_cosserat.envs.tasks.base import Tip
 from knode_cosserat.rods.system import System
 from knode_cosserat.rotation import dot, rotation_matrix
 from knode_cosserat.solvers.history import StateHistory, rest_record, resting_history
 from knode_cosserat.solvers.result import Result
+from knode_cosserat.solvers.rollout import rollout
 from knode_cosserat.solvers.run import TimeIntegration
-from knode_cosserat.solvers.time_loop import StepRows, loop_many
+from knode_cosserat.solvers.steps import StepRows
 
 
 class EpisodeState(NamedTuple):
@@ -227,7 +229,9 @@ def step_many(
     moves = moved(spec, arrays, states, actions)
     systems = arrays.robot if spec.is_shared else moves.system
     acting, pasts = moves.acting[:, None], moves.state.history
-    _, histories, rows = loop_many(systems, spec.settings, task_of(spec).coefficients, acting, pasts, 1)
+    solve = rollout(task_of(spec), Pattern.of(systems))
+    axes = None if spec.is_shared else 0, 0, 0
+    rows, histories = jax.vmap(solve, in_axes=axes)(systems, acting, pasts)
     return arrived(spec, arrays, moves, histories, rows)
 
 

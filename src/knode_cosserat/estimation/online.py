@@ -20,9 +20,8 @@ from knode_cosserat.estimation.outputs import Output
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.history import StateHistory
 from knode_cosserat.solvers.run import TimeIntegration
-from knode_cosserat.solvers.sensitivity import TangentState, tangent_time_loop
+from knode_cosserat.solvers.sensitivity import SystemMoves, TangentState, tangent_time_loop
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.tangent import SystemMoves
 
 #: in the place of zero
 TINY = 1e-200

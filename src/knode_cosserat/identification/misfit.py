@@ -19,19 +19,19 @@ from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.load_cells import LoadCells
 from knode_cosserat.rotation import conjugate, quaternion_product, since_first
 from knode_cosserat.solvers.boundary import NewtonOptions
+from knode_cosserat.solvers.evaluation import unloaded_shape
 from knode_cosserat.solvers.history import constant_history
 from knode_cosserat.solvers.places import Places, places_at, positions_at, quaternions_at
 from knode_cosserat.solvers.run import Equilibria, TimeIntegration, run_one, usable_cores
 from knode_cosserat.solvers.sensitivity import (
+    SystemMoves,
     TangentState,
     static_tangents,
     tangent_time_loop,
 )
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.solvers.static_loop import unloaded_shape
-from knode_cosserat.solvers.tangent import SystemMoves
-from knode_cosserat.solvers.time_loop import StepCoefficients
+from knode_cosserat.solvers.steps import StepCoefficients
 
 #: seconds that recovery of one simulation may take
 RECOVERY = 0.5

@@ -15,6 +15,7 @@ from knode_cosserat.engine.loops import Pattern
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.rods.trained_range import without_range
 from knode_cosserat.solvers.boundary import NewtonOptions
+from knode_cosserat.solvers.evaluation import unloaded_shape
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.guess import state_from_positions
 from knode_cosserat.solvers.rollout import static_rollout
@@ -35,7 +36,6 @@ from knode_cosserat.solvers.simulate import (
     stacked,
 )
 from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.solvers.static_loop import unloaded_shape
 from knode_cosserat.solvers.static_run import static_batch, static_run
 from knode_cosserat.trajectory import Trajectory
 

@@ -10,8 +10,9 @@ import jax
 import numpy as np
 
 from knode_cosserat.engine import loops as engine
-from knode_cosserat.engine.program import EngineError
 from knode_cosserat.rods.system import System, is_traced
+from knode_cosserat.solvers.grid import grid_of
+from knode_cosserat.solvers.history import unloaded
 from knode_cosserat.solvers.problem import Evaluated, StepProblem, no_history
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
@@ -23,13 +24,11 @@ def evaluator(system: System, settings: Settings, traced: bool = False) -> Calla
     Its arguments are c0, the time (s), the control, history terms (places, x), and y at all points, or at the
     nodes. Inside JAX's transformations, all may be `traced`.
     """
-    in_jax = functools.partial(_evaluated, system, settings.space)
-    if traced:
-        return in_jax
-    try:
-        return engine.evaluator(system, settings)
-    except EngineError:
-        return lambda *arguments: jax.tree.map(np.asarray, in_jax(*arguments))
+    return (
+        functools.partial(_evaluated, system, settings.space)
+        if traced
+        else engine.evaluator(system, settings)
+    )
 
 
 @functools.partial(jax.jit, static_argnames="space")
@@ -52,3 +51,10 @@ def map_robots(function: Callable[..., Any], system: System, *arguments: Any) ->
 def still_state(system: System, space: SpaceScheme, control: Any, y: Any, t: Any = 0.0) -> Evaluated:
     """Return the state at rest of y at all points, or at the nodes, under a control."""
     return evaluator(system, Settings(None, space))(0.0, t, control, no_history(system, space), y)
+
+
+def unloaded_shape(system: System, space: SpaceScheme) -> Any:
+    """Return y at all points (points, y) of the unloaded robot, or of a batch of robots."""
+    if np.ndim(system.length):
+        return map_robots(lambda one: unloaded_shape(one, space), system)
+    return unloaded(system, space)[1][: grid_of(system).tip + 1, : system.y_layout.size]

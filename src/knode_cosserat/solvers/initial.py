@@ -10,7 +10,7 @@ import numpy as np
 
 from knode_cosserat.engine.loops import Pattern
 from knode_cosserat.rods.system import System, is_traced
-from knode_cosserat.solvers.evaluation import map_robots
+from knode_cosserat.solvers.evaluation import map_robots, unloaded_shape
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.history import (
     EXTRAPOLATIONS,
@@ -32,7 +32,6 @@ from knode_cosserat.solvers.rollout import static_rollout
 from knode_cosserat.solvers.run import Equilibria, InitialState, warn_of_results
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.solvers.static_loop import unloaded_shape
 from knode_cosserat.solvers.static_run import static_run
 from knode_cosserat.trajectory import Trajectory
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -13,30 +11,14 @@ import numpy as np
 from jaxtyping import Float, Shaped
 
 from knode_cosserat.rods.strands import in_strands
-from knode_cosserat.rods.system import System, is_traced, unknowns_of
+from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.grid import Grid, grid_of, inside, taken
-from knode_cosserat.solvers.hoisting import split_function
-from knode_cosserat.solvers.linear import Linearisation, filled_up, matrix_products, quotient
 from knode_cosserat.solvers.semi_discrete import History, Point, records_in_strands, unpacked_history
 from knode_cosserat.solvers.space import Formula, SpaceScheme
-from knode_cosserat.solvers.sparsity import nonzero_columns
 
 #: Newton corrections of y at discontinuities inside a segment, for each discontinuity of the segment
 FILLING = 5
-
-
-class Hoisted(NamedTuple):
-    """Terms that do not change during Newton's iteration (`ahead.InTwo`), and the function of the rest."""
-
-    #: function of (hoisted terms, s, (y, packed record of history)) that returns y_s and z
-    remainder: Callable[[Any, Any, Any], Any]
-    #: hoisted terms at all places of all strands
-    terms: Any
-    #: columns of the Jacobian with respect to a strand's y that may be nonzero
-    columns: tuple[int, ...]
-    #: the same for a strand's packed record of history
-    history_columns: tuple[int, ...]
 
 
 def no_history(system: System, space: SpaceScheme) -> Float[Any, "places x"]:
@@ -83,55 +65,12 @@ class StepProblem(eqx.Module):
     #: history terms at every place where the equations are evaluated (`Grid`)
     history: Float[Any, "places x"]
     space: SpaceScheme = eqx.field(static=True)
-    #: right-hand side of the tip's boundary conditions: zero, except during continuation
-    tip_offset: Any = None
-    hoisted: Hoisted | None = None
 
     @classmethod
-    def still(
-        cls, system: System, space: SpaceScheme, control: Any, t: Any = 0.0, **options: Any
-    ) -> StepProblem:
+    def still(cls, system: System, space: SpaceScheme, control: Any, t: Any = 0.0) -> StepProblem:
         """Return the problem of an equilibrium: no rates, no history."""
         t, c0 = jnp.asarray(t, dtype=float), jnp.zeros(())
-        return cls(system, t, jnp.asarray(control), c0, no_history(system, space), space, **options)
-
-    def ready(self) -> StepProblem:
-        """Hoist the terms that depend on neither y nor the history."""
-        strand, places = self.system.strand, self.places
-
-        def at_point(s: Any, state: tuple[Any, Any]) -> Any:
-            return self.point_rates(s, *state)
-
-        record = self.history_by_strand(self.history[:1])[0]
-        parts = split_function(at_point, places[0], (jnp.zeros(strand.y_layout.size), record))
-        # if y does not enter the equations: one column of zeros
-        columns, of_history = (tuple(nonzero_columns(parts.traced, k).tolist()) or (0,) for k in (1, 2))
-        hoisted = Hoisted(parts.remainder, jax.vmap(parts.first)(places), columns, of_history)
-        return dataclasses.replace(self, hoisted=hoisted)
-
-    @property
-    def columns(self) -> np.ndarray:
-        """Columns of the Jacobian with respect to a strand's y that may be nonzero; all if not `ready`."""
-        every = np.arange(self.system.strand.y_layout.size)
-        return every if self.hoisted is None else np.array(self.hoisted.columns, dtype=int)
-
-    @property
-    def history_columns(self) -> np.ndarray:
-        """Columns with respect to a strand's history that may be nonzero, of a `ready` problem."""
-        assert self.hoisted is not None
-        return np.array(self.hoisted.history_columns, dtype=int)
-
-    def with_data(self, history: Float[Any, "places x"], control: Any) -> StepProblem:
-        """Return the same problem with another history and control."""
-        return dataclasses.replace(self, history=history, control=control, hoisted=None)
-
-    def of_system(self, system: System) -> StepProblem:
-        """Return the same problem of another system."""
-        return dataclasses.replace(self, system=system, hoisted=None)
-
-    def with_history(self, history: Float[Any, "places x"]) -> StepProblem:
-        """Return the same problem with another history."""
-        return dataclasses.replace(self, history=history)
+        return cls(system, t, jnp.asarray(control), c0, no_history(system, space), space)
 
     def point_rates(self, s: Any, y: Float[Any, " y"], history: Float[Any, " x"]) -> Any:
         """Return x = [y_s; z] at one point of a strand (paper eq. 5, compact form x = M⁻¹ f).
@@ -153,10 +92,8 @@ class StepProblem(eqx.Module):
 
     def tip_residual(self, y: Float[Any, " y"]) -> Float[Any, " k"]:
         """Return the residual of the tip's boundary conditions, from y of the last node."""
-        left = semi_discrete.tip(
-            self.system, self.t, self.control, y, self._unpack(self.history[self.grid.tip])
-        )
-        return left if self.tip_offset is None else left - self.tip_offset
+        history = self._unpack(self.history[self.grid.tip])
+        return semi_discrete.tip(self.system, self.t, self.control, y, history)
 
     def jump(self, acting: Any, y: Float[Any, " y"], history: Float[Any, " x"]) -> Float[Any, " y"]:
         """Return y on the far side of the active discontinuities."""
@@ -201,53 +138,15 @@ class StepProblem(eqx.Module):
 
     def _evaluated(self, lanes: slice, y: Float[Any, "n y"]) -> tuple[Any, Any]:
         """Return f and z at places, from y there."""
-        f, z = self._side_by_side(self._at_point, lanes, y)
-        return self._joined(f), self._joined(z)
-
-    def _linearised(self, lanes: slice, y: Float[Any, "n y"]) -> tuple[Any, Float[Any, "b used n_strands"]]:
-        """Return the rates at places, and their derivatives with respect to the used columns of y."""
-        directions = jnp.eye(self.system.strand.y_layout.size)[:, self.columns]
-
-        def at_point(s: Any, y: Any, history: Any, terms: Any) -> Any:
-            def along(direction: Any) -> Any:
-                return jax.jvp(lambda y: self._at_point(s, y, history, terms)[0], (y,), (direction,))
-
-            return jax.vmap(along, in_axes=-1, out_axes=(None, -1))(directions)
-
-        f, slopes = self._side_by_side(at_point, lanes, y)
-        return self._joined(f), slopes
-
-    def lanes(self, lanes: slice, y: Float[Any, "n y"]) -> tuple[Any, Any, Any]:
-        """Return arclength (m), y and packed history of the strands at places."""
-        return (
-            self._each_strand(self.places[lanes]),
-            self.by_strand(y),
-            self.history_by_strand(self.history[lanes]),
-        )
-
-    def _side_by_side(self, function: Any, lanes: slice, y: Any) -> Any:
-        """Apply a function of (s, y, history, hoisted terms) at places (last axis of the result)."""
-        terms = None if self.hoisted is None else self.hoisted.terms
-        s, terms = jax.tree.map(lambda each: self._each_strand(each[lanes]), (self.places, terms))
-        history = self.history_by_strand(self.history[lanes])
-        # places last inside: XLA then vectorises over them
-        each = jax.vmap(function, in_axes=(0, -1, -1, 0), out_axes=-1)
-        return each(s, self.by_strand(y).T, history.T, terms)
-
-    def _at_point(self, s: Any, y: Any, history: Any, terms: Any) -> Any:
-        if self.hoisted is None:
-            return self.point_rates(s, y, history)
-        return self.hoisted.remainder(terms, s, (y, history))
+        s, history = self._each_strand(self.places[lanes]), self.history_by_strand(self.history[lanes])
+        f, z = jax.vmap(self.point_rates)(s, self.by_strand(y), history)
+        return f.reshape(len(y), -1), z.reshape(len(y), -1)
 
     def _ends(self, y: Float[Any, "points y"], every: bool) -> tuple[slice, Any]:
         """Return the places at the ends of pieces that the scheme uses (all if `every`), and y there."""
         far = self.far(y)
         if not (every or self.space.implicit):
             return slice(0, self.grid.tip), far
-        return self.all_ends(y, far)
-
-    def all_ends(self, y: Float[Any, "points y"], far: Any) -> tuple[slice, Any]:
-        """Return the places at all ends of pieces, and y there, from y on the near and far sides."""
         grid = self.grid
         return slice(0, grid.ends), jnp.concatenate([far, y[-1:], taken(y, grid.near)])
 
@@ -318,57 +217,16 @@ class StepProblem(eqx.Module):
         defects, tip = self.residuals(y)
         return Evaluated(y, self.records(y), jnp.max(jnp.abs(defects) / self.system.scales().y), tip)
 
-    def linearise(self, y: Float[Any, "points y"], unknowns: Any) -> Linearisation:
-        """Return the exact derivatives of the residuals, all pieces side by side."""
-        grid, formula, used = self.grid, self.space.formula, self.columns
-        lanes, ends = self._ends(y, every=False)
-        f, slopes = self._linearised(lanes, ends)
-        rates = [*self.at_ends(f)]
-        h, eye = self._each_strand(self.lengths()[:, 0]), jnp.eye(slopes.shape[0])[:, used, None]
-        start, end = self._slopes_at_ends(slopes)
-        by_start, by_end = [start, 0.0], [0.0, end]
-        for k, stage in enumerate(formula.stages):
-            between = self.between(stage, ends[: grid.tip], y[1:], rates)
-            f, slopes = self._linearised(grid.stage(k), between)
-            rates.append(f)
-            for ways, part in ((by_start, 1.0 - stage.end), (by_end, stage.end)):
-                moved = sum(x * way for x, way in zip(stage.rates, ways, strict=False))
-                ways.append(matrix_products(slopes, taken(part * eye + h * moved, used)))
-        A, B = (
-            eye + sign * h * sum(b * way for b, way in zip(formula.weights, ways, strict=True))
-            for sign, ways in ((1.0, by_start), (-1.0, by_end))
-        )
-        G = None
-        if self.space.implicit:
-            # otherwise XLA evaluates both again for each use
-            A, B = jax.lax.optimization_barrier((A, B))
-            A, G = quotient(A, B, used)
-        F = self._jumped(self._blocks(filled_up(A, used)), y)
-        M, S = jax.jacfwd(self.tip_residual)(y[-1]), jax.jacfwd(self.base)(unknowns)
-        return Linearisation(F, None if G is None else self._blocks(filled_up(G, used)), S, M)
-
-    def _slopes_at_ends(self, J: Float[Any, "b used n_strands"]) -> tuple[Any, Any]:
-        """Return the derivatives of the rates at the starts and the ends of pieces."""
-        grid, strands = self.grid, self.system.strands
-        start = J[..., : grid.tip * strands]
-        if not self.space.implicit:
-            return start, 0.0
-        of_places = J.T.reshape(-1, strands, *J.shape[1::-1])
-        return start, taken(of_places, grid.end_of).reshape(-1, *J.shape[1::-1]).T
-
-    def _jumped(self, F: Any, y: Any) -> Any:
-        """Return F with respect to y on the near side of jumps at the starts of pieces."""
-        if not self.system.jumps:
-            return F
-        slopes = jax.vmap(jax.jacfwd(self.jump, 1))
-        D = slopes(jnp.asarray(self.grid.acting), y[:-1], self.history[: self.grid.tip])
-        return jnp.sum(F[..., :, :, None] * D[..., None, :, :], axis=-2)
-
-    def _blocks(self, matrices: Any) -> Any:
-        """Reshape matrices (b, b, pieces and strands) to (pieces, b, b), or (pieces, strands, b, b)."""
-        found = jnp.moveaxis(matrices, -1, 0)
-        strands = self.system.strands
-        return found.reshape(-1, strands, *found.shape[1:]) if strands > 1 else found
+    def linearise(
+        self, y: Float[Any, "points y"]
+    ) -> tuple[Float[Any, "pieces y y"], Float[Any, "pieces y y"]]:
+        """Return the derivatives of `reached` by y at the starts of the pieces, and by y at their ends."""
+        # points of even number move together, and the others
+        odd, pieces = np.arange(len(y)) % 2, np.arange(len(y) - 1)
+        moves = np.eye(2)[:, odd][:, None, :, None] * np.eye(y.shape[1])[:, None]
+        slopes = jax.vmap(jax.vmap(lambda move: jax.jvp(self.reached, (y,), (move,))[1]))(moves)
+        slopes = jnp.moveaxis(slopes, 1, -1)
+        return slopes[odd[:-1], pieces], slopes[odd[1:], pieces]
 
     def filled(self, y: Float[Any, "nodes y"]) -> Float[Any, "points y"]:
         """Return y at all points from y at the nodes; at other discontinuities by the scheme."""
@@ -381,9 +239,8 @@ class StepProblem(eqx.Module):
 
         def corrected(_: Any, y: Any) -> Any:
             defects = self.reached(y) - y[1:]
-            # systems with several strands have no discontinuities
-            G = self.linearise(y, unknowns_of(self.system, y[0])).G
-            change = defects if G is None else jnp.sum(G * defects[:, None, :], axis=-1)
+            B = self.linearise(y)[1]
+            change = jnp.linalg.solve(jnp.eye(y.shape[1]) - B, defects[..., None])[..., 0]
             return y.at[1:].add(jnp.where(before, change, 0.0))
 
         return jax.lax.fori_loop(0, FILLING * most, corrected, found)
@@ -397,9 +254,6 @@ class StepProblem(eqx.Module):
         """Return rows of y or z split by strand."""
         own = in_strands(self.system, rows)
         return own.reshape(-1, own.shape[-1])
-
-    def _joined(self, values: Float[Any, "x_of_strand n_strands"]) -> Float[Any, "n x"]:
-        return values.T.reshape(values.shape[-1] // self.system.strands, -1)
 
     def history_by_strand(self, records: Float[Any, "n x"]) -> Float[Any, "n_strands own"]:
         """Return packed records of history split by strand."""

@@ -8,25 +8,20 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-import functools
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from knode_cosserat.engine import loops as engine
-from knode_cosserat.engine.program import EngineError
 from knode_cosserat.errors import KnodeCosseratError
-from knode_cosserat.rods.system import System, unknown_count, unknowns_of
-from knode_cosserat.solvers.boundary import newton
+from knode_cosserat.rods.system import System, unknown_count
 from knode_cosserat.solvers.history import EXTRAPOLATIONS
-from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.time_loop import StepCoefficients, StepRows, TimeStep, recorded_step, solved_row
+from knode_cosserat.solvers.steps import StepCoefficients, StepRows, TimeStep
 
 #: smallest load step of continuation, as a part of the change of control
 LEAST_PART = 1.0 / 512.0
@@ -47,7 +42,7 @@ class BudgetError(KnodeCosseratError):
 
 
 class Budget:
-    """The time (s) that recovery may take in one run; compiling its program does not count."""
+    """The time (s) that recovery may take in one run."""
 
     def __init__(self, seconds: float | None):
         """Set a fixed budget in seconds; None: in proportion to the run's own time."""
@@ -90,40 +85,16 @@ def attempt(
         settings, newton=dataclasses.replace(settings.newton, max_linearisations=MOST_LINEARISATIONS)
     )
     controls = np.asarray(control)[None]
-    try:
-        if step is None:
-            _, state, rows = engine.static_one(system, patient, controls, y, (0, 1), tip_offset)
-        else:
-            past, weights = step.past, EXTRAPOLATIONS[0]
-            # the first guess is the newest of the earlier states
-            guess = past._replace(y=np.stack([y, *past.y[:-1]]), weights=weights, t0=0.0)
-            one = StepCoefficients(np.stack([step.coefficients] * 2), step.t)
-            _, after, rows = engine.loop_one(system, patient, one, controls, guess, (0, 1), tip_offset)
-            state = after._replace(y=np.stack([after.y[0], *past.y[:-1]]), weights=weights, t0=past.t0)
-        return SolvedStep(state, StepRows(*(leaf[0] for leaf in rows)))
-    except EngineError:
-        found = _attempt_in_jax(system, patient, step, control, y, tip_offset)
-        return SolvedStep(*jax.tree.map(np.asarray, found))
-
-
-@functools.partial(jax.jit, static_argnames="settings")
-def _attempt_in_jax(
-    system: System, settings: Settings, step: TimeStep | None, control: Any, y: Any, tip_offset: Any
-) -> tuple[Any, StepRows]:
     if step is None:
-        problem = StepProblem.still(system, settings.space, control).ready()
+        _, state, rows = engine.static_one(system, patient, controls, y, (0, 1), tip_offset)
     else:
-        problem = step.problem(system, settings, control).ready()
-    problem = dataclasses.replace(problem, tip_offset=tip_offset)
-    solution, kept = newton(problem, y, unknowns_of(system, y[0]), settings.newton)
-    if step is None:
-        return solution.y, solved_row(problem, settings.newton, solution, kept.factors)[0]
-    after, row = recorded_step(problem, settings, step, solution, kept.factors)
-    return after._replace(weights=jnp.asarray(EXTRAPOLATIONS[0])), row
-
-
-#: programs of `attempt`: the first call of each compiles and does not count
-_COMPILED: set[Any] = set()
+        past, weights = step.past, EXTRAPOLATIONS[0]
+        # the first guess is the newest of the earlier states
+        guess = past._replace(y=np.stack([y, *past.y[:-1]]), weights=weights, t0=0.0)
+        one = StepCoefficients(np.stack([step.coefficients] * 2), step.t)
+        _, after, rows = engine.loop_one(system, patient, one, controls, guess, (0, 1), tip_offset)
+        state = after._replace(y=np.stack([after.y[0], *past.y[:-1]]), weights=weights, t0=past.t0)
+    return SolvedStep(state, StepRows(*(leaf[0] for leaf in rows)))
 
 
 class Recovery(abc.ABC):
@@ -160,10 +131,7 @@ class Recovery(abc.ABC):
         began, own = time.perf_counter(), system or self.system
         found = attempt(own, self.settings, self.step, control, guess, tip_offset)
         self.corrections += int(found.row.corrections)
-        program = jax.tree.structure((own, self.step)), self.settings, np.shape(guess)
-        if program in _COMPILED:
-            self.budget.spend(time.perf_counter() - began)
-        _COMPILED.add(program)
+        self.budget.spend(time.perf_counter() - began)
         return found
 
     def solved(self, found: SolvedStep) -> bool:

@@ -14,8 +14,8 @@ from knode_cosserat.solvers.history import EXTRAPOLATIONS, repeated_record_histo
 from knode_cosserat.solvers.recovery import Budget, Recovery, SolvedStep, natural_time
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.steps import TimeStep
 from knode_cosserat.solvers.time import BDF1, BDF2
-from knode_cosserat.solvers.time_loop import StepRows, TimeStep, joined_stages, stage_controls
 
 #: smallest substep as a part of a time step, and largest number of substeps tried
 LEAST_SUBSTEP, MOST_SUBSTEPS = 2.0**-14, 400
@@ -117,7 +117,8 @@ def recovered_stages(
     system: System, settings: Settings, step: TimeStep, dt: float, budget: Budget, controls: tuple[Any, Any]
 ) -> SolvedStep:
     """Recover a step of several stages: each stage, or all of them by substeps of a multistep scheme."""
-    before, now = (stage_controls(system, settings, np.asarray(each)) for each in controls)
+    shape = settings.stages, system.control_size
+    before, now = (np.broadcast_to(np.reshape(each, (-1, shape[1])), shape) for each in controls)
     last, past, found = before[-1], step.past, []
     for coefficients, t, own in zip(step.coefficients, step.t, now, strict=True):
         stage = _Stage(system, settings, TimeStep(past, coefficients, t), dt, budget)
@@ -127,10 +128,14 @@ def recovered_stages(
         found.append(solved.row)
         past, last = solved.state, own
     else:
-        rows = StepRows(*map(np.stack, zip(*found, strict=True)))
-        row = joined_stages(rows)
+        row = found[-1]._replace(
+            error=max(each.error for each in found), corrections=sum(each.corrections for each in found),
+            result=max(int(each.result) for each in found),
+            stages=np.stack([each.records for each in found[:-1]]),
+            stage_unknowns=np.stack([each.unknowns for each in found[:-1]]),
+        )  # fmt: skip
         past = past._replace(time_error=np.full_like(past.time_error, np.nan))
-        return SolvedStep(past, row._replace(result=max(int(each.result) for each in found)))
+        return SolvedStep(past, row)
     whole = TimeStep(step.past, BDF1().coefficients(dt, dt), step.t[-1])
     solved = _Substeps(system, settings, whole, dt, budget).recover((before[-1], now[-1]))
     lost = solved.state._replace(time_error=np.full_like(solved.state.time_error, np.nan))

@@ -33,7 +33,7 @@ from knode_cosserat.solvers.history import (
 from knode_cosserat.solvers.problem import no_history, row_of
 from knode_cosserat.solvers.settings import MEASURED, Settings
 from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.solvers.time_loop import StepCoefficients
+from knode_cosserat.solvers.steps import StepCoefficients
 from knode_cosserat.trajectory import Trajectory
 
 #: row 0 is the state at rest if it differs by less than this (natural units)

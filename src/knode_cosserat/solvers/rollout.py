@@ -1,7 +1,7 @@
 """Simulations and equilibria inside JAX's transformations: primitives that run in the engine.
 
 Three primitives solve all steps, and map tangents of their data to those of their results, and cotangents
-back. They run in the engine, by callbacks with NumPy only, or in JAX where the engine does not cover them.
+back. They run in the engine, by callbacks with NumPy only.
 
 Arrays of a primitive have robots as first axis, and tangents columns as second axis. One system for all
 robots has one entry there. A batch of tangents of the same robots is more columns.
@@ -29,10 +29,7 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.history import StateHistory, used_places
 from knode_cosserat.solvers.problem import no_history
 from knode_cosserat.solvers.run import Equilibria, TimeIntegration
-from knode_cosserat.solvers.sensitivity import TangentState, tangent_loop_in_jax
-from knode_cosserat.solvers.static_loop import static_one
-from knode_cosserat.solvers.tangent import SystemMoves
-from knode_cosserat.solvers.time_loop import StepRows, loop_one, no_rows
+from knode_cosserat.solvers.steps import StepRows, no_rows
 
 Arrays = Sequence[Any]
 
@@ -46,10 +43,6 @@ class Solves:
     #: true for leaves of the system that have tangents
     moving: tuple[bool, ...] = ()
 
-    def of_system(self, leaves: Arrays) -> System:
-        """Return the system with these leaves."""
-        return jax.tree.unflatten(self.pattern.structure, leaves)
-
     @property
     def leaves(self) -> int:
         """Number of arrays of a system."""
@@ -61,9 +54,8 @@ class Solves:
 
 
 def _primitive(
-    name: str, shapes: Callable[..., Any], core: Callable[..., Any], run: Callable[..., Any],
-    in_jax: Callable[..., Any],
-) -> Primitive:  # fmt: skip
+    name: str, shapes: Callable[..., Any], core: Callable[..., Any], run: Callable[..., Any]
+) -> Primitive:
     """Return a primitive with results of some shapes.
 
     `core` compiles code for the operands, before the program runs; `run` evaluates results by it.
@@ -84,11 +76,7 @@ def _primitive(
         return [jax.core.ShapedArray(each.shape, each.dtype) for each in shapes(spec, *operands)]
 
     def lower(ctx: Any, *operands: Any, spec: Solves) -> Any:
-        try:
-            code = core(spec, *ctx.avals_in)
-        except EngineError:
-            traced = functools.partial(in_jax, spec)
-            return mlir.lower_fun(traced, multiple_results=True)(ctx, *operands)
+        code = core(spec, *ctx.avals_in)
 
         def call(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:
             results = run(code, spec, *arrays)
@@ -164,24 +152,7 @@ def _solve(core: Any, spec: Solves, *arrays: np.ndarray) -> list[Any]:
     return [done, *last, *rows]
 
 
-def _solve_in_jax(spec: Solves, *operands: Any) -> list[Any]:
-    task, leaves, each = spec.task, operands[: spec.leaves], operands[spec.leaves :]
-    shared = all(leaf.shape[0] == 1 for leaf in leaves)
-
-    def one(given: Any) -> Any:
-        system = spec.of_system([leaf[0] for leaf in leaves] if shared else given[0])
-        controls, *states = given[1]
-        if isinstance(task, Equilibria):
-            done, last, rows = static_one(system, task.settings, controls, *states, (0, task.steps))
-            return done, last, *rows
-        past = StateHistory(*states)
-        done, last, rows = loop_one(system, task.settings, task.coefficients, controls, past, (0, task.steps))
-        return done, *last, *rows
-
-    return jax.lax.map(one, ((), each) if shared else (leaves, each))
-
-
-solve_p = _primitive("solve", _solved_shapes, _core_of_solves, _solve, _solve_in_jax)
+solve_p = _primitive("solve", _solved_shapes, _core_of_solves, _solve)
 
 
 def _batched_solve(operands: Arrays, axes: Arrays, *, spec: Solves) -> Any:
@@ -280,48 +251,14 @@ def _pull(core: CotangentCore, spec: Solves, *arrays: np.ndarray) -> list[np.nda
     return _each_robot(pull, spec, arrays)
 
 
-def _push_in_jax(spec: Solves, *operands: Any) -> list[Any]:
-    task, n = spec.task, _residuals(spec)
-    robots = operands[-1].shape[0]
-    leaves = [jnp.broadcast_to(leaf, (robots, *leaf.shape[1:])) for leaf in operands[: spec.leaves]]
-
-    def one(own: Any) -> Any:
-        *leaves, controls, records, rate, t0, rows, unknowns = own[:n]
-        *moved, d_controls, d_records, d_rate = own[n:]
-        columns, given = len(d_rate), iter(moved)
-        moves = SystemMoves(None, np.zeros((0, columns)))
-        if moved:
-            directions = [
-                next(given) if moves else jnp.zeros((columns, *leaf.shape))
-                for leaf, moves in zip(leaves, spec.moving, strict=True)
-            ]
-            moves = SystemMoves(spec.of_system(directions), np.eye(columns))
-        d_controls, d_records, d_rate = (
-            jnp.moveaxis(each, 0, -1) for each in (d_controls, d_records, d_rate)
-        )
-        after, found = tangent_loop_in_jax(
-            task.settings, task.coefficients, (rows, unknowns), (spec.of_system(leaves), controls),
-            (moves, d_controls), TangentState(records, rate, d_records, d_rate, t0),
-        )  # fmt: skip
-        return [jnp.moveaxis(each, -1, 0) for each in (*found, after.d_records, after.d_rate)]
-
-    return jax.lax.map(one, [*leaves, *operands[spec.leaves :]])
-
-
-def _pull_in_jax(spec: Solves, *operands: Any) -> list[Any]:
-    residuals, cotangents = operands[: _residuals(spec)], operands[_residuals(spec) :]
-    push = functools.partial(_push_in_jax, spec, *residuals)
-    return list(jax.linear_transpose(push, *_linear_shapes(0, spec, *operands))(list(cotangents)))
-
-
 DATA, RESULTS = 0, 1
 push_p = _primitive(
     "push", functools.partial(_linear_shapes, RESULTS), functools.partial(_core_of_linear, TangentCore),
-    _push, _push_in_jax,
+    _push,
 )  # fmt: skip
 pull_p = _primitive(
     "pull", functools.partial(_linear_shapes, DATA), functools.partial(_core_of_linear, CotangentCore),
-    _pull, _pull_in_jax,
+    _pull,
 )  # fmt: skip
 
 
@@ -339,16 +276,14 @@ def _batched_linear(primitive: Primitive, operands: Arrays, axes: Arrays, *, spe
     return [_divided(x, robots) for x in found], [0] * len(found)
 
 
-def _tangents_of_linear(
-    primitive: Primitive, in_jax: Any, primals: Arrays, tangents: Arrays, *, spec: Solves
-) -> Any:
+def _tangents_of_linear(primitive: Primitive, primals: Arrays, tangents: Arrays, *, spec: Solves) -> Any:
     n, found = _residuals(spec), primitive.bind(*primals, spec=spec)
-    moves = [not isinstance(tangent, ad.Zero) for tangent in tangents]
-    tangents = [ad.instantiate_zeros(each) for each in tangents]
-    if any(moves[:n]):
-        # second derivatives
-        return found, jax.jvp(functools.partial(in_jax, spec), tuple(primals), tuple(tangents))[1]
-    return found, primitive.bind(*primals[:n], *tangents[n:], spec=spec)
+    if not all(isinstance(tangent, ad.Zero) for tangent in tangents[:n]):
+        raise EngineError(
+            "a simulation has first derivatives only; take differences of them (one call of `jax.grad` each)"
+        )
+    moved = [ad.instantiate_zeros(each) for each in tangents[n:]]
+    return found, primitive.bind(*primals[:n], *moved, spec=spec)
 
 
 def _transposed(other: Primitive, cotangents: Arrays, *operands: Any, spec: Solves) -> list[Any]:
@@ -357,9 +292,9 @@ def _transposed(other: Primitive, cotangents: Arrays, *operands: Any, spec: Solv
     return [None] * n + list(other.bind(*operands[:n], *given, spec=spec))
 
 
-for _one, _other, _in_jax in ((push_p, pull_p, _push_in_jax), (pull_p, push_p, _pull_in_jax)):
+for _one, _other in ((push_p, pull_p), (pull_p, push_p)):
     batching.primitive_batchers[_one] = functools.partial(_batched_linear, _one)
-    ad.primitive_jvps[_one] = functools.partial(_tangents_of_linear, _one, _in_jax)
+    ad.primitive_jvps[_one] = functools.partial(_tangents_of_linear, _one)
     ad.primitive_transposes[_one] = functools.partial(_transposed, _other)
 
 

@@ -8,7 +8,6 @@ import logging
 import os
 import time
 import warnings
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -17,7 +16,6 @@ import numpy as np
 from tqdm import tqdm
 
 from knode_cosserat.engine import loops as engine
-from knode_cosserat.engine.program import EngineError
 from knode_cosserat.rods.elastic_rod import ElasticRod
 from knode_cosserat.rods.section import INWARD
 from knode_cosserat.rods.strands import in_strands
@@ -30,15 +28,12 @@ from knode_cosserat.solvers.recovery_methods import StaticRecovery, StepRecovery
 from knode_cosserat.solvers.result import Result, SimulationError
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import Euler
-from knode_cosserat.solvers.static_loop import static_many, static_one
-from knode_cosserat.solvers.time_loop import StepCoefficients, StepRows, TimeStep, loop_many, loop_one
+from knode_cosserat.solvers.steps import StepCoefficients, StepRows, TimeStep
 
 log = logging.getLogger(__name__)
 
 #: number of robots that one thread solves at a time
 CHUNK = 64
-#: smallest number of steps for which a run of one robot is compiled, so that short runs share a program
-LEAST_CAPACITY = 128
 #: seconds between two checks for signals, and number of steps before the first check
 RESPONSE, FIRST_STEPS = 0.2, 128
 #: rod theory holds up to this product of radius and curvature, and between these stretches
@@ -83,21 +78,11 @@ class TimeIntegration:
 
     def solve(self, system: System, controls: Any, state: StateHistory, span: tuple[int, int]) -> Any:
         """Solve a span of steps until one fails: number of steps done, the last state, rows of the span."""
-        arguments = system, self.settings, self.coefficients
-        return _solved(
-            lambda: engine.loop_one(*arguments, controls, state, span),
-            lambda: loop_one(*arguments, padded_rows(controls, least=LEAST_CAPACITY), state, span),
-            span,
-        )
+        return engine.loop_one(system, self.settings, self.coefficients, controls, state, span)
 
     def solve_many(self, system: System, controls: Any, states: StateHistory) -> Any:
         """Solve all steps of a batch of robots, each until one fails: as `solve`, for each robot."""
-        arguments = system, self.settings, self.coefficients
-        return _solved(
-            lambda: engine.loop_many(*arguments, controls, states, self.steps),
-            lambda: loop_many(*arguments, padded_rows(controls), states, self.steps),
-            (0, self.steps),
-        )
+        return engine.loop_many(system, self.settings, self.coefficients, controls, states, self.steps)
 
     def recover(self, system: System, state: Any, controls: Any, i: int, budget: Budget) -> SolvedStep:
         """Recover step i; `controls` are the previous step's and its own."""
@@ -122,35 +107,15 @@ class Equilibria:
 
     def solve(self, system: System, controls: Any, state: Any, span: tuple[int, int]) -> Any:
         """Solve a span of equilibria until one fails: the number done, the last state, rows of the span."""
-        return _solved(
-            lambda: engine.static_one(system, self.settings, controls, state, span),
-            lambda: static_one(
-                system, self.settings, padded_rows(controls, least=LEAST_CAPACITY), state, span
-            ),
-            span,
-        )
+        return engine.static_one(system, self.settings, controls, state, span)
 
     def solve_many(self, system: System, controls: Any, states: Any) -> Any:
         """Solve the lists of a batch of robots, each until one fails: as `solve`, for each robot."""
-        return _solved(
-            lambda: engine.static_many(system, self.settings, controls, states, self.steps),
-            lambda: static_many(system, self.settings, padded_rows(controls), states, self.steps),
-            (0, self.steps),
-        )
+        return engine.static_many(system, self.settings, controls, states, self.steps)
 
     def recover(self, system: System, state: Any, controls: Any, i: int, budget: Budget) -> SolvedStep:
         """Recover an equilibrium; `controls` are the previous one's and its own."""
         return StaticRecovery(system, self.settings, state, budget).recover(controls)
-
-
-def _solved(in_engine: Callable[[], Any], in_jax: Callable[[], Any], span: tuple[int, int]) -> Any:
-    """Return the results of a loop of the engine or, of what it does not cover, of JAX: rows of the span."""
-    try:
-        return in_engine()
-    except EngineError:
-        done, last, rows = jax.tree.map(np.asarray, in_jax())
-        inside = (slice(None),) * done.ndim + (slice(*span),)
-        return done, last, jax.tree.map(lambda leaf: leaf[inside], rows)
 
 
 def run_one(
@@ -201,15 +166,6 @@ def _merged(rows: StepRows | None, new: StepRows, first: int, last: int, total: 
     for every, leaf in zip(rows, new, strict=True):
         every[first:last] = leaf[: last - first]
     return rows
-
-
-def padded_rows(rows: Any, least: int = 1) -> np.ndarray:
-    """Return rows (…, T, n) padded to a power of two, so that a few more rows need no new program."""
-    rows = np.asarray(rows)
-    count = rows.shape[-2]
-    width = [(0, 0)] * rows.ndim
-    width[-2] = (0, max(least, 2 ** int(np.ceil(np.log2(count)))) - count)
-    return np.pad(rows, width, mode="edge")
 
 
 def with_carried_results(rows: StepRows, before: Any) -> StepRows:
@@ -361,19 +317,13 @@ def run_batch(
     with tqdm(total=size, disable=not progress, unit="robot", leave=False) as bar:
 
         def work(first: int) -> Any:
-            # the last chunk is padded with its last robot: one shape, one program
-            index = np.minimum(np.arange(first, first + chunk), size - 1)
+            index = slice(first, first + chunk)
             done, lasts, rows = task.solve_many(robot(index), controls[index], _picked(states, index))
-            count = min(chunk, size - first)
-            bar.update(count)
-            return jax.tree.map(lambda leaf: leaf[:count], (done, lasts, *rows))
+            bar.update(len(done))
+            return done, lasts, *rows
 
-        firsts = range(0, size, chunk)
-        program = _program(system, states, padded_rows(controls), task.settings, batched, chunk)
-        first = [] if program in _COMPILED else [work(firsts[0])]
-        _COMPILED.add(program)
         with concurrent.futures.ThreadPoolExecutor(workers) as pool:
-            chunks = first + list(pool.map(work, firsts[len(first) :]))
+            chunks = list(pool.map(work, range(0, size, chunk)))
     done, lasts, *leaves = (
         jax.tree.map(lambda *parts: np.concatenate(parts), *parts) for parts in zip(*chunks, strict=True)
     )
@@ -391,17 +341,6 @@ def run_batch(
 
 def _picked(tree: Any, index: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf[index], tree)
-
-
-#: compiled programs of `run_batch`. JAX may crash if one thread writes a program to the disk's cache while
-#: another compiles the same program, so the first chunk of a new program runs alone.
-_COMPILED: set[Any] = set()
-
-
-def _program(system: System, past: Any, controls: np.ndarray, *static: Any) -> Any:
-    """Return the structures and shapes that determine a compiled program."""
-    leaves, structure = jax.tree.flatten((system, past))
-    return structure, tuple(np.shape(leaf) for leaf in leaves), controls.shape, static
 
 
 def usable_cores() -> int:

@@ -35,8 +35,8 @@ from knode_cosserat.solvers.run import (
 )
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.solvers.steps import StepRows
 from knode_cosserat.solvers.time import TimeScheme
-from knode_cosserat.solvers.time_loop import StepRows
 from knode_cosserat.trajectory import Trajectory
 
 #: shortest and longest time steps (s): shorter ones are lost in rounding errors of the times

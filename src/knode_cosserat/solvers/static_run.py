@@ -17,6 +17,7 @@ import numpy as np
 
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.energy import RodEnergy, is_tested
+from knode_cosserat.solvers.evaluation import unloaded_shape
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.guess import (
     are_clamped,
@@ -28,8 +29,7 @@ from knode_cosserat.solvers.guess import (
 )
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.run import Equilibria, Run, run_batch, run_one
-from knode_cosserat.solvers.static_loop import unloaded_shape
-from knode_cosserat.solvers.time_loop import StepRows
+from knode_cosserat.solvers.steps import StepRows
 
 #: largest rotation (rad) of an end from one equilibrium to the next
 LARGEST_TURN = 1.0

@@ -16,12 +16,12 @@ from knode_cosserat.solvers.history import SolverState, StateHistory, at_stages
 from knode_cosserat.solvers.initial import continued_state, initial_state
 from knode_cosserat.solvers.recovery import Budget
 from knode_cosserat.solvers.result import Result, SimulationError
-from knode_cosserat.solvers.run import LEAST_CAPACITY, TimeIntegration, carried_results, rows_of
+from knode_cosserat.solvers.run import TimeIntegration, carried_results, rows_of
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.simulate import check_initial, checked_dt, marked, split_initial
 from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.solvers.steps import StepRows
 from knode_cosserat.solvers.time import TimeScheme
-from knode_cosserat.solvers.time_loop import StepRows
 from knode_cosserat.trajectory import Trajectory
 
 
@@ -86,7 +86,7 @@ class Stepper:
         first = at_start.state.first_step(settings)
         self._task = TimeIntegration(settings, self.dt, 1, first, recovery_budget)
         self._past, self._t0 = at_start.state.history, float(at_start.state.history.t0)
-        self._index, self._steps, self._result = 0, 0, int(at_start.result)
+        self._steps, self._result = 0, int(at_start.result)
         self._control = np.asarray(at_start.control, dtype=float)
         self._begun = at_start.state.dt is not None
         stages = np.full((settings.stages - 1, *np.shape(at_start.record)), np.nan)
@@ -123,11 +123,7 @@ class Stepper:
         row, after = self._solve(control, stop)
         self._past, self._control, self._begun = after, control, True
         self._result = int(row.result)
-        self._steps, self._index = self._steps + 1, self._index + 1
-        if self._index == LEAST_CAPACITY:
-            # restart the count at row 1, not at row 0, because the coefficients of row 0 may differ
-            self._index = 1
-            self._past = self._past._replace(t0=np.asarray(self.time - self.dt))
+        self._steps += 1
         self._state = self._row(row, control, self.time, self._state_after(after, self.time))
         return self._state
 
@@ -159,10 +155,9 @@ class Stepper:
         return ", ".join(f"{field.name} ({field.size}, {field.unit})" for field in self._layout.fields)
 
     def _solve(self, control: np.ndarray, stop: Callable[[], bool] | None) -> tuple[StepRows, StateHistory]:
-        i, settings = self._index, self._task.settings
+        i, settings = self._steps, self._task.settings
         control = at_stages(self.robot, settings, control[None], self._control[None], not self._begun)[0]
-        controls = np.zeros((LEAST_CAPACITY, len(control)))
-        controls[i] = control
+        controls = np.broadcast_to(control, (i + 1, len(control)))
         done, after, rows = self._task.solve(self.robot, controls, self._past, (i, i + 1))
         row, cause = StepRows(*(leaf[0] for leaf in rows)), ""
         if int(done) == i:

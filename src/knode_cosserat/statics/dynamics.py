@@ -8,28 +8,30 @@ those of `simulate`; no potential is needed.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from knode_cosserat.rods.law import InternalState, MaterialLaw
 from knode_cosserat.rods.strands import in_strands
-from knode_cosserat.rods.system import System, unknowns_of
+from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import NewtonOptions
+from knode_cosserat.solvers.evaluation import still_state
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.history import used_places
-from knode_cosserat.solvers.problem import StepProblem
+from knode_cosserat.solvers.run import Equilibria
+from knode_cosserat.solvers.sensitivity import SystemMoves, TangentState, tangent_time_loop
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import Lobatto4
-from knode_cosserat.solvers.tangent import Moves, StepTangent
-from knode_cosserat.statics.response import solve_response
+from knode_cosserat.solvers.steps import StepCoefficients
 
 #: nodes of the two grids that are compared: for robots of at most as many nodes as the finer one, or the last
 GRIDS = ((11, 21), (21, 41))
 #: largest number of history terms of a step on the finer grid; beyond, eigenvalues take minutes
 MOST_TERMS = 4000
+#: number of tangents side by side
+COLUMNS = 512
 #: c0 of the step in natural units: near the lowest frequencies, which are thereby the most accurate
 RATE = 10.0
 #: factors below this are of history that does not move anything
@@ -92,7 +94,7 @@ def linearised_modes(system: System, y: np.ndarray, control: np.ndarray) -> Mode
             raise ValueError(f"its motions have more than {MOST_TERMS} history terms")
         at = np.linspace(0.0, 1.0, nodes)
         guess = np.stack([np.interp(at, np.linspace(0.0, 1.0, system.nodes), each) for each in y.T], axis=1)
-        solved, error, step = map(np.asarray, _step(own, guess, control, c0))
+        solved, error, step = _step(own, guess, control, c0)
         off = np.max(np.abs(in_strands(system, solved - guess)[..., layout.slice("p")]))
         if not (error <= NewtonOptions().acceptable and off < SAME * float(system.length)):
             raise ValueError(f"no equilibrium near it is found with {nodes} nodes")
@@ -128,20 +130,29 @@ def _history_size(system: System) -> int:
     return system.y_layout.size * (2 if system.mixed else 1) + system.z_layout.size
 
 
-@jax.jit
-def _step(system: System, guess: Any, control: Any, c0: Any) -> tuple[Any, Any, Any]:
+def _step(
+    system: System, guess: np.ndarray, control: np.ndarray, c0: float
+) -> tuple[np.ndarray, float, np.ndarray]:
     """Return the equilibrium at the nodes, its error, and the matrix of a linearised step on its history."""
-    grid, space, used = grid_of(system), Lobatto4(), used_places(system, Lobatto4())
-    y = grid.spread(guess)
-    settings = Settings.of(None, space, "paper", NewtonOptions())
-    found = solve_response(system, settings, control, y, unknowns_of(system, y[0]))
-    records = StepProblem.still(system, space, control).records(found.y)[:used]
-    moving = StepProblem(system, jnp.zeros(()), control, c0, -c0 * records, space)
-    count, size = records.size, records.shape[1]
-    changes = jnp.eye(count).reshape(used, size, count)
-    moves = Moves(-c0 * changes, jnp.zeros((system.control_size, count)), jnp.zeros((0, count)))
-    _, _, after = StepTangent(moving, found.y, found.unknowns, None).solved(moves)
-    return found.y[grid.nodes], found.error, after.reshape(count, count)
+    space, used, ny = Lobatto4(), used_places(system, Lobatto4()), system.y_layout.size
+    still, settings = (Settings.of(time, space, "paper", NewtonOptions()) for time in (None, "bdf1"))
+    y = still_state(system, space, control, guess).y
+    _, y, found = Equilibria(still, 1).solve(system, control[None], y, (0, 1))
+    records = still_state(system, space, control, y).records[:used]
+    steps = StepCoefficients.of(settings, 1.0 / c0, "regular")
+    count, past, parts = records.size, np.stack([records] * 2), []
+    for k in range(0, count, COLUMNS):
+        m = min(COLUMNS, count - k)
+        d_past = np.zeros((2, count, m))
+        d_past[0, k : k + m] = np.eye(m)
+        d_past = d_past.reshape(2, *records.shape, m)
+        state = TangentState(past, np.zeros_like(records), d_past, np.zeros_like(d_past[0]), 0.0)
+        changes = SystemMoves(None, np.zeros((0, m))), np.zeros((1, system.control_size, m))
+        after, _ = tangent_time_loop(
+            settings, steps, (found.records, found.unknowns), (system, control[None]), changes, state
+        )
+        parts.append(after.d_records[0].reshape(count, -1))
+    return found.records[0, :, :ny], float(found.error[0]), np.concatenate(parts, axis=1)
 
 
 def _motion(system: System, step: np.ndarray, moving: np.ndarray, factor: complex) -> np.ndarray:

@@ -20,19 +20,21 @@ import jax.numpy as jnp
 import numpy as np
 
 from knode_cosserat.rods.system import System, unknowns_of
-from knode_cosserat.solvers.boundary import NewtonOptions, factors_of, pivots_of
+from knode_cosserat.solvers.boundary import NewtonOptions, pivots_of
 from knode_cosserat.solvers.equilibrium import equilibrium
-from knode_cosserat.solvers.linear import solved_correction
+from knode_cosserat.solvers.evaluation import still_state
+from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.statics.arguments import checked_control, checked_system, static_settings
-from knode_cosserat.statics.response import node_values, static_problem
+from knode_cosserat.statics.response import node_values
 from knode_cosserat.statics.stability import stability
 from knode_cosserat.trajectory import Trajectory
 
-#: largest number of corrections of a point; thresholds for a longer or a shorter next step
-MOST_CORRECTIONS, FEW, MANY = 12, 4, 7
+#: largest number of corrections of a point, and error above which there are no more (natural units);
+#: thresholds for a longer or a shorter next step
+MOST_CORRECTIONS, LARGEST_ERROR, FEW, MANY = 12, 1e6, 4, 7
 #: shortest, longest and first step along the path, in natural units
 SHORTEST, LONGEST, FIRST = 1e-5, 0.2, 0.05
 #: singular value of the tip's conditions below which a direction may be neutral, as a fraction of the
@@ -124,8 +126,8 @@ class _Walk:
 
     def __init__(self, system: System, settings: Settings, ends: tuple[Any, Any], nodes: np.ndarray):
         self.system, self.settings, self.ends = system, settings, ends
-        y = _filled(system, settings, ends[0], jnp.asarray(nodes))
-        self.y, self.parts, self.errors = [np.asarray(y)], [0.0], [0.0]
+        y = np.asarray(still_state(system, settings.space, ends[0], nodes).y)
+        self.y, self.parts, self.errors = [y], [0.0], [0.0]
         zero = np.zeros_like(self.y[0])
         y, _, _, _, tangent = _corrected(system, settings, ends, (y, 0.0), (zero, 1.0), (y, 0.0))
         self.tangent, self.step, self.complete = tangent, FIRST, False
@@ -135,7 +137,7 @@ class _Walk:
         while self.step >= SHORTEST:
             y, part = self.y[-1], self.parts[-1]
             ty, tp = self.tangent
-            guess = (y + self.step * ty, part + self.step * float(tp))
+            guess = (y + self.step * ty, part + self.step * tp)
             if guess[1] >= 1.0 > part:
                 # the last point is at the last control
                 share = (1.0 - part) / (guess[1] - part)
@@ -148,12 +150,11 @@ class _Walk:
             y_new, part_new, error, count, (way, rate) = found
             if error <= self.settings.newton.acceptable:
                 scale = np.asarray(self.system.scales().y)
-                forward = float(np.mean(np.asarray(way) / scale * np.asarray(ty) / scale) + rate * tp) > 0.0
-                sign = 1.0 if forward else -1.0
-                self.tangent = (sign * np.asarray(way), sign * float(rate))
-                self.y.append(np.asarray(y_new))
-                self.parts.append(float(part_new))
-                self.errors.append(float(error))
+                sign = 1.0 if np.mean(way / scale * ty / scale) + rate * tp > 0.0 else -1.0
+                self.tangent = (sign * way, sign * rate)
+                self.y.append(y_new)
+                self.parts.append(part_new)
+                self.errors.append(error)
                 self.complete = guess[1] == 1.0
                 self.step *= 1.5 if count <= FEW else 0.5 if count >= MANY else 1.0
                 self.step = min(self.step, LONGEST)
@@ -163,64 +164,98 @@ class _Walk:
 
 
 @functools.partial(jax.jit, static_argnames="settings")
-def _filled(system, settings, control, y):  # type: ignore[no-untyped-def]
-    return static_problem(system, settings, control).filled(y)
+def _linearised(system, settings, ends, y, part):  # type: ignore[no-untyped-def]
+    """Return the residuals of pieces, tip and base, and their derivatives by the part.
+
+    Then those of pieces by y at their starts and ends, of the base by its unknowns, and of the tip by y.
+    """
+    unknowns = unknowns_of(system, y[0])
+
+    def problem_at(part: Any) -> StepProblem:
+        return StepProblem.still(system, settings.space, ends[0] + part * (ends[1] - ends[0]))
+
+    def residuals(part: Any) -> Any:
+        problem = problem_at(part)
+        return *problem.residuals(y), problem.base(unknowns) - y[0]
+
+    found, by_part = jax.jvp(residuals, (part,), (jnp.ones(()),))
+    problem = problem_at(part)
+    at_ends = jax.jacfwd(problem.base)(unknowns), jax.jacfwd(problem.tip_residual)(y[-1])
+    return found, by_part, problem.linearise(y), at_ends
 
 
-@functools.partial(jax.jit, static_argnames="settings")
-def _corrected(system, settings, ends, start, tangent, plane):  # type: ignore[no-untyped-def]
-    """Return y, part, error, corrections and the new tangent, by Newton's method across the tangent."""
-    scale, pivots = system.scales().y, pivots_of(system)
-    ty, tp = tangent
+class _Elimination:
+    """The linear equations of a correction, eliminated from base to tip.
 
-    def across(y: Any, part: Any) -> Any:
-        return jnp.mean(ty / scale * (y - plane[0]) / scale) + tp * (part - plane[1])
+    δy_0 = S δξ + base, δy_{j+1} = A δy_j + B δy_{j+1} + r_j and M δy_N = -tip. As in the engine, every
+    solution is δy_j = X_j α_j + w_j, with α_j the values at point j of the unknowns of the base.
+    """
 
-    def at(y: Any, part: Any) -> Any:
-        """Return the error of the residuals, and the changes of y that remove them or follow the load."""
+    def __init__(self, A: np.ndarray, B: np.ndarray, S: np.ndarray, M: np.ndarray, *, pivots: np.ndarray):
+        self.G, self.S, self.M, self.pivots = np.linalg.inv(np.eye(A.shape[-1]) - B), S, M, pivots
+        self.F, self.X, self.T = self.G @ A, [S], list[np.ndarray]()
+        for F in self.F:
+            X = F @ self.X[-1]
+            self.T.append(np.linalg.inv(X[pivots]))
+            self.X.append(X @ self.T[-1])
 
-        def residuals(part: Any) -> Any:
-            control = ends[0] + part * (ends[1] - ends[0])
-            problem = static_problem(system, settings, control)
-            base = problem.base(unknowns_of(system, y[0])) - y[0]
-            return *problem.residuals(y), base
+    def solved(self, inverse: np.ndarray, r: np.ndarray, tip: np.ndarray, base: np.ndarray) -> np.ndarray:
+        """Return δy (points, y), by the inverse of M X at the tip."""
+        ws, betas = [base], list[np.ndarray]()
+        for F, X, added in zip(self.F, self.X[1:], np.einsum("jik,jk->ji", self.G, r), strict=True):
+            w = F @ ws[-1] + added
+            betas.append(w[self.pivots])
+            ws.append(w - X @ betas[-1])
+        alphas = [-inverse @ (tip + self.M @ ws[-1])]
+        for T, beta in zip(reversed(self.T), reversed(betas), strict=True):
+            alphas.append(T @ (alphas[-1] - beta))
+        return np.stack([w + X @ alpha for w, X, alpha in zip(ws, self.X, reversed(alphas), strict=True)])
 
-        (defects, tip, base), moved = jax.jvp(residuals, (part,), (jnp.ones(()),))
-        error = jnp.maximum(jnp.max(jnp.abs(defects) / scale), jnp.max(jnp.abs(tip) / system.scales().tip))
-        problem = static_problem(system, settings, ends[0] + part * (ends[1] - ends[0]))
-        factors = factors_of(problem, y, unknowns_of(system, y[0]))
+
+def _directions(
+    system: System, settings: Settings, ends: tuple[Any, Any], y: np.ndarray, part: float
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Return the error of the residuals, and the changes of y that remove them or follow the load."""
+    given = jax.tree.map(np.asarray, _linearised(system, settings, ends, y, part))
+    (defects, tip, base), moved, pieces, at_ends = given
+    scales = system.scales()
+    scale, rows = np.asarray(scales.y), np.asarray(scales.tip)
+    error = float(np.maximum(np.max(np.abs(defects) / scale), np.max(np.abs(tip) / rows)))
+    try:
+        rod = _Elimination(*pieces, *at_ends, pivots=pivots_of(system))
+        at_tip, columns = rod.M @ rod.X[-1], scale[rod.pivots]
         # of a neutral family, the smallest solutions
-        rows, columns = system.scales().tip, scale[pivots]
-        at_tip = factors.tip @ factors.X[-1, -1] * columns / rows[:, None]
-        smallest = factors._replace(inverse=columns[:, None] * jnp.linalg.pinv(at_tip, NEUTRAL) / rows)
-        follow, _ = solved_correction(smallest, pivots, *moved)
-        left = jnp.max(jnp.abs(moved[1] + factors.tip @ follow[-1]) / rows)
-        driven = left > DRIVEN * jnp.sqrt(jnp.mean((follow / scale) ** 2))
-        factors = factors._replace(inverse=jnp.where(driven, factors.inverse, smallest.inverse))
-        remove, _ = solved_correction(factors, pivots, defects, tip, base)
-        follow, _ = solved_correction(factors, pivots, *moved)
-        return jnp.where(jnp.isnan(error), jnp.inf, error), remove, follow
+        inverse = np.linalg.pinv(at_tip * columns / rows[:, None], NEUTRAL)
+        inverse = columns[:, None] * inverse / rows
+        follow = rod.solved(inverse, *moved)
+        left = np.max(np.abs(moved[1] + rod.M @ follow[-1]) / rows)
+        if left > DRIVEN * np.sqrt(np.mean((follow / scale) ** 2)):
+            inverse = np.linalg.inv(at_tip)
+            follow = rod.solved(inverse, *moved)
+        return error, rod.solved(inverse, defects, tip, base), follow
+    except np.linalg.LinAlgError:
+        return np.inf, np.zeros_like(y), np.zeros_like(y)
 
-    def correct(state: Any) -> Any:
-        y, part, _, _, remove, follow, count = state
-        slope = jnp.mean(ty / scale * follow / scale) + tp
-        change = -(across(y, part) + jnp.mean(ty / scale * remove / scale)) / slope
+
+def _corrected(
+    system: System, settings: Settings, ends: tuple[Any, Any], start: tuple[np.ndarray, float],
+    tangent: tuple[np.ndarray, float], plane: tuple[np.ndarray, float],
+) -> tuple[np.ndarray, float, float, int, tuple[np.ndarray, float]]:  # fmt: skip
+    """Return y, part, error, corrections and the new tangent, by Newton's method across the tangent."""
+    scale, (ty, tp), (y, part) = np.asarray(system.scales().y), tangent, start
+
+    def along(change: np.ndarray) -> float:
+        return float(np.mean(ty / scale * change / scale))
+
+    for count in range(MOST_CORRECTIONS + 1):
+        error, remove, follow = _directions(system, settings, ends, y, part)
+        across = along(y - plane[0]) + tp * (part - plane[1])
+        solved = error <= settings.newton.tolerance and abs(across) <= 1e-9
+        if solved or count == MOST_CORRECTIONS or not error < LARGEST_ERROR:
+            break
+        change = -(across + along(remove)) / (along(follow) + tp)
         y, part = y + remove + change * follow, part + change
-        return y, part, *_sized(at(y, part), across(y, part)), count + 1
-
-    def _sized(found: Any, off: Any) -> Any:
-        error, remove, follow = found
-        return error, jnp.abs(off), remove, follow
-
-    def going(state: Any) -> Any:
-        _, _, error, off, _, _, count = state
-        return (
-            ((error > settings.newton.tolerance) | (off > 1e-9)) & (count < MOST_CORRECTIONS) & (error < 1e6)
-        )
-
-    state = (start[0], jnp.asarray(start[1]), *_sized(at(*start), across(*start)), 0)
-    y, part, error, _, _, follow, count = jax.lax.while_loop(going, correct, state)
-    size = jnp.sqrt(jnp.mean((follow / scale) ** 2) + 1.0)
+    size = float(np.sqrt(np.mean((follow / scale) ** 2) + 1.0))
     return y, part, error, count, (follow / size, 1.0 / size)
 
 

@@ -15,14 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from knode_cosserat.rods.system import System, unknown_count
-from knode_cosserat.solvers.boundary import Solution, factors_of, newton, pivots_of
-from knode_cosserat.solvers.evaluation import still_state
+from knode_cosserat.solvers.evaluation import still_state, unloaded_shape
 from knode_cosserat.solvers.history import rest_record
-from knode_cosserat.solvers.linear import solved_correction
-from knode_cosserat.solvers.problem import StepProblem, row_of
+from knode_cosserat.solvers.problem import row_of
 from knode_cosserat.solvers.run import Equilibria
+from knode_cosserat.solvers.sensitivity import SystemMoves, static_tangents
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.static_loop import unloaded_shape
 
 #: function from a system and its last node's y to position (d,) in m and quaternion (scalar first) or None
 Pose = Callable[[System, Any], tuple[Any, Any]]
@@ -54,17 +52,6 @@ class Response(NamedTuple):
     compliance: Any
 
 
-def static_problem(system: System, settings: Settings, control: Any) -> StepProblem:
-    """Return the boundary-value problem of `kc.equilibrium`."""
-    return StepProblem.still(system, settings.space, control)
-
-
-def solve_response(system: System, settings: Settings, control: Any, y: Any, unknowns: Any) -> Solution:
-    """Solve for an equilibrium from a guess; its `error` tells if it converged."""
-    problem = static_problem(system, settings, control).ready()
-    return newton(problem, y, unknowns, settings.newton)[0]
-
-
 def node_values(system: System, settings: Settings, control: Any, y: Any) -> tuple[Any, Any]:
     """Return y and z of an equilibrium at the nodes, from y at all points."""
     found, ny = still_state(system, settings.space, control, np.asarray(y)), system.y_layout.size
@@ -89,39 +76,23 @@ def twist(system: System, pose: Pose, y: Any, dy: Any) -> Any:
 
 def respond(system: System, settings: Settings, pose: Pose, control: Any, guess: Any) -> Response:
     """Return the equilibrium found from a guess of y at all points, its pose, and the pose's derivatives."""
-    control = np.asarray(control, dtype=float)
+    control, c, ny = np.asarray(control, dtype=float), system.control_size, system.y_layout.size
     _, y, rows = Equilibria(settings, 1).solve(system, control[None], np.asarray(guess), (0, 1))
-    unknowns = rows.unknowns[0]
-    pose_and_slopes = _pose_of(system, settings, pose, control, y, unknowns)
-    return Response(y, rows.error[0], *pose_and_slopes)
+    wrench = system.tip_layout.indices(wrench_fields(system))
+    d_controls, d_tip = np.eye(c, c + len(wrench))[None], np.zeros((unknown_count(system), c + len(wrench)))
+    d_tip[wrench, c + np.arange(len(wrench))] = 1.0
+    changes = SystemMoves(None, np.zeros((0, d_tip.shape[1]))), d_controls
+    solved = rows.records, rows.unknowns
+    d_rows, _, _ = static_tangents(settings, solved, (system, control[None]), changes, d_tip)
+    position, quaternion, twists = _pose_of(system, pose, y[-1], d_rows[0, -1, :ny])
+    return Response(y, rows.error[0], position, quaternion, twists[:, :c], twists[:, c:])
 
 
-@functools.partial(jax.jit, static_argnames=("settings", "pose"))
-def _pose_of(system, settings, pose, control, y, unknowns):  # type: ignore[no-untyped-def]
-    """Return the pose of an equilibrium, and its derivatives by controls and by a wrench."""
-    problem = static_problem(system, settings, control)
-    factors, pivots = factors_of(problem, y, unknowns), pivots_of(system)
-
-    def by_control(d_control: Any) -> Any:
-        def at_solution(control: Any) -> Any:
-            problem = static_problem(system, settings, control)
-            return *problem.residuals(y), problem.base(unknowns)
-
-        defects, tip, base = jax.jvp(at_solution, (control,), (d_control,))[1]
-        dy, _ = solved_correction(factors, pivots, defects, tip, base)
-        return twist(system, pose, y[-1], dy[-1])
-
-    def by_wrench(tip: Any) -> Any:
-        dy, _ = solved_correction(factors, pivots, jnp.zeros_like(y[1:]), tip)
-        return twist(system, pose, y[-1], dy[-1])
-
-    names = wrench_fields(system)
-    columns = np.eye(unknown_count(system))[system.tip_layout.indices(names) if names else []]
-    position, quaternion = pose(system, y[-1])
-    jacobian = jax.vmap(by_control, out_axes=-1)(jnp.eye(system.control_size))
-    empty = jnp.zeros((jacobian.shape[0], 0))
-    compliance = jax.vmap(by_wrench, out_axes=-1)(jnp.asarray(columns)) if names else empty
-    return position, quaternion, jacobian, compliance
+@functools.partial(jax.jit, static_argnames="pose")
+def _pose_of(system, pose, y, d_y):  # type: ignore[no-untyped-def]
+    """Return the pose of a last node, and its twists for changes d_y (y, m)."""
+    twists = jax.vmap(functools.partial(twist, system, pose, y), in_axes=-1, out_axes=-1)(d_y)
+    return *pose(system, y), twists
 
 
 def equilibrium_poses(system: System, settings: Settings, pose: Pose, controls: np.ndarray) -> Any:

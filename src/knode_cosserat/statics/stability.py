@@ -16,18 +16,20 @@ import dataclasses
 import functools
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import block_diag
 
 from knode_cosserat._reprs import count_of
 from knode_cosserat.rods.strands import in_strands
-from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.boundary import static_error
+from knode_cosserat.rods.system import System, unknowns_of
 from knode_cosserat.solvers.equilibrium import equilibrium as rests
+from knode_cosserat.solvers.evaluation import still_state
+from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.space import Lobatto4
+from knode_cosserat.solvers.space import Lobatto4, SpaceScheme
 from knode_cosserat.statics.dynamics import linearised_modes
 from knode_cosserat.statics.stiffness import (
     NEEDED,
@@ -176,15 +178,26 @@ def _checked(equilibrium: Any, row: Any) -> tuple[System, np.ndarray, np.ndarray
             f"a {type(system).__name__} has y = {', '.join(names)}; allowed are rods with p, h, n and m"
         )
     y, z, control = y[row], np.asarray(equilibrium.z)[row], np.asarray(equilibrium.control)[row]
-    record = np.concatenate([y, z] + ([np.zeros_like(y)] if system.mixed else []), axis=1)
     space = (equilibrium.settings or Settings()).space
-    off = float(static_error(system, space, record, control, jnp.zeros(())))
+    found, scales = still_state(system, space, control, y), system.scales()
+    off = float(
+        np.max([
+            found.error, np.max(np.abs(found.tip) / scales.tip),
+            np.max(np.abs(_base(system, space, control, y[0]) - y[0]) / scales.y),
+        ])
+    )  # fmt: skip
     if not off <= BALANCED:
         raise ValueError(
             f"row {row} is no equilibrium: {off:.2g} of natural size is left when every rate is zero; "
             f"allowed is {BALANCED:g}"
         )
     return system, y, z, control
+
+
+@functools.partial(jax.jit, static_argnames="space")
+def _base(system: System, space: SpaceScheme, control: Any, y: Any) -> Any:
+    """Return y at the base for its own unknowns."""
+    return StepProblem.still(system, space, control).base(unknowns_of(system, y))
 
 
 def _require_rest(system: System, base: np.ndarray, moved: np.ndarray) -> None:

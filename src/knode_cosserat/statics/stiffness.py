@@ -24,6 +24,7 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.strands import in_strands
 from knode_cosserat.rods.system import System, unknowns_of
+from knode_cosserat.solvers.evaluation import still_state
 from knode_cosserat.solvers.grid import grid_of, inside
 from knode_cosserat.solvers.problem import StepProblem, no_history
 from knode_cosserat.solvers.space import Lobatto4
@@ -127,12 +128,6 @@ def _carried(rates: Any, begin: Any, end: Any, y: Any) -> Any:
 
 
 @jax.jit
-def _filled(system: System, y: Any, control: Any, history: Any) -> Any:
-    """Return y at the nodes and at the cuts between them."""
-    return StepProblem(system, jnp.zeros(()), control, jnp.zeros(()), history, Lobatto4()).filled(y)
-
-
-@jax.jit
 def _ends(system: System, base: Any, tip: Any, control: Any, history: Any) -> tuple[Any, Any, Any]:
     problem = StepProblem(system, jnp.zeros(()), control, jnp.zeros(()), history, Lobatto4())
     changes = jax.jacfwd(problem.base)(unknowns_of(system, base)), jax.jacfwd(problem.tip_residual)(tip)
@@ -187,7 +182,7 @@ def divided(system: System, y: Any, control: Any, by: Sequence[int]) -> Iterator
     control, history = jnp.asarray(control), no_history(system, Lobatto4())
     points, length = grid_of(system), float(system.length)
     bounds = (points.segment[:, None] + points.bounds) * length / (system.nodes - 1)
-    found = np.asarray(_filled(system, jnp.asarray(y), control, history))
+    found = np.asarray(still_state(system, Lobatto4(), control, np.asarray(y)).y)
 
     def ends(y: np.ndarray) -> Ends:
         asked = _ends(system, jnp.asarray(y[0]), jnp.asarray(y[-1]), control, history)

@@ -43,10 +43,9 @@ from knode_cosserat.solvers.initial import continued_state, initial_state
 from knode_cosserat.solvers.places import Places, places_at, positions_at, quaternions_at
 from knode_cosserat.solvers.result import SimulationError
 from knode_cosserat.solvers.run import TimeIntegration, run_one
-from knode_cosserat.solvers.sensitivity import TangentState, static_tangents, tangent_time_loop
+from knode_cosserat.solvers.sensitivity import SystemMoves, TangentState, static_tangents, tangent_time_loop
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.solvers.tangent import SystemMoves
 from knode_cosserat.trajectory import Trajectory
 
 #: numbers of rows in preliminary searches
