@@ -58,7 +58,7 @@ def test_every_public_name_is_there_and_says_what_it_is(space):
         assert said and said.split()[0] not in VAGUE, f"{space}.{name}: {said}"
 
 
-@pytest.mark.parametrize("space", [kc.solvers, kc.learning])
+@pytest.mark.parametrize("space", [kc, kc.solvers, kc.learning])
 def test_a_lazy_package_has_the_names_that_it_lists(space):
     assert dir(space) == sorted(space.__all__)
     with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
@@ -75,15 +75,6 @@ def test_functions_win_over_the_modules_that_are_called_like_them():
         "assert kc.statics.workspace is kc.workspace and kc.identification.identify is kc.identify\n"
     )
     subprocess.run([sys.executable, "-W", "error", "-c", program], check=True)
-
-
-@pytest.mark.parametrize("name", sorted(kc._NAMESPACES))
-def test_old_names_still_work_and_say_where_they_are_now(name):
-    place = kc._NAMESPACES[name]
-    with pytest.warns(DeprecationWarning, match=rf"is now knode_cosserat\.{place}\.{name};") as caught:
-        thing = getattr(kc, name)
-    assert thing is getattr(getattr(kc, place), name) and name not in kc.__all__
-    assert caught[0].filename == __file__
 
 
 def test_a_name_that_never_was_is_an_attribute_error():

@@ -7,45 +7,46 @@ public names are in the namespaces `robots`, `solvers`, `learning`, `calibration
 a handler is added.
 """
 
-import importlib
 import logging
-import typing
-import warnings
+from typing import TYPE_CHECKING
 
 from knode_cosserat import _jax as _jax  # isort: split  (first: it sets JAX up)
-from knode_cosserat import (
-    calibration,
-    control,
-    controls,
-    envs,
-    estimation,
-    figures,
-    hardware,
-    identification,
-    learning,
-    metrics,
-    named_controls,
-    recordings,
-    robots,
-    solvers,
-    statics,
-    sweeps,
-    viewer,
-)
-from knode_cosserat.calibration import calibrate
-from knode_cosserat.errors import KnodeCosseratError
-from knode_cosserat.identification import fit, identify
-from knode_cosserat.learning import KNODE, FitConfig, load_model
-from knode_cosserat.recordings import estimate_states, load_recording
-from knode_cosserat.robots import System, catalog, load_robot, save_robot
-from knode_cosserat.solvers import Result, SimulationError, equilibrium, simulate
-from knode_cosserat.statics import inverse_kinematics, workspace
-from knode_cosserat.trajectory import Trajectory
-from knode_cosserat.trajectory_file import load_trajectory
-from knode_cosserat.trajectory_system import TrajectoryFileError
-from knode_cosserat.viewer import view
+from knode_cosserat._lazy import make_lazy
 
-logging.getLogger(__name__).addHandler(logging.NullHandler())
+if TYPE_CHECKING:
+    from knode_cosserat import (
+        calibration,
+        control,
+        controls,
+        envs,
+        estimation,
+        figures,
+        hardware,
+        identification,
+        learning,
+        metrics,
+        named_controls,
+        recordings,
+        robots,
+        solvers,
+        statics,
+        sweeps,
+        viewer,
+    )
+    from knode_cosserat.calibration import calibrate
+    from knode_cosserat.errors import KnodeCosseratError
+    from knode_cosserat.identification.fit import fit
+    from knode_cosserat.identification.identify import identify
+    from knode_cosserat.learning import KNODE, FitConfig, load_model
+    from knode_cosserat.recordings import estimate_states, load_recording
+    from knode_cosserat.robots import System, catalog, load_robot, save_robot
+    from knode_cosserat.solvers import Result, SimulationError, equilibrium, simulate
+    from knode_cosserat.statics.reach import inverse_kinematics
+    from knode_cosserat.statics.workspace import workspace
+    from knode_cosserat.trajectory import Trajectory
+    from knode_cosserat.trajectory_file import load_trajectory
+    from knode_cosserat.trajectory_system import TrajectoryFileError
+    from knode_cosserat.viewer import view
 
 __all__ = [
     "KNODE",
@@ -90,49 +91,28 @@ __all__ = [
     "workspace",
 ]
 
-#: names that used to be here, by the namespace that has them now
-_MOVED = {
-    "robots": (
-        "Differences Field FunctionSection Layout ParallelRobot ParameterError RobotFileError Rod "
-        "RoutedTendonRobot Scales SlenderRod Stretch TendonRobot ends loads parameter robot_schema routing "
-        "surroundings"
-    ),
-    "solvers": (
-        "BDF1 BDF2 BDFAlpha Euler History Lobatto2 Lobatto4 NewtonOptions Settings Stepper Trapezoidal"
-    ),
-    "learning": (
-        "CheckpointError ConfigError DataError Ensemble FitError ModelFileError NetworkOptions "
-        "PassiveOptions Residual RolloutTraining StructuredOptions Training explain load_ensemble"
-    ),
-    "calibration": "Calibration CalibrationError",
-    "recordings": "Measurements Recording RecordingConfig RecordingError estimate_parts",
-    "statics": (
-        "Configuration EquilibriumPath InverseKinematics Manipulability Reach Stability Workspace compliance "
-        "configuration equilibrium_path jacobian manipulability stability"
-    ),
-    "identification": "IdentificationError Identified",
-    "metrics": "StateError node_error pose_mse rotation_rmse state_errors tip_dtw tip_rmse",
-    "viewer": "export_scene view_live",
-    "diagnosis": "Diagnosis doctor",
-}
-_NAMESPACES = {name: place for place, names in _MOVED.items() for name in names.split()}
+# a first simulation does not wait for the import of control, estimation, learning
+make_lazy(
+    __name__,
+    {
+        "knode_cosserat": (
+            "calibration control controls envs estimation figures hardware identification learning metrics "
+            "named_controls recordings robots solvers statics sweeps viewer"
+        ),
+        "knode_cosserat.calibration": "calibrate",
+        "knode_cosserat.errors": "KnodeCosseratError",
+        "knode_cosserat.identification": "fit identify",
+        "knode_cosserat.learning": "KNODE FitConfig load_model",
+        "knode_cosserat.recordings": "estimate_states load_recording",
+        "knode_cosserat.rods.robot_file": "catalog load_robot save_robot",
+        "knode_cosserat.rods.system": "System",
+        "knode_cosserat.solvers": "Result SimulationError equilibrium simulate",
+        "knode_cosserat.statics": "inverse_kinematics workspace",
+        "knode_cosserat.trajectory": "Trajectory",
+        "knode_cosserat.trajectory_file": "load_trajectory",
+        "knode_cosserat.trajectory_system": "TrajectoryFileError",
+        "knode_cosserat.viewer": "view",
+    },
+)
 
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
-
-
-if not typing.TYPE_CHECKING:  # a type checker is to report names that do not exist
-
-    def __getattr__(name: str) -> typing.Any:
-        if name in _MOVED:
-            return importlib.import_module(f"{__name__}.{name}")
-        place = _NAMESPACES.get(name)
-        if place is None:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        warnings.warn(
-            f"{__name__}.{name} is now {__name__}.{place}.{name}; the old name will be removed",
-            DeprecationWarning,
-            stacklevel=2,
-        )
-        return getattr(importlib.import_module(f"{__name__}.{place}"), name)
+logging.getLogger(__name__).addHandler(logging.NullHandler())

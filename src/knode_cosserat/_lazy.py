@@ -1,4 +1,4 @@
-"""Packages whose public names are imported on first use, where importing them at once would make a cycle."""
+"""Packages whose public names are imported on first use."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ class _LazyPackage(types.ModuleType):
     def __getattr__(self, name: str) -> Any:
         if name not in self._homes:
             raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}")
-        value = getattr(importlib.import_module(self._homes[name]), name)
+        home = self._homes[name]
+        own = home == self.__name__
+        value = importlib.import_module(f"{home}.{name}" if own else home)
+        value = value if own else getattr(value, name)
         self.__dict__[name] = value
         return value
 
@@ -35,7 +38,8 @@ def make_lazy(package: str, names: Mapping[str, str]) -> None:
 
     Args:
         package: its `__name__`.
-        names: module, and the names that come from it, separated by spaces.
+        names: module, and the names that come from it, separated by spaces. Those of the package itself are
+            its submodules.
     """
     module = sys.modules[package]
     module.__dict__["_homes"] = {name: home for home, listed in names.items() for name in listed.split()}

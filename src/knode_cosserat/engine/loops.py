@@ -99,7 +99,7 @@ def _compiled(key: Any, build: Callable[[], AnyCore]) -> AnyCore:
         if core is None:
             try:
                 # also while JAX traces a caller: equations are traced by themselves
-                with jax.ensure_compile_time_eval():
+                with jax.core.eval_context():
                     core = build()
             except EngineError as error:
                 # without the frames that a traceback keeps alive
