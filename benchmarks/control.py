@@ -40,7 +40,7 @@ def costs() -> dict[str, Any]:
 
     from knode_cosserat.control import circle
     from knode_cosserat.control.prediction import linearised_prediction
-    from knode_cosserat.engine.loops import Pattern
+    from knode_cosserat.engine.pattern import Pattern
     from knode_cosserat.estimation.online import Spread, errors_of
     from knode_cosserat.solvers.rollout import rollout
     from knode_cosserat.solvers.run import TimeIntegration

@@ -1,64 +1,23 @@
-"""Time loops of the engine: the same arguments and results as the compiled loops of `solvers.steps`."""
+"""Runs of the engine: of one robot or of a batch, over time steps or equilibria."""
 
 from __future__ import annotations
 
-import dataclasses
-import logging
-import threading
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Self, TypeVar
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
 
 from knode_cosserat.engine.core import Constants, Core, Shape, States, coefficients_of
-from knode_cosserat.engine.equations import constant_zeros
+from knode_cosserat.engine.pattern import Pattern, compiled, masks_of, parameters_of
 from knode_cosserat.engine.program import EngineError
-from knode_cosserat.engine.tangents import CotangentCore, TangentCode, TangentCore
-from knode_cosserat.rods.system import System, is_traced
+from knode_cosserat.engine.tangents import CotangentCore, TangentCore
+from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.problem import Evaluated
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.steps import StepCoefficients, StepRows
 
-log = logging.getLogger(__name__)
-
-#: compiled cores, or the reason why there is none, by what their code depends on; the last used come last
-_CORES: dict[Any, Core | TangentCode | EngineError] = {}
-#: number of cores that a process keeps: a core takes some MB
-MOST_CORES = 100
-_COMPILING = threading.Lock()
-
-AnyCore = TypeVar("AnyCore", Core, TangentCore, CotangentCore)
 AnyTangents = TypeVar("AnyTangents", TangentCore, CotangentCore)
-
-
-@dataclasses.dataclass(frozen=True)
-class Pattern:
-    """Structure of a system, and its parameters that are zero: constants of the code."""
-
-    structure: Any
-    #: shape of each leaf, and its zeros as bits
-    zeros: tuple[tuple[tuple[int, ...], bytes], ...]
-
-    @classmethod
-    def of(cls, system: System) -> Self:
-        """Return the pattern of a system; zeros of a batch are those of all, and no traced value is one."""
-        leaves, structure = jax.tree.flatten(system)
-        axis, zeros = np.ndim(system.length), []
-        for leaf in leaves:
-            known = np.ones(np.shape(leaf)) if is_traced(leaf) else np.asarray(leaf, float)
-            zeros.append(constant_zeros(np.max(np.abs(known), axis=tuple(range(axis)))))
-        return cls(structure, _masks(zeros))
-
-    @property
-    def system(self) -> System:
-        """A system of this pattern, with ones for all other parameters."""
-        leaves = []
-        for shape, bits in self.zeros:
-            size = int(np.prod(shape))
-            mask = np.unpackbits(np.frombuffer(bits, np.uint8), count=size).reshape(shape)
-            leaves.append(1.0 - mask)
-        return jax.tree.unflatten(self.structure, leaves)
 
 
 def core_of(system: System, settings: Settings, robots: bool) -> Core:
@@ -70,14 +29,14 @@ def core_of(system: System, settings: Settings, robots: bool) -> Core:
         EngineError: the engine does not cover the system or the settings.
     """
     pattern, schemes = Pattern.of(system), Settings(settings.time, settings.space)
-    return _compiled((pattern, schemes, robots), lambda: Core(pattern.system, schemes, robots))
+    return compiled((pattern, schemes, robots), lambda: Core(pattern.system, schemes, robots))
 
 
 def tangents_for(
     kind: type[AnyTangents], pattern: Pattern, settings: Settings, moving: Sequence[np.ndarray]
 ) -> AnyTangents:
     """Return the core of tangents or cotangents of a pattern, with masks of `moving` parameters."""
-    key = pattern, _masks(moving), settings.space, settings.uses_rate, kind
+    key = pattern, masks_of(moving), settings.space, settings.uses_rate, kind
 
     def build() -> AnyTangents:
         system = pattern.system
@@ -85,36 +44,7 @@ def tangents_for(
             raise EngineError("engine: tangents only of one rod")
         return kind(system, settings, moving)
 
-    return _compiled(key, build)
-
-
-def _masks(masks: Iterable[np.ndarray]) -> Any:
-    return tuple((mask.shape, np.packbits(mask).tobytes()) for mask in masks)
-
-
-def _compiled(key: Any, build: Callable[[], AnyCore]) -> AnyCore:
-    """Return compiled code that is kept by a key."""
-    with _COMPILING:
-        core: Any = _CORES.pop(key, None)
-        if core is None:
-            try:
-                # also while JAX traces a caller: equations are traced by themselves
-                with jax.core.eval_context():
-                    core = build()
-            except EngineError as error:
-                # without the frames that a traceback keeps alive
-                core = error.with_traceback(None)
-        _CORES[key] = core
-        if len(_CORES) > MOST_CORES:
-            del _CORES[next(iter(_CORES))]
-    if isinstance(core, EngineError):
-        raise core.with_traceback(None)
-    return core
-
-
-def parameters_of(system: System) -> np.ndarray:
-    """Return all numeric parameters of a system in one vector."""
-    return np.concatenate([np.asarray(leaf, float).reshape(-1) for leaf in jax.tree.leaves(system)])
+    return compiled(key, build)
 
 
 def loop_one(

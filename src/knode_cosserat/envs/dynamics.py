@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from knode_cosserat.engine.loops import Pattern
+from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.envs.spec import MEASURED, PREVIEW, Arrays, Ending, Spec, commanded, scaled
 from knode_cosserat.envs.tasks.base import Tip
 from knode_cosserat.rods.system import System

@@ -283,12 +283,12 @@ class Rod(ElasticRod):
             return self.material(at, still).u_star
 
         ends = {place for each in self.sections for place in (each.begin, each.end)}
-        edges = self.length * np.array(sorted({0.0, *ends, 1.0}))
+        edges = np.array(sorted({0.0, *ends, 1.0}))
         # z at a node is the far-side value, and where two sections meet both curvatures act; the margin is
         # less than the distance that moves places away from that side
         margin = 0.2 * INWARD * self.length / (self.nodes - 1)
         beyond = jnp.minimum(s + margin, self.length - margin)
-        return *shape_at_rest(base.p, base.h, s, curvature, edges), curvature(beyond)
+        return *shape_at_rest(base.p, base.h, s, curvature, self.length, edges), curvature(beyond)
 
     def base(self, t: Any, control: Any, unknowns: Float[Any, " k"]) -> Float[Any, " y"]:
         """Return y at s = 0: the pose of the base's end, with the unknowns."""

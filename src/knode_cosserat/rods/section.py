@@ -262,18 +262,17 @@ def shape_at_rest(
     h: Float[Any, "4"],
     s: Any,
     curvature: Callable[[Any], Any],
-    edges: Float[Any, " edges"],
+    length: Any,
+    edges: Float[np.ndarray, " edges"],
 ) -> tuple[Float[Any, "3"], Float[Any, "4"]]:
     """Return position (m) and orientation at s of a rod without strain, from its base pose and its curvature.
 
-    `edges` are places (m), from 0 to the rod's length, with a smooth curvature (1/m) between them. The
+    `edges` are parts of the length, from 0 to 1, with a smooth curvature (1/m) between them. The
     integration is Magnus' series of order 4 on poses: a constant curvature gives an exact helix for any step.
     """
-    even = edges[-1] * (np.arange(1, REST_STEPS) / REST_STEPS)
-    between = jnp.sort(jnp.concatenate([even, edges[1:-1]]))
-    bounds = jnp.concatenate([edges[:1], between, edges[-1:]])
+    bounds = length * np.sort(np.concatenate([np.arange(1, REST_STEPS) / REST_STEPS, edges]))
     # all steps beyond s have zero length
-    passed = jnp.concatenate([edges[:1], jnp.minimum(between, s), jnp.reshape(s, 1)])
+    passed = jnp.concatenate([bounds[:1], jnp.minimum(bounds[1:-1], s), jnp.reshape(s, 1)])
     ds = jnp.diff(passed)
     at = passed[:-1] + (0.5 + np.array([[-1.0], [1.0]]) / np.sqrt(12.0)) * ds
     margin = INWARD * jnp.diff(bounds)

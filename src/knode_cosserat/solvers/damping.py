@@ -40,7 +40,7 @@ def _robots_of_users(robot: Any) -> Iterator[System]:
 def warn_of_long_steps(robot: Any, dt: float) -> None:
     """Warn if time steps are longer than a robot's slowest vibration. To be called by `simulate` itself."""
     for system in _robots_of_users(robot):
-        with jax.ensure_compile_time_eval():
+        with jax.core.eval_context():
             natural = natural_time(system)
         if natural is None or dt <= SLOWEST * natural:
             continue
@@ -63,7 +63,7 @@ def warn_if_undamped(robot: Any, dt: float) -> None:
     """
     for system in _robots_of_users(robot):
         # the numbers of this robot are known, also inside a `jit` of the caller
-        with jax.ensure_compile_time_eval():
+        with jax.core.eval_context():
             strand = system.strand
             if not getattr(strand, "is_undamped", False):
                 continue

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from knode_cosserat._numbers import real_array
-from knode_cosserat.engine.loops import Pattern
+from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.rods.trained_range import without_range
 from knode_cosserat.solvers.boundary import NewtonOptions

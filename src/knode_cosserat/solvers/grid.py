@@ -156,7 +156,7 @@ def at_places(system: System, space: SpaceScheme, records: Float[Any, "nodes x"]
 def inside(s: Any, low: Any, high: Any) -> Any:
     """Return s, moved a little into the piece from low to high if it is at its end."""
     margin = INWARD * (high - low)
-    return jnp.clip(s, low + margin, high - margin)
+    return (jnp if is_traced(s) else np).clip(s, low + margin, high - margin)
 
 
 def taken(values: Any, rows: np.ndarray) -> Any:

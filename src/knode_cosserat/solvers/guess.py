@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from knode_cosserat.engine.places import values_along
 from knode_cosserat.rods.ends import AXES, Clamped, Pinned, Pose
 from knode_cosserat.rods.rod import Rod
 from knode_cosserat.rods.section import ALONG
@@ -144,10 +145,13 @@ def curve_guesses(system: System, control: Any) -> list[Float[Any, "points y"]]:
     return found
 
 
-@jax.jit
 def materials(system: Any, s: Any, control: Any) -> Any:
     """Return section and material at places (m) along a rod."""
-    return jax.vmap(lambda s: system.material(s, control))(s)
+    return values_along(_material, system, s, control)
+
+
+def _material(system: Any, s: Any, control: Any) -> Any:
+    return system.material(s, control)
 
 
 def rotations(h: Any) -> Any:

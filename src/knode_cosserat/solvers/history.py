@@ -16,9 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.engine.places import values_along
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.solvers.grid import at_places, grid_of
-from knode_cosserat.solvers.problem import Evaluated, StepProblem, row_of
+from knode_cosserat.solvers.problem import Evaluated, StepProblem, places_of, row_of
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import LOBATTO2, SpaceScheme
 from knode_cosserat.solvers.time import BDF1
@@ -129,16 +130,17 @@ def advanced(past: StateHistory, records: Any, rate: Any, y: Any, weights: Any) 
 
 def unloaded(system: System, space: SpaceScheme) -> tuple[Float[Any, "nodes x"], Float[Any, "places x"]]:
     """Return y and z of the unloaded system, at the nodes and at all places."""
-    found = _unloaded(system, space)
-    return found if is_traced(found) else (np.asarray(found[0]), np.asarray(found[1]))
-
-
-@functools.partial(jax.jit, static_argnames="space")
-def _unloaded(system: System, space: SpaceScheme) -> Any:
-    nodes = jnp.linspace(0.0, 1.0, system.nodes) * system.length
-    places = StepProblem.still(system, space, jnp.zeros(system.control_size)).places
-    found = jnp.concatenate(jax.vmap(system.rest)(jnp.concatenate([nodes, places])), axis=1)
+    nodes, places = np.linspace(0.0, 1.0, system.nodes) * system.length, places_of(system, space)
+    traced = is_traced(system)
+    numeric: Any = jnp if traced else np
+    s = numeric.concatenate([nodes, places])
+    rest = jax.vmap(system.rest)(s) if traced else values_along(_rest, system, s)
+    found = numeric.concatenate(rest, axis=1)
     return found[: system.nodes], found[system.nodes :]
+
+
+def _rest(system: System, s: Any, _: Any) -> Any:
+    return system.rest(s)
 
 
 def rest_record(system: System) -> Float[Any, "nodes x"]:

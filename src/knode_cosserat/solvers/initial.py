@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from knode_cosserat.engine.loops import Pattern
+from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.solvers.evaluation import map_robots, unloaded_shape
 from knode_cosserat.solvers.grid import grid_of

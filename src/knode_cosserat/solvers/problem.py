@@ -36,6 +36,28 @@ def row_of(
     return numeric.concatenate([taken(y, nodes), taken(records, nodes)[:, ny:]], axis=1)
 
 
+def _bounds(system: System) -> tuple[Any, Any]:
+    """Return the arclength (m) of the start and the end of every piece."""
+    grid, ds = grid_of(system), system.length / (system.nodes - 1)
+    if not system.cuts:
+        s = np.linspace(0.0, 1.0, system.nodes) * system.length
+        return s[:-1], s[1:]
+    low, high = (ds * (grid.segment + grid.bounds[:, k]) for k in (0, 1))
+    return low, high
+
+
+def places_of(system: System, space: SpaceScheme) -> Float[Any, " places"]:
+    """Return the arclength (m) of all places where a step evaluates the equations (`Grid`)."""
+    grid, (low, high) = grid_of(system, space), _bounds(system)
+    first, last, near = low, high[-1:], high[grid.near - 1]
+    if system.cuts:
+        first, last = inside(first, low, high), inside(last, low[-1:], high[-1:])
+        near = inside(near, low[grid.near - 1], near)
+    stages = [low + stage.place * (high - low) for stage in space.check.stages]
+    numeric: Any = jnp if is_traced(low) else np
+    return numeric.concatenate([first, last, near, *stages])
+
+
 class Stages(NamedTuple):
     """Rates and strains of a state: at the ends of pieces, then at each stage between them."""
 
@@ -114,25 +136,9 @@ class StepProblem(eqx.Module):
         return grid_of(self.system, self.space)
 
     @property
-    def _bounds(self) -> tuple[Any, Any]:
-        """Arclength (m) of the start and the end of every piece."""
-        grid, ds = self.grid, self.system.length / (self.system.nodes - 1)
-        if not self.system.cuts:
-            s = jnp.linspace(0.0, 1.0, self.system.nodes) * self.system.length
-            return s[:-1], s[1:]
-        low, high = (ds * (grid.segment + grid.bounds[:, k]) for k in (0, 1))
-        return low, high
-
-    @property
     def places(self) -> Float[Any, " places"]:
         """Arclength (m) where the equations are evaluated."""
-        grid, (low, high) = self.grid, self._bounds
-        first, last, near = low, high[-1:], high[grid.near - 1]
-        if self.system.cuts:
-            first, last = inside(first, low, high), inside(last, low[-1:], high[-1:])
-            near = inside(near, low[grid.near - 1], near)
-        stages = [low + stage.place * (high - low) for stage in self.space.check.stages]
-        return jnp.concatenate([first, last, near, *stages])
+        return places_of(self.system, self.space)
 
     # along the rod
 
@@ -152,7 +158,7 @@ class StepProblem(eqx.Module):
 
     def lengths(self) -> Float[Any, "pieces 1"]:
         """Return the lengths of all pieces (m)."""
-        low, high = self._bounds
+        low, high = _bounds(self.system)
         return (high - low)[:, None]
 
     def at_ends(self, values: Any) -> tuple[Any, Any]:

@@ -12,10 +12,10 @@ import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from knode_cosserat.engine import loops as engine
+from knode_cosserat.engine.places import values_along
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.rods.system import System, unknown_count
 from knode_cosserat.solvers.history import EXTRAPOLATIONS
@@ -262,7 +262,7 @@ def other_unit(system: System, control: np.ndarray) -> str:
     """Return a hint at another unit if a force in the control is absurdly large."""
     if "n" not in system.y_layout.names:
         return ""
-    natural = float(np.asarray(_scales_of_y(system))[system.y_layout.slice("n")][0])
+    natural = float(_scales_of_y(system)[system.y_layout.slice("n")][0])
     for field in system.control_layout.fields:
         largest = float(np.max(np.abs(system.control_layout.get(control, field.name)), initial=0.0))
         if field.unit == "N" and largest > ABSURD * natural:
@@ -273,8 +273,12 @@ def other_unit(system: System, control: np.ndarray) -> str:
     return ""
 
 
-#: one program: without it, each operation is compiled at a robot's first simulation
-_scales_of_y = jax.jit(lambda system: system.scales().y)
+def _scales_of_y(system: System) -> Any:
+    return values_along(_scales_at, system, [0.0])[0]
+
+
+def _scales_at(system: System, s: Any, _: Any) -> Any:
+    return system.scales().y
 
 
 def natural_time(system: System) -> float | None:
@@ -282,5 +286,5 @@ def natural_time(system: System) -> float | None:
     layout = system.strand.y_layout
     if "p" not in layout.names or "q" not in layout.names:
         return None
-    scale = np.asarray(_scales_of_y(system.strand))
+    scale = _scales_of_y(system.strand)
     return float(np.min(scale[..., layout.slice("p")] / scale[..., layout.slice("q")]))

@@ -22,7 +22,8 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from knode_cosserat.engine.core import Constants, Shape
-from knode_cosserat.engine.loops import Pattern, at_all_stages, core_of, table_of, tangents_for
+from knode_cosserat.engine.loops import at_all_stages, core_of, table_of, tangents_for
+from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.engine.program import EngineError
 from knode_cosserat.engine.tangents import CotangentCore, TangentCore
 from knode_cosserat.rods.system import System

@@ -15,14 +15,8 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.engine.loops import (
-    STILL,
-    Pattern,
-    at_all_stages,
-    parameters_of,
-    table_of,
-    tangents_for,
-)
+from knode_cosserat.engine.loops import STILL, at_all_stages, table_of, tangents_for
+from knode_cosserat.engine.pattern import Pattern, parameters_of
 from knode_cosserat.engine.tangents import TangentCore
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.history import StateHistory, used_places
