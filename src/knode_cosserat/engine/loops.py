@@ -79,13 +79,7 @@ def tangents_for(
     """Return the core of tangents or cotangents of a pattern, with masks of `moving` parameters."""
     key = pattern, _masks(moving), settings.space, settings.uses_rate, kind
 
-    def build() -> AnyTangents:
-        system = pattern.system
-        if system.strands > 1:
-            raise EngineError("engine: tangents only of one rod")
-        return kind(system, settings, moving)
-
-    return _compiled(key, build)
+    return _compiled(key, lambda: kind(pattern.system, settings, moving))
 
 
 def _masks(masks: Iterable[np.ndarray]) -> Any:
