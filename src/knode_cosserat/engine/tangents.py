@@ -93,7 +93,7 @@ class TangentCode(EliminationCode):
         self._reserve_state()
         self.state_size, self._size = self._size, whole
         groups = self.groups[1] * self.strands
-        #: the component of a row, packed, of each strand's record
+        #: component of a packed row for each number of each strand's record
         self.packed = e.by_strand(np.arange(self.strands * numbers))
         self.tangents = Tangents(
             records, rate, many(e.nc, 1), many(numbers, self.used), many(nx, self.used),
@@ -171,10 +171,10 @@ class TangentCode(EliminationCode):
                 self._put(f.load(at, int(self.packed[q, i])), self.y, i, here + self.bases[q])
         if not len(grid.between):
             return
-        for base, own in itertools.product(self.bases, map(int, grid.between)):
-            point = base + own
-            start, end = (base + int(grid.nodes[grid.segment[own] + k]) for k in (0, 1))
-            part = float(grid.bounds[own, 0])
+        for base, cut in itertools.product(self.bases, map(int, grid.between)):
+            point = base + cut
+            start, end = (base + int(grid.nodes[grid.segment[cut] + k]) for k in (0, 1))
+            part = float(grid.bounds[cut, 0])
             for i in range(e.ny):
                 low, high = self._get(self.y, i, start), self._get(self.y, i, end)
                 self._put(low + part * (high - low), self.y, i, point)
@@ -218,12 +218,12 @@ class TangentCode(EliminationCode):
             known[node] = self._term(node, self.step_terms, first, 0, self.P)
         return self._now.evaluate(e.program, nodes, known, 1)
 
-    def _of_places(self, nodes: Sequence[int]) -> Iterator[tuple[int, int]]:
-        """Yield each place with its node of those at the places of a strand."""
+    def _of_places(self, nodes: Any) -> Iterator[tuple[int, int]]:
+        """Yield all places with their nodes, from the nodes of a strand's places."""
         yield from ((k, int(nodes[place])) for k, (_, place) in enumerate(self.origins[: self.used]))
 
-    def _of_pieces(self, nodes: Sequence[int]) -> Iterator[tuple[int, int]]:
-        """Yield each piece that is not idle with its node of those of the pieces of a strand."""
+    def _of_pieces(self, nodes: Any) -> Iterator[tuple[int, int]]:
+        """Yield all pieces but the idle ones with their nodes, from the nodes of a strand's pieces."""
         yield from ((base + k, int(node)) for base in self.bases for k, node in enumerate(nodes))
 
     def _states_at(self, name: str) -> Iterator[tuple[Index, Value | bool, dict[int, Value]]]:
@@ -412,10 +412,10 @@ class TangentCode(EliminationCode):
             point = self._node(node)
             return _set(
                 (
-                    Number(t.row, int(of_row), node),
+                    Number(t.row, int(component), node),
                     Number(t.y if i < e.ny else t.newest, i, point + self.bases[q]),
                 )
-                for (q, i), of_row in np.ndenumerate(self.packed)
+                for (q, i), component in np.ndenumerate(self.packed)
             )
 
         found += [Loop(0, self.used, recorded), Loop(0, len(self.grid.nodes), shown)]
@@ -871,8 +871,9 @@ class CotangentCore(TangentCode):
         state = np.zeros((m, self.state_size))
         for array, values in zip(parts, (*d_records, d_rate), strict=True):
             self._put_in(state, array, self._by_strand(array, np.moveaxis(values, -1, 0))[:, None])
-            # no result is one of an idle piece
-            self._numbers(state, array)[:, :, self.idle] = 0.0
+            # idle pieces have no results
+            for place in self.idle:
+                self._numbers(state, array)[:, :, place] = 0.0
         d_controls = np.empty((count, self.equations.nc, m))
         kept = np.empty((count, self._kept_size))
         arrays = *begun, kept, state, d_controls, d_rows, d_unknowns
