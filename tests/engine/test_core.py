@@ -17,7 +17,8 @@ from knode_cosserat.rods.system import unknown_count
 from knode_cosserat.solvers import evaluation, recovery, static_loop, time_loop
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.grid import grid_of
-from knode_cosserat.solvers.history import constant_history, resting_history
+from knode_cosserat.solvers.history import repeated_record_history, resting_history
+from knode_cosserat.solvers.problem import no_history
 from knode_cosserat.solvers.recovery import attempt
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SCHEMES, Formula, SpaceScheme, Stage
@@ -134,12 +135,13 @@ def displacements(count=1):
     return 0.01 * (1.0 - np.cos(TIMES * np.random.default_rng(5).uniform(1.0, 5.0, (count, 1, 6))))
 
 
-def standing_history(settings):
+def standing_history(robot, settings):
     """History of six legs in equilibrium."""
-    robot = robot_of(LEGS)
-    start = unloaded_shape(robot, settings.space)
-    _, _, rows = loops.static_one(robot, Settings(None, settings.space), np.zeros((1, 6)), start, (0, 1))
-    return jax.jit(constant_history, static_argnums=1)(robot, settings, rows.records[0], np.zeros(6))
+    y, control = unloaded_shape(robot, settings.space), np.zeros(6)
+    _, y, _ = loops.static_one(robot, Settings(None, settings.space), control[None], y, (0, 1))
+    none = no_history(robot, settings.space)
+    found = loops.evaluator(robot, settings)(0.0, 0.0, control, none, y)
+    return repeated_record_history(robot, settings.space, found.records, found.y, 0.0)
 
 
 #: robots, controls, schemes in time and along the rod, and the accuracy of estimates
@@ -162,7 +164,7 @@ def test_schemes_and_systems(case):
     name, controls, time, space, estimates = CASES[case]
     robot, settings = robot_of(name) if isinstance(name, str) else name, settings_of(time, space)
     steps = StepCoefficients.of(settings, DT)
-    past = standing_history(settings) if name == LEGS else resting_history(robot, settings)
+    past = (standing_history if name == LEGS else resting_history)(robot, settings)
     given = robot, settings, steps, controls, past, (0, STEPS)
     done, state, rows = time_loop.loop_one(*given)
     own_done, own_state, own_rows = loops.loop_one(*given)
@@ -173,7 +175,7 @@ def test_schemes_and_systems(case):
 
 def test_strands_in_lanes():
     robot, settings, control = robot_of(LEGS), settings_of("sdirk2"), displacements(3)
-    past, steps = standing_history(settings), StepCoefficients.of(settings, DT)
+    past, steps = standing_history(robot, settings), StepCoefficients.of(settings, DT)
     pasts = jax.tree.map(lambda leaf: np.stack([leaf] * 3), past)
     done, states, rows = loops.loop_many(robot, settings, steps, control, pasts, STEPS)
     assert np.all(done == STEPS)

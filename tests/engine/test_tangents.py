@@ -9,7 +9,6 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.engine import loops
-from knode_cosserat.engine.program import EngineError
 from knode_cosserat.estimation.adapted import Adapted, AdaptedParameters
 from knode_cosserat.estimation.online import OnlineModel
 from knode_cosserat.rods.loads import AttachedMass, PointWrench
@@ -24,15 +23,29 @@ from knode_cosserat.solvers.static_loop import unloaded_shape
 from knode_cosserat.solvers.tangent import SystemMoves
 from knode_cosserat.solvers.time_loop import StepCoefficients
 from tests.engine.networks import with_network
-from tests.engine.test_core import Stretching
+from tests.engine.test_core import LEGS, Stretching, displacements, standing_history
 
 DT, STEPS, COLUMNS = 0.05, 6, 11
 PAPER, ROUTED, CURVED = "delrin-tendon-robot", "delrin-routed-tendon-robot", "variable-curvature-robot"
-NETWORK, BAR = "network of 512 units", "bar"
+NETWORK, BAR, CUT_LEGS = "network of 512 units", "bar", "six legs with discontinuities"
 
 
-#: robots and schemes of which the places between ends, and y_s, enter
-SPACES = [(ROUTED, "sdirk2", "lobatto4"), (BAR, "bdf-alpha", "lobatto4"), (PAPER, "bdf2", "euler")]
+#: robots and schemes of which the places between ends, y_s, and several strands enter
+SPACES = [
+    (ROUTED, "sdirk2", "lobatto4"), (BAR, "bdf-alpha", "lobatto4"), (PAPER, "bdf2", "euler"),
+    (LEGS, "bdf-alpha", "lobatto2"), (CUT_LEGS, "bdf2", "lobatto4"),
+]  # fmt: skip
+
+
+class CutLegs(kc.robots.ParallelRobot):
+    """Legs with places of discontinuity, of which one lies on a node."""
+
+    cuts = (0.37, 5 / 9)
+
+
+def cut_legs():
+    robot = kc.load_robot(LEGS)
+    return CutLegs(**{name: getattr(robot, name) for name in robot.parameters()}, nodes=robot.nodes)
 
 
 class Motion:
@@ -40,13 +53,20 @@ class Motion:
 
     def __init__(self, name, scheme, space="lobatto2", **changes):
         rng = np.random.default_rng(0)
-        own = {NETWORK: functools.partial(with_network, 512, history=True), BAR: Stretching}
+        own = {
+            NETWORK: functools.partial(with_network, 512, history=True),
+            BAR: Stretching,
+            CUT_LEGS: cut_legs,
+        }
         robot = own[name]() if name in own else kc.load_robot(name).replace(**changes)
         self.robot, self.settings = robot, Settings.of(scheme, space, "paper", NewtonOptions())
         self.steps = StepCoefficients.of(self.settings, DT)
-        self.past = jax.tree.map(np.asarray, resting_history(robot, self.settings))
+        start = resting_history if robot.strands == 1 else standing_history
+        self.past = jax.tree.map(np.asarray, start(robot, self.settings))
         low, high = (2.0, 5.0) if name != CURVED else (0.2, 0.5)
         self.controls = rng.uniform(low, high, (STEPS, robot.control_size))
+        if robot.strands > 1:
+            self.controls = displacements()[0, :STEPS]
         self.directions = jax.tree.map(lambda leaf: 0.1 * leaf * rng.normal(size=(3, *np.shape(leaf))), robot)
         self.weights = rng.normal(size=(3, COLUMNS))
         self.d_controls = 0.1 * rng.normal(size=(*self.controls.shape, COLUMNS))
@@ -134,8 +154,9 @@ def test_an_adapted_zero_is_no_constant_of_the_code():
     assert cores[0] is cores[1]
 
 
-def test_tangents_equal_those_in_jax(monkeypatch):
-    motion = Motion(PAPER, "sdirk2")
+@pytest.mark.parametrize(("name", "scheme"), [(PAPER, "sdirk2"), (LEGS, "bdf2")])
+def test_tangents_equal_those_in_jax(name, scheme, monkeypatch):
+    motion = Motion(name, scheme)
     wanted = tangent_loop_in_jax(*motion.given)
     monkeypatch.setattr(sensitivity, "tangent_loop_in_jax", None)
     found = tangent_time_loop(*motion.given)
@@ -190,13 +211,30 @@ def test_cotangents_are_those_of_the_transposed_map(name, scheme, space, monkeyp
     assert_transposed(results, at, along)
 
 
-def test_cotangents_of_equilibria(monkeypatch):
+@pytest.mark.parametrize(("name", "low", "high"), [(ROUTED, 2.0, 5.0), (LEGS, 0.0, 0.02)])
+def test_tangents_and_cotangents_of_equilibria(name, low, high, monkeypatch):
     monkeypatch.setattr(rollout, "tangent_loop_in_jax", None)
-    robot, controls = kc.load_robot(ROUTED), np.random.default_rng(0).uniform(2.0, 5.0, (3, 4))
+    robot, rng, eps = kc.load_robot(name), np.random.default_rng(0), 1e-4
+    controls, y = rng.uniform(low, high, (3, robot.control_size)), unloaded_shape(robot, LOBATTO2)
     run = rollout.static_rollout(Equilibria(Settings(None), 3), loops.Pattern.of(robot))
-    y, rng = unloaded_shape(robot, LOBATTO2), np.random.default_rng(1)
-    along = jax.tree.map(lambda x: 0.1 * x * rng.normal(size=np.shape(x)), robot), rng.normal(size=(3, 4))
-    assert_transposed(lambda *at: [*run(*at, y)[:2]], (robot, controls), along)
+    along = (
+        jax.tree.map(lambda x: 0.1 * x * rng.normal(size=np.shape(x)), robot),
+        0.1 * high * rng.normal(size=controls.shape),
+    )
+
+    def results(robot, controls):
+        return [*run(robot, controls, y)[:2]]
+
+    assert_transposed(results, (robot, controls), along)
+    moved = jax.jvp(results, (robot, controls), along)[1]
+    ends = [
+        results(*jax.tree.map(lambda x, dx, part=part: x + part * dx, (robot, controls), along))
+        for part in (eps, -eps)
+    ]
+    for found, above, below in zip(moved, *ends, strict=True):
+        wanted = np.asarray(above - below) / (2.0 * eps)
+        size = np.max(np.abs(wanted), axis=tuple(range(wanted.ndim - 1)))
+        assert np.all(np.abs(found - wanted) <= 1e-4 * size + 1e-10)
 
 
 @pytest.fixture(scope="module")
@@ -243,10 +281,3 @@ def test_transformations_agree_with_each_other(tip_height):
 def test_unsolved_rows_are_nan(tip_height):
     function, tensions = tip_height
     assert np.isnan(jax.jit(function)(1.0, 1e7 * tensions[0]))
-
-
-def test_what_the_engine_does_not_cover_is_refused():
-    settings = Settings.of("bdf2", "lobatto2", "paper", NewtonOptions())
-    at, changes = (kc.load_robot("six-legged-robot"), np.zeros((1, 6))), ((None, None), np.zeros((1, 6, 1)))
-    with pytest.raises(EngineError, match="one rod"):
-        loops.tangent_loop(settings, None, None, at, changes, (), 0.0)

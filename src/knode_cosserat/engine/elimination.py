@@ -371,7 +371,7 @@ class EliminationCode(RodCode):
             with self._places(self.pieces) as j:
                 points = self._pointer(self.r, j), self._pointer(self.wide_added, j)
                 f.call(self.solved, f.arguments[0], *points, j.value)
-            for point in map(int, self.grid.between):
+            for point in (base + int(cut) for base in self.bases for cut in self.grid.between):
                 for i in range(self.equations.ny):
                     change = self._get(self.wide_added, i, point - 1)
                     self._put(self._get(self.y, i, point) + change, self.y, i, point)

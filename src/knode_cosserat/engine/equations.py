@@ -236,7 +236,9 @@ class TangentEquations(Equations):
             "base": [*self.base],
         }  # fmt: skip
         self.z_by_y = self._nonzeros(self.z, self.y)
-        self.by_history = {name: self._nonzeros(nodes, self.history) for name, nodes in results.items()}
+        #: by the history of all strands in turn; that of a point is the first
+        whole = np.concatenate(self.strand_history)
+        self.by_history = {name: self._nonzeros(nodes, whole) for name, nodes in results.items()}
         self.by_control = {name: self._nonzeros(nodes, self.control) for name, nodes in results.items()}
         for nonzeros in (self.z_by_y, *self.by_history.values(), *self.by_control.values()):
             self._outputs += [node for *_, node in nonzeros]

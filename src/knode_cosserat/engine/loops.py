@@ -10,7 +10,6 @@ import numpy as np
 
 from knode_cosserat.engine.core import Constants, Core, Shape, States, coefficients_of
 from knode_cosserat.engine.pattern import Pattern, compiled, masks_of, parameters_of
-from knode_cosserat.engine.program import EngineError
 from knode_cosserat.engine.tangents import CotangentCore, TangentCore
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.problem import Evaluated
@@ -38,13 +37,7 @@ def tangents_for(
     """Return the core of tangents or cotangents of a pattern, with masks of `moving` parameters."""
     key = pattern, masks_of(moving), settings.space, settings.uses_rate, kind
 
-    def build() -> AnyTangents:
-        system = pattern.system
-        if system.strands > 1:
-            raise EngineError("engine: tangents only of one rod")
-        return kind(system, settings, moving)
-
-    return compiled(key, build)
+    return compiled(key, lambda: kind(pattern.system, settings, moving))
 
 
 def loop_one(

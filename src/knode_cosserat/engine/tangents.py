@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import itertools
 import operator
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,8 +34,8 @@ class Tangents(NamedTuple):
     records: list[Array]
     rate: Array
     control: Array
-    #: history terms; rates and strains, those at ends of pieces, y behind jumps and at stages, lengths, and
-    #: defects of pieces and tip, at fixed y
+    #: history terms; rates and strains, those at ends of pieces, y behind jumps and at stages, lengths,
+    #: defects of pieces and tip, and y at the bases, at fixed y
     history: Array
     rates: Array
     far: Array
@@ -43,7 +44,8 @@ class Tangents(NamedTuple):
     lengths: Array
     r: Array
     tip: Array
-    #: y along the rod without the changes of the unknowns, and the unknowns of the groups of pieces
+    base: Array
+    #: y along the strands without the changes of the unknowns, and those of each strand's groups of pieces
     w: Array
     alpha: Array
     beta: Array
@@ -81,6 +83,8 @@ class TangentCode(EliminationCode):
             (self.by_history["far"], _nodes(e.by_history["far"])),
             (self.by_control["far"], _nodes(e.by_control["far"])),
         ]
+        #: stages of the pieces between strands
+        self.idle = [first + tip for first in self.stages for tip in self.tips[:-1]]
         #: number of tangents side by side, and an array of them
         self.columns = 1 if self.transposed else lanes
         many = a if self.transposed else self._tangent_array
@@ -88,17 +92,20 @@ class TangentCode(EliminationCode):
         records, rate = [many(numbers, self.used, 1) for _ in range(2)], many(numbers, self.used, 1)
         self._reserve_state()
         self.state_size, self._size = self._size, whole
-        groups = self.groups[1]
+        groups = self.groups[1] * self.strands
+        #: component of a packed row for each number of each strand's record
+        self.packed = e.by_strand(np.arange(self.strands * numbers))
         self.tangents = Tangents(
             records, rate, many(e.nc, 1), many(numbers, self.used), many(nx, self.used),
             many(ny, self.pieces), many(ny, self.pieces), many(ny, self.used - self.ends),
-            many(1, self.pieces), many(ny, self.pieces), many(k, 1),
-            many(ny, self.points), many(k, groups + 1), many(k, groups), many(ny, self.points),
-            many(ny, self.used), many(numbers, self.used), many(numbers, len(self.grid.nodes)), many(k, 1),
+            many(1, self.pieces), many(ny, self.pieces), many(k, 1), many(ny * self.strands, 1),
+            many(ny, self.points), many(self.own, groups + self.strands), many(self.own, groups),
+            many(ny, self.points), many(ny, self.used), many(numbers, self.used),
+            many(self.packed.size, len(self.grid.nodes)), many(k, 1),
         )  # fmt: skip
         #: the results of the equations at fixed y, by the names of their derivatives
         t = self.tangents
-        self.results = {"rates": t.rates, "far": t.far, "tip": t.tip, "base": t.w}
+        self.results = {"rates": t.rates, "far": t.far, "tip": t.tip, "base": t.base}
         self._reserve_products()
         self._write()
         self.compiled = self.module.compile()
@@ -159,14 +166,15 @@ class TangentCode(EliminationCode):
         self.solution = f = self._function("solution", "row")
         row = f.arguments[1]
         with f.loop(len(self.grid.nodes)) as node:
-            at, here = f.pointer(row, node.value * e.numbers), self._node(node)
-            for i in range(e.ny):
-                self._put(f.load(at, i), self.y, i, here)
+            at, here = f.pointer(row, node.value * self.packed.size), self._node(node)
+            for q, i in np.ndindex(self.strands, e.ny):
+                self._put(f.load(at, int(self.packed[q, i])), self.y, i, here + self.bases[q])
         if not len(grid.between):
             return
-        for point in map(int, grid.between):
-            start, end = (int(grid.nodes[grid.segment[point] + k]) for k in (0, 1))
-            part = float(grid.bounds[point, 0])
+        for base, cut in itertools.product(self.bases, map(int, grid.between)):
+            point = base + cut
+            start, end = (base + int(grid.nodes[grid.segment[cut] + k]) for k in (0, 1))
+            part = float(grid.bounds[cut, 0])
             for i in range(e.ny):
                 low, high = self._get(self.y, i, start), self._get(self.y, i, end)
                 self._put(low + part * (high - low), self.y, i, point)
@@ -185,7 +193,7 @@ class TangentCode(EliminationCode):
                     self._put(value, array, i)
 
     def _end_states(self) -> Sequence[tuple[str, dict[int, Value]]]:
-        """Return the state at the tip and at the base."""
+        """Return the state at the tips and at the bases."""
         return ("tip", self._tip_state(self.y, self.H)), ("base", self._base_state(self.unknowns, self.H))
 
     def _write_shift(self) -> None:
@@ -210,6 +218,14 @@ class TangentCode(EliminationCode):
             known[node] = self._term(node, self.step_terms, first, 0, self.P)
         return self._now.evaluate(e.program, nodes, known, 1)
 
+    def _of_places(self, nodes: Any) -> Iterator[tuple[int, int]]:
+        """Yield all places with their nodes, from the nodes of a strand's places."""
+        yield from ((k, int(nodes[place])) for k, (_, place) in enumerate(self.origins[: self.used]))
+
+    def _of_pieces(self, nodes: Any) -> Iterator[tuple[int, int]]:
+        """Yield all pieces but the idle ones with their nodes, from the nodes of a strand's pieces."""
+        yield from ((base + k, int(node)) for base in self.bases for k, node in enumerate(nodes))
+
     def _states_at(self, name: str) -> Iterator[tuple[Index, Value | bool, dict[int, Value]]]:
         """Write loops over places on which rates and strains, or y behind jumps, depend.
 
@@ -228,15 +244,18 @@ class TangentCode(EliminationCode):
 
     # the linear map of a step
 
-    def _by_data(self, name: str, target: Array, j: Any, place: Any) -> list[Operation]:
-        """Set results at fixed y, by history and control."""
-        e, t = self.equations, self.tangents
+    def _by_data(self, name: str, j: Any, places: Sequence[Any]) -> list[Operation]:
+        """Set results at fixed y, by the history at a place of each strand, and by the control."""
+        e, t, target = self.equations, self.tangents, self.results[name]
         found: list[Operation] = [Clear(Number(target, i, j)) for i in range(target.size)]
         for nonzeros, matrix, source, at in (
-            (e.by_history[name], self.by_history[name], t.history, place),
-            (e.by_control[name], self.by_control[name], t.control, 0),
+            (e.by_history[name], self.by_history[name], t.history, places),
+            (e.by_control[name], self.by_control[name], t.control, (0,)),
         ):
-            found += _products(nonzeros, (matrix, j if matrix.count > 1 else 0), (target, j), (source, at))
+            for n, (i, c, _) in enumerate(nonzeros):
+                strand, component = divmod(c, source.size)
+                number = Number(source, component, at[strand])
+                found.append(Add(Number(target, i, j), number, Number(matrix, n, j)))
         return found
 
     def _at_fixed_y(self, coefficients: Value) -> list[Operation]:
@@ -250,14 +269,14 @@ class TangentCode(EliminationCode):
                 found.append(Clear(Number(t.history, i, j)))
                 for part, weight in zip((*t.records, t.rate), weights, strict=False):
                     found.append(Add(Number(t.history, i, j), Number(part, i, j), weight))
-            return found + self._by_data("rates", t.rates, j, j)
+            return found + self._by_data("rates", j, [j])
 
         def behind(j: Index) -> list[Operation]:
-            return [Clear(Number(t.lengths, 0, j)), *self._by_data("far", t.far, j, j)]
+            return [Clear(Number(t.lengths, 0, j)), *self._by_data("far", j, [j])]
 
         return [
             Loop(0, self.used, at_place), Loop(0, self.pieces, behind),
-            *self._by_data("tip", t.tip, 0, self.pieces), *self._by_data("base", t.w, 0, 0),
+            *self._by_data("tip", 0, self.tips), *self._by_data("base", 0, self.bases),
         ]  # fmt: skip
 
     def _solution_and_records(self, coefficients: Value) -> list[Operation]:
@@ -391,18 +410,24 @@ class TangentCode(EliminationCode):
 
         def shown(node: Index) -> list[Operation]:
             point = self._node(node)
-            return [
-                *_copies(e.ny, (t.row, node), (t.y, point)),
-                *_copies(e.numbers - e.ny, (t.row, node), (t.newest, point), e.ny),
-            ]
+            return _set(
+                (
+                    Number(t.row, int(component), node),
+                    Number(t.y if i < e.ny else t.newest, i, point + self.bases[q]),
+                )
+                for (q, i), component in np.ndenumerate(self.packed)
+            )
 
         found += [Loop(0, self.used, recorded), Loop(0, len(self.grid.nodes), shown)]
-        return found + _copies(e.k, (t.unknowns, 0), (t.alpha, 0))
+        return found + _set(
+            (Number(t.unknowns, c), Number(t.alpha, c % self.own, c // self.own * (self.groups[1] + 1)))
+            for c in range(e.k)
+        )
 
     def _correction(self) -> list[Operation]:
-        """Return the map from the defects of pieces and tip, and y at the base, to y and the unknowns."""
+        """Return the map from the defects of pieces and tip, and y at the bases, to y and the unknowns."""
         e, t, el = self.equations, self.tangents, self.elimination
-        ny, k, (size, count) = e.ny, e.k, self.groups
+        ny, k, own, (size, count) = e.ny, e.k, self.own, self.groups
         stored = {int(node): n for n, node in enumerate(el.stored)}
         entries = {at: n for n, at in enumerate(el.entries)}
 
@@ -424,50 +449,71 @@ class TangentCode(EliminationCode):
 
         def by_unknowns(target: Array, j: Any, source: Array, g: Any, is_negative: bool) -> list[Operation]:
             found = list[Operation]()
-            for i, c in np.ndindex(ny, k):
+            for i, c in np.ndindex(ny, own):
                 entry = self._entry_at(self.X, ny, i, c, j)
                 found.append(Add(Number(target, i, j), Number(source, c, g), entry, is_negative))
             return found
 
-        def group(g: Index) -> list[Operation]:
-            last = self._now.index((g.value + 1) * size)
-            pivots = list[Operation]()
-            for c, pivot in enumerate(self.pivots):
-                pivots += [Clear(Number(t.beta, c, g)), Add(Number(t.beta, c, g), Number(t.w, pivot, last))]
+        def group(strand: Index, g: Index) -> list[Operation]:
+            first = strand.value * self.strand_points + g.value * size
+            last, group = self._now.index(first + size), self._now.index(strand.value * count + g.value)
+            pivots = ((Number(t.beta, c, group), Number(t.w, p, last)) for c, p in enumerate(self.pivots))
             return [
-                Loop(g.value * size, (g.value + 1) * size, piece), *pivots,
-                *by_unknowns(t.w, last, t.beta, g, True),
+                Loop(first, last.value, piece), *_set(pivots), *by_unknowns(t.w, last, t.beta, group, True)
             ]  # fmt: skip
 
-        def solved(j: Any, g: Any) -> list[Operation]:
+        def solved(g: Any, j: Any) -> list[Operation]:
             return [*_copies(ny, (t.y, j), (t.w, j)), *by_unknowns(t.y, j, t.alpha, g, False)]
 
-        def group_back(g: Index) -> list[Operation]:
-            end = self._now.index((g.value + 1) * size)
-            found = solved(end, g + 1)
-            for c in range(k):
+        def group_back(strand: Index, g: Index) -> list[Operation]:
+            first = strand.value * self.strand_points + g.value * size
+            end, group = self._now.index(first + size), self._now.index(strand.value * count + g.value)
+            # a strand has one more alpha
+            alpha = self._now.index(group.value + strand.value)
+            found = solved(alpha + 1, end)
+            for c in range(own):
                 found += [
-                    Clear(Number(t.alpha, c, g)),
-                    Add(Number(t.beta, c, g), Number(t.alpha, c, g + 1), is_negative=True),
+                    Clear(Number(t.alpha, c, alpha)),
+                    Add(Number(t.beta, c, group), Number(t.alpha, c, alpha + 1), is_negative=True),
                 ]
-            for i, c in np.ndindex(k, k):
-                entry = self._entry_at(self.T, k, i, c, g)
-                found.append(Add(Number(t.alpha, i, g), Number(t.beta, c, g), entry, is_negative=True))
-            start = g.value * size + 1
-            return [*found, Loop(start, (g.value + 1) * size, lambda j: solved(j, g))]
+            for i, c in np.ndindex(own, own):
+                entry = self._entry_at(self.T, own, i, c, group)
+                found.append(
+                    Add(Number(t.alpha, i, alpha), Number(t.beta, c, group), entry, is_negative=True)
+                )
+            return [*found, Loop(first + 1, end.value, functools.partial(solved, alpha))]
 
+        def strand_ahead(strand: Index) -> list[Operation]:
+            base = strand.value * self.strand_points
+            return [
+                Loop(0, count, functools.partial(group, strand)),
+                Loop(base + count * size, base + self.grid.tip, piece),
+            ]
+
+        def strand_back(strand: Index) -> list[Operation]:
+            base = self._now.index(strand.value * self.strand_points)
+            first = self._now.index(strand.value * (count + 1))
+            return [
+                Loop(
+                    base.value + (count * size + 1), base.value + self.strand_points,
+                    functools.partial(solved, first + count),
+                ),
+                Loop(0, count, functools.partial(group_back, strand), descends=True), *solved(first, base),
+            ]  # fmt: skip
+
+        bases = ((Number(t.w, i % ny, self.bases[i // ny]), Number(t.base, i)) for i in range(t.base.size))
         at_tip = list[Operation]()
         for i, c, _ in self.tip_slopes:
-            entry = self._entry_at(self.M, k, i, c)
-            at_tip.append(Add(Number(t.tip, i), Number(t.w, c, self.points - 1), entry))
-        at_tip += [Clear(Number(t.alpha, i, count)) for i in range(k)]
+            strand, component = divmod(c, ny)
+            entry = self._entry_at(self.M, k, i, component, strand)
+            at_tip.append(Add(Number(t.tip, i), Number(t.w, component, self.tips[strand]), entry))
+        alpha = [Number(t.alpha, i % own, i // own * (count + 1) + count) for i in range(k)]
+        at_tip += map(Clear, alpha)
         for i, c in np.ndindex(k, k):
             entry = self._entry_at(self.inverse, k, i, c)
-            at_tip.append(Add(Number(t.alpha, i, count), Number(t.tip, c), entry, is_negative=True))
+            at_tip.append(Add(alpha[i], Number(t.tip, c), entry, is_negative=True))
         return [
-            Loop(0, count, group), Loop(count * size, self.pieces, piece), *at_tip,
-            Loop(count * size + 1, self.points, lambda j: solved(j, count)),
-            Loop(0, count, group_back, descends=True), *solved(0, 0),
+            *_set(bases), Loop(0, self.strands, strand_ahead), *at_tip, Loop(0, self.strands, strand_back)
         ]  # fmt: skip
 
     def _entry_at(self, matrix: Array, rows: int, i: int, c: int, j: Any = 0) -> Number:
@@ -479,9 +525,13 @@ class TangentCode(EliminationCode):
     def _data_of(self, step: Index, coefficients: Value, *data: Value) -> list[Value]:
         """Return the addresses of a step's coefficients, and of its control, row and unknowns."""
         f, e = self._now, self.equations
-        sizes = e.nc, len(self.grid.nodes) * e.numbers, e.k
+        sizes = e.nc, self._row_size, e.k
         found = [f.pointer(each, step.value * size) for each, size in zip(data, sizes, strict=True)]
         return [f.pointer(coefficients, step.value * 5), *found]
+
+    @property
+    def _row_size(self) -> int:
+        return len(self.grid.nodes) * self.packed.size
 
     def _begun(
         self, parameters: np.ndarray, solved: tuple[Any, Any], controls: Any, table: Any,
@@ -491,9 +541,9 @@ class TangentCode(EliminationCode):
         memory = self._empty_memory()
         self._put_in(memory[None], self.params, parameters[None, None, None])
         for array, values in zip((*self.records, self.rate), (*records, rate), strict=True):
-            self._put_in(memory[None], array, np.asarray(values, float)[None, None])
+            self._put_in(memory[None], array, self._by_strand(array, np.asarray(values, float))[None, None])
         rows, unknowns = solved
-        data = controls, table, np.asarray(rows)[..., : self.equations.numbers], unknowns
+        data = controls, table, np.asarray(rows)[..., : self.packed.size], unknowns
         return [memory, *(np.ascontiguousarray(each, float) for each in data)]
 
 
@@ -532,8 +582,8 @@ class TangentCore(TangentCode):
         every = [*e.moved_terms, *e.dplaces, *e.dlengths]
         moves = self._inputs_of(self.dparameters, [e.dparameters], every)
         values = self._terms_known(every, moves)
-        for array, nodes in ((self.ds, e.dplaces), (self.dh, e.dlengths)):
-            for k, node in enumerate(nodes):
+        for array, nodes in ((self.ds, self._of_places(e.dplaces)), (self.dh, self._of_pieces(e.dlengths))):
+            for k, node in nodes:
                 self._put(values[node], array, 0, k)
         known = {node: values[node] for node in e.moved_terms} | moves
         for name in ("rates", "far"):
@@ -566,15 +616,15 @@ class TangentCore(TangentCode):
                         self._put(self._get(target, i, j, L) + weight * number, target, i, j, L)
         write(self, self._solution_and_records(coefficients), L, False)
         with f.loop(len(self.grid.nodes)) as node:
-            at = f.pointer(row, node.value * width * e.numbers)
-            for i in range(e.numbers):
+            at = f.pointer(row, node.value * width * t.row.size)
+            for i in range(t.row.size):
                 f.store(self._get(t.row, i, node, L), at, width * i, L)
         for i in range(e.k):
             f.store(self._get(t.unknowns, i, 0, L), d_unknowns, width * i, L)
 
     def _write_run(self) -> None:
         """All solved steps in turn; tangents have `n_columns` columns, a multiple of the lanes."""
-        e, L, nodes = self.equations, self.L, len(self.grid.nodes)
+        e, L = self.equations, self.L
         names = ["memory", "controls", "coefficients", "rows", "unknowns", "directions", "states", "weights"]
         names += ["d_controls", "d_rows", "d_unknowns", "n_steps", "n_directions", "n_columns"]
         f = self._now = self.module.function("run", names, exported=True)
@@ -589,7 +639,7 @@ class TangentCore(TangentCode):
             with f.loop(count) as d:
                 f.call(self.direction, memory, f.pointer(directions, d.value * self.direction_size))
             own = f.pointer(d_controls, step.value * width * e.nc)
-            d_row = f.pointer(d_rows, step.value * width * (nodes * e.numbers))
+            d_row = f.pointer(d_rows, step.value * width * self._row_size)
             d_unknown = f.pointer(d_unknowns, step.value * width * e.k)
             with f.loop(width, 0, L) as first:
                 parts = (f.pointer(each, first.value) for each in (weights, own, d_row, d_unknown))
@@ -614,7 +664,7 @@ class TangentCore(TangentCode):
         """
         e, L, (records, rate, d_records, d_rate) = self.equations, self.L, states
         (directions, weights), count = moves, len(controls)
-        m, nodes = d_controls.shape[-1], len(self.grid.nodes)
+        m, nodes, places = d_controls.shape[-1], len(self.grid.nodes), len(rate)
         blocks = -(-m // L)
 
         def filled(values: Any) -> np.ndarray:
@@ -631,23 +681,23 @@ class TangentCore(TangentCode):
         tangents = np.zeros((blocks, self.state_size))
         parts = (*self.tangents.records, self.tangents.rate)
         for array, values in zip(parts, (*d_records, d_rate), strict=True):
-            self._put_in(
-                tangents, array, np.moveaxis(filled(values).reshape(self.used, -1, blocks, L), (2, 3), (0, 1))
-            )
+            columns = filled(values).reshape(places, -1, blocks, L)
+            self._put_in(tangents, array, self._by_strand(array, np.moveaxis(columns, (2, 3), (0, 1))))
         added = filled(np.broadcast_to(d_tip, (e.k, m))).reshape(1, -1, blocks, L)
         self._put_in(tangents, self.added_tip, np.moveaxis(added, (2, 3), (0, 1)))
-        d_rows, d_unknowns = (np.empty((count, *shape, blocks * L)) for shape in ((nodes, e.numbers), (e.k,)))
+        shapes = (nodes, self.packed.size), (e.k,)
+        d_rows, d_unknowns = (np.empty((count, *shape, blocks * L)) for shape in shapes)
         arrays = *begun, moved, tangents, filled(weights), filled(d_controls), d_rows, d_unknowns
         self._run(*(each.ctypes.data for each in arrays), count, len(directions), blocks * L)
-        after = [self._numbers(memory[None], each)[0, 0] for each in (*self.records, self.rate)]
+        after, moved_after = (
+            [self._joined(each, self._numbers(numbers, each), places) for each in arrays]
+            for numbers, arrays in ((memory[None], (*self.records, self.rate)), (tangents, parts))
+        )
+        after = [each[0, 0] for each in after]
         moved_after = [
-            np.moveaxis(self._numbers(tangents, each), (0, 1), (2, 3)).reshape(self.used, -1, blocks * L)
-            for each in parts
+            np.moveaxis(each, (0, 1), (2, 3)).reshape(places, -1, blocks * L)[..., :m] for each in moved_after
         ]
-        found = (
-            np.stack([each[: self.used] for each in after[:2]]), after[2][: self.used],
-            np.stack(moved_after[:2])[..., :m], moved_after[2][..., :m],
-        )  # fmt: skip
+        found = np.stack(after[:2]), after[2], np.stack(moved_after[:2]), moved_after[2]
         return found, (d_rows[..., :m], d_unknowns[..., :m])
 
 
@@ -727,8 +777,12 @@ class CotangentCore(TangentCode):
         e = self.equations
         self.by_geometry = f = self._function("by_geometry", "state")
         known = self._parameters(e.by_geometry)
-        for nodes, array in ((e.of_places, self.place), (e.of_lengths, self.length_of_piece)):
-            known |= {int(node): self._get(array, 0, k) for k, node in enumerate(nodes)}
+        for nodes, array in (
+            (self._of_places(e.of_places), self.place), (self._of_pieces(e.of_lengths), self.length_of_piece)
+        ):  # fmt: skip
+            for k, node in nodes:
+                value = self._get(array, 0, k)
+                known[node] = known[node] + value if node in known else value
         values = f.evaluate(e.program, e.by_geometry, known, 1)
         for k, node in enumerate(e.by_geometry):
             self._put(self._get(self.parameter, k) + values[node], self.parameter, k)
@@ -741,8 +795,8 @@ class CotangentCore(TangentCode):
         )
         memory, state, coefficients, control, row, unknowns, width = f.arguments
         with f.loop(len(self.grid.nodes)) as node:
-            at = f.pointer(row, node.value * width * e.numbers)
-            for i in range(e.numbers):
+            at = f.pointer(row, node.value * width * t.row.size)
+            for i in range(t.row.size):
                 self._put(f.load(at, width * i), t.row, i, node)
         for i in range(e.k):
             self._put(f.load(unknowns, width * i), t.unknowns, i)
@@ -756,7 +810,7 @@ class CotangentCore(TangentCode):
 
     def _write_run(self) -> None:
         """All solved steps in turn, which keeps what each starts from; then their cotangents in reverse."""
-        e, nodes = self.equations, len(self.grid.nodes)
+        e = self.equations
         names = ["memory", "controls", "coefficients", "rows", "unknowns", "kept", "states"]
         names += ["d_controls", "d_rows", "d_unknowns", "n_steps", "n_columns"]
         f = self._now = self.module.function("run", names, exported=True)
@@ -788,7 +842,7 @@ class CotangentCore(TangentCode):
             f.call(self.data, memory, table, control, unknown)
             f.call(self.derivatives, memory)
             own = f.pointer(d_controls, step.value * width * e.nc)
-            d_row = f.pointer(d_rows, step.value * width * (nodes * e.numbers))
+            d_row = f.pointer(d_rows, step.value * width * self._row_size)
             d_unknown = f.pointer(d_unknowns, step.value * width * e.k)
             with f.loop(width) as column:
                 parts = (f.pointer(each, column.value) for each in (own, d_row, d_unknown))
@@ -824,12 +878,16 @@ class CotangentCore(TangentCode):
         m, parts = d_rate.shape[-1], (*self.tangents.records, self.tangents.rate)
         state = np.zeros((m, self.state_size))
         for array, values in zip(parts, (*d_records, d_rate), strict=True):
-            self._put_in(state, array, np.moveaxis(values, -1, 0)[:, None])
+            self._put_in(state, array, self._by_strand(array, np.moveaxis(values, -1, 0))[:, None])
+            # idle pieces have no results
+            for place in self.idle:
+                self._numbers(state, array)[:, :, place] = 0.0
         d_controls = np.empty((count, self.equations.nc, m))
         kept = np.empty((count, self._kept_size))
         arrays = *begun, kept, state, d_controls, d_rows, d_unknowns
         self._run(*(each.ctypes.data for each in arrays), count, m)
-        before = [np.moveaxis(self._numbers(state, each)[:, 0, : self.used], 0, -1) for each in parts]
+        joined = [self._joined(each, self._numbers(state, each)[:, 0], len(d_rate)) for each in parts]
+        before = [np.moveaxis(each, 0, -1) for each in joined]
         return self._numbers(state, self.parameter)[:, 0, 0].T, d_controls, np.stack(before[:2]), before[2]
 
 
@@ -855,8 +913,14 @@ def _copies(
     size: int, target: tuple[Array, Any], source: tuple[Array, Any], first: int = 0
 ) -> list[Operation]:
     """Copy components from `first` on; each has an array and a place."""
+    return _set(
+        (Number(target[0], i, target[1]), Number(source[0], i, source[1])) for i in range(first, first + size)
+    )
+
+
+def _set(pairs: Iterable[tuple[Number, Number]]) -> list[Operation]:
+    """Set the first number of each pair to the second."""
     found = list[Operation]()
-    for i in range(first, first + size):
-        number = Number(target[0], i, target[1])
-        found += [Clear(number), Add(number, Number(source[0], i, source[1]))]
+    for target, source in pairs:
+        found += [Clear(target), Add(target, source)]
     return found
