@@ -33,7 +33,7 @@ from knode_cosserat.errors import KnodeCosseratError
 
 #: largest number of scalar products of one matrix product, and of results of other operations on arrays, that
 #: are scalars
-LARGEST_PRODUCT, LARGEST_SPREAD = 256, 31
+LARGEST_PRODUCT, LARGEST_SPREAD = 96, 31
 #: largest number of entries of a table with a variable index, of turns of a scan, and of numbers to sort
 LARGEST_TABLE, LONGEST_SCAN, LONGEST_SORT = 256, 1024, 32
 #: largest matrix that is factorised with row exchanges that depend on values
@@ -708,8 +708,8 @@ class Program:
                 add(arguments[0], self._view_cotangent(own, arguments[1], self.shapes[arguments[0]]))
             elif name == "spread":
                 add(arguments[0], self.view(own, arguments[1].all()), arguments[1].shape)
-            else:
-                raise self._loop_error(arguments[0] if name == "result" else node)
+            elif name == "result":
+                raise self._loop_error(arguments[0])
         return [
             self.spread(found.get(node, zero), Positions.whole(shape), shape)
             if (shape := self.shapes.get(node)) is not None
@@ -818,11 +818,12 @@ class Program:
         """Return the tangents of an array of scalars.
 
         The variables are these scalars themselves if that takes fewer products: unit vectors choose columns
-        of a matrix, at no cost, but there may be more of them.
+        of a matrix, at no cost, but there may be more of them, and each entry of a result is combined later.
         """
         moving = {k: found[node] for k, node in enumerate(scalars.tolist()) if found.get(node)}
         keys = dict.fromkeys(key for tangents in moving.values() for key in tangents)
-        if len(moving) < 2 * len(keys) and len(keys) > 1:
+        is_sparse = 2 * sum(map(len, moving.values())) < len(moving) * len(keys)
+        if len(moving) < 2 * len(keys) and is_sparse:
             return {Component(int(scalars[k])): self.unit(scalars.size, k) for k in moving}
         zero = np.full(scalars.size, self.constant(0.0))
         tangents = {}
