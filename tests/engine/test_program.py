@@ -55,6 +55,9 @@ def interpreted(program, outputs, inputs):
             found[node] = found[rest[0]].ravel()[rest[1].all()]
         elif name == "sum":
             found[node] = np.sum(found[rest[0]], axis=-1)
+        elif name == "spread":
+            found[node] = np.zeros(rest[2])
+            np.add.at(found[node].reshape(-1), rest[1].all(), found[rest[0]])
         elif name == "entry":
             found[node] = found[rest[0]].flat[rest[1]]
         elif node in program.shapes:
@@ -97,6 +100,19 @@ def evaluated(function, *arguments):
     return program, nodes, outputs, values
 
 
+def gradients(program, outputs, cotangents, inputs):
+    """Return the nodes of the cotangents of inputs: of scalars, plus those of arrays of them in memory."""
+    arrays = {k: array for k, each in enumerate(inputs) if (array := program.known_inputs(each)) is not None}
+    scalars = np.concatenate([each.ravel() for each in inputs])
+    found = program.gradient(outputs, program.constants(cotangents), [*scalars, *arrays.values()])
+    sizes = np.cumsum([each.size for each in inputs])
+    parts = np.split(np.array(found[: len(scalars)], dtype=np.int64), sizes)[:-1]
+    for k, node in zip(arrays, found[len(scalars) :], strict=True):
+        entries = program.entries(node, inputs[k].shape).ravel()
+        parts[k] = [program.apply("add", int(a), int(b)) for a, b in zip(parts[k], entries, strict=True)]
+    return [np.reshape(part, each.shape) for part, each in zip(parts, inputs, strict=True)]
+
+
 def check(function, *arguments, tolerance=1e-12):
     """Compare values and Jacobians by all (float) arguments with JAX."""
     arguments = [np.asarray(each) for each in arguments]
@@ -115,6 +131,11 @@ def check(function, *arguments, tolerance=1e-12):
         found = values(program.jacobian(flat, nodes[k].ravel()), *arguments)
         exact = np.concatenate([np.reshape(part, (-1, arguments[k].size)) for part in jax.tree.leaves(own)])
         np.testing.assert_allclose(found, exact, rtol=tolerance, atol=tolerance)
+        cotangents = np.random.default_rng(k).normal(size=len(flat))
+        [pulled] = gradients(program, flat, cotangents, [nodes[k]])
+        found = values(pulled, *arguments)
+        size = np.max(np.abs(cotangents) @ np.abs(exact), initial=1.0)
+        np.testing.assert_allclose(found.ravel(), cotangents @ exact, atol=tolerance * size)
     return program
 
 
@@ -219,8 +240,14 @@ def test_equations_agree_with_jax(name):
         for k, own in zip(moving, tangents, strict=True)
         for a, b in zip(nodes[k].ravel(), own.ravel(), strict=True)
     }
+    moved = np.concatenate([each.ravel() for each in directions])
     for output, value, along in zip(outputs, exact, products, strict=True):
         product = program.derivative(output.tolist(), seeds)
+        cotangents = rng.normal(size=output.size)
+        pulled = gradients(program, output.tolist(), cotangents, [nodes[k] for k in moving])
+        terms = values(np.concatenate([each.ravel() for each in pulled]), *arguments) * moved
+        total, size = cotangents @ along[0], np.sum(np.abs(terms)) + np.sum(np.abs(cotangents * along[0]))
+        assert abs(np.sum(terms) - total) <= 1e-12 * size
         slopes = values(program.jacobian(output.tolist(), nodes[count + 3].tolist()), *arguments)
         found = values([*output, *product], *arguments, *directions)
         for own, expected in zip(

@@ -2,6 +2,7 @@
 
 import functools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,12 +23,17 @@ from knode_cosserat.solvers.space import LOBATTO2
 from knode_cosserat.solvers.static_loop import unloaded_shape
 from knode_cosserat.solvers.tangent import SystemMoves
 from knode_cosserat.solvers.time_loop import StepCoefficients
-from tests.engine.networks import with_network
+from tests.engine.networks import with_committee, with_network
 from tests.engine.test_core import LEGS, Stretching, displacements, standing_history
 
 DT, STEPS, COLUMNS = 0.05, 6, 11
 PAPER, ROUTED, CURVED = "delrin-tendon-robot", "delrin-routed-tendon-robot", "variable-curvature-robot"
-NETWORK, BAR, CUT_LEGS = "network of 512 units", "bar", "six legs with discontinuities"
+NETWORK, COMMITTEE, BAR, CUT_LEGS = (
+    "network of 512 units",
+    "committee",
+    "bar",
+    "six legs with discontinuities",
+)
 
 
 #: robots and schemes of which the places between ends, y_s, and several strands enter
@@ -54,10 +60,9 @@ class Motion:
     def __init__(self, name, scheme, space="lobatto2", **changes):
         rng = np.random.default_rng(0)
         own = {
-            NETWORK: functools.partial(with_network, 512, history=True),
-            BAR: Stretching,
-            CUT_LEGS: cut_legs,
-        }
+            NETWORK: functools.partial(with_network, 512, history=True), COMMITTEE: with_committee,
+            BAR: Stretching, CUT_LEGS: cut_legs,
+        }  # fmt: skip
         robot = own[name]() if name in own else kc.load_robot(name).replace(**changes)
         self.robot, self.settings = robot, Settings.of(scheme, space, "paper", NewtonOptions())
         self.steps = StepCoefficients.of(self.settings, DT)
@@ -187,7 +192,8 @@ def assert_transposed(function, at, along):
     ("name", "scheme", "space"),
     [
         (PAPER, "bdf-alpha", "lobatto2"), (ROUTED, "sdirk2", "lobatto2"), (ROUTED, "bdf-alpha", "lobatto2"),
-        (CURVED, "bdf-alpha", "lobatto2"), *SPACES,
+        (CURVED, "bdf-alpha", "lobatto2"), (NETWORK, "bdf-alpha", "lobatto2"), (COMMITTEE, "sdirk2", "lobatto2"),
+        *SPACES,
     ],
 )  # fmt: skip
 def test_cotangents_are_those_of_the_transposed_map(name, scheme, space, monkeypatch):
@@ -259,6 +265,28 @@ def test_gradients_are_differences_and_run_in_the_engine(tip_height, monkeypatch
     ends = [function(1.0, tensions[0] + part * direction) for part in (eps, -eps)]
     slope = float(ends[0] - ends[1]) / (2.0 * eps)
     assert float(np.sum(found[1] * direction)) == pytest.approx(slope, rel=1e-6)
+
+
+@pytest.mark.parametrize("hidden", [12, 64])
+def test_gradients_by_weights_are_differences_and_run_in_the_engine(hidden, monkeypatch):
+    for name in ("tangent_loop_in_jax", "loop_one"):
+        monkeypatch.setattr(rollout, name, None)
+    model, tensions = with_network(hidden), np.random.default_rng(0).uniform(2.0, 5.0, (STEPS, 4))
+    eps, weights = 1e-4, lambda model: (model.residual.input_weights, model.residual.output_weights)
+
+    def height(own, tensions):
+        moved = eqx.tree_at(weights, model, own)
+        return kc.simulate(moved, tensions, DT, time="bdf2").tip_position[-1, 2]
+
+    found = jax.jit(jax.grad(height))(weights(model), tensions)
+    for k, slopes in enumerate(found):
+        direction = np.random.default_rng(k).normal(size=slopes.shape)
+        ends = []
+        for part in (eps, -eps):
+            own = list(weights(model))
+            own[k] = own[k] + part * direction
+            ends.append(float(height(tuple(own), tensions)))
+        assert float(np.sum(slopes * direction)) == pytest.approx((ends[0] - ends[1]) / (2.0 * eps), rel=1e-5)
 
 
 def test_transformations_agree_with_each_other(tip_height):

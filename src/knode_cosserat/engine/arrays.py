@@ -33,15 +33,27 @@ class Stored:
     lanes: int = 1
 
 
+def summands(program: Program, node: int) -> Iterator[tuple[int, Positions]]:
+    """Return arrays, with their positions, that add up to an array."""
+    name, *rest = program.operations[node]
+    if name == "spread":
+        yield rest[0], rest[1]
+    elif name == "add" and all(each in program.shapes for each in rest):
+        for each in rest:
+            yield from summands(program, each)
+    else:
+        yield node, Positions.whole(program.shapes[node])
+
+
 class ArrayCode:
     """Code of the arrays among the nodes of a program, in a function."""
 
     def __init__(
         self, function: Function, program: Program, nodes: Sequence[int], outputs: Iterable[int],
-        values: dict[int, Any],
+        values: dict[int, Any], added: Iterable[int] = (),
     ):  # fmt: skip
         self.function, self.program, self._values = function, program, values
-        whole = set(outputs)
+        whole = {*outputs, *added}
         stored = {node for node in outputs if node in program.shapes}
         #: entries that are needed, of arrays of which only entries are
         self._entries: dict[int, list[int]] = {}
@@ -53,7 +65,7 @@ class ArrayCode:
                 whole.add(each)
             if name in ("view", "entry"):
                 stored.add(rest[0])
-            elif name == "stack":
+            elif name in ("stack", "spread"):
                 stored.add(node)
             elif name == "sum":
                 stored |= {node, *self._costly(rest[0])}
@@ -80,12 +92,16 @@ class ArrayCode:
     def _sources(self, node: int) -> Iterator[tuple[int, Positions | None]]:
         """Return the scalars, and the positions in arrays in memory, from which an array is computed."""
         for each in self.program.arguments(node):
-            if each not in self.program.shapes:
-                yield each, None
-            elif (place := self.place(each)) is not None:
-                yield place
-            else:
-                yield from self._sources(each)
+            yield from self._read(each)
+
+    def _read(self, node: int) -> Iterator[tuple[int, Positions | None]]:
+        """Return the scalars, and the positions in arrays in memory, that are read for a node."""
+        if node not in self.program.shapes:
+            yield node, None
+        elif (place := self.place(node)) is not None:
+            yield place
+        else:
+            yield from self._sources(node)
 
     def value(self, node: int) -> Any:
         """Return the value of a scalar, or the memory of an array; None if it is not known yet."""
@@ -101,6 +117,9 @@ class ArrayCode:
         if name == "stack":
             self._values[node] = self._copied(self.program.arguments(node))
             return
+        if name == "spread":
+            self._values[node] = self._spread(node)
+            return
         alike = [
             each for each in self._stored if self._kind(each) == self._kind(node) and self._is_ready(each)
         ]
@@ -114,7 +133,7 @@ class ArrayCode:
         return (name, self.program.shapes[rest[0]]) if name == "sum" else self.program.shapes[node]
 
     def _is_ready(self, node: int) -> bool:
-        if node in self._values or self.program.operations[node][0] in ("stack", "input", "inputs"):
+        if node in self._values or self.program.operations[node][0] in ("stack", "spread", "input", "inputs"):
             return False
         return all(self.value(each) is not None for each, _ in self._sources(node))
 
@@ -134,6 +153,32 @@ class ArrayCode:
         for k, each in enumerate(found):
             self._store(each, target, k * target.distance)
         return target
+
+    def _spread(self, node: int) -> Stored:
+        """Write zeros with entries of an array added."""
+        lanes, count = self._lanes([node]), math.prod(self.program.shapes[node])
+        target = self._reserved(count, lanes)
+        with self.function.loop(count) as k:
+            self.function.store(0.0, target.base, k.value * target.distance, lanes)
+        self._add(*self.program.operations[node][1:3], target)
+        return target
+
+    def add(self, node: int, target: Value, inside: Any) -> None:
+        """Add the entries of an array, each summed over the lanes inside, to numbers in memory."""
+        for part, positions in summands(self.program, node):
+            self._add(part, positions, Stored(target, 1), inside)
+
+    def _add(self, node: int, positions: Positions, target: Stored, inside: Any = None) -> None:
+        """Add the entries of an array at positions in memory, or the sums over their lanes inside."""
+        f = self.function
+        with contextlib.ExitStack() as loops:
+            indices = [loops.enter_context(f.loop(count)) for count in positions.shape]
+            value = Terms(self, self._pointers(self._read(node), indices)).value(node)
+            if inside is not None:
+                value = f.total(f.select(inside, value, 0.0))
+            offset = self._offset(indices, [stride * target.distance for stride in positions.strides])
+            at = f.pointer(f.pointer(target.base, positions.first * target.distance), offset)
+            f.store(f.load(at, 0, target.lanes) + value, at, 0, target.lanes)
 
     def _store(self, value: Value, target: Stored, offset: Any) -> None:
         number = self.function.select(value, 1.0, 0.0) if value.kind == "i1" else value
@@ -155,10 +200,12 @@ class ArrayCode:
         ]
         return sum(products[1:], start=products[0]) if products else 0
 
-    def _pointers(self, nodes: Iterable[int], indices: Sequence[Index]) -> dict[Any, Value]:
-        """Return the addresses, at the indices along the first axes, of all arrays that arrays depend on."""
+    def _pointers(
+        self, sources: Iterable[tuple[int, Positions | None]], indices: Sequence[Index]
+    ) -> dict[Any, Value]:
+        """Return the addresses, at the indices along the first axes, of arrays in memory."""
         found: dict[Any, Value] = {}
-        for base, positions in (each for node in nodes for each in self._sources(node)):
+        for base, positions in sources:
             if positions is not None and (base, positions.strides) not in found:
                 stored = self.value(base)
                 offset = self._offset(indices, [stride * stored.distance for stride in positions.strides])
@@ -172,7 +219,8 @@ class ArrayCode:
         strides = [stride * lanes for stride in Positions.whole(shape).strides]
         with contextlib.ExitStack() as loops:
             indices = [loops.enter_context(self.function.loop(count)) for count in shape]
-            terms = Terms(self, self._pointers(nodes, indices))
+            sources = (each for node in nodes for each in self._sources(node))
+            terms = Terms(self, self._pointers(sources, indices))
             at = self._offset(indices, strides)
             for node, target in zip(nodes, targets, strict=True):
                 self._store(terms.computed(node), target, at)
@@ -201,7 +249,8 @@ class ArrayCode:
                 indices = [loops.enter_context(f.loop(each)) for each in outer[:-1]]
                 if outer:
                     indices.append(loops.enter_context(f.loop(stop, first, own)))
-                pointers = self._pointers(nodes, indices)
+                sources = (each for node in nodes for each in self._sources(node))
+                pointers = self._pointers(sources, indices)
                 zero = f.splat(f.value(0.0), lanes)
                 sums = [[f.variable(zero) for _ in range(own)] for _ in nodes]
                 with f.loop(count) as k:

@@ -19,7 +19,7 @@ from typing import Any
 from knode_cosserat._jax import cache_directory
 from knode_cosserat._program_cache import ProgramCache
 from knode_cosserat.engine import elementary
-from knode_cosserat.engine.arrays import ArrayCode
+from knode_cosserat.engine.arrays import ArrayCode, summands
 from knode_cosserat.engine.program import EngineError, Program
 
 #: rounding may change, NaN and infinity are kept
@@ -562,16 +562,19 @@ class Function:
     # programs
 
     def evaluate(
-        self, program: Program, outputs: Sequence[int], known: Mapping[int, Any], lanes: int
-    ) -> dict[int, Any]:
+        self, program: Program, outputs: Sequence[int], known: Mapping[int, Any], lanes: int,
+        added: Sequence[tuple[int, Value]] = (), inside: Any = True,
+    ) -> dict[int, Any]:  # fmt: skip
         """Write the operations that outputs need, and return the values of all of them.
 
         `known` are values of inputs and of operations that have been evaluated; those of arrays are in memory
-        (`arrays.Stored`). Loops run until every lane is done; lanes that are done keep their values.
+        (`arrays.Stored`). Loops run until every lane is done; lanes that are done keep their values. The arrays
+        `added` are summed over the lanes that are `inside`, and added to memory at their addresses.
         """
         values: dict[int, Any] = dict(known)
-        needed = program.needed(outputs, frozenset(values))
-        arrays = ArrayCode(self, program, needed, outputs, values)
+        parts = [part for node, _ in added for part, _ in summands(program, node)]
+        needed = program.needed([*outputs, *parts], frozenset(values))
+        arrays = ArrayCode(self, program, needed, outputs, values, parts)
         for node in needed:
             if node in values:
                 continue
@@ -589,6 +592,8 @@ class Function:
                 arrays.write(node)
             elif operation != "result":
                 values[node] = self.apply(operation, *(values[each] for each in arguments))
+        for node, target in added:
+            arrays.add(node, target, inside)
         return values
 
     def _loop(self, program: Program, node: int, values: dict[int, Any], lanes: int) -> None:

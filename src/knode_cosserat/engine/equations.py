@@ -5,6 +5,7 @@ All come from the system's own functions (`program.Program`), and derivatives fr
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -265,17 +266,26 @@ class TangentEquations(Equations):
 
     def _pull(self, results: dict[str, list[int]], moved: np.ndarray, places: np.ndarray) -> None:
         program = self.program
+        #: arrays of moving parameters that are read in memory, with the place of each in their vector
+        self.moving_arrays = {
+            array: int(np.searchsorted(moved, nodes.flat[0]))
+            for nodes in self.parameters
+            if (array := program.known_inputs(nodes)) is not None and np.isin(nodes, moved).all()
+        }
+        moving = [*moved, *self.moving_arrays]
         #: cotangents of the results
         self.cotangents = {
             name: program.inputs(f"cotangent of {name}", (len(nodes),), STATE)
             for name, nodes in results.items()
         }
-        needed = self._hoisted([node for nodes in results.values() for node in nodes], {STEP, RUN})
+        needed = self._scalars_of(self._hoisted([*itertools.chain(*results.values())], {STEP, RUN}))
         #: terms of a step by which moving parameters act
-        self.moving_terms = sorted(program.dependent(needed, moved).intersection(needed))
-        #: cotangents of these terms and of the place, from those of the results at a place
+        self.moving_terms = sorted(program.dependent(needed, moving).intersection(needed))
+        #: cotangents of these terms, of the place, and of moving arrays, from those of the results at a place
         self.pulled = {
-            name: program.gradient(nodes, self.cotangents[name], [*self.moving_terms, self.s.item()])
+            name: program.gradient(
+                nodes, self.cotangents[name], [*self.moving_terms, self.s.item(), *self.moving_arrays]
+            )
             for name, nodes in results.items()
         }
         outputs = [node for nodes in self.pulled.values() for node in nodes]
@@ -284,10 +294,19 @@ class TangentEquations(Equations):
         self.of_terms = program.inputs("cotangent of term", (len(self.moving_terms),), STEP)
         self.of_places = program.inputs("cotangent of place", places.shape, RUN)
         self.of_lengths = program.inputs("cotangent of length", self.geometry[3].shape, RUN)
-        self.by_terms = program.gradient(self.moving_terms, self.of_terms, moved)
+        self.by_terms = program.gradient(self.moving_terms, self.of_terms, moving)
         self.by_geometry = program.gradient(
-            [*places, *self.geometry[3]], [*self.of_places, *self.of_lengths], moved
+            [*places, *self.geometry[3]], [*self.of_places, *self.of_lengths], moving
         )
+
+    def _scalars_of(self, terms: Sequence[int]) -> set[int]:
+        """Return terms with the scalars from which arrays among them are computed in their place."""
+        program, found, todo = self.program, set[int](), list(terms)
+        while todo:
+            node = todo.pop()
+            todo += program.arguments(node) if node in program.shapes else ()
+            found |= set() if node in program.shapes else {node}
+        return found
 
     def _nonzeros(self, outputs: Any, variables: Any) -> Nonzeros:
         slopes = self.program.jacobian(outputs, variables)

@@ -7,7 +7,8 @@ without effect are left out. All values are 64-bit floats or booleans; integers 
 A node is a scalar or, where scalars would be too many (matrix products of a network), an array. Arrays take
 the operations of scalars, entry by entry, and a scalar counts as an array of equal entries. Arrays begin
 with a "stack" of scalars, or with "inputs" in memory, and end with an "entry"; "view" is an array of some of
-the entries of another, and "sum" adds those along the last axis.
+the entries of another, "sum" adds those along the last axis, and "spread" adds entries to zeros at some
+positions: the transpose of a view.
 
 Algebra treats values as finite: x * 0 and x - x are 0. `x != x` is kept, because it tests for NaN. "max" and
 "min" return NaN if an argument is NaN. "hold" returns its argument: derivatives stop there, or follow a rule
@@ -32,7 +33,7 @@ from knode_cosserat.errors import KnodeCosseratError
 
 #: largest number of scalar products of one matrix product, and of results of other operations on arrays, that
 #: are scalars
-LARGEST_PRODUCT, LARGEST_SPREAD = 256, 31
+LARGEST_PRODUCT, LARGEST_SPREAD = 96, 31
 #: largest number of entries of a table with a variable index, of turns of a scan, and of numbers to sort
 LARGEST_TABLE, LONGEST_SCAN, LONGEST_SORT = 256, 1024, 32
 #: largest matrix that is factorised with row exchanges that depend on values
@@ -420,6 +421,8 @@ class Program:
         key = ("rule", name, *(x for each in arguments for x in (each.shape, each.tobytes())))
         if key not in self._memo:
             rule = Rule(function, shapes, arguments)
+            # before the results, because nodes are in the order of evaluation
+            self._all_parts(arguments)
             for array in values():
                 held = [self.held(node, rule) for node in self.parts(array)]
                 rule.results.append(self._nodes(held, array.shape))
@@ -542,6 +545,13 @@ class Program:
                     return found
         return self._array(("sum", node), self.shapes[node][:-1], self.levels[node], False)
 
+    def spread(self, node: int, positions: Positions, shape: tuple[int, ...]) -> int:
+        """Return an array of zeros to which the entries of another are added at positions in it."""
+        is_whole = node in self.shapes and positions == Positions.whole(shape)
+        if is_whole or self.is_constant(node, 0.0):
+            return node
+        return self._array(("spread", node, positions, shape), shape, self.levels[node], False)
+
     def unit(self, size: int, k: int) -> int:
         """Return the unit vector along axis k."""
         found = self.array(self.constants(np.equal(np.arange(size), k).astype(float)))
@@ -577,7 +587,7 @@ class Program:
         name, *rest = self.operations[node]
         if name in ("constant", "input", "inputs"):
             return ()
-        if name in ("view", "entry"):
+        if name in ("view", "entry", "spread"):
             return (rest[0],)
         if name == "loop":
             return tuple(rest[1:])
@@ -631,6 +641,7 @@ class Program:
         """Return the cotangents of independent nodes from those of the outputs: a product λᵀ·J.
 
         Outputs that are `linear` in the variables are differentiated as they are evaluated, without rules.
+        The cotangent of an array is an array, or a scalar for equal entries.
         """
         zero, independent = self.constant(0.0), set(map(int, variables))
         dependent = self.dependent(outputs, variables, linear)
@@ -638,15 +649,28 @@ class Program:
         for node in sorted(dependent):
             firsts.setdefault(id(self.rules.get(node)), node)
         found: dict[int, int] = {}
+        #: cotangents of entries, by array
+        entries: dict[int, dict[int, int]] = {}
 
-        def add(node: int, cotangent: int) -> None:
-            if node in dependent:
-                found[node] = self.apply("add", found.get(node, zero), cotangent)
+        def add(node: int, cotangent: int, shape: tuple[int, ...] = ()) -> None:
+            """Add to the cotangent of an argument of an operation of some shape."""
+            if node not in dependent:
+                return
+            if node not in self.shapes:
+                for count in reversed(shape):
+                    cotangent = self.total(cotangent, count)
+                cotangent = int(self.entries(cotangent))
+            found[node] = self.apply("add", found.get(node, zero), cotangent)
 
         for node, cotangent in zip(outputs, cotangents, strict=True):
             add(int(node), int(cotangent))
         for node in sorted(dependent, reverse=True):
             name, *arguments = self.operations[node]
+            shape = self.shapes.get(node, ())
+            if node in entries:
+                scalars = np.full(shape, zero)
+                scalars.flat[list(entries[node])] = list(entries[node].values())
+                add(node, self.array(scalars))
             own, rule = found.get(node), None if linear else self.rules.get(node)
             if node in independent:
                 continue
@@ -654,27 +678,54 @@ class Program:
                 # all results together: those that need them have been passed
                 if node == firsts[id(rule)]:
                     active, product = self._product(rule)
-                    results = [found.get(each, zero) for each in _flat(rule.results)]
+                    results = [found.get(each, zero) for each in self._all_parts(rule.results)]
                     pulled = self.gradient(product.outputs, results, product.inputs, linear=True)
-                    for each, cotangent in zip(_flat(rule.arguments[k] for k in active), pulled, strict=True):
+                    moving = self._all_parts(rule.arguments[k] for k in active)
+                    for each, cotangent in zip(moving, pulled, strict=True):
                         add(each, cotangent)
             elif own is None:
                 continue
             elif name == "select":
                 p, no, yes = arguments
-                add(no, self.apply("select", p, own, zero))
-                add(yes, self.apply("select", p, zero, own))
+                add(no, self.apply("select", p, own, zero), shape)
+                add(yes, self.apply("select", p, zero, own), shape)
             elif name in PARTIALS:
                 for argument, partial in zip(arguments, PARTIALS[name], strict=True):
                     if argument in dependent:
-                        add(argument, self.apply("mul", self._partial(partial, node), own))
+                        add(argument, self.apply("mul", self._partial(partial, node), own), shape)
             elif name == "hold" and linear:
                 add(arguments[0], own)
+            elif name == "entry":
+                entries.setdefault(arguments[0], {})[arguments[1]] = own
+            elif name == "stack":
+                for each, cotangent in zip(arguments, self.entries(own, shape), strict=True):
+                    add(each, int(cotangent))
+            elif name == "sum":
+                positions = np.arange(math.prod(shape)).reshape(*shape, 1)
+                whole = self.shapes[arguments[0]]
+                add(arguments[0], self.view(own, np.broadcast_to(positions, whole)))
+            elif name == "view":
+                add(arguments[0], self._view_cotangent(own, arguments[1], self.shapes[arguments[0]]))
+            elif name == "spread":
+                add(arguments[0], self.view(own, arguments[1].all()), arguments[1].shape)
             elif name == "result":
                 raise self._loop_error(arguments[0])
-            else:
-                raise EngineError("engine: no cotangents of large matrix products")
-        return [found.get(int(node), zero) for node in variables]
+        return [
+            self.spread(found.get(node, zero), Positions.whole(shape), shape)
+            if (shape := self.shapes.get(node)) is not None
+            else found.get(node, zero)
+            for node in map(int, variables)
+        ]
+
+    def _view_cotangent(self, node: int, positions: Positions, shape: tuple[int, ...]) -> int:
+        """Return the cotangent of an array of this shape from that of a view: repeated entries are added."""
+        first, strides, counts = positions
+        for axis in reversed(range(len(counts))):
+            if strides[axis] == 0:
+                order = np.moveaxis(np.arange(math.prod(counts)).reshape(counts), axis, -1)
+                node = self.total(self.view(node, order), counts[axis])
+                strides, counts = (each[:axis] + each[axis + 1 :] for each in (strides, counts))
+        return self.spread(node, Positions(first, strides, counts), shape)
 
     def dependent(
         self, outputs: Sequence[int] | Nodes, variables: Sequence[int] | Nodes, linear: bool = False
@@ -725,6 +776,10 @@ class Program:
                 found[node] = {
                     key: self.view(each, positions) for key, each in found.get(rest[0], {}).items()
                 }
+            elif name == "spread":
+                found[node] = {
+                    key: self.spread(each, *rest[1:]) for key, each in found.get(rest[0], {}).items()
+                }
             elif name == "sum":
                 count = self.shapes[rest[0]][-1]
                 sums = {key: self.total(each, count) for key, each in found.get(rest[0], {}).items()}
@@ -763,11 +818,12 @@ class Program:
         """Return the tangents of an array of scalars.
 
         The variables are these scalars themselves if that takes fewer products: unit vectors choose columns
-        of a matrix, at no cost, but there may be more of them.
+        of a matrix, at no cost, but there may be more of them, and each entry of a result is combined later.
         """
         moving = {k: found[node] for k, node in enumerate(scalars.tolist()) if found.get(node)}
         keys = dict.fromkeys(key for tangents in moving.values() for key in tangents)
-        if len(moving) < 2 * len(keys) and len(keys) > 1:
+        is_sparse = 2 * sum(map(len, moving.values())) < len(moving) * len(keys)
+        if len(moving) < 2 * len(keys) and is_sparse:
             return {Component(int(scalars[k])): self.unit(scalars.size, k) for k in moving}
         zero = np.full(scalars.size, self.constant(0.0))
         tangents = {}
@@ -874,6 +930,8 @@ class Program:
             return self.array(np.array(arguments, dtype=np.int64))
         if name == "view":
             return self.view(arguments[0], rest[1].all())
+        if name == "spread":
+            return self.spread(arguments[0], *rest[1:])
         if name == "sum":
             return self.total(arguments[0], self.shapes[rest[0]][-1])
         if name == "entry":

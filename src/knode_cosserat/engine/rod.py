@@ -175,14 +175,16 @@ class RodCode(Memory):
         return found
 
     def _evaluated(
-        self, outputs: Sequence[int] | np.ndarray, j: Any, wide: bool, state: dict[int, Any]
-    ) -> list[Value]:
-        """Write the operations of outputs at a place."""
-        self._outputs = [int(each) for each in outputs]
+        self, outputs: Sequence[int] | np.ndarray, j: Any, wide: bool, state: dict[int, Any],
+        added: Sequence[tuple[int, Value]] = (), inside: Any = True,
+    ) -> list[Value]:  # fmt: skip
+        """Write the operations of outputs at a place, and of arrays that are added (`Function.evaluate`)."""
+        own = [int(each) for each in outputs]
+        self._outputs = [*own, *(node for node, _ in added)]
         lanes = self.L if wide else self.P
         known = self._known(j, wide, state)
-        values = self._now.evaluate(self.equations.program, self._outputs, known, lanes)
-        return [values[node] for node in self._outputs]
+        values = self._now.evaluate(self.equations.program, own, known, lanes, added, inside)
+        return [values[node] for node in own]
 
     def _write_setup(self) -> None:
         """Scales, places and lengths of pieces: once a run."""

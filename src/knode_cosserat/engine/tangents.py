@@ -713,7 +713,7 @@ class CotangentCore(TangentCode):
     def _reserve_state(self) -> None:
         e, a = self.equations, self._array
         #: cotangents of the moving parameters, of places, and of lengths of pieces
-        self.parameter, self.place = a(len(e.by_terms), memory=1), a(1, self.used, 1)
+        self.parameter, self.place = a(len(e.by_terms) - len(e.moving_arrays), memory=1), a(1, self.used, 1)
         self.length_of_piece = a(1, self.pieces, 1)
 
     def _reserve_products(self) -> None:
@@ -750,7 +750,8 @@ class CotangentCore(TangentCode):
                 here |= known
                 for i, node in enumerate(e.cotangents[name]):
                     here[int(node)] = self._wide(self.results[name], i, j)
-                *values, place = self._evaluated(e.pulled[name], j, True, here)
+                nodes, added = self._parted(e.pulled[name])
+                *values, place = self._evaluated(nodes, j, True, here, added, inside)
                 for k, value in enumerate(values):
                     own = f.select(inside, f.splat(value, self.L), 0.0)
                     self._put(self._get(self.term, k, 0, self.L) + own, self.term, k, 0, self.L)
@@ -761,13 +762,12 @@ class CotangentCore(TangentCode):
         for name, here in self._end_states():
             for i, node in enumerate(e.cotangents[name]):
                 here[int(node)] = self._get(self.results[name], i)
-            values = self._evaluated(e.pulled[name], 0, False, here | known)
+            nodes, added = self._parted(e.pulled[name])
+            values = self._evaluated(nodes, 0, False, here | known, added)
             sums = [a + b for a, b in zip(sums, values, strict=False)]
         given = self._parameters(e.by_terms) | terms
         given |= {int(node): each for node, each in zip(e.of_terms, sums, strict=True)}
-        values_of = f.evaluate(e.program, e.by_terms, given, 1)
-        for k, node in enumerate(e.by_terms):
-            self._put(self._get(self.parameter, k) + values_of[node], self.parameter, k)
+        self._add_parameters(e.by_terms, given)
         with self._places(self.pieces) as j:
             total = self._wide(self.length_of_piece, 0, j) + self._wide(t.lengths, 0, j)
             self._write_wide(total, self.length_of_piece, 0, j)
@@ -783,8 +783,25 @@ class CotangentCore(TangentCode):
             for k, node in nodes:
                 value = self._get(array, 0, k)
                 known[node] = known[node] + value if node in known else value
-        values = f.evaluate(e.program, e.by_geometry, known, 1)
-        for k, node in enumerate(e.by_geometry):
+        self._add_parameters(e.by_geometry, known)
+
+    def _parted(self, cotangents: Sequence[int]) -> tuple[list[int], list[tuple[int, Value]]]:
+        """Return the cotangents of scalars, and those of moving arrays with the addresses of their sums."""
+        arrays, zero = self.equations.moving_arrays, self.equations.program.constant(0.0)
+        first = len(cotangents) - len(arrays)
+        added = [
+            (node, self._now.pointer(*self._at(self.parameter, k, 0)))
+            for k, node in zip(arrays.values(), cotangents[first:], strict=True)
+            if node != zero
+        ]
+        return list(cotangents[:first]), added
+
+    def _add_parameters(self, cotangents: Sequence[int], known: dict[int, Any]) -> None:
+        """Add cotangents of the moving parameters to those known."""
+        (nodes, added), program = self._parted(cotangents), self.equations.program
+        moving = {k: node for k, node in enumerate(nodes) if not program.is_constant(node, 0.0)}
+        values = self._now.evaluate(program, [*moving.values()], known, 1, added)
+        for k, node in moving.items():
             self._put(self._get(self.parameter, k) + values[node], self.parameter, k)
 
     def _write_cotangents(self) -> None:
