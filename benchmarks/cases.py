@@ -154,9 +154,8 @@ def tangents(steps: int = 20, columns: int = 32) -> dict[str, Any]:
     import knode_cosserat as kc
     from knode_cosserat.solvers.history import resting_history
     from knode_cosserat.solvers.run import TimeIntegration
-    from knode_cosserat.solvers.sensitivity import TangentState, tangent_time_loop
+    from knode_cosserat.solvers.sensitivity import SystemMoves, TangentState, tangent_time_loop
     from knode_cosserat.solvers.settings import Settings
-    from knode_cosserat.solvers.sensitivity import SystemMoves
 
     robot, tensions = kc.load_robot("delrin-tendon-robot"), kc.controls.sine(1.5, steps, DT, sampled="end")
     block = np.eye(columns // 4)[np.arange(steps) * (columns // 4) // steps]

@@ -1,9 +1,9 @@
-"""The emitted time loop (docs/engine.md) against the one in JAX: python -m benchmarks.engine.
+"""The time loop of the engine (docs/engine.md): python -m benchmarks.engine.
 
-CPU time of one core; both loops run in turn in one process, from the same states to the same rows, estimates
-included: random tensions of 4 to 8 N, new in every step of 50 ms.
+CPU time of one core, estimates of errors included: random tensions of 4 to 8 N, new in every step of 50 ms.
 """
 
+import functools
 import os
 import time
 
@@ -14,13 +14,11 @@ import knode_cosserat as kc
 from knode_cosserat.engine import loops
 from knode_cosserat.engine.core import Core
 from knode_cosserat.engine.equations import Equations
-from knode_cosserat.solvers import time_loop
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.history import resting_history
-from knode_cosserat.solvers.sensitivity import TangentState, tangent_loop_in_jax, tangent_time_loop
+from knode_cosserat.solvers.sensitivity import SystemMoves, TangentState, tangent_time_loop
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.sensitivity import SystemMoves
-from knode_cosserat.solvers.time_loop import StepCoefficients
+from knode_cosserat.solvers.steps import StepCoefficients
 
 DT, STEPS, BATCH, ROUNDS = 0.05, 100, 64, 7
 COLUMNS, TANGENT_STEPS = 32, 20
@@ -31,37 +29,28 @@ SCHEMES = {"sdirk2": "consistent", "bdf2": "paper"}
 def seconds(run):
     """Return the CPU time of a run (s)."""
     before = time.process_time()
-    jax.block_until_ready(run())
+    run()
     return time.process_time() - before
 
 
 def row_of(label, robot, scheme, batch):
-    """Return a row of the table: µs a robot-step of both loops, their ratio, and CPU seconds of building."""
+    """Return a row of the table: µs a robot-step, and CPU seconds of building."""
     settings = Settings.of(scheme, "lobatto2", SCHEMES[scheme], NewtonOptions())
     steps, past = StepCoefficients.of(settings, DT), resting_history(robot, settings)
     tensions = np.random.default_rng(0).uniform(4.0, 8.0, (BATCH, STEPS, 4))
     built = seconds(lambda: Core(robot, settings, batch).stride)
     if batch:
         pasts = jax.tree.map(lambda leaf: np.stack([leaf] * BATCH), past)
-        runs = (
-            lambda: time_loop.loop_many(robot, settings, steps, tensions, pasts, STEPS),
-            lambda: loops.loop_many(robot, settings, steps, tensions, pasts, STEPS),
-        )
+        run = functools.partial(loops.loop_many, robot, settings, steps, tensions, pasts, STEPS)
     else:
-        runs = (
-            lambda: time_loop.loop_one(robot, settings, steps, tensions[0], past, (0, STEPS)),
-            lambda: loops.loop_one(robot, settings, steps, tensions[0], past, (0, STEPS)),
-        )
-    for run in runs:
-        run()
-    times = np.median([[seconds(run) for run in runs] for _ in range(ROUNDS)], axis=0)
-    in_jax, emitted = times / STEPS / (BATCH if batch else 1) * 1e6
-    cells = f"{in_jax:.0f} | {emitted:.1f} | {in_jax / emitted:.1f} | {built:.1f}"
-    return f"| {label} | {scheme} | {BATCH if batch else 1} | {cells} |"
+        run = functools.partial(loops.loop_one, robot, settings, steps, tensions[0], past, (0, STEPS))
+    run()
+    taken = np.median([seconds(run) for _ in range(ROUNDS)]) / STEPS / (BATCH if batch else 1) * 1e6
+    return f"| {label} | {scheme} | {BATCH if batch else 1} | {taken:.1f} | {built:.1f} |"
 
 
 def tangents_of(label, robot, scheme):
-    """Return a row of the second table: ms of both, their ratio, and CPU seconds of both first calls."""
+    """Return a row of the second table: ms, and CPU seconds of the first call."""
     settings = Settings.of(scheme, "lobatto2", SCHEMES[scheme], NewtonOptions())
     steps, past = StepCoefficients.of(settings, DT), resting_history(robot, settings)
     rng = np.random.default_rng(0)
@@ -71,17 +60,16 @@ def tangents_of(label, robot, scheme):
     state = TangentState.of(robot, settings.space, past, *columns)
     changes = SystemMoves(None, np.zeros((0, COLUMNS))), rng.normal(size=(*controls.shape, COLUMNS))
     given = settings, steps, rows.every_stage, (robot, controls), changes, state
-    runs = lambda: tangent_loop_in_jax(*given), lambda: tangent_time_loop(*given)
-    builds = [seconds(run) for run in runs]
-    in_jax, emitted = 1e3 * np.median([[seconds(run) for run in runs] for _ in range(10 * ROUNDS)], axis=0)
-    cells = f"{in_jax:.1f} | {emitted:.2f} | {in_jax / emitted:.1f} | {builds[0]:.1f} | {builds[1]:.1f}"
-    return f"| {label} | {scheme} | {cells} |"
+    run = functools.partial(tangent_time_loop, *given)
+    built = seconds(run)
+    taken = 1e3 * np.median([seconds(run) for _ in range(10 * ROUNDS)])
+    return f"| {label} | {scheme} | {taken:.2f} | {built:.1f} |"
 
 
 def main() -> None:
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
-    print("| robot | scheme | robots | JAX, µs a robot-step | emitted, µs | ratio | building it, CPU s |")
-    print("| --- | --- | --- | --- | --- | --- | --- |")
+    print("| robot | scheme | robots | µs a robot-step | building it, CPU s |")
+    print("| --- | --- | --- | --- | --- |")
     for label, name in ROBOTS.items():
         robot = kc.load_robot(name)
         Equations(robot)  # JAX's own first call
@@ -89,8 +77,8 @@ def main() -> None:
             for batch in (False, True):
                 print(row_of(label, robot, scheme, batch), flush=True)
     print(f"\n{COLUMNS} tangents of {TANGENT_STEPS} steps:\n")
-    print("| robot | scheme | JAX, ms | emitted, ms | ratio | first call in JAX, CPU s | emitted, CPU s |")
-    print("| --- | --- | --- | --- | --- | --- | --- |")
+    print("| robot | scheme | ms | first call, CPU s |")
+    print("| --- | --- | --- | --- |")
     for label, name in ROBOTS.items():
         for scheme in SCHEMES:
             print(tangents_of(label, kc.load_robot(name), scheme), flush=True)

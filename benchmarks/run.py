@@ -78,7 +78,7 @@ def measure() -> dict[str, Any]:
 
 
 def comparison(found: dict[str, Any], matched: dict[str, Any]) -> str:
-    """Return the comparison with others as a Markdown table, also from the figures of `benchmarks.matched`."""
+    """Return the comparison with others as a Markdown table, with the figures of `benchmarks.matched`."""
     steps, schemes, cantilever = found["steps"], found["schemes"], found["cantilever"]["microseconds"]
     ratios = [steps[kind]["ratio"] for kind in ("sine", "step", "random")]
     own = matched["ours"]["best"]["cpu"]
@@ -92,7 +92,8 @@ def comparison(found: dict[str, Any], matched: dict[str, Any]) -> str:
         ),
         (
             "its scheme along the rod, forward Euler, in this package",
-            f"a tip within 1 mm: {schemes['nodes']['default']} nodes against {schemes['nodes']['fine_euler']}",
+            f"a tip within 1 mm: {schemes['nodes']['default']} nodes "
+            f"against {schemes['nodes']['fine_euler']}",
             f"{schemes['fine_euler'] / schemes['default']:.0f} times as fast",
         ),
         (

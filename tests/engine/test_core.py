@@ -1,7 +1,14 @@
-"""The emitted time loop against the one in JAX: the same equations and the same mathematics."""
+"""The time loop of the engine: results of the version before it, and equations evaluated in JAX.
+
+`stored.npz` has results of the time loop in JAX of commit 09df89b, which the engine has replaced: iterates,
+numbers of corrections and estimates. Names are "case/field" for fields of rows, and "case/newest field" for
+the newest part of each field of the state after a run. Of records and unknowns, only the last row is stored.
+The residuals of all solved rows are evaluated in JAX (`StepProblem`).
+"""
 
 import dataclasses
 import functools
+from pathlib import Path
 from typing import ClassVar
 
 import jax
@@ -14,16 +21,20 @@ from knode_cosserat.engine import loops
 from knode_cosserat.engine.program import EngineError
 from knode_cosserat.rods.ends import Driven
 from knode_cosserat.rods.system import unknown_count
-from knode_cosserat.solvers import evaluation, recovery, static_loop, time_loop
 from knode_cosserat.solvers.boundary import NewtonOptions
+from knode_cosserat.solvers.evaluation import unloaded_shape
 from knode_cosserat.solvers.grid import grid_of
-from knode_cosserat.solvers.history import repeated_record_history, resting_history
-from knode_cosserat.solvers.problem import no_history
+from knode_cosserat.solvers.history import (
+    EXTRAPOLATIONS,
+    history_of,
+    repeated_record_history,
+    resting_history,
+)
+from knode_cosserat.solvers.problem import StepProblem, no_history, row_of
 from knode_cosserat.solvers.recovery import attempt
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SCHEMES, Formula, SpaceScheme, Stage
-from knode_cosserat.solvers.static_loop import unloaded_shape
-from knode_cosserat.solvers.time_loop import StepCoefficients, TimeStep
+from knode_cosserat.solvers.steps import StepCoefficients, TimeStep
 from tests.engine.networks import with_committee, with_network
 
 DT, STEPS = 0.05, 25
@@ -48,28 +59,75 @@ def settings_of(scheme, space="lobatto2"):
     return Settings.of(scheme, space, "consistent" if scheme == "sdirk2" else "paper", NewtonOptions())
 
 
-def in_jax(robot, settings, controls, span=(0, STEPS)):
-    steps, past = StepCoefficients.of(settings, DT), resting_history(robot, settings)
-    return time_loop.loop_one(robot, settings, steps, controls, past, span)
-
-
 def emitted(robot, settings, controls, span=(0, STEPS)):
     steps, past = StepCoefficients.of(settings, DT), resting_history(robot, settings)
     return loops.loop_one(robot, settings, steps, controls, past, span)
 
 
-def assert_same(wanted, found, tolerance, estimates):
-    for name, one, other in zip(wanted._fields, wanted, found, strict=True):
-        one, other = np.asarray(one), np.asarray(other)
-        assert one.shape == other.shape, name
-        if name in ("corrections", "result"):
-            np.testing.assert_array_equal(one, other, name)
+@functools.cache
+def stored_results():
+    """Return all stored arrays by case and field."""
+    with np.load(Path(__file__).with_name("stored.npz")) as file:
+        found = {}
+        for name in file.files:
+            case, field = name.rsplit("/", 1)
+            found.setdefault(case, {})[field] = file[name]
+        return found
+
+
+def assert_stored(case, rows, state=None, tolerance=1e-11, estimates=1e-5):
+    """Compare rows and the newest part of the state after them with those stored."""
+    for name, wanted in stored_results()[case].items():
+        newest, field = name.startswith("newest "), name.removeprefix("newest ")
+        if newest and state is None:
             continue
-        relative = estimates if name in ("error", "position_error", "time_error") else tolerance
+        found = np.asarray(getattr(state if newest else rows, field))
+        if found.ndim > wanted.ndim:
+            found = found[0] if newest else found[-1]
+        assert found.shape == wanted.shape, name
+        if field in ("corrections", "result"):
+            np.testing.assert_array_equal(found, wanted, name)
+            continue
+        relative = 10.0 * tolerance if newest else tolerance
+        if field in ("error", "position_error", "time_error"):
+            relative = estimates
         # residuals are differences of numbers of size one
-        least = 1e-14 if name == "error" else 1e-300
-        atol = max(relative * np.nanmax(np.abs(one), initial=0.0), least)
-        np.testing.assert_allclose(other, one, atol=atol, err_msg=name)
+        least = 1e-14 if field == "error" else 1e-300
+        atol = max(relative * np.max(np.abs(np.nan_to_num(wanted)), initial=0.0), least)
+        np.testing.assert_allclose(found, wanted, atol=atol, err_msg=name)
+
+
+@functools.partial(jax.jit, static_argnames="space")
+def by_jax(system, space, c0, t, control, history, y, unknowns):
+    """Return the state by the equations of a step, its base, and the residual of the tip in natural units."""
+    problem = StepProblem(system, t, control, c0, history, space)
+    found, scales = problem.evaluated(y), system.scales()
+    return found, problem.base(unknowns) / scales.y, found.tip / scales.tip
+
+
+def assert_solved(robot, settings, controls, past, rows, state):
+    """All rows solve the equations of their steps, evaluated in JAX, and the state after them is theirs."""
+    steps, ny, scale = StepCoefficients.of(settings, DT), robot.y_layout.size, np.asarray(robot.scales().y)
+    solved, records, rate = zip(*rows.every_stage, strict=True), past.records, past.rate
+    evaluate = loops.evaluator(robot, settings)
+    for i, control in enumerate(controls):
+        table, times = (np.reshape(part, (settings.stages, -1)) for part in steps.at(past.t0, i))
+        for coefficients, (t,) in zip(table, times, strict=True):
+            row, unknowns = next(solved)
+            history = history_of(records, rate, coefficients, settings)
+            given = coefficients[0], t, control, history
+            # y at all points, which JAX would compile for long
+            y = evaluate(*given, row[:, :ny]).y
+            found, base, tip = by_jax(robot, settings.space, *given, y, unknowns)
+            assert found.error <= 1.1e-10 and np.max(np.abs(tip)) <= 1.1e-10
+            np.testing.assert_allclose(row[0, :ny] / scale, base, atol=1e-12)
+            wanted = np.asarray(row_of(robot, found.y, found.records))
+            np.testing.assert_allclose(row, wanted, atol=1e-11 * np.max(np.abs(wanted)))
+            records = np.stack([found.records, records[0]])
+            rate = coefficients[0] * records[0] + history
+    pairs = [(state.records, records), (state.y[0], found.y)]
+    for found, wanted in [*pairs, (state.rate, rate)] if settings.uses_rate else pairs:
+        np.testing.assert_allclose(found, wanted, atol=1e-10 * np.max(np.abs(wanted)))
 
 
 @pytest.mark.parametrize(
@@ -77,13 +135,12 @@ def assert_same(wanted, found, tolerance, estimates):
     [(PAPER, "sdirk2"), (ROUTED, "bdf-alpha"), (NETWORK, "bdf-alpha"), (COMMITTEE, "sdirk2")],
 )
 def test_a_robot_with_places_in_lanes(name, scheme):
-    """The iterates are those of the loop in JAX; so are the estimates, and the state that follows."""
+    """Iterates, estimates and the state that follows are stored; rows solve their equations."""
     robot, settings, control = robot_of(name), settings_of(scheme), tensions(1)[0]
-    done, state, rows = in_jax(robot, settings, control)
-    own_done, own_state, own_rows = emitted(robot, settings, control)
-    assert int(done) == own_done == STEPS
-    assert_same(rows, own_rows, 1e-11, 1e-5)
-    assert_same(state, own_state, 1e-10, 1e-5)
+    done, state, rows = emitted(robot, settings, control)
+    assert done == STEPS
+    assert_stored(f"{name}, {scheme}", rows, state)
+    assert_solved(robot, settings, control, resting_history(robot, settings), rows, state)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -160,17 +217,15 @@ CASES = {
 
 @pytest.mark.parametrize("case", CASES)
 def test_schemes_and_systems(case):
-    """Iterates, estimates and states are those of the loop in JAX, by every scheme and for every system."""
+    """Iterates, estimates and states are stored, for every scheme and system; rows solve their equations."""
     name, controls, time, space, estimates = CASES[case]
     robot, settings = robot_of(name) if isinstance(name, str) else name, settings_of(time, space)
-    steps = StepCoefficients.of(settings, DT)
     past = (standing_history if name == LEGS else resting_history)(robot, settings)
-    given = robot, settings, steps, controls, past, (0, STEPS)
-    done, state, rows = time_loop.loop_one(*given)
-    own_done, own_state, own_rows = loops.loop_one(*given)
-    assert int(done) == own_done == STEPS
-    assert_same(rows, own_rows, 1e-11, estimates)
-    assert_same(state, own_state, 1e-10, estimates)
+    steps = StepCoefficients.of(settings, DT)
+    done, state, rows = loops.loop_one(robot, settings, steps, controls, past, (0, STEPS))
+    assert done == STEPS
+    assert_stored(case, rows, state, estimates=estimates)
+    assert_solved(robot, settings, controls, past, rows, state)
 
 
 def test_strands_in_lanes():
@@ -190,18 +245,21 @@ def test_strands_in_lanes():
     [(PAPER, "lobatto2"), (ROUTED, "lobatto2"), ("variable-curvature-robot", "euler"), (LEGS, "lobatto2")],
 )
 def test_equilibria(name, space):
-    """Equilibria in turn, of one robot and of several in lanes, are those of the loop in JAX."""
+    """Equilibria in turn are stored, solve their equations in JAX, and are the same in lanes."""
     robot, settings = robot_of(name), Settings(None, SCHEMES[space])
     rng = np.random.default_rng(1)
     size = 8.0 if "tension" in robot.control_layout.names else 0.05 if name == LEGS else 1.0
     controls = rng.uniform(0.0, size, (3, 4, robot.control_size))
-    y = unloaded_shape(robot, settings.space)
-    for own in controls:
-        done, last, rows = static_loop.static_one(robot, settings, own, y, (0, 4))
-        own_done, own_last, own_rows = loops.static_one(robot, settings, own, y, (0, 4))
-        assert own_done == int(done) == 4
-        np.testing.assert_allclose(own_last, last, atol=1e-11 * np.max(np.abs(last)))
-        assert_same(rows, own_rows, 1e-11, 1e-5)
+    y, none = unloaded_shape(robot, settings.space), no_history(robot, settings.space)
+    for k, own in enumerate(controls):
+        done, last, rows = loops.static_one(robot, settings, own, y, (0, 4))
+        assert done == 4
+        assert_stored(f"equilibria {k}, {name}", rows)
+        found, base, tip = by_jax(robot, settings.space, 0.0, 0.0, own[-1], none, last, rows.unknowns[-1])
+        assert found.error <= 1.1e-10 and np.max(np.abs(tip)) <= 1.1e-10
+        np.testing.assert_allclose(last[0] / robot.scales().y, base, atol=1e-12)
+        wanted = np.asarray(row_of(robot, last, found.records))
+        np.testing.assert_allclose(rows.records[-1], wanted, atol=1e-11 * np.max(np.abs(wanted)))
     many = loops.static_many(robot, settings, controls, np.stack([y] * 3), 4)
     np.testing.assert_array_equal(many[0], [4, 4, 4])
     np.testing.assert_allclose(many[2].records[-1], rows.records, atol=1e-8)
@@ -224,15 +282,15 @@ class Joined(kc.robots.ParallelRobot):
 
 
 def test_options_of_newtons_method_are_numbers_of_a_run():
-    """The machine code is the same, and the iterates are those of the loop in JAX."""
+    """The machine code is the same, and the iterates of loose tolerances are stored."""
     robot, control = robot_of(PAPER), tensions(1)[0][:5]
     usual, loose = settings_of("bdf2"), settings_of("bdf2")
     loose = dataclasses.replace(loose, newton=NewtonOptions(1e-3, 1e-2, max_linearisations=2, patience=1))
     assert loops.core_of(robot, usual, robots=False) is loops.core_of(robot, loose, robots=False)
-    found, wanted = emitted(robot, loose, control, (0, 5)), in_jax(robot, loose, control, (0, 5))
+    rows = emitted(robot, loose, control, (0, 5))[2]
     # estimates take other corrections: the last ones of the loose solutions are not computed
-    assert_same(wanted[2], found[2], 1e-11, 1e-2)
-    assert np.sum(found[2].corrections) < np.sum(emitted(robot, usual, control, (0, 5))[2].corrections)
+    assert_stored("options", rows, estimates=1e-2)
+    assert np.sum(rows.corrections) < np.sum(emitted(robot, usual, control, (0, 5))[2].corrections)
 
 
 @pytest.mark.parametrize("kind", ["equilibrium", "bdf-alpha", "sdirk2"])
@@ -242,24 +300,25 @@ def test_one_problem_from_a_guess_with_an_offset_at_the_tip(kind):
     settings = Settings(None) if kind == "equilibrium" else settings_of(kind)
     offset = np.random.default_rng(5).uniform(-0.02, 0.02, unknown_count(robot))
     guess, step = unloaded_shape(robot, settings.space), None
+    c0, t, history = 0.0, 0.0, no_history(robot, settings.space)
     if kind != "equilibrium":
         past = emitted(robot, settings, tensions(1)[0], (0, 4))[1]
         coefficients, t = StepCoefficients.of(settings, DT).at(past.t0, 4)
         if kind == "sdirk2":
             coefficients, t = coefficients[1], t[1]
         guess, step = past.y[1], TimeStep(past, coefficients, t)
+        c0, history = coefficients[0], history_of(past.records, past.rate, coefficients, settings)
     found = attempt(robot, settings, step, control, guess, offset)
     assert found.row.error <= 1e-10
-    wanted = jax.tree.map(np.asarray, recovery._attempt_in_jax(robot, settings, step, control, guess, offset))
-    assert_same(wanted[1], found.row, 1e-11, 1e-5)
-    if step is None:
-        np.testing.assert_allclose(found.state, wanted[0], atol=1e-12)
-        still = loops.evaluator(robot, settings)(0.0, 0.0, control, 0.0 * past_of(robot), found.state)
-        np.testing.assert_allclose(still.tip, offset, atol=1e-10)
-        return
-    for name in ("records", "rate", "y", "weights", "t0"):
-        one, other = getattr(wanted[0], name), getattr(found.state, name)
-        np.testing.assert_allclose(other, one, atol=1e-10 * max(float(np.max(np.abs(one))), 1e-3))
+    assert_stored(f"attempt, {kind}", found.row, found.state)
+    y = found.state if step is None else found.state.y[0]
+    solved, *_ = by_jax(robot, settings.space, c0, t, control, history, y, found.row.unknowns)
+    assert solved.error <= 1.1e-10
+    np.testing.assert_allclose(solved.tip, offset, atol=1e-10)
+    if step is not None:
+        np.testing.assert_array_equal(found.state.y[1:], past.y[:-1])
+        np.testing.assert_array_equal(found.state.records[1], past.records[0])
+        assert found.state.t0 == past.t0
 
 
 def past_of(robot):
@@ -273,10 +332,11 @@ def test_states_evaluated(name):
     robot, settings = robot_of(name), settings_of("bdf2")
     grid, records = grid_of(robot), past_of(robot)
     control, points = tensions(1)[0, 0], records[: grid.tip + 1, : robot.y_layout.size]
+    unknowns = np.zeros(unknown_count(robot))
     evaluate = loops.evaluator(robot, settings)
     for y in (points[grid.nodes], points):
         given = 30.0, 0.1, control, -28.0 * records, y
-        wanted, found = evaluation._evaluated(robot, settings.space, *given), evaluate(*given)
+        wanted, found = by_jax(robot, settings.space, *given, unknowns)[0], evaluate(*given)
         for one, other in zip(wanted, found, strict=True):
             np.testing.assert_allclose(other, one, atol=1e-11 * np.max(np.abs(one)))
     assert len(grid.between) > 0 or name == PAPER
@@ -304,24 +364,41 @@ def test_a_span_continues_another():
     np.testing.assert_allclose(second.records, whole.records[10:], atol=1e-8)
 
 
+@pytest.mark.parametrize("motion", ["smooth", "random", "still"])
+def test_the_first_guess_trusts_what_was_right_before(motion):
+    """Extrapolations are weighted by the third power of their errors in the newest step."""
+    robot, settings = robot_of(PAPER), settings_of("bdf2")
+    control = tensions(1)[0] if motion == "random" else np.full((STEPS, 4), 6.0)
+    if motion == "smooth":
+        control = 6.0 + 2.0 * np.sin(2.0 * TIMES) * [1.0, 0.0, 0.0, 1.0]
+    before, after = (emitted(robot, settings, control, (0, steps))[1] for steps in (14, 15))
+    assert np.sum(after.weights) == pytest.approx(1.0, abs=1e-12)
+    extrapolated = np.tensordot(EXTRAPOLATIONS, before.y, 1)
+    errors = np.max(np.abs(extrapolated - after.y[0]) / robot.scales().y, axis=(1, 2))
+    trust = np.maximum(errors, 1e-12) ** -3.0
+    np.testing.assert_allclose(after.weights, trust / np.sum(trust) @ EXTRAPOLATIONS, atol=1e-6)
+    assert motion != "smooth" or np.argmin(errors) == 2
+    assert motion != "still" or np.max(errors) < 1e-3
+
+
 def test_hard_steps_are_damped():
     """Tensions between 0 and 30 N in steps of 50 ms need several linearisations and shorter corrections."""
     robot, settings, control = robot_of(PAPER), settings_of("bdf2"), tensions(1, 0.0, 30.0)[0]
-    _, _, rows = in_jax(robot, settings, control)
-    _, _, own = emitted(robot, settings, control)
-    assert np.max(own.corrections) > 8
-    assert_same(rows, own, 1e-9, 1e-3)
+    _, state, rows = emitted(robot, settings, control)
+    assert np.max(rows.corrections) > 8
+    assert_stored("hard", rows, tolerance=1e-9, estimates=1e-3)
+    assert_solved(robot, settings, control, resting_history(robot, settings), rows, state)
 
 
 def test_a_failed_step_ends_the_loop_with_the_state_before_it():
     robot, settings = robot_of(PAPER), settings_of("sdirk2")
     control = np.concatenate([tensions(1)[0][:4], np.full((STEPS - 4, 4), [1e7, 0.0, 0.0, 1e7])])
-    done, state, rows = in_jax(robot, settings, control)
-    own_done, own_state, own_rows = emitted(robot, settings, control)
-    assert own_done == int(done) < STEPS
-    assert own_rows.result[own_done] == kc.Result.NO_CONVERGENCE
-    np.testing.assert_allclose(own_state.records, state.records, atol=1e-9)
-    np.testing.assert_allclose(own_rows.records[:own_done], rows.records[:own_done], atol=1e-9)
+    done, state, rows = emitted(robot, settings, control)
+    wanted = stored_results()["failed"]
+    assert done == int(wanted["done"]) < STEPS
+    assert rows.result[done] == kc.Result.NO_CONVERGENCE
+    np.testing.assert_allclose(state.records[0], wanted["newest records"], atol=1e-9)
+    np.testing.assert_allclose(rows.records[done - 1], wanted["records"], atol=1e-9)
 
 
 @pytest.mark.parametrize("name", [PAPER, ROUTED, NETWORK])

@@ -1,4 +1,4 @@
-"""Emitted tangents of motions: differences of motions, and the same linear equations in JAX."""
+"""Emitted tangents of motions: differences of motions, and the linearised equations in JAX."""
 
 import functools
 
@@ -10,19 +10,20 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.engine import loops
+from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.estimation.adapted import Adapted, AdaptedParameters
 from knode_cosserat.estimation.online import OnlineModel
 from knode_cosserat.rods.loads import AttachedMass, PointWrench
-from knode_cosserat.solvers import rollout, sensitivity
+from knode_cosserat.solvers import rollout
 from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.history import resting_history
+from knode_cosserat.solvers.evaluation import unloaded_shape
+from knode_cosserat.solvers.history import history_of, resting_history
+from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.run import Equilibria, TimeIntegration
-from knode_cosserat.solvers.sensitivity import TangentState, tangent_loop_in_jax, tangent_time_loop
+from knode_cosserat.solvers.sensitivity import SystemMoves, TangentState, tangent_time_loop
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import LOBATTO2
-from knode_cosserat.solvers.static_loop import unloaded_shape
-from knode_cosserat.solvers.tangent import SystemMoves
-from knode_cosserat.solvers.time_loop import StepCoefficients
+from knode_cosserat.solvers.steps import StepCoefficients
 from tests.engine.networks import with_committee, with_network
 from tests.engine.test_core import LEGS, Stretching, displacements, standing_history
 
@@ -159,16 +160,48 @@ def test_an_adapted_zero_is_no_constant_of_the_code():
     assert cores[0] is cores[1]
 
 
-@pytest.mark.parametrize(("name", "scheme"), [(PAPER, "sdirk2"), (LEGS, "bdf2")])
-def test_tangents_equal_those_in_jax(name, scheme, monkeypatch):
-    motion = Motion(name, scheme)
-    wanted = tangent_loop_in_jax(*motion.given)
-    monkeypatch.setattr(sensitivity, "tangent_loop_in_jax", None)
-    found = tangent_time_loop(*motion.given)
-    for one, other in zip(jax.tree.leaves(wanted), jax.tree.leaves(found), strict=True):
-        one = np.asarray(one)
-        assert np.shape(other) == one.shape
-        np.testing.assert_allclose(other, one, atol=1e-9 * max(np.max(np.abs(one)), 1e-300))
+def test_tangents_solve_the_linearised_equations():
+    """The residuals of all stages, evaluated in JAX, stay zero along the tangents."""
+    motion, k = Motion(PAPER, "sdirk2"), 0
+    settings, robot, past = motion.settings, motion.robot, motion.past
+    _, found = tangent_time_loop(*motion.given)
+    solved, scales, ny = motion.solved, robot.scales(), robot.y_layout.size
+    used = motion.d_rate.shape[0]
+
+    def residuals(system, controls, records, rate, rows, unknowns):
+        def stage(state, now):
+            coefficients, t, control, y, xi = now
+            history = history_of(*state, coefficients, settings)
+            problem = StepProblem(system, t, control, coefficients[0], history, settings.space)
+            defects, tip = problem.residuals(y)
+            base, own = problem.base(xi) - y[0], problem.records(y)
+            left = jnp.concatenate([base / scales.y, jnp.ravel(defects / scales.y), tip / scales.tip])
+            return (jnp.stack([own, state[0][0]]), coefficients[0] * own + history), left
+
+        tables, times = map(
+            np.concatenate, zip(*(motion.steps.at(past.t0, i) for i in range(STEPS)), strict=True)
+        )
+        controls = jnp.repeat(jnp.asarray(controls), settings.stages, axis=0)
+        return jax.lax.scan(stage, (records, rate), (tables, times, controls, rows[..., :ny], unknowns))[1]
+
+    def places(values, moves, axis):
+        """Return tangents at all places; those of the check stages do not enter."""
+        whole = np.zeros(np.shape(values))
+        whole[(slice(None),) * axis + (slice(used),)] = moves[..., k]
+        return whole
+
+    at = jax.tree.map(jnp.asarray, (robot, motion.controls, past.records, past.rate, *solved))
+    along = (
+        jax.tree.map(lambda moves: np.tensordot(motion.weights[:, k], moves, 1), motion.directions),
+        motion.d_controls[..., k], places(past.records, motion.d_records, 1),
+        places(past.rate, motion.d_rate, 0), *(each[..., k] for each in found),
+    )  # fmt: skip
+    slope = jax.jit(lambda along: jax.jvp(residuals, at, along))
+    still = tuple(jax.tree.map(np.zeros_like, each) for each in along)
+    value, moved = slope(along)
+    size = np.max(np.abs(slope((*along[:4], *still[4:]))[1]))
+    assert np.max(np.abs(value)) <= 1.1e-10 and size > 0.1
+    assert np.max(np.abs(moved)) <= 1e-9 * size
 
 
 def assert_transposed(function, at, along):
@@ -192,15 +225,14 @@ def assert_transposed(function, at, along):
     ("name", "scheme", "space"),
     [
         (PAPER, "bdf-alpha", "lobatto2"), (ROUTED, "sdirk2", "lobatto2"), (ROUTED, "bdf-alpha", "lobatto2"),
-        (CURVED, "bdf-alpha", "lobatto2"), (NETWORK, "bdf-alpha", "lobatto2"), (COMMITTEE, "sdirk2", "lobatto2"),
-        *SPACES,
+        (CURVED, "bdf-alpha", "lobatto2"), (NETWORK, "bdf-alpha", "lobatto2"),
+        (COMMITTEE, "sdirk2", "lobatto2"), *SPACES,
     ],
 )  # fmt: skip
-def test_cotangents_are_those_of_the_transposed_map(name, scheme, space, monkeypatch):
-    monkeypatch.setattr(rollout, "tangent_loop_in_jax", None)
+def test_cotangents_are_those_of_the_transposed_map(name, scheme, space):
     motion = Motion(name, scheme, space)
     task = TimeIntegration(motion.settings, DT, STEPS)
-    run = rollout.rollout(task, loops.Pattern.of(motion.robot))
+    run = rollout.rollout(task, Pattern.of(motion.robot))
 
     def results(robot, controls, records, rate):
         rows, last = run(robot, controls, motion.past._replace(records=records, rate=rate))
@@ -218,11 +250,10 @@ def test_cotangents_are_those_of_the_transposed_map(name, scheme, space, monkeyp
 
 
 @pytest.mark.parametrize(("name", "low", "high"), [(ROUTED, 2.0, 5.0), (LEGS, 0.0, 0.02)])
-def test_tangents_and_cotangents_of_equilibria(name, low, high, monkeypatch):
-    monkeypatch.setattr(rollout, "tangent_loop_in_jax", None)
+def test_tangents_and_cotangents_of_equilibria(name, low, high):
     robot, rng, eps = kc.load_robot(name), np.random.default_rng(0), 1e-4
     controls, y = rng.uniform(low, high, (3, robot.control_size)), unloaded_shape(robot, LOBATTO2)
-    run = rollout.static_rollout(Equilibria(Settings(None), 3), loops.Pattern.of(robot))
+    run = rollout.static_rollout(Equilibria(Settings(None), 3), Pattern.of(robot))
     along = (
         jax.tree.map(lambda x: 0.1 * x * rng.normal(size=np.shape(x)), robot),
         0.1 * high * rng.normal(size=controls.shape),
@@ -254,9 +285,7 @@ def tip_height():
     return function, np.random.default_rng(0).uniform(2.0, 5.0, (3, STEPS, 4))
 
 
-def test_gradients_are_differences_and_run_in_the_engine(tip_height, monkeypatch):
-    for name in ("tangent_loop_in_jax", "loop_one"):
-        monkeypatch.setattr(rollout, name, None)
+def test_gradients_are_differences(tip_height):
     function, tensions = tip_height
     found, eps = jax.jit(jax.grad(function, (0, 1)))(1.0, tensions[0]), 1e-4
     slope = (function(1.0 + eps, tensions[0]) - function(1.0 - eps, tensions[0])) / (2.0 * eps)

@@ -11,7 +11,7 @@ from knode_cosserat.solvers.history import resting_history
 from knode_cosserat.solvers.recovery import Budget, BudgetError
 from knode_cosserat.solvers.recovery_methods import StepRecovery
 from knode_cosserat.solvers.settings import MEASURED
-from knode_cosserat.solvers.time_loop import TimeStep
+from knode_cosserat.solvers.steps import TimeStep
 from tests.trajectories import HOPELESS
 
 DT = 0.05

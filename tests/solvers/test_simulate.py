@@ -7,17 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 import knode_cosserat as kc
 from knode_cosserat.rods.surroundings import Plane
 from knode_cosserat.rods.tendon_friction import TendonFriction, Vibration
 from knode_cosserat.solvers.grid import at_places
-from knode_cosserat.solvers.history import EXTRAPOLATIONS, advanced, history_of, resting_history
+from knode_cosserat.solvers.history import advanced, history_of, resting_history
 from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.time_loop import weights_by
 from tests.trajectories import HOPELESS, synthetic
 
 DT = 0.05
@@ -247,19 +244,6 @@ def test_the_past_keeps_the_newest_first(robot):
         history_of(after.records, after.rate, ones, Settings()),
         3.0 * after.records[0] + 5.0 * after.records[1],
     )
-
-
-@pytest.mark.parametrize(("misfit", "order"), [([1e-2, 1e-5, 1e-3], 1), ([0.0, 1e-3, 1e-2], 0)])
-def test_the_first_guess_trusts_what_was_right_before(misfit, order):
-    weights = weights_by(np.array(misfit))
-    np.testing.assert_allclose(weights, EXTRAPOLATIONS[order], atol=1e-4)
-
-
-@given(st.lists(st.floats(0.0, 1e3), min_size=len(EXTRAPOLATIONS), max_size=len(EXTRAPOLATIONS)))
-def test_the_first_guess_of_what_stands_still_is_where_it_stands(misfit):
-    weights = np.asarray(weights_by(np.array(misfit)))
-    assert weights.sum() == pytest.approx(1.0, abs=1e-12)
-    assert np.abs(weights).sum() <= np.abs(EXTRAPOLATIONS).sum(axis=1).max() + 1e-12
 
 
 # bad input
