@@ -5,6 +5,7 @@ For tests and for docs/validation.md. Rods are 1 m long; loads are in natural un
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -209,6 +210,8 @@ def shaft(nodes: int, space: str) -> float:
         h = np.cos(half) * UP + np.sin(half) * np.array([0.0, 0.0, 0.0, 1.0])
         along = np.broadcast_to([0.0, 0.0, 1.0], (nodes, 3))
         start = resting(robot, s * along, h, along, turn / LENGTH * along)
+        # an equilibrium adds the turns from the control of its initial guess
+        start = dataclasses.replace(start, control=np.array([[turn]]))
         return kc.equilibrium(robot, np.array([turn]), space=space, newton=NEWTON, initial=start)
 
     return abs(critical_load(twisted, 8.8, space) / closed_forms.SHAFT - 1)
