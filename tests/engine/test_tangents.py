@@ -26,10 +26,11 @@ from knode_cosserat.solvers.tangent import SystemMoves
 from knode_cosserat.solvers.time_loop import StepCoefficients
 from tests.engine.networks import with_committee, with_network
 from tests.engine.test_core import Stretching
+from tests.engine.test_program import with_curved_law
 
 DT, STEPS, COLUMNS = 0.05, 6, 11
 PAPER, ROUTED, CURVED = "delrin-tendon-robot", "delrin-routed-tendon-robot", "variable-curvature-robot"
-NETWORK, COMMITTEE, BAR = "network of 512 units", "committee", "bar"
+NETWORK, COMMITTEE, STRUCTURED, BAR = "network of 512 units", "committee", "structured", "bar"
 
 
 #: robots and schemes of which the places between ends, and y_s, enter
@@ -43,7 +44,7 @@ class Motion:
         rng = np.random.default_rng(0)
         own = {
             NETWORK: functools.partial(with_network, 512, history=True), COMMITTEE: with_committee,
-            BAR: Stretching,
+            STRUCTURED: with_curved_law, BAR: Stretching,
         }  # fmt: skip
         robot = own[name]() if name in own else kc.load_robot(name).replace(**changes)
         self.robot, self.settings = robot, Settings.of(scheme, space, "paper", NewtonOptions())
@@ -170,8 +171,8 @@ def assert_transposed(function, at, along):
     ("name", "scheme", "space"),
     [
         (PAPER, "bdf-alpha", "lobatto2"), (ROUTED, "sdirk2", "lobatto2"), (ROUTED, "bdf-alpha", "lobatto2"),
-        (CURVED, "bdf-alpha", "lobatto2"), (NETWORK, "bdf-alpha", "lobatto2"), (COMMITTEE, "sdirk2", "lobatto2"),
-        *SPACES,
+        (CURVED, "bdf-alpha", "lobatto2"), (NETWORK, "bdf-alpha", "lobatto2"),
+        (COMMITTEE, "sdirk2", "lobatto2"), (STRUCTURED, "bdf2", "lobatto2"), *SPACES,
     ],
 )  # fmt: skip
 def test_cotangents_are_those_of_the_transposed_map(name, scheme, space, monkeypatch):

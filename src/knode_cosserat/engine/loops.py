@@ -69,7 +69,12 @@ def core_of(system: System, settings: Settings, robots: bool) -> Core:
     Raises:
         EngineError: the engine does not cover the system or the settings.
     """
-    pattern, schemes = Pattern.of(system), Settings(settings.time, settings.space)
+    return core_for(Pattern.of(system), settings, robots)
+
+
+def core_for(pattern: Pattern, settings: Settings, robots: bool) -> Core:
+    """Return the core of a pattern; see `core_of`."""
+    schemes = Settings(settings.time, settings.space)
     return _compiled((pattern, schemes, robots), lambda: Core(pattern.system, schemes, robots))
 
 

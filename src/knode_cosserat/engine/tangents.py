@@ -717,7 +717,7 @@ class CotangentCore(TangentCode):
     def _write_geometry(self) -> None:
         """Add the cotangents of parameters from those of places and lengths: once a run."""
         e = self.equations
-        self.by_geometry = f = self._function("by_geometry", "state")
+        self.by_geometry = self._function("by_geometry", "state")
         known = self._parameters(e.by_geometry)
         for nodes, array in ((e.of_places, self.place), (e.of_lengths, self.length_of_piece)):
             known |= {int(node): self._get(array, 0, k) for k, node in enumerate(nodes)}

@@ -22,7 +22,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from knode_cosserat.engine.core import Constants, Shape
-from knode_cosserat.engine.loops import Pattern, at_all_stages, core_of, table_of, tangents_for
+from knode_cosserat.engine.loops import Pattern, at_all_stages, core_for, table_of, tangents_for
 from knode_cosserat.engine.program import EngineError
 from knode_cosserat.engine.tangents import CotangentCore, TangentCore
 from knode_cosserat.rods.system import System
@@ -146,7 +146,7 @@ def _solved_shapes(spec: Solves, *operands: Any) -> list[Any]:
 
 
 def _core_of_solves(spec: Solves, *operands: Any) -> Any:
-    return core_of(spec.pattern.system, spec.task.settings, robots=operands[spec.leaves].shape[0] > 1)
+    return core_for(spec.pattern, spec.task.settings, robots=operands[spec.leaves].shape[0] > 1)
 
 
 def _states_of(spec: Solves, states: Arrays) -> Any:
