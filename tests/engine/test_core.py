@@ -18,6 +18,7 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.engine import loops
+from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.engine.program import EngineError
 from knode_cosserat.rods.ends import Driven
 from knode_cosserat.rods.system import unknown_count
@@ -286,7 +287,8 @@ def test_options_of_newtons_method_are_numbers_of_a_run():
     robot, control = robot_of(PAPER), tensions(1)[0][:5]
     usual, loose = settings_of("bdf2"), settings_of("bdf2")
     loose = dataclasses.replace(loose, newton=NewtonOptions(1e-3, 1e-2, max_linearisations=2, patience=1))
-    assert loops.core_of(robot, usual, robots=False) is loops.core_of(robot, loose, robots=False)
+    pattern = Pattern.of(robot)
+    assert loops.core_of(pattern, usual, False) is loops.core_of(pattern, loose, False)
     rows = emitted(robot, loose, control, (0, 5))[2]
     # estimates take other corrections: the last ones of the loose solutions are not computed
     assert_stored("options", rows, estimates=1e-2)
@@ -348,7 +350,7 @@ def test_a_refusal_keeps_no_frames():
     robot = Joined(**{name: getattr(legs, name) for name in legs.parameters()}, nodes=legs.nodes)
     for _ in range(3):
         with pytest.raises(EngineError, match="unknowns of another") as caught:
-            loops.core_of(robot, settings_of("sdirk2"), robots=False)
+            loops.core_of(Pattern.of(robot), settings_of("sdirk2"), robots=False)
         assert len(caught.traceback) == 3
 
 

@@ -9,7 +9,6 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.engine import loops
-from knode_cosserat.engine.program import EngineError
 from knode_cosserat.rods.system import unknowns_of
 from knode_cosserat.rods.tendon_friction import TendonFriction
 from knode_cosserat.solvers.boundary import NewtonOptions
@@ -95,25 +94,17 @@ def dense_correction(system, settings, dt, past, control, y):
     return found[: y.size].reshape(y.shape), found[y.size :]
 
 
-def marks_of(name, space):
-    """Return the marks of a case; friction and reels are too many operations for two stages more."""
-    marks = [] if (name, space) in QUICK else [pytest.mark.campaign]
-    if space == "lobatto4" and name in ("friction", "friction, one ends", "reel"):
-        marks.append(pytest.mark.xfail(raises=EngineError))
-    return marks
-
-
 @pytest.mark.parametrize(
     ("name", "space"),
     [
-        pytest.param(name, space, marks=marks_of(name, space))
+        pytest.param(name, space, marks=[] if (name, space) in QUICK else [pytest.mark.campaign])
         for name in ROBOTS
         for space in ("lobatto2", "lobatto4", "euler")
     ],
 )
 def test_a_correction_is_that_of_a_dense_solve(name, space):
     robot, settings = ROBOTS[name](), Settings.of("bdf2", space, "paper", ONCE)
-    past = standing_history(settings) if name == "six legs" else resting_history(robot, settings)
+    past = standing_history(robot, settings) if name == "six legs" else resting_history(robot, settings)
     control = np.random.default_rng(1).uniform(0.2, 0.4, robot.control_size)
     control *= {"reel": 1e-3, "six legs": 1e-3}.get(name, 1.0)
     steps, y = StepCoefficients.of(settings, DT), np.asarray(past.y[0])

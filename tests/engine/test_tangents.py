@@ -26,15 +26,12 @@ from knode_cosserat.solvers.space import LOBATTO2
 from knode_cosserat.solvers.steps import StepCoefficients
 from tests.engine.networks import with_committee, with_network
 from tests.engine.test_core import LEGS, Stretching, displacements, standing_history
+from tests.engine.test_program import with_curved_law
 
 DT, STEPS, COLUMNS = 0.05, 6, 11
 PAPER, ROUTED, CURVED = "delrin-tendon-robot", "delrin-routed-tendon-robot", "variable-curvature-robot"
-NETWORK, COMMITTEE, BAR, CUT_LEGS = (
-    "network of 512 units",
-    "committee",
-    "bar",
-    "six legs with discontinuities",
-)
+NETWORK, COMMITTEE, STRUCTURED = "network of 512 units", "committee", "structured"
+BAR, CUT_LEGS = "bar", "six legs with discontinuities"
 
 
 #: robots and schemes of which the places between ends, y_s, and several strands enter
@@ -62,7 +59,7 @@ class Motion:
         rng = np.random.default_rng(0)
         own = {
             NETWORK: functools.partial(with_network, 512, history=True), COMMITTEE: with_committee,
-            BAR: Stretching, CUT_LEGS: cut_legs,
+            STRUCTURED: with_curved_law, BAR: Stretching, CUT_LEGS: cut_legs,
         }  # fmt: skip
         robot = own[name]() if name in own else kc.load_robot(name).replace(**changes)
         self.robot, self.settings = robot, Settings.of(scheme, space, "paper", NewtonOptions())
@@ -153,7 +150,7 @@ def test_an_adapted_zero_is_no_constant_of_the_code():
     cores, still = [], np.zeros(robot.control_size)
     for x in (0.0, 0.5):
         system, _ = model.moved(np.array([x]))
-        cores.append(loops.core_of(system, model.settings, robots=False))
+        cores.append(loops.core_of(Pattern.of(system), model.settings, robots=False))
         assert (
             model.task(1).solve(system, still[None], resting_history(system, model.settings), (0, 1))[0] == 1
         )
@@ -226,7 +223,7 @@ def assert_transposed(function, at, along):
     [
         (PAPER, "bdf-alpha", "lobatto2"), (ROUTED, "sdirk2", "lobatto2"), (ROUTED, "bdf-alpha", "lobatto2"),
         (CURVED, "bdf-alpha", "lobatto2"), (NETWORK, "bdf-alpha", "lobatto2"),
-        (COMMITTEE, "sdirk2", "lobatto2"), *SPACES,
+        (COMMITTEE, "sdirk2", "lobatto2"), (STRUCTURED, "bdf2", "lobatto2"), *SPACES,
     ],
 )  # fmt: skip
 def test_cotangents_are_those_of_the_transposed_map(name, scheme, space):
@@ -297,9 +294,7 @@ def test_gradients_are_differences(tip_height):
 
 
 @pytest.mark.parametrize("hidden", [12, 64])
-def test_gradients_by_weights_are_differences_and_run_in_the_engine(hidden, monkeypatch):
-    for name in ("tangent_loop_in_jax", "loop_one"):
-        monkeypatch.setattr(rollout, name, None)
+def test_gradients_by_weights_are_differences(hidden):
     model, tensions = with_network(hidden), np.random.default_rng(0).uniform(2.0, 5.0, (STEPS, 4))
     eps, weights = 1e-4, lambda model: (model.residual.input_weights, model.residual.output_weights)
 

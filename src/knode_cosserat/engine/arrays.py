@@ -160,7 +160,8 @@ class ArrayCode:
         target = self._reserved(count, lanes)
         with self.function.loop(count) as k:
             self.function.store(0.0, target.base, k.value * target.distance, lanes)
-        self._add(*self.program.operations[node][1:3], target)
+        _, part, positions, _ = self.program.operations[node]
+        self._add(part, positions, target)
         return target
 
     def add(self, node: int, target: Value, inside: Any) -> None:

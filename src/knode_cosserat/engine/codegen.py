@@ -568,8 +568,8 @@ class Function:
         """Write the operations that outputs need, and return the values of all of them.
 
         `known` are values of inputs and of operations that have been evaluated; those of arrays are in memory
-        (`arrays.Stored`). Loops run until every lane is done; lanes that are done keep their values. The
-        arrays `added` are summed over the lanes that are `inside`, and added to memory at their addresses.
+        (`arrays.Stored`). Loops run until every lane is done; lanes that are done keep their values. The sums
+        of the arrays `added` over the lanes `inside` are added to memory at their addresses.
         """
         values: dict[int, Any] = dict(known)
         parts = [part for node, _ in added for part, _ in summands(program, node)]

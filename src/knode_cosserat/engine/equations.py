@@ -280,7 +280,7 @@ class TangentEquations(Equations):
         }
         needed = self._scalars_of(self._hoisted([*itertools.chain(*results.values())], {STEP, RUN}))
         #: terms of a step by which moving parameters act
-        self.moving_terms = sorted(program.dependent(needed, moving).intersection(needed))
+        self.moving_terms = sorted(program.dependent([*needed], moving).intersection(needed))
         #: cotangents of these terms, of the place, and of moving arrays, from those of the results at a place
         self.pulled = {
             name: program.gradient(

@@ -19,15 +19,15 @@ from knode_cosserat.solvers.steps import StepCoefficients, StepRows
 AnyTangents = TypeVar("AnyTangents", TangentCore, CotangentCore)
 
 
-def core_of(system: System, settings: Settings, robots: bool) -> Core:
-    """Return the core of a system or, with robots in lanes, of a batch of systems or one for all.
+def core_of(pattern: Pattern, settings: Settings, robots: bool) -> Core:
+    """Return the core of a pattern, of one robot or with robots in lanes.
 
     Newton's options are not part of the code.
 
     Raises:
         EngineError: the engine does not cover the system or the settings.
     """
-    pattern, schemes = Pattern.of(system), Settings(settings.time, settings.space)
+    schemes = Settings(settings.time, settings.space)
     return compiled((pattern, schemes, robots), lambda: Core(pattern.system, schemes, robots))
 
 
@@ -48,7 +48,7 @@ def loop_one(
 
     The offset (k,) is subtracted from the residual of the tip's conditions.
     """
-    core = core_of(system, settings, robots=False)
+    core = core_of(Pattern.of(system), settings, robots=False)
     batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], past)
     constants = Constants(parameters_of(system), settings.newton, tip_offset)
     found = core.integrate(constants, np.asarray(controls)[None], steps, batch, span)
@@ -63,7 +63,7 @@ def loop_many(
 
     Robots are solved side by side in the lanes of vectors; see `Core.integrate`.
     """
-    core = core_of(system, settings, robots=len(controls) > 1)
+    core = core_of(Pattern.of(system), settings, robots=len(controls) > 1)
     parameters = parameters_of(system)
     if np.ndim(system.length):
         leaves = [np.asarray(leaf, float) for leaf in jax.tree.leaves(system)]
@@ -79,7 +79,7 @@ STILL = StepCoefficients(np.zeros((2, 4)), 0.0)
 
 def evaluator(system: System, settings: Settings) -> Callable[..., Evaluated]:
     """Return a function that evaluates states of a system (see `Core.evaluator`)."""
-    return core_of(system, settings, robots=False).evaluator(parameters_of(system))
+    return core_of(Pattern.of(system), settings, robots=False).evaluator(parameters_of(system))
 
 
 def static_one(

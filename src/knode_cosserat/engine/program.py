@@ -711,8 +711,8 @@ class Program:
             elif name == "result":
                 raise self._loop_error(arguments[0])
         return [
-            self.spread(found.get(node, zero), Positions.whole(shape), shape)
-            if (shape := self.shapes.get(node)) is not None
+            self.spread(found.get(node, zero), Positions.whole(self.shapes[node]), self.shapes[node])
+            if node in self.shapes
             else found.get(node, zero)
             for node in map(int, variables)
         ]

@@ -135,7 +135,7 @@ def _solved_shapes(spec: Solves, *operands: Any) -> list[Any]:
 
 
 def _core_of_solves(spec: Solves, *operands: Any) -> Any:
-    return core_of(spec.pattern.system, spec.task.settings, robots=operands[spec.leaves].shape[0] > 1)
+    return core_of(spec.pattern, spec.task.settings, robots=operands[spec.leaves].shape[0] > 1)
 
 
 def _states_of(spec: Solves, states: Arrays) -> Any:
