@@ -23,7 +23,7 @@ from knode_cosserat.solvers.space import LOBATTO2, SpaceScheme
 
 RUN, STEP, PLACE, STATE = 1, 2, 3, 4
 #: largest number of operations: LLVM's time grows faster than their number, to minutes for a large network
-MOST_OPERATIONS = 20_000
+MOST_OPERATIONS = 60_000
 
 
 def constant_zeros(leaf: np.ndarray) -> np.ndarray:
