@@ -12,7 +12,7 @@ from knode_cosserat.rods import ends, loads, routing, section, surroundings
 from knode_cosserat.rods.parts import kinds_of
 from knode_cosserat.rods.robot_file import KINDS
 from knode_cosserat.solvers.time import BDFAlpha
-from tools.site import api, changelog, examples, performance, robot_file, source
+from tools.site import api, changelog, examples, robot_file, source
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -89,11 +89,6 @@ def test_every_example_has_its_section():
     for file in (ROOT / "examples").glob("*.py"):
         assert f"`examples/{file.name}`" in page
     assert "    ```python\n" in page
-
-
-def test_the_figures_are_those_of_the_readme():
-    table = [line for line in performance.page().splitlines() if "against fsolve" in line]
-    assert len(table) == 3 and all(line in (ROOT / "README.md").read_text(encoding="utf-8") for line in table)
 
 
 def test_the_navigation_names_every_page():

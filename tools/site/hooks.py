@@ -1,7 +1,7 @@
 """What MkDocs calls while it builds the site: pages are made of the code and the results that they speak of.
 
 A block with the language `source` holds paths of objects, and becomes their source. A comment such as
-`<!-- site: performance -->` becomes what is made for it. Equations between `$$` become MathML. Links to
+`<!-- site: api -->` becomes what is made for it. Equations between `$$` become MathML. Links to
 elsewhere are listed beside the site, in external-links.txt. Whatever cannot be made ends the build; so does
 a page that would load something from elsewhere.
 """
@@ -17,7 +17,7 @@ from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File
 
 import knode_cosserat as kc
-from tools.site import api, changelog, equations, examples, notebooks, performance, robot_file, source
+from tools.site import api, changelog, equations, examples, notebooks, robot_file, source
 
 #: pages that others write: without them the site is whole
 OPTIONAL = ("viewer.md", "notebooks.md")
@@ -31,7 +31,6 @@ MADE = {
     "changelog": changelog.page,
     "examples": examples.page,
     "notebook": notebooks.page,
-    "performance": performance.page,
     "robot-file": robot_file.page,
 }
 
