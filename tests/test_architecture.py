@@ -22,7 +22,6 @@ LAYERS = (
         "_numbers",
         "_processes",
         "_program_cache",
-        "_programs",
         "_registry",
         "_reprs",
         "rotation",

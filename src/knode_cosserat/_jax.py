@@ -1,4 +1,4 @@
-"""JAX configuration of this package: double precision, cache on disk, bounded programs in memory."""
+"""JAX configuration of this package: double precision, cache on disk."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from pathlib import Path
 import jax
 
 from knode_cosserat._program_cache import install
-from knode_cosserat._programs import limit_programs
 
 
 def machine_name() -> str:
@@ -50,5 +49,3 @@ def configure() -> None:
 
 
 configure()
-#: limits the compiled programs of this process
-program_budget = limit_programs()

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.engine import loops
+from knode_cosserat.engine import loops, pattern
 from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.engine.program import EngineError
 from knode_cosserat.rods.ends import Driven
@@ -287,8 +287,8 @@ def test_options_of_newtons_method_are_numbers_of_a_run():
     robot, control = robot_of(PAPER), tensions(1)[0][:5]
     usual, loose = settings_of("bdf2"), settings_of("bdf2")
     loose = dataclasses.replace(loose, newton=NewtonOptions(1e-3, 1e-2, max_linearisations=2, patience=1))
-    pattern = Pattern.of(robot)
-    assert loops.core_of(pattern, usual, False) is loops.core_of(pattern, loose, False)
+    own = Pattern.of(robot)
+    assert loops.core_of(own, usual, False) is loops.core_of(own, loose, False)
     rows = emitted(robot, loose, control, (0, 5))[2]
     # estimates take other corrections: the last ones of the loose solutions are not computed
     assert_stored("options", rows, estimates=1e-2)
@@ -352,6 +352,16 @@ def test_a_refusal_keeps_no_frames():
         with pytest.raises(EngineError, match="unknowns of another") as caught:
             loops.core_of(Pattern.of(robot), settings_of("sdirk2"), robots=False)
         assert len(caught.traceback) == 3
+
+
+def test_a_process_keeps_a_bounded_number_of_codes(monkeypatch):
+    monkeypatch.setattr(pattern, "MOST_CODES", 3)
+    monkeypatch.setattr(pattern, "_CODES", {})
+    built = []
+    for key in (0, 1, 2, 0, 3, 0, 1):
+        assert pattern.compiled(key, lambda key=key: built.append(key) or [key]) == [key]
+    # the code used least recently goes
+    assert built == [0, 1, 2, 3, 1] and set(pattern._CODES) == {0, 1, 3}
 
 
 def test_a_span_continues_another():

@@ -16,8 +16,8 @@ from knode_cosserat.rods.system import System, is_traced
 
 #: compiled code, or the reason why there is none, by what it depends on; the last used come last
 _CODES: dict[Any, Any] = {}
-#: number of codes that a process keeps: that of a time loop takes some MB
-MOST_CODES = 200
+#: number of codes that a process keeps: that of a time loop takes about 5 MB
+MOST_CODES = 100
 _COMPILING = threading.Lock()
 
 Code = TypeVar("Code")
