@@ -3,8 +3,8 @@
 The names that a first script needs are here; start with `load_robot`, `simulate` and `Trajectory`. All other
 public names are in the namespaces `robots`, `solvers`, `learning`, `calibration`, `recordings`, `statics`,
 `estimation`, `control`, `hardware`, `identification`, `metrics`, `figures`, `viewer`, `controls`,
-`named_controls`, `envs`, `sweeps` and `diagnosis`. Events are logged to the logger "knode_cosserat", which is
-quiet unless a handler is added.
+`named_controls`, `envs` and `sweeps`. Events are logged to the logger "knode_cosserat", which is quiet unless
+a handler is added.
 """
 
 import logging
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
         calibration,
         control,
         controls,
-        diagnosis,
         envs,
         estimation,
         figures,
@@ -63,7 +62,6 @@ __all__ = [
     "catalog",
     "control",
     "controls",
-    "diagnosis",
     "envs",
     "equilibrium",
     "estimate_states",
@@ -97,10 +95,6 @@ __all__ = [
 make_lazy(
     __name__,
     {
-        "knode_cosserat": (
-            "calibration control controls diagnosis envs estimation figures hardware identification "
-            "learning metrics named_controls recordings robots solvers statics sweeps viewer"
-        ),
         "knode_cosserat.calibration": "calibrate",
         "knode_cosserat.errors": "KnodeCosseratError",
         "knode_cosserat.identification": "fit identify",
