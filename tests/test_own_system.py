@@ -85,12 +85,3 @@ def test_what_it_does_not_have_is_said(string):
         _ = kc.equilibrium(string, HAND, space="lobatto4").quaternion
     with pytest.raises(kc.robots.ParameterError, match=r"no parameter 'youngs_modulus'.*stiffness"):
         string.replace(youngs_modulus=1.0)
-
-
-def test_equations_of_earlier_versions_are_refused():
-    """A method that no solver calls would be ignored silently."""
-    with pytest.raises(TypeError, match=r"Old defines `rates`, which no solver calls; define `balance"):
-
-        class Old(kc.robots.TendonRobot):
-            def rates(self, s, t, y, z, control, history):
-                return y

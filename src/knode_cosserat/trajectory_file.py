@@ -23,7 +23,7 @@ from knode_cosserat.errors import first_line
 from knode_cosserat.rods.layout import Field, Layout
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.history import GUESS_STATES, SolverState, StateHistory
-from knode_cosserat.solvers.result import EARLIER_RESULTS, Result
+from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.trajectory import Trajectory
 from knode_cosserat.trajectory_integrity import (
@@ -92,8 +92,6 @@ _STATE_PARTS = (
 #: comment on each control about its interval; attribute for omitted intermediate rows
 _ACTED = "row i acted from row i - 1 to row i; row 0 before the motion"
 _THINNED = "rows_left_out"
-#: names in files of earlier versions, whose initial histories are not read: their rows are replayed
-_EARLIER = ("begun", "begun_step", "initial_history_step")
 
 # writing
 
@@ -211,7 +209,7 @@ def _require_names(system: System, source: str) -> None:
     names = [field.name for layout in _layouts(system) for field in layout.fields]
     taken = {"time", "node", "batch", "arclength", "axis", "quaternion", BYTES, SIZES}
     taken |= {name + suffix for name, *_ in _STATES for suffix, *_ in _STATE_PARTS}
-    taken |= {*_EARLIER, *(name for name, *_ in (*_ROWS, _ERROR, _TIME_ERROR, _OUTSIDE, _STAGES))}
+    taken |= {*(name for name, *_ in (*_ROWS, _ERROR, _TIME_ERROR, _OUTSIDE, _STAGES))}
     for name in names:
         if name in taken or "/" in name or name.startswith(PARAMETER) or name.endswith("_index"):
             raise TrajectoryFileError(
@@ -262,7 +260,6 @@ def load_trajectory(path: str | Path, *, system: System | None = None) -> Trajec
         packed.append(np.concatenate(fields, axis=-1) if fields else np.zeros((*shape, 0)))
     y, z, control = packed
     numbers = {name: values_of(path, data, name, rows) for name, *_ in _ROWS}
-    numbers["result"] = _current_codes(numbers["result"], data["result"].attrs)
     for name, *_ in (_ERROR, _TIME_ERROR):
         if name in data.variables:
             numbers[name] = values_of(path, data, name, rows)
@@ -275,17 +272,6 @@ def load_trajectory(path: str | Path, *, system: System | None = None) -> Trajec
     states = {attribute: _state(path, data, name) for name, attribute, _ in _STATES}
     require_possible(path, time, numbers, y)
     return Trajectory(system, settings, time, y, z, control, **numbers, **states, thinned=thinned)
-
-
-def _current_codes(codes: np.ndarray, attributes: dict[Any, Any]) -> np.ndarray:
-    """Return this version's result codes: a file names its codes, and earlier versions had others."""
-    values = np.ravel(attributes.get("flag_values", ()))
-    names = str(attributes.get("flag_meanings", "")).split()
-    current = codes.copy()
-    for value, name in zip(values, names, strict=False):
-        if name in EARLIER_RESULTS and isinstance(value, np.integer):
-            current[codes == value] = int(EARLIER_RESULTS[name])
-    return current
 
 
 def _state_arrays(state: SolverState) -> tuple[np.ndarray, ...]:

@@ -29,7 +29,6 @@ import numpy as np
 from knode_cosserat._files.writing import replacing
 from knode_cosserat._files.yaml_text import YAMLTextError, did_you_mean, flow, mapping_of, read_yaml, shown
 from knode_cosserat.errors import KnodeCosseratError
-from knode_cosserat.rods.old_keys import upgraded
 from knode_cosserat.rods.parallel_robot import ParallelRobot
 from knode_cosserat.rods.parameters import (
     Parameter,
@@ -182,7 +181,7 @@ def parse_robot(text: str, source: str) -> System:
         raise RobotFileError(
             f"{source}: parameters is {shown(values)}; allowed is a mapping from names to values"
         )
-    return _robot(KINDS[kind], upgraded(kind, values), source)
+    return _robot(KINDS[kind], values, source)
 
 
 def _robot(cls: type[System], values: dict[Any, Any], source: str) -> System:

@@ -34,15 +34,6 @@ from knode_cosserat.rotation import dot, rotation_matrix
 #: smallest and largest number of nodes of a rod
 FEWEST_NODES, MOST_NODES = 2, 10_000
 
-#: methods of earlier versions, which received a time scheme, and the methods that replace them
-REPLACED = {
-    "derivatives": "`constitutive` and `balance`",
-    "left_of_law": "`constitutive`",
-    "rates": "`balance(s, t, y, y_t, z, z_t, control)`",
-    "spatial_rates": "`balance(s, t, y, y_t, z, z_t, control)`",
-    "strains": "`constitutive(s, t, y, y_t, control)`",
-}
-
 
 class Correction(NamedTuple):
     """A learned correction of y_s and z (`learning.residual.Residual`), and the system that it corrects."""
@@ -285,13 +276,6 @@ class System(Parametrised):
             if name not in settable:
                 raise ParameterError(unknown_parameter(type(self), name, settable))
         return dataclasses.replace(self, **changes)
-
-    def __init_subclass__(cls, **options: Any) -> None:
-        super().__init_subclass__(**options)
-        for name in REPLACED.keys() & vars(cls).keys():
-            raise TypeError(
-                f"{cls.__name__} defines `{name}`, which no solver calls; define {REPLACED[name]}"
-            )
 
     def __check_init__(self) -> None:
         given: Any = self.nodes

@@ -101,13 +101,6 @@ class ResultCodes(Codes):
     members = Result
 
 
-#: result names in files of earlier versions, and their present equivalents
-EARLIER_RESULTS = {
-    "recovered_stable_elimination": Result.CONVERGED,
-    "recovered_finer_segments": Result.CONVERGED,
-}
-
-
 class SimulationError(KnodeCosseratError, RuntimeError):
     """A step could not be solved.
 

@@ -77,32 +77,19 @@ class Settings:
 
     @classmethod
     def from_description(cls, described: Any) -> Self:
-        """Return settings from plain data. Raises `KeyError`, `TypeError` or `ValueError` if it is not valid.
-
-        Data of earlier versions is accepted: RK4 becomes the scheme of the same order, the scheme Static
-        becomes none, and removed options are ignored.
-        """
+        """Return settings from plain data; `KeyError`, `TypeError` or `ValueError` if it is not valid."""
         time = described["time"]
-        time = None if time in (None, _EARLIER_STATICS) else _named(TimeScheme, **time)
-        space, newton = dict(described["space"]), dict(described["newton"])
-        space["scheme"] = _EARLIER_SCHEMES.get(space["scheme"], space["scheme"])
-        newton.pop("across_steps", None)
         return cls(
-            time=time,
-            space=_named(SpaceScheme, **space),
+            time=None if time is None else _named(TimeScheme, **time),
+            space=_named(SpaceScheme, **described["space"]),
             start=described["start"],
-            newton=NewtonOptions(**newton),
-            between=described.get("between", "held"),
+            newton=NewtonOptions(**described["newton"]),
+            between=described["between"],
         )
 
 
 #: for rows that were not simulated: rates are differences of the rows, by the paper's scheme
 MEASURED = Settings(time_schemes.BDF2(), start="paper")
-
-#: schemes along the rod of earlier versions, and present schemes of the same order
-_EARLIER_SCHEMES = {"RK4": "Lobatto4"}
-#: time scheme of equilibria in earlier versions
-_EARLIER_STATICS = {"scheme": "Static"}
 
 
 def _described(scheme: Any) -> dict[str, Any] | None:

@@ -26,13 +26,6 @@ from knode_cosserat.learning.files.container import (
     fields_of,
 )
 
-#: classes of earlier versions, and the class of the same order that replaced them
-EARLIER_CLASSES = {"RK4": "Lobatto4"}
-#: classes of earlier versions that became None: the time scheme of equilibria
-EARLIER_NONE = ("Static",)
-#: fields that classes had in earlier versions
-EARLIER_FIELDS = {"Settings": ("elimination",), "NewtonOptions": ("across_steps",)}
-
 #: deepest nesting of a header: a KNODE of a KNODE of a KNODE has 40
 MOST_NESTED = 200
 
@@ -103,18 +96,11 @@ class Reader:
 
     def _object(self, name: str, fields: dict[str, Any], where: str, classes: Classes) -> Any:
         if name not in classes:
-            name = EARLIER_CLASSES.get(name, name)
-        if name in EARLIER_NONE and name not in classes:
-            return None
-        if name not in classes:
             raise UnknownClassError(f"{where} is of a class {name[:60]!r}, which is not known here", name)
         self._objects += 1
         if self._objects > self._most_objects:
             raise ContainerError(f"it has more than {self._most_objects} objects; {MORE}")
-        # not read: values of removed fields may be of classes that no longer exist
-        removed = set(EARLIER_FIELDS.get(name, ())) - set(fields_of(classes[name]))
-        kept = {key: part for key, part in fields.items() if key not in removed}
-        values = {key: self._value(part, f"{where}.{key}", classes) for key, part in kept.items()}
+        values = {key: self._value(part, f"{where}.{key}", classes) for key, part in fields.items()}
         return _made(classes[name], values, where)
 
 
