@@ -20,8 +20,8 @@ from knode_cosserat.rods.load_cells import LoadCells
 from knode_cosserat.rotation import conjugate, quaternion_product, since_first
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.evaluation import unloaded_shape
-from knode_cosserat.solvers.history import constant_history
 from knode_cosserat.solvers.places import Places, places_at, positions_at, quaternions_at
+from knode_cosserat.solvers.replay import at_one_state
 from knode_cosserat.solvers.run import Equilibria, TimeIntegration, run_one, usable_cores
 from knode_cosserat.solvers.sensitivity import (
     SystemMoves,
@@ -178,7 +178,7 @@ class Misfit:
             task, state = dataclasses.replace(still, steps=count), first.state
         else:
             record = first.rows.records[0][:, : ny + system.z_layout.size]
-            state = _initial(system, settings, record, data.initial_tension)
+            state = at_one_state(system, settings, record, data.initial_tension)
         found, _, cause = run_one(task, system, acting, state, data.initial_tension)
         if cause:
             return None
@@ -239,9 +239,6 @@ def _acting(system: Any, data: RecordingData) -> tuple[np.ndarray, np.ndarray]:
 @jax.jit
 def _system(robot: ParametrisedRobot, x: Any) -> Any:
     return robot(x)
-
-
-_initial = jax.jit(constant_history, static_argnames="settings")
 
 
 @jax.jit

@@ -41,6 +41,7 @@ from knode_cosserat.solvers.history import (
 )
 from knode_cosserat.solvers.initial import continued_state, initial_state
 from knode_cosserat.solvers.places import Places, places_at, positions_at, quaternions_at
+from knode_cosserat.solvers.replay import at_one_state
 from knode_cosserat.solvers.result import SimulationError
 from knode_cosserat.solvers.run import TimeIntegration, run_one
 from knode_cosserat.solvers.sensitivity import SystemMoves, TangentState, static_tangents, tangent_time_loop
@@ -124,20 +125,6 @@ def _started(robot, coordinates, before, past, unknowns, settings, one_state):  
     return jax.vmap(along, out_axes=(0, None, -1))(jnp.eye(coordinates.shape[0]))
 
 
-@functools.partial(jax.jit, static_argnames="settings")
-def _settled(system, directions, first, d_first, held, settings):  # type: ignore[no-untyped-def]
-    """Return the history of an equilibrium, and its tangents by the directions of system and row."""
-
-    def along(d_system: Any, d_first: Any) -> Any:
-        past, d_past = jax.jvp(
-            lambda system, row: constant_history(system, settings, row, held),
-            (system, first), (d_system, d_first),
-        )  # fmt: skip
-        return past, (d_past.records, d_past.rate)
-
-    return jax.vmap(along, in_axes=(0, -1), out_axes=(None, -1))(directions, d_first)
-
-
 @functools.partial(jax.jit, static_argnames=("oriented", "relative"))
 def _compared(robot, rows, y, d_y, oriented, relative):  # type: ignore[no-untyped-def]
     """Return differences (M,) of y in all rows from measurements, and their derivatives (M, n)."""
@@ -171,9 +158,9 @@ def _differences(
     if rows.held is not None:
         solved, held = (first[None], np.asarray(unknowns_of(system, first[0]))[None]), rows.held[None]
         changes = moves, np.zeros((*held.shape, n))
-        d_first = np.asarray(static_tangents(settings, solved, (system, held), changes)[0])[0]
-        d_first = d_first[:, : first.shape[1]]
-        past, d_past = _settled(system, directions, first, d_first, rows.held, settings)
+        d_rows, _, d_records = static_tangents(settings, solved, (system, held), changes)
+        d_first, past = d_rows[0, :, : first.shape[1]], at_one_state(system, settings, first, rows.held)
+        d_past = np.stack([d_records] * 2), np.zeros_like(d_records)
     state = TangentState.of(system, settings.space, past, *d_past)
     changes = moves, np.zeros((*rows.control.shape, n))
     _, (d_records, _) = tangent_time_loop(
