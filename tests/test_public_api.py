@@ -77,6 +77,28 @@ def test_functions_win_over_the_modules_that_are_called_like_them():
     subprocess.run([sys.executable, "-W", "error", "-c", program], check=True)
 
 
+@pytest.mark.parametrize("use", ["found.save('it.nc')", "kc.load_trajectory('it.nc')", "kc.viewer.view"])
+def test_a_process_that_imports_nothing_else_finds_what_it_uses(use, tmp_path):
+    program = "import knode_cosserat as kc\nrobot = kc.load_robot('delrin-tendon-robot')\n"
+    program += "found = kc.simulate(robot, [[4.0] * 4] * 2, 0.05)\n"
+    setup = "" if "save" in use else "found.save('it.nc')\n"
+    subprocess.run([sys.executable, "-c", program + setup + use], check=True, cwd=tmp_path)
+
+
+def test_a_model_and_its_motion_are_read_by_another_process(tmp_path):
+    robot = kc.load_robot("delrin-tendon-robot")
+    truth = kc.simulate(robot.replace(length=0.6), kc.controls.sine(1.5, 20, 0.05), 0.05)
+    model = kc.fit(robot, [truth], kc.FitConfig())
+    kc.simulate(model, truth.control[1:], 0.05).save(tmp_path / "it.nc")
+    model.save(tmp_path / "it.model")
+    program = (
+        "import knode_cosserat as kc\n"
+        "assert type(kc.load_trajectory('it.nc').system).__name__ == 'KNODE'\n"
+        "kc.load_model('it.model').save('again.model')\n"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, cwd=tmp_path)
+
+
 def test_a_name_that_never_was_is_an_attribute_error():
     with pytest.raises(AttributeError, match="has no attribute 'simulatee'"):
         kc.simulatee  # noqa: B018

@@ -6,13 +6,21 @@ its function for the class:
     provide(Trajectory, "save", save)          # in the module with the file format
     provided(Trajectory, "save")(self, path)   # in the class
 
-The packages' `__init__` import every module that registers functions.
+The modules that register functions are imported when one is missing.
 """
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
 from typing import Any
+
+#: modules that register functions
+PROVIDERS = (
+    "knode_cosserat.trajectory_file",
+    "knode_cosserat.recordings",
+    "knode_cosserat.learning.files.model_file",
+)
 
 _functions: dict[tuple[type, str], Callable[..., Any]] = {}
 
@@ -28,9 +36,14 @@ def provided(cls: type, name: str) -> Callable[..., Any]:
     Raises:
         NotImplementedError: no module has registered it.
     """
+    load_providers()
     for base in cls.__mro__:
         if (base, name) in _functions:
             return _functions[base, name]
-    raise NotImplementedError(
-        f"no function {name!r} is registered for a {cls.__name__}; import knode_cosserat registers all"
-    )
+    raise NotImplementedError(f"no function {name!r} is registered for a {cls.__name__}")
+
+
+def load_providers() -> None:
+    """Import all modules that register functions."""
+    for module in PROVIDERS:
+        importlib.import_module(module)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import numpy as np
 
+from knode_cosserat._registry import load_providers
 from knode_cosserat.errors import KnodeCosseratError, first_line
 from knode_cosserat.rods import robot_file
 from knode_cosserat.rods.parameters import Parameter, ParameterError, parameters_of, slots_of
@@ -61,7 +62,6 @@ def register_codec(
 
 def described(system: System) -> tuple[dict[str, str], dict[str, Any]]:
     """Return attributes and variables that reconstruct the system, if that is possible."""
-    codec = _codecs.get(type(system).__name__)
     batch = np.ndim(system.length) > 0
     if type(system) in robot_file.KINDS.values():
         try:
@@ -69,6 +69,8 @@ def described(system: System) -> tuple[dict[str, str], dict[str, Any]]:
         except robot_file.RobotFileError as error:  # one of its parts is a Python function
             return {"system_missing": first_line(error)}, {}
         return robot, _parameters(system) if batch else {}
+    load_providers()
+    codec = _codecs.get(type(system).__name__)
     if codec is None or codec.cls is not type(system):
         return {}, {}
     robots = [_robot(system, i) for i in range(len(system.length))] if batch else [system]
@@ -153,6 +155,7 @@ def _from_bytes(path: Path, data: xarray.Dataset) -> System:
     if BYTES not in data.variables:
         why = f" ({data.attrs['system_missing']})" if "system_missing" in data.attrs else ""
         raise TrajectoryFileError(f"{path}: the file does not describe its system, a {name}{why}: {ask}")
+    load_providers()
     if name not in _codecs:
         raise TrajectoryFileError(f"{path}: nothing that is imported here reads its system, a {name}: {ask}")
     content, sizes = np.asarray(data[BYTES].values), np.array([data[BYTES].size])
