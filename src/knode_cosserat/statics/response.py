@@ -78,7 +78,8 @@ def respond(system: System, settings: Settings, pose: Pose, control: Any, guess:
     """Return the equilibrium found from a guess of y at all points, its pose, and the pose's derivatives."""
     control, c, ny = np.asarray(control, dtype=float), system.control_size, system.y_layout.size
     _, y, rows = Equilibria(settings, 1).solve(system, control[None], np.asarray(guess), (0, 1))
-    wrench = system.tip_layout.indices(wrench_fields(system))
+    names = wrench_fields(system)
+    wrench = np.asarray(system.tip_layout.indices(names) if names else [], dtype=int)
     d_controls, d_tip = np.eye(c, c + len(wrench))[None], np.zeros((unknown_count(system), c + len(wrench)))
     d_tip[wrench, c + np.arange(len(wrench))] = 1.0
     changes = SystemMoves(None, np.zeros((0, d_tip.shape[1]))), d_controls
