@@ -31,15 +31,17 @@ def provide(cls: type, name: str, function: Callable[..., Any]) -> None:
 
 
 def provided(cls: type, name: str) -> Callable[..., Any]:
-    """Return the function that is registered for a class, or for the nearest of its bases.
+    """Return the function that is registered for a class, or for one of its bases.
 
     Raises:
         NotImplementedError: no module has registered it.
     """
-    load_providers()
-    for base in cls.__mro__:
-        if (base, name) in _functions:
-            return _functions[base, name]
+    for module in (None, *PROVIDERS):
+        if module is not None:
+            importlib.import_module(module)
+        for base in cls.__mro__:
+            if (base, name) in _functions:
+                return _functions[base, name]
     raise NotImplementedError(f"no function {name!r} is registered for a {cls.__name__}")
 
 
