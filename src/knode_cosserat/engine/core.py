@@ -314,6 +314,10 @@ class Core(EliminationCode):
 
         The residual that the solution has left is none of its errors. Errors beyond the rod's length, and all
         later ones, are unknown.
+
+        The factors may be those of an earlier step: a single correction would leave an error in every step,
+        and these add up where the motion turns. Corrections go on until the next one is small relative
+        to the change of the error in this step.
         """
         e = self.equations
         f = self._function(name, "numbers")
@@ -445,7 +449,12 @@ class Core(EliminationCode):
         return off, 2.0 * angle
 
     def _write_time_history(self) -> None:
-        """History terms of the time scheme's errors, of a checked stage (see `time_loop.time_errors`)."""
+        """History terms of the time scheme's errors, of a checked stage.
+
+        A step of y' = J y + … adds a multiple of dt³ J² y'. The difference of the rates at both stages is one
+        of dt J y'. The equations of the step multiply it once more by J, and damp the vibrations that a step
+        does not resolve.
+        """
         e, scheme = self.equations, self.scheme
         assert isinstance(scheme, SDIRK2)
         self.time_history = f = self._function("time_history", "coefficients")
@@ -767,7 +776,7 @@ class Core(EliminationCode):
         self, constants: Constants, controls: np.ndarray, steps: StepCoefficients, states: States,
         span: tuple[int, int],
     ) -> tuple[np.ndarray, States, StepRows]:  # fmt: skip
-        """Solve a span of steps of each robot until one fails (see `time_loop.time_loop`).
+        """Solve a span of steps of each robot until one fails.
 
         Controls (robots, T, c) or (robots, T, stages * c) and states (robots, ...). Returns the numbers of
         steps done, the states after them, and rows. In a batch, a robot with a failed step waits for the

@@ -12,7 +12,7 @@ minimum of the strictly convex energy ½ vᵀK_v v + ½ uᵀK_u u + Σ Tᵢ |ṗ
 
 Tendons rotate little relative to the rod, so J is nearly constant. Three or four corrections with J of the
 unbent rod and tendons, `unbent_flexibility`, usually solve the law. This J does not change during the
-solvers' iterations, and is evaluated once for a step (`solvers/hoisting.py`). If this converges slowly
+solvers' iterations, and is evaluated once for a step (`engine`). If this converges slowly
 because tendons rotate far, a damped Newton's method continues from the last iterate. Errors are measured by
 the relative change of ṗᵢ in a correction.
 """
