@@ -1,0 +1,115 @@
+"""Measure the size of the code against its budgets (docs/architecture.md).
+
+    python -m tools.budget
+
+Each figure has an aim and a ceiling. A figure above its ceiling fails; a ceiling is lowered with the code, and never raised.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+import sys
+import types
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).resolve().parent.parent
+LIBRARY = ROOT / "src" / "knode_cosserat"
+#: parameters of a function that a reader can keep apart
+MOST_PARAMETERS = 5
+
+
+class Budget(NamedTuple):
+    """A figure, its aim, and the ceiling that it must not exceed."""
+
+    name: str
+    value: int
+    aim: int
+    ceiling: int
+
+
+def lines_of(*folders: Path) -> int:
+    """Return the number of lines of Python in folders."""
+    return sum(len(file.read_bytes().splitlines()) for folder in folders for file in folder.rglob("*.py"))
+
+
+def syntax_trees(folder: Path) -> Iterator[ast.Module]:
+    """Yield the syntax tree of each file of a folder."""
+    for file in folder.rglob("*.py"):
+        yield ast.parse(file.read_bytes())
+
+
+def public_classes(folder: Path) -> int:
+    """Return the number of classes at the top of modules, without those of private names."""
+    return sum(
+        isinstance(node, ast.ClassDef) and not node.name.startswith("_")
+        for tree in syntax_trees(folder)
+        for node in tree.body
+    )
+
+
+def long_signatures(folder: Path) -> int:
+    """Return the number of functions with more than five parameters, `self` not counted."""
+    count = 0
+    for tree in syntax_trees(folder):
+        for node in ast.walk(tree):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                names = [arg.arg for arg in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
+                count += len([name for name in names if name not in ("self", "cls")]) > MOST_PARAMETERS
+    return count
+
+
+def namespace_names() -> int:
+    """Return the number of public names in the namespaces of the package."""
+    package = importlib.import_module("knode_cosserat")
+    spaces = [getattr(package, name) for name in package.__all__]
+    names = 0
+    for space in spaces:
+        if isinstance(space, types.ModuleType):
+            names += len(
+                getattr(space, "__all__", None)
+                or [
+                    name
+                    for name, value in vars(space).items()
+                    if not name.startswith("_") and getattr(value, "__module__", None) == space.__name__
+                ]
+            )
+    return names
+
+
+def system_members() -> int:
+    """Return the number of public members that the class `System` itself defines."""
+    System = importlib.import_module("knode_cosserat").System
+    names = {*vars(System), *inspect.get_annotations(System)}
+    return sum(not name.startswith("_") for name in names)
+
+
+def budgets() -> list[Budget]:
+    """Return all figures."""
+    return [
+        Budget("lines of the library", lines_of(LIBRARY), 37_000, 77_800),
+        Budget("lines of hardware", lines_of(ROOT / "hardware"), 7_500, 11_000),
+        Budget("lines of studies", lines_of(ROOT / "studies"), 6_000, 9_000),
+        Budget("lines of tests", lines_of(ROOT / "tests"), 25_000, 39_400),
+        Budget("public classes of the library", public_classes(LIBRARY), 300, 645),
+        Budget("names in namespaces", namespace_names(), 150, 400),
+        Budget("members of System", system_members(), 14, 45),
+        Budget("functions with more than 5 parameters", long_signatures(LIBRARY), 60, 197),
+    ]
+
+
+def main() -> None:
+    """Print the table, and fail if a figure is above its ceiling."""
+    rows = budgets()
+    print(f"{'':40}{'now':>8}{'aim':>8}{'ceiling':>9}")
+    for row in rows:
+        mark = "  above its ceiling" if row.value > row.ceiling else ""
+        print(f"{row.name:40}{row.value:8,}{row.aim:8,}{row.ceiling:9,}{mark}")
+    sys.exit(any(row.value > row.ceiling for row in rows))
+
+
+if __name__ == "__main__":
+    main()
