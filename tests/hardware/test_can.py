@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from knode_cosserat.hardware.can_messages import (
+from knode_cosserat_hardware.can_messages import (
     CanCommand,
     Heartbeat,
     identifier,
@@ -19,9 +19,9 @@ from knode_cosserat.hardware.can_messages import (
     read_heartbeat,
     read_two_floats,
 )
-from knode_cosserat.hardware.can_robot import CanRobot
-from knode_cosserat.hardware.driver import DriverState, HardwareError, Limits
-from knode_cosserat.hardware.motor_robot import MotorReel
+from knode_cosserat_hardware.can_robot import CanRobot
+from knode_cosserat_hardware.driver import DriverState, HardwareError, Limits
+from knode_cosserat_hardware.motor_robot import MotorReel
 
 can = pytest.importorskip("can")
 NODES = (3, 5, 7, 9)

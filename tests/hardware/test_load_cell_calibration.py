@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.hardware.calibration import fit_load_cell, wire_settings, write_calibration
-from knode_cosserat.hardware.driver import HardwareError
-from knode_cosserat.hardware.simulated import MachineParameters, SimulatedRobot
+from knode_cosserat_hardware.calibration import fit_load_cell, wire_settings, write_calibration
+from knode_cosserat_hardware.driver import HardwareError
+from knode_cosserat_hardware.simulated import MachineParameters, SimulatedRobot
 
 UP_AND_DOWN = np.array([0.0, 1.0, 2.0, 4.0, 8.0, 4.0, 2.0, 1.0, 0.0])
 

@@ -7,14 +7,14 @@ import time
 
 import numpy as np
 import pytest
-
-from knode_cosserat.hardware.driver import DriverState, HardwareError, Limits
-from knode_cosserat.hardware.faults import FAULTS, fault_message
-from knode_cosserat.hardware.lines import GRAM_FORCE
-from knode_cosserat.hardware.plant import HardwarePlant
-from knode_cosserat.hardware.serial_board import SerialBoard
-from knode_cosserat.hardware.transport import SerialTransport
 from tests.hardware.fake_board import FakeBoard
+
+from knode_cosserat_hardware.driver import DriverState, HardwareError, Limits
+from knode_cosserat_hardware.faults import FAULTS, fault_message
+from knode_cosserat_hardware.lines import GRAM_FORCE
+from knode_cosserat_hardware.plant import HardwarePlant
+from knode_cosserat_hardware.serial_board import SerialBoard
+from knode_cosserat_hardware.transport import SerialTransport
 
 pytest.importorskip("serial")
 #: no rate limit that a test would wait for
