@@ -54,8 +54,8 @@ assert firmware_folder().parent.name == "knode_cosserat_hardware"
 HARDWARE_ONLY = ("can", "dynamixel_sdk", "serial", "knode_cosserat_hardware")
 
 
-def run(*command: object, **options: object) -> str:
-    """A program's output, without this environment's own Python in its way; its failure is ours."""
+def run(*command: object, status: int = 0, **options: object) -> str:
+    """A program's output, without this environment's own Python in its way; another status is our failure."""
     hidden = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")
     environment = {k: v for k, v in os.environ.items() if k not in hidden} | {"PIP_USER": "0"}
     done = subprocess.run(
@@ -66,9 +66,9 @@ def run(*command: object, **options: object) -> str:
         check=False,
         **options,
     )
-    if done.returncode:
+    if done.returncode != status:
         sys.exit(f"{done.stdout}{done.stderr}\nerror: failed: {' '.join(map(str, command))}")
-    return done.stdout
+    return done.stderr if status else done.stdout
 
 
 def built(package: pathlib.Path, out: pathlib.Path) -> tuple[pathlib.Path, pathlib.Path]:
@@ -125,9 +125,9 @@ def used(wheel: pathlib.Path, hardware: pathlib.Path, scratch: pathlib.Path) -> 
     absent = f"import importlib.util as u; assert not any(map(u.find_spec, {HARDWARE_ONLY}))"
     run(python, "-c", absent, cwd=elsewhere)
     program = python.with_name("knode-cosserat")
-    refused = subprocess.run([program, "robot", "--help"], cwd=elsewhere, capture_output=True, text=True)
-    if refused.returncode != 2 or "pip install knode-cosserat-hardware" not in refused.stderr:
-        sys.exit(f"error: without the hardware distribution `robot` prints {refused.stdout}{refused.stderr}")
+    refused = run(program, "robot", "--help", status=2, cwd=elsewhere)
+    if "pip install knode-cosserat-hardware" not in refused:
+        sys.exit(f"error: without the distribution for hardware `robot` prints {refused}")
     run(*pip, hardware)
     run(python, "-W", "error", "-c", USE_HARDWARE, cwd=elsewhere)
     run(program, "robot", "--help", cwd=elsewhere)
