@@ -24,7 +24,7 @@ def firmware_folder() -> Path:
         HardwareError: the package was installed without them.
     """
     here = Path(__file__).resolve()
-    for folder in (here.parents[4] / "firmware", here.parents[2] / "firmware"):
+    for folder in (here.parents[4] / "firmware", here.parents[1] / "firmware"):
         if (folder / "Makefile").is_file():
             return folder
     raise HardwareError("the firmware's sources are not installed; use a checkout of the repository")
