@@ -40,7 +40,7 @@ assert kc.load_trajectory("it.nc").all_valid
 USE_HARDWARE = """
 import knode_cosserat as kc
 import knode_cosserat_hardware as kch
-from knode_cosserat_hardware.emulation.toolchain import firmware_folder
+from knode_cosserat_hardware.emulation import firmware_folder
 for name in kch.__all__:
     if name not in ("DDSBridge", "measure_loopback", "LoopbackLatency"):
         getattr(kch, name)

@@ -16,10 +16,10 @@ import numpy as np
 import knode_cosserat as kc
 from knode_cosserat.recordings import RecordingConfig
 from knode_cosserat_hardware import Limits, Recorder, SerialBoard
-from knode_cosserat_hardware.clock import HostClock
+from knode_cosserat_hardware.driver import HostClock
 from knode_cosserat_hardware.emulation import EmulatedPort, EmulatedRobot
-from knode_cosserat_hardware.encoder import MessageEncoder
-from knode_cosserat_hardware.middleware.simulated_capture import SimulatedCapture
+from knode_cosserat_hardware.middleware.mocap import SimulatedCapture
+from knode_cosserat_hardware.recorder import MessageEncoder
 
 #: time between commands (s); time at rest before a motion, and duration of the motion (s)
 DT, REST, SECONDS = 0.05, 1.5, 3.5

@@ -19,8 +19,7 @@ import knode_cosserat as kc
 from knode_cosserat.rods.robot_file import format_robot
 from knode_cosserat_hardware import Dimensions, HardwareDescription, Limits
 from knode_cosserat_hardware.cad import PartError, bill_of_materials, export_parts, load_dimensions
-from knode_cosserat_hardware.cad.checks import capacity
-from knode_cosserat_hardware.cad.dimensions import BOARD_LIMIT, part_dimensions
+from knode_cosserat_hardware.cad.dimensions import BOARD_LIMIT, capacity, part_dimensions
 from knode_cosserat_hardware.cad.materials import materials_table
 
 ROOT = Path(__file__).parents[2]
@@ -303,7 +302,7 @@ def test_a_printed_rib_has_about_the_mass_of_the_model(solids):
 @with_cad
 @pytest.mark.parametrize("offset", [0.018, 0.02, 0.03])
 def test_no_two_bodies_of_the_robot_overlap(offset):
-    from knode_cosserat_hardware.cad.assembly import place_parts
+    from knode_cosserat_hardware.cad.parts import place_parts
 
     part = part_dimensions(ROBOT.replace(tendon_offset=offset), described(rib_diameter=0.07))
     bodies = place_parts(part)

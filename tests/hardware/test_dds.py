@@ -12,8 +12,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from knode_cosserat_hardware.clock import HostClock
-from knode_cosserat_hardware.driver import Driver, DriverState, HardwareError, Latency, Limits, Reading
+from knode_cosserat_hardware.driver import (
+    Driver,
+    DriverState,
+    HardwareError,
+    HostClock,
+    Latency,
+    Limits,
+    Reading,
+)
 from knode_cosserat_hardware.middleware.commands import CommandGate
 from knode_cosserat_hardware.middleware.mocap import PoseFrame
 

@@ -14,8 +14,7 @@ from knode_cosserat_hardware.emulation import missing
 if missing():
     pytest.skip(f"the firmware cannot be built here: {missing()}", allow_module_level=True)
 
-from knode_cosserat_hardware.emulation.logic import HostBoard, run_on_chip
-from knode_cosserat_hardware.emulation.toolchain import built
+from knode_cosserat_hardware.emulation import HostBoard, built, run_on_chip
 
 #: reading of a slack tendon (counts), and counts per gram-force, by the default settings
 ZERO, PER_GRAM = 800, 2

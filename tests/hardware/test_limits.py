@@ -5,8 +5,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from knode_cosserat_hardware.driver import HardwareError, Limits
-from knode_cosserat_hardware.limits import TensionLimiter
+from knode_cosserat_hardware.driver import HardwareError, Limits, TensionLimiter
 from knode_cosserat_hardware.serial_board import SerialBoard
 
 

@@ -13,11 +13,9 @@ import pytest
 from tests.recordings.made import PAPER, made
 
 from knode_cosserat.recordings import RecordingConfig, RecordingError, load_recording
-from knode_cosserat_hardware.bag_stream import BagStream
-from knode_cosserat_hardware.clock import HostClock
-from knode_cosserat_hardware.driver import DriverState, HardwareError, Reading
+from knode_cosserat_hardware.driver import DriverState, HardwareError, HostClock, Reading
 from knode_cosserat_hardware.middleware.mocap import PoseFrame
-from knode_cosserat_hardware.recorder import Recorder, record_robot
+from knode_cosserat_hardware.recorder import BagStream, Recorder, record_robot
 
 pytest.importorskip("rosbags", reason="bags need rosbags: pip install 'knode-cosserat[ros]'")
 

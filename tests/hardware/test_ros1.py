@@ -29,9 +29,9 @@ ROBOT = """
 import sys, time
 import numpy as np
 import knode_cosserat as kc
-from knode_cosserat_hardware.clock import HostClock
+from knode_cosserat_hardware.driver import HostClock
 from knode_cosserat_hardware.middleware.ros1 import ROS1Node
-from knode_cosserat_hardware.middleware.simulated_capture import SimulatedCapture
+from knode_cosserat_hardware.middleware.mocap import SimulatedCapture
 from knode_cosserat_hardware.recorder import Recorder
 from knode_cosserat_hardware.simulated import SimulatedRobot
 from knode_cosserat.recordings import RecordingConfig

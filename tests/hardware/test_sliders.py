@@ -14,8 +14,7 @@ from knode_cosserat.cli import app
 from knode_cosserat_hardware.driver import DriverState, HardwareError, Limits
 from knode_cosserat_hardware.safety import EmergencyStop
 from knode_cosserat_hardware.simulated import SimulatedRobot
-from knode_cosserat_hardware.sliders import SliderWindow
-from knode_cosserat_hardware.teleoperation import teleoperate
+from knode_cosserat_hardware.teleoperation import SliderWindow, teleoperate
 
 pytest.importorskip("tkinter")
 ROD = kc.load_robot("delrin-tendon-robot").replace(nodes=6)

@@ -8,32 +8,35 @@ from typing import TYPE_CHECKING
 from knode_cosserat._lazy import make_lazy
 
 if TYPE_CHECKING:
+    from knode_cosserat_hardware.board_link import SerialTransport, Transport
     from knode_cosserat_hardware.calibration import LoadCellFit, fit_load_cell, write_calibration
     from knode_cosserat_hardware.can_robot import CanRobot
-    from knode_cosserat_hardware.clock import HostClock
     from knode_cosserat_hardware.commissioning import Commissioning, Person
     from knode_cosserat_hardware.description import Dimensions, HardwareDescription, load_hardware
-    from knode_cosserat_hardware.driver import Driver, DriverState, HardwareError, Latency, Limits, Reading
+    from knode_cosserat_hardware.driver import (
+        Driver,
+        DriverState,
+        HardwareError,
+        HostClock,
+        Latency,
+        Limits,
+        Reading,
+    )
     from knode_cosserat_hardware.dynamixel import DynamixelRobot
     from knode_cosserat_hardware.middleware.commands import CommandGate
     from knode_cosserat_hardware.middleware.dds import DDSBridge
     from knode_cosserat_hardware.middleware.loopback import LoopbackLatency, measure_loopback
-    from knode_cosserat_hardware.middleware.mocap import MotionCapture, PoseFrame
+    from knode_cosserat_hardware.middleware.mocap import VRPN, MotionCapture, PoseFrame, SimulatedCapture
     from knode_cosserat_hardware.middleware.natnet import NatNet, NatNetAddress
     from knode_cosserat_hardware.middleware.ros1 import ROS1Node
-    from knode_cosserat_hardware.middleware.simulated_capture import SimulatedCapture
-    from knode_cosserat_hardware.middleware.vrpn import VRPN
     from knode_cosserat_hardware.motor_robot import MotorReel
     from knode_cosserat_hardware.open_driver import OpenedDriver, open_driver
     from knode_cosserat_hardware.plant import HardwarePlant
     from knode_cosserat_hardware.recorder import Recorder, record_robot
     from knode_cosserat_hardware.safety import EmergencyStop, SafeRegion, StoppedError
     from knode_cosserat_hardware.serial_board import SerialBoard
-    from knode_cosserat_hardware.simulated import SimulatedRobot
-    from knode_cosserat_hardware.simulated_cells import MachineParameters
-    from knode_cosserat_hardware.sliders import SliderWindow
-    from knode_cosserat_hardware.teleoperation import Gamepad, Keyboard, TensionMap, teleoperate
-    from knode_cosserat_hardware.transport import SerialTransport, Transport
+    from knode_cosserat_hardware.simulated import MachineParameters, SimulatedRobot
+    from knode_cosserat_hardware.teleoperation import Gamepad, Keyboard, SliderWindow, TensionMap, teleoperate
 
 __all__ = [
     "VRPN",
@@ -88,31 +91,26 @@ __all__ = [
 make_lazy(
     __name__,
     {
+        "knode_cosserat_hardware.board_link": "SerialTransport Transport",
         "knode_cosserat_hardware.calibration": "LoadCellFit fit_load_cell write_calibration",
         "knode_cosserat_hardware.can_robot": "CanRobot",
-        "knode_cosserat_hardware.clock": "HostClock",
         "knode_cosserat_hardware.commissioning": "Commissioning Person",
         "knode_cosserat_hardware.description": "Dimensions HardwareDescription load_hardware",
-        "knode_cosserat_hardware.driver": "Driver DriverState HardwareError Latency Limits Reading",
+        "knode_cosserat_hardware.driver": "Driver DriverState HardwareError HostClock Latency Limits Reading",
         "knode_cosserat_hardware.dynamixel": "DynamixelRobot",
         "knode_cosserat_hardware.middleware.commands": "CommandGate",
         "knode_cosserat_hardware.middleware.dds": "DDSBridge",
         "knode_cosserat_hardware.middleware.loopback": "LoopbackLatency measure_loopback",
-        "knode_cosserat_hardware.middleware.mocap": "MotionCapture PoseFrame",
+        "knode_cosserat_hardware.middleware.mocap": "MotionCapture PoseFrame SimulatedCapture VRPN",
         "knode_cosserat_hardware.middleware.natnet": "NatNet NatNetAddress",
         "knode_cosserat_hardware.middleware.ros1": "ROS1Node",
-        "knode_cosserat_hardware.middleware.simulated_capture": "SimulatedCapture",
-        "knode_cosserat_hardware.middleware.vrpn": "VRPN",
         "knode_cosserat_hardware.motor_robot": "MotorReel",
         "knode_cosserat_hardware.open_driver": "OpenedDriver open_driver",
         "knode_cosserat_hardware.plant": "HardwarePlant",
         "knode_cosserat_hardware.recorder": "Recorder record_robot",
         "knode_cosserat_hardware.safety": "EmergencyStop SafeRegion StoppedError",
         "knode_cosserat_hardware.serial_board": "SerialBoard",
-        "knode_cosserat_hardware.simulated": "SimulatedRobot",
-        "knode_cosserat_hardware.simulated_cells": "MachineParameters",
-        "knode_cosserat_hardware.sliders": "SliderWindow",
-        "knode_cosserat_hardware.teleoperation": "Gamepad Keyboard TensionMap teleoperate",
-        "knode_cosserat_hardware.transport": "SerialTransport Transport",
+        "knode_cosserat_hardware.simulated": "MachineParameters SimulatedRobot",
+        "knode_cosserat_hardware.teleoperation": "Gamepad Keyboard SliderWindow TensionMap teleoperate",
     },
 )

@@ -187,9 +187,6 @@ def wire_settings(fit: LoadCellFit, gain: int, zero: int) -> tuple[int, int]:
         fit: fit of tensions that the board measured with these settings (N).
         gain: setting during the measurement (1/4096 gf per count).
         zero: setting during the measurement (counts).
-
-    Raises:
-        HardwareError: the new gain is not between 1 and 32767, or has the wrong sign.
     """
     changed = round(gain * fit.gain)
     if not 0 < abs(changed) <= LARGEST_GAIN or fit.gain < 0.0:

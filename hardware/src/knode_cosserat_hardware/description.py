@@ -19,21 +19,7 @@ from typing import Any
 
 from knode_cosserat._files.yaml_text import did_you_mean, mapping_of, shown
 from knode_cosserat.rods.robot_file import RobotFileError, file_mapping
-from knode_cosserat_hardware.driver import HardwareError, Limits
-
-
-def _require(name: str, value: Any, stated: Any, whole: bool = False) -> None:
-    """Check a number's type and range."""
-    low, high, unit = stated["low"], stated["high"], stated["unit"]
-    kinds = int if whole else (int, float)
-    # the comparison is false for NaN
-    if isinstance(value, kinds) and not isinstance(value, bool) and low <= value <= high:
-        return
-    kind = "a whole number " if whole else ""
-    message = f"{name} must be {kind}between {low:g} and {high:g} {unit}".rstrip() + f" (got {shown(value)})"
-    if unit == "m" and isinstance(value, int | float) and low <= value / 1000 <= high:
-        message += f". Did you mean {value / 1000:.12g} ({value:g} mm)?"
-    raise HardwareError(message)
+from knode_cosserat_hardware.driver import HardwareError, Limits, require_limits, require_number
 
 
 def _length(default: float, low: float, high: float) -> Any:
@@ -89,7 +75,7 @@ class Dimensions:
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
-            _require(field.name, getattr(self, field.name), field.metadata, type(field.default) is int)
+            require_number(field.name, getattr(self, field.name), field.metadata, type(field.default) is int)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,22 +112,6 @@ def parse_hardware(text: str, source: str) -> HardwareDescription:
         YAMLTextError: the text is not YAML.
     """
     return _described(mapping_of(text, "format, kind and parameters").get("hardware"), source)
-
-
-def require_limits(limits: Limits) -> None:
-    """Check limits of tensions.
-
-    Raises:
-        HardwareError: a limit is no finite number, or the limits contradict each other.
-    """
-    for field in dataclasses.fields(limits):
-        value = getattr(limits, field.name)
-        low = 0.0 if field.name == "low" else 0.001
-        _require(field.name, value, {"low": low, "high": 1e5, "unit": "N/s" if field.name == "rate" else "N"})
-    if limits.low >= limits.high:
-        raise HardwareError(f"low must be below high, {limits.high:g} N (got {limits.low:g})")
-    if limits.total < limits.low:
-        raise HardwareError(f"total must be at least low, {limits.low:g} N (got {limits.total:g})")
 
 
 def _described(section: Any, source: str) -> HardwareDescription:

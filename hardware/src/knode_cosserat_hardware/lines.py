@@ -94,22 +94,14 @@ def is_newer(number: int, other: int) -> bool:
 
 
 def encode_tensions(tension: Sequence[int]) -> bytes:
-    """Return the plain command of tensions (grams-force).
-
-    Raises:
-        HardwareError: a tension is negative or too large for the line.
-    """
+    """Return the plain command of tensions (grams-force)."""
     if any(not 0 <= value < NUMBERS for value in tension):
         raise HardwareError(f"tensions on the wire must be between 0 and 65535 gf (got {list(tension)})")
     return encode_plain(" ".join(str(int(value)) for value in tension))
 
 
 def encode_plain(text: str) -> bytes:
-    """Return a line without number and checksum.
-
-    Raises:
-        HardwareError: the text is not ASCII on one line, or too long.
-    """
+    """Return a line without number and checksum."""
     if not text.isascii() or not text.isprintable() or len(text) > LONGEST:
         raise HardwareError(
             f"a line must be printable ASCII of at most {LONGEST} characters (got {text[:80]!r})"
@@ -118,11 +110,7 @@ def encode_plain(text: str) -> bytes:
 
 
 def encode_framed(number: int, verb: str, *arguments: int | str) -> bytes:
-    """Return a line with number and checksum.
-
-    Raises:
-        HardwareError: the number is not in its range, or a word is not printable ASCII without spaces.
-    """
+    """Return a line with number and checksum."""
     words = [verb, *map(str, arguments)]
     wrong = [word for word in words if not _WORD.fullmatch(word)]
     if wrong:

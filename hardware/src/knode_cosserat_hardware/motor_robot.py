@@ -14,9 +14,18 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat_hardware.driver import Driver, DriverState, HardwareError, Latency, Limits, Reading
-from knode_cosserat_hardware.faults import fault_message
-from knode_cosserat_hardware.limits import LatencyWindow, TensionLimiter, checked_tensions
+from knode_cosserat_hardware.driver import (
+    Driver,
+    DriverState,
+    HardwareError,
+    Latency,
+    LatencyWindow,
+    Limits,
+    Reading,
+    TensionLimiter,
+    checked_tensions,
+    fault_message,
+)
 
 #: age of a reading at which a command takes a new one first (s)
 STALE = 0.1
@@ -154,11 +163,7 @@ class MotorRobot(Driver):
         return self._latencies.summary()
 
     def connect(self) -> None:
-        """Open the bus and set up the motors.
-
-        Raises:
-            HardwareError: the bus cannot be opened, or a motor does not answer.
-        """
+        """Open the bus and set up the motors."""
         with self._lock:
             if self._state is not DriverState.DISCONNECTED:
                 return
@@ -185,11 +190,7 @@ class MotorRobot(Driver):
             self._shut()
 
     def arm(self) -> None:
-        """Let the motors follow commands, from zero tension on.
-
-        Raises:
-            HardwareError: a motor has a fault or does not answer.
-        """
+        """Let the motors follow commands, from zero tension on."""
         with self._lock:
             self._require()
             if self._state is DriverState.ARMED:
@@ -220,11 +221,7 @@ class MotorRobot(Driver):
         self._latch("stopped:0")
 
     def reset(self) -> None:
-        """Clear a latched fault; ready afterwards.
-
-        Raises:
-            HardwareError: the fault is still there.
-        """
+        """Clear a latched fault; ready afterwards."""
         with self._lock:
             if self._state is not DriverState.FAULT:
                 return
@@ -236,11 +233,7 @@ class MotorRobot(Driver):
     # motion
 
     def command(self, tension: Float[np.ndarray, " c"]) -> Float[np.ndarray, " c"]:
-        """Send tensions (N), and return those sent, which the limits may have reduced.
-
-        Raises:
-            HardwareError: the robot is not armed, has a fault, or the tensions are not finite.
-        """
+        """Send tensions (N), and return those sent, which the limits may have reduced."""
         wanted = checked_tensions(tension, self.tendon_count)
         with self._lock:
             self._require()
@@ -258,11 +251,7 @@ class MotorRobot(Driver):
             return sent
 
     def read(self, timeout: float = 1.0) -> Reading:
-        """Return a new reading; its drives are the measured tensions by `limits.high`.
-
-        Raises:
-            HardwareError: a motor did not answer in time (s).
-        """
+        """Return a new reading; its drives are the measured tensions by `limits.high`."""
         with self._lock:
             if self._state is DriverState.DISCONNECTED:
                 raise HardwareError("the robot is not connected; call connect(), or check the cable")
@@ -272,11 +261,7 @@ class MotorRobot(Driver):
             return Reading(sample.time, tension, drive, self._state, self._fault)
 
     def tare(self) -> None:
-        """Tighten the tendons, and take the motors' angles as the zero of their travel.
-
-        Raises:
-            HardwareError: the robot is armed, has a fault, or the motors do not come to rest.
-        """
+        """Tighten the tendons, and take the motors' angles as the zero of their travel."""
         with self._lock:
             self._require_ready("tare")
             # the travel counts from here
@@ -300,11 +285,7 @@ class MotorRobot(Driver):
                 self._disable()
 
     def jog(self, tendon: int, drive: float) -> None:
-        """Drive one motor for a tenth of a second; tendon from 0 on, drive from -1 to 1 (2 N at the reel).
-
-        Raises:
-            HardwareError: an argument is not allowed, or the robot is armed or has a fault.
-        """
+        """Drive one motor for a tenth of a second; tendon from 0 on, drive from -1 to 1 (2 N at the reel)."""
         if tendon not in range(self.tendon_count):
             raise HardwareError(
                 f"tendon must be a whole number from 0 to {self.tendon_count - 1} (got {tendon!r})"

@@ -125,8 +125,7 @@ def _ids(options: dict[str, str]) -> list[int]:
 def _simulated(
     address: str, options: dict[str, str], hardware: HardwareDescription, robot: Any
 ) -> OpenedDriver:
-    from knode_cosserat_hardware.simulated import SimulatedRobot
-    from knode_cosserat_hardware.simulated_cells import MachineParameters
+    from knode_cosserat_hardware.simulated import MachineParameters, SimulatedRobot
 
     machine = MachineParameters(noise=_number(options, "noise", MachineParameters.noise))
     driver = SimulatedRobot(

@@ -12,8 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.control.plants import Plant
-from knode_cosserat_hardware.driver import Driver, DriverState, HardwareError, Reading
-from knode_cosserat_hardware.faults import fault_message
+from knode_cosserat_hardware.driver import Driver, DriverState, HardwareError, Reading, fault_message
 from knode_cosserat_hardware.safety import EmergencyStop, SafeRegion
 
 #: source of measurements: time on the driver's clock (s), and numbers (p,) such as positions (m)
@@ -67,11 +66,7 @@ class HardwarePlant(Plant):
         self._last: tuple[float, Float[np.ndarray, " p"]] | None = None
 
     def start(self) -> Float[np.ndarray, " c"]:
-        """Release the tendons, and return the acting control, zero tensions; the first command arms.
-
-        Raises:
-            HardwareError: the robot has a fault.
-        """
+        """Release the tendons, and return the acting control, zero tensions; the first command arms."""
         if self.driver.state is DriverState.ARMED:
             self.driver.disarm()
         self._check()
@@ -85,11 +80,7 @@ class HardwarePlant(Plant):
         return _Rehearsal(self)
 
     def measure(self) -> Float[np.ndarray, " p"]:
-        """Wait for the begin of the period, and return its measurement; NaN if it is older than a period.
-
-        Raises:
-            HardwareError: the robot has a fault, the tip has left its region, or the robot was stopped.
-        """
+        """Wait for the begin of the period, and return its measurement; NaN if it is older than a period."""
         try:
             self._wait_for_period()
             self._check()
@@ -122,11 +113,7 @@ class HardwarePlant(Plant):
         return stamp, measured if self._clock() - stamp <= self.dt else nothing
 
     def apply(self, control: Float[np.ndarray, " c"]) -> None:
-        """Send a command (N); the first one arms the robot.
-
-        Raises:
-            HardwareError: the robot has a fault; it was stopped.
-        """
+        """Send a command (N); the first one arms the robot."""
         try:
             if self._emergency is not None:
                 self._emergency.check()

@@ -5,20 +5,183 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat_hardware import board_plain
-from knode_cosserat_hardware.board_link import BoardLink
-from knode_cosserat_hardware.board_settings import ask_setting
-from knode_cosserat_hardware.board_start import find_board, negotiate
-from knode_cosserat_hardware.driver import Driver, DriverState, HardwareError, Latency, Limits, Reading
-from knode_cosserat_hardware.faults import fault_message
-from knode_cosserat_hardware.limits import TensionLimiter, checked_tensions
+from knode_cosserat._files.yaml_text import did_you_mean
+from knode_cosserat_hardware.board_link import BoardLink, SerialTransport, Transport
+from knode_cosserat_hardware.driver import (
+    Driver,
+    DriverState,
+    HardwareError,
+    Latency,
+    Limits,
+    Reading,
+    TensionLimiter,
+    checked_tensions,
+    fault_message,
+)
 from knode_cosserat_hardware.lines import GRAM_FORCE, encode_tensions
-from knode_cosserat_hardware.transport import SerialTransport, Transport
+
+#: a plain board disarms itself after a silence of 0.5 s
+PLAIN_SILENCE = 0.45
+
+
+def is_plain_armed(link: BoardLink) -> bool:
+    """True while commands are repeated and the board has not disarmed itself."""
+    return bool(link.plain_line) and link.transport.now() - link.sent_at < PLAIN_SILENCE
+
+
+def arm_plain(link: BoardLink, tendons: int, timeout: float) -> None:
+    """Send zero tensions until the board does not refuse them: one that tares does."""
+    zeros = encode_tensions([0] * tendons)
+    end = link.transport.now() + timeout
+    while link.transport.now() < end:
+        link.last_refusal = ""
+        link.write(zeros)
+        link.until(lambda: link.last_refusal or link.fault, 0.1)
+        if link.fault:
+            raise HardwareError(fault_message(link.fault))
+        if not link.last_refusal:
+            link.plain_line = zeros
+            return
+    raise HardwareError(
+        f"{link.transport.name}: the board refused to arm ({link.last_refusal}); wait for its tare"
+    )
+
+
+def release_plain(link: BoardLink, tendons: int) -> None:
+    """Send zero tensions once; the silence that follows disarms the board."""
+    if link.plain_line:
+        link.write(encode_tensions([0] * tendons))
+    link.plain_line = b""
+
+
+def reset_plain(link: BoardLink) -> None:
+    """Ask the board to clear its fault, after its release of the tendons."""
+    for _ in range(2):
+        link.last_refusal = ""
+        link.send_plain("reset")
+        if link.until(lambda: link.last_refusal, 0.2) != "state":
+            break
+        link.until(lambda: None, 0.6)
+    if link.last_refusal == "emergency-stop":
+        raise HardwareError(fault_message("emergency-stop:0"))
+    link.host_fault = link.plain_fault = ""
+
+
+#: names of settings, for the hints of errors; a newer board may have more
+SETTINGS = (
+    *("kp", "ki", "kd", "hold", "friction", "smooth", "limit", "watchdog", "silence", "release", "jog"),
+    *("tare_drive", "tare_time", "tare_rise", "tare_on_start", "estop"),
+    *(f"{name}{k}" for name in ("gain", "zero") for k in range(1, 5)),
+)
+
+
+def ask_setting(link: BoardLink, verb: str, name: str, *value: int) -> int:
+    """Return a setting that the board answers to `get NAME` or `set NAME VALUE`."""
+    try:
+        whole = [int(each) for each in value]
+    except (TypeError, ValueError, OverflowError):
+        whole = []
+    if whole != list(value) or any(isinstance(each, bool) for each in value):
+        raise HardwareError(f"{name} must be a whole number (got {value[0]!r:.60})")
+    try:
+        answer = link.request(verb, name, *whole)
+    except HardwareError as error:
+        hint = "" if name in SETTINGS else did_you_mean(name, SETTINGS)
+        raise HardwareError(f"{error}; setting {name}{hint}") from None
+    try:
+        return int(answer.values[1])
+    except (IndexError, ValueError):
+        raise HardwareError(f"{link.transport.name}: the answer to {verb} {name} is not understood") from None
+
+
+#: a board without a banner that has sent telemetry for this time is running (s). One that restarts is silent
+RUNNING_TIME = 0.5
+#: longest wait for a banner or telemetry (s): the boot loader of an Arduino takes up to 2 s
+FIRST_LINE = 5.0
+
+
+class StartedBoard(NamedTuple):
+    """Number of tendons of a board, and the greatest tension that it accepts (N, None if it states none)."""
+
+    tendons: int
+    high: float | None
+
+
+def find_board(link: BoardLink, timeout: float) -> None:
+    """Wait (s) for a board's banner or a running one's telemetry: a boot loader would take other lines."""
+    opened = link.transport.now()
+
+    def is_there() -> bool:
+        running = link.telemetry is not None and link.arrival - opened >= RUNNING_TIME
+        return link.banner is not None or running
+
+    link.until(is_there, min(FIRST_LINE, timeout))
+
+
+def negotiate(link: BoardLink, protocol: int, tendons: int, timeout: float) -> StartedBoard:
+    """Choose framed or plain lines, and wait (s) until a framed board has tared or has a fault.
+
+    Args:
+        link: the connection; its mode is set.
+        protocol: 2, or 1 for plain lines.
+        tendons: number of tendons of a plain board.
+        timeout: longest wait for the end of taring (s).
+    """
+    offered = link.banner.protocol if link.banner else protocol
+    answer = None
+    if min(offered, protocol) >= 2:
+        for _ in range(3):
+            if answer := link.hello(2, 0.5):
+                break
+    if answer is None:
+        return _start_plain(link, tendons)
+    with link.lock:
+        link.mode, link.telemetry = "framed", None
+    started = _stated(link, answer.values)
+    # taring moves the motors; the link feeds the watchdog meanwhile
+    settled = ("ready", "armed", "fault")
+    if not link.until(lambda: link.telemetry and link.telemetry.state in settled, timeout):
+        raise HardwareError(
+            f"{link.transport.name}: the board was not ready in {timeout:g} s; check the tendons, "
+            "or turn off the setting tare_on_start"
+        )
+    return _checked(link, started)
+
+
+def _start_plain(link: BoardLink, tendons: int) -> StartedBoard:
+    if link.until(lambda: link.telemetry, 1.0) is None:
+        raise HardwareError(
+            f"{link.transport.name}: no answer; check that this is the board's port, its power, "
+            "and that 115200 baud is its speed"
+        )
+    link.mode = "plain"
+    return _checked(link, StartedBoard(tendons, None))
+
+
+def _stated(link: BoardLink, values: tuple[str, ...]) -> StartedBoard:
+    """Return what the answer to hello states: `2 knode-tension 1.0.0 TENDONS RATE LIMIT`."""
+    try:
+        return StartedBoard(int(values[3]), int(values[5]) * GRAM_FORCE)
+    except (IndexError, ValueError):
+        raise HardwareError(
+            f"{link.transport.name}: the answer to hello is not understood ({' '.join(values)[:60]})"
+        ) from None
+
+
+def _checked(link: BoardLink, started: StartedBoard) -> StartedBoard:
+    count = len(link.telemetry.tension) if link.telemetry else 0
+    if count != started.tendons:
+        raise HardwareError(
+            f"{link.transport.name}: the board sends {count} tensions (expected {started.tendons}); "
+            "give the right tendon_count"
+        )
+    return started
+
 
 #: age of telemetry at which a command is refused (s): 25 lines were lost
 STALE = 0.5
@@ -83,7 +246,7 @@ class SerialBoard(Driver):
             if link.mode == "framed":
                 armed = link.telemetry is not None and link.telemetry.state == "armed"
             else:
-                armed = board_plain.is_armed(link)
+                armed = is_plain_armed(link)
             return DriverState.ARMED if armed else DriverState.READY
 
     @property
@@ -115,11 +278,7 @@ class SerialBoard(Driver):
     # connection
 
     def connect(self) -> None:
-        """Open the port, wait for the board's banner and the end of its tare, and choose the protocol.
-
-        Raises:
-            HardwareError: the port cannot be opened, or no board answers.
-        """
+        """Open the port, wait for the board's banner and the end of its tare, and choose the protocol."""
         if self._link is not None and self._link.error is None:
             return
         self.close()
@@ -167,16 +326,12 @@ class SerialBoard(Driver):
     # motion
 
     def arm(self) -> None:
-        """Let the motors follow commands, from zero tension on; waits while the board tares or releases.
-
-        Raises:
-            HardwareError: the robot has a fault, or does not arm.
-        """
+        """Let the motors follow commands, from zero tension on; waits while the board tares or releases."""
         link = self._connected()
         if self.state is DriverState.ARMED:
             return
         if link.mode == "plain":
-            board_plain.arm(link, self.tendon_count, self._start_timeout)
+            arm_plain(link, self.tendon_count, self._start_timeout)
         else:
             # a board that is releasing or taring is ready soon
             self._expect(link, lambda: self._board_state(link) == "ready", 3.0, "was not ready to be armed")
@@ -185,12 +340,7 @@ class SerialBoard(Driver):
         self._limiter.reset(link.transport.now())
 
     def command(self, tension: Float[np.ndarray, " c"]) -> Float[np.ndarray, " c"]:
-        """Send tensions (N), and return those sent: within the limits, and in whole grams-force (9.8 mN).
-
-        Raises:
-            HardwareError: the robot is not armed, has a fault, sends no telemetry, or the tensions are not
-                finite.
-        """
+        """Send tensions (N), and return those sent: within the limits, and in whole grams-force (9.8 mN)."""
         link = self._connected()
         wanted = checked_tensions(tension, self.tendon_count)
         with link.lock:
@@ -212,11 +362,7 @@ class SerialBoard(Driver):
         return np.array(grams) * GRAM_FORCE
 
     def read(self, timeout: float = 1.0) -> Reading:
-        """Return the newest reading; waits (s) for one that was not returned before.
-
-        Raises:
-            HardwareError: none came in time, or the connection is lost.
-        """
+        """Return the newest reading; waits (s) for one that was not returned before."""
         link = self._connected()
         telemetry: Any = link.until(
             lambda: link.telemetry if link.arrivals > self._returned else None, timeout
@@ -236,11 +382,7 @@ class SerialBoard(Driver):
             )
 
     def tare(self) -> None:
-        """Take the readings of slack tendons as zero; moves the motors. Returns when it is done.
-
-        Raises:
-            HardwareError: the board failed, is armed, or is a plain one, which tares on its start only.
-        """
+        """Take the readings of slack tendons as zero; moves the motors. Returns when it is done."""
         link = self._framed("tare")
         self._require_no_fault()
         link.request("tare")
@@ -249,11 +391,7 @@ class SerialBoard(Driver):
         self._expect(link, tared, self._start_timeout, "did not finish its tare")
 
     def jog(self, tendon: int, drive: float) -> None:
-        """Drive one motor for a tenth of a second; tendon from 0 on, drive from -1 to 1.
-
-        Raises:
-            HardwareError: the robot is armed or has a fault, or the drive is above the setting `jog`.
-        """
+        """Drive one motor for a tenth of a second; tendon from 0 on, drive from -1 to 1."""
         if tendon not in range(self.tendon_count):
             raise HardwareError(
                 f"tendon must be a whole number from 0 to {self.tendon_count - 1} (got {tendon!r})"
@@ -270,7 +408,7 @@ class SerialBoard(Driver):
 
     def _release(self, link: BoardLink) -> None:
         if link.mode == "plain":
-            board_plain.release(link, self.tendon_count)
+            release_plain(link, self.tendon_count)
         elif self.state is DriverState.ARMED:
             link.request("disarm")
             link.until(lambda: self.fault or self._board_state(link) == "ready", 3.0)
@@ -293,11 +431,7 @@ class SerialBoard(Driver):
                     break
 
     def reset(self) -> None:
-        """Clear a latched fault; ready afterwards. A board that restarted is asked for its protocol again.
-
-        Raises:
-            HardwareError: the board keeps its fault.
-        """
+        """Clear a latched fault; ready afterwards. A board that restarted is asked for its protocol again."""
         link = self._connected()
         if not self.fault:
             return
@@ -306,7 +440,7 @@ class SerialBoard(Driver):
             self._negotiate(link)
             return
         if link.mode == "plain":
-            board_plain.reset(link)
+            reset_plain(link)
             return
         released = lambda: self._board_state(link) in ("fault", "ready")  # noqa: E731
         self._expect(link, released, 3.0, "did not end its release", check=False)

@@ -2,24 +2,141 @@
 
 from __future__ import annotations
 
+import abc
+import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat.control.lag import mean_part, remaining_part
+from knode_cosserat.estimation.outputs import BodyPoses, BodyPositions, final_output
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.result import SimulationError
 from knode_cosserat.solvers.stepper import Stepper
 from knode_cosserat.trajectory import Trajectory
-from knode_cosserat_hardware.driver import Driver, DriverState, HardwareError, Latency, Limits, Reading
-from knode_cosserat_hardware.faults import FAULTS, fault_message
-from knode_cosserat_hardware.limits import LatencyWindow, TensionLimiter
+from knode_cosserat_hardware.driver import (
+    FAULTS,
+    Driver,
+    DriverState,
+    HardwareError,
+    Latency,
+    LatencyWindow,
+    Limits,
+    Reading,
+    TensionLimiter,
+    fault_message,
+)
 from knode_cosserat_hardware.lines import GRAM_FORCE
-from knode_cosserat_hardware.simulated_cells import MachineParameters, SimulatedLoadCells
-from knode_cosserat_hardware.true_shape import TrueShape
+
+
+class TrueShape(abc.ABC):
+    """A robot whose true shape is known."""
+
+    #: the simulated rod
+    robot: System
+
+    @abc.abstractmethod
+    def true_state(self) -> Trajectory:
+        """Return the state at this time, a trajectory of one row."""
+
+    def tip(self) -> Float[np.ndarray, "3"]:
+        """Return the true position of the tip (m)."""
+        return self.positions((1.0,))[0]
+
+    def positions(self, fractions: Sequence[float]) -> Float[np.ndarray, "M 3"]:
+        """Return true positions of places along the rod (m), by their fractions of its length."""
+        return final_output(self.robot, self.true_state(), BodyPositions(tuple(fractions))).reshape(-1, 3)
+
+    def poses(self, fractions: Sequence[float]) -> Float[np.ndarray, "M 7"]:
+        """Return true positions (m) and quaternions (w, x, y, z) of places along the rod."""
+        return final_output(self.robot, self.true_state(), BodyPoses(tuple(fractions))).reshape(-1, 7)
+
+
+#: settings and their first values, in the units of the wire protocol
+SETTINGS = {"kp": 64, "ki": 256, "kd": 0, "limit": 2300, "jog": 80, "watchdog": 60, "release": 500}
+#: gain of each load cell (1/4096 gf per count)
+GAIN = 1024
+#: number of conversions of a tare
+CONVERSIONS = 25
+
+
+@dataclasses.dataclass(frozen=True)
+class MachineParameters:
+    """Parameters of a simulated machine around the rod.
+
+    Attributes:
+        lag: time constant of the tensions (s).
+        noise: standard deviation of the load cells (N).
+        offset: of the load cells before they are tared (N).
+        gain_error: relative error of the load cells' calibration.
+        seed: of the noise.
+    """
+
+    lag: float = 0.05
+    noise: float = 0.02
+    offset: float = 0.3
+    gain_error: float = 0.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not (self.lag >= 0.0 and self.noise >= 0.0):
+            raise HardwareError(
+                f"lag and noise must be zero or more (got {self.lag:g} s and {self.noise:g} N)"
+            )
+
+
+class SimulatedLoadCells:
+    """Load cells with noise, offset and an error of their gain, and the settings of their board.
+
+    Args:
+        machine: errors of the cells.
+        count: number of tendons.
+    """
+
+    def __init__(self, machine: MachineParameters, count: int):
+        self.machine, self.count = machine, count
+        self._random = np.random.default_rng(machine.seed)
+        self.settings = dict(SETTINGS)
+        for k in range(1, count + 1):
+            self.settings |= {f"gain{k}": GAIN, f"zero{k}": 0}
+
+    def counts(self, force: Float[np.ndarray, " c"]) -> Float[np.ndarray, " c"]:
+        """Return one conversion of true forces (N), in counts."""
+        machine = self.machine
+        noise = machine.noise * self._random.normal(size=self.count)
+        return (force * (1.0 + machine.gain_error) + machine.offset + noise) / GRAM_FORCE * 4096.0 / GAIN
+
+    def measured(self, force: Float[np.ndarray, " c"]) -> Float[np.ndarray, " c"]:
+        """Return one measurement of true forces (N), by the settings (N)."""
+        zero, gain = (
+            np.array([self.settings[f"{name}{k + 1}"] for k in range(self.count)], dtype=float)
+            for name in ("zero", "gain")
+        )
+        return (self.counts(force) - zero) * gain / 4096.0 * GRAM_FORCE
+
+    def tare(self, force: Float[np.ndarray, " c"]) -> None:
+        """Take the present readings as zero."""
+        counts = np.mean([self.counts(force) for _ in range(CONVERSIONS)], axis=0)
+        for k, zero in enumerate(counts):
+            self.settings[f"zero{k + 1}"] = round(zero)
+
+    def setting(self, name: str) -> int:
+        """Return a setting. Raises `HardwareError` if there is none of this name."""
+        if name not in self.settings:
+            raise HardwareError(f"the setting {name!r} is unknown{did_you_mean(name, list(self.settings))}")
+        return self.settings[name]
+
+    def change(self, name: str, value: int) -> int:
+        """Change a setting, and return it. Raises `HardwareError` if name or value are not allowed."""
+        self.setting(name)
+        if isinstance(value, bool) or value != int(value):
+            raise HardwareError(f"{name} must be a whole number (got {value!r})")
+        self.settings[name] = int(value)
+        return self.settings[name]
+
 
 #: time between readings (s), longest silence of the host while armed (s), duration of a tare (s)
 STEP, SILENCE, TARE = 0.02, 0.31, 0.5
@@ -156,11 +273,7 @@ class SimulatedRobot(TrueShape, Driver):
     # interface of drivers
 
     def connect(self) -> None:
-        """Start the simulation at rest.
-
-        Raises:
-            HardwareError: the rest position was not found.
-        """
+        """Start the simulation at rest."""
         if self._stepper is not None:
             return
         try:
@@ -191,11 +304,7 @@ class SimulatedRobot(TrueShape, Driver):
         self._touch()
 
     def command(self, tension: Float[np.ndarray, " c"]) -> Float[np.ndarray, " c"]:
-        """Set the wanted tensions (N), and return them within the limits.
-
-        Raises:
-            HardwareError: the robot is not armed, has a fault, or the tensions are not finite.
-        """
+        """Set the wanted tensions (N), and return them within the limits."""
         self._touch()
         if self._fault:
             raise HardwareError(fault_message(self._fault))
@@ -206,11 +315,7 @@ class SimulatedRobot(TrueShape, Driver):
         return self._wanted.copy()
 
     def read(self, timeout: float = 1.0) -> Reading:
-        """Return the newest reading; waits (s) for one that was not returned before.
-
-        Raises:
-            HardwareError: none came in time.
-        """
+        """Return the newest reading; waits (s) for one that was not returned before."""
         self._touch()
         end = self.now() + timeout
         while self._count == self._returned:
@@ -222,11 +327,7 @@ class SimulatedRobot(TrueShape, Driver):
         return Reading(stamp, self._measured.copy(), self._drive.copy(), self.state, self._fault)
 
     def jog(self, tendon: int, drive: float) -> None:
-        """Drive one motor for a tenth of a second; tendon from 0 on, drive from -1 to 1.
-
-        Raises:
-            HardwareError: the robot is armed or has a fault, or the drive is not allowed.
-        """
+        """Drive one motor for a tenth of a second; tendon from 0 on, drive from -1 to 1."""
         if tendon not in range(self.tendon_count):
             raise HardwareError(f"tendon must be from 0 to {self.tendon_count - 1} (got {tendon!r})")
         largest = self.cells.settings["jog"] / 255.0

@@ -30,8 +30,7 @@ from knode_cosserat.studies.hardware_rig import (
 from knode_cosserat.studies.report import Report, as_json, check_row, checks_table, write_texts
 from knode_cosserat.studies.runner import Job, Product, run
 from knode_cosserat_hardware.driver import DriverState, HardwareError
-from knode_cosserat_hardware.emulation.robot import EmulatedRobot
-from knode_cosserat_hardware.emulation.toolchain import built, firmware_folder, missing
+from knode_cosserat_hardware.emulation import EmulatedRobot, built, firmware_folder, missing
 from knode_cosserat_hardware.lines import GRAM_FORCE
 from knode_cosserat_hardware.plant import HardwarePlant
 
@@ -137,7 +136,7 @@ def build(settings: Any) -> Product:
 
 def fuzz(settings: Any) -> Product:
     """Send fuzzed frames to the board's logic on this computer."""
-    from knode_cosserat_hardware.emulation.logic import HostBoard
+    from knode_cosserat_hardware.emulation import HostBoard
 
     each = settings["frames"] // 10
     found = [HostBoard().fuzz(seed, each) for seed in range(10)]

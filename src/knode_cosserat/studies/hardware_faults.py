@@ -24,7 +24,7 @@ from knode_cosserat.studies.hardware_rig import (
 )
 from knode_cosserat.studies.runner import Product
 from knode_cosserat_hardware.driver import HardwareError
-from knode_cosserat_hardware.emulation.robot import EmulatedRobot
+from knode_cosserat_hardware.emulation import EmulatedRobot
 from knode_cosserat_hardware.lines import GRAM_FORCE
 from knode_cosserat_hardware.plant import HardwarePlant
 from knode_cosserat_hardware.serial_board import SerialBoard

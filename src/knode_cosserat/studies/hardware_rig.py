@@ -17,8 +17,7 @@ from knode_cosserat.rods.load_cells import LoadCells
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.studies.stand_in import DAMPING, NOISE, OFFSETS
 from knode_cosserat_hardware.driver import Limits
-from knode_cosserat_hardware.emulation.port import EmulatedPort
-from knode_cosserat_hardware.emulation.robot import ROBOT, EmulatedRobot
+from knode_cosserat_hardware.emulation import ROBOT, EmulatedPort, EmulatedRobot
 from knode_cosserat_hardware.lines import GRAM_FORCE
 from knode_cosserat_hardware.serial_board import SerialBoard
 

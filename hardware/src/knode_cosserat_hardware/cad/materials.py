@@ -7,10 +7,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from knode_cosserat_hardware.cad.checks import DEAD_TURNS
-from knode_cosserat_hardware.cad.dimensions import BOARD_LIMIT, PartDimensions, load_dimensions
-from knode_cosserat_hardware.cad.shapes import SHAFT_FIT, TENDON
-from knode_cosserat_hardware.emulation.motors import MotorParameters
+from knode_cosserat_hardware.cad.dimensions import (
+    BOARD_LIMIT,
+    DEAD_TURNS,
+    SHAFT_FIT,
+    TENDON,
+    PartDimensions,
+    load_dimensions,
+)
+from knode_cosserat_hardware.emulation import MotorParameters
 
 
 class Item(NamedTuple):

@@ -5,10 +5,26 @@ from __future__ import annotations
 import importlib
 import math
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
-from knode_cosserat_hardware.cad import shapes
-from knode_cosserat_hardware.cad.dimensions import PartDimensions
+from knode_cosserat_hardware.cad.dimensions import (
+    BOSS,
+    MOTOR_LENGTH,
+    SHAFT_CUT,
+    SHAFT_FIT,
+    SHAFT_LENGTH,
+    TENDON,
+    Base,
+    Bracket,
+    Cell,
+    Mount,
+    PartDimensions,
+    Plate,
+    Rib,
+    Spool,
+    load_dimensions,
+)
 
 
 def library() -> Any:
@@ -50,7 +66,7 @@ def _without(solid: Any, holes: Iterable[Any]) -> Any:
     return solid
 
 
-def make_rib(rib: shapes.Rib) -> Any:
+def make_rib(rib: Rib) -> Any:
     """Return a rib; z = 0 is the upper face of its disk, the hub is below."""
     cad = library()
     disk = cylinder(rib.outer_radius, -rib.thickness, 0.0)
@@ -75,7 +91,7 @@ def make_rib(rib: shapes.Rib) -> Any:
     )
 
 
-def make_spool(spool: shapes.Spool) -> Any:
+def make_spool(spool: Spool) -> Any:
     """Return a spool along z; its hub begins at z = 0, at the motor."""
     hub, thick, width = spool.hub_length, spool.flange_thickness, spool.width
     solid = (
@@ -98,7 +114,7 @@ def make_spool(spool: shapes.Spool) -> Any:
     )
 
 
-def make_base(base: shapes.Base) -> Any:
+def make_base(base: Base) -> Any:
     """Return the base; z = 0 is its top, where the rod leaves the socket."""
     low, flange = -base.height, -base.height + base.flange_thickness
     solid = (
@@ -118,7 +134,7 @@ def make_base(base: shapes.Base) -> Any:
     return _without(solid, holes)
 
 
-def make_plate(plate: shapes.Plate) -> Any:
+def make_plate(plate: Plate) -> Any:
     """Return the motor plate; z = 0 is its upper side."""
     low = -plate.thickness
     sizes = [
@@ -131,7 +147,7 @@ def make_plate(plate: shapes.Plate) -> Any:
     return _without(cylinder(plate.radius, low, 0.0), holes)
 
 
-def make_cell(cell: shapes.Cell) -> Any:
+def make_cell(cell: Cell) -> Any:
     """Return a load cell's beam along y; z = 0 is its upper side, y = 0 its end at the motor."""
     half = cell.width / 2.0
     beam = block((-half, 0.0, -cell.thickness), (half, cell.length, 0.0))
@@ -140,7 +156,7 @@ def make_cell(cell: shapes.Cell) -> Any:
     )
 
 
-def make_mount(mount: shapes.Mount) -> Any:
+def make_mount(mount: Mount) -> Any:
     """Return a load-cell mount along y; z = 0 is its upper side, at the plate."""
     half = mount.width / 2.0
     solid = block((-half, 0.0, -mount.height), (half, mount.length, 0.0))
@@ -149,7 +165,7 @@ def make_mount(mount: shapes.Mount) -> Any:
     )
 
 
-def make_bracket(bracket: shapes.Bracket) -> Any:
+def make_bracket(bracket: Bracket) -> Any:
     """Return a motor bracket; x = 0 at the tendon, y = 0 at the spool's side, z = 0 at the foot's top."""
     cad = library()
     x, z = bracket.axis
@@ -183,12 +199,12 @@ def make_bracket(bracket: shapes.Bracket) -> Any:
 
 def make_motor(part: PartDimensions) -> Any:
     """Return a plain model of a gear motor along z; z = 0 is the gear's face, the shaft points up."""
-    radius = (part.spool.bore - shapes.SHAFT_FIT) / 2.0
-    flat = block((radius - shapes.SHAFT_CUT, -radius, 2.5), (2.0 * radius, radius, shapes.SHAFT_LENGTH + 1.0))
+    radius = (part.spool.bore - SHAFT_FIT) / 2.0
+    flat = block((radius - SHAFT_CUT, -radius, 2.5), (2.0 * radius, radius, SHAFT_LENGTH + 1.0))
     return (
-        cylinder(part.motor_radius, -shapes.MOTOR_LENGTH, 0.0)
-        + cylinder(shapes.BOSS / 2.0, 0.0, 2.5)
-        + (cylinder(radius, 0.0, shapes.SHAFT_LENGTH) - flat)
+        cylinder(part.motor_radius, -MOTOR_LENGTH, 0.0)
+        + cylinder(BOSS / 2.0, 0.0, 2.5)
+        + (cylinder(radius, 0.0, SHAFT_LENGTH) - flat)
     )
 
 
@@ -203,3 +219,102 @@ def make_parts(part: PartDimensions) -> dict[str, Any]:
         "load-cell-mount": make_mount(part.mount),
         "motor-bracket": make_bracket(part.bracket),
     }
+
+
+def place_parts(part: PartDimensions) -> list[tuple[str, Any]]:
+    """Return names and solids of all bodies of the robot; z = 0 is the rod's clamped end."""
+    made = make_parts(part)
+    cad, plate_top = library(), -part.base.height
+    below = plate_top - part.plate.thickness
+    bodies = [
+        ("rod", cylinder(part.rod_radius, -part.base.socket_depth, part.rod_length)),
+        ("base", made["base"]),
+        ("motor-plate", cad.Pos(0, 0, plate_top) * made["motor-plate"]),
+    ]
+    bodies += [(f"rib-{k + 1}", cad.Pos(0, 0, z) * made["rib"]) for k, z in enumerate(part.rib_heights)]
+    motor = make_motor(part)
+    for k, angle in enumerate(part.angles):
+        frame = cad.Pos(0, 0, below) * cad.Rot(0, 0, math.degrees(angle)) * cad.Pos(part.tendon_radius, 0, 0)
+        bodies += [(f"{name}-{k + 1}", frame * each) for name, each in _drive(part, made, motor)]
+        at = part.plate.passages[k]
+        bodies.append(
+            (f"tendon-{k + 1}", cylinder(TENDON / 2.0, below - part.axis_depth, part.rod_length, at))
+        )
+    bodies += [
+        (f"leg-{k + 1}", cylinder(4.0, below - part.leg_length, below, at))
+        for k, at in enumerate(part.plate.leg_holes)
+    ]
+    return bodies
+
+
+def _drive(part: PartDimensions, made: dict[str, Any], motor: Any) -> list[tuple[str, Any]]:
+    """Return the bodies of one tendon below the plate, in its frame: x radial, y tangential, z up."""
+    cad, face = library(), part.face_distance
+    start, top = face + part.bracket.face, -part.mount.height
+    foot = top - part.cell.thickness
+    axis = (part.bracket.axis[0], foot + part.bracket.axis[1])
+    # z of spool and motor points from the motor to the tendon: along -y
+    turned = cad.Rot(90, 0, 0)
+    return [
+        (
+            "load-cell-mount",
+            cad.Pos(0, start + part.cell.length - part.mount.length, 0) * made["load-cell-mount"],
+        ),
+        ("load-cell", cad.Pos(0, start, top) * made["load-cell"]),
+        ("motor-bracket", cad.Pos(0, face, foot) * made["motor-bracket"]),
+        ("spool", cad.Pos(axis[0], part.spool.centre, axis[1]) * turned * made["spool"]),
+        ("motor", cad.Pos(axis[0], start, axis[1]) * turned * motor),
+    ]
+
+
+def make_assembly(part: PartDimensions) -> Any:
+    """Return the assembled robot as one compound with named children."""
+    cad = library()
+    children = []
+    for name, solid in place_parts(part):
+        solid.label = name
+        children.append(solid)
+    return cad.Compound(label="robot", children=children)
+
+
+#: greatest distance between the surface and its triangles (mm), and angle of neighbouring triangles (rad)
+CHORD, ANGLE = 0.05, 0.2
+
+
+def export_parts(robot: str | Path, folder: str | Path) -> dict[str, Path]:
+    """Write the parts of a robot as STEP and STL files, and the assembled robot as a STEP file.
+
+    Existing files of these names are replaced. Lengths in the files are in mm.
+
+    Args:
+        robot: a name of the catalog or the path of a robot file.
+        folder: folder of the files; it is created if it does not exist.
+
+    Returns:
+        The files by their names, such as "rib.step".
+
+    Raises:
+        RobotFileError: there is no such robot, or its file is invalid.
+        PartError: parts of this robot cannot be made.
+        ImportError: build123d is not installed.
+    """
+    dimensions = load_dimensions(robot)
+    cad = library()
+    out = Path(folder)
+    out.mkdir(parents=True, exist_ok=True)
+    written: dict[str, Path] = {}
+    for name, solid in make_parts(dimensions).items():
+        written[f"{name}.step"] = _step(cad, solid, out / f"{name}.step")
+        path = out / f"{name}.stl"
+        if not cad.export_stl(solid, str(path), tolerance=CHORD, angular_tolerance=ANGLE):
+            raise OSError(f"{path}: the STL file was not written")
+        written[path.name] = path
+    written["robot.step"] = _step(cad, make_assembly(dimensions), out / "robot.step")
+    return written
+
+
+def _step(cad: Any, solid: Any, path: Path) -> Path:
+    # without its time, equal parts give equal files
+    if not cad.export_step(solid, str(path), timestamp="2000-01-01T00:00:00"):
+        raise OSError(f"{path}: the STEP file was not written")
+    return path

@@ -57,7 +57,7 @@ def connect(port: Port, robot: RobotFile = None, yes: Yes = False, as_json: Json
     Opening the serial port of a tension board resets it: the board tares, and its reels move.
     """
     machine = opened(port, robot)
-    from knode_cosserat_hardware.faults import fault_message
+    from knode_cosserat_hardware.driver import fault_message
 
     with connected(machine, yes) as driver:
         reading, limits = driver.read(), driver.limits
@@ -101,7 +101,7 @@ def reset(
 
     The fault `settings` of a new board is cleared too: its program's settings are used. --save keeps them.
     """
-    from knode_cosserat_hardware.faults import fault_message
+    from knode_cosserat_hardware.driver import fault_message
 
     machine = opened(port, robot)
     with connected(machine, yes) as driver:
@@ -237,8 +237,7 @@ def calibrate(
 def _weighed(driver: Driver, index: int, weights: list[float]) -> Any:
     """Return the fit of readings under weights (N), each hung by a person or by the simulation."""
     from knode_cosserat_hardware.calibration import fit_load_cell
-    from knode_cosserat_hardware.driver import HardwareError
-    from knode_cosserat_hardware.faults import fault_message
+    from knode_cosserat_hardware.driver import HardwareError, fault_message
 
     hang: Any = getattr(driver, "hang", None)
     wait: Any = getattr(driver, "wait", None)

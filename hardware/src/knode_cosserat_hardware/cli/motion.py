@@ -77,7 +77,7 @@ def record(
         f"{count} tendons follow {controls} for {len(rows) * dt:g} s, {float(rows.min()):.3g} to "
         f"{float(rows.max()):.3g} N (within {machine.driver.limits.high:g} N)"
     )
-    from knode_cosserat_hardware.clock import HostClock
+    from knode_cosserat_hardware.driver import HostClock
     from knode_cosserat_hardware.recorder import Recorder
 
     with contextlib.ExitStack() as stack:
@@ -381,8 +381,7 @@ def steer(
 def _input_device(device: str, mapping: Any, tendons: int, title: str) -> Any:
     """Return gamepad, keyboard or window of sliders; the keyboard, with a line, if there is no display."""
     from knode_cosserat_hardware.driver import HardwareError
-    from knode_cosserat_hardware.sliders import SliderWindow
-    from knode_cosserat_hardware.teleoperation import Gamepad, Keyboard
+    from knode_cosserat_hardware.teleoperation import Gamepad, Keyboard, SliderWindow
 
     if device == "sliders":
         try:

@@ -160,7 +160,7 @@ def motion_capture(machine: OpenedDriver, source: str | None) -> Iterator[Motion
 
         made = NatNet({name: int(names[name]) for name in ordered}, server, clock=machine.clock)
     else:
-        from knode_cosserat_hardware.middleware.vrpn import VRPN
+        from knode_cosserat_hardware.middleware.mocap import VRPN
 
         made = VRPN(ordered, server, clock=machine.clock)
     with made as capture:

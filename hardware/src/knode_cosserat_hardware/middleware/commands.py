@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat_hardware.clock import HostClock
-from knode_cosserat_hardware.driver import Driver, DriverState, HardwareError
+from knode_cosserat_hardware.driver import Driver, DriverState, HardwareError, HostClock
 
 #: age from which a command is stale, and greatest advance of its stamp (s)
 LARGEST_AGE, LARGEST_ADVANCE = 0.2, 0.05

@@ -13,8 +13,7 @@ from typing import Any, Protocol, Self
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat_hardware.clock import HostClock
-from knode_cosserat_hardware.driver import Driver, HardwareError, Reading
+from knode_cosserat_hardware.driver import Driver, HardwareError, HostClock, Reading
 from knode_cosserat_hardware.middleware.commands import CommandGate, tendon_names
 from knode_cosserat_hardware.middleware.mocap import MotionCapture, PoseFrame
 

@@ -77,11 +77,7 @@ def measure_loopback(
 
 
 def send(domain: int, messages: int, rate: float) -> None:
-    """Write messages, at a rate (Hz), once a reader is there; the time of writing travels as the position.
-
-    Raises:
-        HardwareError: no reader came.
-    """
+    """Write messages, at a rate (Hz), once a reader is there; the time of writing travels as the position."""
     participant = open_participant(domain, loopback=True)
     from knode_cosserat_hardware.middleware import idl as definitions
 

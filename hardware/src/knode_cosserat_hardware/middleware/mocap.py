@@ -1,4 +1,4 @@
-"""Motion capture: interface of its sources, frames of axes, bodies that are lost."""
+"""Motion capture: interface of its sources, frames of axes, bodies that are lost; simulated cameras; VRPN."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from types import TracebackType
-from typing import Literal, NamedTuple, Self
+from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat_hardware.driver import HardwareError
+from knode_cosserat_hardware.simulated import TrueShape
 
 #: most frames that wait for `frames` (25 s at 240 Hz); older ones are dropped and counted
 WAITING = 6000
@@ -200,3 +202,152 @@ class MotionCapture(abc.ABC):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+class SimulatedCapture(MotionCapture):
+    """Poses of a simulated or emulated robot, without noise, in the order of a recording's bodies.
+
+    Args:
+        robot: a connected `SimulatedRobot`, or an `EmulatedRobot`. A call reads its present state: there is
+            no thread.
+        config: base and markers of the recording; the paper's robot if None.
+        clock: the driver's clock (s), such as `EmulatedPort.now`; None: `robot.now`.
+    """
+
+    def __init__(
+        self, robot: TrueShape, config: RecordingConfig | None = None,
+        clock: Callable[[], float] | None = None,
+    ):  # fmt: skip
+        config = RecordingConfig.paper_robot() if config is None else config
+        base = [] if config.base is None else ["base"]
+        given: Any = robot
+        self._now: Callable[[], float] = given.now if clock is None else clock
+        super().__init__([*base, *(marker.name for marker in config.markers)], clock=self._now)
+        self.robot = robot
+        self._height = None if config.base is None else config.base.height
+        self._fractions: Sequence[float] = [marker.fraction for marker in config.markers]
+        self._last = -np.inf
+
+    def poses(self, timeout: float = 1.0) -> PoseFrame:
+        """Return the present poses; does not wait.
+
+        Raises:
+            HardwareError: the robot is not connected.
+        """
+        values = np.asarray(self.robot.poses(self._fractions), dtype=float)
+        if self._height is not None:
+            values = np.concatenate([[[0.0, 0.0, self._height, 1.0, 0.0, 0.0, 0.0]], values])
+        return PoseFrame(self._now(), values[:, :3], values[:, 3:])
+
+    def frames(self) -> list[PoseFrame]:
+        """Return the present poses once for each time of the robot.
+
+        Raises:
+            HardwareError: the robot is not connected.
+        """
+        frame = self.poses()
+        if frame.time <= self._last:
+            return []
+        self._last = frame.time
+        return [frame]
+
+    def open(self) -> None:
+        """Do nothing: the robot is connected."""
+
+    def close(self) -> None:
+        """Do nothing: the robot stays connected."""
+
+    def _connect(self) -> None:
+        raise HardwareError("a simulated capture has no connection")
+
+    def _receive(self) -> PoseFrame | None:
+        return None
+
+    def _disconnect(self) -> None:
+        pass
+
+
+PORT = 3883
+#: a body whose pose has not changed for this time is lost (s): noise changes every measured pose
+LOST = 0.1
+
+
+class VRPN(MotionCapture):
+    """Motion capture by a VRPN server.
+
+    The library gives no times of measurement: arrival times less `latency` are used. A server sends no pose
+    of a lost body: its last pose is held for 0.1 s, and is NaN from then on. `poses` raises an error for a
+    server that does not answer, because the library waits for it in silence.
+
+    Args:
+        names: names of the server's trackers, in the order of poses.
+        host: address of the server.
+        port: its port.
+        rate: greatest number of frames in a second (Hz).
+        up: axis of the server that points up.
+        latency: time from measurement to arrival (s).
+        clock: monotonic clock (s).
+
+    Raises:
+        HardwareError: a value is not allowed.
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        host: str,
+        *,
+        port: int = PORT,
+        rate: float = 200.0,
+        up: UpAxis = "z",
+        latency: float = 0.0,
+        clock: Callable[[], float] = time.monotonic,
+    ):
+        super().__init__(names, up=up, latency=latency, clock=clock)
+        if not 1.0 <= rate <= 2000.0:
+            raise HardwareError(f"rate must be between 1 and 2000 Hz (got {rate!r})")
+        self.address = f"{host}:{port}"
+        self.rate = rate
+        self._client: Any = None
+        self._changed = np.full(len(self.names), -np.inf)
+        self._last = np.full((len(self.names), 7), np.nan)
+        #: names of the server's trackers that have sent poses
+        self.trackers: set[str] = set()
+
+    def _connect(self) -> None:
+        try:
+            import motioncapture
+        except ImportError:
+            raise ImportError(
+                "VRPN needs motioncapture: pip install 'knode-cosserat-hardware[mocap]' (Linux)"
+            ) from None
+        try:
+            settings = {"hostname": self.address, "update_frequency": f"{self.rate:.0f}"}
+            self._client = motioncapture.connect("vrpn", settings)
+        except (RuntimeError, ValueError) as error:
+            raise HardwareError(f"{self.address}: no VRPN server: {error!s:.150}") from None
+
+    def _receive(self) -> PoseFrame | None:
+        self._client.waitForNextFrame()
+        now = self.clock()
+        # the bodies that sent a pose since the last call
+        bodies = self._client.rigidBodies
+        self.trackers.update(bodies)
+        is_fresh = False
+        for row, name in enumerate(self.names):
+            body = bodies.get(name)
+            if body is None:
+                continue
+            turned = body.rotation
+            pose = np.array([*body.position, turned.w, turned.x, turned.y, turned.z], dtype=float)
+            if not np.all(np.isfinite(pose)):
+                self._ignore(f"a pose of {name} is not finite")
+            elif not np.array_equal(pose, self._last[row]):
+                self._last[row], self._changed[row], is_fresh = pose, now, True
+        if not is_fresh:
+            return None
+        poses = np.where((now - self._changed > LOST)[:, None], np.nan, self._last)
+        return PoseFrame(now - self.latency, poses[:, :3], poses[:, 3:])
+
+    def _disconnect(self) -> None:
+        self._client = None

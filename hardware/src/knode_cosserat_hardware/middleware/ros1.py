@@ -25,12 +25,11 @@ from jaxtyping import Float
 
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.recordings.config import RecordingConfig
-from knode_cosserat_hardware.clock import HostClock
-from knode_cosserat_hardware.driver import Driver, HardwareError, Reading
-from knode_cosserat_hardware.encoder import Encoded, MessageEncoder
+from knode_cosserat_hardware.driver import Driver, HardwareError, HostClock, Reading
 from knode_cosserat_hardware.middleware.commands import CommandGate
 from knode_cosserat_hardware.middleware.dds import Source
 from knode_cosserat_hardware.middleware.mocap import MotionCapture, PoseFrame
+from knode_cosserat_hardware.recorder import Encoded, MessageEncoder
 
 #: folder of Debian's Python packages
 DEBIAN = Path("/usr/lib/python3/dist-packages")
@@ -64,9 +63,6 @@ def require_master(timeout: float = 2.0) -> str:
     """Return the address of the ROS master, which must run; this host's without ROS_MASTER_URI.
 
     Without ROS_IP and ROS_HOSTNAME the node is reachable from this host only.
-
-    Raises:
-        HardwareError: there is no master.
     """
     address = os.environ.setdefault("ROS_MASTER_URI", MASTER)
     if "ROS_HOSTNAME" not in os.environ:
