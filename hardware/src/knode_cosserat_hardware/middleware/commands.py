@@ -1,15 +1,18 @@
-"""Commands from other programs: accepted only if fresh, complete, and while the robot is armed."""
+"""Bridges to other programs: readings and poses out; commands in, only if fresh and complete."""
 
 from __future__ import annotations
 
+import abc
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any
+from types import TracebackType
+from typing import Any, Protocol, Self
 
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat_hardware.driver import Driver, DriverState, HardwareError, HostClock
+from knode_cosserat_hardware.driver import Driver, DriverState, HardwareError, HostClock, Reading
+from knode_cosserat_hardware.middleware.mocap import MotionCapture, PoseFrame
 
 #: age from which a command is stale, and greatest advance of its stamp (s)
 LARGEST_AGE, LARGEST_ADVANCE = 0.2, 0.05
@@ -99,3 +102,94 @@ class CommandGate:
         if self.driver.state is not DriverState.ARMED:
             return "not armed", None
         return "", values
+
+
+class Source(Protocol):
+    """Source of readings, such as a driver."""
+
+    tendon_count: int
+
+    def read(self, timeout: float = 1.0) -> Reading:
+        """Return the newest reading."""
+        ...
+
+
+class Bridge(abc.ABC):
+    """Publisher of readings and poses, and, if chosen, subscriber of commands; a context manager.
+
+    Args:
+        source: a connected driver, or another source of readings.
+        commands: True accepts commands; the source must be a driver.
+        capture: motion capture, whose frames are published too.
+        clock: clock of the stamps; a program's recorders and bridges share it.
+
+    Raises:
+        HardwareError: commands without a driver.
+    """
+
+    def __init__(
+        self, source: Source, commands: bool, capture: MotionCapture | None, clock: HostClock | None
+    ):
+        if commands and not isinstance(source, Driver):
+            raise HardwareError(f"commands need a driver (got {type(source).__name__})")
+        self.source, self.capture = source, capture
+        self.clock = HostClock() if clock is None else clock
+        #: gate of commands, with counts; None without commands
+        self.gate = CommandGate(source, self.clock) if commands and isinstance(source, Driver) else None
+
+    @abc.abstractmethod
+    def publish(self, reading: Reading) -> None:
+        """Publish the tensions of a reading."""
+
+    @abc.abstractmethod
+    def publish_poses(self, frame: PoseFrame) -> None:
+        """Publish the poses of all bodies."""
+
+    @abc.abstractmethod
+    def handle_commands(self) -> Any:
+        """Send the newest command to the driver."""
+
+    @abc.abstractmethod
+    def close(self) -> None:
+        """Leave the network. The driver is left as it is."""
+
+    @property
+    def is_open(self) -> bool:
+        """True until another program ends the bridge."""
+        return True
+
+    def step(self, timeout: float = 1.0) -> Reading:
+        """Read, publish the reading and new poses, and handle commands; return the reading.
+
+        A command waits for the next reading: 20 ms at most with the paper's board.
+
+        Raises:
+            HardwareError: the robot or motion capture does not answer.
+        """
+        self.handle_commands()
+        reading = self.source.read(timeout)
+        self.publish(reading)
+        self.handle_commands()
+        for frame in self.capture.frames() if self.capture is not None else ():
+            self.publish_poses(frame)
+        return reading
+
+    def run(self, duration: float = float("inf")) -> int:
+        """Step for a time (s, on the bridge's clock) while it is open, and return the number of readings.
+
+        Raises:
+            HardwareError: the robot or motion capture does not answer.
+        """
+        end, count = self.clock.now() + duration, 0
+        while self.clock.now() < end and self.is_open:
+            self.step()
+            count += 1
+        return count
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

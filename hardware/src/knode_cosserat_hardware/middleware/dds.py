@@ -7,14 +7,13 @@ import os
 import socket
 import sys
 from collections.abc import Iterator
-from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat_hardware.driver import Driver, HardwareError, HostClock, Reading
-from knode_cosserat_hardware.middleware.commands import CommandGate, tendon_names
+from knode_cosserat_hardware.driver import HardwareError, HostClock, Reading
+from knode_cosserat_hardware.middleware.commands import Bridge, Source, tendon_names
 from knode_cosserat_hardware.middleware.mocap import MotionCapture, PoseFrame
 
 #: topics of the bridge; ROS 2 shows them without rt
@@ -29,16 +28,6 @@ LOOPBACK = """<CycloneDDS><Domain Id="any">
 </Domain></CycloneDDS>"""
 #: domains of this process, by number: (their object, True if on loopback only)
 _domains: dict[int, tuple[Any, bool]] = {}
-
-
-class Source(Protocol):
-    """Source of readings, such as a driver."""
-
-    tendon_count: int
-
-    def read(self, timeout: float = 1.0) -> Reading:
-        """Return the newest reading."""
-        ...
 
 
 def open_participant(domain: int, loopback: bool) -> Any:
@@ -104,7 +93,7 @@ def _sockets() -> Iterator[socket.socket]:
                 yield socket.socket(fileno=os.dup(int(name)))
 
 
-class DDSBridge:
+class DDSBridge(Bridge):
     """Publisher of a robot's readings for ROS 2, and, if chosen, subscriber of commands.
 
         with DDSBridge(robot) as bridge:
@@ -139,11 +128,7 @@ class DDSBridge:
         clock: HostClock | None = None,
         frame: str = "world",
     ):
-        if commands and not isinstance(source, Driver):
-            raise HardwareError(f"commands need a driver (got {type(source).__name__})")
-        self.source = source
-        self.capture = capture
-        self.clock = HostClock() if clock is None else clock
+        super().__init__(source, commands, capture, clock)
         self.frame = frame
         self._participant = open_participant(domain, loopback)
         from knode_cosserat_hardware.middleware import idl
@@ -158,11 +143,7 @@ class DDSBridge:
                 (WRENCH_TOPIC, idl.WrenchStamped),
             )
         )
-        #: gate of commands, with counts; None without commands
-        self.gate: CommandGate | None = None
         if commands:
-            assert isinstance(source, Driver)
-            self.gate = CommandGate(source, self.clock)
             self._commands = open_reader(self._participant, COMMAND_TOPIC, idl.JointState)
 
     def publish(self, reading: Reading) -> None:
@@ -206,45 +187,9 @@ class DDSBridge:
         self.gate.watch()
         return len(messages)
 
-    def step(self, timeout: float = 1.0) -> Reading:
-        """Read, publish the reading and new poses, and handle commands; return the reading.
-
-        A command waits for the next reading: 20 ms at most with the paper's board.
-
-        Raises:
-            HardwareError: the robot or motion capture does not answer.
-        """
-        self.handle_commands()
-        reading = self.source.read(timeout)
-        self.publish(reading)
-        self.handle_commands()
-        for frame in self.capture.frames() if self.capture is not None else ():
-            self.publish_poses(frame)
-        return reading
-
-    def run(self, duration: float) -> int:
-        """Step for a time (s, on the bridge's clock), and return the number of readings.
-
-        Raises:
-            HardwareError: the robot or motion capture does not answer.
-        """
-        end, count = self.clock.now() + duration, 0
-        while self.clock.now() < end:
-            self.step()
-            count += 1
-        return count
-
     def close(self) -> None:
         """Leave the domain. The driver is left as it is."""
         self._state = self._poses = self._wrench = self._commands = self._participant = None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _header(self, time: float) -> Any:
         stamp = self.clock.stamp(time)

@@ -17,17 +17,15 @@ import urllib.parse
 import xmlrpc.client
 from http.client import HTTPConnection
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.recordings.config import RecordingConfig
-from knode_cosserat_hardware.driver import Driver, HardwareError, HostClock, Reading
-from knode_cosserat_hardware.middleware.commands import CommandGate
-from knode_cosserat_hardware.middleware.dds import Source
+from knode_cosserat_hardware.driver import HardwareError, HostClock, Reading
+from knode_cosserat_hardware.middleware.commands import Bridge, Source
 from knode_cosserat_hardware.middleware.mocap import MotionCapture, PoseFrame
 from knode_cosserat_hardware.recorder import Encoded, MessageEncoder
 
@@ -83,7 +81,7 @@ def require_master(timeout: float = 2.0) -> str:
     return address
 
 
-class ROS1Node:
+class ROS1Node(Bridge):
     """Node of ROS 1 that publishes readings, poses and commands on a recording's topics.
 
         with ROS1Node(robot) as node:
@@ -115,10 +113,7 @@ class ROS1Node:
         capture: MotionCapture | None = None,
         clock: HostClock | None = None,
     ):
-        if commands and not isinstance(source, Driver):
-            raise HardwareError(f"commands need a driver (got {type(source).__name__})")
-        self.source, self.capture = source, capture
-        self.clock = HostClock() if clock is None else clock
+        super().__init__(source, commands, capture, clock)
         self.encoder = MessageEncoder(RecordingConfig.paper_robot() if config is None else config)
         self._rospy = rospy = import_rospy()
         require_master()
@@ -133,13 +128,9 @@ class ROS1Node:
                 raise ImportError(f"{topic.type} is missing in ROS: on Debian, apt-get install {PACKAGES}")
             self._kinds[topic.name] = kind
             self._publishers[topic.name] = rospy.Publisher(topic.name, kind, queue_size=100)
-        #: gate of commands, with counts; None without commands
-        self.gate: CommandGate | None = None
         self._lock = threading.Lock()
         self._newest: Any = None
         if commands:
-            assert isinstance(source, Driver)
-            self.gate = CommandGate(source, self.clock)
             kind = message_class("sensor_msgs/JointState")
             self._subscriber = rospy.Subscriber(COMMAND_TOPIC, kind, self._take, queue_size=1)
         if self.encoder.config.simulated:
@@ -170,43 +161,14 @@ class ROS1Node:
                 self.publish_command(sent)
         self.gate.watch()
 
-    def step(self, timeout: float = 1.0) -> Reading:
-        """Read, publish the reading and new poses, and handle commands; return the reading.
-
-        Raises:
-            HardwareError: the robot or motion capture does not answer.
-        """
-        self.handle_commands()
-        reading = self.source.read(timeout)
-        self.publish(reading)
-        for frame in self.capture.frames() if self.capture is not None else ():
-            self.publish_poses(frame)
-        self.handle_commands()
-        return reading
-
-    def run(self, duration: float = float("inf")) -> int:
-        """Step for a time (s), or until ROS stops the node, and return the number of readings.
-
-        Raises:
-            HardwareError: the robot or motion capture does not answer.
-        """
-        end, count = self.clock.now() + duration, 0
-        while self.clock.now() < end and not self._rospy.is_shutdown():
-            self.step()
-            count += 1
-        return count
+    @property
+    def is_open(self) -> bool:
+        """True until ROS stops the node."""
+        return not self._rospy.is_shutdown()
 
     def close(self) -> None:
         """Leave ROS. The driver is left as it is."""
         self._rospy.signal_shutdown("closed")
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def subscribers(self, topic: str) -> int:
         """Return the number of connections to a topic's subscribers."""
