@@ -121,11 +121,8 @@ class CanRobot(MotorRobot):
         bitrate: int = 1_000_000,
     ):
         self._nodes = tuple(node_ids)
-        if not self._nodes or len(set(self._nodes)) != len(self._nodes):
-            raise HardwareError(
-                f"node_ids must be different whole numbers from 0 to 63 (got {list(node_ids)})"
-            )
-        if any(node not in range(64) for node in self._nodes):
+        is_repeated = len(set(self._nodes)) != len(self._nodes)
+        if not self._nodes or is_repeated or any(node not in range(64) for node in self._nodes):
             raise HardwareError(
                 f"node_ids must be different whole numbers from 0 to 63 (got {list(node_ids)})"
             )

@@ -144,6 +144,14 @@ class Driver(abc.ABC):
             HardwareError: an argument is not allowed, or the robot is armed or has a fault.
         """
 
+    def _check_jog(self, tendon: int, drive: float, largest: float = 1.0) -> None:
+        if tendon not in range(self.tendon_count):
+            raise HardwareError(
+                f"tendon must be a whole number from 0 to {self.tendon_count - 1} (got {tendon!r})"
+            )
+        if not abs(drive) <= largest + 1e-9:
+            raise HardwareError(f"drive must be between {-largest:.3g} and {largest:.3g} (got {drive!r})")
+
     @abc.abstractmethod
     def disarm(self) -> None:
         """Release the tendons and stop the motors."""

@@ -286,12 +286,7 @@ class MotorRobot(Driver):
 
     def jog(self, tendon: int, drive: float) -> None:
         """Drive one motor for a tenth of a second; tendon from 0 on, drive from -1 to 1 (2 N at the reel)."""
-        if tendon not in range(self.tendon_count):
-            raise HardwareError(
-                f"tendon must be a whole number from 0 to {self.tendon_count - 1} (got {tendon!r})"
-            )
-        if not -1.0 <= drive <= 1.0:
-            raise HardwareError(f"drive must be between -1 and 1 (got {drive!r})")
+        self._check_jog(tendon, drive)
         with self._lock:
             self._require_ready("jog")
             torque = np.zeros(self.tendon_count)

@@ -78,11 +78,6 @@ class MessageEncoder:
         """Topics of all messages."""
         return [coder.topic for coder in (*self._poses, self._tension, self._command) if coder]
 
-    @property
-    def command_topic(self) -> str | None:
-        """Topic of commands; None without commands."""
-        return self._command.topic.name if self._command else None
-
     def poses(
         self, stamp: int, position: Float[np.ndarray, "bodies 3"], quaternion: Float[np.ndarray, "bodies 4"]
     ) -> list[Encoded]:

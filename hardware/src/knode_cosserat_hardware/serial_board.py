@@ -392,12 +392,7 @@ class SerialBoard(Driver):
 
     def jog(self, tendon: int, drive: float) -> None:
         """Drive one motor for a tenth of a second; tendon from 0 on, drive from -1 to 1."""
-        if tendon not in range(self.tendon_count):
-            raise HardwareError(
-                f"tendon must be a whole number from 0 to {self.tendon_count - 1} (got {tendon!r})"
-            )
-        if not -1.0 <= drive <= 1.0:
-            raise HardwareError(f"drive must be between -1 and 1 (got {drive!r})")
+        self._check_jog(tendon, drive)
         link = self._framed("jog")
         self._require_no_fault()
         link.request("drive", int(tendon) + 1, round(255 * float(drive)))

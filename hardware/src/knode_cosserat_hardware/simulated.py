@@ -328,11 +328,7 @@ class SimulatedRobot(TrueShape, Driver):
 
     def jog(self, tendon: int, drive: float) -> None:
         """Drive one motor for a tenth of a second; tendon from 0 on, drive from -1 to 1."""
-        if tendon not in range(self.tendon_count):
-            raise HardwareError(f"tendon must be from 0 to {self.tendon_count - 1} (got {tendon!r})")
-        largest = self.cells.settings["jog"] / 255.0
-        if not abs(drive) <= largest + 1e-9:
-            raise HardwareError(f"drive must be between {-largest:.3g} and {largest:.3g} (got {drive!r})")
+        self._check_jog(tendon, drive, self.cells.settings["jog"] / 255.0)
         self._ready("jog")
         self._wanted = self.tension.copy()
         self._wanted[tendon] = max(0.0, self._wanted[tendon] + JOG * drive)

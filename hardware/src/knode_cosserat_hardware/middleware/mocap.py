@@ -7,7 +7,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from types import TracebackType
 from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
@@ -198,9 +197,7 @@ class MotionCapture(abc.ABC):
         self.open()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
@@ -267,6 +264,7 @@ class SimulatedCapture(MotionCapture):
         pass
 
 
+#: port of VRPN servers
 PORT = 3883
 #: a body whose pose has not changed for this time is lost (s): noise changes every measured pose
 LOST = 0.1
