@@ -115,7 +115,7 @@ def test_a_port_that_is_not_there_or_in_use(board):
 
 def test_without_pyserial_the_error_says_what_to_install(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "serial", None)
-    with pytest.raises(HardwareError, match=r"pip install 'knode-cosserat-hardware"):
+    with pytest.raises(HardwareError, match=r"pip install knode-cosserat-hardware"):
         SerialTransport("/dev/ttyACM0")
 
 
