@@ -32,6 +32,16 @@ def test_the_version_is_told():
     assert succeeded("--version").startswith("knode-cosserat ")
 
 
+def test_without_the_distribution_for_hardware_its_commands_name_it(monkeypatch):
+    monkeypatch.setattr("knode_cosserat.cli.program.entry_points", lambda **_: ())
+    for command in ("robot", "robot-parts"):
+        result = run(command, "--help")
+        assert result.exit_code == 2
+        assert result.stderr == (
+            f"error: {command} needs knode-cosserat-hardware: pip install knode-cosserat-hardware\n"
+        )
+
+
 # simulate
 
 
