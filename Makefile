@@ -18,7 +18,7 @@ unexport PYTHONHOME
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' Makefile
 
-$(READY): requirements.lock pyproject.toml tools/bootstrap.py
+$(READY): requirements.lock pyproject.toml hardware/pyproject.toml tools/bootstrap.py
 	@$(PYTHON) tools/bootstrap.py
 	@touch $@
 
@@ -71,15 +71,15 @@ firmware: ## build the firmware of the tension board, and its emulator (needs De
 attack: $(READY) ## damaged files, kills, disk faults, extreme robots, a flood of the live server (an hour; see tools/attack)
 	$(BIN)/python -m tools.attack
 
-package: $(READY) ## build wheel and sdist into dist/, and use the wheel in an environment of its own
+package: $(READY) ## build wheels and sdists into dist/, and use the wheels in an environment of their own
 	$(BIN)/python tools/check_package.py
 
-lock: ## write requirements.lock anew from pyproject.toml (UPGRADE=1: with the newest versions)
+lock: ## write requirements.lock anew from both pyproject.toml (UPGRADE=1: with the newest versions)
 	$(PYTHON) tools/bootstrap.py lock $(if $(UPGRADE),--upgrade)
 
 clean: ## remove outputs and caches
-	rm -rf demo build dist .pytest_cache .ruff_cache .mypy_cache .hypothesis
-	find src tests examples benchmarks tools -name __pycache__ -type d -prune -exec rm -rf {} + 2>/dev/null || true
+	rm -rf demo build dist hardware/dist .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	find src hardware tests examples benchmarks tools -name __pycache__ -type d -prune -exec rm -rf {} + 2>/dev/null || true
 
 distclean: clean ## remove the virtual environment too
 	rm -rf .venv

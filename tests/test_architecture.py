@@ -33,7 +33,6 @@ LAYERS = (
     ("metrics", "evaluation.metrics", "evaluation.state_errors"),
     ("recordings", "statics", "estimation"),
     ("control",),
-    ("hardware",),
     ("learning", "calibration"),
     ("identification",),
     ("evaluation", "figures"),
@@ -122,6 +121,18 @@ def test_packages_depend_in_one_direction() -> None:
         if layer_of(other) > layer_of(name)
     ]
     assert not upwards
+
+
+def test_the_library_does_not_import_the_hardware_distribution() -> None:
+    importers = [
+        name
+        for name, file in MODULES.items()
+        for statement in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        if isinstance(statement, ast.Import | ast.ImportFrom)
+        and "knode_cosserat_hardware" in ast.unparse(statement)
+    ]
+    # the studies are no part of the library
+    assert not [name for name in importers if not name.startswith("studies.")]
 
 
 def test_physics_knows_no_time_scheme() -> None:

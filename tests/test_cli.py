@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.commands import COMMANDS, ROBOT, run, simulated, succeeded, told
 
 import knode_cosserat as kc
 from knode_cosserat.evaluation.metrics import dtw_distance
-from tests.commands import COMMANDS, ROBOT, run, simulated, succeeded, told
 
 # help
 
@@ -30,6 +30,16 @@ def test_without_a_command_there_is_help():
 
 def test_the_version_is_told():
     assert succeeded("--version").startswith("knode-cosserat ")
+
+
+def test_without_the_distribution_for_hardware_its_commands_name_it(monkeypatch):
+    monkeypatch.setattr("knode_cosserat.cli.program.entry_points", lambda **_: ())
+    for command in ("robot", "robot-parts"):
+        result = run(command, "--help")
+        assert result.exit_code == 2
+        assert result.stderr == (
+            f"error: {command} needs knode-cosserat-hardware: pip install knode-cosserat-hardware\n"
+        )
 
 
 # simulate

@@ -11,16 +11,16 @@ from pathlib import Path
 import pytest
 import typer
 import typer.testing
+from examples import your_own_robot
 
 import knode_cosserat as kc
-from examples import your_own_robot
 from knode_cosserat.cli import app
 from knode_cosserat.recordings.virtual import record_virtual
 
 ROOT = Path(__file__).parents[1]
 PAGES = {
     page.relative_to(ROOT).as_posix(): page.read_text(encoding="utf-8")
-    for page in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
+    for page in (ROOT / "README.md", ROOT / "hardware" / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
 }
 BLOCK = re.compile(r"(<!-- test: long -->\n)?^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 LONG = "<!-- test: long -->"
@@ -134,10 +134,10 @@ def parsed(words, whole=True):
     """The command that some words name; fails on one, or an option, that does not exist."""
     command = typer.main.get_command(app)
     words = list(words)
-    while hasattr(command, "commands") and words and not words[0].startswith("-"):
+    while hasattr(command, "get_command") and words and not words[0].startswith("-"):
         name = words.pop(0)
-        assert name in command.commands, f"there is no command {name}"
-        command = command.commands[name]
+        command = command.get_command(None, name)
+        assert command, f"there is no command {name}"
     if whole:
         command.make_context(command.name, words)
         return

@@ -13,18 +13,19 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
+import knode_cosserat_hardware as kch
 from knode_cosserat.learning.residual import Nothing
 from knode_cosserat.statics.configuration import Ellipsoid
 
-NAMESPACES = sorted(name for name in kc.__all__ if isinstance(getattr(kc, name), types.ModuleType))
+SPACES = [thing for name in sorted(kc.__all__) if isinstance(thing := getattr(kc, name), types.ModuleType)]
 #: first words of a docstring that says nothing on its own
 VAGUE = {"What", "Whether", "That", "Those", "How", "Of"}
 #: errors of computations; all others are of arguments
 RUNNING = {
     kc.SimulationError,
     kc.estimation.ObserverError,
-    kc.hardware.HardwareError,
-    kc.hardware.StoppedError,
+    kch.HardwareError,
+    kch.StoppedError,
 }
 ROBOT = kc.load_robot("delrin-tendon-robot")
 
@@ -48,17 +49,16 @@ def test_the_top_level_is_small_and_lists_itself():
     assert all(hasattr(kc, name) for name in kc.__all__)
 
 
-@pytest.mark.parametrize("space", ["", *NAMESPACES])
-def test_every_public_name_is_there_and_says_what_it_is(space):
-    module = getattr(kc, space) if space else kc
+@pytest.mark.parametrize("module", [kc, kch, *SPACES], ids=lambda module: module.__name__)
+def test_every_public_name_is_there_and_says_what_it_is(module):
     assert names_of(module)
     for name in names_of(module):
         thing = getattr(module, name)
         said = inspect.getdoc(thing) if callable(thing) or inspect.ismodule(thing) else "A constant."
-        assert said and said.split()[0] not in VAGUE, f"{space}.{name}: {said}"
+        assert said and said.split()[0] not in VAGUE, f"{module.__name__}.{name}: {said}"
 
 
-@pytest.mark.parametrize("space", [kc, kc.solvers, kc.learning])
+@pytest.mark.parametrize("space", [kc, kc.solvers, kc.learning, kch])
 def test_a_lazy_package_has_the_names_that_it_lists(space):
     assert dir(space) == sorted(space.__all__)
     with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
@@ -108,16 +108,17 @@ def test_a_name_that_never_was_is_an_attribute_error():
 
 
 def modules():
-    """All modules of the package that can be imported here."""
-    for found in pkgutil.walk_packages(kc.__path__, f"{kc.__name__}."):
-        if found.name.endswith("__main__"):
-            continue
-        try:
-            yield importlib.import_module(found.name)
-        except ModuleNotFoundError as error:
-            if error.name is None or error.name.startswith(kc.__name__):
-                raise
-            # otherwise an extra is not installed
+    """All modules of both packages that can be imported here."""
+    for package in (kc, kch):
+        for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+            if found.name.endswith("__main__"):
+                continue
+            try:
+                yield importlib.import_module(found.name)
+            except ModuleNotFoundError as error:
+                if error.name is None or error.name.startswith(kc.__name__):
+                    raise
+                # otherwise an extra is not installed
 
 
 def errors():
@@ -143,8 +144,10 @@ def test_all_errors_have_one_base_and_a_code_each():
 
 
 def test_public_errors_keep_their_built_in_bases():
-    spaces = [getattr(kc, name) for name in NAMESPACES]
-    public = [kc.TrajectoryFileError, *(getattr(space, name) for space in spaces for name in names_of(space))]
+    public = [
+        kc.TrajectoryFileError,
+        *(getattr(space, name) for space in [*SPACES, kch] for name in names_of(space)),
+    ]
     raised = [thing for thing in public if isinstance(thing, type) and issubclass(thing, Exception)]
     assert len(raised) > 10
     for error in raised:

@@ -27,6 +27,8 @@ UV = "uv==0.13.8"
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 VENV = ROOT / ".venv"
 LOCK = ROOT / "requirements.lock"
+# the library, and the distribution for hardware
+PACKAGES = (ROOT, ROOT / "hardware")
 PIP = ROOT / "tools" / "pip-26.3-py3-none-any.whl"
 # Held by whoever works on .venv, installers included: one that outlives its killed set-up would otherwise
 # write into the environment that the next set-up makes. The folder itself, so as to leave no file behind.
@@ -89,7 +91,7 @@ def make_venv(folder: pathlib.Path) -> pathlib.Path:
 
 
 def set_up() -> None:
-    """Bring .venv to what requirements.lock and pyproject.toml say."""
+    """Bring .venv to what requirements.lock and both pyproject.toml say."""
     # Some network file systems have no such locks: there, two set-ups at once remain the user's own affair.
     with contextlib.suppress(OSError):
         fcntl.flock(TURN, fcntl.LOCK_EX)
@@ -106,15 +108,19 @@ def set_up() -> None:
         # Wheels only: there may be no compiler here, and the hashes would not cover what a build downloads.
         run(python, "-m", "pip", "install", "--only-binary=:all:", "--require-hashes", "-r", LOCK)
         installed.write_text(wanted)
-    run(python, "-m", "pip", "install", "--no-deps", "--no-build-isolation", "--editable", ROOT)
+    packages = [word for folder in PACKAGES for word in ("--editable", folder)]
+    run(python, "-m", "pip", "install", "--no-deps", "--no-build-isolation", *packages)
 
 
 def lock(upgrade: bool) -> None:
-    """Write requirements.lock from pyproject.toml; versions already locked are kept unless upgrading."""
+    """Write requirements.lock from both pyproject.toml; versions already locked are kept unless upgrading."""
     with tempfile.TemporaryDirectory() as scratch:
         python = make_venv(pathlib.Path(scratch) / "venv")
         run(python, "-m", "pip", "install", "--only-binary=:all:", UV)
-        uv = [python.parent / "uv", "pip", "compile", "pyproject.toml", "--output-file", LOCK.name]
+        uv = [python.parent / "uv", "pip", "compile", "--output-file", LOCK.name]
+        uv += [(folder / "pyproject.toml").relative_to(ROOT) for folder in PACKAGES]
+        # hardware needs the library, which is installed from here
+        uv += ["--no-emit-package", "knode-cosserat"]
         # `all` leaves out what is too large for every environment
         uv += ["--universal", "--python-version", ".".join(map(str, MINIMUM)), "--extra", "all"]
         uv += ["--generate-hashes", "--custom-compile-command", "make lock"]

@@ -13,9 +13,8 @@ from PIL import Image
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-from knode_cosserat.hardware.cad import load_dimensions
-from knode_cosserat.hardware.cad.assembly import place_parts
-from knode_cosserat.hardware.cad.parts import make_parts
+from knode_cosserat_hardware.cad import load_dimensions
+from knode_cosserat_hardware.cad.parts import make_parts, place_parts
 
 ROOT = Path(__file__).parents[1]
 IMAGES = ROOT / "docs" / "images"

@@ -2,9 +2,9 @@
 
 The names that a first script needs are here; start with `load_robot`, `simulate` and `Trajectory`. All other
 public names are in the namespaces `robots`, `solvers`, `learning`, `calibration`, `recordings`, `statics`,
-`estimation`, `control`, `hardware`, `identification`, `metrics`, `figures`, `viewer`, `controls`,
-`named_controls`, `envs` and `sweeps`. Events are logged to the logger "knode_cosserat", which is quiet unless
-a handler is added.
+`estimation`, `control`, `identification`, `metrics`, `figures`, `viewer`, `controls`, `named_controls`,
+`envs` and `sweeps`. Drivers of robots are a distribution of their own, `knode_cosserat_hardware`. Events are
+logged to the logger "knode_cosserat", which is quiet unless a handler is added.
 """
 
 import logging
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
         envs,
         estimation,
         figures,
-        hardware,
         identification,
         learning,
         metrics,
@@ -68,7 +67,6 @@ __all__ = [
     "estimation",
     "figures",
     "fit",
-    "hardware",
     "identification",
     "identify",
     "inverse_kinematics",

@@ -20,7 +20,6 @@ from knode_cosserat.evaluation.figures import (
     tips,
     workspace,
 )
-from knode_cosserat.evaluation.hardware_figures import load_cell
 
 __all__ = [
     "animate",
@@ -28,7 +27,6 @@ __all__ = [
     "compare",
     "curves",
     "error",
-    "load_cell",
     "overview",
     "path",
     "prediction_against_measurement",

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tests.engine.networks import with_committee, with_network
 
 import knode_cosserat as kc
 from knode_cosserat.engine import loops, pattern
@@ -36,7 +37,6 @@ from knode_cosserat.solvers.recovery import attempt
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SCHEMES, Formula, SpaceScheme, Stage
 from knode_cosserat.solvers.steps import StepCoefficients, TimeStep
-from tests.engine.networks import with_committee, with_network
 
 DT, STEPS = 0.05, 25
 PAPER, ROUTED, LEGS = "delrin-tendon-robot", "delrin-routed-tendon-robot", "six-legged-robot"

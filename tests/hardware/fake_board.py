@@ -8,7 +8,7 @@ import threading
 import time
 import tty
 
-from knode_cosserat.hardware.lines import (
+from knode_cosserat_hardware.lines import (
     Answer,
     Banner,
     FaultNotice,

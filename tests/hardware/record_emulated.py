@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 
 import knode_cosserat as kc
-from knode_cosserat.hardware import Limits, Recorder, SerialBoard
-from knode_cosserat.hardware.clock import HostClock
-from knode_cosserat.hardware.emulation import EmulatedPort, EmulatedRobot
-from knode_cosserat.hardware.middleware.simulated_capture import SimulatedCapture
 from knode_cosserat.recordings import RecordingConfig
-from knode_cosserat.recordings.encoder import MessageEncoder
+from knode_cosserat_hardware import Limits, Recorder, SerialBoard
+from knode_cosserat_hardware.driver import HostClock
+from knode_cosserat_hardware.emulation import EmulatedPort, EmulatedRobot
+from knode_cosserat_hardware.middleware.mocap import SimulatedCapture
+from knode_cosserat_hardware.recorder import MessageEncoder
 
 #: time between commands (s); time at rest before a motion, and duration of the motion (s)
 DT, REST, SECONDS = 0.05, 1.5, 3.5
@@ -78,7 +78,7 @@ def other_recorder(target, board, clock):
     """The node that `rosbag record` listens to, or a writer of another bag."""
     if target != "ros":
         return RosbagsWriter(Path(target), clock)
-    from knode_cosserat.hardware.middleware.ros1 import ROS1Node
+    from knode_cosserat_hardware.middleware.ros1 import ROS1Node
 
     node = ROS1Node(board, config=CONFIG, clock=clock)
     while min(node.subscribers(topic.name) for topic in node.encoder.topics) < 1:

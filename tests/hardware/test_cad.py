@@ -13,21 +13,20 @@ import hypothesis
 import numpy as np
 import pytest
 from hypothesis import strategies as st
+from tests.commands import run, succeeded, told
 
 import knode_cosserat as kc
-from knode_cosserat.hardware import Dimensions, HardwareDescription, Limits
-from knode_cosserat.hardware.cad import PartError, bill_of_materials, export_parts, load_dimensions
-from knode_cosserat.hardware.cad.checks import capacity
-from knode_cosserat.hardware.cad.dimensions import BOARD_LIMIT, part_dimensions
-from knode_cosserat.hardware.cad.materials import materials_table
 from knode_cosserat.rods.robot_file import format_robot
-from tests.commands import run, succeeded, told
+from knode_cosserat_hardware import Dimensions, HardwareDescription, Limits
+from knode_cosserat_hardware.cad import PartError, bill_of_materials, export_parts, load_dimensions
+from knode_cosserat_hardware.cad.dimensions import BOARD_LIMIT, capacity, part_dimensions
+from knode_cosserat_hardware.cad.materials import materials_table
 
 ROOT = Path(__file__).parents[2]
 ROBOT = kc.load_robot("delrin-routed-tendon-robot")
 PART = part_dimensions(ROBOT)
 CAD = importlib.util.find_spec("build123d") is not None
-with_cad = pytest.mark.skipif(not CAD, reason="needs build123d: pip install 'knode-cosserat[cad]'")
+with_cad = pytest.mark.skipif(not CAD, reason="needs build123d: pip install 'knode-cosserat-hardware[cad]'")
 NAMES = ("rib", "spool", "base", "motor-plate", "load-cell", "load-cell-mount", "motor-bracket")
 
 
@@ -196,7 +195,7 @@ def test_the_command_prints_the_bill_of_materials():
 @pytest.mark.skipif(CAD, reason="build123d is installed")
 def test_without_the_library_the_error_names_the_extra(tmp_path):
     refused = run("robot-parts", "delrin-tendon-robot", "--out", tmp_path / "parts")
-    assert refused.exit_code == 2 and "pip install 'knode-cosserat[cad]'" in refused.stderr
+    assert refused.exit_code == 2 and "pip install 'knode-cosserat-hardware[cad]'" in refused.stderr
     assert not (tmp_path / "parts").exists()
 
 
@@ -205,7 +204,7 @@ def test_without_the_library_the_error_names_the_extra(tmp_path):
 
 @pytest.fixture(scope="module")
 def solids():
-    from knode_cosserat.hardware.cad.parts import make_parts
+    from knode_cosserat_hardware.cad.parts import make_parts
 
     return make_parts(PART)
 
@@ -303,7 +302,7 @@ def test_a_printed_rib_has_about_the_mass_of_the_model(solids):
 @with_cad
 @pytest.mark.parametrize("offset", [0.018, 0.02, 0.03])
 def test_no_two_bodies_of_the_robot_overlap(offset):
-    from knode_cosserat.hardware.cad.assembly import place_parts
+    from knode_cosserat_hardware.cad.parts import place_parts
 
     part = part_dimensions(ROBOT.replace(tendon_offset=offset), described(rib_diameter=0.07))
     bodies = place_parts(part)

@@ -11,17 +11,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from knode_cosserat.hardware.can_messages import (
+from knode_cosserat_hardware.can_robot import (
     CanCommand,
+    CanRobot,
     Heartbeat,
     identifier,
     node_and_command,
     read_heartbeat,
     read_two_floats,
 )
-from knode_cosserat.hardware.can_robot import CanRobot
-from knode_cosserat.hardware.driver import DriverState, HardwareError, Limits
-from knode_cosserat.hardware.motor_robot import MotorReel
+from knode_cosserat_hardware.driver import DriverState, HardwareError, Limits
+from knode_cosserat_hardware.motor_robot import MotorReel
 
 can = pytest.importorskip("can")
 NODES = (3, 5, 7, 9)
@@ -315,5 +315,5 @@ def test_arguments_are_checked(monkeypatch):
     with pytest.raises(HardwareError, match=r"cannot be opened.*ip link set nothing0 up"):
         CanRobot("nothing0", [1], interface="no-such-interface").connect()
     monkeypatch.setitem(sys.modules, "can", None)
-    with pytest.raises(HardwareError, match=r"pip install 'knode-cosserat\[hardware\]'"):
+    with pytest.raises(HardwareError, match=r"pip install knode-cosserat-hardware"):
         CanRobot("x", [1], interface="virtual").connect()

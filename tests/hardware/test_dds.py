@@ -12,16 +12,23 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from knode_cosserat.hardware.clock import HostClock
-from knode_cosserat.hardware.driver import Driver, DriverState, HardwareError, Latency, Limits, Reading
-from knode_cosserat.hardware.middleware.commands import CommandGate
-from knode_cosserat.hardware.middleware.mocap import PoseFrame
+from knode_cosserat_hardware.driver import (
+    Driver,
+    DriverState,
+    HardwareError,
+    HostClock,
+    Latency,
+    Limits,
+    Reading,
+)
+from knode_cosserat_hardware.middleware.commands import CommandGate
+from knode_cosserat_hardware.middleware.mocap import PoseFrame
 
-pytest.importorskip("cyclonedds", reason="DDS needs cyclonedds: pip install 'knode-cosserat[dds]'")
+pytest.importorskip("cyclonedds", reason="DDS needs cyclonedds: pip install 'knode-cosserat-hardware[dds]'")
 
-from knode_cosserat.hardware.middleware import dds, idl
-from knode_cosserat.hardware.middleware.dds import DDSBridge
-from knode_cosserat.hardware.middleware.loopback import measure_loopback
+from knode_cosserat_hardware.middleware import dds, idl
+from knode_cosserat_hardware.middleware.dds import DDSBridge
+from knode_cosserat_hardware.middleware.loopback import measure_loopback
 
 pytestmark = pytest.mark.slow
 
@@ -331,12 +338,12 @@ def test_wrong_values():
 def test_a_missing_package_is_said():
     program = (
         "import sys; sys.modules['cyclonedds'] = None\n"
-        "from knode_cosserat.hardware.middleware.dds import DDSBridge\n"
+        "from knode_cosserat_hardware.middleware.dds import DDSBridge\n"
         "try: DDSBridge(object())\n"
         "except ImportError as error: print(error)"
     )
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert run.stdout.strip() == "the DDS bridge needs cyclonedds: pip install 'knode-cosserat[dds]'"
+    assert run.stdout.strip() == "the DDS bridge needs cyclonedds: pip install 'knode-cosserat-hardware[dds]'"
 
 
 def test_the_latency_between_two_processes():

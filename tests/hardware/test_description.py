@@ -6,9 +6,10 @@ import pytest
 import yaml
 
 import knode_cosserat as kc
-from knode_cosserat.hardware import Dimensions, HardwareError, Limits, load_hardware
-from knode_cosserat.hardware.description import HardwareDescription, parse_hardware, require_limits
 from knode_cosserat.rods.robot_file import RobotFileError, format_robot, parse_robot
+from knode_cosserat_hardware import Dimensions, HardwareError, Limits, load_hardware
+from knode_cosserat_hardware.description import HardwareDescription, parse_hardware
+from knode_cosserat_hardware.driver import require_limits
 
 TEXT = format_robot(kc.load_robot("delrin-tendon-robot"))
 

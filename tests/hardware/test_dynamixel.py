@@ -6,12 +6,11 @@ import time
 
 import numpy as np
 import pytest
-
-from knode_cosserat.hardware.driver import DriverState, HardwareError, Limits
-from knode_cosserat.hardware.dynamixel import CURRENT, DynamixelRobot
-from knode_cosserat.hardware.dynamixel_bus import Register
-from knode_cosserat.hardware.motor_robot import MotorReel
 from tests.hardware.fake_dynamixel import SYNC_READ, FakeDynamixel, crc, packet
+
+from knode_cosserat_hardware.driver import DriverState, HardwareError, Limits
+from knode_cosserat_hardware.dynamixel import CURRENT, DynamixelRobot, Register
+from knode_cosserat_hardware.motor_robot import MotorReel
 
 pytest.importorskip("dynamixel_sdk")
 IDS = (11, 12, 13, 14)
@@ -221,7 +220,7 @@ def test_arguments_are_checked(bus, monkeypatch):
     with pytest.raises(HardwareError, match="cannot be opened"):
         DynamixelRobot("/dev/ttyNothing", [1]).connect()
     monkeypatch.setitem(sys.modules, "dynamixel_sdk", None)
-    with pytest.raises(HardwareError, match=r"pip install 'knode-cosserat\[hardware\]'"):
+    with pytest.raises(HardwareError, match=r"pip install knode-cosserat-hardware"):
         driver(bus).connect()
 
 

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.hardware.driver import DriverState, HardwareError, Limits
-from knode_cosserat.hardware.emulation import EmulatedPort, EmulatedRobot, PseudoTerminal, missing
-from knode_cosserat.hardware.emulation import robot as emulated
-from knode_cosserat.hardware.emulation.robot import Switch
-from knode_cosserat.hardware.lines import GRAM_FORCE
-from knode_cosserat.hardware.serial_board import SerialBoard
+import knode_cosserat_hardware.emulation as emulated
+from knode_cosserat_hardware.driver import DriverState, HardwareError, Limits
+from knode_cosserat_hardware.emulation import EmulatedPort, EmulatedRobot, PseudoTerminal, Switch, missing
+from knode_cosserat_hardware.lines import GRAM_FORCE
+from knode_cosserat_hardware.serial_board import SerialBoard
 
 pytestmark = pytest.mark.slow
 

@@ -9,13 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from knode_cosserat.hardware.emulation import missing
+from knode_cosserat_hardware.emulation import missing
 
 if missing():
     pytest.skip(f"the firmware cannot be built here: {missing()}", allow_module_level=True)
 
-from knode_cosserat.hardware.emulation.logic import HostBoard, run_on_chip
-from knode_cosserat.hardware.emulation.toolchain import built
+from knode_cosserat_hardware.emulation import HostBoard, built, run_on_chip
 
 #: reading of a slack tendon (counts), and counts per gram-force, by the default settings
 ZERO, PER_GRAM = 800, 2

@@ -5,9 +5,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from knode_cosserat.hardware.driver import HardwareError, Limits
-from knode_cosserat.hardware.limits import TensionLimiter
-from knode_cosserat.hardware.serial_board import SerialBoard
+from knode_cosserat_hardware.driver import HardwareError, Limits, TensionLimiter
+from knode_cosserat_hardware.serial_board import SerialBoard
 
 
 @given(

@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from knode_cosserat.hardware.driver import HardwareError
-from knode_cosserat.hardware.lines import (
+from knode_cosserat_hardware.driver import HardwareError
+from knode_cosserat_hardware.lines import (
     STATES,
     Answer,
     Banner,

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.hardware.calibration import fit_load_cell, wire_settings, write_calibration
-from knode_cosserat.hardware.driver import HardwareError
-from knode_cosserat.hardware.simulated import MachineParameters, SimulatedRobot
+from knode_cosserat_hardware.calibration import fit_load_cell, wire_settings, write_calibration
+from knode_cosserat_hardware.driver import HardwareError
+from knode_cosserat_hardware.figures import load_cell
+from knode_cosserat_hardware.simulated import MachineParameters, SimulatedRobot
 
 UP_AND_DOWN = np.array([0.0, 1.0, 2.0, 4.0, 8.0, 4.0, 2.0, 1.0, 0.0])
 
@@ -90,5 +91,5 @@ def test_it_can_be_drawn(tmp_path):
     pytest.importorskip("matplotlib")
     random = np.random.default_rng(0)
     fit = fit_load_cell(UP_AND_DOWN, 512.0 + 40.0 * UP_AND_DOWN + random.normal(size=len(UP_AND_DOWN)))
-    kc.figures.load_cell(fit).savefig(tmp_path / "cell.png")
+    load_cell(fit).savefig(tmp_path / "cell.png")
     assert (tmp_path / "cell.png").stat().st_size > 1000

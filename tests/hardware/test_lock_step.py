@@ -8,11 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from knode_cosserat.hardware.board_link import BoardLink
-from knode_cosserat.hardware.driver import DriverState, HardwareError, Limits
-from knode_cosserat.hardware.lines import Answer, Telemetry, decode_framed, encode_message
-from knode_cosserat.hardware.serial_board import SerialBoard
-from knode_cosserat.hardware.transport import Transport
+from knode_cosserat_hardware.board_link import BoardLink, Transport
+from knode_cosserat_hardware.driver import DriverState, HardwareError, Limits
+from knode_cosserat_hardware.lines import Answer, Telemetry, decode_framed, encode_message
+from knode_cosserat_hardware.serial_board import SerialBoard
 
 pytest.importorskip("serial")
 #: no rate limit that a test would wait for

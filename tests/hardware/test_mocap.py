@@ -11,21 +11,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from tests.hardware.vrpn_server import VRPNServer
 
 import knode_cosserat as kc
-from knode_cosserat.hardware.driver import HardwareError
-from knode_cosserat.hardware.middleware import natnet
-from knode_cosserat.hardware.middleware.mocap import PoseFrame, upright
-from knode_cosserat.hardware.middleware.natnet import (
+from knode_cosserat_hardware.driver import HardwareError
+from knode_cosserat_hardware.middleware import natnet
+from knode_cosserat_hardware.middleware.mocap import PoseFrame, SimulatedCapture, upright
+from knode_cosserat_hardware.middleware.natnet import (
     NatNet,
     NatNetAddress,
     PacketError,
     parse_frame,
     parse_server_info,
 )
-from knode_cosserat.hardware.middleware.simulated_capture import SimulatedCapture
-from knode_cosserat.hardware.simulated import SimulatedRobot
-from tests.hardware.vrpn_server import VRPNServer
+from knode_cosserat_hardware.simulated import SimulatedRobot
 
 VERSIONS = [(3, 0), (3, 1), (4, 0), (4, 1), (4, 2)]
 #: identity, position, quaternion (scalar last), tracked
@@ -286,9 +285,9 @@ def test_y_up_becomes_z_up():
 
 def test_a_vrpn_server():
     pytest.importorskip(
-        "motioncapture", reason="VRPN needs motioncapture: pip install 'knode-cosserat[mocap]'"
+        "motioncapture", reason="VRPN needs motioncapture: pip install 'knode-cosserat-hardware[mocap]'"
     )
-    from knode_cosserat.hardware.middleware.vrpn import VRPN
+    from knode_cosserat_hardware.middleware.mocap import VRPN
 
     names = ["base", "tip", "other"]
     with VRPNServer(names) as server, VRPN(["tip", "base"], "127.0.0.1", port=server.port) as capture:
@@ -315,9 +314,9 @@ def test_a_vrpn_server():
 
 def test_a_vrpn_server_that_is_not_there():
     pytest.importorskip(
-        "motioncapture", reason="VRPN needs motioncapture: pip install 'knode-cosserat[mocap]'"
+        "motioncapture", reason="VRPN needs motioncapture: pip install 'knode-cosserat-hardware[mocap]'"
     )
-    from knode_cosserat.hardware.middleware.vrpn import VRPN
+    from knode_cosserat_hardware.middleware.mocap import VRPN
 
     with (
         VRPN(["tip"], "127.0.0.1", port=free_port()) as capture,

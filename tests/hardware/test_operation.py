@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.hardware.commissioning import CHECKLIST, Commissioning, Person
-from knode_cosserat.hardware.driver import DriverState, HardwareError, Limits
-from knode_cosserat.hardware.plant import HardwarePlant
-from knode_cosserat.hardware.safety import EmergencyStop, SafeRegion, StoppedError
-from knode_cosserat.hardware.simulated import MachineParameters, SimulatedRobot
+from knode_cosserat_hardware.commissioning import CHECKLIST, Commissioning, Person
+from knode_cosserat_hardware.driver import DriverState, HardwareError, Limits
+from knode_cosserat_hardware.plant import HardwarePlant
+from knode_cosserat_hardware.safety import EmergencyStop, SafeRegion, StoppedError
+from knode_cosserat_hardware.simulated import MachineParameters, SimulatedRobot
 
 pytestmark = pytest.mark.slow
 

@@ -7,11 +7,11 @@ import time
 from pathlib import Path
 
 import pytest
-
-from knode_cosserat.hardware.emulation import missing
-from knode_cosserat.recordings import load_recording
 from tests.hardware import test_ros1
 from tests.hardware.test_ros1 import RosBag, equal, ros
+
+from knode_cosserat.recordings import load_recording
+from knode_cosserat_hardware.emulation import missing
 
 pytestmark = [
     pytest.mark.campaign,

@@ -10,14 +10,12 @@ import time
 
 import numpy as np
 import pytest
-
-from knode_cosserat.hardware.bag_stream import BagStream
-from knode_cosserat.hardware.clock import HostClock
-from knode_cosserat.hardware.driver import DriverState, HardwareError, Reading
-from knode_cosserat.hardware.middleware.mocap import PoseFrame
-from knode_cosserat.hardware.recorder import Recorder, record_robot
-from knode_cosserat.recordings import RecordingConfig, RecordingError, load_recording
 from tests.recordings.made import PAPER, made
+
+from knode_cosserat.recordings import RecordingConfig, RecordingError, load_recording
+from knode_cosserat_hardware.driver import DriverState, HardwareError, HostClock, Reading
+from knode_cosserat_hardware.middleware.mocap import PoseFrame
+from knode_cosserat_hardware.recorder import BagStream, Recorder, record_robot
 
 pytest.importorskip("rosbags", reason="bags need rosbags: pip install 'knode-cosserat[ros]'")
 
@@ -112,9 +110,9 @@ def test_lost_bodies_and_tensions_have_no_message(tmp_path):
 KILLED = """
 import sys, time
 import numpy as np
-from knode_cosserat.hardware.driver import DriverState, Reading
-from knode_cosserat.hardware.middleware.mocap import PoseFrame
-from knode_cosserat.hardware.recorder import Recorder
+from knode_cosserat_hardware.driver import DriverState, Reading
+from knode_cosserat_hardware.middleware.mocap import PoseFrame
+from knode_cosserat_hardware.recorder import Recorder
 recorder = Recorder(sys.argv[1])
 height = np.array([0.0635, -0.42, -0.28, -0.14, 0.0]) + 0.635
 k = 0

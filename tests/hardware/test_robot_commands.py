@@ -10,16 +10,16 @@ import time
 
 import numpy as np
 import pytest
-
-import knode_cosserat as kc
-from knode_cosserat.cli import robot_motion, robot_options
-from knode_cosserat.hardware.description import HardwareDescription
-from knode_cosserat.hardware.driver import HardwareError
-from knode_cosserat.hardware.middleware.mocap import PoseFrame
-from knode_cosserat.hardware.open_driver import open_driver
-from knode_cosserat.hardware.simulated import SimulatedRobot
 from tests.commands import run
 from tests.hardware.fake_board import FakeBoard
+
+import knode_cosserat as kc
+from knode_cosserat_hardware.cli import motion, options
+from knode_cosserat_hardware.description import HardwareDescription
+from knode_cosserat_hardware.driver import HardwareError
+from knode_cosserat_hardware.middleware.mocap import PoseFrame
+from knode_cosserat_hardware.open_driver import open_driver
+from knode_cosserat_hardware.simulated import SimulatedRobot
 
 pytestmark = pytest.mark.slow
 
@@ -51,7 +51,7 @@ def error(result, code=2):
 def answering(monkeypatch, *answers):
     """A person at a terminal, who answers."""
     left = list(answers)
-    monkeypatch.setattr(robot_options, "has_terminal", lambda: True)
+    monkeypatch.setattr(options, "has_terminal", lambda: True)
     monkeypatch.setattr("typer.confirm", lambda *_, **__: left.pop(0))
     return left
 
@@ -287,7 +287,7 @@ def test_keys_steer_and_stop_and_the_terminal_is_restored(folder):
 
 @pytest.mark.campaign
 def test_the_firmware_passes_its_commissioning(folder):
-    from knode_cosserat.hardware.emulation import missing
+    from knode_cosserat_hardware.emulation import missing
 
     if missing():
         pytest.skip("the emulator is not installed")
@@ -309,10 +309,10 @@ class Capture:
 
 def test_the_measured_tip_is_relative_to_the_clamped_end():
     opened = open_driver("/dev/ttyACM0", HardwareDescription(), lambda: ROD)
-    stamp, tip = robot_options.tip_source(opened, Capture())()
+    stamp, tip = options.tip_source(opened, Capture())()
     np.testing.assert_allclose(tip, [0.1, 0.0, 0.5 + 0.0635])
-    assert stamp == 3.0 and robot_options.tip_source(opened, None) is None
-    config = robot_motion._recording_config(4, ["base", "rib", "tip"], opened)
+    assert stamp == 3.0 and options.tip_source(opened, None) is None
+    config = motion._recording_config(4, ["base", "rib", "tip"], opened)
     assert config.base.height == 0.0635 and [each.fraction for each in config.markers] == [0.5, 1.0]
 
 

@@ -12,9 +12,9 @@ import time
 import numpy as np
 import pytest
 
-from knode_cosserat.hardware.driver import HardwareError
-from knode_cosserat.hardware.middleware import ros1
 from knode_cosserat.recordings import load_recording
+from knode_cosserat_hardware.driver import HardwareError
+from knode_cosserat_hardware.middleware import ros1
 
 MISSING = [name for name in ("rosmaster", "rosbag") if shutil.which(name) is None]
 HAS_ROSPY = any(os.path.isdir(os.path.join(each, "rospy")) for each in [*sys.path, str(ros1.DEBIAN)])
@@ -29,11 +29,11 @@ ROBOT = """
 import sys, time
 import numpy as np
 import knode_cosserat as kc
-from knode_cosserat.hardware.clock import HostClock
-from knode_cosserat.hardware.middleware.ros1 import ROS1Node
-from knode_cosserat.hardware.middleware.simulated_capture import SimulatedCapture
-from knode_cosserat.hardware.recorder import Recorder
-from knode_cosserat.hardware.simulated import SimulatedRobot
+from knode_cosserat_hardware.driver import HostClock
+from knode_cosserat_hardware.middleware.ros1 import ROS1Node
+from knode_cosserat_hardware.middleware.mocap import SimulatedCapture
+from knode_cosserat_hardware.recorder import Recorder
+from knode_cosserat_hardware.simulated import SimulatedRobot
 from knode_cosserat.recordings import RecordingConfig
 
 config = RecordingConfig.paper_robot().replace(simulated=True)
@@ -163,9 +163,9 @@ def test_rosbag_records_what_the_driver_records(tmp_path, ros):
 COMMANDED = """
 import time
 import numpy as np
-from knode_cosserat.hardware.middleware.ros1 import ROS1Node, import_rospy
+from knode_cosserat_hardware.middleware.ros1 import ROS1Node, import_rospy
 import knode_cosserat as kc
-from knode_cosserat.hardware.simulated import SimulatedRobot
+from knode_cosserat_hardware.simulated import SimulatedRobot
 
 with SimulatedRobot(kc.load_robot("delrin-tendon-robot"), real_time=True) as robot:
     robot.read()

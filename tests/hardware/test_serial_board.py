@@ -7,14 +7,13 @@ import time
 
 import numpy as np
 import pytest
-
-from knode_cosserat.hardware.driver import DriverState, HardwareError, Limits
-from knode_cosserat.hardware.faults import FAULTS, fault_message
-from knode_cosserat.hardware.lines import GRAM_FORCE
-from knode_cosserat.hardware.plant import HardwarePlant
-from knode_cosserat.hardware.serial_board import SerialBoard
-from knode_cosserat.hardware.transport import SerialTransport
 from tests.hardware.fake_board import FakeBoard
+
+from knode_cosserat_hardware.board_link import SerialTransport
+from knode_cosserat_hardware.driver import FAULTS, DriverState, HardwareError, Limits, fault_message
+from knode_cosserat_hardware.lines import GRAM_FORCE
+from knode_cosserat_hardware.plant import HardwarePlant
+from knode_cosserat_hardware.serial_board import SerialBoard
 
 pytest.importorskip("serial")
 #: no rate limit that a test would wait for
@@ -116,7 +115,7 @@ def test_a_port_that_is_not_there_or_in_use(board):
 
 def test_without_pyserial_the_error_says_what_to_install(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "serial", None)
-    with pytest.raises(HardwareError, match=r"pip install 'knode-cosserat\[hardware\]'"):
+    with pytest.raises(HardwareError, match=r"pip install knode-cosserat-hardware"):
         SerialTransport("/dev/ttyACM0")
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.hardware.driver import Driver, DriverState, HardwareError, Limits
-from knode_cosserat.hardware.simulated import MachineParameters, SimulatedRobot
+from knode_cosserat_hardware.driver import Driver, DriverState, HardwareError, Limits
+from knode_cosserat_hardware.simulated import MachineParameters, SimulatedRobot
 
 ROD = kc.load_robot("delrin-tendon-robot").replace(nodes=6)
 EXACT = MachineParameters(noise=0.0, offset=0.0)

@@ -11,11 +11,10 @@ from typer.testing import CliRunner
 
 import knode_cosserat as kc
 from knode_cosserat.cli import app
-from knode_cosserat.hardware.driver import DriverState, HardwareError, Limits
-from knode_cosserat.hardware.safety import EmergencyStop
-from knode_cosserat.hardware.simulated import SimulatedRobot
-from knode_cosserat.hardware.sliders import SliderWindow
-from knode_cosserat.hardware.teleoperation import teleoperate
+from knode_cosserat_hardware.driver import DriverState, HardwareError, Limits
+from knode_cosserat_hardware.safety import EmergencyStop
+from knode_cosserat_hardware.simulated import SimulatedRobot
+from knode_cosserat_hardware.teleoperation import SliderWindow, teleoperate
 
 pytest.importorskip("tkinter")
 ROD = kc.load_robot("delrin-tendon-robot").replace(nodes=6)

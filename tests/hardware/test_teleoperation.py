@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.hardware.driver import DriverState, HardwareError, Limits
-from knode_cosserat.hardware.safety import EmergencyStop
-from knode_cosserat.hardware.simulated import SimulatedRobot
-from knode_cosserat.hardware.teleoperation import Gamepad, Keyboard, TensionMap, Wish, teleoperate
+from knode_cosserat_hardware.driver import DriverState, HardwareError, Limits
+from knode_cosserat_hardware.safety import EmergencyStop
+from knode_cosserat_hardware.simulated import SimulatedRobot
+from knode_cosserat_hardware.teleoperation import Gamepad, Keyboard, TensionMap, Wish, teleoperate
 
 ROD = kc.load_robot("delrin-tendon-robot").replace(nodes=6)
 

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from tests.identification.recorded import DT, measured, tensions
 
 import knode_cosserat as kc
 from knode_cosserat.identification.evaluate import evaluate
@@ -16,7 +17,6 @@ from knode_cosserat.rods.parameters import ParameterError
 from knode_cosserat.rods.rib_spacing import RibSpacing
 from knode_cosserat.rods.section import Sleeve, Stretch
 from knode_cosserat.rods.tendon_friction import TendonFriction
-from tests.identification.recorded import DT, measured, tensions
 
 #: as ruler, scale and data sheet have it: lying along z, with gravity across
 NOMINAL = kc.load_robot("delrin-tendon-robot").replace(

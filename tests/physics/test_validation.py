@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-
 from benchmarks import beams, closed_forms, motions
 
 GRID = (20, 40)

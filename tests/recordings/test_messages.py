@@ -4,6 +4,8 @@ import math
 
 import numpy as np
 import pytest
+from tests.commands import succeeded
+from tests.recordings.formats.exported import bent, times
 
 from knode_cosserat.recordings import (
     CommandSource,
@@ -16,8 +18,6 @@ from knode_cosserat.recordings import (
     proposed_config,
 )
 from knode_cosserat.recordings.messages import typestore
-from tests.commands import succeeded
-from tests.recordings.formats.exported import bent, times
 
 rosbag1 = pytest.importorskip("rosbags.rosbag1")
 rosbag2 = pytest.importorskip("rosbags.rosbag2")
@@ -358,7 +358,7 @@ def test_a_body_of_a_pose_array(tmp_path):
 
 def test_the_bridges_own_poses_are_read(tmp_path):
     """Bytes of the DDS bridge, as a recorder stores them."""
-    idl = pytest.importorskip("knode_cosserat.hardware.middleware.idl")
+    idl = pytest.importorskip("knode_cosserat_hardware.middleware.idl")
     store = typestore(2)
     kind = "geometry_msgs/msg/PoseArray"
     with rosbag2.Writer(tmp_path / "it", version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:

@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
-import knode_cosserat as kc
 from benchmarks.motions import soft_rod
 from examples.hanging_string import HangingString
+
+import knode_cosserat as kc
 from knode_cosserat.solvers.grid import at_places, grid_of
 from knode_cosserat.solvers.history import resting_history, still_records
 from knode_cosserat.solvers.initial import continued_state

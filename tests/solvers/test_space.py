@@ -5,9 +5,9 @@ import itertools
 
 import numpy as np
 import pytest
+from benchmarks.motions import soft_rod
 
 import knode_cosserat as kc
-from benchmarks.motions import soft_rod
 from knode_cosserat.solvers.space import SCHEMES
 
 LOBATTO = ("lobatto2", "lobatto4")

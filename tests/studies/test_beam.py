@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.commands import run
 
 from knode_cosserat.recordings.beam import THRESHOLD, find_release, load_of, read_beam, tip_drop
 from knode_cosserat.recordings.findings import RecordingError
@@ -22,7 +23,6 @@ from knode_cosserat.studies.beam_model import (
     step_count,
     torsion_constant,
 )
-from tests.commands import run
 
 FOLDER = Path(__file__).parents[1] / "files" / "beam"
 HELD_OUT = "beam_load52_V2_b"

@@ -5,10 +5,10 @@ import os
 import numpy as np
 import pytest
 
-from knode_cosserat.hardware.emulation import missing
 from knode_cosserat.studies import hardware
 from knode_cosserat.studies.hardware_rig import Cable
 from knode_cosserat.studies.runner import Job, Product
+from knode_cosserat_hardware.emulation import missing
 
 FACTS = {
     "build": {"seconds": 5.0, "flash": 20_000, "ram": 1800},

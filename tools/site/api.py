@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import knode_cosserat as kc
+import knode_cosserat_hardware as kch
 
 PACKAGE = "knode_cosserat"
 #: functions that most readers look for: first on their pages, in this order
@@ -31,9 +32,9 @@ MAIN = (
 
 
 def public() -> dict[str, Any]:
-    """All public objects by their path: those at the top level and in its namespaces."""
+    """All public objects by their path: those of the library, of its namespaces, and of hardware."""
     found: dict[str, Any] = {}
-    for space in [kc, *(thing for name in kc.__all__ if _is_namespace(thing := getattr(kc, name)))]:
+    for space in [kc, kch, *(thing for name in kc.__all__ if _is_namespace(thing := getattr(kc, name)))]:
         for name in space.__all__:
             thing = getattr(space, name)
             if not _is_namespace(thing) and not _is_constant(thing):
@@ -53,10 +54,11 @@ def _is_constant(thing: Any) -> bool:
 
 
 def rooms() -> dict[str, list[str]]:
-    """Paths of all public objects by room: a folder of the package, or a module at its top."""
+    """Paths of all public objects by room: a folder of the library, a module at its top, or hardware."""
     found: dict[str, list[str]] = {}
     for path, thing in public().items():
-        found.setdefault(where(thing).split(".")[1], []).append(path)
+        package, room = where(thing).split(".")[:2]
+        found.setdefault("hardware" if package == kch.__name__ else room, []).append(path)
     return found
 
 

@@ -13,7 +13,7 @@ def found(path: str) -> tuple[Path, int, str]:
     """File, first line and source of `package.module.Class.method`. Raises `LookupError`."""
     names = path.split(".")
     for count in range(len(names), 0, -1):
-        for base in (ROOT / "src", ROOT):
+        for base in (ROOT / "src", ROOT / "hardware" / "src", ROOT):
             file = base.joinpath(*names[:count]).with_suffix(".py")
             if file.is_file():
                 text = file.read_text(encoding="utf-8")

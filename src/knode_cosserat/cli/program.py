@@ -1,4 +1,8 @@
-"""The typer application: name, options of the program, help and error handling."""
+"""The typer application: name, options of the program, help and error handling.
+
+Other distributions add commands by entry points of the group `knode_cosserat.commands`: the command's name
+and its typer application. They are imported when they are called, or listed in the help.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +11,7 @@ import logging
 import re
 import sys
 import warnings
+from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -20,6 +25,9 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 PROGRAM = "knode-cosserat"
+COMMANDS = "knode_cosserat.commands"
+#: commands of other distributions of this project
+OPTIONAL_COMMANDS = {"robot": "knode-cosserat-hardware", "robot-parts": "knode-cosserat-hardware"}
 #: errors caused by the input; any other error is a defect of the package and shows its traceback
 _EXPECTED = (KnodeCosseratError, ValueError, OSError, ImportError, MemoryError, OverflowError)
 
@@ -43,6 +51,22 @@ _NAMED_OPTIONS = frozenset(["--control"])
 
 class _Program(TyperGroup):
     """Group of all commands. Errors and warnings are printed in one line on stderr."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return [*super().list_commands(ctx), *(entry.name for entry in entry_points(group=COMMANDS))]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        command = super().get_command(ctx, cmd_name)
+        if command is not None:
+            return command
+        for entry in entry_points(group=COMMANDS, name=cmd_name):
+            command = typer.main.get_command(entry.load())
+            command.name = cmd_name
+            return command
+        if cmd_name in OPTIONAL_COMMANDS:
+            distribution = OPTIONAL_COMMANDS[cmd_name]
+            raise ImportError(f"{cmd_name} needs {distribution}: pip install {distribution}")
+        return None
 
     def main(
         self, args: Sequence[str] | None = None, prog_name: str | None = None, *_: Any, **extra: Any
@@ -118,7 +142,8 @@ def _print_warning(message: Warning | str, *_: Any, **__: Any) -> None:
     typer.echo("warning: " + printable(" ".join(str(message).split())), err=True)
 
 
-def _app(**options: Any) -> typer.Typer:
+def command_group(**options: Any) -> typer.Typer:
+    """Return a typer application in the style of this program."""
     return _App(
         add_completion=options.pop("add_completion", False),
         rich_markup_mode=None,
@@ -128,11 +153,9 @@ def _app(**options: Any) -> typer.Typer:
     )
 
 
-app = _app(cls=_Program, add_completion=True)
+app = command_group(cls=_Program, add_completion=True)
 #: the commands under `study`
-studies = _app(help="Repeat a study of the paper, or of a folder of recordings.")
-#: the commands under `robot`
-hardware = _app(help="Operate a real, emulated or simulated robot: connect, calibrate, record, control.")
+studies = command_group(help="Repeat a study of the paper, or of a folder of recordings.")
 
 
 def main() -> None:

@@ -15,11 +15,6 @@ import numpy as np
 
 from knode_cosserat.control.loop import run_loop
 from knode_cosserat.control.references import circle, figure_eight
-from knode_cosserat.hardware.driver import DriverState, HardwareError
-from knode_cosserat.hardware.emulation.robot import EmulatedRobot
-from knode_cosserat.hardware.emulation.toolchain import built, firmware_folder, missing
-from knode_cosserat.hardware.lines import GRAM_FORCE
-from knode_cosserat.hardware.plant import HardwarePlant
 from knode_cosserat.studies.hardware_faults import faults, loop_faults
 from knode_cosserat.studies.hardware_rig import (
     DT,
@@ -34,6 +29,10 @@ from knode_cosserat.studies.hardware_rig import (
 )
 from knode_cosserat.studies.report import Report, as_json, check_row, checks_table, write_texts
 from knode_cosserat.studies.runner import Job, Product, run
+from knode_cosserat_hardware.driver import DriverState, HardwareError
+from knode_cosserat_hardware.emulation import EmulatedRobot, built, firmware_folder, missing
+from knode_cosserat_hardware.lines import GRAM_FORCE
+from knode_cosserat_hardware.plant import HardwarePlant
 
 #: tip RMSE of the PyElastica stand-in in the study `control` (% of length), and the allowed multiple of it
 STAND_IN, FACTOR = 0.18, 1.5
@@ -137,7 +136,7 @@ def build(settings: Any) -> Product:
 
 def fuzz(settings: Any) -> Product:
     """Send fuzzed frames to the board's logic on this computer."""
-    from knode_cosserat.hardware.emulation.logic import HostBoard
+    from knode_cosserat_hardware.emulation import HostBoard
 
     each = settings["frames"] // 10
     found = [HostBoard().fuzz(seed, each) for seed in range(10)]
@@ -237,7 +236,7 @@ def loop(settings: Any) -> Product:
 
 def dds(settings: Any) -> Product:
     """Measure the latency of DDS between two processes; with real-time priority where it is allowed."""
-    from knode_cosserat.hardware.middleware.loopback import measure_loopback
+    from knode_cosserat_hardware.middleware.loopback import measure_loopback
 
     try:
         found = measure_loopback(settings["messages"], real_time=True)

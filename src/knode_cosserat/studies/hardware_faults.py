@@ -11,11 +11,6 @@ import numpy as np
 from knode_cosserat.control.commands import Controller
 from knode_cosserat.control.loop import LoopLog, run_loop
 from knode_cosserat.control.references import circle
-from knode_cosserat.hardware.driver import HardwareError
-from knode_cosserat.hardware.emulation.robot import EmulatedRobot
-from knode_cosserat.hardware.lines import GRAM_FORCE
-from knode_cosserat.hardware.plant import HardwarePlant
-from knode_cosserat.hardware.serial_board import SerialBoard
 from knode_cosserat.studies.hardware_rig import (
     DT,
     HIGH,
@@ -28,6 +23,11 @@ from knode_cosserat.studies.hardware_rig import (
     true_robot,
 )
 from knode_cosserat.studies.runner import Product
+from knode_cosserat_hardware.driver import HardwareError
+from knode_cosserat_hardware.emulation import EmulatedRobot
+from knode_cosserat_hardware.lines import GRAM_FORCE
+from knode_cosserat_hardware.plant import HardwarePlant
+from knode_cosserat_hardware.serial_board import SerialBoard
 
 #: faults of robot, board and host
 KINDS = (

@@ -13,14 +13,13 @@ from knode_cosserat.control.commands import Controller, ControlLimits
 from knode_cosserat.control.lag import identified_lag
 from knode_cosserat.control.named import controller_named
 from knode_cosserat.estimation.outputs import TipPosition
-from knode_cosserat.hardware.driver import Limits
-from knode_cosserat.hardware.emulation.port import EmulatedPort
-from knode_cosserat.hardware.emulation.robot import ROBOT, EmulatedRobot
-from knode_cosserat.hardware.lines import GRAM_FORCE
-from knode_cosserat.hardware.serial_board import SerialBoard
 from knode_cosserat.rods.load_cells import LoadCells
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.studies.stand_in import DAMPING, NOISE, OFFSETS
+from knode_cosserat_hardware.driver import Limits
+from knode_cosserat_hardware.emulation import ROBOT, EmulatedPort, EmulatedRobot
+from knode_cosserat_hardware.lines import GRAM_FORCE
+from knode_cosserat_hardware.serial_board import SerialBoard
 
 #: period of the loop (s), and its tension limits (N, N/s)
 DT, LOW, HIGH, RATE = 0.05, 0.5, 12.0, 40.0

@@ -6,6 +6,7 @@ import gzip
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.recordings.formats import exported
 
 from knode_cosserat.recordings import (
     BaseSource,
@@ -17,7 +18,6 @@ from knode_cosserat.recordings import (
     load_recording,
 )
 from knode_cosserat.recordings.formats import format_of, formats
-from tests.recordings.formats import exported
 
 TIME = exported.times()
 LOST = range(80, 90)

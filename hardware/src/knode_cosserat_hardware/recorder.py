@@ -1,0 +1,525 @@
+"""Recorder of a robot's readings and poses: straight to a bag that `load_recording` reads."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import struct
+import threading
+from collections.abc import Callable, Iterable
+from io import BytesIO
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.recordings.config import RecordingConfig
+from knode_cosserat.recordings.findings import RecordingError
+from knode_cosserat.recordings.formats.ros1 import BAG, CHUNK, CHUNK_INFO, CONNECTION, INDEX, MESSAGE, VERSION
+from knode_cosserat.recordings.messages import typestore
+from knode_cosserat.recordings.sources import POSITION_UNITS, TensionSource
+from knode_cosserat.recordings.write import WireStream, message_maker, message_type, sent_tensions
+from knode_cosserat_hardware.driver import Driver, HardwareError, HostClock, Reading
+from knode_cosserat_hardware.middleware.mocap import MotionCapture, PoseFrame
+
+
+class BagTopic(NamedTuple):
+    """Topic of a ROS 1 bag with its message type, such as geometry_msgs/msg/PoseStamped."""
+
+    name: str
+    type: str
+
+
+class Encoded(NamedTuple):
+    """Encoded message of a topic."""
+
+    topic: str
+    data: bytes
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Coder:
+    topic: BagTopic
+    encode: Callable[[int, Any], Encoded]
+
+
+class MessageEncoder:
+    """Encoder of poses, tensions and commands (SI units) as ROS 1 messages of a configuration's topics.
+
+    Args:
+        config: topics, order and units of the messages.
+
+    Raises:
+        RecordingError: the configuration has motors in place of tensions.
+        ImportError: rosbags is not installed.
+    """
+
+    def __init__(self, config: RecordingConfig):
+        if config.motors is not None:
+            raise RecordingError("motors cannot be recorded; required is a configuration with tensions")
+        self.config = config
+        #: names of the bodies, in the order of poses: the base, where there is one, then the markers
+        self.bodies: tuple[str, ...] = tuple(marker.name for marker in config.markers)
+        sources = [marker.topic for marker in config.markers]
+        if config.base is not None:
+            self.bodies, sources = ("base", *self.bodies), [config.base.topic, *sources]
+        self._scale = POSITION_UNITS[config.position_unit]
+        self._poses = [_coder(WireStream(topic, "pose", [], np.zeros((0, 7)))) for topic in sources]
+        self._tension, self._command = (
+            None if source is None else _coder(_numbers(role, source))
+            for role, source in (("tension", config.tension), ("command", config.command))
+        )
+
+    @property
+    def topics(self) -> list[BagTopic]:
+        """Topics of all messages."""
+        return [coder.topic for coder in (*self._poses, self._tension, self._command) if coder]
+
+    def poses(
+        self, stamp: int, position: Float[np.ndarray, "bodies 3"], quaternion: Float[np.ndarray, "bodies 4"]
+    ) -> list[Encoded]:
+        """Return the messages of all bodies with finite values: a lost body has no message.
+
+        Args:
+            stamp: time of the measurement (ns since 1970).
+            position: positions (m), in the order of `bodies`.
+            quaternion: orientations, scalar first.
+
+        Raises:
+            RecordingError: the number of bodies is wrong.
+        """
+        values = np.concatenate([np.asarray(position) / self._scale, np.asarray(quaternion)], axis=1)
+        if values.shape != (len(self.bodies), 7):
+            raise RecordingError(
+                f"poses must be of {len(self.bodies)} bodies: {', '.join(self.bodies)} (got {len(values)})"
+            )
+        pairs = zip(self._poses, values, strict=True)
+        return [coder.encode(stamp, row) for coder, row in pairs if np.all(np.isfinite(row))]
+
+    def tension(self, stamp: int, tension: Float[np.ndarray, " tendons"]) -> list[Encoded]:
+        """Return the message of measured tensions (N).
+
+        There is none if one is not finite, as without a measurement, or without a topic for tensions.
+
+        Raises:
+            RecordingError: the number of tensions is wrong.
+        """
+        if not np.all(np.isfinite(tension)):
+            return []
+        return self._encoded(self._tension, self.config.tension, stamp, tension)
+
+    def command(self, stamp: int, tension: Float[np.ndarray, " tendons"]) -> list[Encoded]:
+        """Return the message of commanded tensions (N); none if the configuration has no topic for it.
+
+        Text commands in grams-force are rounded to whole numbers.
+
+        Raises:
+            RecordingError: the number of tensions is wrong, or one is not finite.
+        """
+        return self._encoded(self._command, self.config.command, stamp, tension)
+
+    def simulation(self, stamp: int) -> list[Encoded]:
+        """Return the line of the log on a simulated robot; none if commands are not text."""
+        source = self.config.command
+        if self._command is None or source is None or source.text is None:
+            return []
+        return [self._command.encode(stamp, np.full(len(source.order), np.nan))]
+
+    @staticmethod
+    def _encoded(
+        coder: _Coder | None, source: TensionSource | None, stamp: int, tension: Any
+    ) -> list[Encoded]:
+        if coder is None or source is None:
+            return []
+        values = np.asarray(tension, dtype=float)
+        if values.shape != (len(source.order),):
+            raise RecordingError(
+                f"topic {source.topic} has {len(source.order)} tendons (got tensions of shape {values.shape})"
+            )
+        if not np.all(np.isfinite(values)):
+            raise RecordingError(f"topic {source.topic}: tensions must be finite (got {values.tolist()})")
+        return [coder.encode(stamp, sent_tensions(source, values[None])[0])]
+
+
+def _numbers(role: str, source: TensionSource) -> WireStream:
+    return WireStream(source.topic, role, [], np.zeros((0, len(source.order))), source)
+
+
+def _coder(stream: WireStream) -> _Coder:
+    kind, make, store = message_type(stream, 1), message_maker(stream, 1), typestore(1)
+
+    def encode(stamp: int, values: Any) -> Encoded:
+        return Encoded(stream.topic, bytes(store.serialize_ros1(make(stamp, 0, values), kind)))
+
+    return _Coder(BagTopic(stream.topic, kind), encode)
+
+
+#: size of the bag's first record (bytes), which is written again at the end
+FIRST_SIZE = 4096
+_long = struct.Struct("<I").pack
+_longer = struct.Struct("<Q").pack
+
+
+class BagMessage(NamedTuple):
+    """Encoded message with its recording time (ns since 1970)."""
+
+    received: int
+    topic: str
+    data: bytes
+
+
+@dataclasses.dataclass
+class _Chunk:
+    position: int
+    start: int
+    end: int
+    counts: dict[int, int]
+
+
+class BagStream:
+    """ROS 1 bag that is written in chunks.
+
+    Args:
+        path: the file; it must not exist.
+        topics: topics of the messages.
+
+    Raises:
+        OSError: the file exists or cannot be written.
+        ImportError: rosbags is not installed.
+    """
+
+    def __init__(self, path: Path, topics: Iterable[BagTopic]):
+        store = typestore(1)
+        self.path = path
+        self._numbers: dict[str, int] = {}
+        records = []
+        for topic in topics:
+            number = self._numbers.setdefault(topic.name, len(self._numbers))
+            definition, digest = store.generate_msgdef(topic.type)
+            fields = {
+                "topic": topic.name.encode(),
+                "type": topic.type.replace("/msg/", "/").encode(),
+                "md5sum": digest.encode(),
+                "message_definition": definition.encode(),
+            }
+            header = {"conn": _long(number), "topic": topic.name.encode()}
+            records.append(_record(CONNECTION, header, _fields(fields)))
+        self._connections = b"".join(records)
+        self._chunks: list[_Chunk] = []
+        # unbuffered: a failed write leaves no bytes that a later flush would write
+        self._file = path.open("xb", buffering=0)
+        #: end of the last complete chunk (bytes)
+        self._end = 0
+        try:
+            self._append(VERSION + self._first(0))
+            self._sync()
+        except OSError:
+            self._file.close()
+            path.unlink(missing_ok=True)
+            raise
+
+    @property
+    def size(self) -> int:
+        """Size of the complete part of the file (bytes)."""
+        return self._end
+
+    def write(self, messages: list[BagMessage]) -> None:
+        """Write messages as one chunk, and wait until the disk has it.
+
+        Raises:
+            OSError: the disk is full, for example; the file ends with the last complete chunk.
+        """
+        if not messages:
+            return
+        # the connections are repeated in the first chunk only
+        data, index = BytesIO(b"" if self._chunks else self._connections), dict[int, list[bytes]]()
+        data.seek(0, os.SEEK_END)
+        for message in messages:
+            number = self._numbers[message.topic]
+            stamp = _stamp(message.received)
+            index.setdefault(number, []).append(stamp + _long(data.tell()))
+            data.write(_record(MESSAGE, {"conn": _long(number), "time": stamp}, message.data))
+        content = data.getvalue()
+        header = {"compression": b"none", "size": _long(len(content))}
+        parts = [_record(CHUNK, header, content)]
+        for number, entries in index.items():
+            header = {"ver": _long(1), "conn": _long(number), "count": _long(len(entries))}
+            parts.append(_record(INDEX, header, b"".join(entries)))
+        times = [message.received for message in messages]
+        counts = {number: len(entries) for number, entries in index.items()}
+        chunk = _Chunk(self._end, min(times), max(times), counts)
+        self._append(b"".join(parts))
+        self._chunks.append(chunk)
+        self._sync()
+
+    def finish(self) -> None:
+        """Write the index at the file's end, and close it.
+
+        Raises:
+            OSError: the disk is full, for example; the file has no index then.
+        """
+        if self._file.closed:
+            return
+        try:
+            position = self._end
+            parts = [self._connections]
+            for chunk in self._chunks:
+                header = {
+                    "ver": _long(1),
+                    "chunk_pos": _longer(chunk.position),
+                    "start_time": _stamp(chunk.start),
+                    "end_time": _stamp(chunk.end),
+                    "count": _long(len(chunk.counts)),
+                }
+                counts = b"".join(_long(number) + _long(count) for number, count in chunk.counts.items())
+                parts.append(_record(CHUNK_INFO, header, counts))
+            self._append(b"".join(parts))
+            self._sync()
+            self._file.seek(len(VERSION))
+            self._file.write(self._first(position))
+            self._sync()
+        finally:
+            self._file.close()
+
+    def close(self) -> None:
+        """Close the file without an index. Never raises."""
+        self._file.close()
+
+    def _first(self, index: int) -> bytes:
+        header = {
+            "index_pos": _longer(index),
+            "conn_count": _long(len(self._numbers)),
+            "chunk_count": _long(len(self._chunks)),
+        }
+        size = len(_record(BAG, header, b""))
+        return _record(BAG, header, b" " * (FIRST_SIZE - size))
+
+    def _append(self, data: bytes) -> None:
+        """Write bytes at the end; after an error the file is cut to its former size."""
+        rest = memoryview(data)
+        try:
+            while rest:
+                rest = rest[self._file.write(rest) :]
+        except OSError:
+            self._file.truncate(self._end)
+            self._file.seek(self._end)
+            raise
+        self._end += len(data)
+
+    def _sync(self) -> None:
+        os.fsync(self._file.fileno())
+
+
+def _record(kind: int, header: dict[str, bytes], data: bytes) -> bytes:
+    fields = _fields({"op": bytes([kind]), **header})
+    return _long(len(fields)) + fields + _long(len(data)) + data
+
+
+def _fields(values: dict[str, bytes]) -> bytes:
+    return b"".join(
+        _long(len(name) + 1 + len(value)) + name.encode() + b"=" + value for name, value in values.items()
+    )
+
+
+def _stamp(time: int) -> bytes:
+    return struct.pack("<II", time // 10**9, time % 10**9)
+
+
+#: default time between two writes to the disk (s)
+INTERVAL = 0.5
+
+
+class Recorder:
+    """Recorder of tensions, poses and commands into a ROS 1 bag with the paper's topics.
+
+        with Recorder("run.bag") as recorder:
+            recorder.add_reading(robot.read())
+
+    A thread writes to the disk, so that no call waits for it. While it records, the file is `run.bag.active`,
+    which `load_recording` reads too; at the end it is renamed. A killed process loses what was added in the
+    last `interval`, and what is being written. On a full disk the file keeps everything up to the last
+    complete chunk, and the next call raises an error.
+
+    Args:
+        path: the bag; its name ends in .bag. An existing file is never replaced.
+        config: topics, order and units; the paper's robot if None. A simulated robot is stated in the bag.
+        clock: clock of readings and poses; a program's bridges and nodes share it.
+        interval: time between two writes to the disk (s).
+
+    Raises:
+        HardwareError: the name is not allowed, or the file exists or cannot be created.
+        RecordingError: the configuration has motors in place of tensions.
+        ImportError: rosbags is not installed.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        config: RecordingConfig | None = None,
+        *,
+        clock: HostClock | None = None,
+        interval: float = INTERVAL,
+    ):
+        self.path = Path(path)
+        if self.path.suffix != ".bag":
+            raise HardwareError(f"{self.path}: the name of a recording must end in .bag")
+        if not 0.01 <= interval <= 60.0:
+            raise HardwareError(f"interval must be between 0.01 and 60 s (got {interval!r})")
+        self.clock = HostClock() if clock is None else clock
+        self.encoder = MessageEncoder(RecordingConfig.paper_robot() if config is None else config)
+        self._interval = interval
+        self._lock = threading.Condition()
+        self._pending: list[BagMessage] = []
+        #: number of messages that are on the disk
+        self.written = 0
+        self._error: HardwareError | None = None
+        self._is_raised = False
+        self._closing = False
+        self._stream = self._open()
+        if self.encoder.config.simulated:
+            stamp = self.clock.stamp(self.clock.now())
+            self._add(self.encoder.simulation(stamp))
+        self._thread = threading.Thread(target=self._run, name=f"recorder {self.path.name}", daemon=True)
+        self._thread.start()
+
+    @property
+    def active_path(self) -> Path:
+        """File that is written while the recorder runs, and that remains if it is killed."""
+        return self.path.with_name(self.path.name + ".active")
+
+    def _open(self) -> BagStream:
+        if self.path.exists():
+            raise HardwareError(f"{self.path}: this file exists; choose another name, or delete it")
+        try:
+            return BagStream(self.active_path, self.encoder.topics)
+        except FileExistsError:
+            raise HardwareError(
+                f"{self.active_path}: this file exists; it is from a recording that runs or was killed: "
+                "rename it, for load_recording reads it"
+            ) from None
+        except OSError as error:
+            raise HardwareError(f"{self.path}: cannot be written: {error.strerror}") from None
+
+    def add_reading(self, reading: Reading) -> None:
+        """Add the measured tensions of a reading; one without a measurement (NaN) has no message.
+
+        Raises:
+            HardwareError: an earlier message could not be written.
+            RecordingError: the number of tensions is wrong.
+        """
+        self._add(self.encoder.tension(self.clock.stamp(reading.time), reading.tension))
+
+    def add_poses(self, frame: PoseFrame) -> None:
+        """Add the poses of all bodies in the order of `encoder.bodies`; a lost body (NaN) has no message.
+
+        Raises:
+            HardwareError: an earlier message could not be written.
+            RecordingError: the number of bodies is wrong.
+        """
+        self._add(self.encoder.poses(self.clock.stamp(frame.time), frame.position, frame.quaternion))
+
+    def add_command(self, tension: Float[np.ndarray, " c"], time: float | None = None) -> None:
+        """Add commanded tensions (N), at a time (s, monotonic); now if None.
+
+        Raises:
+            HardwareError: an earlier message could not be written.
+            RecordingError: the number of tensions is wrong, or one is not finite.
+        """
+        self._add(self.encoder.command(self.clock.stamp(self.clock.now() if time is None else time), tension))
+
+    def close(self) -> None:
+        """Write the rest and the index, and rename the file. A second call does nothing.
+
+        Raises:
+            HardwareError: a message could not be written; not if an earlier call has raised it.
+        """
+        with self._lock:
+            if self._closing:
+                return
+            self._closing = True
+            self._lock.notify_all()
+        self._thread.join()
+        if self._error is None:
+            try:
+                self._stream.finish()
+                if self.path.exists():
+                    self._fail("a file of this name was made meanwhile")
+                else:
+                    os.rename(self.active_path, self.path)
+            except OSError as error:
+                self._fail(error.strerror or str(error))
+        self._stream.close()
+        if not self._is_raised:
+            self._check()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        # an error that leaves the block is more important than the file's
+        with contextlib.suppress(HardwareError) if kind is not None else contextlib.nullcontext():
+            self.close()
+
+    def _add(self, messages: list[Encoded]) -> None:
+        received = self.clock.stamp(self.clock.now())
+        with self._lock:
+            self._check()
+            if self._closing:
+                raise HardwareError(f"{self.path}: the recorder is closed; open another one")
+            self._pending += [BagMessage(received, message.topic, message.data) for message in messages]
+
+    def _check(self) -> None:
+        if self._error is not None:
+            self._is_raised = True
+            raise HardwareError(str(self._error))
+
+    def _fail(self, reason: str) -> None:
+        self._error = HardwareError(
+            f"{self.path}: recording stopped: {reason}; "
+            f"{self.written} messages are kept in {self.active_path}"
+        )
+
+    def _run(self) -> None:
+        while self._error is None:
+            with self._lock:
+                self._lock.wait_for(lambda: self._closing, self._interval)
+                messages, self._pending = self._pending, []
+                is_last = self._closing
+            try:
+                self._stream.write(messages)
+                self.written += len(messages)
+            except Exception as error:  # an error in a thread would be lost
+                reason = error.strerror if isinstance(error, OSError) else None
+                with self._lock:
+                    self._fail(reason or f"{error!r:.150}")
+            if is_last:
+                return
+
+
+def record_robot(
+    recorder: Recorder, driver: Driver, duration: float, capture: MotionCapture | None = None
+) -> int:
+    """Record a connected robot, which nothing commands meanwhile, and return the number of readings.
+
+    Args:
+        recorder: an open recorder.
+        driver: a connected robot.
+        duration: how long (s), on the recorder's clock.
+        capture: motion capture, in the order of the recorder's bodies.
+
+    Raises:
+        HardwareError: the robot or motion capture does not answer, or the disk is full.
+    """
+    end = recorder.clock.now() + duration
+    count = 0
+    while recorder.clock.now() < end:
+        recorder.add_reading(driver.read())
+        count += 1
+        for frame in capture.frames() if capture is not None else ():
+            recorder.add_poses(frame)
+    return count

@@ -1,4 +1,0 @@
-"""Middleware: ROS 2's messages by DDS, a ROS 1 node, motion capture.
-
-Optional packages: `pip install 'knode-cosserat[dds,mocap,ros]'`. They are imported on first use.
-"""
