@@ -40,9 +40,10 @@ LAYERS = (
     ("viewer", "diagnosis", "sweeps", "envs"),
     # the public names: `import knode_cosserat`
     ("",),
-    ("studies",),
     ("cli",),
 )
+#: folders of the repository beside the package
+REPOSITORY = ("studies", "benchmarks", "examples", "tools", "tests")
 
 
 def name_of(file: Path) -> str:
@@ -122,6 +123,12 @@ def test_packages_depend_in_one_direction() -> None:
         if layer_of(other) > layer_of(name)
     ]
     assert not upwards
+
+
+def test_the_library_imports_no_study_and_no_benchmark() -> None:
+    pattern = re.compile(rf"^\s*(?:from|import) (?:{'|'.join(REPOSITORY)})\b.*", re.MULTILINE)
+    found = {name: pattern.findall(file.read_text(encoding="utf-8")) for name, file in MODULES.items()}
+    assert not {name: lines for name, lines in found.items() if lines}
 
 
 def test_physics_knows_no_time_scheme() -> None:

@@ -7,7 +7,12 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-SOURCES = sorted(file for file in (ROOT / "src").rglob("*.py") if "vendor" not in file.parts)
+SOURCES = sorted(
+    file
+    for folder in ("src", "studies")
+    for file in (ROOT / folder).rglob("*.py")
+    if "vendor" not in file.parts
+)
 #: a first line is a verb phrase or a noun phrase
 FORBIDDEN = ("What", "Whether", "That", "Those", "How", "Of")
 #: sentences of earlier versions that readers found hard to understand; each has a plain replacement
@@ -38,7 +43,8 @@ PHRASES = (
 TEXTS = [
     *(
         file
-        for file in (ROOT / "src").rglob("*")
+        for folder in ("src", "studies")
+        for file in (ROOT / folder).rglob("*")
         if file.suffix in (".py", ".js", ".html", ".yaml") and "vendor" not in file.parts
     ),
     *(file for file in (ROOT / "docs").rglob("*") if file.suffix in (".md", ".py", ".ipynb")),

@@ -3,7 +3,7 @@
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.studies.simulation import CONTROLS, DT, IMPERFECTIONS, PUBLISHED, ROBOT, ROWS
+from studies.simulation import CONTROLS, DT, IMPERFECTIONS, PUBLISHED, ROBOT, ROWS
 
 # Self-weight under the step was published from a solve that had not converged, as 1.30 and 0.23; these are
 # the true figures, which the NumPy transcription confirms.

@@ -6,7 +6,7 @@ import pytest
 pytest.importorskip("gymnasium", reason="needs gymnasium: pip install 'knode-cosserat[rl]'")
 
 from knode_cosserat import envs
-from knode_cosserat.studies import environments
+from studies import environments
 
 
 @pytest.fixture

@@ -2,7 +2,7 @@
 
 import pytest
 
-from knode_cosserat.studies.environments_sweep import measure_sweep
+from studies.environments_sweep import measure_sweep
 
 
 @pytest.mark.campaign

@@ -41,17 +41,21 @@ VECTOR_OPTIONS = frozenset(
 _NAMED_OPTIONS = frozenset(["--control"])
 
 
-class _Program(TyperGroup):
+class Program(TyperGroup):
     """Group of all commands. Errors and warnings are printed in one line on stderr."""
+
+    #: name of the program in its help texts
+    program = PROGRAM
 
     def main(
         self, args: Sequence[str] | None = None, prog_name: str | None = None, *_: Any, **extra: Any
     ) -> Any:
+        """Run the command that the arguments name, and exit with its status."""
         args = list(sys.argv[1:] if args is None else args)
         try:
             with warnings.catch_warnings():
                 warnings.showwarning = _print_warning
-                status = super().main(args or ["--help"], PROGRAM, **{**extra, "standalone_mode": False})
+                status = super().main(args or ["--help"], self.program, **{**extra, "standalone_mode": False})
         except typer.Abort:
             sys.exit(1)
         except Exception as error:
@@ -118,7 +122,8 @@ def _print_warning(message: Warning | str, *_: Any, **__: Any) -> None:
     typer.echo("warning: " + printable(" ".join(str(message).split())), err=True)
 
 
-def _app(**options: Any) -> typer.Typer:
+def new_app(**options: Any) -> typer.Typer:
+    """Return an application whose commands accept vectors as separate words, and `-h`."""
     return _App(
         add_completion=options.pop("add_completion", False),
         rich_markup_mode=None,
@@ -128,25 +133,41 @@ def _app(**options: Any) -> typer.Typer:
     )
 
 
-app = _app(cls=_Program, add_completion=True)
-#: the commands under `study`
-studies = _app(help="Repeat a study of the paper, or of a folder of recordings.")
+app = new_app(cls=Program, add_completion=True)
 #: the commands under `robot`
-hardware = _app(help="Operate a real, emulated or simulated robot: connect, calibrate, record, control.")
+hardware = new_app(help="Operate a real, emulated or simulated robot: connect, calibrate, record, control.")
 
 
-def main() -> None:
-    """Run the program `knode-cosserat`."""
+def main(application: typer.Typer = app) -> None:
+    """Run the program `knode-cosserat`, or another one of the same make."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a terminal that has no "²" shows \xb2
             stream.reconfigure(errors="backslashreplace")
-    app()
+    application()
 
 
-def examples(*commands: str) -> str:
+def examples(*commands: str, program: str = PROGRAM) -> str:
     """Return the examples at the end of a help text. The first character keeps the line breaks."""
     title = "Example:" if len(commands) == 1 else "Examples:"
-    return "\n".join(["\b", title, *(f"  {PROGRAM} {command}" for command in commands)])
+    return "\n".join(["\b", title, *(f"  {program} {command}" for command in commands)])
+
+
+Verbose = Annotated[
+    bool,
+    typer.Option(
+        "--verbose", "-v", help="Log details on stderr, such as recovered time steps and fitting progress."
+    ),
+]
+
+
+def log_details(*packages: str) -> None:
+    """Log the details of some packages on stderr."""
+    handler = logging.StreamHandler()
+    handler.setFormatter(logging.Formatter("%(name)s: %(message)s"))
+    for package in packages:
+        logger = logging.getLogger(package)
+        logger.addHandler(handler)
+        logger.setLevel(logging.INFO)
 
 
 def _version(requested: bool) -> None:
@@ -166,22 +187,19 @@ def program(
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
     ] = False,
-    verbose: Annotated[
-        bool,
-        typer.Option(
-            "--verbose",
-            "-v",
-            help="Log details on stderr, such as recovered time steps and fitting progress.",
-        ),
-    ] = False,
+    verbose: Verbose = False,
 ) -> None:
     """Simulate Cosserat-rod robots, learn residual models and identify parameters.
 
     Units are SI: m, s, kg, N, Pa, rad. Vectors are numbers separated by commas or spaces: 7,5,5,7.
     """
     if verbose:
-        handler = logging.StreamHandler()
-        handler.setFormatter(logging.Formatter("%(name)s: %(message)s"))
-        logger = logging.getLogger("knode_cosserat")
-        logger.addHandler(handler)
-        logger.setLevel(logging.INFO)
+        log_details("knode_cosserat")
+
+
+@app.command(
+    "study", hidden=True, context_settings={"ignore_unknown_options": True, "allow_extra_args": True}
+)
+def study() -> None:
+    """Point to the studies."""
+    raise ValueError("studies are part of the repository: git clone it, and there python -m studies NAME")

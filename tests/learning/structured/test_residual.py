@@ -14,7 +14,7 @@ from knode_cosserat.learning.explain import explain
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.structured.closed_form import residuals_of
 from knode_cosserat.solvers.semi_discrete import History, Point
-from knode_cosserat.studies import truths
+from studies import truths
 from tests.learning.bar import BAR, pulled
 
 DT = 0.05

@@ -1,0 +1,560 @@
+"""Studies of the paper, further ones, and those of recordings: `python -m studies NAME`, in a clone.
+
+Modules with a long import time are imported inside the commands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from knode_cosserat.cli import program
+from knode_cosserat.cli.arguments import Json, Progress, figures, require_writable, shows_progress
+from knode_cosserat.cli.control import PLANTS, control
+from knode_cosserat.cli.output import write_output
+
+if TYPE_CHECKING:
+    from studies.report import Report
+
+
+class _Program(program.Program):
+    program = "python -m studies"
+
+
+def _examples(*commands: str) -> str:
+    return program.examples(*commands, program=_Program.program)
+
+
+app = program.new_app(cls=_Program)
+
+Out = Annotated[Path, typer.Option(metavar="DIR", help="Output folder; created if it does not exist.")]
+Seeds = Annotated[int, typer.Option(metavar="N", min=1, help="Number of random seeds, 0 to N - 1.")]
+Workers = Annotated[
+    int | None,
+    typer.Option(
+        metavar="N", min=1, help="Worker processes on this machine.", show_default="one per four cores"
+    ),
+]
+Dask = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS", help="Run on the Dask cluster of this scheduler, such as tcp://host:8786."
+    ),
+]
+
+
+def _quick(text: str) -> Any:
+    return typer.Option("--quick", help=text)
+
+
+def _subset(names: str) -> Any:
+    return typer.Option(metavar="A,B,…", help=f"Subset of {names}.", show_default="all")
+
+
+@app.callback()
+def studies(verbose: program.Verbose = False) -> None:
+    """Repeat a study of the paper, or of a folder of recordings."""
+    if verbose:
+        program.log_details("knode_cosserat", "studies")
+
+
+# before and after a study
+
+
+def _prepare(out: Path, workers: int | None = None, dask: str | None = None) -> None:
+    """Check options, output folder and matplotlib before a long run."""
+    if workers and dask:
+        raise ValueError("--workers is for this machine and --dask for a cluster; give one of them")
+    require_writable(folders=[out])
+    figures()
+
+
+def _selected(option: str, names: str | None, known: Iterable[str]) -> list[str]:
+    """Return the selected names in the order of the table. A known name may contain a comma."""
+    if names is None:
+        return list(known)
+    rest = f"{names},"
+    selected = set()
+    while rest.strip():
+        # the longest match: one name may begin with another
+        name = max((each for each in known if rest.startswith(f"{each},")), key=len, default=None)
+        if name is None:
+            wrong = rest.partition(",")[0].strip()
+            raise ValueError(f"--{option}: {wrong!r} is unknown; allowed is a subset of {', '.join(known)}")
+        selected.add(name)
+        rest = rest.removeprefix(f"{name},").strip()
+    return [name for name in known if name in selected]
+
+
+def _names(options: Sequence[str] | None) -> list[str] | None:
+    """Return names separated by commas, without endings of tables; None if the option is not given."""
+    if options is None:
+        return None
+    names = (name.strip().removesuffix(".csv") for option in options for name in option.split(","))
+    return [name for name in names if name]
+
+
+def _loads(options: Sequence[str]) -> dict[str, float]:
+    """Return masses (kg) by name, from NAME=GRAMS."""
+    masses = {}
+    for option in options:
+        name, _, grams = option.rpartition("=")
+        try:
+            mass = 1e-3 * float(grams)
+        except ValueError:
+            mass = -1.0
+        if not name or not 0.0 <= mass < 10.0:
+            raise ValueError(
+                f"--load must be NAME=GRAMS with 0 to 10000 g, such as beam_run3=30 (got {option!r})"
+            )
+        masses[name.strip().removesuffix(".csv")] = mass
+    return masses
+
+
+def _run(
+    rerun: Callable[..., Report],
+    out: Path,
+    *settings: Any,
+    facts: dict[str, Any],
+    as_json: bool,
+    **named: Any,
+) -> None:
+    """Run a study; print its table, the files written and the computing time."""
+    if "progress" in named:
+        named["progress"] = shows_progress(named["progress"])
+    began = perf_counter()
+    report = rerun(out, *settings, **named)
+    seconds = perf_counter() - began
+    failed = sum("failed" in cell for cell in report.cells)
+    facts |= {
+        "cells": len(report.cells),
+        "failed": failed,
+        "computing_time": round(seconds, 2),
+        "written": [str(path) for path in report.tables + report.figures],
+    }
+    count = len(report.figures)
+    lines = [
+        report.tables[0].read_text(encoding="utf-8"),
+        f"{len(report.cells)} cells ({failed} failed) in {seconds:.0f} s",
+        *(f"wrote {path}" for path in report.tables),
+        f"wrote {count} figure{'s' * (count > 1)} to {out / 'figures'}",
+    ]
+    write_output(as_json, facts, lines, out=out if as_json else None)
+
+
+@app.command(
+    epilog=_examples(
+        "simulation --out results",
+        "simulation --out results --methods baseline,best --seeds 1",
+        "simulation --out results --dask tcp://scheduler:8786",
+    )
+)
+def simulation(
+    out: Out,
+    seeds: Seeds = 5,
+    methods: Annotated[str | None, _subset("baseline, paper, calibrated, best")] = None,
+    workers: Workers = None,
+    dask: Dask = None,
+    progress: Progress = None,
+    as_json: Json = False,
+) -> None:
+    """Repeat the paper's simulation study, Table I.
+
+    Four imperfect models are each trained on two short sines. Writes Table I with the paper's published
+    values (table1.md, .csv, .json), figures, trajectories and models. Resumes an earlier run in the same
+    folder.
+    """
+    _prepare(out, workers, dask)
+    from studies.methods import METHODS
+    from studies.simulation_report import rerun
+
+    chosen = _selected("methods", methods, METHODS)
+    _run(
+        rerun, out, seeds=range(seeds), methods=chosen, workers=workers, dask=dask, progress=progress,
+        facts={"methods": chosen, "seeds": seeds}, as_json=as_json,
+    )  # fmt: skip
+
+
+@app.command("control", epilog=_examples("control --out results", "control --quick --out results"))
+def closed_loop(
+    out: Out,
+    quick: Annotated[bool, _quick("Fewer and shorter runs: about 10 min.")] = False,
+    workers: Workers = None,
+    dask: Dask = None,
+    progress: Progress = None,
+    as_json: Json = False,
+) -> None:
+    """Compare controllers in closed loop, with exact and with wrong models.
+
+    Writes tracking errors of predictive control and of its baselines, and checks of limits, observers,
+    adaptation and times (control.md; control.json: check, value, limit, ok). Times are those of this machine.
+    Resumes an earlier run in the same folder.
+    """
+    _prepare(out, workers, dask)
+    from studies.control import rerun
+
+    _run(
+        rerun, out, quick, workers=workers, dask=dask, progress=progress, facts={"quick": quick},
+        as_json=as_json,
+    )  # fmt: skip
+
+
+@app.command(epilog=_examples("environments --quick --out results"))
+def environments(
+    out: Out,
+    quick: Annotated[bool, _quick("Shorter trainings and sweeps: less than 10 min.")] = False,
+    workers: Workers = None,
+    dask: Dask = None,
+    progress: Progress = None,
+    as_json: Json = False,
+) -> None:
+    """Measure environments and sweeps: rates, checks, predictive control, and a policy that PPO learns.
+
+    Writes environments.md and environments.json (check, value, limit, ok), and the policies. It needs the
+    extras rl, sweep and studies. Resumes an earlier run in the same folder.
+    """
+    _prepare(out, workers, dask)
+    from studies.environments import rerun
+
+    _run(
+        rerun, out, quick, workers=workers, dask=dask, progress=progress, facts={"quick": quick},
+        as_json=as_json,
+    )  # fmt: skip
+
+
+@app.command(epilog=_examples("hardware --quick --out results"))
+def hardware(
+    out: Out,
+    quick: Annotated[bool, _quick("Shorter runs: less than 10 min.")] = False,
+    workers: Workers = None,
+    dask: Dask = None,
+    progress: Progress = None,
+    as_json: Json = False,
+) -> None:
+    """Try the firmware on an emulated board: tensions, faults, fuzzing, and the whole closed loop.
+
+    Writes hardware.md and hardware.json (check, value, limit, ok). It needs the firmware's tools, as
+    firmware/README.md lists them. Resumes an earlier run in the same folder.
+    """
+    _prepare(out, workers, dask)
+    from studies.hardware import rerun
+
+    _run(
+        rerun, out, quick, workers=workers, dask=dask, progress=progress, facts={"quick": quick},
+        as_json=as_json,
+    )  # fmt: skip
+
+
+@app.command(
+    epilog=_examples(
+        "imperfections --out results",
+        "imperfections --out results --only 'damping,tip mass' --seeds 1",
+    )
+)
+def imperfections(
+    out: Out,
+    seeds: Seeds = 1,
+    only: Annotated[str | None, _subset("the imperfections, such as damping, tip mass, stiffening")] = None,
+    workers: Workers = None,
+    dask: Dask = None,
+    progress: Progress = None,
+    as_json: Json = False,
+) -> None:
+    """Measure errors for robots that differ from the model.
+
+    The robots differ by more than a parameter. Each model is learned with the preset best. It is trained on
+    two sines of 30 rows. It predicts 30 s of held-out controls, and of controls with twice the tension.
+    Writes imperfections.md, .json and a figure. Resumes an earlier run in the same folder.
+    """
+    _prepare(out, workers, dask)
+    from studies.imperfections import IMPERFECTIONS
+    from studies.imperfections_report import rerun
+
+    chosen = _selected("only", only, IMPERFECTIONS)
+    _run(
+        rerun, out, seeds=range(seeds), names=chosen, workers=workers, dask=dask, progress=progress,
+        facts={"imperfections": chosen, "seeds": seeds}, as_json=as_json,
+    )  # fmt: skip
+
+
+@app.command(
+    epilog=_examples(
+        "data --out results",
+        "data --out results --methods baseline,best --seeds 1",
+    )
+)
+def data(
+    out: Out,
+    seeds: Seeds = 3,
+    methods: Annotated[
+        str | None,
+        _subset("baseline, best, paper; 'paper, no knowledge', 'network, no knowledge', 'linear (DMDc)'"),
+    ] = None,
+    workers: Workers = None,
+    dask: Dask = None,
+    progress: Progress = None,
+    as_json: Json = False,
+) -> None:
+    """Measure errors against the amount of training data.
+
+    Trains on 5 to 30 rows of one sine, and of two. Compares the paper's imperfect models with predictors
+    without a physical model: networks of the same size and a linear predictor (needs the extra `studies`).
+    Writes data.md, .json and figures. Resumes an earlier run in the same folder.
+    """
+    _prepare(out, workers, dask)
+    from studies.data_efficiency import ALL
+    from studies.data_report import rerun
+
+    chosen = _selected("methods", methods, ALL)
+    _run(
+        rerun, out, seeds=range(seeds), methods=chosen, workers=workers, dask=dask, progress=progress,
+        facts={"methods": chosen, "seeds": seeds}, as_json=as_json,
+    )  # fmt: skip
+
+
+@app.command(epilog=_examples("estimation --out results"))
+def estimation(out: Out, as_json: Json = False) -> None:
+    """Measure the error of state estimation.
+
+    Compares the paper's method and the best one. Records the virtual robot (simulated, so its true states are
+    known). Writes the errors of all quantities (estimation.md, .json), a figure, and the bags.
+    """
+    _prepare(out)
+    from studies.estimation import rerun
+
+    _run(rerun, out, facts={}, as_json=as_json)
+
+
+@app.command(
+    epilog=_examples(
+        "recordings bags/",
+        "recordings bags/ --train sine_1p0,sine_3p0,rand_0 --out results",
+        "recordings bags/ --robot my-robot.yaml --config my-recordings.yaml --train first,second",
+    )
+)
+def recordings(
+    bags: Annotated[Path, typer.Argument(metavar="BAGDIR", help="Folder with bags or tables.")],
+    train: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME,…",
+            help="Training recordings: file names without endings. All others are predicted.",
+            show_default="sine_1p0, sine_3p0, rand_0",
+        ),
+    ] = None,
+    out: Out = Path("recordings-study"),
+    robot: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ROBOT",
+            help="Nominal robot: a catalog name or a file.",
+            show_default="robot.yaml in BAGDIR, or delrin-tendon-robot",
+        ),
+    ] = None,
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="YAML",
+            help="Meaning of the recordings' topics or columns.",
+            show_default="recording.yaml in BAGDIR, or NAME.yaml of robot record; else the paper's robot for "
+            "bags, titles for tables",
+        ),
+    ] = None,
+    start: Annotated[
+        float | None,
+        typer.Option(
+            metavar="S",
+            min=0.0,
+            help="Start time of predictions (s), at which the robot rests.",
+            show_default="1, and 0 for names that begin with step",
+        ),
+    ] = None,
+    seconds: Annotated[float, typer.Option(metavar="S", min=0.1, help="Duration of predictions (s).")] = 10.0,
+    seeds: Seeds = 5,
+    methods: Annotated[
+        str,
+        typer.Option(
+            metavar="A,B,…",
+            help="Subset of: baseline (nominal model), paper-a, paper-b, best (identified model), network "
+            "(passive network on the nominal model), residual (passive network on the best model), "
+            "calibrated (nominal model with five identified parameters).",
+        ),
+    ] = "baseline,paper-a,paper-b,best",
+    simulated: Annotated[
+        bool | None,
+        typer.Option(
+            "--simulated/--physical",
+            help="Label the robot as simulated or physical in the report.",
+            show_default="stated by the recordings",
+        ),
+    ] = None,
+    workers: Workers = None,
+    dask: Dask = None,
+    progress: Progress = None,
+    as_json: Json = False,
+) -> None:
+    """Learn a robot from recordings, as in the paper's Table II.
+
+    Predicts the recordings that are not used for training. Estimates states, trains the paper's model without
+    (A) and with (B) the recordings named rand*, and identifies the best model from measured poses alone.
+    Files robot.yaml and recording.yaml in BAGDIR are the defaults of --robot and --config. Writes table2.md,
+    .json, figures and models. Resumes an earlier run in the same folder.
+    """
+    _prepare(out, workers, dask)
+    from studies.recordings import METHODS, ROBOT, RecordingsOptions, described_in
+    from studies.recordings_report import rerun
+
+    chosen = _selected("methods", methods, METHODS)
+    names = None if train is None else [name.strip() for each in train for name in each.split(",")]
+    defaults = described_in(bags)
+    used = [
+        defaults[key]
+        for key, option in (("robot", robot), ("config", config))
+        if key in defaults and option is None
+    ]
+    if used:
+        typer.echo(f"using {' and '.join(path.name for path in used)} of {bags}", err=True)
+    files = {key: str(path) for key, path in defaults.items()}
+    nominal = files.get("robot", ROBOT) if robot is None else robot
+    columns = files.get("config") if config is None else str(config)
+    options = RecordingsOptions(nominal, columns, start, seconds, seeds)
+    _run(
+        rerun, out, bags, train=names, methods=chosen, options=options, simulated=simulated, workers=workers,
+        dask=dask, progress=progress, facts={"methods": chosen, "seeds": seeds}, as_json=as_json,
+    )  # fmt: skip
+
+
+@app.command(
+    epilog=_examples(
+        "beam recordings/ --out results",
+        "beam recordings/ --train beam_gravity_V2_b,beam_load52_V2_a --out results",
+        "beam recordings/ --load beam_run3=30 --out results",
+    )
+)
+def beam(
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="Folder with beam_gravity*.csv and beam_load<grams>*.csv.")
+    ],
+    out: Out = Path("beam-study"),
+    train: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME,…",
+            help="Training recordings: file names without endings. All others are predicted.",
+            show_default="beam_gravity_V2_b, beam_load52_V2_a; else one for each of the two lightest loads",
+        ),
+    ] = None,
+    load: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=GRAMS",
+            help="Load (g) of a recording whose file name does not state it; may be repeated.",
+        ),
+    ] = None,
+    progress: Progress = None,
+    as_json: Json = False,
+) -> None:
+    """Identify a silicone beam from recordings.
+
+    The beam is real and released by hand; recordings not used for training are predicted. Detects the release
+    in each recording, and identifies stiffness, damping and creep by least squares over whole rollouts of the
+    training recordings. Writes the errors of the tip markers (beam.md, .json) and a figure.
+    """
+    _prepare(out)
+    from studies.beam import rerun
+
+    names = _names(train)
+
+    def tell(line: str) -> None:
+        if shows_progress(progress):
+            typer.echo(line, err=True)
+
+    _run(rerun, out, folder, names, _loads(load or []), tell=tell, facts={"train": names}, as_json=as_json)
+
+
+@app.command(epilog=_examples("cables data_set/ --out results", "cables data_set/DLO1 --train 5 --json"))
+def cables(
+    folder: Annotated[
+        Path,
+        typer.Argument(metavar="DIR", help="Folder with NAME/train/*.pkl and NAME/eval/*.pkl, or NAME.npz."),
+    ],
+    out: Out = Path("cables-study"),
+    nodes: Annotated[int, typer.Option(metavar="N", min=5, help="Number of nodes of the rod.")] = 31,
+    space: Annotated[str, typer.Option(metavar="SCHEME", help="Scheme along the rod.")] = "lobatto2",
+    train: Annotated[
+        int, typer.Option(metavar="N", min=2, help="Number of training motions of each cable.")
+    ] = 10,
+    seconds: Annotated[
+        float, typer.Option(metavar="S", min=0.0, help="CPU time of the search for each cable (s).")
+    ] = 400.0,
+    as_json: Json = False,
+) -> None:
+    """Identify cables held by two grippers.
+
+    Predicts the motions in `eval` open loop. Reads marker positions at 100 Hz in the format of the DEFORM
+    data set; pickle files are read without running code from them. Writes cables.json, cables.md, a figure,
+    and a 3-D scene of prediction and measurement for each cable.
+    """
+    _prepare(out)
+    from studies.cables.study import CableOptions, rerun
+
+    options = CableOptions(nodes=nodes, space=space, train=train, seconds=seconds)
+    _run(
+        rerun, out, folder, options=options, tell=lambda line: typer.echo(line, err=True),
+        facts={"train": train}, as_json=as_json,
+    )  # fmt: skip
+
+
+@app.command(
+    "virtual-robots",
+    epilog=_examples("virtual-robots --robots 20 --out results"),
+)
+def virtual_robots(
+    out: Out = Path("virtual-robots-study"),
+    robots: Annotated[int, typer.Option(metavar="N", min=1, help="Number of robots: seeds 0 to N - 1.")] = 20,
+    workers: Workers = None,
+    dask: Dask = None,
+    progress: Progress = None,
+    as_json: Json = False,
+) -> None:
+    """Identify virtual robots with random, known imperfections.
+
+    Each robot is recorded with noise, identified from three recordings, and evaluated on two others. Writes
+    the improvement over the nominal robot, missed and false effects, and the coverage of confidence intervals
+    (virtual_robots.md, .json). A robot takes some minutes. Resumes an earlier run in the same folder.
+    """
+    _prepare(out, workers, dask)
+    from studies.virtual_robots import rerun
+
+    _run(
+        rerun, out, range(robots), workers=workers, dask=dask, progress=progress, facts={"robots": robots},
+        as_json=as_json,
+    )  # fmt: skip
+
+
+# a loop around another simulator's robot
+
+
+def _elastica(text: str, dt: float, sensor: Any) -> Any:
+    from studies.elastica.plant import parsed_plant
+
+    return parsed_plant(text, dt, sensor)
+
+
+PLANTS["elastica"] = _elastica
+app.command(
+    "loop",
+    help="Close a loop as `knode-cosserat control` does; --plant elastica:ROBOT,lag=0.1 is a robot that "
+    "PyElastica simulates, with friction and lag (extra `studies`).",
+    epilog=_examples(
+        "loop found.yaml --plant elastica:my-robot.yaml,friction=0.2 --lag 0.06 --reference path.csv"
+    ),
+)(control)
+
+
+if __name__ == "__main__":
+    program.main(app)

@@ -1,0 +1,123 @@
+"""Study of state estimation: both methods on recordings of the virtual robot, whose states are known."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from knode_cosserat.evaluation.state_errors import state_errors
+from knode_cosserat.recordings.estimation.estimate import Method, estimate_states
+from knode_cosserat.recordings.load import load_recording
+from knode_cosserat.recordings.virtual import Sensors, record_virtual, virtual_robot
+from knode_cosserat.rods.robot_file import load_robot
+from knode_cosserat.rods.system import System
+from knode_cosserat.trajectory import Trajectory
+from studies import estimation_figures
+from studies.report import Report, as_json, write_figures, write_texts
+from studies.tables import markdown_table
+
+#: recorded signals, by the names of the files
+SIGNALS = {"sine": "sine:1.0", "random": "random:0", "step": "step:4.4"}
+SECONDS, NODES = 12.0, 10
+METHODS: tuple[Method, ...] = ("paper", "best")
+#: names of the robots whose balance and constitutive law give n, m and v
+TRUE, CRUDE = "the robot's own", "the paper's knowledge"
+#: title, factor and unit of each quantity in a table
+QUANTITIES = {
+    "p": ("position", 1e3, "mm"),
+    "h": ("orientation", 1e3, "mrad"),
+    "q": ("velocity q", 1e3, "mm/s"),
+    "w": ("angular velocity ω", 1e3, "mrad/s"),
+    "n": ("force n", 1e3, "mN"),
+    "m": ("moment m", 1e3, "mN m"),
+    "v": ("strain v", 1e6, "1e-6"),
+    "u": ("curvature u", 1.0, "1/m"),
+}
+#: the part of the random recording that is drawn (s)
+DRAWN = (1.0, 4.0)
+
+
+def rerun(out: Path, signals: Mapping[str, str] = SIGNALS, seed: int = 0) -> Report:
+    """Record the virtual robot, estimate its states by both methods, and write errors and a figure.
+
+    Args:
+        out: the folder; the bags are kept there.
+        signals: signals of the recordings, by name.
+        seed: of the sensors' noise.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    robots: dict[str, System] = {TRUE: virtual_robot(NODES), CRUDE: load_robot("delrin-tendon-robot")}
+    cells: list[dict[str, Any]] = []
+    drawn: tuple[Trajectory, Mapping[str, Trajectory]] | None = None
+    for k, (name, signal) in enumerate(signals.items()):
+        path = out / f"{name}.bag"
+        truth = record_virtual(path, signal, SECONDS, seed + k)
+        recording = load_recording(path)
+        for balance, robot in robots.items():
+            found: dict[str, Trajectory] = {
+                method: estimate_states(recording, robot, method) for method in METHODS
+            }
+            about = {"recording": name, "signal": signal, "balance": balance}
+            for method, estimate in found.items():
+                for quantity, error in state_errors(estimate, truth).items():
+                    cells.append({**about, "method": method, "quantity": quantity, **error._asdict()})
+            if balance == TRUE and (drawn is None or name == "random"):
+                drawn = truth, found
+    texts = {"estimation.md": as_markdown(cells), "estimation.json": as_json(cells)}
+    tables = write_texts(out, texts)
+    assert drawn is not None
+    return Report(
+        cells, tables, write_figures(out, {"estimation": estimation_figures.estimated_states(*drawn, DRAWN)})
+    )
+
+
+def as_markdown(cells: Sequence[Mapping[str, Any]]) -> str:
+    """Return a table of errors for each recording with the true robot's balance, and the nominal model's."""
+    noise = dataclasses.asdict(Sensors())
+    known = {"p": np.sqrt(3) * noise["position_noise"], "h": np.sqrt(3) * noise["turn_noise"]}
+    parts = [
+        "# State estimation",
+        "Root mean squares, over rows and nodes, of the lengths of error vectors. The robot is virtual\n"
+        "(simulated), and so its states are known. n, m and v follow from the balance and law of the robot\n"
+        "that is given.",
+    ]
+    names = list(dict.fromkeys(cell["recording"] for cell in cells))
+    for name in names:
+        own = _chosen(cells, name, TRUE)
+        signal = next(cell["signal"] for cell in cells if cell["recording"] == name)
+        rows = []
+        for quantity, (title, factor, unit) in QUANTITIES.items():
+            paper, best = (own[method, quantity] for method in METHODS)
+            said = f"{factor * known[quantity]:.3g}" if quantity in known else ""
+            rows.append(
+                [f"{title} [{unit}]", f"{factor * paper['size']:.3g}", said, f"{factor * paper['rms']:.3g}",
+                 f"{factor * best['rms']:.3g}", f"{paper['rms'] / best['rms']:.1f}"]
+            )  # fmt: skip
+        heads = ["quantity", "its size", "markers' noise", "paper", "best", "paper / best"]
+        parts += [f"## {signal}, with {TRUE} balance", markdown_table(heads, rows)]
+    rows = []
+    for quantity in ("n", "m", "v", "u"):
+        title, factor, unit = QUANTITIES[quantity]
+        by_name = [_chosen(cells, name, CRUDE) for name in names]
+        row = [f"{title} [{unit}]"]
+        for each in by_name:
+            row += [f"{factor * each[method, quantity]['rms']:.3g}" for method in METHODS]
+        rows.append(row)
+    heads = ["quantity", *(f"{name}: {method}" for name in names for method in METHODS)]
+    parts += [f"## What follows from the robot that is given: with {CRUDE}", markdown_table(heads, rows)]
+    parts.append("The other quantities do not depend on it.")
+    return "\n\n".join(parts) + "\n"
+
+
+def _chosen(
+    cells: Sequence[Mapping[str, Any]], name: str, balance: str
+) -> dict[tuple[str, str], Mapping[str, Any]]:
+    return {
+        (cell["method"], cell["quantity"]): cell
+        for cell in cells
+        if cell["recording"] == name and cell["balance"] == balance
+    }
