@@ -81,7 +81,7 @@ def learned_steps() -> dict[str, Any]:
 def study() -> dict[str, Any]:
     """The whole simulation study, from nothing compiled to table and figures."""
     from studies.methods import METHODS
-    from studies.simulation_report import rerun
+    from studies.simulation import rerun
 
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)

@@ -170,7 +170,7 @@ def simulation(
     """
     _prepare(out, workers, dask)
     from studies.methods import METHODS
-    from studies.simulation_report import rerun
+    from studies.simulation import rerun
 
     chosen = _selected("methods", methods, METHODS)
     _run(
@@ -251,8 +251,7 @@ def hardware(
 
 @app.command(
     epilog=_examples(
-        "imperfections --out results",
-        "imperfections --out results --only 'damping,tip mass' --seeds 1",
+        "imperfections --out results", "imperfections --out results --only 'damping,tip mass' --seeds 1"
     )
 )
 def imperfections(
@@ -271,8 +270,7 @@ def imperfections(
     Writes imperfections.md, .json and a figure. Resumes an earlier run in the same folder.
     """
     _prepare(out, workers, dask)
-    from studies.imperfections import IMPERFECTIONS
-    from studies.imperfections_report import rerun
+    from studies.imperfections import IMPERFECTIONS, rerun
 
     chosen = _selected("only", only, IMPERFECTIONS)
     _run(
@@ -281,12 +279,7 @@ def imperfections(
     )  # fmt: skip
 
 
-@app.command(
-    epilog=_examples(
-        "data --out results",
-        "data --out results --methods baseline,best --seeds 1",
-    )
-)
+@app.command(epilog=_examples("data --out results", "data --out results --methods baseline,best --seeds 1"))
 def data(
     out: Out,
     seeds: Seeds = 3,
@@ -306,8 +299,7 @@ def data(
     Writes data.md, .json and figures. Resumes an earlier run in the same folder.
     """
     _prepare(out, workers, dask)
-    from studies.data_efficiency import ALL
-    from studies.data_report import rerun
+    from studies.data_efficiency import ALL, rerun
 
     chosen = _selected("methods", methods, ALL)
     _run(
@@ -509,10 +501,7 @@ def cables(
     )  # fmt: skip
 
 
-@app.command(
-    "virtual-robots",
-    epilog=_examples("virtual-robots --robots 20 --out results"),
-)
+@app.command("virtual-robots", epilog=_examples("virtual-robots --robots 20 --out results"))
 def virtual_robots(
     out: Out = Path("virtual-robots-study"),
     robots: Annotated[int, typer.Option(metavar="N", min=1, help="Number of robots: seeds 0 to N - 1.")] = 20,

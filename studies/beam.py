@@ -2,20 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.evaluation.comparison import REFERENCE
+from knode_cosserat.evaluation.drawing import new_figure
+from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
 from knode_cosserat.recordings.findings import RecordingError
-from studies import beam_figures
-from studies.beam_fit import NOMINAL, identify_beam, marker_rmse
-from studies.beam_model import DEFAULT, Beam, Numerics, predict_markers, step_count
-from studies.beam_recordings import BeamRecording, read_beam
+from studies.beam_model import (
+    DEFAULT,
+    NOMINAL,
+    Beam,
+    Numerics,
+    identify_beam,
+    marker_rmse,
+    predict_markers,
+    step_count,
+)
+from studies.beam_recordings import BeamRecording, read_beam, tip_drop
 from studies.report import Report, as_json, write_figures, write_texts
 from studies.tables import markdown_table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 #: names of the files
 PATTERN = "beam_*.csv"
@@ -103,7 +116,7 @@ def rerun(
     cells = _cells(recordings, names, predictions)
     out.mkdir(parents=True, exist_ok=True)
     texts = {"beam.md": as_markdown(cells, found.beam), "beam.json": as_json(cells)}
-    figure = beam_figures.drops(recordings, predictions, names)
+    figure = drops(recordings, predictions, names)
     return Report(cells, write_texts(out, texts), write_figures(out, {"beam": figure}))
 
 
@@ -161,3 +174,43 @@ def as_markdown(cells: Sequence[Mapping[str, Any]], beam: Beam) -> str:
         )
         + "\n"
     )
+
+
+#: line styles of predictions, by method
+LINES: dict[str, dict[str, Any]] = {
+    "nominal": {"color": PALETTE[1], "linewidth": 0.8},
+    "identified": {"color": PALETTE[0], "linewidth": 1.0},
+}
+#: duration of the enlarged motion after the release (s)
+SHOWN = 1.5
+
+
+def drops(
+    recordings: Sequence[BeamRecording],
+    predictions: Mapping[str, Mapping[str, Float[np.ndarray, "T 3 3"]]],
+    train: Collection[str],
+) -> Figure:
+    """Return a figure of the tip drop over time, a row per recording: first 1.5 s left, all right.
+
+    Raises:
+        ImportError: matplotlib is not installed.
+    """
+    with style():
+        figure = new_figure(TWO_COLUMNS, 1.7 * len(recordings) + 0.4)
+        grid = figure.subplots(len(recordings), 2, squeeze=False, width_ratios=(1.6, 1.0), sharey="row")
+        for row, each in zip(grid, recordings, strict=True):
+            time = each.time - each.crossing
+            for axes in row:
+                axes.plot(time, 1e3 * each.drop, label="measured", **REFERENCE)
+                for method, predicted in predictions[each.name].items():
+                    axes.plot(time, 1e3 * tip_drop(predicted), label=method, **LINES[method])
+                axes.invert_yaxis()
+            use = "training" if each.name in train else "held out"
+            row[0].set(ylabel="tip drop [mm]", xlim=(-0.1, SHOWN))
+            row[0].set_title(f"load {1e3 * each.load:g} g, {use} ({each.name})")
+            row[1].set_xlim(-0.1, float(time[-1]))
+        for axes in grid[-1]:
+            axes.set_xlabel("time from the release [s]")
+        handles, labels = grid[0, 0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+    return figure

@@ -12,52 +12,46 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.evaluation.metrics import PoseHistory, pose_mse, tip_dtw
-from knode_cosserat.rods.layout import Layout
-from knode_cosserat.rods.system import Scales, System
+from knode_cosserat.rods.system import System
 from knode_cosserat.trajectory import Trajectory
+
+
+def _of_model(name: str) -> Any:
+    return property(lambda self: getattr(self.model, name), doc=f"The model's `{name}`.")
 
 
 class NoKnowledge(System):
     """System without physics between its ends: y_s = 0, z = 0.
 
-    A residual on it learns everything. Layouts, boundary conditions and rest come from another system.
+    A residual on it learns everything. Layouts, boundary conditions and rest come from another system: an
+    initial state is not physics. The network has the same input as with a nominal model, its actuation.
     """
 
     model: System
+
+    y_layout = _of_model("y_layout")
+    z_layout = _of_model("z_layout")
+    control_layout = _of_model("control_layout")
+    tip_layout = _of_model("tip_layout")
+    base_unknowns = _of_model("base_unknowns")
+    length = _of_model("length")
+    rest = _of_model("rest")
+    base = _of_model("base")
+    moving_base = _of_model("moving_base")
+    tip = _of_model("tip")
+    scales = _of_model("scales")
+    actuation = _of_model("actuation")
+    positions = _of_model("positions")
+    quaternions = _of_model("quaternions")
 
     def __init__(self, model: System):
         self.model = model
         self.nodes = model.nodes
 
     @property
-    def y_layout(self) -> Layout:  # type: ignore[override]
-        """Layout of the model's y."""
-        return self.model.y_layout
-
-    @property
-    def z_layout(self) -> Layout:  # type: ignore[override]
-        """Layout of the model's z."""
-        return self.model.z_layout
-
-    @property
-    def control_layout(self) -> Layout:  # type: ignore[override]
-        """Layout of the model's controls."""
-        return self.model.control_layout
-
-    @property
-    def base_unknowns(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Unknowns at the model's base."""
-        return self.model.base_unknowns
-
-    @property
     def mixed(self) -> bool:  # type: ignore[override]
         """False for every model: B is unknown."""
         return False
-
-    @property  # type: ignore[misc]
-    def length(self) -> Any:
-        """Length of the model (m)."""
-        return self.model.length
 
     def constitutive(self, s: Any, t: Any, y: Any, y_t: Any, control: Any) -> Float[Any, " z"]:
         """Return zeros for z."""
@@ -66,43 +60,6 @@ class NoKnowledge(System):
     def balance(self, s: Any, t: Any, y: Any, y_t: Any, z: Any, z_t: Any, control: Any) -> Float[Any, " y"]:
         """Return zeros for y_s."""
         return jnp.zeros(self.y_layout.size)
-
-    def rest(self, s: Any) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-        """Return the model's rest state: an initial state is not physics."""
-        return self.model.rest(s)
-
-    def base(self, t: Any, control: Any, unknowns: Float[Any, " k"]) -> Float[Any, " y"]:
-        """Return the model's y at the base."""
-        return self.model.base(t, control, unknowns)
-
-    def moving_base(self, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " y"]:
-        """Return the model's y at the base with its velocities."""
-        return self.model.moving_base(y, y_t)
-
-    def tip(self, t: Any, control: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " k"]:
-        """Return the residual of the model's boundary conditions at the tip."""
-        return self.model.tip(t, control, y, y_t)
-
-    @property
-    def tip_layout(self) -> Layout:
-        """Layout of the residual at the model's tip."""
-        return self.model.tip_layout
-
-    def scales(self) -> Scales:
-        """Return the model's scales."""
-        return self.model.scales()
-
-    def actuation(self, control: Float[Any, " c"]) -> Float[Any, " a"]:
-        """Return the model's actuation, so that the network has the same input as with a nominal model."""
-        return self.model.actuation(control)
-
-    def positions(self, y: Any) -> Any:
-        """Return the model's positions."""
-        return self.model.positions(y)
-
-    def quaternions(self, y: Any) -> Any:
-        """Return the model's quaternions."""
-        return self.model.quaternions(y)
 
     def replace(self, **changes: Any) -> Self:
         """Return a copy with changed parameters (or nodes) of the model."""

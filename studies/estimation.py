@@ -5,20 +5,26 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from knode_cosserat.evaluation.comparison import METHODS as LINES
+from knode_cosserat.evaluation.comparison import REFERENCE
+from knode_cosserat.evaluation.drawing import new_figure
 from knode_cosserat.evaluation.state_errors import state_errors
+from knode_cosserat.evaluation.style import TWO_COLUMNS, style
 from knode_cosserat.recordings.estimation.estimate import Method, estimate_states
 from knode_cosserat.recordings.load import load_recording
 from knode_cosserat.recordings.virtual import Sensors, record_virtual, virtual_robot
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.system import System
 from knode_cosserat.trajectory import Trajectory
-from studies import estimation_figures
 from studies.report import Report, as_json, write_figures, write_texts
 from studies.tables import markdown_table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 #: recorded signals, by the names of the files
 SIGNALS = {"sine": "sine:1.0", "random": "random:0", "step": "step:4.4"}
@@ -70,9 +76,7 @@ def rerun(out: Path, signals: Mapping[str, str] = SIGNALS, seed: int = 0) -> Rep
     texts = {"estimation.md": as_markdown(cells), "estimation.json": as_json(cells)}
     tables = write_texts(out, texts)
     assert drawn is not None
-    return Report(
-        cells, tables, write_figures(out, {"estimation": estimation_figures.estimated_states(*drawn, DRAWN)})
-    )
+    return Report(cells, tables, write_figures(out, {"estimation": estimated_states(*drawn, DRAWN)}))
 
 
 def as_markdown(cells: Sequence[Mapping[str, Any]]) -> str:
@@ -121,3 +125,44 @@ def _chosen(
         for cell in cells
         if cell["recording"] == name and cell["balance"] == balance
     }
+
+
+#: quantity, component, node and title of each panel
+_SHOWN = (
+    ("q", 0, -1, "tip: q along x [m/s]"),
+    ("w", 1, -1, "tip: ω about y [rad/s]"),
+    ("n", 0, 0, "base: n along x [N]"),
+    ("m", 1, 0, "base: m about y [N m]"),
+)
+
+
+def estimated_states(
+    truth: Trajectory, estimates: Mapping[str, Trajectory], span: tuple[float, float]
+) -> Figure:
+    """Return a figure of tip velocities, base force and base moment over a time span (s), with their errors.
+
+    Raises:
+        ImportError: matplotlib is not installed.
+    """
+    with style():
+        figure = new_figure(TWO_COLUMNS, 6.2)
+        grid = figure.subplots(4, 2, sharex=True, height_ratios=(2, 1, 2, 1))
+        for k, (name, component, node, title) in enumerate(_SHOWN):
+            above, below = grid[2 * (k // 2), k % 2], grid[2 * (k // 2) + 1, k % 2]
+            true = np.asarray(truth.part(name))[:, node, component]
+            above.plot(truth.time, true, label="truth", **REFERENCE)
+            for method, estimate in estimates.items():
+                found = np.asarray(estimate.part(name))[:, node, component]
+                above.plot(estimate.time, found, label=method, **LINES[method])
+                at_rows = np.interp(np.asarray(estimate.time), np.asarray(truth.time), true)
+                below.plot(estimate.time, found - at_rows, label=method, **LINES[method])
+            inside = (np.asarray(truth.time) >= span[0]) & (np.asarray(truth.time) <= span[1])
+            low, high = true[inside].min(), true[inside].max()
+            room = 0.1 * (high - low)
+            above.set(title=title, xlim=span, ylim=(low - room, high + room))
+            below.set(ylabel="error", ylim=(-1.5 * room, 1.5 * room))
+        for axes in grid[-1]:
+            axes.set_xlabel("time [s]")
+        handles, labels = grid[0, 0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+    return figure

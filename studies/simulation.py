@@ -8,12 +8,11 @@ the imperfection. It then predicts a held-out sine and a held-out step.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 from knode_cosserat import controls
-from knode_cosserat.evaluation.metrics import pose_mse, tip_dtw
 from knode_cosserat.learning.files.model_file import encoded
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.rods.robot_file import load_robot
@@ -21,9 +20,13 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.result import SimulationError
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.trajectory import Trajectory
+from knode_cosserat.trajectory_file import load_trajectory
+from studies import figures, runner
+from studies.comparisons import compared
 from studies.methods import METHODS
+from studies.report import Report, as_json, write_figures, write_texts
 from studies.runner import Job, Product
-from studies.tables import Cell, Published
+from studies.tables import Cell, Published, as_csv, as_markdown
 
 ROBOT = "delrin-tendon-robot"
 #: time step (s)
@@ -86,7 +89,7 @@ def reference(settings: Any) -> Product:
     kept = _Kept()
     robot = load_robot(settings["robot"])
     for name, control in settings["controls"].items():
-        kept.trajectory(_moved(robot, control, settings["rows"], settings["dt"]), name, REFERENCE)
+        kept.trajectory(moved(robot, control, settings["rows"], settings["dt"]), name, REFERENCE)
     return Product({"cells": [], "trajectories": kept.trajectories}, kept.files)
 
 
@@ -94,17 +97,17 @@ def predict(settings: Any) -> Product:
     """Return the cells of one imperfection and method: every seed under every control."""
     robot, dt = load_robot(settings["robot"]), settings["dt"]
     imperfection, method = settings["imperfection"], settings["method"]
-    training = [_moved(robot, control, settings["training_rows"], dt) for control in settings["training"]]
+    training = [moved(robot, control, settings["training_rows"], dt) for control in settings["training"]]
     learned = METHODS[method](robot.replace(**settings["changes"]), training, settings["seeds"])
     cells: list[Cell] = []
     kept = _Kept()
     for name, control in settings["controls"].items():
-        truth = _moved(robot, control, settings["rows"], dt)
+        truth = moved(robot, control, settings["rows"], dt)
         for seed, system in learned.systems.items():
-            measures, prediction = _outcome(system, truth, control, settings)
+            prediction = predicted(system, control, settings["rows"], dt)
             case = {"imperfection": imperfection, "control": name, "method": method, "seed": seed}
-            cells.append(cast(Cell, case | measures))
-            if prediction is not None and seed == min(learned.systems):
+            cells.append(cast(Cell, case | compared(prediction, truth)))
+            if isinstance(prediction, Trajectory) and seed == min(learned.systems):
                 kept.trajectory(prediction, name, f"{imperfection}-{method}")
     for seed, system in learned.systems.items():
         if isinstance(system, KNODE):
@@ -131,25 +134,85 @@ class _Kept:
         self.files[f"models/{name}"] = encoded(model, name)
 
 
-class _Outcome(NamedTuple):
-    measures: Any
-    prediction: Trajectory | None
-
-
-def _outcome(system: System | str, truth: Trajectory, control: str, settings: Any) -> _Outcome:
-    """Return the two metrics, or the reason of a failure."""
-    if isinstance(system, str):
-        return _Outcome({"tip_dtw": None, "pose_mse": None, "failed": system}, None)
+def predicted(system: System | str, control: str, rows: int, dt: float) -> Trajectory | str:
+    """Return a prediction, or the reason of a failure."""
     try:
-        prediction = _moved(system, control, settings["rows"], settings["dt"])
+        return system if isinstance(system, str) else moved(system, control, rows, dt)
     except SimulationError as error:
-        return _Outcome({"tip_dtw": None, "pose_mse": None, "failed": str(error)}, None)
-    return _Outcome(
-        {"tip_dtw": tip_dtw(prediction, truth), "pose_mse": pose_mse(prediction, truth)}, prediction
-    )
+        return str(error)
 
 
-def _moved(system: System, control: str, rows: int, dt: float) -> Trajectory:
+def moved(system: System, control: str, rows: int, dt: float) -> Trajectory:
     """Return the first rows of a simulation from rest: as many as controls, as in the paper."""
     tensions = controls.parse(control, rows, dt, sampled="end")
     return simulate(system, tensions, dt, time="bdf2", start="paper", space="euler")[:rows]
+
+
+Facts = Mapping[str, Mapping[str, Any]]
+
+
+def rerun(out: Path, *, seeds: Sequence[int], methods: Sequence[str], **how: Any) -> Report:
+    """Run the study's pending jobs and write its table and figures into the folder.
+
+    Args:
+        out: the folder; an earlier run in it is continued.
+        seeds: whole numbers.
+        methods: some of those in `methods.METHODS`.
+        how: `workers`, `dask`, `progress` as `runner.run` has them.
+
+    Raises:
+        StudyError: see `runner.run`.
+    """
+    facts = runner.run(jobs(seeds, methods), out, **how)
+    cells = cells_of(facts)
+    return Report(cells, write_table(cells, out), draw(facts, methods, out))
+
+
+def cells_of(facts: Facts) -> list[Cell]:
+    """Return all cells of the jobs in the order of the paper's table: control, imperfection, method, seed."""
+    cells = [cell for each in facts.values() for cell in each["cells"]]
+    controls, imperfections = list(CONTROLS), list(IMPERFECTIONS)
+    return sorted(
+        cells, key=lambda it: (controls.index(it["control"]), imperfections.index(it["imperfection"]))
+    )
+
+
+def write_table(cells: Sequence[Cell], out: Path) -> list[Path]:
+    """Write `table1.md`, `table1.csv` and `table1.json`."""
+    return write_texts(
+        out,
+        {
+            "table1.md": as_markdown(cells, PUBLISHED, NOTES),
+            "table1.csv": as_csv(cells, PUBLISHED),
+            "table1.json": as_json(cells),
+        },
+    )
+
+
+def draw(facts: Facts, methods: Sequence[str], out: Path) -> list[Path]:
+    """Write figures to OUT/figures: controls, shapes and tips of the first seed, losses of all."""
+    truths = _trajectories(facts[REFERENCE], out)
+    drawn = {"controls": figures.controls(truths)}
+    for imperfection in IMPERFECTIONS:
+        found = {method: _trajectories(facts[f"{imperfection}-{method}"], out) for method in methods}
+        cases = {
+            control: (truth, {method: each[control] for method, each in found.items() if control in each})
+            for control, truth in truths.items()
+        }
+        drawn[f"tips-{imperfection}"] = figures.predicted_tips(cases)
+        for control, (truth, predictions) in cases.items():
+            if predictions:
+                drawn[f"shapes-{imperfection}-{control}"] = figures.shapes(truth, predictions)
+    losses = {
+        imperfection: list(facts[f"{imperfection}-{method}"]["loss"].values())
+        for method in methods
+        for imperfection in IMPERFECTIONS
+        if facts[f"{imperfection}-{method}"]["loss"]
+    }
+    if losses:
+        drawn["loss"] = figures.losses(losses)
+    return write_figures(out, drawn)
+
+
+def _trajectories(facts: Mapping[str, Any], out: Path) -> dict[str, Trajectory]:
+    return {control: load_trajectory(out / name) for control, name in facts["trajectories"].items()}

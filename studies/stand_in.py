@@ -29,12 +29,7 @@ from knode_cosserat.identification import identify
 from knode_cosserat.rods.load_cells import LoadCells
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.tendon_rod import TendonRod
-from studies.elastica.plant import (
-    ElasticaPlant,
-    Recorded,
-    record_elastica,
-    sine_commands,
-)
+from studies.elastica.plant import ElasticaPlant, Recorded, record_elastica, sine_commands
 from studies.elastica.rod import ElasticaRod, Imperfections
 
 #: name of the robot in the study's tables, and the reason for a study without it

@@ -16,14 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from studies.cables.model import CableParameters
-from studies.cables.rollouts import (
-    NAMES,
-    UNKNOWNS,
-    Rollouts,
-    cable_coordinates,
-    cable_parameters,
-    in_threads,
-)
+from studies.cables.rollouts import NAMES, UNKNOWNS, Rollouts, cable_coordinates, cable_parameters, in_threads
 
 _LOG = logging.getLogger(__name__)
 #: differences from which on they count by their size instead of their square (m)

@@ -157,8 +157,7 @@ class CableModel:
             drag=jnp.diag(jnp.asarray(p.square_drag) * direction),
             sections=(
                 Stretch(
-                    curvature=jnp.concatenate([begin, zero]),
-                    curvature_slope=jnp.concatenate([change, zero]),
+                    curvature=jnp.concatenate([begin, zero]), curvature_slope=jnp.concatenate([change, zero])
                 ),
             ),
             loads=(
@@ -176,10 +175,7 @@ class CableModel:
     def end_frames(self, p: CableParameters, markers: Any) -> tuple[Any, Any]:
         """Return the cable's frames (T, 4) at both ends."""
         found = []
-        turns = (
-            (np.array([*p.base_tangent, 0.0]), 0.0),
-            (np.array([*p.tip_tangent, 0.0]), p.twist),
-        )
+        turns = ((np.array([*p.base_tangent, 0.0]), 0.0), (np.array([*p.tip_tangent, 0.0]), p.twist))
         for k, (directions, (tangent, twist)) in enumerate(zip(_pairs(markers), turns, strict=True)):
             gripper = frames.quaternion_product(
                 frames.shortest(self.grips.directions[k], directions), self.grips.frames[k]

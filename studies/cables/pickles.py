@@ -15,8 +15,10 @@ The result is an array of float64, made from arrays and nested lists or tuples o
 from __future__ import annotations
 
 import io
+import math
 import pickle
 import pickletools
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +27,6 @@ from jaxtyping import Float
 
 from knode_cosserat._files.limits import MORE, LimitSettingError, allowed
 from knode_cosserat._files.reading import ReadError, read_bytes
-from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.recordings.findings import RecordingError
 
 #: largest size of a file (bytes), and largest count of numbers in it
@@ -36,95 +37,96 @@ DEEPEST = 6
 FORMATS = ("f2", "f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")
 #: memory slots that a pickle may use beyond its own size
 SPARE_PLACES = 1 << 16
+TOO_MANY = "too many numbers"
 
 
-class _RefusedError(KnodeCosseratError):
+class _RefusedError(Exception):
     """Error for content that is not an array of numbers."""
 
-    code = "pickle"
 
+class _Name:
+    """Stand-in for a function or class that a pickle names; it has no state to be changed."""
 
-class _TooManyError(_RefusedError):
-    """Error for more numbers than a limit allows."""
+    def __init__(self, call: Callable[..., Any]):
+        self._call = call
 
-    code = "pickle-size"
+    def __call__(self, *arguments: Any) -> Any:
+        return self._call(*arguments)
+
+    def __setstate__(self, state: Any) -> None:
+        raise _RefusedError("a function with a state")
 
 
 class _Format:
-    """Stand-in for `numpy.dtype`: a number format."""
+    """Number format: stand-in for an object of `numpy.dtype`."""
 
-    def __init__(self, code: Any, align: Any = False, copy: Any = True):
+    def __init__(self, code: Any, *_: Any):
         if code not in FORMATS:
             raise _RefusedError(f"an array of format {code!r}; accepted are {', '.join(FORMATS)}")
-        self.code, self.order = str(code), "<"
+        self.dtype = np.dtype(f"<{code}")
 
     def __setstate__(self, state: Any) -> None:
         if not isinstance(state, tuple) or len(state) < 5 or state[1] not in ("<", ">", "|", "="):
             raise _RefusedError("a number format with an unknown state")
         if any(part is not None for part in state[2:5]):
             raise _RefusedError("an array of records")
-        self.order = str(state[1])
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """Number format as a NumPy dtype."""
-        return np.dtype(self.order.replace("|", "<") + self.code)
-
-
-class _ArrayClass:
-    """Stand-in for the class `numpy.ndarray`; pickles name it but do not call it."""
-
-    def __init__(self, *_: Any):
-        raise _RefusedError("an array made by its class")
-
-    def __setstate__(self, state: Any) -> None:
-        raise _RefusedError("an array made by its class")
+        self.dtype = self.dtype.newbyteorder(">" if state[1] == ">" else "<")
 
 
 class _Array:
-    """Stand-in for `numpy.core.multiarray._reconstruct`: an array filled by its state."""
+    """Array filled by its state: stand-in for one of `numpy.core.multiarray._reconstruct`."""
 
     values: np.ndarray[Any, Any] | None = None
-
-    def __init__(self, kind: Any, shape: Any = (0,), code: Any = b"b"):
-        if kind is not _ArrayClass:
-            raise _RefusedError("an array of another class than numpy.ndarray")
 
     def __setstate__(self, state: Any) -> None:
         if not isinstance(state, tuple) or len(state) != 5:
             raise _RefusedError("an array with an unknown state")
         _, shape, kind, fortran, raw = state
-        self.values = _filled(raw, kind, shape, "F" if fortran else "C")
+        self.fill(raw, kind, shape, "F" if fortran else "C")
+
+    def fill(self, raw: Any, kind: Any, shape: Any, order: Any) -> _Array:
+        """Set the values from bytes after checking their number against shape and format."""
+        if not isinstance(raw, bytes | bytearray) or not isinstance(kind, _Format):
+            raise _RefusedError("an array of objects")
+        shape = (shape,) if isinstance(shape, int) else shape
+        if not isinstance(shape, tuple) or not all(isinstance(n, int) and n >= 0 for n in shape):
+            raise _RefusedError("an array with an impossible shape")
+        if max(shape, default=0) > allowed(MOST_NUMBERS):
+            raise _RefusedError(TOO_MANY)
+        if len(shape) > DEEPEST or math.prod(shape) * kind.dtype.itemsize != len(raw):
+            raise _RefusedError("an array with more or fewer bytes than its shape says")
+        values = np.frombuffer(bytes(raw), kind.dtype)
+        self.values = values.reshape(shape, order="F" if order == "F" else "C")
+        return self
 
 
-class _Buffer:
-    """Stand-in for `numpy.core.numeric._frombuffer`: an array of protocol 5."""
-
-    def __init__(self, raw: Any, kind: Any, shape: Any, order: Any = "C", *_: Any):
-        self.values = _filled(raw, kind, shape, "F" if order == "F" else "C")
-
-    def __setstate__(self, state: Any) -> None:
-        raise _RefusedError("an array with a second state")
+def _array_class(*_: Any) -> None:
+    raise _RefusedError("an array made by its class")
 
 
-class _Encoded(bytes):
-    """Stand-in for `_codecs.encode`: old protocols write bytes as text."""
-
-    def __new__(cls, text: Any, encoding: Any = "latin1") -> _Encoded:
-        if not isinstance(text, str) or encoding != "latin1":
-            raise _RefusedError("a text that does not stand for bytes")
-        return super().__new__(cls, text.encode("latin1"))
-
-    def __setstate__(self, state: Any) -> None:
-        raise _RefusedError("bytes with a state")
+def _reconstruct(kind: Any, *_: Any) -> _Array:
+    if not isinstance(kind, _Name) or kind._call is not _array_class:
+        raise _RefusedError("an array of another class than numpy.ndarray")
+    return _Array()
 
 
-_NAMES: dict[tuple[str, str], type] = {
-    ("numpy", "ndarray"): _ArrayClass,
+def _from_buffer(raw: Any, kind: Any, shape: Any, order: Any = "C", *_: Any) -> _Array:
+    return _Array().fill(raw, kind, shape, order)
+
+
+def _encoded(text: Any, encoding: Any = "latin1") -> bytes:
+    """Return the bytes that old protocols write as text."""
+    if not isinstance(text, str) or encoding != "latin1":
+        raise _RefusedError("a text that does not stand for bytes")
+    return text.encode("latin1")
+
+
+_NAMES: dict[tuple[str, str], Callable[..., Any]] = {
+    ("numpy", "ndarray"): _array_class,
     ("numpy", "dtype"): _Format,
-    ("_codecs", "encode"): _Encoded,
-    **{(f"numpy.{core}.multiarray", "_reconstruct"): _Array for core in ("core", "_core")},
-    **{(f"numpy.{core}.numeric", "_frombuffer"): _Buffer for core in ("core", "_core")},
+    ("_codecs", "encode"): _encoded,
+    **{(f"numpy.{core}.multiarray", "_reconstruct"): _reconstruct for core in ("core", "_core")},
+    **{(f"numpy.{core}.numeric", "_frombuffer"): _from_buffer for core in ("core", "_core")},
 }
 
 
@@ -132,10 +134,9 @@ class _Reader(pickle.Unpickler):
     """Unpickler restricted to the names in the table."""
 
     def find_class(self, module: str, name: str) -> Any:
-        found = _NAMES.get((module, name))
-        if found is None:
+        if (module, name) not in _NAMES:
             raise _RefusedError(f"the name {module}.{name}")
-        return found
+        return _Name(_NAMES[module, name])
 
 
 def read_pickled_array(path: str | Path) -> Float[np.ndarray, "..."]:
@@ -148,19 +149,18 @@ def read_pickled_array(path: str | Path) -> Float[np.ndarray, "..."]:
         RecordingError: the file cannot be read, or is not such a pickle; one line with the reason.
     """
     path = Path(path)
-    try:
-        data = read_bytes(path, LARGEST_FILE)
-    except ReadError as error:
-        raise RecordingError(f"{path}: {error}") from None
     accepted = "accepted are NumPy arrays of numbers, and lists of them"
     try:
+        data = read_bytes(path, LARGEST_FILE)
         _scan(data)
         values = _numbers(_Reader(io.BytesIO(data)).load(), [allowed(MOST_NUMBERS)], DEEPEST)
         return np.asarray(values, dtype=float)
     except LimitSettingError:
         raise
+    except ReadError as error:
+        raise RecordingError(f"{path}: {error}") from None
     except _RefusedError as error:
-        more = f"; {MORE}" if isinstance(error, _TooManyError) else ""
+        more = f"; {MORE}" if str(error) == TOO_MANY else ""
         raise RecordingError(f"{path}: the pickle holds {error}; {accepted}{more}") from None
     # the unpickler raises various errors on a damaged program
     except Exception as error:
@@ -178,42 +178,19 @@ def _scan(data: bytes) -> None:
             raise _RefusedError("a reference to data outside of the file")
 
 
-def _filled(raw: Any, kind: Any, shape: Any, order: Any) -> np.ndarray[Any, Any]:
-    """Return an array from its bytes after checking their number against shape and format."""
-    if not isinstance(raw, bytes | bytearray) or not isinstance(kind, _Format):
-        raise _RefusedError("an array of objects")
-    if isinstance(shape, int):
-        shape = (shape,)
-    if not isinstance(shape, tuple) or not all(isinstance(n, int) and n >= 0 for n in shape):
-        raise _RefusedError("an array with an impossible shape")
-    if max(shape, default=0) > allowed(MOST_NUMBERS):
-        raise _TooManyError("too many numbers")
-    count = 1
-    for n in shape:
-        count *= n
-    if len(shape) > DEEPEST or count * kind.dtype.itemsize != len(raw):
-        raise _RefusedError("an array with more or fewer bytes than its shape says")
-    return np.frombuffer(bytes(raw), kind.dtype).reshape(shape, order=order)
-
-
 def _numbers(given: Any, left: list[int], depth: int) -> Any:
     """Return arrays and numbers in nested lists; `left` counts down the remaining allowance of numbers."""
-    values: np.ndarray[Any, Any] | None = None
-    if isinstance(given, _Array | _Buffer):
-        values = given.values
-        if values is None:
-            raise _RefusedError("an array without numbers")
-        left[0] -= values.size
-    elif isinstance(given, int | float) and not isinstance(given, bool):
-        left[0] -= 1
-    elif isinstance(given, list | tuple):
+    values = given.values if isinstance(given, _Array) else None
+    if isinstance(given, _Array) and values is None:
+        raise _RefusedError("an array without numbers")
+    number = isinstance(given, int | float) and not isinstance(given, bool)
+    if values is None and not number and not isinstance(given, list | tuple):
+        raise _RefusedError(f"a {type(given).__name__.strip('_').lower()}")
+    left[0] -= 1 if values is None else values.size
+    if left[0] < 0:
+        raise _RefusedError(TOO_MANY)
+    if isinstance(given, list | tuple):
         if depth == 0:
             raise _RefusedError("lists nested too deeply")
-        left[0] -= 1
-        if left[0] >= 0:
-            return [_numbers(each, left, depth - 1) for each in given]
-    else:
-        raise _RefusedError(f"a {type(given).__name__.strip('_').lower()}")
-    if left[0] < 0:
-        raise _TooManyError("too many numbers")
+        return [_numbers(each, left, depth - 1) for each in given]
     return float(given) if values is None else values.astype(float)

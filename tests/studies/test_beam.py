@@ -10,12 +10,14 @@ import pytest
 
 from knode_cosserat.recordings.findings import RecordingError
 from studies import beam
-from studies.beam_fit import NOMINAL, identify_beam, marker_rmse
 from studies.beam_model import (
+    NOMINAL,
     Beam,
     Numerics,
     beam_rod,
     held_beam,
+    identify_beam,
+    marker_rmse,
     predict_markers,
     shear_factor,
     step_count,

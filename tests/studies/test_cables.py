@@ -17,8 +17,6 @@ from studies.cables.identification import SearchStage, identify_cable
 from studies.cables.model import DT, CableModel, CableParameters, Grips
 from studies.cables.places import marker_places
 from studies.cables.recordings import CableData, CableMotion
-from studies.cables.report import as_markdown
-from studies.cables.result import CableResult
 from studies.cables.rollouts import (
     CHUNK,
     NAMES,
@@ -28,6 +26,7 @@ from studies.cables.rollouts import (
     cable_parameters,
 )
 from studies.cables.shapes import CableGrid, Fitter
+from studies.cables.study import CableResult, as_markdown
 
 SPACE, NODES = "lobatto2", 9
 TRUE = CableParameters(

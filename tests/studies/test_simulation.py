@@ -15,7 +15,7 @@ import knode_cosserat as kc
 from knode_cosserat.learning.files.model_file import load_model
 from studies import methods, simulation
 from studies.__main__ import app
-from studies.simulation_report import cells_of, rerun
+from studies.simulation import cells_of, rerun
 from studies.tables import MEASURES, spreads
 
 KEYS = {"imperfection", "control", "method", "seed", "tip_dtw", "pose_mse"}

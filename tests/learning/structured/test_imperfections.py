@@ -13,7 +13,7 @@ from knode_cosserat.rotation import rotation_matrix
 from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.semi_discrete import History, Point
 from studies import imperfections, truths
-from studies.imperfections_report import as_markdown, figure, missed, ratios, rerun
+from studies.imperfections import as_markdown, figure, missed, ratios, rerun
 
 DT = imperfections.DT
 ROBOT = kc.load_robot(imperfections.ROBOT)
