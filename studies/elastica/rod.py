@@ -78,7 +78,7 @@ class ElasticaRod:
             ParameterError: a robot with parts that the rod does not have.
         """
         try:
-            from knode_cosserat.control import elastica_kernel as kernel
+            from studies.elastica import kernel
         except ImportError:
             raise ImportError("the stand-in robot needs PyElastica: pip install '.[studies]'") from None
         if elements < 3:
